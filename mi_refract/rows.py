@@ -1,0 +1,67 @@
+"""Rows: what a measurement leaves behind, and the only thing a report reads.
+
+`rows.json` is `{"schema": 1, "context": {...}, "rows": [row, ...]}`; a row is the dictionary form of `Row`
+below plus its `verdict`. `context` holds what every row shares: versions, machine, profile, start.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measurement: who, on what, under which backend, what came out, what was allowed.
+
+    `values` are the numbers by metric name. `budgets` are upper bounds for some of them; a value that is NaN
+    breaks its budget. A row without values was not run, and `reason` says why; otherwise `reason` is a remark.
+    `replay` is what repeats the row: seed, sizes, hex floats. `pictures` are EXR paths relative to the output
+    folder, by role (`reference`, `test`, `difference`). `curves` are named lists of (seconds, error) points.
+    """
+
+    study: str  # "directions"
+    subject: str  # what is judged: a formula, a plugin
+    case: str  # a regime of rays, a scene
+    setting: str  # "llvm float32", a Mitsuba variant
+    values: dict[str, float] = field(default_factory=dict)
+    budgets: dict[str, float] = field(default_factory=dict)
+    reason: str = ""
+    replay: dict[str, Any] = field(default_factory=dict)
+    pictures: dict[str, str] = field(default_factory=dict)
+    curves: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        unmeasured = self.budgets.keys() - self.values.keys() if self.values else set()
+        if unmeasured:
+            raise ValueError(f"row {self.name}: a budget without a value: {sorted(unmeasured)}")
+        if not self.values and not self.reason:
+            raise ValueError(f"row {self.name}: neither values nor the reason why it was not run")
+
+    @property
+    def name(self) -> str:
+        return " / ".join((self.study, self.subject, self.case, self.setting))
+
+    @property
+    def broken(self) -> dict[str, float]:
+        """The budgets that did not hold. `not (v <= b)`, so that NaN breaks them."""
+        return {m: b for m, b in self.budgets.items() if self.values and not (self.values[m] <= b)}
+
+    @property
+    def verdict(self) -> str:
+        """"not run", "fail", "pass", or "info" where nothing was demanded."""
+        if not self.values:
+            return "not run"
+        if self.broken:
+            return "fail"
+        return "pass" if self.budgets else "info"
+
+    def as_dict(self) -> dict[str, Any]:
+        return dataclasses.asdict(self) | {"verdict": self.verdict}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Row:
+        return cls(**{f.name: data[f.name] for f in dataclasses.fields(cls)})
