@@ -1,1 +1,35 @@
-"""The reference for refraction in rendering."""
+"""The reference for refraction in rendering.
+
+`import mi_refract` makes the BSDF `refract` known to Mitsuba, in the present variant and in every later one.
+
+Conventions, everywhere in this package:
+
+- `a` is the incident direction, pointing toward the surface; `n` the surface normal, on either side, unit;
+  `k = n_from / n_to`, the index of the medium the ray leaves over the one it enters; `b` the direction after.
+- A formula is `f(a, n, k) -> (b, transmitted)`. Where `transmitted` is False `b` is the mirror direction.
+  `b` keeps the length of `a`.
+- Exactly at the critical angle the ray is transmitted, along the surface. A tangential ray (n·a = 0) neither
+  enters nor leaves: `transmitted` is False and b = a.
+- NaN in gives NaN out and `transmitted = False`; so does a zero vector, or a k that is not positive and finite.
+- `contrast` is κ = k² − 1, for those who know it better than float32 `k` does.
+"""
+
+import mitsuba as _mi
+
+from . import bsdf as _bsdf
+from .formulas import FORMULAS, reflect, reflect_sandwich, refract_2d
+
+__all__ = ["FORMULAS", "reflect", "reflect_sandwich", "refract_2d"]
+__version__ = "0.1.0"
+
+
+def _register(old: str | None, new: str | None) -> None:
+    """After every `set_variant`. Registration is per variant and does not outlive a switch."""
+    if new:
+        _bsdf.register(getattr(_mi, new))
+
+
+# `scalar_rgb` always: Mitsuba's parser asks only that variant what kind of plugin a name is.
+_bsdf.register(_mi.scalar_rgb)
+_register(None, _mi.variant())
+_mi.detail.add_variant_callback(_register)

@@ -1,0 +1,227 @@
+"""The Mitsuba BSDF `refract`, a drop-in for `dielectric`. Glue only: the mathematics is in formulas and fresnel.
+
+A plugin class belongs to one variant, so `plugin_class` builds it from that variant's module, and `register`
+makes it known there. Parameters: `int_ior`, `ext_ior` (number or a name from Mitsuba's table),
+`specular_reflectance`, `specular_transmittance` (textures or numbers), `formula` (a key of FORMULAS, or "auto").
+"""
+
+from __future__ import annotations
+
+import math
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+
+from . import fresnel
+from .formulas import resolve
+
+PLUGIN = "refract"
+LOBES = ("specular_reflectance", "specular_transmittance")  # tint of the reflected and of the transmitted lobe
+
+
+class Side(NamedTuple):
+    """What a ray needs to know of the boundary from one side: k = n_from / n_to and κ = k² − 1."""
+
+    k: Any
+    contrast: Any
+
+
+class Ray(NamedTuple):
+    """One refraction in the local frame: `eta` is n_to / n_from, `r` the unpolarised reflectance."""
+
+    side: Side
+    wo: Any
+    eta: Any
+    cos_i: Any
+    cos_t: Any
+    transmitted: Any
+    r: Any
+
+
+def read_ior(props: Any, name: str, default: str) -> float:
+    """The index of refraction in double precision, from a number or a name of Mitsuba's table.
+
+    RuntimeError naming parameter, value and what is accepted, for anything but a positive finite number or a name.
+    """
+    value = props.get(name, default)
+    if isinstance(value, str):
+        return _named_ior(name, value)
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < math.inf:
+        return float(value)
+    raise ValueError(f"{PLUGIN}: {name} = {value!r}: accepted: a positive finite number, or a material's name")
+
+
+def _named_ior(name: str, material: str) -> float:
+    query = mi.Properties()
+    query[name] = material
+    try:
+        single = mi.lookup_ior(query, name, material)
+    except RuntimeError as error:
+        known = str(error).partition("choices are:")[2] or "the names of Mitsuba's table"
+        raise ValueError(f"{PLUGIN}: {name} = {material!r}: unknown material; accepted: {known.strip()}") from None
+    # The table holds decimal numbers of at most seven digits in float32: the shortest decimal gives them back.
+    return float(str(dr.scalar.TensorXf([single]).numpy()[0]))
+
+
+def plugin_class(variant: ModuleType) -> type:
+    """The class of the plugin for one variant, given its module (`mitsuba.llvm_ad_rgb`, say)."""
+    v: Any = variant
+    flags = mi.BSDFFlags
+    reflection, transmission = flags.DeltaReflection, flags.DeltaTransmission
+    both_sides = flags.FrontSide | flags.BackSide
+
+    class Refract(v.BSDF):
+        """Smooth dielectric boundary; see the module docstring."""
+
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            int_ior, ext_ior = read_ior(props, "int_ior", "bk7"), read_ior(props, "ext_ior", "air")
+            self.requested = props.get("formula", "auto")
+            try:
+                self.formula_name, self.formula = resolve(self.requested, dr.backend_v(v.Float))
+            except ValueError as error:
+                raise ValueError(f"{PLUGIN}: {error}") from None
+            self.textures = {name: props.get_texture(name, 1.0) for name in LOBES if props.has_property(name)}
+            # Scalar variants: Mitsuba can set an array of one number, but not a bare Python float.
+            number = v.Float if dr.is_jit_v(v.Float) else dr.scalar.Array1f
+            self.eta = number(int_ior / ext_ior)
+            self._face(int_ior / ext_ior, (int_ior - ext_ior) * (int_ior + ext_ior) / ext_ior**2)
+            self.m_components = [reflection | both_sides, transmission | both_sides | flags.NonSymmetric]
+            self.m_flags = self.m_components[0] | self.m_components[1]
+
+        def _face(self, eta: Any, contrast: Any) -> None:
+            """Set both sides from eta and eta² − 1 in double precision, each number rounded once.
+
+            Opaque, so that an edit changes the data of a kernel and not its code.
+            """
+            self.outer = Side(v.Float(1 / eta), v.Float(-contrast / (eta * eta)))
+            self.inner = Side(v.Float(eta), v.Float(contrast))
+            dr.make_opaque(self.eta, self.outer, self.inner)
+
+        def traverse(self, cb: Any) -> None:
+            cb.put("eta", self.eta, mi.ParamFlags.Differentiable)
+            for name, texture in self.textures.items():
+                cb.put(name, texture, mi.ParamFlags.Differentiable)
+
+        def parameters_changed(self, keys: Any) -> None:
+            if not keys or "eta" in keys:
+                wide: Any = dr.float64_array_t(v.Float)
+                eta = wide(self._eta())
+                self._face(eta, (eta - 1) * (eta + 1))
+
+        def _eta(self) -> Any:
+            return self.eta if dr.is_jit_v(v.Float) else self.eta[0]
+
+        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+            has_r, has_t = ctx.is_enabled(reflection, 0), ctx.is_enabled(transmission, 1)
+            bs = dr.zeros(v.BSDFSample3f)
+            if not (has_r or has_t):
+                return bs, v.Spectrum(0)
+            ray = self._refract(si.wi)
+            if has_r and has_t:
+                # r > 0: an index-matched boundary never reflects, not even the sample that is exactly 0.
+                selected_r = (sample1 <= ray.r) & (ray.r > 0) & active
+                bs.pdf = dr.detach(dr.select(selected_r, ray.r, 1 - ray.r))
+            else:
+                selected_r = v.Bool(has_r) & active
+                bs.pdf = 1
+            selected_t = (selected_r ^ True) & active
+            bs.sampled_component = dr.select(selected_r, v.UInt32(0), v.UInt32(1))
+            bs.sampled_type = dr.select(selected_r, v.UInt32(+reflection), v.UInt32(+transmission))
+            bs.wo = dr.select(selected_r, v.Vector3f(-si.wi.x, -si.wi.y, si.wi.z), ray.wo)
+            bs.eta = dr.select(selected_r, v.Float(1), ray.eta)
+            weight = self._weight(ctx, si, bs, ray, selected_r, has_r and has_t)
+            for texture, selected in self._tints(selected_r, selected_t):
+                tint = dr.select(selected, texture.eval(si, selected), v.UnpolarizedSpectrum(1))
+                weight = weight @ v.mueller.absorber(tint) if v.is_polarized else weight * tint
+            if ctx.mode == mi.TransportMode.Radiance:
+                weight = weight * dr.select(selected_t, dr.square(ray.side.k), 1)
+            return bs, dr.select(active, weight, 0)
+
+        def _refract(self, wi: Any) -> Ray:
+            """The ray's side, refracted direction and reflectance. The normal is a literal: Dr.Jit folds it away."""
+            outside = wi.z >= 0
+            side = Side(*(dr.select(outside, o, i) for o, i in zip(self.outer, self.inner, strict=True)))
+            wo, transmitted = self.formula(-wi, v.Vector3f(0, 0, 1), side.k, side.contrast)
+            cos_i, cos_t = dr.abs(wi.z), dr.abs(wo.z)
+            r = fresnel.reflectance(cos_i, cos_t, transmitted, side.k, side.contrast)
+            return Ray(side, wo, dr.select(outside, self.inner.k, self.outer.k), cos_i, cos_t, transmitted, r)
+
+        def _weight(self, ctx: Any, si: Any, bs: Any, ray: Ray, selected_r: Any, both: bool) -> Any:
+            """The lobe's value over its probability, without tint and without the radiance factor."""
+            if v.is_polarized:
+                return self._mueller(ctx, si, bs, ray, selected_r) / bs.pdf
+            value = dr.select(selected_r, ray.r, 1 - ray.r)
+            if not both:
+                return v.Spectrum(value)
+            if not dr.grad_enabled(value):
+                return v.Spectrum(1)
+            return v.Spectrum(dr.replace_grad(v.Float(1), value / dr.detach(value)))
+
+        def _tints(self, selected_r: Any, selected_t: Any) -> list[tuple[Any, Any]]:
+            masks = dict(zip(LOBES, (selected_r, selected_t), strict=True))
+            return [(texture, masks[name]) for name, texture in self.textures.items()]
+
+        def _mueller(self, ctx: Any, si: Any, bs: Any, ray: Ray, selected_r: Any) -> Any:
+            """The Mueller matrix of the selected lobe, turned into the implicit Stokes bases of both directions."""
+            r = fresnel.mueller_reflection(ray.cos_i, ray.side.k, ray.side.contrast)
+            t = fresnel.mueller_transmission(ray.cos_i, ray.cos_t, ray.transmitted, ray.side.k)
+            matrix = v.Spectrum(v.Matrix4f([[dr.select(selected_r, x, y) for x, y in zip(*p)] for p in zip(r, t)]))
+            # Light arrives along −wo and leaves along wi when radiance is transported, and the other way for importance.
+            radiance = ctx.mode == mi.TransportMode.Radiance
+            arrival, departure = (-bs.wo, si.wi) if radiance else (-si.wi, bs.wo)
+            axes = [self._perpendicular(direction) for direction in (arrival, departure)]
+            return v.mueller.rotate_mueller_basis(
+                matrix, arrival, axes[0], v.mueller.stokes_basis(arrival),
+                departure, axes[1], v.mueller.stokes_basis(departure),
+            )  # fmt: skip
+
+        @staticmethod
+        def _perpendicular(direction: Any) -> Any:
+            """The unit normal of the plane of incidence; any tangent where there is no such plane."""
+            axis = v.Vector3f(-direction.y, direction.x, 0)
+            length = dr.norm(axis)
+            return dr.select(length > 0, axis / dr.select(length > 0, length, 1), v.Vector3f(1, 0, 0))
+
+        # A pair of delta lobes has no density anywhere.
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return v.Spectrum(0)
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return v.Float(0)
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+            return v.Spectrum(0), v.Float(0)
+
+        def has_attribute(self, name: str, active: Any = True) -> Any:
+            return v.Bool(name == "eta" or name in self.textures)
+
+        def eval_attribute(self, name: str, si: Any, active: Any = True) -> Any:
+            return v.UnpolarizedSpectrum(self._eta()) if name == "eta" else self._texture(name).eval(si, active)
+
+        def eval_attribute_1(self, name: str, si: Any, active: Any = True) -> Any:
+            return self._eta() if name == "eta" else self._texture(name).eval_1(si, active)
+
+        def eval_attribute_3(self, name: str, si: Any, active: Any = True) -> Any:
+            return v.Color3f(self._eta()) if name == "eta" else self._texture(name).eval_3(si, active)
+
+        def _texture(self, name: str) -> Any:
+            if name not in self.textures:
+                raise RuntimeError(f"{PLUGIN}: no attribute {name!r}; it has {', '.join(('eta', *self.textures))}")
+            return self.textures[name]
+
+        def to_string(self) -> str:
+            chosen = f"{self.formula_name} (auto)" if self.requested == "auto" else self.formula_name
+            lines = [f"eta = {dr.slice(self._eta())}", f"formula = {chosen}"]
+            lines += [f"{name} = {texture}" for name, texture in self.textures.items()]
+            return "Refract[\n" + "".join(f"  {line},\n" for line in lines).replace("\n  ", "\n  ") + "]"
+
+    return Refract
+
+
+def register(variant: ModuleType) -> None:
+    """Make the plugin known to one variant, given its module. Registering again is harmless."""
+    variant.register_bsdf(PLUGIN, plugin_class(variant))

@@ -1,0 +1,157 @@
+"""Error-free transforms and double-word arithmetic on Dr.Jit arrays. No optics.
+
+A *pair* `(hi, lo)` stands for the unevaluated sum hi + lo with |lo| ≤ u |hi|, u the roundoff of the working
+precision (2⁻²⁴ in float32, 2⁻⁵³ in float64). All functions hold for any Dr.Jit float type, scalar, LLVM or CUDA,
+as long as nothing over- or underflows. They need a true fused multiply-add: `dr.fma` is one on every backend.
+
+Sources: Knuth, TAOCP 2, 4.2.2 (two_sum); Ogita, Rump, Oishi 2005 (dot); Kahan, in Jeannerod, Louvet, Muller
+2013 (difference of products); Joldes, Muller, Popescu 2017 (double-word operations and their bounds).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+Pair = tuple[Any, Any]
+
+
+def quotient(x: Any, y: Any) -> Any:
+    """x / y by the rules of IEEE 754 on every backend; a Python float would raise where y is 0."""
+    if isinstance(y, float) and y == 0:
+        return x * dr.rcp(y)
+    return x / y
+
+
+def two_sum(x: Any, y: Any) -> Pair:
+    """s = fl(x + y) and e with s + e = x + y exactly, whatever the magnitudes."""
+    s = x + y
+    y_part = s - x
+    return s, (x - (s - y_part)) + (y - y_part)
+
+
+def fast_two_sum(x: Any, y: Any) -> Pair:
+    """As `two_sum`, three operations instead of six. Precondition: |x| ≥ |y| or x = 0."""
+    s = x + y
+    return s, y - (s - x)
+
+
+def two_prod(x: Any, y: Any) -> Pair:
+    """p = fl(x y) and e with p + e = x y exactly."""
+    p = x * y
+    return p, dr.fma(x, y, -p)
+
+
+@dataclass(frozen=True)
+class Double:
+    """A number of twice the working precision, as the unevaluated sum hi + lo.
+
+    Supports what a formula needs: + − × with another `Double` or a plain number, negation and `sqrt`.
+    Relative error of each operation ≤ 5u² (addition included, whatever cancels).
+    """
+
+    hi: Any
+    lo: Any = 0.0
+
+    @staticmethod
+    def product(x: Any, y: Any) -> Double:
+        """x y exactly, for plain numbers x, y."""
+        return Double(*two_prod(x, y))
+
+    @staticmethod
+    def of(x: Any) -> Double:
+        return x if isinstance(x, Double) else Double(x)
+
+    def __add__(self, other: Any) -> Double:
+        # AccurateDWPlusDW: ≤ 3u² + 13u³, also where the high parts cancel.
+        other = Double.of(other)
+        s, s_lo = two_sum(self.hi, other.hi)
+        t, t_lo = two_sum(self.lo, other.lo)
+        s, s_lo = fast_two_sum(s, s_lo + t)
+        return Double(*fast_two_sum(s, s_lo + t_lo))
+
+    def __neg__(self) -> Double:
+        return Double(-self.hi, -self.lo)
+
+    def __sub__(self, other: Any) -> Double:
+        return self + -Double.of(other)
+
+    def __mul__(self, other: Any) -> Double:
+        # DWTimesDW3: ≤ 4u².
+        other = Double.of(other)
+        p, e = two_prod(self.hi, other.hi)
+        cross = dr.fma(self.hi, other.lo, dr.fma(self.lo, other.hi, self.lo * other.lo))
+        return Double(*fast_two_sum(p, e + cross))
+
+    def scaled(self, x: Any, x_low: Any = 0) -> Double:
+        """self · (x + x_low), not normalised: for sums that are rounded right after. |x_low| ≤ u |x|."""
+        p, e = two_prod(self.hi, x)
+        return Double(p, e + dr.fma(self.lo, x, self.hi * x_low))
+
+    def sqrt(self) -> Double:
+        """√max(x, 0), with a finite derivative at 0."""
+        root = dr.safe_sqrt(self.hi)
+        rest = quotient(dr.fma(-root, root, self.hi) + self.lo, 2 * root)
+        return Double(*fast_two_sum(root, dr.select(root > 0, rest, 0)))
+
+
+def select(mask: Any, x: Double, y: Double) -> Double:
+    return Double(dr.select(mask, x.hi, y.hi), dr.select(mask, x.lo, y.lo))
+
+
+def dot(x: Any, y: Any) -> Double:
+    """x · y of two 3-vectors as a `Double`: error ≤ u² · 12 Σ|xᵢ yᵢ|, and 0 exactly when the sum is 0."""
+    p, e0 = two_prod(x[0], y[0])
+    q, e1 = two_prod(x[1], y[1])
+    r, e2 = two_prod(x[2], y[2])
+    s, e3 = two_sum(p, q)
+    s, e4 = two_sum(s, r)
+    # The five errors are at most u each of a partial sum; their own sum is kept as a pair, because after a
+    # cancellation of s they are all that is left.
+    t, t0 = two_sum(e0, e1)
+    t, t1 = two_sum(t, e2)
+    v, v0 = two_sum(e3, e4)
+    t, t2 = two_sum(t, v)
+    s, f = two_sum(s, t)
+    return Double(*fast_two_sum(s, f + ((t0 + t1) + (t2 + v0))))
+
+
+def cross(x: Any, y: Any) -> list[Double]:
+    """x × y of two 3-vectors as three `Double`s, each with relative error ≤ 4u² + the fourth-order tail."""
+    return [_exact_difference(x[i], y[j], x[j], y[i]) for i, j in ((1, 2), (2, 0), (0, 1))]
+
+
+def sum_of_squares(x: list[Double]) -> Double:
+    """Σ xᵢ² of `Double`s: no term is negative, so plain accumulation of the low parts keeps a few u²."""
+    total, low = None, 0
+    for x_i in x:
+        p, e = two_prod(x_i.hi, x_i.hi)
+        low = low + dr.fma(2 * x_i.hi, x_i.lo, e)
+        if total is None:
+            total = p
+        else:
+            total, f = two_sum(total, p)
+            low = low + f
+    return Double(*fast_two_sum(total, low))
+
+
+def defect(target: Double, *products: Pair) -> Any:
+    """target − Σ xᵢ yᵢ as a plain number: error ≤ u · |result| + 8u² Σ|xᵢ yᵢ|, so small defects keep their digits."""
+    total, low = two_prod(*products[0])
+    for x, y in products[1:]:
+        p, e = two_prod(x, y)
+        total, f = two_sum(total, p)
+        low = low + (e + f)
+    return (target.hi - total) + (target.lo - low)
+
+
+def _exact_difference(x: Any, y: Any, z: Any, w: Any) -> Double:
+    """x y − z w: both products are exact pairs, and their four parts are added without loss to second order."""
+    p, p_lo = two_prod(x, y)
+    q, q_lo = two_prod(z, w)
+    d, d_lo = two_sum(p, -q)
+    e, e_lo = two_sum(p_lo, -q_lo)
+    s, s_lo = two_sum(d, e)
+    return Double(*fast_two_sum(s, s_lo + (d_lo + e_lo)))
