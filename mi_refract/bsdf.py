@@ -158,7 +158,8 @@ def plugin_class(variant: ModuleType) -> type:
                 return v.Spectrum(value)
             if not dr.grad_enabled(value):
                 return v.Spectrum(1)
-            return v.Spectrum(dr.replace_grad(v.Float(1), value / dr.detach(value)))
+            one: Any = dr.replace_grad(v.Float(1), value / dr.detach(value))  # the choice of a lobe is detached
+            return v.Spectrum(one)
 
         def _tints(self, selected_r: Any, selected_t: Any) -> list[tuple[Any, Any]]:
             masks = dict(zip(LOBES, (selected_r, selected_t), strict=True))
@@ -168,8 +169,11 @@ def plugin_class(variant: ModuleType) -> type:
             """The Mueller matrix of the selected lobe, turned into the implicit Stokes bases of both directions."""
             r = fresnel.mueller_reflection(ray.cos_i, ray.side.k, ray.side.contrast)
             t = fresnel.mueller_transmission(ray.cos_i, ray.cos_t, ray.transmitted, ray.side.k)
-            matrix = v.Spectrum(v.Matrix4f([[dr.select(selected_r, x, y) for x, y in zip(*p)] for p in zip(r, t)]))
-            # Light arrives along −wo and leaves along wi when radiance is transported, and the other way for importance.
+            entries = [
+                [dr.select(selected_r, x, y) for x, y in zip(*rows, strict=True)] for rows in zip(r, t, strict=True)
+            ]
+            matrix = v.Spectrum(v.Matrix4f(entries))
+            # Radiance: light arrives along −wo and leaves along wi. Importance: the other way round.
             radiance = ctx.mode == mi.TransportMode.Radiance
             arrival, departure = (-bs.wo, si.wi) if radiance else (-si.wi, bs.wo)
             axes = [self._perpendicular(direction) for direction in (arrival, departure)]

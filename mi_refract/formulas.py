@@ -202,12 +202,14 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
         return refract_compensated(a, n, k, contrast)
     wide: Any = dr.float64_array_t(type(a))
     number = dr.value_t(wide)
-    d, m, k2 = wide(a), wide(n), number(_scalar(a, k))
-    if contrast is None:
-        kappa = k2 * k2 - 1  # k² has 48 bits: the difference is rounded at most once
-    else:
-        kappa = number(contrast)
-        k2 = dr.sqrt(1 + kappa)
+    k = _scalar(a, k)
+    d, m, k2 = wide(a), wide(n), number(k)
+    kappa = k2 * k2 - 1  # k² has 48 bits: the difference is rounded at most once
+    if contrast is not None:
+        # √(1 + κ) = k + (κ − (k² − 1))/2k to second order; the quotient needs few digits, so it stays narrow.
+        known = number(contrast)
+        k2 = k2 + number(quotient(type(k)(known - kappa), 2 * k))
+        kappa = known
     # Products of components are exact and their sums rounded at 2⁻⁵³: error of the radicand ≤ 8·2⁻⁵³ of its terms.
     c, w = dr.dot(m, d), dr.cross(m, d)
     radicand = c * c - kappa * dr.dot(w, w)
