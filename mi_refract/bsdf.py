@@ -7,6 +7,7 @@ makes it known there. Parameters: `int_ior`, `ext_ior` (number or a name from Mi
 
 from __future__ import annotations
 
+import functools
 import math
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import fresnel
-from .formulas import resolve
+from .formulas import FORMULAS, resolve
 
 PLUGIN = "refract"
 LOBES = ("specular_reflectance", "specular_transmittance")  # tint of the reflected and of the transmitted lobe
@@ -75,10 +76,10 @@ def plugin_class(variant: ModuleType) -> type:
     class Refract(v.BSDF):
         """Smooth dielectric boundary; see the module docstring."""
 
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: Any, formula: str = "auto") -> None:
             super().__init__(props)
             int_ior, ext_ior = read_ior(props, "int_ior", "bk7"), read_ior(props, "ext_ior", "air")
-            self.requested = props.get("formula", "auto")
+            self.requested = props.get("formula", formula)
             try:
                 self.formula_name, self.formula = resolve(self.requested, dr.backend_v(v.Float))
             except ValueError as error:
@@ -227,5 +228,12 @@ def plugin_class(variant: ModuleType) -> type:
 
 
 def register(variant: ModuleType) -> None:
-    """Make the plugin known to one variant, given its module. Registering again is harmless."""
-    variant.register_bsdf(PLUGIN, plugin_class(variant))
+    """Make `refract` known to one variant, given its module; and `refract_<formula>` for every formula.
+
+    The latter are for scenes whose plugin is a parameter: there no word is left to name the formula with.
+    Registering again is harmless.
+    """
+    plugin = plugin_class(variant)
+    variant.register_bsdf(PLUGIN, plugin)
+    for name in FORMULAS:
+        variant.register_bsdf(f"{PLUGIN}_{name}", functools.partial(plugin, formula=name))

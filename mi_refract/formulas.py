@@ -281,7 +281,7 @@ def _rounding(u: float, k: float) -> float:
     return 0.92 * u
 
 
-def _cancelling(growth: int) -> Callable[[float, float], float]:
+def cancelling(growth: int) -> Callable[[float, float], float]:
     """A-priori bound of a form whose radicand cancels.
 
     The radicand is off by ≤ 12u K^growth, K = max(1, k): nine roundings and inputs that are unit only to u. Its
@@ -318,22 +318,22 @@ class Formula:
 
 FORMULAS = {
     "wedge": Formula(
-        refract_wedge, "000, boxed", "b = k n(n∧a) + s n √(a² + k²(n∧a)²)", budget=_cancelling(1)
+        refract_wedge, "000, boxed", "b = k n(n∧a) + s n √(a² + k²(n∧a)²)", budget=cancelling(1)
     ),
     "wedge_contrast": Formula(
         refract_wedge_contrast,
         "000, last form",
         "b = k n(n∧a) + s n √((n·a)² + (n∧a)²(k² − 1))",
-        budget=_cancelling(1),
+        budget=cancelling(1),
     ),
     "cross": Formula(
-        refract_cross, "001, eq. 6", "t = n×c + s √(1 − ‖c‖²) n, c = k (i×n)", budget=_cancelling(1)
+        refract_cross, "001, eq. 6", "t = n×c + s √(1 − ‖c‖²) n, c = k (i×n)", budget=cancelling(1)
     ),
     "decomposed": Formula(
-        refract_decomposed, "002, eq. 1", "b = k a − n (k c − s √(1 − k²(1 − c²))), c = n·a", budget=_cancelling(2)
+        refract_decomposed, "002, eq. 1", "b = k a − n (k c − s √(1 − k²(1 − c²))), c = n·a", budget=cancelling(2)
     ),
     "rotated": Formula(
-        refract_rotated, "004", "b = B (s √(1 − X²), X), X = k R/√(1 + R²)", budget=_cancelling(1)
+        refract_rotated, "004", "b = B (s √(1 − X²), X), X = k R/√(1 + R²)", budget=cancelling(1)
     ),
     "compensated": Formula(
         refract_compensated,
