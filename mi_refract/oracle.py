@@ -283,7 +283,7 @@ def _inputs(a: Any, n: Any, k: Any, contrast: Any) -> tuple:
 def _floats(name: str, x: Any, *shapes: tuple) -> np.ndarray:
     """`x` as float64, exactly. One of `shapes`, where "N" is any length."""
     x = np.asarray(float(x) if isinstance(x, int) else x)
-    fits = any(len(s) == x.ndim and all(w in ("N", m) for w, m in zip(s, x.shape, strict=True)) for s in shapes)
+    fits = any(len(s) == x.ndim and all(map(lambda w, m: w in ("N", m), s, x.shape)) for s in shapes)
     if x.dtype not in (np.float32, np.float64) or not fits:
         accepted = " or ".join(f"({', '.join(map(str, s))})" if s else "a number" for s in shapes)
         raise ValueError(f"oracle: {name} is {x.dtype} {x.shape}; accepted: float32 or float64, {accepted}")
