@@ -220,8 +220,7 @@ def residual(a: Any, n: Any, k: Any, certified: Certified, *, contrast: Any = No
 
     With u = n/|n|, i = a/|a| and ratio = k (transmitted) or 1, in balls around the answer:
         u×b − ratio u×i = 0     Snell's law, its plane and its side
-        |b|² − 1 = 0
-        u·b − (±√(1 − ratio²|u×i|²)) = 0     at the critical angle the length alone is blind along n
+        u·b − (±√(1 − ratio²|u×i|²)) = 0     |b| = 1; the length itself is blind along n at the critical angle
     and the flag must be what the exact signs of n·a and 1 − k² sin²θi say. Invalid rays must be NaN.
     A ball wider than 1e-28 proves nothing: the law does not hold there.
     """
@@ -240,7 +239,7 @@ def residual(a: Any, n: Any, k: Any, certified: Certified, *, contrast: Any = No
 
 
 def _law(ray: tuple, high: list, low: list, radius: float, transmitted: bool) -> list:
-    """The five balls of `residual`; none where the flag is wrong."""
+    """The four balls of `residual`; none where the flag is wrong."""
     with ctx.workprec(EXACT_BITS):
         ax, ay, az, nx, ny, nz = (arb(x) for x in ray[:6])
         k2 = arb(ray[6]) ** 2 if ray[7] is None else arb(ray[7]) + 1
@@ -262,7 +261,6 @@ def _law(ray: tuple, high: list, low: list, radius: float, transmitted: bool) ->
             uy * bz - uz * by + scale * cross[0],
             uz * bx - ux * bz + scale * cross[1],
             ux * by - uy * bx + scale * cross[2],
-            bx * bx + by * by + bz * bz - 1,
             bx * ux + by * uy + bz * uz - side * cosine.sqrt() * unit,
         ]
 

@@ -204,6 +204,16 @@ def test_residual_flags_a_direction_off_by_1e25th(make, axis):
     assert not oracle.residual(a, n, k, dataclasses.replace(c, direction_low=low)).holds.any()
 
 
+@pytest.mark.parametrize("k", [0.75, 1.9])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_residual_flags_each_component_alone(axis, k):
+    """n and the error along the axes, so that only one of the residual's balls can see each error."""
+    a, n = np.array([[2.0, -3, 4]]).repeat(3, 0), np.eye(3)[[axis]].repeat(3, 0)
+    c = oracle.refract(a, n, k)
+    bad = dataclasses.replace(c, direction_low=c.direction_low + 1e-25 * np.eye(3))
+    assert not oracle.residual(a, n, k, bad).holds.any()
+
+
 def test_residual_sees_along_n_at_the_critical_angle():
     a = np.array([[4.0, 0, -3]])
     c = oracle.refract(a, Z, 1.25)
@@ -302,6 +312,30 @@ def test_the_smallest_cosine_is_not_tangential():
     assert c.transmitted.all()
     assert np.allclose(c.direction[:, 2], [0.75**0.5, -(0.75**0.5)], rtol=1e-15, atol=0)
     assert not oracle.refract(a, n, np.nextafter(1, 2)).transmitted.any()
+
+
+TINY, HUGE = 5e-324, 2.0**1023
+
+
+@pytest.mark.parametrize(
+    ("a", "n", "k", "transmitted", "side"),
+    [
+        ([HUGE, TINY, HUGE], [HUGE, TINY, -HUGE], 0.5, True, 1),  # n·a = +TINY²
+        ([HUGE, TINY, HUGE], [HUGE, -TINY, -HUGE], 0.5, True, -1),  # n·a = −TINY²
+        ([HUGE, 0, HUGE], [HUGE, TINY, -HUGE], 0.5, False, 0),  # tangential
+        ([4, TINY, -3], [0, 0, 1], 1.25, False, 0),  # the radicand is −(9/16) TINY²
+        ([4, 0, -3], [0, TINY, 1], 1.25, False, 0),
+        ([4, TINY, -3], [0, -TINY, 1], 1.25, False, 0),
+        ([4, 0, -3 - 2.0**-51], [0, TINY, 1], 1.25, True, -1),
+    ],
+)
+def test_the_last_bit_decides(a, n, k, transmitted, side):
+    """The signs of n·a and of the radicand where 2^±2000 meet: `side` is the side of n on which b leaves."""
+    a, n = np.array([a], float), np.array([n], float)
+    c = oracle.refract(a, n, k)
+    assert not c.undecided[0] and c.transmitted[0] == transmitted
+    assert not transmitted or np.sign(c.direction[0] @ (n[0] / np.abs(n).max())) == side
+    assert oracle.residual(a, n, k, c).holds.all()
 
 
 @pytest.mark.parametrize("make", REGIMES)
