@@ -38,7 +38,7 @@ MAX_RESIDUAL = 1e-28
 # |x| ≤ 1 as a pair of doubles: |x − high| ≤ 2⁻⁵⁴, so |x − high − low| ≤ 2⁻¹⁰⁸. Two bits spare for the radius.
 PAIR_ERROR = 2.0**-106
 
-_CHUNK = 1024
+_CHUNK = 256
 _COLUMNS = 18
 _FIRST_FRESNEL = 10
 _NO_FRESNEL = (math.nan,) * 8
