@@ -227,7 +227,7 @@ def residual(a: Any, n: Any, k: Any, certified: Certified, *, contrast: Any = No
     a, n, k, contrast, valid = _inputs(a, n, k, contrast)
     if len(certified) != len(a):
         raise ValueError(f"oracle: certified holds {len(certified)} rays; accepted: {len(a)}, as many as a")
-    holds = np.isnan(certified.direction).all(axis=1) & ~certified.transmitted & ~valid
+    holds = np.isnan(certified.direction).all(axis=1) & ~certified.transmitted
     width = np.zeros(len(a))
     index = np.flatnonzero(valid)
     for i, ray in zip(index, _rays(a, n, k, contrast, index), strict=True):

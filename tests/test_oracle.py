@@ -40,6 +40,12 @@ def grazing(rng, size):
     return unit(np.cross(n, rng.normal(size=n.shape))) + cos_i * n, n, rng.uniform(0.5, 1, size)
 
 
+def skimming(rng, size):
+    angle, cos_i = rng.uniform(0, 6.3, size), 10.0 ** rng.uniform(-100, -20, size)
+    a = np.column_stack([np.cos(angle), np.sin(angle), rng.choice([-1, 1], size) * cos_i])
+    return a, Z.repeat(size, 0), rng.uniform(0.5, 1, size)
+
+
 def critical(rng, size):
     a, n = at_angle(rng, rng.uniform(0.3, 0.999, size))
     k = np.linalg.norm(n, axis=1) * np.linalg.norm(a, axis=1) / np.linalg.norm(np.cross(n, a), axis=1)
@@ -75,7 +81,7 @@ def single(rng, size):
     return tuple(x.astype(np.float32) for x in generic(rng, size))
 
 
-REGIMES = [generic, grazing, critical, matched, far, near_normal, lengths, denormal, single]
+REGIMES = [generic, grazing, skimming, critical, matched, far, near_normal, lengths, denormal, single]
 BOTH_OUTCOMES = [generic, critical, matched, far, lengths, denormal, single]
 
 

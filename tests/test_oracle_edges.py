@@ -55,7 +55,7 @@ def test_the_critical_angle_is_decided_exactly(case):
     assert c.cos_t[0] > 0 and c.cos_t[1] == 0
     u, b = n[0] / np.abs(n).max(), c.direction[1]
     assert abs(b @ u) < 1e-15 and b @ (a[0] / np.abs(a).max()) > 0
-    assert c.reflectance[1] == 1 and c.transmittance[1] == 0
+    assert (c.reflectance[1], c.reflectance_low[1], c.transmittance[1]) == (1, 0, 0)
     assert c.amplitude_s[1] == 1 and c.amplitude_p[1] == 1
 
 
@@ -116,6 +116,8 @@ def test_invalid_rays_are_nan(bad, dtype):
     assert oracle.residual(a, n, k, c).holds.all()
     plausible = dataclasses.replace(c, direction=np.tile(c.direction[0], (4, 1)))
     assert oracle.residual(a, n, k, plausible).holds.tolist() == [True, False, False, False]
+    through = dataclasses.replace(c, transmitted=np.ones(4, bool))
+    assert oracle.residual(a, n, k, through).holds.tolist() == [True, False, False, False]
 
 
 @pytest.mark.parametrize("k", [-1.5, -1e-300])
