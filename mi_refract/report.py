@@ -35,9 +35,6 @@ ROLES = ("reference", "test", "difference")
 WORDS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
-# JSON
-
-
 def write_json(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]) -> None:
     """Write the document `rows.py` describes, as strict JSON: NaN and the infinities become words.
 
@@ -56,8 +53,8 @@ def read_json(path: str | Path) -> tuple[list[Row], dict[str, Any]]:
     """
     try:
         document = json.loads(Path(path).read_bytes(), parse_constant=_no_constant)
-        if not isinstance(document, dict) or document.get("schema") != SCHEMA:
-            found = document.get("schema") if isinstance(document, dict) else None
+        found = document.get("schema") if isinstance(document, dict) else None
+        if found != SCHEMA:
             raise ValueError(f"schema {found!r}, expected {SCHEMA}")
         rows = [_row(number, data) for number, data in enumerate(document["rows"])]
         return rows, dict(document["context"])
@@ -104,9 +101,6 @@ def _row(number: int, data: dict[str, Any]) -> Row:
         raise ValueError(f"row {number}: {error}") from error
 
 
-# Words shared by every output
-
-
 def verdict(rows: Sequence[Row]) -> str:
     """One sentence: how many budgets were measured, how many broke, how many rows were not run."""
     measured = sum(len(row.budgets) for row in rows if row.values)
@@ -130,9 +124,6 @@ def _studies(rows: Iterable[Row]) -> dict[str, list[Row]]:
     for row in rows:
         studies.setdefault(row.study, []).append(row)
     return studies
-
-
-# JUnit
 
 
 def write_junit(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]) -> None:
@@ -177,9 +168,6 @@ def _xml(text: Any) -> str:
     return re.sub("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", str(text))
 
 
-# Terminal
-
-
 def summary(rows: Sequence[Row]) -> RenderableType:
     """Broken budgets first, then verdicts by study, then the sentence, for rich's console."""
     from rich.console import Group
@@ -207,9 +195,6 @@ def summary(rows: Sequence[Row]) -> RenderableType:
     return Group(*parts, counts, Text(), Text(verdict(rows), style="bold red" if broken else "bold"))
 
 
-# HTML
-
-
 def write_html(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any], folder: str | Path) -> None:
     """Write one page that needs no other file; `folder` is what the rows' picture paths are relative to.
 
@@ -220,13 +205,13 @@ def write_html(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]
     from markupsafe import Markup
 
     here = Path(__file__).parent
-    environment = Environment(
-        loader=FileSystemLoader(here),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    strict: Any = {
+        "autoescape": True,
+        "undefined": StrictUndefined,
+        "trim_blocks": True,
+        "lstrip_blocks": True,
+    }
+    environment = Environment(loader=FileSystemLoader(here), **strict)
     environment.filters |= {"compact": compact, "words": _words}
     pictures = Pictures(Path(folder))
     page = _page(rows, context, pictures)
@@ -265,9 +250,7 @@ def _missing(rows: Sequence[Row]) -> list[tuple[str, str, list[Row]]]:
     return [(*key, members) for key, members in groups.items()]
 
 
-def _study(
-    name: str, rows: list[Row], context: Mapping[str, Any], pictures: Pictures, key: str
-) -> dict[str, Any]:
+def _study(name: str, rows: list[Row], context: Mapping[str, Any], pictures: Pictures, key: str) -> dict[str, Any]:
     about = context.get("studies", {}).get(name, {})
     metrics = list(dict.fromkeys(metric for row in rows for metric in row.values))
     labels = {"error": about.get("error", "relMSE"), "slope": about.get("slope", -1)}
@@ -296,14 +279,10 @@ def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | No
         return [{"heading": "", "matrix": None, "table": _table(rows, metrics)}]
     return [
         {"heading": s, "matrix": matrices[s],
-         "table": _table(parts[s], metrics, s) if _ran(parts[s]) else None,
+         "table": _table(parts[s], metrics, s) if any(row.values for row in parts[s]) else None,
          "reasons": list(dict.fromkeys(row.reason for row in parts[s]))}
         for s in settings
     ]  # fmt: skip
-
-
-def _ran(rows: Iterable[Row]) -> bool:
-    return any(row.values for row in rows)
 
 
 def _matrix(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> dict[str, Any] | None:
@@ -318,15 +297,23 @@ def _matrix(rows: list[Row], metrics: list[str], scale: tuple[float, float] | No
 
 def _shade(row: Row | None, metric: str, scale: tuple[float, float]) -> dict[str, Any]:
     """A cell of the matrix: its number, how deep its colour is on the logarithmic scale, what it broke."""
-    if row is None or metric not in row.values:
-        return {"text": "·", "state": "none", "depth": 0, "hint": row.reason if row else "", "broken": []}
-    value = row.values[metric]
+    if row is None or not row.values:
+        text, state, hint = ("not run", "not-run", row.reason) if row else ("·", "none", "")
+        return {"text": text, "state": state, "depth": 0, "hint": hint, "broken": []}
     low, high = map(math.log, scale)
+    value = row.values.get(metric, 0)
     place = (math.log(value) - low) / (high - low) if 0 < value < math.inf and high > low else 0
+    depth = round(place, 3) if value < math.inf else 1  # NaN is no small error
     hint = "\n".join(_phrase(row, m) for m in row.values)
     broken = [_bound(row, m) if m == metric else _phrase(row, m) for m in row.broken]
-    text = apart(value, row.broken[metric])[0] if metric in row.broken else compact(value)
-    return {"text": text, "state": row.verdict, "depth": round(place, 3), "hint": hint, "broken": broken}
+    cell = _cell(row, metric)
+    return {
+        "text": cell["text"] if cell else "·",
+        "state": row.verdict,
+        "depth": depth,
+        "hint": hint,
+        "broken": broken,
+    }
 
 
 def _scale(rows: list[Row], metrics: list[str]) -> tuple[float, float] | None:
@@ -378,12 +365,9 @@ def _cell(row: Row, metric: str) -> dict[str, str] | None:
 
 def _replay(row: Row) -> str:
     """`row.replay` as JSON, one entry a line; "" where there is none."""
-    entries = [f" {json.dumps(key)}: {_line(value)}" for key, value in _strict(row.replay).items()]
+    form: Any = {"ensure_ascii": False, "default": str}
+    entries = [f" {json.dumps(k, **form)}: {json.dumps(v, **form)}" for k, v in _strict(row.replay).items()]
     return "{\n" + ",\n".join(entries) + "\n}" if entries else ""
-
-
-def _line(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False, default=str)
 
 
 def _left_out(row: Row) -> int:

@@ -174,7 +174,14 @@ def test_matrix_marks_a_row_whose_other_metric_broke(tmp_path):
     assert '<table class="matrix"' in html(tmp_path, rows)
     assert '<table class="matrix"' not in html(tmp_path, rows[:6])
     rows[4] = dataclasses.replace(rows[4], values={"worst": 1e-8, "misjudged": 7.0})
-    assert re.search(r'<td class="fail" [^>]*>1e-8<small>misjudged 7 &gt; 0</small>', html(tmp_path, rows))
+    rows[5] = dataclasses.replace(rows[5], values={"misjudged": 8.0})
+    rows[6] = dataclasses.replace(rows[6], values={"worst": NAN}, budgets={})
+    rows[7] = dataclasses.replace(rows[7], values={}, reason="lost")
+    text = html(tmp_path, rows)
+    assert re.search(r'<td class="fail" [^>]*>1e-8<small>misjudged 7 &gt; 0</small>', text)
+    assert re.search(r'<td class="fail" [^>]*>·<small>misjudged 8 &gt; 0</small>', text)
+    assert re.search(r'<td class="info" style="--depth:1" [^>]*>nan<', text)
+    assert re.search(r'<td class="not-run" [^>]*title="lost">not run<', text)
 
 
 def test_pictures_are_embedded_exactly_and_once(tmp_path):
@@ -190,6 +197,7 @@ def test_pictures_are_embedded_exactly_and_once(tmp_path):
     with np.errstate(over="ignore"):
         expected = pixels.astype(np.float32).astype(np.float16)
     assert len(data) == 2
+    assert re.findall(r'data-pixels="([^"]*)"', text) == ["p0", "p1"] * 2
     np.testing.assert_array_equal(halves[0], expected)
     np.testing.assert_array_equal(halves[1], np.repeat(expected[..., :1], 3, axis=-1))
 
@@ -206,7 +214,7 @@ def test_a_picture_that_cannot_be_shown_is_an_error_and_the_old_page_stays(tmp_p
 
 def test_curves_keep_the_guide_and_literal_names():
     svg = curves_svg({"$x$": [(1, 1e-2), (10, 1e-3)]}, error="relMSE", slope=-1, salt="s")
-    assert "slope −1" in svg and "$x$" in svg and "var(--c0)" in svg
+    assert "slope −1" in svg and ">$x$</text>" in svg and "var(--c0)" in svg
     assert curves_svg({"x": [(1, 0), (NAN, 1)]}, error="e", slope=-1, salt="s") == ""
 
 
