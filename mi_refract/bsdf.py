@@ -84,7 +84,7 @@ def plugin_class(variant: ModuleType) -> type:
                 self.formula_name, self.formula = resolve(self.requested, dr.backend_v(v.Float))
             except ValueError as error:
                 raise ValueError(f"{PLUGIN}: {error}") from None
-            self.textures = {name: props.get_texture(name, 1.0) for name in LOBES if props.has_property(name)}
+            self.textures = {name: props.get_texture(name, 1.0) for name in LOBES if name in props}
             # Scalar variants: Mitsuba can set an array of one number, but not a bare Python float.
             number = v.Float if dr.is_jit_v(v.Float) else dr.scalar.Array1f
             self.eta = number(int_ior / ext_ior)
@@ -99,7 +99,7 @@ def plugin_class(variant: ModuleType) -> type:
             """
             self.outer = Side(v.Float(1 / eta), v.Float(-contrast / (eta * eta)))
             self.inner = Side(v.Float(eta), v.Float(contrast))
-            dr.make_opaque(self.eta, self.outer, self.inner)
+            dr.make_opaque(self.eta, *self.outer, *self.inner)
 
         def traverse(self, cb: Any) -> None:
             cb.put("eta", self.eta, mi.ParamFlags.Differentiable)
@@ -109,7 +109,8 @@ def plugin_class(variant: ModuleType) -> type:
         def parameters_changed(self, keys: Any) -> None:
             if not keys or "eta" in keys:
                 wide: Any = dr.float64_array_t(v.Float)
-                eta = wide(self._eta())
+                # Only a derivative needs a kernel here; a number is read back, so that an edit compiles nothing.
+                eta = wide(self.eta) if dr.grad_enabled(self.eta) else float(self.eta[0])
                 self._face(eta, (eta - 1) * (eta + 1))
 
         def _eta(self) -> Any:

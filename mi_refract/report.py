@@ -89,7 +89,7 @@ def _number(value: Any) -> float:
 
 def _row(number: int, data: dict[str, Any]) -> Row:
     try:
-        numbers = {f: {m: _number(v) for m, v in data[f].items()} for f in ("values", "budgets")}
+        numbers = {f: {m: _number(v) for m, v in data[f].items()} for f in ("values", "budgets", "goals")}
         curves = {name: [(_number(x), _number(y)) for x, y in pts] for name, pts in data["curves"].items()}
         row = Row.from_dict(data | numbers | {"curves": curves})
         if data["verdict"] != row.verdict:
@@ -102,7 +102,7 @@ def _row(number: int, data: dict[str, Any]) -> Row:
 
 
 def verdict(rows: Sequence[Row]) -> str:
-    """One sentence: how many budgets were measured, how many broke, how many rows were not run."""
+    """One sentence: budgets measured and broken, goals missed, rows not run."""
     measured = sum(len(row.budgets) for row in rows if row.values)
     broken = sum(len(row.broken) for row in rows)
     missing = sum(row.verdict == "not run" for row in rows)
@@ -112,6 +112,9 @@ def verdict(rows: Sequence[Row]) -> str:
         sentence = f"{broken} of {_count(measured, 'budget')} broken"
     else:
         sentence = f"All {measured} budgets held" if measured > 1 else "The one budget held"
+    missed = sum(len(row.missed) for row in rows)
+    goals = sum(len(row.goals) for row in rows if row.values)
+    sentence += f", {missed} of {_count(goals, 'goal')} missed" if missed else ""
     return sentence + (f", {_count(missing, 'row')} not run" if missing else "")
 
 
@@ -323,14 +326,14 @@ def _scale(rows: list[Row], metrics: list[str]) -> tuple[float, float] | None:
 
 
 def _phrase(row: Row, metric: str) -> str:
-    if metric not in row.budgets:
+    if metric not in row.bounds:
         return f"{metric} {compact(row.values[metric])}"
-    return f"{metric} {apart(row.values[metric], row.budgets[metric])[0]} {_bound(row, metric)}"
+    return f"{metric} {apart(row.values[metric], row.bounds[metric])[0]} {_bound(row, metric)}"
 
 
 def _bound(row: Row, metric: str) -> str:
-    """The budget with how the value stands to it; NaN is neither above nor below."""
-    value, budget = row.values[metric], row.budgets[metric]
+    """The budget or goal with how the value stands to it; NaN is neither above nor below."""
+    value, budget = row.values[metric], row.bounds[metric]
     sign = "≤" if value <= budget else ">" if value > budget else "≰"
     return f"{sign} {apart(value, budget)[1]}"
 
@@ -356,10 +359,10 @@ def _table(rows: list[Row], metrics: list[str], heading: str = "") -> dict[str, 
 def _cell(row: Row, metric: str) -> dict[str, str] | None:
     if metric not in row.values:
         return None
-    if metric not in row.budgets:
+    if metric not in row.bounds:
         return {"state": "info", "text": compact(row.values[metric]), "budget": ""}
-    text = apart(row.values[metric], row.budgets[metric])[0]
-    state = "fail" if metric in row.broken else "pass"
+    text = apart(row.values[metric], row.bounds[metric])[0]
+    state = "fail" if metric in row.broken else "missed" if metric in row.missed else "pass"
     return {"state": state, "text": text, "budget": _bound(row, metric)}
 
 

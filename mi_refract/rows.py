@@ -19,8 +19,8 @@ class Row:
 
     `values` are the numbers by metric name. `budgets` are upper bounds for some of them; a value that is NaN
     breaks its budget. `goals` are upper bounds too, for what a busy machine can spoil (times): a missed goal is
-    shown, and decides no verdict. A row without values was not run, and `reason` says why; otherwise `reason` is a remark.
-    `replay` is what repeats the row: seed, sizes, hex floats. `pictures` are EXR paths relative to the output
+    shown, and decides no verdict. A row without values was not run, and `reason` says why; otherwise `reason` is
+    a remark. `replay` is what repeats the row: seed, sizes, hex floats. `pictures` are EXR paths relative to the output
     folder, by role (`reference`, `test`, `difference`). `curves` are named lists of (seconds, error) points.
     """
 
@@ -46,6 +46,11 @@ class Row:
     @property
     def name(self) -> str:
         return " / ".join((self.study, self.subject, self.case, self.setting))
+
+    @property
+    def bounds(self) -> dict[str, float]:
+        """Budgets and goals by metric."""
+        return self.goals | self.budgets
 
     @property
     def broken(self) -> dict[str, float]:
