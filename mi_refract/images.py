@@ -80,11 +80,17 @@ def _write(path: Path, pixels: NDArray[np.float32], channels: Sequence[str], att
     output = oiio.ImageOutput.create(str(path))
     if output is None:
         raise OSError(_one_line(oiio.geterror()))
-    # Several of these report a failure only in the next call; each is asked.
     done = output.open(str(path), spec) and output.write_image(pixels)
     message = output.geterror()
     if not (output.close() and done):
         raise OSError(_one_line(message or output.geterror()) or "OpenImageIO gives no reason")
+    # On a full disk `close` is True all the same when the image was small enough for a buffer.
+    try:
+        complete = read_exr(path)[0].shape == pixels.shape
+    except ValueError:
+        complete = False
+    if not complete:
+        raise OSError("what was written cannot be read; is the disk full?")
 
 
 def _attributes(path: Path, metadata: Mapping[str, str | int | float]) -> Metadata:
