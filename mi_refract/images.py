@@ -1,104 +1,232 @@
-"""Comparing pictures: same-seed differences, Welch's t-test on tiles, relMSE. Pictures are (height, width, channels).
+"""Images in OpenEXR files, through OpenImageIO: writing, reading, and rendering into one.
 
-Fails closed: pictures of different shapes are an error, and a pixel that is not finite equals nothing.
+A pixel array is H × W × C float32, row 0 at the top. A file appears complete or not at all.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import contextlib
+import importlib.metadata
+import json
+import os
+import re
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
+
+Metadata = dict[str, Any]
+LOADER_OPTIONS = ("path", "parallel", "optimize")  # mi.load_file would take these names for its own
 
 
-@dataclass(frozen=True)
-class Paired:
-    """Two pictures of the same random numbers: share of changed pixels, largest change, RMSE, ratio of the means."""
+def write_exr(
+    path: str | os.PathLike[str],
+    pixels: NDArray[np.floating[Any]],
+    channels: Sequence[str] = ("R", "G", "B"),
+    metadata: Mapping[str, str | int | float] | None = None,
+) -> None:
+    """Write H × W × C pixels as float32. One header attribute for each entry of `metadata`.
 
-    changed: float
-    largest: float
-    rmse: float
-    mean_ratio: float
-
-
-def paired(reference: np.ndarray, test: np.ndarray, threshold: float) -> Paired:
-    """A pixel is changed where any channel differs by more than `threshold`, or is not finite."""
-    _same_shape(reference, test)
-    difference = np.abs(test - reference).max(-1)
-    finite = np.isfinite(test).all(-1) & np.isfinite(reference).all(-1)
-    changed = float((~(difference <= threshold) | ~finite).mean())
-    if not finite.all():
-        return Paired(changed, np.inf, np.inf, np.nan)
-    return Paired(changed, float(difference.max()), float(np.sqrt(np.square(test - reference).mean())),
-                  float(test.mean() / reference.mean()))  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Welch:
-    """`alarms`: tiles and channels that differ, at the given probability of any alarm between equal pictures.
-
-    `smallest_p` is Šidák-adjusted; `detectable` the median over tiles of the smallest relative difference of means
-    that would have been an alarm; `certain` counts tiles without any variance, which a t-test knows nothing of:
-    they are alarms where the means differ at all.
+    Attributes keep str, int of 32 bits and float (to 24 bits); any other int becomes text. Replaces an existing file.
+    ValueError for a shape that does not fit `channels`, a name that is not .exr, or an attribute of another type;
+    OSError for a folder that cannot be written or a full disk. Nothing is left behind then.
     """
+    path = writable_exr(path)
+    pixels = np.ascontiguousarray(pixels, dtype=np.float32)
+    if pixels.ndim != 3 or pixels.size == 0 or pixels.shape[2] != len(channels):
+        raise ValueError(f"{path}: pixels of shape {pixels.shape}; accepted: H × W × {len(channels)} {tuple(channels)}")
+    if len(set(channels)) != len(channels):
+        raise ValueError(f"{path}: channels {tuple(channels)}: accepted: distinct names")
+    temporary = temporary_name(path)
+    try:
+        _write(temporary, pixels, channels, _attributes(path, metadata or {}))
+        temporary.replace(path)
+    except OSError as error:
+        raise OSError(f"{path}: cannot be written: {error.strerror or error}") from None
+    finally:
+        temporary.unlink(missing_ok=True)
 
-    alarms: int
-    smallest_p: float
-    detectable: float
-    certain: int
+
+def temporary_name(path: str | os.PathLike[str]) -> Path:
+    """Where this process writes before the rename: in the same folder, and .exr, by which OpenImageIO goes."""
+    path = Path(path)
+    return path.with_name(f".{path.stem}.{os.getpid()}.exr")
 
 
-def welch(reference: np.ndarray, test: np.ndarray, tile: int, family_error: float) -> Welch:
-    """Welch's t-test on tile means of two stacks of independent renders, (renders, height, width, channels).
+def writable_exr(path: str | os.PathLike[str]) -> Path:
+    """The path, where an EXR file can be put; otherwise ValueError for its name, OSError for its folder."""
+    path = Path(path)
+    if path.suffix.lower() != ".exr":
+        raise ValueError(f"{path}: accepted: a file name that ends in .exr")
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: is a folder; accepted: the name of a file")
+    if not path.parent.is_dir():
+        raise NotADirectoryError(f"{path}: {path.parent} is not a folder; accepted: an existing one")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise PermissionError(f"{path}: {path.parent} is not writable; accepted: a writable folder")
+    return path
 
-    The variance of a tile mean is the sum of its pixels' variances over the renders, and its degrees of freedom
-    follow Satterthwaite: pixels are independent under a box filter. ValueError for fewer than 2 renders a side.
+
+def _write(path: Path, pixels: NDArray[np.float32], channels: Sequence[str], attributes: Metadata) -> None:
+    import OpenImageIO as oiio
+
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "float")
+    spec.channelnames = tuple(channels)
+    for name, value in attributes.items():
+        spec.attribute(name, value)
+    output = oiio.ImageOutput.create(str(path))
+    if output is None:
+        raise OSError(_one_line(oiio.geterror()))
+    done = output.open(str(path), spec) and output.write_image(pixels)
+    message = output.geterror()
+    if not (output.close() and done):
+        raise OSError(_one_line(message or output.geterror()) or "OpenImageIO gives no reason")
+    # On a full disk `close` is True all the same when the image was small enough for a buffer.
+    try:
+        complete = read_exr(path)[0].shape == pixels.shape
+    except ValueError:
+        complete = False
+    if not complete:
+        raise OSError("what was written cannot be read; is the disk full?")
+
+
+def _attributes(path: Path, metadata: Mapping[str, str | int | float]) -> Metadata:
+    for name, value in metadata.items():
+        if not isinstance(value, (str, int, float)):
+            raise ValueError(f"{path}: attribute {name} = {value!r}: accepted: str, int, float")
+    return {n: str(v) if isinstance(v, int) and not -(2**31) <= v < 2**31 else v for n, v in metadata.items()}
+
+
+def read_exr(path: str | os.PathLike[str]) -> tuple[NDArray[np.float32], Metadata]:
+    """(pixels, metadata): H × W × C float32, and the header attributes with the channels' names under "channels".
+
+    The order of channels is the file's as OpenImageIO gives it: R, G, B, A first, then by name.
+    FileNotFoundError or OSError for a file that cannot be read, ValueError for one that is not a complete EXR image.
     """
-    from scipy import stats
+    import OpenImageIO as oiio
 
-    _same_shape(reference[0], test[0])
-    if min(len(reference), len(test)) < 2:
-        raise ValueError(f"welch: {len(reference)} and {len(test)} renders: at least 2 a side are needed")
-    m1, v1, d1 = _tile_moments(reference, tile)
-    m2, v2, d2 = _tile_moments(test, tile)
-    variance = v1 + v2
-    certain = variance == 0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        freedom = np.where(certain, 1.0, variance**2 / (d1 + d2))
-        t = np.where(certain, np.where(m1 == m2, 0.0, np.inf), np.abs(m1 - m2) / np.sqrt(variance))
-    p = np.where(np.isfinite(m1) & np.isfinite(m2), 2 * stats.t.sf(t, freedom), 0.0)
-    threshold = -np.expm1(np.log1p(-family_error) / p.size)  # Šidák
-    critical = stats.t.isf(threshold / 2, freedom[~certain])
-    lit = np.abs(m1[~certain]) > 0
-    detectable = critical[lit] * np.sqrt(variance[~certain][lit]) / np.abs(m1[~certain][lit])
-    return Welch(
-        int((p <= threshold).sum()),
-        float(-np.expm1(p.size * np.log1p(-min(float(p.min()), 1 - 1e-16)))),
-        float(np.median(detectable)) if detectable.size else 0.0,
-        int(certain.sum()),
-    )
-
-
-def _tile_moments(stack: np.ndarray, tile: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Per tile and channel: the mean, its variance, and Satterthwaite's denominator Σ v_i²/(n − 1)."""
-    count = len(stack)
-
-    def tiles(x: np.ndarray) -> np.ndarray:
-        height, width = (size // tile * tile for size in x.shape[:2])
-        return x[:height, :width].reshape(height // tile, tile, width // tile, tile, -1)
-
-    pixel_variance = tiles(stack.var(0, ddof=1)) / (count * tile**4)
-    mean = tiles(stack.mean(0)).mean((1, 3))
-    return mean, pixel_variance.sum((1, 3)), (pixel_variance**2).sum((1, 3)) / (count - 1)
+    path = Path(path)
+    with path.open("rb") as file:  # the operating system's own words for what is missing or forbidden
+        if file.read(4) != b"\x76\x2f\x31\x01":
+            raise ValueError(f"{path}: not an EXR file")
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        raise ValueError(f"{path}: corrupt EXR file: {_one_line(oiio.geterror())}")
+    try:
+        spec = source.spec()
+        if spec.deep:
+            raise ValueError(f"{path}: accepted: an EXR image without deep samples")
+        pixels = source.read_image("float")
+        message = source.geterror()
+    finally:
+        source.close()
+    if pixels is None or message:
+        raise ValueError(f"{path}: corrupt EXR file: {_one_line(message)}")
+    metadata = {attribute.name: attribute.value for attribute in spec.extra_attribs}
+    pixels = np.asarray(pixels, dtype=np.float32).reshape(spec.height, spec.width, spec.nchannels)
+    return pixels, metadata | {"channels": tuple(spec.channelnames)}
 
 
-def relative_mse(picture: np.ndarray, references: np.ndarray, epsilon: float = 0.01) -> float:
-    """mean((x − r)²/(r² + ε)) against the mean r of a stack of independent renders, less what r's own noise adds."""
-    r = references.mean(0)
-    _same_shape(r, picture)
-    own = references.var(0, ddof=1) / len(references)
-    return float(((np.square(picture - r) - own) / (np.square(r) + epsilon)).mean())
+# Rendering -----------------------------------------------------------------------------------------------------
 
 
-def _same_shape(reference: np.ndarray, test: np.ndarray) -> None:
-    if reference.shape != test.shape:
-        raise ValueError(f"pictures of different shapes: reference {reference.shape}, test {test.shape}")
+def load_scene(path: str | os.PathLike[str], defines: Mapping[str, str] | None = None) -> Any:
+    """The Mitsuba scene in an XML file, under the present variant; `defines` replace its `<default>`s.
+
+    FileNotFoundError for a missing file; ValueError, in one line, for anything Mitsuba does not accept in it.
+    """
+    import mitsuba as mi
+
+    defines = dict(defines or {})
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such scene file")
+    if taken := [name for name in LOADER_OPTIONS if name in defines]:
+        raise ValueError(f"define {taken[0]!r}: taken by Mitsuba's loader; accepted: any name but {LOADER_OPTIONS}")
+    try:
+        scene = mi.load_file(str(path), **cast(Any, defines))
+    except Exception as error:  # RuntimeError from the parser; whatever a Python plugin raises
+        raise ValueError(_naming(path, error)) from None
+    if not isinstance(scene, mi.Scene):
+        raise ValueError(f"{path}: holds a {type(scene).__name__}; accepted: a <scene>")
+    if not scene.sensors():
+        raise ValueError(f"{path}: a scene without a sensor; accepted: at least one")
+    return scene
+
+
+def render_to_exr(
+    scene: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    defines: Mapping[str, str] | None = None,
+    spp: int | None = None,
+    seed: int = 0,
+) -> Metadata:
+    """Render a scene file by one `mi.render(scene, spp=spp, seed=seed)` in the present variant; the metadata written.
+
+    `spp`: samples per pixel, the scene's own where None. ValueError or OSError in one line, before the rendering
+    wherever possible, InterruptedError for a rendering that was cut short; then no file is written.
+    """
+    import mitsuba as mi
+
+    if spp is not None and spp < 1:
+        raise ValueError(f"spp = {spp}: accepted: a positive whole number")
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"seed = {seed}: accepted: a whole number from 0 to 2³² − 1")
+    output = writable_exr(output)
+    loaded = load_scene(scene, defines)
+    start = time.perf_counter()
+    try:
+        pixels = np.array(mi.render(loaded, spp=spp or 0, seed=seed))
+    except Exception as error:
+        raise ValueError(_naming(scene, error)) from None
+    seconds = time.perf_counter() - start
+    # On Ctrl-C the C++ integrators return what they have, and so they do after their `timeout`.
+    if loaded.integrator().should_stop():
+        raise InterruptedError(f"{scene}: the rendering was stopped before its last sample; nothing is written")
+    sensor = loaded.sensors()[0]
+    channels = [str(field.name) for field in sensor.film().bitmap().struct_()]
+    metadata = provenance() | {
+        "mi_refract:variant": mi.variant(),
+        "mi_refract:spp": spp or sensor.sampler().sample_count(),
+        "mi_refract:seed": seed,
+        "mi_refract:scene": str(scene),
+        "mi_refract:defines": json.dumps(dict(defines or {}), sort_keys=True),
+        "mi_refract:formulas": ", ".join(formulas_in(loaded)) or "none",
+        "mi_refract:render_seconds": seconds,
+    }
+    write_exr(output, pixels, channels, metadata)
+    return metadata
+
+
+def formulas_in(scene: Any) -> list[str]:
+    """The formulas that the `refract` BSDFs of a scene use, sorted; "promoted (auto)" where it was not asked for."""
+    texts = (str(shape.bsdf()) for shape in scene.shapes())
+    return sorted({name for text in texts for name in re.findall(r"Refract\[.*?formula = (.+?),\n", text, re.DOTALL)})
+
+
+def provenance() -> Metadata:
+    """Header attributes that say which software made an image."""
+    from . import __version__
+
+    versions = {"mi_refract": __version__, "mitsuba": version("mitsuba"), "drjit": version("drjit")}
+    return {"Software": f"mi_refract {__version__}"} | {f"mi_refract:version:{n}": v for n, v in versions.items()}
+
+
+def version(distribution: str) -> str:
+    """The installed version; "unknown" where it runs without being installed."""
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        return importlib.metadata.version(distribution)
+    return "unknown"
+
+
+def _naming(path: str | os.PathLike[str], error: Exception) -> str:
+    """One line that names the file; without the place in Mitsuba's source."""
+    text = re.sub(r"\[\w+\.(cpp|h):\d+\] ", "", _one_line(str(error)))
+    return text if str(path) in text else f"{path}: {text}"
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())

@@ -1,73 +1,114 @@
-"""Chooses a backend that works before anything initialises LLVM, and says visibly what is skipped and why."""
+"""Chooses the libLLVM before anything imports Dr.Jit, once for all tests, and says which variants run here."""
 
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
 
-import drjit as dr
-import numpy as np
 import pytest
 
-from mi_refract import backend
 
-backend.activate()
-
-
-@dataclass(frozen=True)
-class Setting:
-    """A Dr.Jit backend in a precision; `vector` is its 3-vector type."""
-
-    backend: str
-    precision: type
-    roundoff: float
-
-    @property
-    def vector(self):
-        name = "Array3f" if self.precision is np.float32 else "Array3f64"
-        return getattr(getattr(dr, self.backend), name)
+def _alone(name: str) -> ModuleType:
+    """A module of mi_refract without the package around it, which would import Dr.Jit."""
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[1] / f"{name.replace('.', '/')}.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
 
 
-# Scalar arrays compute in double whatever they store: float32 is judged on the vectorised backends.
-SETTINGS = [("scalar", np.float64)] + [(b, p) for b in ("llvm", "cuda") for p in (np.float32, np.float64)]
+backend = _alone("mi_refract.backend")
+VARIANT = backend.activate()
+sys.modules["mi_refract"].backend = backend
+USABLE: dict[str, str | None] = backend.usable_variants()
 
 
-def _setting(request):
-    name, precision = request.param
-    entry = backend.detect()[name]
-    if not entry.usable:
-        pytest.skip(f"{name}: {entry.reason}")
-    return Setting(name, precision, float(np.finfo(precision).eps) / 2)
+def pytest_report_header() -> str:
+    return f"mi_refract: {VARIANT}; {backend.summary()}"
 
 
-def _label(param):
-    return f"{param[0]}-{np.dtype(param[1]).name}"
+@pytest.fixture(scope="session")
+def usable_variants() -> list[str]:
+    """The variants of Mitsuba that run here."""
+    return [variant for variant, reason in USABLE.items() if reason is None]
 
 
-@pytest.fixture(params=SETTINGS, ids=_label, scope="module")
-def setting(request):
-    """Every backend and precision."""
-    return _setting(request)
+@pytest.fixture(scope="session")
+def needs_variant() -> Callable[[str], None]:
+    """`needs_variant("llvm_ad_rgb")` skips the test, with the reason, where that variant cannot run."""
 
+    def check(variant: str) -> None:
+        if reason := USABLE[variant]:
+            pytest.skip(f"{variant}: {reason}")
 
-@pytest.fixture(params=SETTINGS[1:], ids=_label, scope="module")
-def vectorised(request):
-    """Those that carry derivatives."""
-    return _setting(request)
-
-
-def pytest_generate_tests(metafunc):
-    """`variant`: every variant of the wheel, skipped with the reason where it cannot run."""
-    if "variant" in metafunc.fixturenames:
-        marks = {
-            name: [] if reason is None else [pytest.mark.skip(reason=f"{name}: {reason}")]
-            for name, reason in backend.usable_variants().items()
-        }
-        metafunc.parametrize("variant", [pytest.param(name, marks=m) for name, m in marks.items()], indirect=True)
+    return check
 
 
 @pytest.fixture
-def variant(request):
+def variant(request: pytest.FixtureRequest):
+    """Every variant of the wheel, skipped with the reason where it cannot run; see `pytest_generate_tests`."""
     import mitsuba as mi
 
     before = mi.variant()
     mi.set_variant(request.param)
     yield request.param
     mi.set_variant(before)
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "variant" in metafunc.fixturenames:
+        marks = {name: pytest.mark.skip(reason=f"{name}: {why}") if why else () for name, why in USABLE.items()}
+        parameters = [pytest.param(name, marks=mark) for name, mark in marks.items()]
+        metafunc.parametrize("variant", parameters, indirect=True)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A Dr.Jit backend in a precision, "float32" or "float64"."""
+
+    backend: str
+    name: str
+
+    @property
+    def precision(self):
+        import numpy as np
+
+        return getattr(np, self.name)
+
+    @property
+    def roundoff(self) -> float:
+        return {"float32": 2.0**-24, "float64": 2.0**-53}[self.name]
+
+    @property
+    def vector(self):
+        import drjit as dr
+
+        return getattr(getattr(dr, self.backend), {"float32": "Array3f", "float64": "Array3f64"}[self.name])
+
+
+# Scalar arrays compute in double whatever they store: float32 is judged on the vectorised backends.
+SETTINGS = [("scalar", "float64")] + [(b, p) for b in ("llvm", "cuda") for p in ("float32", "float64")]
+
+
+def _setting(request: pytest.FixtureRequest) -> Setting:
+    entry = backend.detect()[request.param[0]]
+    if not entry.usable:
+        pytest.skip(f"{entry.name}: {entry.reason}")
+    return Setting(*request.param)
+
+
+@pytest.fixture(params=SETTINGS, ids="-".join, scope="module")
+def setting(request: pytest.FixtureRequest) -> Setting:
+    """Every backend and precision."""
+    return _setting(request)
+
+
+@pytest.fixture(params=SETTINGS[1:], ids="-".join, scope="module")
+def vectorised(request: pytest.FixtureRequest) -> Setting:
+    """Those that carry derivatives."""
+    return _setting(request)

@@ -16,7 +16,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract import images
+from mi_refract import compare, images
 from mi_refract.bsdf import PLUGIN
 from mi_refract.formulas import FORMULAS
 from mi_refract.rows import Row
@@ -98,7 +98,7 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
 
 def _paired(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """Same seeds, picture by picture."""
-    found = images.paired(reference.reshape(-1, *reference.shape[2:]), test.reshape(-1, *test.shape[2:]), CHANGED)
+    found = compare.paired(reference.reshape(-1, *reference.shape[2:]), test.reshape(-1, *test.shape[2:]), CHANGED)
     return {
         "changed share": found.changed,
         "largest change": found.largest,
@@ -108,7 +108,7 @@ def _paired(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
 
 
 def _independent(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    found = images.welch(reference, test, TILE, FAMILY_ERROR)
+    found = compare.welch(reference, test, TILE, FAMILY_ERROR)
     return {
         "Welch alarms": float(found.alarms),
         "smallest p, adjusted": found.smallest_p,
@@ -123,7 +123,7 @@ def _curves(context: Context, cameras: dict[str, Camera], reference: np.ndarray)
         for name, camera in cameras.items():
             camera(spp, seed=context.profile.pairs)  # compiles what this sample count needs
             points = [camera(spp, seed=context.profile.pairs + 1 + i) for i in range(3)]
-            error = statistics.fmean(images.relative_mse(picture, reference) for picture, _ in points)
+            error = statistics.fmean(compare.relative_mse(picture, reference) for picture, _ in points)
             curves[name].append((statistics.median(seconds for _, seconds in points), error))
     return curves
 

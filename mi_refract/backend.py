@@ -1,0 +1,370 @@
+"""Which Mitsuba variants really run here, and with which libLLVM.
+
+Mitsuba's wheel brings no libLLVM, and Dr.Jit is easily given a bad one: LLVM 14 is refused, LLVM 15 and 16 end the
+process (no exception) in the first kernel with a minimum in it. So a library is tried in a process of its own
+before it is trusted, and the answer is remembered in `$XDG_CACHE_HOME/mi_refract/backend.json`.
+
+Dr.Jit loads libLLVM when it is imported, and never another one. `activate` therefore does its best work before
+that; this module needs nothing but the standard library and can be executed without the package around it. Once
+Dr.Jit is there, a better library needs a new process: `activate(may_restart=True)`, which is for commands.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib.metadata
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+CHOICE = "DRJIT_LIBLLVM_PATH"  # where Dr.Jit looks first
+OWN_CHOICE = "MI_REFRACT_LIBLLVM"  # set to the same value where the choice was ours, not the user's
+TIMEOUT = 120.0  # seconds; a probe takes 0.4 s of one idle core
+
+# Last line of the output: "works", or the reason why not. 67 numbers: full vectors and a remainder.
+_PROBE = """
+import ctypes, importlib, math, sys
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+except ImportError:
+    pass
+import drjit as dr
+
+name = sys.argv[1]
+if not dr.has_backend(getattr(dr.JitBackend, name.upper())):
+    if name == "cuda":
+        ctypes.CDLL("libcuda.so.1")
+    sys.exit("refused")
+arrays = importlib.import_module("drjit." + name)
+for number in (arrays.Float32, arrays.Float64):
+    x = dr.arange(number, 67) / 16
+    y = dr.sqrt(dr.fma(dr.minimum(dr.maximum(x, 0.5), 3), x, 1))
+    for i, y_i in enumerate(y):
+        if not abs(y_i - math.sqrt(min(max(i / 16, 0.5), 3) * i / 16 + 1)) < 1e-5:
+            sys.exit("a kernel computes wrong numbers")
+if name == "cuda":
+    import mitsuba as mi
+    mi.set_variant("cuda_ad_rgb")
+    scene = mi.load_dict({"type": "scene", "sphere": {"type": "sphere"}})
+    if not abs(scene.ray_intersect(mi.Ray3f([0, 0, -3], [0, 0, 1])).t[0] - 2) < 1e-5:
+        sys.exit("OptiX traces rays wrongly")
+print("works")
+"""
+
+
+@dataclass(frozen=True)
+class Backend:
+    """One way to run Dr.Jit. `reason` is why it is not usable, or what it runs on; one line."""
+
+    name: str  # "scalar", "llvm", "cuda"
+    usable: bool
+    reason: str
+    library: str | None = None
+
+
+@dataclass(frozen=True)
+class Library:
+    """A libLLVM and what is wrong with it; "" where it works."""
+
+    path: str
+    defect: str
+
+    @property
+    def works(self) -> bool:
+        return not self.defect
+
+
+def detect() -> dict[str, Backend]:
+    """What can run in this process: scalar, llvm, cuda. Never raises; each answer is found once per process."""
+    return {"scalar": Backend("scalar", True, "always there"), "llvm": llvm(), "cuda": cuda()}
+
+
+def usable_variants() -> dict[str, str | None]:
+    """Every variant Mitsuba has here: None where it runs, otherwise the reason in one line. Imports Mitsuba."""
+    backends = detect()
+    _announce(backends["llvm"])
+    import mitsuba as mi
+
+    found = {variant: backends[variant.partition("_")[0]] for variant in mi.variants()}
+    return {variant: None if backend.usable else backend.reason for variant, backend in found.items()}
+
+
+def activate(preferred: str | None = None, *, may_restart: bool = False) -> str:
+    """Set the variant `preferred`, else llvm_ad_rgb where it runs, else scalar_rgb; register our plugins; its name.
+
+    ValueError, in one line, for a variant that Mitsuba does not have or that cannot run here.
+    `may_restart`: call `restart_if_needed` first.
+    """
+    if may_restart:
+        restart_if_needed()
+    here = llvm()
+    _announce(here)
+    import mitsuba as mi
+
+    import mi_refract  # noqa: F401  its plugins join every variant set from here on
+
+    if preferred is None:
+        preferred = "llvm_ad_rgb" if here.usable else "scalar_rgb"
+    elif preferred not in mi.variants():
+        raise ValueError(f"variant {preferred!r}: unknown; accepted: {', '.join(_running())}")
+    elif not preferred.startswith("scalar_") and (reason := usable_variants()[preferred]):
+        raise ValueError(f"variant {preferred!r} cannot run here: {reason}; accepted: {', '.join(_running())}")
+    mi.set_variant(preferred)
+    return preferred
+
+
+def _running() -> list[str]:
+    return [variant for variant, reason in usable_variants().items() if reason is None]
+
+
+def advice() -> str:
+    """What to install to get more variants; one line."""
+    missing = [f"the {b.name}_* variants are missing: {b.reason}" for b in detect().values() if not b.usable]
+    return missing[0] if missing else "nothing is missing"
+
+
+def summary() -> str:
+    """What the CPU's variants run on; one line."""
+    here = llvm()
+    return f"llvm_* variants run on {here.reason}" if here.usable else f"only scalar_* variants run: {here.reason}"
+
+
+# libLLVM -------------------------------------------------------------------------------------------------------
+
+
+def libraries() -> list[Library]:
+    """Every libLLVM that may be used, tried; the best version first. Only the user's, where the user chose one."""
+    chosen = _users_choice()
+    return [_try(path) for path in ([chosen] if chosen else candidates())]
+
+
+def candidates() -> list[str]:
+    """Every libLLVM on this machine, the highest version first; in a process that has one loaded, that one first."""
+    found = {os.path.realpath(path) for path in _search()}
+    loaded = _loaded() or set()
+    versioned = [(path in loaded, version, path) for path in found if (version := _version(path)) is not None]
+    return [path for _, _, path in sorted(versioned, reverse=True)]
+
+
+def _search() -> Iterable[str]:
+    ldconfig = shutil.which("ldconfig", path=os.pathsep.join([os.environ.get("PATH", ""), "/sbin", "/usr/sbin"]))
+    if ldconfig:
+        listing = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, check=False).stdout
+        yield from re.findall(r"=> (\S*/libLLVM\S*)$", listing, re.MULTILINE)
+    folders = [*os.environ.get("LD_LIBRARY_PATH", "").split(":"), f"{sys.prefix}/lib", "/usr/lib", "/usr/lib64"]
+    folders += ["/usr/lib/*-linux-gnu", "/usr/lib/llvm*/lib*", "/usr/lib/llvm/*/lib*", "/usr/local/lib*"]
+    folders += ["/usr/local/llvm*/lib*", "/opt/homebrew/opt/llvm*/lib", "/usr/local/opt/llvm*/lib"]
+    for folder in folders:
+        if folder.startswith("/"):
+            yield from map(str, Path("/").glob(f"{folder[1:]}/libLLVM*"))
+
+
+def _version(path: str) -> tuple[int, ...] | None:
+    """From the file's name: (19, 1) of libLLVM.so.19.1, (15,) of libLLVM-15.so.1; None: not LLVM's C interface."""
+    name = re.fullmatch(r"libLLVM(?:-(\d[\d.]*))?\.(?:so|dylib)(?:\.(\d[\d.]*))?", Path(path).name)
+    if name is None:
+        return None
+    return tuple(int(part) for part in re.findall(r"\d+", name[1] or name[2] or ""))
+
+
+def _title(path: str) -> str:
+    version = _version(os.path.realpath(path))
+    return f"libLLVM {'.'.join(map(str, version))}" if version else path
+
+
+def _users_choice() -> str | None:
+    chosen = os.environ.get(CHOICE)
+    return chosen if chosen and chosen != os.environ.get(OWN_CHOICE) else None
+
+
+@functools.cache
+def llvm() -> Backend:
+    """Dr.Jit on the CPU, compiled: the best libLLVM that works. `library` without `usable`: it needs a new process."""
+    chosen = _users_choice()
+    defects = []
+    for path in [chosen] if chosen else candidates():
+        library = _try(path)
+        if library.works:
+            return _if_loaded(path)
+        defects.append(f"{CHOICE}={path}: {library.defect}" if chosen else f"{_title(path)}: {library.defect}")
+    return Backend("llvm", False, f"{'; '.join(defects) or 'no libLLVM found'}; {_remedy(chosen)}")
+
+
+def _if_loaded(path: str) -> Backend:
+    """`path` works; but does Dr.Jit, if it is there already, have this library and no other?"""
+    if "drjit" in sys.modules:
+        loaded = _loaded()
+        there = any(_same(path, other) for other in loaded) if loaded is not None else True
+        if not there:
+            holds = ", ".join(sorted(map(_title, loaded or ()))) or "no libLLVM"
+            reason = f"Dr.Jit was imported with {holds}; start Python with {CHOICE}={path}"
+            return Backend("llvm", False, reason, path)
+    return Backend("llvm", True, _title(path), path)
+
+
+def _same(path: str, other: str) -> bool:
+    """A path without a folder is looked up by the dynamic linker, so only its name can be compared."""
+    return os.path.realpath(path) == other if "/" in path else Path(other).name.startswith(path)
+
+
+def _loaded() -> set[str] | None:
+    """The libLLVM files mapped into this process; None where the system does not tell."""
+    try:
+        maps = Path("/proc/self/maps").read_text()
+    except OSError:
+        return None
+    return {os.path.realpath(path) for path in re.findall(r"(/\S*)$", maps, re.MULTILINE) if _version(path) is not None}
+
+
+def _remedy(chosen: str | None) -> str:
+    install = "apt-get install libllvm19" if shutil.which("apt-get") else "install LLVM 17 or newer"
+    return f"accepted: the file of a libLLVM 17 or newer ({install})" if chosen else install
+
+
+def _announce(backend: Backend) -> None:
+    """Tell Dr.Jit, if it is not imported yet, which library to load."""
+    if backend.usable and backend.library and "drjit" not in sys.modules and not _users_choice():
+        os.environ[CHOICE] = os.environ[OWN_CHOICE] = backend.library
+
+
+def restart_if_needed() -> None:
+    """For commands: where Dr.Jit was imported with another libLLVM than the one that works, start this process's
+    command line again with the right one, and do not return."""
+    here = llvm()
+    # Where it was set already and did not help, go on without.
+    if here.usable or here.library is None or os.environ.get(CHOICE) == here.library:
+        return
+    os.environ[CHOICE] = os.environ[OWN_CHOICE] = here.library
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+
+
+# Trying --------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def cuda() -> Backend:
+    """Dr.Jit on an NVIDIA GPU, and Mitsuba's ray tracing on it. Not remembered: drivers come and go."""
+    defect, _ = _probe("cuda", {})
+    return Backend("cuda", not defect, defect or "NVIDIA driver and OptiX")
+
+
+def _try(path: str) -> Library:
+    """Try one libLLVM, or remember how it went: the answer for an unchanged file, Dr.Jit and CPU does not change."""
+    try:
+        state = Path(path).stat()
+    except OSError as error:
+        if "/" in path:
+            return Library(path, (error.strerror or "cannot be read").lower())
+        state = None
+    known = _recall()
+    key = state and f"{os.path.realpath(path)}, {state.st_mtime_ns}, {state.st_size}, {_circumstances()}"
+    if key in known:
+        return Library(path, known[key])
+    defect, lasting = _probe("llvm", {CHOICE: path})
+    if key and lasting:
+        _remember(known | {key: defect})
+    return Library(path, defect)
+
+
+def _probe(name: str, environment: dict[str, str]) -> tuple[str, bool]:
+    """(defect, lasting) of a backend, tried in a process of its own. A lasting defect would be found again."""
+    with tempfile.TemporaryDirectory(prefix="mi_refract-", ignore_cleanup_errors=True) as folder:
+        # An empty kernel cache: a kernel on disk would not be compiled.
+        own = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "DRJIT_CACHE_DIR": folder}
+        command = [sys.executable, "-c", _PROBE, name]
+        try:
+            done = subprocess.run(
+                command, env=os.environ | own | environment, cwd=folder, timeout=TIMEOUT,
+                stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace", check=False,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            return f"a tiny kernel took longer than {TIMEOUT:.0f} s", False
+        except OSError as error:
+            return f"no process could be started: {error.strerror}", False
+    if done.returncode < 0:
+        lasting = done.returncode not in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT)
+        return f"ends the process in Dr.Jit's kernels ({_signal(-done.returncode)})", lasting
+    if done.returncode == 0 and done.stdout.endswith("works\n"):
+        return "", True
+    return _complaint(name, done.stderr), True
+
+
+def _signal(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def _complaint(name: str, stderr: str) -> str:
+    """The one line of the probe's messages that says most: Dr.Jit's own if it refused the library, else the last."""
+    lines = [line.strip() for line in stderr.splitlines() if line.strip()] or ["no answer"]
+    if "libcuda.so.1: cannot open" in lines[-1]:
+        return "no NVIDIA driver: libcuda.so.1 not found"
+    if lines[-1] != "refused":
+        return lines[-1][:200]
+    # "jit_find_library(): Unable to load "x": x: invalid ELF header!", "jit_llvm_init(): ... too old. The Dr.Jit ..."
+    said = next((line for line in lines[:-1] if name in line or name == "llvm"), "no message")
+    said = re.sub(r'^(\w+\(\): )?(Unable to load "[^"]*": [^:]*: )?', "", said)
+    return f"refused by Dr.Jit: {said.split('. ')[0].rstrip('.! ')[:200]}"
+
+
+# Remembering ---------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def _circumstances() -> str:
+    """What decides, besides the library: Dr.Jit, the CPU's instruction sets, and the probe itself."""
+    try:
+        drjit = importlib.metadata.version("drjit")
+    except importlib.metadata.PackageNotFoundError:
+        drjit = "unknown"
+    try:
+        flags = re.search(r"^(?:flags|Features)\s*:.*$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    except OSError:
+        flags = None
+    return f"drjit {drjit}, {zlib.crc32((_PROBE + (flags[0] if flags else '')).encode()):08x}"
+
+
+def _cache_file() -> Path:
+    """RuntimeError where nobody has a home."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "mi_refract" / "backend.json"
+
+
+def _recall() -> dict[str | None, str]:
+    """The remembered defects by key; a file that is missing or not ours is an empty memory."""
+    try:
+        known = json.loads(_cache_file().read_text())
+    except (OSError, ValueError, RuntimeError):
+        return {}
+    if not isinstance(known, dict):
+        return {}
+    return {key: defect for key, defect in known.items() if isinstance(defect, str)}
+
+
+def _remember(known: dict[str | None, str]) -> None:
+    """Replace the memory in one step. Where it cannot be written, the next process tries again."""
+    temporary = None
+    try:
+        path = _cache_file()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f"{path.name}.{os.getpid()}")
+        temporary.write_text(json.dumps(dict(list(known.items())[-50:]), indent=1))
+        temporary.replace(path)
+    except (OSError, RuntimeError):
+        if temporary:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
