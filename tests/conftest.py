@@ -50,7 +50,7 @@ def needs_variant() -> Callable[[str], None]:
 
 
 @pytest.fixture
-def variant(request: pytest.FixtureRequest):
+def each_variant(request: pytest.FixtureRequest):
     """Every variant of the wheel, skipped with the reason where it cannot run; see `pytest_generate_tests`."""
     import mitsuba as mi
 
@@ -61,10 +61,10 @@ def variant(request: pytest.FixtureRequest):
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    if "variant" in metafunc.fixturenames:
+    if "each_variant" in metafunc.fixturenames:
         marks = {name: pytest.mark.skip(reason=f"{name}: {why}") if why else () for name, why in USABLE.items()}
         parameters = [pytest.param(name, marks=mark) for name, mark in marks.items()]
-        metafunc.parametrize("variant", parameters, indirect=True)
+        metafunc.parametrize("each_variant", parameters, indirect=True)
 
 
 @dataclass(frozen=True)

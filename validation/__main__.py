@@ -59,7 +59,7 @@ def _run(options: argparse.Namespace) -> int:
     from .plan import PROFILES, SCALAR_PROFILES, Context
 
     start = time.perf_counter()
-    variant = backend.activate()
+    variant = backend.activate(may_restart=True)
     profiles = SCALAR_PROFILES if variant.startswith("scalar") else PROFILES
     context = Context(profiles[options.profile], options.out, variant, backend.detect(), backend.usable_variants())
     studies: dict[str, ModuleType] = {name: import_module(f"validation.{name}") for name in options.studies or STUDIES}
