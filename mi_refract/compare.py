@@ -38,7 +38,7 @@ class Welch:
 
     `smallest_p` is Šidák-adjusted; `detectable` the median over tiles of the smallest relative difference of means
     that would have been an alarm; `certain` counts tiles without any variance, which a t-test knows nothing of:
-    they are alarms where the means differ at all.
+    they are alarms where the means differ beyond the margin.
     """
 
     alarms: int
@@ -47,8 +47,11 @@ class Welch:
     certain: int
 
 
-def welch(reference: np.ndarray, test: np.ndarray, tile: int, family_error: float) -> Welch:
+def welch(reference: np.ndarray, test: np.ndarray, tile: int, family_error: float, margin: float = 0.0) -> Welch:
     """Welch's t-test on tile means of two stacks of independent renders, (renders, height, width, channels).
+
+    Means that differ by no more than `margin`, relative, are equal for all practical purposes: the test asks
+    whether they differ by more. It keeps noise-free tiles from turning last bits into certainties.
 
     The variance of a tile mean is the sum of its pixels' variances over the renders, and its degrees of freedom
     follow Satterthwaite: pixels are independent under a box filter. ValueError for fewer than 2 renders a side.
@@ -64,7 +67,8 @@ def welch(reference: np.ndarray, test: np.ndarray, tile: int, family_error: floa
     certain = variance == 0
     with np.errstate(divide="ignore", invalid="ignore"):
         freedom = np.where(certain, 1.0, variance**2 / (d1 + d2))
-        t = np.where(certain, np.where(m1 == m2, 0.0, np.inf), np.abs(m1 - m2) / np.sqrt(variance))
+        beyond = np.maximum(np.abs(m1 - m2) - margin * np.abs(m1), 0)
+        t = np.where(certain, np.where(beyond == 0, 0.0, np.inf), beyond / np.sqrt(variance))
     p = np.where(np.isfinite(m1) & np.isfinite(m2), 2 * stats.t.sf(t, freedom), 0.0)
     threshold = -np.expm1(np.log1p(-family_error) / p.size)  # Šidák
     critical = stats.t.isf(threshold / 2, freedom[~certain])

@@ -26,6 +26,9 @@ from .plan import Context, Task
 
 TITLE = "Directions"
 TEXT = __doc__.partition("\n")[2].strip()
+SCATTER = [
+    {"study": "directions", "x": "time / copy", "y": "worst / u", "title": "Worst error against time per ray"},
+]
 BUILTIN = "mi.fresnel + mi.refract"
 SEED = 2026
 
