@@ -23,7 +23,8 @@ class Paired:
 def paired(reference: np.ndarray, test: np.ndarray, threshold: float) -> Paired:
     """A pixel is changed where any channel differs by more than `threshold`, or is not finite."""
     _same_shape(reference, test)
-    difference = np.abs(test - reference).max(-1)
+    with np.errstate(invalid="ignore"):
+        difference = np.abs(test - reference).max(-1)
     finite = np.isfinite(test).all(-1) & np.isfinite(reference).all(-1)
     changed = float((~(difference <= threshold) | ~finite).mean())
     if not finite.all():
@@ -61,8 +62,9 @@ def welch(reference: np.ndarray, test: np.ndarray, tile: int, family_error: floa
     _same_shape(reference[0], test[0])
     if min(len(reference), len(test)) < 2:
         raise ValueError(f"welch: {len(reference)} and {len(test)} renders: at least 2 a side are needed")
-    m1, v1, d1 = _tile_moments(reference, tile)
-    m2, v2, d2 = _tile_moments(test, tile)
+    with np.errstate(invalid="ignore"):
+        m1, v1, d1 = _tile_moments(reference, tile)
+        m2, v2, d2 = _tile_moments(test, tile)
     variance = v1 + v2
     certain = variance == 0
     with np.errstate(divide="ignore", invalid="ignore"):

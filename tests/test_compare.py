@@ -71,7 +71,7 @@ def test_tiles_without_noise_are_counted_and_compared_within_the_margin():
 
 
 def test_relative_mse_leaves_out_the_references_own_noise():
-    references = renders(4)
+    references = renders(32)
     picture = renders(1)[0]
     expected = 0.3**2 / 1.01
     assert relative_mse(picture, references) == pytest.approx(expected, rel=0.15)
