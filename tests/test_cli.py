@@ -26,7 +26,10 @@ SCENE = """<scene version="3.0.0">
   <integrator type="path"><integer name="max_depth" value="5"/></integrator>
   <sensor type="perspective">
     <transform name="to_world"><lookat origin="0,1,-4" target="0,0,0" up="0,1,0"/></transform>
-    <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="6"/></film>
+    <film type="hdrfilm">
+      <integer name="width" value="8"/><integer name="height" value="6"/>
+      <rfilter type="box"/>  <!-- with a wider one, the order in which threads finish shows in the last bits -->
+    </film>
     <sampler type="independent"><integer name="sample_count" value="4"/></sampler>
   </sensor>
   <emitter type="constant"/>
