@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import math
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -66,14 +65,19 @@ def _named_ior(name: str, material: str) -> float:
     return float(str(dr.scalar.TensorXf([single]).numpy()[0]))
 
 
-def plugin_class(variant: ModuleType) -> type:
+# Dr.Jit's type stub says that it returns nothing.
+_attach: Any = dr.replace_grad
+
+
+def plugin_class(v: Any) -> type:
     """The class of the plugin for one variant, given its module (`mitsuba.llvm_ad_rgb`, say)."""
-    v: Any = variant
     flags = mi.BSDFFlags
     reflection, transmission = flags.DeltaReflection, flags.DeltaTransmission
     both_sides = flags.FrontSide | flags.BackSide
 
-    class Refract(v.BSDF):
+    base: Any = v.BSDF
+
+    class Refract(base):
         """Smooth dielectric boundary; see the module docstring."""
 
         def __init__(self, props: Any, formula: str = "auto") -> None:
@@ -160,8 +164,8 @@ def plugin_class(variant: ModuleType) -> type:
                 return v.Spectrum(value)
             if not dr.grad_enabled(value):
                 return v.Spectrum(1)
-            one: Any = dr.replace_grad(v.Float(1), value / dr.detach(value))  # the choice of a lobe is detached
-            return v.Spectrum(one)
+            # The choice of a lobe is detached; its probability is what the weight is differentiated against.
+            return v.Spectrum(_attach(v.Float(1), value / dr.detach(value)))
 
         def _tints(self, selected_r: Any, selected_t: Any) -> list[tuple[Any, Any]]:
             masks = dict(zip(LOBES, (selected_r, selected_t), strict=True))
@@ -228,7 +232,7 @@ def plugin_class(variant: ModuleType) -> type:
     return Refract
 
 
-def register(variant: ModuleType) -> None:
+def register(variant: Any) -> None:
     """Make `refract` known to one variant, given its module; and `refract_<formula>` for every formula.
 
     The latter are for scenes whose plugin is a parameter: there no word is left to name the formula with.

@@ -86,7 +86,7 @@ REGIMES = {
 
 
 def make(name: str, count: int, precision: DTypeLike, seed: int = 0) -> Rays:
-    """`count` rays of a regime in `precision` (float32 or float64), normals on either side. KeyError: no such regime."""
+    """`count` rays of a regime in `precision`, float32 or float64, normals on either side. KeyError: no such regime."""
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
     angle, k = REGIMES[name].draw(rng, count)
     n = _unit(rng.normal(size=(count, 3))).astype(precision)

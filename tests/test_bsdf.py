@@ -192,7 +192,8 @@ def test_eta_can_be_read_edited_and_is_an_attribute(each_variant):
 
 def test_textures_are_traversed_and_tint_their_lobe_only(each_variant):
     bsdf = tinted()
-    assert {"specular_reflectance", "specular_transmittance"} <= {key.partition(".")[0] for key in mi.traverse(bsdf).keys()}  # noqa: SIM118
+    names = {key.partition(".")[0] for key in mi.traverse(bsdf).keys()}  # noqa: SIM118
+    assert {"specular_reflectance", "specular_transmittance"} <= names
     only_reflected = load(int_ior=1.5, ext_ior=1, specular_reflectance=0.25)
     _, reflected = sample(only_reflected, (0, 0, 1), 0.0, "Importance")
     _, transmitted = sample(only_reflected, (0, 0, 1), 0.9, "Importance")
@@ -222,7 +223,7 @@ def test_total_internal_reflection_takes_everything(each_variant):
 
 
 def test_a_direction_that_is_none_stays_none(each_variant):
-    bs, weight = sample(load(), (math.nan, 0, 1), 0.5)
+    bs, _ = sample(load(), (math.nan, 0, 1), 0.5)
     assert np.isnan(vector(bs.wo)).any()
     assert np.isnan(number(bs.pdf))
 

@@ -9,6 +9,7 @@ import pytest
 from mi_refract import backend
 
 LOAD = "mi.load_dict({'type': 'refract'})"
+XML = '<scene version="3.0.0"><shape type="sphere"><bsdf type="refract"/></shape></scene>'
 CASES = {
     "before any variant": f"import mitsuba as mi; import mi_refract; mi.set_variant('scalar_rgb'); {LOAD}",
     "before mitsuba": f"import mi_refract; import mitsuba as mi; mi.set_variant('scalar_rgb'); {LOAD}",
@@ -21,11 +22,10 @@ CASES = {
         "import mitsuba as mi; mi.set_variant('scalar_rgb'); import mi_refract, importlib;"
         f"importlib.reload(mi_refract); {LOAD}"
     ),
-    "written as a string, where the parser asks scalar_rgb": (
+    "parsed from XML, where Mitsuba asks scalar_rgb": (
         "import mitsuba as mi; mi.set_variant('scalar_spectral'); import mi_refract;"
-        "scene = mi.load_string('<scene version=\"3.0.0\"><shape type=\"sphere\"><bsdf type=\"refract\"/></shape></scene>');"
-        "mi.parser.write_string(mi.parser.parse_string(mi.parser.ParserConfig('scalar_spectral'),"
-        "'<scene version=\"3.0.0\"><shape type=\"sphere\"><bsdf type=\"refract\"/></shape></scene>'))"
+        f"config, xml = mi.parser.ParserConfig('scalar_spectral'), {XML!r};"
+        "mi.parser.write_string(mi.parser.parse_string(config, xml)); mi.load_string(xml)"
     ),
 }
 

@@ -12,6 +12,7 @@ import time
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 STUDIES = ("directions", "renders")
 
@@ -39,7 +40,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"of {', '.join(STUDIES)}; all by default")
     parser.add_argument("--profile", default="quick", choices=("quick", "full"))
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder of the report (default: out)")
-    parser.add_argument("--readme", type=Path, help="write the accuracy table into this Markdown file, too")
+    parser.add_argument("--readme", type=Path, help="write the tables and the gallery of this Markdown file, too")
     return parser
 
 
@@ -55,7 +56,7 @@ def _check(options: argparse.Namespace) -> None:
 def _run(options: argparse.Namespace) -> int:
     from mi_refract import backend, report
 
-    from . import runner
+    from . import readme, runner
     from .plan import PROFILES, SCALAR_PROFILES, Context
 
     start = time.perf_counter()
@@ -70,18 +71,18 @@ def _run(options: argparse.Namespace) -> int:
     report.write_json(options.out / "rows.json", rows, described)
     report.write_junit(options.out / "junit.xml", rows, described)
     report.write_html(options.out / "report.html", rows, described, options.out)
+    if options.readme:
+        readme.update(options.readme, rows, context)
     runner.forget(context)
-    print_summary(rows, options.out / "report.html")
+    _print_summary(report.summary(rows), options.out / "report.html")
     return 1 if any(row.verdict == "fail" for row in rows) else 0
 
 
-def print_summary(rows: list, page: Path) -> None:
+def _print_summary(summary: Any, page: Path) -> None:
     from rich.console import Console
 
-    from mi_refract import report
-
     console = Console()
-    console.print(report.summary(rows))
+    console.print(summary)
     console.print(f"report: {page}", highlight=False)
 
 

@@ -62,7 +62,7 @@ def tasks(context: Context) -> list[Task]:
 
 def settings(context: Context) -> list[Setting]:
     found = [
-        Setting("scalar float32", np.float32, reason="components of scalar arrays are Python floats: computed in double"),
+        Setting("scalar float32", np.float32, reason="components of scalar arrays are Python floats, so doubles"),
         Setting("scalar float64", np.float64, dr.scalar.Array3f64),
     ]
     for backend in ("llvm", "cuda"):
@@ -115,7 +115,8 @@ def builtin(a: Any, n: Any, k: Any) -> tuple[Any, Any]:
     n = n * dr.sign(dr.dot(-wi, n))
     _, cos_t, _, eta_ti = mi.fresnel(dr.dot(wi, n), k)
     transmitted = cos_t != 0
-    return dr.select(transmitted, mi.refract(wi, mi.Normal3f(n), cos_t, eta_ti), mi.reflect(wi, mi.Normal3f(n))), transmitted
+    m = mi.Normal3f(n)
+    return dr.select(transmitted, mi.refract(wi, m, cos_t, eta_ti), mi.reflect(wi, m)), transmitted
 
 
 def evaluate(subject: Subject, rays: regimes.Rays, vector: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -136,7 +137,8 @@ def errors(b: np.ndarray, rays: regimes.Rays, exact: oracle.Certified) -> tuple[
     norm = np.sqrt((unit**2).sum(1))
     across = np.sqrt((np.cross(unit, difference) ** 2).sum(1)) / norm
     angle = np.arctan2(across, norm - (unit * difference).sum(1) / norm)
-    return tuple(np.nan_to_num(x.astype(float), nan=np.inf) for x in (chord, angle, np.abs(norm - 1)))  # type: ignore[return-value]
+    chord, angle, drift = (np.nan_to_num(x.astype(float), nan=np.inf) for x in (chord, angle, np.abs(norm - 1)))
+    return chord, angle, drift
 
 
 def _regime_row(name: str, subject: Subject, regime: str, setting: Setting, count: int) -> Row:

@@ -29,6 +29,7 @@ TEXT = __doc__.partition("\n")[2].strip()
 BUILTIN = "dielectric"
 # Paths in these scenes are short: a difference in the last bit stays one, unless it flips the choice of a lobe.
 SHORT_PATHS = {"sphere", "slab", "prism", "furnace"}
+Curves = dict[str, list[tuple[float, float]]]
 CHANGED = 1e-5
 TILE = 16
 MARGIN = 1e-5  # relative: float32 pictures that differ by less are equal
@@ -93,7 +94,7 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
         Row(
             "renders", plugin, scene, context.variant, values, budgets, {"time / dielectric": 1.03}, replay=settings,
             pictures=_save(context, settings, test.mean(0), reference.mean(0)),
-            curves=_curves(context, cameras, reference),
+            curves=_curves(context, cameras, reference) if plugin == PLUGIN else {},
         )
     ]  # fmt: skip
 
@@ -118,9 +119,9 @@ def _independent(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     }
 
 
-def _curves(context: Context, cameras: dict[str, Camera], reference: np.ndarray) -> dict[str, list[tuple[float, float]]]:
+def _curves(context: Context, cameras: dict[str, Camera], reference: np.ndarray) -> Curves:
     """relMSE against seconds at growing samples per pixel, both plugins in turn; seeds the reference has not seen."""
-    curves: dict[str, list[tuple[float, float]]] = {name: [] for name in cameras}
+    curves: Curves = {name: [] for name in cameras}
     for spp in context.profile.curve_spp:
         for name, camera in cameras.items():
             camera(spp, seed=context.profile.pairs)  # compiles what this sample count needs

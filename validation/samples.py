@@ -75,10 +75,12 @@ def _mode_row(mode: Any, mode_name: str, count: int, variant: str) -> Row:
         values |= {f"{name} worst": float(d.max()), f"{name} p99": float(np.quantile(d, 0.99))}
     # The built-in's radicand cancels: the a-priori bound of such a form, and a few roundings for 99 rays of 100.
     bound = cancelling(2)(2.0**-24, INT_IOR)
-    budgets = {f"{name} worst": bound for name in ("wo", "pdf", "weight")} | {"eta worst": 2e-7, "lobe flips": 1e-3 * count}
+    budgets = {f"{name} worst": bound for name in ("wo", "pdf", "weight")}
+    budgets |= {"eta worst": 2e-7, "lobe flips": 1e-3 * count}
     budgets |= {f"{name} p99": 4e-6 for name in ("wo", "pdf", "weight")}
     replay = {"count": 3 * count, "seed": SEED, **description}
-    return Row("directions", "refract − dielectric", f"bsdf.sample, {mode_name}", variant, values, budgets, replay=replay)
+    case = f"bsdf.sample, {mode_name}"
+    return Row("directions", "refract − dielectric", case, variant, values, budgets, replay=replay)
 
 
 def sample_all(bsdf: Any, context: Any, wi: np.ndarray, sample1: np.ndarray) -> dict[str, np.ndarray]:
