@@ -75,9 +75,7 @@ def plugin_class(v: Any) -> type:
     reflection, transmission = flags.DeltaReflection, flags.DeltaTransmission
     both_sides = flags.FrontSide | flags.BackSide
 
-    base: Any = v.BSDF
-
-    class Refract(base):
+    class Refract(v.BSDF):
         """Smooth dielectric boundary; see the module docstring."""
 
         def __init__(self, props: Any, formula: str = "auto") -> None:

@@ -85,16 +85,20 @@ def welch(reference: np.ndarray, test: np.ndarray, tile: int, family_error: floa
 
 
 def _tile_moments(stack: np.ndarray, tile: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Per tile and channel: the mean, its variance, and Satterthwaite's denominator Σ v_i²/(n − 1)."""
-    count = len(stack)
+    """Per tile and channel: the mean, its variance, and Satterthwaite's denominator Σ v_i²/(n − 1).
 
-    def tiles(x: np.ndarray) -> np.ndarray:
-        height, width = (size // tile * tile for size in x.shape[:2])
-        return x[:height, :width].reshape(height // tile, tile, width // tile, tile, -1)
+    Tiles at the right and lower edge are as large as what is left.
+    """
+    count, height, width = stack.shape[:3]
+    rows, columns = np.arange(0, height, tile), np.arange(0, width, tile)
+    area = np.outer(np.diff(rows, append=height), np.diff(columns, append=width))[..., None]
 
-    pixel_variance = tiles(stack.var(0, ddof=1)) / (count * tile**4)
-    mean = tiles(stack.mean(0)).mean((1, 3))
-    return mean, pixel_variance.sum((1, 3)), (pixel_variance**2).sum((1, 3)) / (count - 1)
+    def total(x: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(np.add.reduceat(x, rows, 0), columns, 1)
+
+    variance = stack.var(0, ddof=1) / count
+    mean = total(stack.mean(0)) / area
+    return mean, total(variance) / area**2, total(variance**2) / area**4 / (count - 1)
 
 
 def relative_mse(picture: np.ndarray, references: np.ndarray, epsilon: float = 0.01) -> float:

@@ -61,6 +61,12 @@ def test_a_difference_twice_the_detectable_one_is_seen():
     assert welch(reference, local, 16, 1e-3).alarms == 1
 
 
+def test_the_edge_that_fills_no_tile_is_tested_too():
+    reference, test = renders(6, shape=(20, 20, 3)), renders(6, shape=(20, 20, 3))
+    test[:, 17:, 17:] *= 2
+    assert welch(reference, test, 16, 1e-3).alarms == 3
+
+
 def test_tiles_without_noise_are_counted_and_compared_within_the_margin():
     reference = np.ones((4, *SHAPE))
     last_bits, off = reference * (1 + 1e-7), reference * (1 + 1e-4)
