@@ -61,6 +61,7 @@ def _run(options: argparse.Namespace) -> int:
 
     start = time.perf_counter()
     variant = backend.activate(may_restart=True)
+    print(f"validation: {backend.summary()}", file=sys.stderr)
     profiles = SCALAR_PROFILES if variant.startswith("scalar") else PROFILES
     context = Context(profiles[options.profile], options.out, variant, backend.detect(), backend.usable_variants())
     studies: dict[str, ModuleType] = {name: import_module(f"validation.{name}") for name in options.studies or STUDIES}

@@ -86,13 +86,15 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
     budgets = {"|mean ratio − 1|": 1e-4, "Welch alarms": 0.0}
     if scene in SHORT_PATHS:
         budgets["changed share"] = 1e-3
+    # A Python plugin costs a call per operation in scalar variants: its time is demanded of compiled ones only.
+    goals = {} if context.variant.startswith("scalar") else {"time / dielectric": 1.03}
     settings = {
         "scene": path.name, "plugin": plugin, "variant": context.variant, "resolution": profile.resolution,
         "spp": profile.spp, "seeds": profile.pairs,
     }  # fmt: skip
     return [
         Row(
-            "renders", plugin, scene, context.variant, values, budgets, {"time / dielectric": 1.03}, replay=settings,
+            "renders", plugin, scene, context.variant, values, budgets, goals, replay=settings,
             pictures=_save(context, settings, test.mean(0), reference.mean(0)),
             curves=_curves(context, cameras, reference) if plugin == PLUGIN else {},
         )
