@@ -14,7 +14,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-STUDIES = ("directions", "renders")
+# Each study by name, and the modules that make it up.
+STUDIES = {"directions": ("directions", "samples"), "renders": ("renders",)}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -64,10 +65,11 @@ def _run(options: argparse.Namespace) -> int:
     print(f"validation: {backend.summary()}", file=sys.stderr)
     profiles = SCALAR_PROFILES if variant.startswith("scalar") else PROFILES
     context = Context(profiles[options.profile], options.out, variant, backend.detect(), backend.usable_variants())
-    studies: dict[str, ModuleType] = {name: import_module(f"validation.{name}") for name in options.studies or STUDIES}
+    names = [module for study in options.studies or STUDIES for module in STUDIES[study]]
+    studies: dict[str, ModuleType] = {name: import_module(f"validation.{name}") for name in names}
     rows = runner.run([task for study in studies.values() for task in study.tasks(context)], context)
     described = runner.describe(context, time.perf_counter() - start)
-    described["studies"] = {name: {"title": study.TITLE, "text": study.TEXT} for name, study in studies.items()}
+    described["studies"] = {name: {"title": study.TITLE, "text": " ".join(study.TEXT.split())} for name, study in studies.items()}
     described["scatter"] = [scatter for study in studies.values() for scatter in getattr(study, "SCATTER", [])]
     report.write_json(options.out / "rows.json", rows, described)
     report.write_junit(options.out / "junit.xml", rows, described)

@@ -21,7 +21,6 @@ from mi_refract import oracle, regimes
 from mi_refract.formulas import FORMULAS, Formula, cancelling
 from mi_refract.rows import Row
 
-from . import samples
 from .plan import Context, Task
 
 TITLE = "Directions"
@@ -52,12 +51,11 @@ class Setting:
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per backend and precision, then the samples of the BSDFs."""
-    formulas = [
+    """One task per backend and precision."""
+    return [
         Task(f"directions: {setting.label}", functools.partial(_setting_rows, context, setting))
         for setting in settings(context)
     ]
-    return formulas + samples.tasks(context)
 
 
 def settings(context: Context) -> list[Setting]:

@@ -17,6 +17,8 @@ from mi_refract.rows import Row
 
 from .plan import Context, Task
 
+TITLE = "Samples"
+TEXT = __doc__.partition("\n")[2].strip()
 SEED = 2027
 INT_IOR, EXT_IOR = 1.5, 1.0
 LOBES = {"both lobes": 0xFFFFFFFF, "reflection": 0, "transmission": 1}
@@ -34,7 +36,7 @@ def _variant_rows(context: Context, variant: str, reason: str | None) -> list[Ro
     import mitsuba as mi
 
     if reason is not None:
-        return [Row("directions", "refract − dielectric", "bsdf.sample", variant, reason=reason)]
+        return [Row("samples", "refract − dielectric", "all", variant, reason=reason)]
     mi.set_variant(variant)
     try:
         count = context.profile.rays if dr.is_jit_v(mi.Float) else context.profile.scalar_rays
@@ -79,8 +81,7 @@ def _mode_row(mode: Any, mode_name: str, count: int, variant: str) -> Row:
     budgets |= {"eta worst": 2e-7, "lobe flips": 1e-3 * count}
     budgets |= {f"{name} p99": 4e-6 for name in ("wo", "pdf", "weight")}
     replay = {"count": 3 * count, "seed": SEED, **description}
-    case = f"bsdf.sample, {mode_name}"
-    return Row("directions", "refract − dielectric", case, variant, values, budgets, replay=replay)
+    return Row("samples", "refract − dielectric", mode_name, variant, values, budgets, replay=replay)
 
 
 def sample_all(bsdf: Any, context: Any, wi: np.ndarray, sample1: np.ndarray) -> dict[str, np.ndarray]:
