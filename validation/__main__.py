@@ -69,7 +69,9 @@ def _run(options: argparse.Namespace) -> int:
     studies: dict[str, ModuleType] = {name: import_module(f"validation.{name}") for name in names}
     rows = runner.run([task for study in studies.values() for task in study.tasks(context)], context)
     described = runner.describe(context, time.perf_counter() - start)
-    described["studies"] = {name: {"title": study.TITLE, "text": " ".join(study.TEXT.split())} for name, study in studies.items()}
+    described["studies"] = {
+        name: {"title": study.TITLE, "text": " ".join(study.TEXT.split())} for name, study in studies.items()
+    }
     described["scatter"] = [scatter for study in studies.values() for scatter in getattr(study, "SCATTER", [])]
     report.write_json(options.out / "rows.json", rows, described)
     report.write_junit(options.out / "junit.xml", rows, described)
