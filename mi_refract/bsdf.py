@@ -7,15 +7,15 @@ makes it known there. Parameters: `int_ior`, `ext_ior` (number or a name from Mi
 
 from __future__ import annotations
 
+import functools
 import math
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 
 from . import fresnel
-from .formulas import resolve
+from .formulas import FORMULAS, resolve
 
 PLUGIN = "refract"
 LOBES = ("specular_reflectance", "specular_transmittance")  # tint of the reflected and of the transmitted lobe
@@ -65,9 +65,12 @@ def _named_ior(name: str, material: str) -> float:
     return float(str(dr.scalar.TensorXf([single]).numpy()[0]))
 
 
-def plugin_class(variant: ModuleType) -> type:
+# Dr.Jit's type stub says that it returns nothing.
+_attach: Any = dr.replace_grad
+
+
+def plugin_class(v: Any) -> type:
     """The class of the plugin for one variant, given its module (`mitsuba.llvm_ad_rgb`, say)."""
-    v: Any = variant
     flags = mi.BSDFFlags
     reflection, transmission = flags.DeltaReflection, flags.DeltaTransmission
     both_sides = flags.FrontSide | flags.BackSide
@@ -75,15 +78,15 @@ def plugin_class(variant: ModuleType) -> type:
     class Refract(v.BSDF):
         """Smooth dielectric boundary; see the module docstring."""
 
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: Any, formula: str = "auto") -> None:
             super().__init__(props)
             int_ior, ext_ior = read_ior(props, "int_ior", "bk7"), read_ior(props, "ext_ior", "air")
-            self.requested = props.get("formula", "auto")
+            self.requested = props.get("formula", formula)
             try:
                 self.formula_name, self.formula = resolve(self.requested, dr.backend_v(v.Float))
             except ValueError as error:
                 raise ValueError(f"{PLUGIN}: {error}") from None
-            self.textures = {name: props.get_texture(name, 1.0) for name in LOBES if props.has_property(name)}
+            self.textures = {name: props.get_texture(name, 1.0) for name in LOBES if name in props}
             # Scalar variants: Mitsuba can set an array of one number, but not a bare Python float.
             number = v.Float if dr.is_jit_v(v.Float) else dr.scalar.Array1f
             self.eta = number(int_ior / ext_ior)
@@ -98,7 +101,7 @@ def plugin_class(variant: ModuleType) -> type:
             """
             self.outer = Side(v.Float(1 / eta), v.Float(-contrast / (eta * eta)))
             self.inner = Side(v.Float(eta), v.Float(contrast))
-            dr.make_opaque(self.eta, self.outer, self.inner)
+            dr.make_opaque(self.eta, *self.outer, *self.inner)
 
         def traverse(self, cb: Any) -> None:
             cb.put("eta", self.eta, mi.ParamFlags.Differentiable)
@@ -108,7 +111,8 @@ def plugin_class(variant: ModuleType) -> type:
         def parameters_changed(self, keys: Any) -> None:
             if not keys or "eta" in keys:
                 wide: Any = dr.float64_array_t(v.Float)
-                eta = wide(self._eta())
+                # Only a derivative needs a kernel here; a number is read back, so that an edit compiles nothing.
+                eta = wide(self.eta) if dr.grad_enabled(self.eta) else float(self.eta[0])
                 self._face(eta, (eta - 1) * (eta + 1))
 
         def _eta(self) -> Any:
@@ -158,7 +162,8 @@ def plugin_class(variant: ModuleType) -> type:
                 return v.Spectrum(value)
             if not dr.grad_enabled(value):
                 return v.Spectrum(1)
-            return v.Spectrum(dr.replace_grad(v.Float(1), value / dr.detach(value)))
+            # The choice of a lobe is detached; its probability is what the weight is differentiated against.
+            return v.Spectrum(_attach(v.Float(1), value / dr.detach(value)))
 
         def _tints(self, selected_r: Any, selected_t: Any) -> list[tuple[Any, Any]]:
             masks = dict(zip(LOBES, (selected_r, selected_t), strict=True))
@@ -168,8 +173,11 @@ def plugin_class(variant: ModuleType) -> type:
             """The Mueller matrix of the selected lobe, turned into the implicit Stokes bases of both directions."""
             r = fresnel.mueller_reflection(ray.cos_i, ray.side.k, ray.side.contrast)
             t = fresnel.mueller_transmission(ray.cos_i, ray.cos_t, ray.transmitted, ray.side.k)
-            matrix = v.Spectrum(v.Matrix4f([[dr.select(selected_r, x, y) for x, y in zip(*p)] for p in zip(r, t)]))
-            # Light arrives along −wo and leaves along wi when radiance is transported, and the other way for importance.
+            entries = [
+                [dr.select(selected_r, x, y) for x, y in zip(*rows, strict=True)] for rows in zip(r, t, strict=True)
+            ]
+            matrix = v.Spectrum(v.Matrix4f(entries))
+            # Radiance: light arrives along −wo and leaves along wi. Importance: the other way round.
             radiance = ctx.mode == mi.TransportMode.Radiance
             arrival, departure = (-bs.wo, si.wi) if radiance else (-si.wi, bs.wo)
             axes = [self._perpendicular(direction) for direction in (arrival, departure)]
@@ -222,6 +230,13 @@ def plugin_class(variant: ModuleType) -> type:
     return Refract
 
 
-def register(variant: ModuleType) -> None:
-    """Make the plugin known to one variant, given its module. Registering again is harmless."""
-    variant.register_bsdf(PLUGIN, plugin_class(variant))
+def register(variant: Any) -> None:
+    """Make `refract` known to one variant, given its module; and `refract_<formula>` for every formula.
+
+    The latter are for scenes whose plugin is a parameter: there no word is left to name the formula with.
+    Registering again is harmless.
+    """
+    plugin = plugin_class(variant)
+    variant.register_bsdf(PLUGIN, plugin)
+    for name in FORMULAS:
+        variant.register_bsdf(f"{PLUGIN}_{name}", functools.partial(plugin, formula=name))

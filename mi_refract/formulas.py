@@ -202,12 +202,14 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
         return refract_compensated(a, n, k, contrast)
     wide: Any = dr.float64_array_t(type(a))
     number = dr.value_t(wide)
-    d, m, k2 = wide(a), wide(n), number(_scalar(a, k))
-    if contrast is None:
-        kappa = k2 * k2 - 1  # k² has 48 bits: the difference is rounded at most once
-    else:
-        kappa = number(contrast)
-        k2 = dr.sqrt(1 + kappa)
+    k = _scalar(a, k)
+    d, m, k2 = wide(a), wide(n), number(k)
+    kappa = k2 * k2 - 1  # k² has 48 bits: the difference is rounded at most once
+    if contrast is not None:
+        # √(1 + κ) = k + (κ − (k² − 1))/2k to second order; the quotient needs few digits, so it stays narrow.
+        known = number(contrast)
+        k2 = k2 + number(quotient(type(k)(known - kappa), 2 * k))
+        kappa = known
     # Products of components are exact and their sums rounded at 2⁻⁵³: error of the radicand ≤ 8·2⁻⁵³ of its terms.
     c, w = dr.dot(m, d), dr.cross(m, d)
     radicand = c * c - kappa * dr.dot(w, w)
@@ -279,7 +281,7 @@ def _rounding(u: float, k: float) -> float:
     return 0.92 * u
 
 
-def _cancelling(growth: int) -> Callable[[float, float], float]:
+def cancelling(growth: int) -> Callable[[float, float], float]:
     """A-priori bound of a form whose radicand cancels.
 
     The radicand is off by ≤ 12u K^growth, K = max(1, k): nine roundings and inputs that are unit only to u. Its
@@ -316,22 +318,22 @@ class Formula:
 
 FORMULAS = {
     "wedge": Formula(
-        refract_wedge, "000, boxed", "b = k n(n∧a) + s n √(a² + k²(n∧a)²)", budget=_cancelling(1)
+        refract_wedge, "000, boxed", "b = k n(n∧a) + s n √(a² + k²(n∧a)²)", budget=cancelling(1)
     ),
     "wedge_contrast": Formula(
         refract_wedge_contrast,
         "000, last form",
         "b = k n(n∧a) + s n √((n·a)² + (n∧a)²(k² − 1))",
-        budget=_cancelling(1),
+        budget=cancelling(1),
     ),
     "cross": Formula(
-        refract_cross, "001, eq. 6", "t = n×c + s √(1 − ‖c‖²) n, c = k (i×n)", budget=_cancelling(1)
+        refract_cross, "001, eq. 6", "t = n×c + s √(1 − ‖c‖²) n, c = k (i×n)", budget=cancelling(1)
     ),
     "decomposed": Formula(
-        refract_decomposed, "002, eq. 1", "b = k a − n (k c − s √(1 − k²(1 − c²))), c = n·a", budget=_cancelling(2)
+        refract_decomposed, "002, eq. 1", "b = k a − n (k c − s √(1 − k²(1 − c²))), c = n·a", budget=cancelling(2)
     ),
     "rotated": Formula(
-        refract_rotated, "004", "b = B (s √(1 − X²), X), X = k R/√(1 + R²)", budget=_cancelling(1)
+        refract_rotated, "004", "b = B (s √(1 − X²), X), X = k R/√(1 + R²)", budget=cancelling(1)
     ),
     "compensated": Formula(
         refract_compensated,

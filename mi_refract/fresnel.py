@@ -55,7 +55,7 @@ def reflectance(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: Any 
     """
     kappa = contrast_of(k) if contrast is None else contrast
     r_s2, r_p2 = powers(cos_i, cos_t, k, kappa)
-    certain = dr.select(cos_i >= 0, 1, dr.nan)  # NaN must not come out as a mirror
+    certain = dr.select(cos_i + cos_t >= 0, 1, dr.nan)  # NaN must not come out as a mirror
     return dr.select(transmitted, 0.5 * (r_s2 + r_p2), certain)
 
 
@@ -69,7 +69,7 @@ def transmittances(cos_i: Any, cos_t: Any, k: Any) -> tuple[Any, Any, Any]:
 def transmittance(cos_i: Any, cos_t: Any, transmitted: Any, k: Any) -> Any:
     """Unpolarised transmittance T = 1 − R, formed without that subtraction; 0 where the ray is not transmitted."""
     t_s, t_p, _ = transmittances(cos_i, cos_t, k)
-    certain = dr.select(cos_i >= 0, 0, dr.nan)
+    certain = dr.select(cos_i + cos_t >= 0, 0, dr.nan)
     return dr.select(transmitted, 0.5 * (t_s + t_p), certain)
 
 

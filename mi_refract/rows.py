@@ -18,8 +18,9 @@ class Row:
     """One measurement: who, on what, under which backend, what came out, what was allowed.
 
     `values` are the numbers by metric name. `budgets` are upper bounds for some of them; a value that is NaN
-    breaks its budget. A row without values was not run, and `reason` says why; otherwise `reason` is a remark.
-    `replay` is what repeats the row: seed, sizes, hex floats. `pictures` are EXR paths relative to the output
+    breaks its budget. `goals` are upper bounds too, for what a busy machine can spoil (times): a missed goal is
+    shown, and decides no verdict. A row without values was not run, and `reason` says why; otherwise `reason` is
+    a remark. `replay` is what repeats the row: seed, sizes, hex floats. `pictures` are EXR paths relative to the output
     folder, by role (`reference`, `test`, `difference`). `curves` are named lists of (seconds, error) points.
     """
 
@@ -29,15 +30,16 @@ class Row:
     setting: str  # "llvm float32", a Mitsuba variant
     values: dict[str, float] = field(default_factory=dict)
     budgets: dict[str, float] = field(default_factory=dict)
+    goals: dict[str, float] = field(default_factory=dict)
     reason: str = ""
     replay: dict[str, Any] = field(default_factory=dict)
     pictures: dict[str, str] = field(default_factory=dict)
     curves: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        unmeasured = self.budgets.keys() - self.values.keys() if self.values else set()
+        unmeasured = (self.budgets.keys() | self.goals.keys()) - self.values.keys() if self.values else set()
         if unmeasured:
-            raise ValueError(f"row {self.name}: a budget without a value: {sorted(unmeasured)}")
+            raise ValueError(f"row {self.name}: a bound without a value: {sorted(unmeasured)}")
         if not self.values and not self.reason:
             raise ValueError(f"row {self.name}: neither values nor the reason why it was not run")
 
@@ -46,9 +48,22 @@ class Row:
         return " / ".join((self.study, self.subject, self.case, self.setting))
 
     @property
+    def bounds(self) -> dict[str, float]:
+        """Budgets and goals by metric."""
+        return self.goals | self.budgets
+
+    @property
     def broken(self) -> dict[str, float]:
         """The budgets that did not hold. `not (v <= b)`, so that NaN breaks them."""
-        return {m: b for m, b in self.budgets.items() if self.values and not (self.values[m] <= b)}
+        return self._exceeded(self.budgets)
+
+    @property
+    def missed(self) -> dict[str, float]:
+        """The goals that were not reached."""
+        return self._exceeded(self.goals)
+
+    def _exceeded(self, bounds: dict[str, float]) -> dict[str, float]:
+        return {m: b for m, b in bounds.items() if self.values and not (self.values[m] <= b)}
 
     @property
     def verdict(self) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
@@ -46,3 +47,68 @@ def needs_variant() -> Callable[[str], None]:
             pytest.skip(f"{variant}: {reason}")
 
     return check
+
+
+@pytest.fixture
+def each_variant(request: pytest.FixtureRequest):
+    """Every variant of the wheel, skipped with the reason where it cannot run; see `pytest_generate_tests`."""
+    import mitsuba as mi
+
+    before = mi.variant()
+    mi.set_variant(request.param)
+    yield request.param
+    mi.set_variant(before)
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "each_variant" in metafunc.fixturenames:
+        marks = {name: pytest.mark.skip(reason=f"{name}: {why}") if why else () for name, why in USABLE.items()}
+        parameters = [pytest.param(name, marks=mark) for name, mark in marks.items()]
+        metafunc.parametrize("each_variant", parameters, indirect=True)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A Dr.Jit backend in a precision, "float32" or "float64"."""
+
+    backend: str
+    name: str
+
+    @property
+    def precision(self):
+        import numpy as np
+
+        return getattr(np, self.name)
+
+    @property
+    def roundoff(self) -> float:
+        return {"float32": 2.0**-24, "float64": 2.0**-53}[self.name]
+
+    @property
+    def vector(self):
+        import drjit as dr
+
+        return getattr(getattr(dr, self.backend), {"float32": "Array3f", "float64": "Array3f64"}[self.name])
+
+
+# Scalar arrays compute in double whatever they store: float32 is judged on the vectorised backends.
+SETTINGS = [("scalar", "float64")] + [(b, p) for b in ("llvm", "cuda") for p in ("float32", "float64")]
+
+
+def _setting(request: pytest.FixtureRequest) -> Setting:
+    entry = backend.detect()[request.param[0]]
+    if not entry.usable:
+        pytest.skip(f"{entry.name}: {entry.reason}")
+    return Setting(*request.param)
+
+
+@pytest.fixture(params=SETTINGS, ids="-".join, scope="module")
+def setting(request: pytest.FixtureRequest) -> Setting:
+    """Every backend and precision."""
+    return _setting(request)
+
+
+@pytest.fixture(params=SETTINGS[1:], ids="-".join, scope="module")
+def vectorised(request: pytest.FixtureRequest) -> Setting:
+    """Those that carry derivatives."""
+    return _setting(request)

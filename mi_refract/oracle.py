@@ -1,0 +1,325 @@
+"""Certified answers: Snell's law solved by ball arithmetic for the exact values of the inputs.
+
+A float is a dyadic rational, so everything in the law short of its square roots is a polynomial that is
+computed exactly; the signs of n·a and of the radicand are then facts, at the critical angle too. The roots
+and the division follow in balls, whose radius is the certificate. No formula of this package is imported.
+
+Writing A = |a|², N = |n|², c = n·a, s = sign(c), for a and n of any length:
+
+    sin²θi = |n×a|² / AN                                    AN − c² = |n×a|²
+    radicand D = c² − (k²−1)|n×a|²                          cos²θt = D / AN
+    b/|a| = (k t + s√D n) / (N√A),   t = N a − c n          Snell: the tangent scales by k
+    b/|a| = (t − c n) / (N√A)                               total internal reflection, D < 0
+
+Arithmetic: F. Johansson, "Arb: efficient arbitrary-precision midpoint-radius interval arithmetic", 2017.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+try:
+    from flint import arb, ctx
+except ImportError as error:
+    raise ImportError("oracle needs python-flint: pip install 'mi-refract[validation]'") from error
+
+# The radicand of float64 inputs has its bits between 2^±12600: twice n·a (2 × 4200) and k² (4200).
+EXACT_BITS = 16384
+# 160 bits leave the direction 1e-47 wide; the higher ones are taken only where a ball stays too wide.
+PRECISIONS = (160, 320, 640)
+MAX_RADIUS = 1e-30
+MAX_RESIDUAL = 1e-28
+# |x| ≤ 1 as a pair of doubles: |x − high| ≤ 2⁻⁵⁴, so |x − high − low| ≤ 2⁻¹⁰⁸. Two bits spare for the radius.
+PAIR_ERROR = 2.0**-106
+
+_CHUNK = 256
+_COLUMNS = 18
+_FIRST_FRESNEL = 10
+_NO_FRESNEL = (math.nan,) * 8
+_UNDECIDED = (math.nan,) * _COLUMNS
+
+
+@dataclass(frozen=True)
+class Certified:
+    """The exact answer for each ray, as doubles with a bound on what they leave out.
+
+    Directions are unit, b/|a|. `x + x_low` is the value to about 106 bits, `x` alone the nearest double.
+    `radius` bounds the error of every component of `direction + direction_low` and is at most 1e-30.
+    `cos_i`, `cos_t` are |n·a|/|n||a| and |n·b|/|n||b|; `cos_t` is 0 where nothing is transmitted.
+    Reflectance and transmittance are unpolarised, R and 1 − R, each to 100 bits of its own size
+    short of underflow.
+    Amplitudes follow Verdet, as in Mitsuba's `fresnel_polarized`: with η = 1/k,
+        a_s = (cᵢ − ηcₜ)/(cᵢ + ηcₜ),  a_p = (ηcᵢ − cₜ)/(ηcᵢ + cₜ),
+    and cₜ = −i√(k² sin²θi − 1) under total internal reflection. A tangential ray has R = 1, a_s = a_p = −1.
+
+    A ray with a or n zero or not finite, or k not finite and positive, has NaN numbers and both masks False.
+    """
+
+    direction: np.ndarray  # (N, 3) float64
+    direction_low: np.ndarray  # (N, 3) float64
+    radius: np.ndarray  # (N,) float64
+    transmitted: np.ndarray  # (N,) bool
+    undecided: np.ndarray  # (N,) bool: no precision sufficed, all numbers NaN; impossible for doubles
+    cos_i: np.ndarray  # (N,) float64
+    cos_t: np.ndarray  # (N,) float64
+    reflectance: np.ndarray  # (N,) float64, as all below NaN without `fresnel`
+    reflectance_low: np.ndarray
+    transmittance: np.ndarray
+    transmittance_low: np.ndarray
+    amplitude_s: np.ndarray  # (N,) complex128, to 1e-16
+    amplitude_p: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.radius)
+
+
+@dataclass(frozen=True)
+class Residual:
+    """What Snell's law says of a certified answer: `holds` (N,) bool, `width` (N,) of its widest ball."""
+
+    holds: np.ndarray
+    width: np.ndarray
+
+
+def refract(
+    a: Any, n: Any, k: Any, *, contrast: Any = None, fresnel: bool = True, progress: bool = True
+) -> Certified:
+    """Solve Snell's law, sin θt = k sin θi in the plane of a and n, for exactly these numbers.
+
+    a: (N, 3) float32 or float64, incident, toward the surface, any length. n: (N, 3), normal on either side,
+    any length. k: number or (N,), n_from/n_to. contrast: number or (N,), k² − 1 where it is known better than
+    k knows it: the problem solved then has k = √(1 + contrast). `fresnel=False` leaves the Fresnel terms NaN.
+    `progress` shows a bar on a terminal's stderr once two seconds have passed.
+
+    D = 0 is transmitted along the surface; n·a = 0 is tangential, not transmitted, b = a.
+    Raises ValueError on a wrong shape or dtype; never on a value.
+    """
+    a, n, k, contrast, valid = _inputs(a, n, k, contrast)
+    table = np.full((len(a), _COLUMNS), math.nan)
+    for chunk in _watched(len(a), progress):
+        index = np.flatnonzero(valid[chunk]) + chunk.start
+        rays = _rays(a, n, k, contrast, index)
+        with ctx.workprec(EXACT_BITS):
+            pending = [(i, _exact(*ray)) for i, ray in zip(index, rays, strict=True)]
+        for bits in PRECISIONS:
+            if not pending:
+                break
+            with ctx.workprec(bits):
+                solved = [_solve(polynomials, fresnel) for _, polynomials in pending]
+            table[[i for i, _ in pending]] = solved
+            pending = [p for p, row in zip(pending, solved, strict=True) if not row[6] <= MAX_RADIUS]
+        table[[i for i, _ in pending]] = math.nan
+    return _certified(table, valid)
+
+
+def _certified(table: np.ndarray, valid: np.ndarray) -> Certified:
+    fresnel = table[:, _FIRST_FRESNEL:]
+    return Certified(
+        direction=table[:, 0:3].copy(),
+        direction_low=table[:, 3:6].copy(),
+        radius=table[:, 6].copy(),
+        transmitted=table[:, 7] == 1,
+        undecided=valid & np.isnan(table[:, 6]),
+        cos_i=table[:, 8].copy(),
+        cos_t=table[:, 9].copy(),
+        reflectance=fresnel[:, 0].copy(),
+        reflectance_low=fresnel[:, 1].copy(),
+        transmittance=fresnel[:, 2].copy(),
+        transmittance_low=fresnel[:, 3].copy(),
+        amplitude_s=fresnel[:, 4] + 1j * fresnel[:, 5],
+        amplitude_p=fresnel[:, 6] + 1j * fresnel[:, 7],
+    )
+
+
+def _exact(ax: Any, ay: Any, az: Any, nx: Any, ny: Any, nz: Any, k: float, contrast: float | None) -> tuple:
+    """The polynomials of the law, exact at EXACT_BITS: c, A, N, AN, c², |n×a|², k²−1, k², D, t, n."""
+    ax, ay, az, nx, ny, nz = arb(ax), arb(ay), arb(az), arb(nx), arb(ny), arb(nz)
+    if contrast is None:
+        k2 = arb(k) * k
+        e = k2 - 1
+    else:
+        e = arb(contrast)
+        k2 = e + 1
+    c = ax * nx + ay * ny + az * nz
+    aa = ax * ax + ay * ay + az * az
+    nn = nx * nx + ny * ny + nz * nz
+    aann = aa * nn
+    c2 = c * c
+    s2 = aann - c2
+    d = c2 - e * s2
+    tx, ty, tz = nn * ax - c * nx, nn * ay - c * ny, nn * az - c * nz
+    return c, aa, nn, aann, c2, s2, e, k2, d, tx, ty, tz, nx, ny, nz
+
+
+def _solve(polynomials: tuple, fresnel: bool) -> tuple[float, ...]:
+    """One ray at the working precision: a row of the table."""
+    c, aa, nn, aann, _, _, _, k2, d, tx, ty, tz, nx, ny, nz = polynomials
+    tangential, total = c == 0, d < 0
+    # A comparison of balls is true only when it is certain: none true means that 0 is inside.
+    if not (tangential or c > 0 or c < 0) or not (total or d >= 0):
+        return _UNDECIDED
+    scale = aa.rsqrt() / nn
+    unit = aann.rsqrt()
+    root = abs(d).sqrt()
+    k = k2.sqrt()
+    transmitted = not (tangential or total)
+    if transmitted:
+        along, across = (root if c > 0 else -root) * scale, k * scale
+        cos_t = float(root * unit)
+    else:
+        along, across = -c * scale, scale
+        cos_t = 0.0
+    bx, by, bz = across * tx + along * nx, across * ty + along * ny, across * tz + along * nz
+    x, y, z = float(bx), float(by), float(bz)
+    # The radius of a sum is at least the sum of the radii.
+    radius = float((bx + by + bz).rad()) + PAIR_ERROR
+    low = float(bx - x), float(by - y), float(bz - z)
+    cos_i = float(abs(c) * unit)
+    terms = _fresnel(polynomials, k, root, tangential) if fresnel else _NO_FRESNEL
+    return x, y, z, *low, radius, float(transmitted), cos_i, cos_t, *terms
+
+
+def _fresnel(polynomials: tuple, k: Any, root: Any, tangential: bool) -> tuple[float, ...]:
+    """R, 1 − R as pairs, then a_s and a_p as real and imaginary part, with C = |c|, Q = √|D|.
+
+    Nothing cancels that is not exact (k²C² − D = (k²−1)AN, C² − k²D = (k²−1)(|n×a|² − D)):
+
+    a_s = (kC − Q)/(kC + Q) = (k²−1)AN / (kC + Q)²
+    a_p = (C − kQ)/(C + kQ) = (k²−1)(|n×a|² − D) / (C + kQ)²
+    1 − R = 2kCQ (1/(kC + Q)² + 1/(C + kQ)²)
+    D ≤ 0: a_s = (kC + iQ)/(kC − iQ), a_p = (C + ikQ)/(C − ikQ)
+    """
+    if tangential:
+        return 1.0, 0.0, 0.0, 0.0, -1.0, 0.0, -1.0, 0.0
+    c, _, _, aann, c2, s2, e, k2, d, *_ = polynomials
+    kcq2 = 2 * (k * abs(c) * root)
+    if not d > 0:
+        denominator_s, k2d = e * aann, k2 * d
+        denominator_p = c2 - k2d
+        s = float(1 + 2 * d / denominator_s), float(kcq2 / denominator_s)
+        p = float((c2 + k2d) / denominator_p), float(kcq2 / denominator_p)
+        return 1.0, 0.0, 0.0, 0.0, *s, *p
+    c = abs(c)
+    sum_s, sum_p = k * c + root, c + k * root
+    weight_s, weight_p = 1 / (sum_s * sum_s), 1 / (sum_p * sum_p)
+    a_s, a_p = e * aann * weight_s, e * (s2 - d) * weight_p
+    reflectance = (a_s * a_s + a_p * a_p) * 0.5
+    transmittance = kcq2 * (weight_s + weight_p)
+    r, t = float(reflectance), float(transmittance)
+    return r, float(reflectance - r), t, float(transmittance - t), float(a_s), 0.0, float(a_p), 0.0
+
+
+def residual(a: Any, n: Any, k: Any, certified: Certified, *, contrast: Any = None) -> Residual:
+    """Put a certified answer back into the law; arguments as for `refract`.
+
+    With u = n/|n|, i = a/|a| and ratio = k (transmitted) or 1, in balls around the answer:
+        u×b − ratio u×i = 0     Snell's law, its plane and its side
+        u·b − (±√(1 − ratio²|u×i|²)) = 0     |b| = 1; the length itself is blind along n at the critical angle
+    and the flag must be what the exact signs of n·a and 1 − k² sin²θi say. Invalid rays must be NaN.
+    A ball wider than 1e-28 proves nothing: the law does not hold there.
+    """
+    a, n, k, contrast, valid = _inputs(a, n, k, contrast)
+    if len(certified) != len(a):
+        raise ValueError(f"oracle: certified holds {len(certified)} rays; accepted: {len(a)}, as many as a")
+    holds = np.isnan(certified.direction).all(axis=1) & ~certified.transmitted
+    width = np.zeros(len(a))
+    index = np.flatnonzero(valid)
+    for i, ray in zip(index, _rays(a, n, k, contrast, index), strict=True):
+        high, low = certified.direction[i].tolist(), certified.direction_low[i].tolist()
+        balls = _law(ray, high, low, float(certified.radius[i]), bool(certified.transmitted[i]))
+        width[i] = max((2 * float(ball.rad()) for ball in balls), default=math.nan)
+        holds[i] = width[i] <= MAX_RESIDUAL and all(ball.contains(0) for ball in balls)
+    return Residual(holds, width)
+
+
+def _law(ray: tuple, high: list, low: list, radius: float, transmitted: bool) -> list:
+    """The four balls of `residual`; none where the flag is wrong."""
+    with ctx.workprec(EXACT_BITS):
+        ax, ay, az, nx, ny, nz = (arb(x) for x in ray[:6])
+        k2 = arb(ray[6]) ** 2 if ray[7] is None else arb(ray[7]) + 1
+        cross = ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx
+        sines = sum(x * x for x in cross)
+        nn = nx * nx + ny * ny + nz * nz
+        lengths = (ax * ax + ay * ay + az * az) * nn
+        c = ax * nx + ay * ny + az * nz
+        if transmitted != (c != 0 and lengths - k2 * sines >= 0):
+            return []
+        ratio2 = k2 if transmitted else arb(1)
+        cosine = lengths - ratio2 * sines
+    with ctx.workprec(2 * PRECISIONS[0]):
+        bx, by, bz = (arb(h, radius) + rest for h, rest in zip(high, low, strict=True))
+        u, unit, side = nn.rsqrt(), lengths.rsqrt(), 1 if (c > 0) == transmitted else -1
+        scale = ratio2.sqrt() * unit
+        ux, uy, uz = u * nx, u * ny, u * nz
+        return [
+            uy * bz - uz * by + scale * cross[0],
+            uz * bx - ux * bz + scale * cross[1],
+            ux * by - uy * bx + scale * cross[2],
+            bx * ux + by * uy + bz * uz - side * cosine.sqrt() * unit,
+        ]
+
+
+def _inputs(a: Any, n: Any, k: Any, contrast: Any) -> tuple:
+    """Check shapes and dtypes; float64 arrays (it holds float32 exactly) and the mask of valid rays."""
+    a = _floats("a", a, ("N", 3))
+    count = len(a)
+    n, k = _floats("n", n, (count, 3)), np.broadcast_to(_floats("k", k, (), (count,)), (count,))
+    valid = np.isfinite(a).all(axis=1) & np.isfinite(n).all(axis=1) & a.any(axis=1) & n.any(axis=1)
+    valid &= np.isfinite(k) & (k > 0)
+    if contrast is not None:
+        contrast = np.broadcast_to(_floats("contrast", contrast, (), (count,)), (count,))
+        valid &= np.isfinite(contrast) & (contrast > -1)
+    return a, n, k, contrast, valid
+
+
+def _floats(name: str, x: Any, *shapes: tuple) -> np.ndarray:
+    """`x` as float64, exactly. One of `shapes`, where "N" is any length."""
+    x = np.asarray(float(x) if isinstance(x, int) else x)
+    fits = any(len(s) == x.ndim and all(map(lambda w, m: w in ("N", m), s, x.shape)) for s in shapes)
+    if x.dtype not in (np.float32, np.float64) or not fits:
+        accepted = " or ".join(f"({', '.join(map(str, s))})" if s else "a number" for s in shapes)
+        raise ValueError(f"oracle: {name} is {x.dtype} {x.shape}; accepted: float32 or float64, {accepted}")
+    return x.astype(np.float64)
+
+
+def _rays(a: np.ndarray, n: np.ndarray, k: np.ndarray, contrast: Any, index: np.ndarray) -> Iterator[tuple]:
+    """Tuples (ax, ay, az, nx, ny, nz, k, contrast) of Python floats."""
+    columns = [x.tolist() for x in (*a[index].T, *n[index].T, k[index])]
+    return zip(*columns, [None] * len(index) if contrast is None else contrast[index].tolist(), strict=True)
+
+
+def _watched(count: int, progress: bool) -> Iterator[slice]:
+    """Slices of at most _CHUNK rays; past two seconds, a progress bar."""
+    start, bar, task = time.monotonic(), None, None
+    try:
+        for first in range(0, count, _CHUNK):
+            yield slice(first, min(first + _CHUNK, count))
+            if progress and bar is None and time.monotonic() - start > 2:
+                bar, task = _progress_bar(count)
+                progress = bar is not None
+            if bar is not None:
+                bar.update(task, completed=min(first + _CHUNK, count))
+    finally:
+        if bar is not None:
+            bar.stop()
+
+
+def _progress_bar(count: int) -> tuple[Any, Any]:
+    """A started rich bar on stderr and its task; (None, None) where rich is missing or nobody looks."""
+    try:
+        from rich.console import Console
+        from rich.progress import Progress
+    except ImportError:
+        return None, None
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        return None, None
+    bar = Progress(console=console, transient=True)
+    bar.start()
+    return bar, bar.add_task("oracle", total=count)

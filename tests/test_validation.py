@@ -1,0 +1,182 @@
+"""The validation sees planted defects, resumes what was interrupted, and refuses misuse in one line."""
+
+import dataclasses
+import json
+import types
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refract import backend, bsdf, oracle, regimes
+from mi_refract.report import read_json
+from mi_refract.rows import Row
+from validation import __main__ as command
+from validation import directions, readme, renders, runner, samples
+from validation.plan import SCALAR_PROFILES, SCENES, Context, Task
+
+TINY = dataclasses.replace(SCALAR_PROFILES["quick"], scalar_rays=60, resolution=8, spp=4, pairs=8, curve_spp=(1,))
+
+
+@pytest.fixture
+def context(tmp_path):
+    before = mi.variant()
+    mi.set_variant("scalar_rgb")
+    yield Context(TINY, tmp_path, "scalar_rgb", backend.detect(), backend.usable_variants())
+    mi.set_variant(before)
+
+
+def defective(props):
+    """A plugin whose index is off by one part in a hundred."""
+    plugin = bsdf.plugin_class(mi.scalar_rgb)(props)
+    params = mi.traverse(plugin)
+    params["eta"] = 1.01 * float(plugin.eta[0])
+    params.update()
+    return plugin
+
+
+# Studies -------------------------------------------------------------------------------------------------------
+
+
+def test_errors_are_those_that_were_put_in():
+    rays = regimes.make("generic", 50, np.float64, seed=1)
+    exact = oracle.refract(rays.a, rays.n, rays.k, progress=False)
+    length = np.sqrt((rays.a.astype(np.longdouble) ** 2).sum(1))[:, None]
+    direction = exact.direction.astype(np.longdouble) + exact.direction_low
+    chord, angle, drift = directions.errors(direction * length, rays, exact)
+    assert max(chord.max(), angle.max(), drift.max()) < 1e-18
+    across = np.cross(direction, np.roll(direction, 1, axis=1))
+    across /= np.sqrt((across**2).sum(1))[:, None]
+    chord, angle, _ = directions.errors((direction + 1e-9 * across) * length, rays, exact)
+    assert chord == pytest.approx(1e-9, rel=1e-6)
+    assert angle == pytest.approx(1e-9, rel=1e-6)
+    chord, angle, drift = directions.errors(direction * 1.001 * length, rays, exact)
+    assert (chord, drift) == (pytest.approx(1e-3), pytest.approx(1e-3))
+    assert angle.max() < 1e-18
+    chord, _, _ = directions.errors(direction * np.nan, rays, exact)
+    assert np.isinf(chord).all()
+
+
+def test_directions_name_what_does_not_run_and_hold_what_does(context):
+    rows = [row for task in directions.tasks(context) if "directions: scalar" in task.name for row in task.run()]
+    assert {row.verdict for row in rows} == {"not run", "info", "pass"}
+    assert all(row.reason for row in rows if row.verdict == "not run")
+    worst = next(row for row in rows if row.subject == "promoted" and row.case == "critical")
+    assert {"worst / u", "misjudged"} == set(worst.budgets)
+    assert len(worst.replay["worst ray"]["a"]) == 3
+
+
+def test_samples_pass_and_see_an_index_that_is_off(context, monkeypatch):
+    modes = samples._modes()
+    assert all(samples._mode_row(*mode, 200, "scalar_rgb").verdict == "pass" for mode in modes)
+    load = mi.load_dict
+    monkeypatch.setattr(mi, "load_dict", lambda d: load(d | {"int_ior": 1.501} if d["type"] == "refract" else d))
+    broken = samples._mode_row(*modes[0], 200, "scalar_rgb").broken
+    assert {"eta worst", "weight p99", "wo p99"} <= set(broken)
+
+
+@pytest.mark.parametrize(("plugin", "verdict"), [("refract", "pass"), ("refract_defect", "fail")])
+def test_renders_agree_and_see_an_index_that_is_off(context, plugin, verdict):
+    mi.register_bsdf("refract_defect", defective)
+    (row,) = renders._compare(context, SCENES / "sphere.xml", plugin)
+    assert row.verdict == verdict, row.values
+    assert sorted(path.name for path in (context.out / "pictures/sphere").iterdir()) == sorted(
+        ["dielectric.exr", f"{plugin} difference.exr", f"{plugin} test.exr"]
+    )
+    assert set(row.curves) == ({"refract", "dielectric"} if plugin == "refract" else set())
+
+
+# The run -------------------------------------------------------------------------------------------------------
+
+
+def row(**values):
+    return Row("directions", "promoted", "all regimes", "scalar float64", values or {"worst / u": 0.5})
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(context):
+    calls = []
+
+    def work(name):
+        calls.append(name)
+        return [row()]
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    first, last = Task("first", lambda: work("first")), Task("last", lambda: work("last"))
+    with pytest.raises(KeyboardInterrupt):
+        runner.run([first, Task("last", interrupt)], context)
+    assert runner.run([first, last], context) == [row(), row()]
+    assert calls == ["first", "last"]
+    other = dataclasses.replace(context, profile=dataclasses.replace(TINY, rays=17))
+    runner.run([first], other)
+    assert calls == ["first", "last", "first"]
+    runner.forget(context)
+    runner.run([first], context)
+    assert calls[-2:] == ["first", "first"]
+
+
+def study(*rows):
+    return types.SimpleNamespace(TITLE="A study", TEXT="", tasks=lambda context: [Task("a task", lambda: list(rows))])
+
+
+@pytest.mark.parametrize(("budget", "code"), [(1.0, 0), (0.4, 1), (float("nan"), 1)])
+def test_the_exit_code_follows_the_budgets(tmp_path, monkeypatch, capsys, budget, code):
+    measured = dataclasses.replace(row(), budgets={"worst / u": budget})
+    monkeypatch.setattr(command, "import_module", lambda name: study(measured))
+    assert command.main(["directions", "--out", str(tmp_path)]) == code
+    assert {path.name for path in tmp_path.iterdir()} == {"rows.json", "junit.xml", "report.html"}
+    rows, context = read_json(tmp_path / "rows.json")
+    assert rows[0].verdict == ("pass" if code == 0 else "fail")
+    assert context["versions"]["mitsuba"] == mi.__version__
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["refractions"], "unknown study 'refractions'; accepted: directions, renders"),
+        (["--profile", "slow"], "invalid choice: 'slow'"),
+        (["--out", __file__], "File exists"),
+        (["--speed", "9"], "unrecognized arguments"),
+    ],
+)
+def test_misuse_is_one_line_and_exit_code_2(arguments, words, capsys):
+    try:
+        code = command.main(arguments)
+    except SystemExit as stop:
+        code = stop.code
+    printed = capsys.readouterr().err
+    assert code == 2
+    assert words in printed
+    assert len(printed.splitlines()) == 1
+
+
+# The README ----------------------------------------------------------------------------------------------------
+
+
+def test_the_accuracy_table_holds_the_rows_and_nothing_else():
+    settings = {"llvm float32": {"misjudged": 3.0}, "llvm float64": {}}
+    rows = [
+        Row("directions", "promoted", "all regimes", setting,
+            {"worst chord": 4.97e-8, "worst / u": 0.834, "time / copy": 1.01} | more, replay={"rays": 28000})
+        for setting, more in settings.items()
+    ]  # fmt: skip
+    lines = readme.accuracy(rows).splitlines()
+    assert len(lines) == 5
+    assert [cell.strip() for cell in lines[-1].split("|")][1:7] == [
+        "`promoted`", "this project", "4.97e-8", "0.834", "3", "1.01",
+    ]  # fmt: skip
+
+
+def test_a_readme_is_not_written_from_a_run_that_measured_too_little():
+    with pytest.raises(ValueError, match="no directions were measured"):
+        readme.accuracy([])
+    with pytest.raises(ValueError, match="no scene was rendered"):
+        readme.renders([])
+
+
+def test_the_readme_has_its_markers_and_no_number_that_the_validation_did_not_write():
+    text = Path(command.__file__).parents[1].joinpath("README.md").read_text()
+    assert text.count("<!-- begin: ") == text.count("<!-- end: ") == 2
+    assert json.dumps(text).count("command: main") == 1

@@ -1,0 +1,91 @@
+"""`python -m validation [STUDY …] [--profile quick|full] [--out DIR]`.
+
+Exit code 0 where every budget held, 1 where one was broken, 2 for misuse, 130 where it was interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+STUDIES = ("directions", "renders")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    options = _parser().parse_args(arguments)
+    try:
+        _check(options)
+        return _run(options)
+    except KeyboardInterrupt:
+        print("validation: interrupted; the same command goes on from here", file=sys.stderr)
+        return 130
+    except (ValueError, OSError, ImportError) as error:
+        print(f"validation: {error}", file=sys.stderr)
+        return 2
+
+
+class _OneLine(argparse.ArgumentParser):
+    def error(self, message: str) -> None:  # type: ignore[override]
+        self.exit(2, f"{self.prog}: {message}\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _OneLine(prog="validation", description="Measure the formulas and the plugin; write the report.")
+    parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"of {', '.join(STUDIES)}; all by default")
+    parser.add_argument("--profile", default="quick", choices=("quick", "full"))
+    parser.add_argument("--out", type=Path, default=Path("out"), help="folder of the report (default: out)")
+    parser.add_argument("--readme", type=Path, help="write the tables and the gallery of this Markdown file, too")
+    return parser
+
+
+def _check(options: argparse.Namespace) -> None:
+    unknown = [name for name in options.studies if name not in STUDIES]
+    if unknown:
+        raise ValueError(f"unknown study {unknown[0]!r}; accepted: {', '.join(STUDIES)}")
+    options.out.mkdir(parents=True, exist_ok=True)
+    if not os.access(options.out, os.W_OK):
+        raise PermissionError(f"{options.out}: not writable")
+
+
+def _run(options: argparse.Namespace) -> int:
+    from mi_refract import backend, report
+
+    from . import readme, runner
+    from .plan import PROFILES, SCALAR_PROFILES, Context
+
+    start = time.perf_counter()
+    variant = backend.activate(may_restart=True)
+    print(f"validation: {backend.summary()}", file=sys.stderr)
+    profiles = SCALAR_PROFILES if variant.startswith("scalar") else PROFILES
+    context = Context(profiles[options.profile], options.out, variant, backend.detect(), backend.usable_variants())
+    studies: dict[str, ModuleType] = {name: import_module(f"validation.{name}") for name in options.studies or STUDIES}
+    rows = runner.run([task for study in studies.values() for task in study.tasks(context)], context)
+    described = runner.describe(context, time.perf_counter() - start)
+    described["studies"] = {name: {"title": study.TITLE, "text": study.TEXT} for name, study in studies.items()}
+    described["scatter"] = [scatter for study in studies.values() for scatter in getattr(study, "SCATTER", [])]
+    report.write_json(options.out / "rows.json", rows, described)
+    report.write_junit(options.out / "junit.xml", rows, described)
+    report.write_html(options.out / "report.html", rows, described, options.out)
+    if options.readme:
+        readme.update(options.readme, rows, context)
+    runner.forget(context)
+    _print_summary(report.summary(rows), options.out / "report.html")
+    return 1 if any(row.verdict == "fail" for row in rows) else 0
+
+
+def _print_summary(summary: Any, page: Path) -> None:
+    from rich.console import Console
+
+    console = Console()
+    console.print(summary)
+    console.print(f"report: {page}", highlight=False)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

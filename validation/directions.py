@@ -1,0 +1,253 @@
+"""Directions: every formula against the certified answer, ray by ray, with the time it takes.
+
+The error of a ray is the chord |b/|a| − exact| in units of roundoff u (2⁻²⁴, 2⁻⁵³), and the angle in radians.
+Rays whose total internal reflection was decided wrongly are counted, and left out of the errors.
+Times are those of streaming rays from memory, as a multiple of the time of copying the same bytes (a + k n).
+"""
+
+from __future__ import annotations
+
+import functools
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract import oracle, regimes
+from mi_refract.formulas import FORMULAS, Formula, cancelling
+from mi_refract.rows import Row
+
+from . import samples
+from .plan import Context, Task
+
+TITLE = "Directions"
+TEXT = __doc__.partition("\n")[2].strip()
+SCATTER = [
+    {"study": "directions", "x": "time / copy", "y": "worst / u", "title": "Worst error against time per ray"},
+]
+BUILTIN = "mi.fresnel + mi.refract"
+SEED = 2026
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A backend in a precision: `vector` is its 3-vector type, `None` where it cannot run, for `reason`."""
+
+    label: str
+    precision: type
+    vector: Any = None
+    reason: str = ""
+
+    @property
+    def roundoff(self) -> float:
+        return float(np.finfo(self.precision).eps) / 2
+
+    @property
+    def is_scalar(self) -> bool:
+        return self.vector is not None and not dr.is_jit_v(self.vector)
+
+
+def tasks(context: Context) -> list[Task]:
+    """One task per backend and precision, then the samples of the BSDFs."""
+    formulas = [
+        Task(f"directions: {setting.label}", functools.partial(_setting_rows, context, setting))
+        for setting in settings(context)
+    ]
+    return formulas + samples.tasks(context)
+
+
+def settings(context: Context) -> list[Setting]:
+    found = [
+        Setting("scalar float32", np.float32, reason="components of scalar arrays are Python floats, so doubles"),
+        Setting("scalar float64", np.float64, dr.scalar.Array3f64),
+    ]
+    for backend in ("llvm", "cuda"):
+        entry = context.backends[backend]
+        for precision, name in ((np.float32, "Array3f"), (np.float64, "Array3f64")):
+            label = f"{backend} {np.dtype(precision).name}"
+            if entry.usable:
+                found.append(Setting(label, precision, getattr(getattr(dr, backend), name)))
+            else:
+                found.append(Setting(label, precision, reason=entry.reason))
+    return found
+
+
+@functools.cache
+def certified(regime: str, count: int, precision: type) -> tuple[regimes.Rays, oracle.Certified]:
+    rays = regimes.make(regime, count, precision, SEED)
+    return rays, oracle.refract(rays.a, rays.n, rays.k, progress=False)
+
+
+# Errors --------------------------------------------------------------------------------------------------------
+
+Subject = Callable[[Any, Any, Any], tuple[Any, Any]]
+
+
+def _setting_rows(context: Context, setting: Setting) -> list[Row]:
+    if setting.vector is None:
+        return [Row("directions", name, "all regimes", setting.label, reason=setting.reason) for name in FORMULAS]
+    count = context.profile.scalar_rays if setting.is_scalar else context.profile.rays
+    times = _times(context, setting)
+    rows = []
+    for name, subject in _subjects(context, setting).items():
+        parts = [_regime_row(name, subject, regime, setting, count) for regime in regimes.REGIMES]
+        rows += [*parts, _summary(name, parts, setting, times)]
+    return rows
+
+
+def _subjects(context: Context, setting: Setting) -> dict[str, Subject]:
+    """Every formula, and Mitsuba's functions where they exist in this precision."""
+    subjects: dict[str, Subject] = dict(FORMULAS)
+    if setting.label.startswith(context.variant.partition("_")[0]) and setting.precision is np.float32:
+        subjects[BUILTIN] = builtin
+    return subjects
+
+
+def builtin(a: Any, n: Any, k: Any) -> tuple[Any, Any]:
+    """Mitsuba's own functions, with the normal turned so that they need no reciprocal of k."""
+    import mitsuba as mi
+
+    wi, n, k = mi.Vector3f(-a), mi.Vector3f(n), mi.Float(k)
+    n = n * dr.sign(dr.dot(-wi, n))
+    _, cos_t, _, eta_ti = mi.fresnel(dr.dot(wi, n), k)
+    transmitted = cos_t != 0
+    m = mi.Normal3f(n)
+    return dr.select(transmitted, mi.refract(wi, m, cos_t, eta_ti), mi.reflect(wi, m)), transmitted
+
+
+def evaluate(subject: Subject, rays: regimes.Rays, vector: Any) -> tuple[np.ndarray, np.ndarray]:
+    """`subject` on all rays, as numpy arrays (N, 3) and (N,), in extended precision."""
+    if dr.is_jit_v(vector):
+        b, transmitted = subject(vector(rays.a.T), vector(rays.n.T), dr.value_t(vector)(rays.k))
+        return np.array(b).T.astype(np.longdouble), np.array(transmitted)
+    pairs = [subject(vector(a), vector(n), float(k)) for a, n, k in zip(rays.a, rays.n, rays.k, strict=True)]
+    return np.array([list(b) for b, _ in pairs], np.longdouble), np.array([t for _, t in pairs], bool)
+
+
+def errors(b: np.ndarray, rays: regimes.Rays, exact: oracle.Certified) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(chord, angle, drift of the length) of every ray, relative to |a|; NaN counts as infinite."""
+    length = np.sqrt((rays.a.astype(np.longdouble) ** 2).sum(1))[:, None]
+    unit, low = b / length, exact.direction_low.astype(np.longdouble)
+    difference = (unit - exact.direction) - low
+    chord = np.sqrt((difference**2).sum(1))
+    norm = np.sqrt((unit**2).sum(1))
+    across = np.sqrt((np.cross(unit, difference) ** 2).sum(1)) / norm
+    angle = np.arctan2(across, norm - (unit * difference).sum(1) / norm)
+    chord, angle, drift = (np.nan_to_num(x.astype(float), nan=np.inf) for x in (chord, angle, np.abs(norm - 1)))
+    return chord, angle, drift
+
+
+def _regime_row(name: str, subject: Subject, regime: str, setting: Setting, count: int) -> Row:
+    rays, exact = certified(regime, count, setting.precision)
+    b, transmitted = evaluate(subject, rays, setting.vector)
+    wrong = (transmitted != exact.transmitted) & ~exact.undecided
+    chord, angle, drift = errors(b, rays, exact)
+    right = ~wrong & ~exact.undecided
+    u = setting.roundoff
+    worst = int(np.argmax(np.where(right, chord, -1)))
+    values = {
+        "worst chord": float(chord[right].max()),
+        "worst / u": float(chord[right].max() / u),
+        "p99 / u": float(np.quantile(chord[right], 0.99) / u),
+        "mean / u": float(chord[right].mean() / u),
+        "worst rad": float(angle[right].max()),
+        "p99 rad": float(np.quantile(angle[right], 0.99)),
+        "mean rad": float(angle[right].mean()),
+        "length drift": float(drift[right].max()),
+        "misjudged": float(wrong.sum()),
+    }
+    replay = {
+        "regime": regime, "text": regimes.REGIMES[regime].text, "count": count, "seed": SEED,
+        "worst ray": {
+            "a": [float(x).hex() for x in rays.a[worst]],
+            "n": [float(x).hex() for x in rays.n[worst]],
+            "k": float(rays.k[worst]).hex(),
+        },
+    }  # fmt: skip
+    return Row("directions", name, regime, setting.label, values, _budgets(name, regime, u), replay=replay)
+
+
+def _budgets(name: str, regime: str, u: float) -> dict[str, float]:
+    largest_k = regimes.REGIMES[regime].largest_k
+    formula = FORMULAS.get(name)
+    if not isinstance(formula, Formula):
+        return {"worst / u": cancelling(2)(u, largest_k) / u}
+    budgets = {"worst / u": formula.budget(u, largest_k) / u}
+    return budgets | ({"misjudged": 0.0} if formula.exact_decision else {})
+
+
+def _summary(name: str, parts: list[Row], setting: Setting, times: dict[str, dict[str, float]]) -> Row:
+    """The worst over all regimes and what it cost: the point of a formula in the plane of error and time."""
+    worst = {m: max(row.values[m] for row in parts) for m in ("worst chord", "worst / u", "worst rad", "length drift")}
+    total = {"misjudged": sum(row.values["misjudged"] for row in parts)}
+    replay = {"rays": sum(row.replay["count"] for row in parts), "seed": SEED}
+    return Row("directions", name, "all regimes", setting.label, worst | total | times[name], replay=replay)
+
+
+# Times ---------------------------------------------------------------------------------------------------------
+
+
+def _copy(a: Any, n: Any, k: Any) -> tuple[Any, Any]:
+    """Reads and writes what a formula does, and computes as little as can be."""
+    return a + n * k, k > 0
+
+
+def _times(context: Context, setting: Setting) -> dict[str, dict[str, float]]:
+    """Per subject: median time over that of copying, in turn in one run, warm; and the kernel's operations."""
+    subjects = {"copy": _copy, **_subjects(context, setting)}
+    clock = _scalar_clock(context, setting) if setting.is_scalar else _streaming_clock(context, setting)
+    for subject in subjects.values():
+        clock(subject)
+    seconds: dict[str, list[float]] = {name: [] for name in subjects}
+    for _ in range(context.profile.repeats):
+        for name, subject in subjects.items():
+            seconds[name].append(clock(subject))
+    ratios = {
+        name: statistics.median(t / c for t, c in zip(seconds[name], seconds["copy"], strict=True)) for name in subjects
+    }
+    return {
+        name: {"time / copy": ratios[name]} | ({} if setting.is_scalar else {"operations": _operations(clock, subject)})
+        for name, subject in subjects.items()
+    }
+
+
+def _streaming_clock(context: Context, setting: Setting) -> Callable[[Subject], float]:
+    rays = regimes.make("generic", context.profile.streamed_rays, setting.precision, SEED)
+    a, n, k = setting.vector(rays.a.T), setting.vector(rays.n.T), dr.value_t(setting.vector)(rays.k)
+    dr.eval(a, n, k)
+
+    def clock(subject: Subject) -> float:
+        outcome = subject(a, n, k)
+        dr.sync_thread()
+        start = time.perf_counter()
+        dr.eval(outcome)
+        dr.sync_thread()
+        return time.perf_counter() - start
+
+    return clock
+
+
+def _scalar_clock(context: Context, setting: Setting) -> Callable[[Subject], float]:
+    rays = regimes.make("generic", context.profile.scalar_rays, setting.precision, SEED)
+    vectors = [(setting.vector(a), setting.vector(n), float(k)) for a, n, k in zip(rays.a, rays.n, rays.k, strict=True)]
+
+    def clock(subject: Subject) -> float:
+        start = time.perf_counter()
+        for a, n, k in vectors:
+            subject(a, n, k)
+        return time.perf_counter() - start
+
+    return clock
+
+
+def _operations(clock: Callable[[Subject], float], subject: Subject) -> float:
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        clock(subject)
+        return float(max(entry.get("operation_count", 0) for entry in dr.kernel_history()))
+
+

@@ -1,0 +1,97 @@
+"""What the README quotes: an accuracy table, a table of renders, and the gallery, all from the rows of one run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from mi_refract import images
+from mi_refract.bsdf import PLUGIN
+from mi_refract.figures import compact
+from mi_refract.files import update_between, write_atomically
+from mi_refract.formulas import FORMULAS
+from mi_refract.rows import Row
+
+from .plan import SCENES, Context
+
+GALLERY = SCENES / "gallery.png"
+COLUMNS = 3
+
+
+def update(path: Path, rows: list[Row], context: Context) -> None:
+    """Write both tables between their markers in `path`, and the gallery beside the scenes.
+
+    ValueError where a marker is missing or the run has not measured what the README quotes.
+    """
+    update_between(path, "accuracy", accuracy(rows))
+    update_between(path, "renders", renders(rows))
+    write_atomically(GALLERY, gallery(rows, context))
+
+
+def accuracy(rows: list[Row]) -> str:
+    """Markdown: worst error over all regimes and misjudged rays by formula, in float32 and float64, and the time."""
+    settings = ("llvm float32", "llvm float64")
+    found = {(r.subject, r.setting): r for r in rows if r.case == "all regimes" and r.values}
+    subjects = list(dict.fromkeys(subject for subject, setting in found if setting in settings))
+    if not subjects:
+        raise ValueError("README: no directions were measured on LLVM; its accuracy table needs them")
+    rays = found[subjects[0], settings[0]].replay["rays"]
+    lines = [
+        f"Worst over {rays:,} rays in all regimes; u = 2⁻²⁴ or 2⁻⁵³; time as a multiple of copying the same bytes.",
+        "",
+        "| formula | source | float32: worst chord | in u | misjudged | time | float64: worst chord | in u | time |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for subject in subjects:
+        source = FORMULAS[subject].source if subject in FORMULAS else "Mitsuba 3"
+        cells = [f"`{subject}`", source]
+        for setting, metrics in zip(settings, (ACCURACY, ACCURACY_DOUBLE), strict=True):
+            row = found.get((subject, setting))
+            cells += [compact(row.values[metric]) if row else "–" for metric in metrics]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+ACCURACY = ("worst chord", "worst / u", "misjudged", "time / copy")
+ACCURACY_DOUBLE = ("worst chord", "worst / u", "time / copy")
+RENDERS = {
+    "changed share": "pixels changed",
+    "|mean ratio − 1|": "means differ by",
+    "smallest p, adjusted": "Welch, smallest p",
+    "detectable difference": "detectable",
+    "time / dielectric": "time",
+}
+
+
+def renders(rows: list[Row]) -> str:
+    """Markdown: `refract` against `dielectric`, scene by scene."""
+    found = [row for row in rows if row.study == "renders" and row.subject == PLUGIN and row.values]
+    if not found:
+        raise ValueError("README: no scene was rendered; its table needs them")
+    replay = found[0].replay
+    size = f"{replay['resolution']}² pixels, {replay['spp']} spp, {replay['seeds']} seeds, {replay['variant']}"
+    lines = [f"{size}.", "", f"| scene | {' | '.join(RENDERS.values())} |", "|---" * (len(RENDERS) + 1) + "|"]
+    for row in found:
+        lines.append(f"| {row.case} | {' | '.join(compact(row.values[metric]) for metric in RENDERS)} |")
+    return "\n".join(lines)
+
+
+def gallery(rows: list[Row], context: Context) -> bytes:
+    """A PNG of every scene as `refract` rendered it, side by side."""
+    import OpenImageIO as oiio
+
+    paths = [row.pictures["test"] for row in rows if row.study == "renders" and row.subject == PLUGIN]
+    tiles = [images.read_exr(context.out / path)[0] for path in paths]
+    gap = np.ones((tiles[0].shape[0], 4, 3), np.float32)
+    strips = []
+    for start in range(0, len(tiles), COLUMNS):
+        strip = [x for tile in tiles[start : start + COLUMNS] for x in (tile, gap)][:-1]
+        strips += [np.concatenate(strip, axis=1), np.ones((4, sum(x.shape[1] for x in strip), 3), np.float32)]
+    linear = np.clip(np.concatenate(strips[:-1]), 0, 1)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055).astype(np.float32)
+    target = context.out / "gallery.png"
+    picture = oiio.ImageBuf(np.ascontiguousarray(encoded))
+    if not picture.write(str(target), "uint8"):
+        raise OSError(f"{target}: {picture.geterror()}")
+    return target.read_bytes()

@@ -1,0 +1,144 @@
+"""Renders: every scene with `refract` and with `dielectric`, same seeds and independent seeds, and what it costs.
+
+Same seed: both plugins consume the same random numbers, so pictures agree but for last bits and the lobe decisions
+those flip. Independent seeds: Welch's t-test on tiles. The error of a picture is relMSE against the mean of the
+built-in's other renders, less that mean's own variance. Times are of warm renders, both plugins in turn.
+"""
+
+from __future__ import annotations
+
+import functools
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract import compare, images
+from mi_refract.bsdf import PLUGIN
+from mi_refract.formulas import FORMULAS
+from mi_refract.rows import Row
+
+from .plan import SCENES, Context, Task
+
+TITLE = "Renders"
+SCATTER: list[dict[str, str]] = []
+TEXT = __doc__.partition("\n")[2].strip()
+BUILTIN = "dielectric"
+# Paths in these scenes are short: a difference in the last bit stays one, unless it flips the choice of a lobe.
+SHORT_PATHS = {"sphere", "slab", "prism", "furnace"}
+Curves = dict[str, list[tuple[float, float]]]
+CHANGED = 1e-5
+TILE = 16
+MARGIN = 1e-5  # relative: float32 pictures that differ by less are equal
+FAMILY_ERROR = 1e-3  # of Welch's test, per scene, after Šidák: 1 false alarm in 1000 pictures that are equal
+
+
+def tasks(context: Context) -> list[Task]:
+    """One task per scene and plugin of ours."""
+    plugins = [PLUGIN] + [f"{PLUGIN}_{name}" for name in FORMULAS if context.profile.every_formula]
+    return [
+        Task(f"renders: {path.stem}, {plugin}", functools.partial(_compare, context, path, plugin))
+        for path in sorted(SCENES.glob("*.xml"))
+        for plugin in plugins
+    ]
+
+
+class Camera:
+    """One scene with one plugin: renders pictures as numpy arrays and says how long each took."""
+
+    def __init__(self, path: Path, plugin: str, resolution: int) -> None:
+        import mitsuba as mi
+
+        self.scene = mi.load_file(str(path), bsdf=plugin, res=resolution)
+
+    def __call__(self, spp: int, seed: int) -> tuple[np.ndarray, float]:
+        import mitsuba as mi
+
+        start = time.perf_counter()
+        picture = mi.render(self.scene, spp=spp, seed=seed)
+        dr.eval(picture)
+        dr.sync_thread()
+        seconds = time.perf_counter() - start
+        return np.array(picture, dtype=np.float64), seconds
+
+
+def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
+    profile, scene = context.profile, path.stem
+    cameras = {name: Camera(path, name, profile.resolution) for name in (plugin, BUILTIN)}
+    pictures: dict[str, list[np.ndarray]] = {name: [] for name in cameras}
+    seconds: dict[str, list[float]] = {name: [] for name in cameras}
+    for camera in cameras.values():
+        camera(profile.spp, seed=0)  # compiles
+    for seed in range(profile.pairs):
+        for name, camera in cameras.items():
+            picture, elapsed = camera(profile.spp, seed)
+            pictures[name].append(picture)
+            seconds[name].append(elapsed)
+    test, reference = (np.stack(pictures[name]) for name in cameras)
+    half = profile.pairs // 2
+    values = _paired(test, reference) | _independent(test[:half], reference[half:])
+    values["time / dielectric"] = statistics.median(
+        t / b for t, b in zip(seconds[plugin], seconds[BUILTIN], strict=True)
+    )
+    budgets = {"|mean ratio − 1|": 1e-4, "Welch alarms": 0.0}
+    if scene in SHORT_PATHS:
+        budgets["changed share"] = 1e-3
+    # A Python plugin costs a call per operation in scalar variants: its time is demanded of compiled ones only.
+    goals = {} if context.variant.startswith("scalar") else {"time / dielectric": 1.03}
+    settings = {
+        "scene": path.name, "plugin": plugin, "variant": context.variant, "resolution": profile.resolution,
+        "spp": profile.spp, "seeds": profile.pairs,
+    }  # fmt: skip
+    return [
+        Row(
+            "renders", plugin, scene, context.variant, values, budgets, goals, replay=settings,
+            pictures=_save(context, settings, test.mean(0), reference.mean(0)),
+            curves=_curves(context, cameras, reference) if plugin == PLUGIN else {},
+        )
+    ]  # fmt: skip
+
+
+def _paired(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    """Same seeds, picture by picture."""
+    found = compare.paired(reference.reshape(-1, *reference.shape[2:]), test.reshape(-1, *test.shape[2:]), CHANGED)
+    return {
+        "changed share": found.changed,
+        "largest change": found.largest,
+        "RMSE": found.rmse,
+        "|mean ratio − 1|": abs(found.mean_ratio - 1),
+    }
+
+
+def _independent(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    found = compare.welch(reference, test, TILE, FAMILY_ERROR, MARGIN)
+    return {
+        "Welch alarms": float(found.alarms),
+        "smallest p, adjusted": found.smallest_p,
+        "detectable difference": found.detectable,
+    }
+
+
+def _curves(context: Context, cameras: dict[str, Camera], reference: np.ndarray) -> Curves:
+    """relMSE against seconds at growing samples per pixel, both plugins in turn; seeds the reference has not seen."""
+    curves: Curves = {name: [] for name in cameras}
+    for spp in context.profile.curve_spp:
+        for name, camera in cameras.items():
+            camera(spp, seed=context.profile.pairs)  # compiles what this sample count needs
+            points = [camera(spp, seed=context.profile.pairs + 1 + i) for i in range(3)]
+            error = statistics.fmean(compare.relative_mse(picture, reference) for picture, _ in points)
+            curves[name].append((statistics.median(seconds for _, seconds in points), error))
+    return curves
+
+
+def _save(context: Context, settings: dict[str, Any], test: np.ndarray, reference: np.ndarray) -> dict[str, str]:
+    folder = Path("pictures") / Path(settings["scene"]).stem
+    (context.out / folder).mkdir(parents=True, exist_ok=True)
+    saved = {}
+    for role, picture in (("reference", reference), ("test", test), ("difference", test - reference)):
+        name = f"{BUILTIN}.exr" if role == "reference" else f"{settings['plugin']} {role}.exr"
+        images.write_exr(context.out / folder / name, picture.astype(np.float32), metadata=settings | {"role": role})
+        saved[role] = str(folder / name)
+    return saved

@@ -1,0 +1,101 @@
+"""Runs tasks, keeps the rows of each as soon as it is finished, and takes them up again after an interruption."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import mi_refract
+from mi_refract.files import write_atomically
+from mi_refract.rows import Row
+
+from .plan import SCENES, Context, Task
+
+
+def run(tasks: list[Task], context: Context) -> list[Row]:
+    """All rows, in the order of the tasks. KeyboardInterrupt passes, with the finished tasks kept."""
+    store = context.out / "unfinished"
+    store.mkdir(parents=True, exist_ok=True)
+    fingerprint = _fingerprint(context)
+    rows: list[Row] = []
+    with _progress(len(tasks)) as advance:
+        for task in tasks:
+            advance(task.name)
+            kept = store / f"{hashlib.sha256((fingerprint + task.name).encode()).hexdigest()[:24]}.json"
+            found = _recall(kept)
+            if found is None:
+                found = task.run()
+                write_atomically(kept, json.dumps([row.as_dict() for row in found]))
+            rows += found
+    return rows
+
+
+def forget(context: Context) -> None:
+    """Drop the rows of single tasks: once the report is written, the next run starts anew."""
+    shutil.rmtree(context.out / "unfinished", ignore_errors=True)
+
+
+def describe(context: Context, seconds: float) -> dict[str, Any]:
+    """What all rows share."""
+    return {
+        "profile": context.profile.name,
+        "variant": context.variant,
+        "libLLVM": context.backends["llvm"].library,
+        "seconds": round(seconds, 1),
+        "versions": {"mi_refract": mi_refract.__version__}
+        | {name: version(name) for name in ("mitsuba", "drjit", "numpy", "OpenImageIO", "python-flint")},
+        "machine": {"processor": _processor(), "system": platform.platform(), "python": platform.python_version()},
+    }
+
+
+def _processor() -> str:
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return f"{len(names)} × {names[0]}" if names else platform.machine()
+
+
+def _recall(kept: Path) -> list[Row] | None:
+    """The rows of a finished task; None where there are none, or where they cannot be read."""
+    try:
+        return [Row.from_dict(data) for data in json.loads(kept.read_text())]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _fingerprint(context: Context) -> str:
+    """Rows are taken up again only for the same sources, scenes, profile, variant and versions."""
+    digest = hashlib.sha256(repr((context.profile, context.variant, describe(context, 0))).encode())
+    sources = [Path(mi_refract.__file__).parent.glob("*.py"), Path(__file__).parent.glob("*.py"), SCENES.rglob("*")]
+    for path in sorted(path for group in sources for path in group if path.is_file()):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[Any]:
+    """A bar on a terminal, a line per task elsewhere; `advance(name)` says what begins."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda name: console.print(name, highlight=False)
+        return
+    columns = BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}")
+    with Progress(*columns, console=console, transient=True) as progress:
+        bar, started = progress.add_task("", total=total), [0]
+
+        def advance(name: str) -> None:
+            progress.update(bar, completed=started[0], description=name)
+            started[0] += 1
+
+        yield advance
+
+
