@@ -78,16 +78,13 @@ def render(
 ) -> None:
     """Render a scene that may use the plugin `refract`, which Mitsuba's own executable cannot see."""
     defines = parse_defines(define or [])
-    images.writable_exr(output)
-    if not scene.is_file():
-        raise FileNotFoundError(f"{scene}: no such scene file")
     chosen = backend.activate(variant, may_restart=True)
-    if variant is None and not backend.llvm().usable:
-        print(f"mi-refract: rendering in {chosen}, slowly: {backend.llvm().reason}", file=sys.stderr)
     console = Console(stderr=True)
     with _interruptible(console, images.temporary_name(output)), _spinner(console, f"{scene.name}, {chosen}"):
         header = images.render_to_exr(scene, output, defines=defines, spp=spp, seed=seed)
     print(f"{output}: {chosen}, {header['mi_refract:spp']} spp, {header['mi_refract:render_seconds']:.2f} s")
+    if variant is None and not backend.llvm().usable:
+        print(f"mi-refract: {chosen} is slow; {backend.summary()}", file=sys.stderr)
 
 
 def parse_defines(items: list[str]) -> dict[str, str]:
