@@ -174,29 +174,33 @@ def refract_rotated(a: Any, n: Any, k: Any) -> Refracted:
 
 # Ours: right everywhere ----------------------------------------------------------------------------------------
 #
-# Both evaluate, for `a` and `n` of any length, with w = n × a and κ = k² − 1,
+# Both solve, for `a` and `n` of any length, with w = n × a and κ = k² − 1,
 #
-#     b = (k w × n + s n √radicand) / n²,   radicand = (n·a)² − κ w²,   s = sign(n·a)
+#     n × b = k w,   n·b = s √radicand,   radicand = (n·a)² − κ w²,   s = sign(n·a)
 #
-# and the mirror direction as the same sum with k = 1 and −(n·a) in place of s √radicand. Near the critical angle
-# the two terms of the radicand cancel, and √ makes of an error ε one of √ε: so the radicand must be right to a
-# few u², not to a few u. Nothing else cancels: w × n is as long as w, and perpendicular to n.
+# and the mirror direction as the same with k = 1 and −(n·a) in place of s √radicand. Near the critical angle the
+# two terms of the radicand cancel, and √ makes of an error ε one of √ε: so the radicand must be right to a few u²,
+# not to a few u.
 
 
-def _steer(a: Any, n: Any, k: Any, c: Any, radicand: Any) -> tuple[Any, Any]:
-    """(valid, transmitted) for arrays wide enough to hold the fourth power of a length."""
-    scale = dr.dot(a, a) * dr.dot(n, n) * k
+def _steer(c: Any, c2: Any, w2: Any, k: Any, radicand: Any) -> tuple[Any, Any]:
+    """(valid, transmitted) of a ray with c = n·a, its square, and w² = |n × a|².
+
+    c² + w² = a² n² (Lagrange), so one product tests all inputs: it is 0, infinite or NaN where one is unusable, or
+    negative. Precondition: the fourth power of a length does not over- or underflow.
+    """
+    scale = (c2 + w2) * k
     valid = (scale > 0) & (scale < dr.inf)
     return valid, valid & (radicand >= 0) & (c != 0)
 
 
 def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
-    """The well-conditioned form above, one precision up and rounded once.
+    """The well-conditioned form above, one precision up and rounded once: b = k a + n (n·b − k n·a)/n².
 
     float32 is computed in float64. float64 has no wider type: there the form is `refract_compensated`'s, whose
     double-word steps are that wider type. `contrast`: κ where it is known better than k; the answer is then that
     of k = √(1 + κ). Source: this project. `a`, `n` of any length from 1e-18 to 1e18; shapes (3,), (3,) to (3,).
-    Weak nowhere; slow where float64 is (consumer GPUs).
+    Weak nowhere for k < 1e7; slow where float64 is (consumer GPUs).
     """
     if dr.type_v(a) != dr.VarType.Float32:
         return refract_compensated(a, n, k, contrast)
@@ -212,11 +216,14 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
         kappa = known
     # Products of components are exact and their sums rounded at 2⁻⁵³: error of the radicand ≤ 8·2⁻⁵³ of its terms.
     c, w = dr.dot(m, d), dr.cross(m, d)
-    radicand = c * c - kappa * dr.dot(w, w)
-    valid, transmitted = _steer(d, m, k2, c, radicand)
+    c2, w2 = c * c, dr.dot(w, w)
+    radicand = c2 - kappa * w2
+    valid, transmitted = _steer(c, c2, w2, k2, radicand)
+    # κ = 0 leaves b = a to the last bit: √(c²) is |c| exactly, so the factor of n is 0. So it is for c = 0.
+    # Else k a + n (…) cancels to k·2⁻⁵³ |a|, which is far below 2⁻²⁴ for k < 1e7.
     along = dr.select(transmitted, dr.mulsign(_root(radicand), c), -c)
-    b = dr.cross(w, m) * dr.select(transmitted, k2, 1) + m * along
-    b = dr.select((kappa == 0) | (c == 0), d, b * quotient(1, dr.dot(m, m)))
+    scale = dr.select(transmitted, k2, 1)
+    b = d * scale + m * quotient(along - scale * c, dr.dot(m, m))
     return dr.select(valid, type(a)(b), dr.nan), transmitted
 
 
@@ -235,8 +242,9 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
         k_low = quotient((known - kappa).hi, 2 * k)  # √(1 + κ) = k + k_low, to second order
         kappa = known
     c, w = numerics.dot(n, a), numerics.cross(n, a)
-    radicand = c * c - kappa * numerics.sum_of_squares(w)
-    valid, transmitted = _steer(a, n, k, c.hi, radicand.hi)
+    c2, w2 = c * c, numerics.sum_of_squares(w)
+    radicand = c2 - kappa * w2
+    valid, transmitted = _steer(c.hi, c2.hi, w2.hi, k, radicand.hi)
     root = radicand.sqrt()
     root = Double(dr.mulsign(root.hi, c.hi), dr.mulsign(root.lo, c.hi))
     along = numerics.select(transmitted, root, -c)
