@@ -198,22 +198,17 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     """The well-conditioned form above, one precision up and rounded once: b = k a + n (n·b − k n·a)/n².
 
     float32 is computed in float64. float64 has no wider type: there the form is `refract_compensated`'s, whose
-    double-word steps are that wider type. `contrast`: κ where it is known better than k; the answer is then that
-    of k = √(1 + κ). Source: this project. `a`, `n` of any length from 1e-18 to 1e18; shapes (3,), (3,) to (3,).
+    double-word steps are that wider type. `contrast`: κ where it is known better than k, for the radicand; `k`
+    itself still scales the tangent. Source: this project. `a`, `n` of any length from 1e-18 to 1e18.
     Weak nowhere for k < 1e7; slow where float64 is (consumer GPUs).
     """
     if dr.type_v(a) != dr.VarType.Float32:
         return refract_compensated(a, n, k, contrast)
     wide: Any = dr.float64_array_t(type(a))
     number = dr.value_t(wide)
-    k = _scalar(a, k)
-    d, m, k2 = wide(a), wide(n), number(k)
-    kappa = k2 * k2 - 1  # k² has 48 bits: the difference is rounded at most once
-    if contrast is not None:
-        # √(1 + κ) = k + (κ − (k² − 1))/2k to second order; the quotient needs few digits, so it stays narrow.
-        known = number(contrast)
-        k2 = k2 + number(quotient(type(k)(known - kappa), 2 * k))
-        kappa = known
+    d, m, k2 = wide(a), wide(n), number(_scalar(a, k))
+    # k² has 48 bits: the difference is rounded at most once.
+    kappa = k2 * k2 - 1 if contrast is None else number(contrast)
     # Products of components are exact and their sums rounded at 2⁻⁵³: error of the radicand ≤ 8·2⁻⁵³ of its terms.
     c, w = dr.dot(m, d), dr.cross(m, d)
     c2, w2 = c * c, dr.dot(w, w)
@@ -230,46 +225,45 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
 def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     """The well-conditioned form above with error-free transforms, in the arrays' own precision.
 
-    A plain evaluation b₀ (a few u off) is corrected by its exact defect in the two equations that define b,
-    n × b = k w and n·b = s √radicand, so the sum b₀ + δ is rounded once.
-    `contrast`: κ where it is known better than k; the answer is then that of k = √(1 + κ). Source: this project.
+    A plain evaluation b₀ (a few u off) is corrected by its exact defect in the two equations that define b, so the
+    sum b₀ + δ is rounded once. `contrast`: κ where it is known better than k, for the radicand; `k` itself still
+    scales the tangent. Source: this project. A literal normal along an axis is folded away while tracing.
     Precondition: no over- or underflow in the fourth power of the lengths, 1e-8 to 1e8 in float32. Weak nowhere.
     """
-    k = _scalar(a, k)
-    kappa, k_low = Double.product(k, k) - 1, 0
-    if contrast is not None:
-        known = _split(a, contrast)
-        k_low = quotient((known - kappa).hi, 2 * k)  # √(1 + κ) = k + k_low, to second order
-        kappa = known
+    k, n = _scalar(a, k), numerics.constants(n)
+    kappa = Double.product(k, k) - 1 if contrast is None else _split(a, contrast)
     c, w = numerics.dot(n, a), numerics.cross(n, a)
     c2, w2 = c * c, numerics.sum_of_squares(w)
-    radicand = c2 - kappa * w2
+    radicand = numerics.difference(c2, kappa * w2)
     valid, transmitted = _steer(c.hi, c2.hi, w2.hi, k, radicand.hi)
     root = radicand.sqrt()
     root = Double(dr.mulsign(root.hi, c.hi), dr.mulsign(root.lo, c.hi))
     along = numerics.select(transmitted, root, -c)
-    scale, scale_low = dr.select(transmitted, k, 1), dr.select(transmitted, k_low, 0)
-    b = _correct(n, [w_i.scaled(scale, scale_low) for w_i in w], along, type(a))
+    scale = dr.select(transmitted, k, 1)
+    b = type(a)(*_correct(n, [w_i.scaled(scale) for w_i in w], along))
     b = dr.select((kappa.hi == 0) | (c.hi == 0), a, b)
     return dr.select(valid, b, dr.nan), transmitted
 
 
-def _correct(n: Any, around: list[Double], along: Double, vector: type) -> Any:
+def _correct(n: list[Any], around: list[Double], along: Double) -> list[Any]:
     """The b with n × b = `around` and n·b = `along`: b = (around × n + along n)/n², rounded once.
 
     |b₀ − b| ≤ 8u |b|, and δ from the exact defects is right to 8u of itself: b₀ + δ is b to 64u² before it is
     rounded, so the final error is that of rounding, u/2 ulp a component.
     """
-    inverse = quotient(1, dr.dot(n, n))
+    times, plus = numerics.times, numerics.plus
+    n2 = plus(plus(times(n[0], n[0]), times(n[1], n[1])), times(n[2], n[2]))
+    inverse = 1 if isinstance(n2, int) and n2 == 1 else quotient(1, n2)
+    cyclic = (1, 2, 0), (2, 0, 1), (0, 1, 2)
 
-    def solve(around: list[Any], along: Any) -> Any:
-        return (dr.cross(vector(*around), n) + n * along) * inverse
+    def solve(x: list[Any], y: Any) -> list[Any]:
+        parts = [plus(times(x[i], n[j]), times(x[j], -n[i])) for i, j, _ in cyclic]
+        return [times(plus(part, times(y, n[m])), inverse) for part, (_, _, m) in zip(parts, cyclic, strict=True)]
 
     b = solve([x.hi for x in around], along.hi)
-    missing = [
-        numerics.defect(around[m], (n[i], b[j]), (-n[j], b[i])) for i, j, m in ((1, 2, 0), (2, 0, 1), (0, 1, 2))
-    ]
-    return b + solve(missing, numerics.defect(along, *zip(n, b, strict=True)))
+    missing = [numerics.defect(around[m], (n[i], b[j]), (-n[j], b[i])) for i, j, m in cyclic]
+    delta = solve(missing, numerics.defect(along, *zip(n, b, strict=True)))
+    return [plus(x, y) for x, y in zip(b, delta, strict=True)]
 
 
 def _split(a: Any, x: Any) -> Double:

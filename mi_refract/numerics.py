@@ -25,8 +25,41 @@ def quotient(x: Any, y: Any) -> Any:
     return x / y
 
 
+def constants(v: Any) -> list[Any]:
+    """The components of a vector, with Dr.Jit literals that are −1, 0 or 1 as Python ints.
+
+    The transforms below fold ints away while a kernel is traced: x + 0 has no error term, 1·x needs no product.
+    Dr.Jit folds the sum and the product by itself, but not what a transform derives from them.
+    """
+    return [_constant(component) for component in v]
+
+
+def _constant(x: Any) -> Any:
+    if dr.is_jit_v(x) and x.state == dr.VarState.Literal and x[0] in (-1, 0, 1):
+        return int(x[0])
+    return x
+
+
+def _is(x: Any, value: int) -> bool:
+    return isinstance(x, int) and x == value
+
+
+def times(x: Any, y: Any) -> Any:
+    """x y, where y may be one of the ints that fold."""
+    if _is(x, 0) or _is(y, 0):
+        return 0
+    return x if _is(y, 1) else -x if _is(y, -1) else y if _is(x, 1) else -y if _is(x, -1) else x * y
+
+
+def plus(x: Any, y: Any) -> Any:
+    """x + y, where either may be the int 0."""
+    return y if _is(x, 0) else x if _is(y, 0) else x + y
+
+
 def two_sum(x: Any, y: Any) -> Pair:
     """s = fl(x + y) and e with s + e = x + y exactly, whatever the magnitudes."""
+    if _is(x, 0) or _is(y, 0):
+        return plus(x, y), 0
     s = x + y
     y_part = s - x
     return s, (x - (s - y_part)) + (y - y_part)
@@ -34,14 +67,22 @@ def two_sum(x: Any, y: Any) -> Pair:
 
 def fast_two_sum(x: Any, y: Any) -> Pair:
     """As `two_sum`, three operations instead of six. Precondition: |x| ≥ |y| or x = 0."""
+    if _is(x, 0) or _is(y, 0):
+        return plus(x, y), 0
     s = x + y
     return s, y - (s - x)
 
 
 def two_prod(x: Any, y: Any) -> Pair:
     """p = fl(x y) and e with p + e = x y exactly."""
+    if isinstance(x, int) or isinstance(y, int):
+        return times(x, y), 0
     p = x * y
     return p, dr.fma(x, y, -p)
+
+
+def _fma(x: Any, y: Any, z: Any) -> Any:
+    return z if _is(x, 0) or _is(y, 0) else times(x, y) if _is(z, 0) else dr.fma(x, y, z)
 
 
 @dataclass(frozen=True)
@@ -53,7 +94,7 @@ class Double:
     """
 
     hi: Any
-    lo: Any = 0.0
+    lo: Any = 0
 
     @staticmethod
     def product(x: Any, y: Any) -> Double:
@@ -69,8 +110,8 @@ class Double:
         other = Double.of(other)
         s, s_lo = two_sum(self.hi, other.hi)
         t, t_lo = two_sum(self.lo, other.lo)
-        s, s_lo = fast_two_sum(s, s_lo + t)
-        return Double(*fast_two_sum(s, s_lo + t_lo))
+        s, s_lo = fast_two_sum(s, plus(s_lo, t))
+        return Double(*fast_two_sum(s, plus(s_lo, t_lo)))
 
     def __neg__(self) -> Double:
         return Double(-self.hi, -self.lo)
@@ -82,23 +123,29 @@ class Double:
         # DWTimesDW3: ≤ 4u².
         other = Double.of(other)
         p, e = two_prod(self.hi, other.hi)
-        cross = dr.fma(self.hi, other.lo, dr.fma(self.lo, other.hi, self.lo * other.lo))
-        return Double(*fast_two_sum(p, e + cross))
+        cross = _fma(self.hi, other.lo, _fma(self.lo, other.hi, times(self.lo, other.lo)))
+        return Double(*fast_two_sum(p, plus(e, cross)))
 
-    def scaled(self, x: Any, x_low: Any = 0) -> Double:
-        """self · (x + x_low), not normalised: for sums that are rounded right after. |x_low| ≤ u |x|."""
+    def scaled(self, x: Any) -> Double:
+        """self · x for a plain number x, not normalised: for sums that are rounded right after."""
         p, e = two_prod(self.hi, x)
-        return Double(p, e + dr.fma(self.lo, x, self.hi * x_low))
+        return Double(p, plus(e, times(self.lo, x)))
 
     def sqrt(self) -> Double:
         """√max(x, 0), with a finite derivative at 0."""
         root = dr.safe_sqrt(self.hi)
-        rest = quotient(dr.fma(-root, root, self.hi) + self.lo, 2 * root)
+        rest = quotient(plus(dr.fma(-root, root, self.hi), self.lo), 2 * root)
         return Double(*fast_two_sum(root, dr.select(root > 0, rest, 0)))
 
 
 def select(mask: Any, x: Double, y: Double) -> Double:
     return Double(dr.select(mask, x.hi, y.hi), dr.select(mask, x.lo, y.lo))
+
+
+def difference(x: Double, y: Double) -> Double:
+    """x − y with an error ≤ 3u² (|x| + |y|): what cancels is not regained, for half the operations of `-`."""
+    s, s_lo = two_sum(x.hi, -y.hi)
+    return Double(*fast_two_sum(s, plus(s_lo, plus(x.lo, -y.lo))))
 
 
 def dot(x: Any, y: Any) -> Double:
@@ -115,36 +162,12 @@ def dot(x: Any, y: Any) -> Double:
     v, v0 = two_sum(e3, e4)
     t, t2 = two_sum(t, v)
     s, f = two_sum(s, t)
-    return Double(*fast_two_sum(s, f + ((t0 + t1) + (t2 + v0))))
+    return Double(*fast_two_sum(s, plus(f, plus(plus(t0, t1), plus(t2, v0)))))
 
 
 def cross(x: Any, y: Any) -> list[Double]:
-    """x × y of two 3-vectors as three `Double`s, each with relative error ≤ 4u² + the fourth-order tail."""
+    """x × y of two 3-vectors as three `Double`s, each with relative error ≤ 6u²."""
     return [_exact_difference(x[i], y[j], x[j], y[i]) for i, j in ((1, 2), (2, 0), (0, 1))]
-
-
-def sum_of_squares(x: list[Double]) -> Double:
-    """Σ xᵢ² of `Double`s: no term is negative, so plain accumulation of the low parts keeps a few u²."""
-    total, low = None, 0
-    for x_i in x:
-        p, e = two_prod(x_i.hi, x_i.hi)
-        low = low + dr.fma(2 * x_i.hi, x_i.lo, e)
-        if total is None:
-            total = p
-        else:
-            total, f = two_sum(total, p)
-            low = low + f
-    return Double(*fast_two_sum(total, low))
-
-
-def defect(target: Double, *products: Pair) -> Any:
-    """target − Σ xᵢ yᵢ as a plain number: error ≤ u · |result| + 8u² Σ|xᵢ yᵢ|, so small defects keep their digits."""
-    total, low = two_prod(*products[0])
-    for x, y in products[1:]:
-        p, e = two_prod(x, y)
-        total, f = two_sum(total, p)
-        low = low + (e + f)
-    return (target.hi - total) + (target.lo - low)
 
 
 def _exact_difference(x: Any, y: Any, z: Any, w: Any) -> Double:
@@ -154,4 +177,26 @@ def _exact_difference(x: Any, y: Any, z: Any, w: Any) -> Double:
     d, d_lo = two_sum(p, -q)
     e, e_lo = two_sum(p_lo, -q_lo)
     s, s_lo = two_sum(d, e)
-    return Double(*fast_two_sum(s, s_lo + (d_lo + e_lo)))
+    return Double(*fast_two_sum(s, plus(s_lo, plus(d_lo, e_lo))))
+
+
+def sum_of_squares(x: list[Double]) -> Double:
+    """Σ xᵢ² of `Double`s: no term is negative, so plain accumulation of the low parts keeps a few u²."""
+    total: Any = 0
+    low: Any = 0
+    for x_i in x:
+        p, e = two_prod(x_i.hi, x_i.hi)
+        total, f = two_sum(total, p)
+        low = plus(low, plus(f, _fma(times(2, x_i.hi), x_i.lo, e)))
+    return Double(*fast_two_sum(total, low))
+
+
+def defect(target: Double, *products: Pair) -> Any:
+    """target − Σ xᵢ yᵢ as a plain number: error ≤ u · |result| + 8u² Σ|xᵢ yᵢ|, so small defects keep their digits."""
+    total: Any = 0
+    low: Any = 0
+    for x, y in products:
+        p, e = two_prod(x, y)
+        total, f = two_sum(total, p)
+        low = plus(low, plus(e, f))
+    return plus(plus(target.hi, -total), plus(target.lo, -low))
