@@ -26,18 +26,17 @@ def quotient(x: Any, y: Any) -> Any:
 
 
 def constants(v: Any) -> list[Any]:
-    """The components of a vector, with Dr.Jit literals that are −1, 0 or 1 as Python ints.
+    """The components of a vector; as the Python ints −1, 0 and 1 where it is a Dr.Jit literal along an axis.
 
     The transforms below fold ints away while a kernel is traced: x + 0 has no error term, 1·x needs no product.
     Dr.Jit folds the sum and the product by itself, but not what a transform derives from them.
     """
-    return [_constant(component) for component in v]
-
-
-def _constant(x: Any) -> Any:
-    if dr.is_jit_v(x) and x.state == dr.VarState.Literal and x[0] in (-1, 0, 1):
-        return int(x[0])
-    return x
+    components = list(v)
+    if all(dr.is_jit_v(x) and x.state == dr.VarState.Literal for x in components):
+        values = [x[0] for x in components]
+        if sorted(map(abs, values)) == [0, 0, 1]:
+            return [int(x) for x in values]
+    return components
 
 
 def _is(x: Any, value: int) -> bool:
