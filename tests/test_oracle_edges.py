@@ -221,6 +221,7 @@ def test_the_bar_is_on_stderr_and_only_for_a_terminal(monkeypatch, capsys):
     monkeypatch.delenv("FORCE_COLOR", raising=False)
     assert oracle._progress_bar(100) == (None, None)
     monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm")  # a dumb terminal shows no bar
     bar, task = oracle._progress_bar(100)
     bar.update(task, completed=50)
     bar.stop()
