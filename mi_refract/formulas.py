@@ -180,7 +180,7 @@ def refract_rotated(a: Any, n: Any, k: Any) -> Refracted:
 #
 # and the mirror direction as the same with k = 1 and −(n·a) in place of s √radicand. Near the critical angle the
 # two terms of the radicand cancel, and √ makes of an error ε one of √ε: so the radicand must be right to a few u²,
-# not to a few u.
+# not to a few u. A literal normal along an axis, as in a local frame, is folded away while a kernel is traced.
 
 
 def _steer(c: Any, c2: Any, w2: Any, k: Any, radicand: Any) -> tuple[Any, Any]:
@@ -204,22 +204,24 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     """
     if dr.type_v(a) != dr.VarType.Float32:
         return refract_compensated(a, n, k, contrast)
-    wide: Any = dr.float64_array_t(type(a))
-    number = dr.value_t(wide)
-    d, m, k2 = wide(a), wide(n), number(_scalar(a, k))
+    narrow, wide = dr.value_t(type(a)), dr.value_t(dr.float64_array_t(type(a)))
+    d, m = [wide(x) for x in a], [x if isinstance(x, int) else wide(x) for x in numerics.constants(n)]
+    k2 = wide(_scalar(a, k))
     # k² has 48 bits: the difference is rounded at most once.
-    kappa = k2 * k2 - 1 if contrast is None else number(contrast)
+    kappa = k2 * k2 - 1 if contrast is None else wide(contrast)
     # Products of components are exact and their sums rounded at 2⁻⁵³: error of the radicand ≤ 8·2⁻⁵³ of its terms.
-    c, w = dr.dot(m, d), dr.cross(m, d)
-    c2, w2 = c * c, dr.dot(w, w)
+    c, w = numerics.plain_dot(m, d), numerics.plain_cross(m, d)
+    c2, w2 = c * c, numerics.plain_dot(w, w)
     radicand = c2 - kappa * w2
     valid, transmitted = _steer(c, c2, w2, k2, radicand)
     # κ = 0 leaves b = a to the last bit: √(c²) is |c| exactly, so the factor of n is 0. So it is for c = 0.
     # Else k a + n (…) cancels to k·2⁻⁵³ |a|, which is far below 2⁻²⁴ for k < 1e7.
-    along = dr.select(transmitted, dr.mulsign(_root(radicand), c), -c)
     scale = dr.select(transmitted, k2, 1)
-    b = d * scale + m * quotient(along - scale * c, dr.dot(m, m))
-    return dr.select(valid, type(a)(b), dr.nan), transmitted
+    rest = dr.select(transmitted, dr.mulsign(_root(radicand), c), -c) - scale * c
+    n2 = numerics.plain_dot(m, m)
+    q = rest if isinstance(n2, int) else quotient(rest, n2)
+    b = [numerics.fma(q, m_i, d_i * scale) for m_i, d_i in zip(m, d, strict=True)]
+    return dr.select(valid, type(a)(*map(narrow, b)), dr.nan), transmitted
 
 
 def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
@@ -227,7 +229,7 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
 
     A plain evaluation b₀ (a few u off) is corrected by its exact defect in the two equations that define b, so the
     sum b₀ + δ is rounded once. `contrast`: κ where it is known better than k, for the radicand; `k` itself still
-    scales the tangent. Source: this project. A literal normal along an axis is folded away while tracing.
+    scales the tangent. Source: this project.
     Precondition: no over- or underflow in the fourth power of the lengths, 1e-8 to 1e8 in float32. Weak nowhere.
     """
     k, n = _scalar(a, k), numerics.constants(n)
@@ -252,8 +254,8 @@ def _correct(n: list[Any], around: list[Double], along: Double) -> list[Any]:
     rounded, so the final error is that of rounding, u/2 ulp a component.
     """
     times, plus = numerics.times, numerics.plus
-    n2 = plus(plus(times(n[0], n[0]), times(n[1], n[1])), times(n[2], n[2]))
-    inverse = 1 if isinstance(n2, int) and n2 == 1 else quotient(1, n2)
+    n2 = numerics.plain_dot(n, n)
+    inverse = n2 if isinstance(n2, int) else quotient(1, n2)
     cyclic = (1, 2, 0), (2, 0, 1), (0, 1, 2)
 
     def solve(x: list[Any], y: Any) -> list[Any]:

@@ -39,25 +39,36 @@ def constants(v: Any) -> list[Any]:
     return components
 
 
-def _is(x: Any, value: int) -> bool:
-    return isinstance(x, int) and x == value
+def _is_zero(x: Any) -> bool:
+    return isinstance(x, int) and x == 0
 
 
 def times(x: Any, y: Any) -> Any:
-    """x y, where y may be one of the ints that fold."""
-    if _is(x, 0) or _is(y, 0):
-        return 0
-    return x if _is(y, 1) else -x if _is(y, -1) else y if _is(x, 1) else -y if _is(x, -1) else x * y
+    """x y, where either may be an int that folds."""
+    if isinstance(x, int):
+        x, y = y, x
+    if not isinstance(y, int):
+        return x * y
+    return 0 if y == 0 else x if y == 1 else -x if y == -1 else x * y
 
 
 def plus(x: Any, y: Any) -> Any:
-    """x + y, where either may be the int 0."""
-    return y if _is(x, 0) else x if _is(y, 0) else x + y
+    """x + y, where either may be an int that folds."""
+    if isinstance(x, int):
+        x, y = y, x
+    return x if _is_zero(y) else x + y
+
+
+def fma(x: Any, y: Any, z: Any) -> Any:
+    """x y + z, rounded once, where any may be an int that folds."""
+    if isinstance(x, int) or isinstance(y, int) or isinstance(z, int):
+        return plus(times(x, y), z)
+    return dr.fma(x, y, z)
 
 
 def two_sum(x: Any, y: Any) -> Pair:
     """s = fl(x + y) and e with s + e = x + y exactly, whatever the magnitudes."""
-    if _is(x, 0) or _is(y, 0):
+    if _is_zero(x) or _is_zero(y):
         return plus(x, y), 0
     s = x + y
     y_part = s - x
@@ -66,22 +77,28 @@ def two_sum(x: Any, y: Any) -> Pair:
 
 def fast_two_sum(x: Any, y: Any) -> Pair:
     """As `two_sum`, three operations instead of six. Precondition: |x| ≥ |y| or x = 0."""
-    if _is(x, 0) or _is(y, 0):
+    if _is_zero(x) or _is_zero(y):
         return plus(x, y), 0
     s = x + y
     return s, y - (s - x)
 
 
 def two_prod(x: Any, y: Any) -> Pair:
-    """p = fl(x y) and e with p + e = x y exactly."""
+    """p = fl(x y) and e with p + e = x y exactly. An int among them is −1, 0, 1 or a power of two."""
     if isinstance(x, int) or isinstance(y, int):
         return times(x, y), 0
     p = x * y
     return p, dr.fma(x, y, -p)
 
 
-def _fma(x: Any, y: Any, z: Any) -> Any:
-    return z if _is(x, 0) or _is(y, 0) else times(x, y) if _is(z, 0) else dr.fma(x, y, z)
+def plain_dot(x: Any, y: Any) -> Any:
+    """x · y of two 3-vectors, in the working precision."""
+    return fma(x[2], y[2], fma(x[1], y[1], times(x[0], y[0])))
+
+
+def plain_cross(x: Any, y: Any) -> list[Any]:
+    """x × y of two 3-vectors, in the working precision."""
+    return [fma(x[i], y[j], -times(x[j], y[i])) for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
 @dataclass(frozen=True)
@@ -122,7 +139,7 @@ class Double:
         # DWTimesDW3: ≤ 4u².
         other = Double.of(other)
         p, e = two_prod(self.hi, other.hi)
-        cross = _fma(self.hi, other.lo, _fma(self.lo, other.hi, times(self.lo, other.lo)))
+        cross = fma(self.hi, other.lo, fma(self.lo, other.hi, times(self.lo, other.lo)))
         return Double(*fast_two_sum(p, plus(e, cross)))
 
     def scaled(self, x: Any) -> Double:
@@ -186,7 +203,7 @@ def sum_of_squares(x: list[Double]) -> Double:
     for x_i in x:
         p, e = two_prod(x_i.hi, x_i.hi)
         total, f = two_sum(total, p)
-        low = plus(low, plus(f, _fma(times(2, x_i.hi), x_i.lo, e)))
+        low = plus(low, plus(f, fma(times(2, x_i.hi), x_i.lo, e)))
     return Double(*fast_two_sum(total, low))
 
 
