@@ -29,8 +29,9 @@ class Side(NamedTuple):
 
 
 class Ray(NamedTuple):
-    """One refraction in the local frame: `eta` is n_to / n_from, `r` the unpolarised reflectance."""
+    """One refraction of `a` = −wi in the local frame: `eta` is n_to / n_from, `r` the unpolarised reflectance."""
 
+    a: Any
     side: Side
     wo: Any
     eta: Any
@@ -123,47 +124,39 @@ def plugin_class(v: Any) -> type:
             bs = dr.zeros(v.BSDFSample3f)
             if not (has_r or has_t):
                 return bs, v.Spectrum(0)
-            ray = self._refract(si.wi)
-            if has_r and has_t:
-                # r > 0: an index-matched boundary never reflects, not even the sample that is exactly 0.
-                selected_r = (sample1 <= ray.r) & (ray.r > 0) & active
-                bs.pdf = dr.detach(dr.select(selected_r, ray.r, 1 - ray.r))
-            else:
-                selected_r = v.Bool(has_r) & active
-                bs.pdf = 1
+            both, ray = has_r and has_t, self._refract(si.wi)
+            # r > 0: an index-matched boundary never reflects, not even the sample that is exactly 0.
+            selected_r = ((sample1 <= ray.r) & (ray.r > 0) if both else v.Bool(has_r)) & active
             selected_t = (selected_r ^ True) & active
+            value = dr.select(selected_r, ray.r, 1 - ray.r)
+            bs.pdf = dr.detach(value) if both else 1
             bs.sampled_component = dr.select(selected_r, v.UInt32(0), v.UInt32(1))
             bs.sampled_type = dr.select(selected_r, v.UInt32(+reflection), v.UInt32(+transmission))
-            bs.wo = dr.select(selected_r, v.Vector3f(-si.wi.x, -si.wi.y, si.wi.z), ray.wo)
+            bs.wo = dr.select(selected_r, v.Vector3f(ray.a.x, ray.a.y, si.wi.z), ray.wo)
             bs.eta = dr.select(selected_r, v.Float(1), ray.eta)
-            weight = self._weight(ctx, si, bs, ray, selected_r, has_r and has_t)
+            factor = dr.select(selected_t, dr.square(ray.side.k), 1) if ctx.mode == mi.TransportMode.Radiance else 1
+            if v.is_polarized:
+                weight = self._mueller(ctx, si, bs, ray, selected_r) * (factor / bs.pdf)
+            else:
+                weight = v.Spectrum(self._attached(value) * factor if both else value * factor)
             for texture, selected in self._tints(selected_r, selected_t):
                 tint = dr.select(selected, texture.eval(si, selected), v.UnpolarizedSpectrum(1))
                 weight = weight @ v.mueller.absorber(tint) if v.is_polarized else weight * tint
-            if ctx.mode == mi.TransportMode.Radiance:
-                weight = weight * dr.select(selected_t, dr.square(ray.side.k), 1)
             return bs, dr.select(active, weight, 0)
 
         def _refract(self, wi: Any) -> Ray:
             """The ray's side, refracted direction and reflectance. The normal is a literal: Dr.Jit folds it away."""
-            outside = wi.z >= 0
+            a, outside = -wi, wi.z >= 0
             side = Side(*(dr.select(outside, o, i) for o, i in zip(self.outer, self.inner, strict=True)))
-            wo, transmitted = self.formula(-wi, v.Vector3f(0, 0, 1), side.k, side.contrast)
+            wo, transmitted = self.formula(a, v.Vector3f(0, 0, 1), side.k, side.contrast)
             cos_i, cos_t = dr.abs(wi.z), dr.abs(wo.z)
             r = fresnel.reflectance(cos_i, cos_t, transmitted, side.k, side.contrast)
-            return Ray(side, wo, dr.select(outside, self.inner.k, self.outer.k), cos_i, cos_t, transmitted, r)
+            return Ray(a, side, wo, dr.select(outside, self.inner.k, self.outer.k), cos_i, cos_t, transmitted, r)
 
-        def _weight(self, ctx: Any, si: Any, bs: Any, ray: Ray, selected_r: Any, both: bool) -> Any:
-            """The lobe's value over its probability, without tint and without the radiance factor."""
-            if v.is_polarized:
-                return self._mueller(ctx, si, bs, ray, selected_r) / bs.pdf
-            value = dr.select(selected_r, ray.r, 1 - ray.r)
-            if not both:
-                return v.Spectrum(value)
-            if not dr.grad_enabled(value):
-                return v.Spectrum(1)
-            # The choice of a lobe is detached; its probability is what the weight is differentiated against.
-            return v.Spectrum(_attach(v.Float(1), value / dr.detach(value)))
+        @staticmethod
+        def _attached(value: Any) -> Any:
+            """1, with the derivative of log `value`: the choice of a lobe is detached, its probability is not."""
+            return _attach(v.Float(1), value / dr.detach(value)) if dr.grad_enabled(value) else 1
 
         def _tints(self, selected_r: Any, selected_t: Any) -> list[tuple[Any, Any]]:
             masks = dict(zip(LOBES, (selected_r, selected_t), strict=True))

@@ -134,6 +134,25 @@ def test_the_critical_angle_is_transmitted_along_the_surface_and_the_next_ratio_
     assert b.tolist() == [4, 0, 3]
 
 
+@pytest.mark.parametrize("axis", [(0, 0, 1), (0, -1, 0)])
+@pytest.mark.parametrize("regime", REGIMES)
+@pytest.mark.parametrize("name", EXACT)
+def test_a_literal_axis_is_folded_away_and_nothing_else_changes(name, regime, axis, setting):
+    """As in a local frame. A literal normal takes shorter ways through both formulas."""
+    count = COUNTS[setting.backend]
+    rng = np.random.default_rng(8)
+    angle, k = REGIMES[regime].draw(rng, count)
+    turn = rng.uniform(0, 2 * np.pi, count)
+    local = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], axis=1)
+    a = np.roll(local, axis.index(1 if 1 in axis else -1) - 2, axis=1).astype(setting.precision)
+    rays = Rays(a, np.tile(np.array(axis, setting.precision), (count, 1)), k.astype(setting.precision))
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    literal = setting.vector(*map(float, axis))
+    error, misjudged = worst(lambda a, _, k: FORMULAS[name](a, literal, k), rays, exact, setting)
+    assert misjudged == 0
+    assert error <= 0.92
+
+
 @pytest.mark.parametrize("name", EXACT)
 def test_a_matched_boundary_returns_the_same_bits(name, setting):
     rays = make("generic", COUNTS[setting.backend], setting.precision, seed=3)
