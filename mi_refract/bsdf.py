@@ -121,9 +121,9 @@ def plugin_class(v: Any) -> type:
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
             has_r, has_t = ctx.is_enabled(reflection, 0), ctx.is_enabled(transmission, 1)
-            bs = dr.zeros(v.BSDFSample3f)
             if not (has_r or has_t):
-                return bs, v.Spectrum(0)
+                return dr.zeros(v.BSDFSample3f), v.Spectrum(0)
+            bs = v.BSDFSample3f()
             both, ray = has_r and has_t, self._refract(si.wi)
             # r > 0: an index-matched boundary never reflects, not even the sample that is exactly 0.
             selected_r = ((sample1 <= ray.r) & (ray.r > 0) if both else v.Bool(has_r)) & active
@@ -139,7 +139,8 @@ def plugin_class(v: Any) -> type:
                 weight = self._mueller(ctx, si, bs, ray, selected_r) * (factor / bs.pdf)
             else:
                 weight = v.Spectrum(self._attached(value) * factor if both else value * factor)
-            for texture, selected in self._tints(selected_r, selected_t):
+            for name, texture in self.textures.items():
+                selected = selected_r if name == LOBES[0] else selected_t
                 tint = dr.select(selected, texture.eval(si, selected), v.UnpolarizedSpectrum(1))
                 weight = weight @ v.mueller.absorber(tint) if v.is_polarized else weight * tint
             return bs, dr.select(active, weight, 0)
@@ -147,20 +148,18 @@ def plugin_class(v: Any) -> type:
         def _refract(self, wi: Any) -> Ray:
             """The ray's side, refracted direction and reflectance. The normal is a literal: Dr.Jit folds it away."""
             a, outside = -wi, wi.z >= 0
-            side = Side(*(dr.select(outside, o, i) for o, i in zip(self.outer, self.inner, strict=True)))
-            wo, transmitted = self.formula(a, v.Vector3f(0, 0, 1), side.k, side.contrast)
+            outer, inner = self.outer, self.inner
+            side = Side(dr.select(outside, outer.k, inner.k), dr.select(outside, outer.contrast, inner.contrast))
+            # Unchecked: the indices are positive and finite since the construction, and NaN stays NaN.
+            wo, transmitted = self.formula.unchecked(a, v.Vector3f(0, 0, 1), side.k, side.contrast)
             cos_i, cos_t = dr.abs(wi.z), dr.abs(wo.z)
             r = fresnel.reflectance(cos_i, cos_t, transmitted, side.k, side.contrast)
-            return Ray(a, side, wo, dr.select(outside, self.inner.k, self.outer.k), cos_i, cos_t, transmitted, r)
+            return Ray(a, side, wo, dr.select(outside, inner.k, outer.k), cos_i, cos_t, transmitted, r)
 
         @staticmethod
         def _attached(value: Any) -> Any:
             """1, with the derivative of log `value`: the choice of a lobe is detached, its probability is not."""
             return _attach(v.Float(1), value / dr.detach(value)) if dr.grad_enabled(value) else 1
-
-        def _tints(self, selected_r: Any, selected_t: Any) -> list[tuple[Any, Any]]:
-            masks = dict(zip(LOBES, (selected_r, selected_t), strict=True))
-            return [(texture, masks[name]) for name, texture in self.textures.items()]
 
         def _mueller(self, ctx: Any, si: Any, bs: Any, ray: Ray, selected_r: Any) -> Any:
             """The Mueller matrix of the selected lobe, turned into the implicit Stokes bases of both directions."""

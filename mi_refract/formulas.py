@@ -4,9 +4,10 @@ Every formula is `f(a, n, k) -> (b, transmitted)` in the conventions of the pack
 the surface, `n` is a normal on either side, k = n_from / n_to, and `b` leaves the boundary with the length of `a`.
 Where `transmitted` is False (total internal reflection, or a tangential ray) `b` is the mirror direction.
 
-All are total functions without branches on data: input that is not a refraction (a zero or non-finite vector, an
-index ratio that is not a positive finite number) gives NaN and False. `a` and `n` are 3-vectors of any Dr.Jit
-backend and precision, `k` a number or an array of that precision; a wider `k` is rounded to it first, once.
+The entries of FORMULAS are total functions without branches on data: input that is not a refraction (a zero or
+non-finite vector, a ratio that is not a positive finite number) gives NaN and False. The functions themselves leave
+that check out (NaN still gives NaN), for callers that have made it, as the plugin has. `a` and `n` are 3-vectors of
+any Dr.Jit backend and precision, `k` a number or an array of that precision; a wider `k` is rounded to it, once.
 The documented formulas take unit `a` and `n`; what those are off by, the result is off by.
 """
 
@@ -35,17 +36,10 @@ def _scalar(a: Any, k: Any) -> Any:
     return component(k)
 
 
-def _conclude(a: Any, n: Any, k: Any, c: Any, radicand: Any, b: Any) -> Refracted:
-    """Choose between the transmitted and the mirror direction, and refuse what is not a refraction.
-
-    One product tests all three inputs: it is 0, negative, infinite or NaN where any of them is unusable.
-    """
-    nn = dr.dot(n, n)
-    scale = dr.dot(a, a) * nn * k
-    valid = (scale > 0) & (scale < dr.inf)
-    transmitted = valid & (radicand >= 0) & (c != 0)
-    mirror = a - n * quotient(2 * c, nn)
-    return dr.select(valid, dr.select(transmitted, b, mirror), dr.nan), transmitted
+def _conclude(a: Any, n: Any, c: Any, radicand: Any, b: Any) -> Refracted:
+    """Choose between the transmitted direction `b` and the mirror direction."""
+    transmitted = (radicand >= 0) & (c != 0)
+    return dr.select(transmitted, b, a - n * quotient(2 * c, dr.dot(n, n))), transmitted
 
 
 def _root(radicand: Any) -> Any:
@@ -93,7 +87,7 @@ def refract_wedge(a: Any, n: Any, k: Any) -> Refracted:
     c, bivector = dr.dot(n, a), wedge(n, a)
     radicand = dr.dot(a, a) - k * k * dr.dot(bivector, bivector)  # (n∧a)² = −|n×a|²
     b = k * contract(n, bivector) + n * dr.mulsign(_root(radicand), c)
-    return _conclude(a, n, k, c, radicand, b)
+    return _conclude(a, n, c, radicand, b)
 
 
 def refract_wedge_contrast(a: Any, n: Any, k: Any) -> Refracted:
@@ -106,7 +100,7 @@ def refract_wedge_contrast(a: Any, n: Any, k: Any) -> Refracted:
     c, bivector = dr.dot(n, a), wedge(n, a)
     radicand = c * c - dr.dot(bivector, bivector) * (k * k - 1)
     b = k * contract(n, bivector) + n * dr.mulsign(_root(radicand), c)
-    return _conclude(a, n, k, c, radicand, b)
+    return _conclude(a, n, c, radicand, b)
 
 
 def refract_cross(a: Any, n: Any, k: Any) -> Refracted:
@@ -119,7 +113,7 @@ def refract_cross(a: Any, n: Any, k: Any) -> Refracted:
     cos, c = dr.dot(a, n), k * dr.cross(a, n)
     radicand = 1 - dr.dot(c, c)
     t = dr.cross(n, c) + n * dr.mulsign(_root(radicand), cos)
-    return _conclude(a, n, k, cos, radicand, t)
+    return _conclude(a, n, cos, radicand, t)
 
 
 def refract_decomposed(a: Any, n: Any, k: Any) -> Refracted:
@@ -133,7 +127,7 @@ def refract_decomposed(a: Any, n: Any, k: Any) -> Refracted:
     c = dr.dot(n, a)
     radicand = 1 - k * k * (1 - c * c)
     b = k * a - n * (k * c - dr.mulsign(_root(radicand), c))
-    return _conclude(a, n, k, c, radicand, b)
+    return _conclude(a, n, c, radicand, b)
 
 
 def refract_2d(i: Any, l: Any, k: Any) -> tuple[list[Any], Any]:  # noqa: E741 (the document's names)
@@ -169,7 +163,7 @@ def refract_rotated(a: Any, n: Any, k: Any) -> Refracted:
     sine = dr.norm(tangent)
     (b_n, b_t), transmitted = refract_2d((c, sine), (0, 1), k)
     b = n * b_n + tangent * dr.select(sine > 0, quotient(b_t, sine), 0)
-    return _conclude(a, n, k, c, dr.select(transmitted, 1, -1), b)
+    return _conclude(a, n, c, dr.select(transmitted, 1, -1), b)
 
 
 # Ours: right everywhere ----------------------------------------------------------------------------------------
@@ -181,17 +175,6 @@ def refract_rotated(a: Any, n: Any, k: Any) -> Refracted:
 # and the mirror direction as the same with k = 1 and −(n·a) in place of s √radicand. Near the critical angle the
 # two terms of the radicand cancel, and √ makes of an error ε one of √ε: so the radicand must be right to a few u²,
 # not to a few u. A literal normal along an axis, as in a local frame, is folded away while a kernel is traced.
-
-
-def _steer(c: Any, c2: Any, w2: Any, k: Any, radicand: Any) -> tuple[Any, Any]:
-    """(valid, transmitted) of a ray with c = n·a, its square, and w² = |n × a|².
-
-    c² + w² = a² n² (Lagrange), so one product tests all inputs: it is 0, infinite or NaN where one is unusable, or
-    negative. Precondition: the fourth power of a length does not over- or underflow.
-    """
-    scale = (c2 + w2) * k
-    valid = (scale > 0) & (scale < dr.inf)
-    return valid, valid & (radicand >= 0) & (c != 0)
 
 
 def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
@@ -211,9 +194,8 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     kappa = k2 * k2 - 1 if contrast is None else wide(contrast)
     # Products of components are exact and their sums rounded at 2⁻⁵³: error of the radicand ≤ 8·2⁻⁵³ of its terms.
     c, w = numerics.plain_dot(m, d), numerics.plain_cross(m, d)
-    c2, w2 = c * c, numerics.plain_dot(w, w)
-    radicand = c2 - kappa * w2
-    valid, transmitted = _steer(c, c2, w2, k2, radicand)
+    radicand = c * c - kappa * numerics.plain_dot(w, w)
+    transmitted = (radicand >= 0) & (c != 0)
     # κ = 0 leaves b = a to the last bit: √(c²) is |c| exactly, so the factor of n is 0. So it is for c = 0.
     # Else k a + n (…) cancels to k·2⁻⁵³ |a|, which is far below 2⁻²⁴ for k < 1e7.
     scale = dr.select(transmitted, k2, 1)
@@ -221,7 +203,7 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     n2 = numerics.plain_dot(m, m)
     q = rest if isinstance(n2, int) else quotient(rest, n2)
     b = [numerics.fma(q, m_i, d_i * scale) for m_i, d_i in zip(m, d, strict=True)]
-    return dr.select(valid, type(a)(*map(narrow, b)), dr.nan), transmitted
+    return type(a)(*map(narrow, b)), transmitted
 
 
 def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
@@ -235,16 +217,14 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
     k, n = _scalar(a, k), numerics.constants(n)
     kappa = Double.product(k, k) - 1 if contrast is None else _split(a, contrast)
     c, w = numerics.dot(n, a), numerics.cross(n, a)
-    c2, w2 = c * c, numerics.sum_of_squares(w)
-    radicand = numerics.difference(c2, kappa * w2)
-    valid, transmitted = _steer(c.hi, c2.hi, w2.hi, k, radicand.hi)
+    radicand = numerics.difference(c * c, kappa * numerics.sum_of_squares(w))
+    transmitted = (radicand.hi >= 0) & (c.hi != 0)
     root = radicand.sqrt()
     root = Double(dr.mulsign(root.hi, c.hi), dr.mulsign(root.lo, c.hi))
     along = numerics.select(transmitted, root, -c)
     scale = dr.select(transmitted, k, 1)
     b = type(a)(*_correct(n, [w_i.scaled(scale) for w_i in w], along))
-    b = dr.select((kappa.hi == 0) | (c.hi == 0), a, b)
-    return dr.select(valid, b, dr.nan), transmitted
+    return dr.select((kappa.hi == 0) | (c.hi == 0), a, b), transmitted
 
 
 def _correct(n: list[Any], around: list[Double], along: Double) -> list[Any]:
@@ -315,6 +295,15 @@ class Formula:
     takes_contrast: bool = False
 
     def __call__(self, a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
+        """The formula as a total function: NaN and False for what is no refraction."""
+        b, transmitted = self.unchecked(a, n, k, contrast)
+        valid = (k > 0) & (k < dr.inf)
+        for length2 in (dr.dot(a, a), dr.dot(n, n)):
+            valid &= (length2 > 0) & (length2 < dr.inf)
+        return dr.select(valid, b, dr.nan), valid & transmitted
+
+    def unchecked(self, a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
+        """The formula alone. Precondition: `a`, `n` not zero, `k` positive and finite; NaN gives NaN and False."""
         if self.takes_contrast:
             return self.function(a, n, k, contrast)
         return self.function(a, n, k)

@@ -225,6 +225,8 @@ def test_total_internal_reflection_takes_everything(each_variant):
 def test_a_direction_that_is_none_stays_none(each_variant):
     bs, _ = sample(load(), (math.nan, 0, 1), 0.5)
     assert np.isnan(vector(bs.wo)).any()
+    bs, _ = sample(load(), (0, 0, math.nan), 0.5)
+    assert np.isnan(vector(bs.wo)).any()
     assert np.isnan(number(bs.pdf))
 
 
