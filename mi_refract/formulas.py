@@ -20,7 +20,7 @@ from typing import Any
 import drjit as dr
 
 from . import numerics
-from .numerics import Double, quotient
+from .numerics import Double, plus, quotient, times
 
 Refracted = tuple[Any, Any]
 
@@ -219,12 +219,14 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
     c, w = numerics.dot(n, a), numerics.cross(n, a)
     radicand = numerics.difference(c * c, kappa * numerics.sum_of_squares(w))
     transmitted = (radicand.hi >= 0) & (c.hi != 0)
-    root = radicand.sqrt()
+    root, scale = radicand.sqrt(), dr.select(transmitted, k, 1)
+    if all(isinstance(n_i, int) for n_i in n):
+        # A literal axis leaves nothing to add up: each component is one product, or the root.
+        along = dr.select(transmitted, dr.mulsign(root.rounded(), c.hi), -c.hi)
+        return type(a)(*(times(along, n_i) if n_i else a_i * scale for a_i, n_i in zip(a, n, strict=True))), transmitted
     root = Double(dr.mulsign(root.hi, c.hi), dr.mulsign(root.lo, c.hi))
-    along = numerics.select(transmitted, root, -c)
-    scale = dr.select(transmitted, k, 1)
-    b = type(a)(*_correct(n, [w_i.scaled(scale) for w_i in w], along))
-    return dr.select((kappa.hi == 0) | (c.hi == 0), a, b), transmitted
+    b = _correct(n, [w_i * scale for w_i in w], numerics.select(transmitted, root, -c))
+    return dr.select((kappa.hi == 0) | (c.hi == 0), a, type(a)(*b)), transmitted
 
 
 def _correct(n: list[Any], around: list[Double], along: Double) -> list[Any]:
@@ -233,7 +235,6 @@ def _correct(n: list[Any], around: list[Double], along: Double) -> list[Any]:
     |b₀ − b| ≤ 8u |b|, and δ from the exact defects is right to 8u of itself: b₀ + δ is b to 64u² before it is
     rounded, so the final error is that of rounding, u/2 ulp a component.
     """
-    times, plus = numerics.times, numerics.plus
     n2 = numerics.plain_dot(n, n)
     inverse = n2 if isinstance(n2, int) else quotient(1, n2)
     cyclic = (1, 2, 0), (2, 0, 1), (0, 1, 2)
