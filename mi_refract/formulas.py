@@ -349,8 +349,12 @@ FORMULAS = {
 
 
 def automatic(backend: dr.JitBackend) -> str:
-    """The key of the cheapest formula at the rounding limit: float64 is slow on consumer GPUs, not on CPUs."""
-    return "compensated" if backend == dr.JitBackend.CUDA else "promoted"
+    """The key of the cheapest formula at the rounding limit in a local frame, where the normal is a literal axis.
+
+    Compiled, `compensated` folds to less than the conversions of `promoted` cost, and needs no float64 on a GPU.
+    On scalar arrays every operation is a call, and `promoted` has fewer.
+    """
+    return "promoted" if backend == dr.JitBackend.Invalid else "compensated"
 
 
 def resolve(name: str, backend: dr.JitBackend) -> tuple[str, Formula]:
