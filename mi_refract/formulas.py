@@ -20,7 +20,7 @@ from typing import Any
 import drjit as dr
 
 from . import numerics
-from .numerics import Double, plus, quotient, times
+from .numerics import Double, quotient
 
 Refracted = tuple[Any, Any]
 
@@ -174,7 +174,23 @@ def refract_rotated(a: Any, n: Any, k: Any) -> Refracted:
 #
 # and the mirror direction as the same with k = 1 and −(n·a) in place of s √radicand. Near the critical angle the
 # two terms of the radicand cancel, and √ makes of an error ε one of √ε: so the radicand must be right to a few u²,
-# not to a few u. A literal normal along an axis, as in a local frame, is folded away while a kernel is traced.
+# not to a few u. A literal normal along an axis, as in a local frame, leaves nothing to add up: w are the other two
+# components of `a`, and each component of b is one product, or the root.
+
+
+def _axis(n: Any) -> tuple[int, int] | None:
+    """(index, ±1) of a normal that is a Dr.Jit literal along an axis, as known while a kernel is traced; else None."""
+    if not all(dr.is_jit_v(x) and x.state == dr.VarState.Literal for x in n):
+        return None
+    values = [x[0] for x in n]
+    index = max(range(3), key=lambda i: abs(values[i]))
+    return (index, int(values[index])) if sorted(map(abs, values)) == [0, 0, 1] else None
+
+
+def _along_axis(a: Any, axis: tuple[int, int], scale: Any, along: Any) -> Any:
+    """The b with n·b = `along` and the other components of `a` times `scale`, for a literal axis n."""
+    index, sign = axis
+    return type(a)(*((along if sign > 0 else -along) if i == index else a[i] * scale for i in range(3)))
 
 
 def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
@@ -187,23 +203,19 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     """
     if dr.type_v(a) != dr.VarType.Float32:
         return refract_compensated(a, n, k, contrast)
-    narrow, wide = dr.value_t(type(a)), dr.value_t(dr.float64_array_t(type(a)))
-    d, m = [wide(x) for x in a], [x if isinstance(x, int) else wide(x) for x in numerics.constants(n)]
-    k2 = wide(_scalar(a, k))
+    wide: Any = dr.float64_array_t(type(a))
+    number = dr.value_t(wide)
+    d, m, k2 = wide(a), wide(n), number(_scalar(a, k))
     # k² has 48 bits: the difference is rounded at most once.
-    kappa = k2 * k2 - 1 if contrast is None else wide(contrast)
+    kappa = k2 * k2 - 1 if contrast is None else number(contrast)
     # Products of components are exact and their sums rounded at 2⁻⁵³: error of the radicand ≤ 8·2⁻⁵³ of its terms.
-    c, w = numerics.plain_dot(m, d), numerics.plain_cross(m, d)
-    radicand = c * c - kappa * numerics.plain_dot(w, w)
+    c, w = dr.dot(m, d), dr.cross(m, d)
+    radicand = c * c - kappa * dr.dot(w, w)
     transmitted = (radicand >= 0) & (c != 0)
+    along, scale = dr.select(transmitted, dr.mulsign(_root(radicand), c), -c), dr.select(transmitted, k2, 1)
     # κ = 0 leaves b = a to the last bit: √(c²) is |c| exactly, so the factor of n is 0. So it is for c = 0.
     # Else k a + n (…) cancels to k·2⁻⁵³ |a|, which is far below 2⁻²⁴ for k < 1e7.
-    scale = dr.select(transmitted, k2, 1)
-    rest = dr.select(transmitted, dr.mulsign(_root(radicand), c), -c) - scale * c
-    n2 = numerics.plain_dot(m, m)
-    q = rest if isinstance(n2, int) else quotient(rest, n2)
-    b = [numerics.fma(q, m_i, d_i * scale) for m_i, d_i in zip(m, d, strict=True)]
-    return type(a)(*map(narrow, b)), transmitted
+    return type(a)(d * scale + m * quotient(along - scale * c, dr.dot(m, m))), transmitted
 
 
 def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
@@ -214,39 +226,40 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
     scales the tangent. Source: this project.
     Precondition: no over- or underflow in the fourth power of the lengths, 1e-8 to 1e8 in float32. Weak nowhere.
     """
-    k, n = _scalar(a, k), numerics.constants(n)
+    k, axis = _scalar(a, k), _axis(n)
     kappa = Double.product(k, k) - 1 if contrast is None else _split(a, contrast)
-    c, w = numerics.dot(n, a), numerics.cross(n, a)
+    if axis:
+        index, sign = axis
+        c, w = Double(a[index] if sign > 0 else -a[index]), [Double(a[i]) for i in range(3) if i != index]
+    else:
+        c, w = numerics.dot(n, a), numerics.cross(n, a)
     radicand = numerics.difference(c * c, kappa * numerics.sum_of_squares(w))
     transmitted = (radicand.hi >= 0) & (c.hi != 0)
     root, scale = radicand.sqrt(), dr.select(transmitted, k, 1)
-    if all(isinstance(n_i, int) for n_i in n):
-        # A literal axis leaves nothing to add up: each component is one product, or the root.
+    if axis:
         along = dr.select(transmitted, dr.mulsign(root.rounded(), c.hi), -c.hi)
-        return type(a)(*(times(along, n_i) if n_i else a_i * scale for a_i, n_i in zip(a, n, strict=True))), transmitted
+        return _along_axis(a, axis, scale, along), transmitted
     root = Double(dr.mulsign(root.hi, c.hi), dr.mulsign(root.lo, c.hi))
-    b = _correct(n, [w_i * scale for w_i in w], numerics.select(transmitted, root, -c))
-    return dr.select((kappa.hi == 0) | (c.hi == 0), a, type(a)(*b)), transmitted
+    b = _correct(type(a), n, [w_i * scale for w_i in w], numerics.select(transmitted, root, -c))
+    return dr.select((kappa.hi == 0) | (c.hi == 0), a, b), transmitted
 
 
-def _correct(n: list[Any], around: list[Double], along: Double) -> list[Any]:
+def _correct(vector: type, n: Any, around: list[Double], along: Double) -> Any:
     """The b with n × b = `around` and n·b = `along`: b = (around × n + along n)/n², rounded once.
 
     |b₀ − b| ≤ 8u |b|, and δ from the exact defects is right to 8u of itself: b₀ + δ is b to 64u² before it is
     rounded, so the final error is that of rounding, u/2 ulp a component.
     """
-    n2 = numerics.plain_dot(n, n)
-    inverse = n2 if isinstance(n2, int) else quotient(1, n2)
-    cyclic = (1, 2, 0), (2, 0, 1), (0, 1, 2)
+    inverse = quotient(1, dr.dot(n, n))
 
-    def solve(x: list[Any], y: Any) -> list[Any]:
-        parts = [plus(times(x[i], n[j]), times(x[j], -n[i])) for i, j, _ in cyclic]
-        return [times(plus(part, times(y, n[m])), inverse) for part, (_, _, m) in zip(parts, cyclic, strict=True)]
+    def solve(around: list[Any], along: Any) -> Any:
+        return (dr.cross(vector(*around), n) + n * along) * inverse
 
     b = solve([x.hi for x in around], along.hi)
-    missing = [numerics.defect(around[m], (n[i], b[j]), (-n[j], b[i])) for i, j, m in cyclic]
-    delta = solve(missing, numerics.defect(along, *zip(n, b, strict=True)))
-    return [plus(x, y) for x, y in zip(b, delta, strict=True)]
+    missing = [
+        numerics.defect(around[m], (n[i], b[j]), (-n[j], b[i])) for i, j, m in ((1, 2, 0), (2, 0, 1), (0, 1, 2))
+    ]
+    return b + solve(missing, numerics.defect(along, *zip(n, b, strict=True)))
 
 
 def _split(a: Any, x: Any) -> Double:

@@ -25,51 +25,8 @@ def quotient(x: Any, y: Any) -> Any:
     return x / y
 
 
-def constants(v: Any) -> list[Any]:
-    """The components of a vector; as the Python ints −1, 0 and 1 where it is a Dr.Jit literal along an axis.
-
-    The transforms below fold ints away while a kernel is traced: x + 0 has no error term, 1·x needs no product.
-    Dr.Jit folds the sum and the product by itself, but not what a transform derives from them.
-    """
-    components = list(v)
-    if all(dr.is_jit_v(x) and x.state == dr.VarState.Literal for x in components):
-        values = [x[0] for x in components]
-        if sorted(map(abs, values)) == [0, 0, 1]:
-            return [int(x) for x in values]
-    return components
-
-
-def _is_zero(x: Any) -> bool:
-    return isinstance(x, int) and x == 0
-
-
-def times(x: Any, y: Any) -> Any:
-    """x y, where either may be an int that folds."""
-    if isinstance(x, int):
-        x, y = y, x
-    if not isinstance(y, int):
-        return x * y
-    return 0 if y == 0 else x if y == 1 else -x if y == -1 else x * y
-
-
-def plus(x: Any, y: Any) -> Any:
-    """x + y, where either may be an int that folds."""
-    if isinstance(x, int):
-        x, y = y, x
-    return x if _is_zero(y) else x + y
-
-
-def fma(x: Any, y: Any, z: Any) -> Any:
-    """x y + z, rounded once, where any may be an int that folds."""
-    if isinstance(x, int) or isinstance(y, int) or isinstance(z, int):
-        return plus(times(x, y), z)
-    return dr.fma(x, y, z)
-
-
 def two_sum(x: Any, y: Any) -> Pair:
     """s = fl(x + y) and e with s + e = x + y exactly, whatever the magnitudes."""
-    if _is_zero(x) or _is_zero(y):
-        return plus(x, y), 0
     s = x + y
     y_part = s - x
     return s, (x - (s - y_part)) + (y - y_part)
@@ -77,28 +34,14 @@ def two_sum(x: Any, y: Any) -> Pair:
 
 def fast_two_sum(x: Any, y: Any) -> Pair:
     """As `two_sum`, three operations instead of six. Precondition: |x| ≥ |y| or x = 0."""
-    if _is_zero(x) or _is_zero(y):
-        return plus(x, y), 0
     s = x + y
     return s, y - (s - x)
 
 
 def two_prod(x: Any, y: Any) -> Pair:
-    """p = fl(x y) and e with p + e = x y exactly. An int among them is −1, 0, 1 or a power of two."""
-    if isinstance(x, int) or isinstance(y, int):
-        return times(x, y), 0
+    """p = fl(x y) and e with p + e = x y exactly."""
     p = x * y
     return p, dr.fma(x, y, -p)
-
-
-def plain_dot(x: Any, y: Any) -> Any:
-    """x · y of two 3-vectors, in the working precision."""
-    return fma(x[2], y[2], fma(x[1], y[1], times(x[0], y[0])))
-
-
-def plain_cross(x: Any, y: Any) -> list[Any]:
-    """x × y of two 3-vectors, in the working precision."""
-    return [fma(x[i], y[j], -times(x[j], y[i])) for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
 @dataclass(frozen=True)
@@ -111,6 +54,11 @@ class Double:
 
     hi: Any
     lo: Any = 0
+
+    @property
+    def is_plain(self) -> bool:
+        """Without a low part, known while a kernel is traced: operations leave out what it would add."""
+        return isinstance(self.lo, int)
 
     @staticmethod
     def product(x: Any, y: Any) -> Double:
@@ -125,9 +73,11 @@ class Double:
         # AccurateDWPlusDW: ≤ 3u² + 13u³, also where the high parts cancel.
         other = Double.of(other)
         s, s_lo = two_sum(self.hi, other.hi)
+        if other.is_plain:
+            return Double(*fast_two_sum(s, s_lo + self.lo))
         t, t_lo = two_sum(self.lo, other.lo)
-        s, s_lo = fast_two_sum(s, plus(s_lo, t))
-        return Double(*fast_two_sum(s, plus(s_lo, t_lo)))
+        s, s_lo = fast_two_sum(s, s_lo + t)
+        return Double(*fast_two_sum(s, s_lo + t_lo))
 
     def __neg__(self) -> Double:
         return Double(-self.hi, -self.lo)
@@ -139,11 +89,13 @@ class Double:
         # ≤ 5u², and |lo| ≤ 3u |hi| for normalised factors: lo · lo and the last normalisation are left out.
         other = Double.of(other)
         p, e = two_prod(self.hi, other.hi)
-        return Double(p, fma(self.hi, other.lo, fma(self.lo, other.hi, e)))
+        if not self.is_plain:
+            e = dr.fma(self.lo, other.hi, e)
+        return Double(p, e if other.is_plain else dr.fma(self.hi, other.lo, e))
 
     def rounded(self) -> Any:
         """The nearest plain number."""
-        return plus(self.hi, self.lo)
+        return self.hi + self.lo
 
     def sqrt(self) -> Double:
         """√x for x ≥ 0; a finite number that means nothing for x < 0, and a finite derivative everywhere.
@@ -153,7 +105,7 @@ class Double:
         """
         inverse = dr.rsqrt(dr.select(self.hi > 0, self.hi, 1))
         root = self.hi * inverse
-        return Double(root, plus(dr.fma(-root, root, self.hi), self.lo) * (0.5 * inverse))
+        return Double(root, (dr.fma(-root, root, self.hi) + self.lo) * (0.5 * inverse))
 
 
 def select(mask: Any, x: Double, y: Double) -> Double:
@@ -163,7 +115,7 @@ def select(mask: Any, x: Double, y: Double) -> Double:
 def difference(x: Double, y: Double) -> Double:
     """x − y with an error ≤ 3u² (|x| + |y|): what cancels is not regained, for half the operations of `-`."""
     s, s_lo = two_sum(x.hi, -y.hi)
-    return Double(*fast_two_sum(s, plus(s_lo, plus(x.lo, -y.lo))))
+    return Double(*fast_two_sum(s, s_lo + (x.lo - y.lo)))
 
 
 def dot(x: Any, y: Any) -> Double:
@@ -180,7 +132,7 @@ def dot(x: Any, y: Any) -> Double:
     v, v0 = two_sum(e3, e4)
     t, t2 = two_sum(t, v)
     s, f = two_sum(s, t)
-    return Double(*fast_two_sum(s, plus(f, plus(plus(t0, t1), plus(t2, v0)))))
+    return Double(*fast_two_sum(s, f + ((t0 + t1) + (t2 + v0))))
 
 
 def cross(x: Any, y: Any) -> list[Double]:
@@ -195,26 +147,27 @@ def _exact_difference(x: Any, y: Any, z: Any, w: Any) -> Double:
     d, d_lo = two_sum(p, -q)
     e, e_lo = two_sum(p_lo, -q_lo)
     s, s_lo = two_sum(d, e)
-    return Double(*fast_two_sum(s, plus(s_lo, plus(d_lo, e_lo))))
+    return Double(*fast_two_sum(s, s_lo + (d_lo + e_lo)))
 
 
 def sum_of_squares(x: list[Double]) -> Double:
     """Σ xᵢ² of `Double`s: no term is negative, so plain accumulation of the low parts keeps a few u²."""
-    total: Any = 0
-    low: Any = 0
-    for x_i in x:
-        p, e = two_prod(x_i.hi, x_i.hi)
-        total, f = two_sum(total, p)
-        low = plus(low, plus(f, fma(times(2, x_i.hi), x_i.lo, e)))
+    total, low = two_prod(x[0].hi, x[0].hi)
+    for i, x_i in enumerate(x):
+        if i > 0:
+            p, e = two_prod(x_i.hi, x_i.hi)
+            total, f = two_sum(total, p)
+            low = low + (e + f)
+        if not x_i.is_plain:
+            low = dr.fma(2 * x_i.hi, x_i.lo, low)
     return Double(total, low)
 
 
 def defect(target: Double, *products: Pair) -> Any:
     """target − Σ xᵢ yᵢ as a plain number: error ≤ u · |result| + 8u² Σ|xᵢ yᵢ|, so small defects keep their digits."""
-    total: Any = 0
-    low: Any = 0
-    for x, y in products:
+    total, low = two_prod(*products[0])
+    for x, y in products[1:]:
         p, e = two_prod(x, y)
         total, f = two_sum(total, p)
-        low = plus(low, plus(e, f))
-    return plus(plus(target.hi, -total), plus(target.lo, -low))
+        low = low + (e + f)
+    return (target.hi - total) + (target.lo - low)

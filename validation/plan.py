@@ -30,7 +30,7 @@ class Profile:
 
 PROFILES = {
     "quick": Profile("quick", 4000, 150, 1 << 21, 7, 128, 16, 8, (1, 4, 16), False),
-    "full": Profile("full", 100_000, 1000, 1 << 22, 15, 256, 32, 12, (1, 4, 16, 64, 256), True),
+    "full": Profile("full", 100_000, 1000, 1 << 22, 15, 192, 32, 8, (1, 4, 16, 64), True),
 }
 # Where only scalar variants run, a render costs a hundred times as much.
 SCALAR_PROFILES = {
