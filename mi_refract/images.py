@@ -146,7 +146,8 @@ def load_scene(path: str | os.PathLike[str], defines: Mapping[str, str] | None =
     if taken := [name for name in LOADER_OPTIONS if name in defines]:
         raise ValueError(f"define {taken[0]!r}: taken by Mitsuba's loader; accepted: any name but {LOADER_OPTIONS}")
     try:
-        scene = mi.load_file(str(path), **cast(Any, defines))
+        # Not in parallel: emitters would come in the order in which threads finish, and a seed not mean a picture.
+        scene = mi.load_file(str(path), parallel=False, **cast(Any, defines))
     except Exception as error:  # RuntimeError from the parser; whatever a Python plugin raises
         raise ValueError(_naming(path, error)) from None
     if not isinstance(scene, mi.Scene):

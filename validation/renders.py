@@ -53,7 +53,8 @@ class Camera:
     def __init__(self, path: Path, plugin: str, resolution: int) -> None:
         import mitsuba as mi
 
-        self.scene = mi.load_file(str(path), bsdf=plugin, res=resolution)
+        # Not in parallel: emitters would come in the order in which threads finish, and seeds would not pair.
+        self.scene = mi.load_file(str(path), parallel=False, bsdf=plugin, res=resolution)
 
     def __call__(self, spp: int, seed: int) -> tuple[np.ndarray, float]:
         import mitsuba as mi
