@@ -15,7 +15,8 @@ import drjit as dr
 import mitsuba as mi
 
 from . import fresnel
-from .formulas import FORMULAS, resolve
+from .formulas import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, resolve
+from .numerics import quotient
 
 PLUGIN = "refract"
 LOBES = ("specular_reflectance", "specular_transmittance")  # tint of the reflected and of the transmitted lobe
@@ -29,7 +30,7 @@ class Side(NamedTuple):
 
 
 class Ray(NamedTuple):
-    """One refraction of `a` = −wi in the local frame: `eta` is n_to / n_from, `r` the unpolarised reflectance."""
+    """One refraction of `a` = −wi in the local frame: `eta` is n_to / n_from, `r` and `t` the unpolarised powers."""
 
     a: Any
     side: Side
@@ -39,12 +40,13 @@ class Ray(NamedTuple):
     cos_t: Any
     transmitted: Any
     r: Any
+    t: Any
 
 
 def read_ior(props: Any, name: str, default: str) -> float:
     """The index of refraction in double precision, from a number or a name of Mitsuba's table.
 
-    RuntimeError naming parameter, value and what is accepted, for anything but a positive finite number or a name.
+    ValueError naming parameter, value and what is accepted, for anything but a positive finite number or a name.
     """
     value = props.get(name, default)
     if isinstance(value, str):
@@ -52,6 +54,12 @@ def read_ior(props: Any, name: str, default: str) -> float:
     if isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < math.inf:
         return float(value)
     raise ValueError(f"{PLUGIN}: {name} = {value!r}: accepted: a positive finite number, or a material's name")
+
+
+def _checked(name: str, eta: float) -> float:
+    if not SMALLEST_RATIO <= eta <= LARGEST_RATIO:
+        raise ValueError(f"{PLUGIN}: {name} = {eta!r}: accepted: a ratio from {SMALLEST_RATIO} to {LARGEST_RATIO}")
+    return eta
 
 
 def _named_ior(name: str, material: str) -> float:
@@ -63,7 +71,7 @@ def _named_ior(name: str, material: str) -> float:
         known = str(error).partition("choices are:")[2] or "the names of Mitsuba's table"
         raise ValueError(f"{PLUGIN}: {name} = {material!r}: unknown material; accepted: {known.strip()}") from None
     # The table holds decimal numbers of at most seven digits in float32: the shortest decimal gives them back.
-    return float(str(dr.scalar.TensorXf([single]).numpy()[0]))
+    return float(f"{single:.7g}")
 
 
 # Dr.Jit's type stub says that it returns nothing.
@@ -82,6 +90,8 @@ def plugin_class(v: Any) -> type:
         def __init__(self, props: Any, formula: str = "auto") -> None:
             super().__init__(props)
             int_ior, ext_ior = read_ior(props, "int_ior", "bk7"), read_ior(props, "ext_ior", "air")
+            if formula != "auto" and "formula" in props:
+                raise ValueError(f"{PLUGIN}_{formula}: formula = {props['formula']!r}: accepted: nothing here")
             self.requested = props.get("formula", formula)
             try:
                 self.formula_name, self.formula = resolve(self.requested, dr.backend_v(v.Float))
@@ -91,7 +101,8 @@ def plugin_class(v: Any) -> type:
             # Scalar variants: Mitsuba can set an array of one number, but not a bare Python float.
             number = v.Float if dr.is_jit_v(v.Float) else dr.scalar.Array1f
             self.eta = number(int_ior / ext_ior)
-            self._face(int_ior / ext_ior, (int_ior - ext_ior) * (int_ior + ext_ior) / ext_ior**2)
+            eta = _checked("int_ior / ext_ior", int_ior / ext_ior)
+            self._face(eta, (int_ior - ext_ior) / ext_ior * (int_ior + ext_ior) / ext_ior)
             self.m_components = [reflection | both_sides, transmission | both_sides | flags.NonSymmetric]
             self.m_flags = self.m_components[0] | self.m_components[1]
 
@@ -100,9 +111,9 @@ def plugin_class(v: Any) -> type:
 
             Opaque, so that an edit changes the data of a kernel and not its code.
             """
-            self.outer = Side(v.Float(1 / eta), v.Float(-contrast / (eta * eta)))
-            self.inner = Side(v.Float(eta), v.Float(contrast))
-            dr.make_opaque(self.eta, *self.outer, *self.inner)
+            self.k_outer, self.contrast_outer = v.Float(1 / eta), v.Float(-contrast / (eta * eta))
+            self.k_inner, self.contrast_inner = v.Float(eta), v.Float(contrast)
+            dr.make_opaque(self.eta, self.k_outer, self.contrast_outer, self.k_inner, self.contrast_inner)
 
         def traverse(self, cb: Any) -> None:
             cb.put("eta", self.eta, mi.ParamFlags.Differentiable)
@@ -111,9 +122,12 @@ def plugin_class(v: Any) -> type:
 
         def parameters_changed(self, keys: Any) -> None:
             if not keys or "eta" in keys:
+                if len(self.eta) != 1:
+                    raise ValueError(f"{PLUGIN}: eta has {len(self.eta)} entries; accepted: one number")
                 wide: Any = dr.float64_array_t(v.Float)
                 # Only a derivative needs a kernel here; a number is read back, so that an edit compiles nothing.
-                eta = wide(self.eta) if dr.grad_enabled(self.eta) else float(self.eta[0])
+                number = _checked("eta", float(self.eta[0]))
+                eta = wide(self.eta) if dr.grad_enabled(self.eta) else number
                 self._face(eta, (eta - 1) * (eta + 1))
 
         def _eta(self) -> Any:
@@ -128,7 +142,7 @@ def plugin_class(v: Any) -> type:
             # r > 0: an index-matched boundary never reflects, not even the sample that is exactly 0.
             selected_r = ((sample1 <= ray.r) & (ray.r > 0) if both else v.Bool(has_r)) & active
             selected_t = (selected_r ^ True) & active
-            value = dr.select(selected_r, ray.r, 1 - ray.r)
+            value = dr.select(selected_r, ray.r, ray.t)
             bs.pdf = dr.detach(value) if both else 1
             bs.sampled_component = dr.select(selected_r, v.UInt32(0), v.UInt32(1))
             bs.sampled_type = dr.select(selected_r, v.UInt32(+reflection), v.UInt32(+transmission))
@@ -136,7 +150,9 @@ def plugin_class(v: Any) -> type:
             bs.eta = dr.select(selected_r, v.Float(1), ray.eta)
             factor = dr.select(selected_t, dr.square(ray.side.k), 1) if ctx.mode == mi.TransportMode.Radiance else 1
             if v.is_polarized:
-                weight = self._mueller(ctx, si, bs, ray, selected_r) * (factor / bs.pdf)
+                # Cosines below 1e-19 have squares of 0 in float32: such a lobe has no density and no weight.
+                scale = dr.select(bs.pdf > 0, quotient(factor, bs.pdf), 0)
+                weight = self._mueller(ctx, si, bs, ray, selected_r) * scale
             else:
                 weight = v.Spectrum(self._attached(value) * factor if both else value * factor)
             for name, texture in self.textures.items():
@@ -148,13 +164,15 @@ def plugin_class(v: Any) -> type:
         def _refract(self, wi: Any) -> Ray:
             """The ray's side, refracted direction and reflectance. The normal is a literal: Dr.Jit folds it away."""
             a, outside = -wi, wi.z >= 0
-            outer, inner = self.outer, self.inner
-            side = Side(dr.select(outside, outer.k, inner.k), dr.select(outside, outer.contrast, inner.contrast))
-            # Unchecked: the indices are positive and finite since the construction, and NaN stays NaN.
+            side = Side(
+                dr.select(outside, self.k_outer, self.k_inner),
+                dr.select(outside, self.contrast_outer, self.contrast_inner),
+            )
+            # Unchecked: the ratio is checked where it is set, and NaN stays NaN.
             wo, transmitted = self.formula.unchecked(a, v.Vector3f(0, 0, 1), side.k, side.contrast)
             cos_i, cos_t = dr.abs(wi.z), dr.abs(wo.z)
-            r = fresnel.reflectance(cos_i, cos_t, transmitted, side.k, side.contrast)
-            return Ray(a, side, wo, dr.select(outside, inner.k, outer.k), cos_i, cos_t, transmitted, r)
+            r, t = fresnel.powers(cos_i, cos_t, transmitted, side.k, side.contrast)
+            return Ray(a, side, wo, dr.select(outside, self.k_inner, self.k_outer), cos_i, cos_t, transmitted, r, t)
 
         @staticmethod
         def _attached(value: Any) -> Any:
@@ -217,7 +235,7 @@ def plugin_class(v: Any) -> type:
             chosen = f"{self.formula_name} (auto)" if self.requested == "auto" else self.formula_name
             lines = [f"eta = {dr.slice(self._eta())}", f"formula = {chosen}"]
             lines += [f"{name} = {texture}" for name, texture in self.textures.items()]
-            return "Refract[\n" + "".join(f"  {line},\n" for line in lines).replace("\n  ", "\n  ") + "]"
+            return "Refract[\n" + "".join("  " + line.replace("\n", "\n  ") + ",\n" for line in lines) + "]"
 
     return Refract
 

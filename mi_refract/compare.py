@@ -30,7 +30,7 @@ def paired(reference: np.ndarray, test: np.ndarray, threshold: float) -> Paired:
     if not finite.all():
         return Paired(changed, np.inf, np.inf, np.nan)
     return Paired(changed, float(difference.max()), float(np.sqrt(np.square(test - reference).mean())),
-                  float(test.mean() / reference.mean()))  # fmt: skip
+                  float(test.mean() / reference.mean()) if reference.any() else 1.0 + float(test.mean()))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,9 @@ class Welch:
 def welch(reference: np.ndarray, test: np.ndarray, tile: int, family_error: float, margin: float = 0.0) -> Welch:
     """Welch's t-test on tile means of two stacks of independent renders, (renders, height, width, channels).
 
-    Means that differ by no more than `margin`, relative, are equal for all practical purposes: the test asks
-    whether they differ by more. It keeps noise-free tiles from turning last bits into certainties.
+    Means that differ by no more than `margin`, relative to the tile's or to a thousandth of the picture's, are equal
+    for all practical purposes: the test asks whether they differ by more. It keeps noise-free tiles from turning last
+    bits into certainties.
 
     The variance of a tile mean is the sum of its pixels' variances over the renders, and its degrees of freedom
     follow Satterthwaite: pixels are independent under a box filter. ValueError for fewer than 2 renders a side.
@@ -68,8 +69,9 @@ def welch(reference: np.ndarray, test: np.ndarray, tile: int, family_error: floa
     variance = v1 + v2
     certain = variance == 0
     with np.errstate(divide="ignore", invalid="ignore"):
+        allowed = margin * np.maximum(np.abs(m1), 1e-3 * np.abs(m1).mean())
         freedom = np.where(certain, 1.0, variance**2 / (d1 + d2))
-        beyond = np.maximum(np.abs(m1 - m2) - margin * np.abs(m1), 0)
+        beyond = np.maximum(np.abs(m1 - m2) - allowed, 0)
         t = np.where(certain, np.where(beyond == 0, 0.0, np.inf), beyond / np.sqrt(variance))
     p = np.where(np.isfinite(m1) & np.isfinite(m2), 2 * stats.t.sf(t, freedom), 0.0)
     threshold = -np.expm1(np.log1p(-family_error) / p.size)  # Šidák

@@ -18,6 +18,16 @@ import drjit as dr
 Pair = tuple[Any, Any]
 
 
+def component_of(a: Any, k: Any) -> Any:
+    """The number `k` in the precision and backend of the components of the vector `a`, rounded once."""
+    component = dr.value_t(type(a))
+    if not dr.is_array_v(k):
+        k = float(k)
+    if component is float and dr.type_v(a) == dr.VarType.Float32:
+        return dr.scalar.Array1f(k)[0]
+    return component(k)
+
+
 def quotient(x: Any, y: Any) -> Any:
     """x / y by the rules of IEEE 754 on every backend; a Python float would raise where y is 0."""
     if isinstance(y, float) and y == 0:
@@ -48,8 +58,9 @@ def two_prod(x: Any, y: Any) -> Pair:
 class Double:
     """A number of twice the working precision, as the unevaluated sum hi + lo, |lo| ≤ 8u |hi|.
 
-    Supports what a formula needs: + − × with another `Double` or a plain number, negation and `sqrt`.
-    Relative error of each operation ≤ 5u² (addition included, whatever cancels).
+    Supports what a formula needs: + − × with another `Double` or a plain number, negation and `sqrt`. Relative error
+    for normalised operands, |lo| ≤ u |hi|: + − ≤ 3u² whatever cancels, × ≤ 5u², √ ≤ 16u²; for others + − ≤ 10u²,
+    × ≤ 90u².
     """
 
     hi: Any
@@ -70,7 +81,7 @@ class Double:
         return x if isinstance(x, Double) else Double(x)
 
     def __add__(self, other: Any) -> Double:
-        # AccurateDWPlusDW: ≤ 3u² + 13u³, also where the high parts cancel.
+        # AccurateDWPlusDW, also right where the high parts cancel.
         other = Double.of(other)
         s, s_lo = two_sum(self.hi, other.hi)
         if other.is_plain:
@@ -86,7 +97,7 @@ class Double:
         return self + -Double.of(other)
 
     def __mul__(self, other: Any) -> Double:
-        # ≤ 5u², and |lo| ≤ 3u |hi| for normalised factors: lo · lo and the last normalisation are left out.
+        # lo · lo and the last normalisation are left out: |lo| ≤ 3u |hi| for normalised factors.
         other = Double.of(other)
         p, e = two_prod(self.hi, other.hi)
         if not self.is_plain:
@@ -113,7 +124,7 @@ def select(mask: Any, x: Double, y: Double) -> Double:
 
 
 def difference(x: Double, y: Double) -> Double:
-    """x − y with an error ≤ 3u² (|x| + |y|): what cancels is not regained, for half the operations of `-`."""
+    """x − y with an error ≤ 8u² (|x| + |y|): what cancels is not regained, for half the operations of `-`."""
     s, s_lo = two_sum(x.hi, -y.hi)
     return Double(*fast_two_sum(s, s_lo + (x.lo - y.lo)))
 

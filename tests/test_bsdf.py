@@ -250,6 +250,47 @@ def test_bad_parameters_are_named_with_what_is_accepted(each_variant, parameters
     assert words in str(error.value).replace("\n", " ")
 
 
+@pytest.mark.parametrize(
+    ("int_ior", "ext_ior"), [(1e300, 1), (1e-50, 1), (1e200, 1e-200), (1e-320, 1)]
+)
+def test_indices_whose_ratio_is_beyond_float32_are_refused(each_variant, int_ior, ext_ior):
+    with pytest.raises(RuntimeError, match=r"int_ior / ext_ior = .*: accepted: a ratio from"):
+        load(int_ior=int_ior, ext_ior=ext_ior)
+
+
+@pytest.mark.parametrize("eta", [0.0, -1.5, math.nan, math.inf])
+def test_an_edit_that_is_no_index_is_refused(each_variant, eta):
+    params = mi.traverse(load())
+    params["eta"] = eta
+    with pytest.raises((ValueError, RuntimeError), match="eta = "):
+        params.update()
+
+
+@pytest.mark.parametrize("z", [0.0, 1e-30, 1e-12, 1e-7, 1e-4])
+@pytest.mark.parametrize("int_ior", [1.3, 1.5])
+def test_weights_and_densities_are_probabilities_down_to_grazing_incidence(each_variant, z, int_ior):
+    bsdf = load(int_ior=int_ior, ext_ior=1.3)
+    for component in (BOTH, REFLECTION, TRANSMISSION):
+        bs, weight = sample(bsdf, (math.sqrt(1 - z * z), 0, z), 0.999, "Importance", component)
+        assert 0 <= number(bs.pdf) <= 1
+        assert (weight >= 0).all()
+        assert (weight <= 1 + 1e-6).all()
+
+
+@pytest.mark.parametrize("z", [0.9, 0.3, -0.9, -0.6, -0.2])
+@pytest.mark.parametrize("sample1", [0.0, 0.999])
+def test_mueller_matrices_are_those_of_the_built_in(each_variant, z, sample1):
+    if not mi.is_polarized:
+        pytest.skip(f"{each_variant}: not polarised")
+    ours, theirs = load(), mi.load_dict({"type": "dielectric"})
+    for mode in ("Radiance", "Importance"):
+        wi = 0.6 * math.sqrt(1 - z * z), 0.8 * math.sqrt(1 - z * z), z
+        context = mi.BSDFContext(getattr(mi.TransportMode, mode))
+        x, y = (np.array(b.sample(context, interaction(wi), sample1, [0, 0])[1]) for b in (ours, theirs))
+        assert x == pytest.approx(y, abs=3e-6)
+        assert np.abs(y).max() > 0.1
+
+
 # Kernels and gradients -----------------------------------------------------------------------------------------
 
 
@@ -317,3 +358,16 @@ def test_gradient_of_a_picture_in_the_index_matches_a_finite_difference(jit):
         means.append(number(mean(8192, 2)))
     # The paths' noise is under 2 % of the slope; a detached direction or lobe gives five times it.
     assert gradient == pytest.approx((means[1] - means[0]) / 0.1, rel=0.08)
+
+
+def test_a_scene_can_be_frozen(jit):
+    scene = ball("path", int_ior=1.5, ext_ior=1)
+    params = mi.traverse(scene)
+
+    @dr.freeze
+    def picture(params, seed):
+        return mi.render(scene, params, spp=4, seed=seed)
+
+    plain = np.array(mi.render(scene, spp=4, seed=mi.UInt32(3)))
+    assert np.array(picture(params, mi.UInt32(2))).shape == plain.shape
+    assert np.array(picture(params, mi.UInt32(3))) == pytest.approx(plain)

@@ -67,6 +67,18 @@ def test_the_edge_that_fills_no_tile_is_tested_too():
     assert welch(reference, test, 16, 1e-3).alarms == 3
 
 
+def test_black_equals_black_and_a_dark_tile_has_a_floor():
+    black = np.zeros(SHAPE)
+    assert paired(black, black, 1e-5).mean_ratio == 1
+    stack = np.ones((4, *SHAPE))
+    stack[:, :16, :16] = 0
+    other = stack.copy()
+    other[:, :16, :16] = 1e-9
+    assert welch(stack, other, 16, 1e-3, margin=1e-5).alarms == 0
+    other[:, :16, :16] = 1e-6
+    assert welch(stack, other, 16, 1e-3, margin=1e-5).alarms == 3
+
+
 def test_tiles_without_noise_are_counted_and_compared_within_the_margin():
     reference = np.ones((4, *SHAPE))
     last_bits, off = reference * (1 + 1e-7), reference * (1 + 1e-4)

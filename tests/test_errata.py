@@ -47,14 +47,17 @@ def test_004_divides_by_zero_along_the_boundary():
 
 
 def test_004_loses_the_axis_component_to_sign_of_zero():
-    """sign(0) · √(1 − X²) drops the whole normal component where the document's sign(…) meets a zero."""
-    assert np.sign(0.0) * math.sqrt(1 - 0.0) == 0
-    b, transmitted = refract_2d((1.0, 0.0), (0.0, 1.0), 0.75)
-    assert (numbers(b), transmitted) == ([1.0, 0.0], True)
+    """Along the boundary i_Bα = 0: the printed (sign(i_Bα) √(1 − X²), sign(i_Bβ) X) is (0, k), shorter than i."""
+    k, i_b = 0.75, (0.0, 1.0)
+    x = k * abs(i_b[1]) / math.hypot(*i_b)
+    printed = np.sign(i_b[0]) * math.sqrt(1 - x * x), np.sign(i_b[1]) * x
+    assert math.hypot(*printed) == k
+    b, _ = refract_2d(i_b, (0.0, 1.0), k)
+    assert math.hypot(*numbers(b)) == 1
 
 
 def test_004_excludes_indices_below_one_that_exist():
-    """A plasma: from vacuum into n = 0.9, k = 1/0.9, at 60° beyond and at 30° within the critical angle."""
+    """Plasmas: from vacuum into n = 0.9, 30° is within the critical angle; into n = 0.75, 60° is beyond it."""
     for name, formula in FORMULAS.items():
         b, transmitted = formula(Vector(0.5, 0, -math.sqrt(0.75)), Vector(0, 0, 1), 1 / 0.9)
         assert transmitted, name

@@ -9,10 +9,10 @@ import pytest
 from mi_refract import oracle, reflect, reflect_sandwich, refract_2d
 from mi_refract.formulas import FORMULAS
 from mi_refract.regimes import REGIMES, Rays, make
-from validation.directions import errors, evaluate
+from validation.directions import _radicand, errors, evaluate
 
 COUNTS = {"scalar": 25, "llvm": 4000, "cuda": 4000}
-EXACT = [name for name, formula in FORMULAS.items() if formula.exact_decision]
+EXACT = [name for name, formula in FORMULAS.items() if formula.takes_contrast]
 Z = [0.0, 0.0, 1.0]
 
 
@@ -30,22 +30,33 @@ def certified():
     return ask
 
 
-def worst(formula, rays, exact, setting):
-    """(worst chord error in u over rays judged rightly, rays misjudged)."""
+def worst(formula, rays, exact, setting, margin=0.0):
+    """(worst chord error in u over rays judged rightly, rays misjudged whose radicand exceeds `margin`)."""
     b, transmitted = evaluate(formula, rays, setting.vector)
     right = transmitted == exact.transmitted
     chord, _, _ = errors(b, rays, exact)
-    return chord[right].max() / setting.roundoff, int((~right).sum())
+    return chord[right].max() / setting.roundoff, int((~right & (_radicand(rays) > margin)).sum())
 
 
 @pytest.mark.parametrize("regime", REGIMES)
 @pytest.mark.parametrize("name", FORMULAS)
 def test_within_its_budget_in_every_regime(name, regime, setting, certified):
     rays, exact = certified(regime, COUNTS[setting.backend], setting.precision)
-    error, misjudged = worst(FORMULAS[name], rays, exact, setting)
-    u = setting.roundoff
-    assert error <= FORMULAS[name].budget(u, REGIMES[regime].largest_k) / u
-    assert misjudged == 0 or not FORMULAS[name].exact_decision
+    u, budget, largest_k = setting.roundoff, FORMULAS[name].budget, REGIMES[regime].largest_k
+    error, misjudged = worst(FORMULAS[name], rays, exact, setting, budget.margin(u, largest_k))
+    assert error <= budget.chord(u, largest_k) / u
+    assert misjudged == 0
+
+
+@pytest.mark.parametrize("constant", [False, True])
+@pytest.mark.parametrize("name", FORMULAS)
+def test_a_decision_that_is_always_the_same_is_seen(name, constant, setting, certified):
+    def stuck(a, n, k):
+        b, _ = FORMULAS["promoted"](a, n, k)
+        return (b, b[0] == b[0]) if constant else (reflect(a, n), b[0] != b[0])
+
+    rays, exact = certified("generic", COUNTS[setting.backend], setting.precision)
+    assert worst(stuck, rays, exact, setting, FORMULAS[name].budget.margin(setting.roundoff, 1.5))[1] > 0
 
 
 # Mutants: each is a slip one makes, and the check above must see it -------------------------------------------
@@ -91,7 +102,7 @@ def test_mutants_break_the_budget_of_the_exact_formulas(mutant, regime, setting,
     rays, exact = certified(regime, COUNTS[setting.backend], setting.precision)
     error, misjudged = worst(mutant, rays, exact, setting)
     u = setting.roundoff
-    assert error > FORMULAS["promoted"].budget(u, REGIMES[regime].largest_k) / u or misjudged > 0
+    assert error > FORMULAS["promoted"].budget.chord(u, REGIMES[regime].largest_k) / u or misjudged > 0
 
 
 # Edges ---------------------------------------------------------------------------------------------------------
@@ -193,12 +204,32 @@ def test_a_known_contrast_is_used_where_the_ratio_has_lost_it(name, setting):
         ((0.6, 0, -0.8), Z, -1.5),
         ((0.6, 0, -0.8), Z, math.nan),
         ((0.6, 0, -0.8), Z, math.inf),
+        ((0.6, 0, -0.8), Z, 1e300),
+        ((0.6, 0, -0.8), Z, 1e-300),
     ],
 )
 def test_what_is_no_refraction_gives_nan_and_false(name, a, n, k, setting):
     b, transmitted = one(setting, FORMULAS[name], a, n, k)
     assert np.isnan(b).all()
     assert not transmitted
+
+
+@pytest.mark.parametrize("name", EXACT)
+@pytest.mark.parametrize("contrast", [math.nan, math.inf, -1.0, -2.0])
+def test_a_contrast_that_is_none_gives_nan_and_false(name, contrast, setting):
+    b, transmitted = one(setting, FORMULAS[name], (0.6, 0, -0.8), Z, 0.7, contrast=contrast)
+    assert np.isnan(b).all()
+    assert not transmitted
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_numbers_of_numpy_and_vectors_of_another_precision_are_taken(name, setting):
+    other = getattr(getattr(dr, setting.backend), "Array3f64" if setting.precision is np.float32 else "Array3f")
+    a = setting.vector(0.6, 0, -0.8)
+    b, transmitted = FORMULAS[name](a, other(0, 0, 1), np.float32(0.75))
+    assert type(b) is setting.vector
+    assert np.array(transmitted).all()
+    assert np.array(b).ravel()[0] == pytest.approx(0.45)
 
 
 # Reflection, the plane, derivatives ----------------------------------------------------------------------------
@@ -254,3 +285,31 @@ def test_derivative_is_finite_where_the_ray_is_reflected(name, vectorised):
     dr.forward(k)
     assert not np.array(transmitted).any()
     assert np.array(dr.grad(b)).ravel().tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+@pytest.mark.parametrize("opaque", [False, True])
+def test_derivative_in_the_normal_survives_a_literal(name, opaque, vectorised):
+    vector = dr.diff_array_t(vectorised.vector)
+    n = vector(0, 0, 1)
+    if opaque:
+        dr.make_opaque(n)
+    dr.enable_grad(n)
+    b, _ = FORMULAS[name](vector(0.6, 0, -0.8), n, 0.75)
+    dr.backward(b.x)
+    # ∂b_x/∂n_x = −(k cos θ_i − cos θ_t), by the formula b = k a + n (…) at n = z
+    expected = 0.75 * 0.8 - math.sqrt(1 - 0.45**2)
+    assert np.array(dr.grad(n)).ravel()[0] == pytest.approx(expected, abs=40 * vectorised.roundoff)
+
+
+@pytest.mark.parametrize("name", EXACT)
+@pytest.mark.parametrize("opaque", [False, True])
+def test_derivative_at_a_matched_boundary_is_not_that_of_the_identity(name, opaque, vectorised):
+    vector = dr.diff_array_t(vectorised.vector)
+    n, k = vector(0, 0, 1), dr.value_t(vector)(1.0)
+    if opaque:
+        dr.make_opaque(n)
+    dr.enable_grad(k)
+    b, _ = FORMULAS[name](vector(0.6, 0, -0.8), n, k)
+    dr.forward(k)
+    assert np.array(dr.grad(b)).ravel() == pytest.approx([0.6, 0, 0.36 / 0.8], abs=40 * vectorised.roundoff)
