@@ -226,6 +226,7 @@ def version(distribution: str) -> str:
 def _naming(path: str | os.PathLike[str], error: Exception) -> str:
     """One line that names the file; without the place in Mitsuba's source."""
     text = re.sub(r"\[\w+\.(cpp|h):\d+\] ", "", _one_line(str(error)))
+    text = re.sub(r"Traceback \(most recent call last\):.* (\w+Error: )", "", text)
     return text if str(path) in text else f"{path}: {text}"
 
 

@@ -5,7 +5,7 @@ Everything here lays out what the rows already say; nothing is measured, average
 `context` is what all rows share. Every entry is shown as it is, except four that steer the page:
 
 - `title`: the page's name;
-- `studies`: {study: {"title", "text", "error", "slope"}}, all optional: heading and introduction of a study,
+- `studies`: {study: {"title", "text", "terms", "error", "slope"}}, all optional: heading and introduction of a study,
   the name of the error in its curves (default relMSE) and the slope of their guide (default −1, since relMSE
   is a variance);
 - `scatter`: [{"study", "x", "y", "title"}]: plots of one metric against another, a panel per setting;
@@ -172,21 +172,20 @@ def _xml(text: Any) -> str:
 
 
 def summary(rows: Sequence[Row]) -> RenderableType:
-    """Broken budgets first, then verdicts by study, then the sentence, for rich's console."""
+    """Broken budgets and missed goals first, then verdicts by study, then the sentence, for rich's console."""
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
-    broken = [(row, metric) for row in rows for metric in row.broken]
+    broken, missed = ([(row, m) for row in rows for m in getattr(row, kind)] for kind in ("broken", "missed"))
     parts: list[RenderableType] = []
-    if broken:
-        table = Table("broken budget", "metric", box=None, title_justify="left", pad_edge=False)
-        table.add_column("value", justify="right", style="bold red")
-        table.add_column("budget", justify="right")
-        for row, metric in broken:
-            texts = apart(row.values[metric], row.budgets[metric])
-            table.add_row(Text(row.name), Text(metric), *texts)
-        parts += [table, Text()]
+    for heading, exceeded, style in (("broken budget", broken, "bold red"), ("missed goal", missed, "yellow")):
+        table = Table(heading, "metric", box=None, title_justify="left", pad_edge=False)
+        table.add_column("value", justify="right", style=style)
+        table.add_column("bound", justify="right")
+        for row, metric in exceeded:
+            table.add_row(Text(row.name), Text(metric), *apart(row.values[metric], row.bounds[metric]))
+        parts += [table, Text()] if exceeded else []
     counts = Table("study", box=None, pad_edge=False)
     for word in VERDICTS:
         counts.add_column(word, justify="right")
@@ -263,7 +262,7 @@ def _study(name: str, rows: list[Row], context: Mapping[str, Any], pictures: Pic
     return {
         "key": key,
         "title": about.get("title", name),
-        "text": about.get("text", ""),
+        "text": about.get("text", ""), "terms": about.get("terms", {}),
         "failures": sum(row.verdict == "fail" for row in rows),
         "scale": (scale := _scale(rows, metrics)),
         "panels": _panels(rows, metrics, scale),

@@ -119,7 +119,10 @@ def test_an_interrupted_run_goes_on_where_it_stopped(context):
 
 
 def study(*rows):
-    return types.SimpleNamespace(TITLE="A study", TEXT="", tasks=lambda context: [Task("a task", lambda: list(rows))])
+    def tasks(context):
+        return [Task("a task", lambda: list(rows))]
+
+    return types.SimpleNamespace(TITLE="A study", TEXT="", TERMS={}, tasks=tasks)
 
 
 @pytest.mark.parametrize(("budget", "code"), [(1.0, 0), (0.4, 1), (float("nan"), 1)])

@@ -22,11 +22,15 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         _check(options)
+    except (ValueError, OSError) as error:
+        print(f"validation: {error}", file=sys.stderr)
+        return 2
+    try:
         return _run(options)
     except KeyboardInterrupt:
         print("validation: interrupted; the same command goes on from here", file=sys.stderr)
         return 130
-    except (ValueError, OSError, ImportError) as error:
+    except (OSError, ImportError) as error:  # anything else is a defect of ours, and keeps its traceback
         print(f"validation: {error}", file=sys.stderr)
         return 2
 
@@ -39,7 +43,7 @@ class _OneLine(argparse.ArgumentParser):
 def _parser() -> argparse.ArgumentParser:
     parser = _OneLine(prog="validation", description="Measure the formulas and the plugin; write the report.")
     parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"of {', '.join(STUDIES)}; all by default")
-    parser.add_argument("--profile", default="quick", choices=("quick", "full"))
+    parser.add_argument("--profile", default="quick", choices=("quick", "full"), help="a minute, or half an hour")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder of the report (default: out)")
     parser.add_argument("--readme", type=Path, help="write the tables and the gallery of this Markdown file, too")
     return parser
@@ -49,7 +53,10 @@ def _check(options: argparse.Namespace) -> None:
     unknown = [name for name in options.studies if name not in STUDIES]
     if unknown:
         raise ValueError(f"unknown study {unknown[0]!r}; accepted: {', '.join(STUDIES)}")
-    options.out.mkdir(parents=True, exist_ok=True)
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(f"--out {options.out}: {error.strerror}; accepted: a writable folder") from None
     if not os.access(options.out, os.W_OK):
         raise PermissionError(f"{options.out}: not writable")
 
@@ -70,7 +77,8 @@ def _run(options: argparse.Namespace) -> int:
     rows = runner.run([task for study in studies.values() for task in study.tasks(context)], context)
     described = runner.describe(context, time.perf_counter() - start)
     described["studies"] = {
-        name: {"title": study.TITLE, "text": " ".join(study.TEXT.split())} for name, study in studies.items()
+        name: {"title": study.TITLE, "text": " ".join(study.TEXT.split()), "terms": study.TERMS}
+        for name, study in studies.items()
     }
     described["scatter"] = [scatter for study in studies.values() for scatter in getattr(study, "SCATTER", [])]
     report.write_json(options.out / "rows.json", rows, described)

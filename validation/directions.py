@@ -25,6 +25,18 @@ from .plan import Context, Task
 
 TITLE = "Directions"
 TEXT = __doc__.partition("\n")[2].strip()
+TERMS = (
+    {name: f"{formula.equation} (source: {formula.source})" for name, formula in FORMULAS.items()}
+    | {name: regime.text for name, regime in regimes.REGIMES.items()}
+    | {
+        "worst / u": "the largest chord error in units of roundoff; rounding the exact answer costs 0.87",
+        "misjudged": "rays whose total internal reflection was decided wrongly",
+        "misjudged far": "those of them that are farther from the critical angle than the formula's own error",
+        "length drift": "how far the length of b is from that of a, relative",
+        "time / copy": "median time of a ray over that of copying its bytes, streaming; below 1 it is noise",
+        "operations": "Dr.Jit's count for the whole kernel",
+    }
+)
 SCATTER = [
     {"study": "directions", "x": "time / copy", "y": "worst / u", "title": "Worst error against time per ray"},
 ]

@@ -24,6 +24,13 @@ from mi_refract.rows import Row
 from .plan import SCENES, Context, Profile, Task
 
 TITLE = "Renders"
+TERMS = {
+    "reference, test, difference": "dielectric, refract, refract − dielectric: means over the same seeds",
+    "changed share": "pixels of which any channel differs by more than 1e-5, same seeds",
+    "Welch alarms": "tiles and channels whose means differ, independent seeds; at most one picture in 1000 by chance",
+    "detectable difference": "relative difference of a tile's mean that would have been an alarm, median over tiles",
+    "time / dielectric": "median over alternating warm renders; a goal, not a budget, because a busy machine spoils it",
+}
 SCATTER: list[dict[str, str]] = []
 TEXT = __doc__.partition("\n")[2].strip()
 BUILTIN = "dielectric"

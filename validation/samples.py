@@ -19,6 +19,10 @@ from .plan import Context, Task
 
 TITLE = "Samples"
 TEXT = __doc__.partition("\n")[2].strip()
+TERMS = {
+    "lobe flips": "rays for which the two plugins chose different lobes",
+    "wo, pdf, eta, weight": "entries of the sample: worst, and what 99 rays of 100 stay below",
+}
 SEED = 2027
 INT_IOR, EXT_IOR = 1.5, 1.0
 LOBES = {"both lobes": 0xFFFFFFFF, "reflection": 0, "transmission": 1}
