@@ -264,13 +264,20 @@ def test_doctor_where_nothing_runs(monkeypatch, capfd):
     assert capfd.readouterr().err == "mi-refract: no variant of Mitsuba runs here; accepted: at least one\n"
 
 
-@pytest.mark.parametrize("arguments", [[], ["nonesuch"], ["render"], ["doctor", "extra"]])
+@pytest.mark.parametrize("arguments", [["nonesuch"], ["render"], ["doctor", "extra"]])
 def test_bad_command(arguments, capfd):
     assert cli.main(arguments) == 2
     out, err = capfd.readouterr()
     assert out == ""
     assert err.startswith("mi-refract: ")
     assert err.count("\n") == 1
+
+
+def test_without_a_command_the_help_is_printed_and_with_version_the_version(capfd):
+    assert cli.main([]) == 2
+    assert "doctor" in capfd.readouterr().out
+    assert cli.main(["--version"]) == 0
+    assert capfd.readouterr().out == f"{cli.__version__}\n"
 
 
 def test_without_the_extra():
