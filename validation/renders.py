@@ -101,13 +101,14 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
 def _rounds(profile: Profile, cameras: list[Camera]) -> tuple[np.ndarray, np.ndarray, list[float]]:
     """Pictures of the first and of the second camera, seed by seed, and the ratios of their times.
 
-    Times are taken for a second longer than the pictures need: quick scenes are the noisiest to time.
+    Times are taken for two seconds at least: quick scenes are the noisiest to time.
     """
     for camera in cameras:
         camera(profile.spp, seed=0)  # compiles
+    end = time.perf_counter() + 2.0
     rounds = [[camera(profile.spp, seed) for camera in cameras] for seed in range(profile.pairs)]
     first, second = (np.stack([each[i][0] for each in rounds]) for i in range(2))
-    ratios, end = [ours[1] / theirs[1] for ours, theirs in rounds], time.perf_counter() + 1.0
+    ratios = [ours[1] / theirs[1] for ours, theirs in rounds]
     while time.perf_counter() < end:
         ours, theirs = (camera(profile.spp, seed=0)[1] for camera in cameras)
         ratios.append(ours / theirs)
