@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 
 Metadata = dict[str, Any]
 LOADER_OPTIONS = ("path", "parallel", "optimize")  # mi.load_file would take these names for its own
+# Merged meshes come in the order of their addresses, and parallel loading in that of its threads. Then so do emitters,
+# and a seed no longer means a picture.
+REPRODUCIBLE: Any = {"parallel": False, "optimize": False}
 
 
 def write_exr(
@@ -146,8 +149,7 @@ def load_scene(path: str | os.PathLike[str], defines: Mapping[str, str] | None =
     if taken := [name for name in LOADER_OPTIONS if name in defines]:
         raise ValueError(f"define {taken[0]!r}: taken by Mitsuba's loader; accepted: any name but {LOADER_OPTIONS}")
     try:
-        # Not in parallel: emitters would come in the order in which threads finish, and a seed not mean a picture.
-        scene = mi.load_file(str(path), parallel=False, **cast(Any, defines))
+        scene = mi.load_file(str(path), **REPRODUCIBLE, **cast(Any, defines))
     except Exception as error:  # RuntimeError from the parser; whatever a Python plugin raises
         raise ValueError(_naming(path, error)) from None
     if not isinstance(scene, mi.Scene):

@@ -60,8 +60,7 @@ class Camera:
     def __init__(self, path: Path, plugin: str, resolution: int) -> None:
         import mitsuba as mi
 
-        # Not in parallel: emitters would come in the order in which threads finish, and seeds would not pair.
-        self.scene = mi.load_file(str(path), parallel=False, bsdf=plugin, res=resolution)
+        self.scene = mi.load_file(str(path), **images.REPRODUCIBLE, bsdf=plugin, res=resolution)
 
     def __call__(self, spp: int, seed: int) -> tuple[np.ndarray, float]:
         import mitsuba as mi
