@@ -151,7 +151,9 @@ def refract_rotated(a: Any, n: Any, k: Any) -> Refracted:
     tangent = a - n * c
     sine = dr.norm(tangent)
     (b_n, b_t), transmitted = refract_2d((c, sine), (0, 1), k)
-    b = n * b_n + tangent * dr.select(sine > 0, quotient(b_t, sine), 0)
+    # Where the tangent is 0 its factor is the limit k, for the derivative's sake.
+    factor = dr.select(sine > 0, quotient(b_t, sine), dr.select(transmitted, k, 1))
+    b = n * b_n + tangent * factor
     return _conclude(a, n, c, dr.select(transmitted, 1, -1), b)
 
 

@@ -288,6 +288,16 @@ def test_derivative_is_finite_where_the_ray_is_reflected(name, vectorised):
 
 
 @pytest.mark.parametrize("name", FORMULAS)
+def test_derivative_in_the_direction_at_normal_incidence_is_the_ratio(name, vectorised):
+    vector = dr.diff_array_t(vectorised.vector)
+    a = vector(0, 0, -1)
+    dr.enable_grad(a)
+    b, _ = FORMULAS[name](a, vector(0, 0, 1), 0.75)
+    dr.backward(b.x)
+    assert np.array(dr.grad(a)).ravel().tolist() == pytest.approx([0.75, 0, 0], abs=8 * vectorised.roundoff)
+
+
+@pytest.mark.parametrize("name", FORMULAS)
 @pytest.mark.parametrize("opaque", [False, True])
 def test_derivative_in_the_normal_survives_a_literal(name, opaque, vectorised):
     vector = dr.diff_array_t(vectorised.vector)
