@@ -1,0 +1,262 @@
+"""Chains of plane boundaries with closed answers: the layers of a mirage, and the walls of a light pipe.
+
+Everything exact is in extended precision. With c = cos θ₀, s = sin θ₀ and κ_j = (n_0/n_j)² − 1, n sin θ is conserved:
+
+    cos²θ_j = c² − κ_j s²;   the ray turns back at the first boundary whose far side has κ_j > c²/s²
+    ∂(cos θ_e)/cos θ_e = Σ (n_i/n_e)² (cos θ_i / cos²θ_e) ε_i     ε_i: error of the direction in layer i, in radians
+    ∂(cos θ_e)/cos θ_e = tan²θ_e Σ δ_i                             δ_i: relative error of the ratio at boundary i
+
+A ray that turns leaves through the top with the cosine it came with: there e = 0, and the sums go down and up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from .directions import Setting
+
+Array = NDArray[Any]
+Subject = Callable[..., tuple[Any, Any]]
+
+TOP = 1.0003  # the index of the coldest air
+MIRAGE = 3e-5  # what it loses down to the road
+EXACT_RATIO = 2.0**-23  # 1 + this is the first float32 after 1
+FEEDS = ("ratios", "indices", "contrasts")
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Boundaries 0 … count − 1, each met after the one before, as a formula is told of them.
+
+    `normals` (rays or 1, count or 1, 3). `k` (2 count): n_from/n_to on the way down, then on the way up. `contrasts`:
+    k² − 1 likewise, or None. `turns`: a mirrored ray goes back up; else it goes on, as between the walls of a pipe.
+    """
+
+    normals: Array
+    k: Array
+    contrasts: Array | None = None
+    turns: bool = True
+
+    @property
+    def count(self) -> int:
+        return len(self.k) // 2
+
+
+@dataclass(frozen=True)
+class Carried:
+    """Where the rays are in the end: `b` (N, 3), extended precision; `place` (N,) the boundary they would meet next,
+    −1 above the top; `passed` (N,) how often they were transmitted."""
+
+    b: Array
+    place: Array
+    passed: Array
+
+
+def carry(subject: Subject, chain: Chain, a: Array, stop: Array, setting: Setting) -> Carried:
+    """Rays `a` (N, 3) from the top to boundary `stop` (N,), or back out of the top, by one formula; one launch."""
+    if dr.is_jit_v(setting.vector):
+        return _compiled(subject, chain, a, stop, setting)
+    parts = [_scalar(subject, chain, ray, a, int(stop[ray]), setting) for ray in range(len(a))]
+    b, place, passed = zip(*parts, strict=True)
+    return Carried(np.array([list(x) for x in b], np.longdouble), np.array(place), np.array(passed))
+
+
+def _follow(subject: Subject, boundary: Callable[..., tuple], turns: Any, stop: Any, start: tuple) -> tuple:
+    """The loop both kinds of arrays share: (a, place, way ±1, passed, steps left) until the ray is out or at `stop`."""
+
+    def inside(a: Any, place: Any, way: Any, passed: Any, left: Any) -> Any:
+        return (place >= 0) & (place < stop) & (left > 0)
+
+    def step(a: Any, place: Any, way: Any, passed: Any, left: Any) -> tuple:
+        b, transmitted = subject(a, *boundary(place, way))
+        way = dr.select(turns, dr.select(transmitted, way, -way), way)
+        return type(a)(b), place + way, way, passed + dr.select(transmitted, 1, 0), left - 1
+
+    return dr.while_loop(start, inside, step)
+
+
+def _compiled(subject: Subject, chain: Chain, a: Array, stop: Array, setting: Setting) -> Carried:
+    """Everything that tells one chain from another is data, so that each formula is compiled once."""
+    vector, number = setting.vector, dr.value_t(setting.vector)
+    integer: Any = dr.int32_array_t(number)
+    rows, columns, _ = chain.normals.shape
+    normals, k = (number(x.astype(setting.precision).ravel()) for x in (chain.normals, chain.k))
+    wide: Any = dr.float64_array_t(number)
+    contrasts = None if chain.contrasts is None else wide(chain.contrasts.astype(np.float64))
+    count, stride = dr.opaque(integer, chain.count), dr.opaque(integer, int(columns > 1))
+    first = integer((np.arange(len(a)) * (columns if rows > 1 else 0)).astype(np.int32))
+
+    def boundary(place: Any, way: Any) -> tuple:
+        here = dr.select(way > 0, place, place + count)
+        known = () if contrasts is None else (dr.gather(wide, contrasts, here),)
+        return dr.gather(vector, normals, first + stride * place), dr.gather(number, k, here), *known
+
+    def detached(*given: Any) -> tuple:
+        # Mitsuba's functions return arrays that carry derivatives, and the state of the loop must keep its type.
+        return dr.detach(subject(*given), preserve_type=False)
+
+    start = (vector(a.astype(setting.precision).T), *(dr.full(integer, x, len(a)) for x in (0, 1, 0)))
+    turns = dr.opaque(dr.mask_t(integer), chain.turns)
+    limit = dr.full(integer, 2 * chain.count + 2, len(a))
+    b, place, _, passed, _ = _follow(detached, boundary, turns, integer(stop.astype(np.int32)), (*start, limit))
+    return Carried(np.array(b).T.astype(np.longdouble), np.array(place), np.array(passed))
+
+
+def _scalar(subject: Subject, chain: Chain, ray: int, a: Array, stop: int, setting: Setting) -> tuple:
+    rows, columns, _ = chain.normals.shape
+    normals = [setting.vector(n) for n in chain.normals[ray if rows > 1 else 0].astype(setting.precision)]
+    k = chain.k.astype(setting.precision).tolist()
+    contrasts = None if chain.contrasts is None else chain.contrasts.astype(np.float64).tolist()
+
+    def boundary(place: int, way: int) -> tuple:
+        here = place if way > 0 else place + chain.count
+        known = () if contrasts is None else (contrasts[here],)
+        return normals[place if columns > 1 else 0], k[here], *known
+
+    start = (setting.vector(a[ray].astype(setting.precision)), 0, 1, 0, 2 * chain.count + 2)
+    b, place, _, passed, _ = _follow(subject, boundary, chain.turns, stop, start)
+    return b, place, passed
+
+
+# The mirage ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Plane layers 0 … count whose index falls from one to the next; all arrays in extended precision.
+
+    `index` (count + 1,); `kappa` (count + 1,): (n_0/n_j)² − 1; `steps` (count,): (n_j/n_(j+1))² − 1. `exact`: float32
+    holds the ratios on the way down.
+    """
+
+    index: Array
+    kappa: Array
+    steps: Array
+    exact: bool = False
+
+    @property
+    def count(self) -> int:
+        return len(self.steps)
+
+    def chain(self, normal: Array, feed: str, precision: type) -> Chain:
+        """What a formula is told: `ratios`, each rounded once; `contrasts` too; or the ratios of rounded `indices`."""
+        index = self.index.astype(precision) if feed == "indices" else self.index
+        down, up = index[:-1] / index[1:], index[1:] / index[:-1]
+        contrasts = np.concatenate([self.steps, -self.steps / (1 + self.steps)]) if feed == "contrasts" else None
+        return Chain(normal.reshape(1, 1, 3), np.concatenate([down, up]), contrasts)
+
+    def cosine(self, c2: Array, s2: Array, layer: Array) -> Array:
+        """cos θ of rays with cos²θ₀ = c2 in `layer`; 0 where they do not get."""
+        return np.sqrt(np.maximum(c2 - self.kappa[layer] * s2, 0))
+
+    def turning(self, c2: Array, s2: Array) -> Array:
+        """The layer in which a ray turns; `count` where it passes through all of them."""
+        return np.searchsorted(self.kappa[1:], c2 / s2, side="right")
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Rays into `layers`, each up to its boundary `stop`, and what must become of them; arrays (N,), extended precision.
+
+    `passes`: it gets there; else it turns in layer `last` and leaves by the top. `end`: its cosine where it ends.
+    `by_directions`, `by_ratios`: the sums at the head of this module with every ε and every δ 1; `height`: how many
+    layers higher or lower it turns then, for each of the two. All are to first order.
+    """
+
+    layers: Layers
+    normal: Array
+    a: Array
+    stop: Array
+    passes: Array
+    last: Array
+    end: Array
+    by_directions: Array
+    by_ratios: Array
+    height: tuple[Array, Array]
+
+
+def enter(layers: Layers, degrees: Array, stop: Array, plane: Array, precision: type) -> Rays:
+    """Rays at these angles to the normal plane[0], towards plane[1]; normal and rays rounded to `precision`."""
+    normal, radians = plane[0].astype(precision), np.deg2rad(np.asarray(degrees, np.longdouble))[:, None]
+    a = (np.cos(radians) * plane[0] + np.sin(radians) * plane[1]).astype(precision)
+    c2, s2 = cosine(a, normal) ** 2, sine2(a, normal)
+    turning = layers.turning(c2, s2)
+    passes = turning >= stop
+    last = np.where(passes, stop, turning)
+    end = np.where(passes, layers.cosine(c2, s2, last), np.sqrt(c2))
+    sums = np.array([_cosines(layers, *ray) for ray in zip(c2, s2, last, strict=True)])
+    squeeze = 1 + np.where(passes, layers.kappa[last], 0)
+    # Down into layers 1 … last; turned, also the mirror direction in the last, and up into last − 1 … 0.
+    outputs = np.where(passes, sums - np.sqrt(c2), 2 * sums - np.sqrt(c2))
+    ratios = last * np.where(passes, not layers.exact, 2 - layers.exact)
+    by_ratios = ratios * s2 * squeeze / end**2
+    slope = layers.steps[0] * s2 / 2
+    height = np.abs(sums) / slope, last * (not layers.exact) * s2 / slope
+    return Rays(layers, normal, a, stop, passes, last, end, outputs * squeeze / end**2, by_ratios, height)
+
+
+def _cosines(layers: Layers, c2: Any, s2: Any, last: int) -> Any:
+    """Σ (n_i/n_0)² cos θ_i over layers 0 … last."""
+    here = np.arange(last + 1)
+    return (layers.cosine(c2, s2, here) / (1 + layers.kappa[here])).sum()
+
+
+def cosine(b: Array, normal: Array) -> Array:
+    """|cos| of the angle between each b (N, 3) and the normal, whatever their lengths."""
+    b, normal = b.astype(np.longdouble), normal.astype(np.longdouble)
+    return np.abs(b @ normal) / np.sqrt((b * b).sum(1) * (normal @ normal))
+
+
+def sine2(b: Array, normal: Array) -> Array:
+    """sin² of the same angle."""
+    b, normal = b.astype(np.longdouble), normal.astype(np.longdouble)
+    return (np.cross(normal, b) ** 2).sum(1) / ((b * b).sum(1) * (normal @ normal))
+
+
+def air(count: int) -> Layers:
+    """n_j = TOP − j MIRAGE/count: the air above a hot road, 3e-8 a layer for a thousand of them."""
+    j, top, step = np.arange(count + 1).astype(np.longdouble), np.longdouble(TOP), np.longdouble(MIRAGE) / count
+    index = top - j * step
+    return Layers(index, j * step * (2 * top - j * step) / index**2, step * (index[:-1] + index[1:]) / index[1:] ** 2)
+
+
+def exact_ratios(count: int) -> Layers:
+    """n_j/n_(j+1) = 1 + 2⁻²³, which float32 holds: nothing is lost before a formula begins."""
+    growth = np.arange(count + 1) * np.log1p(np.longdouble(EXACT_RATIO))
+    step = np.longdouble(EXACT_RATIO) * (2 + np.longdouble(EXACT_RATIO))
+    return Layers(TOP * np.exp(-growth), np.expm1(2 * growth), np.full(count, step), exact=True)
+
+
+# The light pipe ------------------------------------------------------------------------------------------------
+
+
+def frame(precision: type) -> Array:
+    """Three rows that are orthogonal exactly, as rounded to `precision`, and unit to half an ulp."""
+    return np.longdouble(precision(1) / precision(3)) * np.array([[1, 2, 2], [2, 1, -2], [2, -2, 1]], np.longdouble)
+
+
+def pipe(reflections: int, rays: int, index: float, precision: type) -> tuple[Array, Chain, Array]:
+    """(a, chain, exact direction in the end) in a square pipe with the axes `frame`: walls ±0, ±1, length 2.
+
+    Unfolded, the ray is straight and meets the walls of either pair at equal distances: each meeting changes the
+    sign of one component, and nothing else.
+    """
+    rng, axes = np.random.default_rng(7), frame(precision)
+    across = rng.uniform(0.05, 0.6, (rays, 2)) * rng.choice([-1, 1], (rays, 2))
+    local = np.column_stack([across, np.sqrt(1 - (across**2).sum(1))])
+    a = (local @ axes).astype(precision)
+    components = a.astype(np.longdouble) @ axes[:2].T
+    met = (np.arange(reflections) + 0.5)[None, :, None] / np.abs(components)[:, None, :]
+    order = np.argsort(met.reshape(rays, -1), axis=1)[:, :reflections] % 2
+    before = np.where(order == 1, np.cumsum(order == 1, axis=1), np.cumsum(order == 0, axis=1)) - 1
+    outward = np.sign(np.take_along_axis(components, order, axis=1)) * (-1.0) ** before
+    chain = Chain(outward[..., None] * axes[order], np.full(2 * reflections, index), turns=False)
+    times = np.stack([(order == wall).sum(1) for wall in (0, 1)], axis=1)
+    flipped = np.where(times % 2 == 1, 2 * components, 0) / (axes[:2] ** 2).sum(1)
+    return a, chain, a - flipped @ axes[:2]
