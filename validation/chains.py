@@ -7,6 +7,10 @@ Everything exact is in extended precision. With c = cos θ₀, s = sin θ₀ and
     ∂(cos θ_e)/cos θ_e = tan²θ_e Σ δ_i                             δ_i: relative error of the ratio at boundary i
 
 A ray that turns leaves through the top with the cosine it came with: there e = 0, and the sums go down and up.
+
+Ratios of rounded indices err together: their product is the ratio of the first index to the last. Neighbours in
+float32 are n and n + mε, ε = 2⁻²³; their quotients are rounded to 1 ± mε, off by mε(n − 1), over the whole mirage by
+3e-5 · 3e-4, less than u. So |Σ δ| ≤ 3u: the first index, the last, and all quotients; of a ray that turned, ≤ u.
 """
 
 from __future__ import annotations
@@ -27,7 +31,6 @@ Subject = Callable[..., tuple[Any, Any]]
 TOP = 1.0003  # the index of the coldest air
 MIRAGE = 3e-5  # what it loses down to the road
 EXACT_RATIO = 2.0**-23  # 1 + this is the first float32 after 1
-FEEDS = ("ratios", "indices", "contrasts")
 
 
 @dataclass(frozen=True)
@@ -103,8 +106,9 @@ def _compiled(subject: Subject, chain: Chain, a: Array, stop: Array, setting: Se
 
     start = (vector(a.astype(setting.precision).T), *(dr.full(integer, x, len(a)) for x in (0, 1, 0)))
     turns = dr.opaque(dr.mask_t(integer), chain.turns)
-    limit = dr.full(integer, 2 * chain.count + 2, len(a))
+    limit = dr.opaque(integer, 2 * chain.count + 2, len(a))
     b, place, _, passed, _ = _follow(detached, boundary, turns, integer(stop.astype(np.int32)), (*start, limit))
+    dr.eval(b, place, passed)
     return Carried(np.array(b).T.astype(np.longdouble), np.array(place), np.array(passed))
 
 
@@ -162,11 +166,10 @@ class Layers:
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays into `layers`, each up to its boundary `stop`, and what must become of them; arrays (N,), extended precision.
+    """Rays into `layers`, each up to its boundary `stop`, and what must become of them.
 
-    `passes`: it gets there; else it turns in layer `last` and leaves by the top. `end`: its cosine where it ends.
-    `by_directions`, `by_ratios`: the sums at the head of this module with every ε and every δ 1; `height`: how many
-    layers higher or lower it turns then, for each of the two. All are to first order.
+    Arrays (N,), extended precision. `passes`: it gets there; else it turns in layer `last` and leaves by the top.
+    `end`: its cosine where it ends. `sine2`: sin²θ₀; `cosines`: Σ (n_i/n_0)² cos θ_i over layers 0 … last.
     """
 
     layers: Layers
@@ -176,9 +179,24 @@ class Rays:
     passes: Array
     last: Array
     end: Array
-    by_directions: Array
-    by_ratios: Array
-    height: tuple[Array, Array]
+    sine2: Array
+    cosines: Array
+
+    def condition(self, feed: str) -> Array:
+        """Of ln cos θ where the ray ends: the sums at the head of this module with every ε and every δ 1."""
+        # Down into layers 1 … last; turned, also the mirror direction in the last, and up into last − 1 … 0.
+        outputs = np.where(self.passes, self.cosines, 2 * self.cosines) - np.sqrt(1 - self.sine2)
+        up = {"ratios": self.last, "indices": 1, "contrasts": 0}[feed]
+        ratios = np.where(self.passes, self._down(feed), up + (feed == "ratios") * self._down(feed))
+        squeeze = 1 + np.where(self.passes, self.layers.kappa[self.last], 0)
+        return (outputs + ratios * self.sine2) * squeeze / self.end**2
+
+    def height(self, feed: str) -> Array:
+        """How many layers too high or too low a ray turns where every ε and every δ is 1, to first order."""
+        return 2 * (self.cosines + self._down(feed) * self.sine2) / (self.layers.steps[0] * self.sine2)
+
+    def _down(self, feed: str) -> Any:
+        return {"ratios": self.last * (not self.layers.exact), "indices": 3, "contrasts": 0}[feed]
 
 
 def enter(layers: Layers, degrees: Array, stop: Array, plane: Array, precision: type) -> Rays:
@@ -190,21 +208,12 @@ def enter(layers: Layers, degrees: Array, stop: Array, plane: Array, precision: 
     passes = turning >= stop
     last = np.where(passes, stop, turning)
     end = np.where(passes, layers.cosine(c2, s2, last), np.sqrt(c2))
-    sums = np.array([_cosines(layers, *ray) for ray in zip(c2, s2, last, strict=True)])
-    squeeze = 1 + np.where(passes, layers.kappa[last], 0)
-    # Down into layers 1 … last; turned, also the mirror direction in the last, and up into last − 1 … 0.
-    outputs = np.where(passes, sums - np.sqrt(c2), 2 * sums - np.sqrt(c2))
-    ratios = last * np.where(passes, not layers.exact, 2 - layers.exact)
-    by_ratios = ratios * s2 * squeeze / end**2
-    slope = layers.steps[0] * s2 / 2
-    height = np.abs(sums) / slope, last * (not layers.exact) * s2 / slope
-    return Rays(layers, normal, a, stop, passes, last, end, outputs * squeeze / end**2, by_ratios, height)
-
-
-def _cosines(layers: Layers, c2: Any, s2: Any, last: int) -> Any:
-    """Σ (n_i/n_0)² cos θ_i over layers 0 … last."""
-    here = np.arange(last + 1)
-    return (layers.cosine(c2, s2, here) / (1 + layers.kappa[here])).sum()
+    cosines, everywhere = np.zeros(len(a), np.longdouble), np.arange(layers.count + 1)
+    for c in np.unique(c2):
+        here = c2 == c
+        weighted = layers.cosine(c, s2[here][0], everywhere) / (1 + layers.kappa)
+        cosines[here] = np.cumsum(weighted)[last[here]]
+    return Rays(layers, normal, a, stop, passes, last, end, s2, cosines)
 
 
 def cosine(b: Array, normal: Array) -> Array:
@@ -250,7 +259,7 @@ def pipe(reflections: int, rays: int, index: float, precision: type) -> tuple[Ar
     rng, axes = np.random.default_rng(7), frame(precision)
     across = rng.uniform(0.05, 0.6, (rays, 2)) * rng.choice([-1, 1], (rays, 2))
     local = np.column_stack([across, np.sqrt(1 - (across**2).sum(1))])
-    a = (local @ axes).astype(precision)
+    a: Array = (local @ axes).astype(precision)
     components = a.astype(np.longdouble) @ axes[:2].T
     met = (np.arange(reflections) + 0.5)[None, :, None] / np.abs(components)[:, None, :]
     order = np.argsort(met.reshape(rays, -1), axis=1)[:, :reflections] % 2

@@ -19,8 +19,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.formulas import FORMULAS, ROUNDING
 from mi_refract import regimes
+from mi_refract.formulas import FORMULAS, ROUNDING
 from mi_refract.rows import Row
 
 from . import directions, systems
@@ -40,8 +40,7 @@ AXES = {
 SEEN_AT = 89.4  # degrees: the ray of the curves
 PASSING, TURNING = (88.0, 89.0, 89.4, 89.55), (89.6, 89.8, 89.95)
 # A normal, and the direction along the layers.
-UPRIGHT, ASKEW = np.array([[0, 0, 1], [1, 0, 0]]), np.array([[0.36, 0.48, 0.8], [0.8, -0.6, 0]])
-STOPS = np.unique(np.geomspace(1, 1000, 25).astype(int))
+PLANES = {"upright": np.array([[0, 0, 1], [1, 0, 0]]), "askew": np.array([[0.36, 0.48, 0.8], [0.8, -0.6, 0]])}
 CORE = 1.5  # the index of the light pipe
 PIPE_RAYS = 8
 PROBLEM = "the problem"
@@ -54,15 +53,16 @@ TERMS = {
     "turning height": "how far the layer in which a ray turned is from the right one, over all layers",
     "length drift": "how far the length of the direction is from what it was, relative",
     "over print": "the largest deviation from CODE V's print, over what printing rounds to",
-    "mirage": "1.0003 − 3e-5 from the top to the bottom, in layers; entered at 88 … 89.95°, the last three turn",
-    "askew": "the same with a normal that is no axis",
-    "exact ratios": "1000 layers of ratio 1 + 2⁻²³, which float32 holds; askew",
+    "mirage": "air of index 1.0003 at the top and 3e-5 less at the bottom, in layers; entered at 88 … 89.95°, the last "
+    "three turn. Upright: the normal is an axis; askew: it is none",
+    "exact ratios": "250 layers of ratio 1 + 2⁻²³, which float32 holds: nothing is lost before a formula begins",
+    PROBLEM: f"condition · u of the ray that enters at {SEEN_AT}°, with the error of every formula layer by layer",
     "light pipe": f"total internal reflections in a square pipe of index {CORE}, askew; only signs may change",
 } | {name: " ".join((trace.__doc__ or "").split()) for name, trace in systems.SYSTEMS.items()}  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Plan:
+class Extent:
     """How much a backend does: scalar arrays cost a Python call per operation."""
 
     layers: tuple[int, ...]
@@ -72,13 +72,13 @@ class Plan:
     remark: str = ""
 
 
-def plan(context: Context, setting: Setting) -> Plan:
+def extent(context: Context, setting: Setting) -> Extent:
     if not setting.is_scalar:
-        return Plan((1000, 100_000), 10_000, PASSING + TURNING, True)
+        return Extent((1000, 100_000), 10_000, PASSING + TURNING, True)
     if context.profile.name == "full":
-        return Plan((1000, 100_000), 10_000, (88.0, 89.55, 89.95), False, "three rays: scalar arrays are slow")
+        return Extent((1000, 100_000), 10_000, (89.55, 89.95), False, "two rays: scalar arrays are slow")
     remark = "two rays, no more than 1000 boundaries: scalar arrays are slow"
-    return Plan((1000,), 1000, (89.4, 89.8), False, remark)
+    return Extent((1000,), 1000, (89.4, 89.8), False, remark)
 
 
 def settings(context: Context) -> list[Setting]:
@@ -117,7 +117,7 @@ def subjects(context: Context, setting: Setting) -> Iterator[dict[str, Subject]]
 def chain_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
         return [Row("stability", name, "all", setting.label, reason=setting.reason) for name in FORMULAS]
-    how = plan(context, setting)
+    how = extent(context, setting)
     rows = []
     with subjects(context, setting) as found:
         for case, layers, plane in mirages(how):
@@ -126,111 +126,108 @@ def chain_rows(context: Context, setting: Setting) -> list[Row]:
     return rows
 
 
-def mirages(how: Plan) -> list[tuple[str, Layers, Array]]:
+def mirages(how: Extent) -> list[tuple[str, Layers, Array]]:
     """(case, layers, normal and direction along them)."""
-    cases = [(f"mirage, {count} layers", air(count), UPRIGHT) for count in how.layers]
-    cases += [("mirage askew, 1000 layers", air(1000), ASKEW), ("exact ratios, 250 layers", exact_ratios(250), ASKEW)]
-    return cases
+    cases = [(f"mirage {name}, {n} layers", air(n), plane) for n in how.layers for name, plane in PLANES.items()]
+    return [*cases, ("exact ratios askew, 250 layers", exact_ratios(250), PLANES["askew"])]
+
+
+def feeds(layers: Layers, setting: Setting) -> list[str]:
+    """What float32 holds exactly needs no other way; and rounded indices are another problem in float32 only."""
+    if layers.exact:
+        return ["ratios"]
+    return ["ratios", *(["indices"] if setting.precision is np.float32 else []), "contrasts"]
+
+
+def at_limit(name: str) -> bool:
+    """Whether a subject is a form at the rounding limit: those take a contrast, and have budgets."""
+    return name in FORMULAS and FORMULAS[name].takes_contrast
 
 
 def mirage_rows(
-    found: dict[str, Subject], case: str, layers: Layers, plane: Array, setting: Setting, how: Plan
+    found: dict[str, Subject], case: str, layers: Layers, plane: Array, setting: Setting, how: Extent
 ) -> list[Row]:
     """A row per formula and per way to feed it, and one of the problem with the curves of all of them."""
-    seen = STOPS[(layers.count >= STOPS) & how.curves & (plane is ASKEW)]
-    degrees = np.array([*how.angles, *np.full(len(seen), SEEN_AT)])
-    stop = np.array([*np.full(len(how.angles), layers.count), *seen])
+    drawn = how.curves and plane is PLANES["askew"]
+    seen = np.unique(np.geomspace(1, layers.count, 25).astype(int)) if drawn else np.array([], int)
+    degrees = np.concatenate([how.angles, np.full(len(seen), SEEN_AT)])
+    stop = np.concatenate([np.full(len(how.angles), layers.count), seen])
     rays = enter(layers, degrees, stop, plane, setting.precision)
     rows = []
     for feed in feeds(layers, setting):
         curves = {}
         for name, subject in found.items():
-            if feed == "contrasts" and not (name in FORMULAS and FORMULAS[name].takes_contrast):
+            if feed == "contrasts" and not at_limit(name):
                 continue
-            row, error = mirage_row(name, subject, f"{case}, {feed}", rays, feed, setting, how)
+            row, error = mirage_row(name, subject, case, rays, feed, setting, how)
             rows.append(row)
             curves[name] = error[len(how.angles) :]
-        if len(seen):
-            rows.append(problem_row(f"{case}, {feed}", rays, feed, setting, curves))
+        if drawn:
+            rows.append(problem_row(case, rays, feed, setting, curves))
     return rows
 
 
-def feeds(layers: Layers, setting: Setting) -> list[str]:
-    """Rounded indices make a difference in float32 only, where neighbours may be the same number."""
-    told = [] if layers.exact or setting.precision is not np.float32 else ["indices"]
-    return ["ratios", *told, "contrasts"]
-
-
-def conditions(rays: Rays, feed: str) -> Array:
-    """Of ln cos θ at the end: contrasts from double precision leave nothing to the ratios."""
-    return rays.by_directions + (0 if feed == "contrasts" else rays.by_ratios)
-
-
 def mirage_row(
-    name: str, subject: Subject, case: str, rays: Rays, feed: str, setting: Setting, how: Plan
+    name: str, subject: Subject, case: str, rays: Rays, feed: str, setting: Setting, how: Extent
 ) -> tuple[Row, Array]:
-    """The row, and the relative error of the cosine of every ray, 1 where it turned or passed wrongly."""
-    count, u, final = rays.layers.count, setting.roundoff, slice(0, len(how.angles))
-    carried = carry(subject, rays.layers.chain(rays.normal, feed, setting.precision), rays.a, rays.stop, setting)
+    """The row, and the relative error of the cosine of every ray: 1 where it turned or passed wrongly."""
+    count, final = rays.layers.count, slice(0, len(how.angles))
+    chain = rays.layers.chain(rays.normal, feed, setting.precision)
+    carried = carry(subject, chain, rays.a, rays.stop, setting)
     right = (carried.place >= rays.stop) == rays.passes
     error = np.where(right, np.abs(cosine(carried.b, rays.normal) / rays.end - 1), 1)
     error = np.nan_to_num(error.astype(float), nan=np.inf)
     turned = np.where(carried.place < 0, carried.passed // 2, rays.stop)
-    height = np.where(rays.passes, 0, np.abs(turned - rays.last) / count)
     length = np.sqrt((carried.b**2).sum(1) / (rays.a.astype(np.longdouble) ** 2).sum(1))
     values = {
-        "error / condition": worst(np.where(right, error / (conditions(rays, feed) * u), 0)[final]),
+        "error / condition": worst((error / (rays.condition(feed) * setting.roundoff))[final][right[final]]),
         "error": worst(error[final]),
         "misjudged": float((~right)[final].sum()),
-        "turning height": worst(height[final]),
+        "turning height": worst((np.abs(turned - rays.last) / count)[final][~rays.passes[final]]),
         "length drift": worst(np.abs(length - 1)[final]),
     } | {f"{angle}°": float(e) for angle, e in zip(how.angles, error, strict=False) if angle in PASSING}
-    budgets = mirage_budgets(rays, feed, u, final) if name in FORMULAS and FORMULAS[name].takes_contrast else {}
-    replay = {"top": 1.0003, "layers": count, "kappa": float(rays.layers.kappa[-1]), "angles": how.angles,
-              "normal": [float(x).hex() for x in rays.normal]}  # fmt: skip
+    budgets = mirage_budgets(rays, feed, setting.roundoff, final) if at_limit(name) else {}
+    replay = {"layers": count, "n_0": float(rays.layers.index[0]), "n_last": float(rays.layers.index[-1]),
+              "angles": how.angles, "normal": [float(x).hex() for x in rays.normal]}  # fmt: skip
+    case = f"{case}, {feed}"
     return Row("stability", name, case, setting.label, values, budgets, reason=how.remark, replay=replay), error
+
+
+# Where ln cos θ changes by x to first order, cos²θ changes by 2x of itself, and |1 − √(1 ± 2x)| ≤ 2x: so twice the
+# condition bounds the error whatever its size. A form at the rounding limit is off by ROUNDING.linear u a step.
+LIMIT = 2 * ROUNDING.linear
+
+
+def mirage_budgets(rays: Rays, feed: str, u: float, final: slice) -> dict[str, float]:
+    """Of a form at the rounding limit. Where its bound reaches as far as the decision, a ray may be misjudged."""
+    count, height = rays.layers.count, LIMIT * u * rays.height(feed) + 1
+    doubtful = np.where(rays.passes, LIMIT * u * rays.condition(feed) >= 1, rays.last + height >= count)
+    return {
+        "error / condition": LIMIT,
+        "misjudged": float(doubtful[final].sum()),
+        "turning height": min(1.0, worst((height / count)[final][~rays.passes[final]])),
+    }
 
 
 def worst(x: Array) -> float:
     return float(np.nan_to_num(x.astype(float), nan=np.inf).max(initial=0))
 
 
-# To first order cos²θ changes by 2x of itself where ln cos θ changes by x, and |1 − √(1 ± 2x)| ≤ 2x: so twice the
-# condition bounds the error whatever its size. A form at the rounding limit is off by ROUNDING.linear u a step.
-LIMIT = 2 * ROUNDING.linear
-
-
-def mirage_budgets(rays: Rays, feed: str, u: float, final: slice) -> dict[str, float]:
-    """Of a form at the rounding limit; rays whose bound reaches as far as the decision may be misjudged."""
-    by_directions, by_ratios = rays.height
-    height = LIMIT * u * (by_directions + (0 if feed == "contrasts" else by_ratios))
-    open_ = np.where(
-        rays.passes, LIMIT * u * conditions(rays, feed) >= 1, rays.last + height + 1 >= rays.layers.count
-    )
-    turning = np.where(rays.passes, 0, (height + 1) / rays.layers.count)
-    return {
-        "error / condition": LIMIT,
-        "misjudged": float(open_[final].sum()),
-        "turning height": min(1.0, worst(turning[final])),
-    }
-
-
 def problem_row(case: str, rays: Rays, feed: str, setting: Setting, curves: dict[str, Array]) -> Row:
     """What the problem itself makes of u, and the error of every formula against the number of layers."""
     seen = len(rays.stop) - len(next(iter(curves.values())))
-    limit = (conditions(rays, feed) * setting.roundoff).astype(float)[seen:]
-    lines = {name: list(zip(rays.stop[seen:].tolist(), error.tolist(), strict=True)) for name, error in curves.items()}
-    lines["condition · u"] = list(zip(rays.stop[seen:].tolist(), limit.tolist(), strict=True))
-    values = {"condition · u": float(limit[-1])}
-    return Row("stability", PROBLEM, f"{case}, {SEEN_AT}°", setting.label, values, curves=lines)
+    curves = curves | {"condition · u": (rays.condition(feed) * setting.roundoff).astype(float)[seen:]}
+    lines = {name: list(zip(rays.stop[seen:].tolist(), y.tolist(), strict=True)) for name, y in curves.items()}
+    values = {"condition · u": lines["condition · u"][-1][1]}
+    return Row("stability", PROBLEM, f"{case}, {feed}", setting.label, values, curves=lines)
 
 
-def pipe_row(name: str, subject: Subject, setting: Setting, how: Plan) -> Row:
+def pipe_row(name: str, subject: Subject, setting: Setting, how: Extent) -> Row:
     rays = 2 if setting.is_scalar else PIPE_RAYS
     a, chain, exact = pipe(how.reflections, rays, CORE, setting.precision)
     carried = carry(subject, chain, a, np.full(rays, how.reflections), setting)
     lengths = [np.sqrt((x.astype(np.longdouble) ** 2).sum(1)) for x in (carried.b, a)]
-    chord = np.sqrt((((carried.b - exact) ** 2).sum(1))) / lengths[1]
+    chord = np.sqrt(((carried.b - exact) ** 2).sum(1)) / lengths[1]
     # Every reflection passes on what is wrong with the direction, and adds its own: at most u each.
     condition = how.reflections
     values = {
@@ -240,8 +237,9 @@ def pipe_row(name: str, subject: Subject, setting: Setting, how: Plan) -> Row:
         "length drift": worst(np.abs(lengths[0] / lengths[1] - 1)),
     }
     limits = {"error / condition": 1.0, "misjudged": 0.0}
-    budgets = limits if name in FORMULAS and FORMULAS[name].takes_contrast else {}
-    replay = {"reflections": how.reflections, "rays": rays, "axes": [float(x).hex() for x in frame(setting.precision)[0]]}
+    budgets = limits if at_limit(name) else {}
+    axis = [float(x).hex() for x in frame(setting.precision)[2]]
+    replay = {"reflections": how.reflections, "rays": rays, "axis": axis}
     case = f"light pipe, {how.reflections} reflections"
     return Row("stability", name, case, setting.label, values, budgets, reason=how.remark, replay=replay)
 
@@ -279,8 +277,7 @@ def system_row(name: str, subject: Subject, case: str, setting: Setting) -> Row:
         "misjudged": float(refractor.mirrored),
     }
     # The condition counts u for every rounding, and they are at most ROUNDING.linear u.
-    limit = name in FORMULAS and FORMULAS[name].takes_contrast
-    budgets = {"error / condition": 1.0, "misjudged": 0.0} if limit else {}
+    budgets = {"error / condition": 1.0, "misjudged": 0.0} if at_limit(name) else {}
     if case == "double Gauss":
         values["over print"] = systems.off_print(Refractor(subject, setting))
         # Any formula is off by less than 1e-12 here in float64, and the exact retrace is within the print.

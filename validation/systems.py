@@ -140,7 +140,7 @@ def weierstrass(refract: Refract) -> Array:
 def ellipsoid(refract: Refract) -> Array:
     """An ellipsoid of eccentricity 1/n: light parallel to its axis meets in the far focus.
 
-    Major half-axis 1, BK7, rays over the whole aperture up to 89 degrees of eccentric anomaly. (direction − closed form).
+    Major half-axis 1, BK7, rays at 1 … 89 degrees of eccentric anomaly. (direction − closed form).
     """
     e = 1 / BK7
     minor = np.sqrt((1 - e) * (1 + e))
