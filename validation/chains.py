@@ -15,6 +15,7 @@ float32 are n and n + mε, ε = 2⁻²³; their quotients are rounded to 1 ± m�
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -31,6 +32,12 @@ Subject = Callable[..., tuple[Any, Any]]
 TOP = 1.0003  # the index of the coldest air
 MIRAGE = 3e-5  # what it loses down to the road
 EXACT_RATIO = 2.0**-23  # 1 + this is the first float32 after 1
+FEEDS = {
+    "ratios": "each k rounded once; of neighbours 3e-8 apart they are 1 in float32, and the ray goes straight",
+    "reciprocals": "each k as 1/η of a rounded η = n_to/n_from; in float32 then 1 + 2⁻²³, four times what it should be",
+    "indices": "each k as a quotient of rounded indices, as scenes give them",
+    "contrasts": "each k rounded once, and with it k² − 1 from double precision",
+}
 
 
 @dataclass(frozen=True)
@@ -149,11 +156,13 @@ class Layers:
         return len(self.steps)
 
     def chain(self, normal: Array, feed: str, precision: type) -> Chain:
-        """What a formula is told: `ratios`, each rounded once; `contrasts` too; or the ratios of rounded `indices`."""
+        """What a formula is told of a boundary: one of FEEDS."""
         index = self.index.astype(precision) if feed == "indices" else self.index
-        down, up = index[:-1] / index[1:], index[1:] / index[:-1]
+        k = np.concatenate([index[:-1] / index[1:], index[1:] / index[:-1]])
+        if feed == "reciprocals":
+            k = 1 / (1 / k).astype(precision)
         contrasts = np.concatenate([self.steps, -self.steps / (1 + self.steps)]) if feed == "contrasts" else None
-        return Chain(normal.reshape(1, 1, 3), np.concatenate([down, up]), contrasts)
+        return Chain(normal.reshape(1, 1, 3), k, contrasts)
 
     def cosine(self, c2: Array, s2: Array, layer: Array) -> Array:
         """cos θ of rays with cos²θ₀ = c2 in `layer`; 0 where they do not get."""
@@ -182,21 +191,29 @@ class Rays:
     sine2: Array
     cosines: Array
 
-    def condition(self, feed: str) -> Array:
-        """Of ln cos θ where the ray ends: the sums at the head of this module with every ε and every δ 1."""
+    def fed(self, feed: str, precision: type) -> Fed:
+        """The same rays, as a formula in `precision` is told of the layers."""
+        each = {"ratios": 1, "reciprocals": 2}.get(feed, 0)  # a reciprocal is rounded twice
+        all_down = 3 if feed == "indices" else each * self.last * (not self.layers.exact)
+        turned = 1 if feed == "indices" else each * self.last * (2 - self.layers.exact)
         # Down into layers 1 … last; turned, also the mirror direction in the last, and up into last − 1 … 0.
         outputs = np.where(self.passes, self.cosines, 2 * self.cosines) - np.sqrt(1 - self.sine2)
-        up = {"ratios": self.last, "indices": 1, "contrasts": 0}[feed]
-        ratios = np.where(self.passes, self._down(feed), up + (feed == "ratios") * self._down(feed))
         squeeze = 1 + np.where(self.passes, self.layers.kappa[self.last], 0)
-        return (outputs + ratios * self.sine2) * squeeze / self.end**2
+        condition = (outputs + np.where(self.passes, all_down, turned) * self.sine2) * squeeze / self.end**2
+        height = 2 * (self.cosines + all_down * self.sine2) / (self.layers.steps[0] * self.sine2)
+        return Fed(self, feed, self.layers.chain(self.normal, feed, precision), condition, height)
 
-    def height(self, feed: str) -> Array:
-        """How many layers too high or too low a ray turns where every ε and every δ is 1, to first order."""
-        return 2 * (self.cosines + self._down(feed) * self.sine2) / (self.layers.steps[0] * self.sine2)
 
-    def _down(self, feed: str) -> Any:
-        return {"ratios": self.last * (not self.layers.exact), "indices": 3, "contrasts": 0}[feed]
+@dataclass(frozen=True)
+class Fed:
+    """`condition` (N,): of ln cos θ where a ray ends, the sums at the head of this module with every ε and every δ 1.
+    `height` (N,): how many layers too high or too low it turns then. Both are to first order."""
+
+    rays: Rays
+    feed: str
+    chain: Chain
+    condition: Array
+    height: Array
 
 
 def enter(layers: Layers, degrees: Array, stop: Array, plane: Array, precision: type) -> Rays:
@@ -250,6 +267,7 @@ def frame(precision: type) -> Array:
     return np.longdouble(precision(1) / precision(3)) * np.array([[1, 2, 2], [2, 1, -2], [2, -2, 1]], np.longdouble)
 
 
+@functools.cache
 def pipe(reflections: int, rays: int, index: float, precision: type) -> tuple[Array, Chain, Array]:
     """(a, chain, exact direction in the end) in a square pipe with the axes `frame`: walls ±0, ±1, length 2.
 

@@ -1,11 +1,10 @@
 """Stability: formulas at work, boundary after boundary, against closed answers.
 
 A formula is fed with inputs rounded to its precision, and its output is carried on; all geometry in between is in
-extended precision. Each error stands next to itself over condition · u, which is what the answer may be off by if
-every input a formula is given and every direction it returns were off by u, the roundoff, to first order: up to 1 the
-problem is to blame (rounding the exact answers does no better), above 1 the formula. In a mirage the ratios of
-neighbouring layers are given as such (ratios), or as quotients of rounded indices (indices, as Mitsuba's scenes give
-them), or with k² − 1 from double precision (contrasts). Mitsuba has no variant in float64.
+extended precision. Each error stands next to itself over condition · u: that is what the answer may be off by if
+every rounded input and every direction a formula returns were off by u, the roundoff, to first order. Up to 1 the
+problem is to blame, for rounding the exact answers may do as badly; above 1 the formula. Mitsuba's functions exist in
+float32 only.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from mi_refract.formulas import FORMULAS, ROUNDING
 from mi_refract.rows import Row
 
 from . import directions, systems
-from .chains import Array, Layers, Rays, Subject, air, carry, cosine, enter, exact_ratios, frame, pipe
+from .chains import FEEDS, Array, Fed, Layers, Subject, air, carry, cosine, enter, exact_ratios, frame, pipe
 from .directions import BUILTIN, Setting
 from .plan import Context, Task
 
@@ -56,6 +55,7 @@ TERMS = {
     "mirage": "air of index 1.0003 at the top and 3e-5 less at the bottom, in layers; entered at 88 … 89.95°, the last "
     "three turn. Upright: the normal is an axis; askew: it is none",
     "exact ratios": "250 layers of ratio 1 + 2⁻²³, which float32 holds: nothing is lost before a formula begins",
+    **FEEDS,
     PROBLEM: f"condition · u of the ray that enters at {SEEN_AT}°, with the error of every formula layer by layer",
     "light pipe": f"total internal reflections in a square pipe of index {CORE}, askew; only signs may change",
 } | {name: " ".join((trace.__doc__ or "").split()) for name, trace in systems.SYSTEMS.items()}  # fmt: skip
@@ -66,6 +66,7 @@ class Extent:
     """How much a backend does: scalar arrays cost a Python call per operation."""
 
     layers: tuple[int, ...]
+    planes: tuple[str, ...]
     reflections: int
     angles: tuple[float, ...]
     curves: bool
@@ -74,11 +75,11 @@ class Extent:
 
 def extent(context: Context, setting: Setting) -> Extent:
     if not setting.is_scalar:
-        return Extent((1000, 100_000), 10_000, PASSING + TURNING, True)
+        return Extent((1000, 100_000), tuple(PLANES), 10_000, PASSING + TURNING, True)
     if context.profile.name == "full":
-        return Extent((1000, 100_000), 10_000, (89.55, 89.95), False, "two rays: scalar arrays are slow")
-    remark = "two rays, no more than 1000 boundaries: scalar arrays are slow"
-    return Extent((1000,), 1000, (89.4, 89.8), False, remark)
+        return Extent((1000, 100_000), ("askew",), 10_000, (89.55, 89.95), False, "two rays: scalar arrays are slow")
+    remark = "two rays, at most 1000 boundaries: scalar arrays are slow"
+    return Extent((1000,), ("askew",), 1000, (89.4, 89.8), False, remark)
 
 
 def settings(context: Context) -> list[Setting]:
@@ -128,15 +129,15 @@ def chain_rows(context: Context, setting: Setting) -> list[Row]:
 
 def mirages(how: Extent) -> list[tuple[str, Layers, Array]]:
     """(case, layers, normal and direction along them)."""
-    cases = [(f"mirage {name}, {n} layers", air(n), plane) for n in how.layers for name, plane in PLANES.items()]
+    cases = [(f"mirage {plane}, {n} layers", air(n), PLANES[plane]) for n in how.layers for plane in how.planes]
     return [*cases, ("exact ratios askew, 250 layers", exact_ratios(250), PLANES["askew"])]
 
 
 def feeds(layers: Layers, setting: Setting) -> list[str]:
-    """What float32 holds exactly needs no other way; and rounded indices are another problem in float32 only."""
+    """What float32 holds exactly is told in one way; where nothing is lost, in float64, the way makes no difference."""
     if layers.exact:
         return ["ratios"]
-    return ["ratios", *(["indices"] if setting.precision is np.float32 else []), "contrasts"]
+    return [*FEEDS] if setting.precision is np.float32 else ["ratios", "contrasts"]
 
 
 def at_limit(name: str) -> bool:
@@ -155,41 +156,39 @@ def mirage_rows(
     rays = enter(layers, degrees, stop, plane, setting.precision)
     rows = []
     for feed in feeds(layers, setting):
-        curves = {}
+        fed, curves = rays.fed(feed, setting.precision), {}
         for name, subject in found.items():
             if feed == "contrasts" and not at_limit(name):
                 continue
-            row, error = mirage_row(name, subject, case, rays, feed, setting, how)
+            row, error = mirage_row(name, subject, case, fed, setting, how)
             rows.append(row)
             curves[name] = error[len(how.angles) :]
         if drawn:
-            rows.append(problem_row(case, rays, feed, setting, curves))
+            rows.append(problem_row(case, fed, setting, curves))
     return rows
 
 
-def mirage_row(
-    name: str, subject: Subject, case: str, rays: Rays, feed: str, setting: Setting, how: Extent
-) -> tuple[Row, Array]:
+def mirage_row(name: str, subject: Subject, case: str, fed: Fed, setting: Setting, how: Extent) -> tuple[Row, Array]:
     """The row, and the relative error of the cosine of every ray: 1 where it turned or passed wrongly."""
-    count, final = rays.layers.count, slice(0, len(how.angles))
-    chain = rays.layers.chain(rays.normal, feed, setting.precision)
-    carried = carry(subject, chain, rays.a, rays.stop, setting)
+    rays, final = fed.rays, slice(0, len(how.angles))
+    count = rays.layers.count
+    carried = carry(subject, fed.chain, rays.a, rays.stop, setting)
     right = (carried.place >= rays.stop) == rays.passes
     error = np.where(right, np.abs(cosine(carried.b, rays.normal) / rays.end - 1), 1)
     error = np.nan_to_num(error.astype(float), nan=np.inf)
     turned = np.where(carried.place < 0, carried.passed // 2, rays.stop)
     length = np.sqrt((carried.b**2).sum(1) / (rays.a.astype(np.longdouble) ** 2).sum(1))
     values = {
-        "error / condition": worst((error / (rays.condition(feed) * setting.roundoff))[final][right[final]]),
+        "error / condition": worst((error / (fed.condition * setting.roundoff))[final][right[final]]),
         "error": worst(error[final]),
         "misjudged": float((~right)[final].sum()),
         "turning height": worst((np.abs(turned - rays.last) / count)[final][~rays.passes[final]]),
         "length drift": worst(np.abs(length - 1)[final]),
     } | {f"{angle}°": float(e) for angle, e in zip(how.angles, error, strict=False) if angle in PASSING}
-    budgets = mirage_budgets(rays, feed, setting.roundoff, final) if at_limit(name) else {}
+    budgets = mirage_budgets(fed, setting.roundoff, final) if at_limit(name) else {}
     replay = {"layers": count, "n_0": float(rays.layers.index[0]), "n_last": float(rays.layers.index[-1]),
               "angles": how.angles, "normal": [float(x).hex() for x in rays.normal]}  # fmt: skip
-    case = f"{case}, {feed}"
+    case = f"{case}, {fed.feed}"
     return Row("stability", name, case, setting.label, values, budgets, reason=how.remark, replay=replay), error
 
 
@@ -198,10 +197,11 @@ def mirage_row(
 LIMIT = 2 * ROUNDING.linear
 
 
-def mirage_budgets(rays: Rays, feed: str, u: float, final: slice) -> dict[str, float]:
+def mirage_budgets(fed: Fed, u: float, final: slice) -> dict[str, float]:
     """Of a form at the rounding limit. Where its bound reaches as far as the decision, a ray may be misjudged."""
-    count, height = rays.layers.count, LIMIT * u * rays.height(feed) + 1
-    doubtful = np.where(rays.passes, LIMIT * u * rays.condition(feed) >= 1, rays.last + height >= count)
+    rays, height = fed.rays, LIMIT * u * fed.height + 1
+    count = rays.layers.count
+    doubtful = np.where(rays.passes, LIMIT * u * fed.condition >= 1, rays.last + height >= count)
     return {
         "error / condition": LIMIT,
         "misjudged": float(doubtful[final].sum()),
@@ -213,13 +213,14 @@ def worst(x: Array) -> float:
     return float(np.nan_to_num(x.astype(float), nan=np.inf).max(initial=0))
 
 
-def problem_row(case: str, rays: Rays, feed: str, setting: Setting, curves: dict[str, Array]) -> Row:
+def problem_row(case: str, fed: Fed, setting: Setting, curves: dict[str, Array]) -> Row:
     """What the problem itself makes of u, and the error of every formula against the number of layers."""
-    seen = len(rays.stop) - len(next(iter(curves.values())))
-    curves = curves | {"condition · u": (rays.condition(feed) * setting.roundoff).astype(float)[seen:]}
-    lines = {name: list(zip(rays.stop[seen:].tolist(), y.tolist(), strict=True)) for name, y in curves.items()}
+    stop = fed.rays.stop
+    seen = len(stop) - len(next(iter(curves.values())))
+    curves = curves | {"condition · u": (fed.condition * setting.roundoff).astype(float)[seen:]}
+    lines = {name: list(zip(stop[seen:].tolist(), y.tolist(), strict=True)) for name, y in curves.items()}
     values = {"condition · u": lines["condition · u"][-1][1]}
-    return Row("stability", PROBLEM, f"{case}, {feed}", setting.label, values, curves=lines)
+    return Row("stability", PROBLEM, f"{case}, {fed.feed}", setting.label, values, curves=lines)
 
 
 def pipe_row(name: str, subject: Subject, setting: Setting, how: Extent) -> Row:
@@ -263,9 +264,7 @@ class Refractor:
 
 def system_rows(context: Context, setting: Setting) -> list[Row]:
     with subjects(context, setting) as found:
-        return [
-            system_row(name, subject, case, setting) for case in systems.SYSTEMS for name, subject in found.items()
-        ]
+        return [system_row(name, subject, case, setting) for case in systems.SYSTEMS for name, subject in found.items()]
 
 
 def system_row(name: str, subject: Subject, case: str, setting: Setting) -> Row:
