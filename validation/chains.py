@@ -33,8 +33,8 @@ TOP = 1.0003  # the index of the coldest air
 MIRAGE = 3e-5  # what it loses down to the road
 EXACT_RATIO = 2.0**-23  # 1 + this is the first float32 after 1
 FEEDS = {
-    "ratios": "each k rounded once; of neighbours 3e-8 apart they are 1 in float32, and the ray goes straight",
-    "reciprocals": "each k as 1/η of a rounded η = n_to/n_from; in float32 then 1 + 2⁻²³, four times what it should be",
+    "ratios": "each k rounded once; neighbours 3e-8 apart have 1 in float32, and the ray goes straight",
+    "reciprocals": "each k as 1/η of a rounded η = n_to/n_from; the same neighbours have 1 + 2⁻²³, four times too much",
     "indices": "each k as a quotient of rounded indices, as scenes give them",
     "contrasts": "each k rounded once, and with it k² − 1 from double precision",
 }

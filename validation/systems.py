@@ -192,11 +192,12 @@ def double_gauss_data() -> dict[str, Any]:
 
 
 def meet(p: Array, d: Array, curvature: float) -> tuple[Array, Array]:
-    """Where rays meet the surface c (x² + y² + z²) = 2 z next to its vertex, and its unit normal there."""
+    """Where rays meet the surface c (x² + y² + z²) = 2 z next to its vertex, and its unit normal; NaN if they miss."""
     p = p - d * (p[:, 2:] / d[:, 2:])  # on the vertex plane, where the smaller root is the near one
     e = curvature * dot(p[:, :2], p[:, :2])
     f = d[:, 2:] - curvature * dot(d[:, :2], p[:, :2])
-    p = p + d * (e / (f + np.copysign(np.sqrt(f * f - curvature * e), f)))
+    with np.errstate(invalid="ignore"):
+        p = p + d * (e / (f + np.copysign(np.sqrt(f * f - curvature * e), f)))
     return p, vectors(0, 0, 1) - curvature * p
 
 
