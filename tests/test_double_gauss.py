@@ -1,22 +1,29 @@
 """A double Gauss, traced exactly by CODE V, retraced surface by surface with every formula in float64."""
 
 import drjit as dr
-import numpy as np
 import pytest
 
 from mi_refract import FORMULAS
 from validation import systems
-from validation.directions import Setting
-from validation.stability import Refractor
 
-SCALAR = Setting("scalar float64", np.float64, dr.scalar.Array3f64)
+
+def refract(formula):
+    """A formula on scalar arrays, ray by ray, as a system asks for it."""
+
+    def by_rows(a, n, k):
+        vector, found = dr.scalar.Array3f64, []
+        for a_i, n_i in zip(a.astype(float), n.astype(float), strict=True):
+            b, transmitted = formula(vector(a_i), vector(n_i), float(k))
+            assert transmitted
+            found.append(list(b))
+        return systems.vectors(*zip(*found, strict=True))
+
+    return by_rows
 
 
 @pytest.mark.parametrize("name", FORMULAS)
 def test_every_formula_retraces_the_lens_within_the_print(name):
-    refractor = Refractor(FORMULAS[name], SCALAR)
-    assert systems.off_print(refractor) <= 1
-    assert refractor.mirrored == 0
+    assert systems.off_print(refract(FORMULAS[name])) <= 1
 
 
 def test_the_print_is_that_of_nine_rays_through_eleven_surfaces():

@@ -1,9 +1,10 @@
 """The closed answers of the stability study against independent evaluations, and its sight of planted defects."""
 
+import dataclasses
 import itertools
 import math
+from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -12,28 +13,28 @@ from flint import arb, ctx, fmpq
 from mi_refract import FORMULAS, backend, oracle
 from validation import chains, stability, systems
 from validation.chains import air, carry, enter, exact_ratios, pipe
-from validation.directions import BUILTIN, Setting, builtin
+from validation.directions import BUILTIN, builtin
 from validation.plan import SCALAR_PROFILES, Context
 
-SCALAR = Setting("scalar float64", np.float64, dr.scalar.Array3f64)
+HERE = Context(SCALAR_PROFILES["quick"], Path(), "scalar_rgb", backend.detect(), backend.usable_variants())
+SETTINGS = {setting.label: setting for setting in stability.settings(HERE)}
+SCALAR = SETTINGS["scalar float64"]
 SMALL = stability.Extent((40,), ("askew",), 60, (89.4, 89.8), False)
 ASKEW = stability.PLANES["askew"]
 DEGREES = stability.PASSING + stability.TURNING
 
 
-@pytest.fixture
-def context(tmp_path):
-    before = mi.variant()
-    yield Context(SCALAR_PROFILES["quick"], tmp_path, before, backend.detect(), backend.usable_variants())
-    assert mi.variant() == before
-
-
 def compiled(precision):
-    entry = backend.detect()["llvm"]
-    if not entry.usable:
-        pytest.skip(f"llvm: {entry.reason}")
-    name = {"float32": "Array3f", "float64": "Array3f64"}[precision]
-    return Setting(f"llvm {precision}", getattr(np, precision), getattr(dr.llvm, name))
+    setting = SETTINGS[f"llvm {precision}"]
+    return setting if setting.vector is not None else pytest.skip(f"llvm: {setting.reason}")
+
+
+@pytest.fixture
+def context():
+    """One whose variant is the present one, as it must be afterwards."""
+    before = mi.variant()
+    yield dataclasses.replace(HERE, variant=before)
+    assert mi.variant() == before
 
 
 def exactly(x):
@@ -276,7 +277,7 @@ def test_a_system_passes_and_sees_planted_defects(name):
 # Rows ----------------------------------------------------------------------------------------------------------
 
 
-def test_single_precision_stays_within_its_budgets_and_shows_what_ratios_cost(context):
+def test_single_precision_stays_within_its_budgets_and_shows_what_ratios_cost():
     setting = compiled("float32")
     how = stability.Extent((1000,), ("upright",), 1000, DEGREES, False)
     rows = stability.mirage_rows(FORMULAS, "mirage", air(1000), stability.PLANES["upright"], setting, how)
@@ -292,7 +293,7 @@ def test_single_precision_stays_within_its_budgets_and_shows_what_ratios_cost(co
     assert [row.case for row in rows if row.verdict == "fail"] == ["mirage, contrasts"]
 
 
-def test_curves_run_through_the_layers(context):
+def test_curves_run_through_the_layers():
     how = stability.Extent((30,), ("askew",), 10, (89.0, 89.95), True)
     found = {"promoted": promoted, "wedge": FORMULAS["wedge"]}
     rows = stability.mirage_rows(found, "mirage", air(30), ASKEW, SCALAR, how)
@@ -305,13 +306,12 @@ def test_curves_run_through_the_layers(context):
 
 
 def test_tasks_name_what_does_not_run_and_mitsuba_runs_on_scalars_too(context):
-    settings = {s.label: s for s in stability.settings(context)}
-    absent = [s for s in settings.values() if s.vector is None]
+    absent = [s for s in SETTINGS.values() if s.vector is None]
     assert all(row.verdict == "not run" and row.reason for s in absent for row in stability.chain_rows(context, s))
-    single = settings["scalar float32"]
+    single = SETTINGS["scalar float32"]
     with stability.subjects(context, single) as found:
         assert [*found] == [BUILTIN]
         row = stability.system_row(BUILTIN, builtin, "prism", single)
     assert row.verdict == "info"
     assert 0.01 < row.values["error / condition"] < 2
-    assert [*settings] == list(dict.fromkeys(task.name[11:].partition(",")[0] for task in stability.tasks(context)))
+    assert [*SETTINGS] == list(dict.fromkeys(task.name[11:].partition(",")[0] for task in stability.tasks(context)))
