@@ -100,7 +100,12 @@ def _compiled(subject: Subject, chain: Chain, a: Array, stop: Array, setting: Se
     wide: Any = dr.float64_array_t(number)
     contrasts = None if chain.contrasts is None else wide(chain.contrasts.astype(np.float64))
     count, stride = dr.opaque(integer, chain.count), dr.opaque(integer, int(columns > 1))
-    first = integer((np.arange(len(a)) * (columns if rows > 1 else 0)).astype(np.int32))
+    turns, limit = dr.opaque(dr.mask_t(integer), chain.turns), 2 * chain.count + 2
+    start = (vector(a.astype(setting.precision).T), *(dr.opaque(integer, x, len(a)) for x in (0, 1, 0, limit)))
+    # numpy's memory may be aligned or not, and be transposed: each is another kernel, unless it is copied first.
+    rays = np.arange(len(a)) if rows > 1 else np.zeros(len(a))
+    first, end = (integer(x.astype(np.int32)) + start[1] for x in (rays * columns, stop))
+    dr.eval(start, first, end)
 
     def boundary(place: Any, way: Any) -> tuple:
         here = dr.select(way > 0, place, place + count)
@@ -111,10 +116,7 @@ def _compiled(subject: Subject, chain: Chain, a: Array, stop: Array, setting: Se
         # Mitsuba's functions return arrays that carry derivatives, and the state of the loop must keep its type.
         return dr.detach(subject(*given), preserve_type=False)
 
-    start = (vector(a.astype(setting.precision).T), *(dr.full(integer, x, len(a)) for x in (0, 1, 0)))
-    turns = dr.opaque(dr.mask_t(integer), chain.turns)
-    limit = dr.opaque(integer, 2 * chain.count + 2, len(a))
-    b, place, _, passed, _ = _follow(detached, boundary, turns, integer(stop.astype(np.int32)), (*start, limit))
+    b, place, _, passed, _ = _follow(detached, boundary, turns, end, start)
     dr.eval(b, place, passed)
     return Carried(np.array(b).T.astype(np.longdouble), np.array(place), np.array(passed))
 
@@ -245,6 +247,7 @@ def sine2(b: Array, normal: Array) -> Array:
     return (np.cross(normal, b) ** 2).sum(1) / ((b * b).sum(1) * (normal @ normal))
 
 
+@functools.cache
 def air(count: int) -> Layers:
     """n_j = TOP − j MIRAGE/count: the air above a hot road, 3e-8 a layer for a thousand of them."""
     j, top, step = np.arange(count + 1).astype(np.longdouble), np.longdouble(TOP), np.longdouble(MIRAGE) / count
