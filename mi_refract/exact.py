@@ -9,8 +9,14 @@ two terms of the radicand cancel, and √ makes of an error ε one of √ε: so 
 not to a few u. A literal normal along an axis, as in a local frame, leaves nothing to add up: w are the other two
 components of `a`, and each component of b is one product, or the root.
 
-Total internal reflection is decided for the exact inputs wherever |radicand| exceeds 100u² of its terms, (n·a)² and
-κ w²: 4e-13 in float32. Nearer to the critical angle either answer may come out, and the root may be off by 2u.
+Write ρ for |radicand| over its larger term, (n·a)² or κ w², and ε for the error of the radicand over that term.
+Total internal reflection is decided for the exact inputs wherever ρ > ε, and the root is off by ε cosθ/2√ρ:
+
+    compensated   ε ≤ 36u² by the inequalities below; ≤ 9u² in all rays ever tried
+    promoted      ε ≤ (8 + 4/cosθ) 2⁻⁵³ in float32, which is 2⁻⁴⁷ for cosθ ≥ 1/14; in float64 it is the compensated form
+
+so both decide rightly where ρ > 2⁻⁴⁴ in float32. Below that T < 4√ρ < 2⁻²⁰: the refracted lobe whose direction is in
+doubt carries less than a millionth of the power, and no float32 input is known to within what would decide it.
 """
 
 from __future__ import annotations
@@ -23,6 +29,25 @@ from . import numerics
 from .numerics import Double, component_of, quotient
 
 Refracted = tuple[Any, Any]
+
+
+def near_unit(a: Any, n: Any) -> Any:
+    """`n` times the power of two that brings |a| |n| near 1, where no square over- or underflows.
+
+    float32 on Dr.Jit arrays, lengths of 1e-18 to 1e18; every other type has the range without it and is returned as
+    it is. Exact, and b does not depend on the length of `n`.
+    """
+    if dr.type_v(a) != dr.VarType.Float32 or not dr.is_jit_v(a):
+        return n
+    number, bits = dr.value_t(type(a)), dr.uint32_array_t(dr.value_t(type(a)))
+
+    def largest(v: Any) -> Any:
+        x, y, z = (dr.reinterpret_array(bits, dr.detach(v_i)) & 0x7FFFFFFF for v_i in v)
+        return dr.maximum(dr.maximum(x, y), z)
+
+    # The exponents of both are subtracted from that of 1; 127 is its bias, once for each of the three.
+    exponent = (bits(3 * 127 << 23) - (largest(a) + largest(n))) & 0x7F800000
+    return n * dr.reinterpret_array(number, exponent)
 
 
 def _axis(n: Any) -> tuple[int, int] | None:
@@ -54,15 +79,15 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     number = dr.value_t(wide)
     d, m, k2 = wide(a), wide(n), number(component_of(a, k))
     # k² has 48 bits: the difference is rounded at most once.
-    kappa = k2 * k2 - 1 if contrast is None else number(contrast)
-    # Products of components are exact and their sums rounded at 2⁻⁵³: error of the radicand ≤ 8·2⁻⁵³ of its terms.
+    kappa = dr.fma(k2, k2, -1) if contrast is None else number(contrast)
+    # Products of components are exact in float64, so c is off by 2·2⁻⁵³ |n| |a|, each w by 2⁻⁵³ of itself.
     c, w = dr.dot(m, d), dr.cross(m, d)
-    radicand = c * c - kappa * dr.dot(w, w)
+    radicand = dr.fma(c, c, -kappa * dr.dot(w, w))
     transmitted = (radicand >= 0) & (c != 0)
     along, scale = dr.select(transmitted, dr.mulsign(dr.safe_sqrt(radicand), c), -c), dr.select(transmitted, k2, 1)
     # κ = 0 leaves b = a to the last bit: √(c²) is |c| exactly, so the factor of n is 0. So it is for c = 0.
-    # Else k a + n (…) cancels to k·2⁻⁵³ |a|, which is far below 2⁻²⁴ for k ≤ 1e6.
-    return type(a)(d * scale + m * quotient(along - scale * c, dr.dot(m, m))), transmitted
+    # Else k a + n (…) cancels to 4k·2⁻⁵³ |a|, which is u/128 for k = 1e6.
+    return type(a)(dr.fma(m, quotient(dr.fma(-scale, c, along), dr.dot(m, m)), d * scale)), transmitted
 
 
 def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
@@ -70,18 +95,18 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
 
     A plain evaluation b₀ (a few u off) is corrected by its exact defect in the two equations that define b, so the
     sum b₀ + δ is rounded once. `contrast`: κ where it is known better than k, for the radicand; `k` itself still
-    scales the tangent. Source: this project.
-    Precondition: no over- or underflow in the fourth power of a length times k², which for float32 and k ≤ 1e6 means
-    lengths of 1e-5 to 1e5. Weak nowhere.
+    scales the tangent. Source: this project. Weak nowhere for k ≤ 1e6.
+    Precondition: |a| |n| such that no fourth power of it times k² over- or underflows (`near_unit` sees to it).
     """
     k, axis = component_of(a, k), _axis(n)
-    kappa = Double.product(k, k) - 1 if contrast is None else _split(a, contrast)
+    kappa = Double.product(k, k) - 1 if contrast is None else _split(a, contrast)  # u²
     if axis:
         index, sign = axis
         c, w = Double(a[index] if sign > 0 else -a[index]), [Double(a[i]) for i in range(3) if i != index]
     else:
-        c, w = numerics.dot(n, a), numerics.cross(n, a)
-    radicand = numerics.difference(c * c, kappa * numerics.sum_of_squares(w))
+        c, w = numerics.dot(n, a), numerics.cross(n, a)  # 2u² each of itself
+    # c²: 2·2u² + 4u². κ w²: 2·4u² + 12u² + u², and 6u² for the product. The difference: 2u² of the larger.
+    radicand = numerics.difference(numerics.square(c), kappa * numerics.sum_of_squares(w))
     transmitted = (radicand.hi >= 0) & (c.hi != 0)
     root, scale = radicand.sqrt(), dr.select(transmitted, k, 1)
     if axis:
@@ -89,8 +114,9 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
         return _along_axis(a, axis, scale, along), transmitted
     root = Double(dr.mulsign(root.hi, c.hi), dr.mulsign(root.lo, c.hi))
     b = _correct(type(a), n, [w_i * scale for w_i in w], numerics.select(transmitted, root, -c))
-    exact = dr.select((kappa.hi == 0) | (c.hi == 0), a, b)
-    # To the last bit where the answer is `a`, but with the derivative of b, which is not that of `a`.
+    # To the last bit where the answer is `a`, but with the derivative of b, which is not that of `a`. Where `n` is no
+    # normal b is NaN, and stays so.
+    exact = dr.select(((kappa.hi == 0) | (c.hi == 0)) & (b[0] == b[0]), a, b)
     return (_attach(exact, b) if dr.grad_enabled(b) else exact), transmitted
 
 
@@ -102,12 +128,12 @@ def _correct(vector: type, n: Any, around: list[Double], along: Double) -> Any:
     """The b with n × b = `around` and n·b = `along`: b = (around × n + along n)/n², rounded once.
 
     |b₀ − b| ≤ 8u |b|, and δ from the exact defects is right to 8u of itself: b₀ + δ is b to 64u² before it is
-    rounded, so the final error is that of rounding, u/2 ulp a component.
+    rounded, so the final error is that of rounding, half an ulp a component.
     """
     inverse = quotient(1, dr.dot(n, n))
 
     def solve(around: list[Any], along: Any) -> Any:
-        return (dr.cross(vector(*around), n) + n * along) * inverse
+        return dr.fma(n, along, dr.cross(vector(*around), n)) * inverse
 
     b = solve([x.hi for x in around], along.hi)
     missing = [

@@ -147,38 +147,43 @@ def dot(x: Any, y: Any) -> Double:
 
 
 def cross(x: Any, y: Any) -> list[Double]:
-    """x × y of two 3-vectors as three `Double`s, each with relative error ≤ 6u²."""
+    """x × y of two 3-vectors as three `Double`s: each within 4u² of the larger product in it, and 4u² of itself."""
     return [_exact_difference(x[i], y[j], x[j], y[i]) for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
 def _exact_difference(x: Any, y: Any, z: Any, w: Any) -> Double:
-    """x y − z w: both products are exact pairs, and their four parts are added without loss to second order."""
+    """x y − z w. Where it cancels p − q is exact and at least as large as e − f, which then carries the digits."""
     p, p_lo = two_prod(x, y)
     q, q_lo = two_prod(z, w)
     d, d_lo = two_sum(p, -q)
     e, e_lo = two_sum(p_lo, -q_lo)
-    s, s_lo = two_sum(d, e)
-    return Double(*fast_two_sum(s, s_lo + (d_lo + e_lo)))
+    # Either d_lo = 0 or |d| ≥ max(|p|, |q|)/2: so d_lo + e is off by ≤ 4u² |d|, and |d| ≥ |d_lo + e| or d = 0.
+    s, s_lo = fast_two_sum(d, d_lo + e)
+    return Double(s, s_lo + e_lo)
+
+
+def square(x: Double) -> Double:
+    """x², error ≤ 4u² x². |lo| ≤ 3u hi."""
+    p, e = two_prod(x.hi, x.hi)
+    return Double(p, e if x.is_plain else dr.fma(x.lo, dr.fma(2, x.hi, x.lo), e))
 
 
 def sum_of_squares(x: list[Double]) -> Double:
-    """Σ xᵢ² of `Double`s: no term is negative, so plain accumulation of the low parts keeps a few u²."""
-    total, low = two_prod(x[0].hi, x[0].hi)
-    for i, x_i in enumerate(x):
-        if i > 0:
-            p, e = two_prod(x_i.hi, x_i.hi)
-            total, f = two_sum(total, p)
-            low = low + (e + f)
-        if not x_i.is_plain:
-            low = dr.fma(2 * x_i.hi, x_i.lo, low)
-    return Double(total, low)
+    """Σ xᵢ² of two or three `Double`s: no term is negative, so their low parts, ≤ 5u of the sum, add up to ≤ 12u²."""
+    squares = [square(x_i) for x_i in x]
+    total, low = squares[0].hi, squares[0].lo
+    for each in squares[1:]:
+        total, e = two_sum(total, each.hi)
+        low = low + (each.lo + e)
+    return Double(*fast_two_sum(total, low))
 
 
 def defect(target: Double, *products: Pair) -> Any:
-    """target − Σ xᵢ yᵢ as a plain number: error ≤ u · |result| + 8u² Σ|xᵢ yᵢ|, so small defects keep their digits."""
-    total, low = two_prod(*products[0])
-    for x, y in products[1:]:
+    """target − Σ xᵢ yᵢ as a plain number: error ≤ u |result| + 4u² Σ|xᵢ yᵢ|, so small defects keep their digits."""
+    rest, low = target.hi, target.lo
+    for x, y in products[:-1]:
         p, e = two_prod(x, y)
-        total, f = two_sum(total, p)
-        low = low + (e + f)
-    return (target.hi - total) + (target.lo - low)
+        rest, f = two_sum(rest, -p)
+        low = low + (f - e)
+    x, y = products[-1]
+    return dr.fma(-x, y, rest) + low
