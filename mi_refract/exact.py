@@ -31,25 +31,6 @@ from .numerics import Double, component_of, quotient
 Refracted = tuple[Any, Any]
 
 
-def near_unit(a: Any, n: Any) -> Any:
-    """`n` times the power of two that brings |a| |n| near 1, where no square over- or underflows.
-
-    float32 on Dr.Jit arrays, lengths of 1e-18 to 1e18; every other type has the range without it and is returned as
-    it is. Exact, and b does not depend on the length of `n`.
-    """
-    if dr.type_v(a) != dr.VarType.Float32 or not dr.is_jit_v(a):
-        return n
-    number, bits = dr.value_t(type(a)), dr.uint32_array_t(dr.value_t(type(a)))
-
-    def largest(v: Any) -> Any:
-        x, y, z = (dr.reinterpret_array(bits, dr.detach(v_i)) & 0x7FFFFFFF for v_i in v)
-        return dr.maximum(dr.maximum(x, y), z)
-
-    # The exponents of both are subtracted from that of 1; 127 is its bias, once for each of the three.
-    exponent = (bits(3 * 127 << 23) - (largest(a) + largest(n))) & 0x7F800000
-    return n * dr.reinterpret_array(number, exponent)
-
-
 def _axis(n: Any) -> tuple[int, int] | None:
     """(index, ±1) of a normal that is a Dr.Jit literal along an axis and has no derivative; else None."""
     if dr.grad_enabled(n) or not all(dr.is_jit_v(x) and x.state == dr.VarState.Literal for x in n):
@@ -96,7 +77,8 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
     A plain evaluation b₀ (a few u off) is corrected by its exact defect in the two equations that define b, so the
     sum b₀ + δ is rounded once. `contrast`: κ where it is known better than k, for the radicand; `k` itself still
     scales the tangent. Source: this project. Weak nowhere for k ≤ 1e6.
-    Precondition: |a| |n| such that no fourth power of it times k² over- or underflows (`near_unit` sees to it).
+    Precondition in float32: lengths of 1e-3 to 1e3, so that no product of four over- or underflows
+    (`numerics.near_unit` sees to it, in the entries of FORMULAS).
     """
     k, axis = component_of(a, k), _axis(n)
     kappa = Double.product(k, k) - 1 if contrast is None else _split(a, contrast)  # u²

@@ -19,8 +19,8 @@ from typing import Any
 
 import drjit as dr
 
-from .exact import Refracted, near_unit, refract_compensated, refract_promoted
-from .numerics import component_of, quotient
+from .exact import Refracted, refract_compensated, refract_promoted
+from .numerics import component_of, near_unit, quotient
 
 # Shared by all formulas ----------------------------------------------------------------------------------------
 
@@ -199,7 +199,7 @@ SMALLEST_RATIO, LARGEST_RATIO = 1e-9, 1e9
 class Formula:
     """A formula of refraction, `entry(a, n, k) -> (b, transmitted)`, with its source and its error budget.
 
-    `takes_contrast`: `contrast` is used, not ignored. `scales`: the function wants |a| |n| near 1. `automatic_for`:
+    `takes_contrast`: `contrast` is used, not ignored. `scales`: the function wants lengths near 1. `automatic_for`:
     the kinds of array it is the default on.
     """
 
@@ -217,9 +217,12 @@ class Formula:
         That is: `a` or `n` zero or not finite, `k` outside 1e-9 … 1e9, `contrast` not finite or not above −1.
         """
         n, k = type(a)(n), component_of(a, k)
-        b, transmitted = self.unchecked(a, near_unit(a, n) if self.scales else n, k, contrast)
+        scale: Any = 1
+        if self.scales:
+            (a, scale), (n, _) = near_unit(a), near_unit(n)
+        b, transmitted = self.unchecked(a, n, k, contrast)
         # `b` has the length of `a`, and a zero or non-finite `n` makes it NaN: one length tells of both.
-        length2 = dr.dot(b, b)
+        b, length2 = b * scale, dr.dot(b, b)
         valid = (k >= SMALLEST_RATIO) & (k <= LARGEST_RATIO) & (length2 > 0) & (length2 < dr.inf)
         if contrast is not None:
             valid &= (contrast > -1) & (contrast < dr.inf)

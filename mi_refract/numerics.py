@@ -35,6 +35,22 @@ def quotient(x: Any, y: Any) -> Any:
     return x / y
 
 
+def near_unit(v: Any) -> tuple[Any, Any]:
+    """(v / p, p), p the power of two for which the largest component of v / p is in [1, 2). Exact.
+
+    Where squares could over- or underflow, which is in float32 on Dr.Jit's arrays; every other type has the range
+    for lengths of 1e-18 to 1e18 as it is, and p is the literal 1.
+    """
+    if dr.type_v(v) != dr.VarType.Float32 or not dr.is_jit_v(v):
+        return v, 1
+    number: Any = dr.value_t(type(v))
+    bits: Any = dr.uint32_array_t(number)
+    x, y, z = (dr.reinterpret_array(bits, dr.detach(v_i)) & 0x7FFFFFFF for v_i in v)
+    exponent = dr.maximum(dr.maximum(x, y), z) & 0x7F800000
+    # 127 is the bias: of 1 / p and of p one each.
+    return v * dr.reinterpret_array(number, (2 * 127 << 23) - exponent), dr.reinterpret_array(number, exponent)
+
+
 def two_sum(x: Any, y: Any) -> Pair:
     """s = fl(x + y) and e with s + e = x + y exactly, whatever the magnitudes."""
     s = x + y
