@@ -9,14 +9,14 @@ two terms of the radicand cancel, and √ makes of an error ε one of √ε: so 
 not to a few u. A literal normal along an axis, as in a local frame, leaves nothing to add up: w are the other two
 components of `a`, and each component of b is one product, or the root.
 
-Write ρ for |radicand| over its larger term, (n·a)² or κ w², and ε for the error of the radicand over that term.
-Total internal reflection is decided for the exact inputs wherever ρ > ε, and the root is off by ε cosθ/2√ρ:
+Write ρ for |radicand| over the larger of its terms, and ε for its error over that term. Total internal reflection is
+decided as the exact inputs decide it wherever ρ > ε, and the root is off by ε cosθ/2√ρ. For float32, u = 2⁻²⁴:
 
-    compensated   ε ≤ 36u² by the inequalities below; ≤ 9u² in all rays ever tried
-    promoted      ε ≤ (8 + 4/cosθ) 2⁻⁵³ in float32, which is 2⁻⁴⁷ for cosθ ≥ 1/14; in float64 it is the compensated form
+    compensated   ε ≤ 48u² = 2⁻⁴²·⁴, if all roundings took their largest values at once; the largest ever seen is 9u²
+    promoted      ε ≤ 10·2⁻⁵³ < 2⁻⁴⁹
 
-so both decide rightly where ρ > 2⁻⁴⁴ in float32. Below that T < 4√ρ < 2⁻²⁰: the refracted lobe whose direction is in
-doubt carries less than a millionth of the power, and no float32 input is known to within what would decide it.
+Where ρ < 2⁻⁴⁴ the refracted ray is within 2⁻²² cosθ of the surface and carries T ≈ 2 (k + 1/k) √ρ of the power, less
+than 2e-6 for k ≤ 2.5. A ρ that small takes inputs made for it: of random ones near the critical angle one in 10⁹.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from typing import Any
 import drjit as dr
 
 from . import numerics
-from .numerics import Double, component_of, quotient
+from .numerics import Double, component_of, quotient, two_sum
 
 Refracted = tuple[Any, Any]
 
@@ -61,14 +61,26 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     d, m, k2 = wide(a), wide(n), number(component_of(a, k))
     # k² has 48 bits: the difference is rounded at most once.
     kappa = dr.fma(k2, k2, -1) if contrast is None else number(contrast)
-    # Products of components are exact in float64, so c is off by 2·2⁻⁵³ |n| |a|, each w by 2⁻⁵³ of itself.
-    c, w = dr.dot(m, d), dr.cross(m, d)
+    # Products of components are exact in float64. Each w is off by 2⁻⁵³ of itself, and so is c, twice: at grazing
+    # incidence the sum of its first two products is much larger than c, and what rounding it loses is put back.
+    (partial, lost), w = two_sum(m.x * d.x, m.y * d.y), dr.cross(m, d)
+    c = dr.fma(m.z, d.z, partial) + lost
+    # c²: 4·2⁻⁵³; κ w²: 2 from w, 3 from their squares and sum, 1 from the product.
     radicand = dr.fma(c, c, -kappa * dr.dot(w, w))
     transmitted = (radicand >= 0) & (c != 0)
     along, scale = dr.select(transmitted, dr.mulsign(dr.safe_sqrt(radicand), c), -c), dr.select(transmitted, k2, 1)
     # κ = 0 leaves b = a to the last bit: √(c²) is |c| exactly, so the factor of n is 0. So it is for c = 0.
     # Else k a + n (…) cancels to 4k·2⁻⁵³ |a|, which is u/128 for k = 1e6.
     return type(a)(dr.fma(m, quotient(dr.fma(-scale, c, along), dr.dot(m, m)), d * scale)), transmitted
+
+
+def _radicand(c: Double, w: list[Double], kappa: Double) -> Double:
+    """c² − κ w²; its error ε over the larger term, near the critical angle, in u².
+
+    c is off by 1 (and 10u/cosθ more), each w by 5, κ by none for 1 ≤ k < 2²³. So c² is off by 2·1 + 5, w² by
+    2·5 + 19, the product with κ by 6 more, and the difference, of which only the low parts are rounded, by 6: 48.
+    """
+    return numerics.difference(numerics.square(c), kappa * numerics.sum_of_squares(w))
 
 
 def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
@@ -81,14 +93,13 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
     (`numerics.near_unit` sees to it, in the entries of FORMULAS).
     """
     k, axis = component_of(a, k), _axis(n)
-    kappa = Double.product(k, k) - 1 if contrast is None else _split(a, contrast)  # u²
+    kappa = Double.product(k, k) - 1 if contrast is None else _split(a, contrast)
     if axis:
         index, sign = axis
         c, w = Double(a[index] if sign > 0 else -a[index]), [Double(a[i]) for i in range(3) if i != index]
     else:
-        c, w = numerics.dot(n, a), numerics.cross(n, a)  # 2u² each of itself
-    # c²: 2·2u² + 4u². κ w²: 2·4u² + 12u² + u², and 6u² for the product. The difference: 2u² of the larger.
-    radicand = numerics.difference(numerics.square(c), kappa * numerics.sum_of_squares(w))
+        c, w = numerics.dot(n, a), numerics.cross(n, a)
+    radicand = _radicand(c, w, kappa)
     transmitted = (radicand.hi >= 0) & (c.hi != 0)
     root, scale = radicand.sqrt(), dr.select(transmitted, k, 1)
     if axis:

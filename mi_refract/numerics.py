@@ -45,8 +45,8 @@ def near_unit(v: Any) -> tuple[Any, Any]:
         return v, 1
     number: Any = dr.value_t(type(v))
     bits: Any = dr.uint32_array_t(number)
-    x, y, z = (dr.reinterpret_array(bits, dr.detach(v_i)) & 0x7FFFFFFF for v_i in v)
-    exponent = dr.maximum(dr.maximum(x, y), z) & 0x7F800000
+    absolute: Any = [dr.reinterpret_array(bits, dr.detach(v_i)) & 0x7FFFFFFF for v_i in v]  # ordered as |v_i| are
+    exponent = dr.maximum(dr.maximum(absolute[0], absolute[1]), absolute[2]) & 0x7F800000
     # 127 is the bias: of 1 / p and of p one each.
     return v * dr.reinterpret_array(number, (2 * 127 << 23) - exponent), dr.reinterpret_array(number, exponent)
 
@@ -146,7 +146,7 @@ def difference(x: Double, y: Double) -> Double:
 
 
 def dot(x: Any, y: Any) -> Double:
-    """x · y of two 3-vectors as a `Double`: error ≤ u² · 12 Σ|xᵢ yᵢ|, and 0 exactly when the sum is 0."""
+    """x · y of two 3-vectors as a `Double`: error ≤ u² |x · y| + 10u³ Σ|xᵢ yᵢ|, and 0 exactly when the sum is 0."""
     p, e0 = two_prod(x[0], y[0])
     q, e1 = two_prod(x[1], y[1])
     r, e2 = two_prod(x[2], y[2])
@@ -163,29 +163,32 @@ def dot(x: Any, y: Any) -> Double:
 
 
 def cross(x: Any, y: Any) -> list[Double]:
-    """x × y of two 3-vectors as three `Double`s: each within 4u² of the larger product in it, and 4u² of itself."""
+    """x × y of two 3-vectors as three `Double`s, each with relative error ≤ 5u²."""
     return [_exact_difference(x[i], y[j], x[j], y[i]) for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
 def _exact_difference(x: Any, y: Any, z: Any, w: Any) -> Double:
-    """x y − z w. Where it cancels p − q is exact and at least as large as e − f, which then carries the digits."""
+    """x y − z w, relative error ≤ 5u².
+
+    Where p and q cancel, d is exact, and a multiple of the last place of e: `fast_two_sum` is exact. Elsewhere
+    |d| ≥ max(|p|, |q|)/2, so |e| ≤ 3u |d|, and d_lo + e loses at most 4u² |d|.
+    """
     p, p_lo = two_prod(x, y)
     q, q_lo = two_prod(z, w)
     d, d_lo = two_sum(p, -q)
     e, e_lo = two_sum(p_lo, -q_lo)
-    # Either d_lo = 0 or |d| ≥ max(|p|, |q|)/2: so d_lo + e is off by ≤ 4u² |d|, and |d| ≥ |d_lo + e| or d = 0.
     s, s_lo = fast_two_sum(d, d_lo + e)
     return Double(s, s_lo + e_lo)
 
 
 def square(x: Double) -> Double:
-    """x², error ≤ 4u² x². |lo| ≤ 3u hi."""
+    """x², relative error ≤ 5u², and |lo| ≤ 3u hi. Precondition: |lo| ≤ u |hi|, as for the two below."""
     p, e = two_prod(x.hi, x.hi)
     return Double(p, e if x.is_plain else dr.fma(x.lo, dr.fma(2, x.hi, x.lo), e))
 
 
 def sum_of_squares(x: list[Double]) -> Double:
-    """Σ xᵢ² of two or three `Double`s: no term is negative, so their low parts, ≤ 5u of the sum, add up to ≤ 12u²."""
+    """Σ xᵢ² of two or three `Double`s, relative error ≤ 19u²: 5u² of the squares, 14u² of their low parts' sum."""
     squares = [square(x_i) for x_i in x]
     total, low = squares[0].hi, squares[0].lo
     for each in squares[1:]:
