@@ -35,6 +35,10 @@ def quotient(x: Any, y: Any) -> Any:
     return x / y
 
 
+# Dr.Jit's type stub says that it returns an object.
+_reinterpret: Any = dr.reinterpret_array
+
+
 def near_unit(v: Any) -> tuple[Any, Any]:
     """(v / p, p), p the power of two for which the largest component of v / p is in [1, 2). Exact.
 
@@ -44,11 +48,11 @@ def near_unit(v: Any) -> tuple[Any, Any]:
     if dr.type_v(v) != dr.VarType.Float32 or not dr.is_jit_v(v):
         return v, 1
     number: Any = dr.value_t(type(v))
-    bits: Any = dr.uint32_array_t(number)
-    absolute: Any = [dr.reinterpret_array(bits, dr.detach(v_i)) & 0x7FFFFFFF for v_i in v]  # ordered as |v_i| are
-    exponent = dr.maximum(dr.maximum(absolute[0], absolute[1]), absolute[2]) & 0x7F800000
+    bits, reinterpret = dr.uint32_array_t(number), _reinterpret
+    x, y, z = (reinterpret(bits, dr.detach(v_i)) & 0x7FFFFFFF for v_i in v)  # ordered as |v_i| are
+    exponent = dr.maximum(dr.maximum(x, y), z) & 0x7F800000
     # 127 is the bias: of 1 / p and of p one each.
-    return v * dr.reinterpret_array(number, (2 * 127 << 23) - exponent), dr.reinterpret_array(number, exponent)
+    return v * reinterpret(number, (2 * 127 << 23) - exponent), reinterpret(number, exponent)
 
 
 def two_sum(x: Any, y: Any) -> Pair:
