@@ -8,7 +8,7 @@ import math
 import re
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -125,15 +125,24 @@ def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str) -> str:
         return _page_svg(figure)
 
 
-def scatter_svg(panels: Mapping[str, Mapping[str, Points]], axes: Axes, *, salt: str) -> str:
-    """One panel per setting, one labelled colour per subject.
+@dataclass
+class Scatter:
+    """A panel: points by subject, (subject, low x, high x, y) of the intervals, and the x of the floor."""
+
+    points: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    intervals: list[tuple[str, float, float, float]] = field(default_factory=list)
+    floor: float = math.nan
+
+
+def scatter_svg(panels: Mapping[str, Scatter], axes: Axes, *, floor: str, front: bool, salt: str) -> str:
+    """One panel per setting, one labelled colour per subject; `floor` names the floor's line, `front` draws the front.
 
     The points of a subject are joined, so that its spread over the cases is one vertical stroke.
     Points without a place on the axes are left out. "" where nothing can be drawn.
     """
     drawn = {
-        setting: {s: p for s, points in subjects.items() if (p := sorted(drawable(points, axes)))}
-        for setting, subjects in panels.items()
+        setting: {s: p for s, points in panel.points.items() if (p := sorted(drawable(points, axes)))}
+        for setting, panel in panels.items()
     }
     drawn = {setting: subjects for setting, subjects in drawn.items() if subjects}
     if not drawn:
@@ -151,12 +160,11 @@ def scatter_svg(panels: Mapping[str, Mapping[str, Points]], axes: Axes, *, salt:
         colours = {s: SERIES[i % len(SERIES)] for i, s in enumerate(names)}
         for panel, (setting, subjects) in zip(grid, drawn.items(), strict=False):
             panel.set(xscale=axes.x_scale, yscale=axes.y_scale, title=setting, xlabel=axes.x)
-            for subject, points in subjects.items():
-                style = {"color": colours[subject], "marker": "o", "markersize": 4.5, "linewidth": 1}
-                panel.plot(*zip(*points, strict=True), **style)
-            panel.margins(x=0.3, y=0.1)
+            _points(panel, subjects, panels[setting].intervals, colours)
             if axes.x_scale == "linear" and min(x for points in subjects.values() for x, _ in points) >= 0:
                 panel.set_xlim(left=0)
+            _floor(panel, panels[setting].floor, floor)
+            _front(panel, subjects if front else {})
             _ticks(panel, axes.logarithmic)
         figure.canvas.draw()  # settles the layout that the labels' places depend on
         for panel, subjects in zip(grid, drawn.values(), strict=False):
@@ -166,6 +174,40 @@ def scatter_svg(panels: Mapping[str, Mapping[str, Points]], axes: Axes, *, salt:
         for panel in figure.axes[::columns]:
             panel.set_ylabel(axes.y)
         return _page_svg(figure)
+
+
+def pareto(points: Points) -> list[tuple[float, float]]:
+    """The points that no other one beats or equals in both coordinates (less is better), by growing x."""
+    front: list[tuple[float, float]] = []
+    for x, y in sorted(points):
+        if not front or y < front[-1][1]:
+            front.append((x, y))
+    return front
+
+
+def _points(panel: Panel, subjects: Mapping[str, Points], intervals: Any, colours: Mapping[str, str]) -> None:
+    for subject, points in subjects.items():
+        style = {"color": colours[subject], "marker": "o", "markersize": 4.5, "linewidth": 1}
+        panel.plot(*zip(*points, strict=True), **style)  # type: ignore[arg-type]
+    for subject, low, high, y in intervals:
+        if subject in subjects:
+            panel.plot([low, high], [y, y], color=colours[subject], linewidth=1)
+    panel.margins(x=0.3, y=0.1)
+
+
+def _floor(panel: Panel, x: float, name: str) -> None:
+    if math.isfinite(x):
+        panel.axvline(x, color=MUTED, linewidth=1, linestyle=(0, (1, 2)))
+        place = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "fontsize": 9.5}
+        panel.annotate(name, (x, 0), (-4, 6), color=MUTED, ha="right", **place)  # type: ignore[arg-type]
+
+
+def _front(panel: Panel, subjects: Mapping[str, Points]) -> None:
+    """Steps along the front, on to the panel's edges."""
+    if front := pareto([point for points in subjects.values() for point in points]):
+        (_, right), (_, top) = panel.get_xlim(), panel.get_ylim()
+        x, y = zip((front[0][0], top), *front, (right, front[-1][1]), strict=True)
+        panel.step(x, y, where="post", color=MUTED, linewidth=1, zorder=1, scalex=False, scaley=False)
 
 
 def _style(salt: str) -> Any:

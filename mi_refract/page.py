@@ -5,7 +5,9 @@
 - `title`: the page's name;
 - `studies`: {study: {"title", "text", "terms", "axes"}}, all optional: heading, introduction and glossary of a study,
   and the fields of `figures.Axes`, which say how the curves of its rows are drawn;
-- `scatter`: [{"study", "x", "y", "title"}]: plots of one metric against another, a panel per setting;
+- `scatter`: [{"study", "x", "y", "title", "interval", "floor", "front"}]: plots of one metric against another, a panel
+  per setting; all but the first three optional. `interval` are two metrics between which x lies, `floor` the subject
+  whose x is a line (it has no y), `front` steps along the points that no other one of the panel beats in x and y;
 - `replay`: the command that repeats the whole run, shown on top.
 """
 
@@ -16,7 +18,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .figures import Axes, Pictures, apart, compact, curves_svg, drawable, scatter_svg
+from .figures import Axes, Pictures, Scatter, apart, compact, curves_svg, drawable, scatter_svg
 from .rows import Row, by_study
 
 STEERING = ("title", "studies", "scatter", "replay")
@@ -66,7 +68,7 @@ def _study(name: str, rows: list[Row], context: Mapping[str, Any], pictures: Pic
         "failures": sum(row.verdict == "fail" for row in rows),
         "scale": (scale := _scale(rows, metrics)),
         "panels": _panels(rows, metrics, scale),
-        "scatters": [_scatter(s, rows, f"{key}-scatter-{i}") for i, s in enumerate(scatters)],
+        "scatters": [s for i, each in enumerate(scatters) if (s := _scatter(each, rows, f"{key}-scatter-{i}"))],
         "plots": plots,
         "figures": [_figure(row, pictures) for row in rows if row.pictures],
     }
@@ -169,15 +171,23 @@ def _left_out(row: Row, axes: Axes) -> int:
     return sum(len(points) - len(drawable(points, axes)) for points in row.curves.values())
 
 
-def _scatter(scatter: Mapping[str, str], rows: list[Row], salt: str) -> dict[str, Any]:
+def _scatter(scatter: Mapping[str, Any], rows: list[Row], salt: str) -> dict[str, Any] | None:
     x, y = scatter["x"], scatter["y"]
-    panels: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    points = [(row, (row.values[x], row.values[y])) for row in rows if x in row.values and y in row.values]
-    for row, point in points:
-        panels.setdefault(row.setting, {}).setdefault(row.subject, []).append(point)
+    panels: dict[str, Scatter] = {}
+    for row in rows:
+        panel = panels.setdefault(row.setting, Scatter())
+        if x in row.values and y in row.values:
+            panel.points.setdefault(row.subject, []).append((row.values[x], row.values[y]))
+            low, high = (row.values.get(metric, math.nan) for metric in scatter.get("interval", (x, x)))
+            panel.intervals.append((row.subject, low, high, row.values[y]))
+        elif x in row.values and row.subject == scatter.get("floor"):
+            panel.floor = row.values[x]
+    points = [point for panel in panels.values() for each in panel.points.values() for point in each]
+    if not points:
+        return None
     axes = Axes(x, y, x_scale="linear")
-    omitted = len(points) - len(drawable([point for _, point in points], axes))
-    svg = scatter_svg(panels, axes, salt=salt)
+    svg = scatter_svg(panels, axes, floor=scatter.get("floor", ""), front=scatter.get("front", False), salt=salt)
+    omitted = len(points) - len(drawable(points, axes))
     return {"title": scatter.get("title", f"{y} against {x}"), "svg": svg, "omitted": omitted}
 
 

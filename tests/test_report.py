@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from mi_refract import report
-from mi_refract.figures import Axes, apart, compact, curves_svg
+from mi_refract.figures import Axes, apart, compact, curves_svg, pareto
 from mi_refract.files import update_between, write_atomically
 from mi_refract.rows import Row
 
@@ -231,6 +231,31 @@ def test_what_has_no_place_depends_on_the_scales_a_study_asks_for(scales, left_o
     assert ">height</text>" in text and ">turn</text>" in text
     assert [int(n) for n in re.findall(r"Not drawn: (\d+) point", text)] == [left_out] * bool(left_out)
     assert "slope" not in text
+
+
+def test_the_front_are_the_points_that_nothing_beats():
+    points = [(2.0, 5.0), (1.0, 9.0), (3.0, 5.0), (1.0, 8.0), (4.0, 1.0), (5.0, 2.0)]
+    assert pareto(points) == [(1.0, 8.0), (2.0, 5.0), (4.0, 1.0)]
+    assert pareto([]) == []
+
+
+def test_a_scatter_shows_front_floor_and_intervals_where_asked(tmp_path):
+    def paths(**more):
+        scatter = {"study": "s", "x": "time", "y": "worst", **more}
+        text = html(tmp_path, rows, {"scatter": [scatter, {**scatter, "x": "absent"}]})
+        assert text.count('class="plot wide"') == 1  # what no row has measured is not drawn
+        return text.count("<path"), text
+
+    rows = [Row("s", name, "", "llvm", {"time": x, "low": x - 0.1, "high": x + 0.1, "worst": y})
+            for name, x, y in (("a", 1.0, 1e-3), ("b", 2.0, 1e-6), ("c", 3.0, 1e-5))]  # fmt: skip
+    rows.append(Row("s", "copy", "", "llvm", {"time": 0.9}))
+    plain, text = paths()
+    assert ">copy</text>" not in text
+    assert paths(front=True)[0] == plain + 1
+    floored, text = paths(floor="copy")
+    assert floored == plain + 1 and ">copy</text>" in text
+    wide = paths(interval=["low", "high"])[1]
+    assert wide.count("<path") == plain and wide != text
 
 
 @pytest.mark.parametrize("axes", [{"x_scale": "cubic"}, {"slope": 2, "y_scale": "linear"}])
