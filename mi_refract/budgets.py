@@ -28,12 +28,12 @@ class Budget:
     growth: int = 0
     any_length: float | None = None
 
-    def chord(self, u: Any, k: Any, cos_t: Any = 0.0, transmitted: Any = True, unit: bool = True) -> Any:
+    def chord(self, u: Any, k: Any, cos_t: Any = 0.0, transmitted: Any = True, unit: Any = True) -> Any:
         """Bound of |b/|a| − exact|; at the critical angle, where it is largest, by default."""
         return self.of_terms(u, k, transmitted, unit) + self.of_root(u, k, cos_t, transmitted)
 
-    def of_terms(self, u: Any, k: Any, transmitted: Any = True, unit: bool = True) -> Any:
-        linear = self.linear if unit or self.any_length is None else self.any_length
+    def of_terms(self, u: Any, k: Any, transmitted: Any = True, unit: Any = True) -> Any:
+        linear = np.where(unit, self.linear, self.any_length or self.linear)
         return linear * u * np.where(transmitted & (self.growth > 0), np.maximum(1.0, k), 1.0)
 
     def of_root(self, u: Any, k: Any, cos_t: Any, transmitted: Any = True) -> Any:

@@ -41,6 +41,11 @@ class Judgement:
         """Error over bound of the rays judged rightly, 0 elsewhere."""
         return np.where(self.right, self.chord / self.bound, 0.0)
 
+    @property
+    def seen(self) -> np.ndarray:
+        """The rays that break the budget."""
+        return ~(self.share <= 1) | self.far
+
     def values(self) -> dict[str, float]:
         """What a budget is set on: every one of them at most `BUDGETS`."""
         return {"error / bound": float(self.share.max()), "misjudged far": float(self.far.sum())}
@@ -50,7 +55,7 @@ BUDGETS = {"error / bound": 1.0, "misjudged far": 0.0}
 
 
 def judge(
-    subject: Subject, rays: Rays, exact: oracle.Certified, vector: Any, budget: Budget, unit: bool = True
+    subject: Subject, rays: Rays, exact: oracle.Certified, vector: Any, budget: Budget, unit: Any = True
 ) -> Judgement:
     """`subject` on all rays, in arrays of the 3-vector type `vector`; `unit`: |a| = |n| = 1 but for rounding."""
     b, transmitted = evaluate(subject, rays, vector)
