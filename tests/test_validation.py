@@ -177,13 +177,16 @@ def test_the_accuracy_table_holds_the_rows_and_nothing_else():
     settings = {"llvm float32": {"misjudged": 3.0}, "llvm float64": {}}
     rows = [
         Row("directions", "promoted", "all regimes", setting,
-            {"worst chord": 4.97e-8, "worst / u": 0.834, "time / copy": 1.01} | more, replay={"rays": 28000})
+            {"worst chord": 4.97e-8, "worst / u": 0.834, "time / copy": 1.01, "time / copy, low": 0.98,
+             "time / copy, high": 1.2, "time / plain": 1.05} | more, replay={"rays": 28000})
         for setting, more in settings.items()
     ]  # fmt: skip
-    lines = readme.accuracy(rows).splitlines()
-    assert len(lines) == 5
-    assert [cell.strip() for cell in lines[-1].split("|")][1:7] == [
-        "`promoted`", "this project", "4.97e-8", "0.834", "3", "1.01",
+    floor = [dataclasses.replace(r, subject="copy", values={"time / copy": 1.0}, replay={}) for r in rows]
+    lines = readme.accuracy([*rows, *floor]).splitlines()
+    assert len(lines) == 6
+    assert [cell.strip() for cell in lines[-1].split("|")][1:-1] == [
+        "`promoted`", "this project", "4.97e-8", "0.834", "3", "1.01 (0.98–1.2)", "1.05",
+        "4.97e-8", "0.834", "1.01 (0.98–1.2)",
     ]  # fmt: skip
 
 
