@@ -62,14 +62,21 @@ class Path:
     directions: np.ndarray
     media: tuple[int, ...]
 
+    def segments(self) -> np.ndarray:
+        """Starts, directions and ends, M × 3 × 3."""
+        return np.stack([self.starts, self.directions, self.ends], 1)
+
+    def cosines(self, layers: Layers) -> np.ndarray:
+        """|d · n| of every segment, n the normal where it starts."""
+        return np.abs([d @ layers.normal(p) for p, d in zip(self.starts, self.directions, strict=True)])
+
     def at(self, layers: Layers, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(points, directions) where the coordinate along the axis has the values `along`."""
+        """(segments, points) where the coordinate along the axis has the values `along`."""
         axis = layers.axis
         forward = math.copysign(1.0, self.directions[0, axis])
         segment = np.searchsorted(forward * self.ends[:-1, axis], forward * along)
-        d = self.directions[segment]
-        distance = (along - self.starts[segment, axis]) / d[:, axis]
-        return self.starts[segment] + distance[:, None] * d, d
+        distance = (along - self.starts[segment, axis]) / self.directions[segment, axis]
+        return segment, self.starts[segment] + distance[:, None] * self.directions[segment]
 
 
 def exact_path(layers: Layers, p: np.ndarray, d: np.ndarray, medium: int, offset: float = OFFSET) -> Path:
