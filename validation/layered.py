@@ -86,7 +86,8 @@ def exact_path(layers: Layers, p: np.ndarray, d: np.ndarray, medium: int, offset
     would make it negative, P_n is reversed. In double precision: c = P_n/n is right to 2⁻⁵² n/P_n. Mitsuba's ray
     offset is part of the path, unless `offset` = 0.
     """
-    p, momentum = np.array(p, float), layers.indices[medium] * np.array(d, float) / np.linalg.norm(d)
+    p, momentum = np.array(p, float), np.array(d, float)
+    momentum *= layers.indices[medium] / np.linalg.norm(momentum)
     starts, ends, media = [], [], []
     while True:
         direction = momentum / np.linalg.norm(momentum)
@@ -162,14 +163,16 @@ def _boxes(layers: Layers, k: int) -> str:
     top, bottom = layers.boundaries[k - 1], layers.boundaries[-1] - 1 + STEP * k
     inset = STEP * (k - 1)
     scale = f'x="{POOL - inset:.2f}" y="{(top - bottom) / 2:.5f}" z="{6 - inset:.2f}"'
-    return _shape("cube", f"layer_{k}", k, _transform(f"<scale {scale}/>", f'<translate y="{(top + bottom) / 2:.5f}"/>'))
+    moves = [f"<scale {scale}/>", f'<translate y="{(top + bottom) / 2:.5f}"/>']
+    return _shape("cube", f"layer_{k}", k, _transform(*moves))
 
 
 def _rods(layers: Layers, k: int) -> str:
     """A cylinder with both its ends."""
     radius, half = layers.boundaries[k - 1], 1 - layers.end - STEP * (k - 1)
-    ends = f'        <point name="p0" value="0, 0, {-half:.3f}"/>\n        <point name="p1" value="0, 0, {half:.3f}"/>\n'
-    parts = [_shape("cylinder", f"shell_{k}", k, ends + f'        <float name="radius" value="{radius}"/>\n')]
+    lines = [f'<point name="p{i}" value="0, 0, {z:.3f}"/>' for i, z in enumerate((-half, half))]
+    lines.append(f'<float name="radius" value="{radius}"/>')
+    parts = [_shape("cylinder", f"shell_{k}", k, "".join(f"        {line}\n" for line in lines))]
     for name, turn in (("near", 0), ("far", 180)):
         moves = [f'<scale value="{radius}"/>', f'<translate z="{half:.3f}"/>', f'<rotate y="1" angle="{turn}"/>']
         parts.append(_shape("disk", f"{name}_{k}", k, _transform(*moves)))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +15,14 @@ from mi_refract import images
 from .plan import SCENES
 
 UPSCALE = 4  # pixels of the drawing per pixel of the render
-WHITE, DARK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.05)
+WHITE, GREEN, CASING = (1.0, 1.0, 1.0), (0.3, 1.0, 0.1), (0.0, 0.0, 0.03)
 MARK = 5  # half the size of a mark, in pixels of the drawing
 
 
 class View:
     """A scene with one plugin, rendered once with seed 0. Perspective camera, square film."""
 
-    def __init__(self, scene: str, plugin: str, parameters: dict[str, str], size: int, spp: int) -> None:
+    def __init__(self, scene: str, plugin: str, parameters: Mapping[str, Any], size: int, spp: int) -> None:
         import mitsuba as mi
 
         path = str(SCENES / f"{scene}.xml")
@@ -47,27 +49,27 @@ def _number(x: Any) -> float:
 
 
 def draw(view: View, paths: list[np.ndarray], ends: np.ndarray) -> np.ndarray:
-    """The picture, enlarged; the paths (points N × 3 each) in white with a square at the end, `ends` as dark crosses."""
+    """The picture, enlarged; the paths (points N × 3 each) in white between two squares, `ends` as green crosses."""
     import OpenImageIO as oiio
 
     enlarged = np.kron(view.picture, np.ones((UPSCALE, UPSCALE, 1))).astype(np.float32)
     buffer, scale = oiio.ImageBuf(np.ascontiguousarray(enlarged)), enlarged.shape[0]
 
-    def line(a: np.ndarray, b: np.ndarray, colour: tuple[float, ...]) -> None:
-        if np.isfinite([a, b]).all():
-            oiio.ImageBufAlgo.render_line(buffer, *(int(round(float(x))) for x in (*a, *b)), colour)
+    def polyline(points: np.ndarray, colour: tuple[float, ...]) -> None:
+        strokes = [*((x, y, CASING) for x in (-1, 0, 1) for y in (-1, 0, 1)), (0, 0, colour)]
+        for x, y, ink in strokes:
+            corners = (np.rint(points).astype(int) + np.array([x, y])).tolist()
+            for (x1, y1), (x2, y2) in itertools.pairwise(corners):
+                oiio.ImageBufAlgo.render_line(buffer, x1, y1, x2, y2, ink)
 
+    square = MARK * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
     for points in paths:
         seen = view.project(points) * scale
         seen = seen[np.isfinite(seen).all(1)]
-        for a, b in zip(seen, seen[1:], strict=False):
-            line(a, b, WHITE)
-        corners = seen[-1] + MARK * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
-        for a, b in zip(corners, corners[1:], strict=False):
-            line(a, b, WHITE)
+        for stroke in (seen, seen[0] + square, seen[-1] + square):
+            polyline(stroke, WHITE)
     for p in view.project(ends) * scale:
-        for slope in (-1, 1):
-            line(p - [MARK, slope * MARK], p + [MARK, slope * MARK], DARK)
+        polyline(p + 1.6 * MARK * np.array([[-1, -1], [1, 1], [0, 0], [-1, 1], [1, -1]]), GREEN)
     return np.asarray(buffer.get_pixels(oiio.FLOAT))
 
 

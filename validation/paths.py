@@ -1,9 +1,10 @@
 """Paths: rays through the layers of `scenes/mirage.xml` and `scenes/fibre.xml`, against the exact path.
 
-A ray is traced through Mitsuba's scene with the plugin's own samples, transmitted wherever it can be, and compared with
-straight segments and Snell's law in double precision; Mitsuba's ray offset is part of both. Then the pictures: the
-mirage in a telescope and to the naked eye, and the fibre, with exact paths drawn over them (white, ending in a
-square) and the ends of the traced ones (dark crosses).
+A ray is traced through Mitsuba's scene with the plugin's own samples, transmitted wherever it can be, and compared
+with straight segments and Snell's law in double precision. Mitsuba's ray offset is part of both: in the mirage it
+moves rays more than anything here, but it turns none. Then the pictures: the mirage in a telescope and to the naked
+eye, and the fibre, with exact paths drawn over them (white, between squares) and the ends of the traced ones (green
+crosses).
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ TITLE = "Paths"
 TEXT = __doc__.partition("\n")[2].strip()
 TERMS = {
     "direction": "largest |d − exact| anywhere on a path, over the sine of the angle at which it enters",
+    "direction / condition": "the same, less what the fall of a cosine to a smaller one magnifies of any error",
     "place": "largest distance from the exact path, over that path's own extent across the layers",
     "astray": "rays that meet another number of boundaries than they should",
     "ray offset": "the place, if the exact path were without Mitsuba's ray offset: the same for every plugin",
@@ -44,7 +46,11 @@ SEED = 2028
 RAYS = 64
 VISIBLE = 0.1
 # The pictures: a scene, what its parameters are, and the name of the view.
-VIEWS = (("mirage", {}, "mirage, telescope"), ("mirage", {"fov": "1.3"}, "mirage, naked eye"), ("fibre", {}, "fibre"))
+VIEWS: tuple[tuple[str, dict[str, str], str], ...] = (
+    ("mirage", {}, "mirage, telescope"),
+    ("mirage", {"fov": "1.3"}, "mirage, naked eye"),
+    ("fibre", {}, "fibre"),
+)
 
 
 @dataclass(frozen=True)
@@ -63,8 +69,9 @@ class Bundle:
 
 def tasks(context: Context) -> list[Task]:
     """One task per scene for the paths, one per view for the pictures."""
-    rows = [Task(f"paths: {layers.scene}", functools.partial(_path_rows, context, layers)) for layers in (MIRAGE, FIBRE)]
-    return rows + [Task(f"paths: {view[2]}", functools.partial(_view_rows, context, *view)) for view in VIEWS]
+    paths = [(layers.scene, functools.partial(_path_rows, context, layers)) for layers in (MIRAGE, FIBRE)]
+    views = [(f"picture of the {view[2]}", functools.partial(_view_rows, context, *view)) for view in VIEWS]
+    return [Task(f"paths: {name}", work) for name, work in paths + views]
 
 
 def plugins() -> list[str]:
@@ -85,7 +92,8 @@ def bundle(layers: Layers) -> Bundle:
         media = rng.integers(2, len(layers.indices) - 1, RAYS)
         edges = np.array([*layers.boundaries, 0.0])
         radius, n = (edges[media - 1] + edges[media]) / 2, np.array(layers.indices)[media]
-        origins = np.stack([radius, 0 * radius, np.full(RAYS, -layers.end)], 1)
+        turn = rng.uniform(0, 2 * np.pi, RAYS)
+        origins = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(RAYS, -layers.end)], 1)
         sine = rng.uniform(0.1, 0.9, RAYS) * np.sqrt(n**2 - layers.indices[1] ** 2) / n
         azimuth = rng.uniform(0, 2 * np.pi, RAYS)
         directions = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), -np.sqrt(1 - sine**2)], 1)
@@ -94,7 +102,7 @@ def bundle(layers: Layers) -> Bundle:
 
 
 def trace(scene: Any, layers: Layers, rays: Bundle, steps: int) -> np.ndarray:
-    """Start, direction and end of the segments as Mitsuba has them, S × 3 × R × 3; NaN after a path has left the layers.
+    """Start, direction and end of each segment as Mitsuba has it, S × 3 × R × 3; NaN after the end of a path.
 
     The sample 1 − 2⁻²⁴ reflects only where the reflectance is 1: total internal reflection.
     """
@@ -164,8 +172,8 @@ def _path_rows(context: Context, layers: Layers) -> list[Row]:
     found = {plugin: _deviations(layers, rays, exact, plugin, steps) for plugin in plugins()}
     replay = {"scene": f"{layers.scene}.xml", "rays": RAYS, "seed": SEED, "shown": rays.shown}
     rows = [
-        Row(STUDY, plugin, f"{layers.scene}: path", context.variant, _values(exact, parts), _budgets(layers, plugin, exact),
-            replay=replay | {"plugin": plugin})
+        Row(STUDY, plugin, f"{layers.scene}: path", context.variant, _values(exact, parts),
+            _budgets(layers, plugin, exact), replay=replay | {"plugin": plugin})
         for plugin, parts in found.items()
     ]  # fmt: skip
     offset = {"ray offset": _moved(layers, rays, exact)}
@@ -238,13 +246,14 @@ def _view_rows(context: Context, scene: str, parameters: dict[str, str], name: s
     if context.variant.startswith("scalar"):
         return [Row(STUDY, PLUGIN, f"{name}: picture", context.variant, reason=SCALAR)]
     profile, right = context.profile, _other_right_formula()
-    views = {p: View(scene, p, parameters, profile.resolution, profile.spp) for p in (BUILTIN, PLUGIN, right)}
+    spp = max(1, profile.spp // 4)
+    views = {p: View(scene, p, parameters, profile.resolution, spp) for p in (BUILTIN, PLUGIN, right)}
     reference, test, control = (view.picture for view in views.values())
     values = {
         "pixels off": compare.paired(reference, test, VISIBLE).changed,
         "pixels off, control": compare.paired(control, test, VISIBLE).changed,
     }
-    about = {"scene": f"{scene}.xml", "spp": profile.spp, "seed": 0, **parameters}
+    about = {"scene": f"{scene}.xml", "resolution": profile.resolution, "spp": spp, "seed": 0, **parameters}
     pictures = {
         role: overlay.save(context.out, f"{name} {plugin} with paths", _with_paths(views[plugin], scene), about)
         for role, plugin in (("reference", BUILTIN), ("test", PLUGIN))

@@ -17,7 +17,7 @@ from mi_refract.rows import Row
 from .plan import SCENES, Context
 
 GALLERY = SCENES / "gallery.png"
-COLUMNS = 4
+COLUMNS = 5
 
 
 def update(path: Path, rows: list[Row], context: Context) -> None:
