@@ -9,6 +9,7 @@ crosses).
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from dataclasses import dataclass
@@ -29,10 +30,13 @@ from .plan import SCENES, Context, Task
 
 TITLE = "Paths"
 TEXT = __doc__.partition("\n")[2].strip()
+INDICES, RATIOS = "exact, indices in float32", "exact, ratios in float32"
 TERMS = {
     "direction": "largest |d − exact| anywhere on a path, over the sine of the angle at which it enters",
     "direction / condition": "the same, less what the fall of a cosine to a smaller one magnifies of any error",
     "place": "largest distance from the exact path, over that path's own extent across the layers",
+    INDICES: "Snell's law in double precision for the indices rounded to float32, which the built-in starts from",
+    RATIOS: "the same for the ratio of every two neighbours rounded to float32, which the other formulas start from",
     "astray": "rays that meet another number of boundaries than they should",
     "ray offset": "the place, if the exact path were without Mitsuba's ray offset: the same for every plugin",
     "pixels off": "pixels of which a channel differs by more than 0.1 from the built-in's, same seed",
@@ -170,6 +174,7 @@ def _path_rows(context: Context, layers: Layers) -> list[Row]:
     exact = rays.exact(layers)
     steps = 4 * max(len(path.media) for path in exact)
     found = {plugin: _deviations(layers, rays, exact, plugin, steps) for plugin in plugins()}
+    found |= {name: _exact_deviations(other, layers, rays, exact) for name, other in rounded(layers).items()}
     replay = {"scene": f"{layers.scene}.xml", "rays": RAYS, "seed": SEED, "shown": rays.shown}
     rows = [
         Row(STUDY, plugin, f"{layers.scene}: path", context.variant, _values(exact, parts),
@@ -207,6 +212,18 @@ def _deviations(layers: Layers, rays: Bundle, exact: list[Path], plugin: str, st
     return [deviation(layers, path, segments[:, :, i]) for i, path in enumerate(exact)]
 
 
+def rounded(layers: Layers) -> dict[str, Layers]:
+    """What is lost before any formula: the indices in float32, and their ratios, as a plugin may be given them."""
+    n = np.array(layers.indices)
+    ratios = (n[1:] / n[:-1]).astype(np.float32).astype(float)
+    indices = {INDICES: n.astype(np.float32).astype(float), RATIOS: n[0] * np.cumprod([1.0, *ratios])}
+    return {name: dataclasses.replace(layers, indices=tuple(x.tolist())) for name, x in indices.items()}
+
+
+def _exact_deviations(other: Layers, layers: Layers, rays: Bundle, exact: list[Path]) -> list[Deviation]:
+    return [deviation(layers, p, q.segments()) for p, q in zip(exact, rays.exact(other), strict=True)]
+
+
 def _values(exact: list[Path], parts: list[Deviation]) -> dict[str, float]:
     astray = [part.boundaries != len(path.media) - 1 for path, part in zip(exact, parts, strict=True)]
     return {
@@ -235,7 +252,8 @@ def _budgets(layers: Layers, plugin: str, exact: list[Path]) -> dict[str, float]
 def _moved(layers: Layers, rays: Bundle, exact: list[Path]) -> float:
     """How far the ray offset moves the exact paths, as `place`; the median, for some turn elsewhere without it."""
     plain = rays.exact(layers, offset=0.0)
-    return float(np.median([deviation(layers, p, q.segments()).place.max() for p, q in zip(plain, exact, strict=True)]))
+    moved = [deviation(layers, p, q.segments()) for p, q in zip(plain, exact, strict=True)]
+    return float(np.median([part.place.max() for part in moved]))
 
 
 # Pictures ------------------------------------------------------------------------------------------------------
