@@ -128,8 +128,8 @@ def _mirage() -> Layers:
 
 
 def _fibre() -> Layers:
-    """24 shells of equal thickness, n² falling by (r/R)² from 1.53² on the axis to 1.4585² at R = 8; in air."""
-    count, radius, core, clad = 24, 8.0, 1.53, 1.4585
+    """16 shells of equal thickness, n² falling by (r/R)² from 1.53² on the axis to 1.4585² at R = 8; in air."""
+    count, radius, core, clad = 16, 8.0, 1.53, 1.4585
     radii = radius * (1 - np.arange(count) / count)
     middle2 = (radii**2 + np.append(radii[1:], 0) ** 2) / 2 / radius**2
     indices = (AIR, *(round(math.sqrt(core**2 - (core**2 - clad**2) * float(x)), 6) for x in middle2))
