@@ -1,11 +1,9 @@
 """The closed answers of the stability study against independent evaluations, and its sight of planted defects."""
 
-import dataclasses
 import itertools
 import math
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from flint import arb, ctx, fmpq
@@ -13,8 +11,8 @@ from flint import arb, ctx, fmpq
 from mi_refract import FORMULAS, backend, oracle
 from validation import chains, stability, systems
 from validation.chains import air, carry, enter, exact_ratios, pipe
-from validation.directions import BUILTIN, builtin
 from validation.plan import SCALAR_PROFILES, Context
+from validation.settings import BUILTIN
 
 HERE = Context(SCALAR_PROFILES["quick"], Path(), "scalar_rgb", backend.detect(), backend.usable_variants())
 SETTINGS = {setting.label: setting for setting in stability.settings(HERE)}
@@ -27,14 +25,6 @@ DEGREES = stability.PASSING + stability.TURNING
 def compiled(precision):
     setting = SETTINGS[f"llvm {precision}"]
     return setting if setting.vector is not None else pytest.skip(f"llvm: {setting.reason}")
-
-
-@pytest.fixture
-def context():
-    """One whose variant is the present one, as it must be afterwards."""
-    before = mi.variant()
-    yield dataclasses.replace(HERE, variant=before)
-    assert mi.variant() == before
 
 
 def exactly(x):
@@ -305,13 +295,13 @@ def test_curves_run_through_the_layers():
     assert limit[30] == problem.values["condition · u"]
 
 
-def test_tasks_name_what_does_not_run_and_mitsuba_runs_on_scalars_too(context):
+def test_tasks_name_what_does_not_run_and_mitsuba_runs_on_scalars_too():
     absent = [s for s in SETTINGS.values() if s.vector is None]
-    assert all(row.verdict == "not run" and row.reason for s in absent for row in stability.chain_rows(context, s))
+    assert all(row.verdict == "not run" and row.reason for s in absent for row in stability.chain_rows(HERE, s))
     single = SETTINGS["scalar float32"]
-    with stability.subjects(context, single) as found:
-        assert [*found] == [BUILTIN]
-        row = stability.system_row(BUILTIN, builtin, "prism", single)
+    found = stability.subjects(single)
+    assert [*found] == [BUILTIN]
+    row = stability.system_row(BUILTIN, found[BUILTIN], "prism", single)
     assert row.verdict == "info"
     assert 0.01 < row.values["error / condition"] < 2
-    assert [*SETTINGS] == list(dict.fromkeys(task.name[11:].partition(",")[0] for task in stability.tasks(context)))
+    assert [*SETTINGS] == list(dict.fromkeys(task.name[11:].partition(",")[0] for task in stability.tasks(HERE)))

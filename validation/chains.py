@@ -24,10 +24,10 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .directions import Setting
+from .judge import Subject
+from .settings import Setting
 
 Array = NDArray[Any]
-Subject = Callable[..., tuple[Any, Any]]
 
 TOP = 1.0003  # the index of the coldest air
 MIRAGE = 3e-5  # what it loses down to the road

@@ -10,8 +10,6 @@ float32 only.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,10 +20,12 @@ from mi_refract import regimes
 from mi_refract.formulas import FORMULAS
 from mi_refract.rows import Row
 
-from . import directions, systems
-from .chains import FEEDS, Array, Fed, Layers, Subject, air, carry, cosine, enter, exact_ratios, frame, pipe
-from .directions import BUILTIN, Setting
+from . import settings as backends
+from . import systems
+from .chains import FEEDS, Array, Fed, Layers, air, carry, cosine, enter, exact_ratios, frame, pipe
+from .judge import Subject, evaluate
 from .plan import Context, Task
+from .settings import Setting
 
 TITLE = "Stability"
 TEXT = __doc__.partition("\n")[2].strip()
@@ -84,7 +84,7 @@ def extent(context: Context, setting: Setting) -> Extent:
 
 def settings(context: Context) -> list[Setting]:
     """Those of the directions, and scalar float32 for Mitsuba alone: Dr.Jit's own scalars compute in double."""
-    return [Setting("scalar float32", np.float32, dr.scalar.Array3f), *directions.settings(context)]
+    return [Setting("scalar", np.float32, dr.scalar.Array3f, mitsuba="scalar_rgb"), *backends.settings(context)]
 
 
 def tasks(context: Context) -> list[Task]:
@@ -96,20 +96,10 @@ def tasks(context: Context) -> list[Task]:
     ]
 
 
-@contextmanager
-def subjects(context: Context, setting: Setting) -> Iterator[dict[str, Subject]]:
-    """Every formula, and Mitsuba's functions in their own precision, in a variant that has the setting's arrays."""
-    import mitsuba as mi
-
-    mitsubas = {BUILTIN: directions.builtin} if setting.precision is np.float32 else {}
-    if setting.is_scalar and mitsubas:
-        mi.set_variant("scalar_rgb")
-        try:
-            yield mitsubas
-        finally:
-            mi.set_variant(context.variant)
-    else:
-        yield FORMULAS | (mitsubas if setting.label.startswith(context.variant.partition("_")[0]) else {})
+def subjects(setting: Setting) -> dict[str, Subject]:
+    """Those of the setting; on scalar float32 Mitsuba's functions alone."""
+    alone = setting.is_scalar and setting.precision is np.float32
+    return {name: subject for name, subject in setting.subjects.items() if name not in FORMULAS or not alone}
 
 
 # Chains --------------------------------------------------------------------------------------------------------
@@ -118,13 +108,10 @@ def subjects(context: Context, setting: Setting) -> Iterator[dict[str, Subject]]
 def chain_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
         return [Row("stability", name, "all", setting.label, reason=setting.reason) for name in FORMULAS]
-    how = extent(context, setting)
-    rows = []
-    with subjects(context, setting) as found:
-        for case, layers, plane in mirages(how):
-            rows += mirage_rows(found, case, layers, plane, setting, how)
-        rows += [pipe_row(name, subject, setting, how) for name, subject in found.items()]
-    return rows
+    how, found, rows = extent(context, setting), subjects(setting), []
+    for case, layers, plane in mirages(how):
+        rows += mirage_rows(found, case, layers, plane, setting, how)
+    return [*rows, *(pipe_row(name, subject, setting, how) for name, subject in found.items())]
 
 
 def mirages(how: Extent) -> list[tuple[str, Layers, Array]]:
@@ -257,14 +244,14 @@ class Refractor:
     def __call__(self, a: Array, n: Array, k: Any) -> Array:
         given = np.broadcast_arrays(a, n, np.reshape(k, (-1, 1)))
         a, n, k = (x.astype(self.setting.precision) for x in given)
-        b, transmitted = directions.evaluate(self.subject, regimes.Rays(a, n, k[:, 0]), self.setting.vector)
+        b, transmitted = evaluate(self.subject, regimes.Rays(a, n, k[:, 0]), self.setting.vector)
         self.mirrored += int((~transmitted).sum())
         return b
 
 
 def system_rows(context: Context, setting: Setting) -> list[Row]:
-    with subjects(context, setting) as found:
-        return [system_row(name, subject, case, setting) for case in systems.SYSTEMS for name, subject in found.items()]
+    found = subjects(setting).items()
+    return [system_row(name, subject, case, setting) for case in systems.SYSTEMS for name, subject in found]
 
 
 def system_row(name: str, subject: Subject, case: str, setting: Setting) -> Row:
