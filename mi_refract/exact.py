@@ -10,23 +10,28 @@ not to a few u. A literal normal along an axis, as in a local frame, leaves noth
 components of `a`, and each component of b is one product, or the root.
 
 Write ρ for |radicand| over the larger of its terms, and ε for its error over that term. Total internal reflection is
-decided as the exact inputs decide it wherever ρ > ε, and the root is off by ε cosθ/2√ρ. For float32, u = 2⁻²⁴:
+decided as the exact inputs decide it wherever ρ > ε, and the root is off by ε cosθ/(√ρ + √(ρ + ε)) ≤ √ε cosθ:
 
-    compensated   ε ≤ 48u² = 2⁻⁴²·⁴, if all roundings took their largest values at once; the largest ever seen is 9u²
-    promoted      ε ≤ 10·2⁻⁵³ < 2⁻⁴⁹
+    compensated   ε ≤ 500u³ (the largest ever seen is 9u³): in float32 1e-19, and the root is off by 0.006u at most,
+                  however near the critical angle
+    promoted      ε ≤ 10·2⁻⁵³ < 2⁻⁴⁹ in float32, so 0.08u where ρ > 2⁻⁴⁴ and 0.6u at the critical angle itself;
+                  in float64 it is the compensated form
 
-Where ρ < 2⁻⁴⁴ the refracted ray is within 2⁻²² cosθ of the surface and carries T ≈ 2 (k + 1/k) √ρ of the power, less
-than 2e-6 for k ≤ 2.5. A ρ that small takes inputs made for it: of random ones near the critical angle one in 10⁹.
+so both are at the rounding limit wherever ρ > 2⁻⁴⁴, and the first everywhere. It takes inputs made for it to be nearer:
+of random ones near the critical angle one in 10⁹. There the refracted ray is within 2⁻²² cosθ of the surface and
+carries T ≈ 2 (k + 1/k) √ρ of the power, less than 2e-6 for k ≤ 2.5.
 """
 
 from __future__ import annotations
 
+import functools
+import operator
 from typing import Any
 
 import drjit as dr
 
 from . import numerics
-from .numerics import Double, component_of, quotient, two_sum
+from .numerics import Double, Expansion, component_of, quotient, two_sum
 
 Refracted = tuple[Any, Any]
 
@@ -74,13 +79,13 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     return type(a)(dr.fma(m, quotient(dr.fma(-scale, c, along), dr.dot(m, m)), d * scale)), transmitted
 
 
-def _radicand(c: Double, w: list[Double], kappa: Double) -> Double:
-    """c² − κ w²; its error ε over the larger term, near the critical angle, in u².
+def _radicand(c: Expansion, w: list[Expansion], kappa: Double) -> Double:
+    """c² − κ w²; its error ε over the larger term, in u³.
 
-    c is off by 1 (and 10u/cosθ more), each w by 5, κ by none for 1 ≤ k < 2²³. So c² is off by 2·1 + 5, w² by
-    2·5 + 19, the product with κ by 6 more, and the difference, of which only the low parts are rounded, by 6: 48.
+    c is off by 3/cosθ and κ by none for 1 ≤ k < 2²³. Each w is off by 6, each square by 100 at most, their sums,
+    the product with κ and the difference by as much: 500 where cosθ > 0.1. At grazing incidence 12/cosθ more.
     """
-    return numerics.difference(numerics.square(c), kappa * numerics.sum_of_squares(w))
+    return (c.squared() - functools.reduce(operator.add, (w_i.squared() for w_i in w)).times(kappa)).double()
 
 
 def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
@@ -96,7 +101,7 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
     kappa = Double.product(k, k) - 1 if contrast is None else _split(a, contrast)
     if axis:
         index, sign = axis
-        c, w = Double(a[index] if sign > 0 else -a[index]), [Double(a[i]) for i in range(3) if i != index]
+        c, w = Expansion(a[index] if sign > 0 else -a[index]), [Expansion(a[i]) for i in range(3) if i != index]
     else:
         c, w = numerics.dot(n, a), numerics.cross(n, a)
     radicand = _radicand(c, w, kappa)
@@ -106,7 +111,7 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
         along = dr.select(transmitted, dr.mulsign(root.rounded(), c.hi), -c.hi)
         return _along_axis(a, axis, scale, along), transmitted
     root = Double(dr.mulsign(root.hi, c.hi), dr.mulsign(root.lo, c.hi))
-    b = _correct(type(a), n, [w_i * scale for w_i in w], numerics.select(transmitted, root, -c))
+    b = _correct(type(a), n, [w_i.pair * scale for w_i in w], numerics.select(transmitted, root, -c.pair))
     # To the last bit where the answer is `a`, but with the derivative of b, which is not that of `a`. Where `n` is no
     # normal b is NaN, and stays so.
     exact = dr.select(((kappa.hi == 0) | (c.hi == 0)) & (b[0] == b[0]), a, b)

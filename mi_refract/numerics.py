@@ -143,14 +143,69 @@ def select(mask: Any, x: Double, y: Double) -> Double:
     return Double(dr.select(mask, x.hi, y.hi), dr.select(mask, x.lo, y.lo))
 
 
-def difference(x: Double, y: Double) -> Double:
-    """x − y with an error ≤ 8u² (|x| + |y|): what cancels is not regained, for half the operations of `-`."""
-    s, s_lo = two_sum(x.hi, -y.hi)
-    return Double(*fast_two_sum(s, s_lo + (x.lo - y.lo)))
+@dataclass(frozen=True)
+class Expansion:
+    """A number to the third order in u: hi, plus the sum of `first`, each ≤ 3u |hi|, plus `second`, ≤ 20u² |hi|.
+
+    What is added up only where two expansions meet loses nothing before: sums and products keep every error of first
+    order as a term of its own. `second` is a plain sum, so each of the operations here has a relative error ≤ 100u³.
+    """
+
+    hi: Any
+    first: tuple[Any, ...] = ()
+    second: Any = 0
+
+    def __add__(self, other: Expansion) -> Expansion:
+        s, e = two_sum(self.hi, other.hi)
+        return Expansion(s, (*self.first, *other.first, e), self.second + other.second)
+
+    def __neg__(self) -> Expansion:
+        return Expansion(-self.hi, tuple(-x for x in self.first), -self.second)
+
+    def __sub__(self, other: Expansion) -> Expansion:
+        return self + -other
+
+    def collected(self) -> Expansion:
+        """The same with one term of first order."""
+        first, *rest = self.first
+        second = self.second
+        for x in rest:
+            first, e = two_sum(first, x)
+            second = second + e
+        return Expansion(self.hi, (first,), second)
+
+    def times(self, x: Double) -> Expansion:
+        y = self.collected()
+        (p, e), (q, f) = two_prod(x.hi, y.hi), two_prod(x.hi, y.first[0])
+        if x.is_plain:
+            return Expansion(p, (e, q), dr.fma(x.hi, y.second, f))
+        r, g = two_prod(x.lo, y.hi)
+        return Expansion(p, (e, q, r), dr.fma(x.hi, y.second, dr.fma(x.lo, y.first[0], f + g)))
+
+    def squared(self) -> Expansion:
+        """Of a number with at most one term of first order."""
+        p, e = two_prod(self.hi, self.hi)
+        if not self.first:
+            return Expansion(p, (e,))
+        twice, mid = self.hi + self.hi, self.first[0]
+        q, f = two_prod(twice, mid)
+        return Expansion(p, (e, q), dr.fma(twice, self.second, dr.fma(mid, mid, f)))
+
+    def double(self) -> Double:
+        """Rounded to a pair, also where the terms of hi have cancelled."""
+        # hi is a multiple of the last place of the first-order terms, or 0: `fast_two_sum` is exact.
+        x = self.collected()
+        hi, lo = fast_two_sum(x.hi, x.first[0])
+        return Double(*fast_two_sum(hi, lo + x.second))
+
+    @property
+    def pair(self) -> Double:
+        """The first two terms, of a number with at most one of first order."""
+        return Double(self.hi, *self.first)
 
 
-def dot(x: Any, y: Any) -> Double:
-    """x · y of two 3-vectors as a `Double`: error ≤ u² |x · y| + 10u³ Σ|xᵢ yᵢ|, and 0 exactly when the sum is 0."""
+def dot(x: Any, y: Any) -> Expansion:
+    """x · y of two 3-vectors: error ≤ 3u³ Σ|xᵢ yᵢ|, and hi is 0 only where the sum is less than that."""
     p, e0 = two_prod(x[0], y[0])
     q, e1 = two_prod(x[1], y[1])
     r, e2 = two_prod(x[2], y[2])
@@ -163,42 +218,29 @@ def dot(x: Any, y: Any) -> Double:
     v, v0 = two_sum(e3, e4)
     t, t2 = two_sum(t, v)
     s, f = two_sum(s, t)
-    return Double(*fast_two_sum(s, f + ((t0 + t1) + (t2 + v0))))
+    mid, lo = two_sum(f, (t0 + t1) + (t2 + v0))
+    hi, mid = fast_two_sum(s, mid)
+    return Expansion(hi, (mid,), lo)
 
 
-def cross(x: Any, y: Any) -> list[Double]:
-    """x × y of two 3-vectors as three `Double`s, each with relative error ≤ 5u²."""
+def cross(x: Any, y: Any) -> list[Expansion]:
+    """x × y of two 3-vectors, each component with relative error ≤ 6u³."""
     return [_exact_difference(x[i], y[j], x[j], y[i]) for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
-def _exact_difference(x: Any, y: Any, z: Any, w: Any) -> Double:
-    """x y − z w, relative error ≤ 5u².
+def _exact_difference(x: Any, y: Any, z: Any, w: Any) -> Expansion:
+    """x y − z w, relative error ≤ 6u³: its four exact terms are d, d_lo, e, e_lo.
 
-    Where p and q cancel, d is exact, and a multiple of the last place of e: `fast_two_sum` is exact. Elsewhere
-    |d| ≥ max(|p|, |q|)/2, so |e| ≤ 3u |d|, and d_lo + e loses at most 4u² |d|.
+    Where p and q cancel, d is exact, and a multiple of the last place of e; elsewhere |d| ≥ max(|p|, |q|)/2, so that
+    |d_lo + e| ≤ 4u |d|. Either way `fast_two_sum` is exact.
     """
     p, p_lo = two_prod(x, y)
     q, q_lo = two_prod(z, w)
     d, d_lo = two_sum(p, -q)
     e, e_lo = two_sum(p_lo, -q_lo)
-    s, s_lo = fast_two_sum(d, d_lo + e)
-    return Double(s, s_lo + e_lo)
-
-
-def square(x: Double) -> Double:
-    """x², relative error ≤ 5u², and |lo| ≤ 3u hi. Precondition: |lo| ≤ u |hi|, as for the two below."""
-    p, e = two_prod(x.hi, x.hi)
-    return Double(p, e if x.is_plain else dr.fma(x.lo, dr.fma(2, x.hi, x.lo), e))
-
-
-def sum_of_squares(x: list[Double]) -> Double:
-    """Σ xᵢ² of two or three `Double`s, relative error ≤ 19u²: 5u² of the squares, 14u² of their low parts' sum."""
-    squares = [square(x_i) for x_i in x]
-    total, low = squares[0].hi, squares[0].lo
-    for each in squares[1:]:
-        total, e = two_sum(total, each.hi)
-        low = low + (each.lo + e)
-    return Double(*fast_two_sum(total, low))
+    mid, lo = two_sum(d_lo, e)
+    hi, mid = fast_two_sum(d, mid)
+    return Expansion(hi, (mid,), lo + e_lo)
 
 
 def defect(target: Double, *products: Pair) -> Any:

@@ -139,7 +139,7 @@ def test_every_formula_bends_the_ray_and_is_named(each_variant, formula):
 
 
 def test_automatic_choice_is_written_out(each_variant):
-    name = "promoted" if each_variant.startswith("scalar") else "compensated"
+    name = "compensated" if each_variant.startswith("cuda") else "promoted"
     assert f"formula = {name} (auto)" in str(load())
 
 

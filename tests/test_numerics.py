@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mi_refract import numerics
-from mi_refract.numerics import Double
+from mi_refract.numerics import Double, Expansion
 
 RNG = np.random.default_rng(11)
 
@@ -16,8 +16,10 @@ def exact(x):
     return Fraction(float(np.array(x).ravel()[0]))
 
 
-def value(pair):
-    hi, lo = (pair.hi, pair.lo) if isinstance(pair, Double) else pair
+def value(x):
+    if isinstance(x, Expansion):
+        return sum(map(exact, (x.hi, *x.first, x.second)))
+    hi, lo = (x.hi, x.lo) if isinstance(x, Double) else x
     return exact(hi) + exact(lo)
 
 
@@ -53,11 +55,11 @@ def test_dot_and_cross_survive_cancellation(trial, setting, number):
     x, y, u, v = cancelling(setting, number)
     fx, fy = [Fraction(c) for c in x], [Fraction(c) for c in y]
     terms = [a * b for a, b in zip(fx, fy, strict=True)]
-    assert abs(value(numerics.dot(u, v)) - sum(terms)) <= 12 * Fraction(setting.roundoff) ** 2 * sum(map(abs, terms))
+    assert abs(value(numerics.dot(u, v)) - sum(terms)) <= 8 * Fraction(setting.roundoff) ** 3 * sum(map(abs, terms))
     for i, component in enumerate(numerics.cross(u, v)):
         j, k = (i + 1) % 3, (i + 2) % 3
         expected = fx[j] * fy[k] - fx[k] * fy[j]
-        assert abs(value(component) - expected) <= 6 * Fraction(setting.roundoff) ** 2 * abs(expected)
+        assert abs(value(component) - expected) <= 6 * Fraction(setting.roundoff) ** 3 * abs(expected)
 
 
 def test_a_dot_product_that_is_zero_is_zero_and_one_that_is_not_is_not(setting, number):
@@ -79,15 +81,37 @@ def test_double_words_keep_five_units_of_the_second_order(trial, setting, number
     assert abs(value(square.sqrt()) ** 2 - value(square)) <= 4 * bound * value(square)
 
 
-def test_sum_of_squares_and_defect(setting, number):
+@pytest.mark.parametrize("trial", range(10))
+def test_expansions_keep_the_third_order(trial, setting, number):
+    u, v = ([number(float(setting.precision(x))) for x in RNG.normal(size=3)] for _ in range(2))
+    x, y, *_ = numerics.cross(u, v)
+    k = Double.product(u[0], u[0]) - 1
+    fx, fy, fk = value(x), value(y), value(k)
+    bound = 100 * Fraction(setting.roundoff) ** 3
+    x2, y2 = x.squared(), y.squared()
+    for found, expected in (
+        (x2, fx * fx), (x2 + y2, fx * fx + fy * fy), (x2.collected(), fx * fx), (x2.times(k), fx * fx * fk),
+        (x2.times(Double(u[1])), fx * fx * value((u[1], 0))),
+    ):  # fmt: skip
+        assert abs(value(found) - expected) <= bound * abs(expected)
+    difference = (x2 - y2).double()
+    larger, left = max(fx * fx, fy * fy), abs(fx * fx - fy * fy)
+    assert abs(value(difference) - (fx * fx - fy * fy)) <= bound * larger + Fraction(setting.roundoff) ** 2 * left
+    assert value(Expansion(u[0]).squared()) == value((u[0], 0)) ** 2
+
+
+@pytest.mark.parametrize("trial", range(10))
+def test_a_defect_that_is_small_keeps_its_digits(trial, setting, number):
     x, y, u, v = cancelling(setting, number)
-    w = numerics.cross(u, v)
-    expected = sum(value(c) ** 2 for c in w)
-    assert abs(value(numerics.sum_of_squares(w)) - expected) <= 12 * Fraction(setting.roundoff) ** 2 * expected
-    target = numerics.dot(u, v)
+    target = numerics.dot(u, v).pair
     left = numerics.defect(target, *zip(u, v, strict=True))
     scale = sum(abs(Fraction(a) * Fraction(b)) for a, b in zip(x, y, strict=True))
     assert abs(exact(left)) <= 20 * Fraction(setting.roundoff) ** 2 * scale
+    halved = Double(target.hi * 0.5, target.lo * 0.5)
+    missing = exact(numerics.defect(halved, *zip(u, v, strict=True)))
+    expected = -value(target) / 2
+    u1 = Fraction(setting.roundoff)
+    assert abs(missing - expected) <= 2 * u1 * abs(expected) + 20 * u1**2 * scale
 
 
 def test_quotient_by_zero_raises_on_no_backend(setting, number):

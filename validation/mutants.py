@@ -137,8 +137,12 @@ def _unfused(x: Any, y: Any, z: Any) -> Any:
     return x * y + z
 
 
-def _truncated_difference(x: Any, y: Any) -> Any:
-    return numerics.Double(x.hi - y.hi, 0 * x.hi)
+def _truncated(x: numerics.Expansion) -> numerics.Double:
+    return numerics.Double(x.hi, 0 * x.hi)
+
+
+def _plainly_collected(x: numerics.Expansion) -> numerics.Expansion:
+    return numerics.Expansion(x.hi, (sum(x.first),), 0 * x.hi)
 
 
 # Slips of the documents, as printed ----------------------------------------------------------------------------
@@ -209,7 +213,10 @@ MUTANTS = {
     "narrow contrast": Mutant("κ = k² − 1 in working precision", _narrow_contrast, EXACT),
     "no fma": Mutant("x y + z rounded twice", _patched(dr, "fma", _unfused), ("compensated",)),
     "truncated radicand": Mutant(
-        "its low part dropped", _patched(numerics, "difference", _truncated_difference), ("compensated",)
+        "its low part dropped", _patched(numerics.Expansion, "double", _truncated), ("compensated",)
+    ),
+    "radicand of second order": Mutant(
+        "sums of first order rounded", _patched(numerics.Expansion, "collected", _plainly_collected), ("compensated",)
     ),
 }
 TERMS = {name: mutant.text for name, mutant in MUTANTS.items()} | {
