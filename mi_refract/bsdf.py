@@ -170,9 +170,9 @@ def plugin_class(v: Any) -> type:
             )
             # Unchecked: the ratio is checked where it is set, and NaN stays NaN.
             wo, transmitted = self.formula.unchecked(a, v.Vector3f(0, 0, 1), side.k, side.contrast)
-            cos_i, cos_t = dr.abs(wi.z), dr.abs(wo.z)
-            r, t = fresnel.powers(cos_i, cos_t, transmitted, side.k, side.contrast)
-            return Ray(a, side, wo, dr.select(outside, self.k_inner, self.k_outer), cos_i, cos_t, transmitted, r, t)
+            r, t = fresnel.local_powers(a, wo, transmitted, side.k, side.contrast)
+            eta = dr.select(outside, self.k_inner, self.k_outer)
+            return Ray(a, side, wo, eta, dr.abs(wi.z), dr.abs(wo.z), transmitted, r, t)
 
         @staticmethod
         def _attached(value: Any) -> Any:
