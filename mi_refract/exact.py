@@ -9,8 +9,14 @@ two terms of the radicand cancel, and √ makes of an error ε one of √ε: so 
 not to a few u. A literal normal along an axis, as in a local frame, leaves nothing to add up: w are the other two
 components of `a`, and each component of b is one product, or the root.
 
-Total internal reflection is decided for the exact inputs wherever |radicand| exceeds 100u² of its terms, (n·a)² and
-κ w²: 4e-13 in float32. Nearer to the critical angle either answer may come out, and the root may be off by 2u.
+Write ρ for |radicand| over the larger of its terms, and ε for its error over that term. Total internal reflection is
+decided as the exact inputs decide it wherever ρ > ε, and the root is off by ε cosθ/2√ρ. For float32, u = 2⁻²⁴:
+
+    compensated   ε ≤ 48u² = 2⁻⁴²·⁴, if all roundings took their largest values at once; the largest ever seen is 9u²
+    promoted      ε ≤ 10·2⁻⁵³ < 2⁻⁴⁹
+
+Where ρ < 2⁻⁴⁴ the refracted ray is within 2⁻²² cosθ of the surface and carries T ≈ 2 (k + 1/k) √ρ of the power, less
+than 2e-6 for k ≤ 2.5. A ρ that small takes inputs made for it: of random ones near the critical angle one in 10⁹.
 """
 
 from __future__ import annotations
@@ -20,7 +26,7 @@ from typing import Any
 import drjit as dr
 
 from . import numerics
-from .numerics import Double, component_of, quotient
+from .numerics import Double, component_of, quotient, two_sum
 
 Refracted = tuple[Any, Any]
 
@@ -54,15 +60,27 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     number = dr.value_t(wide)
     d, m, k2 = wide(a), wide(n), number(component_of(a, k))
     # k² has 48 bits: the difference is rounded at most once.
-    kappa = k2 * k2 - 1 if contrast is None else number(contrast)
-    # Products of components are exact and their sums rounded at 2⁻⁵³: error of the radicand ≤ 8·2⁻⁵³ of its terms.
-    c, w = dr.dot(m, d), dr.cross(m, d)
-    radicand = c * c - kappa * dr.dot(w, w)
+    kappa = dr.fma(k2, k2, -1) if contrast is None else number(contrast)
+    # Products of components are exact in float64. Each w is off by 2⁻⁵³ of itself, and so is c, twice: at grazing
+    # incidence the sum of its first two products is much larger than c, and what rounding it loses is put back.
+    (partial, lost), w = two_sum(m.x * d.x, m.y * d.y), dr.cross(m, d)
+    c = dr.fma(m.z, d.z, partial) + lost
+    # c²: 4·2⁻⁵³; κ w²: 2 from w, 3 from their squares and sum, 1 from the product.
+    radicand = dr.fma(c, c, -kappa * dr.dot(w, w))
     transmitted = (radicand >= 0) & (c != 0)
     along, scale = dr.select(transmitted, dr.mulsign(dr.safe_sqrt(radicand), c), -c), dr.select(transmitted, k2, 1)
     # κ = 0 leaves b = a to the last bit: √(c²) is |c| exactly, so the factor of n is 0. So it is for c = 0.
-    # Else k a + n (…) cancels to k·2⁻⁵³ |a|, which is far below 2⁻²⁴ for k ≤ 1e6.
-    return type(a)(d * scale + m * quotient(along - scale * c, dr.dot(m, m))), transmitted
+    # Else k a + n (…) cancels to 4k·2⁻⁵³ |a|, which is u/128 for k = 1e6.
+    return type(a)(dr.fma(m, quotient(dr.fma(-scale, c, along), dr.dot(m, m)), d * scale)), transmitted
+
+
+def _radicand(c: Double, w: list[Double], kappa: Double) -> Double:
+    """c² − κ w²; its error ε over the larger term, near the critical angle, in u².
+
+    c is off by 1 (and 10u/cosθ more), each w by 5, κ by none for 1 ≤ k < 2²³. So c² is off by 2·1 + 5, w² by
+    2·5 + 19, the product with κ by 6 more, and the difference, of which only the low parts are rounded, by 6: 48.
+    """
+    return numerics.difference(numerics.square(c), kappa * numerics.sum_of_squares(w))
 
 
 def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
@@ -70,9 +88,9 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
 
     A plain evaluation b₀ (a few u off) is corrected by its exact defect in the two equations that define b, so the
     sum b₀ + δ is rounded once. `contrast`: κ where it is known better than k, for the radicand; `k` itself still
-    scales the tangent. Source: this project.
-    Precondition: no over- or underflow in the fourth power of a length times k², which for float32 and k ≤ 1e6 means
-    lengths of 1e-5 to 1e5. Weak nowhere.
+    scales the tangent. Source: this project. Weak nowhere for k ≤ 1e6.
+    Precondition in float32: lengths of 1e-3 to 1e3, so that no product of four over- or underflows
+    (`numerics.near_unit` sees to it, in the entries of FORMULAS).
     """
     k, axis = component_of(a, k), _axis(n)
     kappa = Double.product(k, k) - 1 if contrast is None else _split(a, contrast)
@@ -81,7 +99,7 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
         c, w = Double(a[index] if sign > 0 else -a[index]), [Double(a[i]) for i in range(3) if i != index]
     else:
         c, w = numerics.dot(n, a), numerics.cross(n, a)
-    radicand = numerics.difference(c * c, kappa * numerics.sum_of_squares(w))
+    radicand = _radicand(c, w, kappa)
     transmitted = (radicand.hi >= 0) & (c.hi != 0)
     root, scale = radicand.sqrt(), dr.select(transmitted, k, 1)
     if axis:
@@ -89,8 +107,9 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
         return _along_axis(a, axis, scale, along), transmitted
     root = Double(dr.mulsign(root.hi, c.hi), dr.mulsign(root.lo, c.hi))
     b = _correct(type(a), n, [w_i * scale for w_i in w], numerics.select(transmitted, root, -c))
-    exact = dr.select((kappa.hi == 0) | (c.hi == 0), a, b)
-    # To the last bit where the answer is `a`, but with the derivative of b, which is not that of `a`.
+    # To the last bit where the answer is `a`, but with the derivative of b, which is not that of `a`. Where `n` is no
+    # normal b is NaN, and stays so.
+    exact = dr.select(((kappa.hi == 0) | (c.hi == 0)) & (b[0] == b[0]), a, b)
     return (_attach(exact, b) if dr.grad_enabled(b) else exact), transmitted
 
 
@@ -102,12 +121,12 @@ def _correct(vector: type, n: Any, around: list[Double], along: Double) -> Any:
     """The b with n × b = `around` and n·b = `along`: b = (around × n + along n)/n², rounded once.
 
     |b₀ − b| ≤ 8u |b|, and δ from the exact defects is right to 8u of itself: b₀ + δ is b to 64u² before it is
-    rounded, so the final error is that of rounding, u/2 ulp a component.
+    rounded, so the final error is that of rounding, half an ulp a component.
     """
     inverse = quotient(1, dr.dot(n, n))
 
     def solve(around: list[Any], along: Any) -> Any:
-        return (dr.cross(vector(*around), n) + n * along) * inverse
+        return dr.fma(n, along, dr.cross(vector(*around), n)) * inverse
 
     b = solve([x.hi for x in around], along.hi)
     missing = [

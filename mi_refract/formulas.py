@@ -20,7 +20,7 @@ from typing import Any
 import drjit as dr
 
 from .exact import Refracted, refract_compensated, refract_promoted
-from .numerics import component_of, quotient
+from .numerics import component_of, near_unit, quotient
 
 # Shared by all formulas ----------------------------------------------------------------------------------------
 
@@ -199,7 +199,8 @@ SMALLEST_RATIO, LARGEST_RATIO = 1e-9, 1e9
 class Formula:
     """A formula of refraction, `entry(a, n, k) -> (b, transmitted)`, with its source and its error budget.
 
-    `takes_contrast`: `contrast` is used, not ignored. `automatic_for`: the kinds of array it is the default on.
+    `takes_contrast`: `contrast` is used, not ignored. `scales`: the function wants lengths near 1. `automatic_for`:
+    the kinds of array it is the default on.
     """
 
     function: Callable[..., Refracted]
@@ -207,6 +208,7 @@ class Formula:
     equation: str
     budget: Budget
     takes_contrast: bool = False
+    scales: bool = False
     automatic_for: tuple[str, ...] = ()
 
     def __call__(self, a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
@@ -215,10 +217,13 @@ class Formula:
         That is: `a` or `n` zero or not finite, `k` outside 1e-9 … 1e9, `contrast` not finite or not above −1.
         """
         n, k = type(a)(n), component_of(a, k)
+        scale: Any = 1
+        if self.scales:
+            (a, scale), (n, _) = near_unit(a), near_unit(n)
         b, transmitted = self.unchecked(a, n, k, contrast)
-        valid = (k >= SMALLEST_RATIO) & (k <= LARGEST_RATIO)
-        for length2 in (dr.dot(a, a), dr.dot(n, n)):
-            valid &= (length2 > 0) & (length2 < dr.inf)
+        # `b` has the length of `a`, and a zero or non-finite `n` makes it NaN: one length tells of both.
+        b, length2 = b * scale, dr.dot(b, b)
+        valid = (k >= SMALLEST_RATIO) & (k <= LARGEST_RATIO) & (length2 > 0) & (length2 < dr.inf)
         if contrast is not None:
             valid &= (contrast > -1) & (contrast < dr.inf)
         return dr.select(valid, b, dr.nan), valid & transmitted
@@ -255,6 +260,7 @@ FORMULAS = {
         "b = (k w×n + s n √((n·a)² − κ w²))/n², w = n×a, κ = k² − 1; error-free transforms",
         budget=ROUNDING,
         takes_contrast=True,
+        scales=True,
         automatic_for=("compiled",),
     ),
     "promoted": Formula(

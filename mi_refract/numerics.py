@@ -35,6 +35,26 @@ def quotient(x: Any, y: Any) -> Any:
     return x / y
 
 
+# Dr.Jit's type stub says that it returns an object.
+_reinterpret: Any = dr.reinterpret_array
+
+
+def near_unit(v: Any) -> tuple[Any, Any]:
+    """(v / p, p), p the power of two for which the largest component of v / p is in [1, 2). Exact.
+
+    Where squares could over- or underflow, which is in float32 on Dr.Jit's arrays; every other type has the range
+    for lengths of 1e-18 to 1e18 as it is, and p is the literal 1.
+    """
+    if dr.type_v(v) != dr.VarType.Float32 or not dr.is_jit_v(v):
+        return v, 1
+    number: Any = dr.value_t(type(v))
+    bits, reinterpret = dr.uint32_array_t(number), _reinterpret
+    x, y, z = (reinterpret(bits, dr.detach(v_i)) & 0x7FFFFFFF for v_i in v)  # ordered as |v_i| are
+    exponent = dr.maximum(dr.maximum(x, y), z) & 0x7F800000
+    # 127 is the bias: of 1 / p and of p one each.
+    return v * reinterpret(number, (2 * 127 << 23) - exponent), reinterpret(number, exponent)
+
+
 def two_sum(x: Any, y: Any) -> Pair:
     """s = fl(x + y) and e with s + e = x + y exactly, whatever the magnitudes."""
     s = x + y
@@ -130,7 +150,7 @@ def difference(x: Double, y: Double) -> Double:
 
 
 def dot(x: Any, y: Any) -> Double:
-    """x · y of two 3-vectors as a `Double`: error ≤ u² · 12 Σ|xᵢ yᵢ|, and 0 exactly when the sum is 0."""
+    """x · y of two 3-vectors as a `Double`: error ≤ u² |x · y| + 10u³ Σ|xᵢ yᵢ|, and 0 exactly when the sum is 0."""
     p, e0 = two_prod(x[0], y[0])
     q, e1 = two_prod(x[1], y[1])
     r, e2 = two_prod(x[2], y[2])
@@ -147,38 +167,46 @@ def dot(x: Any, y: Any) -> Double:
 
 
 def cross(x: Any, y: Any) -> list[Double]:
-    """x × y of two 3-vectors as three `Double`s, each with relative error ≤ 6u²."""
+    """x × y of two 3-vectors as three `Double`s, each with relative error ≤ 5u²."""
     return [_exact_difference(x[i], y[j], x[j], y[i]) for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
 def _exact_difference(x: Any, y: Any, z: Any, w: Any) -> Double:
-    """x y − z w: both products are exact pairs, and their four parts are added without loss to second order."""
+    """x y − z w, relative error ≤ 5u².
+
+    Where p and q cancel, d is exact, and a multiple of the last place of e: `fast_two_sum` is exact. Elsewhere
+    |d| ≥ max(|p|, |q|)/2, so |e| ≤ 3u |d|, and d_lo + e loses at most 4u² |d|.
+    """
     p, p_lo = two_prod(x, y)
     q, q_lo = two_prod(z, w)
     d, d_lo = two_sum(p, -q)
     e, e_lo = two_sum(p_lo, -q_lo)
-    s, s_lo = two_sum(d, e)
-    return Double(*fast_two_sum(s, s_lo + (d_lo + e_lo)))
+    s, s_lo = fast_two_sum(d, d_lo + e)
+    return Double(s, s_lo + e_lo)
+
+
+def square(x: Double) -> Double:
+    """x², relative error ≤ 5u², and |lo| ≤ 3u hi. Precondition: |lo| ≤ u |hi|, as for the two below."""
+    p, e = two_prod(x.hi, x.hi)
+    return Double(p, e if x.is_plain else dr.fma(x.lo, dr.fma(2, x.hi, x.lo), e))
 
 
 def sum_of_squares(x: list[Double]) -> Double:
-    """Σ xᵢ² of `Double`s: no term is negative, so plain accumulation of the low parts keeps a few u²."""
-    total, low = two_prod(x[0].hi, x[0].hi)
-    for i, x_i in enumerate(x):
-        if i > 0:
-            p, e = two_prod(x_i.hi, x_i.hi)
-            total, f = two_sum(total, p)
-            low = low + (e + f)
-        if not x_i.is_plain:
-            low = dr.fma(2 * x_i.hi, x_i.lo, low)
-    return Double(total, low)
+    """Σ xᵢ² of two or three `Double`s, relative error ≤ 19u²: 5u² of the squares, 14u² of their low parts' sum."""
+    squares = [square(x_i) for x_i in x]
+    total, low = squares[0].hi, squares[0].lo
+    for each in squares[1:]:
+        total, e = two_sum(total, each.hi)
+        low = low + (each.lo + e)
+    return Double(*fast_two_sum(total, low))
 
 
 def defect(target: Double, *products: Pair) -> Any:
-    """target − Σ xᵢ yᵢ as a plain number: error ≤ u · |result| + 8u² Σ|xᵢ yᵢ|, so small defects keep their digits."""
-    total, low = two_prod(*products[0])
-    for x, y in products[1:]:
+    """target − Σ xᵢ yᵢ as a plain number: error ≤ u |result| + 4u² Σ|xᵢ yᵢ|, so small defects keep their digits."""
+    rest, low = target.hi, target.lo
+    for x, y in products[:-1]:
         p, e = two_prod(x, y)
-        total, f = two_sum(total, p)
-        low = low + (e + f)
-    return (target.hi - total) + (target.lo - low)
+        rest, f = two_sum(rest, -p)
+        low = low + (f - e)
+    x, y = products[-1]
+    return dr.fma(-x, y, rest) + low
