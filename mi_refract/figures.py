@@ -8,11 +8,12 @@ import math
 import re
 import zlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    from matplotlib.axes import Axes as Panel
     from matplotlib.figure import Figure
 
 Points = Sequence[tuple[float, float]]
@@ -67,18 +68,43 @@ def apart(value: float, budget: float) -> tuple[str, str]:
     return repr(value), repr(budget)
 
 
-def drawable(points: Points, *, log_x: bool) -> list[tuple[float, float]]:
-    """The points that have a place on the axes: finite, and positive where the axis is logarithmic."""
-    return [(x, y) for x, y in points if math.isfinite(x) and 0 < y < math.inf and (x > 0 or not log_x)]
+@dataclass(frozen=True)
+class Axes:
+    """Labels and scales, "log" or "linear", of a plot; `slope` is that of a dashed guide, y ~ x^slope.
+
+    ValueError for another scale, or a slope without two logarithmic axes.
+    """
+
+    x: str = ""
+    y: str = ""
+    x_scale: str = "log"
+    y_scale: str = "log"
+    slope: float | None = None
+
+    def __post_init__(self) -> None:
+        if not {self.x_scale, self.y_scale} <= {"log", "linear"}:
+            raise ValueError(f"axes: scales {self.x_scale!r}, {self.y_scale!r}; accepted: 'log', 'linear'")
+        if self.slope is not None and self.logarithmic != "xy":
+            raise ValueError("axes: a slope needs both scales logarithmic")
+
+    @property
+    def logarithmic(self) -> str:
+        return ("x" if self.x_scale == "log" else "") + ("y" if self.y_scale == "log" else "")
 
 
-def curves_svg(curves: Mapping[str, Points], *, error: str, slope: float, salt: str) -> str:
-    """Error against seconds, both logarithmic, with a dashed guide of `slope` from the first curve's start.
+def drawable(points: Points, axes: Axes) -> list[tuple[float, float]]:
+    """The points that have a place on the axes: finite, and positive where a scale is logarithmic."""
+    x_low, y_low = (0 if scale == "log" else -math.inf for scale in (axes.x_scale, axes.y_scale))
+    return [(x, y) for x, y in points if x_low < x < math.inf and y_low < y < math.inf]
 
-    Points without a place on logarithmic axes are left out. "" where nothing can be drawn.
+
+def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str) -> str:
+    """One line per name, and a dashed guide of the axes' slope from the first line's start.
+
+    Points without a place on the axes are left out. "" where nothing can be drawn.
     `salt` makes the ids inside the SVG unique on the page; the same arguments give the same bytes.
     """
-    lines = {name: drawable(points, log_x=True) for name, points in curves.items()}
+    lines = {name: drawable(points, axes) for name, points in curves.items()}
     if not any(lines.values()):
         return ""
     import matplotlib
@@ -87,26 +113,36 @@ def curves_svg(curves: Mapping[str, Points], *, error: str, slope: float, salt: 
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(5.3, 3.3), layout="constrained", dpi=72)
-        axes = figure.add_subplot(xscale="log", yscale="log", xlabel="seconds", ylabel=error)
+        panel = figure.add_subplot(xscale=axes.x_scale, yscale=axes.y_scale, xlabel=axes.x, ylabel=axes.y)
         for i, (name, points) in enumerate(lines.items()):
             if points:
                 style = {"color": SERIES[i % len(SERIES)], "marker": "o", "markersize": 3.5, "linewidth": 1.6}
-                axes.plot(*zip(*points, strict=True), label=name, **style)  # type: ignore[arg-type]
-        _guide(axes, [points for points in lines.values() if points], slope)
-        _ticks(axes, "xy")
-        axes.legend()
+                panel.plot(*zip(*points, strict=True), label=name, **style)  # type: ignore[arg-type]
+        if axes.slope is not None:
+            _guide(panel, [points for points in lines.values() if points], axes.slope)
+        _ticks(panel, axes.logarithmic)
+        panel.legend()
         return _page_svg(figure)
 
 
-def scatter_svg(panels: Mapping[str, Mapping[str, Points]], *, x: str, y: str, salt: str) -> str:
-    """One panel per setting: `x` linear, `y` logarithmic, one labelled colour per subject.
+@dataclass
+class Scatter:
+    """A panel: points by subject, (subject, low x, high x, y) of the intervals, and the x of the floor."""
+
+    points: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    intervals: list[tuple[str, float, float, float]] = field(default_factory=list)
+    floor: float = math.nan
+
+
+def scatter_svg(panels: Mapping[str, Scatter], axes: Axes, *, floor: str, front: bool, salt: str) -> str:
+    """One panel per setting, one labelled colour per subject; `floor` names the floor's line, `front` draws the front.
 
     The points of a subject are joined, so that its spread over the cases is one vertical stroke.
     Points without a place on the axes are left out. "" where nothing can be drawn.
     """
     drawn = {
-        setting: {s: p for s, points in subjects.items() if (p := sorted(drawable(points, log_x=False)))}
-        for setting, subjects in panels.items()
+        setting: {s: p for s, points in panel.points.items() if (p := sorted(drawable(points, axes)))}
+        for setting, panel in panels.items()
     }
     drawn = {setting: subjects for setting, subjects in drawn.items() if subjects}
     if not drawn:
@@ -122,62 +158,95 @@ def scatter_svg(panels: Mapping[str, Mapping[str, Points]], *, x: str, y: str, s
         grid = figure.subplots(lines, columns, sharey=True, squeeze=False).flatten()
         names = dict.fromkeys(s for subjects in drawn.values() for s in subjects)
         colours = {s: SERIES[i % len(SERIES)] for i, s in enumerate(names)}
-        for axes, (setting, subjects) in zip(grid, drawn.items(), strict=False):
-            axes.set(yscale="log", title=setting, xlabel=x)
-            for subject, points in subjects.items():
-                style = {"color": colours[subject], "marker": "o", "markersize": 4.5, "linewidth": 1}
-                axes.plot(*zip(*points, strict=True), **style)
-            axes.margins(x=0.3, y=0.1)
-            if min(px for points in subjects.values() for px, _ in points) >= 0:
-                axes.set_xlim(left=0)
-            _ticks(axes, "y")
+        for panel, (setting, subjects) in zip(grid, drawn.items(), strict=False):
+            panel.set(xscale=axes.x_scale, yscale=axes.y_scale, title=setting, xlabel=axes.x)
+            _points(panel, subjects, panels[setting].intervals, colours)
+            if axes.x_scale == "linear" and min(x for points in subjects.values() for x, _ in points) >= 0:
+                panel.set_xlim(left=0)
+            _floor(panel, panels[setting].floor, floor)
+            _front(panel, subjects if front else {})
+            _ticks(panel, axes.logarithmic)
         figure.canvas.draw()  # settles the layout that the labels' places depend on
-        for axes, subjects in zip(grid, drawn.values(), strict=False):
-            _labels(axes, subjects, colours)
-        for axes in grid[len(drawn) :]:
-            axes.set_visible(False)
-        for axes in figure.axes[::columns]:
-            axes.set_ylabel(y)
+        for panel, subjects in zip(grid, drawn.values(), strict=False):
+            _labels(panel, subjects, colours)
+        for panel in grid[len(drawn) :]:
+            panel.set_visible(False)
+        for panel in figure.axes[::columns]:
+            panel.set_ylabel(axes.y)
         return _page_svg(figure)
+
+
+def pareto(points: Points) -> list[tuple[float, float]]:
+    """The points that no other one beats or equals in both coordinates (less is better), by growing x."""
+    front: list[tuple[float, float]] = []
+    for x, y in sorted(points):
+        if not front or y < front[-1][1]:
+            front.append((x, y))
+    return front
+
+
+def _points(panel: Panel, subjects: Mapping[str, Points], intervals: Any, colours: Mapping[str, str]) -> None:
+    for subject, points in subjects.items():
+        style = {"color": colours[subject], "marker": "o", "markersize": 4.5, "linewidth": 1}
+        panel.plot(*zip(*points, strict=True), **style)  # type: ignore[arg-type]
+    for subject, low, high, y in intervals:
+        if subject in subjects:
+            panel.plot([low, high], [y, y], color=colours[subject], linewidth=1)
+    panel.margins(x=0.3, y=0.1)
+
+
+def _floor(panel: Panel, x: float, name: str) -> None:
+    if math.isfinite(x):
+        panel.axvline(x, color=MUTED, linewidth=1, linestyle=(0, (1, 2)))
+        place = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "fontsize": 9.5}
+        panel.annotate(name, (x, 0), (-4, 6), color=MUTED, ha="right", **place)  # type: ignore[arg-type]
+
+
+def _front(panel: Panel, subjects: Mapping[str, Points]) -> None:
+    """Steps along the front, on to the panel's edges."""
+    if front := pareto([point for points in subjects.values() for point in points]):
+        (_, right), (_, top) = panel.get_xlim(), panel.get_ylim()
+        x, y = zip((front[0][0], top), *front, (right, front[-1][1]), strict=True)
+        panel.step(x, y, where="post", color=MUTED, linewidth=1, zorder=1, scalex=False, scaley=False)
 
 
 def _style(salt: str) -> Any:
     return STYLE | {"svg.hashsalt": salt}
 
 
-def _guide(axes: Axes, lines: list[list[tuple[float, float]]], slope: float) -> None:
+def _guide(panel: Panel, lines: list[list[tuple[float, float]]], slope: float) -> None:
     start, y = min(lines[0])
     stop = max(x for points in lines for x, _ in points)
     if stop > start:
         end = y * (stop / start) ** slope
         label = f"slope {slope:g}".replace("-", "−")
-        axes.plot([start, stop], [y, end], color=MUTED, linewidth=1, linestyle=(0, (4, 3)), label=label)
+        panel.plot([start, stop], [y, end], color=MUTED, linewidth=1, linestyle=(0, (4, 3)), label=label)
 
 
-def _ticks(axes: Axes, which: str) -> None:
+def _ticks(panel: Panel, which: str) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     for name in which:
-        axis = axes.xaxis if name == "x" else axes.yaxis
+        axis = panel.xaxis if name == "x" else panel.yaxis
         low, high = sorted(axis.get_view_interval())
         axis.set_major_locator(LogLocator(subs=(1,) if high / low > 50 else (1, 2, 5), numticks=9))
         axis.set_minor_locator(NullLocator())
         axis.set_major_formatter(FuncFormatter(lambda v, _: compact(v)))
 
 
-def _labels(axes: Axes, subjects: Mapping[str, Points], colours: Mapping[str, str]) -> None:
+def _labels(panel: Panel, subjects: Mapping[str, Points], colours: Mapping[str, str]) -> None:
     """Name every subject beside its highest point, moved down where another name is in the way."""
     heads = {s: max(points, key=lambda p: p[1]) for s, points in subjects.items()}
     placed: list[tuple[float, float]] = []
     for subject, head in sorted(heads.items(), key=lambda item: -item[1][1]):
-        x, y = axes.transData.transform(head)
+        x, y = panel.transData.transform(head)
         lowered = y
         while any(abs(x - px) < 95 and abs(lowered - py) < 13 for px, py in placed):
             lowered -= 1
         placed.append((x, lowered))
         offset = (7, lowered - y)
         text = {"fontsize": 9.5, "color": colours[subject], "va": "center", "textcoords": "offset pixels"}
-        axes.annotate(subject, head, offset, **text)  # type: ignore[arg-type]
+        panel.annotate(subject, head, offset, **text)  # type: ignore[arg-type]
 
 
 def _page_svg(figure: Figure) -> str:

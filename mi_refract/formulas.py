@@ -19,6 +19,7 @@ from typing import Any
 
 import drjit as dr
 
+from .budgets import CONTRASTING, ROUNDING, Budget, cancelling
 from .exact import Refracted, refract_compensated, refract_promoted
 from .numerics import component_of, near_unit, quotient
 
@@ -160,37 +161,6 @@ def refract_rotated(a: Any, n: Any, k: Any) -> Refracted:
 # The table -----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Budget:
-    """A-priori bounds for unit `a`, roundoff u and ratios up to k, with K = max(1, k).
-
-    The radicand is off by ≤ `radicand` u K^growth: where it is larger, total internal reflection is decided rightly;
-    its root is off by at most √ of that, and what is linear in the inputs by ≤ `linear` u K.
-    """
-
-    linear: float
-    radicand: float = 0.0
-    growth: int = 0
-
-    def chord(self, u: float, k: float) -> float:
-        """Bound of |b − exact|."""
-        scale = max(1.0, k) if self.growth else 1.0
-        return self.linear * u * scale + self.margin(u, k) ** 0.5
-
-    def margin(self, u: float, k: float) -> float:
-        """What |1 − k² sin²θ| must exceed for the decision to be right."""
-        return self.radicand * u * max(1.0, k) ** self.growth
-
-
-# Rounding the exact answer costs √3/2 u at most; a twentieth more for what precedes it.
-ROUNDING = Budget(0.92)
-
-
-def cancelling(growth: int) -> Budget:
-    """Of a form whose radicand cancels: nine roundings and inputs that are unit only to u make 12u."""
-    return Budget(8, 12, growth)
-
-
 # Ratios between them leave k², κ and Fresnel's terms within the range of float32.
 SMALLEST_RATIO, LARGEST_RATIO = 1e-9, 1e9
 
@@ -200,7 +170,8 @@ class Formula:
     """A formula of refraction, `entry(a, n, k) -> (b, transmitted)`, with its source and its error budget.
 
     `takes_contrast`: `contrast` is used, not ignored. `scales`: the function wants lengths near 1. `automatic_for`:
-    the kinds of array it is the default on.
+    the kinds of array it is the default on. `time_goal`: what a ray in float32, streamed through a CPU, may take as
+    a multiple of the plain form's time.
     """
 
     function: Callable[..., Refracted]
@@ -210,6 +181,7 @@ class Formula:
     takes_contrast: bool = False
     scales: bool = False
     automatic_for: tuple[str, ...] = ()
+    time_goal: float | None = None
 
     def __call__(self, a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
         """The formula as a total function: NaN and False for what is no refraction.
@@ -243,7 +215,7 @@ FORMULAS = {
         refract_wedge_contrast,
         "000, last form",
         "b = k n(n∧a) + s n √((n·a)² + (n∧a)²(k² − 1))",
-        budget=cancelling(1),
+        budget=CONTRASTING,
     ),
     "cross": Formula(
         refract_cross, "001, eq. 6", "t = n×c + s √(1 − ‖c‖²) n, c = k (i×n)", budget=cancelling(1)
@@ -262,6 +234,7 @@ FORMULAS = {
         takes_contrast=True,
         scales=True,
         automatic_for=("compiled",),
+        time_goal=2.0,
     ),
     "promoted": Formula(
         refract_promoted,
@@ -270,6 +243,7 @@ FORMULAS = {
         budget=ROUNDING,
         takes_contrast=True,
         automatic_for=("scalar",),
+        time_goal=1.1,
     ),
 }
 

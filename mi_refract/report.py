@@ -2,14 +2,7 @@
 
 Everything here lays out what the rows already say; nothing is measured, averaged or judged.
 
-`context` is what all rows share. Every entry is shown as it is, except four that steer the page:
-
-- `title`: the page's name;
-- `studies`: {study: {"title", "text", "terms", "error", "slope"}}, all optional: heading and introduction of a study,
-  the name of the error in its curves (default relMSE) and the slope of their guide (default −1, since relMSE
-  is a variance);
-- `scatter`: [{"study", "x", "y", "title"}]: plots of one metric against another, a panel per setting;
-- `replay`: the command that repeats the whole run, shown on top.
+`context` is what all rows share; `page.py` says which of its entries steer the page.
 """
 
 from __future__ import annotations
@@ -18,20 +11,19 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .figures import Pictures, apart, compact, curves_svg, drawable, scatter_svg
+from . import page
+from .figures import Pictures, apart, compact
 from .files import write_atomically
-from .rows import SCHEMA, Row
+from .rows import SCHEMA, Row, by_study, strict
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
 VERDICTS = ("fail", "not run", "pass", "info")
-STEERING = ("title", "studies", "scatter", "replay")
-ROLES = ("reference", "test", "difference")
 WORDS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
@@ -41,7 +33,7 @@ def write_json(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]
     Errors: TypeError for a value JSON has no form for; OSError.
     """
     document = {"schema": SCHEMA, "context": context, "rows": [row.as_dict() for row in rows]}
-    text = json.dumps(_strict(document), indent=1, allow_nan=False)
+    text = json.dumps(strict(document), indent=1, allow_nan=False)
     write_atomically(path, text + "\n")
 
 
@@ -61,18 +53,6 @@ def read_json(path: str | Path) -> tuple[list[Row], dict[str, Any]]:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         what = f"missing {error}" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"{path}: {' '.join(what.split())}") from error
-
-
-def _strict(value: Any) -> Any:
-    if isinstance(value, float):  # numpy's float64 too, hence the conversion
-        return float(value) if math.isfinite(value) else str(float(value))
-    if isinstance(value, Mapping):
-        return {str(key): _strict(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_strict(item) for item in value]
-    if hasattr(value, "tolist"):  # numpy scalars and arrays
-        return _strict(value.tolist())
-    return str(value) if isinstance(value, Path) else value
 
 
 def _no_constant(word: str) -> float:
@@ -122,13 +102,6 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" + ("" if number == 1 else "s")
 
 
-def _studies(rows: Iterable[Row]) -> dict[str, list[Row]]:
-    studies: dict[str, list[Row]] = {}
-    for row in rows:
-        studies.setdefault(row.study, []).append(row)
-    return studies
-
-
 def write_junit(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]) -> None:
     """One suite per study, one case per measured budget, one skipped case per row that was not run.
 
@@ -137,7 +110,7 @@ def write_junit(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any
     from xml.etree import ElementTree as xml
 
     root = xml.Element("testsuites", name=_xml(context.get("title", "mi_refract")))
-    for study, members in _studies(rows).items():
+    for study, members in by_study(rows).items():
         suite = xml.SubElement(root, "testsuite", name=_xml(study))
         for row in members:
             _junit_cases(suite, row)
@@ -162,7 +135,7 @@ def _junit_cases(suite: Any, row: Row) -> None:
         if metric in row.broken:
             text, limit = apart(row.values[metric], budget)
             failure = xml.SubElement(case, "failure", message=_xml(f"{metric} {text}, budget {limit}"))
-            parts = (f"value {row.values[metric]!r}, budget {budget!r}", row.reason, _replay(row))
+            parts = (f"value {row.values[metric]!r}, budget {budget!r}", row.reason, row.replay_text)
             failure.text = _xml("\n".join(filter(None, parts)))
 
 
@@ -189,7 +162,7 @@ def summary(rows: Sequence[Row]) -> RenderableType:
     counts = Table("study", box=None, pad_edge=False)
     for word in VERDICTS:
         counts.add_column(word, justify="right")
-    for study, members in _studies(rows).items():
+    for study, members in by_study(rows).items():
         tally = Counter(row.verdict for row in members)
         styles = {"fail": "bold red", "not run": "yellow", "pass": "green", "info": ""}
         cells = [Text(str(tally[w] or "·"), style=styles[w] if tally[w] else "dim") for w in VERDICTS]
@@ -207,194 +180,11 @@ def write_html(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]
     from markupsafe import Markup
 
     here = Path(__file__).parent
-    strict: Any = {
-        "autoescape": True,
-        "undefined": StrictUndefined,
-        "trim_blocks": True,
-        "lstrip_blocks": True,
-    }
-    environment = Environment(loader=FileSystemLoader(here), **strict)
-    environment.filters |= {"compact": compact, "words": _words}
+    options: Any = {"autoescape": True, "undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(loader=FileSystemLoader(here), **options)
+    environment.filters |= {"compact": compact, "words": page.words}
     pictures = Pictures(Path(folder))
-    page = _page(rows, context, pictures)
+    content = page.prepare(rows, context, pictures) | {"sentence": verdict(rows)}
     inline = {name: Markup((here / f"report.{name}").read_text("utf-8")) for name in ("css", "js")}
-    text = environment.get_template("report.html.j2").render(**page, **inline, pictures=pictures.embedded)
+    text = environment.get_template("report.html.j2").render(**content, **inline, pictures=pictures.embedded)
     write_atomically(path, text.encode("utf-8", "replace"))
-
-
-def _page(rows: Sequence[Row], context: Mapping[str, Any], pictures: Pictures) -> dict[str, Any]:
-    verdicts = Counter(row.verdict for row in rows)
-    return {
-        "title": context.get("title", "mi_refract"),
-        "sentence": verdict(rows),
-        "state": "fail" if verdicts["fail"] else "pass" if verdicts["pass"] else "empty",
-        "counts": [(word, verdicts[word]) for word in ("pass", "fail", "not run", "info")],
-        "context": {key: value for key, value in context.items() if key not in STEERING},
-        "command": context.get("replay", ""),
-        "failures": [{"row": r, "broken": [(m, _cell(r, m)) for m in r.broken],
-                      "others": [_phrase(r, m) for m in r.values if m not in r.broken],
-                      "replay": _replay(r)} for r in rows if r.broken],
-        "missing": _missing(rows),
-        "absent": verdicts["not run"],
-        "studies": [
-            _study(name, members, context, pictures, f"study-{number}")
-            for number, (name, members) in enumerate(_studies(rows).items(), 1)
-        ],
-    }  # fmt: skip
-
-
-def _missing(rows: Sequence[Row]) -> list[tuple[str, str, list[Row]]]:
-    """The rows that were not run, one entry per study and reason."""
-    groups: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        if row.verdict == "not run":
-            groups.setdefault((row.study, row.reason), []).append(row)
-    return [(*key, members) for key, members in groups.items()]
-
-
-def _study(name: str, rows: list[Row], context: Mapping[str, Any], pictures: Pictures, key: str) -> dict[str, Any]:
-    about = context.get("studies", {}).get(name, {})
-    metrics = list(dict.fromkeys(metric for row in rows for metric in row.values))
-    labels = {"error": about.get("error", "relMSE"), "slope": about.get("slope", -1)}
-    plots = [(row, curves_svg(row.curves, **labels, salt=f"{key}-{number}"), _left_out(row))
-             for number, row in enumerate(rows) if row.curves]  # fmt: skip
-    scatters = [scatter for scatter in context.get("scatter", ()) if scatter["study"] == name]
-    return {
-        "key": key,
-        "title": about.get("title", name),
-        "text": about.get("text", ""), "terms": about.get("terms", {}),
-        "failures": sum(row.verdict == "fail" for row in rows),
-        "scale": (scale := _scale(rows, metrics)),
-        "panels": _panels(rows, metrics, scale),
-        "scatters": [_scatter(s, rows, f"{key}-scatter-{i}") for i, s in enumerate(scatters)],
-        "plots": plots,
-        "figures": [_figure(row, pictures) for row in rows if row.pictures],
-    }
-
-
-def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> list[dict[str, Any]]:
-    """A table per setting, under a matrix of subjects by cases, where there is enough to see."""
-    settings = list(dict.fromkeys(row.setting for row in rows))
-    parts = {setting: [row for row in rows if row.setting == setting] for setting in settings}
-    matrices = {setting: _matrix(part, metrics, scale) for setting, part in parts.items()}
-    if not any(matrices.values()):
-        return [{"heading": "", "matrix": None, "table": _table(rows, metrics)}]
-    return [
-        {"heading": s, "matrix": matrices[s],
-         "table": _table(parts[s], metrics, s) if any(row.values for row in parts[s]) else None,
-         "reasons": list(dict.fromkeys(row.reason for row in parts[s]))}
-        for s in settings
-    ]  # fmt: skip
-
-
-def _matrix(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> dict[str, Any] | None:
-    subjects = list(dict.fromkeys(row.subject for row in rows))
-    cases = list(dict.fromkeys(row.case for row in rows))
-    cells = {(row.subject, row.case): row for row in rows}
-    if len(subjects) < 3 or len(cases) < 3 or len(cells) < len(rows) or scale is None:
-        return None
-    lines = [(s, [_shade(cells.get((s, c)), metrics[0], scale) for c in cases]) for s in subjects]
-    return {"metric": metrics[0], "cases": cases, "lines": lines}
-
-
-def _shade(row: Row | None, metric: str, scale: tuple[float, float]) -> dict[str, Any]:
-    """A cell of the matrix: its number, how deep its colour is on the logarithmic scale, what it broke."""
-    if row is None or not row.values:
-        text, state, hint = ("not run", "not-run", row.reason) if row else ("·", "none", "")
-        return {"text": text, "state": state, "depth": 0, "hint": hint, "broken": []}
-    low, high = map(math.log, scale)
-    value = row.values.get(metric, 0)
-    place = (math.log(value) - low) / (high - low) if 0 < value < math.inf and high > low else 0
-    depth = round(place, 3) if value < math.inf else 1  # NaN is no small error
-    hint = "\n".join(_phrase(row, m) for m in row.values)
-    broken = [_bound(row, m) if m == metric else _phrase(row, m) for m in row.broken]
-    cell = _cell(row, metric)
-    return {
-        "text": cell["text"] if cell else "·",
-        "state": row.verdict,
-        "depth": depth,
-        "hint": hint,
-        "broken": broken,
-    }
-
-
-def _scale(rows: list[Row], metrics: list[str]) -> tuple[float, float] | None:
-    values = [row.values[metrics[0]] for row in rows if metrics and metrics[0] in row.values]
-    positive = [value for value in values if 0 < value < math.inf]
-    return (min(positive), max(positive)) if positive else None
-
-
-def _phrase(row: Row, metric: str) -> str:
-    if metric not in row.bounds:
-        return f"{metric} {compact(row.values[metric])}"
-    return f"{metric} {apart(row.values[metric], row.bounds[metric])[0]} {_bound(row, metric)}"
-
-
-def _bound(row: Row, metric: str) -> str:
-    """The budget or goal with how the value stands to it; NaN is neither above nor below."""
-    value, budget = row.values[metric], row.bounds[metric]
-    sign = "≤" if value <= budget else ">" if value > budget else "≰"
-    return f"{sign} {apart(value, budget)[1]}"
-
-
-def _table(rows: list[Row], metrics: list[str], heading: str = "") -> dict[str, Any]:
-    """Columns: what tells the rows apart, then every metric; a label equal to the one above is marked."""
-    keys = [k for k in ("subject", "case", "setting") if len({getattr(row, k) for row in rows}) > 1]
-    keys = keys or ["subject"]
-    used = [m for m in metrics if any(m in row.values for row in rows)]
-    lines, above = [], [""] * len(keys)
-    for row in rows:
-        labels = [getattr(row, key) for key in keys]
-        again = [labels[: i + 1] == above[: i + 1] for i in range(len(keys))]
-        cells = [_cell(row, metric) for metric in used]
-        lines.append({"row": row, "labels": list(zip(labels, again, strict=True)), "cells": cells,
-                      "replay": _replay(row)})  # fmt: skip
-        above = labels
-    shared = [getattr(rows[0], k) for k in ("subject", "case", "setting") if k not in keys]
-    shared = [label for label in shared if label and label != heading]
-    return {"keys": keys, "metrics": used, "lines": lines, "shared": " · ".join(shared)}
-
-
-def _cell(row: Row, metric: str) -> dict[str, str] | None:
-    if metric not in row.values:
-        return None
-    if metric not in row.bounds:
-        return {"state": "info", "text": compact(row.values[metric]), "budget": ""}
-    text = apart(row.values[metric], row.bounds[metric])[0]
-    state = "fail" if metric in row.broken else "missed" if metric in row.missed else "pass"
-    return {"state": state, "text": text, "budget": _bound(row, metric)}
-
-
-def _replay(row: Row) -> str:
-    """`row.replay` as JSON, one entry a line; "" where there is none."""
-    form: Any = {"ensure_ascii": False, "default": str}
-    entries = [f" {json.dumps(k, **form)}: {json.dumps(v, **form)}" for k, v in _strict(row.replay).items()]
-    return "{\n" + ",\n".join(entries) + "\n}" if entries else ""
-
-
-def _left_out(row: Row) -> int:
-    return sum(len(points) - len(drawable(points, log_x=True)) for points in row.curves.values())
-
-
-def _scatter(scatter: Mapping[str, str], rows: list[Row], salt: str) -> dict[str, Any]:
-    x, y = scatter["x"], scatter["y"]
-    panels: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    points = [(row, (row.values[x], row.values[y])) for row in rows if x in row.values and y in row.values]
-    for row, point in points:
-        panels.setdefault(row.setting, {}).setdefault(row.subject, []).append(point)
-    omitted = len(points) - len(drawable([point for _, point in points], log_x=False))
-    svg = scatter_svg(panels, x=x, y=y, salt=salt)
-    return {"title": scatter.get("title", f"{y} against {x}"), "svg": svg, "omitted": omitted}
-
-
-def _figure(row: Row, pictures: Pictures) -> dict[str, Any]:
-    roles = [role for role in ROLES if role in row.pictures]
-    roles += [role for role in row.pictures if role not in ROLES]
-    panes = [(role, pictures.embed(row.pictures[role])) for role in roles]
-    return {"row": row, "panes": panes, "paired": roles[:2] == ["reference", "test"]}
-
-
-def _words(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_words(item)}" for key, item in value.items())
-    return ", ".join(map(_words, value)) if isinstance(value, list | tuple) else str(value)

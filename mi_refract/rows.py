@@ -7,7 +7,11 @@ below plus its `verdict`. `context` holds what every row shares: versions, machi
 from __future__ import annotations
 
 import dataclasses
+import json
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 SCHEMA = 1
@@ -21,7 +25,8 @@ class Row:
     breaks its budget. `goals` are upper bounds too, for what a busy machine can spoil (times): a missed goal is
     shown, and decides no verdict. A row without values was not run, and `reason` says why; otherwise `reason` is
     a remark. `replay` is what repeats the row: seed, sizes, hex floats. `pictures` are EXR paths relative to the output
-    folder, by role (`reference`, `test`, `difference`). `curves` are named lists of (seconds, error) points.
+    folder, by role (`reference`, `test`, `overlay`, `difference`). `curves` are named lists of (x, y) points; what x
+    and y are is said once per study, by its `axes` in the context.
     """
 
     study: str  # "directions"
@@ -80,3 +85,30 @@ class Row:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Row:
         return cls(**{f.name: data[f.name] for f in dataclasses.fields(cls)})
+
+    @property
+    def replay_text(self) -> str:
+        """`replay` as JSON, one entry a line; "" where there is none."""
+        form: Any = {"ensure_ascii": False, "default": str}
+        entries = [f" {json.dumps(k, **form)}: {json.dumps(v, **form)}" for k, v in strict(self.replay).items()]
+        return "{\n" + ",\n".join(entries) + "\n}" if entries else ""
+
+
+def by_study(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    studies: dict[str, list[Row]] = {}
+    for row in rows:
+        studies.setdefault(row.study, []).append(row)
+    return studies
+
+
+def strict(value: Any) -> Any:
+    """`value` in the types strict JSON has: numpy's as lists and numbers, NaN and the infinities as words."""
+    if isinstance(value, float):  # numpy's float64 too, hence the conversion
+        return float(value) if math.isfinite(value) else str(float(value))
+    if isinstance(value, Mapping):
+        return {str(key): strict(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [strict(item) for item in value]
+    if hasattr(value, "tolist"):  # numpy scalars and arrays
+        return strict(value.tolist())
+    return str(value) if isinstance(value, Path) else value

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from mi_refract import report
-from mi_refract.figures import apart, compact, curves_svg
+from mi_refract.figures import Axes, apart, compact, curves_svg, pareto
 from mi_refract.files import update_between, write_atomically
 from mi_refract.rows import Row
 
@@ -213,9 +213,63 @@ def test_a_picture_that_cannot_be_shown_is_an_error_and_the_old_page_stays(tmp_p
 
 
 def test_curves_keep_the_guide_and_literal_names():
-    svg = curves_svg({"$x$": [(1, 1e-2), (10, 1e-3)]}, error="relMSE", slope=-1, salt="s")
+    axes = Axes("seconds", "relMSE", slope=-1)
+    svg = curves_svg({"$x$": [(1, 1e-2), (10, 1e-3)]}, axes, salt="s")
     assert "slope −1" in svg and ">$x$</text>" in svg and "var(--c0)" in svg
-    assert curves_svg({"x": [(1, 0), (NAN, 1)]}, error="e", slope=-1, salt="s") == ""
+    assert ">seconds</text>" in svg and ">relMSE</text>" in svg
+    assert curves_svg({"x": [(1, 0), (NAN, 1)]}, axes, salt="s") == ""
+
+
+@pytest.mark.parametrize(
+    ("scales", "left_out"),
+    [({}, 2), ({"x_scale": "linear"}, 1), ({"y_scale": "linear"}, 1), ({"x_scale": "linear", "y_scale": "linear"}, 0)],
+)
+def test_what_has_no_place_depends_on_the_scales_a_study_asks_for(scales, left_out, tmp_path):
+    axes = {"x": "height", "y": "turn", **scales}
+    row = dataclasses.replace(INFO, curves={"a": [(-1.0, 1.0), (1.0, -1.0), (1.0, 1.0), (2.0, 3.0)]})
+    text = html(tmp_path, [row], {"studies": {"speed": {"axes": axes}}})
+    assert ">height</text>" in text and ">turn</text>" in text
+    assert [int(n) for n in re.findall(r"Not drawn: (\d+) point", text)] == [left_out] * bool(left_out)
+    assert "slope" not in text
+
+
+def test_the_front_are_the_points_that_nothing_beats():
+    points = [(2.0, 5.0), (1.0, 9.0), (3.0, 5.0), (1.0, 8.0), (4.0, 1.0), (5.0, 2.0)]
+    assert pareto(points) == [(1.0, 8.0), (2.0, 5.0), (4.0, 1.0)]
+    assert pareto([]) == []
+
+
+def test_a_scatter_shows_front_floor_and_intervals_where_asked(tmp_path):
+    def paths(**more):
+        scatter = {"study": "s", "x": "time", "y": "worst", **more}
+        text = html(tmp_path, rows, {"scatter": [scatter, {**scatter, "x": "absent"}]})
+        assert text.count('class="plot wide"') == 1  # what no row has measured is not drawn
+        return text.count("<path"), text
+
+    rows = [Row("s", name, "", "llvm", {"time": x, "low": x - 0.1, "high": x + 0.1, "worst": y})
+            for name, x, y in (("a", 1.0, 1e-3), ("b", 2.0, 1e-6), ("c", 3.0, 1e-5))]  # fmt: skip
+    rows.append(Row("s", "copy", "", "llvm", {"time": 0.9}))
+    plain, text = paths()
+    assert ">copy</text>" not in text
+    assert paths(front=True)[0] == plain + 1
+    floored, text = paths(floor="copy")
+    assert floored == plain + 1 and ">copy</text>" in text
+    wide = paths(interval=["low", "high"])[1]
+    assert wide.count("<path") == plain and wide != text
+
+
+@pytest.mark.parametrize("axes", [{"x_scale": "cubic"}, {"slope": 2, "y_scale": "linear"}])
+def test_axes_that_cannot_be_drawn_are_an_error(axes):
+    with pytest.raises(ValueError, match="axes: "):
+        Axes(**axes)
+
+
+def test_an_overlay_stands_beside_the_other_pictures_in_a_fixed_order(tmp_path):
+    write_exr(tmp_path / "a.exr", np.zeros((2, 2, 3)))
+    pictures = dict.fromkeys(("overlay", "extra", "difference", "test", "reference"), "a.exr")
+    text = html(tmp_path, [dataclasses.replace(GOOD, pictures=pictures)])
+    assert re.findall('data-role="([^"]*)"', text) == ["reference", "test", "overlay", "difference", "extra"]
+    assert 'class="compare paired"' in text
 
 
 @pytest.mark.parametrize(

@@ -64,8 +64,22 @@ def test_directions_name_what_does_not_run_and_hold_what_does(context):
     absent = [s for s in directions.settings(context) if s.vector is None]
     assert all(row.verdict == "not run" and row.reason for s in absent for row in directions._setting_rows(context, s))
     worst = next(row for row in rows if row.subject == "promoted" and row.case == "critical")
-    assert {"worst / u", "misjudged far"} == set(worst.budgets)
-    assert len(worst.replay["worst ray"]["a"]) == 3
+    assert {"error / bound", "misjudged far"} == set(worst.budgets)
+    assert len(worst.replay["largest error"]["a"]) == 3
+
+
+@pytest.mark.parametrize(("constant", "factor"), [("linear", 6), ("radicand", 6), ("linear", 1), ("linear", 0.2)])
+def test_a_budget_that_is_loose_or_too_tight_fails_the_full_sweep(constant, factor, context, monkeypatch):
+    monkeypatch.setattr(directions, "TWO_SIDED", 60)
+    formula = FORMULAS["decomposed"]
+    off = dataclasses.replace(formula.budget, **{constant: factor * getattr(formula.budget, constant)})
+    monkeypatch.setitem(FORMULAS, "decomposed", dataclasses.replace(formula, budget=off))
+    setting = directions.settings(context)[0]
+    parts = [directions._regime_row("decomposed", formula, r, setting, 3000) for r in ("grazing", "critical", "k ≫ 1")]
+    whole = directions._summary("decomposed", parts, setting, {})
+    assert set(whole.budgets) == {"slack, linear", "slack, radicand"}
+    broken = {metric for row in (whole, *parts) for metric in row.broken}
+    assert broken == ({f"slack, {constant}"} if factor > 1 else {"error / bound"} if factor < 1 else set())
 
 
 def test_samples_pass_and_see_an_index_that_is_off(context, monkeypatch):
@@ -163,13 +177,16 @@ def test_the_accuracy_table_holds_the_rows_and_nothing_else():
     settings = {"llvm float32": {"misjudged": 3.0}, "llvm float64": {}}
     rows = [
         Row("directions", "promoted", "all regimes", setting,
-            {"worst chord": 4.97e-8, "worst / u": 0.834, "time / copy": 1.01} | more, replay={"rays": 28000})
+            {"worst chord": 4.97e-8, "worst / u": 0.834, "time / copy": 1.01, "time / copy, low": 0.98,
+             "time / copy, high": 1.2, "time / plain": 1.05} | more, replay={"rays": 28000})
         for setting, more in settings.items()
     ]  # fmt: skip
-    lines = readme.accuracy(rows).splitlines()
-    assert len(lines) == 5
-    assert [cell.strip() for cell in lines[-1].split("|")][1:7] == [
-        "`promoted`", "this project", "4.97e-8", "0.834", "3", "1.01",
+    floor = [dataclasses.replace(r, subject="copy", values={"time / copy": 1.0}, replay={}) for r in rows]
+    lines = readme.accuracy([*rows, *floor]).splitlines()
+    assert len(lines) == 6
+    assert [cell.strip() for cell in lines[-1].split("|")][1:-1] == [
+        "`promoted`", "this project", "4.97e-8", "0.834", "3", "1.01 (0.98–1.2)", "1.05",
+        "4.97e-8", "0.834", "1.01 (0.98–1.2)",
     ]  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import Any
 
 # Each study by name, and the modules that make it up.
-STUDIES = {"directions": ("directions", "samples"), "renders": ("renders",)}
+STUDIES = {"directions": ("directions", "mutants", "samples"), "renders": ("renders",)}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -78,6 +78,7 @@ def _run(options: argparse.Namespace) -> int:
     described = runner.describe(context, time.perf_counter() - start)
     described["studies"] = {
         name: {"title": study.TITLE, "text": " ".join(study.TEXT.split()), "terms": study.TERMS}
+        | ({"axes": study.AXES} if hasattr(study, "AXES") else {})
         for name, study in studies.items()
     }
     described["scatter"] = [scatter for study in studies.values() for scatter in getattr(study, "SCATTER", [])]

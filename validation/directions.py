@@ -1,27 +1,28 @@
 """Directions: every formula against the certified answer, ray by ray, with the time it takes.
 
 The error of a ray is the chord |b/|a| − exact| in units of roundoff u (2⁻²⁴, 2⁻⁵³), and the angle in radians.
-Rays whose total internal reflection was decided wrongly are counted, and left out of the errors.
-Times are those of streaming rays from memory, as a multiple of the time of copying the same bytes (a + k n).
+Its bound is an a-priori one for that very ray. Rays whose total internal reflection was decided wrongly are counted,
+and left out of the errors. Times are those of kernels that stream rays from memory, as a multiple of the time of
+copying the same bytes (a + k n). The stepped line joins the formulas that none is both faster and more accurate than.
 """
 
 from __future__ import annotations
 
 import functools
-import statistics
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
-import drjit as dr
 import numpy as np
 
 from mi_refract import oracle, regimes
-from mi_refract.formulas import FORMULAS, Budget, cancelling
+from mi_refract.formulas import FORMULAS
 from mi_refract.rows import Row
 
+from . import timing
+from .judge import BUDGETS, Subject, errors, evaluate, judge
 from .plan import Context, Task
+from .settings import BUILTIN, Setting, budget_of, builtin, settings
+
+__all__ = ["BUILTIN", "Setting", "builtin", "certified", "errors", "evaluate", "settings", "tasks"]
 
 TITLE = "Directions"
 TEXT = __doc__.partition("\n")[2].strip()
@@ -30,36 +31,25 @@ TERMS = (
     | {name: regime.text for name, regime in regimes.REGIMES.items()}
     | {
         "worst / u": "the largest chord error in units of roundoff; rounding the exact answer costs 0.87",
+        "error / bound": "the largest share that an error takes of its ray's a-priori bound",
         "misjudged": "rays whose total internal reflection was decided wrongly",
         "misjudged far": "those of them that are farther from the critical angle than the formula's own error",
         "length drift": "how far the length of b is from that of a, relative",
-        "time / copy": "median time of a ray over that of copying its bytes, streaming; below 1 it is noise",
-        "operations": "Dr.Jit's count for the whole kernel",
+        "slack": "by how much a constant of the bound could be smaller: of what is linear, of what is under the root",
     }
+    | timing.TERMS
 )
 SCATTER = [
-    {"study": "directions", "x": "time / copy", "y": "worst / u", "title": "Worst error against time per ray"},
-]
-BUILTIN = "mi.fresnel + mi.refract"
+    {
+        "study": "directions", "x": x, "y": "worst / u", "title": f"Worst error against {x}",
+        "front": True, "interval": [f"{x}, low", f"{x}, high"], "floor": timing.COPY,
+    }
+    for x in ("time / copy", "ns per ray")
+]  # fmt: skip
 SEED = 2026
-
-
-@dataclass(frozen=True)
-class Setting:
-    """A backend in a precision: `vector` is its 3-vector type, `None` where it cannot run, for `reason`."""
-
-    label: str
-    precision: type
-    vector: Any = None
-    reason: str = ""
-
-    @property
-    def roundoff(self) -> float:
-        return float(np.finfo(self.precision).eps) / 2
-
-    @property
-    def is_scalar(self) -> bool:
-        return self.vector is not None and not dr.is_jit_v(self.vector)
+# Fewer rays than this need not come near a bound: only from here on a bound that is too wide is a defect.
+TWO_SIDED = 50_000
+LARGEST_SLACK = 4.0
 
 
 def tasks(context: Context) -> list[Task]:
@@ -70,198 +60,86 @@ def tasks(context: Context) -> list[Task]:
     ]
 
 
-def settings(context: Context) -> list[Setting]:
-    found = [
-        Setting("scalar float64", np.float64, dr.scalar.Array3f64),
-    ]
-    for backend in ("llvm", "cuda"):
-        entry = context.backends[backend]
-        for precision, name in ((np.float32, "Array3f"), (np.float64, "Array3f64")):
-            label = f"{backend} {np.dtype(precision).name}"
-            if entry.usable:
-                found.append(Setting(label, precision, getattr(getattr(dr, backend), name)))
-            else:
-                found.append(Setting(label, precision, reason=entry.reason))
-    return found
-
-
 @functools.cache
 def certified(regime: str, count: int, precision: type) -> tuple[regimes.Rays, oracle.Certified]:
     rays = regimes.make(regime, count, precision, SEED)
-    return rays, oracle.refract(rays.a, rays.n, rays.k, progress=False)
-
-
-# Errors --------------------------------------------------------------------------------------------------------
-
-Subject = Callable[[Any, Any, Any], tuple[Any, Any]]
+    return rays, oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
 
 
 def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
-        return [Row("directions", name, "all regimes", setting.label, reason=setting.reason) for name in FORMULAS]
+        return [
+            Row("directions", name, "all regimes", setting.label, reason=setting.reason)
+            for name in (*FORMULAS, timing.COPY)
+        ]
     count = context.profile.scalar_rays if setting.is_scalar else context.profile.rays
-    times = _times(context, setting)
+    times = timing.measure(context, setting)
     rows = []
-    for name, subject in _subjects(context, setting).items():
-        parts = [_regime_row(name, subject, regime, setting, count) for regime in regimes.REGIMES]
-        rows += [*parts, _summary(name, parts, setting, times)]
-    return rows
+    for name, subject in setting.subjects.items():
+        parts = [
+            _regime_row(name, subject, regime, setting, count) for regime in regimes.REGIMES if _is_for(name, regime)
+        ]
+        rows += [*parts, _summary(name, parts, setting, times[name])]
+    floor = Row("directions", timing.COPY, "all regimes", setting.label, times[timing.COPY])
+    return [*rows, floor]
 
 
-def _subjects(context: Context, setting: Setting) -> dict[str, Subject]:
-    """Every formula, and Mitsuba's functions where they exist in this precision."""
-    subjects: dict[str, Subject] = dict(FORMULAS)
-    if setting.label.startswith(context.variant.partition("_")[0]) and setting.precision is np.float32:
-        subjects[BUILTIN] = builtin
-    return subjects
+def _is_for(name: str, regime: str) -> bool:
+    """Vectors that are not unit are for the formulas that take them."""
+    return _is_unit(regime) or budget_of(name).any_length is not None
 
 
-def builtin(a: Any, n: Any, k: Any) -> tuple[Any, Any]:
-    """Mitsuba's own functions, with the normal turned so that they need no reciprocal of k."""
-    import mitsuba as mi
-
-    wi, n, k = mi.Vector3f(-a), mi.Vector3f(n), mi.Float(k)
-    n = n * dr.sign(dr.dot(-wi, n))
-    _, cos_t, _, eta_ti = mi.fresnel(dr.dot(wi, n), k)
-    transmitted = cos_t != 0
-    m = mi.Normal3f(n)
-    return dr.select(transmitted, mi.refract(wi, m, cos_t, eta_ti), mi.reflect(wi, m)), transmitted
-
-
-def evaluate(subject: Subject, rays: regimes.Rays, vector: Any) -> tuple[np.ndarray, np.ndarray]:
-    """`subject` on all rays, as numpy arrays (N, 3) and (N,), in extended precision."""
-    if dr.is_jit_v(vector):
-        b, transmitted = subject(vector(rays.a.T), vector(rays.n.T), dr.value_t(vector)(rays.k))
-        return np.array(b).T.astype(np.longdouble), np.array(transmitted)
-    pairs = [subject(vector(a), vector(n), float(k)) for a, n, k in zip(rays.a, rays.n, rays.k, strict=True)]
-    return np.array([list(b) for b, _ in pairs], np.longdouble), np.array([t for _, t in pairs], bool)
-
-
-def errors(b: np.ndarray, rays: regimes.Rays, exact: oracle.Certified) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(chord, angle, drift of the length) of every ray, relative to |a|; NaN counts as infinite."""
-    length = np.sqrt((rays.a.astype(np.longdouble) ** 2).sum(1))[:, None]
-    unit, low = b / length, exact.direction_low.astype(np.longdouble)
-    difference = (unit - exact.direction) - low
-    chord = np.sqrt((difference**2).sum(1))
-    norm = np.sqrt((unit**2).sum(1))
-    across = np.sqrt((np.cross(unit, difference) ** 2).sum(1)) / norm
-    angle = np.arctan2(across, norm - (unit * difference).sum(1) / norm)
-    chord, angle, drift = (np.nan_to_num(x.astype(float), nan=np.inf) for x in (chord, angle, np.abs(norm - 1)))
-    return chord, angle, drift
+def _is_unit(regime: str) -> bool:
+    return getattr(regimes.REGIMES[regime], "unit", True)
 
 
 def _regime_row(name: str, subject: Subject, regime: str, setting: Setting, count: int) -> Row:
     rays, exact = certified(regime, count, setting.precision)
-    b, transmitted = evaluate(subject, rays, setting.vector)
-    wrong = (transmitted != exact.transmitted) & ~exact.undecided
-    chord, angle, drift = errors(b, rays, exact)
-    right = ~wrong & ~exact.undecided
-    u, largest_k = setting.roundoff, regimes.REGIMES[regime].largest_k
-    worst = int(np.argmax(np.where(right, chord, -1)))
+    budget, u = budget_of(name), setting.roundoff
+    found = judge(subject, rays, exact, setting.vector, budget, _is_unit(regime))
+    chord, angle = found.chord[found.right], found.angle[found.right]
     values = {
-        "worst / u": float(chord[right].max() / u),
-        "worst chord": float(chord[right].max()),
-        "p99 / u": float(np.quantile(chord[right], 0.99) / u),
-        "mean / u": float(chord[right].mean() / u),
-        "worst rad": float(angle[right].max()),
-        "p99 rad": float(np.quantile(angle[right], 0.99)),
-        "mean rad": float(angle[right].mean()),
-        "length drift": float(drift[right].max()),
-        "misjudged": float(wrong.sum()),
-        "misjudged far": float((wrong & (_radicand(rays) > _budget(name).margin(u, largest_k))).sum()),
+        "worst / u": float(chord.max() / u),
+        **found.values(),
+        "worst chord": float(chord.max()),
+        "p99 / u": float(np.quantile(chord, 0.99) / u),
+        "mean / u": float(chord.mean() / u),
+        "worst rad": float(angle.max()),
+        "p99 rad": float(np.quantile(angle, 0.99)),
+        "mean rad": float(angle.mean()),
+        "length drift": float(found.drift[found.right].max()),
+        "misjudged": float(found.misjudged.sum()),
     }
+    worst = {"largest error": np.where(found.right, found.chord, -1), "nearest to its bound": found.share}
     replay = {
         "regime": regime, "text": regimes.REGIMES[regime].text, "count": count, "seed": SEED,
-        "worst ray": {
-            "a": [float(x).hex() for x in rays.a[worst]],
-            "n": [float(x).hex() for x in rays.n[worst]],
-            "k": float(rays.k[worst]).hex(),
-        },
+        **{title: _hexadecimal(rays, int(np.argmax(x))) for title, x in worst.items()},
+        "needed": {"linear": float(found.linear.max()), "radicand": float(found.radicand.max())},
     }  # fmt: skip
-    budgets = {"worst / u": _budget(name).chord(u, largest_k) / u, "misjudged far": 0.0}
-    return Row("directions", name, regime, setting.label, values, budgets, replay=replay)
+    return Row("directions", name, regime, setting.label, values, BUDGETS, replay=replay)
 
 
-def _budget(name: str) -> Budget:
-    """That of the formula; the built-in's radicand cancels as that of the decomposed form does."""
-    return FORMULAS[name].budget if name in FORMULAS else cancelling(2)
+def _hexadecimal(rays: regimes.Rays, i: int) -> dict[str, Any]:
+    a, n = ([float(x).hex() for x in v[i]] for v in (rays.a, rays.n))
+    return {"a": a, "n": n, "k": float(rays.k[i]).hex()}
 
 
-def _radicand(rays: regimes.Rays) -> np.ndarray:
-    """|1 − k² sin²θ_i| of every ray, in extended precision: how far the decision is from the critical angle."""
-    a, n, k = (x.astype(np.longdouble) for x in (rays.a, rays.n, rays.k))
-    sin2 = (np.cross(n, a) ** 2).sum(1) / ((a * a).sum(1) * (n * n).sum(1))
-    return np.abs(1 - k * k * sin2)
-
-
-def _summary(name: str, parts: list[Row], setting: Setting, times: dict[str, dict[str, float]]) -> Row:
+def _summary(name: str, parts: list[Row], setting: Setting, times: dict[str, float]) -> Row:
     """The worst over all regimes and what it cost: the point of a formula in the plane of error and time."""
-    worst = {m: max(row.values[m] for row in parts) for m in ("worst / u", "worst chord", "worst rad", "length drift")}
-    total = {"misjudged": sum(row.values["misjudged"] for row in parts)}
+    metrics = "worst / u", "error / bound", "worst chord", "worst rad", "length drift"
+    values = {m: max(row.values[m] for row in parts) for m in metrics}
+    values |= {m: sum(row.values[m] for row in parts) for m in ("misjudged", "misjudged far")}
+    budgets = {}
+    if min(row.replay["count"] for row in parts) >= TWO_SIDED:
+        slack = _slack(name, parts)
+        values, budgets = values | slack, dict.fromkeys(slack, LARGEST_SLACK)
     replay = {"rays": sum(row.replay["count"] for row in parts), "seed": SEED}
-    return Row("directions", name, "all regimes", setting.label, worst | total | times[name], replay=replay)
+    goals = timing.goals(name, setting)
+    return Row("directions", name, "all regimes", setting.label, values | times, budgets, goals, replay=replay)
 
 
-# Times ---------------------------------------------------------------------------------------------------------
-
-
-def _copy(a: Any, n: Any, k: Any) -> tuple[Any, Any]:
-    """Reads and writes what a formula does, and computes as little as can be."""
-    return a + n * k, k > 0
-
-
-def _times(context: Context, setting: Setting) -> dict[str, dict[str, float]]:
-    """Per subject: median time over that of copying, in turn in one run, warm; and the kernel's operations."""
-    subjects = {"copy": _copy, **_subjects(context, setting)}
-    clock = _scalar_clock(context, setting) if setting.is_scalar else _streaming_clock(context, setting)
-    for subject in subjects.values():
-        clock(subject)
-    seconds: dict[str, list[float]] = {name: [] for name in subjects}
-    for _ in range(context.profile.repeats):
-        for name, subject in subjects.items():
-            seconds[name].append(clock(subject))
-    ratios = {
-        name: statistics.median(t / c for t, c in zip(seconds[name], seconds["copy"], strict=True)) for name in subjects
-    }
-    return {
-        name: {"time / copy": ratios[name]} | ({} if setting.is_scalar else {"operations": _operations(clock, subject)})
-        for name, subject in subjects.items()
-    }
-
-
-def _streaming_clock(context: Context, setting: Setting) -> Callable[[Subject], float]:
-    rays = regimes.make("generic", context.profile.streamed_rays, setting.precision, SEED)
-    a, n, k = setting.vector(rays.a.T), setting.vector(rays.n.T), dr.value_t(setting.vector)(rays.k)
-    dr.eval(a, n, k)
-
-    def clock(subject: Subject) -> float:
-        outcome = subject(a, n, k)
-        dr.sync_thread()
-        start = time.perf_counter()
-        dr.eval(outcome)
-        dr.sync_thread()
-        return time.perf_counter() - start
-
-    return clock
-
-
-def _scalar_clock(context: Context, setting: Setting) -> Callable[[Subject], float]:
-    rays = regimes.make("generic", context.profile.scalar_rays, setting.precision, SEED)
-    vectors = [(setting.vector(a), setting.vector(n), float(k)) for a, n, k in zip(rays.a, rays.n, rays.k, strict=True)]
-
-    def clock(subject: Subject) -> float:
-        start = time.perf_counter()
-        for a, n, k in vectors:
-            subject(a, n, k)
-        return time.perf_counter() - start
-
-    return clock
-
-
-def _operations(clock: Callable[[Subject], float], subject: Subject) -> float:
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
-        clock(subject)
-        return float(max(entry.get("operation_count", 0) for entry in dr.kernel_history()))
-
-
+def _slack(name: str, parts: list[Row]) -> dict[str, float]:
+    """Constant over what the sweep needs of it, each with the other one as it is."""
+    constants = {"linear": budget_of(name).linear, "radicand": budget_of(name).radicand}
+    needed = {c: max(row.replay["needed"][c] for row in parts) for c in constants}
+    return {f"slack, {c}": x / max(needed[c], 1e-3 * x) for c, x in constants.items() if x}

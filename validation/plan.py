@@ -29,12 +29,12 @@ class Profile:
 
 
 PROFILES = {
-    "quick": Profile("quick", 4000, 150, 1 << 21, 7, 128, 16, 8, (1, 4, 16), False),
-    "full": Profile("full", 100_000, 1000, 1 << 22, 15, 192, 32, 8, (1, 4, 16, 64), True),
+    "quick": Profile("quick", 4000, 150, 1 << 21, 11, 128, 16, 8, (1, 4, 16), False),
+    "full": Profile("full", 100_000, 1000, 1 << 22, 21, 192, 32, 8, (1, 4, 16, 64), True),
 }
 # Where only scalar variants run, a render costs a hundred times as much.
 SCALAR_PROFILES = {
-    "quick": Profile("quick", 4000, 150, 200, 7, 12, 4, 8, (1, 4), False),
+    "quick": Profile("quick", 4000, 150, 200, 9, 12, 4, 8, (1, 4), False),
     "full": Profile("full", 100_000, 2000, 1000, 9, 32, 8, 12, (1, 4, 16), True),
 }
 

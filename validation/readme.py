@@ -15,6 +15,7 @@ from mi_refract.formulas import FORMULAS
 from mi_refract.rows import Row
 
 from .plan import SCENES, Context
+from .settings import PLAIN
 
 GALLERY = SCENES / "gallery.png"
 COLUMNS = 4
@@ -31,31 +32,43 @@ def update(path: Path, rows: list[Row], context: Context) -> None:
 
 
 def accuracy(rows: list[Row]) -> str:
-    """Markdown: worst error over all regimes and misjudged rays by formula, in float32 and float64, and the time."""
-    settings = ("llvm float32", "llvm float64")
-    found = {(r.subject, r.setting): r for r in rows if r.case == "all regimes" and r.values}
-    subjects = list(dict.fromkeys(subject for subject, setting in found if setting in settings))
+    """Markdown: worst error over all regimes and misjudged rays by formula, in float32 and float64, and the times."""
+    found = {(r.subject, r.setting): r for r in rows if r.case == "all regimes" and "worst chord" in r.values}
+    subjects = list(dict.fromkeys(subject for subject, setting in found if setting in ACCURACY))
     if not subjects:
         raise ValueError("README: no directions were measured on LLVM; its accuracy table needs them")
-    rays = found[subjects[0], settings[0]].replay["rays"]
+    rays = max(row.replay["rays"] for (_, setting), row in found.items() if setting in ACCURACY)
+    heading = ["formula", "source"]
+    for setting, metrics in ACCURACY.items():
+        heading += [(f"{setting.split()[1]}: " if i == 0 else "") + title for i, title in enumerate(metrics)]
     lines = [
-        f"Worst over {rays:,} rays in all regimes; u = 2⁻²⁴ or 2⁻⁵³; time as a multiple of copying the same bytes.",
+        f"Worst over {rays:,} rays in all regimes; u = 2⁻²⁴ or 2⁻⁵³; times are medians over copying the same bytes and",
+        f"over `{PLAIN}`, with their 95 % intervals.",
         "",
-        "| formula | source | float32: worst chord | in u | misjudged | time | float64: worst chord | in u | time |",
-        "|---|---|---|---|---|---|---|---|---|",
+        f"| {' | '.join(heading)} |",
+        "|---" * len(heading) + "|",
     ]
     for subject in subjects:
-        source = FORMULAS[subject].source if subject in FORMULAS else "Mitsuba 3"
-        cells = [f"`{subject}`", source]
-        for setting, metrics in zip(settings, (ACCURACY, ACCURACY_DOUBLE), strict=True):
+        cells = [f"`{subject}`", FORMULAS[subject].source if subject in FORMULAS else "Mitsuba 3"]
+        for setting, metrics in ACCURACY.items():
             row = found.get((subject, setting))
-            cells += [compact(row.values[metric]) if row else "–" for metric in metrics]
+            cells += [_with_interval(row, metric) if row else "–" for metric in metrics.values()]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
-ACCURACY = ("worst chord", "worst / u", "misjudged", "time / copy")
-ACCURACY_DOUBLE = ("worst chord", "worst / u", "time / copy")
+def _with_interval(row: Row, metric: str) -> str:
+    ends = [compact(row.values[end]) for end in (f"{metric}, low", f"{metric}, high") if end in row.values]
+    return compact(row.values[metric]) + (f" ({'–'.join(ends)})" if ends else "")
+
+
+ACCURACY = {
+    "llvm float32": {
+        "worst chord": "worst chord", "in u": "worst / u", "misjudged": "misjudged",
+        "time / copy": "time / copy", "time / plain": "time / plain",
+    },
+    "llvm float64": {"worst chord": "worst chord", "in u": "worst / u", "time / copy": "time / copy"},
+}  # fmt: skip
 RENDERS = {
     "changed share": "pixels changed",
     "|mean ratio − 1|": "means differ by",

@@ -31,7 +31,7 @@ TERMS = {
     "detectable difference": "relative difference of a tile's mean that would have been an alarm, median over tiles",
     "time / dielectric": "median over alternating warm renders; a goal, not a budget, because a busy machine spoils it",
 }
-SCATTER: list[dict[str, str]] = []
+AXES = {"x": "seconds", "y": "relMSE", "slope": -1}  # relMSE is a variance
 TEXT = __doc__.partition("\n")[2].strip()
 BUILTIN = "dielectric"
 # Paths in these scenes are short: a difference in the last bit stays one, unless it flips the choice of a lobe.

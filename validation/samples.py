@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.formulas import cancelling
+from mi_refract.budgets import cancelling
 from mi_refract.rows import Row
 
 from .plan import Context, Task
@@ -80,7 +80,7 @@ def _mode_row(mode: Any, mode_name: str, count: int, variant: str) -> Row:
         d = np.nan_to_num(np.concatenate(parts), nan=np.inf)
         values |= {f"{name} worst": float(d.max()), f"{name} p99": float(np.quantile(d, 0.99))}
     # The built-in's radicand cancels: the a-priori bound of such a form, and a few roundings for 99 rays of 100.
-    bound = cancelling(2).chord(2.0**-24, INT_IOR)
+    bound = float(cancelling(2).chord(2.0**-24, INT_IOR))
     budgets = {f"{name} worst": bound for name in ("wo", "pdf", "weight")}
     budgets |= {"eta worst": 2e-7, "lobe flips": 1e-3 * count}
     budgets |= {f"{name} p99": 4e-6 for name in ("wo", "pdf", "weight")}

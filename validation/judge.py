@@ -1,0 +1,105 @@
+"""The judgement of a formula: every ray against the certified answer, and against the formula's budget for that ray.
+
+Subjects are called as formulas are, `subject(a, n, k) -> (b, transmitted)`; studies, mutants and tests judge alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract import oracle
+from mi_refract.budgets import Budget, radicand_for
+from mi_refract.regimes import Rays
+
+Subject = Callable[[Any, Any, Any], tuple[Any, Any]]
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What came out, ray by ray; `right` are the rays whose decision was right, and errors count only there.
+
+    `linear`, `radicand` say what the budget's constants would have to be for this ray, the other one as it is.
+    """
+
+    chord: np.ndarray  # |b/|a| − exact|; infinite where b is NaN
+    angle: np.ndarray
+    drift: np.ndarray  # of the length of b from that of a, relative
+    right: np.ndarray
+    misjudged: np.ndarray
+    far: np.ndarray  # misjudged although |1 − k² sin²θ| exceeds the budget's margin
+    bound: np.ndarray  # of the chord
+    linear: np.ndarray
+    radicand: np.ndarray
+
+    @property
+    def share(self) -> np.ndarray:
+        """Error over bound of the rays judged rightly, 0 elsewhere."""
+        return np.where(self.right, self.chord / self.bound, 0.0)
+
+    @property
+    def seen(self) -> np.ndarray:
+        """The rays that break the budget."""
+        return ~(self.share <= 1) | self.far
+
+    def values(self) -> dict[str, float]:
+        """What a budget is set on: every one of them at most `BUDGETS`."""
+        return {"error / bound": float(self.share.max()), "misjudged far": float(self.far.sum())}
+
+
+BUDGETS = {"error / bound": 1.0, "misjudged far": 0.0}
+
+
+def judge(
+    subject: Subject, rays: Rays, exact: oracle.Certified, vector: Any, budget: Budget, unit: Any = True
+) -> Judgement:
+    """`subject` on all rays, in arrays of the 3-vector type `vector`; `unit`: |a| = |n| = 1 but for rounding."""
+    b, transmitted = evaluate(subject, rays, vector)
+    chord, angle, drift = errors(b, rays, exact)
+    misjudged = (transmitted != exact.transmitted) & ~exact.undecided
+    right, distance = ~misjudged & ~exact.undecided, radicand(rays)
+    u: Any = float(np.finfo(rays.a.dtype).eps) / 2
+    if budget.any_length is None:  # what unit vectors are off by, the result is off by
+        u = np.maximum(u, np.maximum(*(np.abs(lengths(v) - 1) for v in (rays.a, rays.n))).astype(float))
+    k, cos_t, through = rays.k.astype(float), exact.cos_t, exact.transmitted
+    of_terms, of_root = budget.of_terms(u, k, through, unit), budget.of_root(u, k, cos_t, through)
+    needed = np.where(through, radicand_for(np.maximum(chord - of_terms, 0), cos_t), 0.0)
+    needed = np.where(misjudged, distance.astype(float), needed) / (u * np.maximum(1.0, k) ** budget.growth)
+    linear = np.where(right, budget.linear * (chord - of_root) / of_terms, 0.0)
+    far = misjudged & (distance > budget.margin(u, k))
+    return Judgement(chord, angle, drift, right, misjudged, far, of_terms + of_root, linear, needed)
+
+
+def evaluate(subject: Subject, rays: Rays, vector: Any) -> tuple[np.ndarray, np.ndarray]:
+    """`subject` on all rays, as numpy arrays (N, 3) and (N,), in extended precision."""
+    if dr.is_jit_v(vector):
+        b, transmitted = subject(vector(rays.a.T), vector(rays.n.T), dr.value_t(vector)(rays.k))
+        return np.array(b).T.astype(np.longdouble), np.array(transmitted)
+    pairs = [subject(vector(a), vector(n), float(k)) for a, n, k in zip(rays.a, rays.n, rays.k, strict=True)]
+    return np.array([list(b) for b, _ in pairs], np.longdouble), np.array([t for _, t in pairs], bool)
+
+
+def errors(b: np.ndarray, rays: Rays, exact: oracle.Certified) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(chord, angle, drift of the length) of every ray, relative to |a|; NaN counts as infinite."""
+    unit, low = b / lengths(rays.a)[:, None], exact.direction_low.astype(np.longdouble)
+    difference = (unit - exact.direction) - low
+    chord, norm = lengths(difference), lengths(unit)
+    across = lengths(np.cross(unit, difference)) / norm
+    angle = np.arctan2(across, norm - (unit * difference).sum(1) / norm)
+    chord, angle, drift = (np.nan_to_num(x.astype(float), nan=np.inf) for x in (chord, angle, np.abs(norm - 1)))
+    return chord, angle, drift
+
+
+def radicand(rays: Rays) -> np.ndarray:
+    """|1 − k² sin²θ_i| of every ray, in extended precision: how far the decision is from the critical angle."""
+    a, n, k = (x.astype(np.longdouble) for x in (rays.a, rays.n, rays.k))
+    return np.abs(1 - (k * lengths(np.cross(n, a)) / (lengths(a) * lengths(n))) ** 2)
+
+
+def lengths(v: np.ndarray) -> np.ndarray:
+    """(N,) of (N, 3), in extended precision."""
+    return np.sqrt((v.astype(np.longdouble) ** 2).sum(1))
