@@ -153,7 +153,7 @@ def test_the_exit_code_follows_the_budgets(tmp_path, monkeypatch, capsys, budget
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["refractions"], "unknown study 'refractions'; accepted: directions, renders"),
+        (["refractions"], "unknown study 'refractions'; accepted: directions, stability, renders"),
         (["--profile", "slow"], "invalid choice: 'slow'"),
         (["--out", __file__], "File exists"),
         (["--speed", "9"], "unrecognized arguments"),
