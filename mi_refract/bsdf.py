@@ -145,7 +145,8 @@ def plugin_class(v: Any) -> type:
             bs.sampled_type = dr.select(selected_r, v.UInt32(+reflection), v.UInt32(+transmission))
             bs.wo = dr.select(selected_r, v.Vector3f(ray.a.x, ray.a.y, si.wi.z), ray.wo)
             bs.eta = dr.select(selected_r, v.Float(1), ray.eta)
-            factor = dr.select(selected_t, dr.square(v.Float(ray.side.k)), 1) if ctx.mode == mi.TransportMode.Radiance else 1
+            radiance = ctx.mode == mi.TransportMode.Radiance
+            factor = dr.select(selected_t, dr.square(v.Float(ray.side.k)), 1) if radiance else 1
             if v.is_polarized:
                 # Cosines below 1e-19 have squares of 0 in float32: such a lobe has no density and no weight.
                 scale = dr.select(bs.pdf > 0, quotient(factor, bs.pdf), 0)

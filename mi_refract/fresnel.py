@@ -23,10 +23,6 @@ import drjit as dr
 
 from .numerics import Double, component_of, quotient, two_prod, two_sum
 
-# Keep 0/0 out of a tangential ray at k = 1; far below what cosines of 1e-45 leave, the smallest of float32.
-TINY_ROOT = 1e-150
-TINY = TINY_ROOT**2
-
 
 def _is_single(x: Any) -> bool:
     return dr.type_v(x) == dr.VarType.Float32
@@ -63,7 +59,7 @@ def powers(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: Any = Non
     c, ratio = lift(cos_i), lift(k)
     kappa = ratio * ratio - 1 if contrast is None else lift(contrast)
     number = type(cos_i)
-    r, t = _powers(c, lift(dr.select(transmitted, cos_t, 0 * cos_t)), _fma(-c, c, 1), ratio, kappa)
+    r, t = _powers(c, lift(_only(transmitted, cos_t)), _fma(-c, c, 1), ratio, kappa, dr.select(transmitted, 0.0, 1.0))
     return number(r), number(t)
 
 
@@ -74,7 +70,8 @@ def local_powers(a: Any, b: Any, transmitted: Any, k: Any, contrast: Any) -> tup
     """
     lift = _wide if _is_single(a) else Double
     x, y, c = lift(a.x), lift(a.y), lift(dr.abs(a.z))
-    r, t = _powers(c, lift(dr.select(transmitted, dr.abs(b.z), 0 * b.z)), _fma(x, x, y * y), lift(k), lift(contrast))
+    cos_t, mirror = lift(_only(transmitted, dr.abs(b.z))), dr.select(transmitted, 0.0, 1.0)
+    r, t = _powers(c, cos_t, _fma(x, x, y * y), lift(k), lift(contrast), mirror)
     return component_of(a, r), component_of(a, t)
 
 
@@ -88,19 +85,26 @@ def transmittance(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: An
     return powers(cos_i, cos_t, transmitted, k, contrast)[1]
 
 
-def _powers(c: Any, y: Any, sin2: Any, k: Any, kappa: Any) -> tuple[Any, Any]:
-    """R and T from cos_i = `c` and cos_t = `y`, 0 where nothing is transmitted, in an arithmetic of twice the precision.
+def _only(transmitted: Any, cos_t: Any) -> Any:
+    """0 where nothing is transmitted; NaN stays."""
+    return dr.select(transmitted, cos_t, 0 * cos_t)
 
-    What is left is the rounding of the arguments. ∂ log R/∂ log cₜ ≤ 2.12 because the denominator R + T is kept as a
-    sum (its square would make it 4), and ∂ log T/∂ log cₜ ≤ 1 because there it is the square (the sum: 3). With cₜ
-    and k rounded independently that makes 2.12u in R and 2u in T at most, and u for the final rounding.
+
+def _powers(c: Any, y: Any, sin2: Any, k: Any, kappa: Any, mirror: Any) -> tuple[Any, Any]:
+    """R and T from cos_i = `c` and cos_t = `y`, in twice the precision wanted.
+
+    `mirror` is 1 where nothing is transmitted, `y` being 0 there: so R is 1 and T is 0 at k = 1 and c = 0, too.
+
+    What is left is the rounding of cₜ, and of the result: |∂ log R/∂ log cₜ| ≤ 2.12 and |∂ log T/∂ log cₜ| ≤ 1, so R is
+    right to 3.12u and T to 2u. For this the denominator of R is a sum (the square it is equal to would make it 4),
+    and that of T the square (the sum: 3).
     """
     p, q = c * y, k * sin2
     d_s, d_p = _fma(k, c, y), _fma(k, y, c)
-    r = _fma(kappa * kappa, _fma(q, q, p * p), TINY)
+    r = _fma(kappa * kappa, _fma(q, q, p * p), mirror)
     kp = k * p
     t = (kp + kp) * _fma(d_s, d_s, d_p * d_p)
-    root = _fma(d_s, d_p, TINY_ROOT)
+    root = _fma(d_s, d_p, mirror)
     return _divide(r, r + t), _divide(t, root * root)
 
 
@@ -128,14 +132,16 @@ def amplitudes(cos_i: Any, k: Any, contrast: Any = None) -> tuple[Any, Any]:
     transmitted = (radicand.hi >= 0) & (cos_i > 0)
     c, y, k = _wide(cos_i), _root(radicand), _wide(k)
     kappa = dr.fma(k, k, -1) if contrast is None else _wide(contrast)
-    d_s, d_p = dr.fma(k, c, y), dr.fma(k, y, c)
+    # 1 where no wave is transmitted and the quotients below are not used: a tangential ray would divide by 0.
+    d_s, d_p = (dr.select(transmitted, d, 1) for d in (dr.fma(k, c, y), dr.fma(k, y, c)))
     # Of float64 each term is a few roundings: κ and the defect u, each d² 4u, products and quotient 3u.
-    r_s, r_p = kappa / dr.fma(d_s, d_s, TINY), kappa * brewster / dr.fma(d_p, d_p, TINY)
-    complex_type = _complex_type(cos_i)
-    return tuple(
-        complex_type(dr.select(transmitted, r, re), dr.select(transmitted, 0, im))
-        for r, (re, im) in ((r_s, _phase(k * c, y)), (r_p, _phase(c, k * y)))
-    )  # type: ignore[return-value]
+    r_s, r_p = kappa / (d_s * d_s), kappa * brewster / (d_p * d_p)
+    number = _complex_type(cos_i)
+    (s_re, s_im), (p_re, p_im) = _phase(k * c, y), _phase(c, k * y)
+    return (
+        number(dr.select(transmitted, r_s, s_re), dr.select(transmitted, 0, s_im)),
+        number(dr.select(transmitted, r_p, p_re), dr.select(transmitted, 0, p_im)),
+    )
 
 
 def mueller_reflection(cos_i: Any, k: Any, contrast: Any = None) -> list[list[Any]]:
@@ -148,9 +154,10 @@ def mueller_reflection(cos_i: Any, k: Any, contrast: Any = None) -> list[list[An
 def mueller_transmission(cos_i: Any, cos_t: Any, transmitted: Any, k: Any) -> list[list[Any]]:
     """Mueller matrix of the transmission in the plane of incidence (4 × 4 numbers); 0 where not transmitted."""
     c, y, ratio, number = _wide(cos_i), _wide(cos_t), _wide(k), type(cos_i)
-    d_s, d_p, power = dr.fma(ratio, c, y), dr.fma(ratio, y, c), 4 * ratio * (c * y)
+    d_s, d_p = (dr.select(transmitted, d, 1) for d in (dr.fma(ratio, c, y), dr.fma(ratio, y, c)))
+    power = 4 * ratio * (c * y)
     pairs = (d_s, d_s), (d_p, d_p), (d_s, d_p)
-    t_s, t_p, cross = (dr.select(transmitted, number(power / dr.fma(x, y, TINY)), 0) for x, y in pairs)
+    t_s, t_p, cross = (dr.select(transmitted, number(power / (x * y)), 0) for x, y in pairs)
     return _mueller(t_s, t_p, (cross, 0))
 
 

@@ -15,7 +15,11 @@ from types import ModuleType
 from typing import Any
 
 # Each study by name, and the modules that make it up.
-STUDIES = {"directions": ("directions", "mutants", "samples"), "stability": ("energy", "derivatives"), "renders": ("renders",)}
+STUDIES = {
+    "directions": ("directions", "mutants", "samples"),
+    "stability": ("energy", "derivatives"),
+    "renders": ("renders",),
+}
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,14 +1,15 @@
 """Derivatives by automatic differentiation, of directions and of the reflectance, against certified ones.
 
-∂b/∂a along two unit vectors at right angles to `a`, in the plane of incidence and across it; k ∂b/∂k; and η ∂R/∂η, which
-is −k ∂R/∂k. The error is relative, or absolute where the derivative is below 1 (below R). At the critical angle they
-diverge as 1/cosθt: the condition, 1 + k² sinθi (sinθi + 2 cosθi)/cos²θt, is what inputs off by u may change the
+∂b/∂a along two unit vectors at right angles to `a`, in the plane of incidence and across it; k ∂b/∂k; and η ∂R/∂η,
+which is −k ∂R/∂k. The error is relative, or absolute where the derivative is below 1 (below R). At the critical angle
+they diverge as 1/cosθt: the condition, 1 + k² sinθi (sinθi + 2 cosθi)/cos²θt, is what inputs off by u may change the
 derivative by, in u, to first order.
 """
 
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -98,7 +99,8 @@ def inputs(count: int, precision: type) -> Inputs:
     for _ in range(2):  # near the normal rounding has left some of `a` in it
         across /= lengths(across)[:, None]
         across -= (across * wide).sum(1, keepdims=True) * wide
-    along = {"∂b/∂a in the plane": np.cross(across, wide).astype(precision), "∂b/∂a across it": across.astype(precision)}
+    within: Any = np.cross(across, wide)
+    along = {"∂b/∂a in the plane": within.astype(precision), "∂b/∂a across it": across.astype(precision)}
     exact = {name: oracle_derivative.derivative(a, n, k, e, 0.0) for name, e in along.items()}
     exact["∂b/∂k"] = oracle_derivative.derivative(a, n, k, np.zeros_like(a), k)
     kept = np.isfinite(exact["∂b/∂k"]).all(1)
@@ -146,7 +148,8 @@ def formula_rows(
     name: str, formula: Any, given: Inputs, setting: Setting
 ) -> tuple[list[Row], list[tuple[float, float]]]:
     found, transmitted = differentiate(formula, given, setting)
-    right, rows, curve = transmitted == given.certified.transmitted, [], []
+    right, rows = transmitted == given.certified.transmitted, []
+    curve: list[tuple[float, float]] = []
     budgets = {"error / condition": LIMIT, "not finite": 0.0} if FORMULAS[name].takes_contrast else {}
     for case, exact in given.exact.items():
         error = lengths(found[case] - exact) / np.maximum(1, lengths(exact))
@@ -185,7 +188,7 @@ def binned(given: Inputs, y: np.ndarray) -> list[tuple[float, float]]:
     """The largest y of the transmitted rays in each bin of cos²θt."""
     cos2 = given.certified.cos_t**2
     bins = [given.certified.transmitted & (cos2 >= low) & (cos2 < 2 * high) & np.isfinite(y) & (y > 0)
-            for low, high in zip(BINS, BINS[1:], strict=False)]  # fmt: skip
+            for low, high in itertools.pairwise(BINS)]  # fmt: skip
     centres = np.sqrt(BINS[:-1] * BINS[1:])
     return [(float(x), float(y[inside].max())) for x, inside in zip(centres, bins, strict=True) if inside.any()]
 
@@ -193,7 +196,8 @@ def binned(given: Inputs, y: np.ndarray) -> list[tuple[float, float]]:
 def reflectance_row(given: Inputs, setting: Setting) -> Row:
     """Of exact cosines: those of the rays, rounded."""
     number = dr.value_t(differentiable(setting))
-    cos_i, k = given.certified.cos_i.astype(setting.precision), given.rays.k
+    k: Any = given.rays.k
+    cos_i: Any = given.certified.cos_i.astype(setting.precision)
     exact = oracle_derivative.derivative_of_powers(cos_i, k, 0.0, k)
     cosine = number(cos_i)
 

@@ -9,8 +9,8 @@ are rational in v, which goes from √κ (grazing) to n + 1 (normal). For s,
 
     ∫ r_s² 2x dx = κ/6 − κ²/4(n+1)² + κ⁴/12(n+1)⁶ = (n − 1)(3n + 1)/(3(n + 1)²) ,
 
-and for p partial fractions leave logarithms. Half of each: Walsh 1926 (Dept. Sci. Ind. Res., Illum. Res. Tech. Paper 2),
-Duntley 1942 (J. Opt. Soc. Am. 32, 61), Judd 1942 (J. Res. NBS 29, 329):
+and for p partial fractions leave logarithms. Half of each: Walsh 1926 (Dept. Sci. Ind. Res., Illum. Res. Tech.
+Paper 2), Duntley 1942 (J. Opt. Soc. Am. 32, 61), Judd 1942 (J. Res. NBS 29, 329):
 
     R_e = 1/2 + (n−1)(3n+1)/(6(n+1)²) + n²(n²−1)²/(n²+1)³ ln((n−1)/(n+1))
           − 2n³(n²+2n−1)/((n²+1)(n⁴−1)) + 8n⁴(n⁴+1)/((n²+1)(n⁴−1)²) ln n

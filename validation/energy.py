@@ -1,8 +1,8 @@
 """Energy: reflected and transmitted power against certified values, and the laws they obey.
 
-Errors are relative, in units of roundoff u (2⁻²⁴, 2⁻⁵³), of R, of 1 − R and of both amplitudes; phases are points of the
-unit circle, and their error is the distance. The exact values are those of the very cosine and ratio that were given.
-Mitsuba's `mi.fresnel` stands beside.
+Errors are relative, in units of roundoff u (2⁻²⁴, 2⁻⁵³), of R, of 1 − R and of both amplitudes; phases are points of
+the unit circle, and their error is the distance. The exact values are those of the very cosine and ratio that were
+given. Mitsuba's `mi.fresnel` stands beside.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ TERMS = {
     "R / u, 1 − R / u, r_s / u, r_p / u": "the largest relative errors, in units of roundoff",
     "phase / u": "under total internal reflection, the largest distance from the exact point of the unit circle",
     "R + T − 1 / u": "the largest deviation from 1",
-    "nearer than rounding": "rays whose radicand is below 48u of its terms: there the rounding of `b` alone moves T, and "
-    "the errors leave them out",
+    "nearer than rounding": "rays whose radicand is below 48u of its terms, where what the formula has left of it "
+    "moves T; the errors leave them out",
     "T there and back / u": "T(θi, k) over T(θt, 1/k), less 1: light takes the same way back",
     "weights in and out / u": "the plugin's weight of radiance that enters over n², times that of leaving, less 1",
-    "outside, inside": "the share of diffuse light that is reflected or not, relative, against its closed form; from the "
-    "inside with what is reflected totally",
+    "outside, inside": "the share of diffuse light that is reflected or not, relative, against its closed form; from "
+    "the inside with what is reflected totally",
     "white furnace": "the weights of both lobes times their densities, which must add up to 1",
 }  # fmt: skip
 SEED = 2028
@@ -172,13 +172,15 @@ def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray
     """In the local frame, where `a` is unit only up to rounding. The ratio is a double, as in the plugin."""
     azimuth = np.random.default_rng(SEED).uniform(0, 2 * np.pi, len(k))
     sine = np.sqrt((1 - cos_i.astype(float)) * (1 + cos_i.astype(float)))
-    a = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cos_i], axis=1).astype(setting.precision)
-    n = np.tile(np.array([[0, 0, 1]], setting.precision), (len(k), 1))
+    a: Any = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cos_i], axis=1).astype(setting.precision)
+    n: Any = np.tile(np.array([[0, 0, 1]], setting.precision), (len(k), 1))
     exact = oracle.refract(a, n, k, progress=False)
     formula = resolve("auto", dr.backend_v(setting.vector))[1]
 
+    widened: Any = dr.float64_array_t(dr.value_t(setting.vector))
+
     def powers(x: Any, y: Any, z: Any, ratio: Any) -> tuple:
-        ray, wide = setting.vector(x, y, z), dr.float64_array_t(type(ratio))(ratio)
+        ray, wide = setting.vector(x, y, z), widened(ratio)
         contrast = dr.fma(wide, wide, -1)
         b, transmitted = formula.unchecked(ray, setting.vector(0, 0, 1), wide, contrast)
         return *fresnel.local_powers(ray, b, transmitted, wide, contrast), transmitted
@@ -194,8 +196,8 @@ def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray
 
 def relative(x: np.ndarray, exact: np.ndarray, low: np.ndarray, setting: Setting) -> np.ndarray:
     """|x/exact − 1|; of what is below the smallest normal number, the error over that."""
-    error = np.abs((x - exact) - low)
-    return np.nan_to_num((error / np.maximum(np.abs(exact), np.finfo(setting.precision).tiny)).astype(float), nan=np.inf)
+    error = np.abs((x - exact) - low) / np.maximum(np.abs(exact), np.finfo(setting.precision).tiny)
+    return np.nan_to_num(error.astype(float), nan=np.inf)
 
 
 def worst(x: np.ndarray) -> float:
@@ -248,14 +250,16 @@ def diffuse_row(setting: Setting, index: float) -> Row:
             f"{side}: 1 − R / u": float(abs(transmitted / (1 - exact) - 1)) / setting.roundoff,
         }
     budgets = {name: 12.5 for name in values if name.endswith("/ u")}
-    return Row("energy", "powers", f"diffuse light, n = {index}", setting.label, values, budgets, replay={"nodes": GRADE})
+    case, replay = f"diffuse light, n = {index}", {"nodes": GRADE}
+    return Row("energy", "powers", case, setting.label, values, budgets, replay=replay)
 
 
 def matched_row(setting: Setting) -> Row:
     """The error of R against |k − 1|, from an ulp on, at four cosines."""
     steps = np.geomspace(2 * setting.roundoff, 0.1, 40)
     cosines = (0.05, 0.3, 0.7, 1.0)
-    k, cos_i = (x.ravel().astype(setting.precision) for x in np.meshgrid(1 - steps, cosines))
+    given: list[Any] = np.meshgrid(1 - steps, cosines)
+    k, cos_i = (x.ravel().astype(setting.precision) for x in given)
     exact, curves = oracle.fresnel(cos_i, k), {}
     subjects = {"powers": ours} | ({BUILTIN: builtin(setting.mitsuba)} if setting.mitsuba else {})
     for name, subject in subjects.items():
