@@ -67,11 +67,16 @@ def dense(rng, count, precision):
 
 
 DRAWS = {f.__name__: f for f in (generic, near_normal, grazing, critical, brewster, matched, steep, dense)}
-# Where hill-climbing on the bits, from the worst of 10⁶ rays a regime, came to rest: cos θ_i and k.
+# Where hill-climbing on the bits came to rest, from the worst of 10⁶ rays in each of eleven regimes: R, R, T, r_p.
 WORST = {
-    "float32": [("0x1.ff0eeap-1", "0x1.fffffep-1"), ("0x1.e97d84p-1", "0x1.ffffc6p-1"), ("0x1.f5a42ap-1", "0x1.39500p+2")],
-    "float64": [("0x1.ff0eea5a7e436p-1", "0x1.fffffffffffffp-1"), ("0x1.ffff14907d4dbp-1", "0x1.0af1e420a71bep+8"),
-                ("0x1.6a07de5680264p-1", "0x1.0000000000003p+0")],
+    "float32": [
+        ("0x1.66e34ep-3", "0x1.f71f70p-1"), ("0x1.c81bbap-3", "0x1.fc2786p-1"),
+        ("0x1.011ddap-18", "0x1.ffeff8p-1"), ("0x1.80031cp-7", "0x1.818ad6p-7"),
+    ],
+    "float64": [
+        ("0x1.e898ee75f23cfp-3", "0x1.c844d6fedd815p-1"), ("0x1.044677cde968cp-3", "0x1.fffffffde5f77p-1"),
+        ("0x1.064d256c22f3ep-25", "0x1.b7d121d98bfe6p-1"), ("0x1.528f43a801557p-26", "0x1.ffffffffffbfbp-1"),
+    ],
 }  # fmt: skip
 
 
@@ -131,8 +136,8 @@ def test_the_worst_that_was_found(setting):
     cos_i, k = (np.array([float.fromhex(x) for x in column], setting.precision)
                 for column in zip(*WORST[setting.name], strict=True))  # fmt: skip
     r, t, amplitude = errors(setting, cos_i, k)
-    assert 2 < r <= 4
-    assert t <= 4
+    assert 2.9 < r <= 4
+    assert 1.9 < t <= 4
     assert amplitude <= 8
 
 
