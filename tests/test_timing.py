@@ -25,7 +25,7 @@ def context(tmp_path):
 @pytest.mark.parametrize("count", [9, 11, 21])
 def test_the_interval_of_a_median_covers_it_19_times_in_20(count):
     """Exact coverage from the ranks it takes; then 2000 samples, false alarm 1e-5 by 4.3σ of the binomial."""
-    found = timing._interval("t", list(map(float, range(1, count + 1))))
+    found = timing.interval("t", list(map(float, range(1, count + 1))))
     rank = int(found["t, low"])
     assert (found["t"], found["t, high"]) == ((count + 1) / 2, count + 1 - rank)
     coverage = 1 - 2 * binom.cdf(rank - 1, count, 0.5)
@@ -33,7 +33,7 @@ def test_the_interval_of_a_median_covers_it_19_times_in_20(count):
     samples = np.random.default_rng(6).exponential(size=(2000, count))
     inside = 0
     for x in samples.tolist():
-        interval = timing._interval("t", x)
+        interval = timing.interval("t", x)
         inside += interval["t, low"] <= np.log(2) <= interval["t, high"]
     assert abs(inside - 2000 * coverage) <= 4.3 * np.sqrt(2000 * coverage * (1 - coverage))
 
@@ -41,7 +41,7 @@ def test_the_interval_of_a_median_covers_it_19_times_in_20(count):
 def test_a_ratio_is_that_of_one_round():
     """A machine that is twice as slow in some rounds does not move it."""
     load = [1.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 1.0]
-    ratio = timing._ratio("t", [3.0 * x for x in load], load)
+    ratio = timing.ratio("t", [3.0 * x for x in load], load)
     assert ratio == {"t": 3.0, "t, low": 3.0, "t, high": 3.0}
 
 
@@ -52,7 +52,7 @@ def test_every_second_round_runs_backwards_and_the_first_is_thrown_away():
         calls.append(subject)
         return float(len(calls))
 
-    seconds = timing._rounds({"a": "a", "b": "b"}, clock, 3)
+    seconds = timing.rounds({"a": "a", "b": "b"}, clock, 3)
     assert "".join(calls) == "abbaabba"
     assert seconds == {"a": [4, 5, 8], "b": [3, 6, 7]}
 

@@ -258,7 +258,7 @@ def matched_row(setting: Setting) -> Row:
     """The error of R against |k − 1|, from an ulp on, at four cosines."""
     steps = np.geomspace(2 * setting.roundoff, 0.1, 40)
     cosines = (0.05, 0.3, 0.7, 1.0)
-    given: list[Any] = np.meshgrid(1 - steps, cosines)
+    given: Any = np.meshgrid(1 - steps, cosines)
     k, cos_i = (x.ravel().astype(setting.precision) for x in given)
     exact, curves = oracle.fresnel(cos_i, k), {}
     subjects = {"powers": ours} | ({BUILTIN: builtin(setting.mitsuba)} if setting.mitsuba else {})

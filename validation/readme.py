@@ -18,7 +18,7 @@ from .plan import SCENES, Context
 from .settings import PLAIN
 
 GALLERY = SCENES / "gallery.png"
-COLUMNS = 4
+COLUMNS = 5
 
 
 def update(path: Path, rows: list[Row], context: Context) -> None:

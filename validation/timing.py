@@ -44,12 +44,12 @@ def measure(context: Context, setting: Setting) -> dict[str, dict[str, float]]:
     rays = context.profile.scalar_rays if setting.is_scalar else context.profile.streamed_rays
     inputs = _inputs(setting, rays)
     clock = _scalar_clock(inputs) if setting.is_scalar else _kernel_clock(inputs)
-    seconds = _rounds(subjects, clock, context.profile.repeats)
-    found = {name: _ratio("time / copy", seconds[name], seconds[COPY]) for name in subjects}
+    seconds = rounds(subjects, clock, context.profile.repeats)
+    found = {name: ratio("time / copy", seconds[name], seconds[COPY]) for name in subjects}
     for name, subject in subjects.items():
-        found[name] |= _ratio("time / plain", seconds[name], seconds[PLAIN])
+        found[name] |= ratio("time / plain", seconds[name], seconds[PLAIN])
         if setting.backend == "cuda":
-            found[name] |= _interval("ns per ray", [s / rays * 1e9 for s in seconds[name]])
+            found[name] |= interval("ns per ray", [s / rays * 1e9 for s in seconds[name]])
         if not setting.is_scalar:
             found[name] |= _kernel(subject, inputs)
     return found
@@ -64,7 +64,7 @@ def goals(subject: str, setting: Setting) -> dict[str, float]:
     return {"time / plain": goal} if setting.label == "llvm float32" else {}
 
 
-def _rounds(subjects: dict[str, Subject], clock: Clock, repeats: int) -> dict[str, list[float]]:
+def rounds(subjects: dict[str, Any], clock: Callable[[Any], float], repeats: int) -> dict[str, list[float]]:
     """Seconds by subject, every second round in the reverse order; the first round is thrown away."""
     seconds: dict[str, list[float]] = {name: [] for name in subjects}
     order = list(subjects)
@@ -75,11 +75,11 @@ def _rounds(subjects: dict[str, Subject], clock: Clock, repeats: int) -> dict[st
     return {name: times[1:] for name, times in seconds.items()}
 
 
-def _ratio(metric: str, times: list[float], others: list[float]) -> dict[str, float]:
-    return _interval(metric, [t / o for t, o in zip(times, others, strict=True)])
+def ratio(metric: str, times: list[float], others: list[float]) -> dict[str, float]:
+    return interval(metric, [t / o for t, o in zip(times, others, strict=True)])
 
 
-def _interval(metric: str, x: list[float]) -> dict[str, float]:
+def interval(metric: str, x: list[float]) -> dict[str, float]:
     """The median and the order statistics around it: P(median outside) ≤ 2 P(Binomial(n, ½) < rank) ≤ 5 %."""
     from scipy.stats import binom
 
