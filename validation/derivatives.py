@@ -8,6 +8,7 @@ derivative by, in u, to first order.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 from collections.abc import Callable
@@ -104,13 +105,18 @@ def inputs(count: int, precision: type) -> Inputs:
     exact = {name: oracle_derivative.derivative(a, n, k, e, 0.0) for name, e in along.items()}
     exact["∂b/∂k"] = oracle_derivative.derivative(a, n, k, np.zeros_like(a), k)
     kept = np.isfinite(exact["∂b/∂k"]).all(1)
-    cos_i, cos_t = certified.cos_i[kept], certified.cos_t[kept]
-    sin_i, k = np.sqrt((1 - cos_i) * (1 + cos_i)), k[kept]
+    along, exact = ({name: x[kept] for name, x in found.items()} for found in (along, exact))
+    condition = condition_of(certified, k)[kept]
+    return Inputs(regimes.Rays(a[kept], n[kept], k[kept]), along, exact, pick(certified, kept), condition, regime[kept])
+
+
+def condition_of(certified: oracle.Certified, k: np.ndarray) -> np.ndarray:
+    """1 + k² sinθi (sinθi + 2 cosθi)/cos²θt: k and both directions, each off by u, move log cosθt by as much u."""
+    cos_i = certified.cos_i
+    sin_i = np.sqrt((1 - cos_i) * (1 + cos_i))
     with np.errstate(divide="ignore", invalid="ignore"):
-        moved = k.astype(float) ** 2 * sin_i * (sin_i + 2 * cos_i) / cos_t**2
-    condition = 1 + np.where(certified.transmitted[kept], moved, 0)
-    return Inputs(regimes.Rays(a[kept], n[kept], k), {m: e[kept] for m, e in along.items()},
-                  {m: e[kept] for m, e in exact.items()}, pick(certified, kept), condition, regime[kept])  # fmt: skip
+        moved = k.astype(float) ** 2 * sin_i * (sin_i + 2 * cos_i) / certified.cos_t**2
+    return 1 + np.where(certified.transmitted, moved, 0)
 
 
 def pick(certified: oracle.Certified, kept: np.ndarray) -> oracle.Certified:
@@ -199,7 +205,7 @@ def reflectance_row(given: Inputs, setting: Setting) -> Row:
     k: Any = given.rays.k
     cos_i: Any = given.certified.cos_i.astype(setting.precision)
     exact = oracle_derivative.derivative_of_powers(cos_i, k, 0.0, k)
-    cosine = number(cos_i)
+    cosine, condition = number(cos_i), condition_of(oracle.fresnel(cos_i, k), k)
 
     def reflectance(k: Any) -> Any:
         cos_t, transmitted = fresnel.refracted_cosine(cosine, k)
@@ -210,4 +216,5 @@ def reflectance_row(given: Inputs, setting: Setting) -> Row:
         error = np.abs(found - exact) / np.maximum(np.maximum(np.abs(exact), r), np.finfo(setting.precision).tiny)
     exists = np.isfinite(exact)
     budgets = {"error / condition": LIMIT, "not finite": 0.0}
+    given = dataclasses.replace(given, condition=condition)  # that of the rounded cosines
     return row("powers", "∂R/∂η", error, given, setting, exists, budgets)
