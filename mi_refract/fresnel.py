@@ -59,7 +59,7 @@ def powers(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: Any = Non
     c, ratio = lift(cos_i), lift(k)
     kappa = ratio * ratio - 1 if contrast is None else lift(contrast)
     number = type(cos_i)
-    r, t = _powers(c, lift(_only(transmitted, cos_t)), _fma(-c, c, 1), ratio, kappa, dr.select(transmitted, 0.0, 1.0))
+    r, t = _powers(c, *_through(lift, transmitted, cos_t), _fma(-c, c, 1), ratio, kappa)
     return number(r), number(t)
 
 
@@ -70,8 +70,7 @@ def local_powers(a: Any, b: Any, transmitted: Any, k: Any, contrast: Any) -> tup
     """
     lift = _wide if _is_single(a) else Double
     x, y, c = lift(a.x), lift(a.y), lift(dr.abs(a.z))
-    cos_t, mirror = lift(_only(transmitted, dr.abs(b.z))), dr.select(transmitted, 0.0, 1.0)
-    r, t = _powers(c, cos_t, _fma(x, x, y * y), lift(k), lift(contrast), mirror)
+    r, t = _powers(c, *_through(lift, transmitted, dr.abs(b.z)), _fma(x, x, y * y), lift(k), lift(contrast))
     return component_of(a, r), component_of(a, t)
 
 
@@ -85,12 +84,16 @@ def transmittance(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: An
     return powers(cos_i, cos_t, transmitted, k, contrast)[1]
 
 
-def _only(transmitted: Any, cos_t: Any) -> Any:
-    """0 where nothing is transmitted; NaN stays."""
-    return dr.select(transmitted, cos_t, 0 * cos_t)
+def _through(lift: Any, transmitted: Any, cos_t: Any) -> tuple[Any, Any]:
+    """(cos_t or 0, about 0 or 1) where light is transmitted or not. NaN stays.
+
+    Of float32 the 1e-300 leaves nothing: R ≤ 1e-300/16c⁴ at k = 1. It is there for a cos_t that underflowed to 0.
+    """
+    wide: Any = dr.float64_array_t(type(cos_t))
+    return lift(dr.select(transmitted, cos_t, 0 * cos_t)), dr.select(transmitted, wide(1e-300), wide(1))
 
 
-def _powers(c: Any, y: Any, sin2: Any, k: Any, kappa: Any, mirror: Any) -> tuple[Any, Any]:
+def _powers(c: Any, y: Any, mirror: Any, sin2: Any, k: Any, kappa: Any) -> tuple[Any, Any]:
     """R and T from cos_i = `c` and cos_t = `y`, in twice the precision wanted.
 
     `mirror` is 1 where nothing is transmitted, `y` being 0 there: so R is 1 and T is 0 at k = 1 and c = 0, too.
