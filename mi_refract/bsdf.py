@@ -23,7 +23,7 @@ LOBES = ("specular_reflectance", "specular_transmittance")  # tint of the reflec
 
 
 class Side(NamedTuple):
-    """What a ray needs to know of the boundary from one side: k = n_from / n_to and κ = k² − 1."""
+    """What a ray needs to know of the boundary from one side: k = n_from / n_to and κ = k² − 1, in float64."""
 
     k: Any
     contrast: Any
@@ -83,6 +83,7 @@ def plugin_class(v: Any) -> type:
     flags = mi.BSDFFlags
     reflection, transmission = flags.DeltaReflection, flags.DeltaTransmission
     both_sides = flags.FrontSide | flags.BackSide
+    wide: Any = dr.float64_array_t(v.Float)
 
     class Refract(v.BSDF):
         """Smooth dielectric boundary; see the module docstring."""
@@ -107,12 +108,9 @@ def plugin_class(v: Any) -> type:
             self.m_flags = self.m_components[0] | self.m_components[1]
 
         def _face(self, eta: Any, contrast: Any) -> None:
-            """Set both sides from eta and eta² − 1 in double precision, each number rounded once.
-
-            Opaque, so that an edit changes the data of a kernel and not its code.
-            """
-            self.k_outer, self.contrast_outer = v.Float(1 / eta), v.Float(-contrast / (eta * eta))
-            self.k_inner, self.contrast_inner = v.Float(eta), v.Float(contrast)
+            """Set both sides from eta and eta² − 1. Opaque: an edit changes the data of a kernel and not its code."""
+            self.k_outer, self.contrast_outer = wide(1 / eta), wide(-contrast / (eta * eta))
+            self.k_inner, self.contrast_inner = wide(eta), wide(contrast)
             dr.make_opaque(self.eta, self.k_outer, self.contrast_outer, self.k_inner, self.contrast_inner)
 
         def traverse(self, cb: Any) -> None:
@@ -124,7 +122,6 @@ def plugin_class(v: Any) -> type:
             if not keys or "eta" in keys:
                 if len(self.eta) != 1:
                     raise ValueError(f"{PLUGIN}: eta has {len(self.eta)} entries; accepted: one number")
-                wide: Any = dr.float64_array_t(v.Float)
                 # Only a derivative needs a kernel here; a number is read back, so that an edit compiles nothing.
                 number = _checked("eta", float(self.eta[0]))
                 eta = wide(self.eta) if dr.grad_enabled(self.eta) else number
@@ -139,8 +136,8 @@ def plugin_class(v: Any) -> type:
                 return dr.zeros(v.BSDFSample3f), v.Spectrum(0)
             bs = v.BSDFSample3f()
             both, ray = has_r and has_t, self._refract(si.wi)
-            # r > 0: an index-matched boundary never reflects, not even the sample that is exactly 0.
-            selected_r = ((sample1 <= ray.r) & (ray.r > 0) if both else v.Bool(has_r)) & active
+            # Not ≤: an index-matched boundary never reflects, not even the sample that is exactly 0.
+            selected_r = (sample1 < ray.r if both else v.Bool(has_r)) & active
             selected_t = (selected_r ^ True) & active
             value = dr.select(selected_r, ray.r, ray.t)
             bs.pdf = dr.detach(value) if both else 1
@@ -148,7 +145,8 @@ def plugin_class(v: Any) -> type:
             bs.sampled_type = dr.select(selected_r, v.UInt32(+reflection), v.UInt32(+transmission))
             bs.wo = dr.select(selected_r, v.Vector3f(ray.a.x, ray.a.y, si.wi.z), ray.wo)
             bs.eta = dr.select(selected_r, v.Float(1), ray.eta)
-            factor = dr.select(selected_t, dr.square(ray.side.k), 1) if ctx.mode == mi.TransportMode.Radiance else 1
+            radiance = ctx.mode == mi.TransportMode.Radiance
+            factor = dr.select(selected_t, dr.square(v.Float(ray.side.k)), 1) if radiance else 1
             if v.is_polarized:
                 # Cosines below 1e-19 have squares of 0 in float32: such a lobe has no density and no weight.
                 scale = dr.select(bs.pdf > 0, quotient(factor, bs.pdf), 0)
@@ -170,9 +168,9 @@ def plugin_class(v: Any) -> type:
             )
             # Unchecked: the ratio is checked where it is set, and NaN stays NaN.
             wo, transmitted = self.formula.unchecked(a, v.Vector3f(0, 0, 1), side.k, side.contrast)
-            cos_i, cos_t = dr.abs(wi.z), dr.abs(wo.z)
-            r, t = fresnel.powers(cos_i, cos_t, transmitted, side.k, side.contrast)
-            return Ray(a, side, wo, dr.select(outside, self.k_inner, self.k_outer), cos_i, cos_t, transmitted, r, t)
+            r, t = fresnel.local_powers(a, wo, transmitted, side.k, side.contrast)
+            eta = v.Float(dr.select(outside, self.k_inner, self.k_outer))
+            return Ray(a, side, wo, eta, dr.abs(wi.z), dr.abs(wo.z), transmitted, r, t)
 
         @staticmethod
         def _attached(value: Any) -> Any:

@@ -1,15 +1,18 @@
-"""Fresnel's equations for a boundary of two dielectrics, without cancellation.
+"""Fresnel's equations for a boundary of two dielectrics, to the last bits of R and of 1 − R.
 
-With the absolute cosines cos_i, cos_t, the ratio k = n_from / n_to and the contrast κ = k² − 1, Snell's law turns
-the differences in the amplitudes into products:
+With the absolute cosines cᵢ, cₜ, the ratio k = n_from / n_to and the contrast κ = k² − 1, Snell's law turns every
+difference in the amplitudes into a product, and both powers into sums of positive terms:
 
-    r_s = (k cos_i − cos_t) / (k cos_i + cos_t) = κ / (k cos_i + cos_t)²
-    r_p = (cos_i − k cos_t) / (cos_i + k cos_t) = κ (k² sin²θ_i − cos²θ_i) / (cos_i + k cos_t)²
-    T_s = 4 k cos_i cos_t / (k cos_i + cos_t)²,   T_p = 4 k cos_i cos_t / (cos_i + k cos_t)²
+    d_s = k cᵢ + cₜ,   r_s = (k cᵢ − cₜ)/d_s = κ/d_s²
+    d_p = cᵢ + k cₜ,   r_p = (cᵢ − k cₜ)/d_p = κ (k² sin²θᵢ − cᵢ²)/d_p²
+    R : T = κ² (P² + Q²) : 2 k P (d_s² + d_p²),   R + T ∝ (d_s d_p)²,   P = cᵢ cₜ,  Q = sin θᵢ sin θₜ = k sin²θᵢ
 
-so R keeps its relative accuracy as k → 1 and 1 − R keeps it at grazing incidence and near the critical angle.
-Signs follow Verdet's convention, as in Mitsuba. Sources: Born and Wolf, Principles of Optics, 1.5; the products:
-this project. All arguments are Dr.Jit numbers of one precision and any backend; NaN in gives NaN out.
+so R keeps its relative accuracy as k → 1 and T keeps it at grazing incidence and near the critical angle; the length
+of the incident vector cancels. Signs follow Verdet's convention, as in Mitsuba. Sources: Born and Wolf, Principles of
+Optics, 1.5; R : T, from cos(θᵢ ± θₜ) = P ∓ Q and r_p/r_s = −(P − Q)/(P + Q): this project.
+
+float32 is computed in float64 and rounded once; float64 in double words. Arguments are Dr.Jit numbers of one precision
+and any backend, or Python floats, which are float64. NaN in gives NaN out. Precondition: k from 1e-9 to 1e9.
 """
 
 from __future__ import annotations
@@ -18,83 +21,130 @@ from typing import Any
 
 import drjit as dr
 
-from .numerics import Double, quotient
+from .numerics import Double, component_of, quotient, two_prod, two_sum
 
 
-def refracted_cosine(cos_i: Any, k: Any, contrast: Any = None) -> tuple[Any, Any]:
-    """(|cos θ_t|, transmitted): √|cos²θ_i − κ sin²θ_i|, which is real where the ray is transmitted.
+def _is_single(x: Any) -> bool:
+    return dr.type_v(x) == dr.VarType.Float32
 
-    Under total internal reflection the cosine is imaginary; its modulus is returned. The radicand is formed in
-    double-word arithmetic, because √ magnifies what it has lost near the critical angle. 0 ≤ cos_i ≤ 1.
+
+def _wide(x: Any) -> Any:
+    """float64 of whatever precision."""
+    wide: Any = dr.float64_array_t(type(x))
+    return wide(x)
+
+
+def _fma(x: Any, y: Any, z: Any) -> Any:
+    return x * y + z if isinstance(x, Double) else dr.fma(x, y, z)
+
+
+def _divide(x: Any, y: Any) -> Any:
+    """x / y; of `Double`s, rounded once."""
+    if not isinstance(x, Double):
+        return quotient(x, y)
+    q = quotient(x.hi, y.hi)
+    return q + quotient(dr.fma(-q, y.hi, x.hi) + dr.fma(-q, y.lo, x.lo), y.hi)
+
+
+# Powers --------------------------------------------------------------------------------------------------------
+
+
+def powers(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: Any = None) -> tuple[Any, Any]:
+    """(R, T) for unpolarised light, both between 0 and 1; (1, 0) where the ray is not transmitted.
+
+    `cos_i`, `cos_t` absolute cosines, `transmitted` a mask, as a formula of refraction or `refracted_cosine`
+    gives them. `contrast`: κ where it is known better than k.
     """
-    kappa = Double.product(k, k) - 1 if contrast is None else Double(contrast)
-    cos2 = Double.product(cos_i, cos_i)
-    radicand = cos2 - kappa * (-cos2 + 1)
-    transmitted = (radicand.hi >= 0) & (cos_i > 0)
-    return dr.safe_sqrt(dr.abs(radicand.hi)), transmitted
+    lift = _wide if _is_single(cos_i) else Double
+    c, ratio = lift(cos_i), lift(k)
+    kappa = ratio * ratio - 1 if contrast is None else lift(contrast)
+    number = type(cos_i)
+    r, t = _powers(c, *_through(lift, transmitted, cos_t), _fma(-c, c, 1), ratio, kappa)
+    return number(r), number(t)
 
 
-def contrast_of(k: Any) -> Any:
-    """k² − 1 of an exact k: relative error ≤ 3u."""
-    return (k - 1) * (k + 1)
+def local_powers(a: Any, b: Any, transmitted: Any, k: Any, contrast: Any) -> tuple[Any, Any]:
+    """(R, T) as `powers` gives them, of a ray `a` refracted to `b` where the normal is the z axis.
 
-
-def _parts(cos_i: Any, cos_t: Any, k: Any, contrast: Any) -> tuple[Any, Any, Any, Any]:
-    """(r_s, r_p, 1/(k cos_i + cos_t), 1/(cos_i + k cos_t)) of a transmitted ray; `contrast` is κ.
-
-    k² sin²θ_i − cos²θ_i is formed from the smaller pair of terms: for k > 1 it equals sin²θ_i − cos²θ_t, whose terms
-    are at most 1/k². Factors are applied one by one: their squares would underflow for cosines below 1e-19.
+    `a`, `b`: 3-vectors of one length, which need not be 1.
     """
-    inverse_s, inverse_p = quotient(1, dr.fma(k, cos_i, cos_t)), quotient(1, dr.fma(k, cos_t, cos_i))
-    sin2 = (1 - cos_i) * (1 + cos_i)
-    brewster = dr.select(k > 1, dr.fma(-cos_t, cos_t, sin2), dr.fma(k * k, sin2, -cos_i * cos_i))
-    return contrast * inverse_s * inverse_s, (contrast * inverse_p) * (brewster * inverse_p), inverse_s, inverse_p
+    lift = _wide if _is_single(a) else Double
+    x, y, c = lift(a.x), lift(a.y), lift(dr.abs(a.z))
+    r, t = _powers(c, *_through(lift, transmitted, dr.abs(b.z)), _fma(x, x, y * y), lift(k), lift(contrast))
+    return component_of(a, r), component_of(a, t)
 
 
 def reflectance(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: Any = None) -> Any:
-    """Unpolarised reflectance R = (r_s² + r_p²)/2; 1 where the ray is not transmitted. See `powers`."""
+    """Unpolarised reflectance R = (r_s² + r_p²)/2; see `powers`."""
     return powers(cos_i, cos_t, transmitted, k, contrast)[0]
 
 
 def transmittance(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: Any = None) -> Any:
-    """Unpolarised transmittance T = 1 − R, formed without that subtraction; 0 where not transmitted. See `powers`."""
+    """Unpolarised transmittance T = 1 − R, formed without that subtraction; see `powers`."""
     return powers(cos_i, cos_t, transmitted, k, contrast)[1]
 
 
-def powers(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: Any = None) -> tuple[Any, Any]:
-    """(R, T) for unpolarised light, both between 0 and 1.
+def _through(lift: Any, transmitted: Any, cos_t: Any) -> tuple[Any, Any]:
+    """(cos_t or 0, about 0 or 1) where light is transmitted or not. NaN stays.
 
-    `cos_i`, `cos_t` absolute cosines, `transmitted` a mask, as a formula of refraction or `refracted_cosine`
-    gives them. `contrast`: κ where it is known better than k. Precondition: k from 1e-9 to 1e9.
+    Of float32 the 1e-300 leaves nothing: R ≤ 1e-300/16c⁴ at k = 1. It is there for a cos_t that underflowed to 0.
     """
-    kappa = contrast_of(k) if contrast is None else contrast
-    r_s, r_p, inverse_s, inverse_p = _parts(cos_i, cos_t, k, kappa)
-    r = 0.5 * dr.fma(r_s, r_s, r_p * r_p)
-    t = 2 * k * ((cos_i * inverse_s) * (cos_t * inverse_s) + (cos_i * inverse_p) * (cos_t * inverse_p))
-    valid = cos_i + cos_t >= 0  # NaN must not come out as a mirror
-    # Near 1 rounding may exceed it by an ulp or two, and a probability must not.
-    return (
-        dr.select(transmitted, dr.select(r > 1, 1, r), dr.select(valid, 1, dr.nan)),
-        dr.select(transmitted, dr.select(t > 1, 1, t), dr.select(valid, 0, dr.nan)),
-    )
+    wide: Any = dr.float64_array_t(type(cos_t))
+    return lift(dr.select(transmitted, cos_t, 0 * cos_t)), dr.select(transmitted, wide(1e-300), wide(1))
+
+
+def _powers(c: Any, y: Any, mirror: Any, sin2: Any, k: Any, kappa: Any) -> tuple[Any, Any]:
+    """R and T from cos_i = `c` and cos_t = `y`, in twice the precision wanted.
+
+    `mirror` is 1 where nothing is transmitted, `y` being 0 there: so R is 1 and T is 0 at k = 1 and c = 0, too.
+
+    What is left is the rounding of cₜ, and of the result: |∂ log R/∂ log cₜ| ≤ 2.12 and |∂ log T/∂ log cₜ| ≤ 1, so R is
+    right to 3.12u and T to 2u. For this the denominator of R is a sum (the square it is equal to would make it 4),
+    and that of T the square (the sum: 3).
+    """
+    p, q = c * y, k * sin2
+    d_s, d_p = _fma(k, c, y), _fma(k, y, c)
+    r = _fma(kappa * kappa, _fma(q, q, p * p), mirror)
+    kp = k * p
+    t = (kp + kp) * _fma(d_s, d_s, d_p * d_p)
+    root = _fma(d_s, d_p, mirror)
+    return _divide(r, r + t), _divide(t, root * root)
+
+
+# Cosines and amplitudes ----------------------------------------------------------------------------------------
+
+
+def refracted_cosine(cos_i: Any, k: Any, contrast: Any = None) -> tuple[Any, Any]:
+    """(|cos θ_t|, transmitted): √|cos²θ_t|, cos²θ_t = k² cos²θ_i − κ, which is positive where the ray is transmitted.
+
+    Under total internal reflection the cosine is imaginary; its modulus is returned. 0 ≤ cos_i ≤ 1. Of the exact
+    cos_i and k (or κ) both are right to the last bit, however near to the critical angle.
+    """
+    radicand, _ = _differences(cos_i, k, contrast)
+    return type(cos_i)(_root(radicand)), (radicand.hi >= 0) & (cos_i > 0)
 
 
 def amplitudes(cos_i: Any, k: Any, contrast: Any = None) -> tuple[Any, Any]:
     """Complex amplitudes (r_s, r_p) of the reflected wave, with the phase under total internal reflection.
 
-    There cos_t = −i γ, γ = √(κ sin²θ_i − cos²θ_i), and both have modulus 1:
+    There cos_t = −i γ, γ = √(κ − k² cos²θ_i), and both have modulus 1:
     r_s = (k cos_i + i γ)² / κ,   r_p = (cos_i + i k γ)² / (cos_i² + k² γ²). A tangential ray has r_s = r_p = −1.
     0 ≤ cos_i ≤ 1; shapes: complex numbers of the type of `cos_i`.
     """
-    cos_t, transmitted = refracted_cosine(cos_i, k, contrast)
-    kappa = contrast_of(k) if contrast is None else contrast
-    r_s, _, _, inverse_p = _parts(cos_i, cos_t, k, kappa)
-    # Near Brewster's angle k² sin² − cos² cancels: formed as 1·k² − (1 + k²) cos² in double-word arithmetic.
-    k2 = Double.product(k, k)
-    brewster = (k2 - (k2 + 1) * Double.product(cos_i, cos_i)).hi
-    r_p = (kappa * inverse_p) * (brewster * inverse_p)
-    phase_s, phase_p = _phase(k * cos_i, cos_t), _phase(cos_i, k * cos_t)
-    return _complex(transmitted, r_s, phase_s), _complex(transmitted, r_p, phase_p)
+    radicand, brewster = _differences(cos_i, k, contrast)
+    transmitted = (radicand.hi >= 0) & (cos_i > 0)
+    c, y, k = _wide(cos_i), _root(radicand), _wide(k)
+    kappa = dr.fma(k, k, -1) if contrast is None else _wide(contrast)
+    # 1 where no wave is transmitted and the quotients below are not used: a tangential ray would divide by 0.
+    d_s, d_p = (dr.select(transmitted, d, 1) for d in (dr.fma(k, c, y), dr.fma(k, y, c)))
+    # Of float64 each term is a few roundings: κ and the defect u, each d² 4u, products and quotient 3u.
+    r_s, r_p = kappa / (d_s * d_s), kappa * brewster / (d_p * d_p)
+    number = _complex_type(cos_i)
+    (s_re, s_im), (p_re, p_im) = _phase(k * c, y), _phase(c, k * y)
+    return (
+        number(dr.select(transmitted, r_s, s_re), dr.select(transmitted, 0, s_im)),
+        number(dr.select(transmitted, r_p, p_re), dr.select(transmitted, 0, p_im)),
+    )
 
 
 def mueller_reflection(cos_i: Any, k: Any, contrast: Any = None) -> list[list[Any]]:
@@ -106,10 +156,46 @@ def mueller_reflection(cos_i: Any, k: Any, contrast: Any = None) -> list[list[An
 
 def mueller_transmission(cos_i: Any, cos_t: Any, transmitted: Any, k: Any) -> list[list[Any]]:
     """Mueller matrix of the transmission in the plane of incidence (4 × 4 numbers); 0 where not transmitted."""
-    s, p = quotient(1, dr.fma(k, cos_i, cos_t)), quotient(1, dr.fma(k, cos_t, cos_i))
-    pairs = (s, s), (p, p), (s, p)
-    t_s, t_p, cross = (dr.select(transmitted, 4 * k * ((cos_i * x) * (cos_t * y)), 0) for x, y in pairs)
+    c, y, ratio, number = _wide(cos_i), _wide(cos_t), _wide(k), type(cos_i)
+    d_s, d_p = (dr.select(transmitted, d, 1) for d in (dr.fma(ratio, c, y), dr.fma(ratio, y, c)))
+    power = 4 * ratio * (c * y)
+    pairs = (d_s, d_s), (d_p, d_p), (d_s, d_p)
+    t_s, t_p, cross = (dr.select(transmitted, number(power / (x * y)), 0) for x, y in pairs)
     return _mueller(t_s, t_p, (cross, 0))
+
+
+def _differences(cos_i: Any, k: Any, contrast: Any) -> tuple[Double, Any]:
+    """cos²θ_t = k² cos²θ_i − κ and k² sin²θ_i − cos²θ_i of exact arguments, each to the last bit and in float64.
+
+    They cancel near the critical angle and near Brewster's; there double words would leave 5u²/|difference|.
+    """
+    if _is_single(cos_i):
+        # Squares of float32 are exact in float64, and an fma rounds once. Where the second cancels, so are 1 − cos²
+        # (k > 1: cos² > 1/2) and k² − cos² (k < 1: within a factor of 2); where the first does, κ is (k > 1).
+        c2 = _wide(cos_i) * _wide(cos_i)
+        k2 = _wide(k) * _wide(k) if contrast is None else _wide(contrast) + 1
+        kappa = k2 - 1 if contrast is None else _wide(contrast)
+        brewster = dr.select(k2 > 1, dr.fma(k2, 1 - c2, -c2), dr.fma(-k2, c2, k2 - c2))
+        return Double(dr.fma(k2, c2, -kappa)), brewster
+    c2 = two_prod(cos_i, cos_i)
+    k2 = two_prod(k, k) if contrast is None else (contrast, 1)
+    products = [part for x in c2 for y in k2 for part in two_prod(x, y)]
+    radicand = _sum([1, -k2[0], -k2[1], *products] if contrast is None else [-contrast, *products])
+    return radicand, _sum([*k2, -c2[0], -c2[1], *(-x for x in products)]).rounded()
+
+
+def _sum(terms: list[Any]) -> Double:
+    """Σ terms: error ≤ u² |sum| + O(u³) Σ|terms|. Source: Ogita, Rump, Oishi 2005, SumK with K = 3."""
+    for _ in range(2):
+        for i in range(1, len(terms)):
+            terms[i], terms[i - 1] = two_sum(terms[i], terms[i - 1])
+    return Double(terms[-1], sum(terms[:-1]))
+
+
+def _root(radicand: Double) -> Any:
+    """√|radicand|, rounded once, with a finite derivative at 0."""
+    size = Double(dr.abs(radicand.hi), dr.mulsign(radicand.lo, radicand.hi))
+    return dr.safe_sqrt(size.hi) if radicand.is_plain else size.sqrt().rounded()
 
 
 def _mueller(s2: Any, p2: Any, cross: Any) -> list[list[Any]]:
@@ -125,9 +211,7 @@ def _phase(x: Any, y: Any) -> tuple[Any, Any]:
     return (x - y) * (x + y), 2 * x * y
 
 
-def _complex(transmitted: Any, real: Any, phase: tuple[Any, Any]) -> Any:
-    re, im = dr.select(transmitted, real, phase[0]), dr.select(transmitted, 0, phase[1])
-    if isinstance(re, float):
-        return dr.scalar.Complex2f64(re, im)
-    complex_type: Any = dr.replace_shape_t(type(re), (2, -1), "complex")
-    return complex_type(re, im)
+def _complex_type(number: Any) -> Any:
+    if isinstance(number, float):
+        return dr.scalar.Complex2f64
+    return dr.replace_shape_t(type(number), (2, -1), "complex")

@@ -104,18 +104,38 @@ def refract(
     table = np.full((len(a), _COLUMNS), math.nan)
     for chunk in _watched(len(a), progress):
         index = np.flatnonzero(valid[chunk]) + chunk.start
-        rays = _rays(a, n, k, contrast, index)
-        with ctx.workprec(EXACT_BITS):
-            pending = [(i, _exact(*ray)) for i, ray in zip(index, rays, strict=True)]
-        for bits in PRECISIONS:
-            if not pending:
-                break
-            with ctx.workprec(bits):
-                solved = [_solve(polynomials, fresnel) for _, polynomials in pending]
-            table[[i for i, _ in pending]] = solved
-            pending = [p for p, row in zip(pending, solved, strict=True) if not row[6] <= MAX_RADIUS]
-        table[[i for i, _ in pending]] = math.nan
+        _fill(table, index, (_exact(*ray) for ray in _rays(a, n, k, contrast, index)), fresnel)
     return _certified(table, valid)
+
+
+def fresnel(cos_i: Any, k: Any, *, contrast: Any = None) -> Certified:
+    """As `refract`, of rays known by their cosine alone, for exactly these numbers; directions are NaN.
+
+    cos_i: (N,) float32 or float64. Rays whose cosine is outside 0 … 1 are invalid. Raises as `refract` does.
+    """
+    cos_i = _floats("cos_i", cos_i, ("N",))
+    axis = np.tile([0.0, 0.0, 1.0], (len(cos_i), 1))
+    _, _, k, contrast, valid = _inputs(axis, axis, k, contrast)
+    valid &= (cos_i >= 0) & (cos_i <= 1)
+    table, index = np.full((len(cos_i), _COLUMNS), math.nan), np.flatnonzero(valid)
+    ratios = k[index].tolist(), [None] * len(index) if contrast is None else contrast[index].tolist()
+    _fill(table, index, (_exact_of_cosine(*x) for x in zip(cos_i[index].tolist(), *ratios, strict=True)), True)
+    table[:, :6] = math.nan
+    return _certified(table, valid)
+
+
+def _fill(table: np.ndarray, index: np.ndarray, polynomials: Iterator[tuple], fresnel: bool) -> None:
+    """Solve the rays of these polynomials, one precision after the other, into their rows of the table."""
+    with ctx.workprec(EXACT_BITS):
+        pending = list(zip(index, polynomials, strict=True))
+    for bits in PRECISIONS:
+        if not pending:
+            return
+        with ctx.workprec(bits):
+            solved = [_solve(exact, fresnel) for _, exact in pending]
+        table[[i for i, _ in pending]] = solved
+        pending = [p for p, row in zip(pending, solved, strict=True) if not row[6] <= MAX_RADIUS]
+    table[[i for i, _ in pending]] = math.nan
 
 
 def _certified(table: np.ndarray, valid: np.ndarray) -> Certified:
@@ -155,6 +175,15 @@ def _exact(ax: Any, ay: Any, az: Any, nx: Any, ny: Any, nz: Any, k: float, contr
     d = c2 - e * s2
     tx, ty, tz = nn * ax - c * nx, nn * ay - c * ny, nn * az - c * nz
     return c, aa, nn, aann, c2, s2, e, k2, d, tx, ty, tz, nx, ny, nz
+
+
+def _exact_of_cosine(cos_i: float, k: float, contrast: float | None) -> tuple:
+    """The same of unit vectors at this cosine; the direction is left out."""
+    c = arb(cos_i)
+    e = arb(k) * k - 1 if contrast is None else arb(contrast)
+    c2 = c * c
+    s2 = 1 - c2
+    return c, arb(1), arb(1), arb(1), c2, s2, e, e + 1, c2 - e * s2, *[arb(0)] * 6
 
 
 def _solve(polynomials: tuple, fresnel: bool) -> tuple[float, ...]:

@@ -17,7 +17,7 @@ from typing import Any
 # Each study by name, and the modules that make it up.
 STUDIES = {
     "directions": ("directions", "mutants", "samples"),
-    "stability": ("stability",),
+    "stability": ("stability", "energy", "derivatives"),
     "renders": ("renders",),
 }
 
