@@ -46,14 +46,14 @@ def distil(terms: Sequence[Any], words: int = 3) -> Expansion:
         if not errors:
             break
         rest = errors
-    # Where the first sum cancelled, the next one leads.
-    for i in range(len(taken) - 2, -1, -1):
-        for j in range(i, len(taken) - 1):
+    # Where the first sums cancelled, the next one leads.
+    for _ in taken:
+        for j in reversed(range(len(taken) - 1)):
             taken[j], taken[j + 1] = two_sum(taken[j], taken[j + 1])
     return taken
 
 
-def product(x: Sequence[Any], y: Sequence[Any], words: int = 3) -> Expansion:
+def product(x: Any, y: Any, words: int = 3) -> Expansion:
     """x y of two expansions: relative error ≤ 16 u^words."""
     terms: list[Any] = []
     for i, x_i in enumerate(x):
@@ -63,11 +63,11 @@ def product(x: Sequence[Any], y: Sequence[Any], words: int = 3) -> Expansion:
     return distil(terms, words)
 
 
-def negated(x: Sequence[Any]) -> Expansion:
+def negated(x: Any) -> Expansion:
     return [-x_i for x_i in x]
 
 
-def quotient(x: Sequence[Any], y: Sequence[Any], words: int = 2) -> Expansion:
+def quotient(x: Any, y: Any, words: int = 2) -> Expansion:
     """x / y of two expansions, by long division: relative error ≤ 16 u^words."""
     digits, rest = [], list(x)
     for _ in range(words):
@@ -77,17 +77,17 @@ def quotient(x: Sequence[Any], y: Sequence[Any], words: int = 2) -> Expansion:
     return distil(digits, words)
 
 
-def dot(x: Sequence[Any], y: Sequence[Any], words: int = 3) -> Expansion:
+def dot(x: Any, y: Any, words: int = 3) -> Expansion:
     """x · y of two vectors of floats, and 0 where it is 0. One word more than asked for is kept for what cancels."""
     return distil([part for x_i, y_i in zip(x, y, strict=True) for part in two_prod(x_i, y_i)], words + 1)[:words]
 
 
-def cross(x: Sequence[Any], y: Sequence[Any], words: int = 3) -> list[Expansion]:
+def cross(x: Any, y: Any, words: int = 3) -> list[Expansion]:
     """x × y of two 3-vectors of floats, each component as `dot` has it."""
     return [dot((x[i], x[j]), (y[j], -y[i]), words) for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
-def radicand(a: Sequence[Any], n: Sequence[Any], k: Any) -> tuple[Expansion, Expansion, Any]:
+def radicand(a: Any, n: Any, k: Any) -> tuple[Expansion, Expansion, Any]:
     """(n·a, D, T): D = (n·a)² − κ |n×a|², κ = k² − 1, which is negative under total internal reflection.
 
     `a`, `n`: three components each. T = (n·a)² + |κ| |n×a|², to a few u; the error of D is at most 2⁻¹⁴⁰ T.

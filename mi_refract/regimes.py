@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import functools
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.random import Generator
@@ -19,6 +20,7 @@ from . import expansions
 
 Array = NDArray[np.floating]
 Triple = tuple[Array, Array, Array]
+Index = NDArray[np.integer]
 
 
 @dataclass(frozen=True)
@@ -29,11 +31,21 @@ class Rays:
     n: Array
     k: Array
 
-    def __getitem__(self, index: object) -> Rays:
-        return Rays(self.a[index], self.n[index], self.k[index])  # type: ignore[index]
+    def __getitem__(self, index: Any) -> Rays:
+        return Rays(self.a[index], self.n[index], self.k[index])
 
     def __len__(self) -> int:
         return len(self.k)
+
+    def hexed(self, i: int) -> dict[str, Any]:
+        """Ray `i`, to the last bit."""
+        a, n = ([float(x).hex() for x in v[i]] for v in (self.a, self.n))
+        return {"a": a, "n": n, "k": float(self.k[i]).hex()}
+
+    @staticmethod
+    def joined(parts: Sequence[Rays]) -> Rays:
+        a, n, k = (np.concatenate([getattr(part, name) for part in parts]) for name in ("a", "n", "k"))
+        return Rays(a, n, k)
 
 
 @dataclass(frozen=True)
@@ -41,13 +53,14 @@ class Regime:
     """`build(rng, n)` gives (a, n, k) for unit normals `n` (N, 3), whose precision is the one wanted.
 
     `largest_k` bounds k; `text` defines the set; `unit`: `a` and `n` are unit up to the rounding of their components,
-    as the documented formulas demand.
+    as the documented formulas demand. `rests_on_denormals`: the answer is another one where those are taken for 0.
     """
 
     build: Callable[[Generator, Array], Triple]
     largest_k: float
     text: str
     unit: bool = True
+    rests_on_denormals: bool = False
 
 
 def _log_uniform(rng: Generator, low: float, high: float, count: int) -> Array:
@@ -165,17 +178,35 @@ def _keep_some(rng: Generator, v: Array, most: int) -> Array:
 def _zeros(rng: Generator, n: Array) -> Triple:
     a, n, k = _rays_at(_mixed, rng, _keep_some(rng, n, 2).astype(n.dtype))
     some = rng.random(len(n)) < 0.5
-    return np.where(some[:, None], _keep_some(rng, a, 2), a), n, k
+    a = np.where(some[:, None], _keep_some(rng, a, 2), a)
+    return np.where((a * n).sum(1, keepdims=True) == 0, n, a), n, k
 
 
 def _denormal(rng: Generator, n: Array) -> Triple:
-    """One or two components of a, of n or of both below the smallest normal number, which is 2⁻¹²⁶ or 2⁻¹⁰²²."""
+    """The zeros of n, of a or of both become numbers below the smallest normal one, 2⁻¹²⁶ or 2⁻¹⁰²²."""
     a, n, k = _zeros(rng, n)
-    least, precision = float(np.finfo(n.dtype).smallest_subnormal), n.dtype
-    bits = np.finfo(precision).nmant
-    tiny = np.exp2(rng.uniform(0, bits, (2, *n.shape))).round() * least * _either(rng, 6 * len(n)).reshape(2, -1, 3)
     which = rng.integers(1, 4, len(n))[:, None]
-    return np.where((a == 0) & (which & 1 > 0), tiny[0], a), np.where((n == 0) & (which & 2 > 0), tiny[1], n), k
+    a = np.where((a == 0) & (which & 1 > 0), _tiny(rng, n), a)
+    return a, np.where((n == 0) & (which & 2 > 0), _tiny(rng, n), n), k
+
+
+def _on_a_denormal(rng: Generator, n: Array) -> Triple:
+    """n an axis, and a denormal number along it is all that keeps `a` from being tangential."""
+    count, axis = len(n), rng.integers(0, 3, len(n))
+    a, rows = rng.normal(size=(count, 3)), np.arange(count)
+    a[rows, axis] = 0
+    a = _unit(a)
+    a[rows, axis] = _tiny(rng, n)[:, 0]
+    normal = np.zeros((count, 3))
+    normal[rows, axis] = _either(rng, count)
+    return a, normal, _mixed(rng, count, float(np.finfo(n.dtype).eps))[1]
+
+
+def _tiny(rng: Generator, like: Array) -> Array:
+    """Denormal numbers of either sign."""
+    limits = np.finfo(like.dtype)
+    whole = np.exp2(rng.uniform(0, limits.nmant, like.shape)).round()
+    return np.ldexp(whole, limits.minexp - limits.nmant) * rng.choice([-1.0, 1.0], like.shape)
 
 
 # Facts that rounding does not spoil ----------------------------------------------------------------------------
@@ -185,26 +216,17 @@ def _tangential(rng: Generator, n: Array) -> Triple:
     """Half of them a = n × v in whole numbers, half (x, y, 0) and (−y, x, 0) in some order; times powers of two."""
     count, bits = len(n), np.finfo(n.dtype).nmant // 2 - 1
     whole, v = np.rint(rng.uniform(-(2**bits), 2**bits, (2, count, 3)))
-    whole[~whole.any(axis=1)] = 1, 1, 1
-    x, y = _unit(rng.normal(size=(count, 2))).astype(n.dtype).astype(float).T
-    swap, turn = rng.random(count) < 0.5, rng.integers(0, 3, count)
-    zero = np.zeros(count)
+    product = np.cross(whole, v)
+    x, y = _rounded(_unit(rng.normal(size=(count, 2))), n.dtype).T
+    turn, zero = rng.integers(0, 3, count), np.zeros(count)
     flat_a, flat_n = (_turned(np.stack(c, axis=1), turn) for c in ((x, y, zero), (-y, x, zero)))
-    a = np.where(swap[:, None], flat_a, np.cross(whole, v))
-    a[~a.any(axis=1)] = 0  # v along n: no direction, replaced below
-    a, n = _valid(a, np.where(swap[:, None], flat_n, whole))
-    _, k = _mixed(rng, count, float(np.finfo(np.float32).eps))
+    flat = (rng.random(count) < 0.5) | ~product.any(axis=1)
+    a, n = np.where(flat[:, None], flat_a, product), np.where(flat[:, None], flat_n, whole)
+    _, k = _mixed(rng, count, float(np.finfo(n.dtype).eps))
     return a * _power_of_two(rng, count), n * _power_of_two(rng, count), k
 
 
-def _valid(a: Array, n: Array) -> tuple[Array, Array]:
-    """Rays without a direction become the axes x and z."""
-    none = ~a.any(axis=1)
-    a[none], n[none] = (1, 0, 0), (0, 0, 1)
-    return a, n
-
-
-def _turned(v: Array, turn: Array) -> Array:
+def _turned(v: Array, turn: Index) -> Array:
     """The components of every vector moved on cyclically by 0, 1 or 2."""
     return np.take_along_axis(v, (np.arange(3) - turn[:, None]) % 3, axis=1)
 
@@ -281,7 +303,7 @@ def _rounded(x: Array, precision: DTypeLike) -> Array:
     return x.astype(precision).astype(np.float64)
 
 
-def _on_the_cone(rng: Generator, n: Array, j: Array, sine: Array, start: Array) -> Array:
+def _on_the_cone(rng: Generator, n: Array, j: Index, sine: Array, start: Array) -> Array:
     """Unit a at the angle of `sine` from ±n, whose component j is `start` as far as the cone reaches there."""
     rows, cosine = np.arange(len(n)), np.sqrt(1 - sine * sine) * _either(rng, len(n))
     n = n / _length(n)[:, None]
@@ -294,7 +316,7 @@ def _on_the_cone(rng: Generator, n: Array, j: Array, sine: Array, start: Array) 
     return _unit(cosine[:, None] * n + sine[:, None] * tangent)
 
 
-def _radicand(a: Array, n: Array, k: Array, j: Array) -> Triple:
+def _radicand(a: Array, n: Array, k: Array, j: Index) -> Triple:
     """D of these very numbers, and its derivatives in a_j and k: D = k² c² − κ |a|²|n|²."""
     rows = np.arange(len(k))
     c, d, _ = expansions.radicand(a.T, n.T, k)
@@ -319,11 +341,15 @@ REGIMES = {
     "matched, grazing": Regime(
         _at(_matched_grazing), 1.01, "|k − 1| from an ulp to 1e-2, 1e-7 … 1e-1 rad from the surface"
     ),
-    "Brewster": Regime(_at(_brewster), 2.5, "from an ulp to 1e-2 rad from Brewster's angle, both sides, k in 0.4 … 2.5"),
+    "Brewster": Regime(_at(_brewster), 2.5, "an ulp to 1e-2 rad from Brewster's angle, both sides, k in 0.4 … 2.5"),
     "k ≫ 1": Regime(_at(_steep), 1e6, "k in 10 … 1e6, k sin θ uniform in 0 … 1.2"),
     "k ≪ 1": Regime(_at(_dense), 0.1, "k in 1e-6 … 0.1, cosine uniform"),
-    "axes, signed zeros": Regime(_zeros, 1e6, "n, and a of every other ray, with one or two zeros of either sign"),
+    "axes, signed zeros": Regime(_zeros, 1e6, "n, and a of every other ray, with zeros of either sign; not tangential"),
     "denormal": Regime(_denormal, 1e6, "as before, the zeros of a, n or both replaced by denormal numbers"),
+    "on a denormal": Regime(
+        _on_a_denormal, 1e6, "n an axis, n·a a denormal number: all that keeps a from being tangential",
+        rests_on_denormals=True,
+    ),
     "lengths": Regime(_lengths, 1e6, "|a| and |n| log-uniform in 1e-18 … 1e18, angles and ratios of all sets", False),
     "off unit": Regime(_off_unit, 1e6, "a and n turned by a matrix in their own precision, all angles and k", False),
     "tangential": Regime(_tangential, 1e6, "n·a = 0 exactly, lengths from 2⁻¹² up, ratios of all sets", False),

@@ -18,11 +18,12 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import oracle, regimes
-from mi_refract.formulas import FORMULAS, Budget, cancelling
+from mi_refract.formulas import FORMULAS, ROUNDING, Budget, cancelling
 from mi_refract.rows import Row
 
 from .plan import Context, Task
 
+FLOOR = "exact, rounded"
 TITLE = "Directions"
 TEXT = __doc__.partition("\n")[2].strip()
 TERMS = (
@@ -31,7 +32,11 @@ TERMS = (
     | {
         "worst / u": "the largest chord error in units of roundoff; rounding the exact answer costs 0.87",
         "misjudged": "rays whose total internal reflection was decided wrongly",
-        "misjudged far": "those of them that are farther from the critical angle than the formula's own error",
+        "misjudged far": "those of them that are farther from the critical angle than the formula's own error; at the "
+        "rounding limit, those whose radicand exceeds 16u² of its terms: below, the decision moves b by 4u at most",
+        FLOOR: "the certified direction times |a|, rounded: no form does better. At most √3/2 u where |a| = 1, and 1 u "
+        "elsewhere, where all components may have just passed a power of two",
+        "no budget": "the documented formulas demand unit vectors: where those are not, their rows are shown only",
         "length drift": "how far the length of b is from that of a, relative",
         "time / copy": "median time of a ray over that of copying its bytes, streaming; below 1 it is noise",
         "operations": "Dr.Jit's count for the whole kernel",
@@ -60,6 +65,14 @@ class Setting:
     @property
     def is_scalar(self) -> bool:
         return self.vector is not None and not dr.is_jit_v(self.vector)
+
+    @functools.cached_property
+    def flushes(self) -> bool:
+        """Whether denormal numbers are taken for 0, which Dr.Jit's threads do. Asked of the array, not presumed."""
+        if self.is_scalar:
+            return False
+        least = np.full(1 << 16, np.finfo(self.precision).smallest_subnormal)
+        return not np.array(dr.value_t(self.vector)(least) > 0).all()
 
 
 def tasks(context: Context) -> list[Task]:
@@ -101,7 +114,7 @@ def _setting_rows(context: Context, setting: Setting) -> list[Row]:
         return [Row("directions", name, "all regimes", setting.label, reason=setting.reason) for name in FORMULAS]
     count = context.profile.scalar_rays if setting.is_scalar else context.profile.rays
     times = _times(context, setting)
-    rows = []
+    rows = [floor_row(regime, setting, count) for regime in regimes.REGIMES]
     for name, subject in _subjects(context, setting).items():
         parts = [_regime_row(name, subject, regime, setting, count) for regime in regimes.REGIMES]
         rows += [*parts, _summary(name, parts, setting, times)]
@@ -141,50 +154,96 @@ def errors(b: np.ndarray, rays: regimes.Rays, exact: oracle.Certified) -> tuple[
     """(chord, angle, drift of the length) of every ray, relative to |a|; NaN counts as infinite."""
     length = np.sqrt((rays.a.astype(np.longdouble) ** 2).sum(1))[:, None]
     unit, low = b / length, exact.direction_low.astype(np.longdouble)
-    difference = (unit - exact.direction) - low
-    chord = np.sqrt((difference**2).sum(1))
-    norm = np.sqrt((unit**2).sum(1))
-    across = np.sqrt((np.cross(unit, difference) ** 2).sum(1)) / norm
-    angle = np.arctan2(across, norm - (unit * difference).sum(1) / norm)
-    chord, angle, drift = (np.nan_to_num(x.astype(float), nan=np.inf) for x in (chord, angle, np.abs(norm - 1)))
+    with np.errstate(invalid="ignore", over="ignore"):  # a formula may return anything
+        difference = (unit - exact.direction) - low
+        chord = np.sqrt((difference**2).sum(1))
+        norm = np.sqrt((unit**2).sum(1))
+        across = np.sqrt((np.cross(unit, difference) ** 2).sum(1)) / norm
+        angle = np.arctan2(across, norm - (unit * difference).sum(1) / norm)
+        chord, angle, drift = (np.nan_to_num(x.astype(float), nan=np.inf) for x in (chord, angle, np.abs(norm - 1)))
     return chord, angle, drift
+
+
+def floor_row(regime: str, setting: Setting, count: int) -> Row:
+    """The certified answers themselves, rounded."""
+    rays, exact = certified(regime, count, setting.precision)
+    length = np.sqrt((rays.a.astype(np.longdouble) ** 2).sum(1))[:, None]
+    b = ((exact.direction + exact.direction_low.astype(np.longdouble)) * length).astype(setting.precision)
+    return _judged(FLOOR, regime, setting, rays, exact, b.astype(np.longdouble), exact.transmitted)
 
 
 def _regime_row(name: str, subject: Subject, regime: str, setting: Setting, count: int) -> Row:
     rays, exact = certified(regime, count, setting.precision)
-    b, transmitted = evaluate(subject, rays, setting.vector)
+    return _judged(name, regime, setting, rays, exact, *evaluate(subject, rays, setting.vector))
+
+
+def _judged(
+    name: str, regime: str, setting: Setting, rays: regimes.Rays, exact: oracle.Certified, b: Any, transmitted: Any
+) -> Row:
     wrong = (transmitted != exact.transmitted) & ~exact.undecided
     chord, angle, drift = errors(b, rays, exact)
     right = ~wrong & ~exact.undecided
     u, largest_k = setting.roundoff, regimes.REGIMES[regime].largest_k
     worst = int(np.argmax(np.where(right, chord, -1)))
+    chord, angle, drift = (x[right] if right.any() else np.zeros(1) for x in (chord, angle, drift))
     values = {
-        "worst / u": float(chord[right].max() / u),
-        "worst chord": float(chord[right].max()),
-        "p99 / u": float(np.quantile(chord[right], 0.99) / u),
-        "mean / u": float(chord[right].mean() / u),
-        "worst rad": float(angle[right].max()),
-        "p99 rad": float(np.quantile(angle[right], 0.99)),
-        "mean rad": float(angle[right].mean()),
-        "length drift": float(drift[right].max()),
+        "worst / u": float(chord.max()) / u,
+        "worst chord": float(chord.max()),
+        "p99 / u": _p99(chord) / u,
+        "mean / u": float(chord.mean()) / u,
+        "worst rad": float(angle.max()),
+        "p99 rad": _p99(angle),
+        "mean rad": float(angle.mean()),
+        "length drift": float(drift.max()),
         "misjudged": float(wrong.sum()),
-        "misjudged far": float((wrong & (_radicand(rays) > _budget(name).margin(u, largest_k))).sum()),
+        "misjudged far": float(decisive(name, rays[wrong], u, largest_k).sum()),
     }
     replay = {
-        "regime": regime, "text": regimes.REGIMES[regime].text, "count": count, "seed": SEED,
-        "worst ray": {
-            "a": [float(x).hex() for x in rays.a[worst]],
-            "n": [float(x).hex() for x in rays.n[worst]],
-            "k": float(rays.k[worst]).hex(),
-        },
+        "regime": regime, "text": regimes.REGIMES[regime].text, "count": len(rays), "seed": SEED,
+        "worst ray": rays.hexed(worst),
     }  # fmt: skip
-    budgets = {"worst / u": _budget(name).chord(u, largest_k) / u, "misjudged far": 0.0}
-    return Row("directions", name, regime, setting.label, values, budgets, replay=replay)
+    limit, reason = bound(name, regime, setting, largest_k)
+    budgets = {} if limit is None else {"worst / u": limit, "misjudged far": 0.0}
+    return Row("directions", name, regime, setting.label, values, budgets, reason=reason, replay=replay)
 
 
 def _budget(name: str) -> Budget:
     """That of the formula; the built-in's radicand cancels as that of the decomposed form does."""
     return FORMULAS[name].budget if name in FORMULAS else cancelling(2)
+
+
+def _p99(x: np.ndarray) -> float:
+    """What 99 of 100 stay below; one of the values, which may be infinite."""
+    return float(np.quantile(x, 0.99, method="higher"))
+
+
+def at_the_limit(name: str) -> bool:
+    """Whether `name` is held to the rounding of the exact answer, for vectors of any length."""
+    return name == FLOOR or (name in FORMULAS and FORMULAS[name].takes_contrast)
+
+
+# 16u² of the radicand's terms: below it, the decision moves the direction by less than its root, 4u.
+NEGLIGIBLE = 16.0
+
+
+def decisive(name: str, rays: regimes.Rays, u: float, largest_k: float) -> np.ndarray:
+    """(N,) whether the ray is far enough from the critical angle that `name` must decide it rightly."""
+    if at_the_limit(name):
+        return np.abs(oracle.margin(rays.a, rays.n, rays.k)) > NEGLIGIBLE * u * u
+    return _radicand(rays) > _budget(name).margin(u, largest_k)
+
+
+def bound(name: str, regime: str, setting: Setting, k: float) -> tuple[float | None, str]:
+    """(the chord error in u that is allowed on a regime for ratios up to k, or None; why None)."""
+    entry = regimes.REGIMES[regime]
+    if entry.rests_on_denormals and setting.flushes:
+        return None, "this backend takes denormal numbers for 0"
+    if not at_the_limit(name):
+        if not entry.unit:
+            return None, "no budget: a and n are not unit"
+        return _budget(name).chord(setting.roundoff, k) / setting.roundoff, ""
+    # A component of b may be in a binade twice as coarse for its share of |a| as where |a| = 1.
+    return ROUNDING.linear * (1 if entry.unit else 2 / 3**0.5), ""
 
 
 def _radicand(rays: regimes.Rays) -> np.ndarray:
@@ -195,7 +254,8 @@ def _radicand(rays: regimes.Rays) -> np.ndarray:
 
 
 def _summary(name: str, parts: list[Row], setting: Setting, times: dict[str, dict[str, float]]) -> Row:
-    """The worst over all regimes and what it cost: the point of a formula in the plane of error and time."""
+    """The worst over all regimes with a budget and what it cost: a point in the plane of error and time."""
+    parts = [row for row in parts if row.budgets]
     worst = {m: max(row.values[m] for row in parts) for m in ("worst / u", "worst chord", "worst rad", "length drift")}
     total = {"misjudged": sum(row.values["misjudged"] for row in parts)}
     replay = {"rays": sum(row.replay["count"] for row in parts), "seed": SEED}

@@ -22,9 +22,7 @@ from mi_refract.regimes import Rays
 
 Subject = Callable[[Any, Any, Any], tuple[Any, Any]]
 
-# Below 16u² of its terms the radicand's sign moves a direction by less than its root, 4u, and no budget asks for it.
-NEGLIGIBLE = 16.0
-# The screen's own resolution. Below it, and where a product underflows, its decision is a guess.
+# The screen's own resolution. Below it, and where a component of float64 is denormal and decides, it has guessed.
 RESOLUTION = 2.0**-140
 _UNDERFLOW = 2.0**-900
 
@@ -39,12 +37,16 @@ class Screen:
         self.rays, self.roundoff = rays, float(np.finfo(rays.k.dtype).eps) / 2
         self._inputs = vector(rays.a.T), vector(rays.n.T), dr.value_t(vector)(rays.k)
         dr.eval(self._inputs)
-        wide = dr.float64_array_t(vector)
-        self._a = wide(self._inputs[0])
-        solved = _solve(self._a, wide(self._inputs[1]), dr.value_t(wide)(self._inputs[2]))
-        self._high, self._low, self._transmitted, margin, doubtful = solved
+        wide: Any = dr.float64_array_t(vector)
+        # Widened here: Dr.Jit's threads take denormal numbers for 0.
+        a, n, k = (x.T.astype(np.float64) for x in (rays.a, rays.n, rays.k))
+        self._a = wide(a)
+        solved = _solve(self._a, wide(n), dr.value_t(wide)(k))
+        self._high, self._low, self._transmitted, c, margin, unresolved = solved
         dr.eval(solved)
-        self.margin, self.doubtful = np.array(margin), np.array(doubtful)
+        tiny = ((np.abs((a, n)) < _UNDERFLOW) & (np.array((a, n)) != 0)).any(axis=(0, 1))
+        self.margin = np.array(margin)
+        self.doubtful = np.array(unresolved) | tiny & (np.abs(np.array(c)) < _UNDERFLOW)
 
     def judge(self, subject: Subject) -> tuple[np.ndarray, np.ndarray]:
         """(chord error in u, infinite where it is NaN; whether the decision differs) of every ray."""
@@ -65,9 +67,7 @@ def _solve(a: Any, n: Any, k: Any) -> tuple[Any, ...]:
     along = [dr.select(transmitted, dr.mulsign(r, c[0]), -c_i) for r, c_i in zip(roots, c[:2], strict=True)]
     difference = expansions.distil([*along, *expansions.negated(expansions.product(c, [scale]))], 2)
     factor = expansions.quotient(difference, expansions.dot(n, n))
-    b = [expansions.distil([*expansions.two_prod(scale, a[i]), *expansions.product(factor, [n[i]])], 2) for i in range(3)]
-    products = [(n[i], a[i], dr.abs(n[i] * a[i])) for i in range(3)]
-    lost = [(x != 0) & (y != 0) & (p < _UNDERFLOW) for x, y, p in products]
-    underflow = lost[0] | lost[1] | lost[2]
-    doubtful = (c[0] != 0) & (dr.abs(d[0]) <= RESOLUTION * terms) | underflow & (dr.abs(c[0]) < _UNDERFLOW)
-    return type(a)(*(x[0] for x in b)), type(a)(*(x[1] for x in b)), transmitted, d[0] / terms, doubtful
+    parts = [(*expansions.two_prod(scale, a[i]), *expansions.product(factor, [n[i]])) for i in range(3)]
+    b = [expansions.distil(part, 2) for part in parts]
+    unresolved = (c[0] != 0) & (dr.abs(d[0]) <= RESOLUTION * terms)
+    return type(a)(*(x[0] for x in b)), type(a)(*(x[1] for x in b)), transmitted, c[0], d[0] / terms, unresolved
