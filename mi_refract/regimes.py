@@ -193,9 +193,9 @@ def _denormal(rng: Generator, n: Array) -> Triple:
 def _on_a_denormal(rng: Generator, n: Array) -> Triple:
     """n an axis, and a denormal number along it is all that keeps `a` from being tangential."""
     count, axis = len(n), rng.integers(0, 3, len(n))
-    a, rows = rng.normal(size=(count, 3)), np.arange(count)
+    rows, a = np.arange(count), rng.normal(size=(count, 3))
     a[rows, axis] = 0
-    a = _unit(a)
+    a = _unit(a).astype(float)
     a[rows, axis] = _tiny(rng, n)[:, 0]
     normal = np.zeros((count, 3))
     normal[rows, axis] = _either(rng, count)

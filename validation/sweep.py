@@ -25,11 +25,11 @@ TITLE = "Sweep"
 TEXT = __doc__.partition("\n")[2].strip()
 TERMS = {
     "worst / u": "the largest certified chord error in units of roundoff, of the rays that were decided rightly",
-    "misjudged": "rays whose total internal reflection was decided wrongly: all that the screen is certain of, and of the "
-    "others those that were certified",
+    "misjudged": "rays whose total internal reflection was decided wrongly: all that the screen is certain of, and of "
+    "the others those that were certified",
     "misjudged far": "certified ones that the formula must decide rightly, as in the study of directions",
-    "screen off": "the largest difference between the screen's chord error and the certified one, in u; infinite where a "
-    "decision that the screen is certain of was wrong",
+    "screen off": "the largest difference between the screen's chord error and the certified one, in u; infinite where "
+    "a decision that the screen is certain of was wrong",
     "unresolved": "rays nearer to the critical angle than the screen resolves that were not certified either",
 }
 SEED = 2031
@@ -53,14 +53,14 @@ def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
         return [Row("sweep", name, "all regimes", setting.label, reason=setting.reason) for name in FORMULAS]
     profile = context.profile
-    rows = [row for regime in regimes.REGIMES for row in regime_rows(regime, setting, profile.sweep_rays, profile.certified)]
+    sizes = profile.sweep_rays, profile.certified
+    rows = [row for regime in regimes.REGIMES for row in regime_rows(regime, setting, *sizes)]
     documented = {name: [row for row in rows if row.subject == name] for name in FORMULAS if not at_the_limit(name)}
     return [row for row in rows if at_the_limit(row.subject)] + [_worst_of(name, r) for name, r in documented.items()]
 
 
 def _worst_of(name: str, rows: list[Row]) -> Row:
-    """One row for a documented formula, over the regimes in which it has a budget."""
-    rows = [row for row in rows if row.budgets]
+    """One row for a documented formula, over all regimes it was swept in."""
     worst = max(rows, key=lambda row: row.values["worst / u"])
     values = {"worst / u": worst.values["worst / u"]}
     values |= {metric: sum(row.values[metric] for row in rows) for metric in ("misjudged", "rays", "certified")}
@@ -75,20 +75,25 @@ class Best:
 
     def __init__(self, size: int) -> None:
         self.size, self.offered = size, 0
-        self._score, self._rays = np.empty(0), []  # type: tuple[np.ndarray, list[Rays]]
+        self.score: np.ndarray = np.empty(0)
+        self._rays: list[Rays] = []
 
     def add(self, rays: Rays, score: np.ndarray, mask: np.ndarray) -> None:
         index = np.flatnonzero(mask)
         self.offered += len(index)
-        index = index[np.argsort(-score[index], kind="stable")[: self.size]]
-        self._rays.append(rays[index])
-        self._score = np.concatenate([self._score, score[index]])
-        best = np.argsort(-self._score, kind="stable")[: self.size]
-        self._score, self._rays = self._score[best], [Rays.joined(self._rays)[best]]
+        index = index[_largest(score[index], self.size)]
+        score = np.concatenate([self.score, score[index]])
+        best = _largest(score, self.size)
+        self.score, self._rays = score[best], [Rays.joined([*self._rays, rays[index]])[best]]
 
     @property
     def rays(self) -> Rays:
         return self._rays[0]
+
+
+def _largest(x: np.ndarray, count: int) -> np.ndarray:
+    """Indices of the `count` largest numbers, or of all."""
+    return np.argpartition(-x, count)[:count] if len(x) > count else np.arange(len(x))
 
 
 @dataclass(frozen=True)
@@ -110,19 +115,20 @@ class Gathered:
 
 
 def gather(regime: str, setting: Setting, count: int, kept: int) -> dict[str, Gathered]:
-    """Screen `count` rays of a regime in chunks; chunk i has the seed SEED + i."""
-    found = {name: Gathered(Best(kept), Best(kept), Best(UNRESOLVED_SHARE * kept)) for name in FORMULAS}
+    """Screen `count` rays of a regime in chunks; chunk i has the seed SEED + i. By formula that has a budget there."""
+    names = [name for name in FORMULAS if at_the_limit(name) or bound(name, regime, setting, 1.0)[0] is not None]
+    found = {name: Gathered(Best(kept), Best(kept), Best(UNRESOLVED_SHARE * kept)) for name in names}
     for i, start in enumerate(range(0, count, CHUNK)):
         rays = regimes.make(regime, min(CHUNK, count - start), setting.precision, SEED + i)
         screen = Screen(rays, setting.vector)
-        for name, formula in FORMULAS.items():
-            found[name].add(screen, *screen.judge(formula))
+        for name in names:
+            found[name].add(screen, *screen.judge(FORMULAS[name]))
     return found
 
 
 def regime_rows(regime: str, setting: Setting, count: int, kept: int) -> list[Row]:
     found = gather(regime, setting, count, kept)
-    return [_certified_row(name, regime, setting, found[name], count) for name in FORMULAS]
+    return [_certified_row(name, regime, setting, gathered, count) for name, gathered in found.items()]
 
 
 def _certified_row(name: str, regime: str, setting: Setting, found: Gathered, count: int) -> Row:
@@ -131,13 +137,15 @@ def _certified_row(name: str, regime: str, setting: Setting, found: Gathered, co
     u, entry = setting.roundoff, regimes.REGIMES[regime]
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
     b, transmitted = evaluate(FORMULAS[name], rays, setting.vector)
-    chord, wrong = errors(b, rays, exact)[0] / u, transmitted != exact.transmitted
+    wrong = transmitted != exact.transmitted
+    with np.errstate(over="ignore"):
+        chord = errors(b, rays, exact)[0] / u
     worst = int(np.argmax(np.where(wrong, -1, chord)))
     values = {
         "worst / u": float(np.max(chord, where=~wrong, initial=0)),
         "misjudged": float(found.misjudged.offered + (wrong & ~certain).sum()),
         "misjudged far": float(decisive(name, rays[wrong], u, entry.largest_k).sum()),
-        "screen off": _disagreement(name, setting, rays[certain], chord[certain], wrong[certain]),
+        "screen off": _disagreement(found, chord[certain], wrong[certain]),
         "rays": float(count),
         "certified": float(len(rays)),
         "unresolved": float(found.unresolved.offered - (~certain).sum()),
@@ -151,12 +159,13 @@ def _certified_row(name: str, regime: str, setting: Setting, found: Gathered, co
     return Row("sweep", name, regime, setting.label, values, budgets, reason=reason, replay=replay)
 
 
-def _disagreement(name: str, setting: Setting, rays: Rays, chord: np.ndarray, wrong: np.ndarray) -> float:
-    """How far the screen's judgement of certified rays is off, in u; of errors above 1e6 u, in a millionth of them."""
-    if not len(rays):
-        return 0.0
-    screened, differs = Screen(rays, setting.vector).judge(FORMULAS[name])
-    if (differs != wrong).any():
+def _disagreement(found: Gathered, chord: np.ndarray, wrong: np.ndarray) -> float:
+    """How far the screen is off on the worst and the misjudged rays, in u; of errors above 1e6 u, in millionths."""
+    screened = found.worst.score
+    if wrong[: len(screened)].any() or not wrong[len(screened) :].all():
         return np.inf
-    compared = ~wrong & np.isfinite(chord)
-    return float(np.max(np.abs(screened - chord) / np.maximum(1, chord / 1e6), where=compared, initial=0))
+    finite = np.isfinite(screened)
+    if (finite != np.isfinite(chord[: len(screened)])).any():
+        return np.inf
+    screened, chord = screened[finite], chord[: len(screened)][finite]
+    return float(np.max(np.abs(screened - chord) / np.maximum(1, chord / 1e6), initial=0))
