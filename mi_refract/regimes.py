@@ -71,7 +71,7 @@ def _either(rng: Generator, count: int) -> Array:
     return rng.choice([-1.0, 1.0], count)
 
 
-def _unit(v: Array) -> Array:
+def normalised(v: Array) -> Array:
     """In extended precision: what is rounded from it is unit up to that rounding."""
     wide = v.astype(np.longdouble)
     return wide / np.sqrt((wide * wide).sum(1, keepdims=True))
@@ -139,7 +139,7 @@ def _rays_at(draw: Draw, rng: Generator, n: Array) -> Triple:
     wide = n.astype(np.float64)
     across = np.cross(wide, rng.normal(size=n.shape))
     side = np.cos(angle) * _either(rng, len(n)) / _length(wide)
-    return _unit(side[:, None] * wide + (np.sin(angle) / _length(across))[:, None] * across), n, k
+    return normalised(side[:, None] * wide + (np.sin(angle) / _length(across))[:, None] * across), n, k
 
 
 def _length(v: Array) -> Array:
@@ -172,7 +172,7 @@ def _keep_some(rng: Generator, v: Array, most: int) -> Array:
     kept = order < rng.integers(1, most + 1, len(v))[:, None]
     lone = kept.sum(1, keepdims=True) == 1
     zeros = np.copysign(0.0, rng.normal(size=v.shape))
-    return np.where(kept, _unit(np.where(kept, np.where(lone, np.sign(v), v), 0)), zeros)
+    return np.where(kept, normalised(np.where(kept, np.where(lone, np.sign(v), v), 0)), zeros)
 
 
 def _zeros(rng: Generator, n: Array) -> Triple:
@@ -195,7 +195,7 @@ def _on_a_denormal(rng: Generator, n: Array) -> Triple:
     count, axis = len(n), rng.integers(0, 3, len(n))
     rows, a = np.arange(count), rng.normal(size=(count, 3))
     a[rows, axis] = 0
-    a = _unit(a).astype(float)
+    a = normalised(a).astype(float)
     a[rows, axis] = _tiny(rng, n)[:, 0]
     normal = np.zeros((count, 3))
     normal[rows, axis] = _either(rng, count)
@@ -217,7 +217,7 @@ def _tangential(rng: Generator, n: Array) -> Triple:
     count, bits = len(n), np.finfo(n.dtype).nmant // 2 - 1
     whole, v = np.rint(rng.uniform(-(2**bits), 2**bits, (2, count, 3)))
     product = np.cross(whole, v)
-    x, y = _rounded(_unit(rng.normal(size=(count, 2))), n.dtype).T
+    x, y = _rounded(normalised(rng.normal(size=(count, 2))), n.dtype).T
     turn, zero = rng.integers(0, 3, count), np.zeros(count)
     flat_a, flat_n = (_turned(np.stack(c, axis=1), turn) for c in ((x, y, zero), (-y, x, zero)))
     flat = (rng.random(count) < 0.5) | ~product.any(axis=1)
@@ -313,7 +313,7 @@ def _on_the_cone(rng: Generator, n: Array, j: Index, sine: Array, start: Array) 
     cos_turn = np.clip((start - cosine * n[rows, j]) / (sine * p[rows, j]), -1, 1)
     sin_turn = np.sqrt(1 - cos_turn**2) * _either(rng, len(n))
     tangent = cos_turn[:, None] * p + sin_turn[:, None] * np.cross(n, p)
-    return _unit(cosine[:, None] * n + sine[:, None] * tangent)
+    return normalised(cosine[:, None] * n + sine[:, None] * tangent)
 
 
 def _radicand(a: Array, n: Array, k: Array, j: Index) -> Triple:
@@ -363,6 +363,6 @@ def make(name: str, count: int, precision: DTypeLike, seed: int = 0, normal: Arr
     `normal` takes the place of random normals, in the regimes that do not choose their own.
     """
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-    n = _unit(rng.normal(size=(count, 3))) if normal is None else np.tile(np.asarray(normal, float), (count, 1))
+    n = normalised(rng.normal(size=(count, 3))) if normal is None else np.tile(np.asarray(normal, float), (count, 1))
     a, n, k = REGIMES[name].build(rng, n.astype(precision))
     return Rays(a.astype(precision), n.astype(precision), k.astype(precision))
