@@ -36,6 +36,8 @@ TERMS = (
         "rounding limit, those whose radicand exceeds 16u² of its terms: below, the decision moves b by 4u at most",
         FLOOR: "the certified direction times |a|, rounded: no form does better. At most √3/2 u where |a| = 1, and 1 u "
         "elsewhere, where all components may have just passed a power of two",
+        "other side": "rays within 4u of the surface that a documented formula sends to the other side of it, because "
+        "it knows n·a to no more; left out of the errors",
         "no budget": "the documented formulas demand unit vectors: where those are not, their rows are shown only",
         "length drift": "how far the length of b is from that of a, relative",
         "time / copy": "median time of a ray over that of copying its bytes, streaming; below 1 it is noise",
@@ -182,9 +184,11 @@ def _judged(
 ) -> Row:
     wrong = (transmitted != exact.transmitted) & ~exact.undecided
     chord, angle, drift = errors(b, rays, exact)
-    right = ~wrong & ~exact.undecided
+    side = held(name, exact.cos_i, setting.roundoff)
+    right = ~wrong & ~exact.undecided & side
     u, largest_k = setting.roundoff, regimes.REGIMES[regime].largest_k
     worst = int(np.argmax(np.where(right, chord, -1)))
+    crossed = ~side & ~wrong & (chord > exact.cos_t)
     chord, angle, drift = (x[right] if right.any() else np.zeros(1) for x in (chord, angle, drift))
     values = {
         "worst / u": float(chord.max()) / u,
@@ -196,6 +200,7 @@ def _judged(
         "mean rad": float(angle.mean()),
         "length drift": float(drift.max()),
         "misjudged": float(wrong.sum()),
+        "other side": float(crossed.sum()),
         "misjudged far": float(decisive(name, rays[wrong], u, largest_k).sum()),
     }
     replay = {
@@ -224,6 +229,15 @@ def at_the_limit(name: str) -> bool:
 
 # 16u² of the radicand's terms: below it, the decision moves the direction by less than its root, 4u.
 NEGLIGIBLE = 16.0
+
+
+# The documented formulas know n·a, and with it the side that b goes to, to 4u: three products and two sums.
+SIDE = 4.0
+
+
+def held(name: str, cos_i: np.ndarray, u: float) -> np.ndarray:
+    """(N,) the rays for which `name` has a bound: all, or those that are not within 4u of the surface."""
+    return np.full(cos_i.shape, True) if at_the_limit(name) else cos_i > SIDE * u
 
 
 def decisive(name: str, rays: regimes.Rays, u: float, largest_k: float) -> np.ndarray:

@@ -30,7 +30,8 @@ _UNDERFLOW = 2.0**-900
 class Screen:
     """The answers for `rays` as vectors of type `vector`, a Dr.Jit 3-vector of a vectorised backend.
 
-    `margin`: D/(c² + |κ||n×a|²), within a factor of 2 of `oracle.margin`; `doubtful`: transmission was not resolved.
+    `margin`: D/(c² + |κ||n×a|²), within a factor of 2 of `oracle.margin`; `cos_i`: |n·a|/|n||a| to a few u of float64;
+    `doubtful`: transmission was not resolved.
     """
 
     def __init__(self, rays: Rays, vector: Any) -> None:
@@ -45,8 +46,9 @@ class Screen:
         self._high, self._low, self._transmitted, c, margin, unresolved = solved
         dr.eval(solved)
         tiny = ((np.abs((a, n)) < _UNDERFLOW) & (np.array((a, n)) != 0)).any(axis=(0, 1))
-        self.margin = np.array(margin)
-        self.doubtful = np.array(unresolved) | tiny & (np.abs(np.array(c)) < _UNDERFLOW)
+        self.margin, c = np.array(margin), np.abs(np.array(c))
+        self.cos_i = c / np.array(dr.norm(self._a) * dr.norm(wide(n)))
+        self.doubtful = np.array(unresolved) | tiny & (c < _UNDERFLOW)
 
     def judge(self, subject: Subject) -> tuple[np.ndarray, np.ndarray]:
         """(chord error in u, infinite where it is NaN; whether the decision differs) of every ray."""

@@ -25,7 +25,7 @@ from mi_refract.regimes import REGIMES, Rays
 from mi_refract.rows import Row
 
 from . import worst
-from .directions import Setting, at_the_limit, bound, decisive, errors, evaluate, settings
+from .directions import Setting, at_the_limit, bound, decisive, errors, evaluate, held, settings
 from .plan import PROFILES, Context, Task
 from .screen import Screen, Subject
 from .worst import Found
@@ -60,8 +60,8 @@ def _rows(context: Context, name: str, setting: Setting) -> list[Row]:
     if setting.vector is None:
         return [Row("search", name, "all regimes", setting.label, reason=setting.reason)]
     generations = context.profile.generations
-    herd = climb(FORMULAS[name], domain(name, setting), setting, generations)
-    found = certify(FORMULAS[name], name, herd, setting)
+    herd = climb(name, FORMULAS[name], domain(name, setting), setting, generations)
+    found = certify(name, FORMULAS[name], herd, setting)
     chords = [f for f in found if f.line.objective == "chord"]
     far = [f.line.line() for f in found if f.line.objective == "decision" and f.share > 0]
     values = {"worst / bound": max((f.share for f in chords), default=0.0), "misjudged far": float(len(far))}
@@ -94,16 +94,18 @@ def domain(name: str, setting: Setting) -> tuple[str, ...]:
     return tuple(regime for regime in REGIMES if bound(name, regime, setting, 1.0)[0] is not None)
 
 
-def climb(subject: Subject, names: Iterable[str], setting: Setting, generations: int, seed: int = SEED) -> Herd:
-    """The herd after so many generations."""
+def climb(
+    name: str, subject: Subject, names: Iterable[str], setting: Setting, generations: int, seed: int = SEED
+) -> Herd:
+    """The herd after so many generations. `subject` is evaluated, and held to what `name` is held to."""
     rng, names = np.random.default_rng(seed), tuple(names)
-    herd = _parents(subject, names, setting, seed)
+    herd = _parents(name, subject, names, setting, seed)
     rows = np.arange(len(herd))
     for _ in range(generations):
         parents = np.repeat(rows, CHILDREN)
         children = _mutated(rng, herd.rays[parents], _unit_only(herd)[parents])
         inside = _inside(children, herd, parents)
-        score = _scores(subject, Screen(children, setting.vector), herd.decision[parents])
+        score = _scores(name, subject, Screen(children, setting.vector), herd.decision[parents])
         score = np.where(inside, score, -np.inf)
         best = score.reshape(-1, CHILDREN).argmax(1) + rows * CHILDREN
         # A child as bad as its parent replaces it: a plateau is crossed at random.
@@ -113,13 +115,13 @@ def climb(subject: Subject, names: Iterable[str], setting: Setting, generations:
     return herd
 
 
-def _parents(subject: Subject, names: tuple[str, ...], setting: Setting, seed: int) -> Herd:
+def _parents(name: str, subject: Subject, names: tuple[str, ...], setting: Setting, seed: int) -> Herd:
     """The worst of a sample, by either objective, of every regime."""
     rays, scores = [], []
-    for name in names:
-        screen = _sample(name, setting, seed)
+    for regime_name in names:
+        screen = _sample(regime_name, setting, seed)
         for objective in (False, True):
-            score = _scores(subject, screen, np.full(SAMPLE, objective))
+            score = _scores(name, subject, screen, np.full(SAMPLE, objective))
             worst_ones = np.argsort(-score, kind="stable")[:FAMILIES]
             rays.append(screen.rays[worst_ones])
             scores.append(score[worst_ones])
@@ -133,13 +135,14 @@ def _sample(name: str, setting: Setting, seed: int) -> Screen:
     return Screen(regimes.make(name, SAMPLE, setting.precision, seed), setting.vector)
 
 
-def _scores(subject: Subject, screen: Screen, decision: np.ndarray) -> np.ndarray:
+def _scores(name: str, subject: Subject, screen: Screen, decision: np.ndarray) -> np.ndarray:
     """The higher the worse. Chord: its error in u over max(1, k), of rays that are decided rightly. Decision: the
     distance from the critical angle where it is wrong, minus that distance where it is right.
     """
     chord, wrong = screen.judge(subject)
     far = np.abs(screen.margin)
-    by_chord = np.where(wrong, -np.inf, chord / np.maximum(1, screen.rays.k))
+    out = wrong | ~held(name, screen.cos_i, screen.roundoff)
+    by_chord = np.where(out, -np.inf, chord / np.maximum(1, screen.rays.k))
     score = np.where(decision, np.where(wrong, far, -far), by_chord)
     return np.where(screen.doubtful | np.isnan(score), -np.inf, score)
 
@@ -190,8 +193,8 @@ class Certified:
     share: float
 
 
-def certify(subject: Subject, name: str, herd: Herd, setting: Setting) -> list[Certified]:
-    """Every parent's certified score, held to the budget of `name`. Only errors; a right decision is none."""
+def certify(name: str, subject: Subject, herd: Herd, setting: Setting) -> list[Certified]:
+    """Every parent's certified score, held to the budget of `name`."""
     rays, u = herd.rays, setting.roundoff
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
     b, transmitted = evaluate(subject, rays, setting.vector)
@@ -200,7 +203,7 @@ def certify(subject: Subject, name: str, herd: Herd, setting: Setting) -> list[C
         chord = errors(b, rays, exact)[0] / u
     margin = np.abs(oracle.margin(rays.a, rays.n, rays.k)) / u**2
     found = []
-    for i in range(len(herd)):
+    for i in np.flatnonzero(held(name, exact.cos_i, u)).tolist():
         regime, k = herd.names[herd.regime[i]], float(rays.k[i])
         if wrong[i]:
             share = float(decisive(name, rays[i : i + 1], u, k)[0])
@@ -231,11 +234,11 @@ def main(arguments: list[str] | None = None) -> int:
         if setting.is_scalar or setting.vector is None:
             continue
         for name in options.formulas or FORMULAS:
-            herd = climb(FORMULAS[name], domain(name, setting), setting, options.generations, options.seed)
-            found = certify(FORMULAS[name], name, herd, setting)
+            herd = climb(name, FORMULAS[name], domain(name, setting), setting, options.generations, options.seed)
+            found = certify(name, FORMULAS[name], herd, setting)
             kept = worth_keeping(found)
             broken = sum(f.share > 1 if f.line.objective == "chord" else f.share > 0 for f in found)
-            print(f"{setting.label}, {name}: {max(f.share for f in found):.3g} of what is allowed, {broken} rays over it")
+            print(f"{setting.label}, {name}: {max(f.share for f in found):.3g} of its bound, {broken} rays over it")
             if options.keep:
                 print(f"  {worst.keep(kept)} new lines")
     return 0

@@ -17,14 +17,15 @@ from mi_refract.formulas import FORMULAS
 from mi_refract.regimes import Rays
 from mi_refract.rows import Row
 
-from .directions import Setting, at_the_limit, bound, decisive, errors, evaluate, settings
+from .directions import Setting, at_the_limit, bound, decisive, errors, evaluate, held, settings
 from .plan import Context, Task
 from .screen import Screen
 
 TITLE = "Sweep"
 TEXT = __doc__.partition("\n")[2].strip()
 TERMS = {
-    "worst / u": "the largest certified chord error in units of roundoff, of the rays that were decided rightly",
+    "worst / u": "the largest certified chord error in units of roundoff, of the rays that were decided rightly and, "
+    "for documented formulas, are not within 4u of the surface",
     "misjudged": "rays whose total internal reflection was decided wrongly: all that the screen is certain of, and of "
     "the others those that were certified",
     "misjudged far": "certified ones that the formula must decide rightly, as in the study of directions",
@@ -107,9 +108,9 @@ class Gathered:
     misjudged: Best
     unresolved: Best
 
-    def add(self, screen: Screen, chord: np.ndarray, wrong: np.ndarray) -> None:
+    def add(self, screen: Screen, held: np.ndarray, chord: np.ndarray, wrong: np.ndarray) -> None:
         rays, certain = screen.rays, ~screen.doubtful
-        self.worst.add(rays, chord, certain & ~wrong)
+        self.worst.add(rays, chord, certain & held & ~wrong)
         self.misjudged.add(rays, np.abs(screen.margin), certain & wrong)
         self.unresolved.add(rays, wrong.astype(float), ~certain)
 
@@ -122,7 +123,7 @@ def gather(regime: str, setting: Setting, count: int, kept: int) -> dict[str, Ga
         rays = regimes.make(regime, min(CHUNK, count - start), setting.precision, SEED + i)
         screen = Screen(rays, setting.vector)
         for name in names:
-            found[name].add(screen, *screen.judge(FORMULAS[name]))
+            found[name].add(screen, held(name, screen.cos_i, setting.roundoff), *screen.judge(FORMULAS[name]))
     return found
 
 
