@@ -274,26 +274,27 @@ def _rotation(w: Array, x: Array, y: Array, z: Array) -> Array:
 _STEPS = 2
 
 
-def _to_the_ulp(rng: Generator, n: Array) -> Triple:
+def _to_the_ulp(least: float, most: float, rng: Generator, n: Array) -> Triple:
     """Rays whose exact radicand is as near to 0 as one number among them can bring it, then up to two ulps aside.
 
-    For a third of them that number is k. For the rest it is the component of `a` along the axis j that n is farthest
-    from: it starts at 2^-p … 2^-2, and the smaller it is the finer are its ulps, down to a radicand of u² of its terms.
+    k − 1 is log-uniform in `least` … `most`. For a third of them that number is k, for the rest the component of `a`
+    along the axis j that n is farthest from: it starts at 2u … 2⁻², and the smaller it is the finer are its ulps, down
+    to a radicand of u² of its terms.
     """
     count, precision, eps = len(n), n.dtype, float(np.finfo(n.dtype).eps)
     wide, rows = n.astype(np.float64), np.arange(count)
     j = np.argmin(np.abs(wide), axis=1)
-    k = rng.uniform(1.05, np.minimum(2.5, 0.99 / np.maximum(np.abs(wide[rows, j]), 0.1)))
+    k = _rounded(1 + _log_uniform(rng, least, most, count), precision)
     start = _log_uniform(rng, eps, 0.25, count) * _either(rng, count)
-    a, k = _rounded(_on_the_cone(rng, wide, j, 1 / k, start), precision), _rounded(k, precision)
-    by_k = rng.random(count) < 1 / 3
+    a = _rounded(_on_the_cone(rng, wide, j, k, start), precision)
+    by_k = (rng.random(count) < 1 / 3) | (np.abs(a[rows, j]) > 0.25)
     for _ in range(_STEPS):
-        d, along_a, along_k = _radicand(a, wide, k, j)
+        d, along = radicand(a, wide, k)
         # A step that would leave |a| = 1 by more than u/4 is left to k.
-        step = np.abs(d / along_a)
-        by_k |= step * (np.abs(a[rows, j]) + step) > eps / 8
-        a[rows, j] -= np.where(by_k, 0, d / along_a)
-        a, k = _rounded(a, precision), _rounded(k - np.where(by_k, d / along_k, 0), precision)
+        step = d / along[rows, j]
+        by_k |= np.abs(step) * (np.abs(a[rows, j]) + np.abs(step)) > eps / 8
+        a[rows, j] -= np.where(by_k, 0, step)
+        a, k = _rounded(a, precision), _rounded(k - np.where(by_k, d / along[:, 6], 0), precision)
     aside = rng.integers(-2, 3, count)
     a[rows, j] += np.where(by_k, 0, aside) * np.spacing(np.abs(a[rows, j]).astype(precision))
     return a, n, k + np.where(by_k, aside, 0) * np.spacing(k.astype(precision))
@@ -303,9 +304,9 @@ def _rounded(x: Array, precision: DTypeLike) -> Array:
     return x.astype(precision).astype(np.float64)
 
 
-def _on_the_cone(rng: Generator, n: Array, j: Index, sine: Array, start: Array) -> Array:
-    """Unit a at the angle of `sine` from ±n, whose component j is `start` as far as the cone reaches there."""
-    rows, cosine = np.arange(len(n)), np.sqrt(1 - sine * sine) * _either(rng, len(n))
+def _on_the_cone(rng: Generator, n: Array, j: Index, k: Array, start: Array) -> Array:
+    """Unit a at the critical angle from ±n, whose component j is `start` as far as the cone reaches there."""
+    rows, sine, cosine = np.arange(len(n)), 1 / k, np.sqrt((k - 1) * (k + 1)) / k * _either(rng, len(n))
     n = n / _length(n)[:, None]
     p = -n[rows, j][:, None] * n
     p[rows, j] += 1
@@ -316,15 +317,14 @@ def _on_the_cone(rng: Generator, n: Array, j: Index, sine: Array, start: Array) 
     return normalised(cosine[:, None] * n + sine[:, None] * tangent)
 
 
-def _radicand(a: Array, n: Array, k: Array, j: Index) -> Triple:
-    """D of these very numbers, and its derivatives in a_j and k: D = k² c² − κ |a|²|n|²."""
-    rows = np.arange(len(k))
+def radicand(a: Array, n: Array, k: Array) -> tuple[Array, Array]:
+    """D = k² c² − κ |a|²|n|² of these very numbers (N,), and its derivatives in a, n and k (N, 7). float64."""
     c, d, _ = expansions.radicand(a.T, n.T, k)
-    nn, kappa = (n * n).sum(1), k * k - 1
-    along_a = 2 * (k * k * c[0] * n[rows, j] - kappa * nn * a[rows, j])
-    along_k = -2 * k * ((a * a).sum(1) * nn - c[0] ** 2)
-    floor = 1e-300
-    return d[0], np.where(along_a == 0, floor, along_a), np.where(along_k == 0, floor, along_k)
+    aa, nn, k2c, kappa = (a * a).sum(1), (n * n).sum(1), k * k * c[0], k * k - 1
+    along_a = 2 * (k2c[:, None] * n - (kappa * nn)[:, None] * a)
+    along_n = 2 * (k2c[:, None] * a - (kappa * aa)[:, None] * n)
+    along = np.column_stack([along_a, along_n, -2 * k * (aa * nn - c[0] ** 2)])
+    return d[0], np.where(along == 0, 1e-300, along)
 
 
 # The table -----------------------------------------------------------------------------------------------------
@@ -335,7 +335,12 @@ REGIMES = {
     "grazing": Regime(_at(_grazing), 2.5, "1e-7 … 1e-2 rad from the surface, k in 0.4 … 2.5"),
     "critical": Regime(_at(_critical), 2.5, "1e-7 … 1e-2 rad from the critical angle, both sides, k in 1.05 … 2.5"),
     "critical, to the ulp": Regime(
-        _to_the_ulp, 2.51, "the radicand of the rounded numbers within two ulps of one of them of 0, both sides"
+        functools.partial(_to_the_ulp, 0.05, 1.5),
+        2.51,
+        "k in 1.05 … 2.5, the radicand of the rounded numbers as near to 0 as two ulps of one of them, both sides",
+    ),
+    "critical, any k, to the ulp": Regime(
+        functools.partial(_to_the_ulp, 1e-6, 9.9e5), 1e6, "the same for k − 1 in 1e-6 … 1e6: grazing to near-normal"
     ),
     "matched": Regime(_at(_matched), 1.01, "|k − 1| from an ulp to 1e-2, cosine uniform"),
     "matched, grazing": Regime(

@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import Any
 
 # Each study by name, and the modules that make it up.
-STUDIES = {"directions": ("directions", "samples"), "renders": ("renders",)}
+STUDIES = {"directions": ("directions", "samples", "sweep", "search"), "renders": ("renders",)}
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -2,8 +2,9 @@
 
 The worst of a sample of each regime are the parents. In every generation each has children with a few numbers changed
 by a power of two of ulps, and the worst child that is no better than its parent takes its place. Climbed are the chord
-error, and the distance from the critical angle at which total internal reflection is still decided wrongly. Children
-stay in the domain: unit vectors stay unit up to rounding, lengths within 1e-18 … 1e18, ratios within the regime's.
+error, and the distance from the critical angle at which total internal reflection is still decided wrongly; there some
+children are as near to that angle as a few ulps of their numbers bring them. All stay in the domain: unit vectors stay
+unit up to rounding, lengths within 1e-18 … 1e18, ratios within the regime's.
 
 `python -m validation.search --keep` adds the worst to tests/data/worst_rays.txt, which the tests replay.
 """
@@ -41,6 +42,7 @@ SEED = 2037
 SAMPLE = 4096
 FAMILIES = 6  # per regime and objective
 CHILDREN = 24
+TRIALS = 1024
 OBJECTIVES = ("chord", "decision")
 # Of what is allowed: above it a ray is worth keeping. Formulas at the limit are near it by rounding alone.
 WORTH_KEEPING = {True: 0.9, False: 0.25}
@@ -104,6 +106,7 @@ def climb(
     for _ in range(generations):
         parents = np.repeat(rows, CHILDREN)
         children = _mutated(rng, herd.rays[parents], _unit_only(herd)[parents])
+        children = _stepped(rng, children, herd.decision[parents])
         inside = _inside(children, herd, parents)
         score = _scores(name, subject, Screen(children, setting.vector), herd.decision[parents])
         score = np.where(inside, score, -np.inf)
@@ -151,18 +154,44 @@ def _unit_only(herd: Herd) -> np.ndarray:
     return np.array([REGIMES[name].unit for name in herd.names])[herd.regime]
 
 
+def _stepped(rng: Generator, rays: Rays, decision: np.ndarray) -> Rays:
+    """One in four of those that climb the decision steps to the critical angle."""
+    some = np.flatnonzero(decision & (rng.random(len(rays)) < 0.25))
+    order = np.arange(len(rays))
+    order[some] = len(rays) + np.arange(len(some))
+    return Rays.joined([rays, _to_critical(rng, rays[some])])[order]
+
+
+@np.errstate(over="ignore", invalid="ignore")  # a step may lead out of the domain
+def _to_critical(rng: Generator, rays: Rays) -> Rays:
+    """A Newton step to radicand 0 in one number, then the best of TRIALS combinations of ulps, by its linear part."""
+    rows, precision = np.arange(len(rays)), rays.k.dtype
+    numbers = np.column_stack([rays.a, rays.n, rays.k]).astype(np.float64)
+    d, along = regimes.radicand(numbers[:, :3], numbers[:, 3:6], numbers[:, 6])
+    j = rng.integers(0, 7, len(rays))
+    numbers[rows, j] -= d / along[rows, j]
+    ulps = np.spacing(np.abs(numbers).astype(precision)).astype(np.float64)
+    numbers = numbers.astype(precision).astype(np.float64)
+    d, along = regimes.radicand(numbers[:, :3], numbers[:, 3:6], numbers[:, 6])
+    steps = rng.integers(-3, 4, (TRIALS, 7)) * (rng.random((TRIALS, 7)) < 0.5)
+    best = np.abs(d[:, None] + (along * ulps) @ steps.T).argmin(1)
+    numbers = (numbers + steps[best] * ulps).astype(precision)
+    return Rays(numbers[:, :3], numbers[:, 3:6], numbers[:, 6])
+
+
 def _mutated(rng: Generator, rays: Rays, unit: np.ndarray) -> Rays:
-    """One number in four is moved by ±2^j ulps, small j mostly; half of the unit vectors are made unit again."""
+    """A few numbers are moved by ±2^j ulps, small j mostly; a quarter of the unit vectors are made unit again."""
     precision = rays.k.dtype
     limits = np.finfo(precision)
     bits = np.column_stack([rays.a, rays.n, rays.k]).view(f"i{precision.itemsize}")
     step = np.exp2(np.floor(limits.nmant * rng.random(bits.shape) ** 2)).astype(bits.dtype)
     step *= rng.choice(np.array([-1, 1], bits.dtype), bits.shape)
     # Zeros and denormal numbers stay: those are regimes of their own.
-    moved = (rng.random(bits.shape) < 0.25) & (np.abs(bits.view(precision)) >= limits.smallest_normal)
+    chance = rng.choice([0.05, 0.3], (len(rays), 1))
+    moved = (rng.random(bits.shape) < chance) & (np.abs(bits.view(precision)) >= limits.smallest_normal)
     numbers = np.where(moved, bits + step, bits).view(precision)
     a, n, k = numbers[:, :3], numbers[:, 3:6], numbers[:, 6]
-    again = (unit & (rng.random(len(k)) < 0.5))[:, None]
+    again = (unit & (rng.random(len(k)) < 0.25))[:, None]
     a, n = (np.where(again, regimes.normalised(v), v).astype(precision) for v in (a, n))
     return Rays(a, n, k)
 
