@@ -26,9 +26,9 @@ class Profile:
     pairs: int
     curve_spp: tuple[int, ...]  # error against run time
     every_formula: bool  # renders with every formula, not only the default one
-    sweep_rays: int = 50_000  # per regime, screened
+    sweep_rays: int = 40_000  # per regime, screened
     certified: int = 32  # of these, per formula: the worst, and as many misjudged ones
-    generations: int = 12  # of the search
+    generations: int = 6  # of the search
 
 
 PROFILES = {

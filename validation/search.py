@@ -2,7 +2,7 @@
 
 The worst of a sample of each regime are the parents. In every generation each has children with a few numbers changed
 by a power of two of ulps, and the worst child that is no better than its parent takes its place. Climbed are the chord
-error, and the distance from the critical angle at which total internal reflection is still decided wrongly; there some
+error, and the distance from the critical angle at which total internal reflection is still decided wrongly. Some
 children are as near to that angle as a few ulps of their numbers bring them. All stay in the domain: unit vectors stay
 unit up to rounding, lengths within 1e-18 … 1e18, ratios within the regime's.
 
@@ -155,8 +155,8 @@ def _unit_only(herd: Herd) -> np.ndarray:
 
 
 def _stepped(rng: Generator, rays: Rays, decision: np.ndarray) -> Rays:
-    """One in four of those that climb the decision steps to the critical angle."""
-    some = np.flatnonzero(decision & (rng.random(len(rays)) < 0.25))
+    """One in four of those that climb the decision steps to the critical angle, and one in sixteen of the others."""
+    some = np.flatnonzero(rng.random(len(rays)) < np.where(decision, 1 / 4, 1 / 16))
     order = np.arange(len(rays))
     order[some] = len(rays) + np.arange(len(some))
     return Rays.joined([rays, _to_critical(rng, rays[some])])[order]

@@ -34,7 +34,7 @@ TERMS = {
     "unresolved": "rays nearer to the critical angle than the screen resolves that were not certified either",
 }
 SEED = 2031
-CHUNK = 1 << 18
+CHUNK = 1 << 16
 # What the screen may be off by: extended precision, which compares with the certified answer, costs as much.
 SCREEN_BUDGET = 0.01
 # Rays nearer to the critical angle than the screen resolves, per kept one.
