@@ -14,7 +14,7 @@ from typing import Any
 from .numerics import two_sum
 
 Expansion = list[Any]
-# Splits 53 bits into 26 and 27. For float64 and what is wider than 26 bits nowhere else.
+# Splits the 53 bits of a float64 in two halves, whose products are exact.
 _SPLITTER = 2.0**27 + 1
 
 
