@@ -27,7 +27,7 @@ from mi_refract.rows import Row
 
 from . import worst
 from .directions import Setting, at_the_limit, bound, decisive, errors, evaluate, held, settings
-from .plan import PROFILES, Context, Task
+from .plan import PROFILES, Context, Profile, Task
 from .screen import Screen, Subject
 from .worst import Found
 
@@ -39,7 +39,7 @@ TERMS = {
     "rays tried": "children of all generations",
 }
 SEED = 2037
-SAMPLE = 4096
+SAMPLE, LARGEST_SAMPLE = 4000, 1 << 16
 FAMILIES = 6  # per regime and objective
 CHILDREN = 24
 TRIALS = 1024
@@ -61,17 +61,21 @@ def tasks(context: Context) -> list[Task]:
 def _rows(context: Context, name: str, setting: Setting) -> list[Row]:
     if setting.vector is None:
         return [Row("search", name, "all regimes", setting.label, reason=setting.reason)]
-    generations = context.profile.generations
-    herd = climb(name, FORMULAS[name], domain(name, setting), setting, generations)
+    generations, sample = context.profile.generations, _sample_size(context.profile)
+    herd = climb(name, FORMULAS[name], domain(name, setting), setting, generations, sample=sample)
     found = certify(name, FORMULAS[name], herd, setting)
     chords = [f for f in found if f.line.objective == "chord"]
     far = [f.line.line() for f in found if f.line.objective == "decision" and f.share > 0]
     values = {"worst / bound": max((f.share for f in chords), default=0.0), "misjudged far": float(len(far))}
     values["rays tried"] = float(generations * CHILDREN * len(herd))
     worst_lines = [f.line.line() for f in sorted(chords, key=lambda f: -f.share)[:3]]
-    replay = {"seed": SEED, "generations": generations, "worst": worst_lines, "misjudged": far[:3]}
+    replay = {"seed": SEED, "sample": sample, "generations": generations, "worst": worst_lines, "misjudged": far[:3]}
     budgets = {"worst / bound": 1.0, "misjudged far": 0.0}
     return [Row("search", name, "all regimes", setting.label, values, budgets, replay=replay)]
+
+
+def _sample_size(profile: Profile) -> int:
+    return min(profile.sweep_rays // 10, LARGEST_SAMPLE)
 
 
 # The herd ------------------------------------------------------------------------------------------------------
@@ -97,11 +101,17 @@ def domain(name: str, setting: Setting) -> tuple[str, ...]:
 
 
 def climb(
-    name: str, subject: Subject, names: Iterable[str], setting: Setting, generations: int, seed: int = SEED
+    name: str,
+    subject: Subject,
+    names: Iterable[str],
+    setting: Setting,
+    generations: int,
+    seed: int = SEED,
+    sample: int = SAMPLE,
 ) -> Herd:
     """The herd after so many generations. `subject` is evaluated, and held to what `name` is held to."""
     rng, names = np.random.default_rng(seed), tuple(names)
-    herd = _parents(name, subject, names, setting, seed)
+    herd = _parents(name, subject, names, setting, seed, sample)
     rows = np.arange(len(herd))
     for _ in range(generations):
         parents = np.repeat(rows, CHILDREN)
@@ -118,13 +128,15 @@ def climb(
     return herd
 
 
-def _parents(name: str, subject: Subject, names: tuple[str, ...], setting: Setting, seed: int) -> Herd:
+def _parents(
+    name: str, subject: Subject, names: tuple[str, ...], setting: Setting, seed: int, sample: int
+) -> Herd:
     """The worst of a sample, by either objective, of every regime."""
     rays, scores = [], []
     for regime_name in names:
-        screen = _sample(regime_name, setting, seed)
+        screen = _sample(regime_name, setting, seed, sample)
         for objective in (False, True):
-            score = _scores(name, subject, screen, np.full(SAMPLE, objective))
+            score = _scores(name, subject, screen, np.full(sample, objective))
             worst_ones = np.argsort(-score, kind="stable")[:FAMILIES]
             rays.append(screen.rays[worst_ones])
             scores.append(score[worst_ones])
@@ -134,8 +146,8 @@ def _parents(name: str, subject: Subject, names: tuple[str, ...], setting: Setti
 
 
 @functools.cache
-def _sample(name: str, setting: Setting, seed: int) -> Screen:
-    return Screen(regimes.make(name, SAMPLE, setting.precision, seed), setting.vector)
+def _sample(name: str, setting: Setting, seed: int, count: int) -> Screen:
+    return Screen(regimes.make(name, count, setting.precision, seed), setting.vector)
 
 
 def _scores(name: str, subject: Subject, screen: Screen, decision: np.ndarray) -> np.ndarray:
@@ -263,7 +275,8 @@ def main(arguments: list[str] | None = None) -> int:
         if setting.is_scalar or setting.vector is None:
             continue
         for name in options.formulas or FORMULAS:
-            herd = climb(name, FORMULAS[name], domain(name, setting), setting, options.generations, options.seed)
+            start = options.generations, options.seed, LARGEST_SAMPLE
+            herd = climb(name, FORMULAS[name], domain(name, setting), setting, *start)
             found = certify(name, FORMULAS[name], herd, setting)
             kept = worth_keeping(found)
             broken = sum(f.share > 1 if f.line.objective == "chord" else f.share > 0 for f in found)
