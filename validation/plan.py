@@ -28,7 +28,7 @@ class Profile:
     every_formula: bool  # renders with every formula, not only the default one
     sweep_rays: int = 40_000  # per regime, screened
     certified: int = 32  # of these, per formula: the worst, and as many misjudged ones
-    generations: int = 6  # of the search
+    generations: int = 4  # of the search
 
 
 PROFILES = {
