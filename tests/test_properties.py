@@ -14,7 +14,7 @@ from mi_refract.regimes import REGIMES, Rays, make
 from validation.judge import evaluate, lengths, radicand
 from validation.mutants import EXACT, MUTANTS
 
-UNIT = [name for name, regime in REGIMES.items() if getattr(regime, "unit", True)]
+UNIT = [name for name, regime in REGIMES.items() if regime.unit]
 COUNTS = {"scalar": 12, "llvm": 256, "cuda": 256}
 # Powers of two by which `a` and `n` are scaled.
 EXPONENTS = st.integers(-12, 12)

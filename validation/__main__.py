@@ -16,7 +16,7 @@ from typing import Any
 
 # Each study by name, and the modules that make it up.
 STUDIES = {
-    "directions": ("directions", "mutants", "samples"),
+    "directions": ("directions", "mutants", "samples", "sweep", "search"),
     "stability": ("stability",),
     "renders": ("renders",),
 }
