@@ -81,9 +81,10 @@ def test_the_best_are_the_best_of_all_chunks():
     rays = Rays(np.repeat(score[:, None], 3, 1), np.zeros((1000, 3)), score)
     kept = sweep.Best(20)
     for chunk in np.array_split(np.arange(1000), 7):
-        kept.add(rays[chunk], score[chunk], score[chunk] < 0.9)
+        kept.add(rays[chunk], score[chunk], score[chunk] < 0.9, 2 * score[chunk])
     expected = np.sort(score[score < 0.9])[-20:]
     assert np.sort(kept.score).tolist() == expected.tolist() == np.sort(kept.rays.k).tolist()
+    assert (kept.chord == 2 * kept.score).all()
     assert kept.offered == np.count_nonzero(score < 0.9)
 
 

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_refract import oracle, regimes
+from mi_refract.budgets import Budget
 from mi_refract.formulas import FORMULAS
 from mi_refract.regimes import Rays
 from mi_refract.rows import Row
 
-from .judge import BUDGETS, Subject, judge
+from .judge import BUDGETS, judge
 from .plan import Context, Task
 from .screen import Screen
 from .settings import Setting, budget_of, settings
@@ -75,20 +76,22 @@ def _worst_of(rows: list[Row]) -> Row:
 
 
 class Best:
-    """The rays with the highest scores so far, at most `size`, and how many were offered."""
+    """The rays with the highest scores so far, at most `size`, with their chords, and how many were offered."""
 
     def __init__(self, size: int) -> None:
         self.size, self.offered = size, 0
         self.score: np.ndarray = np.empty(0)
+        self.chord: np.ndarray = np.empty(0)
         self._rays: list[Rays] = []
 
-    def add(self, rays: Rays, score: np.ndarray, mask: np.ndarray) -> None:
+    def add(self, rays: Rays, score: np.ndarray, mask: np.ndarray, chord: np.ndarray) -> None:
         index = np.flatnonzero(mask)
         self.offered += len(index)
         index = index[_largest(score[index], self.size)]
         score = np.concatenate([self.score, score[index]])
         best = _largest(score, self.size)
         self.score, self._rays = score[best], [Rays.joined([*self._rays, rays[index]])[best]]
+        self.chord = np.concatenate([self.chord, chord[index]])[best]
 
     @property
     def rays(self) -> Rays:
@@ -111,11 +114,11 @@ class Gathered:
     misjudged: Best
     unresolved: Best
 
-    def add(self, screen: Screen, share: np.ndarray, wrong: np.ndarray) -> None:
+    def add(self, screen: Screen, budget: Budget, chord: np.ndarray, wrong: np.ndarray) -> None:
         rays, certain = screen.rays, ~screen.doubtful
-        self.worst.add(rays, share, certain & ~wrong)
-        self.misjudged.add(rays, np.abs(screen.margin), certain & wrong)
-        self.unresolved.add(rays, wrong.astype(float), ~certain)
+        self.worst.add(rays, chord / screen.bound(budget), certain & ~wrong, chord)
+        self.misjudged.add(rays, np.abs(screen.margin), certain & wrong, chord)
+        self.unresolved.add(rays, wrong.astype(float), ~certain, chord)
 
 
 def gather(regime: str, setting: Setting, count: int, kept: int) -> dict[str, Gathered]:
@@ -127,8 +130,7 @@ def gather(regime: str, setting: Setting, count: int, kept: int) -> dict[str, Ga
         rays = regimes.make(regime, min(CHUNK, count - start), setting.precision, SEED + i)
         screen = Screen(rays, setting.vector)
         for name in names:
-            chord, wrong = screen.judge(FORMULAS[name])
-            found[name].add(screen, chord / screen.bound(budget_of(name)), wrong)
+            found[name].add(screen, budgets[name], *screen.judge(FORMULAS[name]))
     return found
 
 
@@ -148,7 +150,7 @@ def _certified_row(name: str, regime: str, setting: Setting, found: Gathered, co
         "worst / u": float(np.max(seen.chord, where=seen.right, initial=0)) / setting.roundoff,
         **({} if reason else seen.values()),
         "misjudged": float(found.misjudged.offered + (wrong & ~certain).sum()),
-        "screen off": _disagreement(FORMULAS[name], rays[certain], setting, seen.chord[certain], wrong[certain]),
+        "screen off": _disagreement(found, seen.chord[certain] / setting.roundoff, wrong[certain]),
         "rays": float(count),
         "certified": float(len(rays)),
         "unresolved": float(found.unresolved.offered - (~certain).sum()),
@@ -162,12 +164,13 @@ def _certified_row(name: str, regime: str, setting: Setting, found: Gathered, co
     return Row("sweep", name, regime, setting.label, values, budgets, reason=reason, replay=replay)
 
 
-def _disagreement(subject: Subject, rays: Rays, setting: Setting, chord: np.ndarray, wrong: np.ndarray) -> float:
-    """How far the screen is off, in u; of errors above 1e6 u, in millionths."""
-    screened, differs = Screen(rays, setting.vector).judge(subject)
-    chord = chord / setting.roundoff
-    finite = np.isfinite(screened) & ~wrong
-    if (differs != wrong).any() or (finite != np.isfinite(chord) & ~wrong).any():
+def _disagreement(found: Gathered, chord: np.ndarray, wrong: np.ndarray) -> float:
+    """How far the screen is off on the worst and the misjudged rays, in u; of errors above 1e6 u, in millionths."""
+    screened = found.worst.chord
+    if wrong[: len(screened)].any() or not wrong[len(screened) :].all():
         return np.inf
-    screened, chord = screened[finite], chord[finite]
+    finite = np.isfinite(screened)
+    if (finite != np.isfinite(chord[: len(screened)])).any():
+        return np.inf
+    screened, chord = screened[finite], chord[: len(screened)][finite]
     return float(np.max(np.abs(screened - chord) / np.maximum(1, chord / 1e6), initial=0))
