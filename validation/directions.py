@@ -103,6 +103,7 @@ def _regime_row(name: str, subject: Subject, regime: str, setting: Setting, coun
     return _row(name, regime, setting, rays, found, setting.no_budget(budget_of(name), regime))
 
 
+@np.errstate(over="ignore")
 def _row(name: str, regime: str, setting: Setting, rays: regimes.Rays, found: Judgement, reason: str = "") -> Row:
     """`reason`: why there is no budget. Then nothing is said of the share of it either."""
     u, some = setting.roundoff, found.right.any()

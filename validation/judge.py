@@ -38,6 +38,7 @@ class Judgement:
     radicand: np.ndarray
 
     @property
+    @np.errstate(over="ignore")
     def share(self) -> np.ndarray:
         """Error over bound of the rays judged rightly, 0 elsewhere."""
         return np.where(self.right, self.chord / self.bound, 0.0)
@@ -60,6 +61,7 @@ def judge(subject: Subject, rays: Rays, exact: oracle.Certified, vector: Any, bu
     return judged(*evaluate(subject, rays, vector), rays, exact, budget)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a subject may return anything
 def judged(
     b: np.ndarray, transmitted: np.ndarray, rays: Rays, exact: oracle.Certified, budget: Budget
 ) -> Judgement:
@@ -102,7 +104,7 @@ def evaluate(subject: Subject, rays: Rays, vector: Any) -> tuple[np.ndarray, np.
 def errors(b: np.ndarray, rays: Rays, exact: oracle.Certified) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(chord, angle, drift of the length) of every ray, relative to |a|; NaN counts as infinite."""
     unit, low = b / lengths(rays.a)[:, None], exact.direction_low.astype(np.longdouble)
-    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):  # a formula may return anything
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a subject may return anything
         difference = (unit - exact.direction) - low
         chord, norm = lengths(difference), lengths(unit)
         across = lengths(np.cross(unit, difference)) / norm

@@ -26,7 +26,7 @@ class Profile:
     pairs: int
     curve_spp: tuple[int, ...]  # error against run time
     every_formula: bool  # renders with every formula, not only the default one
-    sweep_rays: int = 40_000  # per regime, screened
+    sweep_rays: int = 30_000  # per regime, screened
     certified: int = 32  # of these, per formula: the worst, and as many misjudged ones
     generations: int = 4  # of the search
 
