@@ -126,3 +126,11 @@ def test_the_length_of_the_ray_itself_says_which_rounding_it_is_held_to(length, 
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
     found = judge(lambda a, n, k: (list(a), True), rays, exact, list, ROUNDING)
     assert found.bound == pytest.approx(bound * U)
+
+
+def test_a_mirrored_ray_next_to_the_surface_has_not_crossed_it():
+    rays = regimes.Rays(np.array([[1.0, 0.0, -2 * U]]), np.array([[0.0, 0.0, 1.0]]), np.array([1.5]))
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    found = judge(lambda a, n, k: ([1.0, 0.0, 3 * U], False), rays, exact, list, cancelling(1))
+    assert found.chord[0] > 0
+    assert not found.seen[0] and not found.crossed[0]

@@ -86,7 +86,7 @@ def judged(
     needed = np.where(misjudged, distance.astype(float), needed) / (u * np.maximum(1.0, k) ** budget.growth)
     linear = np.where(right & ~open_side, budget.linear * (chord - of_root) / of_terms, 0.0)
     bound = budget.chord(u, k, cos_t, through, unit, exact.cos_i)
-    crossed = open_side & right & (chord > cos_t)
+    crossed = open_side & right & through & (chord > cos_t)
     return Judgement(
         chord, angle, drift, right, misjudged, far, crossed, bound, linear, np.where(open_side, 0.0, needed)
     )
