@@ -6,6 +6,9 @@ With u the roundoff, K = max(1, k) for a transmitted ray and 1 for a reflected o
 
 because what is linear in rounded terms is off by a few u of its largest one, k; and because
 |√(D + e) − √D| = |e| / (√(D + e) + √D) ≤ ρ(x, D) for |e| ≤ x. Where |D| > x, the decision is right.
+
+A formula that knows n·a to `side` u only may take a ray as near to the surface as that for one from the other side,
+which moves b by 2 cosθ_t more, or for a tangential one: there neither is held against it.
 """
 
 from __future__ import annotations
@@ -20,17 +23,30 @@ import numpy as np
 class Budget:
     """The constants of the bound above; K = 1 where `growth` is 0.
 
-    `any_length`: `linear` where `a` or `n` is not unit; None of a formula that takes unit vectors only.
+    `any_length`: `linear` where |a| is not 1; None of a formula that takes unit vectors only.
     """
 
     linear: float
     radicand: float = 0.0
     growth: int = 0
     any_length: float | None = None
+    side: float = 0.0
 
-    def chord(self, u: Any, k: Any, cos_t: Any = 0.0, transmitted: Any = True, unit: Any = True) -> Any:
+    @property
+    def at_the_limit(self) -> bool:
+        """Whether nothing but the rounding of the exact answer is allowed, for vectors of any length."""
+        return self.any_length is not None
+
+    def chord(
+        self, u: Any, k: Any, cos_t: Any = 0.0, transmitted: Any = True, unit: Any = True, cos_i: Any = 1.0
+    ) -> Any:
         """Bound of |b/|a| − exact|; at the critical angle, where it is largest, by default."""
-        return self.of_terms(u, k, transmitted, unit) + self.of_root(u, k, cos_t, transmitted)
+        bound = self.of_terms(u, k, transmitted, unit) + self.of_root(u, k, cos_t, transmitted)
+        return bound + np.where(self.side_open(u, cos_i), 2 * cos_t, 0.0)
+
+    def side_open(self, u: Any, cos_i: Any) -> Any:
+        """Whether the ray is so near to the surface that its side is not known; never where `side` is 0."""
+        return (cos_i <= self.side * u) & (self.side > 0)
 
     def of_terms(self, u: Any, k: Any, transmitted: Any = True, unit: Any = True) -> Any:
         linear = np.where(unit, self.linear, self.any_length or self.linear)
@@ -59,6 +75,12 @@ def radicand_for(error: Any, cos_t: Any) -> Any:
 # Rounding the exact answer costs √3/2 u at most, where no component exceeds 1: half an ulp of each. What precedes it
 # is allowed a hundredth more. For other lengths half an ulp is up to u of a component: √Σ(u bᵢ)² = u |b|.
 ROUNDING = Budget(0.8724, any_length=1.005)
+# What "|a| = 1" means there: rounding its components moves a length by no more, in u.
+UNIT = 3**0.5 / 2
+# In u² of the radicand's terms: below it a decision moves b by less than its root, 4u, and may be either.
+NEGLIGIBLE = 16.0
+# In u: n·a of unit vectors by three products and two sums.
+SIDE = 4.0
 
 
 def cancelling(growth: int) -> Budget:
@@ -69,9 +91,9 @@ def cancelling(growth: int) -> Budget:
     2c δc ≤ 6u, inputs 4u, c² u, all times k², and 3u: 14uK². Linear terms: six roundings and the mirror direction's
     2c/n², 10u.
     """
-    return Budget(10, 14, growth)
+    return Budget(10, 14, growth, side=SIDE)
 
 
 # (n·a)² − κ w²: at the critical angle c² = 1 − 1/k² is off by 2c (2 + c) u + c² u, κ w² by 2κw (1 + w) u + 3κw² u + u.
 # Their sum is 6.7uK at k = 1.5, 7.3uK at k = 2.5, 4.8uK at k = 5. Both terms scale alike with |a| and |n|.
-CONTRASTING = Budget(10, 8, 1)
+CONTRASTING = Budget(10, 8, 1, side=SIDE)

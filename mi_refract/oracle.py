@@ -244,6 +244,23 @@ def _fresnel(polynomials: tuple, k: Any, root: Any, tangential: bool) -> tuple[f
     return r, float(reflectance - r), t, float(transmittance - t), float(a_s), 0.0, float(a_p), 0.0
 
 
+def margin(a: Any, n: Any, k: Any) -> np.ndarray:
+    """(N,) how far each ray is from the critical angle: D / max(c², |k²−1| |n×a|²), from −1 to 1, to 2⁻⁵³ of itself.
+
+    Exactly 0 at the critical angle, negative under total internal reflection; NaN where both terms are 0 or the ray
+    is invalid. Arguments as for `refract`.
+    """
+    a, n, k, _, valid = _inputs(a, n, k, None)
+    index, ratio = np.flatnonzero(valid), np.full(len(a), math.nan)
+    for i, ray in zip(index, _rays(a, n, k, None, index), strict=True):
+        with ctx.workprec(EXACT_BITS):
+            _, _, _, _, c2, s2, e, _, d, *_ = _exact(*ray)
+            larger = max(c2, abs(e) * s2)
+        with ctx.workprec(PRECISIONS[0]):
+            ratio[i] = float(d / larger) if larger > 0 else math.nan
+    return ratio
+
+
 def residual(a: Any, n: Any, k: Any, certified: Certified, *, contrast: Any = None) -> Residual:
     """Put a certified answer back into the law; arguments as for `refract`.
 

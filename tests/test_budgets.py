@@ -41,6 +41,12 @@ def test_a_bound_grows_with_the_ratio_where_the_ray_is_transmitted_only():
     assert budget.chord(U, 1.0, 1.0, unit=False) == budget.chord(U, 1.0, 1.0)
 
 
+def test_a_side_that_is_not_known_may_be_either():
+    open_side, known = Budget(10, side=4), Budget(10)
+    assert open_side.chord(U, 0.5, 0.8, cos_i=4 * U) == 10 * U + 1.6
+    assert open_side.chord(U, 0.5, 0.8, cos_i=5 * U) == known.chord(U, 0.5, 0.8, cos_i=0.0) == 10 * U
+
+
 @pytest.fixture(scope="module")
 def sample():
     rays = regimes.make("critical", 300, np.float64, seed=4)
@@ -88,3 +94,43 @@ def test_a_decision_far_from_the_critical_angle_is_held_against_the_subject(samp
     assert mirrored.misjudged.sum() == exact.transmitted.sum()
     assert mirrored.far.sum() == exact.transmitted.sum()  # within 1e-7 rad, the margin is 14 · 2⁻⁵³
     assert mirrored.radicand.max() > 14
+
+
+@pytest.mark.parametrize("transmitted", [True, False])
+@pytest.mark.parametrize(("side", "cos_i", "held"), [(4.0, 2 * U, False), (4.0, 32 * U, True), (0.0, 2 * U, True)])
+def test_next_to_the_surface_either_side_is_right_where_the_side_is_open(side, cos_i, held, transmitted):
+    """A ray into the denser medium that comes out on the wrong side, or is taken for a tangential one."""
+    rays = regimes.Rays(np.array([[1.0, 0.0, -cos_i]]), np.array([[0.0, 0.0, 1.0]]), np.array([0.5]))
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    x, _, z = exact.direction[0]
+    crossed = ([float(x), 0.0, -float(z)] if transmitted else list(rays.a[0])), transmitted
+    found = judge(lambda a, n, k: crossed, rays, exact, list, Budget(10, 14, 1, side=side))
+    assert found.seen.tolist() == [held]
+    assert found.crossed.tolist() == [transmitted and not held]
+
+
+@pytest.mark.parametrize(("steps", "far"), [(0, False), (1, True), (-1, True)])
+def test_at_the_limit_a_decision_is_held_to_the_terms_of_the_radicand(steps, far):
+    """sin θ = 4/5: critical at k = 5/4 exactly, and an ulp of k is 1e16 times more than what is left undecided."""
+    k = np.array([1.25 + steps * 2.0**-52])
+    rays = regimes.Rays(np.array([[4.0, 0.0, -3.0]]), np.array([[0.0, 0.0, 1.0]]), k)
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    found = judge(lambda a, n, k: (list(a), not exact.transmitted[0]), rays, exact, list, ROUNDING)
+    assert found.misjudged.tolist() == [True]
+    assert found.far.tolist() == [far]
+
+
+@pytest.mark.parametrize(("length", "bound"), [(1.0, 0.8724), (1 + 2.0**-52, 1.005), (3.0, 1.005)])
+def test_the_length_of_the_ray_itself_says_which_rounding_it_is_held_to(length, bound):
+    rays = regimes.Rays(np.array([[0.0, 0.0, -length]]), np.array([[0.0, 0.0, 1.0]]), np.array([1.5]))
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    found = judge(lambda a, n, k: (list(a), True), rays, exact, list, ROUNDING)
+    assert found.bound == pytest.approx(bound * U)
+
+
+def test_a_mirrored_ray_next_to_the_surface_has_not_crossed_it():
+    rays = regimes.Rays(np.array([[1.0, 0.0, -2 * U]]), np.array([[0.0, 0.0, 1.0]]), np.array([1.5]))
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    found = judge(lambda a, n, k: ([1.0, 0.0, 3 * U], False), rays, exact, list, cancelling(1))
+    assert found.chord[0] > 0
+    assert not found.seen[0] and not found.crossed[0]

@@ -14,7 +14,14 @@ from mi_refract.regimes import REGIMES, Rays, make
 from validation.judge import evaluate, lengths, radicand
 from validation.mutants import EXACT, MUTANTS
 
-UNIT = [name for name, regime in REGIMES.items() if getattr(regime, "unit", True)]
+
+def has_denormals(name):
+    """Those are neither scaled exactly, nor numbers other than 0 on every backend."""
+    rays = make(name, 64, np.float32)
+    return any(((v != 0) & (np.abs(v) < np.finfo(np.float32).smallest_normal)).any() for v in (rays.a, rays.n))
+
+
+UNIT = [name for name, regime in REGIMES.items() if regime.unit and not has_denormals(name)]
 COUNTS = {"scalar": 12, "llvm": 256, "cuda": 256}
 # Powers of two by which `a` and `n` are scaled.
 EXPONENTS = st.integers(-12, 12)
@@ -78,6 +85,8 @@ def reversibility(subject, budget, setting):
         # What is off: the way there, the length of b, 1/k by u.
         moved = there.bound() + there.u
         kept &= back.transmitted & ~back.undecidable(moved)
+        # Of a ray along the surface that may be its side.
+        kept &= np.abs((there.b * there.n).sum(1)) > moved
         agree(back.b, -there.a, back.bound(moved), ~kept)
 
     check()

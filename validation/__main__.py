@@ -16,8 +16,8 @@ from typing import Any
 
 # Each study by name, and the modules that make it up.
 STUDIES = {
-    "directions": ("directions", "mutants", "samples"),
-    "stability": ("stability", "energy", "derivatives"),
+    "directions": ("directions", "mutants", "samples", "sweep", "search"),
+    "stability": ("stability", "energy", "derivatives", "paths"),
     "renders": ("renders",),
 }
 

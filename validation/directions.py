@@ -9,21 +9,22 @@ copying the same bytes (a + k n). The stepped line joins the formulas that none 
 from __future__ import annotations
 
 import functools
-from typing import Any
 
 import numpy as np
 
 from mi_refract import oracle, regimes
+from mi_refract.budgets import ROUNDING
 from mi_refract.formulas import FORMULAS
 from mi_refract.rows import Row
 
 from . import timing
-from .judge import BUDGETS, Subject, errors, evaluate, judge
+from .judge import BUDGETS, Judgement, Subject, errors, evaluate, judge, judged, lengths
 from .plan import Context, Task
 from .settings import BUILTIN, Setting, budget_of, builtin, settings
 
 __all__ = ["BUILTIN", "Setting", "builtin", "certified", "errors", "evaluate", "settings", "tasks"]
 
+FLOOR = "exact, rounded"
 TITLE = "Directions"
 TEXT = __doc__.partition("\n")[2].strip()
 TERMS = (
@@ -33,7 +34,13 @@ TERMS = (
         "worst / u": "the largest chord error in units of roundoff; rounding the exact answer costs 0.87",
         "error / bound": "the largest share that an error takes of its ray's a-priori bound",
         "misjudged": "rays whose total internal reflection was decided wrongly",
-        "misjudged far": "those of them that are farther from the critical angle than the formula's own error",
+        "misjudged far": "those of them that are farther from the critical angle than the formula's own error; at the "
+        "rounding limit, those whose radicand exceeds 16u² of its terms: below, the decision moves b by 4u at most",
+        FLOOR: "the certified direction times |a|, rounded: no form does better. At most √3/2 u where |a| = 1, and 1 u "
+        "elsewhere, where all components may have just passed a power of two",
+        "other side": "rays within 4u of the surface that a documented formula sends to the other side of it, because "
+        "it knows n·a to no more; their bound is wider by 2 cosθ_t, and their decision is either",
+        "no budget": "the documented formulas demand unit vectors: where those are not, their rows are shown only",
         "length drift": "how far the length of b is from that of a, relative",
         "slack": "by how much a constant of the bound could be smaller: of what is linear, of what is under the root",
     }
@@ -74,61 +81,67 @@ def _setting_rows(context: Context, setting: Setting) -> list[Row]:
         ]
     count = context.profile.scalar_rays if setting.is_scalar else context.profile.rays
     times = timing.measure(context, setting)
-    rows = []
+    rows = [_floor_row(regime, setting, count) for regime in regimes.REGIMES]
     for name, subject in setting.subjects.items():
-        parts = [
-            _regime_row(name, subject, regime, setting, count) for regime in regimes.REGIMES if _is_for(name, regime)
-        ]
+        parts = [_regime_row(name, subject, regime, setting, count) for regime in regimes.REGIMES]
         rows += [*parts, _summary(name, parts, setting, times[name])]
-    floor = Row("directions", timing.COPY, "all regimes", setting.label, times[timing.COPY])
-    return [*rows, floor]
+    copying = Row("directions", timing.COPY, "all regimes", setting.label, times[timing.COPY])
+    return [*rows, copying]
 
 
-def _is_for(name: str, regime: str) -> bool:
-    """Vectors that are not unit are for the formulas that take them."""
-    return _is_unit(regime) or budget_of(name).any_length is not None
-
-
-def _is_unit(regime: str) -> bool:
-    return getattr(regimes.REGIMES[regime], "unit", True)
+def _floor_row(regime: str, setting: Setting, count: int) -> Row:
+    """The certified answers themselves, rounded."""
+    rays, exact = certified(regime, count, setting.precision)
+    b = (exact.direction + exact.direction_low.astype(np.longdouble)) * lengths(rays.a)[:, None]
+    b = b.astype(setting.precision).astype(np.longdouble)
+    return _row(FLOOR, regime, setting, rays, judged(b, exact.transmitted, rays, exact, ROUNDING))
 
 
 def _regime_row(name: str, subject: Subject, regime: str, setting: Setting, count: int) -> Row:
     rays, exact = certified(regime, count, setting.precision)
-    budget, u = budget_of(name), setting.roundoff
-    found = judge(subject, rays, exact, setting.vector, budget, _is_unit(regime))
-    chord, angle = found.chord[found.right], found.angle[found.right]
+    found = judge(subject, rays, exact, setting.vector, budget_of(name))
+    return _row(name, regime, setting, rays, found, setting.no_budget(budget_of(name), regime))
+
+
+@np.errstate(over="ignore")
+def _row(name: str, regime: str, setting: Setting, rays: regimes.Rays, found: Judgement, reason: str = "") -> Row:
+    """`reason`: why there is no budget. Then nothing is said of the share of it either."""
+    u, some = setting.roundoff, found.right.any()
+    chord, angle, drift = (x[found.right] if some else np.zeros(1) for x in (found.chord, found.angle, found.drift))
     values = {
-        "worst / u": float(chord.max() / u),
-        **found.values(),
+        "worst / u": float(chord.max()) / u,
+        **({} if reason else found.values()),
         "worst chord": float(chord.max()),
-        "p99 / u": float(np.quantile(chord, 0.99) / u),
-        "mean / u": float(chord.mean() / u),
+        "p99 / u": _p99(chord) / u,
+        "mean / u": float(chord.mean()) / u,
         "worst rad": float(angle.max()),
-        "p99 rad": float(np.quantile(angle, 0.99)),
+        "p99 rad": _p99(angle),
         "mean rad": float(angle.mean()),
-        "length drift": float(found.drift[found.right].max()),
+        "length drift": float(drift.max()),
         "misjudged": float(found.misjudged.sum()),
+        "other side": float(found.crossed.sum()),
     }
     worst = {"largest error": np.where(found.right, found.chord, -1), "nearest to its bound": found.share}
     replay = {
-        "regime": regime, "text": regimes.REGIMES[regime].text, "count": count, "seed": SEED,
-        **{title: _hexadecimal(rays, int(np.argmax(x))) for title, x in worst.items()},
+        "regime": regime, "text": regimes.REGIMES[regime].text, "count": len(rays), "seed": SEED,
+        **{title: rays.hexed(int(np.argmax(x))) for title, x in worst.items()},
         "needed": {"linear": float(found.linear.max()), "radicand": float(found.radicand.max())},
     }  # fmt: skip
-    return Row("directions", name, regime, setting.label, values, BUDGETS, replay=replay)
+    budgets = {} if reason else BUDGETS
+    return Row("directions", name, regime, setting.label, values, budgets, reason=reason, replay=replay)
 
 
-def _hexadecimal(rays: regimes.Rays, i: int) -> dict[str, Any]:
-    a, n = ([float(x).hex() for x in v[i]] for v in (rays.a, rays.n))
-    return {"a": a, "n": n, "k": float(rays.k[i]).hex()}
+def _p99(x: np.ndarray) -> float:
+    """What 99 of 100 stay below; one of the values, which may be infinite."""
+    return float(np.quantile(x, 0.99, method="higher"))
 
 
 def _summary(name: str, parts: list[Row], setting: Setting, times: dict[str, float]) -> Row:
-    """The worst over all regimes and what it cost: the point of a formula in the plane of error and time."""
+    """The worst over all regimes with a budget and what it cost: a point in the plane of error and time."""
+    parts = [row for row in parts if row.budgets]
     metrics = "worst / u", "error / bound", "worst chord", "worst rad", "length drift"
     values = {m: max(row.values[m] for row in parts) for m in metrics}
-    values |= {m: sum(row.values[m] for row in parts) for m in ("misjudged", "misjudged far")}
+    values |= {m: sum(row.values[m] for row in parts) for m in ("misjudged", "misjudged far", "other side")}
     budgets = {}
     if min(row.replay["count"] for row in parts) >= TWO_SIDED:
         slack = _slack(name, parts)

@@ -12,8 +12,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract import oracle
-from mi_refract.budgets import Budget, radicand_for
+from mi_refract import expansions, oracle
+from mi_refract.budgets import NEGLIGIBLE, UNIT, Budget, radicand_for
 from mi_refract.regimes import Rays
 
 Subject = Callable[[Any, Any, Any], tuple[Any, Any]]
@@ -31,12 +31,14 @@ class Judgement:
     drift: np.ndarray  # of the length of b from that of a, relative
     right: np.ndarray
     misjudged: np.ndarray
-    far: np.ndarray  # misjudged although |1 − k² sin²θ| exceeds the budget's margin
+    far: np.ndarray  # misjudged although the radicand exceeds what the budget leaves undecided
+    crossed: np.ndarray  # on the other side of the surface, where the budget leaves the side open
     bound: np.ndarray  # of the chord
     linear: np.ndarray
     radicand: np.ndarray
 
     @property
+    @np.errstate(over="ignore")
     def share(self) -> np.ndarray:
         """Error over bound of the rays judged rightly, 0 elsewhere."""
         return np.where(self.right, self.chord / self.bound, 0.0)
@@ -54,24 +56,40 @@ class Judgement:
 BUDGETS = {"error / bound": 1.0, "misjudged far": 0.0}
 
 
-def judge(
-    subject: Subject, rays: Rays, exact: oracle.Certified, vector: Any, budget: Budget, unit: Any = True
+def judge(subject: Subject, rays: Rays, exact: oracle.Certified, vector: Any, budget: Budget) -> Judgement:
+    """`subject` on all rays, in arrays of the 3-vector type `vector`."""
+    return judged(*evaluate(subject, rays, vector), rays, exact, budget)
+
+
+@np.errstate(over="ignore", invalid="ignore")  # a subject may return anything
+def judged(
+    b: np.ndarray, transmitted: np.ndarray, rays: Rays, exact: oracle.Certified, budget: Budget
 ) -> Judgement:
-    """`subject` on all rays, in arrays of the 3-vector type `vector`; `unit`: |a| = |n| = 1 but for rounding."""
-    b, transmitted = evaluate(subject, rays, vector)
+    """What a subject returned, in extended precision."""
     chord, angle, drift = errors(b, rays, exact)
     misjudged = (transmitted != exact.transmitted) & ~exact.undecided
     right, distance = ~misjudged & ~exact.undecided, radicand(rays)
     u: Any = float(np.finfo(rays.a.dtype).eps) / 2
-    if budget.any_length is None:  # what unit vectors are off by, the result is off by
-        u = np.maximum(u, np.maximum(*(np.abs(lengths(v) - 1) for v in (rays.a, rays.n))).astype(float))
     k, cos_t, through = rays.k.astype(float), exact.cos_t, exact.transmitted
+    off = [np.abs(lengths(v) - 1) for v in (rays.a, rays.n)]
+    unit = off[0] <= UNIT * u
+    if not budget.at_the_limit:  # what unit vectors are off by, the result is off by
+        u = np.maximum(u, np.maximum(*off)).astype(float)
+    open_side = budget.side_open(u, exact.cos_i)
+    far = misjudged & ~open_side
+    if budget.at_the_limit:
+        far[far] = ~(margin(rays[far]) <= NEGLIGIBLE * u * u)
+    else:
+        far &= distance > budget.margin(u, k)
     of_terms, of_root = budget.of_terms(u, k, through, unit), budget.of_root(u, k, cos_t, through)
     needed = np.where(through, radicand_for(np.maximum(chord - of_terms, 0), cos_t), 0.0)
     needed = np.where(misjudged, distance.astype(float), needed) / (u * np.maximum(1.0, k) ** budget.growth)
-    linear = np.where(right, budget.linear * (chord - of_root) / of_terms, 0.0)
-    far = misjudged & (distance > budget.margin(u, k))
-    return Judgement(chord, angle, drift, right, misjudged, far, of_terms + of_root, linear, needed)
+    linear = np.where(right & ~open_side, budget.linear * (chord - of_root) / of_terms, 0.0)
+    bound = budget.chord(u, k, cos_t, through, unit, exact.cos_i)
+    crossed = open_side & right & through & (chord > cos_t)
+    return Judgement(
+        chord, angle, drift, right, misjudged, far, crossed, bound, linear, np.where(open_side, 0.0, needed)
+    )
 
 
 def evaluate(subject: Subject, rays: Rays, vector: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -86,11 +104,12 @@ def evaluate(subject: Subject, rays: Rays, vector: Any) -> tuple[np.ndarray, np.
 def errors(b: np.ndarray, rays: Rays, exact: oracle.Certified) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(chord, angle, drift of the length) of every ray, relative to |a|; NaN counts as infinite."""
     unit, low = b / lengths(rays.a)[:, None], exact.direction_low.astype(np.longdouble)
-    difference = (unit - exact.direction) - low
-    chord, norm = lengths(difference), lengths(unit)
-    across = lengths(np.cross(unit, difference)) / norm
-    angle = np.arctan2(across, norm - (unit * difference).sum(1) / norm)
-    chord, angle, drift = (np.nan_to_num(x.astype(float), nan=np.inf) for x in (chord, angle, np.abs(norm - 1)))
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a subject may return anything
+        difference = (unit - exact.direction) - low
+        chord, norm = lengths(difference), lengths(unit)
+        across = lengths(np.cross(unit, difference)) / norm
+        angle = np.arctan2(across, norm - (unit * difference).sum(1) / norm)
+        chord, angle, drift = (np.nan_to_num(x.astype(float), nan=np.inf) for x in (chord, angle, np.abs(norm - 1)))
     return chord, angle, drift
 
 
@@ -98,6 +117,16 @@ def radicand(rays: Rays) -> np.ndarray:
     """|1 − k² sin²θ_i| of every ray, in extended precision: how far the decision is from the critical angle."""
     a, n, k = (x.astype(np.longdouble) for x in (rays.a, rays.n, rays.k))
     return np.abs(1 - (k * lengths(np.cross(n, a)) / (lengths(a) * lengths(n))) ** 2)
+
+
+def margin(rays: Rays) -> np.ndarray:
+    """|(n·a)² − κ|n×a|²| of every ray, over the mean of the two terms, right to 2⁻¹⁴⁰; NaN where both are 0.
+
+    Near the critical angle, where the terms are alike, it is |`oracle.margin`|.
+    """
+    _, d, terms = expansions.radicand(*(x.T.astype(np.float64) for x in (rays.a, rays.n, rays.k)))
+    with np.errstate(invalid="ignore"):
+        return np.abs(d[0]) / (terms / 2)
 
 
 def lengths(v: np.ndarray) -> np.ndarray:

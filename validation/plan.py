@@ -26,11 +26,14 @@ class Profile:
     pairs: int
     curve_spp: tuple[int, ...]  # error against run time
     every_formula: bool  # renders with every formula, not only the default one
+    sweep_rays: int = 30_000  # per regime, screened
+    certified: int = 32  # of these, per formula: the worst, and as many misjudged ones
+    generations: int = 4  # of the search
 
 
 PROFILES = {
     "quick": Profile("quick", 4000, 150, 1 << 21, 11, 128, 16, 8, (1, 4, 16), False),
-    "full": Profile("full", 100_000, 1000, 1 << 22, 21, 192, 32, 8, (1, 4, 16, 64), True),
+    "full": Profile("full", 100_000, 1000, 1 << 22, 21, 192, 32, 8, (1, 4, 16, 64), True, 10_000_000, 300, 1000),
 }
 # Where only scalar variants run, a render costs a hundred times as much.
 SCALAR_PROFILES = {

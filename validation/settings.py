@@ -11,6 +11,7 @@ import numpy as np
 
 from mi_refract.budgets import Budget
 from mi_refract.formulas import FORMULAS
+from mi_refract.regimes import REGIMES
 
 from .judge import Subject
 from .plan import Context
@@ -43,6 +44,21 @@ class Setting:
     @property
     def is_scalar(self) -> bool:
         return self.backend == "scalar"
+
+    @functools.cached_property
+    def flushes(self) -> bool:
+        """Whether denormal numbers are taken for 0, which Dr.Jit's threads do. Asked of the array, not presumed."""
+        if self.is_scalar:
+            return False
+        least = np.full(1 << 16, np.finfo(self.precision).smallest_subnormal)
+        return not np.array(dr.value_t(self.vector)(least) > 0).all()
+
+    def no_budget(self, budget: Budget, regime: str) -> str:
+        """Why a formula is not held to its budget in a regime; "" where it is."""
+        entry = REGIMES[regime]
+        if entry.rests_on_denormals and self.flushes:
+            return "no budget: this backend takes denormal numbers for 0"
+        return "" if entry.unit or budget.at_the_limit else "no budget: a and n are not unit"
 
     @property
     def subjects(self) -> dict[str, Subject]:

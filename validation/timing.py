@@ -24,6 +24,7 @@ from .settings import PLAIN, Setting
 
 COPY = "copy"
 SEED = 2026
+DIFFERENT = 1 << 16  # rays; the rest of a stream repeats them
 TERMS = {
     "time / copy": "median time of a ray over that of copying its bytes, streaming; low, high: its 95 % interval",
     "time / plain": f"the same over the time of `{PLAIN}`",
@@ -90,7 +91,7 @@ def interval(metric: str, x: list[float]) -> dict[str, float]:
 
 def _inputs(setting: Setting, count: int) -> Any:
     """(a, n, k) of generic rays: arrays in memory, or a list of single rays."""
-    rays = regimes.make("generic", count, setting.precision, SEED)
+    rays = regimes.make("generic", min(count, DIFFERENT), setting.precision, SEED)[np.arange(count) % DIFFERENT]
     vector = setting.vector
     if setting.is_scalar:
         return [(vector(a), vector(n), float(k)) for a, n, k in zip(rays.a, rays.n, rays.k, strict=True)]
