@@ -108,10 +108,12 @@ def plugin_class(v: Any) -> type:
             self.m_flags = self.m_components[0] | self.m_components[1]
 
         def _face(self, eta: Any, contrast: Any) -> None:
-            """Set both sides from eta and eta² − 1. Opaque: an edit changes the data of a kernel and not its code."""
-            self.k_outer, self.contrast_outer = wide(1 / eta), wide(-contrast / (eta * eta))
-            self.k_inner, self.contrast_inner = wide(eta), wide(contrast)
-            dr.make_opaque(self.eta, self.k_outer, self.contrast_outer, self.k_inner, self.contrast_inner)
+            """Set eta and eta² − 1, in float64. Opaque: an edit changes the data of a kernel and not its code.
+
+            A kernel reads each number with a gather, so there are no more than save it a division.
+            """
+            self.k_inner, self.k_outer, self.contrast_inner = wide(eta), wide(1 / eta), wide(contrast)
+            dr.make_opaque(self.eta, self.k_inner, self.k_outer, self.contrast_inner)
 
         def traverse(self, cb: Any) -> None:
             cb.put("eta", self.eta, mi.ParamFlags.Differentiable)
@@ -162,9 +164,10 @@ def plugin_class(v: Any) -> type:
         def _refract(self, wi: Any) -> Ray:
             """The ray's side, refracted direction and reflectance. The normal is a literal: Dr.Jit folds it away."""
             a, outside = -wi, wi.z >= 0
+            contrast_outer = -self.contrast_inner * self.k_outer * self.k_outer
             side = Side(
                 dr.select(outside, self.k_outer, self.k_inner),
-                dr.select(outside, self.contrast_outer, self.contrast_inner),
+                dr.select(outside, contrast_outer, self.contrast_inner),
             )
             # Unchecked: the ratio is checked where it is set, and NaN stays NaN.
             wo, transmitted = self.formula.unchecked(a, v.Vector3f(0, 0, 1), side.k, side.contrast)

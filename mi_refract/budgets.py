@@ -16,7 +16,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
+
+def _numpy() -> Any:
+    """Once a bound is asked for: the package and its plugin do without."""
+    import numpy
+
+    return numpy
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,7 @@ class Budget:
         self, u: Any, k: Any, cos_t: Any = 0.0, transmitted: Any = True, unit: Any = True, cos_i: Any = 1.0
     ) -> Any:
         """Bound of |b/|a| − exact|; at the critical angle, where it is largest, by default."""
+        np = _numpy()
         bound = self.of_terms(u, k, transmitted, unit) + self.of_root(u, k, cos_t, transmitted)
         return bound + np.where(self.side_open(u, cos_i), 2 * cos_t, 0.0)
 
@@ -49,19 +55,23 @@ class Budget:
         return (cos_i <= self.side * u) & (self.side > 0)
 
     def of_terms(self, u: Any, k: Any, transmitted: Any = True, unit: Any = True) -> Any:
+        np = _numpy()
         linear = np.where(unit, self.linear, self.any_length or self.linear)
         return linear * u * np.where(transmitted & (self.growth > 0), np.maximum(1.0, k), 1.0)
 
     def of_root(self, u: Any, k: Any, cos_t: Any, transmitted: Any = True) -> Any:
+        np = _numpy()
         return np.where(transmitted, root(self.margin(u, k), cos_t), 0.0)
 
     def margin(self, u: Any, k: Any) -> Any:
         """Bound of the error of the radicand, which |1 − k² sin²θ| must exceed for the decision to be right."""
+        np = _numpy()
         return self.radicand * u * np.maximum(1.0, k) ** self.growth
 
 
 def root(x: Any, cos_t: Any) -> Any:
     """ρ(x, cos²θ_t): how far √ moves when its argument is off by x."""
+    np = _numpy()
     rest = np.sqrt(np.maximum(cos_t * cos_t - x, 0))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.fmin(np.sqrt(x), x / (cos_t + rest))
@@ -69,6 +79,7 @@ def root(x: Any, cos_t: Any) -> Any:
 
 def radicand_for(error: Any, cos_t: Any) -> Any:
     """The x with ρ(x, cos²θ_t) = `error`."""
+    np = _numpy()
     return np.where(error <= cos_t, error * (2 * cos_t - error), error * error)
 
 

@@ -394,7 +394,8 @@ def test_length_of_the_ray_cancels(vectorised):
 
 
 def test_the_powers_of_the_plugin_are_a_short_kernel(vectorised):
-    """Operations of the kernel that turns (a, b, mask, k, κ) into R and T; the κ/d² form it replaced had 53."""
+    """Operations of the kernel that turns (a, b, mask, k, κ) into R and T; the κ/d² form it replaced had 53. A division
+    takes as long as eight others, and there is one."""
     if vectorised.name != "float32":
         pytest.skip("the plugin's precision is float32")
     number = dr.value_t(vectorised.vector)
@@ -405,4 +406,4 @@ def test_the_powers_of_the_plugin_are_a_short_kernel(vectorised):
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         dr.eval(fresnel.local_powers(a, b, transmitted, x[4], x[5]))
-        assert max(entry.get("operation_count", 0) for entry in dr.kernel_history()) <= 44
+        assert max(entry.get("operation_count", 0) for entry in dr.kernel_history()) <= 47

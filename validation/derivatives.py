@@ -88,12 +88,12 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
 def inputs(count: int, precision: type) -> Inputs:
     """Unit rays of all regimes that have derivatives: neither tangential nor exactly critical."""
     names = [name for name, regime in regimes.REGIMES.items()
-             if getattr(regime, "unit", True) and not getattr(regime, "rests_on_denormals", False)]  # fmt: skip
+             if regime.unit and not regime.rests_on_denormals]  # fmt: skip
     parts = [regimes.make(name, count, precision, SEED) for name in names]
     a, n, k = (np.concatenate([getattr(part, x) for part in parts]) for x in ("a", "n", "k"))
     regime = np.repeat(names, count)
     certified = oracle.refract(a, n, k, progress=False, fresnel=False)
-    wide = regimes.normalised(a) if hasattr(regimes, "normalised") else regimes._unit(a.astype(np.longdouble))
+    wide = regimes.normalised(a)
     across = np.cross(n.astype(np.longdouble), wide)
     normal = (np.abs(across).max(1) == 0)[:, None]
     across = np.where(normal, np.cross(wide, np.roll(wide, 1, axis=1)), across)

@@ -69,7 +69,7 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
 
 def cases() -> list[str]:
     """Regimes but those whose rays rest on denormal numbers: where a backend takes those for 0 they are other rays."""
-    return [name for name, regime in regimes.REGIMES.items() if not getattr(regime, "rests_on_denormals", False)]
+    return [name for name, regime in regimes.REGIMES.items() if not regime.rests_on_denormals]
 
 
 # Against certified values --------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ from .settings import Setting, settings
 TITLE = "Mutants"
 TEXT = __doc__.partition("\n")[2].strip()
 SEED = 2028
-COUNT, SCALAR_COUNT = 400, 20  # rays per regime
+COUNT, SCALAR_COUNT = 400, 60  # rays per regime
 EXACT = tuple(name for name, formula in FORMULAS.items() if formula.takes_contrast)
 
 

@@ -123,8 +123,12 @@ def _at_the_limit() -> list[str]:
 
 def _times(profile: Profile, cameras: dict[str, Camera]) -> dict[str, float]:
     """Values "time / dielectric" of the first camera, and by name of the others; the built-in's is not shown."""
+    import mitsuba as mi
+
     _, seconds = cameras[BUILTIN](profile.spp, seed=0)
-    spp = profile.spp * 2 ** max(0, math.ceil(math.log2(TIMED / seconds)))
+    spp = profile.spp
+    if dr.is_jit_v(mi.Float):  # a scalar plugin costs calls per sample: no number of them outweighs those
+        spp *= 2 ** max(0, math.ceil(math.log2(TIMED / seconds)))
     found = timing.rounds(cameras, lambda camera: camera(spp, seed=0)[1], profile.repeats)
     ours = [name for name in cameras if name != BUILTIN]
     values = {"timed renders": float(profile.repeats), "timed spp": float(spp)}
