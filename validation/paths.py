@@ -43,7 +43,7 @@ TERMS = {
     "pixels off, control": "the same between two formulas at the rounding limit: what flipped lobes alone do",
 }
 AXES = {"x": "distance, or mrad of entry", "y": "deviation", "x_scale": "linear", "y_scale": "log", "slope": None}
-STUDY = "stability"
+STUDY = "paths"
 BUILTIN = "dielectric"
 SCALAR = "needs a compiled variant: on scalar arrays formulas compute in double precision"
 SEED = 2028
