@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from . import fresnel
 from .formulas import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, resolve
-from .numerics import quotient
+from .numerics import attach, quotient
 
 PLUGIN = "refract"
 LOBES = ("specular_reflectance", "specular_transmittance")  # tint of the reflected and of the transmitted lobe
@@ -72,10 +72,6 @@ def _named_ior(name: str, material: str) -> float:
         raise ValueError(f"{PLUGIN}: {name} = {material!r}: unknown material; accepted: {known.strip()}") from None
     # The table holds decimal numbers of at most seven digits in float32: the shortest decimal gives them back.
     return float(f"{single:.7g}")
-
-
-# Dr.Jit's type stub says that it returns nothing.
-_attach: Any = dr.replace_grad
 
 
 def plugin_class(v: Any) -> type:
@@ -178,7 +174,7 @@ def plugin_class(v: Any) -> type:
         @staticmethod
         def _attached(value: Any) -> Any:
             """1, with the derivative of log `value`: the choice of a lobe is detached, its probability is not."""
-            return _attach(v.Float(1), value / dr.detach(value)) if dr.grad_enabled(value) else 1
+            return attach(v.Float(1), value / dr.detach(value)) if dr.grad_enabled(value) else 1
 
         def _mueller(self, ctx: Any, si: Any, bs: Any, ray: Ray, selected_r: Any) -> Any:
             """The Mueller matrix of the selected lobe, turned into the implicit Stokes bases of both directions."""

@@ -85,11 +85,13 @@ def radicand_for(error: Any, cos_t: Any) -> Any:
 
 # Rounding the exact answer costs √3/2 u at most, where no component exceeds 1: half an ulp of each. What precedes it
 # is allowed a hundredth more. For other lengths half an ulp is up to u of a component: √Σ(u bᵢ)² = u |b|.
+# The promoted form can be off by 0.6u more where the radicand is below 2⁻⁴⁴ of its terms; no ray found is beyond this.
 ROUNDING = Budget(0.8724, any_length=1.005)
 # What "|a| = 1" means there: rounding its components moves a length by no more, in u.
 UNIT = 3**0.5 / 2
-# In u² of the radicand's terms: below it a decision moves b by less than its root, 4u, and may be either.
-NEGLIGIBLE = 16.0
+# In u² of the radicand's terms: below it a decision moves b by less than its root, u, and may be either. What the forms
+# need is 0.32u² (promoted, in float32) and 500u³.
+NEGLIGIBLE = 1.0
 # In u: n·a of unit vectors by three products and two sums.
 SIDE = 4.0
 

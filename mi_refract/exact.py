@@ -17,9 +17,10 @@ decided as the exact inputs decide it wherever ρ > ε, and the root is off by �
     promoted      ε ≤ 10·2⁻⁵³ < 2⁻⁴⁹ in float32, so 0.08u where ρ > 2⁻⁴⁴ and 0.6u at the critical angle itself;
                   in float64 it is the compensated form
 
-so both are at the rounding limit wherever ρ > 2⁻⁴⁴, and the first everywhere. It takes inputs made for it to be nearer:
-of random ones near the critical angle one in 10⁹. There the refracted ray is within 2⁻²² cosθ of the surface and
-carries T ≈ 2 (k + 1/k) √ρ of the power, less than 2e-6 for k ≤ 2.5.
+so both are at the rounding limit wherever ρ > 2⁻⁴⁴, and the first everywhere. That is for an exact k; a `contrast` that
+is wider than a pair is rounded to one, and then ε ≤ u². It takes inputs made for it to be nearer: of random ones near
+the critical angle one in 10⁹. There the refracted ray is within 2⁻²² cosθ of the surface and carries
+T ≈ 2 (k + 1/k) √ρ of the power, less than 2e-6 for k ≤ 2.5.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from typing import Any
 import drjit as dr
 
 from . import numerics
-from .numerics import Double, Expansion, component_of, quotient, two_sum
+from .numerics import Double, Expansion, attach, component_of, quotient, two_sum
 
 Refracted = tuple[Any, Any]
 
@@ -108,18 +109,17 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
     transmitted = (radicand.hi >= 0) & (c.hi != 0)
     root, scale = radicand.sqrt(), dr.select(transmitted, k, 1)
     if axis:
-        along = dr.select(transmitted, dr.mulsign(root.rounded(), c.hi), -c.hi)
+        onward = dr.mulsign(root.rounded(), c.hi)
+        # c² may have underflowed: κ = 0 leaves c to the last bit, but with the derivative of the root.
+        exact = dr.select(kappa.hi == 0, c.hi, onward)
+        along = dr.select(transmitted, attach(exact, onward) if dr.grad_enabled(onward) else exact, -c.hi)
         return _along_axis(a, axis, scale, along), transmitted
     root = Double(dr.mulsign(root.hi, c.hi), dr.mulsign(root.lo, c.hi))
     b = _correct(type(a), n, [w_i.pair * scale for w_i in w], numerics.select(transmitted, root, -c.pair))
     # To the last bit where the answer is `a`, but with the derivative of b, which is not that of `a`. Where `n` is no
     # normal b is NaN, and stays so.
     exact = dr.select(((kappa.hi == 0) | (c.hi == 0)) & (b[0] == b[0]), a, b)
-    return (_attach(exact, b) if dr.grad_enabled(b) else exact), transmitted
-
-
-# Dr.Jit's type stub says that it returns nothing.
-_attach: Any = dr.replace_grad
+    return (attach(exact, b) if dr.grad_enabled(b) else exact), transmitted
 
 
 def _correct(vector: type, n: Any, around: list[Double], along: Double) -> Any:

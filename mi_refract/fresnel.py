@@ -12,7 +12,8 @@ of the incident vector cancels. Signs follow Verdet's convention, as in Mitsuba.
 Optics, 1.5; R : T, from cos(θᵢ ± θₜ) = P ∓ Q and r_p/r_s = −(P − Q)/(P + Q): this project.
 
 float32 is computed in float64 and rounded once; float64 in double words. Arguments are Dr.Jit numbers of one precision
-and any backend, or Python floats, which are float64. NaN in gives NaN out. Precondition: k from 1e-9 to 1e9.
+and any backend, or Python floats, which are float64. NaN in gives NaN out. Precondition: k from 1e-9 to
+1e9; in float64 cosines above 1e-150, or 0.
 """
 
 from __future__ import annotations
@@ -102,6 +103,9 @@ def _powers(c: Any, y: Any, mirror: Any, sin2: Any, k: Any, kappa: Any) -> tuple
     right to 3.12u and T to 2u. For this the denominator of R is a sum (the square it is equal to would make it 4),
     and that of T the square (the sum: 3, and sin²θᵢ would count, which a cosine near 1 does not know).
     """
+    if isinstance(c, Double):
+        # Of float64 cosines below 1e-75 have fourth powers that underflow. Where κ = 0 they do not matter.
+        c, y = (Double(dr.select((kappa.hi == 0) & (x.hi > 0), 1, x.hi), x.lo) for x in (c, y))
     p, q = c * y, k * sin2
     d_s, d_p = _fma(k, c, y), _fma(k, y, c)
     r = _fma(kappa * kappa, _fma(q, q, p * p), mirror)

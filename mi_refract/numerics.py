@@ -35,8 +35,9 @@ def quotient(x: Any, y: Any) -> Any:
     return x / y
 
 
-# Dr.Jit's type stub says that it returns an object.
+# Dr.Jit's type stubs say that the first returns an object, and nothing of what the second returns.
 _reinterpret: Any = dr.reinterpret_array
+attach: Any = dr.replace_grad
 
 
 def near_unit(v: Any) -> tuple[Any, Any]:
@@ -145,10 +146,11 @@ def select(mask: Any, x: Double, y: Double) -> Double:
 
 @dataclass(frozen=True)
 class Expansion:
-    """A number to the third order in u: hi, plus the sum of `first`, each ≤ 3u |hi|, plus `second`, ≤ 20u² |hi|.
+    """A number to the third order in u: hi, plus the sum of `first`, each of order u, plus `second`, of order u².
 
-    What is added up only where two expansions meet loses nothing before: sums and products keep every error of first
-    order as a term of its own. `second` is a plain sum, so each of the operations here has a relative error ≤ 100u³.
+    Sums and products keep every error of first order as a term of its own and add up those of second order plainly. As
+    long as nothing has cancelled |first| ≤ 5u |hi| and |second| ≤ 100u² |hi|, so each operation here is right to 100u³
+    of its larger operand. Nothing may underflow at the third order.
     """
 
     hi: Any

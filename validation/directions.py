@@ -35,7 +35,7 @@ TERMS = (
         "error / bound": "the largest share that an error takes of its ray's a-priori bound",
         "misjudged": "rays whose total internal reflection was decided wrongly",
         "misjudged far": "those of them that are farther from the critical angle than the formula's own error; at the "
-        "rounding limit, those whose radicand exceeds 16u² of its terms: below, the decision moves b by 4u at most",
+        "rounding limit, those whose radicand exceeds u² of its terms: below, the decision moves b by u at most",
         FLOOR: "the certified direction times |a|, rounded: no form does better. At most √3/2 u where |a| = 1, and 1 u "
         "elsewhere, where all components may have just passed a power of two",
         "other side": "rays within 4u of the surface that a documented formula sends to the other side of it, because "

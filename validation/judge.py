@@ -50,10 +50,15 @@ class Judgement:
 
     def values(self) -> dict[str, float]:
         """What a budget is set on: every one of them at most `BUDGETS`."""
-        return {"error / bound": float(self.share.max()), "misjudged far": float(self.far.sum())}
+        undecided = ~self.right & ~self.misjudged  # by the oracle; it leaves no float so
+        return {
+            "error / bound": float(self.share.max()),
+            "misjudged far": float(self.far.sum()),
+            "undecided": float(undecided.sum()),
+        }
 
 
-BUDGETS = {"error / bound": 1.0, "misjudged far": 0.0}
+BUDGETS = {"error / bound": 1.0, "misjudged far": 0.0, "undecided": 0.0}
 
 
 def judge(subject: Subject, rays: Rays, exact: oracle.Certified, vector: Any, budget: Budget) -> Judgement:

@@ -252,6 +252,18 @@ def worth_keeping(found: Iterable[Certified]) -> list[Found]:
     return [f.line for f in found if f.share > WORTH_KEEPING[budget_of(f.line.formula).at_the_limit]]
 
 
+def rescored(name: str, setting: Setting) -> list[Found]:
+    """The lines of the file for `name` in that precision, with the scores of the formula as it is now."""
+    precision = np.dtype(setting.precision).name
+    lines = [line for line in worst.read() if (line.formula, line.precision) == (name, precision)]
+    rays, u = worst.rays_of(lines, precision), setting.roundoff
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    seen = judge(FORMULAS[name], rays, exact, setting.vector, budget_of(name))
+    far = np.where(seen.misjudged, np.abs(oracle.margin(rays.a, rays.n, rays.k)) / u**2, 0.0)
+    scores = {"chord": seen.chord / u, "decision": far}
+    return [line.scored(float(scores[line.objective][i])) for i, line in enumerate(lines)]
+
+
 # By hand -------------------------------------------------------------------------------------------------------
 
 
@@ -275,7 +287,7 @@ def main(arguments: list[str] | None = None) -> int:
             broken = sum(f.share > 1 if f.line.objective == "chord" else f.share > 0 for f in found)
             print(f"{setting.label}, {name}: {max(f.share for f in found):.3g} of its bound, {broken} rays over it")
             if options.keep:
-                print(f"  {worst.keep(kept)} new lines")
+                print(f"  {worst.keep([*rescored(name, setting), *kept])} new lines")
     return 0
 
 

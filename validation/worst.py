@@ -2,13 +2,14 @@
 
 `precision | formula | regime | objective | score | a | n | k`, with hexadecimal floats. The objective is "chord",
 scored by the certified chord error in u, or "decision": total internal reflection that the formula decided wrongly,
-scored by |D| in u² of the radicand's terms (`oracle.margin`). The score is that of the formula as it was on the day.
+scored by |D| in u² of the radicand's terms (`oracle.margin`), or 0 once it is decided rightly. Adding rays scores the
+present ones anew, so that what the formula does today decides which are kept.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 
@@ -39,6 +40,9 @@ class Found:
         ray = rays.hexed(i)
         numbers = *ray["a"], *ray["n"], ray["k"]
         return cls(rays.k.dtype.name, formula, regime, objective, float(f"{score:.4g}"), numbers)
+
+    def scored(self, score: float) -> Found:
+        return replace(self, score=float(f"{score:.4g}"))
 
     @property
     def group(self) -> tuple[str, ...]:
@@ -74,7 +78,7 @@ def rays_of(found: Iterable[Found], precision: str) -> Rays:
 def keep(found: Iterable[Found], path: Path = PATH) -> int:
     """Merge into the file: no ray twice, sorted, the MOST worst of every group. Returns how many lines are new."""
     before = read(path)
-    unique = {(line.group, line.numbers): line for line in (*found, *before)}
+    unique = {(line.group, line.numbers): line for line in (*before, *found)}
     ordered = sorted(unique.values(), key=lambda line: (*line.group, -line.score, line.numbers))
     kept = [line for _, lines in groupby(ordered, key=lambda line: line.group) for line in list(lines)[:MOST]]
     header = ["# " + line if line else "#" for line in __doc__.strip().splitlines()]
