@@ -208,7 +208,7 @@ def test_a_plugin_that_gives_too_much_is_seen(case, weight, context, monkeypatch
 def test_derivatives_hold_for_the_forms_at_the_limit_and_are_measured_for_all(context):
     for setting in compiled(context):
         rows = by_case(derivatives.setting_rows(context, setting))
-        limit = {name for name, formula in FORMULAS.items() if formula.takes_contrast}
+        limit = {name for name, formula in FORMULAS.items() if formula.budget.at_the_limit}
         for (subject, _), row in rows.items():
             assert row.verdict == ("pass" if subject in limit | {"powers"} else "info"), (row.name, row.values)
         assert {subject for subject, _ in rows} == {*FORMULAS, "powers", "the problem"}

@@ -14,7 +14,7 @@ from validation.judge import BUDGETS, evaluate, judge
 from validation.settings import Setting
 
 COUNTS = {"scalar": 25, "llvm": 4000, "cuda": 4000}
-EXACT = [name for name, formula in FORMULAS.items() if formula.takes_contrast]
+EXACT = [name for name, formula in FORMULAS.items() if formula.budget.at_the_limit]
 # The regimes that do not choose or change their normals.
 AROUND_A_NORMAL = [name for name, entry in REGIMES.items() if isinstance(entry.build, functools.partial)]
 Z = [0.0, 0.0, 1.0]

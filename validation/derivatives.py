@@ -156,7 +156,7 @@ def formula_rows(
     found, transmitted = differentiate(formula, given, setting)
     right, rows = transmitted == given.certified.transmitted, []
     curve: list[tuple[float, float]] = []
-    budgets = {"error / condition": LIMIT, "not finite": 0.0} if FORMULAS[name].takes_contrast else {}
+    budgets = {"error / condition": LIMIT, "not finite": 0.0} if FORMULAS[name].budget.at_the_limit else {}
     for case, exact in given.exact.items():
         error = lengths(found[case] - exact) / np.maximum(1, lengths(exact))
         rows.append(row(name, case, error, given, setting, right, budgets))

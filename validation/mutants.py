@@ -30,7 +30,7 @@ TITLE = "Mutants"
 TEXT = __doc__.partition("\n")[2].strip()
 SEED = 2028
 COUNT, SCALAR_COUNT = 400, 20  # rays per regime
-EXACT = tuple(name for name, formula in FORMULAS.items() if formula.takes_contrast)
+EXACT = tuple(name for name, formula in FORMULAS.items() if formula.budget.at_the_limit)
 
 
 @dataclass(frozen=True)

@@ -118,7 +118,7 @@ def _at_the_limit() -> list[str]:
     import mitsuba as mi
 
     default = automatic(dr.backend_v(mi.Float))
-    return [f"{PLUGIN}_{name}" for name, formula in FORMULAS.items() if formula.takes_contrast and name != default]
+    return [f"{PLUGIN}_{name}" for name, formula in FORMULAS.items() if formula.budget.at_the_limit and name != default]
 
 
 def _times(profile: Profile, cameras: dict[str, Camera]) -> dict[str, float]:
