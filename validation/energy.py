@@ -37,8 +37,8 @@ TERMS = {
     "R / u, 1 − R / u, r_s / u, r_p / u": "the largest relative errors, in units of roundoff",
     "phase / u": "under total internal reflection, the largest distance from the exact point of the unit circle",
     "R + T − 1 / u": "the largest deviation from 1",
-    "nearer than rounding": "rays whose radicand is below 0.32u of its larger term, where its own error moves T by more "
-    "than u/2; the errors leave them out",
+    "nearer than rounding": "rays whose radicand is below 0.32u of its larger term, where its own error may move T by "
+    "more than u/2; the errors leave them out",
     "T there and back / u": "T(θi, k) over T(θt, 1/k), less 1: light takes the same way back",
     "weights in and out / u": "the plugin's weight of radiance that enters over n², times that of leaving, less 1",
     "outside, inside": "the share of diffuse light that is reflected or not, relative, against its closed form; from "
@@ -194,7 +194,7 @@ def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray
 
 
 def resolved(a: np.ndarray, k: np.ndarray, exact: oracle.Certified, u: float) -> np.ndarray:
-    """Whether an error of RADICAND moves T by less than u/2: of ρ, the radicand over its larger term, it is ε/2ρ of T."""
+    """Whether an error of RADICAND moves T by less than u/2: by ε/2ρ, ρ the radicand over its larger term."""
     x, y, z = a.astype(np.longdouble).T
     terms = np.maximum(z * z, np.abs(k.astype(np.longdouble) ** 2 - 1) * (x * x + y * y))
     return exact.cos_t**2 * lengths(a) ** 2 > RADICAND / u * terms
