@@ -283,6 +283,24 @@ def test_single_precision_stays_within_its_budgets_and_shows_what_ratios_cost():
     assert [row.case for row in rows if row.verdict == "fail"] == ["mirage, contrasts"]
 
 
+def test_a_budget_that_no_answer_could_break_is_none():
+    """100 000 ratios, each off by u in float32: condition · u is above 1 for every ray, in float64 for none."""
+
+    def row(precision, angles):
+        rays = enter(air(100_000), np.array(angles), np.full(len(angles), 100_000), ASKEW, precision)
+        how, fed = stability.Extent((), (), 0, angles, False), rays.fed("ratios", precision)
+        setting = stability.Setting("scalar", precision, SCALAR.vector)
+        straight = lambda a, n, k, contrast=None: (a, True)  # noqa: E731
+        return stability.mirage_row("promoted", straight, "mirage", fed, setting, how)[0]
+
+    lost = row(np.float32, (89.4, 89.8))
+    assert (lost.verdict, lost.reason) == ("info", stability.NOTHING)
+    assert row(np.float64, (89.4,)).broken.keys() == {"error / condition"}
+    held = row(np.float64, (89.4, 89.8))
+    assert held.budgets.keys() == {"error / condition", "misjudged", "turning height"}
+    assert held.broken.keys() == held.budgets.keys()
+
+
 def test_curves_run_through_the_layers():
     how = stability.Extent((30,), ("askew",), 10, (89.0, 89.95), True)
     found = {"promoted": promoted, "wedge": FORMULAS["wedge"]}
@@ -299,7 +317,14 @@ def test_tasks_name_what_does_not_run_and_mitsuba_runs_on_scalars_too():
     absent = [s for s in SETTINGS.values() if s.vector is None]
     assert all(row.verdict == "not run" and row.reason for s in absent for row in stability.chain_rows(HERE, s))
     single = SETTINGS["scalar float32"]
-    found = stability.subjects(single)
+    reasons = {(s.label, name): why for s in SETTINGS.values() for name, why in stability.absent(HERE, s).items()}
+    assert {("scalar float32", name) for name in FORMULAS} | {("scalar float64", BUILTIN)} <= reasons.keys()
+    assert all(reasons.values())
+    for setting in SETTINGS.values():
+        if setting.vector is not None:
+            found = stability.subjects(HERE, setting).keys() | stability.absent(HERE, setting).keys()
+            assert found == {*FORMULAS, BUILTIN}
+    found = stability.subjects(HERE, single)
     assert [*found] == [BUILTIN]
     row = stability.system_row(BUILTIN, found[BUILTIN], "prism", single)
     assert row.verdict == "info"

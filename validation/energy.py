@@ -37,8 +37,8 @@ TERMS = {
     "R / u, 1 − R / u, r_s / u, r_p / u": "the largest relative errors, in units of roundoff",
     "phase / u": "under total internal reflection, the largest distance from the exact point of the unit circle",
     "R + T − 1 / u": "the largest deviation from 1",
-    "nearer than rounding": "rays whose radicand is below 48u of its terms, where what the formula has left of it "
-    "moves T; the errors leave them out",
+    "nearer than rounding": "rays whose radicand is below 0.32u of its larger term, where its own error may move T by "
+    "more than u/2; the errors leave them out",
     "T there and back / u": "T(θi, k) over T(θt, 1/k), less 1: light takes the same way back",
     "weights in and out / u": "the plugin's weight of radiance that enters over n², times that of leaving, less 1",
     "outside, inside": "the share of diffuse light that is reflected or not, relative, against its closed form; from "
@@ -47,10 +47,13 @@ TERMS = {
 }  # fmt: skip
 SEED = 2028
 INDICES = (1.0003, 1.1, 1.33, 1.5, 2.42)
-# What the forms promise (see `fresnel._powers`: 3.1u, 3u) and what the study holds them to.
+# What the study holds the forms to; they promise 3.12u of R and 2u of T (see `fresnel._powers`).
 POWERS = {"R / u": 4.0, "1 − R / u": 4.0}
 SUMMED = POWERS | {"R + T − 1 / u": 4.0}  # R · 4u + T · 4u
 AMPLITUDES = {"r_s / u": 8.0, "r_p / u": 8.0, "phase / u": 8.0}
+# Of the larger term of a float32 radicand (see `exact`): the promoted form's error. The compensated one's is less, as
+# κ of a float32 k up to 2²³ is a pair exactly.
+RADICAND = 10 * 2.0**-53
 
 
 def tasks(context: Context) -> list[Task]:
@@ -185,13 +188,16 @@ def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray
         b, transmitted = formula.unchecked(ray, setting.vector(0, 0, 1), wide, contrast)
         return *fresnel.local_powers(ray, b, transmitted, wide, contrast), transmitted
 
-    # ε ≤ 48u² of the terms of the radicand (see `exact`) moves T by ε/2ρ: half a u at ρ = 48u.
-    x, y, z = a.astype(np.longdouble).T
-    terms = np.maximum(z * z, np.abs(k.astype(np.longdouble) ** 2 - 1) * (x * x + y * y))
-    far = exact.cos_t**2 * lengths(a) ** 2 > 48 * setting.roundoff * terms
-    far |= ~exact.transmitted
+    far = resolved(a, k, exact, setting.roundoff) | ~exact.transmitted
     row = power_row("pipeline", regime, setting, each(powers, setting, *a.T, k), exact, POWERS, replay, far)
     return dataclasses.replace(row, values=row.values | {"nearer than rounding": float((~far).sum())})
+
+
+def resolved(a: np.ndarray, k: np.ndarray, exact: oracle.Certified, u: float) -> np.ndarray:
+    """Whether an error of RADICAND moves T by less than u/2: by ε/2ρ, ρ the radicand over its larger term."""
+    x, y, z = a.astype(np.longdouble).T
+    terms = np.maximum(z * z, np.abs(k.astype(np.longdouble) ** 2 - 1) * (x * x + y * y))
+    return exact.cos_t**2 * lengths(a) ** 2 > RADICAND / u * terms
 
 
 def relative(x: np.ndarray, exact: np.ndarray, low: np.ndarray, setting: Setting) -> np.ndarray:

@@ -20,7 +20,7 @@ import numpy as np
 
 from mi_refract import compare, images
 from mi_refract.bsdf import PLUGIN
-from mi_refract.formulas import FORMULAS, ROUNDING, automatic
+from mi_refract.formulas import FORMULAS, automatic
 from mi_refract.rows import Row
 
 from . import layered, overlay
@@ -49,6 +49,7 @@ SCALAR = "needs a compiled variant: on scalar arrays formulas compute in double 
 SEED = 2028
 RAYS = 64
 VISIBLE = 0.1
+FLIPPED = 1e-3  # of the pixels: those of which a last bit changes the choice between reflection and refraction
 # The pictures: a scene, what its parameters are, and the name of the view.
 VIEWS: tuple[tuple[str, dict[str, str], str], ...] = (
     ("mirage", {}, "mirage, telescope"),
@@ -243,7 +244,7 @@ def _budgets(layers: Layers, plugin: str, exact: list[Path]) -> dict[str, float]
     are no more than sin² α: (2 m + 1) u after m boundaries. A curved boundary adds the rounding of the intersection.
     """
     name = plugin.removeprefix(f"{PLUGIN}_")
-    if plugin != PLUGIN and (name not in FORMULAS or FORMULAS[name].budget is not ROUNDING):
+    if plugin != PLUGIN and (name not in FORMULAS or not FORMULAS[name].budget.at_the_limit):
         return {}
     most = max(len(path.media) - 1 for path in exact)
     return {"astray": 0.0} | ({} if layers.round else {"direction / condition": (2 * most + 1) * 2.0**-24})
@@ -277,7 +278,8 @@ def _view_rows(context: Context, scene: str, parameters: dict[str, str], name: s
         for role, plugin in (("reference", BUILTIN), ("test", PLUGIN))
     }
     replay = about | {"control": right}
-    return [Row(STUDY, PLUGIN, f"{name}: picture", context.variant, values, replay=replay, pictures=pictures)]
+    budgets = {"pixels off, control": FLIPPED}
+    return [Row(STUDY, PLUGIN, f"{name}: picture", context.variant, values, budgets, replay=replay, pictures=pictures)]
 
 
 def _other_right_formula() -> str:
@@ -285,7 +287,7 @@ def _other_right_formula() -> str:
     import mitsuba as mi
 
     default = automatic(dr.backend_v(mi.Float))
-    return next(f"{PLUGIN}_{k}" for k, f in FORMULAS.items() if f.budget is ROUNDING and k != default)
+    return next(f"{PLUGIN}_{k}" for k, f in FORMULAS.items() if f.budget.at_the_limit and k != default)
 
 
 def _with_paths(view: View, scene: str) -> np.ndarray:

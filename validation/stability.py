@@ -96,19 +96,30 @@ def tasks(context: Context) -> list[Task]:
     ]
 
 
-def subjects(setting: Setting) -> dict[str, Subject]:
-    """Those of the setting; on scalar float32 Mitsuba's functions alone."""
-    alone = setting.is_scalar and setting.precision is np.float32
-    return {name: subject for name, subject in setting.subjects.items() if name not in FORMULAS or not alone}
+def subjects(context: Context, setting: Setting) -> dict[str, Subject]:
+    """Those of the setting that run there."""
+    return {name: subject for name, subject in setting.subjects.items() if name not in absent(context, setting)}
+
+
+def absent(context: Context, setting: Setting) -> dict[str, str]:
+    """Why a formula, or Mitsuba's functions, are not measured in a setting."""
+    if setting.vector is None:
+        return dict.fromkeys([*FORMULAS, backends.BUILTIN], setting.reason)
+    if setting.precision is np.float64:
+        return {backends.BUILTIN: "Mitsuba's wheel has no variant in double precision"}
+    if setting.is_scalar:
+        return dict.fromkeys(FORMULAS, "Dr.Jit's scalar arrays compute in double precision")
+    return {} if setting.mitsuba else {backends.BUILTIN: context.variants[f"{setting.backend}_ad_rgb"] or ""}
 
 
 # Chains --------------------------------------------------------------------------------------------------------
 
 
 def chain_rows(context: Context, setting: Setting) -> list[Row]:
+    rows = [Row("stability", name, "all", setting.label, reason=why) for name, why in absent(context, setting).items()]
     if setting.vector is None:
-        return [Row("stability", name, "all", setting.label, reason=setting.reason) for name in FORMULAS]
-    how, found, rows = extent(context, setting), subjects(setting), []
+        return rows
+    how, found = extent(context, setting), subjects(context, setting)
     for case, layers, plane in mirages(how):
         rows += mirage_rows(found, case, layers, plane, setting, how)
     return [*rows, *(pipe_row(name, subject, setting, how) for name, subject in found.items())]
@@ -173,27 +184,39 @@ def mirage_row(name: str, subject: Subject, case: str, fed: Fed, setting: Settin
         "length drift": worst(np.abs(length - 1)[final]),
     } | {f"{angle}°": float(e) for angle, e in zip(how.angles, error, strict=False) if angle in PASSING}
     budgets = mirage_budgets(fed, setting.roundoff, final) if at_limit(name) else {}
+    remark = how.remark if budgets or not at_limit(name) else "; ".join(filter(None, (NOTHING, how.remark)))
     replay = {"layers": count, "n_0": float(rays.layers.index[0]), "n_last": float(rays.layers.index[-1]),
               "angles": how.angles, "normal": [float(x).hex() for x in rays.normal]}  # fmt: skip
     case = f"{case}, {fed.feed}"
-    return Row("stability", name, case, setting.label, values, budgets, reason=how.remark, replay=replay), error
+    return Row("stability", name, case, setting.label, values, budgets, reason=remark, replay=replay), error
 
 
-# Where ln cos θ changes by x to first order, cos²θ changes by 2x of itself, and |1 − √(1 ± 2x)| ≤ 2x for 2x ≤ 1. A form
-# at the rounding limit is off by 0.92u a step, and by cos θ u/2 ≤ 0.02u for the rounded k that scales the tangent.
+# Where ln cos θ changes by x to first order, cos²θ changes by 2x of itself, and |1 − √(1 ± 2x)| ≤ 2x/(1 + √(1 − 2x)).
+# A form at the rounding limit is off by 1.005u a step, where a length has left 1, and by cos θ u/2 ≤ 0.02u for the
+# rounded k that scales the tangent: x ≤ 1.025 condition · u. That is a cosine off by 2 condition · u at most while
+# √(1 − 2x) ≥ 0.025, so while condition · u ≤ 0.487.
 LIMIT = 2.0
+FIRST_ORDER = 0.487
+NOTHING = "no budget: with every input and output off by u, these rays may go anywhere"
 
 
 def mirage_budgets(fed: Fed, u: float, final: slice) -> dict[str, float]:
-    """Of a form at the rounding limit. Where its bound reaches as far as the decision, a ray may be misjudged."""
+    """Of a form at the rounding limit, as far as the problem leaves anything to demand: each of them can be broken.
+
+    Where its bound reaches as far as the decision, a ray may be misjudged.
+    """
     rays, height = fed.rays, LIMIT * u * fed.height + 1
     count = rays.layers.count
-    doubtful = np.where(rays.passes, LIMIT * u * fed.condition >= 1, rays.last + height >= count)
-    return {
-        "error / condition": LIMIT,
-        "misjudged": float(doubtful[final].sum()),
-        "turning height": min(1.0, worst((height / count)[final][~rays.passes[final]])),
-    }
+    doubtful = np.where(rays.passes, fed.condition * u > FIRST_ORDER, rays.last + height >= count)[final]
+    heights = (height / count)[final][~rays.passes[final]]
+    budgets = {}
+    if (fed.condition[final] * u <= FIRST_ORDER).any():
+        budgets["error / condition"] = LIMIT
+    if not doubtful.all():
+        budgets["misjudged"] = float(doubtful.sum())
+    if len(heights) and worst(heights) < 1:
+        budgets["turning height"] = worst(heights)
+    return budgets
 
 
 def worst(x: Array) -> float:
@@ -250,7 +273,7 @@ class Refractor:
 
 
 def system_rows(context: Context, setting: Setting) -> list[Row]:
-    found = subjects(setting).items()
+    found = subjects(context, setting).items()
     return [system_row(name, subject, case, setting) for case in systems.SYSTEMS for name, subject in found]
 
 
@@ -262,7 +285,8 @@ def system_row(name: str, subject: Subject, case: str, setting: Setting) -> Row:
         "error": worst(error),
         "misjudged": float(refractor.mirrored),
     }
-    # The condition counts u for every rounding; a form at the rounding limit and the inputs are off by 0.92u at most.
+    # The condition counts u for every rounding. Inputs take √3/2 of it, a form at the rounding limit 0.8724, or 1.005
+    # where a length has left 1: that half a hundredth is not granted.
     budgets = {"error / condition": 1.0, "misjudged": 0.0} if at_limit(name) else {}
     if case == "double Gauss":
         values["over print"] = systems.off_print(Refractor(subject, setting))
