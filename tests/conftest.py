@@ -112,3 +112,19 @@ def setting(request: pytest.FixtureRequest) -> Setting:
 def vectorised(request: pytest.FixtureRequest) -> Setting:
     """Those that carry derivatives."""
     return _setting(request)
+
+
+@pytest.fixture
+def scalar_context(tmp_path):
+    """`scalar_context(rays=800, ...)`: a run of the validation on scalar_rgb, quick but for what is given."""
+    import dataclasses
+
+    import mitsuba as mi
+
+    from validation.plan import SCALAR_PROFILES, Context
+
+    before = mi.variant()
+    mi.set_variant("scalar_rgb")
+    quick = SCALAR_PROFILES["quick"]
+    yield lambda **given: Context(dataclasses.replace(quick, **given), tmp_path, "scalar_rgb", backend.detect(), USABLE)
+    mi.set_variant(before)

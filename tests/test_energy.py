@@ -1,27 +1,19 @@
 """The studies of energy and of derivatives hold what they measure to its budget, and see planted defects."""
 
-import dataclasses
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from flint import acb, arb, ctx
 
-from mi_refract import FORMULAS, backend, bsdf, fresnel, oracle, oracle_derivative, regimes
+from mi_refract import FORMULAS, bsdf, fresnel, oracle, oracle_derivative, regimes
 from validation import derivatives, diffuse, energy
-from validation.plan import SCALAR_PROFILES, Context
 from validation.settings import settings
-
-TINY = dataclasses.replace(SCALAR_PROFILES["quick"], rays=800, scalar_rays=60)
 
 
 @pytest.fixture
-def context(tmp_path):
-    before = mi.variant()
-    mi.set_variant("scalar_rgb")
-    yield Context(TINY, tmp_path, "scalar_rgb", backend.detect(), backend.usable_variants())
-    mi.set_variant(before)
+def context(scalar_context):
+    return scalar_context(rays=800, scalar_rays=60)
 
 
 def compiled(context):
@@ -242,7 +234,7 @@ def unsafe(a, n, k):
 @pytest.mark.parametrize(("defect", "metric"), [(scaled, "error / condition"), (unsafe, "not finite")])
 def test_wrong_derivatives_are_seen(defect, metric, context):
     setting = compiled(context)[0]
-    given = derivatives.inputs(TINY.rays // 40, setting.precision)
+    given = derivatives.inputs(20, setting.precision)
     rows, _ = derivatives.formula_rows("promoted", defect, given, setting)
     assert all(metric in row.broken for row in rows if row.case == "∂b/∂k")
 
@@ -250,7 +242,7 @@ def test_wrong_derivatives_are_seen(defect, metric, context):
 def test_a_contrast_that_is_detached_is_seen(context, monkeypatch):
     """∂R/∂η through the cosine and k alone."""
     setting = compiled(context)[0]
-    given = derivatives.inputs(TINY.rays // 40, setting.precision)
+    given = derivatives.inputs(20, setting.precision)
     assert derivatives.reflectance_row(given, setting).verdict == "pass"
     monkeypatch.setattr(fresnel, "_powers", lambda *x: POWERS(*x[:-1], dr.detach(x[-1])))
     assert "error / condition" in derivatives.reflectance_row(given, setting).broken
@@ -258,7 +250,7 @@ def test_a_contrast_that_is_detached_is_seen(context, monkeypatch):
 
 def test_misjudged_rays_are_no_rays_of_the_derivative(context):
     setting = compiled(context)[0]
-    given = derivatives.inputs(TINY.rays // 40, setting.precision)
+    given = derivatives.inputs(20, setting.precision)
     values = derivatives.row("x", "y", np.full(len(given.rays.k), np.nan), given, setting,
                              np.zeros(len(given.rays.k), bool), {}).values  # fmt: skip
     assert values == {"error / condition": 0, "error": 0, "not finite": 0}

@@ -62,9 +62,26 @@ class Case:
         return radicand(self.rays) <= self.budget.margin(self.u, self.k) + across * (2 + across)
 
 
-def agree(b, other, bound, excluded):
+def agree(b, other, bound, kept):
     error = lengths(b - other)
-    assert (error <= bound)[~excluded].all(), (error / bound)[~excluded].max()
+    assert (error <= bound)[kept].all(), (error / bound)[kept].max()
+
+
+class Kept:
+    """What a property was asked of, over all its examples: one that leaves out most rays says nothing."""
+
+    def __init__(self, least=0.85):
+        self.least, self.masks = least, []
+
+    def __call__(self, mask):
+        self.masks.append(mask)
+        return mask
+
+    def check(self, property):
+        property()
+        share = np.concatenate(self.masks).mean()
+        if share < self.least:  # no AssertionError, which is what a defect is seen by
+            raise RuntimeError(f"of all rays only {share:.0%} were asked for")
 
 
 # The properties: of a subject, with its budget -----------------------------------------------------------------
@@ -72,6 +89,7 @@ def agree(b, other, bound, excluded):
 
 def reversibility(subject, budget, setting):
     """Sent back by 1/k, the refracted ray is the incident one."""
+    asked = Kept(0.4)  # the others are reflected
 
     @REPLAYED
     @given(SEEDS)
@@ -87,9 +105,9 @@ def reversibility(subject, budget, setting):
         kept &= back.transmitted & ~back.undecidable(moved)
         # Of a ray along the surface that may be its side.
         kept &= np.abs((there.b * there.n).sum(1)) > moved
-        agree(back.b, -there.a, back.bound(moved), ~kept)
+        agree(back.b, -there.a, back.bound(moved), asked(kept))
 
-    check()
+    asked.check(check)
 
 
 def coplanarity(subject, budget, setting):
@@ -125,6 +143,7 @@ def powers_of_two(subject, budget, setting):
 
 def any_factor(subject, budget, setting):
     """Scaled by what is no power of two, `a` and `n` are rounded: b moves as far as that takes it."""
+    kept = Kept()
 
     @REPLAYED
     @given(SEEDS, st.floats(2.0**-10, 2.0**10), st.floats(2.0**-10, 2.0**10))
@@ -135,15 +154,16 @@ def any_factor(subject, budget, setting):
         scaled = Rays((s * one.a).astype(setting.precision), (t * one.n).astype(setting.precision), rays.k)
         b, transmitted = evaluate(subject, scaled, setting.vector)
         moved = 2 * setting.roundoff
-        excluded = one.undecidable(moved)
-        assert (transmitted == one.transmitted)[~excluded].all()
-        agree(b / s, one.b, 2 * one.bound(moved), excluded)
+        mask = kept(~one.undecidable(moved))
+        assert (transmitted == one.transmitted)[mask].all()
+        agree(b / s, one.b, 2 * one.bound(moved), mask)
 
-    check()
+    kept.check(check)
 
 
 def rotation(subject, budget, setting):
     """Turned rays have turned answers."""
+    kept = Kept()
 
     @REPLAYED
     @given(SEEDS, st.integers(0, 2**32 - 1), st.booleans())
@@ -154,11 +174,11 @@ def rotation(subject, budget, setting):
         turned = Rays((one.a @ r.T).astype(setting.precision), (one.n @ r.T).astype(setting.precision), rays.k)
         b, transmitted = evaluate(subject, turned, setting.vector)
         moved = lengths(turned.a - one.a @ r.T) + lengths(turned.n - one.n @ r.T)
-        excluded = one.undecidable(moved)
-        assert (transmitted == one.transmitted)[~excluded].all()
-        agree(b, one.b @ r.T, 2 * one.bound(moved), excluded)
+        mask = kept(~one.undecidable(moved))
+        assert (transmitted == one.transmitted)[mask].all()
+        agree(b, one.b @ r.T, 2 * one.bound(moved), mask)
 
-    check()
+    kept.check(check)
 
 
 def both_sides(subject, budget, setting):

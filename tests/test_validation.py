@@ -9,22 +9,17 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refract import FORMULAS, backend, bsdf, oracle, regimes
+from mi_refract import FORMULAS, bsdf, oracle, regimes
 from mi_refract.report import read_json
 from mi_refract.rows import Row
 from validation import __main__ as command
-from validation import directions, readme, renders, runner, samples
-from validation.plan import SCALAR_PROFILES, SCENES, Context, Task
-
-TINY = dataclasses.replace(SCALAR_PROFILES["quick"], scalar_rays=60, resolution=8, spp=4, pairs=8, curve_spp=(1,))
+from validation import directions, judge, readme, renders, runner, samples, settings
+from validation.plan import SCENES, Task
 
 
 @pytest.fixture
-def context(tmp_path):
-    before = mi.variant()
-    mi.set_variant("scalar_rgb")
-    yield Context(TINY, tmp_path, "scalar_rgb", backend.detect(), backend.usable_variants())
-    mi.set_variant(before)
+def context(scalar_context):
+    return scalar_context(scalar_rays=60, resolution=8, spp=4, pairs=8, curve_spp=(1,))
 
 
 def defective(props):
@@ -44,24 +39,24 @@ def test_errors_are_those_that_were_put_in():
     exact = oracle.refract(rays.a, rays.n, rays.k, progress=False)
     length = np.sqrt((rays.a.astype(np.longdouble) ** 2).sum(1))[:, None]
     direction = exact.direction.astype(np.longdouble) + exact.direction_low
-    chord, angle, drift = directions.errors(direction * length, rays, exact)
+    chord, angle, drift = judge.errors(direction * length, rays, exact)
     assert max(chord.max(), angle.max(), drift.max()) < 1e-18
     across = np.cross(direction, np.roll(direction, 1, axis=1))
     across /= np.sqrt((across**2).sum(1))[:, None]
-    chord, angle, _ = directions.errors((direction + 1e-9 * across) * length, rays, exact)
+    chord, angle, _ = judge.errors((direction + 1e-9 * across) * length, rays, exact)
     assert chord == pytest.approx(1e-9, rel=1e-6)
     assert angle == pytest.approx(1e-9, rel=1e-6)
-    chord, angle, drift = directions.errors(direction * 1.001 * length, rays, exact)
+    chord, angle, drift = judge.errors(direction * 1.001 * length, rays, exact)
     assert (chord, drift) == (pytest.approx(1e-3), pytest.approx(1e-3))
     assert angle.max() < 1e-18
-    chord, _, _ = directions.errors(direction * np.nan, rays, exact)
+    chord, _, _ = judge.errors(direction * np.nan, rays, exact)
     assert np.isinf(chord).all()
 
 
 def test_directions_name_what_does_not_run_and_hold_what_does(context):
     rows = [row for task in directions.tasks(context) if "scalar" in task.name for row in task.run()]
     assert {row.verdict for row in rows} == {"info", "pass"}
-    absent = [s for s in directions.settings(context) if s.vector is None]
+    absent = [s for s in settings.settings(context) if s.vector is None]
     assert all(row.verdict == "not run" and row.reason for s in absent for row in directions._setting_rows(context, s))
     worst = next(row for row in rows if row.subject == "promoted" and row.case == "critical")
     assert {"error / bound", "misjudged far", "undecided"} == set(worst.budgets)
@@ -74,7 +69,7 @@ def test_a_budget_that_is_loose_or_too_tight_fails_the_full_sweep(constant, fact
     formula = FORMULAS["decomposed"]
     off = dataclasses.replace(formula.budget, **{constant: factor * getattr(formula.budget, constant)})
     monkeypatch.setitem(FORMULAS, "decomposed", dataclasses.replace(formula, budget=off))
-    setting = directions.settings(context)[0]
+    setting = settings.settings(context)[0]
     parts = [directions._regime_row("decomposed", formula, r, setting, 3000) for r in ("grazing", "critical", "k ≫ 1")]
     whole = directions._summary("decomposed", parts, setting, {})
     assert set(whole.budgets) == {"slack, linear", "slack, radicand"}
@@ -124,7 +119,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(context):
         runner.run([first, Task("last", interrupt)], context)
     assert runner.run([first, last], context) == [row(), row()]
     assert calls == ["first", "last"]
-    other = dataclasses.replace(context, profile=dataclasses.replace(TINY, rays=17))
+    other = dataclasses.replace(context, profile=dataclasses.replace(context.profile, rays=17))
     runner.run([first], other)
     assert calls == ["first", "last", "first"]
     runner.forget(context)

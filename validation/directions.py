@@ -18,11 +18,9 @@ from mi_refract.formulas import FORMULAS
 from mi_refract.rows import Row
 
 from . import timing
-from .judge import BUDGETS, Judgement, Subject, errors, evaluate, judge, judged, lengths
+from .judge import BUDGETS, Judgement, Subject, judge, judged, lengths
 from .plan import Context, Task
-from .settings import BUILTIN, Setting, budget_of, builtin, settings
-
-__all__ = ["BUILTIN", "Setting", "builtin", "certified", "errors", "evaluate", "settings", "tasks"]
+from .settings import Setting, budget_of, settings
 
 FLOOR = "exact, rounded"
 TITLE = "Directions"
