@@ -1,5 +1,6 @@
 """Budgets bound every ray, and the judgement finds what their constants would have to be."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from mi_refract import oracle, regimes
 from mi_refract.budgets import ROUNDING, Budget, cancelling, radicand_for, root
-from validation.judge import judge
+from validation.judge import judge, judged
 
 U = 2.0**-53
 
@@ -134,3 +135,12 @@ def test_a_mirrored_ray_next_to_the_surface_has_not_crossed_it():
     found = judge(lambda a, n, k: ([1.0, 0.0, 3 * U], False), rays, exact, list, cancelling(1))
     assert found.chord[0] > 0
     assert not found.seen[0] and not found.crossed[0]
+
+
+def test_a_ray_that_the_oracle_could_not_decide_breaks_the_budget():
+    rays = regimes.make("generic", 20, np.float64, seed=3)
+    exact = oracle.refract(rays.a, rays.n, rays.k, progress=False)
+    unknown = dataclasses.replace(exact, undecided=np.arange(20) == 7)
+    b, transmitted = exact.direction.astype(np.longdouble), exact.transmitted
+    assert not judged(b, transmitted, rays, exact, ROUNDING).seen.any()
+    assert np.flatnonzero(judged(b, transmitted, rays, unknown, ROUNDING).seen).tolist() == [7]

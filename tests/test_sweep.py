@@ -162,6 +162,16 @@ def test_the_herd_stays_in_its_domain_and_gets_no_better(measured):
     assert again.rays.a.tobytes() == last.rays.a.tobytes()
 
 
+def test_every_formula_has_its_rows(measured, scalar_context, monkeypatch):
+    monkeypatch.setattr(search, "settings", lambda context: [measured])
+    monkeypatch.setattr(sweep, "settings", lambda context: [measured])
+    context = scalar_context(sweep_rays=2000, certified=4, generations=1)
+    rows = [row for study in (sweep, search) for task in study.tasks(context) for row in task.run()]
+    assert {(row.study, row.subject) for row in rows} == {(s, name) for s in ("sweep", "search") for name in FORMULAS}
+    assert [row.name for row in rows if row.verdict not in ("pass", "info")] == []
+    assert {row.case for row in rows if row.verdict == "info"} == {"on a denormal"}
+
+
 # The worst rays ------------------------------------------------------------------------------------------------
 
 

@@ -13,7 +13,7 @@ from mi_refract import FORMULAS, bsdf, oracle, regimes
 from mi_refract.report import read_json
 from mi_refract.rows import Row
 from validation import __main__ as command
-from validation import directions, judge, readme, renders, runner, samples, settings
+from validation import directions, judge, paths, readme, renders, runner, samples, settings
 from validation.plan import SCENES, Task
 
 
@@ -59,7 +59,7 @@ def test_directions_name_what_does_not_run_and_hold_what_does(context):
     absent = [s for s in settings.settings(context) if s.vector is None]
     assert all(row.verdict == "not run" and row.reason for s in absent for row in directions._setting_rows(context, s))
     worst = next(row for row in rows if row.subject == "promoted" and row.case == "critical")
-    assert {"error / bound", "misjudged far", "undecided"} == set(worst.budgets)
+    assert {"error / bound", "misjudged far"} == set(worst.budgets)
     assert len(worst.replay["largest error"]["a"]) == 3
 
 
@@ -190,12 +190,15 @@ def test_a_readme_is_not_written_from_a_run_that_measured_too_little():
         readme.accuracy([])
     with pytest.raises(ValueError, match="no scene was rendered"):
         readme.renders([])
+    with pytest.raises(ValueError, match="no paths were traced"):
+        readme.paths([])
 
 
-def test_the_readme_holds_both_tables_and_shows_pictures_that_exist():
+def test_the_readme_holds_its_tables_and_shows_pictures_that_exist():
     root = Path(command.__file__).parents[1]
     text = (root / "README.md").read_text()
-    for marker, words in (("accuracy", [*FORMULAS]), ("renders", [path.stem for path in SCENES.glob("*.xml")])):
+    scenes = [path.stem for path in SCENES.glob("*.xml")]
+    for marker, words in (("accuracy", [*FORMULAS]), ("renders", scenes), ("paths", paths.plugins())):
         table = text.partition(f"<!-- begin: {marker} -->")[2].partition(f"<!-- end: {marker} -->")[0]
         assert [word for word in words if word not in table] == []
     pictures = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)

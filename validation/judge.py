@@ -31,7 +31,7 @@ class Judgement:
     drift: np.ndarray  # of the length of b from that of a, relative
     right: np.ndarray
     misjudged: np.ndarray
-    far: np.ndarray  # misjudged although the radicand exceeds what the budget leaves undecided
+    far: np.ndarray  # misjudged although the radicand exceeds what the budget leaves open; or undecided by the oracle
     crossed: np.ndarray  # on the other side of the surface, where the budget leaves the side open
     bound: np.ndarray  # of the chord
     linear: np.ndarray
@@ -50,15 +50,10 @@ class Judgement:
 
     def values(self) -> dict[str, float]:
         """What a budget is set on: every one of them at most `BUDGETS`."""
-        undecided = ~self.right & ~self.misjudged  # by the oracle; it leaves no float so
-        return {
-            "error / bound": float(self.share.max()),
-            "misjudged far": float(self.far.sum()),
-            "undecided": float(undecided.sum()),
-        }
+        return {"error / bound": float(self.share.max()), "misjudged far": float(self.far.sum())}
 
 
-BUDGETS = {"error / bound": 1.0, "misjudged far": 0.0, "undecided": 0.0}
+BUDGETS = {"error / bound": 1.0, "misjudged far": 0.0}
 
 
 def judge(subject: Subject, rays: Rays, exact: oracle.Certified, vector: Any, budget: Budget) -> Judgement:
@@ -86,6 +81,7 @@ def judged(
         far[far] = ~(margin(rays[far]) <= NEGLIGIBLE * u * u)
     else:
         far &= distance > budget.margin(u, k)
+    far |= exact.undecided  # which no float is
     of_terms, of_root = budget.of_terms(u, k, through, unit), budget.of_root(u, k, cos_t, through)
     needed = np.where(through, radicand_for(np.maximum(chord - of_terms, 0), cos_t), 0.0)
     needed = np.where(misjudged, distance.astype(float), needed) / (u * np.maximum(1.0, k) ** budget.growth)

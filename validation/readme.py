@@ -1,4 +1,4 @@
-"""What the README quotes: an accuracy table, a table of renders, and the gallery, all from the rows of one run."""
+"""What the README quotes: tables of accuracy, renders and paths, and the gallery, all from the rows of one run."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from mi_refract.files import update_between, write_atomically
 from mi_refract.formulas import FORMULAS
 from mi_refract.rows import Row
 
+from .layered import MIRAGE
 from .plan import SCENES, Context
 from .settings import PLAIN
 
@@ -22,12 +23,13 @@ COLUMNS = 5
 
 
 def update(path: Path, rows: list[Row], context: Context) -> None:
-    """Write both tables between their markers in `path`, and the gallery beside the scenes.
+    """Write the tables between their markers in `path`, and the gallery beside the scenes.
 
     ValueError where a marker is missing or the run has not measured what the README quotes.
     """
     update_between(path, "accuracy", accuracy(rows))
     update_between(path, "renders", renders(rows))
+    update_between(path, "paths", paths(rows))
     write_atomically(GALLERY, gallery(rows, context))
 
 
@@ -88,6 +90,28 @@ def renders(rows: list[Row]) -> str:
     lines = [f"{size}.", "", f"| scene | {' | '.join(RENDERS.values())} |", "|---" * (len(RENDERS) + 1) + "|"]
     for row in found:
         lines.append(f"| {row.case} | {' | '.join(compact(row.values[metric]) for metric in RENDERS)} |")
+    return "\n".join(lines)
+
+
+PATHS = {
+    "astray": "astray",
+    "median direction": "direction, median",
+    "direction": "direction, worst",
+    "place": "place, worst",
+}
+
+
+def paths(rows: list[Row]) -> str:
+    """Markdown: the paths through the mirage, of every plugin and of exact arithmetic with rounded indices."""
+    found = [row for row in rows if row.study == "paths" and row.values.keys() >= PATHS.keys()]
+    found = [row for row in found if row.replay["scene"] == f"{MIRAGE.scene}.xml"]
+    if not found:
+        raise ValueError("README: no paths were traced; its table needs a compiled variant")
+    lines = [f"{found[0].replay['rays']} rays, {found[0].setting}.", ""]
+    lines += [f"| | {' | '.join(PATHS.values())} |", "|---" * (len(PATHS) + 1) + "|"]
+    for row in found:
+        subject = row.subject if row.subject.startswith("exact") else f"`{row.subject}`"
+        lines.append(f"| {subject} | {' | '.join(compact(row.values[metric]) for metric in PATHS)} |")
     return "\n".join(lines)
 
 

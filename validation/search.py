@@ -241,7 +241,7 @@ def certify(name: str, subject: Subject, herd: Herd, setting: Setting) -> list[C
     seen = judge(subject, rays, exact, setting.vector, budget_of(name))
     margin = np.abs(oracle.margin(rays.a, rays.n, rays.k)) / u**2
     found = []
-    for i, wrong in enumerate(seen.misjudged.tolist()):
+    for i, wrong in enumerate((seen.misjudged | seen.far).tolist()):
         objective, score = ("decision", margin[i]) if wrong else ("chord", seen.chord[i] / u)
         line = Found.at(rays, i, name, herd.names[herd.regime[i]], objective, float(score))
         found.append(Certified(line, float(seen.far[i] if wrong else seen.share[i])))
