@@ -17,7 +17,7 @@ import pytest
 SCENES = Path(__file__).parent.parent / "scenes"
 NAMES = ["diamond", "fibre", "furnace", "glasses64", "lightpipe", "matched"]
 NAMES += ["mirage", "nested", "prism", "slab", "sphere"]
-DEFAULTS = {"bsdf": "refract", "integrator": "path", "max_depth": None, "spp": "64", "res": "128"}
+DEFAULTS = {"bsdf": "refract", "integrator": "path", "max_depth": None, "spp": "64", "res": "128", "sampler": "independent"}
 each_scene = pytest.mark.parametrize("name", NAMES)
 
 
