@@ -9,7 +9,7 @@ import pytest
 from mi_refract.needs import inspect
 from validation.plan import SCENES
 
-GLASS_ONLY = {"fibre", "furnace", "glasses64", "lightpipe", "mirage", "slab"}
+GLASS_ONLY = {"balls", "fibre", "furnace", "glasses64", "lightpipe", "mirage", "slab"}
 BLACK = {"type": "diffuse", "reflectance": 0.0}
 LAMP = {"type": "rectangle", "emitter": {"type": "area"}}
 
