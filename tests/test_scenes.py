@@ -17,7 +17,8 @@ import pytest
 SCENES = Path(__file__).parent.parent / "scenes"
 NAMES = ["balls", "diamond", "fibre", "furnace", "glasses64", "lightpipe", "matched"]
 NAMES += ["mirage", "nested", "prism", "slab", "sphere"]
-DEFAULTS = {"bsdf": "refract", "integrator": "path", "max_depth": None, "spp": "64", "res": "128", "sampler": "independent"}
+DEFAULTS = {"bsdf": "refract", "integrator": "path", "sampler": "independent"}
+DEFAULTS |= {"max_depth": None, "spp": "64", "res": "128"}
 each_scene = pytest.mark.parametrize("name", NAMES)
 
 

@@ -13,7 +13,7 @@ from mi_refract import FORMULAS, bsdf, oracle, regimes
 from mi_refract.report import read_json
 from mi_refract.rows import Row
 from validation import __main__ as command
-from validation import directions, judge, paths, readme, renders, runner, samples, settings
+from validation import directions, judge, methods, paths, readme, renders, runner, samples, settings
 from validation.plan import SCENES, Task
 
 
@@ -208,5 +208,6 @@ def test_the_readme_holds_its_tables_and_shows_pictures_that_exist():
 
 def test_a_scene_is_loaded_in_the_same_order_every_time(context):
     """Loading with Mitsuba's defaults gives one of two pictures, about one time in four the other one."""
-    pictures = [renders.Camera(SCENES / "diamond.xml", "dielectric", 8)(1, seed=0)[0] for _ in range(12)]
+    scenes = [methods.opened(SCENES / "diamond.xml", "dielectric", 8) for _ in range(12)]
+    pictures = [methods.Camera(scene)(1, seed=0)[0] for scene in scenes]
     assert all((picture == pictures[0]).all() for picture in pictures)

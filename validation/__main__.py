@@ -19,6 +19,7 @@ STUDIES = {
     "directions": ("directions", "mutants", "samples", "sweep", "search"),
     "stability": ("stability", "energy", "derivatives", "paths"),
     "renders": ("renders",),
+    "efficiency": ("efficiency", "scaling"),
 }
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import functools
 import math
 import statistics
-import time
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,9 @@ from mi_refract.formulas import FORMULAS, automatic
 from mi_refract.rows import Row
 
 from . import timing
-from .plan import SCENES, Context, Profile, Task
+from .methods import DIELECTRIC as BUILTIN
+from .methods import Camera, opened
+from .plan import NO_REFERENCE, SCENES, Context, Profile, Task
 
 TITLE = "Renders"
 TERMS = {
@@ -37,11 +38,8 @@ TERMS = {
 }
 AXES = {"x": "seconds", "y": "relMSE", "slope": -1}  # relMSE is a variance
 TEXT = __doc__.partition("\n")[2].strip()
-BUILTIN = "dielectric"
 # Paths in these scenes are short: a difference in the last bit stays one, unless it flips the choice of a lobe.
 SHORT_PATHS = {"sphere", "slab", "prism", "furnace"}
-# Where the built-in is no reference: both pictures are shown, and nothing is demanded of their agreement.
-NO_REFERENCE = {"mirage": "the built-in turns slanting edges into stairs here, so it is no reference: see Paths"}
 Curves = dict[str, list[tuple[float, float]]]
 CHANGED = 1e-5
 TILE = 16
@@ -61,34 +59,15 @@ def tasks(context: Context) -> list[Task]:
     ]
 
 
-class Camera:
-    """One scene with one plugin: renders pictures as numpy arrays and says how long each took."""
-
-    def __init__(self, path: Path, plugin: str, resolution: int) -> None:
-        import mitsuba as mi
-
-        self.scene = mi.load_file(str(path), **images.REPRODUCIBLE, bsdf=plugin, res=resolution)
-
-    def __call__(self, spp: int, seed: int) -> tuple[np.ndarray, float]:
-        import mitsuba as mi
-
-        start = time.perf_counter()
-        picture = mi.render(self.scene, spp=spp, seed=seed)
-        dr.eval(picture)
-        dr.sync_thread()
-        seconds = time.perf_counter() - start
-        return np.array(picture, dtype=np.float64), seconds
-
-
 def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
     profile, scene = context.profile, path.stem
-    cameras = {name: Camera(path, name, profile.resolution) for name in (plugin, BUILTIN)}
+    cameras = {name: Camera(opened(path, name, profile.resolution)) for name in (plugin, BUILTIN)}
     test, reference = _pictures(profile, *cameras.values())
     half = profile.pairs // 2
     values = _paired(test, reference) | _independent(test[:half], reference[half:])
     # Both forms at the rounding limit are timed, whichever of them is the default.
     others = _at_the_limit() if plugin == PLUGIN else []
-    values |= _times(profile, cameras | {name: Camera(path, name, profile.resolution) for name in others})
+    values |= _times(profile, cameras | {name: Camera(opened(path, name, profile.resolution)) for name in others})
     budgets = {} if scene in NO_REFERENCE else {"|mean ratio − 1|": 1e-4, "Welch alarms": 0.0}
     if scene in SHORT_PATHS:
         budgets["changed share"] = 1e-3
