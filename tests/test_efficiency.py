@@ -13,7 +13,7 @@ from validation.efficiency import Extent
 from validation.methods import BUILTIN, METHODS, Method
 from validation.plan import PROFILES, SCENES, Context
 
-SMALL = Extent((4, 9), 6, 8)
+SMALL = Extent((4, 9), 6, 8, resolution=32)
 SHORT = Method("short paths", "path", "refract", {"max_depth": 3, "rr_depth": 3})
 ABSENT = Method("absent", "integrator_of_nobody", "refract")
 GIVEN = (BUILTIN, METHODS[1], SHORT, ABSENT)
@@ -24,8 +24,7 @@ def context(tmp_path, needs_variant, monkeypatch):
     needs_variant("llvm_ad_rgb")
     mi.set_variant("llvm_ad_rgb")
     monkeypatch.setitem(efficiency.EXTENTS, "quick", SMALL)
-    profile = dataclasses.replace(PROFILES["quick"], resolution=32)
-    return Context(profile, tmp_path, "llvm_ad_rgb", backend.detect(), backend.usable_variants())
+    return Context(PROFILES["quick"], tmp_path, "llvm_ad_rgb", backend.detect(), backend.usable_variants())
 
 
 # Figures -------------------------------------------------------------------------------------------------------
@@ -57,7 +56,7 @@ def test_the_variance_of_the_reference_is_not_the_methods_error():
 @pytest.fixture
 def rows(context):
     found = efficiency.scene_rows(context, SCENES / "balls.xml", GIVEN)
-    return {row.subject.split(",")[0]: row for row in found if row.subject != f"{BUILTIN.name}, independent"}
+    return {row.subject: row for row in found}
 
 
 def test_efficiency_is_not_bought_with_bias(rows):
@@ -73,10 +72,20 @@ def test_the_same_picture_has_the_same_error_and_more_samples_less(rows):
     ours, builtin = rows[METHODS[1].name].values, rows[BUILTIN.name].values
     for metric in efficiency.METRICS:
         assert ours[metric] == pytest.approx(builtin[metric], rel=1e-2)
-    curve = rows["every method"].curves[rows[BUILTIN.name].subject]
+    curve = rows["every method"].curves[BUILTIN.name]
     assert len(curve) == len(SMALL.spp)
     assert curve[1][1] < curve[0][1]
-    assert builtin["equal-time MSE"] == 1
+    control = rows[f"{BUILTIN.name}, independent"].values
+    assert control["equal-time MSE / independent"] == builtin["equal-time MSE"] == 1
+    assert builtin["equal-time MSE / independent"] < 1
+    assert control["Welch alarms"] == 0
+
+
+def test_pictures_grow_until_their_time_can_be_told(context, monkeypatch):
+    monkeypatch.setattr(efficiency, "LARGEST", 64)
+    path = SCENES / "furnace.xml"
+    sizes = [efficiency._resolution(path, dataclasses.replace(SMALL, seconds=s)) for s in (0.0, 1e-9, 1e9)]
+    assert sizes == [32, 32, 64]
 
 
 @pytest.mark.parametrize(
@@ -92,7 +101,7 @@ def test_what_is_left_out_has_its_reason(context, monkeypatch, scene, words):
 
 def test_goals_go_to_the_best_that_splits_on_glass_and_to_the_best_elsewhere():
     def measured(cost):
-        return {4: efficiency.Measured([1.0], {"MSE": [cost]}, np.zeros(0))}
+        return {4: efficiency.Measured([1.0], {"MSE": [cost]}, None)}
 
     subjects = [efficiency.Subject(method, "multijitter") for method in METHODS]
     costs = dict(zip((s.name for s in subjects), (1.0, 1.0, 0.1, 0.5, 0.3, 0.4), strict=True))

@@ -118,10 +118,10 @@ def test_what_is_the_same_is_not_tested_by_chance_and_still_compared(context):
 def test_scenes_say_what_they_need_and_what_is_left_out(context):
     (row,) = scenes.scene_rows(context, SCENES / "slab.xml")
     assert {name for name, value in row.values.items() if value} == {
-        "sampleable", "area", "environment", "only_glass", "polarising"
+        "sampleable", "area", "environment", "only glass", "polarising"
     }  # fmt: skip
-    assert row.reason.startswith("left out: emitter sampling (every BSDF has delta lobes only); media (")
-    assert "dispersion (no BSDF bends light by its wavelength)" in row.reason
+    assert row.reason == "left out: emitter sampling, media, null lobes, textures, dispersion"
+    assert row.replay["left out"]["dispersion"] == "no BSDF bends light by its wavelength"
 
 
 # The run -------------------------------------------------------------------------------------------------------

@@ -49,40 +49,46 @@ MIXED_GOALS = {"equal-time MSE": 0.8}
 
 @dataclass(frozen=True)
 class Extent:
-    """How much is measured: squares of primes, which every sampler takes as they are, and no scene in () is left out.
+    """How much is measured.
 
-    Six rounds are the fewest that have a 95 % interval.
+    `spp` are squares of primes: every sampler takes them as they are. Six rounds are the fewest that have a 95 %
+    interval. The resolution is doubled, up to `LARGEST`, until the built-in takes `seconds`. `scenes`: () is all.
     """
 
     spp: tuple[int, ...]
     rounds: int
     references: int
+    resolution: int = 128
+    seconds: float = 0.0
     scenes: tuple[str, ...] = ()
 
 
-EXTENTS = {"quick": Extent((4, 25), 6, 12, ("balls", "furnace", "mirage", "sphere")),
-           "full": Extent((4, 25, 49), 8, 24)}  # fmt: skip
+EXTENTS = {
+    "quick": Extent((4, 25), 6, 12, scenes=("balls", "furnace", "mirage", "sphere")),
+    "full": Extent((4, 9, 25), 8, 16, seconds=0.25),
+}
+LARGEST = 512
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A method with a sampler, on one scene."""
+    """A method with a sampler, named only where it is not the scene's best stratified one."""
 
     method: Method
     sampler: str
 
     @property
     def name(self) -> str:
-        return f"{self.method.name}, {self.sampler}"
+        return self.method.name + (f", {INDEPENDENT}" if self.sampler == INDEPENDENT else "")
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Of one subject at one number of samples: seconds and figures by round, and the pictures."""
+    """Of one subject at one number of samples: seconds and figures by round; the pictures at the most samples."""
 
     seconds: list[float]
     figures: dict[str, list[float]]
-    pictures: np.ndarray
+    pictures: np.ndarray | None
 
     def cost(self, metric: str) -> list[float]:
         return [error * seconds for error, seconds in zip(self.figures[metric], self.seconds, strict=True)]
@@ -107,7 +113,7 @@ def scene_rows(context: Context, path: Path, methods: tuple[Method, ...] = METHO
         reason = f"left out: the profile {context.profile.name} measures {', '.join(extent.scenes)}"
     elif path.stem in NO_REFERENCE:
         reason = f"left out: {NO_REFERENCE[path.stem]}"
-    elif (noise := _noise(context, path, extent)) < NOISE:
+    elif (noise := _noise(path, extent)) < NOISE:
         reason = f"left out: no noise, so no error against time: two seeds differ by {noise:.1e} at most"
     if reason:
         return [Row(STUDY, "every method", path.stem, context.variant, reason=reason)]
@@ -115,7 +121,7 @@ def scene_rows(context: Context, path: Path, methods: tuple[Method, ...] = METHO
 
 
 def _measured_rows(context: Context, path: Path, extent: Extent, methods: tuple[Method, ...]) -> list[Row]:
-    resolution = context.profile.resolution
+    resolution = _resolution(path, extent)
     absent = {method.name: reason for method in methods if (reason := method.missing)}
     rows = [Row(STUDY, name, path.stem, context.variant, reason=reason) for name, reason in absent.items()]
     sampler = best_sampler(path, resolution, extent)
@@ -130,23 +136,36 @@ def _measured_rows(context: Context, path: Path, extent: Extent, methods: tuple[
         "scene": path.name, "resolution": resolution, "spp": extent.spp[-1], "rounds": extent.rounds,
         "reference renders": extent.references, "reference seeds from": FIRST_REFERENCE, "sampler": sampler,
     }  # fmt: skip
+    remark = f"the best stratified sampler here: {sampler}"
     for subject in subjects:
         values = _values(subject, subjects[:2], found, references)
         # The reference is the built-in's own.
         budgets = {} if subject.method == BUILTIN else {"Welch alarms": 0.0}
         rows.append(Row(STUDY, subject.name, path.stem, context.variant, values, budgets, goals.get(subject.name, {}),
-                        replay=replay | {"method": subject.method.plugin(-1)}))  # fmt: skip
+                        remark, replay | {"method": subject.method.plugin(-1)}))  # fmt: skip
     own = {"reference variance": float(references.var(0, ddof=1).mean() / len(references))}
-    return [*rows, Row(STUDY, "every method", path.stem, context.variant, own, replay=replay, curves=_curves(found))]
+    rows.append(Row(STUDY, "every method", path.stem, context.variant, own, {}, {}, remark, replay, {}, _curves(found)))
+    return rows
 
 
 def _camera(path: Path, method: Method, resolution: int, sampler: str, extent: Extent) -> Camera:
     return camera(path, method, resolution, sampler=sampler, spp=extent.spp[-1])
 
 
-def _noise(context: Context, path: Path, extent: Extent) -> float:
-    look = _camera(path, BUILTIN, context.profile.resolution, INDEPENDENT, extent)
+def _noise(path: Path, extent: Extent) -> float:
+    look = _camera(path, BUILTIN, extent.resolution, INDEPENDENT, extent)
     return float(np.abs(look(1, seed=0)[0] - look(1, seed=1)[0]).max())
+
+
+def _resolution(path: Path, extent: Extent) -> int:
+    """Of pictures that take long enough for what a render costs beside its samples not to count."""
+    resolution = extent.resolution
+    while resolution < LARGEST and extent.seconds:
+        look = _camera(path, BUILTIN, resolution, INDEPENDENT, extent)
+        if min(look(extent.spp[-1], seed=i)[1] for i in range(2)) >= extent.seconds:
+            break
+        resolution *= 2
+    return resolution
 
 
 def best_sampler(path: Path, resolution: int, extent: Extent, seeds: int = 3) -> str:
@@ -178,10 +197,11 @@ def measure(cameras: dict[str, Camera], references: np.ndarray, extent: Extent) 
 
         seconds = timing.rounds({name: name for name in cameras}, shoot, extent.rounds)
         for name in cameras:
-            pictures = np.stack([picture for picture, _ in shots[name][1:]])
+            pictures = [picture for picture, _ in shots[name][1:]]
             figures = [errors(picture, mean, own) for picture in pictures]
             by_metric = {metric: [figure[metric] for figure in figures] for metric in METRICS}
-            found[name][spp] = Measured(seconds[name], by_metric, pictures)
+            kept = np.stack(pictures) if spp == extent.spp[-1] else None
+            found[name][spp] = Measured(seconds[name], by_metric, kept)
     return found
 
 
@@ -202,14 +222,15 @@ def _values(subject: Subject, builtins: list[Subject], found: Found, references:
     spp = max(found[subject.name])
     test, default, best = (found[s.name][spp] for s in (subject, *builtins))
     same = default if subject == builtins[0] else best
-    values = timing.ratio("time / built-in", test.seconds, same.seconds)
+    values = timing.ratio("equal-time MSE", test.cost("MSE"), same.cost("MSE"))
+    values |= timing.ratio("equal-time MSE / independent", test.cost("MSE"), default.cost("MSE"))
+    values |= timing.ratio("time / built-in", test.seconds, same.seconds)
     values |= {"seconds": statistics.median(test.seconds)}
     values |= {metric: statistics.fmean(test.figures[metric]) for metric in METRICS}
-    values |= timing.ratio("equal-time MSE", test.cost("MSE"), same.cost("MSE"))
-    values |= timing.ratio("equal-time MSE / independent", test.cost("MSE"), default.cost("MSE"))
     for metric in METRICS[1:]:
         ratios = [t / s for t, s in zip(test.cost(metric), same.cost(metric), strict=True)]
         values[f"equal-time {metric}"] = statistics.median(ratios)
+    assert test.pictures is not None
     agreed = compare.welch(references, test.pictures, TILE, FAMILY_ERROR, MARGIN)
     return values | {
         "Welch alarms": float(agreed.alarms), "smallest p, adjusted": agreed.smallest_p,

@@ -1,7 +1,8 @@
 """Scenes: what each of them needs of an integrator and of a study, as the loaded scene shows it, in this variant.
 
-1 where it needs something. What it does not need is left out, and the remark says why: nothing is said of dispersion
-where no index depends on the wavelength, and nothing of polarisation where nothing polarises.
+1 where it has something that needs care. What a scene lacks is left out, of kernels and of studies: nothing is said of
+dispersion where no index depends on the wavelength, and nothing of polarisation where nothing polarises. The remark
+names what is left out, the replay the reason of each.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ TITLE = "Scenes"
 TEXT = __doc__.partition("\n")[2].strip()
 TERMS = {
     "smooth": "some surface scatters, so that it can pay to sample the emitters there",
-    "only_glass": "every lobe of every surface is a delta",
-    "delta_emitters": "some emitter can be found by sampling it only",
+    "only glass": "every lobe of every surface is a delta",
+    "delta emitters": "some emitter can be found by sampling it only",
 }
 STUDY = "scenes"
 
@@ -35,9 +36,9 @@ def tasks(context: Context) -> list[Task]:
 
 def scene_rows(context: Context, path: Path) -> list[Row]:
     found = needs.inspect(opened(path, PLUGIN, context.profile.resolution))
-    values = {name: float(value) for name, value in dataclasses.asdict(found).items() if name != "unknown"}
-    remarks = [f"{feature} ({reason})" for feature, reason in found.left_out.items()]
-    remark = f"left out: {'; '.join(remarks)}" if remarks else ""
+    values = {name.replace("_", " "): float(x) for name, x in dataclasses.asdict(found).items() if name != "unknown"}
+    remark = f"left out: {', '.join(found.left_out)}"
     if found.unknown:
         remark = f"everything is presumed of {', '.join(found.unknown)}"
-    return [Row(STUDY, "needs", path.stem, context.variant, values, reason=remark, replay={"scene": path.name})]
+    replay = {"scene": path.name, "left out": found.left_out}
+    return [Row(STUDY, "needs", path.stem, context.variant, values, reason=remark, replay=replay)]
