@@ -81,6 +81,20 @@ def test_the_same_picture_has_the_same_error_and_more_samples_less(rows):
     assert control["Welch alarms"] == 0
 
 
+@pytest.mark.parametrize(("noise", "seconds", "best"), [(2.0, 1.0, 1), (0.5, 1.0, 0), (0.5, 5.0, 1)])
+def test_the_best_sampler_has_the_least_variance_and_time(monkeypatch, noise, seconds, best):
+    """The first one's noise and time are given, the other's are 1; the first picture of each took forever."""
+
+    def look(path, method, resolution, sampler, extent):
+        first = sampler == efficiency.STRATIFIED[0]
+        shots = iter([1e9] + 3 * [seconds if first else 1.0])
+        rng = np.random.default_rng(1)
+        return lambda spp, seed: (rng.normal(size=(8, 8, 3)) * (noise if first else 1.0), next(shots))
+
+    monkeypatch.setattr(efficiency, "_camera", look)
+    assert efficiency.best_sampler(SCENES / "balls.xml", 8, SMALL) == efficiency.STRATIFIED[best]
+
+
 def test_pictures_grow_until_their_time_can_be_told(context, monkeypatch):
     monkeypatch.setattr(efficiency, "LARGEST", 64)
     path = SCENES / "furnace.xml"

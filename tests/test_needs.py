@@ -64,7 +64,7 @@ EVERYTHING = {"smooth", "null", "textured", "polarising", "dispersive"}
 def test_what_is_not_known_needs_everything():
     mi.set_variant("scalar_rgb")
 
-    class Stranger(mi.BSDF):
+    class Refract(mi.BSDF):  # ours by its name, but not by its module
         def __init__(self, props):
             super().__init__(props)
             self.m_flags = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.FrontSide
@@ -72,15 +72,34 @@ def test_what_is_not_known_needs_everything():
         def traverse(self, callback):
             pass
 
-    mi.register_bsdf("stranger", Stranger)
+    mi.register_bsdf("stranger", Refract)
     part = {"type": "sphere", "bsdf": {"type": "twosided", "nested": {"type": "stranger"}}}
     assert facts(part=part) == EVERYTHING
     scene = mi.load_dict({"type": "scene", "part": part})
     (name,) = inspect(scene).unknown
-    assert name.endswith("Stranger")
+    assert name.endswith("Refract")
     group = {"type": "shapegroup", "id": "group", "a": {"type": "sphere", "bsdf": BLACK}}
     instance = {"type": "instance", "group": {"type": "ref", "id": "group"}}
     assert facts(group=group, instance=instance) == EVERYTHING | {"area", "media"}
+
+
+def test_an_emitter_that_declares_nothing_may_be_a_delta():
+    mi.set_variant("scalar_rgb")
+
+    class Silent(mi.Emitter):
+        def traverse(self, callback):
+            pass
+
+    mi.register_emitter("silent", Silent)
+    assert facts(part={"type": "silent"}) == {"only_glass", "polarising", "sampleable", "delta_emitters"}
+
+
+@pytest.mark.parametrize(("reflectance", "black"), [(0.0, True), ({"type": "rgb", "value": 1e-9}, False)])
+def test_a_spectrum_from_rgb_is_never_exactly_black(reflectance, black):
+    """Mitsuba calls its largest value 0."""
+    mi.set_variant("scalar_spectral")
+    part = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
+    assert ("smooth" in facts(part=part)) != black
 
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])

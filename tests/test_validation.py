@@ -110,6 +110,9 @@ def test_what_is_the_same_is_not_tested_by_chance_and_still_compared(context):
     assert "Welch alarms" not in right.values and not right.curves
     assert {"|mean ratio − 1|", "changed share"} <= set(wrong.broken)
     quiet, noisy = np.ones((4, 8, 8, 3)), np.random.default_rng(1).random((4, 8, 8, 3))
+    assert renders._budgets("nested", "").keys() == {"|mean ratio − 1|", "Welch alarms"}
+    assert renders._budgets("nested", "left out").keys() == {"|mean ratio − 1|", "changed share"}
+    assert renders._budgets("mirage", "left out") == {}
     assert "bit for bit" in renders.no_question(noisy, noisy)
     assert "independent seeds" in renders.no_question(quiet + 1e-7, quiet)
     assert renders.no_question(quiet * np.nan, quiet) == renders.no_question(noisy, quiet) == ""
