@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 SCENES = Path(__file__).parent.parent / "scenes"
-NAMES = ["diamond", "fibre", "furnace", "glasses64", "lightpipe", "matched"]
+NAMES = ["balls", "diamond", "fibre", "furnace", "glasses64", "lightpipe", "matched"]
 NAMES += ["mirage", "nested", "prism", "slab", "sphere"]
-DEFAULTS = {"bsdf": "refract", "integrator": "path", "max_depth": None, "spp": "64", "res": "128"}
+DEFAULTS = {"bsdf": "refract", "integrator": "path", "sampler": "independent"}
+DEFAULTS |= {"max_depth": None, "spp": "64", "res": "128"}
 each_scene = pytest.mark.parametrize("name", NAMES)
 
 
@@ -69,7 +70,7 @@ def file_faults(text):
             yield "an IOR that is neither a float nor a name"
 
 
-def test_there_are_eleven():
+def test_there_are_twelve():
     assert sorted(p.stem for p in SCENES.glob("*.xml")) == NAMES
 
 

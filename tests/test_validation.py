@@ -13,7 +13,7 @@ from mi_refract import FORMULAS, bsdf, oracle, regimes
 from mi_refract.report import read_json
 from mi_refract.rows import Row
 from validation import __main__ as command
-from validation import directions, judge, paths, readme, renders, runner, samples, settings
+from validation import directions, judge, methods, paths, readme, renders, runner, samples, scenes, settings
 from validation.plan import SCENES, Task
 
 
@@ -29,6 +29,11 @@ def defective(props):
     params["eta"] = 1.01 * float(plugin.eta[0])
     params.update()
     return plugin
+
+
+def tinted(props):
+    props["specular_transmittance"] = 0.999
+    return props
 
 
 # Studies -------------------------------------------------------------------------------------------------------
@@ -97,6 +102,31 @@ def test_renders_agree_and_see_an_index_that_is_off(context, plugin, verdict):
     assert set(row.curves) == ({"refract", "dielectric"} if plugin == "refract" else set())
 
 
+def test_what_is_the_same_is_not_tested_by_chance_and_still_compared(context):
+    """The furnace has no noise: no Welch test, but a picture that is off fails; and NaN is no picture at all."""
+    mi.register_bsdf("refract_tinted", lambda props: bsdf.plugin_class(mi.scalar_rgb)(tinted(props)))
+    right, wrong = (renders._compare(context, SCENES / "furnace.xml", p)[0] for p in ("refract", "refract_tinted"))
+    assert right.verdict == "pass" and right.reason.startswith("left out: Welch's test")
+    assert "Welch alarms" not in right.values and not right.curves
+    assert {"|mean ratio − 1|", "changed share"} <= set(wrong.broken)
+    quiet, noisy = np.ones((4, 8, 8, 3)), np.random.default_rng(1).random((4, 8, 8, 3))
+    assert renders._budgets("nested", "").keys() == {"|mean ratio − 1|", "Welch alarms"}
+    assert renders._budgets("nested", "left out").keys() == {"|mean ratio − 1|", "changed share"}
+    assert renders._budgets("mirage", "left out") == {}
+    assert "bit for bit" in renders.no_question(noisy, noisy)
+    assert "independent seeds" in renders.no_question(quiet + 1e-7, quiet)
+    assert renders.no_question(quiet * np.nan, quiet) == renders.no_question(noisy, quiet) == ""
+
+
+def test_scenes_say_what_they_need_and_what_is_left_out(context):
+    (row,) = scenes.scene_rows(context, SCENES / "slab.xml")
+    assert {name for name, value in row.values.items() if value} == {
+        "sampleable", "area", "environment", "only glass", "polarising"
+    }  # fmt: skip
+    assert row.reason == "left out: emitter sampling, media, null lobes, textures, dispersion"
+    assert row.replay["left out"]["dispersion"] == "no BSDF bends light by its wavelength"
+
+
 # The run -------------------------------------------------------------------------------------------------------
 
 
@@ -148,7 +178,7 @@ def test_the_exit_code_follows_the_budgets(tmp_path, monkeypatch, capsys, budget
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["refractions"], "unknown study 'refractions'; accepted: directions, stability, renders"),
+        (["refractions"], "unknown study 'refractions'; accepted: directions, stability, renders, efficiency"),
         (["--profile", "slow"], "invalid choice: 'slow'"),
         (["--out", __file__], "File exists"),
         (["--speed", "9"], "unrecognized arguments"),
@@ -208,5 +238,6 @@ def test_the_readme_holds_its_tables_and_shows_pictures_that_exist():
 
 def test_a_scene_is_loaded_in_the_same_order_every_time(context):
     """Loading with Mitsuba's defaults gives one of two pictures, about one time in four the other one."""
-    pictures = [renders.Camera(SCENES / "diamond.xml", "dielectric", 8)(1, seed=0)[0] for _ in range(12)]
+    scenes = [methods.opened(SCENES / "diamond.xml", "dielectric", 8) for _ in range(12)]
+    pictures = [methods.Camera(scene)(1, seed=0)[0] for scene in scenes]
     assert all((picture == pictures[0]).all() for picture in pictures)

@@ -18,7 +18,8 @@ from typing import Any
 STUDIES = {
     "directions": ("directions", "mutants", "samples", "sweep", "search"),
     "stability": ("stability", "energy", "derivatives", "paths"),
-    "renders": ("renders",),
+    "renders": ("scenes", "renders"),
+    "efficiency": ("efficiency", "scaling"),
 }
 
 

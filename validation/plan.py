@@ -10,6 +10,8 @@ from mi_refract.backend import Backend
 from mi_refract.rows import Row
 
 SCENES = Path(__file__).parent.parent / "scenes"
+# Where the built-in is no reference: pictures are shown, and nothing is demanded of their agreement.
+NO_REFERENCE = {"mirage": "the built-in turns slanting edges into stairs here, so it is no reference: see Paths"}
 
 
 @dataclass(frozen=True)

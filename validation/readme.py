@@ -89,7 +89,8 @@ def renders(rows: list[Row]) -> str:
     size = f"{replay['resolution']}² pixels, {replay['spp']} spp, {replay['seeds']} seeds, {replay['variant']}"
     lines = [f"{size}.", "", f"| scene | {' | '.join(RENDERS.values())} |", "|---" * (len(RENDERS) + 1) + "|"]
     for row in found:
-        lines.append(f"| {row.case} | {' | '.join(compact(row.values[metric]) for metric in RENDERS)} |")
+        cells = [compact(row.values[metric]) if metric in row.values else "–" for metric in RENDERS]
+        lines.append(f"| {row.case} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

@@ -1,0 +1,135 @@
+"""What a loaded Mitsuba scene needs of an integrator, and what it can do without. Any variant, scalar ones too.
+
+A surface that is exactly black counts as none: only a `diffuse` whose reflectance is the number 0, which is what an
+area light without a BSDF gets. In spectral variants `<rgb value="0"/>` is a spectrum of some 3e-8, so not black.
+An unknown plugin, and an instance, whose shapes Mitsuba does not show, count as needing everything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+WRAPPERS = {"BlendBSDF", "BumpMap", "MaskBSDF", "NormalMap", "TwoSidedBRDF"}
+DEPOLARISING = {
+    "Hair", "Measured", "Null", "Principled", "PrincipledThin", "RoughDielectric", "RoughPlastic", "SmoothDiffuse",
+    "SmoothPlastic", "ThinDielectric",
+}  # fmt: skip
+POLARISING = {
+    "CircularPolarizer", "LinearPolarizer", "LinearRetarder", "MeasuredPolarized", "PolarizedPlastic", "Refract",
+    "RoughConductor", "SmoothConductor", "SmoothDielectric",
+}  # fmt: skip
+KNOWN = WRAPPERS | DEPOLARISING | POLARISING
+
+
+@dataclass(frozen=True)
+class Needs:
+    """Facts about a scene; `unknown` names the plugins of which everything was presumed."""
+
+    smooth: bool  # some BSDF has a lobe that is no delta: an emitter sample can matter
+    sampleable: bool  # some emitter can be sampled
+    area: bool  # some shape emits
+    environment: bool
+    delta_emitters: bool  # some emitter is met by sampling it only
+    only_glass: bool  # every BSDF has delta lobes only
+    textured: bool  # something of a BSDF varies over its surface
+    null: bool  # some BSDF has a null lobe
+    polarising: bool  # some BSDF acts on the state of polarisation
+    dispersive: bool  # some BSDF bends light by its wavelength
+    media: bool
+    unknown: tuple[str, ...] = ()
+
+    @property
+    def left_out(self) -> dict[str, str]:
+        """Feature → why the scene can do without it."""
+        reasons = {
+            "emitter sampling": "every BSDF has delta lobes only" if not self.smooth
+            else "" if self.sampleable else "no emitter can be sampled",
+            "area lights": "" if self.area else "no shape emits",
+            "environment": "" if self.environment else "no environment emitter",
+            "media": "" if self.media else "neither a shape, a sensor nor an emitter has a medium",
+            "null lobes": "" if self.null else "no BSDF has one",
+            "textures": "" if self.textured else "no BSDF varies over its surface",
+            "polarisation": "" if self.polarising else "no BSDF acts on it",
+            "dispersion": "" if self.dispersive else "no BSDF bends light by its wavelength",
+        }  # fmt: skip
+        return {feature: reason for feature, reason in reasons.items() if reason}
+
+
+def inspect(scene: Any) -> Needs:
+    """What `scene` needs as it is now: an edited parameter can change it."""
+    import mitsuba as mi
+
+    shapes, emitters = scene.shapes(), scene.emitters()
+    opaque = [shape.class_name() for shape in shapes if shape.class_name() == "Instance"]
+    bsdfs = [bsdf for shape in shapes if not _black(outer := shape.bsdf()) for bsdf in _nested(outer)]
+    names = [_name(bsdf) for bsdf in bsdfs]
+    unknown = tuple(sorted({name for name in names if name not in KNOWN} | set(opaque)))
+    everything = bool(unknown)
+    flags = 0
+    for bsdf in bsdfs:
+        flags |= bsdf.flags()
+    lobes, sampled = mi.BSDFFlags, [emitter.flags() for emitter in emitters]
+    media = [medium for shape in shapes for medium in (shape.interior_medium(), shape.exterior_medium())]
+    media += [end.get_medium() for end in (*emitters, *scene.sensors())]
+    return Needs(
+        smooth=everything or bool(flags & +lobes.Smooth),
+        sampleable=bool(emitters),  # Mitsuba refuses a scene all of whose emitters have the weight 0
+        area=bool(opaque) or any(shape.is_emitter() for shape in shapes),
+        environment=scene.environment() is not None,
+        # An emitter that declares nothing may be anything.
+        delta_emitters=any(not flag or flag & +mi.EmitterFlags.Delta for flag in sampled),
+        only_glass=not (everything or flags & +(lobes.Smooth | lobes.Delta1D)),
+        textured=everything or any(_textured(bsdf) for bsdf in bsdfs),
+        null=everything or bool(flags & +lobes.Null),
+        polarising=any(name not in WRAPPERS | DEPOLARISING for name in names) or everything,
+        dispersive=everything,  # every known plugin has one index for all wavelengths, or only reflects
+        media=bool(opaque) or any(medium is not None for medium in media),
+        unknown=unknown,
+    )
+
+
+def _name(bsdf: Any) -> str:
+    """The C++ class; of a Python plugin, which Mitsuba calls "BSDF", its own, with its module unless it is ours."""
+    name, kind = bsdf.class_name(), type(bsdf)
+    if name != "BSDF" and kind.__module__.startswith("mitsuba"):
+        return str(name)
+    return kind.__name__ if kind.__module__.startswith("mi_refract.") else f"{kind.__module__}.{kind.__name__}"
+
+
+def _nested(bsdf: Any) -> Iterator[Any]:
+    yield bsdf
+    for child in _children(bsdf):
+        if hasattr(child, "eval_null_transmission"):
+            yield from _nested(child)
+
+
+def _textured(bsdf: Any) -> bool:
+    return any(hasattr(child, "is_spatially_varying") and child.is_spatially_varying() for child in _children(bsdf))
+
+
+def _black(bsdf: Any) -> bool:
+    if _name(bsdf) != "SmoothDiffuse":
+        return False
+    (reflectance,) = _children(bsdf)
+    exact = reflectance.class_name() == "UniformSpectrum" or "spectral" not in bsdf.variant_name()
+    return bool(exact and not reflectance.is_spatially_varying() and reflectance.max() == 0)
+
+
+def _children(node: Any) -> list[Any]:
+    """The Mitsuba objects that a plugin shows of itself."""
+    import mitsuba as mi
+
+    class Children(mi.TraversalCallback):
+        def __init__(self) -> None:
+            super().__init__()
+            self.found: list[Any] = []
+
+        def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
+            if isinstance(value, mi.Object):
+                self.found.append(value)
+
+    callback = Children()
+    node.traverse(callback)
+    return callback.found
