@@ -1,6 +1,7 @@
 """The reference for refraction in rendering.
 
-`import mi_refract` makes the BSDF `refract` known to Mitsuba, in the present variant and in every later one.
+`import mi_refract` makes the BSDF `refract` and the integrator `refract_path` known to Mitsuba, in the present variant
+and in every later one.
 
 Conventions, everywhere in this package:
 
@@ -17,6 +18,7 @@ Conventions, everywhere in this package:
 import mitsuba as _mi
 
 from . import bsdf as _bsdf
+from . import integrator as _integrator
 from .formulas import FORMULAS, reflect, reflect_sandwich, refract_2d
 
 __all__ = ["FORMULAS", "reflect", "reflect_sandwich", "refract_2d"]
@@ -26,10 +28,11 @@ __version__ = "0.1.0"
 def _register(old: str | None, new: str | None) -> None:
     """After every `set_variant`. Registration is per variant and does not outlive a switch."""
     if new:
-        _bsdf.register(getattr(_mi, new))
+        for plugin in (_bsdf, _integrator):
+            plugin.register(getattr(_mi, new))
 
 
 # `scalar_rgb` always: Mitsuba's parser asks only that variant what kind of plugin a name is.
-_bsdf.register(_mi.scalar_rgb)
+_register(None, "scalar_rgb")
 _register(None, _mi.variant())
 _mi.detail.add_variant_callback(_register)
