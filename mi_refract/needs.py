@@ -33,7 +33,7 @@ class Needs:
     environment: bool
     delta_emitters: bool  # some emitter is met by sampling it only
     only_glass: bool  # every BSDF has delta lobes only
-    textured: bool  # something of a BSDF varies over its surface
+    textured: bool  # something of a BSDF or of a light varies over its surface
     null: bool  # some BSDF has a null lobe
     polarising: bool  # some BSDF acts on the state of polarisation
     dispersive: bool  # some BSDF bends light by its wavelength
@@ -50,7 +50,7 @@ class Needs:
             "environment": "" if self.environment else "no environment emitter",
             "media": "" if self.media else "neither a shape, a sensor nor an emitter has a medium",
             "null lobes": "" if self.null else "no BSDF has one",
-            "textures": "" if self.textured else "no BSDF varies over its surface",
+            "textures": "" if self.textured else "no BSDF and no area light varies over its surface",
             "polarisation": "" if self.polarising else "no BSDF acts on it",
             "dispersion": "" if self.dispersive else "no BSDF bends light by its wavelength",
         }  # fmt: skip
@@ -71,6 +71,7 @@ def inspect(scene: Any) -> Needs:
     for bsdf in bsdfs:
         flags |= bsdf.flags()
     lobes, sampled = mi.BSDFFlags, [emitter.flags() for emitter in emitters]
+    lamps = [shape.emitter() for shape in shapes if shape.is_emitter()]
     media = [medium for shape in shapes for medium in (shape.interior_medium(), shape.exterior_medium())]
     media += [end.get_medium() for end in (*emitters, *scene.sensors())]
     return Needs(
@@ -81,7 +82,7 @@ def inspect(scene: Any) -> Needs:
         # An emitter that declares nothing may be anything.
         delta_emitters=any(not flag or flag & +mi.EmitterFlags.Delta for flag in sampled),
         only_glass=not (everything or flags & +(lobes.Smooth | lobes.Delta1D)),
-        textured=everything or any(_textured(bsdf) for bsdf in bsdfs),
+        textured=everything or any(_textured(node) for node in (*bsdfs, *lamps)),
         null=everything or bool(flags & +lobes.Null),
         polarising=any(name not in WRAPPERS | DEPOLARISING for name in names) or everything,
         dispersive=everything,  # every known plugin has one index for all wavelengths, or only reflects
@@ -105,8 +106,8 @@ def _nested(bsdf: Any) -> Iterator[Any]:
             yield from _nested(child)
 
 
-def _textured(bsdf: Any) -> bool:
-    return any(hasattr(child, "is_spatially_varying") and child.is_spatially_varying() for child in _children(bsdf))
+def _textured(node: Any) -> bool:
+    return any(hasattr(child, "is_spatially_varying") and child.is_spatially_varying() for child in _children(node))
 
 
 def _black(bsdf: Any) -> bool:

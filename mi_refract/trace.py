@@ -92,8 +92,10 @@ class Pile:
 
 
 def power_heuristic(a: Any, b: Any) -> Any:
-    weight = dr.square(a) / (dr.square(a) + dr.square(b))
-    return dr.select(dr.isfinite(weight), weight, 0)
+    """Of the technique with density `a` beside that with `b`; 0 where neither has any."""
+    a, b = dr.square(a), dr.square(b)
+    some = (a + b > 0) & dr.isfinite(a)
+    return dr.select(some, a / dr.select(some, a + b, 1), 0)
 
 
 class Trace:

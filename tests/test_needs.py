@@ -150,7 +150,7 @@ def test_what_is_left_out_has_its_reason():
     mi.set_variant("scalar_rgb")
     found = inspect(mi.load_file(str(SCENES / "slab.xml"), res=4)).left_out
     assert found["emitter sampling"] == "every BSDF has delta lobes only"
-    assert set(found) == {"emitter sampling", "media", "null lobes", "textures", "dispersion"}
+    assert set(found) == {"emitter sampling", "media", "null lobes", "dispersion"}
     dark = inspect(mi.load_dict({"type": "scene", "a": {"type": "sphere"}})).left_out
     assert dark["emitter sampling"] == "no emitter can be sampled"
     assert {"area lights", "environment", "polarisation"} <= set(dark)
