@@ -114,7 +114,7 @@ def integrator_class(v: Any) -> type:
             """Looked up once a render, as an edit of the scene can change them."""
             if self.seen is None or self.seen[0] is not scene:
                 self.seen = scene, inspect(scene)
-                mi.Log(mi.LogLevel.Info, f"{INTEGRATOR}: left out: {self.left_out()}")
+                mi.Log(mi.LogLevel.Info, f"{INTEGRATOR}: left out: {self.left_out()}")  # type: ignore[operator]
             return self.seen[1]
 
         def left_out(self) -> str:

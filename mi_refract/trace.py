@@ -7,6 +7,7 @@ lane has no more on its stack than levels are split, however many paths it follo
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass, make_dataclass
 from typing import Any
 
@@ -135,8 +136,10 @@ class Trace:
 
         def step(ray: Any, active: Any) -> tuple[Any, Any]:
             si = self.scene.ray_intersect(ray, +mi.RayFlags.Minimal, True, active)
-            lit = dr.neq(si.shape.emitter(), None) if self.vectorised else bool(si.shape and si.shape.emitter())
-            active = active & si.is_valid() & lit
+            if self.vectorised or si.is_valid():
+                active = active & si.is_valid() & operator.ne(si.shape.emitter(), None)
+            else:
+                active = False
             ray.o = dr.select(active, si.spawn_ray(ray.d).o, ray.o)
             return ray, active
 
@@ -149,8 +152,12 @@ class Trace:
         hit = si.is_valid()
         self._add_emission(s, si, hit)
         onward = hit & (s.depth + 1 < self.plan.max_depth)
-        if self.vectorised or hit:
+        if self.plan.deterministic:
+            self._truncate(s, hit & (onward ^ True), 1)
+        if self.vectorised or onward:
             onward = self._scatter(s, si, si.bsdf(), hit, onward)
+        else:
+            s.valid = s.valid or hit
         if self.plan.split_depth:
             onward = self._resume(s, onward)
         s.active = onward
@@ -252,10 +259,14 @@ class Trace:
             both = self._put_aside(s, si, bsdf, bs, second, both)
         if plan.deterministic:
             # The sample 1/2 has picked the stronger lobe; the other one is lost.
-            lost = dr.max(self.v.unpolarized_spectrum(throughput)) * (1 - p)
-            s.truncated = dr.select(pair & (both ^ True), s.truncated + lost, s.truncated)
+            self._truncate(s, pair & (both ^ True), 1 - p)
             both = pair
         return dr.select(both, throughput * bs.pdf, throughput)
+
+    def _truncate(self, s: State, where: Any, share: Any) -> None:
+        # η²: what radiance lost where the path entered a denser medium it regains where it leaves.
+        lost = dr.max(self.v.unpolarized_spectrum(s.throughput)) * dr.square(s.eta) * share
+        s.truncated = dr.select(where, s.truncated + lost, s.truncated)
 
     @staticmethod
     def _is_pair(flags: Any) -> Any:

@@ -1,0 +1,262 @@
+"""`refract_path` renders what `path` does, in every variant, with less; it splits without bias and differentiates."""
+
+import dataclasses
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refract import compare, images, integrator, needs, strata, trace
+from validation.plan import SCENES
+
+LLVM = "llvm_ad_rgb"
+MIXED = ("sphere", "nested")
+GLASS_ONLY = ("balls", "slab", "lightpipe")
+AROUND, DOWN = 0.6 + 0.4 * np.sin(np.arange(64) * 2 * np.pi / 64 + 0.3), np.linspace(0, 0.7, 32)
+SKY = (AROUND[None, :, None] + DOWN[:, None, None]).astype(np.float32) * np.ones(3, np.float32)
+
+
+@pytest.fixture
+def llvm(needs_variant):
+    needs_variant(LLVM)
+    before = mi.variant()
+    mi.set_variant(LLVM)
+    yield
+    mi.set_variant(before)
+
+
+def load(name, resolution=32, **parameters):
+    return mi.load_file(str(SCENES / f"{name}.xml"), **images.REPRODUCIBLE, res=resolution, **parameters)
+
+
+def render(scene, spp=16, seed=0, **parameters):
+    method = mi.load_dict({"type": "refract_path", "max_depth": 16} | parameters)
+    return np.array(mi.render(scene, integrator=method, spp=spp, seed=seed), dtype=float)
+
+
+def by_path(scene, spp=16, seed=0, **parameters):
+    return render(scene, spp, seed, **parameters, type="path")
+
+
+def glass_ball(sampler=None, **parts):
+    place = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    sensor = {
+        "type": "perspective", "sampler": sampler or {"type": "independent"}, "fov": 30, "to_world": place,
+        "film": {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
+    }  # fmt: skip
+    ball = {"type": "sphere", "bsdf": {"type": "refract", "int_ior": 1.5, "ext_ior": 1.0}}
+    return mi.load_dict({"type": "scene", "sensor": sensor, "ball": ball} | parts)
+
+
+def sky():
+    return {"type": "envmap", "bitmap": mi.Bitmap(SKY)}
+
+
+# The same picture ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", MIXED)
+def test_where_nothing_is_left_out_the_numbers_and_the_picture_are_those_of_path(name, each_variant):
+    """With Russian roulette and emitter sampling both integrators draw the same numbers in the same order."""
+    vectorised = dr.is_jit_v(mi.Float)
+    scene, spp = load(name, 24 if vectorised else 4), 16 if vectorised else 2
+    for parameters in ({}, {"max_depth": 3, "rr_depth": 1}):
+        ours, theirs = render(scene, spp, **parameters), by_path(scene, spp, **parameters)
+        assert theirs.std() > 0
+        assert compare.paired(theirs, ours, 1e-4).changed <= 1e-3
+
+
+@pytest.mark.parametrize("name", [*GLASS_ONLY, *MIXED])
+@pytest.mark.parametrize("parameters", [{}, {"split_depth": 1}, {"split_depth": 4, "rr_depth": 3}], ids=str)
+def test_other_numbers_give_the_same_mean(name, parameters, llvm):
+    """Welch's test on tiles, one false alarm in 1000 pictures."""
+    scene = load(name)
+    theirs = np.stack([by_path(scene, seed=i) for i in range(8)])
+    ours = np.stack([render(scene, seed=100 + i, **parameters) for i in range(8)])
+    assert compare.welch(theirs, ours, 8, 1e-3, 1e-5).alarms == 0
+    assert ours.mean() == pytest.approx(theirs.mean(), rel=2e-2)
+
+
+@pytest.mark.parametrize("name", ["area", "environment", "all_of_hit"])
+def test_leaving_out_what_a_scene_needs_is_seen(name, llvm, monkeypatch):
+    scene = load("slab" if name == "all_of_hit" else "sphere")
+    theirs = np.stack([by_path(scene, seed=i) for i in range(8)])
+    monkeypatch.setattr(integrator, "Plan", lambda *a, **k: trace.Plan(*a, **k | {name: False}))
+    ours = np.stack([render(scene, seed=100 + i) for i in range(8)])
+    assert compare.welch(theirs, ours, 8, 1e-3, 1e-5).alarms > 0
+
+
+@pytest.mark.parametrize("name", ["sphere", "slab"])
+@pytest.mark.parametrize("parameters", [{"hide_emitters": True}, {"max_depth": 1}, {"max_depth": 2}], ids=str)
+def test_parameters_mean_what_they_mean_to_path(name, parameters, llvm):
+    scene = load(name)
+    theirs, ours = by_path(scene, 64, **parameters), render(scene, 64, **parameters)
+    assert ((theirs == 0).all(2) == (ours == 0).all(2)).mean() > 0.95
+    assert ours.mean() == pytest.approx(theirs.mean(), rel=0.02)
+    assert by_path(scene, 64).mean() != pytest.approx(theirs.mean(), rel=0.02)
+
+
+def test_nothing_to_see_is_black(each_variant):
+    film = {"type": "hdrfilm", "width": 4, "height": 4, "pixel_format": "rgb"}
+    sensor = {"type": "perspective", "film": film}
+    for parts in ({}, {"ball": {"type": "sphere"}}, {"ball": {"type": "sphere", "bsdf": {"type": "refract"}}}):
+        scene = mi.load_dict({"type": "scene", "sensor": sensor} | parts)
+        for parameters in ({}, {"split_depth": 2}, {"max_depth": -1}):
+            assert (render(scene, 2, **parameters) == 0).all()
+    assert (render(glass_ball(sky=sky()), 2, max_depth=0) == 0).all()
+
+
+# Splitting -----------------------------------------------------------------------------------------------------
+
+
+def test_splitting_takes_noise_away_and_scalars_do_it_too(each_variant):
+    vectorised = dr.is_jit_v(mi.Float)
+    scene, spp, pictures = load("balls", 16 if vectorised else 6), 16 if vectorised else 4, 4 if vectorised else 8
+    noise = {
+        depth: np.var([render(scene, spp, seed, split_depth=depth) for seed in range(pictures)], axis=0).mean()
+        for depth in (0, 3)
+    }
+    assert noise[3] < 0.8 * noise[0]
+
+
+def test_strata_are_those_of_correlated_multi_jitter(llvm):
+    """Of 12 samples of each of 5 pixels every stratum holds one, of rows, columns and cells; keys are independent."""
+    sampler = mi.load_dict({"type": "independent", "sample_count": 12})
+    sampler.seed(3, 60)
+    numbers = strata.Strata(mi, sampler, 3)
+    one = np.array(numbers.one(sampler, mi.UInt32(7))).reshape(5, 12)
+    x, y = np.array(numbers.two(sampler, mi.UInt32(8))).reshape(2, 5, 12)
+    for strata_of, count in ((one, 12), (x, 12), (y, 12)):
+        assert (np.sort(np.floor(strata_of * count), axis=1) == np.arange(count)).all()
+    assert (np.sort(np.floor(x * 4) * 3 + np.floor(y * 3), axis=1) == np.arange(12)).all()
+    other = np.array(numbers.one(sampler, mi.UInt32(9))).reshape(5, 12)
+    assert (np.argsort(one, axis=1) != np.argsort(other, axis=1)).any(axis=1).all()
+    assert (np.argsort(one[0]) != np.argsort(one[1])).any()
+    assert (np.array(numbers.one(sampler, mi.UInt32(7))).reshape(5, 12) == one).all()  # whatever was drawn before
+
+
+def test_a_deterministic_picture_errs_by_what_it_says_was_truncated(llvm):
+    """The ball from one point: no noise but the position in the pixel, which is its centre in every sample."""
+    scene = glass_ball(sky=sky(), sampler={"type": "multijitter", "jitter": False})
+    exact, coarse = (
+        render(scene, 1, deterministic=True, split_weight=weight, max_depth=64) for weight in (2.5e-4, 0.05)
+    )
+    assert exact.shape == (24, 24, 4)
+    bound = coarse[..., 3:] * SKY.max()
+    off = np.abs(coarse - exact)[..., :3]
+    assert (off <= bound + exact[..., 3:] * SKY.max() + 1e-5).all()
+    assert coarse[..., 3].max() > 10 * exact[..., 3].max() > 0
+    assert off.max() > 1e-3
+    assert exact[..., 3].max() < 0.01
+
+
+def test_a_white_sky_shows_what_was_truncated_and_diffuse_surfaces_are_refused(llvm):
+    scene = load("slab", sampler="multijitter")
+    flat = glass_ball(sky={"type": "constant"})
+    picture, truncated = np.split(render(flat, 1, 1, deterministic=True), [3], axis=2)
+    assert (picture <= 1 + 1e-5).all()
+    assert (picture >= 1 - 1e-5 - truncated).all()
+    assert 1e-4 < truncated.max() < 1e-2
+    with pytest.raises(RuntimeError) as caught:
+        render(load("sphere"), 1, deterministic=True)
+    assert "delta lobes only" in str(caught.value.__cause__)
+    assert render(scene, 1, deterministic=True).shape == (32, 32, 4)
+
+
+# Derivatives ---------------------------------------------------------------------------------------------------
+
+
+def eta_of(scene):
+    parameters = mi.traverse(scene)
+    return parameters, next(key for key in [*parameters.keys()] if key.endswith(".eta"))
+
+
+def derivative(scene, method, direction):
+    parameters, key = eta_of(scene)
+    dr.enable_grad(parameters[key])
+    if direction == "forward":
+        dr.set_grad(parameters[key], 1)
+    parameters.update()
+    picture = dr.mean(mi.render(scene, parameters, integrator=method, spp=256), axis=None)
+    if direction == "forward":
+        return float(dr.forward_to(picture).array[0])
+    dr.backward(picture)
+    return float(dr.grad(parameters[key])[0])
+
+
+def difference(scene, method, step=0.02):
+    parameters, key = eta_of(scene)
+    means = []
+    for eta in (1.5 - step, 1.5 + step):
+        parameters[key] = mi.Float(eta)
+        parameters.update()
+        means.append(np.array(mi.render(scene, integrator=method, spp=2048)).mean(dtype=float))
+    return (means[1] - means[0]) / (2 * step)
+
+
+@pytest.mark.parametrize("direction", ["forward", "backward"])
+@pytest.mark.parametrize("mixed", [False, True], ids=["glass", "mixed"])
+@pytest.mark.parametrize("split", [0, 2])
+def test_the_derivative_in_the_index_is_that_of_the_picture(direction, mixed, split, llvm):
+    """Smooth light and no edges, so that nothing is discontinuous. Standard errors are below 2 % on either side."""
+
+    def scene():
+        place = mi.ScalarTransform4f().translate([0, -1.2, 0]).rotate([1, 0, 0], -90).scale(4e3)
+        return glass_ball(sky=sky(), **({"floor": {"type": "rectangle", "to_world": place}} if mixed else {}))
+
+    method = mi.load_dict({"type": "refract_path", "max_depth": 5, "rr_depth": 100, "split_depth": split})
+    assert derivative(scene(), method, direction) == pytest.approx(difference(scene(), method), rel=0.12)
+    theirs = mi.load_dict({"type": "path", "max_depth": 5, "rr_depth": 100})
+    assert abs(derivative(scene(), theirs, direction) / difference(scene(), theirs) - 1) > 1
+
+
+# What is left out, and what is refused -------------------------------------------------------------------------
+
+
+def operations(scene, method):
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        dr.eval(mi.render(scene, integrator=method, spp=4))
+        return max(entry.get("operation_count", 0) for entry in dr.kernel_history())
+
+
+def test_what_is_left_out_is_not_in_the_kernel_and_is_said(llvm, monkeypatch):
+    scene = load("balls")
+    method, theirs = (mi.load_dict({"type": t, "max_depth": 16, "rr_depth": 16}) for t in ("refract_path", "path"))
+    assert "left out = no scene seen yet" in str(method)
+    lean = operations(scene, method)
+    assert "emitter sampling (every BSDF has delta lobes only)" in str(method)
+    assert lean < 0.7 * operations(scene, theirs)
+    full = dataclasses.replace(needs.inspect(scene), smooth=True)
+    monkeypatch.setattr(integrator, "inspect", lambda scene: full)
+    assert operations(scene, mi.load_dict({"type": "refract_path", "max_depth": 16, "rr_depth": 16})) > 1.3 * lean
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        ({"max_depth": -2}, "max_depth = -2: accepted: -1 (no limit) or an integer ≥ 0"),
+        ({"max_depth": 2.5}, "max_depth = 2.5"),
+        ({"max_depth": True}, "max_depth = True"),
+        ({"max_depth": "deep"}, "max_depth = 'deep'"),
+        ({"rr_depth": 0}, "rr_depth = 0: accepted: an integer ≥ 1"),
+        ({"split_depth": -1}, "split_depth = -1: accepted: an integer ≥ 0"),
+        ({"split_depth": 13, "split_weight": 0.0}, "up to 8.19e+03 paths of a sample at once; accepted: up to 4096"),
+        ({"split_depth": 65}, "a split_depth up to 64"),
+        ({"split_weight": 1.5}, "split_weight = 1.5: accepted: a number from 0 to 1"),
+        ({"split_weight": float("nan")}, "split_weight = nan"),
+        ({"deterministic": 1}, "deterministic = 1: accepted: true or false"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_is_refused_in_one_line(parameters, said, each_variant):
+    with pytest.raises(RuntimeError) as caught:
+        mi.load_dict({"type": "refract_path"} | parameters)
+    message = str(caught.value)
+    assert said in message
+
+
+def test_an_unknown_parameter_is_refused():
+    with pytest.raises(RuntimeError, match="unreferenced"):
+        mi.load_dict({"type": "refract_path", "max_dept": 3})
