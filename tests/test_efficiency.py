@@ -115,7 +115,7 @@ def test_what_is_left_out_has_its_reason(context, monkeypatch, scene, words):
 
 def test_goals_go_to_the_best_that_splits_on_glass_and_to_the_best_elsewhere():
     def measured(cost):
-        return {4: efficiency.Measured([1.0], {"MSE": [cost]}, None)}
+        return {4: efficiency.Measured([1.0], {"MSE": [cost]}, [])}
 
     subjects = [efficiency.Subject(method, "multijitter") for method in METHODS]
     costs = dict(zip((s.name for s in subjects), (1.0, 1.0, 0.1, 0.5, 0.3, 0.4), strict=True))
