@@ -13,7 +13,6 @@ import math
 import statistics
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -88,7 +87,7 @@ class Measured:
 
     seconds: list[float]
     figures: dict[str, list[float]]
-    pictures: np.ndarray | None
+    pictures: list[np.ndarray]
 
     def cost(self, metric: str) -> list[float]:
         return [error * seconds for error, seconds in zip(self.figures[metric], self.seconds, strict=True)]
@@ -184,25 +183,27 @@ def _references(look: Camera, extent: Extent) -> np.ndarray:
 
 
 def measure(cameras: dict[str, Camera], references: np.ndarray, extent: Extent) -> Found:
-    """By subject and samples per pixel; every second round in the reverse order, the first one thrown away."""
+    """By subject and samples per pixel."""
     mean, own = references.mean(0), references.var(0, ddof=1) / len(references)
     found: Found = {name: {} for name in cameras}
     for spp in extent.spp:
-        seeds = {name: iter(range(extent.rounds + 1)) for name in cameras}
-        shots: dict[str, list[Any]] = {name: [] for name in cameras}
-
-        def shoot(name: str, spp: int = spp, seeds: Any = seeds, shots: Any = shots) -> float:
-            shots[name].append(cameras[name](spp, seed=next(seeds[name])))
-            return float(shots[name][-1][1])
-
-        seconds = timing.rounds({name: name for name in cameras}, shoot, extent.rounds)
-        for name in cameras:
-            pictures = [picture for picture, _ in shots[name][1:]]
-            figures = [errors(picture, mean, own) for picture in pictures]
+        for name, shots in _rounds(cameras, spp, extent.rounds).items():
+            figures = [errors(picture, mean, own) for picture, _ in shots]
             by_metric = {metric: [figure[metric] for figure in figures] for metric in METRICS}
-            kept = np.stack(pictures) if spp == extent.spp[-1] else None
-            found[name][spp] = Measured(seconds[name], by_metric, kept)
+            kept = [picture for picture, _ in shots] if spp == extent.spp[-1] else []
+            found[name][spp] = Measured([seconds for _, seconds in shots], by_metric, kept)
     return found
+
+
+def _rounds(cameras: dict[str, Camera], spp: int, rounds: int) -> dict[str, list[tuple[np.ndarray, float]]]:
+    """A picture a round of each camera; every second round in the reverse order, the first one thrown away."""
+    shots: dict[str, list[tuple[np.ndarray, float]]] = {name: [] for name in cameras}
+    order = list(cameras)
+    for seed in range(rounds + 1):
+        for name in order:
+            shots[name].append(cameras[name](spp, seed))
+        order.reverse()
+    return {name: found[1:] for name, found in shots.items()}
 
 
 def errors(picture: np.ndarray, mean: np.ndarray, own: np.ndarray) -> dict[str, float]:
@@ -230,8 +231,7 @@ def _values(subject: Subject, builtins: list[Subject], found: Found, references:
     for metric in METRICS[1:]:
         ratios = [t / s for t, s in zip(test.cost(metric), same.cost(metric), strict=True)]
         values[f"equal-time {metric}"] = statistics.median(ratios)
-    assert test.pictures is not None
-    agreed = compare.welch(references, test.pictures, TILE, FAMILY_ERROR, MARGIN)
+    agreed = compare.welch(references, np.stack(test.pictures), TILE, FAMILY_ERROR, MARGIN)
     return values | {
         "Welch alarms": float(agreed.alarms), "smallest p, adjusted": agreed.smallest_p,
         "detectable difference": agreed.detectable,

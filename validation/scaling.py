@@ -12,6 +12,7 @@ import functools
 import json
 import math
 import os
+import site
 import statistics
 import subprocess
 import sys
@@ -187,23 +188,24 @@ def _watermark() -> int:
 
 
 def _peak() -> float:
-    try:
-        import resource
-    except ImportError:  # Windows
-        return math.nan
-    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) * (1 if sys.platform == "darwin" else 1024)
+    """Bytes; NaN where the system does not say. `getrusage` would not do: a child inherits its parent's peak."""
+    status = Path("/proc/self/status")
+    lines = status.read_text().splitlines() if status.exists() else []
+    return next((1024 * float(line.split()[1]) for line in lines if line.startswith("VmHWM:")), math.nan)
 
 
 def run(job: Job, home: str) -> dict[str, float]:
     """`measure` in a process whose kernels go to the folder `home`; no first image (NaN) where it compiled nothing.
 
-    Dr.Jit, and CUDA's driver too, keep compiled kernels below the home folder, and have no other switch.
+    Dr.Jit keeps compiled kernels below the home folder and has no other switch; CUDA and OptiX have their own.
     RuntimeError, with the last line of what the process said, where it fails.
     """
     before = _files(home)
+    environment = dict.fromkeys(("HOME", "CUDA_CACHE_PATH", "OPTIX_CACHE_PATH"), home)
+    environment["PYTHONUSERBASE"] = site.getuserbase()  # packages may be below the home folder, too
     done = subprocess.run(
         [sys.executable, "-m", "validation.scaling", json.dumps(vars(job))], cwd=SCENES.parent, check=False,
-        env=os.environ | {"HOME": home}, capture_output=True, text=True, timeout=LIMIT,
+        env=os.environ | environment, capture_output=True, text=True, timeout=LIMIT,
     )  # fmt: skip
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
