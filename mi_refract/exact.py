@@ -62,6 +62,8 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     """
     if dr.type_v(a) != dr.VarType.Float32:
         return refract_compensated(a, n, k, contrast)
+    if axis := _axis(n):
+        return _promoted_along(a, axis, k, contrast)
     wide: Any = dr.float64_array_t(type(a))
     number = dr.value_t(wide)
     d, m, k2 = wide(a), wide(n), number(component_of(a, k))
@@ -78,6 +80,32 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     # κ = 0 leaves b = a to the last bit: √(c²) is |c| exactly, so the factor of n is 0. So it is for c = 0.
     # Else k a + n (…) cancels to 4k·2⁻⁵³ |a|, which is u/128 for k = 1e6.
     return type(a)(dr.fma(m, quotient(dr.fma(-scale, c, along), dr.dot(m, m)), d * scale)), transmitted
+
+
+def _promoted_along(a: Any, axis: tuple[int, int], k: Any, contrast: Any) -> Refracted:
+    """`refract_promoted` for a literal axis: only the radicand and its root need float64."""
+    index, sign = axis
+    wide: Any = dr.float64_array_t(dr.value_t(type(a)))
+    k, along = component_of(a, k), a[index] if sign > 0 else -a[index]
+    kappa = dr.fma(wide(k), wide(k), -1) if contrast is None else wide(contrast)
+    root, radicand = local_root(*(a[i] for i in range(3) if i != index), along, kappa)
+    transmitted = (radicand >= 0) & (along != 0)
+    onward = dr.select(transmitted, dr.mulsign(component_of(a, root), along), -along)
+    return _along_axis(a, axis, dr.select(transmitted, k, 1), onward), transmitted
+
+
+def local_root(x: Any, y: Any, z: Any, kappa: Any) -> tuple[Any, Any]:
+    """(√|radicand|, radicand = z² − κ (x² + y²)) in float64, of float32 components in a frame whose axis is the normal.
+
+    Who asks for it twice, as the plugin does for the direction and for Fresnel's equations, pays once: Dr.Jit knows an
+    operation that it has seen.
+    """
+    wide: Any = dr.float64_array_t(type(x))
+    x, y, z = wide(x), wide(y), wide(z)
+    # z² is exact; κ (x² + y²): 1·2⁻⁵³ each for a square and the sum, 1 for the product.
+    radicand = dr.fma(z, z, -kappa * dr.fma(x, x, y * y))
+    # Below 0 the root means nothing, and nobody takes it: |x| is shorter than max(x, 0). At 0 its derivative is finite.
+    return dr.safe_sqrt(radicand) if dr.grad_enabled(radicand) else dr.sqrt(dr.abs(radicand)), radicand
 
 
 def _radicand(c: Expansion, w: list[Expansion], kappa: Double) -> Double:
