@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from . import fresnel
 from .formulas import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, resolve
-from .numerics import attach, quotient
+from .numerics import attach, differentiated, quotient
 
 PLUGIN = "refract"
 LOBES = ("specular_reflectance", "specular_transmittance")  # tint of the reflected and of the transmitted lobe
@@ -138,7 +138,7 @@ def plugin_class(v: Any) -> type:
             selected_r = (wide(sample1) * whole < ray.r if both else v.Bool(has_r)) & active
             selected_t = (selected_r ^ True) & active
             value = v.Float(quotient(dr.select(selected_r, ray.r, ray.t), whole))
-            bs.pdf = dr.detach(value) if both else 1
+            bs.pdf = 1 if not both else dr.detach(value) if differentiated(value) else value
             bs.sampled_component = dr.select(selected_r, v.UInt32(0), v.UInt32(1))
             bs.sampled_type = dr.select(selected_r, v.UInt32(+reflection), v.UInt32(+transmission))
             bs.wo = dr.select(selected_r, v.Vector3f(ray.a.x, ray.a.y, si.wi.z), ray.wo)
@@ -169,7 +169,7 @@ def plugin_class(v: Any) -> type:
         @staticmethod
         def _attached(value: Any) -> Any:
             """1, with the derivative of log `value`: the choice of a lobe is detached, its probability is not."""
-            return attach(v.Float(1), value / dr.detach(value)) if dr.grad_enabled(value) else 1
+            return attach(v.Float(1), value / dr.detach(value)) if differentiated(value) else 1
 
         def _mueller(self, ctx: Any, si: Any, bs: Any, ray: Ray, selected_r: Any) -> Any:
             """The Mueller matrix of the selected lobe, turned into the implicit Stokes bases of both directions."""
