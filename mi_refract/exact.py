@@ -96,7 +96,8 @@ def _promoted_along(a: Any, axis: tuple[int, int], k: Any, contrast: Any) -> Ref
     wide: Any = dr.float64_array_t(dr.value_t(type(a)))
     k, along = component_of(a, k), a[index] if sign > 0 else -a[index]
     kappa = dr.fma(wide(k), wide(k), -1) if contrast is None else wide(contrast)
-    root, radicand = local_root(*(a[i] for i in range(3) if i != index), along, kappa)
+    x, y = (a[i] for i in range(3) if i != index)
+    root, radicand = local_root(x, y, along, kappa)
     transmitted = (radicand >= 0) & (along != 0)
     onward = dr.select(transmitted, dr.mulsign(component_of(a, root), along), -along)
     return _along_axis(a, axis, dr.select(transmitted, k, 1), onward), transmitted

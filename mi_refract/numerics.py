@@ -41,7 +41,7 @@ attach: Any = dr.replace_grad
 
 
 def differentiated(x: Any) -> bool:
-    """Whether `x` carries a derivative. Types that cannot are told apart first: asking Dr.Jit takes ten times as long."""
+    """Whether `x` carries a derivative. Types that cannot are told apart first: Dr.Jit takes ten times as long."""
     return dr.is_diff_v(x) and dr.grad_enabled(x)
 
 

@@ -85,12 +85,12 @@ def seconds_of(work: Callable[[], Any]) -> float:
 # `sample` alone ------------------------------------------------------------------------------------------------
 
 
-def operations(plugin: str, parameters: dict[str, Any], component: int | None = None, importance: bool = False,
-               differentiate: bool = False) -> float:  # fmt: skip
+def operations(plugin: str, parameters: dict[str, Any] | None = None, component: int | None = None,
+               importance: bool = False, differentiate: bool = False) -> float:  # fmt: skip
     """Of a kernel that computes all of what `sample` returns, of directions and samples in memory."""
     import mitsuba as mi
 
-    bsdf = mi.load_dict({"type": plugin, "int_ior": 1.5, "ext_ior": 1.0} | parameters)
+    bsdf = mi.load_dict({"type": plugin, "int_ior": 1.5, "ext_ior": 1.0} | (parameters or {}))
     if differentiate:
         params = mi.traverse(bsdf)
         dr.enable_grad(params["eta"])
@@ -114,18 +114,25 @@ def bitmap() -> dict[str, Any]:
 
 def operation_rows(context: Context) -> list[Row]:
     """One row a feature, with the built-in's own where it has it."""
-    plain = {plugin: operations(plugin, {}) for plugin in (PLUGIN, BUILTIN)}
+    plain = {plugin: operations(plugin) for plugin in (PLUGIN, BUILTIN)}
 
-    def row(case: str, shared: bool = True, bound: float | None = None, **asked: Any) -> Row:
+    def row(case: str, shared: bool = True, less: bool = False, **asked: Any) -> Row:
+        """`less`: asked for less, the plugin must leave out at least as many operations as the built-in."""
         values: dict[str, float] = {}
         for plugin, name in ((PLUGIN, ""), (BUILTIN, f", {BUILTIN}"))[: 2 if shared else 1]:
-            count = operations(plugin, asked.get("parameters", {}), **{k: x for k, x in asked.items() if k != "parameters"})
+            count = operations(plugin, **asked)
             values |= {f"operations{name}": count, f"added{name}": count - plain[plugin]}
-        budgets = {} if bound is None else {"added": bound}
-        return Row(STUDY, PLUGIN, case, context.variant, values, budgets, replay={"rays": RAYS} | asked)
+        budgets = {"added": values[f"added, {BUILTIN}"]} if less else {}
+        goals = {"operations": plain[BUILTIN]} if case == "plain" else {}
+        replay = {"rays": RAYS} | asked
+        return Row(STUDY, PLUGIN, case, context.variant, values, budgets, goals, replay=replay)
 
-    rows = [row("plain"), row("reflection only", bound=0, component=0), row("transmission only", bound=0, component=1),
-            row("importance mode", bound=0, importance=True)]  # fmt: skip
+    rows = [
+        row("plain"),
+        row("reflection only", less=True, component=0),
+        row("transmission only", less=True, component=1),
+        row("importance mode", less=True, importance=True),
+    ]
     rows += [row(f"{lobe}, a number", parameters={lobe: 0.5}) for lobe in LOBES]
     rows += [row(f"{lobe}, a bitmap", parameters={lobe: bitmap()}) for lobe in LOBES]
     rows.append(row("derivative in eta", shared=False, differentiate=True))
@@ -284,9 +291,10 @@ def frozen_rows(context: Context) -> list[Row]:
     for plugin, name in ((PLUGIN, ""), (BUILTIN, f", {BUILTIN}")):
         with alone(plugin, count) as balls:
             frozen = balls.frozen()
-            subjects = {"frozen": lambda image=frozen, at=balls.params: image(at, mi.UInt32(1)), "traced": balls.image}
+            replay = functools.partial(frozen, balls.params)
+            subjects = {"frozen": functools.partial(replay, dr.opaque(mi.UInt32, 1)), "traced": balls.image}
             seconds = timing.rounds(subjects, seconds_of, PAIRS)
             values |= timing.ratio(f"frozen / traced{name}", seconds["frozen"], seconds["traced"])
             values |= {f"{x}{name}": float(np.median(seconds[x])) for x in seconds}
-            del frozen, subjects
+            del frozen, replay, subjects
     return [Row(STUDY, PLUGIN, f"frozen, {count} glasses", context.variant, values, replay={"glasses": count})]
