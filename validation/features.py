@@ -33,6 +33,7 @@ TERMS = {
     "first image": "seconds from a loaded scene to its picture, kernels compiled; over the built-in's, median of "
     "alternating pairs; low, high: its 95 % interval, or the extremes of a few pairs",
     "edit": "the same for one index edited, to the next picture",
+    "call": "seconds of one call of `sample`, over the built-in's",
     "frozen": "an image by a function under `dr.freeze`, over the same one traced anew; warm",
     "off after an edit": "largest difference between the two after an index was edited: 0, or the frozen one is stale",
 }
@@ -46,15 +47,18 @@ GLASSES = (1, 16, 64, 1000)
 FIRST_IMAGE_GOALS = {64: 0.6, 1000: 0.15}
 EDIT_GOAL = 0.2
 PAIRS = 5
+CALLS = 2000
 STEPS = 4  # of an optimisation
 UNCHANGED = 1e-5  # of a pixel: the order in which samples are added up
 SCALAR = "scalar variants have no kernels"
 
 
 def tasks(context: Context) -> list[Task]:
+    calls = Task("features: scalar calls", functools.partial(scalar_rows, context))
     if context.variant.startswith("scalar"):
-        return [Task("features", lambda: [Row(STUDY, PLUGIN, "kernels", context.variant, reason=SCALAR)])]
+        return [Task("features", lambda: [Row(STUDY, PLUGIN, "kernels", context.variant, reason=SCALAR)]), calls]
     return [
+        calls,
         Task("features: operations", functools.partial(operation_rows, context)),
         Task("features: glasses", functools.partial(glass_rows, context)),
         Task("features: optimisation", functools.partial(optimisation_rows, context)),
@@ -110,6 +114,40 @@ def operations(plugin: str, parameters: dict[str, Any] | None = None, component:
     return float(max(entry["operation_count"] for entry in kernels(lambda: bsdf.sample(asked, si, sample, [0, 0]))))
 
 
+@contextmanager
+def under(variant: str) -> Iterator[None]:
+    """Another variant of Mitsuba for a while."""
+    import mitsuba as mi
+
+    before: Any = mi.variant()
+    mi.set_variant(variant)
+    try:
+        yield
+    finally:
+        mi.set_variant(before)
+
+
+def scalar_rows(context: Context) -> list[Row]:
+    """What a call of `sample` takes where nothing is compiled: a Python plugin's calls, against the built-in's C++."""
+    import mitsuba as mi
+
+    with under("scalar_rgb"):
+        si: Any = dr.zeros(mi.SurfaceInteraction3f)
+        si.wi = mi.Vector3f(0.6, 0, 0.8)
+        asked = mi.BSDFContext()
+        bsdfs = {name: mi.load_dict({"type": name, "int_ior": 1.5, "ext_ior": 1.0}) for name in (PLUGIN, BUILTIN)}
+
+        def clock(name: str) -> float:
+            bsdf, start = bsdfs[name], time.process_time()
+            for _ in range(CALLS):
+                bsdf.sample(asked, si, 0.5, [0, 0])
+            return time.process_time() - start
+
+        seconds = timing.rounds({name: name for name in bsdfs}, clock, PAIRS)
+    values = timing.ratio(f"call / {BUILTIN}", seconds[PLUGIN], seconds[BUILTIN])
+    return [Row(STUDY, PLUGIN, "a call of sample", "scalar_rgb", values, replay={"calls": CALLS})]
+
+
 def bitmap() -> dict[str, Any]:
     import mitsuba as mi
 
@@ -120,16 +158,17 @@ def operation_rows(context: Context) -> list[Row]:
     """One row a feature, with the built-in's own where it has it."""
     plain = {plugin: operations(plugin) for plugin in (PLUGIN, BUILTIN)}
 
-    def row(case: str, shared: bool = True, less: bool = False, **asked: Any) -> Row:
+    def row(case: str, shared: bool = True, less: bool = False, variant: str = context.variant, **asked: Any) -> Row:
         """`less`: asked for less, the plugin must leave out at least as many operations as the built-in."""
         values: dict[str, float] = {}
         for plugin, name in ((PLUGIN, ""), (BUILTIN, f", {BUILTIN}"))[: 2 if shared else 1]:
-            count = operations(plugin, **asked)
+            with under(variant):
+                count = operations(plugin, **asked)
             values |= {f"operations{name}": count, f"added{name}": count - plain[plugin]}
         budgets = {"added": values[f"added, {BUILTIN}"]} if less else {}
         goals = {"operations": plain[BUILTIN]} if case == "plain" else {}
         replay = {"rays": RAYS} | asked
-        return Row(STUDY, PLUGIN, case, context.variant, values, budgets, goals, replay=replay)
+        return Row(STUDY, PLUGIN, case, variant, values, budgets, goals, replay=replay)
 
     rows = [
         row("plain"),
@@ -140,6 +179,11 @@ def operation_rows(context: Context) -> list[Row]:
     rows += [row(f"{lobe}, a number", parameters={lobe: 0.5}) for lobe in LOBES]
     rows += [row(f"{lobe}, a bitmap", parameters={lobe: bitmap()}) for lobe in LOBES]
     rows.append(row("derivative in eta", shared=False, differentiate=True))
+    polarised = context.variant.replace("rgb", "mono_polarized")
+    if reason := context.variants[polarised]:
+        rows.append(Row(STUDY, PLUGIN, "polarised", polarised, reason=reason))
+    else:
+        rows.append(row("polarised", variant=polarised))
     rows += [row(f"formula {name}", shared=False, parameters={"formula": name}) for name in FORMULAS]
     return rows
 
@@ -148,7 +192,10 @@ def operation_rows(context: Context) -> list[Row]:
 
 
 class Balls:
-    """A scene of `count` glass balls of different indices with one plugin; without `max_depth` no cache has its kernel."""
+    """A scene of `count` glass balls of different indices with one plugin.
+
+    Without a `max_depth` it is one that no path reaches, and that no cache has seen.
+    """
 
     def __init__(self, plugin: str, count: int, integrator: str = "path", max_depth: int = 0) -> None:
         import mitsuba as mi
