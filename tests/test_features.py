@@ -66,7 +66,8 @@ def test_a_feature_that_is_not_asked_for_is_not_computed(context):
 
 def test_a_plugin_that_does_not_listen_is_seen(context, monkeypatch):
     planted(monkeypatch, sample=deaf)  # in this variant only
-    rows = by_case(features.operation_rows(dataclasses.replace(context, variants=dict.fromkeys(context.variants, "no"))))
+    nothing_else = dict.fromkeys(context.variants, "no")
+    rows = by_case(features.operation_rows(dataclasses.replace(context, variants=nothing_else)))
     assert (rows["polarised"].verdict, rows["polarised"].reason) == ("not run", "no")
     assert {case for case, row in rows.items() if row.verdict == "fail"} == {"reflection only", "transmission only",
                                                                              "importance mode"}  # fmt: skip
@@ -136,6 +137,13 @@ def test_a_frozen_picture_that_does_not_follow_an_edit_is_seen(context, monkeypa
     monkeypatch.setattr(features, "PLUGIN", features.BUILTIN)
     (row,) = features.frozen_rows(context)
     assert set(row.broken) == {"off after an edit"}
+
+
+def test_paths_through_the_mirage_are_longer_than_the_built_in_s(context):
+    """65,536 paths; in the furnace both draw the same numbers, and 1e-3 is 50 of them."""
+    furnace, mirage = (row.values["boundaries / dielectric"] for row in features.boundary_rows(context))
+    assert furnace == pytest.approx(1, abs=1e-3)
+    assert mirage > 1.03
 
 
 def test_scalar_variants_have_calls_and_say_why_they_have_no_kernels(scalar_context):

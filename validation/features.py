@@ -23,7 +23,8 @@ from mi_refract.formulas import FORMULAS
 from mi_refract.rows import Row
 
 from . import timing
-from .plan import Context, Task
+from .plan import SCENES, Context, Task
+from .renders import Camera
 
 TITLE = "What a scene does not use"
 TERMS = {
@@ -33,6 +34,7 @@ TERMS = {
     "first image": "seconds from a loaded scene to its picture, kernels compiled; over the built-in's, median of "
     "alternating pairs; low, high: its 95 % interval, or the extremes of a few pairs",
     "edit": "the same for one index edited, to the next picture",
+    "boundaries": "surfaces that a path from the camera meets on average, without roulette",
     "call": "seconds of one call of `sample`, over the built-in's",
     "frozen": "an image by a function under `dr.freeze`, over the same one traced anew; warm",
     "off after an edit": "largest difference between the two after an index was edited: 0, or the frozen one is stale",
@@ -59,6 +61,7 @@ def tasks(context: Context) -> list[Task]:
         return [Task("features", lambda: [Row(STUDY, PLUGIN, "kernels", context.variant, reason=SCALAR)]), calls]
     return [
         calls,
+        Task("features: boundaries", functools.partial(boundary_rows, context)),
         Task("features: operations", functools.partial(operation_rows, context)),
         Task("features: glasses", functools.partial(glass_rows, context)),
         Task("features: optimisation", functools.partial(optimisation_rows, context)),
@@ -354,3 +357,36 @@ def frozen_rows(context: Context) -> list[Row]:
             del replay, subjects
     return [Row(STUDY, PLUGIN, f"frozen, {count} glasses", context.variant, values,
                 {"off after an edit": UNCHANGED}, replay={"glasses": count})]  # fmt: skip
+
+
+def boundary_rows(context: Context) -> list[Row]:
+    """Where the built-in's directions are wrong its paths may be shorter, and a render of them cheaper."""
+    rows = []
+    for name in ("furnace", "mirage"):
+        values = {plugin: boundaries(Camera(SCENES / f"{name}.xml", plugin, RESOLUTION).scene)
+                  for plugin in (PLUGIN, BUILTIN)}  # fmt: skip
+        values[f"boundaries / {BUILTIN}"] = values[PLUGIN] / values[BUILTIN]
+        rows.append(Row(STUDY, PLUGIN, f"{name}: boundaries", context.variant, values, replay={"seed": SEED}))
+    return rows
+
+
+def boundaries(scene: Any, spp: int = 64, most: int = 192) -> float:
+    """How many surfaces a path from the camera meets, on average, without roulette."""
+    import mitsuba as mi
+
+    count = RESOLUTION**2 * spp
+    sampler: Any = mi.load_dict({"type": "independent"})
+    sampler.seed(SEED, count)
+    pixel = dr.arange(mi.UInt32, count) // spp
+    corner = mi.Point2f(pixel % RESOLUTION, pixel // RESOLUTION)
+    ray, _ = scene.sensors()[0].sample_ray(0, 0, (corner + sampler.next_2d()) / RESOLUTION, mi.Point2f(0.5))
+
+    def bounce(met: Any, active: Any, ray: Any, sampler: Any) -> Any:
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid() & (met < most)
+        bs, _ = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(active), sampler.next_2d(active), active)
+        return met + dr.select(active, 1, 0), active, si.spawn_ray(si.to_world(bs.wo)), sampler
+
+    state = (mi.UInt32(0), mi.Bool(True), ray, sampler)
+    met, *_ = dr.while_loop(state, lambda met, active, ray, sampler: active, bounce)
+    return float(np.array(met).mean())
