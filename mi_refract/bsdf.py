@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from . import fresnel
 from .formulas import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, resolve
-from .numerics import attach, quotient
+from .numerics import attach, differentiated, quotient
 
 PLUGIN = "refract"
 LOBES = ("specular_reflectance", "specular_transmittance")  # tint of the reflected and of the transmitted lobe
@@ -30,14 +30,12 @@ class Side(NamedTuple):
 
 
 class Ray(NamedTuple):
-    """One refraction of `a` = −wi in the local frame: `eta` is n_to / n_from, `r` and `t` the unpolarised powers."""
+    """One refraction of `a` = −wi in the local frame: `eta` is n_to / n_from, `r` : `t` are the unpolarised powers."""
 
     a: Any
     side: Side
     wo: Any
     eta: Any
-    cos_i: Any
-    cos_t: Any
     transmitted: Any
     r: Any
     t: Any
@@ -98,18 +96,18 @@ def plugin_class(v: Any) -> type:
             # Scalar variants: Mitsuba can set an array of one number, but not a bare Python float.
             number = v.Float if dr.is_jit_v(v.Float) else dr.scalar.Array1f
             self.eta = number(int_ior / ext_ior)
-            eta = _checked("int_ior / ext_ior", int_ior / ext_ior)
-            self._face(eta, (int_ior - ext_ior) / ext_ior * (int_ior + ext_ior) / ext_ior)
+            self._face(_checked("int_ior / ext_ior", int_ior / ext_ior))
             self.m_components = [reflection | both_sides, transmission | both_sides | flags.NonSymmetric]
             self.m_flags = self.m_components[0] | self.m_components[1]
 
-        def _face(self, eta: Any, contrast: Any) -> None:
-            """Set eta and eta² − 1, in float64. Opaque: an edit changes the data of a kernel and not its code.
+        def _face(self, eta: Any) -> None:
+            """Set k from either side, in float64. Opaque: an edit changes the data of a kernel and not its code.
 
-            A kernel reads each number with a gather, so there are no more than save it a division.
+            A kernel gathers these numbers ray by ray, so there are no more than save it a division. κ = (k − 1)(k + 1)
+            is formed there: it is off by 2⁻⁵²/κ, which is what rounding the ratio of the indices to float64 makes it.
             """
-            self.k_inner, self.k_outer, self.contrast_inner = wide(eta), wide(1 / eta), wide(contrast)
-            dr.make_opaque(self.eta, self.k_inner, self.k_outer, self.contrast_inner)
+            self.k_inner, self.k_outer = wide(eta), wide(1 / eta)
+            dr.make_opaque(self.eta, self.k_inner, self.k_outer)
 
         def traverse(self, cb: Any) -> None:
             cb.put("eta", self.eta, mi.ParamFlags.Differentiable)
@@ -123,7 +121,7 @@ def plugin_class(v: Any) -> type:
                 # Only a derivative needs a kernel here; a number is read back, so that an edit compiles nothing.
                 number = _checked("eta", float(self.eta[0]))
                 eta = wide(self.eta) if dr.grad_enabled(self.eta) else number
-                self._face(eta, (eta - 1) * (eta + 1))
+                self._face(eta)
 
         def _eta(self) -> Any:
             return self.eta if dr.is_jit_v(v.Float) else self.eta[0]
@@ -134,11 +132,13 @@ def plugin_class(v: Any) -> type:
                 return dr.zeros(v.BSDFSample3f), v.Spectrum(0)
             bs = v.BSDFSample3f()
             both, ray = has_r and has_t, self._refract(si.wi)
-            # Not ≤: an index-matched boundary never reflects, not even the sample that is exactly 0.
-            selected_r = (sample1 < ray.r if both else v.Bool(has_r)) & active
+            whole = ray.r + ray.t
+            # sample1 < R, without waiting for the division. Not ≤: an index-matched boundary never reflects, not even
+            # the sample that is exactly 0.
+            selected_r = (wide(sample1) * whole < ray.r if both else v.Bool(has_r)) & active
             selected_t = (selected_r ^ True) & active
-            value = dr.select(selected_r, ray.r, ray.t)
-            bs.pdf = dr.detach(value) if both else 1
+            value = v.Float(quotient(dr.select(selected_r, ray.r, ray.t), whole))
+            bs.pdf = 1 if not both else dr.detach(value) if differentiated(value) else value
             bs.sampled_component = dr.select(selected_r, v.UInt32(0), v.UInt32(1))
             bs.sampled_type = dr.select(selected_r, v.UInt32(+reflection), v.UInt32(+transmission))
             bs.wo = dr.select(selected_r, v.Vector3f(ray.a.x, ray.a.y, si.wi.z), ray.wo)
@@ -160,26 +160,22 @@ def plugin_class(v: Any) -> type:
         def _refract(self, wi: Any) -> Ray:
             """The ray's side, refracted direction and reflectance. The normal is a literal: Dr.Jit folds it away."""
             a, outside = -wi, wi.z >= 0
-            contrast_outer = -self.contrast_inner * self.k_outer * self.k_outer
-            side = Side(
-                dr.select(outside, self.k_outer, self.k_inner),
-                dr.select(outside, contrast_outer, self.contrast_inner),
-            )
+            k, eta = (dr.select(outside, *x) for x in ((self.k_outer, self.k_inner), (self.k_inner, self.k_outer)))
+            side = Side(k, (k - 1) * (k + 1))
             # Unchecked: the ratio is checked where it is set, and NaN stays NaN.
-            wo, transmitted = self.formula.unchecked(a, v.Vector3f(0, 0, 1), side.k, side.contrast)
-            r, t = fresnel.local_powers(a, wo, transmitted, side.k, side.contrast)
-            eta = v.Float(dr.select(outside, self.k_inner, self.k_outer))
-            return Ray(a, side, wo, eta, dr.abs(wi.z), dr.abs(wo.z), transmitted, r, t)
+            wo, transmitted = self.formula.unchecked(a, v.Vector3f(0, 0, 1), *side)
+            return Ray(a, side, wo, v.Float(eta), transmitted, *fresnel.local_odds(a, transmitted, *side))
 
         @staticmethod
         def _attached(value: Any) -> Any:
             """1, with the derivative of log `value`: the choice of a lobe is detached, its probability is not."""
-            return attach(v.Float(1), value / dr.detach(value)) if dr.grad_enabled(value) else 1
+            return attach(v.Float(1), value / dr.detach(value)) if differentiated(value) else 1
 
         def _mueller(self, ctx: Any, si: Any, bs: Any, ray: Ray, selected_r: Any) -> Any:
             """The Mueller matrix of the selected lobe, turned into the implicit Stokes bases of both directions."""
-            r = fresnel.mueller_reflection(ray.cos_i, ray.side.k, ray.side.contrast)
-            t = fresnel.mueller_transmission(ray.cos_i, ray.cos_t, ray.transmitted, ray.side.k)
+            cos_i, cos_t = dr.abs(si.wi.z), dr.abs(ray.wo.z)
+            r = fresnel.mueller_reflection(cos_i, *ray.side)
+            t = fresnel.mueller_transmission(cos_i, cos_t, ray.transmitted, ray.side.k)
             entries = [
                 [dr.select(selected_r, x, y) for x, y in zip(*rows, strict=True)] for rows in zip(r, t, strict=True)
             ]

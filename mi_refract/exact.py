@@ -32,18 +32,26 @@ from typing import Any
 import drjit as dr
 
 from . import numerics
-from .numerics import Double, Expansion, attach, component_of, quotient, two_sum
+from .numerics import Double, Expansion, attach, component_of, differentiated, quotient, two_sum
 
 Refracted = tuple[Any, Any]
 
 
 def _axis(n: Any) -> tuple[int, int] | None:
-    """(index, ±1) of a normal that is a Dr.Jit literal along an axis and has no derivative; else None."""
-    if dr.grad_enabled(n) or not all(dr.is_jit_v(x) and x.state == dr.VarState.Literal for x in n):
+    """(index, ±1) of a normal along an axis that is known while a kernel is traced and has no derivative; else None.
+
+    Known are literals, and Python floats.
+    """
+    if dr.is_jit_v(n):
+        if differentiated(n) or not all(x.state == dr.VarState.Literal for x in n):
+            return None
+        n = [x[0] for x in n]
+    x, y, z = n
+    if not x and not y and abs(z) == 1:
+        return 2, int(z)
+    if sorted(map(abs, (x, y, z))) != [0, 0, 1]:
         return None
-    values = [x[0] for x in n]
-    index = max(range(3), key=lambda i: abs(values[i]))
-    return (index, int(values[index])) if sorted(map(abs, values)) == [0, 0, 1] else None
+    return (0, int(x)) if x else (1, int(y))
 
 
 def _along_axis(a: Any, axis: tuple[int, int], scale: Any, along: Any) -> Any:
@@ -62,6 +70,8 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     """
     if dr.type_v(a) != dr.VarType.Float32:
         return refract_compensated(a, n, k, contrast)
+    if axis := _axis(n):
+        return _promoted_along(a, axis, k, contrast)
     wide: Any = dr.float64_array_t(type(a))
     number = dr.value_t(wide)
     d, m, k2 = wide(a), wide(n), number(component_of(a, k))
@@ -78,6 +88,33 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     # κ = 0 leaves b = a to the last bit: √(c²) is |c| exactly, so the factor of n is 0. So it is for c = 0.
     # Else k a + n (…) cancels to 4k·2⁻⁵³ |a|, which is u/128 for k = 1e6.
     return type(a)(dr.fma(m, quotient(dr.fma(-scale, c, along), dr.dot(m, m)), d * scale)), transmitted
+
+
+def _promoted_along(a: Any, axis: tuple[int, int], k: Any, contrast: Any) -> Refracted:
+    """`refract_promoted` for a literal axis: only the radicand and its root need float64."""
+    index, sign = axis
+    wide: Any = dr.float64_array_t(dr.value_t(type(a)))
+    k, along = component_of(a, k), a[index] if sign > 0 else -a[index]
+    kappa = dr.fma(wide(k), wide(k), -1) if contrast is None else wide(contrast)
+    x, y = (a[i] for i in range(3) if i != index)
+    root, radicand = local_root(x, y, along, kappa)
+    transmitted = (radicand >= 0) & (along != 0)
+    onward = dr.select(transmitted, dr.mulsign(component_of(a, root), along), -along)
+    return _along_axis(a, axis, dr.select(transmitted, k, 1), onward), transmitted
+
+
+def local_root(x: Any, y: Any, z: Any, kappa: Any) -> tuple[Any, Any]:
+    """(√|radicand|, radicand = z² − κ (x² + y²)) in float64, of float32 components in a frame whose axis is the normal.
+
+    Who asks for it twice, as the plugin does for the direction and for Fresnel's equations, pays once: Dr.Jit knows an
+    operation that it has seen.
+    """
+    wide: Any = dr.float64_array_t(type(x))
+    x, y, z = wide(x), wide(y), wide(z)
+    # z² is exact; κ (x² + y²): 1·2⁻⁵³ each for a square and the sum, 1 for the product.
+    radicand = dr.fma(z, z, -kappa * dr.fma(x, x, y * y))
+    # Below 0 the root means nothing, and nobody takes it: |x| is shorter than max(x, 0). At 0 its derivative is finite.
+    return dr.safe_sqrt(radicand) if differentiated(radicand) else dr.sqrt(dr.abs(radicand)), radicand
 
 
 def _radicand(c: Expansion, w: list[Expansion], kappa: Double) -> Double:
@@ -112,14 +149,14 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
         onward = dr.mulsign(root.rounded(), c.hi)
         # c² may have underflowed: κ = 0 leaves c to the last bit, but with the derivative of the root.
         exact = dr.select(kappa.hi == 0, c.hi, onward)
-        along = dr.select(transmitted, attach(exact, onward) if dr.grad_enabled(onward) else exact, -c.hi)
+        along = dr.select(transmitted, attach(exact, onward) if differentiated(onward) else exact, -c.hi)
         return _along_axis(a, axis, scale, along), transmitted
     root = Double(dr.mulsign(root.hi, c.hi), dr.mulsign(root.lo, c.hi))
     b = _correct(type(a), n, [w_i.pair * scale for w_i in w], numerics.select(transmitted, root, -c.pair))
     # To the last bit where the answer is `a`, but with the derivative of b, which is not that of `a`. Where `n` is no
     # normal b is NaN, and stays so.
     exact = dr.select(((kappa.hi == 0) | (c.hi == 0)) & (b[0] == b[0]), a, b)
-    return (attach(exact, b) if dr.grad_enabled(b) else exact), transmitted
+    return (attach(exact, b) if differentiated(b) else exact), transmitted
 
 
 def _correct(vector: type, n: Any, around: list[Double], along: Double) -> Any:

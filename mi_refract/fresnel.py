@@ -22,6 +22,7 @@ from typing import Any
 
 import drjit as dr
 
+from .exact import local_root
 from .numerics import Double, component_of, quotient, two_prod, two_sum
 
 
@@ -64,15 +65,26 @@ def powers(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: Any = Non
     return number(r), number(t)
 
 
-def local_powers(a: Any, b: Any, transmitted: Any, k: Any, contrast: Any) -> tuple[Any, Any]:
-    """(R, T) as `powers` gives them, of a ray `a` refracted to `b` where the normal is the z axis.
+def local_powers(a: Any, transmitted: Any, k: Any, contrast: Any) -> tuple[Any, Any]:
+    """(R, T) as `powers` gives them, of a float32 ray `a` that meets a boundary whose normal is the z axis."""
+    r, t = local_odds(a, transmitted, k, contrast)
+    return component_of(a, quotient(r, r + t)), component_of(a, quotient(t, r + t))
 
-    `a`, `b`: 3-vectors of one length, which need not be 1.
+
+def local_odds(a: Any, transmitted: Any, k: Any, contrast: Any) -> tuple[Any, Any]:
+    """R : T of a float32 ray `a` that meets a boundary whose normal is the z axis, in float64: R = r/(r + t).
+
+    `a`: a 3-vector, of any length from 1e-30 to 1e30. 1 : 0 where not `transmitted`; a mask, as a formula of
+    refraction gives it. The cosine of the refracted ray is that of the exact problem, before it is rounded to float32:
+    so R and T are right to 1.01u, but for what an error ε of the radicand does, ε/2ρ (see `exact`).
     """
-    lift = _wide if _is_single(a) else Double
-    x, y, c = lift(a.x), lift(a.y), lift(dr.abs(a.z))
-    r, t = _powers(c, *_through(lift, transmitted, dr.abs(b.z)), _fma(x, x, y * y), lift(k), lift(contrast))
-    return component_of(a, r), component_of(a, t)
+    x, y, c, ratio, kappa = _wide(a.x), _wide(a.y), _wide(dr.abs(a.z)), _wide(k), _wide(contrast)
+    cos_t, sin2 = local_root(a.x, a.y, a.z, kappa)[0], dr.fma(x, x, y * y)
+    d_s, d_p = dr.fma(ratio, c, cos_t), dr.fma(ratio, cos_t, c)
+    p, q = c * cos_t, ratio * sin2
+    # κ = 0 is always transmitted, or tangential: without the 1 that would be 0 : 0.
+    mirror, power = (dr.select(transmitted, *x) for x in ((0 * p, 1), (2 * ratio * p, 0)))
+    return dr.fma(kappa * kappa, dr.fma(q, q, p * p), mirror), power * dr.fma(d_s, d_s, d_p * d_p)
 
 
 def reflectance(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: Any = None) -> Any:

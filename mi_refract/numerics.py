@@ -40,6 +40,11 @@ _reinterpret: Any = dr.reinterpret_array
 attach: Any = dr.replace_grad
 
 
+def differentiated(x: Any) -> bool:
+    """Whether `x` carries a derivative. Types that cannot are told apart first: Dr.Jit takes ten times as long."""
+    return dr.is_diff_v(x) and dr.grad_enabled(x)
+
+
 def near_unit(v: Any) -> tuple[Any, Any]:
     """(v / p, p), p the power of two for which the largest component of v / p is in [1, 2). Exact.
 

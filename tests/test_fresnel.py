@@ -372,24 +372,26 @@ def test_powers_of_rays_that_are_unit_only_up_to_rounding(name, formula, vectori
     exact = oracle.refract(a, np.tile(np.array([0, 0, 1], a.dtype), (len(k), 1)), k)
     ray, wide = vectorised.vector(a.T), dr.float64_array_t(dr.value_t(vectorised.vector))(k)
     contrast = dr.fma(wide, wide, -1)
-    b, transmitted = FORMULAS[formula].unchecked(ray, vectorised.vector(0, 0, 1), wide, contrast)
-    r, t = (plain(x) for x in fresnel.local_powers(ray, b, transmitted, wide, contrast))
+    _, transmitted = FORMULAS[formula].unchecked(ray, vectorised.vector(0, 0, 1), wide, contrast)
+    r, t = (plain(x) for x in fresnel.local_powers(ray, transmitted, wide, contrast))
     # Off by ε ≤ 10·2⁻⁵³ of its larger term, a radicand moves T by ε/2ρ: nearer to the critical angle by more than u/2.
     scale = np.maximum(cos_i.astype(float) ** 2, np.abs(k.astype(float) ** 2 - 1) * sine**2)
     far = (exact.cos_t**2 > 10 * 2.0**-53 / vectorised.roundoff * scale) | ~exact.transmitted
     far &= np.array(transmitted) == exact.transmitted
     assert far.mean() > 0.99
-    assert relative(r[far], exact.reflectance[far], exact.reflectance_low[far], vectorised) <= 4
-    assert relative(t[far], exact.transmittance[far], exact.transmittance_low[far], vectorised) <= 4
+    assert relative(r[far], exact.reflectance[far], exact.reflectance_low[far], vectorised) <= 2
+    assert relative(t[far], exact.transmittance[far], exact.transmittance_low[far], vectorised) <= 2
 
 
 def test_length_of_the_ray_cancels(vectorised):
     """A length off by 1e-3 changes nothing; the textbook's κ/(k cᵢ + cₜ)² would be off by twice that."""
+    if vectorised.name != "float32":
+        pytest.skip("the plugin's precision is float32")
     number = dr.value_t(vectorised.vector)
     k, contrast = number(1.5), number(1.25)
     found = []
     for length in (1.0, 1.001):
         a = vectorised.vector(0.28 * length, 0, 0.96 * length)
-        b, transmitted = FORMULAS["promoted"](a, vectorised.vector(0, 0, 1), k, contrast)
-        found.append([float(plain(x).ravel()[0]) for x in fresnel.local_powers(a, b, transmitted, k, contrast)])
+        _, transmitted = FORMULAS["promoted"](a, vectorised.vector(0, 0, 1), k, contrast)
+        found.append([float(plain(x).ravel()[0]) for x in fresnel.local_powers(a, transmitted, k, contrast)])
     assert found[1] == pytest.approx(found[0], rel=8 * vectorised.roundoff)

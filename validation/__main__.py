@@ -18,7 +18,7 @@ from typing import Any
 STUDIES = {
     "directions": ("directions", "mutants", "samples", "sweep", "search"),
     "stability": ("stability", "energy", "derivatives", "paths"),
-    "renders": ("scenes", "renders"),
+    "renders": ("scenes", "renders", "features"),
     "efficiency": ("efficiency", "scaling"),
 }
 

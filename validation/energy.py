@@ -31,7 +31,7 @@ AXES = {"x": "|k − 1|", "y": "error of R, in u", "x_scale": "log", "y_scale": 
 BUILTIN = "mi.fresnel"
 TERMS = {
     "powers": "R and T of `fresnel.powers`, with the cosine that `fresnel.refracted_cosine` gives",
-    "pipeline": "R and T as the plugin computes them: from `a`, and from `b` as the default formula returns it",
+    "pipeline": "R and T as the plugin computes them: from `a`, transmitted where the default formula says so",
     "amplitudes": "`fresnel.amplitudes`",
     BUILTIN: "Mitsuba's function of the same cosine and k, from the inside; what it transmits is 1 − R by subtraction",
     "R / u, 1 − R / u, r_s / u, r_p / u": "the largest relative errors, in units of roundoff",
@@ -185,8 +185,8 @@ def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray
     def powers(x: Any, y: Any, z: Any, ratio: Any) -> tuple:
         ray, wide = setting.vector(x, y, z), widened(ratio)
         contrast = dr.fma(wide, wide, -1)
-        b, transmitted = formula.unchecked(ray, setting.vector(0, 0, 1), wide, contrast)
-        return *fresnel.local_powers(ray, b, transmitted, wide, contrast), transmitted
+        _, transmitted = formula.unchecked(ray, setting.vector(0, 0, 1), wide, contrast)
+        return *fresnel.local_powers(ray, transmitted, wide, contrast), transmitted
 
     far = resolved(a, k, exact, setting.roundoff) | ~exact.transmitted
     row = power_row("pipeline", regime, setting, each(powers, setting, *a.T, k), exact, POWERS, replay, far)
