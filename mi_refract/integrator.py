@@ -103,9 +103,11 @@ def integrator_class(v: Any) -> type:
             return Plan(
                 self.max_depth, self.rr_depth, self.hide_emitters,
                 self.split_depth if symbolic else 0, self.split_weight, self.deterministic,
-                emitter_sampling=needs.smooth and needs.sampleable,
+                emitter_sampling=needs.smooth and (needs.lamps if needs.plain_environment else needs.sampleable),
+                lamps_only=needs.plain_environment,
                 area=needs.area,
                 environment=needs.environment,
+                first_number=needs.both_numbers or not (needs.smooth or self.deterministic),
                 second_number=needs.smooth,
                 all_of_hit=needs.smooth or needs.textured,
             )  # fmt: skip

@@ -21,6 +21,11 @@ POLARISING = {
     "RoughConductor", "SmoothConductor", "SmoothDielectric",
 }  # fmt: skip
 KNOWN = WRAPPERS | DEPOLARISING | POLARISING
+# Their samples take the one number or the two, and none of them all three.
+EITHER = {
+    "Null", "Refract", "RoughConductor", "SmoothConductor", "SmoothDielectric", "SmoothDiffuse", "ThinDielectric",
+    "TwoSidedBRDF",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -29,9 +34,12 @@ class Needs:
 
     smooth: bool  # some BSDF has a lobe that is no delta: an emitter sample can matter
     sampleable: bool  # some emitter can be sampled
+    lamps: bool  # some emitter other than the environment can be
     area: bool  # some shape emits
     environment: bool
+    plain_environment: bool  # of the same radiance everywhere
     delta_emitters: bool  # some emitter is met by sampling it only
+    both_numbers: bool  # some BSDF samples with the one random number and with the two as well
     only_glass: bool  # every BSDF has delta lobes only
     textured: bool  # something of a BSDF or of a light varies over its surface
     null: bool  # some BSDF has a null lobe
@@ -46,8 +54,11 @@ class Needs:
         reasons = {
             "emitter sampling": "every BSDF has delta lobes only" if not self.smooth
             else "" if self.sampleable else "no emitter can be sampled",
+            "a random number": "" if self.both_numbers else "no BSDF samples with one number and with two as well",
             "area lights": "" if self.area else "no shape emits",
             "environment": "" if self.environment else "no environment emitter",
+            "sampling the environment": "the BSDFs' own samples meet what is the same everywhere"
+            if self.plain_environment else "",
             "media": "" if self.media else "neither a shape, a sensor nor an emitter has a medium",
             "null lobes": "" if self.null else "no BSDF has one",
             "textures": "" if self.textured else "no BSDF and no area light varies over its surface",
@@ -61,7 +72,7 @@ def inspect(scene: Any) -> Needs:
     """What `scene` needs as it is now: an edited parameter can change it."""
     import mitsuba as mi
 
-    shapes, emitters = scene.shapes(), scene.emitters()
+    shapes, emitters, sky = scene.shapes(), scene.emitters(), scene.environment()
     opaque = [shape.class_name() for shape in shapes if shape.class_name() == "Instance"]
     bsdfs = [bsdf for shape in shapes if not _black(outer := shape.bsdf()) for bsdf in _nested(outer)]
     names = [_name(bsdf) for bsdf in bsdfs]
@@ -77,8 +88,11 @@ def inspect(scene: Any) -> Needs:
     return Needs(
         smooth=everything or bool(flags & +lobes.Smooth),
         sampleable=bool(emitters),  # Mitsuba refuses a scene all of whose emitters have the weight 0
+        lamps=any(not emitter.is_environment() and emitter.sampling_weight() > 0 for emitter in emitters),
         area=bool(opaque) or any(shape.is_emitter() for shape in shapes),
-        environment=scene.environment() is not None,
+        environment=sky is not None,
+        plain_environment=sky is not None and sky.class_name() == "ConstantBackgroundEmitter",
+        both_numbers=bool(set(names) - EITHER) or everything,
         # An emitter that declares nothing may be anything.
         delta_emitters=any(not flag or flag & +mi.EmitterFlags.Delta for flag in sampled),
         only_glass=not (everything or flags & +(lobes.Smooth | lobes.Delta1D)),

@@ -14,6 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .lamps import Everything, Lamps
 from .strata import ONE
 
 # Samples near either end of the unit interval pick the one lobe and the other. What has less power is not followed.
@@ -32,9 +33,11 @@ class Plan:
     split_weight: float
     deterministic: bool
     emitter_sampling: bool
+    lamps_only: bool  # of what is sampled: not a constant environment
     area: bool
     environment: bool
-    second_number: bool  # of a BSDF sample: delta lobes need none
+    first_number: bool  # of a BSDF sample, beside the other two
+    second_number: bool  # those two: delta lobes need none
     all_of_hit: bool  # or only its shading frame
 
     @property
@@ -63,6 +66,7 @@ class State:
     previous: Any = None  # of the vertex before: the interaction, and the density and the kind of its sample
     pdf: Any = None
     delta: Any = None
+    seen: Any = None  # from the camera by delta lobes only: it splits no farther than that
     share: Any = None  # of the light of the pixel: the product of the powers of the lobes that were split
     node: Any = None  # the lobes taken so far
     waiting: Any = None  # branches on the stack
@@ -105,6 +109,7 @@ class Trace:
     def __init__(self, v: Any, scene: Any, plan: Plan, numbers: Any) -> None:
         self.v, self.scene, self.plan, self.numbers = v, scene, plan, numbers
         self.vectorised, self.branch, self.context = dr.is_jit_v(v.Float), branch_class(v), mi.BSDFContext()
+        self.emitters = (Lamps if plan.lamps_only else Everything)(v, scene)
         self.flags = +(mi.RayFlags.All if plan.all_of_hit else mi.RayFlags.ShadingFrame)
 
     def run(self, ray: Any, sampler: Any, active: Any) -> State:
@@ -125,7 +130,7 @@ class Trace:
         if plan.emitter_sampling:
             s.previous, s.pdf, s.delta = dr.zeros(v.Interaction3f), v.Float(1), v.Bool(True)
         if plan.split_depth:
-            s.share, s.node, s.waiting = v.Float(1), v.UInt32(1), v.UInt32(0)
+            s.share, s.node, s.waiting, s.seen = v.Float(1), v.UInt32(1), v.UInt32(0), v.Bool(True)
             s.stack = dr.alloc_local(self.branch, plan.split_depth) if self.vectorised else Pile()
         if plan.deterministic:
             s.truncated = v.Float(0)
@@ -169,8 +174,9 @@ class Trace:
         key = (s.node * 0x9E3779B9 + s.depth) * 4 if plan.split_depth else 0
         if plan.emitter_sampling:
             self._add_direct(s, si, bsdf, onward, key)
-        first = 0.5 if plan.deterministic else self.numbers.one(s.sampler, key + 1)
+        first = self.numbers.one(s.sampler, key + 1) if plan.first_number else None
         second = self.numbers.two(s.sampler, key + 2) if plan.second_number else self.v.Point2f(0.5)
+        first = second.x if first is None else first
         bs, weight = bsdf.sample(self.context, si, first, second, onward)
         ray, throughput = self._next(s, si, bs, weight)
         s.valid = s.valid | (hit & (mi.has_flag(bs.sampled_type, LOBES.Null) ^ True))
@@ -232,28 +238,32 @@ class Trace:
         if not self.plan.emitter_sampling:
             return radiance
         ds = self.v.DirectionSample3f(self.scene, si, s.previous)
-        pdf = self.scene.pdf_emitter_direction(s.previous, ds, active & (s.delta ^ True))
+        pdf = self.emitters.pdf(s.previous, ds, active & (s.delta ^ True))
         return radiance * dr.select(s.delta, 1, power_heuristic(s.pdf, pdf))
 
     def _add_direct(self, s: State, si: Any, bsdf: Any, onward: Any, key: Any) -> None:
         smooth = onward & mi.has_flag(bsdf.flags(), LOBES.Smooth)
         if not self.vectorised and not smooth:
             return
-        ds, radiance = self.scene.sample_emitter_direction(si, self.numbers.two(s.sampler, key), True, smooth)
+        ds, radiance = self.emitters.sample(si, self.numbers.two(s.sampler, key), smooth)
         wo = si.to_local(ds.d)
         value, pdf = bsdf.eval_pdf(self.context, si, wo, smooth)
+        # What reflects nothing needs no shadow ray.
+        lit = smooth & (ds.pdf != 0) & (dr.max(dr.abs(self.v.unpolarized_spectrum(value))) > 0)
+        lit = lit & (self.scene.ray_test(si.spawn_ray_to(ds.p), lit) ^ True)
         if self.v.is_polarized:
             value = si.to_world_mueller(value, -wo, si.wi)
         found = self._times(self._times(s.throughput, value), radiance)
         found *= dr.select(ds.delta, 1, power_heuristic(ds.pdf, pdf))
-        s.result = dr.select(smooth & (ds.pdf != 0), s.result + found, s.result)
+        s.result = dr.select(lit, s.result + found, s.result)
 
     # Both lobes ----------------------------------------------------------------------------------------------------
 
     def _split(self, s: State, si: Any, bsdf: Any, bs: Any, second: Any, throughput: Any, onward: Any) -> Any:
         """Put the other lobe aside where both are worth following; the throughput of the one that was sampled."""
         plan, p = self.plan, dr.detach(bs.pdf)
-        pair = onward & self._is_pair(bsdf.flags())
+        pair = onward & s.seen & self._is_pair(bsdf.flags())
+        s.seen = s.seen & mi.has_flag(bs.sampled_type, LOBES.Delta)
         both = pair & (s.depth <= plan.split_depth) & (s.share * dr.minimum(p, 1 - p) > plan.split_weight)
         if self.vectorised or both:
             both = self._put_aside(s, si, bsdf, bs, second, both)
@@ -302,4 +312,5 @@ class Trace:
             setattr(s, name, dr.select(found, getattr(branch, name), getattr(s, name)))
         if self.plan.emitter_sampling:
             s.pdf, s.delta = dr.select(found, 1, s.pdf), s.delta | found
+        s.seen = s.seen | found
         return onward | found

@@ -16,6 +16,8 @@ GLASS_ONLY = ("balls", "slab", "lightpipe")
 AROUND, DOWN = 0.6 + 0.4 * np.sin(np.arange(64) * 2 * np.pi / 64 + 0.3), np.linspace(0, 0.7, 32)
 SKY = (AROUND[None, :, None] + DOWN[:, None, None]).astype(np.float32) * np.ones(3, np.float32)
 
+BOX = {"type": "box"}
+
 
 @pytest.fixture
 def llvm(needs_variant):
@@ -39,11 +41,11 @@ def by_path(scene, spp=16, seed=0, **parameters):
     return render(scene, spp, seed, **parameters, type="path")
 
 
-def glass_ball(sampler=None, **parts):
+def glass_ball(resolution=24, sampler=None, **parts):
     place = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
     sensor = {
         "type": "perspective", "sampler": sampler or {"type": "independent"}, "fov": 30, "to_world": place,
-        "film": {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
+        "film": {"type": "hdrfilm", "width": resolution, "height": resolution, "pixel_format": "rgb", "rfilter": BOX},
     }  # fmt: skip
     ball = {"type": "sphere", "bsdf": {"type": "refract", "int_ior": 1.5, "ext_ior": 1.0}}
     return mi.load_dict({"type": "scene", "sensor": sensor, "ball": ball} | parts)
@@ -57,8 +59,13 @@ def sky():
 
 
 @pytest.mark.parametrize("name", MIXED)
-def test_where_nothing_is_left_out_the_numbers_and_the_picture_are_those_of_path(name, each_variant):
+def test_where_nothing_is_left_out_the_numbers_and_the_picture_are_those_of_path(name, each_variant, monkeypatch):
     """With Russian roulette and emitter sampling both integrators draw the same numbers in the same order."""
+
+    def everything(scene):
+        return dataclasses.replace(needs.inspect(scene), both_numbers=True, plain_environment=False)
+
+    monkeypatch.setattr(integrator, "inspect", everything)
     vectorised = dr.is_jit_v(mi.Float)
     scene, spp = load(name, 24 if vectorised else 4), 16 if vectorised else 2
     for parameters in ({}, {"max_depth": 3, "rr_depth": 1}):
@@ -76,6 +83,36 @@ def test_other_numbers_give_the_same_mean(name, parameters, llvm):
     ours = np.stack([render(scene, seed=100 + i, **parameters) for i in range(8)])
     assert compare.welch(theirs, ours, 8, 1e-3, 1e-5).alarms == 0
     assert ours.mean() == pytest.approx(theirs.mean(), rel=2e-2)
+
+
+def lamps():
+    """A wall in a constant sky and three lamps before it, one of them small and bright, one that has no surface."""
+    place = mi.ScalarTransform4f
+    wall = {"type": "rectangle", "to_world": place().translate([0, 0, -2]).scale(4)}
+    sky = {"type": "constant", "radiance": 0.2}
+    found = {"wall": wall, "sky": sky, "spot": {"type": "point", "position": [0, 3, 2], "intensity": 4.0}}
+    for i, (x, size, radiance) in enumerate([(-1.5, 0.6, 3.0), (1.5, 0.1, 40.0)]):
+        emitter = {"type": "area", "radiance": radiance, "sampling_weight": 1.0 + i}
+        where = place().translate([x, 2, 1]).rotate([0, 1, 0], 180).scale(size)
+        found[f"lamp {i}"] = {"type": "rectangle", "to_world": where, "emitter": emitter}
+    return found
+
+
+@pytest.mark.parametrize("parameters", [{}, {"split_depth": 2}], ids=str)
+def test_lamps_are_chosen_by_their_weights_and_the_sky_is_met(parameters, each_variant, monkeypatch):
+    """Welch's test on one tile, one false alarm in 1000; a probability that is off is seen."""
+    vectorised = dr.is_jit_v(mi.Float)
+    scene, spp, count = glass_ball(24 if vectorised else 6, **lamps()), 64 if vectorised else 16, 8
+    theirs = np.stack([by_path(scene, spp, i) for i in range(count)])
+    ours = np.stack([render(scene, spp, 100 + i, **parameters) for i in range(count)])
+    tile = theirs.shape[1]
+    assert compare.welch(theirs, ours, tile, 1e-3, 1e-5).alarms == 0
+    if vectorised:
+        choose = mi.DiscreteDistribution.sample_reuse_pmf
+        slip = lambda *a: (*choose(*a)[:2], mi.Float(0.4))  # noqa: E731
+        monkeypatch.setattr(mi.DiscreteDistribution, "sample_reuse_pmf", slip)
+        wrong = np.stack([render(scene, spp, 100 + i, **parameters) for i in range(count)])
+        assert compare.welch(theirs, wrong, tile, 1e-3, 1e-5).alarms > 0
 
 
 @pytest.mark.parametrize("name", ["area", "environment", "all_of_hit"])

@@ -23,8 +23,8 @@ from mi_refract.formulas import FORMULAS
 from mi_refract.rows import Row
 
 from . import timing
+from .methods import opened
 from .plan import SCENES, Context, Task
-from .renders import Camera
 
 TITLE = "What a scene does not use"
 TERMS = {
@@ -363,7 +363,7 @@ def boundary_rows(context: Context) -> list[Row]:
     """Where the built-in's directions are wrong its paths may be shorter, and a render of them cheaper."""
     rows = []
     for name in ("furnace", "mirage"):
-        values = {plugin: boundaries(Camera(SCENES / f"{name}.xml", plugin, RESOLUTION).scene)
+        values = {plugin: boundaries(opened(SCENES / f"{name}.xml", plugin, RESOLUTION))
                   for plugin in (PLUGIN, BUILTIN)}  # fmt: skip
         values[f"boundaries / {BUILTIN}"] = values[PLUGIN] / values[BUILTIN]
         rows.append(Row(STUDY, PLUGIN, f"{name}: boundaries", context.variant, values, replay={"seed": SEED}))
