@@ -32,9 +32,8 @@ class Lamps:
         self.v, emitters = v, scene.emitters()
         kept = [i for i, emitter in enumerate(emitters) if not emitter.is_environment()]
         weights = [float(emitters[i].sampling_weight()) for i in kept]
-        self.total, self.any = sum(weights), sum(weights) > 0
-        self.vectorised = dr.is_jit_v(v.Float)
-        if not self.any:
+        self.total, self.vectorised = sum(weights), dr.is_jit_v(v.Float)
+        if not self.total:  # nothing is asked
             return
         if self.vectorised:
             self.pointers = dr.gather(v.EmitterPtr, scene.emitters_dr(), v.UInt32(kept))

@@ -57,8 +57,8 @@ class Needs:
             "a random number": "" if self.both_numbers else "no BSDF samples with one number and with two as well",
             "area lights": "" if self.area else "no shape emits",
             "environment": "" if self.environment else "no environment emitter",
-            "sampling the environment": "the BSDFs' own samples meet what is the same everywhere"
-            if self.plain_environment else "",
+            "sampling the environment": "what is the same everywhere is met by the BSDFs' own samples"
+            if self.plain_environment and self.smooth else "",
             "media": "" if self.media else "neither a shape, a sensor nor an emitter has a medium",
             "null lobes": "" if self.null else "no BSDF has one",
             "textures": "" if self.textured else "no BSDF and no area light varies over its surface",

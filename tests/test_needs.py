@@ -39,15 +39,14 @@ MEDIUM = {"type": "homogeneous"}
         ({"type": "sphere", "bsdf": {"type": "twosided", "a": {"type": "diffuse", "reflectance": CHECKERS}}},
          {"smooth", "textured"}),
         ({"type": "sphere", "bsdf": {"type": "refract", "specular_reflectance": CHECKERS}}, {"textured"}),
-        ({"type": "sphere", "bsdf": {"type": "mask", "a": {"type": "refract"}}}, {"null"}),
+        ({"type": "sphere", "bsdf": {"type": "mask", "a": {"type": "refract"}}}, {"null", "both_numbers"}),
         ({"type": "sphere", "bsdf": {"type": "thindielectric"}}, {"null"}),
-        ({"type": "sphere", "bsdf": {"type": "roughdielectric"}}, {"smooth"}),
+        ({"type": "sphere", "bsdf": {"type": "roughdielectric"}}, {"smooth", "both_numbers"}),
         ({"type": "sphere", "interior": MEDIUM, "bsdf": {"type": "refract"}}, {"media"}),
         ({"type": "sphere", "bsdf": {"type": "plastic"}}, {"smooth", "both_numbers"}),
         (LAMP, {"sampleable", "lamps", "area"}),
         (LAMP | {"bsdf": {"type": "null"}}, {"sampleable", "lamps", "area", "null"}),
         (LAMP | {"bsdf": {"type": "diffuse"}}, {"sampleable", "lamps", "area", "smooth"}),
-        (LAMP | {"emitter": {"type": "area", "sampling_weight": 0.0}}, {"sampleable", "area"}),
         ({"type": "constant"}, {"sampleable", "environment", "plain_environment"}),
         ({"type": "envmap", "bitmap": mi.Bitmap(np.ones((2, 4, 3), np.float32))}, {"sampleable", "environment"}),
         ({"type": "point"}, {"sampleable", "lamps", "delta_emitters"}),
@@ -61,7 +60,7 @@ def test_each_part_adds_what_it_needs_and_no_more(part, seen):
     assert facts(part=part) == expected
 
 
-EVERYTHING = {"smooth", "null", "textured", "polarising", "dispersive"}
+EVERYTHING = {"both_numbers", "smooth", "null", "textured", "polarising", "dispersive"}
 
 
 def test_what_is_not_known_needs_everything():
@@ -94,7 +93,7 @@ def test_an_emitter_that_declares_nothing_may_be_a_delta():
             pass
 
     mi.register_emitter("silent", Silent)
-    assert facts(part={"type": "silent"}) == {"only_glass", "polarising", "sampleable", "delta_emitters"}
+    assert facts(part={"type": "silent"}) == {"only_glass", "polarising", "sampleable", "lamps", "delta_emitters"}
 
 
 @pytest.mark.parametrize(("reflectance", "black"), [(0.0, True), ({"type": "rgb", "value": 1e-9}, False)])
@@ -153,7 +152,9 @@ def test_what_is_left_out_has_its_reason():
     mi.set_variant("scalar_rgb")
     found = inspect(mi.load_file(str(SCENES / "slab.xml"), res=4)).left_out
     assert found["emitter sampling"] == "every BSDF has delta lobes only"
-    assert set(found) == {"emitter sampling", "media", "null lobes", "dispersion"}
+    assert set(found) == {"emitter sampling", "a random number", "media", "null lobes", "dispersion"}
+    sky = {"type": "scene", "a": {"type": "sphere"}, "sky": {"type": "constant"}}
+    assert "met" in inspect(mi.load_dict(sky)).left_out["sampling the environment"]
     dark = inspect(mi.load_dict({"type": "scene", "a": {"type": "sphere"}})).left_out
     assert dark["emitter sampling"] == "no emitter can be sampled"
     assert {"area lights", "environment", "polarisation"} <= set(dark)

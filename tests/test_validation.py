@@ -121,9 +121,9 @@ def test_what_is_the_same_is_not_tested_by_chance_and_still_compared(context):
 def test_scenes_say_what_they_need_and_what_is_left_out(context):
     (row,) = scenes.scene_rows(context, SCENES / "slab.xml")
     assert {name for name, value in row.values.items() if value} == {
-        "sampleable", "area", "environment", "only glass", "polarising"
+        "sampleable", "lamps", "area", "environment", "plain environment", "only glass", "textured", "polarising"
     }  # fmt: skip
-    assert row.reason == "left out: emitter sampling, media, null lobes, textures, dispersion"
+    assert row.reason == "left out: emitter sampling, a random number, media, null lobes, dispersion"
     assert row.replay["left out"]["dispersion"] == "no BSDF bends light by its wavelength"
 
 
@@ -222,13 +222,16 @@ def test_a_readme_is_not_written_from_a_run_that_measured_too_little():
         readme.renders([])
     with pytest.raises(ValueError, match="no paths were traced"):
         readme.paths([])
+    with pytest.raises(ValueError, match="no efficiency was measured"):
+        readme.efficiency([])
 
 
 def test_the_readme_holds_its_tables_and_shows_pictures_that_exist():
     root = Path(command.__file__).parents[1]
     text = (root / "README.md").read_text()
     scenes = [path.stem for path in SCENES.glob("*.xml")]
-    for marker, words in (("accuracy", [*FORMULAS]), ("renders", scenes), ("paths", paths.plugins())):
+    for marker, words in (("accuracy", [*FORMULAS]), ("renders", scenes), ("paths", paths.plugins()), ("efficiency", methods.METHODS)):
+        words = [getattr(word, "name", word) for word in words]
         table = text.partition(f"<!-- begin: {marker} -->")[2].partition(f"<!-- end: {marker} -->")[0]
         assert [word for word in words if word not in table] == []
     pictures = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)

@@ -1,4 +1,4 @@
-"""What the README quotes: tables of accuracy, renders and paths, and the gallery, all from the rows of one run."""
+"""What the README quotes: tables of accuracy, renders, paths and efficiency, and the gallery, all from the rows of one run."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ def update(path: Path, rows: list[Row], context: Context) -> None:
     update_between(path, "accuracy", accuracy(rows))
     update_between(path, "renders", renders(rows))
     update_between(path, "paths", paths(rows))
+    update_between(path, "efficiency", efficiency(rows))
     write_atomically(GALLERY, gallery(rows, context))
 
 
@@ -113,6 +114,29 @@ def paths(rows: list[Row]) -> str:
     for row in found:
         subject = row.subject if row.subject.startswith("exact") else f"`{row.subject}`"
         lines.append(f"| {subject} | {' | '.join(compact(row.values[metric]) for metric in PATHS)} |")
+    return "\n".join(lines)
+
+
+EFFICIENCY = {
+    "time / built-in": "time",
+    "equal-time MSE": "MSE at equal time",
+    "equal-time MSE / independent": "… over its defaults",
+}
+
+
+def efficiency(rows: list[Row]) -> str:
+    """Markdown: every method on the scenes that were measured, over the built-in with the same sampler."""
+    found = [row for row in rows if row.study == "efficiency" and row.values.keys() >= EFFICIENCY.keys()]
+    if not found:
+        raise ValueError("README: no efficiency was measured; its table needs a compiled variant")
+    replay = found[0].replay
+    lines = [f"{replay['resolution']}² pixels, {replay['spp']} spp, {replay['rounds']} rounds, {found[0].setting}.", ""]
+    lines += [f"| scene | method | sampler | {' | '.join(EFFICIENCY.values())} |", "|---" * (len(EFFICIENCY) + 3) + "|"]
+    for row in found:
+        name, _, own = row.subject.partition(", independent")
+        sampler = "independent" if row.subject.endswith(", independent") else row.replay["sampler"]
+        cells = [row.case, f"`{name}`{own}", sampler, *(_with_interval(row, metric) for metric in EFFICIENCY)]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
