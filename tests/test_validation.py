@@ -230,8 +230,9 @@ def test_the_readme_holds_its_tables_and_shows_pictures_that_exist():
     root = Path(command.__file__).parents[1]
     text = (root / "README.md").read_text()
     scenes = [path.stem for path in SCENES.glob("*.xml")]
-    for marker, words in (("accuracy", [*FORMULAS]), ("renders", scenes), ("paths", paths.plugins()), ("efficiency", methods.METHODS)):
-        words = [getattr(word, "name", word) for word in words]
+    ways = [method.name for method in methods.METHODS]
+    tables = {"accuracy": FORMULAS, "renders": scenes, "paths": paths.plugins(), "efficiency": ways}
+    for marker, words in tables.items():
         table = text.partition(f"<!-- begin: {marker} -->")[2].partition(f"<!-- end: {marker} -->")[0]
         assert [word for word in words if word not in table] == []
     pictures = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)

@@ -170,7 +170,7 @@ def operation_rows(context: Context) -> list[Row]:
             values |= {f"operations{name}": count, f"added{name}": count - plain[plugin]}
         budgets = {"added": values[f"added, {BUILTIN}"]} if less else {}
         goals = {"operations": plain[BUILTIN]} if case == "plain" else {}
-        replay = {"rays": RAYS} | asked
+        replay = {"rays": RAYS} | {key: str(value) for key, value in asked.items()}
         return Row(STUDY, PLUGIN, case, variant, values, budgets, goals, replay=replay)
 
     rows = [

@@ -1,4 +1,4 @@
-"""What the README quotes: tables of accuracy, renders, paths and efficiency, and the gallery, all from the rows of one run."""
+"""What the README quotes: four tables and the gallery, all from the rows of one run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .plan import SCENES, Context
 from .settings import PLAIN
 
 GALLERY = SCENES / "gallery.png"
-COLUMNS = 5
+COLUMNS = 6
 
 
 def update(path: Path, rows: list[Row], context: Context) -> None:
@@ -149,7 +149,9 @@ def gallery(rows: list[Row], context: Context) -> bytes:
     gap = np.ones((tiles[0].shape[0], 4, 3), np.float32)
     strips = []
     for start in range(0, len(tiles), COLUMNS):
-        strip = [x for tile in tiles[start : start + COLUMNS] for x in (tile, gap)][:-1]
+        row = tiles[start : start + COLUMNS]
+        row += [np.ones_like(tiles[0])] * (COLUMNS - len(row))
+        strip = [x for tile in row for x in (tile, gap)][:-1]
         strips += [np.concatenate(strip, axis=1), np.ones((4, sum(x.shape[1] for x in strip), 3), np.float32)]
     linear = np.clip(np.concatenate(strips[:-1]), 0, 1)
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055).astype(np.float32)
