@@ -96,10 +96,12 @@ def integrator_class(v: Any) -> type:
         def plan(self, scene: Any) -> Plan:
             """What is traced of a scene. ValueError where a deterministic render would leave something to chance."""
             needs = self._needs(scene)
-            if self.deterministic and not needs.only_glass:
-                raise ValueError(f"{INTEGRATOR}: deterministic: accepted: scenes whose BSDFs have delta lobes only")
             # Local memory has no derivatives, and the evaluated loops that derivatives need have no local memory.
             symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
+            if self.deterministic and (needs.both_numbers or needs.null or not needs.only_glass):
+                raise ValueError(f"{INTEGRATOR}: deterministic: accepted: scenes of smooth dielectrics and conductors")
+            if self.deterministic and not symbolic:
+                raise ValueError(f"{INTEGRATOR}: deterministic: accepted: renders that are not differentiated")
             return Plan(
                 self.max_depth, self.rr_depth, self.hide_emitters,
                 self.split_depth if symbolic else 0, self.split_weight, self.deterministic,

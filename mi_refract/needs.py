@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+
 WRAPPERS = {"BlendBSDF", "BumpMap", "MaskBSDF", "NormalMap", "TwoSidedBRDF"}
 DEPOLARISING = {
     "Hair", "Measured", "Null", "Principled", "PrincipledThin", "RoughDielectric", "RoughPlastic", "SmoothDiffuse",
@@ -125,7 +127,8 @@ def _textured(node: Any) -> bool:
 
 
 def _black(bsdf: Any) -> bool:
-    if _name(bsdf) != "SmoothDiffuse":
+    # A frozen function is recorded for every value that will come.
+    if _name(bsdf) != "SmoothDiffuse" or dr.flag(dr.JitFlag.FreezingScope):
         return False
     (reflectance,) = _children(bsdf)
     exact = reflectance.class_name() == "UniformSpectrum" or "spectral" not in bsdf.variant_name()
