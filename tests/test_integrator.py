@@ -1,6 +1,7 @@
 """`refract_path` renders what `path` does, in every variant, with less; it splits without bias and differentiates."""
 
 import dataclasses
+import gc
 
 import drjit as dr
 import mitsuba as mi
@@ -275,15 +276,17 @@ def operations(scene, method):
 
 
 def test_what_is_left_out_is_not_in_the_kernel_and_is_said(llvm, monkeypatch):
+    gc.collect()  # Dr.Jit compiles whatever BSDF is alive: differences are compared, not counts
     scene = load("balls")
     method, theirs = (mi.load_dict({"type": t, "max_depth": 16, "rr_depth": 16}) for t in ("refract_path", "path"))
     assert "left out = no scene seen yet" in str(method)
     lean = operations(scene, method)
     assert "emitter sampling (every BSDF has delta lobes only)" in str(method)
-    assert lean < 0.7 * operations(scene, theirs)
+    saved = operations(scene, theirs) - lean
+    assert saved > 250
     full = dataclasses.replace(needs.inspect(scene), smooth=True)
     monkeypatch.setattr(integrator, "inspect", lambda scene: full)
-    assert operations(scene, mi.load_dict({"type": "refract_path", "max_depth": 16, "rr_depth": 16})) > 1.3 * lean
+    assert operations(scene, mi.load_dict({"type": "refract_path", "max_depth": 16, "rr_depth": 16})) > lean + 0.6 * saved
 
 
 @pytest.mark.parametrize("split_depth", [0, 2])
