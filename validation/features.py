@@ -60,8 +60,6 @@ def tasks(context: Context) -> list[Task]:
     if context.variant.startswith("scalar"):
         return [Task("features", lambda: [Row(STUDY, PLUGIN, "kernels", context.variant, reason=SCALAR)]), calls]
     return [
-        calls,
-        Task("features: boundaries", functools.partial(boundary_rows, context)),
         Task("features: operations", functools.partial(operation_rows, context)),
         Task("features: glasses", functools.partial(glass_rows, context)),
         Task("features: optimisation", functools.partial(optimisation_rows, context)),
@@ -69,6 +67,8 @@ def tasks(context: Context) -> list[Task]:
           for n in FIRST_IMAGE_GOALS),
         Task("features: edit", functools.partial(edit_rows, context)),
         Task("features: frozen", functools.partial(frozen_rows, context)),
+        Task("features: boundaries", functools.partial(boundary_rows, context)),
+        calls,
     ]  # fmt: skip
 
 

@@ -44,20 +44,24 @@ def accuracy(rows: list[Row]) -> str:
     heading = ["formula", "source"]
     for setting, metrics in ACCURACY.items():
         heading += [(f"{setting.split()[1]}: " if i == 0 else "") + title for i, title in enumerate(metrics)]
-    lines = [
-        f"Worst over {rays:,} rays in all regimes; u = 2⁻²⁴ or 2⁻⁵³; times are medians over copying the same bytes and",
-        f"over `{PLAIN}`, with their 95 % intervals.",
-        "",
-        f"| {' | '.join(heading)} |",
-        "|---" * len(heading) + "|",
-    ]
+    text = (
+        f"Worst over {rays:,} rays in all regimes; u = 2⁻²⁴ or 2⁻⁵³; times are medians over copying the same bytes and\n"
+        f"over `{PLAIN}`, with their 95 % intervals."
+    )
+    lines = []
     for subject in subjects:
         cells = [f"`{subject}`", FORMULAS[subject].source if subject in FORMULAS else "Mitsuba 3"]
         for setting, metrics in ACCURACY.items():
             row = found.get((subject, setting))
             cells += [_with_interval(row, metric) if row else "–" for metric in metrics.values()]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        lines.append(cells)
+    return _table(text, heading, lines)
+
+
+def _table(text: str, heading: list[str], rows: list[list[str]]) -> str:
+    """Markdown: a line of text, and a table."""
+    lines = [f"| {' | '.join(cells)} |" for cells in (heading, *rows)]
+    return "\n".join([text, "", lines[0], "|---" * len(heading) + "|", *lines[1:]])
 
 
 def _with_interval(row: Row, metric: str) -> str:
@@ -88,11 +92,11 @@ def renders(rows: list[Row]) -> str:
         raise ValueError("README: no scene was rendered; its table needs them")
     replay = found[0].replay
     size = f"{replay['resolution']}² pixels, {replay['spp']} spp, {replay['seeds']} seeds, {replay['variant']}"
-    lines = [f"{size}.", "", f"| scene | {' | '.join(RENDERS.values())} |", "|---" * (len(RENDERS) + 1) + "|"]
-    for row in found:
-        cells = [compact(row.values[metric]) if metric in row.values else "–" for metric in RENDERS]
-        lines.append(f"| {row.case} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+    cells = [
+        [row.case, *(compact(row.values[metric]) if metric in row.values else "–" for metric in RENDERS)]
+        for row in found
+    ]  # fmt: skip
+    return _table(f"{size}.", ["scene", *RENDERS.values()], cells)
 
 
 PATHS = {
@@ -109,12 +113,12 @@ def paths(rows: list[Row]) -> str:
     found = [row for row in found if row.replay["scene"] == f"{MIRAGE.scene}.xml"]
     if not found:
         raise ValueError("README: no paths were traced; its table needs a compiled variant")
-    lines = [f"{found[0].replay['rays']} rays, {found[0].setting}.", ""]
-    lines += [f"| | {' | '.join(PATHS.values())} |", "|---" * (len(PATHS) + 1) + "|"]
-    for row in found:
-        subject = row.subject if row.subject.startswith("exact") else f"`{row.subject}`"
-        lines.append(f"| {subject} | {' | '.join(compact(row.values[metric]) for metric in PATHS)} |")
-    return "\n".join(lines)
+    cells = [
+        [row.subject if row.subject.startswith("exact") else f"`{row.subject}`",
+         *(compact(row.values[metric]) for metric in PATHS)]
+        for row in found
+    ]  # fmt: skip
+    return _table(f"{found[0].replay['rays']} rays, {found[0].setting}.", ["", *PATHS.values()], cells)
 
 
 EFFICIENCY = {
@@ -130,14 +134,13 @@ def efficiency(rows: list[Row]) -> str:
     if not found:
         raise ValueError("README: no efficiency was measured; its table needs a compiled variant")
     replay = found[0].replay
-    lines = [f"{replay['resolution']}² pixels, {replay['spp']} spp, {replay['rounds']} rounds, {found[0].setting}.", ""]
-    lines += [f"| scene | method | sampler | {' | '.join(EFFICIENCY.values())} |", "|---" * (len(EFFICIENCY) + 3) + "|"]
+    size = f"{replay['resolution']}² pixels, {replay['spp']} spp, {replay['rounds']} rounds, {found[0].setting}."
+    cells = []
     for row in found:
-        name, _, own = row.subject.partition(", independent")
-        sampler = "independent" if row.subject.endswith(", independent") else row.replay["sampler"]
-        cells = [row.case, f"`{name}`{own}", sampler, *(_with_interval(row, metric) for metric in EFFICIENCY)]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        name, default, _ = row.subject.partition(", independent")
+        sampler = "independent" if default else row.replay["sampler"]
+        cells.append([row.case, f"`{name}`", sampler, *(_with_interval(row, metric) for metric in EFFICIENCY)])
+    return _table(size, ["scene", "method", "sampler", *EFFICIENCY.values()], cells)
 
 
 def gallery(rows: list[Row], context: Context) -> bytes:
