@@ -45,8 +45,8 @@ def accuracy(rows: list[Row]) -> str:
     for setting, metrics in ACCURACY.items():
         heading += [(f"{setting.split()[1]}: " if i == 0 else "") + title for i, title in enumerate(metrics)]
     text = (
-        f"Worst over {rays:,} rays in all regimes; u = 2⁻²⁴ or 2⁻⁵³; times are medians over copying the same bytes and\n"
-        f"over `{PLAIN}`, with their 95 % intervals."
+        f"Worst over {rays:,} rays in all regimes; u = 2⁻²⁴ or 2⁻⁵³; times are medians over copying the same bytes\n"
+        f"and over `{PLAIN}`, with their 95 % intervals."
     )
     lines = []
     for subject in subjects:
