@@ -5,7 +5,8 @@ lobes of glass are followed, each with its power, instead of one of them by chan
 whose share of the light is less. `deterministic` (False): no lobe is left to chance, and those of a smaller share are
 dropped; the channel `truncated` says how much that is. Times the brightest radiance it bounds the error.
 
-Derivatives are attached: rays move with the index. A render that is differentiated does not split.
+Derivatives are attached: rays move with the index, but edges that move are not seen. A render that is differentiated
+does not split.
 """
 
 from __future__ import annotations
