@@ -1,0 +1,155 @@
+"""Planar: `planar.trace` against an independent retrace, on every scene file.
+
+Paths are followed once more in extended precision, by implicit curves and momenta. A ray is astray where it meets
+other boundaries than it should, or ends another way. Of the others, every point and the last direction count, and
+stand over what rounding may have grown to: each boundary adds a few roundings of the largest coordinate so far and of
+the angle, a facet's own turn by its rounded ends and 1/cos behind the boundary among them, and the first-order
+transfer of a displaced and tilted ray carries them on (`validation/growth.py`). Rays are the file's, and seeded ones
+scattered around them. Then the formulas by name, and closed answers: a box unfolded by mirror images, an ellipse, an
+aplanatic ball, a prism, a rainbow.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_refract.formulas import FORMULAS
+from mi_refract.planar import Paths, Segments, trace
+from mi_refract.planar_scene import PlanarScene, load
+from mi_refract.rows import Row
+
+from .growth import growth
+from .plan import SCENES, Context, Task
+from .retrace import Array, Retraced, retrace
+from .settings import Setting, settings
+
+TITLE = "Planar"
+TEXT = __doc__.partition("\n")[2].strip()
+TERMS = {
+    "difference": "largest distance of a point from the retrace, over the extent of the scene, and |d − exact|",
+    "error / bound": "largest of any point and last direction, over what rounding may have grown to",
+    "astray": "rays that meet other boundaries than they should, or end another way",
+    "astray, far": "of these, how many pass every vertex of the boundaries they should meet at more than their bound",
+    "boundaries": "the most that a ray meets",
+}
+STUDY = "planar"
+FOLDER = SCENES / "planar"
+SEED = 2031
+SCATTERED = 1000  # rays beside the file's own
+SPREAD = 1e-2  # of the extent, and in radians
+EQUAL = 1e-9  # in float64, of the extent and in radians
+SHOWN = "lens"  # the scene of the formulas
+
+
+@dataclass(frozen=True)
+class Case:
+    """Rays to follow through `segments`, and their exact paths. `extent`: the diagonal around the segments."""
+
+    name: str
+    segments: Segments
+    origins: Array
+    directions: Array
+    max_depth: int
+    reflect: Array
+    exact: Retraced
+
+    @property
+    def extent(self) -> float:
+        corners = np.concatenate([self.segments.start, self.segments.end])
+        return float(np.hypot(*np.ptp(corners, axis=0)))
+
+    def trace(self, setting: Setting, formula: str = "rotated") -> Paths:
+        return trace(
+            self.segments, self.origins, self.directions, self.max_depth, reflect=self.reflect, formula=formula,
+            precision=np.dtype(setting.precision).name, backend=setting.backend,
+        )  # fmt: skip
+
+
+def tasks(context: Context) -> list[Task]:
+    """One task per backend and precision."""
+    return [Task(f"planar: {s.label}", functools.partial(_setting_rows, context, s)) for s in settings(context)]
+
+
+def _setting_rows(context: Context, setting: Setting) -> list[Row]:
+    if setting.vector is None:
+        return [Row(STUDY, "trace", "every scene", setting.label, reason=setting.reason)]
+    rays = context.profile.scalar_rays // 10 if setting.is_scalar else SCATTERED
+    cases = [case_of(path, rays) for path in sorted(FOLDER.glob("*.toml"))]
+    rows = [row_of(case, setting) for case in cases]
+    if setting.precision is np.float32:
+        shown = next(case for case in cases if case.name == SHOWN)
+        rows += [row_of(shown, setting, formula) for formula in FORMULAS]
+    return rows
+
+
+def row_of(case: Case, setting: Setting, formula: str = "") -> Row:
+    """A scene in a setting, by the default formula or another one."""
+    paths = case.trace(setting, formula) if formula else case.trace(setting)
+    values = judge(paths, case, setting.roundoff)
+    budgets = {"error / bound": 1.0, "astray, far": 0.0}
+    if setting.precision is np.float64:
+        budgets |= {"difference": EQUAL, "astray": 0.0}
+    replay = {"scene": f"{case.name}.toml", "rays": len(case.origins), "seed": SEED}
+    return Row(STUDY, formula or "trace", case.name, setting.label, values, budgets, replay=replay)
+
+
+@functools.cache
+def case_of(path: Path, scattered: int) -> Case:
+    """The first colour of a scene file: refracted wherever possible, and reflected once where the file has branches."""
+    scene = load(path)
+    origins, directions = rays_of(scene, scattered)
+    masks = [0] + [1 << j for j in range(min(2, scene.max_depth))] * bool(scene.branches)
+    reflect = np.repeat(masks, len(origins))
+    origins, directions = (np.tile(x, (len(masks), 1)) for x in (origins, directions))
+    exact = retrace(scene.segments[0], origins, directions, scene.max_depth, reflect=reflect)
+    return Case(path.stem, scene.segments[0], origins, directions, scene.max_depth, reflect, exact)
+
+
+def rays_of(scene: PlanarScene, scattered: int) -> tuple[Array, Array]:
+    """The file's rays, and `scattered` around them."""
+    rng = np.random.default_rng(SEED)
+    chosen = rng.integers(0, len(scene.origins), scattered)
+    extent = np.hypot(*np.ptp(np.concatenate([scene.segments[0].start, scene.segments[0].end]), axis=0))
+    shift, turn = SPREAD * extent * rng.uniform(-1, 1, (scattered, 2)), SPREAD * rng.uniform(-1, 1, scattered)
+    x, y = scene.directions[chosen].T
+    turned = np.stack([x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn)], 1)
+    return np.concatenate([scene.origins, scene.origins[chosen] + shift]), np.concatenate([scene.directions, turned])
+
+
+def judge(paths: Paths, case: Case, u: float) -> dict[str, float]:
+    """What became of the rays, against the retrace; u: the roundoff. NaN where no ray kept to its boundaries."""
+    exact = case.exact
+    bounds, bound = growth(exact, case.segments, u)
+    astray = (paths.hits != exact.hits).any(1) | (paths.events != exact.events).any(1)
+    near = (clearance(exact, case.segments) <= bounds[:, 1:]).any(1)
+    found = {"boundaries": float(exact.met.max()), "astray": float(astray.sum())}
+    found["astray, far"] = float((astray & ~near).sum())
+    point = np.hypot(*(paths.points - exact.points).transpose(2, 0, 1))[~astray]
+    direction = np.hypot(*(unit(paths.directions) - exact.directions).T)[~astray]
+    # A point that is missing differs by infinity: only what the retrace does not have may be NaN.
+    point = np.where(np.isnan(exact.points[~astray, :, 0]), 0, np.nan_to_num(point, nan=np.inf)).astype(float)
+    direction = np.nan_to_num(direction, nan=np.inf).astype(float)
+    ratio = np.maximum(np.nanmax(point / bounds[~astray], axis=1, initial=0), direction / bound[~astray])
+    worst = np.maximum(point.max(1, initial=0) / case.extent, direction)
+    return found | {"difference": _largest(worst), "error / bound": _largest(ratio)}
+
+
+def _largest(x: Array) -> float:
+    return float(x.max()) if len(x) else float("nan")
+
+
+def unit(d: Any) -> Array:
+    d = np.asarray(d, np.longdouble)
+    return d / np.hypot(*d.T)[:, None]
+
+
+def clearance(exact: Retraced, segments: Segments) -> Array:
+    """How far each point is from the nearer end of its boundary (N × D), NaN after the end."""
+    ends = [np.asarray(x)[exact.hits] for x in (segments.start, segments.end)]
+    distance = np.min([np.hypot(*(exact.points[:, 1:] - end).transpose(2, 0, 1)) for end in ends], axis=0)
+    return np.where(exact.hits >= 0, distance, np.nan)

@@ -1,0 +1,235 @@
+"""Planar, closed: paths whose end is known in closed form.
+
+A billiard in a box unfolds into a straight line by mirror images; its corners are whole numbers though no side is
+along an axis. An ellipse of eccentricity 1/n gathers rays along its axis in its far focus. A ball sends rays from a
+point R/n from its centre as though from n R. A prism of apex A deviates by i + asin(n sin(A − asin(sin i/n))) − A, a
+drop by π + 2 asin b − 4 asin(b/n) for the first rainbow. Beside the ellipse stands the same lens in facets: a facet
+is off in its direction by up to half the angle to the next, so its spot shrinks as their number grows.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_refract.planar import Event, Paths, Segments
+from mi_refract.rows import Row
+
+from .plan import Context, Task
+from .planar import EQUAL, TERMS as PLANAR_TERMS, Case, judge, unit  # isort: skip
+from .retrace import Array, Retraced, retrace
+from .settings import Setting, settings
+
+TITLE = "Planar, closed answers"
+TEXT = __doc__.partition("\n")[2].strip()
+TERMS = PLANAR_TERMS | {
+    "error": "largest deviation from the closed answer: of a line from the point that it should meet, over its "
+    "distance; of a direction, |d − exact|",
+    "error / u": "the same in units of roundoff",
+    "box": "total internal reflections in a box of index 1.5, by their number; answers from mirror images",
+}
+AXES = {"x": "reflections, or facets", "y": "deviation", "x_scale": "log", "y_scale": "log", "slope": None}
+STUDY = "planar_closed"
+SEED = 2032
+REFLECTIONS = (20, 200, 2000)
+INDEX = 1.5
+FACETS = (100, 1000, 10_000, 100_000)
+
+
+@dataclass(frozen=True)
+class Closed:
+    """A case, and how far each of its paths (N) ends from the closed answer."""
+
+    case: Case
+    error: Callable[[Paths], Array]
+
+
+def tasks(context: Context) -> list[Task]:
+    """One task per backend and precision."""
+    return [Task(f"planar, closed: {s.label}", functools.partial(_setting_rows, s)) for s in settings(context)]
+
+
+def _setting_rows(setting: Setting) -> list[Row]:
+    if setting.vector is None:
+        return [Row(STUDY, "trace", "every answer", setting.label, reason=setting.reason)]
+    few = setting.is_scalar
+    rows = [_box_row(setting, count, 4 if few else 32) for count in REFLECTIONS]
+    rows += [_row(setting, name, make(8 if few else 500)) for name, make in CLOSED.items()]
+    return rows if few else [*rows, _curves_row(setting), _facet_row(setting)]
+
+
+def _row(setting: Setting, name: str, closed: Closed) -> Row:
+    paths = closed.case.trace(setting)
+    error = float(np.max(np.nan_to_num(closed.error(paths), nan=np.inf)))
+    values = judge(paths, closed.case, setting.roundoff) | {"error": error, "error / u": error / setting.roundoff}
+    return Row(STUDY, "trace", name, setting.label, values, _budgets(setting), replay={"rays": len(paths.hits)})
+
+
+def _budgets(setting: Setting) -> dict[str, float]:
+    exact = {"difference": EQUAL, "astray": 0.0} if setting.precision is np.float64 else {}
+    return {"error / bound": 1.0, "astray, far": 0.0} | exact
+
+
+# The box -------------------------------------------------------------------------------------------------------
+
+SIDES = np.array([[6.0, 8.0], [-4.0, 3.0]])  # at right angles, 10 and 5 long
+
+
+def box(count: int, rays: int) -> Case:
+    """`count` total internal reflections of each ray; origins and directions exact in float32."""
+    corners = np.array([[0, 0], SIDES[0], SIDES.sum(0), SIDES[1]])
+    segments = Segments(corners, np.roll(corners, -1, 0), np.full(4, INDEX), np.ones(4))
+    rng = np.random.default_rng(SEED)
+    # Angles of incidence of 43 to 47°, beyond the critical 41.8° at all four walls.
+    angle = math.atan2(8, 6) + np.deg2rad(45 + rng.uniform(-2, 2, rays) + 90 * rng.integers(0, 4, rays))
+    origins = (rng.uniform(0.1, 0.9, (rays, 2)) @ SIDES).astype(np.float32).astype(float)
+    directions = np.stack([np.cos(angle), np.sin(angle)], 1).astype(np.float32).astype(float)
+    return Case("box", segments, origins, directions, count, np.zeros(rays, int), unfold(origins, directions, count))
+
+
+def unfold(origins: Array, directions: Array, count: int) -> Retraced:
+    """The path of mirror images, in extended precision: in the coordinates along SIDES the walls are whole numbers."""
+    size2 = (SIDES**2).sum(1)
+    x, v = (np.asarray(a, np.longdouble) @ SIDES.T / size2 for a in (origins, directions))
+    # When each ray's line meets the walls of either pair; then all in order.
+    walls = np.where(v > 0, 1, 0)[:, None] + np.sign(v)[:, None] * np.arange(count)[None, :, None]
+    times = ((walls - x[:, None]) / v[:, None]).reshape(len(x), -1)
+    order = np.argsort(times, axis=1)[:, :count]
+    axis, wall = order % 2, np.take_along_axis(walls.reshape(len(x), -1), order, 1)
+    straight = x[:, None] + v[:, None] * np.take_along_axis(times, order, 1)[..., None]
+    folded = np.abs((straight + 1) % 2 - 1)
+    flips = np.stack([np.cumsum(axis == i, axis=1) % 2 for i in (0, 1)], 2)
+    legs = np.concatenate([v[:, None], v[:, None] * (1 - 2 * flips)], 1) @ SIDES
+    # Walls by id: 0 and 2 along the first side, 1 and 3 along the second; whole numbers fold to 0 and 1.
+    hits = np.where(axis == 1, np.where(wall % 2 == 0, 0, 2), np.where(wall % 2 == 0, 3, 1)).astype(np.int32)
+    outward = SIDES[axis] / np.sqrt(size2)[axis][..., None] * np.where(wall % 2 == 0, 1, -1)[..., None]
+    events = np.full((len(x), count + 1), Event.REFLECTED, np.uint8)
+    events[:, -1] = Event.EXHAUSTED
+    return Retraced(
+        np.concatenate([np.asarray(origins, np.longdouble)[:, None], folded @ SIDES], 1), hits, events,
+        np.full((len(x), count + 1), np.longdouble(INDEX)), legs / np.hypot(legs[..., :1], legs[..., 1:]),
+        outward.astype(np.longdouble), np.zeros(hits.shape, np.longdouble),
+    )  # fmt: skip
+
+
+def _box_row(setting: Setting, count: int, rays: int) -> Row:
+    case = box(count, rays)
+    values = judge(case.trace(setting), case, setting.roundoff)
+    replay = {"rays": rays, "seed": SEED, "reflections": count}
+    return Row(STUDY, "trace", f"box, {count}", setting.label, values, _budgets(setting), replay=replay)
+
+
+def _curves_row(setting: Setting) -> Row:
+    """The median ray's distance from its place, and the worst's, reflection by reflection."""
+    case = box(REFLECTIONS[-1], 32)
+    off = np.hypot(*(case.trace(setting).points - case.exact.points).transpose(2, 0, 1)) / case.extent
+    shown = np.unique(np.geomspace(1, REFLECTIONS[-1], 30).astype(int))
+    curves = {
+        f"place, {name}": [(float(j), float(of(off[:, j]))) for j in shown]
+        for name, of in (("median", np.median), ("worst", np.max))
+    }
+    values = {"place after all": curves["place, worst"][-1][1]}
+    return Row(STUDY, "trace", "box, by reflections", setting.label, values, curves=curves)
+
+
+# Lenses and prisms ---------------------------------------------------------------------------------------------
+
+
+def ellipse_arcs(a: float, b: float, angles: Array) -> tuple[Array, Array, Array, Array]:
+    """(start, end, control, weight) of the arcs between parameter angles, in radians, of x = a cos, y = b sin."""
+    middle, half = (angles[:-1] + angles[1:]) / 2, np.diff(angles) / 2
+    points = np.stack([a * np.cos(angles), b * np.sin(angles)], 1)
+    control = np.stack([a * np.cos(middle), b * np.sin(middle)], 1) / np.cos(half)[:, None]
+    return points[:-1], points[1:], control, np.cos(half)
+
+
+def _body(arcs: tuple[Array, Array, Array, Array], n: float) -> Segments:
+    """Arcs counter-clockwise around glass of index n."""
+    start, end, control, weight = arcs
+    return Segments(start, end, np.full(len(start), n), np.ones(len(start)), control, weight)
+
+
+def _closed(name: str, s: Segments, origins: Array, directions: Array, depth: int, error: Callable[[Paths], Array],
+            reflect: int = 0) -> Closed:  # fmt: skip
+    mask = np.full(len(origins), reflect)
+    exact = retrace(s, origins, directions, depth, reflect=mask)
+    return Closed(Case(name, s, origins, directions, depth, mask, exact), error)
+
+
+def _misses(target: Array, scale: float) -> Callable[[Paths], Array]:
+    """Distance of the last line from `target`, over `scale`."""
+
+    def error(paths: Paths) -> Array:
+        last = paths.points[np.arange(len(paths.hits)), (paths.hits >= 0).sum(1)].astype(np.longdouble)
+        d, to = unit(paths.directions), target - last
+        return np.abs(d[:, 0] * to[:, 1] - d[:, 1] * to[:, 0]) / scale
+
+    return error
+
+
+def _points_to(angle: Array) -> Callable[[Paths], Array]:
+    exact = np.stack([np.cos(angle), np.sin(angle)], 1)
+    return lambda paths: np.hypot(*(unit(paths.directions) - exact).T)
+
+
+def ellipse(rays: int, facets: int = 0) -> Closed:
+    """Semi-axes 5 and 3, eccentricity 4/5, index 5/4: rays along the axis meet in the focus, 9 behind the vertex."""
+    height = 2.8 * np.linspace(-1, 1, 2 * (rays // 2))
+    origins, directions = np.stack([np.full(len(height), -10.0), height], 1), np.tile([1.0, 0.0], (len(height), 1))
+    angles = np.linspace(np.pi / 2, 3 * np.pi / 2, (facets or 2) + 1)
+    segments = _body(ellipse_arcs(5.0, 3.0, angles), 1.25)
+    if facets:
+        segments = Segments(segments.start, segments.end, segments.n_left, segments.n_right)
+    return _closed("ellipse", segments, origins, directions, 1, _misses(np.array([4.0, 0.0]), 9.0))
+
+
+def ball(rays: int) -> Closed:
+    """Radius 1, from the point 1/n left of the centre to the right."""
+    turn = np.deg2rad(np.linspace(-50, 50, 2 * (rays // 2)))
+    segments = _body(ellipse_arcs(1.0, 1.0, np.linspace(0, 2 * np.pi, 5)), INDEX)
+    origins = np.tile([-1 / INDEX, 0.0], (len(turn), 1))
+    directions = np.stack([np.cos(turn), np.sin(turn)], 1)
+    return _closed("aplanatic ball", segments, origins, directions, 1, _misses(np.array([-INDEX, 0.0]), INDEX))
+
+
+def rainbow(rays: int) -> Closed:
+    """A drop of index 4/3, its rays reflected once within."""
+    n, b = 4 / 3, 0.98 * np.linspace(-1, 1, 2 * (rays // 2))
+    segments = _body(ellipse_arcs(1.0, 1.0, np.linspace(0, 2 * np.pi, 5)), n)
+    origins, directions = np.stack([np.full(len(b), -2.0), b], 1), np.tile([1.0, 0.0], (len(b), 1))
+    exact = b.astype(np.longdouble)
+    turned = 4 * np.arcsin(exact / np.longdouble(n)) - 2 * np.arcsin(exact) - np.longdouble(np.pi)
+    return _closed("rainbow", segments, origins, directions, 3, _points_to(turned), reflect=2)
+
+
+def prism(rays: int) -> Closed:
+    """Apex 60°, from 32° of incidence (nearly total reflection within) to 85°; the least deviation is at 48.6°."""
+    corners = np.array([[-1, 0], [1, 0], [0, math.sqrt(3)]])
+    segments = Segments(corners, np.roll(corners, -1, 0), np.full(3, INDEX), np.ones(3))
+    apex, i = np.longdouble(np.pi) / 3, np.deg2rad(np.linspace(32, 85, rays)).astype(np.longdouble)
+    deviation = i + np.arcsin(INDEX * np.sin(apex - np.arcsin(np.sin(i) / INDEX))) - apex
+    angle = (i - apex / 2).astype(float)
+    directions = np.stack([np.cos(angle), np.sin(angle)], 1)
+    origins = np.array([-0.25, 0.75 * math.sqrt(3)]) - directions
+    return _closed("prism", segments, origins, directions, 2, _points_to(i - apex / 2 - deviation))
+
+
+CLOSED = {"ellipse": ellipse, "aplanatic ball": ball, "rainbow": rainbow, "prism": prism}
+
+
+def _facet_row(setting: Setting) -> Row:
+    """The spot of the lens in facets, beside that of arcs."""
+    spots = [(float(m), _spot(setting, m)) for m in FACETS]
+    arcs = _spot(setting, 0)
+    curves = {"facets": spots, "arcs": [(m, arcs) for m, _ in spots]}
+    values = {"error": spots[-1][1], "arcs": arcs}
+    return Row(STUDY, "trace", "ellipse, by facets", setting.label, values, replay={"facets": FACETS}, curves=curves)
+
+
+def _spot(setting: Setting, facets: int) -> float:
+    closed = ellipse(40, facets)
+    return float(np.max(np.nan_to_num(closed.error(closed.case.trace(setting)), nan=np.inf)))
