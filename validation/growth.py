@@ -25,15 +25,17 @@ from .retrace import Array, Retraced
 ROUNDINGS = 4  # a difference of coordinates, a product, a quotient, and the result
 
 
-def growth(path: Retraced, segments: Segments, u: float, offset: float = 0.0) -> tuple[Array, Array]:
-    """(bounds of the points' errors N × (D+1), of the last directions' N), NaN after the end; u: the roundoff.
+def growth(path: Retraced, segments: Segments, offset: float = 0.0) -> tuple[Array, Array]:
+    """(bounds of the points' errors N × (D+1), of the last directions' N), over u; NaN after the end.
 
-    `offset`: how far rays are moved along the normal behind a boundary, over 1 + max |p|.
+    `offset`: how far rays are moved along the normal behind a boundary, over u (1 + max |p|).
     """
-    g, h_factor, phi_factor, cos = _transfer(path)
-    unit, size = ROUNDINGS * u, _sizes(path, segments)
+    g, h_factor, phi_factor, cos = (x.astype(float) for x in _transfer(path))
+    unit, size = float(ROUNDINGS), _sizes(path, segments)
     added_h, added_phi = _added(path, segments, g, size)
-    shift = offset * (1 + np.abs(path.points[:, 1:]).max(2)) * np.abs(_cross(path.normals, path.legs[:, 1:]))
+    shift = (1 + np.abs(path.points[:, 1:]).max(2)) * np.abs(_cross(path.normals, path.legs[:, 1:]))
+    shift = offset * shift.astype(float)
+    leg = np.hypot(*np.diff(path.points, axis=1).transpose(2, 0, 1)).astype(float)
     points, direction = np.full(path.points.shape[:2], np.nan), np.full(len(path.points), unit)
     points[:, 0] = unit * size[:, 0]
     none = np.zeros(len(points))
@@ -42,7 +44,7 @@ def growth(path: Retraced, segments: Segments, u: float, offset: float = 0.0) ->
     for j, met in enumerate((path.hits >= 0).T):
         if not met.any():
             break
-        h = h + np.hypot(*(path.points[:, j + 1] - path.points[:, j]).T)[:, None] * phi
+        h = h + leg[:, j, None] * phi
         reach = (np.abs(h).sum(1) + unit * size[:, j + 1] * (1 + cos[:, j])) / cos[:, j]
         points[:, j + 1] = np.where(met, reach, np.nan)
         phi = g[:, j, None] * phi + phi_factor[:, j, None] * h
@@ -65,7 +67,8 @@ def _added(path: Retraced, segments: Segments, g: Array, size: Array) -> tuple[A
     cos, cos_behind = (np.abs((d * path.normals).sum(2)) for d in (before, behind))
     length = np.hypot(*(np.asarray(segments.end) - segments.start).T)[path.hits]
     to_h = size[:, 1:] * (1 + (cos_behind + np.abs(_cross(before, behind))) / cos)
-    return to_h, 1 + np.abs(g) + 1 / cos_behind + np.abs(1 - g) * size[:, 1:] / length
+    to_phi = 1 + np.abs(g) + 1 / cos_behind + np.abs(1 - g) * size[:, 1:] / length
+    return to_h.astype(float), to_phi.astype(float)
 
 
 def _sizes(path: Retraced, segments: Segments) -> Array:
@@ -74,7 +77,7 @@ def _sizes(path: Retraced, segments: Segments) -> Array:
     largest = np.max([np.nan_to_num(x) for x in corners], axis=0)
     own = np.abs(path.points).max(2)
     own[:, 1:] = np.maximum(own[:, 1:], np.where(path.hits >= 0, largest[path.hits], np.nan))
-    return np.maximum.accumulate(own, axis=1)
+    return np.maximum.accumulate(own, axis=1).astype(float)
 
 
 def _cross(a: Array, b: Array) -> Array:

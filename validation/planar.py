@@ -58,12 +58,17 @@ class Case:
     reflect: Array
     exact: Retraced
 
+    @functools.cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """Of the errors of points and last directions, over u."""
+        return growth(self.exact, self.segments)
+
     @property
     def extent(self) -> float:
         corners = np.concatenate([self.segments.start, self.segments.end])
         return float(np.hypot(*np.ptp(corners, axis=0)))
 
-    def trace(self, setting: Setting, formula: str = "rotated") -> Paths:
+    def trace(self, setting: Setting, formula: str | None = None) -> Paths:
         return trace(
             self.segments, self.origins, self.directions, self.max_depth, reflect=self.reflect, formula=formula,
             precision=np.dtype(setting.precision).name, backend=setting.backend,
@@ -87,10 +92,9 @@ def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     return rows
 
 
-def row_of(case: Case, setting: Setting, formula: str = "") -> Row:
+def row_of(case: Case, setting: Setting, formula: str | None = None) -> Row:
     """A scene in a setting, by the default formula or another one."""
-    paths = case.trace(setting, formula) if formula else case.trace(setting)
-    values = judge(paths, case, setting.roundoff)
+    values = judge(case.trace(setting, formula), case, setting.roundoff)
     budgets = {"error / bound": 1.0, "astray, far": 0.0}
     if setting.precision is np.float64:
         budgets |= {"difference": EQUAL, "astray": 0.0}
@@ -124,7 +128,7 @@ def rays_of(scene: PlanarScene, scattered: int) -> tuple[Array, Array]:
 def judge(paths: Paths, case: Case, u: float) -> dict[str, float]:
     """What became of the rays, against the retrace; u: the roundoff. NaN where no ray kept to its boundaries."""
     exact = case.exact
-    bounds, bound = growth(exact, case.segments, u)
+    bounds, bound = (u * x for x in case.bounds)
     astray = (paths.hits != exact.hits).any(1) | (paths.events != exact.events).any(1)
     near = (clearance(exact, case.segments) <= bounds[:, 1:]).any(1)
     found = {"boundaries": float(exact.met.max()), "astray": float(astray.sum())}

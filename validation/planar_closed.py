@@ -57,7 +57,7 @@ def _setting_rows(setting: Setting) -> list[Row]:
     if setting.vector is None:
         return [Row(STUDY, "trace", "every answer", setting.label, reason=setting.reason)]
     few = setting.is_scalar
-    rows = [_box_row(setting, count, 4 if few else 32) for count in REFLECTIONS]
+    rows = [_box_row(setting, count, 4 if few else 16) for count in REFLECTIONS]
     rows += [_row(setting, name, make(8 if few else 500)) for name, make in CLOSED.items()]
     return rows if few else [*rows, _curves_row(setting), _facet_row(setting)]
 
@@ -79,6 +79,7 @@ def _budgets(setting: Setting) -> dict[str, float]:
 SIDES = np.array([[6.0, 8.0], [-4.0, 3.0]])  # at right angles, 10 and 5 long
 
 
+@functools.cache
 def box(count: int, rays: int) -> Case:
     """`count` total internal reflections of each ray; origins and directions exact in float32."""
     corners = np.array([[0, 0], SIDES[0], SIDES.sum(0), SIDES[1]])
@@ -125,7 +126,7 @@ def _box_row(setting: Setting, count: int, rays: int) -> Row:
 
 def _curves_row(setting: Setting) -> Row:
     """The median ray's distance from its place, and the worst's, reflection by reflection."""
-    case = box(REFLECTIONS[-1], 32)
+    case = box(REFLECTIONS[-1], 16)
     off = np.hypot(*(case.trace(setting).points - case.exact.points).transpose(2, 0, 1)) / case.extent
     shown = np.unique(np.geomspace(1, REFLECTIONS[-1], 30).astype(int))
     curves = {

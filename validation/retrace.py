@@ -79,20 +79,18 @@ def _follow(curves: _Curves, p: Array, d: Array, max_depth: int, bits: Array, n:
         leftward = (normal * d[alive]).sum(1) > 0
         near = np.where(leftward, curves.n_right[hit], curves.n_left[hit])
         far = np.where(leftward, curves.n_left[hit], curves.n_right[hit])
-        right = (n[alive] == near) | np.isnan(n[alive])
-        found.events[alive[~right], j] = Event.CONTRADICTED
-        if j == 0:
-            found.indices[alive[right], 0] = near[right]
-        alive, hit, q, normal, curvature, near, far = (
-            x[right] for x in (alive, hit, q, normal, curvature, near, far)
-        )  # fmt: skip
+        n[alive] = np.where(np.isnan(n[alive]), near, n[alive])
+        found.indices[alive, j], right = n[alive], n[alive] == near
         forced = np.array([int(b) >> j & 1 for b in bits[alive]], bool)
-        d[alive], through = _bend(d[alive], normal, near, far, forced)
-        p[alive], n[alive], last[alive] = q, np.where(through, far, near), hit
+        bent, through = _bend(d[alive], normal, near, far, forced)
+        event = np.where(through, Event.REFRACTED, Event.REFLECTED)
         found.points[alive, j + 1], found.hits[alive, j] = q, hit
+        found.events[alive, j] = np.where(right, event, Event.CONTRADICTED)
         found.normals[alive, j], found.curvatures[alive, j] = normal, curvature
-        found.legs[alive, j + 1], found.indices[alive, j + 1] = d[alive], n[alive]
-        found.events[alive, j] = np.where(through, Event.REFRACTED, Event.REFLECTED)
+        found.legs[alive, j + 1] = np.where(right[:, None], bent, d[alive])
+        p[alive], d[alive], n[alive], last[alive] = q, bent, np.where(through, far, near), hit
+        found.indices[alive, j + 1] = np.where(right, n[alive], np.nan)
+        alive = alive[right]
     return found
 
 
