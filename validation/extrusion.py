@@ -18,6 +18,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from mi_refract import curves
 from mi_refract.bsdf import PLUGIN
 from mi_refract.planar import Event, Paths, Segments
 from mi_refract.rows import Row
@@ -81,20 +82,15 @@ def faceted(case: Case, count: int = FACETS) -> Case:
 
 
 def facets(segments: Segments, count: int) -> Segments:
-    """Each arc as `count` chords between points of it, at equal steps of its parameter; straight ones as they are."""
-    if segments.control is None or segments.weight is None:
+    """Each arc as `count` chords; straight segments as they are."""
+    if segments.control is None:
         return segments
-    s, r, t = (np.asarray(x) for x in (segments.start, segments.end, segments.control))
-    straight = (t == (s + r) / 2).all(1)
-    steps = np.linspace(0, 1, count + 1)
-    b0, b1, b2 = (1 - steps) ** 2, 2 * steps * (1 - steps) * np.asarray(segments.weight)[:, None], steps**2
-    points = b0[:, None] * s[:, None] + b1[..., None] * t[:, None] + b2[:, None] * r[:, None]
-    points /= (b0 + b1 + b2)[..., None]
-    points[:, -1] = r  # 1 is no power of its weight's rounding
-    chosen = ~straight
-    parts = [np.concatenate([x[straight], y[chosen].reshape(-1, 2)]) for x, y in ((s, points[:, :-1]), (r, points[:, 1:]))]
-    media = [np.concatenate([n[straight], np.repeat(n[chosen], count)]) for n in (segments.n_left, segments.n_right)]
-    return Segments(parts[0], parts[1], *media)
+    straight = (segments.control == (segments.start + segments.end) / 2).all(1)
+    along = curves.points(segments, count)[~straight]
+    pieces = (segments.start[straight], along[:, :-1]), (segments.end[straight], along[:, 1:])
+    start, end = (np.concatenate([x, y.reshape(-1, 2)]) for x, y in pieces)
+    media = [np.append(n[straight], np.repeat(n[~straight], count)) for n in (segments.n_left, segments.n_right)]
+    return Segments(start, end, *media)
 
 
 def extrude(segments: Segments) -> Any:

@@ -1,10 +1,10 @@
 """Planar, closed: paths whose end is known in closed form.
 
 A billiard in a box unfolds into a straight line by mirror images; its corners are whole numbers though no side is
-along an axis. An ellipse of eccentricity 1/n gathers rays along its axis in its far focus. A ball sends rays from a
-point R/n from its centre as though from n R. A prism of apex A deviates by i + asin(n sin(A − asin(sin i/n))) − A, a
-drop by π + 2 asin b − 4 asin(b/n) for the first rainbow. Beside the ellipse stands the same lens in facets: a facet
-is off in its direction by up to half the angle to the next, so its spot shrinks as their number grows.
+along an axis. An ellipse of eccentricity 1/n gathers rays along its axis in its far focus, and a circle around that
+lets them out of the glass unbent. A ball sends rays from a point R/n from its centre as though from n R. A prism of apex A deviates by i + asin(n sin(A − asin(sin i/n))) − A, a
+drop by π + 2 asin b − 4 asin(b/n) for the first rainbow. Beside the lens
+of arcs stands the same one in facets, of which each is off in its direction by up to half the angle to the next.
 """
 
 from __future__ import annotations
@@ -16,17 +16,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mi_refract import shapes
 from mi_refract.planar import Event, Paths, Segments
 from mi_refract.rows import Row
 
+from . import planar
 from .plan import Context, Task
-from .planar import EQUAL, TERMS as PLANAR_TERMS, Case, judge, unit  # isort: skip
+from .planar import EQUAL, Case, judge, unit
 from .retrace import Array, Retraced, retrace
 from .settings import Setting, settings
 
 TITLE = "Planar, closed answers"
 TEXT = __doc__.partition("\n")[2].strip()
-TERMS = PLANAR_TERMS | {
+TERMS = planar.TERMS | {
     "error": "largest deviation from the closed answer: of a line from the point that it should meet, over its "
     "distance; of a direction, |d − exact|",
     "error / u": "the same in units of roundoff",
@@ -36,7 +38,7 @@ AXES = {"x": "reflections, or facets", "y": "deviation", "x_scale": "log", "y_sc
 STUDY = "planar_closed"
 SEED = 2032
 REFLECTIONS = (20, 200, 2000)
-INDEX = 1.5
+INDEX, FOCAL_LENGTH = 1.5, 9.0
 FACETS = (100, 1000, 10_000, 100_000)
 
 
@@ -140,20 +142,6 @@ def _curves_row(setting: Setting) -> Row:
 # Lenses and prisms ---------------------------------------------------------------------------------------------
 
 
-def ellipse_arcs(a: float, b: float, angles: Array) -> tuple[Array, Array, Array, Array]:
-    """(start, end, control, weight) of the arcs between parameter angles, in radians, of x = a cos, y = b sin."""
-    middle, half = (angles[:-1] + angles[1:]) / 2, np.diff(angles) / 2
-    points = np.stack([a * np.cos(angles), b * np.sin(angles)], 1)
-    control = np.stack([a * np.cos(middle), b * np.sin(middle)], 1) / np.cos(half)[:, None]
-    return points[:-1], points[1:], control, np.cos(half)
-
-
-def _body(arcs: tuple[Array, Array, Array, Array], n: float) -> Segments:
-    """Arcs counter-clockwise around glass of index n."""
-    start, end, control, weight = arcs
-    return Segments(start, end, np.full(len(start), n), np.ones(len(start)), control, weight)
-
-
 def _closed(name: str, s: Segments, origins: Array, directions: Array, depth: int, error: Callable[[Paths], Array],
             reflect: int = 0) -> Closed:  # fmt: skip
     mask = np.full(len(origins), reflect)
@@ -177,30 +165,28 @@ def _points_to(angle: Array) -> Callable[[Paths], Array]:
     return lambda paths: np.hypot(*(unit(paths.directions) - exact).T)
 
 
-def ellipse(rays: int, facets: int = 0) -> Closed:
-    """Semi-axes 5 and 3, eccentricity 4/5, index 5/4: rays along the axis meet in the focus, 9 behind the vertex."""
-    height = 2.8 * np.linspace(-1, 1, 2 * (rays // 2))
+def ellipse_lens(rays: int, facets: int = 0) -> Closed:
+    """Rays along the axis meet in the origin, by the ellipse at its front; the circle behind bends none of them."""
+    curve = shapes.ellipse_lens(INDEX, FOCAL_LENGTH, thickness=4.0, radius=3.0)
+    height = 2.9 * np.linspace(-1, 1, 2 * (rays // 2))
     origins, directions = np.stack([np.full(len(height), -10.0), height], 1), np.tile([1.0, 0.0], (len(height), 1))
-    angles = np.linspace(np.pi / 2, 3 * np.pi / 2, (facets or 2) + 1)
-    segments = _body(ellipse_arcs(5.0, 3.0, angles), 1.25)
-    if facets:
-        segments = Segments(segments.start, segments.end, segments.n_left, segments.n_right)
-    return _closed("ellipse", segments, origins, directions, 1, _misses(np.array([4.0, 0.0]), 9.0))
+    segments = (curve.faceted(facets) if facets else curve).between(INDEX, 1.0)
+    return _closed("ellipse lens", segments, origins, directions, 2, _misses(np.zeros(2), FOCAL_LENGTH))
 
 
 def ball(rays: int) -> Closed:
     """Radius 1, from the point 1/n left of the centre to the right."""
     turn = np.deg2rad(np.linspace(-50, 50, 2 * (rays // 2)))
-    segments = _body(ellipse_arcs(1.0, 1.0, np.linspace(0, 2 * np.pi, 5)), INDEX)
     origins = np.tile([-1 / INDEX, 0.0], (len(turn), 1))
     directions = np.stack([np.cos(turn), np.sin(turn)], 1)
+    segments = shapes.circle(1.0).between(INDEX, 1.0)
     return _closed("aplanatic ball", segments, origins, directions, 1, _misses(np.array([-INDEX, 0.0]), INDEX))
 
 
 def rainbow(rays: int) -> Closed:
     """A drop of index 4/3, its rays reflected once within."""
     n, b = 4 / 3, 0.98 * np.linspace(-1, 1, 2 * (rays // 2))
-    segments = _body(ellipse_arcs(1.0, 1.0, np.linspace(0, 2 * np.pi, 5)), n)
+    segments = shapes.circle(1.0).between(n, 1.0)
     origins, directions = np.stack([np.full(len(b), -2.0), b], 1), np.tile([1.0, 0.0], (len(b), 1))
     exact = b.astype(np.longdouble)
     turned = 4 * np.arcsin(exact / np.longdouble(n)) - 2 * np.arcsin(exact) - np.longdouble(np.pi)
@@ -209,17 +195,17 @@ def rainbow(rays: int) -> Closed:
 
 def prism(rays: int) -> Closed:
     """Apex 60°, from 32° of incidence (nearly total reflection within) to 85°; the least deviation is at 48.6°."""
-    corners = np.array([[-1, 0], [1, 0], [0, math.sqrt(3)]])
-    segments = Segments(corners, np.roll(corners, -1, 0), np.full(3, INDEX), np.ones(3))
+    curve = shapes.prism(60.0, 2.0)
     apex, i = np.longdouble(np.pi) / 3, np.deg2rad(np.linspace(32, 85, rays)).astype(np.longdouble)
     deviation = i + np.arcsin(INDEX * np.sin(apex - np.arcsin(np.sin(i) / INDEX))) - apex
     angle = (i - apex / 2).astype(float)
     directions = np.stack([np.cos(angle), np.sin(angle)], 1)
-    origins = np.array([-0.25, 0.75 * math.sqrt(3)]) - directions
-    return _closed("prism", segments, origins, directions, 2, _points_to(i - apex / 2 - deviation))
+    # Through a place on the left side, high enough that all leave by the right one.
+    origins = 0.75 * curve.vertices[2] + 0.25 * curve.vertices[0] - directions
+    return _closed("prism", curve.between(INDEX, 1.0), origins, directions, 2, _points_to(i - apex / 2 - deviation))
 
 
-CLOSED = {"ellipse": ellipse, "aplanatic ball": ball, "rainbow": rainbow, "prism": prism}
+CLOSED = {"ellipse lens": ellipse_lens, "aplanatic ball": ball, "rainbow": rainbow, "prism": prism}
 
 
 def _facet_row(setting: Setting) -> Row:
@@ -228,9 +214,9 @@ def _facet_row(setting: Setting) -> Row:
     arcs = _spot(setting, 0)
     curves = {"facets": spots, "arcs": [(m, arcs) for m, _ in spots]}
     values = {"error": spots[-1][1], "arcs": arcs}
-    return Row(STUDY, "trace", "ellipse, by facets", setting.label, values, replay={"facets": FACETS}, curves=curves)
+    return Row(STUDY, "trace", "ellipse lens, by facets", setting.label, values, replay={"facets": FACETS}, curves=curves)
 
 
 def _spot(setting: Setting, facets: int) -> float:
-    closed = ellipse(40, facets)
+    closed = ellipse_lens(40, facets)
     return float(np.max(np.nan_to_num(closed.error(closed.case.trace(setting)), nan=np.inf)))
