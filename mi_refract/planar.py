@@ -24,12 +24,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .crossings import Arcs, Straight
+from .extrusion import SHORTEST, Extrusion
 from .lanes import lanes
 from .walks import Event, Walker
 
 __all__ = ["Event", "Paths", "Segments", "Tracer", "trace"]
 
 Array = NDArray[np.float64]
+METHODS = "auto", "brute", "mesh"
+FEW = 48  # segments that are tried sooner than a query takes
 
 SHAPES: dict[str, tuple[int, ...]] = {
     "start": (2,), "end": (2,), "n_left": (), "n_right": (), "control": (2,), "weight": ()
@@ -141,6 +144,7 @@ def trace(
     formula: str | None = None,
     precision: str = "float64",
     backend: str | None = None,
+    method: str = "auto",
     reflect: Any = 0,
     n_start: Any = None,
     weights: bool = False,
@@ -150,10 +154,11 @@ def trace(
     `formula`: a key of FORMULAS for the direction; None: that of document 004. `precision`: "float64" or "float32".
     `backend`: "llvm", "cuda" or "scalar"; None for the best on this machine. `reflect`: bits, one number or N; where
     bit j is set the ray is reflected at the j-th boundary it meets (from 0, below 32), though it might be refracted.
-    `n_start`: index of the medium in which rays start (N or one). `weights`: fill `Paths.weights`.
+    `method`: "brute" tries every segment, "mesh" those that Mitsuba's ray tracing finds (see `extrusion`), at a cost
+    that grows like log M; both give the same paths, and "auto" chooses. `n_start`: index of the medium in which rays start (N or one). `weights`: fill `Paths.weights`.
     ValueError for what is none of these, and for origins or directions that are not finite, or no direction.
     """
-    tracer = Tracer(segments, formula=formula, precision=precision, backend=backend)
+    tracer = Tracer(segments, formula=formula, precision=precision, backend=backend, method=method)
     return tracer(origins, directions, max_depth, reflect=reflect, n_start=n_start, weights=weights)
 
 
@@ -161,13 +166,15 @@ class Tracer:
     """`trace` for one set of segments, set up once; arguments and errors as there."""
 
     def __init__(
-        self, segments: Segments, *, formula: str | None = None, precision: str = "float64", backend: str | None = None
-    ) -> None:
+        self, segments: Segments, *, formula: str | None = None, precision: str = "float64", backend: str | None = None,
+        method: str = "auto",
+    ) -> None:  # fmt: skip
         self.lanes = to = lanes(backend, precision)
         ends = segments.start, segments.end, segments.vertices
         shapes = (segments.control, segments.weight) if segments.curved else None
         boundaries = Arcs(to, *ends, *shapes) if shapes else Straight(to, *ends)
-        self.walker = Walker(to, boundaries, np.column_stack([segments.n_left, segments.n_right]), formula)
+        mesh = Extrusion(to, *ends) if _wants_mesh(segments, method) else None
+        self.walker = Walker(to, boundaries, mesh, np.column_stack([segments.n_left, segments.n_right]), formula)
 
     def __call__(
         self, origins: Any, directions: Any, max_depth: int, *, reflect: Any = 0, n_start: Any = None,
@@ -191,3 +198,16 @@ class Tracer:
             found["index"].T,
             found["power"].T if weights else None,
         )
+
+
+def _wants_mesh(segments: Segments, method: str) -> bool:
+    if method not in METHODS:
+        raise ValueError(f"method = {method!r}; accepted: {', '.join(METHODS)}")
+    if method == "brute":
+        return False
+    length, extent = np.hypot(*(segments.end - segments.start).T), np.ptp(np.concatenate([segments.start, segments.end]), 0)
+    shortest = length[length > 0].min(initial=np.inf) / (extent.max() / 2 or 1)
+    reason = "arcs" if segments.curved else f"a segment {shortest:.1e} of the extent" if shortest < SHORTEST else ""
+    if reason and method == "mesh":
+        raise ValueError(f"method = 'mesh': accepted: straight segments longer than {SHORTEST:.1e}, not {reason}")
+    return not reason and (method == "mesh" or len(segments) > FEW)

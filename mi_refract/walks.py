@@ -11,6 +11,7 @@ import drjit as dr
 import numpy as np
 
 from .crossings import NOWHERE, Hit, Ray, Straight, cross
+from .extrusion import Extrusion
 from .formulas import FORMULAS, refract_2d
 from .fresnel import powers, refracted_cosine
 from .lanes import Lanes, negated
@@ -44,8 +45,8 @@ class Walk:
 class Walker:
     """Rays between `boundaries` with media of index (left, right)."""
 
-    def __init__(self, to: Lanes, boundaries: Straight, media: Any, formula: str | None) -> None:
-        self.to, self.boundaries, self.media = to, boundaries, to.table(media)
+    def __init__(self, to: Lanes, boundaries: Straight, mesh: Extrusion | None, media: Any, formula: str | None) -> None:
+        self.to, self.boundaries, self.mesh, self.media = to, boundaries, mesh, to.table(media)
         self.refract = _refraction(to, formula)
 
     def __call__(self, rays: Any, bits: Any, max_depth: int, weights: bool) -> dict[str, Any]:
@@ -88,10 +89,9 @@ class Walker:
     def _step(self, walk: Walk, mirrored: Any, max_depth: int, put: Callable[..., None], weights: bool) -> Walk:
         """One leg: to the next boundary, and off it."""
         to, ray, j, active = self.to, walk.ray, walk.depth, walk.active
-        hit = self.nearest(ray, active)
+        hit = self._nearest(ray, walk.index, active)
         some = active & (hit.segment != NOWHERE)
-        media = to.take(self.media, hit.segment, some)
-        near, far = dr.select(hit.to_left, media[1], media[0]), dr.select(hit.to_left, media[0], media[1])
+        near, far = self._sides(hit, some)
         index = dr.select(some & dr.isnan(walk.index), near, walk.index)
         p, e = self.boundaries.place(hit)
         l = _unit(e)  # noqa: E741 (the document's name)
@@ -118,16 +118,28 @@ class Walker:
         index = dr.select(through, far, index)
         return Walk(dr.select(on, after, ray), index, power, j + 1, on)
 
-    def nearest(self, ray: Ray, active: Any) -> Hit:
-        """The first boundary ahead, of all."""
+    def _sides(self, hit: Hit, active: Any) -> tuple[Any, Any]:
+        """Index of the medium before the boundary, and behind it."""
+        left, right = self.to.take(self.media, hit.segment, active)
+        return dr.select(hit.to_left, right, left), dr.select(hit.to_left, left, right)
+
+    def _nearest(self, ray: Ray, index: Any, active: Any) -> Hit:
+        """The first boundary ahead."""
         start = self.boundaries.start(ray)
+        if self.mesh:
+
+            def agrees(hit: Hit) -> Any:
+                some = hit.segment != NOWHERE
+                return some & (dr.isnan(index) | (self._sides(hit, some)[0] == index))
+
+            return self.mesh.nearest(self.boundaries, ray, start, active, agrees)
 
         def test(i: Any, best: Hit) -> tuple[Any, Hit]:
             return i + 1, self.boundaries.nearer(best, ray, start, i)
 
         first = self.to.index(0), self.boundaries.none()
-        _, best = dr.while_loop(first, lambda i, best: active & (i < self.boundaries.count), test, label="boundaries")
-        return best
+        ahead = dr.while_loop(first, lambda i, best: active & (i < self.boundaries.count), test, label="boundaries")
+        return ahead[1]
 
 
 def _unit(v: Any) -> Any:
