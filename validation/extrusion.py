@@ -110,9 +110,8 @@ def wall(segments: Segments, chosen: Array, n_left: float, n_right: float) -> An
     count = len(chosen)
     ends = [np.asarray(x)[chosen] for x in (segments.start, segments.end)]
     corners = [np.column_stack([end, np.full(count, z)]) for z in (BELOW, ABOVE) for end in ends]
-    i = 4 * np.arange(count)[:, None]
     # Start, end, start above, end above; seen from the left of the segment, counter-clockwise.
-    faces = np.concatenate([i + [0, 3, 1], i + [0, 2, 3]], 1).reshape(-1, 3)
+    faces = 4 * np.arange(count)[:, None, None] + np.array([[0, 3, 1], [0, 2, 3]])
     properties = mi.Properties()
     properties["face_normals"] = True
     properties["glass"] = mi.load_dict({"type": PLUGIN, "ext_ior": float(n_left), "int_ior": float(n_right)})
@@ -121,7 +120,7 @@ def wall(segments: Segments, chosen: Array, n_left: float, n_right: float) -> An
     for key, values in (("positions", np.stack(corners, 1).astype(np.float32)), ("faces", faces.astype(np.uint32))):
         name = next(name for name in parameters.keys() if name.endswith(key))  # noqa: SIM118  no dictionary
         parameters[name] = type(parameters[name])(values.ravel())
-    mesh.add_attribute("face_segment", 1, np.repeat(chosen, 2).astype(np.float32))
+    mesh.add_attribute("face_segment", 1, np.repeat(chosen, 2).astype(float).tolist())
     parameters.update()
     return mesh
 
@@ -184,10 +183,10 @@ def trace(scene: Any, case: Case, spawn: Callable[[Any, Any], Any]) -> Paths:
 
     ray = mi.Ray3f(mi.Point3f(flat[0]), mi.Vector3f(flat[1]))
     start = mi.UInt32(0), dr.full(mi.Bool, True, count), ray
-    _, _, last = dr.while_loop(start, lambda j, active, ray: active, step)
+    last: Any = dr.while_loop(start, lambda *state: state[1], step)
     met = np.array(points, float).reshape(2, depth, count).transpose(2, 1, 0)
     return Paths(
-        np.concatenate([case.origins[:, None], met], 1), np.array(last.d, float).T[:, :2],
+        np.concatenate([case.origins[:, None], met], 1), np.array(last[2].d, float).T[:, :2],
         np.array(hits).reshape(depth, count).T, np.array(events).astype(np.uint8).reshape(depth + 1, count).T,
         np.full((count, depth + 1), np.nan),
     )  # fmt: skip

@@ -1,22 +1,23 @@
 """Planar, closed: paths whose end is known in closed form.
 
-A billiard in a box unfolds into a straight line by mirror images; its corners are whole numbers though no side is
+A billiard in a box unfolds into a straight line by mirror images; the corners are whole numbers though no side is
 along an axis. An ellipse of eccentricity 1/n gathers rays along its axis in its far focus, and a circle around that
-lets them out of the glass unbent. A ball sends rays from a point R/n from its centre as though from n R. A prism of apex A deviates by i + asin(n sin(A − asin(sin i/n))) − A, a
-drop by π + 2 asin b − 4 asin(b/n) for the first rainbow. Beside the lens
-of arcs stands the same one in facets, of which each is off in its direction by up to half the angle to the next.
+lets them out of the glass unbent. A ball sends rays from a point R/n from its centre as though from n R. A prism of
+apex A deviates by i + asin(n sin(A − asin(sin i/n))) − A, a drop by π + 2 asin b − 4 asin(b/n) for its first rainbow.
+Beside the lens of arcs stands the same one in facets, of which each is off in its direction by up to half the angle
+to the next.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from mi_refract import shapes
+from mi_refract.curves import Curve
 from mi_refract.planar import Event, Paths, Segments
 from mi_refract.rows import Row
 
@@ -40,14 +41,39 @@ SEED = 2032
 REFLECTIONS = (20, 200, 2000)
 INDEX, FOCAL_LENGTH = 1.5, 9.0
 FACETS = (100, 1000, 10_000, 100_000)
+# Of the ellipse lens, in u: a place, a normal and a direction at either boundary, each rounded once in x and in y.
+SPOT = 6 * math.sqrt(2)
 
 
 @dataclass(frozen=True)
 class Closed:
-    """A case, and how far each of its paths (N) ends from the closed answer."""
+    """A case, and where its paths end: in unit `directions` (N × 2), or on lines through `point`.
+
+    `reach`: how far from the last boundary the point is, at most, and what errors are given over.
+    """
 
     case: Case
-    error: Callable[[Paths], Array]
+    directions: Array | None = None
+    point: tuple[float, float] = (0.0, 0.0)
+    reach: float = 1.0
+
+    def error(self, paths: Paths) -> Array:
+        """|d − exact| (N), or the distance of the last line from the point, over `reach`."""
+        d = unit(paths.directions)
+        if self.directions is not None:
+            return np.hypot(*(d - self.directions).T)
+        to = np.array(self.point) - paths.points[self._last].astype(np.longdouble)
+        return np.abs(d[:, 0] * to[:, 1] - d[:, 1] * to[:, 0]) / self.reach
+
+    @property
+    def bound(self) -> Array:
+        """Of that error, over u."""
+        points, direction = self.case.bounds
+        return direction if self.directions is not None else points[self._last] / self.reach + direction
+
+    @property
+    def _last(self) -> tuple[Array, Array]:
+        return np.arange(len(self.case.origins)), self.case.exact.met
 
 
 def tasks(context: Context) -> list[Task]:
@@ -66,9 +92,12 @@ def _setting_rows(setting: Setting) -> list[Row]:
 
 def _row(setting: Setting, name: str, closed: Closed) -> Row:
     paths = closed.case.trace(setting)
-    error = float(np.max(np.nan_to_num(closed.error(paths), nan=np.inf)))
-    values = judge(paths, closed.case, setting.roundoff) | {"error": error, "error / u": error / setting.roundoff}
-    return Row(STUDY, "trace", name, setting.label, values, _budgets(setting), replay={"rays": len(paths.hits)})
+    errors = np.nan_to_num(closed.error(paths).astype(float), nan=np.inf) / setting.roundoff
+    values = judge(paths, closed.case, setting.roundoff)
+    values |= {"error": float(errors.max() * setting.roundoff), "error / u": float(errors.max())}
+    values["error / bound"] = max(values["error / bound"], float((errors / closed.bound).max()))
+    budgets = _budgets(setting) | ({"error / u": SPOT} if name == "ellipse lens" else {})
+    return Row(STUDY, "trace", name, setting.label, values, budgets, replay={"rays": len(paths.hits)})
 
 
 def _budgets(setting: Setting) -> dict[str, float]:
@@ -142,67 +171,56 @@ def _curves_row(setting: Setting) -> Row:
 # Lenses and prisms ---------------------------------------------------------------------------------------------
 
 
-def _closed(name: str, s: Segments, origins: Array, directions: Array, depth: int, error: Callable[[Paths], Array],
-            reflect: int = 0) -> Closed:  # fmt: skip
-    mask = np.full(len(origins), reflect)
-    exact = retrace(s, origins, directions, depth, reflect=mask)
-    return Closed(Case(name, s, origins, directions, depth, mask, exact), error)
+def _case(
+    name: str, curve: Curve, index: float, origins: Array, directions: Array, depth: int, reflect: int = 0
+) -> Case:
+    """Rays to follow through a body of an index in air."""
+    segments, mask = curve.between(index, 1.0), np.full(len(origins), reflect)
+    exact = retrace(segments, origins, directions, depth, reflect=mask)
+    return Case(name, segments, origins, directions, depth, mask, exact)
 
 
-def _misses(target: Array, scale: float) -> Callable[[Paths], Array]:
-    """Distance of the last line from `target`, over `scale`."""
-
-    def error(paths: Paths) -> Array:
-        last = paths.points[np.arange(len(paths.hits)), (paths.hits >= 0).sum(1)].astype(np.longdouble)
-        d, to = unit(paths.directions), target - last
-        return np.abs(d[:, 0] * to[:, 1] - d[:, 1] * to[:, 0]) / scale
-
-    return error
-
-
-def _points_to(angle: Array) -> Callable[[Paths], Array]:
-    exact = np.stack([np.cos(angle), np.sin(angle)], 1)
-    return lambda paths: np.hypot(*(unit(paths.directions) - exact).T)
+def _along_x(height: Array) -> tuple[Array, Array]:
+    return np.stack([np.full(len(height), -10.0), height], 1), np.tile([1.0, 0.0], (len(height), 1))
 
 
 def ellipse_lens(rays: int, facets: int = 0) -> Closed:
-    """Rays along the axis meet in the origin, by the ellipse at its front; the circle behind bends none of them."""
+    """Index 3/2, focal length 9, aperture 3."""
     curve = shapes.ellipse_lens(INDEX, FOCAL_LENGTH, thickness=4.0, radius=3.0)
+    curve = curve.faceted(facets) if facets else curve
     height = 2.9 * np.linspace(-1, 1, 2 * (rays // 2))
-    origins, directions = np.stack([np.full(len(height), -10.0), height], 1), np.tile([1.0, 0.0], (len(height), 1))
-    segments = (curve.faceted(facets) if facets else curve).between(INDEX, 1.0)
-    return _closed("ellipse lens", segments, origins, directions, 2, _misses(np.zeros(2), FOCAL_LENGTH))
+    return Closed(_case("ellipse lens", curve, INDEX, *_along_x(height), depth=2), reach=FOCAL_LENGTH)
 
 
 def ball(rays: int) -> Closed:
-    """Radius 1, from the point 1/n left of the centre to the right."""
+    """Radius 1, from the point 1/n left of the centre to the right; the virtual image is n left of it."""
     turn = np.deg2rad(np.linspace(-50, 50, 2 * (rays // 2)))
-    origins = np.tile([-1 / INDEX, 0.0], (len(turn), 1))
-    directions = np.stack([np.cos(turn), np.sin(turn)], 1)
-    segments = shapes.circle(1.0).between(INDEX, 1.0)
-    return _closed("aplanatic ball", segments, origins, directions, 1, _misses(np.array([-INDEX, 0.0]), INDEX))
+    origins, directions = np.tile([-1 / INDEX, 0.0], (len(turn), 1)), np.stack([np.cos(turn), np.sin(turn)], 1)
+    case = _case("aplanatic ball", shapes.circle(1.0), INDEX, origins, directions, depth=1)
+    return Closed(case, point=(-INDEX, 0.0), reach=1 + INDEX)
 
 
 def rainbow(rays: int) -> Closed:
     """A drop of index 4/3, its rays reflected once within."""
     n, b = 4 / 3, 0.98 * np.linspace(-1, 1, 2 * (rays // 2))
-    segments = shapes.circle(1.0).between(n, 1.0)
-    origins, directions = np.stack([np.full(len(b), -2.0), b], 1), np.tile([1.0, 0.0], (len(b), 1))
+    case = _case("rainbow", shapes.circle(1.0), n, *_along_x(b), depth=3, reflect=2)
     exact = b.astype(np.longdouble)
-    turned = 4 * np.arcsin(exact / np.longdouble(n)) - 2 * np.arcsin(exact) - np.longdouble(np.pi)
-    return _closed("rainbow", segments, origins, directions, 3, _points_to(turned), reflect=2)
+    return Closed(case, _unit_at(4 * np.arcsin(exact / np.longdouble(n)) - 2 * np.arcsin(exact) - np.longdouble(np.pi)))
 
 
 def prism(rays: int) -> Closed:
     """Apex 60°, from 32° of incidence (nearly total reflection within) to 85°; the least deviation is at 48.6°."""
-    curve = shapes.prism(60.0, 2.0)
-    apex, i = np.longdouble(np.pi) / 3, np.deg2rad(np.linspace(32, 85, rays)).astype(np.longdouble)
+    curve, apex = shapes.prism(60.0, 2.0), np.longdouble(np.pi) / 3
+    i = np.deg2rad(np.linspace(32, 85, rays)).astype(np.longdouble)
     deviation = i + np.arcsin(INDEX * np.sin(apex - np.arcsin(np.sin(i) / INDEX))) - apex
-    angle = (i - apex / 2).astype(float)
-    directions = np.stack([np.cos(angle), np.sin(angle)], 1)
+    directions = _unit_at(i - apex / 2).astype(float)
     # Through a place on the left side, high enough that all leave by the right one.
     origins = 0.75 * curve.vertices[2] + 0.25 * curve.vertices[0] - directions
-    return _closed("prism", curve.between(INDEX, 1.0), origins, directions, 2, _points_to(i - apex / 2 - deviation))
+    return Closed(_case("prism", curve, INDEX, origins, directions, depth=2), _unit_at(i - apex / 2 - deviation))
+
+
+def _unit_at(angle: Array) -> Array:
+    return np.stack([np.cos(angle), np.sin(angle)], 1)
 
 
 CLOSED = {"ellipse lens": ellipse_lens, "aplanatic ball": ball, "rainbow": rainbow, "prism": prism}
@@ -213,8 +231,8 @@ def _facet_row(setting: Setting) -> Row:
     spots = [(float(m), _spot(setting, m)) for m in FACETS]
     arcs = _spot(setting, 0)
     curves = {"facets": spots, "arcs": [(m, arcs) for m, _ in spots]}
-    values = {"error": spots[-1][1], "arcs": arcs}
-    return Row(STUDY, "trace", "ellipse lens, by facets", setting.label, values, replay={"facets": FACETS}, curves=curves)
+    values, case = {"error": spots[-1][1], "arcs": arcs}, "ellipse lens, by facets"
+    return Row(STUDY, "trace", case, setting.label, values, replay={"facets": FACETS}, curves=curves)
 
 
 def _spot(setting: Setting, facets: int) -> float:
