@@ -29,7 +29,7 @@ STEP = 2.0**-22  # past a stroke that was no hit
 
 
 class Extrusion:
-    """Strokes of M straight segments (`start`, `end`: M × 2; `vertices`: M × 2 numbers), and the segments each names."""
+    """Strokes of M straight segments (`start`, `end`, M × 2, and `vertices`), and which segments each of them names."""
 
     def __init__(self, lanes: Lanes, start: Any, end: Any, vertices: Any) -> None:
         import mitsuba
