@@ -78,7 +78,7 @@ class Curve:
         """
         arcs = np.flatnonzero(~self.straight)
         if not 0 < len(arcs) <= facets:
-            raise ValueError(f"facets: {facets}, for {len(arcs)} arcs; accepted: at least one arc, and a facet for each")
+            raise ValueError(f"facets: {facets}, for {len(arcs)} arcs; accepted: an arc at least, and a facet for each")
         steps = np.ones(len(self), int)
         steps[arcs] = np.diff(np.arange(len(arcs) + 1) * facets // len(arcs))
         chords = [self._piece(j).outline(int(n))[:-1] for j, n in enumerate(steps)]
@@ -92,10 +92,9 @@ class Curve:
 
     def between(self, n_left: float, n_right: float) -> Segments:
         """The curve as boundaries between two media."""
-        indices = [np.full(len(self), float(n)) for n in (n_left, n_right)]
-        if self.straight.all():
-            return Segments(self.start, self.end, *indices)
-        return Segments(self.start, self.end, *indices, self.control, self.weight)
+        left, right = np.full(len(self), float(n_left)), np.full(len(self), float(n_right))
+        arcs = () if self.straight.all() else (self.control, self.weight)
+        return Segments(self.start, self.end, left, right, *arcs)
 
 
 def points(segments: Segments, count: int) -> Array:

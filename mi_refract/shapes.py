@@ -49,27 +49,25 @@ def _chain(points: Any, arcs: Sequence[float] | None, closed: bool) -> Curve:
         raise ValueError(f"arcs: {len(turns)} for {pieces} pieces; accepted: one a piece, above -360 and below 360")
     vertices, control, weight = [corners[0]], [], []
     for p, q, turn in zip(corners, np.roll(corners, -1, 0), turns, strict=False):
-        # Two pieces between the same two vertices could not be told apart.
-        finest = min(90.0, abs(turn) / 2) if closed and len(corners) == 2 else 90.0
-        for end, middle, w in _arc(p, q, turn, finest):
+        for end, middle, w in _arc(p, q, turn):
             vertices.append(end)
             control.append(middle)
             weight.append(w)
     return Curve(np.array(vertices[: len(vertices) - closed]), np.array(control), np.array(weight), closed)
 
 
-def _arc(p: Array, q: Array, turn: float, finest: float) -> Iterable[tuple[Array, Array, float]]:
+def _arc(p: Array, q: Array, turn: float) -> Iterable[tuple[Array, Array, float]]:
     """End, control and weight of the pieces of a circle's arc from p to q that turns left by `turn` degrees.
 
     It passes its chord at tan(turn/4)/2 of the chord's length on the right; the tangents meet at tan(turn/2)/2.
     """
     middle, aside = (p + q) / 2, np.array([q[1] - p[1], p[0] - q[0]]) / 2
-    if abs(turn) <= finest or turn == 0:
+    if abs(turn) <= 90:
         cosine, sine = unit(turn / 2)
         return [(q, middle + sine / cosine * aside, cosine)]
     cosine, sine = unit(turn / 4)
     between = middle + sine / cosine * aside
-    return [*_arc(p, between, turn / 2, finest), *_arc(between, q, turn / 2, finest)]
+    return [*_arc(p, between, turn / 2), *_arc(between, q, turn / 2)]
 
 
 def arc(radius: float, start: float, end: float) -> Curve:
