@@ -42,7 +42,7 @@ SCALAR = "needs a compiled variant: a loop over rays in Python would take hours"
 U = 2.0**-24
 FACETS = 64  # of an arc
 LARGEST = 10_000  # walls
-SCATTERED = 200
+RAYS = 100  # of the file's, and as many scattered
 BELOW, ABOVE = -1.0, 2.0  # z of the walls: the triangles' common edge is not where most rays are, in the middle
 
 
@@ -55,7 +55,7 @@ def tasks(context: Context) -> list[Task]:
 def scene_rows(context: Context, path: Path) -> list[Row]:
     if context.variant.startswith("scalar"):
         return [Row(STUDY, PLUGIN, path.stem, context.variant, reason=SCALAR)]
-    case = faceted(planar.case_of(path, SCATTERED))
+    case = faceted(planar.case_of(path, RAYS))
     if len(case.segments) > LARGEST:
         return [Row(STUDY, PLUGIN, path.stem, context.variant, reason=f"more than {LARGEST} walls")]
     scene = extrude(case.segments)

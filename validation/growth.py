@@ -22,7 +22,7 @@ from mi_refract.planar import Segments
 
 from .retrace import Array, Retraced
 
-ROUNDINGS = 4  # a difference of coordinates, a product, a quotient, and the result
+ROUNDINGS = 2  # of the operands, and of the result
 
 
 def growth(path: Retraced, segments: Segments, offset: float = 0.0) -> tuple[Array, Array]:

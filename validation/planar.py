@@ -33,14 +33,15 @@ TEXT = __doc__.partition("\n")[2].strip()
 TERMS = {
     "difference": "largest distance of a point from the retrace, over the extent of the scene, and |d − exact|",
     "error / bound": "largest of any point and last direction, over what rounding may have grown to",
-    "astray": "rays that meet other boundaries than they should, or end another way",
+    "astray": "rays that meet other boundaries than they should, or end another way; at a vertex both of its are right",
     "astray, far": "of these, how many pass every vertex of the boundaries they should meet at more than their bound",
     "boundaries": "the most that a ray meets",
 }
 STUDY = "planar"
 FOLDER = SCENES / "planar"
 SEED = 2031
-SCATTERED = 1000  # rays beside the file's own
+RAYS = {"quick": 250, "full": 2000}  # at most so many of the file's own, and as many scattered around them
+SCALAR_RAYS = 4
 SPREAD = 1e-2  # of the extent, and in radians
 EQUAL = 1e-9  # in float64, of the extent and in radians
 SHOWN = "lens"  # the scene of the formulas
@@ -65,8 +66,7 @@ class Case:
 
     @property
     def extent(self) -> float:
-        corners = np.concatenate([self.segments.start, self.segments.end])
-        return float(np.hypot(*np.ptp(corners, axis=0)))
+        return _extent(self.segments)
 
     def trace(self, setting: Setting, formula: str | None = None) -> Paths:
         return trace(
@@ -83,7 +83,7 @@ def tasks(context: Context) -> list[Task]:
 def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
         return [Row(STUDY, "trace", "every scene", setting.label, reason=setting.reason)]
-    rays = context.profile.scalar_rays // 10 if setting.is_scalar else SCATTERED
+    rays = SCALAR_RAYS if setting.is_scalar else RAYS[context.profile.name]
     cases = [case_of(path, rays) for path in sorted(FOLDER.glob("*.toml"))]
     rows = [row_of(case, setting) for case in cases]
     if setting.precision is np.float32:
@@ -103,10 +103,10 @@ def row_of(case: Case, setting: Setting, formula: str | None = None) -> Row:
 
 
 @functools.cache
-def case_of(path: Path, scattered: int) -> Case:
+def case_of(path: Path, rays: int) -> Case:
     """The first colour of a scene file: refracted wherever possible, and reflected once where the file has branches."""
     scene = load(path)
-    origins, directions = rays_of(scene, scattered)
+    origins, directions = rays_of(scene, rays)
     masks = [0] + [1 << j for j in range(min(2, scene.max_depth))] * bool(scene.branches)
     reflect = np.repeat(masks, len(origins))
     origins, directions = (np.tile(x, (len(masks), 1)) for x in (origins, directions))
@@ -114,22 +114,31 @@ def case_of(path: Path, scattered: int) -> Case:
     return Case(path.stem, scene.segments[0], origins, directions, scene.max_depth, reflect, exact)
 
 
-def rays_of(scene: PlanarScene, scattered: int) -> tuple[Array, Array]:
-    """The file's rays, and `scattered` around them."""
-    rng = np.random.default_rng(SEED)
-    chosen = rng.integers(0, len(scene.origins), scattered)
-    extent = np.hypot(*np.ptp(np.concatenate([scene.segments[0].start, scene.segments[0].end]), axis=0))
-    shift, turn = SPREAD * extent * rng.uniform(-1, 1, (scattered, 2)), SPREAD * rng.uniform(-1, 1, scattered)
+def rays_of(scene: PlanarScene, count: int) -> tuple[Array, Array]:
+    """At most `count` of the file's rays, and `count` scattered around any of them."""
+    rng, extent = np.random.default_rng(SEED), _extent(scene.segments[0])
+    own = np.linspace(0, len(scene.origins) - 1, min(count, len(scene.origins))).astype(int)
+    chosen = rng.integers(0, len(scene.origins), count)
+    shift, turn = SPREAD * extent * rng.uniform(-1, 1, (count, 2)), SPREAD * rng.uniform(-1, 1, count)
     x, y = scene.directions[chosen].T
     turned = np.stack([x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn)], 1)
-    return np.concatenate([scene.origins, scene.origins[chosen] + shift]), np.concatenate([scene.directions, turned])
+    origins, directions = (np.concatenate(parts) for parts in (
+        (scene.origins[own], scene.origins[chosen] + shift), (scene.directions[own], turned)
+    ))  # fmt: skip
+    return origins, directions
+
+
+def _extent(segments: Segments) -> float:
+    """The diagonal around them."""
+    return float(np.hypot(*np.ptp(np.concatenate([segments.start, segments.end]), axis=0)))
 
 
 def judge(paths: Paths, case: Case, u: float) -> dict[str, float]:
     """What became of the rays, against the retrace; u: the roundoff. NaN where no ray kept to its boundaries."""
     exact = case.exact
     bounds, bound = (u * x for x in case.bounds)
-    astray = (paths.hits != exact.hits).any(1) | (paths.events != exact.events).any(1)
+    same = (paths.hits == exact.hits) | _at_their_vertex(paths.hits, case)
+    astray = ~same.all(1) | (paths.events != exact.events).any(1)
     near = (clearance(exact, case.segments) <= bounds[:, 1:]).any(1)
     found = {"boundaries": float(exact.met.max()), "astray": float(astray.sum())}
     found["astray, far"] = float((astray & ~near).sum())
@@ -141,6 +150,18 @@ def judge(paths: Paths, case: Case, u: float) -> dict[str, float]:
     ratio = np.maximum(np.nanmax(point / bounds[~astray], axis=1, initial=0), direction / bound[~astray])
     worst = np.maximum(point.max(1, initial=0) / case.extent, direction)
     return found | {"difference": _largest(worst), "error / bound": _largest(ratio)}
+
+
+def _at_their_vertex(hits: Array, case: Case) -> Array:
+    """Where (N × D) an exact path passes, but for rounding, the vertex that its segment and that of `hits` share."""
+    start, end = (np.asarray(x) for x in (case.segments.start, case.segments.end))
+    ours, theirs = ([x[ids] for x in (start, end)] for ids in (hits, case.exact.hits))
+    touching = 2.0**-50 * np.abs([start, end]).max()
+    there = np.zeros(hits.shape, bool)
+    for vertex in theirs:
+        shared = (vertex == ours[0]).all(2) | (vertex == ours[1]).all(2)
+        there |= shared & (np.hypot(*(case.exact.points[:, 1:] - vertex).transpose(2, 0, 1)) <= touching)
+    return there & (hits >= 0) & (case.exact.hits >= 0)
 
 
 def _largest(x: Array) -> float:
