@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from test_planar import polygon, star
 
 from mi_refract import extrusion
