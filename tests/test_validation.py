@@ -178,7 +178,7 @@ def test_the_exit_code_follows_the_budgets(tmp_path, monkeypatch, capsys, budget
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["refractions"], "unknown study 'refractions'; accepted: directions, stability, renders, efficiency"),
+        (["refractions"], "unknown study 'refractions'; accepted: directions, stability, renders, efficiency, planar"),
         (["--profile", "slow"], "invalid choice: 'slow'"),
         (["--out", __file__], "File exists"),
         (["--speed", "9"], "unrecognized arguments"),

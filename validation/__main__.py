@@ -20,6 +20,7 @@ STUDIES = {
     "stability": ("stability", "energy", "derivatives", "paths"),
     "renders": ("scenes", "renders", "features"),
     "efficiency": ("efficiency", "scaling"),
+    "planar": ("planar", "planar_closed", "extrusion", "planar_times"),
 }
 
 

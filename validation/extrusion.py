@@ -18,12 +18,11 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract import curves
 from mi_refract.bsdf import PLUGIN
-from mi_refract.planar import Event, Paths, Segments
+from mi_refract.planar import Event, Paths
 from mi_refract.rows import Row
 
-from . import planar
+from . import overlay, planar, walls
 from .growth import growth
 from .layered import OFFSET
 from .plan import Context, Task
@@ -40,10 +39,10 @@ TERMS = planar.TERMS | {
 STUDY = "extrusion"
 SCALAR = "needs a compiled variant: a loop over rays in Python would take hours"
 U = 2.0**-24
-FACETS = 64  # of an arc
-LARGEST = 10_000  # walls
+FACETS = 64  # of an arc, at most
+LARGEST = 1500  # walls; arcs have fewer facets where there are more of them
+DRAWN, SHOWN, PIXELS = "along the ray", 9, 192  # rays in a picture, and its size before it is enlarged
 RAYS = 100  # of the file's, and as many scattered
-BELOW, ABOVE = -1.0, 2.0  # z of the walls: the triangles' common edge is not where most rays are, in the middle
 
 
 def tasks(context: Context) -> list[Task]:
@@ -56,73 +55,44 @@ def scene_rows(context: Context, path: Path) -> list[Row]:
     if context.variant.startswith("scalar"):
         return [Row(STUDY, PLUGIN, path.stem, context.variant, reason=SCALAR)]
     case = faceted(planar.case_of(path, RAYS))
-    if len(case.segments) > LARGEST:
-        return [Row(STUDY, PLUGIN, path.stem, context.variant, reason=f"more than {LARGEST} walls")]
-    scene = extrude(case.segments)
+    scene = walls.extrude(case.segments)
     rows = []
     for name, spawn in SPAWNS.items():
         paths = trace(scene, case, spawn.next)
         values = judge(paths, spawn.allow(case), U)
         budgets = {"error / bound": 1.0, "astray, far": 0.0}
-        replay = {"scene": path.name, "facets": FACETS, "rays": len(case.origins), "seed": planar.SEED}
-        rows.append(Row(STUDY, f"{PLUGIN}, {name}", path.stem, context.variant, values, budgets, replay=replay))
+        replay = {"scene": path.name, "walls": len(case.segments), "rays": len(case.origins), "seed": planar.SEED}
+        pictures = {"overlay": _picture(context, scene, case, paths)} if name == DRAWN else {}
+        rows.append(Row(STUDY, f"{PLUGIN}, {name}", path.stem, context.variant, values, budgets,
+                        replay=replay, pictures=pictures))  # fmt: skip
     return rows
 
 
-# The scene -----------------------------------------------------------------------------------------------------
+def _picture(context: Context, scene: Any, case: Case, extruded: Paths) -> str:
+    """The walls from above, the exact paths over them, and where Mitsuba's rays meet the walls."""
+    view = walls.Plan(scene, case.segments, PIXELS)
+    shown = np.linspace(0, len(case.origins) // 2 - 1, SHOWN).astype(int)
+    exact = case.exact
+    ends = exact.points[shown, exact.met[shown]] + case.extent * exact.directions[shown]
+    legs = [_flat(np.concatenate([points[np.isfinite(points[:, 0])], [end]]))
+            for points, end in zip(exact.points[shown], ends, strict=True)]  # fmt: skip
+    met = extruded.points[shown, 1:].reshape(-1, 2)
+    drawn = overlay.draw(view, legs, _flat(met[np.isfinite(met[:, 0])]))
+    return overlay.save(context.out, f"extruded {case.name}", drawn, {"scene": f"{case.name}.toml"})
 
 
-def faceted(case: Case, count: int = FACETS) -> Case:
+def _flat(points: Array) -> Array:
+    """In the plane z = 0."""
+    return np.column_stack([points, np.zeros(len(points))]).astype(float)
+
+
+def faceted(case: Case) -> Case:
     """The same with facets for arcs, refracted wherever possible."""
-    segments = facets(case.segments, count)
-    every = case.reflect == 0
+    facets = max(1, min(FACETS, LARGEST // len(case.segments)))
+    segments, every = walls.facets(case.segments, facets), case.reflect == 0
     origins, directions = case.origins[every], case.directions[every]
     exact = retrace(segments, origins, directions, case.max_depth)
     return Case(case.name, segments, origins, directions, case.max_depth, case.reflect[every], exact)
-
-
-def facets(segments: Segments, count: int) -> Segments:
-    """Each arc as `count` chords; straight segments as they are."""
-    if segments.control is None:
-        return segments
-    straight = (segments.control == (segments.start + segments.end) / 2).all(1)
-    along = curves.points(segments, count)[~straight]
-    pieces = (segments.start[straight], along[:, :-1]), (segments.end[straight], along[:, 1:])
-    start, end = (np.concatenate([x, y.reshape(-1, 2)]) for x, y in pieces)
-    media = [np.append(n[straight], np.repeat(n[~straight], count)) for n in (segments.n_left, segments.n_right)]
-    return Segments(start, end, *media)
-
-
-def extrude(segments: Segments) -> Any:
-    """A Mitsuba scene; the walls' normals point to the left. Faces carry the number of their segment."""
-    import mitsuba as mi
-
-    media = np.stack([segments.n_left, segments.n_right], 1)
-    pairs, which = np.unique(media, axis=0, return_inverse=True)
-    walls = {f"walls_{k}": wall(segments, np.flatnonzero(which.ravel() == k), *pair) for k, pair in enumerate(pairs)}
-    return mi.load_dict({"type": "scene", **walls})
-
-
-def wall(segments: Segments, chosen: Array, n_left: float, n_right: float) -> Any:
-    """A mesh of the segments `chosen`, which part the same two media."""
-    import mitsuba as mi
-
-    count = len(chosen)
-    ends = [np.asarray(x)[chosen] for x in (segments.start, segments.end)]
-    corners = [np.column_stack([end, np.full(count, z)]) for z in (BELOW, ABOVE) for end in ends]
-    # Start, end, start above, end above; seen from the left of the segment, counter-clockwise.
-    faces = 4 * np.arange(count)[:, None, None] + np.array([[0, 3, 1], [0, 2, 3]])
-    properties = mi.Properties()
-    properties["face_normals"] = True
-    properties["glass"] = mi.load_dict({"type": PLUGIN, "ext_ior": float(n_left), "int_ior": float(n_right)})
-    mesh = mi.Mesh("walls", 4 * count, 2 * count, props=properties)
-    parameters = mi.traverse(mesh)
-    for key, values in (("positions", np.stack(corners, 1).astype(np.float32)), ("faces", faces.astype(np.uint32))):
-        name = next(name for name in parameters.keys() if name.endswith(key))  # noqa: SIM118  no dictionary
-        parameters[name] = type(parameters[name])(values.ravel())
-    mesh.add_attribute("face_segment", 1, np.repeat(chosen, 2).astype(float).tolist())
-    parameters.update()
-    return mesh
 
 
 # The rays ------------------------------------------------------------------------------------------------------

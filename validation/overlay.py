@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -17,6 +17,14 @@ from .plan import SCENES
 UPSCALE = 4  # pixels of the drawing per pixel of the render
 WHITE, GREEN, CASING = (1.0, 1.0, 1.0), (0.3, 1.0, 0.1), (0.0, 0.0, 0.03)
 MARK = 5  # half the size of a mark, in pixels of the drawing
+
+
+class Seen(Protocol):
+    """A square picture and where points of space are on it, from 0 to 1, y downward."""
+
+    picture: np.ndarray
+
+    def project(self, points: np.ndarray) -> np.ndarray: ...
 
 
 class View:
@@ -48,7 +56,7 @@ def _number(x: Any) -> float:
     return float(x if isinstance(x, float) else x[0])
 
 
-def draw(view: View, paths: list[np.ndarray], ends: np.ndarray) -> np.ndarray:
+def draw(view: Seen, paths: list[np.ndarray], ends: np.ndarray) -> np.ndarray:
     """The picture, enlarged; the paths (points N × 3 each) in white between two squares, `ends` as green crosses."""
     import OpenImageIO as oiio
 

@@ -33,7 +33,7 @@ TEXT = __doc__.partition("\n")[2].strip()
 TERMS = {
     "difference": "largest distance of a point from the retrace, over the extent of the scene, and |d − exact|",
     "error / bound": "largest of any point and last direction, over what rounding may have grown to",
-    "astray": "rays that meet other boundaries than they should, or end another way; at a vertex both of its are right",
+    "astray": "rays that meet other boundaries than they should, or end another way",
     "astray, far": "of these, how many pass every vertex of the boundaries they should meet at more than their bound",
     "boundaries": "the most that a ray meets",
 }
@@ -136,20 +136,25 @@ def _extent(segments: Segments) -> float:
 def judge(paths: Paths, case: Case, u: float) -> dict[str, float]:
     """What became of the rays, against the retrace; u: the roundoff. NaN where no ray kept to its boundaries."""
     exact = case.exact
-    bounds, bound = (u * x for x in case.bounds)
-    same = (paths.hits == exact.hits) | _at_their_vertex(paths.hits, case)
-    astray = ~same.all(1) | (paths.events != exact.events).any(1)
-    near = (clearance(exact, case.segments) <= bounds[:, 1:]).any(1)
-    found = {"boundaries": float(exact.met.max()), "astray": float(astray.sum())}
-    found["astray, far"] = float((astray & ~near).sum())
-    point = np.hypot(*(paths.points - exact.points).transpose(2, 0, 1))[~astray]
-    direction = np.hypot(*(unit(paths.directions) - exact.directions).T)[~astray]
+    points, direction = (u * x for x in case.bounds)
+    off = np.hypot(*(paths.points - exact.points).transpose(2, 0, 1)).astype(float)
     # A point that is missing differs by infinity: only what the retrace does not have may be NaN.
-    point = np.where(np.isnan(exact.points[~astray, :, 0]), 0, np.nan_to_num(point, nan=np.inf)).astype(float)
-    direction = np.nan_to_num(direction, nan=np.inf).astype(float)
-    ratio = np.maximum(np.nanmax(point / bounds[~astray], axis=1, initial=0), direction / bound[~astray])
-    worst = np.maximum(point.max(1, initial=0) / case.extent, direction)
-    return found | {"difference": _largest(worst), "error / bound": _largest(ratio)}
+    off = np.where(np.isnan(exact.points[..., 0]), 0, np.nan_to_num(off, nan=np.inf))
+    turned = np.nan_to_num(np.hypot(*(unit(paths.directions) - exact.directions).T).astype(float), nan=np.inf)
+    ratio = np.maximum(np.nanmax(off / points, axis=1), turned / direction)
+    same = paths.hits == exact.hits
+    # Of two segments that share a vertex either is right there, if it does the same to the ray.
+    same |= _at_their_vertex(paths.hits, case) & (ratio <= 1)[:, None]
+    astray = ~same.all(1) | (paths.events != exact.events).any(1)
+    near = (clearance(exact, case.segments) <= points[:, 1:]).any(1)
+    worst = np.maximum(off.max(1) / case.extent, turned)
+    return {
+        "boundaries": float(exact.met.max()),
+        "astray": float(astray.sum()),
+        "astray, far": float((astray & ~near).sum()),
+        "difference": _largest(worst[~astray]),
+        "error / bound": _largest(ratio[~astray]),
+    }
 
 
 def _at_their_vertex(hits: Array, case: Case) -> Array:

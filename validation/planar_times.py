@@ -13,7 +13,6 @@ import functools
 import math
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
