@@ -152,7 +152,7 @@ def trace(scene: Any, case: Case, spawn: Callable[[Any, Any], Any]) -> Paths:
         return j + 1, inside, dr.select(inside, spawn(si, si.to_world(bs.wo)), ray)
 
     ray = mi.Ray3f(mi.Point3f(flat[0]), mi.Vector3f(flat[1]))
-    start = mi.UInt32(0), dr.full(mi.Bool, True, count), ray
+    start: Any = mi.UInt32(0), dr.full(mi.Bool, True, count), ray
     last: Any = dr.while_loop(start, lambda *state: state[1], step)
     met = np.array(points, float).reshape(2, depth, count).transpose(2, 1, 0)
     return Paths(

@@ -69,8 +69,9 @@ class Plan:
 
         corners = np.concatenate([segments.start, segments.end])
         self.middle, self.half = (corners.min(0) + corners.max(0)) / 2, 0.75 * float(np.ptp(corners, axis=0).max())
-        at = self.middle[:, None, None] + self.half * (2 * np.mgrid[0.5:size, 0.5:size] / size - 1)[::-1] * [[[1]], [[-1]]]
-        si = scene.ray_intersect(mi.Ray3f(mi.Point3f([*at.reshape(2, -1), 0]), mi.Vector3f(1, 0, 0)))
+        down, right = (2 * np.mgrid[0.5:size, 0.5:size] / size - 1).reshape(2, -1)
+        x, y = self.middle[:, None] + self.half * np.stack([right, -down])
+        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, 0), mi.Vector3f(1, 0, 0)))
         segment = np.array(si.shape.eval_attribute_1("face_segment", si, si.is_valid())).astype(int)
         # A ray along x leaves to the right of a wall whose normal, to the left, is against it.
         index = np.where(np.array(si.n.x) > 0, segments.n_right[segment], segments.n_left[segment])
