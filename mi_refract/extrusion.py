@@ -27,6 +27,7 @@ MARGIN = 2.0**-19
 OFFSET = 2.0**-21
 SHORTEST = 2 * MARGIN
 STEP = 2.0**-22  # past a stroke that was no hit
+BACK = 2.0**-6  # behind a start in the open, which may be within ε of a boundary, down to grazing angles of ε/BACK
 
 Sides = Callable[[Hit, Any], tuple[Any, Any]]
 Found = tuple[Hit, Any, Any]
@@ -75,7 +76,8 @@ class Extrusion:
             return best, near, far, q + ray.d * t, gone, found & negated(settled)
 
         zero = to.number(0)
-        state = best, zero, zero, self._aside(ray, start), zero, active
+        back = dr.select(ray.own == NOWHERE, -BACK, 0)
+        state = best, zero, zero, dr.fma(ray.d, back, self._aside(ray, start)), zero + back, active
         return dr.while_loop(state, lambda *state: state[-1], query, label="strokes")[:3]
 
     def _aside(self, ray: Ray, start: Start) -> Any:
