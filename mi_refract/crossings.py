@@ -74,6 +74,14 @@ class Hit:
     along: Any  # the segment, directed from its left vertex to its right one
 
 
+def _box(*points: Any) -> tuple[list[float], list[float]]:
+    """Corners of a box half as wide again as what holds the points."""
+    places = np.concatenate(points)
+    low, high = places.min(axis=0), places.max(axis=0)
+    margin = (high - low).max() / 4
+    return (low - margin).tolist(), (high + margin).tolist()
+
+
 def _inside(ray: Ray) -> tuple[Any, Any]:
     return dr.maximum(ray.s, LEAST), dr.maximum(ray.r, LEAST)
 
@@ -82,7 +90,7 @@ class Straight:
     """Straight segments; `vertices` (M × 2) name equal ends by equal numbers."""
 
     def __init__(self, lanes: Lanes, start: Any, end: Any, vertices: Any) -> None:
-        self.lanes, self.count = lanes, len(start)
+        self.lanes, self.count, self.box = lanes, len(start), _box(start, end)
         self.ends = lanes.table(np.concatenate([start, end], 1))
         self.vertices = lanes.table(vertices.astype(np.uint32))
 
@@ -159,6 +167,7 @@ class Arcs(Straight):
 
     def __init__(self, lanes: Lanes, start: Any, end: Any, vertices: Any, control: Any, weight: Any) -> None:
         super().__init__(lanes, start, end, vertices)
+        self.box = _box(start, end, control)
         (ax, ay), (bx, by) = (control - start).T, (end - control).T
         turn = np.where((control == (start + end) / 2).all(1), 0.0, ax * by - ay * bx)
         self.shapes = lanes.table(np.column_stack([control, weight, turn]))
