@@ -139,8 +139,11 @@ SHAPES = {
 
 
 def _spread(first: Any, last: Any, count: int) -> Array:
-    """Evenly from the first to the last; one is in the middle."""
-    return np.linspace(first, last, count) if count > 1 else np.array([(first + last) / 2])
+    """Evenly from the first to the last; one is in the middle. What falls on whole numbers is exact."""
+    if count == 1:
+        return np.array([(first + last) / 2])
+    steps = np.arange(count).reshape(-1, *[1] * np.ndim(first))
+    return np.concatenate([(first + (last - first) * steps / (count - 1))[:-1], [last]])
 
 
 def _parallel(v: Values) -> tuple[Array, Array]:

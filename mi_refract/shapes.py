@@ -1,6 +1,6 @@
 """Shapes in the plane by their usual parameters: polygons, circles, ellipses, prisms, and lenses of conic surfaces.
 
-Each is a `Curve` around its own origin; `mapped` stretches, turns and moves it.
+Each is a `Curve` around its own origin; `mapped` stretches, turns and moves it. Lengths are above 0.
 """
 
 from __future__ import annotations
@@ -203,7 +203,10 @@ def document_lens(resolution: float | None = None) -> Curve:
 
     The original draws chords at r = 0, `resolution`, … (0.05 there: 1172 of them) and leaves it open at the tips.
     Here its last vertices are the tips, where the width is 0. Without a resolution: four exact arcs.
+    ValueError for a resolution that is not above 0.
     """
+    if resolution is not None and not resolution > 0:
+        raise ValueError(f"resolution = {resolution}; accepted: above 0")
     c, k, conic = LENS_CURVATURE, LENS_HALF_WIDTH, LENS_CONIC
     whole = lens((-c, c), 2 * k, conic=(conic, conic), vertex=-k)
     whole = whole.mapped(affine(90, (1.0, LENS_STRETCH)))
@@ -211,13 +214,13 @@ def document_lens(resolution: float | None = None) -> Curve:
         return whole
     tip = float(np.abs(whole.vertices[:, 0]).max()) / LENS_STRETCH
     # Summed up as the original sums them.
-    r = np.cumsum(np.full(math.ceil(tip / resolution) + 1, resolution)) - resolution
+    r = np.cumsum([0.0, *[resolution] * math.ceil(tip / resolution)])
     r = r[r < tip][:-1]
     x, y = np.append(LENS_STRETCH * r, LENS_STRETCH * tip), np.append(k + sag(r, c, conic), 0.0)
     quarter = np.stack([x, y], 1)[::-1]
     quarters = [quarter * sign for sign in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
     vertices = [q[:-1] if j % 2 == 0 else q[::-1][:-1] for j, q in enumerate(quarters)]
-    return polygonal(np.concatenate(vertices), closed=True)
+    return polygonal(np.concatenate(vertices) + 0.0, closed=True)
 
 
 def luneburg(radius: float, layers: int) -> list[tuple[Curve, float]]:
