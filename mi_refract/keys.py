@@ -171,7 +171,7 @@ def per_colour(values: Values, keys: dict[str, Key], where: str, colours: int) -
     found = {name: values[name] for name, key in keys.items() if key.type is INDEX and values[name] is not None}
     for name, indices in found.items():
         if len(indices) not in (1, colours):
-            raise ValueError(f"{where}{name}: {len(indices)} numbers; accepted: 1, or 1 for each of {colours} colours")
+            raise ValueError(f"{where}{name}: {len(indices)} numbers; accepted: 1 for all or each of {colours} colours")
     return values | {name: tuple(n) * (colours // len(n)) for name, n in found.items()}
 
 

@@ -91,7 +91,7 @@ SHAPES = {
     ),
     "circle": Kind(
         "around its origin",
-        {"radius": Key(keys.POSITIVE, "")} | SOLID | PLACE | FACETS,
+        {"radius": Key(keys.POSITIVE, "from its origin")} | SOLID | PLACE | FACETS,
         _solid(lambda v: shapes.circle(v["radius"])),
     ),
     "ellipse": Kind(
@@ -122,7 +122,8 @@ SHAPES = {
     ),
     "luneburg": Kind(
         "a ball in concentric layers of index outside × √(2 − (r/radius)²)",
-        {"radius": Key(keys.POSITIVE, ""), "layers": Key(keys.whole(1, 10_000), "how many")} | OUTSIDE | PLACE | FACETS,
+        {"radius": Key(keys.POSITIVE, "of the outermost"), "layers": Key(keys.whole(1, 10_000), "how many")}
+        | OUTSIDE | PLACE | FACETS,
         _luneburg,
     ),
     "boundary": Kind(

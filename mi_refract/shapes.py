@@ -88,6 +88,7 @@ def ellipse(rx: float, ry: float) -> Curve:
 
 
 def circle(radius: float) -> Curve:
+    """Around the origin."""
     return ellipse(radius, radius)
 
 

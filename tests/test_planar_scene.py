@@ -1,15 +1,15 @@
 """Scene files: the ones that ship say what their comments claim, and what a file cannot be is one line with its key."""
 
+import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mi_refract import planar_keys, shapes
-from mi_refract.edges import boundaries
+from mi_refract import keys, planar_keys, shapes
 from mi_refract.planar import Event, trace
-from mi_refract.planar_keys import Part
 from mi_refract.planar_scene import load
 
 SCENES = Path(__file__).parents[1] / "scenes" / "planar"
@@ -134,80 +134,6 @@ def test_the_achromat_unites_three_colours():
     assert np.abs(np.array(foci) - 102.75).max() < 0.15
 
 
-# Shapes that touch ------------------------------------------------------------------------------------------------
-
-
-TWO = """
-index = 1.1
-[[shape]]
-kind = "rectangle"
-name = "left"
-width = 2
-height = 2
-n = 1.5
-at = [{x}, 0.1]
-[[shape]]
-kind = "rectangle"
-width = 2
-height = 2
-n = 1.7
-at = [{x} + 2, 0.1]
-{more}
-[[beam]]
-kind = "parallel"
-from = [-5, -0.7]
-to = [-5, 0.8]
-direction = 0
-count = 5
-"""
-
-
-def two(tmp_path, x="0.3", second="2.3", more=""):
-    return written(tmp_path, TWO.replace("{x} + 2", second).replace("{x}", x).replace("{more}", more))
-
-
-def test_shapes_that_share_an_edge_are_cemented_there(tmp_path):
-    # 2.3 is an ulp from 0.3 + 2 in some corner; a whole 1e-9 is another place.
-    for x, second in (("0.3", "2.3"), ("0.1", "2.1"), ("-0.7", "1.3"), ("0.3", "2.3000000000000003")):
-        scene = load(two(tmp_path, x, second))
-        segments = scene.segments[0]
-        assert len(segments) == 7
-        media = sorted(zip(segments.n_left.tolist(), segments.n_right.tolist(), strict=True))
-        assert media == [(1.5, 1.1)] * 3 + [(1.5, 1.7)] + [(1.7, 1.1)] * 3
-        found = paths(scene, weights=True)
-        assert found.indices[:, :4].tolist() == [[1.1, 1.5, 1.7, 1.1]] * 5
-    apart = load(two(tmp_path, "0.3", "2.300000001"))
-    assert len(apart.segments[0]) == 8
-    assert paths(apart, weights=True).indices[0, :5].tolist() == [1.1, 1.5, 1.1, 1.7, 1.1]
-
-
-def test_a_shape_may_touch_what_it_lies_in(tmp_path):
-    inner = '[[shape]]\nkind = "polygon"\npoints = [[-0.7, -0.9], [1.3, -0.9], [-0.7, 1.1]]\nn = 1.3\nwithin = "left"\n'
-    segments = load(two(tmp_path, more=inner)).segments[0]
-    assert len(segments) == 8  # two of the triangle's edges are the square's
-    triangle = (segments.n_left == 1.3) & (segments.n_right == 1.1)
-    assert triangle.sum() == 2
-    assert ((segments.n_left == 1.3) & (segments.n_right == 1.5)).sum() == 1
-    with pytest.raises(ValueError, match=r"shape\[2\]: along shape\[0\] there is index 1.5; accepted: 1.1"):
-        load(two(tmp_path, more=inner.replace('within = "left"', "")))
-
-
-def test_curves_with_the_same_ends_are_not_the_same():
-    moon, disc = shapes.polygon([(0, -1), (0, 1)], [90, -45]), shapes.polygon([(0, -1), (0, 1)], [45, 60])
-    parts = [("a", Part(moon, (1.5,), (1.0,))), ("b", Part(disc, (1.6,), (1.0,)))]
-    segments = boundaries(parts)[0]
-    assert len(segments) == 3
-    assert sorted(zip(segments.n_left.tolist(), segments.n_right.tolist(), strict=True)) == [
-        (1.5, 1.0), (1.5, 1.6), (1.6, 1.0)
-    ]  # fmt: skip
-
-
-def test_a_boundary_runs_along_nothing(tmp_path):
-    boundary = '[[shape]]\nkind = "boundary"\npoints = [[1.3, -0.9], [1.3, 1.1]]\nn_left = 1.5\nn_right = 1.7\n'
-    with pytest.raises(ValueError, match=r"shape\[2\]: it runs along shape\[0\]"):
-        load(two(tmp_path, more=boundary))
-
-
 # Reading ----------------------------------------------------------------------------------------------------------
 
 
@@ -299,8 +225,8 @@ BAD = {  # what is replaced, by what: the key, what was found, what is accepted
     "date": ("rotate = 30", "rotate = 1999-12-31", "shape[0].rotate: datetime.date(1999, 12, 31); accepted: a number"),
     "index 0": ("n = 1.3", "n = 0", "shape[2].n: 0; accepted: a number above 0"),
     "negative index": ("index = [1, 1.1]", "index = [1, -1.1]", "index: [1, -1.1]; accepted: a number above 0"),
-    "index of a third colour": ("n = 1.3", "n = [1, 2, 3]", "shape[2].n: 3 numbers; accepted: 1, or 1 for each of 2"),
-    "colours missing": ('colours = ["red", "blue"]', "", "index: 2 numbers; accepted: 1, or 1 for each of 1"),
+    "index of a third colour": ("n = 1.3", "n = [1, 2, 3]", "shape[2].n: 3 numbers; accepted: 1 for all or each of 2"),
+    "colours missing": ('colours = ["red", "blue"]', "", "index: 2 numbers; accepted: 1 for all or each of 1"),
     "no colours": ('["red", "blue"]', "[]", "colours: []; accepted: a list of texts"),
     "max_depth 0": ("max_depth = 5", "max_depth = 0", "max_depth: 0; accepted: a whole number, 1 to"),
     "max_depth 1.5": ("max_depth = 5", "max_depth = 1.5", "max_depth: 1.5; accepted: a whole number"),
@@ -313,12 +239,13 @@ BAD = {  # what is replaced, by what: the key, what was found, what is accepted
     "name taken": ("radii = [1, 2]", 'radii = [1, 2]\nname = "disc"', "shape[2].name: 'disc' is another shape's"),
     "within nothing": ('"disc"\nat', '"dish"\nat', "shape[1].within: 'dish'; accepted: the name of a shape above"),
     "within and outside": ('"disc"\nat', '"disc"\noutside = 1\nat', "shape[1].within: 'disc', beside `outside`"),
-    "scale 0": ("scale = [1, 0.5]", "scale = [1, 0]", "shape[0].scale: [1, 0]; accepted: a number of size 1e-100 to 1e100"),
-    "out of range": ("radii = [1, 2]\n", "radii = [1, 2e300]\nscale = 1e100\n", "shape[2].at: the shape leaves the range"),
+    "scale 0": ("scale = [1, 0.5]", "scale = [1, 0]", "shape[0].scale: [1, 0]; accepted: a number of size"),
+    "out of range": ("radii = [1, 2]\n", "radii = [1, 1e99]\nscale = 99\n", "shape[2]: coordinates beyond 1e+100"),
     "facets": ("facets = 20", "facets = 3", "shape[2].facets: 3, for 4 arcs"),
     "no rays": ("count = 3", "count = 0", "beam[1].count: 0; accepted: a whole number, 1 to"),
     "no direction": ("direction = [3, 4]", "direction = [0, 0]", "beam[0].direction: [0, 0]; accepted: degrees, or"),
     "three coordinates": ("at = [-5, 0]", "at = [-5, 0, 1]", "beam[1].at: [-5, 0, 1]; accepted: [x, y]"),
+    "far away": ("origins = [[0, 1]", "origins = [[0, 1e101]", "beam[2]: coordinates beyond 1e+100"),
     "too few directions": ("[180, [0, -1e300]]", "[180]", "beam[2].directions: 1, for 2 origins"),
     "no list": ("origins = [[0, 1], [2, 3]]", "origins = 3", "beam[2].origins: 3; accepted: a list of [x, y]"),
     "one table": ("[[shape]]", "[shape]", "accepted: TOML"),
@@ -400,3 +327,47 @@ def test_the_reference_knows_every_kind_and_key():
             assert f"| `{name}` |" in text
             assert all(f"`{key}`" in text for key in kind.keys)
     assert all(line.count("|") == 4 for line in text.splitlines() if line)
+
+
+NASTY = [0, -1, 1, 3, 1e-300, -1e300, 1e308, 10**400, math.inf, math.nan, True, "", "disc", [], [1], [0, 0], [1, -1],
+         [1e200, 1e-200], [[0, 0], [1, 0], [0, 1]], [[1e308, 0], [-1e308, 1]], {}, [{}], [[[0]]]]  # fmt: skip
+
+
+def toml(value):
+    """As a TOML value."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {toml(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(toml, value))}]"
+    return json.dumps(value).replace("Infinity", "inf").replace("NaN", "nan")
+
+
+def plain(value):
+    """What a default is in a file."""
+    return 1 if value is keys.REQUIRED or value is None else value
+
+
+@pytest.mark.filterwarnings("error")
+def test_whatever_the_values_a_file_is_a_scene_or_one_line(tmp_path):
+    """600 files with values that a key may or may not have, in any place."""
+    rng, read = np.random.default_rng(20), 0
+    beam = {"kind": "rays", "origins": [[0, 0]], "directions": [0]}
+    for _ in range(600):
+        name = str(rng.choice(list(planar_keys.SHAPES)))
+        table = {key: plain(entry.default) for key, entry in planar_keys.SHAPES[name].keys.items()}
+        table = {"kind": name} | {key: value for key, value in table.items() if key not in ("within", "facets", "arcs")}
+        table |= {"points": [[0, 0], [1, 0], [0, 1]]} if "points" in table else {}
+        table |= {key: [0.1, -0.2] for key in ("curvature", "radii") if key in table}
+        table |= {"name": "a"} if "name" in table else {}
+        for key in rng.choice([*planar_keys.SHAPES[name].keys], rng.integers(0, 3)):
+            table[str(key)] = NASTY[rng.integers(len(NASTY))]
+        path = written(tmp_path, f"shape = {toml([table])}\nbeam = {toml([beam])}")
+        try:
+            scene = load(path)
+        except ValueError as error:
+            line = rf"{re.escape(str(path))}: shape\[0\](\.\w+)?( = |: )[^\n]+; accepted: [^\n]+"
+            assert re.fullmatch(line, str(error)), error
+        else:
+            read += 1
+            assert all(np.isfinite(region.outline).all() for region in scene.regions)
+    assert 100 < read < 500
