@@ -45,7 +45,7 @@ def boundaries(parts: list[Named]) -> tuple[Segments, ...]:
     return tuple(Segments(start[kept], end[kept], *n, *arcs) for n in zip(left, right, strict=True))
 
 
-def _present(parts: list[Named], pieces: Array, largest: float) -> None:
+def _present(parts: list[Named], pieces: NDArray[Any], largest: float) -> None:
     """ValueError for a part of which rounding leaves nothing."""
     for (name, _), left in zip(parts, pieces, strict=True):
         if not left:
