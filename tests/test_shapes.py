@@ -123,14 +123,6 @@ def test_arcs_turn_by_what_they_are_told():
         assert np.abs(np.hypot(*(along - centre).T) - radius).max() <= 1e-14 * radius * 10
 
 
-def test_an_arc_of_a_circle_runs_from_angle_to_angle():
-    for start, end, pieces in ((0, 90, 1), (30, 330, 4), (100, -100, 3)):
-        curve = shapes.arc(2, start, end)
-        assert len(curve) == pieces
-        assert np.abs(np.hypot(*points(curve.between(1, 1), 30).reshape(-1, 2).T) - 2).max() <= 8 * ULP
-        assert curve.vertices[[0, -1]].tolist() == [[2 * x for x in unit(start)], [2 * x for x in unit(end)]]
-
-
 def test_smooth_curves_have_one_tangent_at_their_joints():
     lens = shapes.lens((0.02, -0.03), 5, radius=9, conic=(-1.5, 0.4))
     smooth = [(shapes.circle(3), range(4)), (shapes.ellipse(5, 0.1), range(4)), (lens, (1, 4))]
@@ -228,6 +220,12 @@ def test_the_documents_polyline_has_the_originals_vertices_and_closes_at_its_tip
     assert tip[0] == pytest.approx(4 * math.sqrt((-2 * 8.2 + 0.04 * 2.9 * 8.2**2) / -0.04), rel=4 * ULP)
 
 
+@pytest.mark.parametrize("resolution", [0.0, -0.05, math.nan])
+def test_a_polyline_needs_a_resolution(resolution):
+    with pytest.raises(ValueError, match="accepted: above 0"):
+        shapes.document_lens(resolution)
+
+
 def test_the_documents_arcs_are_its_formula():
     x, y = points(shapes.document_lens().between(1, 4.4), 200).reshape(-1, 2).T
     for sign in (1, -1):
@@ -259,8 +257,8 @@ def test_pointed_lenses_end_where_their_surfaces_meet():
     [
         (((0.02, 0.03), 1.0, None), "curvature.*never meet"),
         (((0.0, 0.0), 1.0, None), "curvature.*never meet"),
-        (((0.02, -0.02), 1.0, 60.0), "radius = 60: a surface ends"),
-        (((0.02, -0.02), 1.0, 20.0), "radius = 20: the surfaces meet"),
+        (((0.02, -0.02), 1.0, 60.0), "radius = 60: a surface ends before; accepted: at most 50"),
+        (((0.02, -0.02), 1.0, 20.0), "radius = 20: the surfaces meet before; accepted: at most 7.05"),
     ],
 )
 def test_impossible_lenses_are_refused(arguments, found):
