@@ -146,7 +146,7 @@ def trace(scene: Any, case: Case, spawn: Callable[[Any, Any], Any]) -> Paths:
         dr.scatter(hits, mi.Int32(dr.round(segment)), j * count + lane, inside)
         bs, _ = si.bsdf().sample(sampling, si, 1 - 2.0**-24, [0.5, 0.5], inside)
         through = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission)
-        event = dr.select(through, mi.UInt32(int(Event.REFRACTED)), int(Event.REFLECTED))
+        event: Any = dr.select(through, mi.UInt32(int(Event.REFRACTED)), int(Event.REFLECTED))
         event = dr.select(found, dr.select(inside, event, int(Event.EXHAUSTED)), int(Event.ESCAPED))
         dr.scatter(events, event, j * count + lane, active)
         return j + 1, inside, dr.select(inside, spawn(si, si.to_world(bs.wo)), ray)
