@@ -224,6 +224,8 @@ def test_a_readme_is_not_written_from_a_run_that_measured_too_little():
         readme.paths([])
     with pytest.raises(ValueError, match="no efficiency was measured"):
         readme.efficiency([])
+    with pytest.raises(ValueError, match="no planar paths were traced"):
+        readme.planar([])
 
 
 def test_the_readme_holds_its_tables_and_shows_pictures_that_exist():
@@ -231,7 +233,10 @@ def test_the_readme_holds_its_tables_and_shows_pictures_that_exist():
     text = (root / "README.md").read_text()
     scenes = [path.stem for path in SCENES.glob("*.xml")]
     ways = [method.name for method in methods.METHODS]
-    tables = {"accuracy": FORMULAS, "renders": scenes, "paths": paths.plugins(), "efficiency": ways}
+    planar = [path.stem for path in SCENES.glob("planar/*.toml")]
+    tables = {
+        "accuracy": FORMULAS, "renders": scenes, "paths": paths.plugins(), "efficiency": ways, "planar": planar
+    }  # fmt: skip
     for marker, words in tables.items():
         table = text.partition(f"<!-- begin: {marker} -->")[2].partition(f"<!-- end: {marker} -->")[0]
         assert [word for word in words if word not in table] == []

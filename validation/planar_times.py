@@ -33,7 +33,7 @@ TERMS = {
     "ms to set up": "of the segments, once: tables, and the mesh",
     "differing": "paths of which a bit differs between the two methods",
     "per doubling": "what twice as many segments add to a path, over the path at a thousand; beyond a thousand",
-    "10⁶ over 10³": "the cost of a path with a million segments over that with a thousand",
+    "most over a thousand": "the cost of a path among the most segments over that among a thousand",
     "shuffled": "rays in no order; else they come lens by lens, from one side of each to the other",
     "M": "segments; 1172 are those of the original program",
 }
@@ -42,15 +42,16 @@ STUDY = "planar_times"
 SEED = 2033
 ORIGINAL = 0.05  # its resolution, 1172 segments
 SIZES = (10, 100, 1000, 10_000, 100_000, 1_000_000)
-BRUTE_SIZES = (0, 10, 100, 1000)  # and with so many times fewer rays:
-FEWER = 16
+BRUTE_SIZES = (0, 10, 100, 1000)
 ROUNDS = {"quick": 7, "full": 21}
+LARGEST = {"quick": 5, "full": 6}  # of the sizes: a million segments take seconds to set up
 GOALS = {  # with two cores
     ("llvm float32", "document 004"): {"µs per path": 0.1},
     ("llvm float32", "M = 1000000"): {"µs per path": 1.0},
 }
 MESH, BRUTE = "mesh", "brute"
-METHODS = {MESH: (MESH, False), "mesh, shuffled": (MESH, True), BRUTE: (BRUTE, False)}  # and whether rays are shuffled
+# The method, whether rays are shuffled, and how many times fewer of them there are.
+METHODS = {MESH: (MESH, False, 1), "mesh, shuffled": (MESH, True, 16), BRUTE: (BRUTE, False, 64)}
 BOUNDARIES = 2
 
 
@@ -62,9 +63,7 @@ def tasks(context: Context) -> list[Task]:
 def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
         return [Row(STUDY, "trace", "every size", setting.label, reason=setting.reason)]
-    # A million segments take seconds to set up: in float32 only, for which there is a goal, unless there is time.
-    some = context.profile.name == "quick" and setting.precision is np.float64
-    return measure(context, setting, SIZES[:1] if setting.is_scalar else SIZES[:-1] if some else SIZES)
+    return measure(context, setting, SIZES[:1] if setting.is_scalar else SIZES[: LARGEST[context.profile.name]])
 
 
 @dataclass(frozen=True)
@@ -131,9 +130,9 @@ class Run:
     """A tracer called once; `values`: how long it took to set up, and what is measured later."""
 
     def __init__(self, tracers: Callable[[str, int], tuple[Tracer, float]], method: str, size: int, count: int) -> None:
-        kind, shuffled = METHODS[method]
+        kind, shuffled, fewer = METHODS[method]
         self.method, self.size = method, size
-        self.rays = field(size).beam(max(count // FEWER, 1) if kind == BRUTE else count, shuffled)
+        self.rays = field(size).beam(max(count // fewer, 1), shuffled)
         self.tracer, seconds = tracers(kind, size)
         self.values = {"ms to set up": seconds * 1e3}
         self.first = self.clock()
@@ -170,5 +169,5 @@ def _growth_row(setting: Setting, runs: list[Run]) -> Row:
     }
     size, cost = np.array([point for point in curves[MESH] if point[0] >= 1000]).T
     slope = np.polyfit(np.log2(size), cost, 1)[0]
-    found = {"per doubling": float(slope / cost[0]), "10⁶ over 10³": float(cost[-1] / cost[0])}
+    found = {"per doubling": float(slope / cost[0]), "most over a thousand": float(cost[-1] / cost[0])}
     return Row(STUDY, "every method", "µs per path", setting.label, found, curves=curves)

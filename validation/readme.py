@@ -1,4 +1,4 @@
-"""What the README quotes: four tables and the gallery, all from the rows of one run."""
+"""What the README quotes: tables and the gallery, all from the rows of one run."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ def update(path: Path, rows: list[Row], context: Context) -> None:
     update_between(path, "renders", renders(rows))
     update_between(path, "paths", paths(rows))
     update_between(path, "efficiency", efficiency(rows))
+    update_between(path, "planar", planar(rows))
     write_atomically(GALLERY, gallery(rows, context))
 
 
@@ -141,6 +142,31 @@ def efficiency(rows: list[Row]) -> str:
         sampler = "independent" if default else row.replay["sampler"]
         cells.append([row.case, f"`{name}`", sampler, *(_with_interval(row, metric) for metric in EFFICIENCY)])
     return _table(size, ["scene", "method", "sampler", *EFFICIENCY.values()], cells)
+
+
+def planar(rows: list[Row]) -> str:
+    """Markdown: scene by scene how far paths are from the retrace, and what a path costs by the number of segments."""
+    found = {(r.study, r.subject, r.case, r.setting): r for r in rows if r.values}
+    cells, times = [], []
+    for _, _, case, setting in (key for key in found if key[:2] == ("planar", "trace")):
+        exact, narrow = (found.get(("planar", "trace", case, f"llvm {p}")) for p in ("float64", "float32"))
+        if setting == "llvm float64" and exact and narrow:
+            most = f"{exact.values['boundaries']:.0f}"
+            cells.append([f"`{case}`", str(exact.replay["rays"]), most, compact(exact.values["difference"]),
+                          compact(narrow.values["difference"]), compact(narrow.values["error / bound"])])  # fmt: skip
+    for _, subject, case, setting in (key for key in found if key[0] == "planar_times"):
+        if subject == "mesh" and setting == "llvm float32":
+            columns = [("mesh", "float32"), ("mesh", "float64"), ("mesh, shuffled", "float32"), ("brute", "float32")]
+            timed = [found.get(("planar_times", name, case, f"llvm {p}")) for name, p in columns]
+            times.append([case, *(_with_interval(row, "µs per path") if row else "–" for row in timed)])
+    if not cells or not times:
+        raise ValueError("README: no planar paths were traced on LLVM; its tables need them")
+    heading = ["scene", "rays", "boundaries", "float64: off by", "float32: off by", "over its bound"]
+    return "\n\n".join([
+        _table("Largest distance from an independent retrace, over the scene's extent, on LLVM.", heading, cells),
+        _table("µs per path of two boundaries, with 95 % intervals.",
+               ["segments", "float32", "float64", "float32, rays shuffled", "float32, every segment tried"], times),
+    ])  # fmt: skip
 
 
 def gallery(rows: list[Row], context: Context) -> bytes:
