@@ -71,8 +71,10 @@ def test_the_scenes_are_those_of_the_document():
     assert sorted(reflected[reflected > 0].tolist()) == [1, 4]
 
 
-def test_the_ellipse_focuses_to_rounding():
+def test_the_ellipse_focuses_to_rounding_in_any_medium(tmp_path):
     assert np.abs(misses(paths(load(SCENES / "ellipse.toml")))).max() <= 8 * ULP * 4
+    wet = written(tmp_path, "index = 1.1\n" + (SCENES / "ellipse.toml").read_text())
+    assert np.abs(misses(paths(load(wet)))).max() <= 8 * ULP * 4
 
 
 def test_the_aplanatic_ball_has_one_virtual_image():
@@ -205,6 +207,13 @@ def test_a_scene_is_read_as_it_is_written(tmp_path):
     assert vertex == pytest.approx([2 * math.cos(math.pi / 6), 2 * math.sin(math.pi / 6)], abs=1e-15)
 
 
+def test_rays_start_at_round_numbers_where_they_can():
+    for count in range(2, 200):
+        beam = {"from": [0, 1], "to": [count - 1, 1], "direction": np.array([0, 1]), "count": count}
+        origins, _ = planar_keys.BEAMS["parallel"].build(beam)
+        assert origins.tolist() == [[j, 1] for j in range(count)]
+
+
 def test_a_file_without_a_title_has_its_own_name(tmp_path):
     scene = load(written(tmp_path, SCENE.replace('title = "A disc"', "")))
     assert scene.title == "scene"
@@ -241,6 +250,7 @@ BAD = {  # what is replaced, by what: the key, what was found, what is accepted
     "within and outside": ('"disc"\nat', '"disc"\noutside = 1\nat', "shape[1].within: 'disc', beside `outside`"),
     "scale 0": ("scale = [1, 0.5]", "scale = [1, 0]", "shape[0].scale: [1, 0]; accepted: a number of size"),
     "out of range": ("radii = [1, 2]\n", "radii = [1, 1e99]\nscale = 99\n", "shape[2]: coordinates beyond 1e+100"),
+    "lost": ("radii = [1, 2]", "radii = [1e-20, 2e-20]", "shape[2]: a point, beside coordinates of 9; accepted: above"),
     "facets": ("facets = 20", "facets = 3", "shape[2].facets: 3, for 4 arcs"),
     "no rays": ("count = 3", "count = 0", "beam[1].count: 0; accepted: a whole number, 1 to"),
     "no direction": ("direction = [3, 4]", "direction = [0, 0]", "beam[0].direction: [0, 0]; accepted: degrees, or"),
