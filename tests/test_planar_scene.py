@@ -42,8 +42,10 @@ def written(tmp_path, text):
 
 
 @pytest.mark.parametrize("path", sorted(SCENES.glob("*.toml")), ids=lambda path: path.stem)
-def test_scenes_load_and_all_rays_find_their_way_out(path):
+def test_scenes_load_and_all_rays_find_their_way_out(path, needs_variant):
     scene = load(path)
+    if path.stem == "luneburg":
+        needs_variant("llvm_ad_rgb")  # a second a ray on scalar numbers
     assert len(scene.segments) == len(scene.colours) == len(scene.index)
     assert len(scene.origins) == len(scene.directions) == len(scene.beams)
     assert np.abs(np.hypot(*scene.directions.T) - 1).max() <= 2 * ULP
@@ -83,7 +85,8 @@ def test_the_aplanatic_ball_has_one_virtual_image():
     assert np.abs(misses(found, (-4.4, 0))).max() > 1e-2
 
 
-def test_the_luneburg_lens_focuses_the_better_the_more_layers(tmp_path):
+def test_the_luneburg_lens_focuses_the_better_the_more_layers(tmp_path, needs_variant):
+    needs_variant("llvm_ad_rgb")
     text = (SCENES / "luneburg.toml").read_text()
     spread = []
     for layers in (16, 64, 256):
@@ -105,14 +108,14 @@ def test_the_prism_deviates_by_the_least_angle():
 
 
 def test_the_rainbow_ends_at_its_angle_red_outside(tmp_path):
-    text = (SCENES / "rainbow.toml").read_text().replace("count = 49", "count = 4001")
+    text = (SCENES / "rainbow.toml").read_text().replace("count = 49", "count = 1001")
     scene = load(written(tmp_path, text))
     bows = []
     for colour, n in enumerate((1.33122, 1.33299, 1.33712)):
         u, v = paths(scene, colour, reflect=0b10).directions.T
         bows.append(np.degrees(np.arctan2(-v, -u)).max())
         i = math.acos(math.sqrt((n * n - 1) / 3))  # Descartes
-        assert bows[-1] == pytest.approx(math.degrees(4 * math.asin(math.sin(i) / n) - 2 * i), abs=1e-4)
+        assert bows[-1] == pytest.approx(math.degrees(4 * math.asin(math.sin(i) / n) - 2 * i), abs=5e-4)
     assert bows[0] > bows[1] > bows[2] > 41
 
 
