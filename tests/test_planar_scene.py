@@ -42,8 +42,10 @@ def written(tmp_path, text):
 
 
 @pytest.mark.parametrize("path", sorted(SCENES.glob("*.toml")), ids=lambda path: path.stem)
-def test_scenes_load_and_all_rays_find_their_way_out(path):
+def test_scenes_load_and_all_rays_find_their_way_out(path, needs_variant):
     scene = load(path)
+    if path.stem == "luneburg":
+        needs_variant("llvm_ad_rgb")  # a second a ray on scalar numbers
     assert len(scene.segments) == len(scene.colours) == len(scene.index)
     assert len(scene.origins) == len(scene.directions) == len(scene.beams)
     assert np.abs(np.hypot(*scene.directions.T) - 1).max() <= 2 * ULP
@@ -71,8 +73,10 @@ def test_the_scenes_are_those_of_the_document():
     assert sorted(reflected[reflected > 0].tolist()) == [1, 4]
 
 
-def test_the_ellipse_focuses_to_rounding():
+def test_the_ellipse_focuses_to_rounding_in_any_medium(tmp_path):
     assert np.abs(misses(paths(load(SCENES / "ellipse.toml")))).max() <= 8 * ULP * 4
+    wet = written(tmp_path, "index = 1.1\n" + (SCENES / "ellipse.toml").read_text())
+    assert np.abs(misses(paths(load(wet)))).max() <= 8 * ULP * 4
 
 
 def test_the_aplanatic_ball_has_one_virtual_image():
@@ -81,7 +85,8 @@ def test_the_aplanatic_ball_has_one_virtual_image():
     assert np.abs(misses(found, (-4.4, 0))).max() > 1e-2
 
 
-def test_the_luneburg_lens_focuses_the_better_the_more_layers(tmp_path):
+def test_the_luneburg_lens_focuses_the_better_the_more_layers(tmp_path, needs_variant):
+    needs_variant("llvm_ad_rgb")
     text = (SCENES / "luneburg.toml").read_text()
     spread = []
     for layers in (16, 64, 256):
@@ -103,14 +108,14 @@ def test_the_prism_deviates_by_the_least_angle():
 
 
 def test_the_rainbow_ends_at_its_angle_red_outside(tmp_path):
-    text = (SCENES / "rainbow.toml").read_text().replace("count = 49", "count = 4001")
+    text = (SCENES / "rainbow.toml").read_text().replace("count = 49", "count = 1001")
     scene = load(written(tmp_path, text))
     bows = []
     for colour, n in enumerate((1.33122, 1.33299, 1.33712)):
         u, v = paths(scene, colour, reflect=0b10).directions.T
         bows.append(np.degrees(np.arctan2(-v, -u)).max())
         i = math.acos(math.sqrt((n * n - 1) / 3))  # Descartes
-        assert bows[-1] == pytest.approx(math.degrees(4 * math.asin(math.sin(i) / n) - 2 * i), abs=1e-4)
+        assert bows[-1] == pytest.approx(math.degrees(4 * math.asin(math.sin(i) / n) - 2 * i), abs=5e-4)
     assert bows[0] > bows[1] > bows[2] > 41
 
 
@@ -205,6 +210,13 @@ def test_a_scene_is_read_as_it_is_written(tmp_path):
     assert vertex == pytest.approx([2 * math.cos(math.pi / 6), 2 * math.sin(math.pi / 6)], abs=1e-15)
 
 
+def test_rays_start_at_round_numbers_where_they_can():
+    for count in range(2, 200):
+        beam = {"from": [0, 1], "to": [count - 1, 1], "direction": np.array([0, 1]), "count": count}
+        origins, _ = planar_keys.BEAMS["parallel"].build(beam)
+        assert origins.tolist() == [[j, 1] for j in range(count)]
+
+
 def test_a_file_without_a_title_has_its_own_name(tmp_path):
     scene = load(written(tmp_path, SCENE.replace('title = "A disc"', "")))
     assert scene.title == "scene"
@@ -241,6 +253,7 @@ BAD = {  # what is replaced, by what: the key, what was found, what is accepted
     "within and outside": ('"disc"\nat', '"disc"\noutside = 1\nat', "shape[1].within: 'disc', beside `outside`"),
     "scale 0": ("scale = [1, 0.5]", "scale = [1, 0]", "shape[0].scale: [1, 0]; accepted: a number of size"),
     "out of range": ("radii = [1, 2]\n", "radii = [1, 1e99]\nscale = 99\n", "shape[2]: coordinates beyond 1e+100"),
+    "lost": ("radii = [1, 2]", "radii = [1e-20, 2e-20]", "shape[2]: a point, beside coordinates of 9; accepted: above"),
     "facets": ("facets = 20", "facets = 3", "shape[2].facets: 3, for 4 arcs"),
     "no rays": ("count = 3", "count = 0", "beam[1].count: 0; accepted: a whole number, 1 to"),
     "no direction": ("direction = [3, 4]", "direction = [0, 0]", "beam[0].direction: [0, 0]; accepted: degrees, or"),

@@ -160,6 +160,7 @@ def test_quarter_turns_are_exact():
     square = shapes.rectangle(0.3, 0.7).vertices
     assert shapes.rectangle(0.3, 0.7).mapped(affine(450)).vertices.tolist() == [[-y, x] for x, y in square.tolist()]
     assert unit(-270) == unit(90 + 360e6) == (0, 1)
+    assert unit(1e17) == unit(10**17 % 360)
     assert unit(45) == (math.sqrt(0.5), math.sqrt(0.5))
     assert all(math.hypot(*unit(x)) == pytest.approx(1, abs=ULP) for x in (1e300, 0.1, -44.9, 123.4))
 
@@ -252,11 +253,23 @@ def test_pointed_lenses_end_where_their_surfaces_meet():
         assert off_conic(np.array([z - thickness, r]), curvature[1], conic[1]) <= 8 * ULP * r
 
 
+def test_a_surface_reaches_as_far_as_it_exists():
+    """1/(c √(1 + K)) is rounded: what the sag then takes the root of may be a little below 0."""
+    for c in np.linspace(0.01, 3, 200):
+        for conic in (0, -0.3, 1.9):
+            radius = 1 / (c * math.sqrt(1 + conic))
+            hemisphere = shapes.lens((c, c), 1, radius=radius, conic=(conic, conic))
+            assert off_conic(hemisphere.vertices[0], c, conic) <= 8 * ULP * radius
+            with pytest.raises(ValueError, match="a surface ends before"):
+                shapes.lens((c, c), 1, radius=radius * (1 + 1e-14), conic=(conic, conic))
+
+
 @pytest.mark.parametrize(
     "arguments, found",
     [
         (((0.02, 0.03), 1.0, None), "curvature.*never meet"),
         (((0.0, 0.0), 1.0, None), "curvature.*never meet"),
+        (((0.1, -0.5), 20.5, None), "curvature.*never meet"),  # but their far halves do
         (((0.02, -0.02), 1.0, 60.0), "radius = 60: a surface ends before; accepted: at most 50"),
         (((0.02, -0.02), 1.0, 20.0), "radius = 20: the surfaces meet before; accepted: at most 7.05"),
     ],
