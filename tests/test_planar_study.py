@@ -162,7 +162,6 @@ def test_a_wrong_formula_breaks_a_scene(defect, scalar, monkeypatch):
 def traced_otherwise(case, **changes):
     """The case, its tracer given other segments."""
     other = dataclasses.replace(case.segments, **changes)
-    case = dataclasses.replace(case)
     paths = tracer.trace(other, case.origins, case.directions, case.max_depth, reflect=case.reflect, backend="scalar")
     return planar.judge(paths, case, 2.0**-53)
 
@@ -177,6 +176,18 @@ def test_swapped_media_a_moved_vertex_and_a_gap_are_seen():
     gone = s.end.copy()
     gone[hit] = s.start[hit]
     assert traced_otherwise(case, end=gone)["astray, far"] > 0
+
+
+def test_a_leak_at_a_vertex_is_seen():
+    """Rays along the axes exactly at the vertices of an octagon, whose sides end short of them for the tracer."""
+    corners = np.array([[3, 1], [1, 3], [-1, 3], [-3, 1], [-3, -1], [-1, -3], [1, -3], [3, -1.0]])
+    octagon = Segments(corners, np.roll(corners, -1, 0), np.full(8, 1.5), np.ones(8))
+    d = np.repeat([[1.0, 0], [-1, 0], [0, 1], [0, -1]], 2, axis=0)
+    origins = -10 * d + np.tile([[-1.0], [1.0]], (4, 1)) * d[:, ::-1]
+    case = planar.Case("octagon", octagon, origins, d, 8, np.zeros(8, int))
+    assert (case.exact.met >= 2).all() and traced_otherwise(case)["astray"] == 0
+    short = 1e-12 * (octagon.end - octagon.start)
+    assert traced_otherwise(case, start=corners + short, end=octagon.end - short)["astray"] > 0
 
 
 def settings_of(backend):
@@ -237,9 +248,9 @@ def compiled(needs_variant):
 
 
 def extruded(case, spawn="along the ray", segments=None):
-    spawn = extrusion.SPAWNS[spawn]
-    paths = extrusion.trace(walls.extrude(segments or case.segments), case, spawn.next)
-    return extrusion.judge(paths, spawn.allow(case), extrusion.U)
+    spawn, offset = extrusion.SPAWNS[spawn]
+    paths = extrusion.trace(walls.extrude(segments or case.segments), case, spawn)
+    return planar.judge(paths, case, extrusion.U, offset)
 
 
 @pytest.mark.parametrize("spawn", extrusion.SPAWNS)
@@ -252,8 +263,8 @@ def test_walls_do_what_segments_do(spawn, compiled):
 def test_wrong_walls_are_seen(compiled):
     """Rays moved along the normal without leave, swapped media, an index off by 1e-5, and a wall that is not there."""
     case = extrusion.faceted(planar.case_of(planar.FOLDER / "prism.toml", 30))
-    paths = extrusion.trace(walls.extrude(case.segments), case, extrusion.SPAWNS["spawn_ray"].next)
-    assert extrusion.judge(paths, case, extrusion.U)["error / bound"] > 1
+    paths = extrusion.trace(walls.extrude(case.segments), case, extrusion.SPAWNS["spawn_ray"][0])
+    assert planar.judge(paths, case, extrusion.U)["error / bound"] > 1
     s = case.segments
     assert extruded(case, segments=Segments(s.start, s.end, s.n_right, s.n_left))["astray, far"] > 0
     assert extruded(case, segments=Segments(s.start, s.end, s.n_left * (1 + 1e-5), s.n_right))["error / bound"] > 1

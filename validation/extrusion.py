@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,23 +22,25 @@ from mi_refract.planar import Event, Paths
 from mi_refract.rows import Row
 
 from . import overlay, planar, walls
-from .growth import growth
 from .layered import OFFSET
 from .plan import Context, Task
 from .planar import FOLDER, Case, judge
-from .retrace import Array, retrace
+from .retrace import Array
+from .settings import Setting
 
 TITLE = "Planar, extruded"
 TEXT = __doc__.partition("\n")[2].strip()
 TERMS = planar.TERMS | {
     "along the ray": "rays moved along themselves behind a boundary, so that they do not meet it again",
     "spawn_ray": "moved along the normal, as Mitsuba does by itself; the bound counts that in",
-    "planar − extruded": "largest distance between the points of `planar.trace` and of Mitsuba, over the extent",
+    "from planar float32, float64": "largest distance from the points of `planar.trace`, over the extent, where both "
+    "meet the same walls",
 }
 STUDY = "extrusion"
 SCALAR = "needs a compiled variant: a loop over rays in Python would take hours"
 U = 2.0**-24
 FACETS = 64  # of an arc, at most
+Spawn = Callable[[Any, Any], Any]
 LARGEST = 1500  # walls; arcs have fewer facets where there are more of them
 DRAWN, SHOWN, PIXELS = "along the ray", 9, 192  # rays in a picture, and its size before it is enlarged
 RAYS = 100  # of the file's, and as many scattered
@@ -55,17 +56,26 @@ def scene_rows(context: Context, path: Path) -> list[Row]:
     if context.variant.startswith("scalar"):
         return [Row(STUDY, PLUGIN, path.stem, context.variant, reason=SCALAR)]
     case = faceted(planar.case_of(path, RAYS))
-    scene = walls.extrude(case.segments)
-    rows = []
-    for name, spawn in SPAWNS.items():
-        paths = trace(scene, case, spawn.next)
-        values = judge(paths, spawn.allow(case), U)
+    scene, rows = walls.extrude(case.segments), []
+    planar_paths = {name: case.trace(Setting(context.variant.split("_")[0], np.dtype(name).type))
+                    for name in ("float32", "float64")}  # fmt: skip
+    for name, (spawn, offset) in SPAWNS.items():
+        paths = trace(scene, case, spawn)
+        values = judge(paths, case, U, offset)
+        values |= {f"from planar {p}": apart(paths, other) / case.extent for p, other in planar_paths.items()}
         budgets = {"error / bound": 1.0, "astray, far": 0.0}
         replay = {"scene": path.name, "walls": len(case.segments), "rays": len(case.origins), "seed": planar.SEED}
         pictures = {"overlay": _picture(context, scene, case, paths)} if name == DRAWN else {}
         rows.append(Row(STUDY, f"{PLUGIN}, {name}", path.stem, context.variant, values, budgets,
                         replay=replay, pictures=pictures))  # fmt: skip
     return rows
+
+
+def apart(some: Paths, others: Paths) -> float:
+    """Largest distance of points, of rays that meet the same boundaries; NaN where there are none."""
+    same = (some.hits == others.hits).all(1)
+    distance = np.hypot(*(some.points - others.points)[same].transpose(2, 0, 1))
+    return float(np.nanmax(distance)) if same.any() else float("nan")
 
 
 def _picture(context: Context, scene: Any, case: Case, extruded: Paths) -> str:
@@ -91,8 +101,7 @@ def faceted(case: Case) -> Case:
     facets = max(1, min(FACETS, LARGEST // len(case.segments)))
     segments, every = walls.facets(case.segments, facets), case.reflect == 0
     origins, directions = case.origins[every], case.directions[every]
-    exact = retrace(segments, origins, directions, case.max_depth)
-    return Case(case.name, segments, origins, directions, case.max_depth, case.reflect[every], exact)
+    return Case(case.name, segments, origins, directions, case.max_depth, case.reflect[every])
 
 
 # The rays ------------------------------------------------------------------------------------------------------
@@ -106,27 +115,14 @@ def along_the_ray(si: Any, d: Any) -> Any:
     return ray
 
 
-@dataclass(frozen=True)
-class Spawn:
-    """How a ray goes on from an interaction along a direction, and by how much it is moved along the normal, over u."""
-
-    next: Callable[[Any, Any], Any]
-    offset: float
-
-    def allow(self, case: Case) -> Case:
-        """The case, its bound with that offset."""
-        allowed = Case(**{name: getattr(case, name) for name in case.__dataclass_fields__})
-        allowed.__dict__["bounds"] = growth(case.exact, case.segments, self.offset)
-        return allowed
-
-
-SPAWNS = {
-    "along the ray": Spawn(along_the_ray, 0.0),
-    "spawn_ray": Spawn(lambda si, d: si.spawn_ray(d), OFFSET / U),
+# How a ray goes on from an interaction along a direction, and by how much that moves it along the normal, over u.
+SPAWNS: dict[str, tuple[Spawn, float]] = {
+    "along the ray": (along_the_ray, 0.0),
+    "spawn_ray": (lambda si, d: si.spawn_ray(d), OFFSET / U),
 }
 
 
-def trace(scene: Any, case: Case, spawn: Callable[[Any, Any], Any]) -> Paths:
+def trace(scene: Any, case: Case, spawn: Spawn) -> Paths:
     """As `planar.trace`, by Mitsuba; the sample 1 − 2⁻²⁴ reflects only where the reflectance is 1."""
     import mitsuba as mi
 

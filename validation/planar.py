@@ -49,7 +49,7 @@ SHOWN = "lens"  # the scene of the formulas
 
 @dataclass(frozen=True)
 class Case:
-    """Rays to follow through `segments`, and their exact paths. `extent`: the diagonal around the segments."""
+    """Rays to follow through `segments`. `exact`: their paths; `extent`: the diagonal around the segments."""
 
     name: str
     segments: Segments
@@ -57,7 +57,10 @@ class Case:
     directions: Array
     max_depth: int
     reflect: Array
-    exact: Retraced
+
+    @functools.cached_property
+    def exact(self) -> Retraced:
+        return retrace(self.segments, self.origins, self.directions, self.max_depth, reflect=self.reflect)
 
     @functools.cached_property
     def bounds(self) -> tuple[Array, Array]:
@@ -110,8 +113,7 @@ def case_of(path: Path, rays: int) -> Case:
     masks = [0] + [1 << j for j in range(min(2, scene.max_depth))] * bool(scene.branches)
     reflect = np.repeat(masks, len(origins))
     origins, directions = (np.tile(x, (len(masks), 1)) for x in (origins, directions))
-    exact = retrace(scene.segments[0], origins, directions, scene.max_depth, reflect=reflect)
-    return Case(path.stem, scene.segments[0], origins, directions, scene.max_depth, reflect, exact)
+    return Case(path.stem, scene.segments[0], origins, directions, scene.max_depth, reflect)
 
 
 def rays_of(scene: PlanarScene, count: int) -> tuple[Array, Array]:
@@ -133,10 +135,13 @@ def _extent(segments: Segments) -> float:
     return float(np.hypot(*np.ptp(np.concatenate([segments.start, segments.end]), axis=0)))
 
 
-def judge(paths: Paths, case: Case, u: float) -> dict[str, float]:
-    """What became of the rays, against the retrace; u: the roundoff. NaN where no ray kept to its boundaries."""
+def judge(paths: Paths, case: Case, u: float, offset: float = 0.0) -> dict[str, float]:
+    """What became of the rays, against the retrace; u: the roundoff, `offset`: as in `growth`.
+
+    NaN where no ray kept to its boundaries.
+    """
     exact = case.exact
-    points, direction = (u * x for x in case.bounds)
+    points, direction = (u * x for x in (growth(exact, case.segments, offset) if offset else case.bounds))
     off = np.hypot(*(paths.points - exact.points).transpose(2, 0, 1)).astype(float)
     # A point that is missing differs by infinity: only what the retrace does not have may be NaN.
     off = np.where(np.isnan(exact.points[..., 0]), 0, np.nan_to_num(off, nan=np.inf))
