@@ -173,6 +173,11 @@ class Tracer:
         shapes = (segments.control, segments.weight) if segments.curved else None
         boundaries = Arcs(to, *ends, *shapes) if shapes else Straight(to, *ends)
         mesh = Extrusion(to, *ends) if _wants_mesh(segments, method) else None
+        if mesh and mesh.crowded:
+            if method == "mesh":
+                i, j = mesh.crowded
+                raise ValueError(f"method = 'mesh': segments {i} and {j}: accepted: more than {SHORTEST:.1e} apart")
+            mesh = None
         self.walker = Walker(to, boundaries, mesh, np.column_stack([segments.n_left, segments.n_right]), formula)
 
     def __call__(
@@ -211,7 +216,7 @@ def _wants_mesh(segments: Segments, method: str) -> bool:
     length = np.hypot(*(segments.end - segments.start).T)
     extent = np.ptp(np.concatenate([segments.start, segments.end]), axis=0).max()
     shortest = length[length > 0].min(initial=np.inf) / (extent / 2 or 1)
-    reason = "arcs" if segments.curved else f"a segment {shortest:.1e} of the extent" if shortest < SHORTEST else ""
+    reason = "arcs" if segments.curved else f"a segment of {shortest:.1e} of half the extent" if shortest < SHORTEST else ""
     if reason and method == "mesh":
-        raise ValueError(f"method = 'mesh': accepted: straight segments longer than {SHORTEST:.1e}, not {reason}")
+        raise ValueError(f"method = 'mesh': {reason}; accepted: straight segments longer than {SHORTEST:.1e}")
     return not reason and (method == "mesh" or len(segments) > FEW)
