@@ -216,7 +216,8 @@ def _wants_mesh(segments: Segments, method: str) -> bool:
     length = np.hypot(*(segments.end - segments.start).T)
     extent = np.ptp(np.concatenate([segments.start, segments.end]), axis=0).max()
     shortest = length[length > 0].min(initial=np.inf) / (extent / 2 or 1)
-    reason = "arcs" if segments.curved else f"a segment of {shortest:.1e} of half the extent" if shortest < SHORTEST else ""
+    short = f"a segment of {shortest:.1e} of half the extent" if shortest < SHORTEST else ""
+    reason = "arcs" if segments.curved else short
     if reason and method == "mesh":
         raise ValueError(f"method = 'mesh': {reason}; accepted: straight segments longer than {SHORTEST:.1e}")
     return not reason and (method == "mesh" or len(segments) > FEW)
