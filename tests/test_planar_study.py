@@ -217,6 +217,27 @@ def test_a_ray_that_is_far_from_every_vertex_must_not_go_astray():
     assert found["astray, far"] == 1
 
 
+@pytest.mark.parametrize("height", [1 - 1e-9, 1 + 1e-9, 1 + 1e-3])
+def test_rounding_may_decide_what_touches_a_circle(height):
+    """A path that passes by, judged by one that meets the circle, or the reverse: right within 1e-6 of the top."""
+    ball = shapes.circle(1.0).between(1.5, 1.0)
+    case = planar.Case("ball", ball, np.array([[-3, height]]), np.array([[1.0, 0]]), 4, np.zeros(1, int))
+    other = retrace(ball, [[-3, 1 - 1e-9 if height > 1 else 1 + 1e-9]], case.directions, 4)
+    found = planar.judge(as_paths(other), case, 2.0**-24)
+    assert (found["astray"], found["astray, far"]) == (1, height == 1 + 1e-3)
+
+
+@pytest.mark.parametrize("beyond", [1e-9, 1e-3])
+def test_rounding_may_decide_at_the_critical_angle(beyond):
+    plane = Segments(np.array([[-9.0, 0]]), np.array([[9.0, 0]]), [1.0], [1.5])
+    angle = np.arcsin(1 / 1.5) + beyond
+    d = np.array([[np.sin(angle), np.cos(angle)]])
+    case = planar.Case("plane", plane, np.array([[0.1, -1]]), d, 1, np.zeros(1, int))
+    through = retrace(plane, case.origins, [[0.0, 1.0]], 1)
+    found = planar.judge(as_paths(dataclasses.replace(through, hits=case.exact.hits)), case, 2.0**-24)
+    assert (found["astray"], found["astray, far"]) == (1, beyond == 1e-3)
+
+
 def test_either_segment_is_right_at_their_vertex():
     """The axis of document 004's lens passes two vertices: whichever arc is hit there, the path is the same."""
     case = planar.case_of(planar.FOLDER / "lens.toml", 13)
@@ -333,4 +354,4 @@ def test_what_cannot_run_has_a_reason(study, scalar_context):
 def test_every_scene_file_is_in_the_study(scalar_context):
     setting = settings(scalar_context())[0]
     cases = {row.case for row in planar._setting_rows(scalar_context(), setting)}
-    assert cases == {path.stem for path in Path(planar.FOLDER).glob("*.toml")}
+    assert cases == {path.stem for path in Path(planar.FOLDER).glob("*.toml")} | {"clutter"}

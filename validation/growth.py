@@ -26,7 +26,7 @@ ROUNDINGS = 2  # of the operands, and of the result
 
 
 def growth(path: Retraced, segments: Segments, offset: float = 0.0) -> tuple[Array, Array]:
-    """(bounds of the points' errors N × (D+1), of the last directions' N), over u; NaN after the end.
+    """Bounds of the errors of points and of the legs' directions (N × (D+1) each), over u; NaN after the end.
 
     `offset`: how far rays are moved along the normal behind a boundary, over u (1 + max |p|).
     """
@@ -36,11 +36,11 @@ def growth(path: Retraced, segments: Segments, offset: float = 0.0) -> tuple[Arr
     shift = (1 + np.abs(path.points[:, 1:]).max(2)) * np.abs(_cross(path.normals, path.legs[:, 1:]))
     shift = offset * shift.astype(float)
     leg = np.hypot(*np.diff(path.points, axis=1).transpose(2, 0, 1)).astype(float)
-    points, direction = np.full(path.points.shape[:2], np.nan), np.full(len(path.points), unit)
-    points[:, 0] = unit * size[:, 0]
+    points, directions = np.full((2, *path.points.shape[:2]), np.nan)
+    points[:, 0], directions[:, 0] = unit * size[:, 0], unit
     none = np.zeros(len(points))
     # One column per rounding so far: what it has become.
-    h, phi = np.stack([points[:, 0], none], 1), np.stack([none, direction], 1)
+    h, phi = np.stack([points[:, 0], none], 1), np.stack([none, directions[:, 0]], 1)
     for j, met in enumerate((path.hits >= 0).T):
         if not met.any():
             break
@@ -50,14 +50,15 @@ def growth(path: Retraced, segments: Segments, offset: float = 0.0) -> tuple[Arr
         phi = g[:, j, None] * phi + phi_factor[:, j, None] * h
         h = np.column_stack([h_factor[:, j, None] * h, unit * added_h[:, j] + shift[:, j], none])
         phi = np.column_stack([phi, none, unit * added_phi[:, j]])
-        direction = np.where(met, np.abs(phi).sum(1), direction)
-    return points, direction
+        directions[:, j + 1] = np.where(met, np.abs(phi).sum(1), np.nan)
+    return points, directions
 
 
 def _transfer(path: Retraced) -> tuple[Array, Array, Array, Array]:
     """g, what h and φ take from h, and |d_n| (N × D each)."""
     before, behind = ((legs * path.normals).sum(2) for legs in (path.legs[:, :-1], path.legs[:, 1:]))
-    g = path.indices[:, :-1] * before / (path.indices[:, 1:] * behind)
+    # A ray that ends where it is contradicted goes on as it came.
+    g = np.nan_to_num(path.indices[:, :-1] * before / (path.indices[:, 1:] * behind), nan=1)
     return g, behind / before, (g - 1) * path.curvatures / before, np.abs(before)
 
 

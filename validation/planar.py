@@ -5,8 +5,8 @@ other boundaries than it should, or ends another way. Of the others, every point
 stand over what rounding may have grown to: each boundary adds a few roundings of the largest coordinate so far and of
 the angle, a facet's own turn by its rounded ends and 1/cos behind the boundary among them, and the first-order
 transfer of a displaced and tilted ray carries them on (`validation/growth.py`). Rays are the file's, and seeded ones
-scattered around them. Then the formulas by name, and closed answers: a box unfolded by mirror images, an ellipse, an
-aplanatic ball, a prism, a rainbow.
+scattered around them; `clutter` are scenes by chance, of bodies of every kind, nested and turned. Then the formulas by
+name.
 """
 
 from __future__ import annotations
@@ -23,10 +23,12 @@ from mi_refract.planar import Paths, Segments, trace
 from mi_refract.planar_scene import PlanarScene, load
 from mi_refract.rows import Row
 
+from . import clutter
 from .growth import growth
 from .plan import SCENES, Context, Task
 from .retrace import Array, Retraced, retrace
 from .settings import Setting, settings
+from .undecided import undecided
 
 TITLE = "Planar"
 TEXT = __doc__.partition("\n")[2].strip()
@@ -34,7 +36,8 @@ TERMS = {
     "difference": "largest distance of a point from the retrace, over the extent of the scene, and |d − exact|",
     "error / bound": "largest of any point and last direction, over what rounding may have grown to",
     "astray": "rays that meet other boundaries than they should, or end another way",
-    "astray, far": "of these, how many pass every vertex of the boundaries they should meet at more than their bound",
+    "astray, far": "of these, how many no rounding excuses: they pass every vertex of their boundaries at more than "
+    "their bound, touch no curve, and are off the critical angle",
     "boundaries": "the most that a ray meets",
 }
 STUDY = "planar"
@@ -42,8 +45,10 @@ FOLDER = SCENES / "planar"
 SEED = 2031
 RAYS = {"quick": 250, "full": 2000}  # at most so many of the file's own, and as many scattered around them
 SCALAR_RAYS = 2
+CLUTTER = {"quick": (12, 100), "full": (100, 500)}  # scenes, and rays in each
 SPREAD = 1e-2  # of the extent, and in radians
 EQUAL = 1e-9  # in float64, of the extent and in radians
+GROWN = {"error / bound": 1.0, "astray, far": 0.0}
 SHOWN = "lens"  # the scene of the formulas
 
 
@@ -64,7 +69,7 @@ class Case:
 
     @functools.cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """Of the errors of points and last directions, over u."""
+        """Of the errors of points and directions, over u."""
         return growth(self.exact, self.segments)
 
     @property
@@ -89,6 +94,7 @@ def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     rays = SCALAR_RAYS if setting.is_scalar else RAYS[context.profile.name]
     cases = [case_of(path, rays) for path in sorted(FOLDER.glob("*.toml"))]
     rows = [row_of(case, setting) for case in cases]
+    rows.append(clutter_row(setting, *((2, 5) if setting.is_scalar else CLUTTER[context.profile.name])))
     if setting.precision is np.float32:
         shown = next(case for case in cases if case.name == SHOWN)
         rows += [row_of(shown, setting, formula) for formula in FORMULAS]
@@ -98,11 +104,30 @@ def _setting_rows(context: Context, setting: Setting) -> list[Row]:
 def row_of(case: Case, setting: Setting, formula: str | None = None) -> Row:
     """A scene in a setting, by the default formula or another one."""
     values = judge(case.trace(setting, formula), case, setting.roundoff)
-    budgets = {"error / bound": 1.0, "astray, far": 0.0}
-    if setting.precision is np.float64:
-        budgets |= {"difference": EQUAL, "astray": 0.0}
     replay = {"scene": f"{case.name}.toml", "rays": len(case.origins), "seed": SEED}
-    return Row(STUDY, formula or "trace", case.name, setting.label, values, budgets, replay=replay)
+    return Row(STUDY, formula or "trace", case.name, setting.label, values, budgets(setting), replay=replay)
+
+
+def budgets(setting: Setting) -> dict[str, float]:
+    exact = {"difference": EQUAL, "astray": 0.0} if setting.precision is np.float64 else {}
+    return GROWN | exact
+
+
+def clutter_row(setting: Setting, scenes: int, rays: int) -> Row:
+    """Scenes by chance: counts of all of them, and the worst of the rest."""
+    parts = [judge(case.trace(setting), case, setting.roundoff) for case in _clutter(scenes, rays)]
+    counts = ("astray", "astray, far")
+    values = {name: (sum if name in counts else max)(part[name] for part in parts) for name in parts[0]}
+    replay = {"scenes": scenes, "rays": scenes * rays, "seed": SEED}
+    # Among so many bodies errors may grow beyond any fixed bound: their own one counts.
+    return Row(STUDY, "trace", "clutter", setting.label, values, GROWN, replay=replay)
+
+
+@functools.cache
+def _clutter(scenes: int, rays: int) -> list[Case]:
+    rngs = [np.random.default_rng((SEED, number)) for number in range(scenes)]
+    described = [(clutter.bodies(rng), *clutter.rays(rng, rays)) for rng in rngs]
+    return [Case("clutter", s, o, d, clutter.DEPTH, reflect) for s, o, d, reflect in described]
 
 
 @functools.cache
@@ -141,17 +166,17 @@ def judge(paths: Paths, case: Case, u: float, offset: float = 0.0) -> dict[str, 
     NaN where no ray kept to its boundaries.
     """
     exact = case.exact
-    points, direction = (u * x for x in (growth(exact, case.segments, offset) if offset else case.bounds))
+    points, directions = (u * x for x in (growth(exact, case.segments, offset) if offset else case.bounds))
     off = np.hypot(*(paths.points - exact.points).transpose(2, 0, 1)).astype(float)
     # A point that is missing differs by infinity: only what the retrace does not have may be NaN.
     off = np.where(np.isnan(exact.points[..., 0]), 0, np.nan_to_num(off, nan=np.inf))
     turned = np.nan_to_num(np.hypot(*(unit(paths.directions) - exact.directions).T).astype(float), nan=np.inf)
-    ratio = np.maximum(np.nanmax(off / points, axis=1), turned / direction)
+    ratio = np.maximum(np.nanmax(off / points, axis=1), turned / exact.last(directions))
     same = paths.hits == exact.hits
     # Of two segments that share a vertex either is right there, if it does the same to the ray.
     same |= _at_their_vertex(paths.hits, case) & (ratio <= 1)[:, None]
     astray = ~same.all(1) | (paths.events != exact.events).any(1)
-    near = (clearance(exact, case.segments) <= points[:, 1:]).any(1)
+    near = undecided(exact, paths, case.segments, points, directions)
     worst = np.maximum(off.max(1) / case.extent, turned)
     return {
         "boundaries": float(exact.met.max()),
@@ -181,10 +206,3 @@ def _largest(x: Array) -> float:
 def unit(d: Any) -> Array:
     d = np.asarray(d, np.longdouble)
     return d / np.hypot(*d.T)[:, None]
-
-
-def clearance(exact: Retraced, segments: Segments) -> Array:
-    """How far each point is from the nearer end of its boundary (N × D), NaN after the end."""
-    ends = [np.asarray(x)[exact.hits] for x in (segments.start, segments.end)]
-    distance = np.min([np.hypot(*(exact.points[:, 1:] - end).transpose(2, 0, 1)) for end in ends], axis=0)
-    return np.where(exact.hits >= 0, distance, np.nan)

@@ -23,7 +23,7 @@ from mi_refract.rows import Row
 
 from . import planar
 from .plan import Context, Task
-from .planar import EQUAL, Case, judge, unit
+from .planar import Case, budgets, judge, unit
 from .retrace import Array, Retraced
 from .settings import Setting, settings
 
@@ -62,18 +62,14 @@ class Closed:
         d = unit(paths.directions)
         if self.directions is not None:
             return np.hypot(*(d - self.directions).T)
-        to = np.array(self.point) - paths.points[self._last].astype(np.longdouble)
+        to = np.array(self.point) - self.case.exact.last(paths.points).astype(np.longdouble)
         return np.abs(d[:, 0] * to[:, 1] - d[:, 1] * to[:, 0]) / self.reach
 
     @property
     def bound(self) -> Array:
         """Of that error, over u."""
-        points, direction = self.case.bounds
-        return direction if self.directions is not None else points[self._last] / self.reach + direction
-
-    @property
-    def _last(self) -> tuple[Array, Array]:
-        return np.arange(len(self.case.origins)), self.case.exact.met
+        point, direction = map(self.case.exact.last, self.case.bounds)
+        return direction if self.directions is not None else point / self.reach + direction
 
 
 def tasks(context: Context) -> list[Task]:
@@ -96,13 +92,8 @@ def _row(setting: Setting, name: str, closed: Closed) -> Row:
     values = judge(paths, closed.case, setting.roundoff)
     values |= {"error": float(errors.max() * setting.roundoff), "error / u": float(errors.max())}
     values["error / bound"] = max(values["error / bound"], float((errors / closed.bound).max()))
-    budgets = _budgets(setting) | ({"error / u": SPOT} if name == "ellipse lens" else {})
-    return Row(STUDY, "trace", name, setting.label, values, budgets, replay={"rays": len(paths.hits)})
-
-
-def _budgets(setting: Setting) -> dict[str, float]:
-    exact = {"difference": EQUAL, "astray": 0.0} if setting.precision is np.float64 else {}
-    return {"error / bound": 1.0, "astray, far": 0.0} | exact
+    bounds = budgets(setting) | ({"error / u": SPOT} if name == "ellipse lens" else {})
+    return Row(STUDY, "trace", name, setting.label, values, bounds, replay={"rays": len(paths.hits)})
 
 
 # The box -------------------------------------------------------------------------------------------------------
@@ -160,7 +151,7 @@ def _box_row(setting: Setting, count: int, rays: int) -> Row:
     case = box(count, rays)
     values = judge(case.trace(setting), case, setting.roundoff)
     replay = {"rays": rays, "seed": SEED, "reflections": count}
-    return Row(STUDY, "trace", f"box, {count}", setting.label, values, _budgets(setting), replay=replay)
+    return Row(STUDY, "trace", f"box, {count}", setting.label, values, budgets(setting), replay=replay)
 
 
 def _curves_row(setting: Setting) -> Row:

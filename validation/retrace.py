@@ -40,16 +40,20 @@ class Retraced:
         """How many boundaries (N)."""
         return (self.hits >= 0).sum(1)
 
+    def last(self, x: Array) -> Array:
+        """Of N × (D+1) values, those of the last legs."""
+        return x[np.arange(len(x)), self.met]
+
     @property
     def directions(self) -> Array:
-        return self.legs[np.arange(len(self.legs)), self.met]
+        return self.last(self.legs)
 
 
 def retrace(
     segments: Segments, origins: Any, directions: Any, max_depth: int, *, reflect: Any = 0, n_start: Any = None
 ) -> Retraced:
     """What `planar.trace` returns for the same arguments, in numpy's longdouble."""
-    curves = _Curves(segments)
+    curves = Curves(segments)
     p, d = np.atleast_2d(origins).astype(np.longdouble), np.atleast_2d(directions).astype(np.longdouble)
     bits = np.broadcast_to(reflect, len(p))
     n = np.broadcast_to(np.longdouble(np.nan if n_start is None else n_start), len(p))
@@ -60,7 +64,7 @@ def retrace(
     return Retraced(*(np.concatenate([getattr(part, name) for part in parts]) for name in fields))
 
 
-def _follow(curves: _Curves, p: Array, d: Array, max_depth: int, bits: Array, n: Array) -> Retraced:
+def _follow(curves: Curves, p: Array, d: Array, max_depth: int, bits: Array, n: Array) -> Retraced:
     count, found = len(p), _empty(len(p), max_depth)
     alive, last = np.arange(count), np.full(count, -1)
     d, n = d / np.hypot(*d.T)[:, None], n.copy()
@@ -118,7 +122,7 @@ def _cross(a: Array, b: Array) -> Array:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-class _Curves:
+class Curves:
     """The boundaries as implicit curves. `arcs`: the ids of those that are not straight."""
 
     def __init__(self, segments: Segments) -> None:
@@ -127,12 +131,14 @@ class _Curves:
         chord = self.end - self.start
         self.length = np.hypot(*chord.T)
         self.touching = 64 * np.finfo(np.longdouble).eps * np.abs([self.start, self.end]).max(initial=0)
-        control = self.start if segments.control is None else np.asarray(segments.control, np.longdouble)
-        doubled = np.nan_to_num(_cross(chord, control - self.start))  # twice the area, > 0 with the control on the left
-        self.arcs = np.flatnonzero(np.abs(doubled) > 1e-15 * self.length**2)
+        # By definition a segment is straight where its control is, in double precision, the middle of its ends.
+        middle = (np.asarray(segments.start) + np.asarray(segments.end)) / 2
+        control = middle if segments.control is None else np.asarray(segments.control)
+        self.arcs = np.flatnonzero((control != middle).any(1))
         self.place = np.full(len(chord), -1)  # in `arcs`
         self.place[self.arcs] = np.arange(len(self.arcs))
-        self.control, area = control[self.arcs], doubled[self.arcs]
+        self.control = control[self.arcs].astype(np.longdouble)
+        area = _cross(chord[self.arcs], self.control - self.start[self.arcs])  # twice; > 0 with the control on the left
         w = np.ones(len(chord)) if segments.weight is None else np.asarray(segments.weight)
         self.w4 = 4 * w[self.arcs].astype(np.longdouble) ** 2
         # ∇τ₀, ∇τ₁, ∇τ₂ (3 × arcs × 2); each is the opposite edge, turned.
