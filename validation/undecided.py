@@ -46,18 +46,13 @@ def _touches(exact: Retraced, paths: Paths, segments: Segments, points: Array, d
     first = (paths.hits != exact.hits)[rays].argmax(1)
     met = paths.hits[rays, first] >= 0
     rays, first = rays[met], first[met]
-    start, place = paths.points[rays, first], paths.points[rays, first + 1]
+    place, d = paths.points[rays, first + 1], exact.legs[rays, first]
+    way = place - exact.points[rays, first]
     normal, kappa = Curves(segments).normal(place.astype(np.longdouble), paths.hits[rays, first])
-    leg = np.hypot(*(place - start).T)
-    cos2 = (_unit(place - start) * normal).sum(1) ** 2
-    h = points[rays, first] + leg * directions[rays, first]
+    h = points[rays, first] + np.hypot(*way.T) * directions[rays, first]
     found = np.zeros(len(paths.hits), bool)
-    found[rays] = cos2 <= 2 * np.abs(kappa) * h
+    found[rays] = ((d * normal).sum(1) ** 2 <= 2 * np.abs(kappa) * h) & (np.abs(_cross(d, way)) <= h)
     return found
-
-
-def _unit(v: Array) -> Array:
-    return v / np.hypot(*v.T)[:, None]
 
 
 def _cross(a: Array, b: Array) -> Array:
