@@ -1,0 +1,170 @@
+"""What becomes of the rays of a planar scene: the tree of paths into which partial reflections split each of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import planar
+from .planar import Array, Event, Paths, Segments
+from .planar_scene import PlanarScene
+
+LEAST = 1e-3  # of a ray's power: a partial reflection that would carry no more is not followed
+BITS = 32  # boundaries at which a path may be told to reflect
+MOST = 2**24  # legs of one order of reflection: 1 GB of paths
+
+
+@dataclass(frozen=True)
+class Branches:
+    """P paths of N rays, by their number of partial reflections. `paths` has their weights.
+
+    `rays` P: the ray's number. `reflect` P: bit j is set where the path takes the partial reflection at the j-th
+    boundary it meets; no two paths of a ray have the same bits.
+    """
+
+    paths: Paths
+    rays: NDArray[np.intp]
+    reflect: NDArray[np.uint32]
+
+    @property
+    def first(self) -> NDArray[np.intp]:
+        """P: the first leg that is the path's own. The ones before it belong to another path of the same ray."""
+        return np.frexp(self.reflect.astype(float))[1].astype(np.intp)
+
+    @property
+    def own(self) -> NDArray[np.bool_]:
+        """P × (D+1): whether a leg, and the event at its end, is there and is the path's own."""
+        events = self.paths.events
+        return (events != Event.NONE) & (np.arange(events.shape[1]) >= self.first[:, None])
+
+    @property
+    def last(self) -> NDArray[np.intp]:
+        """P: the last leg, and the event that ended the path."""
+        return np.count_nonzero(self.paths.events, axis=1) - 1
+
+    def tips(self, event: Event) -> Array:
+        """Where the paths that ended with `event` were last known to be."""
+        path = np.arange(len(self.rays))
+        return self.paths.points[path, self.last][self.paths.events[path, self.last] == event]
+
+
+def follow(
+    segments: Segments,
+    origins: Array,
+    directions: Array,
+    max_depth: int,
+    branches: int = 0,
+    *,
+    least: float = LEAST,
+    **how: Any,
+) -> Branches:
+    """Paths with up to `branches` partial reflections, of a share of more than `least` of the power each.
+
+    `how`: formula, precision, backend, as for `planar.trace`. A path reflects in part at the first 32 boundaries only.
+    ValueError as there, for a negative number of branches, and for more of them than memory should hold.
+    """
+    if branches < 0:
+        raise ValueError(f"branches = {branches}: accepted: a whole number from 0")
+    rays, reflect = np.arange(len(origins)), np.zeros(len(origins), np.uint32)
+    orders: list[Branches] = []
+    while True:
+        paths = planar.trace(
+            segments, origins[rays], directions[rays], max_depth, reflect=reflect, weights=True, **how
+        )
+        orders.append(Branches(paths, rays, reflect))
+        parent, boundary = np.nonzero(_worth(orders[-1], least))
+        if len(orders) > branches or not parent.size:
+            return _joined(orders)
+        if parent.size * (max_depth + 1) > MOST:
+            size = f"{parent.size} paths with {len(orders)} partial reflections and max_depth = {max_depth}"
+            raise ValueError(f"branches = {branches}: {size}; accepted: at most {MOST} legs")
+        rays, reflect = rays[parent], reflect[parent] | (np.uint32(1) << boundary.astype(np.uint32))
+
+
+def follow_scene(scene: PlanarScene, **how: Any) -> tuple[Branches, ...]:
+    """The paths of a scene, for each of its colours; see `follow`."""
+    rays = scene.origins, scene.directions, scene.max_depth, scene.branches
+    return tuple(follow(segments, *rays, **how) for segments in scene.segments)
+
+
+def _worth(branches: Branches, least: float) -> NDArray[np.bool_]:
+    """P × D: whether the path refracts at that boundary of its own and reflects more than `least` there."""
+    weights = branches.paths.weights
+    assert weights is not None
+    refracted = branches.own[:, :-1] & (branches.paths.events[:, :-1] == Event.REFRACTED)
+    refracted[:, BITS:] = False
+    with np.errstate(invalid="ignore"):
+        return refracted & (weights[:, :-1] - weights[:, 1:] > least)
+
+
+def _joined(orders: Sequence[Branches]) -> Branches:
+    if len(orders) == 1:
+        return orders[0]
+    columns = {f.name: np.concatenate([getattr(o.paths, f.name) for o in orders]) for f in fields(Paths)}
+    rays, reflect = (np.concatenate([getattr(o, name) for o in orders]) for name in ("rays", "reflect"))
+    return Branches(Paths(**columns), rays, reflect)
+
+
+# In words and numbers --------------------------------------------------------------------------------------------
+
+
+def count(traced: Sequence[Branches]) -> Counter[str]:
+    """Events by name, each once though it be on several paths; REFLECTED are those that leave no choice."""
+    total: Counter[str] = Counter()
+    for branches in traced:
+        events = branches.paths.events[branches.own]
+        total.update({event.name: int(np.count_nonzero(events == event)) for event in Event})
+    return total
+
+
+def summary(scene: PlanarScene, traced: Sequence[Branches]) -> str:
+    """One line: how many rays, and what became of them."""
+    n = count(traced)
+    paths = sum(len(branches.rays) for branches in traced)
+    colours = f" in {len(traced)} colours" if len(traced) > 1 else ""
+    split = f", {paths} paths" if paths > len(scene.origins) * len(traced) else ""
+    return (
+        f"{len(scene.origins)} rays{colours}{split}, {n['REFRACTED'] + n['REFLECTED']} boundaries met, "
+        f"{n['REFLECTED']} reflected totally, {n['ESCAPED']} escaped, {n['EXHAUSTED']} exhausted, "
+        f"{n['CONTRADICTED']} contradicted"
+    )
+
+
+def as_data(scene: PlanarScene, traced: Sequence[Branches]) -> dict[str, Any]:
+    """What `mi-refract trace --json` prints: per colour the paths, each as long as it is; null for what is unknown."""
+    colours = zip(scene.colours, traced, strict=True)
+    return {
+        "scene": str(scene.path),
+        "title": scene.title,
+        "max_depth": scene.max_depth,
+        "branches": scene.branches,
+        "counts": {name.lower(): number for name, number in count(traced).items() if name != "NONE"},
+        "colours": [{"colour": colour or None, "paths": list(_paths(scene, b))} for colour, b in colours],
+    }
+
+
+def _paths(scene: PlanarScene, branches: Branches) -> Iterator[dict[str, Any]]:
+    paths = branches.paths
+    assert paths.weights is not None
+    for i, last in enumerate(branches.last):
+        ray = int(branches.rays[i])
+        yield {
+            "ray": ray,
+            "beam": int(scene.beams[ray]),
+            "reflect": int(branches.reflect[i]),
+            "points": paths.points[i, : last + 1].tolist(),
+            "direction": paths.directions[i].tolist(),
+            "hits": paths.hits[i, :last].tolist(),
+            "events": [Event(event).name.lower() for event in paths.events[i, : last + 1]],
+            "indices": _nullable(paths.indices[i, : last + 1]),
+            "weights": _nullable(paths.weights[i, : last + 1]),
+        }
+
+
+def _nullable(numbers: Array) -> list[float | None]:
+    return [x if np.isfinite(x) else None for x in numbers.tolist()]

@@ -1,0 +1,206 @@
+"""Pictures of planar scenes: media shaded by index, boundaries, and rays as strong as they are bright.
+
+A few rays are drawn as lines. Of many, what is drawn is their density, accumulated in floating point: a line of
+little power among thousands has an opacity of less than the 1/255 that graphics libraries know.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .branches import Branches, count, summary
+from .planar import Event, Segments
+from .planar_scene import PlanarScene
+from .strokes import SHARED, Legs, View, around, curves, density, legs
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FORMATS = (".svg", ".png", ".pdf")
+VECTORS = 2000  # lines that are drawn one by one; of more of them, the density
+DPI = 200
+RAY, WHITE, INK, MUTED = "#c8102e", "#55504c", "#222222", "#6b6b6b"  # WHITE: of all colours, on paper
+DENSE, THIN = (0.70, 0.82, 0.94), (0.99, 0.90, 0.68)  # tints of the media that differ most from what is around all
+NAMED = 5  # media in the legend
+TYPICAL = 0.35  # −log(1 − opacity) of the median pixel that rays touch, where their density is drawn
+MARKS = {
+    Event.EXHAUSTED: ("o", "○ {} stopped after `max_depth` boundaries, with another one ahead"),
+    Event.CONTRADICTED: ("x", "× {} stopped: the next boundary does not border on the medium that the ray is in"),
+}
+STYLE: dict[str, Any] = {
+    "svg.hashsalt": "mi_refract",  # the same scene gives the same bytes
+    "text.parse_math": False,
+    "font.size": 9,
+    "axes.edgecolor": "#b5b5b5",
+    "axes.linewidth": 0.6,
+    "axes.labelcolor": MUTED,
+    "axes.titlecolor": INK,
+    "axes.titlesize": 11,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 21,
+    "xtick.color": "#b5b5b5",
+    "ytick.color": "#b5b5b5",
+    "xtick.labelcolor": MUTED,
+    "ytick.labelcolor": MUTED,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "legend.labelcolor": INK,
+}
+
+
+def picture(scene: PlanarScene, traced: Sequence[Branches], suffix: str) -> bytes:
+    """The file's content, in the format of `suffix`, one of FORMATS. The same arguments give the same bytes.
+
+    ValueError where matplotlib is missing.
+    """
+    require_matplotlib()
+    import matplotlib
+
+    view = scene.view or around(scene, traced)
+    with matplotlib.rc_context(STYLE):
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=_size(view), dpi=DPI, layout="constrained")
+        figure.get_layout_engine().set(w_pad=0.12, h_pad=0.12)
+        panel = figure.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal")
+        panel.set_title(scene.title)
+        _media(panel, scene)
+        _boundaries(panel, scene.segments[0])
+        _rays(figure, panel, scene, legs(traced, view))
+        _ends(panel, traced)
+        panel.set_xlabel(_caption(scene, traced), loc="left", fontsize=7.5)
+        buffer = io.BytesIO()
+        dates = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}, ".png": {}}
+        figure.savefig(buffer, format=suffix[1:], dpi="figure", metadata=dates[suffix])
+    return buffer.getvalue()
+
+
+def require_matplotlib() -> None:
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ValueError("pictures need the extra `plot`: pip install 'mi-refract[plot]'")
+
+
+def _size(view: View) -> tuple[float, float]:
+    """Of the figure, in inches: about as large a picture whatever its shape, and room for the words."""
+    aspect = min(max((view[1] - view[0]) / (view[3] - view[2]), 0.25), 4)
+    height = min(5.2 / aspect**0.5, 7.0)
+    return max(height * aspect, 3.6) + 0.5, height + 0.9
+
+
+# Media and boundaries ----------------------------------------------------------------------------------------------
+
+
+def _media(panel: Axes, scene: PlanarScene) -> None:
+    """Regions tinted by index, paler the nearer it is to that around everything; a legend, or a scale of many."""
+    from matplotlib.patches import Patch, Polygon
+
+    around = float(np.mean(scene.index))
+    means = [float(np.mean(region.indices)) for region in scene.regions]
+    most = max((abs(n - around) for n in means), default=0)
+    tints = {n: _tint((n - around) / (most or 1)) for n in (around, *means)}
+    panel.set_facecolor(tints[around])
+    for region, n in zip(scene.regions, means, strict=True):
+        panel.add_patch(Polygon(region.outline, facecolor=tints[n], edgecolor="none", zorder=0.5))
+    labels = {around: _label(scene.index)} | {n: _label(r.indices) for r, n in zip(scene.regions, means, strict=True)}
+    shown = sorted(labels)
+    if len(shown) > NAMED:  # of many layers the ends and some between
+        shown = [shown[round(i * (len(shown) - 1) / (NAMED - 1))] for i in range(NAMED)]
+    patches = [Patch(facecolor=tints[n], edgecolor="#999999", linewidth=0.5, label=labels[n]) for n in shown]
+    place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.1, "borderpad": 0.2}
+    panel.legend(handles=patches, ncols=len(patches), handlelength=1.2, columnspacing=1.2, **place)
+
+
+def _tint(contrast: float) -> tuple[float, float, float]:
+    """−1 … 1: how far an index is from that around everything. Denser media are blue, thinner ones yellow."""
+    red, green, blue = DENSE if contrast > 0 else THIN
+    share = abs(contrast) and 0.25 + 0.75 * abs(contrast)
+    return 1 - share * (1 - red), 1 - share * (1 - green), 1 - share * (1 - blue)
+
+
+def _label(indices: Sequence[float]) -> str:
+    low, high = (f"{n:.4g}" for n in (min(indices), max(indices)))
+    return f"n = {low}" if low == high else f"n = {low} – {high}"
+
+
+def _boundaries(panel: Axes, segments: Segments) -> None:
+    from matplotlib.collections import LineCollection
+
+    many = len(segments) > VECTORS
+    lines = curves(segments, 5 if many else 33)
+    style: dict[str, Any] = {"colors": INK, "linewidths": 0.7, "capstyle": "round", "zorder": 1.5}
+    panel.add_collection(LineCollection(lines, rasterized=many, **style), autolim=False)
+    panel.plot(0, 0, "+", color=MUTED, markersize=5, markeredgewidth=0.6, zorder=1.4, scalex=False, scaley=False)
+
+
+# Rays ------------------------------------------------------------------------------------------------------------
+
+
+def strength(weight: Any) -> Any:
+    """How strongly a ray is drawn: the square root of its share of the power, or 4 % would not be seen."""
+    return np.sqrt(weight)
+
+
+def _rays(figure: Figure, panel: Axes, scene: PlanarScene, lines: Legs) -> None:
+    from matplotlib.colors import to_rgb
+
+    colours = {i: np.array(to_rgb(name or RAY)) for i, name in enumerate(scene.colours)}
+    colours[SHARED] = np.array(to_rgb(WHITE))
+    if len(lines) > VECTORS:
+        _shade(figure, panel, lines, colours)
+    elif len(lines):
+        _stroke(panel, lines, colours)
+
+
+def _stroke(panel: Axes, lines: Legs, colours: dict[int, Any]) -> None:
+    """One line each, thinner and fainter the more there are; the strongest on top."""
+    from matplotlib.collections import LineCollection
+
+    crowd = min(1.0, (120 / len(lines)) ** 0.5)
+    order = np.argsort(lines.weight, kind="stable")
+    opacity = np.maximum(strength(lines.weight[order]) * max(crowd, 0.35), 0.02)
+    rgba = np.column_stack([np.array([colours[c] for c in lines.colour[order]]), opacity])
+    strokes = np.stack([lines.start, lines.end], axis=1)[order]
+    width = 0.45 + 0.75 * crowd
+    panel.add_collection(LineCollection(list(strokes), colors=rgba, linewidths=width, zorder=2), autolim=False)
+
+
+def _shade(figure: Figure, panel: Axes, lines: Legs, colours: dict[int, Any]) -> None:
+    """The density as a picture of the size that the panel has in this figure: opacity 1 − exp(−density)."""
+    figure.draw_without_rendering()  # settles the layout
+    box = panel.get_window_extent()
+    view = *panel.get_xlim(), *panel.get_ylim()
+    width, height = max(round(box.width), 1), max(round(box.height), 1)
+    layers = {}
+    for number in np.unique(lines.colour).tolist():
+        layer = lines.where(lines.colour == number)
+        layers[number] = density(layer, strength(layer.weight), view, width, height)
+    total = sum(layers.values())
+    mixed = sum(layer[..., None] * colours[number] for number, layer in layers.items())
+    pixels = np.empty((height, width, 4))
+    pixels[..., :3] = np.divide(mixed, total[..., None], out=np.ones_like(mixed), where=total[..., None] > 0)
+    pixels[..., 3] = -np.expm1(-total * TYPICAL / np.median(total[total > 0]))
+    style: dict[str, Any] = {"extent": view, "origin": "lower", "interpolation": "none", "aspect": "equal", "zorder": 2}
+    panel.imshow((pixels * 255).round().astype(np.uint8), **style)
+
+
+def _ends(panel: Axes, traced: Sequence[Branches]) -> None:
+    """A mark where a path ended otherwise than by escaping."""
+    for event, (mark, _) in MARKS.items():
+        ends = np.concatenate([branches.tips(event) for branches in traced])
+        if len(ends):
+            style: dict[str, Any] = {"color": INK, "markersize": 5, "markeredgewidth": 0.9, "fillstyle": "none"}
+            panel.plot(*ends.T, mark, zorder=3, scalex=False, scaley=False, **style)
+
+
+def _caption(scene: PlanarScene, traced: Sequence[Branches]) -> str:
+    numbers = count(traced)
+    notes = [text.format(numbers[event.name]) for event, (_, text) in MARKS.items() if numbers[event.name]]
+    return "\n".join([f"{scene.path.name}: {summary(scene, traced)}", *notes])
