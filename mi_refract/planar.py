@@ -16,25 +16,38 @@ Source: document 004, with its slips corrected (README, Errata).
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .crossings import Arcs, Straight
+from .lanes import lanes
+from .walks import Event, Walker
+
+__all__ = ["Event", "Paths", "Segments", "Tracer", "trace"]
+
 Array = NDArray[np.float64]
 
+SHAPES: dict[str, tuple[int, ...]] = {
+    "start": (2,), "end": (2,), "n_left": (), "n_right": (), "control": (2,), "weight": ()
+}  # fmt: skip
 
-class Event(IntEnum):
-    """What became of a ray at a boundary, and how its path ended."""
 
-    NONE = 0  # after the end
-    REFRACTED = 1
-    REFLECTED = 2
-    ESCAPED = 3  # no boundary left to meet
-    EXHAUSTED = 4  # `max_depth` boundaries met, and another one ahead
-    CONTRADICTED = 5  # the next boundary's near side is not the ray's medium
+def _numbers(name: str, values: Any, shape: tuple[int, ...]) -> Array:
+    """As float64 of that shape, finite; ValueError otherwise."""
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: accepted: numbers of shape {shape}") from None
+    if array.shape != shape:
+        raise ValueError(f"{name}: shape {array.shape}; accepted: {shape}")
+    if not np.isfinite(array).all():
+        place = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise ValueError(f"{name}{list(place)} = {array[place]}: accepted: finite numbers")
+    return array
 
 
 @dataclass(frozen=True)
@@ -55,8 +68,48 @@ class Segments:
     control: Array | None = None
     weight: Array | None = None
 
+    def __post_init__(self) -> None:
+        for name, shape in SHAPES.items():
+            values = getattr(self, name)
+            if values is None and name in ("control", "weight"):
+                continue
+            values = _numbers(f"segments.{name}", values, (np.atleast_1d(self.start).shape[0], *shape))
+            object.__setattr__(self, name, values)
+        if len(self) == 0:
+            raise ValueError("segments: none; accepted: at least one")
+        if (self.control is None) != (self.weight is None):
+            raise ValueError("segments: control and weight: accepted: both or neither")
+        for name in ("n_left", "n_right", "weight"):
+            values = getattr(self, name)
+            if values is not None and not (values > 0).all():
+                i = int(np.argmin(values > 0))
+                raise ValueError(f"segments.{name}[{i}] = {values[i]}: accepted: more than 0")
+        self._distinct()
+
     def __len__(self) -> int:
         return len(self.start)
+
+    @property
+    def curved(self) -> bool:
+        return self.control is not None
+
+    @functools.cached_property
+    def vertices(self) -> NDArray[np.uint32]:
+        """M × 2 numbers, equal for equal ends; of no meaning otherwise."""
+        places = np.concatenate([self.start, self.end]) + 0.0  # −0 is 0
+        _, numbers = np.unique(places.view(complex).ravel(), return_inverse=True)
+        return numbers.reshape(2, -1).T.astype(np.uint32)
+
+    def _distinct(self) -> None:
+        """Two that coincide have no first one of them."""
+        ends = np.sort(self.vertices, axis=1).astype(np.uint64)
+        bulge = np.zeros((len(self), 2)) if self.control is None else self.control
+        key = np.column_stack([ends[:, 0] << np.uint64(32) | ends[:, 1], bulge.view(np.uint64)])
+        order = np.lexsort(key.T)
+        same = (np.diff(key[order].astype(np.int64), axis=0) == 0).all(1) & (ends[order[1:], 0] != ends[order[1:], 1])
+        if same.any():
+            i, j = sorted(order[int(np.argmax(same)) :][:2].tolist())
+            raise ValueError(f"segments {i} and {j} coincide; accepted: one, with the media on either side of both")
 
 
 @dataclass(frozen=True)
@@ -78,26 +131,63 @@ class Paths:
     weights: Array | None = None
 
 
+
 def trace(
     segments: Segments,
     origins: Any,
     directions: Any,
     max_depth: int,
     *,
-    formula: str = "rotated",
+    formula: str | None = None,
     precision: str = "float64",
     backend: str | None = None,
-    method: str = "auto",
     reflect: Any = 0,
     n_start: Any = None,
     weights: bool = False,
 ) -> Paths:
     """Follow rays from `origins` along `directions` (N × 2) until they escape or have met `max_depth` boundaries.
 
-    `formula`: a key of FORMULAS for the direction. `precision`: "float64" or "float32". `backend`: "llvm", "cuda" or
-    "scalar"; None for the best on this machine. `reflect`: bits, one number or N; where bit j is set the ray is
-    reflected at the j-th boundary it meets (from 0), though it might be refracted. `n_start`: index of the medium in
-    which rays start (N or one). `weights`: fill `Paths.weights`.
+    `formula`: a key of FORMULAS for the direction; None: that of document 004. `precision`: "float64" or "float32".
+    `backend`: "llvm", "cuda" or "scalar"; None for the best on this machine. `reflect`: bits, one number or N; where
+    bit j is set the ray is reflected at the j-th boundary it meets (from 0, below 32), though it might be refracted.
+    `n_start`: index of the medium in which rays start (N or one). `weights`: fill `Paths.weights`.
     ValueError for what is none of these, and for origins or directions that are not finite, or no direction.
     """
-    raise NotImplementedError
+    tracer = Tracer(segments, formula=formula, precision=precision, backend=backend)
+    return tracer(origins, directions, max_depth, reflect=reflect, n_start=n_start, weights=weights)
+
+
+class Tracer:
+    """`trace` for one set of segments, set up once; arguments and errors as there."""
+
+    def __init__(
+        self, segments: Segments, *, formula: str | None = None, precision: str = "float64", backend: str | None = None
+    ) -> None:
+        self.lanes = to = lanes(backend, precision)
+        ends = segments.start, segments.end, segments.vertices
+        shapes = (segments.control, segments.weight) if segments.curved else None
+        boundaries = Arcs(to, *ends, *shapes) if shapes else Straight(to, *ends)
+        self.walker = Walker(to, boundaries, np.column_stack([segments.n_left, segments.n_right]), formula)
+
+    def __call__(
+        self, origins: Any, directions: Any, max_depth: int, *, reflect: Any = 0, n_start: Any = None,
+        weights: bool = False,
+    ) -> Paths:  # fmt: skip
+        origins = _numbers("origins", origins, (len(origins), 2) if np.ndim(origins) else (0, 2))
+        directions = _numbers("directions", directions, origins.shape)
+        if not directions.any(axis=1).all():
+            raise ValueError(f"directions[{int(np.argmin(directions.any(axis=1)))}] = (0, 0): accepted: a direction")
+        if not isinstance(max_depth, int | np.integer) or max_depth < 1:
+            raise ValueError(f"max_depth = {max_depth!r}: accepted: a whole number, 1 or more")
+        bits = np.broadcast_to(np.asarray(reflect, dtype=np.uint32), len(origins))
+        index = np.broadcast_to(np.asarray(np.nan if n_start is None else n_start, dtype=float), len(origins))
+        found = self.walker(np.column_stack([origins, directions, index]), bits, max_depth, weights)
+        points = np.concatenate([origins.T[:, None], found["place"]], 1)
+        return Paths(
+            points.transpose(2, 1, 0),
+            found["direction"][:, 0].T,
+            found["hit"].T,
+            found["event"].T,
+            found["index"].T,
+            found["power"].T if weights else None,
+        )
