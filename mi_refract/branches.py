@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import planar
-from .planar import Array, Event, Paths, Segments
+from .planar import Array, Event, Paths, Segments, Tracer
 from .planar_scene import PlanarScene
+from .walks import REFLECT_BITS
 
 LEAST = 1e-3  # of a ray's power: a partial reflection that would carry no more is not followed
-BITS = 32  # boundaries at which a path may be told to reflect
 MOST = 2**24  # legs of one order of reflection: 1 GB of paths
 
 
@@ -44,13 +43,19 @@ class Branches:
 
     @property
     def last(self) -> NDArray[np.intp]:
-        """P: the last leg, and the event that ended the path."""
+        """P: the number of the last leg."""
         return np.count_nonzero(self.paths.events, axis=1) - 1
 
-    def tips(self, event: Event) -> Array:
-        """Where the paths that ended with `event` were last known to be."""
-        path = np.arange(len(self.rays))
-        return self.paths.points[path, self.last][self.paths.events[path, self.last] == event]
+    @property
+    def end(self) -> NDArray[np.uint8]:
+        """P: the event that ended the path."""
+        return self.paths.events[np.arange(len(self.rays)), self.last]
+
+    @property
+    def tips(self) -> Array:
+        """P × 2: the last place where the path met a boundary, or its origin."""
+        places = np.isfinite(self.paths.points[..., 0]).sum(axis=1)
+        return self.paths.points[np.arange(len(self.rays)), places - 1]
 
 
 def follow(
@@ -65,17 +70,16 @@ def follow(
 ) -> Branches:
     """Paths with up to `branches` partial reflections, of a share of more than `least` of the power each.
 
-    `how`: formula, precision, backend, as for `planar.trace`. A path reflects in part at the first 32 boundaries only.
+    `how`: formula, precision, backend, as for `planar.trace`. A path reflects in part at its first 32 boundaries only.
     ValueError as there, for a negative number of branches, and for more of them than memory should hold.
     """
     if branches < 0:
         raise ValueError(f"branches = {branches}: accepted: a whole number from 0")
+    trace = Tracer(segments, **how)
     rays, reflect = np.arange(len(origins)), np.zeros(len(origins), np.uint32)
     orders: list[Branches] = []
     while True:
-        paths = planar.trace(
-            segments, origins[rays], directions[rays], max_depth, reflect=reflect, weights=True, **how
-        )
+        paths = trace(origins[rays], directions[rays], max_depth, reflect=reflect, weights=True)
         orders.append(Branches(paths, rays, reflect))
         parent, boundary = np.nonzero(_worth(orders[-1], least))
         if len(orders) > branches or not parent.size:
@@ -92,12 +96,26 @@ def follow_scene(scene: PlanarScene, **how: Any) -> tuple[Branches, ...]:
     return tuple(follow(segments, *rays, **how) for segments in scene.segments)
 
 
+def with_rays(scene: PlanarScene, count: int) -> PlanarScene:
+    """Every beam of several rays with `count` of them, at places and angles between those that it has."""
+    parts = []
+    for beam in np.unique(scene.beams):
+        origins, directions = scene.origins[scene.beams == beam], scene.directions[scene.beams == beam]
+        have = np.arange(len(origins))
+        want = np.linspace(0, have[-1], count) if len(have) > 1 else have
+        angle = np.interp(want, have, np.unwrap(np.arctan2(directions[:, 1], directions[:, 0])))
+        places = np.column_stack([np.interp(want, have, x) for x in origins.T])
+        parts.append((places, np.column_stack([np.cos(angle), np.sin(angle)]), np.full(len(want), beam)))
+    origins, directions, beams = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return replace(scene, origins=origins, directions=directions, beams=beams)
+
+
 def _worth(branches: Branches, least: float) -> NDArray[np.bool_]:
     """P × D: whether the path refracts at that boundary of its own and reflects more than `least` there."""
     weights = branches.paths.weights
     assert weights is not None
     refracted = branches.own[:, :-1] & (branches.paths.events[:, :-1] == Event.REFRACTED)
-    refracted[:, BITS:] = False
+    refracted[:, REFLECT_BITS:] = False
     with np.errstate(invalid="ignore"):
         return refracted & (weights[:, :-1] - weights[:, 1:] > least)
 
@@ -123,16 +141,20 @@ def count(traced: Sequence[Branches]) -> Counter[str]:
 
 
 def summary(scene: PlanarScene, traced: Sequence[Branches]) -> str:
-    """One line: how many rays, and what became of them."""
+    """One line: how many rays, and what became of them; what did not happen is left out."""
     n = count(traced)
     paths = sum(len(branches.rays) for branches in traced)
     colours = f" in {len(traced)} colours" if len(traced) > 1 else ""
     split = f", {paths} paths" if paths > len(scene.origins) * len(traced) else ""
-    return (
-        f"{len(scene.origins)} rays{colours}{split}, {n['REFRACTED'] + n['REFLECTED']} boundaries met, "
-        f"{n['REFLECTED']} reflected totally, {n['ESCAPED']} escaped, {n['EXHAUSTED']} exhausted, "
-        f"{n['CONTRADICTED']} contradicted"
-    )
+    ends = {
+        "reflected totally": n["REFLECTED"],
+        "escaped": n["ESCAPED"],
+        "exhausted": n["EXHAUSTED"],
+        "contradicted": n["CONTRADICTED"],
+    }
+    met = f"{n['REFRACTED'] + n['REFLECTED'] + n['CONTRADICTED']} boundaries met"
+    said = ", ".join([met, *(f"{number} {what}" for what, number in ends.items() if number)])
+    return f"{len(scene.origins)} rays{colours}{split}, {said}"
 
 
 def as_data(scene: PlanarScene, traced: Sequence[Branches]) -> dict[str, Any]:
@@ -152,14 +174,14 @@ def _paths(scene: PlanarScene, branches: Branches) -> Iterator[dict[str, Any]]:
     paths = branches.paths
     assert paths.weights is not None
     for i, last in enumerate(branches.last):
-        ray = int(branches.rays[i])
+        ray, points = int(branches.rays[i]), paths.points[i]
         yield {
             "ray": ray,
             "beam": int(scene.beams[ray]),
             "reflect": int(branches.reflect[i]),
-            "points": paths.points[i, : last + 1].tolist(),
+            "points": points[np.isfinite(points[:, 0])].tolist(),
             "direction": paths.directions[i].tolist(),
-            "hits": paths.hits[i, :last].tolist(),
+            "hits": paths.hits[i, paths.hits[i] >= 0].tolist(),
             "events": [Event(event).name.lower() for event in paths.events[i, : last + 1]],
             "indices": _nullable(paths.indices[i, : last + 1]),
             "weights": _nullable(paths.weights[i, : last + 1]),

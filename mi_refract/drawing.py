@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import textwrap
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .branches import Branches, count, summary
+from .files import write_atomically
 from .planar import Event, Segments
 from .planar_scene import PlanarScene
 from .strokes import SHARED, Legs, View, around, curves, density, legs
@@ -24,15 +27,16 @@ if TYPE_CHECKING:
 
 FORMATS = (".svg", ".png", ".pdf")
 VECTORS = 2000  # lines that are drawn one by one; of more of them, the density
-DPI = 200
+DPI = {".png": 200, ".svg": 150, ".pdf": 150}  # of what is not lines, in the last two
 RAY, WHITE, INK, MUTED = "#c8102e", "#55504c", "#222222", "#6b6b6b"  # WHITE: of all colours, on paper
-DENSE, THIN = (0.70, 0.82, 0.94), (0.99, 0.90, 0.68)  # tints of the media that differ most from what is around all
+DENSE, THIN = (0.78, 0.88, 0.97), (1.00, 0.93, 0.74)  # tints of the media that differ most from what is around all
 NAMED = 5  # media in the legend
-TYPICAL = 0.35  # −log(1 − opacity) of the median pixel that rays touch, where their density is drawn
+TYPICAL = 0.35  # opacity/(1 − opacity) of the median pixel that rays touch, where their density is drawn
 MARKS = {
     Event.EXHAUSTED: ("o", "○ {} stopped after `max_depth` boundaries, with another one ahead"),
     Event.CONTRADICTED: ("x", "× {} stopped: the next boundary does not border on the medium that the ray is in"),
 }
+UNDATED: dict[str, Any] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}, ".png": {}}
 STYLE: dict[str, Any] = {
     "svg.hashsalt": "mi_refract",  # the same scene gives the same bytes
     "text.parse_math": False,
@@ -56,30 +60,37 @@ STYLE: dict[str, Any] = {
 }
 
 
-def picture(scene: PlanarScene, traced: Sequence[Branches], suffix: str) -> bytes:
-    """The file's content, in the format of `suffix`, one of FORMATS. The same arguments give the same bytes.
+def save(path: Path, scene: PlanarScene, traced: Sequence[Branches]) -> None:
+    """Write the picture, in the format of the path's suffix, one of FORMATS.
 
-    ValueError where matplotlib is missing.
+    ValueError as for `picture`; OSError for what cannot be written. Then no file is there, or the old one.
     """
+    content = picture(scene, traced, path.suffix.lower())
+    try:
+        write_atomically(path, content)
+    except OSError as error:
+        raise OSError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def picture(scene: PlanarScene, traced: Sequence[Branches], suffix: str) -> bytes:
+    """The content of such a file. The same arguments give the same bytes. ValueError where matplotlib is missing."""
     require_matplotlib()
     import matplotlib
 
-    view = scene.view or around(scene, traced)
     with matplotlib.rc_context(STYLE):
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=_size(view), dpi=DPI, layout="constrained")
-        figure.get_layout_engine().set(w_pad=0.12, h_pad=0.12)
-        panel = figure.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal")
-        panel.set_title(scene.title)
+        view = scene.view or around(scene, traced)
+        figure = Figure(figsize=_size(view), dpi=DPI[suffix], layout="constrained")
+        panel = figure.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal", title=scene.title)
+        panel.set_xlabel(_caption(scene, traced, int(14 * figure.get_figwidth())), loc="left", fontsize=7.5)
         _media(panel, scene)
+        _settle(figure)
         _boundaries(panel, scene.segments[0])
-        _rays(figure, panel, scene, legs(traced, view))
+        _rays(panel, scene, legs(traced, view))
         _ends(panel, traced)
-        panel.set_xlabel(_caption(scene, traced), loc="left", fontsize=7.5)
         buffer = io.BytesIO()
-        dates = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}, ".png": {}}
-        figure.savefig(buffer, format=suffix[1:], dpi="figure", metadata=dates[suffix])
+        figure.savefig(buffer, format=suffix[1:], dpi="figure", metadata=UNDATED[suffix])
     return buffer.getvalue()
 
 
@@ -93,6 +104,16 @@ def _size(view: View) -> tuple[float, float]:
     aspect = min(max((view[1] - view[0]) / (view[3] - view[2]), 0.25), 4)
     height = min(5.2 / aspect**0.5, 7.0)
     return max(height * aspect, 3.6) + 0.5, height + 0.9
+
+
+def _settle(figure: Figure) -> None:
+    """From here on everything stays in its place, and an image can have as many pixels as there are for it."""
+    layout = figure.get_layout_engine()
+    assert layout is not None
+    layout.set(w_pad=0.12, h_pad=0.12)  # type: ignore[call-arg]
+    for _ in range(2):  # the first time it is not known yet where the title comes to be
+        figure.draw_without_rendering()
+    figure.set_layout_engine("none")
 
 
 # Media and boundaries ----------------------------------------------------------------------------------------------
@@ -148,13 +169,13 @@ def strength(weight: Any) -> Any:
     return np.sqrt(weight)
 
 
-def _rays(figure: Figure, panel: Axes, scene: PlanarScene, lines: Legs) -> None:
+def _rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
     from matplotlib.colors import to_rgb
 
     colours = {i: np.array(to_rgb(name or RAY)) for i, name in enumerate(scene.colours)}
     colours[SHARED] = np.array(to_rgb(WHITE))
     if len(lines) > VECTORS:
-        _shade(figure, panel, lines, colours)
+        _shade(panel, lines, colours)
     elif len(lines):
         _stroke(panel, lines, colours)
 
@@ -172,35 +193,47 @@ def _stroke(panel: Axes, lines: Legs, colours: dict[int, Any]) -> None:
     panel.add_collection(LineCollection(list(strokes), colors=rgba, linewidths=width, zorder=2), autolim=False)
 
 
-def _shade(figure: Figure, panel: Axes, lines: Legs, colours: dict[int, Any]) -> None:
-    """The density as a picture of the size that the panel has in this figure: opacity 1 − exp(−density)."""
-    figure.draw_without_rendering()  # settles the layout
+def _shade(panel: Axes, lines: Legs, colours: dict[int, Any]) -> None:
+    """The density as an image, with as many pixels as the panel has in this figure."""
     box = panel.get_window_extent()
     view = *panel.get_xlim(), *panel.get_ylim()
     width, height = max(round(box.width), 1), max(round(box.height), 1)
     layers = {}
-    for number in np.unique(lines.colour).tolist():
+    for number in colours:
         layer = lines.where(lines.colour == number)
         layers[number] = density(layer, strength(layer.weight), view, width, height)
-    total = sum(layers.values())
-    mixed = sum(layer[..., None] * colours[number] for number, layer in layers.items())
-    pixels = np.empty((height, width, 4))
-    pixels[..., :3] = np.divide(mixed, total[..., None], out=np.ones_like(mixed), where=total[..., None] > 0)
-    pixels[..., 3] = -np.expm1(-total * TYPICAL / np.median(total[total > 0]))
     style: dict[str, Any] = {"extent": view, "origin": "lower", "interpolation": "none", "aspect": "equal", "zorder": 2}
-    panel.imshow((pixels * 255).round().astype(np.uint8), **style)
+    panel.imshow(_blend(layers, colours), **style)
+
+
+def _blend(layers: dict[int, Any], colours: dict[int, Any]) -> Any:
+    """Densities by colour → RGBA in bytes. As much of all colours is the colour of what they have in common."""
+    shared = layers.pop(SHARED)
+    parts = np.stack(list(layers.values())) / len(layers)
+    common = parts.min(axis=0) * (len(layers) > 1)
+    shared = shared + common * len(layers)
+    total = shared + (parts - common).sum(axis=0)
+    mixed = shared[..., None] * colours[SHARED]
+    for part, number in zip(parts - common, layers, strict=True):
+        mixed += part[..., None] * colours[number]
+    dense = total * TYPICAL / np.median(total[total > 0])
+    colour = np.divide(mixed, total[..., None], out=np.ones_like(mixed), where=total[..., None] > 0)
+    pixels = np.dstack([colour, dense / (1 + dense)])  # without saturating as soon as 1 − exp(−dense) does
+    return (pixels * 255).round().astype(np.uint8)
 
 
 def _ends(panel: Axes, traced: Sequence[Branches]) -> None:
     """A mark where a path ended otherwise than by escaping."""
     for event, (mark, _) in MARKS.items():
-        ends = np.concatenate([branches.tips(event) for branches in traced])
-        if len(ends):
-            style: dict[str, Any] = {"color": INK, "markersize": 5, "markeredgewidth": 0.9, "fillstyle": "none"}
-            panel.plot(*ends.T, mark, zorder=3, scalex=False, scaley=False, **style)
+        ends = np.concatenate([branches.tips[branches.end == event] for branches in traced])
+        size = min(1.0, (40 / max(len(ends), 1)) ** 0.5)
+        style: dict[str, Any] = {"markersize": 1 + 4 * size, "markeredgewidth": 0.9 * size, "fillstyle": "none"}
+        panel.plot(*ends.T, mark, color=INK, zorder=3, scalex=False, scaley=False, **style)
 
 
-def _caption(scene: PlanarScene, traced: Sequence[Branches]) -> str:
+def _caption(scene: PlanarScene, traced: Sequence[Branches], width: int) -> str:
+    """In lines of at most `width` characters."""
     numbers = count(traced)
     notes = [text.format(numbers[event.name]) for event, (_, text) in MARKS.items() if numbers[event.name]]
-    return "\n".join([f"{scene.path.name}: {summary(scene, traced)}", *notes])
+    lines = [f"{scene.path.name}: {summary(scene, traced)}", *notes]
+    return "\n".join(part for line in lines for part in textwrap.wrap(line, width))

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .branches import BITS, Branches
+from .branches import Branches
 from .planar import Array, Event
 from .planar_scene import PlanarScene
+from .walks import REFLECT_BITS
 
 Point = tuple[float, float]
 PARALLEL = 1e-9  # sine of an angle: two lines below that have no crossing worth naming
@@ -27,7 +28,7 @@ class Spread:
     `focus`: the point of least RMS distance from all the rays' lines, `virtual` where it lies behind most of them.
     `spot`: where the rays' mean meets the plane across it in which their RMS distance from their centre, `rms`, is
     smallest; `largest` is the largest such distance. None where a ray is more than 89° off the mean direction.
-    `marginal`, `paraxial`: where the outermost and the innermost pair of the beam's rays cross, if the beam is symmetric.
+    `marginal`, `paraxial`: where the outermost and the innermost pair of rays cross that are mirror images.
     """
 
     rays: int
@@ -45,7 +46,7 @@ def spread(origins: Array, directions: Array) -> Spread:
     focus = closest_point(origins, directions)
     behind = focus is not None and bool(np.median(((focus - origins) * directions).sum(axis=1)) < 0)
     found = Spread(len(origins), _point(focus), behind)
-    if spot := _spot(origins, directions):
+    if len(origins) > 1 and (spot := _spot(origins, directions)):
         place, offsets = spot
         rms, largest = float(np.sqrt(np.mean(offsets**2))), float(np.abs(offsets).max())
         return replace(found, spot=_point(place), rms=rms, largest=largest)
@@ -104,7 +105,7 @@ def _spot(origins: Array, directions: Array) -> tuple[Array, Array] | None:
 
 @dataclass(frozen=True)
 class Group:
-    """The rays of a colour and beam that escape, having met a boundary, with the partial reflections `reflect` (bits)."""
+    """Rays of a colour and beam that met a boundary and escaped, by their partial reflections, as bits."""
 
     colour: str
     beam: int
@@ -124,14 +125,13 @@ def groups(scene: PlanarScene, traced: Sequence[Branches]) -> list[Group]:
 
 
 def _members(scene: PlanarScene, branches: Branches, beam: int, reflect: int) -> NDArray[np.bool_]:
-    final = branches.paths.events[np.arange(len(branches.rays)), branches.last]
-    escaped = (final == Event.ESCAPED) & (branches.last > 0)
+    escaped = (branches.end == Event.ESCAPED) & (branches.last > 0)
     return escaped & (scene.beams[branches.rays] == beam) & (branches.reflect == reflect)
 
 
 def _of_group(scene: PlanarScene, branches: Branches, members: NDArray[np.intp]) -> Spread:
-    origins = branches.paths.points[members, branches.last[members]]
-    directions = branches.paths.directions[members]
+    origins, directions = branches.tips[members], branches.paths.directions[members]
+    directions = directions / np.hypot(*directions.T)[:, None]  # float32 is not unit to the last bit
     found = spread(origins, directions)
     pairs = list(_pairs(scene, branches.rays[members], directions))
     if not pairs:
@@ -162,7 +162,7 @@ def table(found: Sequence[Group]) -> str:
 
 def _cells(group: Group) -> tuple[str, ...]:
     s = group.spread
-    bits = ", ".join(str(j) for j in range(BITS) if group.reflect >> j & 1)
+    bits = ", ".join(str(j) for j in range(REFLECT_BITS) if group.reflect >> j & 1)
     names = group.colour or "–", str(group.beam), bits or "–", str(s.rays)
     focus = _text(s.focus) + (" (virtual)" if s.virtual else "")
     return *names, focus, _text(s.spot), _text(s.rms), _text(s.largest), _text(s.marginal), _text(s.paraxial)
@@ -171,8 +171,8 @@ def _cells(group: Group) -> tuple[str, ...]:
 def _text(value: Point | float | None) -> str:
     if value is None:
         return "–"
-    if isinstance(value, tuple):
-        return ", ".join(map(_text, value))
+    if isinstance(value, tuple):  # a coordinate that is 0 but for roundoff is 0
+        return ", ".join(_text(x if abs(x) > 1e-12 * max(map(abs, value)) else 0.0) for x in value)
     return f"{value:.6g}"
 
 

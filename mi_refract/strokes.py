@@ -15,7 +15,6 @@ from .planar_scene import PlanarScene
 
 View = tuple[float, float, float, float]  # x0, x1, y0, y1
 MARGIN = 0.08  # around what the picture holds, of its larger side
-STUB = 0.03  # of the view's diagonal: so much is drawn of a leg whose end contradicts it
 SHARED = -1  # the number of the colour that stands for all of them
 SAMPLES = 2**22  # pixels of lines at a time: 0.3 GB
 
@@ -69,16 +68,12 @@ def _legs(branches: Branches, number: int, colours: int, view: View) -> Legs:
 def _ends(branches: Branches, view: View) -> Array:
     """Where legs end (P × (D+1) × 2). NaN where there is no leg; an exhausted path has none after its last boundary."""
     x0, x1, y0, y1 = view
-    paths, last, diagonal = branches.paths, branches.last, math.hypot(x1 - x0, y1 - y0)
-    ends = np.full_like(paths.points, np.nan)
-    ends[:, :-1] = paths.points[:, 1:]
-    path = np.arange(len(last))
-    tip, event = paths.points[path, last], paths.events[path, last]
-    reach = np.full(len(last), np.nan)
-    reach[event == Event.CONTRADICTED] = STUB * diagonal
-    away = event == Event.ESCAPED
-    reach[away] = np.hypot(*(tip[away] - [(x0 + x1) / 2, (y0 + y1) / 2]).T) + diagonal
-    ends[path, last] = tip + paths.directions * reach[:, None]
+    ends = np.full_like(branches.paths.points, np.nan)
+    ends[:, :-1] = branches.paths.points[:, 1:]
+    away = np.flatnonzero(branches.end == Event.ESCAPED)
+    tips = branches.tips[away]
+    reach = np.hypot(*(tips - [(x0 + x1) / 2, (y0 + y1) / 2]).T) + math.hypot(x1 - x0, y1 - y0)
+    ends[away, branches.last[away]] = tips + branches.paths.directions[away] * reach[:, None]
     return ends
 
 
