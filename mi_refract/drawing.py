@@ -30,6 +30,7 @@ VECTORS = 2000  # lines that are drawn one by one; of more of them, the density
 DPI = {".png": 200, ".svg": 150, ".pdf": 150}  # of what is not lines, in the last two
 RAY, WHITE, INK, MUTED = "#c8102e", "#55504c", "#222222", "#6b6b6b"  # WHITE: of all colours, on paper
 DENSE, THIN = (0.78, 0.88, 0.97), (1.00, 0.93, 0.74)  # tints of the media that differ most from what is around all
+LINE = 0.13  # inches
 NAMED = 5  # media in the legend
 TYPICAL = 0.35  # opacity/(1 − opacity) of the median pixel that rays touch, where their density is drawn
 MARKS = {
@@ -37,7 +38,7 @@ MARKS = {
     Event.CONTRADICTED: ("x", "× {} stopped: the next boundary does not border on the medium that the ray is in"),
 }
 UNDATED: dict[str, Any] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}, ".png": {}}
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "svg.hashsalt": "mi_refract",  # the same scene gives the same bytes
     "text.parse_math": False,
     "font.size": 9,
@@ -77,21 +78,29 @@ def picture(scene: PlanarScene, traced: Sequence[Branches], suffix: str) -> byte
     require_matplotlib()
     import matplotlib
 
+    buffer = io.BytesIO()
     with matplotlib.rc_context(STYLE):
-        from matplotlib.figure import Figure
-
-        view = scene.view or around(scene, traced)
-        figure = Figure(figsize=_size(view), dpi=DPI[suffix], layout="constrained")
-        panel = figure.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal", title=scene.title)
-        panel.set_xlabel(_caption(scene, traced, int(14 * figure.get_figwidth())), loc="left", fontsize=7.5)
-        _media(panel, scene)
-        _settle(figure)
-        _boundaries(panel, scene.segments[0])
-        _rays(panel, scene, legs(traced, view))
-        _ends(panel, traced)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format=suffix[1:], dpi="figure", metadata=UNDATED[suffix])
+        drawn = figure(scene, traced, DPI[suffix])
+        drawn.savefig(buffer, format=suffix[1:], dpi="figure", metadata=UNDATED[suffix])
     return buffer.getvalue()
+
+
+def figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> Figure:
+    """The picture, in matplotlib's present style; its only axes are in the scene's units."""
+    from matplotlib.figure import Figure
+
+    view = scene.view or around(scene, traced)
+    width, height = _size(view)
+    caption = _caption(scene, traced, int(14 * width))
+    drawn = Figure((width, height + LINE * len(caption)), dpi, layout="constrained")
+    panel = drawn.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal", title=scene.title)
+    panel.set_xlabel("\n".join(caption), loc="left", fontsize=7.5)
+    _media(panel, scene)
+    _settle(drawn)
+    _boundaries(panel, scene.segments[0])
+    _rays(panel, scene, legs(traced, view))
+    _ends(panel, traced)
+    return drawn
 
 
 def require_matplotlib() -> None:
@@ -100,10 +109,10 @@ def require_matplotlib() -> None:
 
 
 def _size(view: View) -> tuple[float, float]:
-    """Of the figure, in inches: about as large a picture whatever its shape, and room for the words."""
+    """Of the figure without its caption, in inches: about as large a picture whatever its shape."""
     aspect = min(max((view[1] - view[0]) / (view[3] - view[2]), 0.25), 4)
     height = min(5.2 / aspect**0.5, 7.0)
-    return max(height * aspect, 3.6) + 0.5, height + 0.9
+    return max(height * aspect, 3.6) + 0.6, height + 0.95
 
 
 def _settle(figure: Figure) -> None:
@@ -170,14 +179,21 @@ def strength(weight: Any) -> Any:
 
 
 def _rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
-    from matplotlib.colors import to_rgb
-
-    colours = {i: np.array(to_rgb(name or RAY)) for i, name in enumerate(scene.colours)}
-    colours[SHARED] = np.array(to_rgb(WHITE))
+    names = {SHARED: WHITE} | {i: name or RAY for i, name in enumerate(scene.colours)}
+    colours = {i: _rgb(scene, name) for i, name in names.items()}
     if len(lines) > VECTORS:
         _shade(panel, lines, colours)
     elif len(lines):
         _stroke(panel, lines, colours)
+
+
+def _rgb(scene: PlanarScene, name: str) -> Any:
+    from matplotlib.colors import to_rgb
+
+    try:
+        return np.array(to_rgb(name))
+    except ValueError:
+        raise ValueError(f"{scene.path}: colours: {name!r}; accepted: a colour that matplotlib knows") from None
 
 
 def _stroke(panel: Axes, lines: Legs, colours: dict[int, Any]) -> None:
@@ -216,7 +232,7 @@ def _blend(layers: dict[int, Any], colours: dict[int, Any]) -> Any:
     mixed = shared[..., None] * colours[SHARED]
     for part, number in zip(parts - common, layers, strict=True):
         mixed += part[..., None] * colours[number]
-    dense = total * TYPICAL / np.median(total[total > 0])
+    dense = total * TYPICAL / np.median(total[total > 0]) if total.any() else total
     colour = np.divide(mixed, total[..., None], out=np.ones_like(mixed), where=total[..., None] > 0)
     pixels = np.dstack([colour, dense / (1 + dense)])  # without saturating as soon as 1 − exp(−dense) does
     return (pixels * 255).round().astype(np.uint8)
@@ -226,14 +242,15 @@ def _ends(panel: Axes, traced: Sequence[Branches]) -> None:
     """A mark where a path ended otherwise than by escaping."""
     for event, (mark, _) in MARKS.items():
         ends = np.concatenate([branches.tips[branches.end == event] for branches in traced])
-        size = min(1.0, (40 / max(len(ends), 1)) ** 0.5)
-        style: dict[str, Any] = {"markersize": 1 + 4 * size, "markeredgewidth": 0.9 * size, "fillstyle": "none"}
-        panel.plot(*ends.T, mark, color=INK, zorder=3, scalex=False, scaley=False, **style)
+        if len(ends):
+            size = min(1.0, (40 / len(ends)) ** 0.5)
+            style: dict[str, Any] = {"markersize": 1 + 4 * size, "markeredgewidth": 0.9 * size, "fillstyle": "none"}
+            panel.plot(*ends.T, mark, color=INK, zorder=3, scalex=False, scaley=False, **style)
 
 
-def _caption(scene: PlanarScene, traced: Sequence[Branches], width: int) -> str:
-    """In lines of at most `width` characters."""
+def _caption(scene: PlanarScene, traced: Sequence[Branches], width: int) -> list[str]:
+    """Lines of at most `width` characters."""
     numbers = count(traced)
     notes = [text.format(numbers[event.name]) for event, (_, text) in MARKS.items() if numbers[event.name]]
     lines = [f"{scene.path.name}: {summary(scene, traced)}", *notes]
-    return "\n".join(part for line in lines for part in textwrap.wrap(line, width))
+    return [part for line in lines for part in textwrap.wrap(line, width)]
