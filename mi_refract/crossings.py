@@ -128,18 +128,19 @@ class Straight:
         )
         a_left, b_left = f_a >= 0, f_b >= 0
         way = dr.select((vertices[1] == start.vertices[0]) | (vertices[1] == start.vertices[1]), to_b, to_a)
-        # |d × e| = |f_a| + |f_b| without cancellation, and λ times it.
+        # |d × e| = |f_a| + |f_b| without cancellation, and λ times it, whose sign is right where λ itself is lost.
         scale = dr.abs(f_a) + dr.abs(f_b)
         reach = dr.select(a_left, -1, 1) * cross(way, e)
         ahead = (a_left != b_left) & (reach > ray.slack * (dr.abs(e.x) + dr.abs(e.y))) & (i != ray.own) & active
-        distance = quotient(reach, scale)
+        s, r = quotient(dr.abs(f_b), scale), quotient(dr.abs(f_a), scale)
+        distance = dr.dot(dr.fma(e, r, to_a), ray.d)  # λ again: that quotient would be noise at grazing incidence
         left, right = (dr.select(a_left, vertices[j], vertices[1 - j]) for j in (0, 1))
         along = dr.select(a_left, e, -e)
         # Of two segments that share a vertex the turn between them says which comes first, whatever λ rounds to.
         turn = cross(along, best.along)
         first = dr.select(right == best.right, turn < 0, distance < best.distance)
         first = ahead & dr.select(left == best.left, turn > 0, first)
-        found = Hit(distance, i, quotient(dr.abs(f_b), scale), quotient(dr.abs(f_a), scale), a_left, left, right, along)
+        found = Hit(distance, i, s, r, a_left, left, right, along)
         return dr.select(first, found, best)
 
     def place(self, hit: Hit) -> tuple[Any, Any]:

@@ -6,6 +6,7 @@ double precision whatever is stored.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +16,8 @@ import numpy as np
 from .backend import detect
 
 PRECISIONS = ("float32", "float64")
+Arrays = dict[str, Any]
+Buffer = tuple[Any, tuple[int, ...]]
 
 
 class Lanes:
@@ -44,7 +47,7 @@ class Lanes:
         columns = 1 if values.ndim == 1 else values.shape[1]
         row = self._indices[columns] if whole else self._vectors[columns] if columns > 1 else self.number
         kind = self.index if whole else self.number
-        return row, kind(values.ravel().astype(np.uint32 if whole else self.precision))
+        return row, kind(values.ravel().astype(np.uint32 if whole else self.precision, copy=False))
 
     def take(self, table: Any, i: Any, active: Any = True) -> Any:
         row, values = table
@@ -54,26 +57,22 @@ class Lanes:
     def roundoff(self) -> float:
         return float(np.finfo(self.precision).eps) / 2
 
-    def run(self, count: int, buffers: dict[str, Any], work: Callable[[Any, Callable[..., None]], None]) -> None:
-        """`work(i, put)` for the lanes i < count. `put(name, j, value, active)` writes a number, or a vector whose
-        components are as many parts of the buffer, to lane i of row j of buffers[name]."""
+    def run(self, count: int, buffers: dict[str, Buffer], work: Callable[[Any, Callable[..., None]], None]) -> Arrays:
+        """`work(i, put)` for the lanes i < count: `put(name, j, x, active)` sets buffers[name][j, i] = x. As numpy."""
         lane = dr.arange(self.index, count)
 
-        def put(name: str, j: Any, value: Any, active: Any) -> None:
-            buffer = buffers[name]
-            parts = list(value) if isinstance(value, self.vector) else [value]
-            for part, x in enumerate(parts):
-                place = (part * (len(buffer) // len(parts))) + j * count + lane
-                dr.scatter(buffer, type(buffer)(x), place, active, mode=dr.ReduceMode.NoConflicts)
+        def put(name: str, j: Any, x: Any, active: Any) -> None:
+            values, _ = buffers[name]
+            x = x if isinstance(x, self.vector) else type(values)(x)
+            dr.scatter(values, x, j * count + lane, active, mode=dr.ReduceMode.NoConflicts)
 
         work(lane, put)
-        dr.eval(buffers)
+        dr.eval(*(values for values, _ in buffers.values()))
+        return {name: values.numpy().reshape(shape) for name, (values, shape) in buffers.items()}
 
-    def buffer(self, kind: Any, value: Any, size: int) -> Any:
-        return dr.full(kind, value, size)
-
-    def numpy(self, buffer: Any) -> Any:
-        return np.array(buffer)
+    def buffer(self, kind: Any, value: Any, shape: tuple[int, ...]) -> Buffer:
+        """Numbers, or where the shape ends in 2 vectors, all of that value."""
+        return dr.full(kind, value, math.prod(shape)), shape
 
 
 class Scalars(Lanes):
@@ -96,21 +95,18 @@ class Scalars(Lanes):
     def take(self, table: Any, i: Any, active: Any = True) -> Any:
         return table[i if i < len(table) else 0]
 
-    def run(self, count: int, buffers: dict[str, Any], work: Callable[[Any, Callable[..., None]], None]) -> None:
+    def run(self, count: int, buffers: dict[str, Buffer], work: Callable[[Any, Callable[..., None]], None]) -> Arrays:
         for lane in range(count):
 
-            def put(name: str, j: Any, value: Any, active: Any, lane: int = lane) -> None:
-                parts = list(value) if isinstance(value, self.vector) else [value]
+            def put(name: str, j: Any, x: Any, active: Any, lane: int = lane) -> None:
                 if active:
-                    buffers[name].reshape(len(parts), -1)[:, j * count + lane] = parts
+                    buffers[name][0][j, lane] = x
 
             work(lane, put)
+        return {name: values for name, (values, _) in buffers.items()}
 
-    def buffer(self, kind: Any, value: Any, size: int) -> Any:
-        return np.full(size, value, kind)
-
-    def numpy(self, buffer: Any) -> Any:
-        return buffer
+    def buffer(self, kind: Any, value: Any, shape: tuple[int, ...]) -> Buffer:
+        return np.full(shape, value, kind), shape
 
 
 def lanes(backend: str | None, precision: str) -> Lanes:

@@ -24,12 +24,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .crossings import Arcs, Straight
+from .extrusion import SHORTEST, Extrusion
 from .lanes import lanes
 from .walks import Event, Walker
 
 __all__ = ["Event", "Paths", "Segments", "Tracer", "trace"]
 
 Array = NDArray[np.float64]
+METHODS = "auto", "brute", "mesh"
+FEW = 48  # segments that are tried sooner than a query takes
 
 SHAPES: dict[str, tuple[int, ...]] = {
     "start": (2,), "end": (2,), "n_left": (), "n_right": (), "control": (2,), "weight": ()
@@ -39,7 +42,7 @@ SHAPES: dict[str, tuple[int, ...]] = {
 def _numbers(name: str, values: Any, shape: tuple[int, ...]) -> Array:
     """As float64 of that shape, finite; ValueError otherwise."""
     try:
-        array = np.array(values, dtype=np.float64)
+        array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
         raise ValueError(f"{name}: accepted: numbers of shape {shape}") from None
     if array.shape != shape:
@@ -118,18 +121,16 @@ class Paths:
 
     `points` N × (D+1) × 2: the origin and the places where boundaries are met, then NaN. `directions` N × 2: after
     the last of them. `hits` N × D: the segment met, then −1. `events` N × (D+1): of each boundary, then the end's,
-    then NONE. `indices` N × (D+1): of the medium of each leg, NaN after the end and where it is not known.
-    `weights` N × (D+1): share of the power that a leg carries, by Fresnel's equations for unpolarised light; None
-    where it was not asked for.
+    then NONE. Where weights were asked for, N × (D+1): `indices` of the medium of each leg, NaN after the end and where
+    it is not known; `weights`, the share of the power that a leg carries, by Fresnel's equations for unpolarised light.
     """
 
     points: Array
     directions: Array
     hits: NDArray[np.int32]
     events: NDArray[np.uint8]
-    indices: Array
+    indices: Array | None = None
     weights: Array | None = None
-
 
 
 def trace(
@@ -141,6 +142,7 @@ def trace(
     formula: str | None = None,
     precision: str = "float64",
     backend: str | None = None,
+    method: str = "auto",
     reflect: Any = 0,
     n_start: Any = None,
     weights: bool = False,
@@ -150,10 +152,12 @@ def trace(
     `formula`: a key of FORMULAS for the direction; None: that of document 004. `precision`: "float64" or "float32".
     `backend`: "llvm", "cuda" or "scalar"; None for the best on this machine. `reflect`: bits, one number or N; where
     bit j is set the ray is reflected at the j-th boundary it meets (from 0, below 32), though it might be refracted.
-    `n_start`: index of the medium in which rays start (N or one). `weights`: fill `Paths.weights`.
+    `method`: "brute" tries every segment, "mesh" those that Mitsuba's ray tracing finds (see `extrusion`), at a cost
+    that grows like log M; both give the same paths, and "auto" chooses. `n_start`: index of the medium in which rays
+    start (N or one). `weights`: fill `Paths.weights` and `Paths.indices`.
     ValueError for what is none of these, and for origins or directions that are not finite, or no direction.
     """
-    tracer = Tracer(segments, formula=formula, precision=precision, backend=backend)
+    tracer = Tracer(segments, formula=formula, precision=precision, backend=backend, method=method)
     return tracer(origins, directions, max_depth, reflect=reflect, n_start=n_start, weights=weights)
 
 
@@ -161,13 +165,15 @@ class Tracer:
     """`trace` for one set of segments, set up once; arguments and errors as there."""
 
     def __init__(
-        self, segments: Segments, *, formula: str | None = None, precision: str = "float64", backend: str | None = None
-    ) -> None:
+        self, segments: Segments, *, formula: str | None = None, precision: str = "float64", backend: str | None = None,
+        method: str = "auto",
+    ) -> None:  # fmt: skip
         self.lanes = to = lanes(backend, precision)
         ends = segments.start, segments.end, segments.vertices
         shapes = (segments.control, segments.weight) if segments.curved else None
         boundaries = Arcs(to, *ends, *shapes) if shapes else Straight(to, *ends)
-        self.walker = Walker(to, boundaries, np.column_stack([segments.n_left, segments.n_right]), formula)
+        mesh = Extrusion(to, *ends) if _wants_mesh(segments, method) else None
+        self.walker = Walker(to, boundaries, mesh, np.column_stack([segments.n_left, segments.n_right]), formula)
 
     def __call__(
         self, origins: Any, directions: Any, max_depth: int, *, reflect: Any = 0, n_start: Any = None,
@@ -175,19 +181,37 @@ class Tracer:
     ) -> Paths:  # fmt: skip
         origins = _numbers("origins", origins, (len(origins), 2) if np.ndim(origins) else (0, 2))
         directions = _numbers("directions", directions, origins.shape)
-        if not directions.any(axis=1).all():
-            raise ValueError(f"directions[{int(np.argmin(directions.any(axis=1)))}] = (0, 0): accepted: a direction")
+        still = (directions[:, 0] == 0) & (directions[:, 1] == 0)
+        if still.any():
+            raise ValueError(f"directions[{int(np.argmax(still))}] = (0, 0): accepted: a direction")
         if not isinstance(max_depth, int | np.integer) or max_depth < 1:
             raise ValueError(f"max_depth = {max_depth!r}: accepted: a whole number, 1 or more")
-        bits = np.broadcast_to(np.asarray(reflect, dtype=np.uint32), len(origins))
-        index = np.broadcast_to(np.asarray(np.nan if n_start is None else n_start, dtype=float), len(origins))
-        found = self.walker(np.column_stack([origins, directions, index]), bits, max_depth, weights)
-        points = np.concatenate([origins.T[:, None], found["place"]], 1)
-        return Paths(
-            points.transpose(2, 1, 0),
-            found["direction"][:, 0].T,
-            found["hit"].T,
-            found["event"].T,
-            found["index"].T,
-            found["power"].T if weights else None,
-        )
+        index = None if n_start is None else _each("n_start", n_start, len(origins), "f", np.float64)
+        none = np.ndim(reflect) == 0 and reflect == 0
+        mirrored = None if none else _each("reflect", reflect, len(origins), "iu", np.uint32)
+        found = self.walker(origins, directions, index, mirrored, max_depth, weights)
+        found["directions"] = found["directions"][0]
+        return Paths(**{name: x if name == "directions" else np.swapaxes(x, 0, 1) for name, x in found.items()})
+
+
+def _each(name: str, values: Any, count: int, kinds: str, kind: Any) -> Any:
+    """One value per ray."""
+    array = np.asarray(values)
+    if array.dtype.kind not in kinds + "iu" or array.shape not in ((), (count,)) or not (array >= 0).all():
+        whole = "" if "f" in kinds else "whole "
+        raise ValueError(f"{name}: accepted: a {whole}number ≥ 0, or {count} of them")
+    return np.ascontiguousarray(np.broadcast_to(array.astype(kind), count))
+
+
+def _wants_mesh(segments: Segments, method: str) -> bool:
+    if method not in METHODS:
+        raise ValueError(f"method = {method!r}; accepted: {', '.join(METHODS)}")
+    if method == "brute":
+        return False
+    length = np.hypot(*(segments.end - segments.start).T)
+    extent = np.ptp(np.concatenate([segments.start, segments.end]), axis=0).max()
+    shortest = length[length > 0].min(initial=np.inf) / (extent / 2 or 1)
+    reason = "arcs" if segments.curved else f"a segment {shortest:.1e} of the extent" if shortest < SHORTEST else ""
+    if reason and method == "mesh":
+        raise ValueError(f"method = 'mesh': accepted: straight segments longer than {SHORTEST:.1e}, not {reason}")
+    return not reason and (method == "mesh" or len(segments) > FEW)

@@ -11,6 +11,7 @@ import drjit as dr
 import numpy as np
 
 from .crossings import NOWHERE, Hit, Ray, Straight, cross
+from .extrusion import Extrusion
 from .formulas import FORMULAS, refract_2d
 from .fresnel import powers, refracted_cosine
 from .lanes import Lanes, negated
@@ -44,33 +45,36 @@ class Walk:
 class Walker:
     """Rays between `boundaries` with media of index (left, right)."""
 
-    def __init__(self, to: Lanes, boundaries: Straight, media: Any, formula: str | None) -> None:
-        self.to, self.boundaries, self.media = to, boundaries, to.table(media)
+    def __init__(
+        self, to: Lanes, boundaries: Straight, mesh: Extrusion | None, media: Any, formula: str | None
+    ) -> None:
+        self.to, self.boundaries, self.mesh, self.media = to, boundaries, mesh, to.table(media)
         self.refract = _refraction(to, formula)
 
-    def __call__(self, rays: Any, bits: Any, max_depth: int, weights: bool) -> dict[str, Any]:
-        """What `planar.Paths` holds, depth × N or 2 × depth × N; `rays`: N × (origin, direction, index)."""
-        to, count = self.to, len(rays)
-        inputs = [to.table(column) for column in (*rays.T, bits)]
-        legs = max_depth + 1
-        self.buffers = {
-            "place": to.buffer(to.number, np.nan, 2 * max_depth * count),
-            "direction": to.buffer(to.number, np.nan, 2 * count),
-            "hit": to.buffer(to.signed, -1, max_depth * count),
-            "event": to.buffer(to.byte, int(Event.NONE), legs * count),
-            "index": to.buffer(to.number, np.nan, legs * count),
+    def __call__(
+        self, origins: Any, directions: Any, index: Any, mirrored: Any, max_depth: int, weights: bool
+    ) -> dict[str, Any]:
+        """The fields of `planar.Paths`, rows of depths; `index` and `mirrored` may be None."""
+        to, count, legs = self.to, len(origins), max_depth + 1
+        rays = [to.table(x) for x in (origins, directions)]
+        others = [None if x is None else to.table(x) for x in (index, mirrored)]
+        buffers = {
+            "points": to.buffer(to.number, np.nan, (legs, count, 2)),
+            "directions": to.buffer(to.number, np.nan, (1, count, 2)),
+            "hits": to.buffer(to.signed, -1, (max_depth, count)),
+            "events": to.buffer(to.byte, int(Event.NONE), (legs, count)),
         }
         if weights:
-            self.buffers["power"] = to.buffer(to.number, np.nan, legs * count)
+            buffers |= {name: to.buffer(to.number, np.nan, (legs, count)) for name in ("indices", "weights")}
 
         def work(lane: Any, put: Callable[..., None]) -> None:
-            x, y, dx, dy, index, mirrored = (to.take(table, lane) for table in inputs)
-            walk = self._start(to.vector(x, y), to.vector(dx, dy), index)
-            self._follow(walk, mirrored, max_depth, put, weights)
+            p, d = (to.take(table, lane) for table in rays)
+            index, bits = (None if table is None else to.take(table, lane) for table in others)
+            put("points", 0, p, True)
+            walk = self._start(p, d, to.number(dr.nan) if index is None else index)
+            put("directions", 0, self._follow(walk, bits, max_depth, put, weights).ray.d, True)
 
-        to.run(count, self.buffers, work)
-        shapes = {"place": (2, max_depth, count), "direction": (2, 1, count), "hit": (max_depth, count)}
-        return {name: to.numpy(b).reshape(shapes.get(name, (legs, count))) for name, b in self.buffers.items()}
+        return to.run(count, buffers, work)
 
     def _start(self, p: Any, d: Any, index: Any) -> Walk:
         to = self.to
@@ -78,56 +82,67 @@ class Walker:
         ray = Ray(p, _unit(d), to.index(NOWHERE), to.number(0.5), to.number(0.5), to.mask(False), slack)
         return Walk(ray, index, to.number(1), to.index(0), to.mask(True))
 
-    def _follow(self, walk: Walk, mirrored: Any, max_depth: int, put: Callable[..., None], weights: bool) -> None:
+    def _follow(self, walk: Walk, mirrored: Any, max_depth: int, put: Callable[..., None], weights: bool) -> Walk:
         def step(walk: Walk) -> tuple[Walk]:
             return (self._step(walk, mirrored, max_depth, put, weights),)
 
-        (end,) = dr.while_loop((walk,), lambda walk: walk.active, step, label="planar")
-        put("direction", 0, end.ray.d, True)
+        return dr.while_loop((walk,), lambda walk: walk.active, step, label="planar")[0]
 
     def _step(self, walk: Walk, mirrored: Any, max_depth: int, put: Callable[..., None], weights: bool) -> Walk:
         """One leg: to the next boundary, and off it."""
         to, ray, j, active = self.to, walk.ray, walk.depth, walk.active
-        hit = self.nearest(ray, active)
+        hit = self._nearest(ray, walk.index, active)
         some = active & (hit.segment != NOWHERE)
-        media = to.take(self.media, hit.segment, some)
-        near, far = dr.select(hit.to_left, media[1], media[0]), dr.select(hit.to_left, media[0], media[1])
+        near, far = self._sides(hit, some)
         index = dr.select(some & dr.isnan(walk.index), near, walk.index)
         p, e = self.boundaries.place(hit)
         l = _unit(e)  # noqa: E741 (the document's name)
         d, transmitted = self.refract(ray.d, l, quotient(near, far))
-        forced = (j < REFLECT_BITS) & ((mirrored >> dr.minimum(j, REFLECT_BITS - 1)) & 1 == 1)
-        d = dr.select(forced & transmitted, _mirrored(ray.d, l), d)
-        through = transmitted & negated(forced)
-
+        through = transmitted
+        if mirrored is not None:
+            forced = (j < REFLECT_BITS) & ((mirrored >> dr.minimum(j, REFLECT_BITS - 1)) & 1 == 1)
+            d = dr.select(forced & transmitted, _mirrored(ray.d, l), d)
+            through = transmitted & negated(forced)
         event = dr.select(through, int(Event.REFRACTED), int(Event.REFLECTED))
         event = dr.select(near == index, event, int(Event.CONTRADICTED))
         event = dr.select(j < max_depth, event, int(Event.EXHAUSTED))
         event = dr.select(some, event, int(Event.ESCAPED))
         met = some & (j < max_depth)
-        put("event", j, event, active)
-        put("index", j, index, active)
-        put("place", j, p, met)
-        put("hit", j, hit.segment, met)
+        put("events", j, event, active)
+        put("points", j + 1, p, met)
+        put("hits", j, hit.segment, met)
         power = walk.power
         if weights:
-            put("power", j, power, active)
+            put("indices", j, index, active)
+            put("weights", j, power, active)
             power = power * _share(ray.d, l, quotient(near, far), through)
         on = met & (near == index)
         after = Ray(p, _unit(d), hit.segment, hit.s, hit.r, hit.to_left == through, to.number(0))
         index = dr.select(through, far, index)
         return Walk(dr.select(on, after, ray), index, power, j + 1, on)
 
-    def nearest(self, ray: Ray, active: Any) -> Hit:
-        """The first boundary ahead, of all."""
+    def _sides(self, hit: Hit, active: Any) -> tuple[Any, Any]:
+        """Index of the medium before the boundary, and behind it."""
+        left, right = self.to.take(self.media, hit.segment, active)
+        return dr.select(hit.to_left, right, left), dr.select(hit.to_left, left, right)
+
+    def _nearest(self, ray: Ray, index: Any, active: Any) -> Hit:
+        """The first boundary ahead."""
         start = self.boundaries.start(ray)
+        if self.mesh:
+
+            def agrees(hit: Hit) -> Any:
+                some = hit.segment != NOWHERE
+                return some & (dr.isnan(index) | (self._sides(hit, some)[0] == index))
+
+            return self.mesh.nearest(self.boundaries, ray, start, active, agrees)
 
         def test(i: Any, best: Hit) -> tuple[Any, Hit]:
             return i + 1, self.boundaries.nearer(best, ray, start, i)
 
         first = self.to.index(0), self.boundaries.none()
-        _, best = dr.while_loop(first, lambda i, best: active & (i < self.boundaries.count), test, label="boundaries")
-        return best
+        ahead = dr.while_loop(first, lambda i, best: active & (i < self.boundaries.count), test, label="boundaries")
+        return ahead[1]
 
 
 def _unit(v: Any) -> Any:

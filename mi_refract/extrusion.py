@@ -1,0 +1,174 @@
+"""Candidates for the first boundary ahead, from Mitsuba's own ray tracing: boundaries as a mesh seen from above.
+
+Of each segment and of each vertex the mesh holds a triangle upright on the plane, which cuts the plane in a stroke:
+the segment, longer by MARGIN at either end, and across each vertex a stroke of 2 MARGIN. Mitsuba works in float32, so
+its ray, with the start moved off its segment by OFFSET, is up to ε < MARGIN from the one that is meant. But a ray that
+crosses a segment within ε of a place crosses that segment's stroke, its neighbour's, or that of a vertex between:
+so the strokes met, in their order, name every segment that `crossings` must try; what it says is exact. Lengths here
+are in units of half the scene's extent.
+
+Precondition: no segment is shorter than SHORTEST, and what shares no vertex is no nearer than that; where it is and
+the rays' media tell, the next strokes are tried, too.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from .backend import activate
+from .crossings import NOWHERE, Hit, Ray, Start, Straight
+from .lanes import Lanes, negated
+
+MARGIN = 2.0**-19
+OFFSET = 2.0**-21
+SHORTEST = 2 * MARGIN
+STEP = 2.0**-22  # past a stroke that was no hit
+
+
+class Extrusion:
+    """Strokes of M straight segments (`start`, `end`, M × 2, and `vertices`), and which segments each of them names."""
+
+    def __init__(self, lanes: Lanes, start: Any, end: Any, vertices: Any) -> None:
+        import mitsuba
+
+        self.lanes = lanes
+        variant = "scalar_rgb" if lanes.backend == "scalar" else f"{lanes.backend}_ad_rgb"
+        self.mi: Any = getattr(mitsuba, variant)
+        low, high = (f(np.concatenate([start, end]), axis=0) for f in (np.min, np.max))
+        self.centre, self.half = (low + high) / 2, float((high - low).max() / 2)
+        a, b = ((x - self.centre) / self.half for x in (start, end))
+        starts, ends = _strokes(a, b, vertices)
+        self.narrow = lanes.table(_narrow(a, b, vertices))
+        self.scene = _upright(variant, starts, ends)
+        first, around = _around(vertices, len(starts) - len(a))
+        self.first, self.around = lanes.table(first), lanes.table(around)
+
+    def nearest(self, boundaries: Straight, ray: Ray, start: Start, active: Any, agrees: Any) -> Hit:
+        """The first boundary ahead. `agrees(hit)`: whether its near side is the medium that the ray is in."""
+        to, own = self.lanes, ray.own != NOWHERE
+        centre = to.vector(*self.centre.tolist())
+        a, b = start.ways
+        e = (b - a) * (1 / self.half)
+        length = dr.norm(e)
+        aside = dr.select(ray.left, OFFSET, -OFFSET) * dr.rcp(length)
+        q = (ray.p - centre) * (1 / self.half)
+        q = dr.select(own, to.vector(q.x - e.y * aside, q.y + e.x * aside), q)
+        # The start may lie beyond a neighbour, or the stroke of the vertex between: neighbours are tried by hand.
+        near_a, near_b = to.take(self.narrow, ray.own, active & own)
+        corner = active & own & ((ray.r * length < near_a) | (ray.s * length < near_b))
+        best = self._tried(boundaries.none(), boundaries, ray, start, ray.own, corner)
+
+        def query(best: Hit, q: Any, gone: Any, going: Any) -> tuple[Hit, Any, Any, Any]:
+            found, t, stroke = self._stroke(q, ray.d, going)
+            best = self._tried(best, boundaries, ray, start, stroke, found)
+            t = dr.select(found, t + STEP, 0)
+            gone = gone + t
+            distance = best.distance * (1 / self.half)
+            settled = (agrees(best) & (distance <= gone + MARGIN)) | (distance + MARGIN < gone)
+            return best, q + ray.d * t, gone, found & negated(settled)
+
+        state = best, q, to.number(0), active
+        return dr.while_loop(state, lambda best, q, gone, going: going, query, label="strokes")[0]
+
+    def _stroke(self, q: Any, d: Any, active: Any) -> tuple[Any, Any, Any]:
+        """Whether a stroke is ahead, how far, and its number."""
+        mi, number = self.mi, self.mi.Float
+        ray = mi.Ray3f(mi.Point3f(number(q.x), number(q.y), 0), mi.Vector3f(number(d.x), number(d.y), 0))
+        seen = self.scene.ray_intersect_preliminary(ray, True, active)
+        return active & seen.is_valid(), self.lanes.number(seen.t), self.lanes.index(seen.prim_index)
+
+    def _tried(self, best: Hit, boundaries: Straight, ray: Ray, start: Start, stroke: Any, active: Any) -> Hit:
+        """`best`, or what comes before it of the segments that a stroke names: its own first, others near its ends."""
+        first, last = (self.lanes.take(self.first, stroke + i, active) for i in (0, 1))
+
+        def test(i: Any, best: Hit, going: Any) -> tuple[Any, Hit, Any]:
+            segment = self.lanes.take(self.around, i, going)
+            best = boundaries.nearer(best, ray, start, segment, going)
+            inside = dr.minimum(best.s, best.r) * dr.norm(best.along) > 4 * MARGIN * self.half
+            i = i + 1
+            return i, best, going & (i < last) & negated((best.segment == stroke) & inside)
+
+        return dr.while_loop((first, best, active), lambda i, best, going: going, test, label="around")[1]
+
+
+def _strokes(a: Any, b: Any, vertices: Any) -> tuple[Any, Any]:
+    """Both ends of every stroke: of the segments from `a` to `b`, then of the vertices."""
+    e = b - a
+    length = np.linalg.norm(e, axis=1, keepdims=True)
+    e = np.divide(e, length, out=np.zeros_like(e), where=length > 0)
+    # Across the principal axis of the directions that leave a vertex, which are strokes themselves.
+    number = vertices.ravel()
+    xx, xy, yy = (np.bincount(number, np.repeat(e[:, i] * e[:, j], 2)) for i, j in ((0, 0), (0, 1), (1, 1)))
+    angle = np.arctan2(2 * xy, xx - yy) / 2
+    across = MARGIN * np.column_stack([-np.sin(angle), np.cos(angle)])
+    place = np.empty((len(across), 2))
+    place[number] = np.stack([a, b], 1).reshape(-1, 2)
+    return np.concatenate([a - MARGIN * e, place - across]), np.concatenate([b + MARGIN * e, place + across])
+
+
+def _narrow(a: Any, b: Any, vertices: Any) -> Any:
+    """How far from either end of each segment the next one at that vertex is no more than 4 MARGIN away, M × 2."""
+    ways = np.stack([b - a, a - b], 1).reshape(-1, 2)
+    angle, number = np.arctan2(ways[:, 1], ways[:, 0]), vertices.ravel()
+    order = np.lexsort([angle, number])
+    begin = np.searchsorted(number[order], number[order])
+    end = np.searchsorted(number[order], number[order], side="right")
+    after = np.arange(1, len(order) + 1)
+    after = np.where(after < end, after, begin)
+    # The angle to the next way out of the same vertex; a full turn where there is no other.
+    turn = (angle[order[after]] - angle[order]) % (2 * np.pi)
+    turn[end - begin == 1] = np.pi
+    least = np.full(len(order), np.pi)
+    np.minimum.at(least, order, turn)
+    np.minimum.at(least, order[after], turn)
+    with np.errstate(divide="ignore"):
+        return (4 * MARGIN / np.sin(np.minimum(least, np.pi / 2))).reshape(-1, 2)
+
+
+def _upright(name: str, a: Any, b: Any) -> Any:
+    """A scene, in the variant of that name, of one triangle per stroke, which cuts the plane z = 0 from `a` to `b`."""
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        activate()
+    variant: Any = getattr(mi, name)
+    count, middle, below, above = len(a), (a + b) / 2, -np.ones(len(a)), np.ones(len(a))
+    corners = (middle, below), (2 * a - middle, above), (2 * b - middle, above)
+    mesh = variant.Mesh("strokes", 3 * count, count)
+    parameters = mi.traverse(mesh)
+    places = np.concatenate([np.column_stack(corner) for corner in corners])
+    parameters["vertex_positions"] = variant.Float(places.ravel())
+    parameters["faces"] = variant.UInt32(np.arange(3 * count, dtype=np.uint32).reshape(3, count).T.ravel())
+    parameters.update()
+    # mi.load_dict would build for the present variant.
+    config = mi.parser.ParserConfig(name)
+    state = mi.parser.parse_dict(config, {"type": "scene", "strokes": mesh})
+    mi.parser.transform_all(config, state)
+    return mi.parser.instantiate(config, state)
+
+
+def _around(vertices: Any, strokes_of_vertices: int) -> tuple[Any, Any]:
+    """For stroke i the segments it names: around[first[i] : first[i + 1]]. Itself, and those at its ends."""
+    count = len(vertices)
+    order = np.argsort(vertices.ravel(), kind="stable")
+    at_vertex, degree = order // 2, np.bincount(vertices.ravel(), minlength=strokes_of_vertices)
+    begin = np.concatenate([[0], np.cumsum(degree)])
+    # Of a segment: itself, then those at either end (itself among them again).
+    sizes = np.concatenate([1 + degree[vertices].sum(1), degree])
+    first = np.concatenate([[0], np.cumsum(sizes)])
+    around = np.empty(first[-1], np.int64)
+    around[first[:count]] = np.arange(count)
+    for column, offset in ((0, np.ones(count, np.int64)), (1, 1 + degree[vertices[:, 0]])):
+        v = vertices[:, column]
+        _spread(around, first[:count] + offset, at_vertex, begin[v], degree[v])
+    _spread(around, first[count:-1], at_vertex, begin[:-1], degree)
+    return first, around
+
+
+def _spread(to: Any, there: Any, source: Any, here: Any, sizes: Any) -> None:
+    """to[there[i] : there[i] + sizes[i]] = source[here[i] : here[i] + sizes[i]] for all i."""
+    within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    to[np.repeat(there, sizes) + within] = source[np.repeat(here, sizes) + within]
