@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .curves import affine
+from .edges import Named, boundaries
+from .keys import per_colour, read, read_kind, shown
 from .planar import Array, Segments
+from .planar_keys import BEAMS, SCENE, SHAPES, Indices, Part
 
 
 @dataclass(frozen=True)
@@ -45,5 +51,103 @@ class PlanarScene:
 
 
 def load(path: str | Path) -> PlanarScene:
-    """Read a scene file. ValueError, one line with file and key, for what it cannot be; OSError for no file."""
-    raise NotImplementedError
+    """Read a scene file. Shapes and beams count from 0 in its errors.
+
+    ValueError, one line with file and key, for what it cannot be; OSError as the system raises it.
+    """
+    path = Path(path)
+    content = path.read_bytes()
+    try:
+        return _scene(path, _parsed(content))
+    except ValueError as error:
+        raise ValueError(" ".join(f"{path}: {error}".split())) from None
+
+
+def _parsed(content: bytes) -> dict[str, Any]:
+    try:
+        return tomllib.loads(content.decode())
+    except UnicodeDecodeError as error:
+        raise ValueError(f"byte {error.start} is no UTF-8; accepted: TOML") from None
+    except RecursionError:
+        raise ValueError("brackets nested too deeply; accepted: TOML") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{error}; accepted: TOML") from None
+
+
+def _scene(path: Path, table: dict[str, Any]) -> PlanarScene:
+    values = read(table, SCENE)
+    colours = tuple(values["colours"] or ("",))
+    values = per_colour(values, SCENE, "", len(colours))
+    parts = _parts(values["shape"], values["index"], len(colours))
+    origins, directions, beams = _rays(values["beam"])
+    regions = tuple(Region(part.curve.outline(), part.left) for _, part in parts if part.curve.closed)
+    return PlanarScene(
+        path,
+        values["title"] or path.stem,
+        colours,
+        boundaries(parts),
+        regions,
+        values["index"],
+        origins,
+        directions,
+        beams,
+        values["max_depth"],
+        values["branches"],
+        tuple(values["view"]) if values["view"] else None,
+    )
+
+
+def _parts(tables: list[dict[str, Any]], ambient: Indices, colours: int) -> list[Named]:
+    """The shapes' parts in their places."""
+    parts: list[Named] = []
+    media: dict[str, Indices] = {}
+    for j, table in enumerate(tables):
+        where = f"shape[{j}]"
+        kind, values = read_kind(table, SHAPES, f"{where}.", colours)
+        values["outside"] = _outside(values, media, where) or ambient
+        if values.get("name") in media:
+            raise ValueError(f"{where}.name: {shown(values['name'])} is another shape's; accepted: a new one")
+        if values.get("name"):
+            media[values["name"]] = values["n"]
+        try:
+            with np.errstate(all="ignore"):
+                parts += [(where, part) for part in _placed(kind.build(values), values)]
+        except ValueError as error:
+            raise ValueError(f"{where}.{error}") from None
+    return parts
+
+
+def _outside(values: dict[str, Any], media: dict[str, Indices], where: str) -> Indices | None:
+    name = values.get("within")
+    if name is None:
+        return values.get("outside")
+    if values["outside"]:
+        raise ValueError(f"{where}.within: {shown(name)}, beside `outside`; accepted: one of them")
+    if name not in media:
+        known = ", ".join(map(shown, media)) or "none so far"
+        raise ValueError(f"{where}.within: {shown(name)}; accepted: the name of a shape above: {known}")
+    return media[name]
+
+
+def _placed(parts: list[Part], values: dict[str, Any]) -> list[Part]:
+    matrix, facets = affine(values["rotate"], values["scale"]), values.get("facets")
+    placed = []
+    for part in parts:
+        curve = part.curve.faceted(facets) if facets else part.curve
+        curve = curve.mapped(matrix, values["at"])
+        if not (np.isfinite(curve.vertices).all() and np.isfinite(curve.control).all()):
+            raise ValueError("at: the shape leaves the range of numbers; accepted: coordinates below 1e308")
+        placed.append(part._replace(curve=curve))
+    return placed
+
+
+def _rays(tables: list[dict[str, Any]]) -> tuple[Array, Array, NDArray[np.intp]]:
+    rays = []
+    for j, table in enumerate(tables):
+        kind, values = read_kind(table, BEAMS, f"beam[{j}].", 1)
+        try:
+            rays.append(kind.build(values))
+        except ValueError as error:
+            raise ValueError(f"beam[{j}].{error}") from None
+    beams = np.repeat(np.arange(len(rays)), [len(origins) for origins, _ in rays])
+    return np.concatenate([o for o, _ in rays]), np.concatenate([d for _, d in rays]), beams
