@@ -120,6 +120,7 @@ def affine(rotate: float = 0.0, scale: float | Sequence[float] = 1.0) -> Array:
 
 def unit(degrees: float) -> tuple[float, float]:
     """Cosine and sine, exact for multiples of 90° and equal for odd ones of 45°."""
+    degrees = math.fmod(degrees, 360)
     quarters = round(degrees / 90)
     rest = degrees - 90 * quarters
     x, y = math.cos(math.radians(rest)), math.sin(math.radians(rest))

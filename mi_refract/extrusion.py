@@ -128,23 +128,24 @@ def _narrow(a: Any, b: Any, vertices: Any) -> Any:
         return (4 * MARGIN / np.sin(np.minimum(least, np.pi / 2))).reshape(-1, 2)
 
 
-def _upright(name: str, a: Any, b: Any) -> Any:
-    """A scene, in the variant of that name, of one triangle per stroke, which cuts the plane z = 0 from `a` to `b`."""
+def _upright(of: str, a: Any, b: Any) -> Any:
+    """A scene of the variant `of`: one triangle per stroke, which cuts the plane z = 0 from `a` to `b`."""
     import mitsuba as mi
 
     if mi.variant() is None:
         activate()
-    variant: Any = getattr(mi, name)
+    variant: Any = getattr(mi, of)
     count, middle, below, above = len(a), (a + b) / 2, -np.ones(len(a)), np.ones(len(a))
     corners = (middle, below), (2 * a - middle, above), (2 * b - middle, above)
     mesh = variant.Mesh("strokes", 3 * count, count)
     parameters = mi.traverse(mesh)
     places = np.concatenate([np.column_stack(corner) for corner in corners])
-    parameters["vertex_positions"] = variant.Float(places.ravel())
-    parameters["faces"] = variant.UInt32(np.arange(3 * count, dtype=np.uint32).reshape(3, count).T.ravel())
+    faces = np.arange(3 * count, dtype=np.uint32).reshape(3, count).T
+    for name, values in (("vertex_positions", places.astype(np.float32)), ("faces", faces)):
+        parameters[name] = type(parameters[name])(values.ravel())
     parameters.update()
     # mi.load_dict would build for the present variant.
-    config = mi.parser.ParserConfig(name)
+    config = mi.parser.ParserConfig(of)
     state = mi.parser.parse_dict(config, {"type": "scene", "strokes": mesh})
     mi.parser.transform_all(config, state)
     return mi.parser.instantiate(config, state)

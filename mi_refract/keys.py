@@ -208,5 +208,6 @@ def _own_keys(kind: Kind, shared: dict[str, Key]) -> str:
 def _default(key: Key) -> str:
     if key.default is REQUIRED or key.default is None:
         return ""
-    default = key.default[0] if key.type is INDEX else key.default
-    return f", default {default:g}" if isinstance(default, float) else f", default {default}"
+    default = key.default if isinstance(key.default, list) else [key.default]
+    text = ", ".join(f"{x:g}" for x in default)
+    return f", default {text if len(default) == 1 else f'[{text}]'}"

@@ -66,7 +66,8 @@ class Lanes:
             x = x if isinstance(x, self.vector) else type(values)(x)
             dr.scatter(values, x, j * count + lane, active, mode=dr.ReduceMode.NoConflicts)
 
-        work(lane, put)
+        if count:  # Dr.Jit takes no part in an empty array
+            work(lane, put)
         dr.eval(*(values for values, _ in buffers.values()))
         return {name: values.numpy().reshape(shape) for name, (values, shape) in buffers.items()}
 

@@ -72,14 +72,14 @@ class Segments:
     weight: Array | None = None
 
     def __post_init__(self) -> None:
+        if len(self.start) == 0:
+            raise ValueError("segments: none; accepted: at least one")
         for name, shape in SHAPES.items():
             values = getattr(self, name)
             if values is None and name in ("control", "weight"):
                 continue
-            values = _numbers(f"segments.{name}", values, (np.atleast_1d(self.start).shape[0], *shape))
+            values = _numbers(f"segments.{name}", values, (len(self.start), *shape))
             object.__setattr__(self, name, values)
-        if len(self) == 0:
-            raise ValueError("segments: none; accepted: at least one")
         if (self.control is None) != (self.weight is None):
             raise ValueError("segments: control and weight: accepted: both or neither")
         for name in ("n_left", "n_right", "weight"):

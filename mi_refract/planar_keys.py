@@ -167,7 +167,7 @@ BEAMS = {
             "from": Key(keys.POINT, "where the first one starts"),
             "to": Key(keys.POINT, "where the last one does"),
             "direction": Key(keys.DIRECTION, "of all"),
-            "count": Key(keys.RAYS, "how many; one starts in the middle"),
+            "count": Key(keys.RAYS, "how many; 1: from the middle"),
         },
         _parallel,
     ),
@@ -176,7 +176,7 @@ BEAMS = {
         {
             "at": Key(keys.POINT, "the point"),
             "angles": Key(keys.PAIR, "of the first and of the last one, in degrees"),
-            "count": Key(keys.RAYS, "how many; one goes in the middle"),
+            "count": Key(keys.RAYS, "how many; 1: in the middle"),
         },
         _fan,
     ),

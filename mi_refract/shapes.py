@@ -83,7 +83,7 @@ def arc(radius: float, start: float, end: float) -> Curve:
 def ellipse(rx: float, ry: float) -> Curve:
     """Around the origin, with these half axes along x and y: four arcs whose vertices and controls are exact."""
     vertices = np.array([(rx, 0.0), (0.0, ry), (-rx, 0.0), (0.0, -ry)])
-    control = np.array([(rx, ry), (-rx, ry), (-rx, -ry), (rx, -ry)])
+    control = np.array([(rx, ry), (-rx, ry), (-rx, -ry), (rx, -ry)], float)
     return Curve(vertices, control, np.full(4, math.sqrt(0.5)), closed=True)
 
 

@@ -1,0 +1,136 @@
+"""The strokes name every segment that a ray may cross: the paths are those of trying all, to the last bit."""
+
+import numpy as np
+import pytest
+from test_planar import polygon, star
+
+from mi_refract import extrusion
+from mi_refract.planar import Event, Segments, trace
+
+RAYS = 600
+
+
+def circle(count, n=1.5):
+    angle = np.arange(count) * 2 * np.pi / count
+    return polygon(np.column_stack([np.cos(angle), np.sin(angle)]), n)
+
+
+def spikes(count=40):
+    """Wedges so sharp that both sides are within the margin of the strokes near the tip."""
+    angle = np.repeat(np.linspace(0, 2 * np.pi, count, endpoint=False), 2)
+    angle[1::2] += 1e-4 * np.arange(1, count + 1)
+    radius = np.tile([1.0, 0.2], count)
+    return polygon(np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]), 1.3)
+
+
+def anywhere(rng):
+    return rng.normal(size=(RAYS, 2)) * 0.5, rng.normal(size=(RAYS, 2))
+
+
+def from_afar(rng):
+    origins = rng.normal(size=(RAYS, 2)) * 300
+    return origins, rng.uniform(-1, 1, size=(RAYS, 2)) - origins
+
+
+def along_the_wall(rng):
+    """Inside a circle, at 10⁻⁶ to 0.1 of the wall's direction."""
+    angle, grazing = rng.uniform(0, 2 * np.pi, RAYS), 10 ** rng.uniform(-6, -1, RAYS)
+    away = angle - grazing
+    return 0.999999 * np.column_stack([np.cos(angle), np.sin(angle)]), np.column_stack([-np.sin(away), np.cos(away)])
+
+
+def at_vertices(segments):
+    def rays(rng):
+        origins = rng.normal(size=(RAYS, 2)) * 2
+        return origins, segments.start[rng.integers(0, len(segments), RAYS)] - origins
+
+    return rays
+
+
+def along_segments(segments):
+    def rays(rng):
+        i = rng.integers(0, len(segments), RAYS)
+        e = segments.end[i] - segments.start[i]
+        return segments.start[i] - 3 * e, e
+
+    return rays
+
+
+CASES = {
+    "circle": (circle(2000), anywhere),
+    "circle, from afar": (circle(300), from_afar),
+    "fine circle, along its wall": (circle(20_000), along_the_wall),
+    "circle, at vertices": (circle(2000), at_vertices(circle(2000))),
+    "circle, along segments": (circle(2000), along_segments(circle(2000))),
+    "star": (star(300), anywhere),
+    "star, at tips": (star(300), at_vertices(star(300))),
+    "spikes": (spikes(), at_vertices(spikes())),
+}
+
+
+def both(case, precision, rays=None):
+    segments, make = CASES[case]
+    origins, directions = make(np.random.default_rng(11))
+    options = {"max_depth": 10, "precision": precision, "backend": "llvm"}
+    return (trace(segments, origins[:rays], directions[:rays], method=m, **options) for m in ("brute", "mesh"))
+
+
+@pytest.fixture
+def llvm(needs_variant):
+    needs_variant("llvm_ad_rgb")
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("case", CASES)
+def test_paths_are_those_of_trying_all(llvm, case, precision):
+    brute, mesh = both(case, precision)
+    for name in ("hits", "events", "points", "directions"):
+        assert np.array_equal(getattr(brute, name), getattr(mesh, name), equal_nan=True), name
+    assert not (brute.events == Event.CONTRADICTED).any()
+    assert (brute.hits >= 0).sum() > RAYS / 4
+
+
+def no_neighbours(first, around, count):
+    """Each stroke names its own segment only; that of a vertex one of its own."""
+    return np.arange(len(first)), np.concatenate([around[first[:-1]], [0]])
+
+
+@pytest.mark.parametrize(
+    ("case", "defect"),
+    [
+        ("spikes", ("_narrow", lambda a, b, vertices: np.zeros(a.shape))),
+        ("fine circle, along its wall", ("MARGIN", 2.0**-26)),
+        ("circle, along segments", ("OFFSET", 2.0**-9)),
+        ("fine circle, along its wall", ("_around", None)),
+    ],
+)
+def test_each_precaution_is_needed(llvm, monkeypatch, case, defect):
+    name, value = defect
+    plain = extrusion._around
+    monkeypatch.setattr(extrusion, name, value or (lambda *given: no_neighbours(*plain(*given), len(given[0]))))
+    with pytest.raises(AssertionError):
+        test_paths_are_those_of_trying_all(None, case, "float64")
+
+
+def test_scalar_variants_have_strokes_too():
+    segments = circle(200)
+    origins, directions = from_afar(np.random.default_rng(2))
+    brute, mesh = (
+        trace(segments, origins[:5], directions[:5], 3, method=m, backend="scalar") for m in ("brute", "mesh")
+    )
+    assert np.array_equal(brute.points, mesh.points, equal_nan=True)
+    assert (brute.hits >= 0).sum() >= 5
+
+
+@pytest.mark.parametrize(
+    ("segments", "message"),
+    [
+        (polygon([(0, 0), (1, 0), (1, 1e-7)]), "not a segment 2.0e-07 of the extent"),
+        (Segments([(0, 0)], [(1, 0)], [1.5], [1.0], [(0.5, 0.5)], [1.0]), "not arcs"),
+    ],
+)
+def test_what_strokes_cannot_tell_apart_is_refused(segments, message):
+    with pytest.raises(ValueError, match="accepted: straight segments") as error:
+        trace(segments, [(0.5, 1)], [(0, -1)], 2, method="mesh")
+    assert message in str(error.value)
+    assert trace(segments, [(0.5, 1)], [(0, -1)], 2).hits[0, 0] >= 0

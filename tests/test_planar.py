@@ -1,0 +1,365 @@
+"""The planar system: what a crossing, a vertex, a start and a medium mean, on every backend and precision."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from mi_refract import crossings
+from mi_refract.formulas import FORMULAS
+from mi_refract.planar import Event, Segments, trace
+
+REFRACTED, REFLECTED, ESCAPED = Event.REFRACTED, Event.REFLECTED, Event.ESCAPED
+SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
+
+
+def polygon(points, n=1.5, outside=1.0):
+    """Counter-clockwise: the inside is on the left."""
+    start = np.array(points, float)
+    return Segments(start, np.roll(start, -1, axis=0), np.full(len(start), n), np.full(len(start), outside))
+
+
+def together(*parts):
+    names = ("start", "end", "n_left", "n_right")
+    return Segments(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def star(count, seed=1, n=1.7):
+    rng = np.random.default_rng(seed)
+    angle, radius = np.sort(rng.uniform(0, 2 * np.pi, count)), rng.uniform(0.3, 1, count)
+    return polygon(np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]), n)
+
+
+@pytest.fixture
+def follow(setting):
+    """`trace` in the setting; paths as lists, without what follows their ends."""
+
+    def run(segments, origins, directions, max_depth=16, **options):
+        options = {"precision": setting.name, "backend": setting.backend, "weights": True} | options
+        return trace(segments, np.atleast_2d(origins), np.atleast_2d(directions), max_depth, **options)
+
+    return run
+
+
+def story(paths, i=0):
+    """Of a path: the segments it meets, and its events."""
+    hits, events = paths.hits[i], paths.events[i]
+    return hits[hits >= 0].tolist(), [Event(e) for e in events if e != Event.NONE]
+
+
+def test_a_slab_shifts_a_ray_as_snells_law_says(follow, setting):
+    angle, n, width = 0.7, 1.5, 2.0
+    slab = polygon([(0, -50), (width, -50), (width, 50), (0, 50)], n)
+    d = np.array([math.cos(angle), math.sin(angle)])
+    paths = follow(slab, -3 * d, d)
+    assert story(paths) == ([3, 1], [REFRACTED, REFRACTED, ESCAPED])
+    inside = math.asin(math.sin(angle) / n)
+    exact = [-3 * d, (0, 0), (width, width * math.tan(inside))]
+    assert paths.points[0, :3] == pytest.approx(np.array(exact), abs=16 * setting.roundoff)
+    assert paths.directions[0] == pytest.approx(d, abs=8 * setting.roundoff)
+    assert paths.indices[0, :3].tolist() == [1, 1.5, 1]
+    assert np.isnan(paths.points[0, 3:]).all()
+
+
+def test_beyond_the_critical_angle_rays_are_reflected_and_nothing_is_lost(follow, setting):
+    paths = follow(polygon([(0, 0), (60, 0), (60, 1), (0, 1)]), (-1, 0.5), (1, 0.5), max_depth=100)
+    hits, events = story(paths)
+    assert events.count(REFLECTED) >= 10
+    # The last face may end the path by reflection on and on in the corner's prism; what counts is the guide.
+    guided = np.array(paths.weights[0, 1 : events.index(REFLECTED) + 10])
+    assert (guided == guided[0]).all()
+    assert hits[0] == 3
+
+
+def test_the_formulas_agree(follow, setting):
+    o, d = np.array([(-1, y) for y in (0.21, 0.43, 0.77)]), np.array([(1, 0.3), (1, -0.2), (1, 0.1)])
+    plain = follow(polygon(SQUARE), o, d)
+    for name, formula in FORMULAS.items():
+        other = follow(polygon(SQUARE), o, d, formula=name)
+        assert (other.hits == plain.hits).all(), name
+        bound = 40 * formula.budget.chord(setting.roundoff, 1.5, 0.5)
+        assert np.nanmax(np.abs(other.points - plain.points)) <= bound, name
+
+
+# Vertices ------------------------------------------------------------------------------------------------------
+
+
+def zigzag(rng, count=20):
+    """A boundary from far left to far right, air above, glass below."""
+    x = np.concatenate([[-100], np.sort(rng.uniform(-1, 1, count)), [100]])
+    points = np.column_stack([x, np.concatenate([[0], rng.uniform(-0.01, 0.01, count), [0]])])
+    return Segments(points[:-1], points[1:], np.ones(count + 1), np.full(count + 1, 1.5))
+
+
+def test_a_ray_through_a_shared_vertex_crosses_once(follow):
+    rng = np.random.default_rng(7)
+    boundary = zigzag(rng)
+    vertices = boundary.end[rng.integers(0, 20, 300)]
+    origins = vertices + np.column_stack([rng.uniform(-2, 2, 300), rng.uniform(1, 2, 300)])
+    paths = follow(boundary, origins, vertices - origins, max_depth=4)
+    assert (paths.events[:, 0] == REFRACTED).all()
+    assert (paths.hits[:, 1:] == -1).all()
+    assert (paths.indices[:, 1] == np.float32(1.5)).all()
+
+
+def test_without_one_side_for_each_vertex_rays_leak(follow, monkeypatch):
+    """A vertex that counts as the left of one segment and as the right of the next is crossed twice, or never."""
+    plain = crossings.Straight._seen
+
+    def slipped(self, ray, start, vertex, place):
+        way, side = plain(self, ray, start, vertex, place)
+        self.turn = not getattr(self, "turn", False)
+        return way, side + (1e-6 if self.turn else -1e-6)
+
+    monkeypatch.setattr(crossings.Straight, "_seen", slipped)
+    with pytest.raises(AssertionError):
+        test_a_ray_through_a_shared_vertex_crosses_once(follow)
+
+
+def test_a_closed_outline_is_left_as_often_as_it_is_entered(follow):
+    """Rays at vertices of a star, tips and notches among them, end in the medium where they began, or within it."""
+    figure, rng = star(60), np.random.default_rng(3)
+    origins = rng.normal(size=(200, 2)) * 0.3 + [3, 0]
+    paths = follow(figure, origins, figure.start[rng.integers(0, 60, 200)] - origins, max_depth=40)
+    assert not (paths.events == Event.CONTRADICTED).any()
+    last = (paths.events != Event.NONE).sum(1) - 1
+    ends = paths.events[np.arange(200), last]
+    assert (paths.indices[np.arange(200), last][(ends == ESCAPED) & (last > 0)] == 1).all()
+    assert ((ends == ESCAPED) & (last > 0)).sum() > 100
+
+
+def test_a_ray_that_grazes_a_tip_passes_it_on_its_right(follow):
+    """Up along x = 1 at the tip (1, 0.5): displaced to the right it misses the glass on its left, down it enters."""
+    tip = polygon([(0, 0), (1, 0.5), (0, 1)])
+    assert story(follow(tip, (1, -1), (0, 1))) == ([], [ESCAPED])
+    hits, events = story(follow(tip, (1, 2), (0, -1)))
+    assert (hits[0], events[0]) == (1, REFRACTED)
+
+
+def test_a_ray_along_a_segment_is_on_the_right_of_itself(follow):
+    square = polygon(SQUARE)
+    assert story(follow(square, (-1, 0), (1, 0))) == ([], [ESCAPED])
+    paths = follow(square, (2, 0), (-1, 0))
+    assert story(paths) == ([1, 3], [REFRACTED, REFRACTED, ESCAPED])
+    assert (paths.points[0, :3, 1] == 0).all()
+
+
+def test_a_segment_of_length_zero_is_no_boundary(follow):
+    square = polygon(SQUARE)
+    dots = polygon([(0.5, 0.5)], n=9.0)
+    o, d = np.array([(-1, 0.25), (0.5, -1), (-1, -0.5), (-1, 0.5)]), np.array([(1, 0.1), (0, 1), (1, 1), (1, 0)])
+    plain, dotted = (follow(segments, o, d) for segments in (square, together(square, dots)))
+    for one, other in zip(dataclasses.astuple(plain), dataclasses.astuple(dotted), strict=True):
+        assert np.array_equal(one, other, equal_nan=True)
+
+
+# Starts --------------------------------------------------------------------------------------------------------
+
+
+def test_a_ray_that_starts_on_a_segment_has_not_met_it(follow):
+    square = polygon([(0, 0), (0.9, 0.1), (1, 1.1), (0.2, 0.8)])
+    for share in (0.1, 1 / 3, 0.7):
+        for i in range(4):
+            a, b = square.start[i], square.end[i]
+            inward = np.array([a[1] - b[1], b[0] - a[0]])
+            within = follow(square, a + share * (b - a), inward)
+            assert i not in story(within)[0][:1]
+            assert within.indices[0, 0] == 1.5
+            assert story(follow(square, a + share * (b - a), -inward)) == ([], [ESCAPED])
+
+
+def test_the_first_boundary_tells_the_medium_unless_it_is_told(follow):
+    square = polygon(SQUARE)
+    assert follow(square, (0.5, 0.5), (1, 0)).indices[0, :2].tolist() == [1.5, 1]
+    assert follow(square, (0.5, 0.5), (1, 0), n_start=1.5).indices[0, :2].tolist() == [1.5, 1]
+    told = follow(square, (0.5, 0.5), (1, 0), n_start=1.25)
+    assert story(told) == ([1], [Event.CONTRADICTED])
+    assert told.points[0, 1].tolist() == [1, 0.5]
+    nowhere = follow(square, (2, 2), (1, 0))
+    assert story(nowhere) == ([], [ESCAPED])
+    assert np.isnan(nowhere.indices[0, 0])
+
+
+# Media ---------------------------------------------------------------------------------------------------------
+
+
+def test_media_may_lie_within_media(follow):
+    inner = polygon([(0.25, 0.25), (0.75, 0.25), (0.75, 0.75), (0.25, 0.75)], 1.33, outside=1.5)
+    paths = follow(together(polygon(SQUARE), inner), (-1, 0.5), (1, 0.01))
+    assert paths.indices[0, :5] == pytest.approx([1, 1.5, 1.33, 1.5, 1], rel=1e-7)
+
+
+def junction():
+    """Three media about (0, 0): 1.5 below, 1.0 above on the left, 1.3 above on the right."""
+    ends = np.array([(-9.0, 0.0), (9.0, 0.0), (0.0, 9.0)])
+    return Segments(np.zeros((3, 2)), ends, np.array([1.5, 1.3, 1.0]), np.array([1.0, 1.5, 1.3]))
+
+
+def test_at_a_junction_boundaries_are_crossed_one_after_the_other(follow):
+    angle = np.linspace(0, 2 * np.pi, 41)[:-1] + 0.05
+    origins = 2 * np.column_stack([np.cos(angle), np.sin(angle)])
+    paths = follow(junction(), origins, -origins, max_depth=8)
+    assert not (paths.events == Event.CONTRADICTED).any()
+    assert (paths.events == ESCAPED).any(axis=1).all()
+    # From straight above the upright boundary is passed on its right, which is the left of the picture.
+    hits, _ = story(follow(junction(), (0, 2), (0, -1)))
+    assert hits == [0]
+
+
+def test_a_vertex_inside_another_segment_is_no_junction(follow):
+    """The boundary below is one segment with 1.0 above it, on the right, too: who comes from 1.3 is told."""
+    whole = Segments(
+        np.array([(-9.0, 0.0), (0.0, 0.0)]), np.array([(9.0, 0.0), (0.0, 9.0)]), np.ones(2), np.array([1.5, 1.3])
+    )
+    assert story(follow(whole, (3, 1), (-0.1, -1), n_start=1.3)) == ([0], [Event.CONTRADICTED])
+    assert story(follow(whole, (-3, 1), (0.1, -1))) == ([0], [REFRACTED, ESCAPED])
+
+
+def test_a_segment_turned_round_is_contradicted(follow):
+    square = polygon(SQUARE)
+    square.n_left[1], square.n_right[1] = 1.0, 1.5
+    paths = follow(square, (-1, 0.5), (1, 0))
+    assert story(paths) == ([3, 1], [REFRACTED, Event.CONTRADICTED])
+    assert paths.directions[0].tolist() == [1, 0]
+
+
+# Ends ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_path_is_exhausted_only_where_another_boundary_is_ahead(follow):
+    square = polygon(SQUARE)
+    assert story(follow(square, (-1, 0.5), (1, 0), max_depth=1)) == ([3], [REFRACTED, Event.EXHAUSTED])
+    assert story(follow(square, (-1, 0.5), (1, 0), max_depth=2)) == ([3, 1], [REFRACTED, REFRACTED, ESCAPED])
+
+
+def test_bits_say_where_a_ray_is_reflected(follow):
+    square = polygon(SQUARE)
+    paths = follow(square, [(-1, 0.5)] * 4, [(1, 0)] * 4, max_depth=6, reflect=[0, 1, 2, 6])
+    stories = [story(paths, i) for i in range(4)]
+    assert stories[0] == ([3, 1], [REFRACTED, REFRACTED, ESCAPED])
+    assert stories[1] == ([3], [REFLECTED, ESCAPED])
+    assert stories[2] == ([3, 1, 3], [REFRACTED, REFLECTED, REFRACTED, ESCAPED])
+    assert stories[3] == ([3, 1, 3, 1], [REFRACTED, REFLECTED, REFLECTED, REFRACTED, ESCAPED])
+    r = 0.2**2
+    powers = [(1 - r) ** 2, r, r * (1 - r) ** 2, r**2 * (1 - r) ** 2]
+    assert [paths.weights[i, len(stories[i][0])] for i in range(4)] == pytest.approx(powers, rel=1e-6)
+
+
+# Arcs ----------------------------------------------------------------------------------------------------------
+
+
+def ball(n=1.5, radius=1.0):
+    """A circle of four arcs."""
+    start = radius * np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], float)
+    control = radius * np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)], float)
+    return Segments(start, np.roll(start, -1, 0), np.full(4, n), np.ones(4), control, np.full(4, math.sqrt(0.5)))
+
+
+def test_a_ball_turns_a_ray_by_twice_the_difference_of_angles(follow, setting):
+    height = np.array([-0.95, -0.5, -0.1, 0.0, 0.3, 0.8])
+    paths = follow(ball(), np.column_stack([-3 + 0 * height, height]), np.tile([1.0, 0.0], (6, 1)))
+    assert (paths.events[:, :3] == [REFRACTED, REFRACTED, ESCAPED]).all()
+    turned = np.arctan2(paths.directions[:, 1], paths.directions[:, 0])
+    exact = -2 * (np.arcsin(height) - np.arcsin(height / 1.5))
+    assert turned == pytest.approx(exact, abs=40 * setting.roundoff)
+    assert np.hypot(*paths.points[:, 1:3].T) == pytest.approx(1, abs=4 * setting.roundoff)
+
+
+@pytest.mark.parametrize("grazing", [0.5, 0.1, 1e-2, 1e-3])
+def test_inside_a_ball_a_ray_turns_by_the_same_angle_each_time(follow, setting, grazing):
+    """Chords of angle 2 α, many of them within one arc; none is skipped, none leaks at the joints."""
+    count = 500
+    start = np.array([math.cos(0.3), math.sin(0.3)]) * math.cos(grazing)
+    along = np.array([-math.sin(0.3), math.cos(0.3)])
+    paths = follow(ball(), start, along, max_depth=count)
+    assert story(paths)[1] == [REFLECTED] * count + [Event.EXHAUSTED]
+    angle = np.unwrap(np.arctan2(*paths.points[0, 1:, ::-1].T))
+    steps = np.diff(angle.astype(float))
+    # A chord's own error: u of the place over the grazing angle, and that of the angle adds up as the rays go on.
+    assert steps == pytest.approx(2 * grazing, abs=60 * count**0.5 * setting.roundoff / grazing)
+
+
+def test_an_arc_is_met_by_rays_that_miss_its_chord(follow):
+    """A ray at height 0.99 over the ball's top arc crosses that arc twice and the chord never."""
+    turned = ball()
+    s = math.sqrt(0.5)
+    corner = np.array([(s, -s), (s, s), (-s, s), (-s, -s)])
+    control = np.array([(2 * s, 0), (0, 2 * s), (-2 * s, 0), (0, -2 * s)])
+    turned = Segments(corner, np.roll(corner, -1, 0), turned.n_left, turned.n_right, control, turned.weight)
+    paths = follow(turned, (-3, 0.99), (1, 0), formula="promoted")
+    assert story(paths)[0][0] == 1
+    assert paths.points[0, 1] == pytest.approx([-math.sqrt(1 - 0.99**2), 0.99], abs=1e-6)
+
+
+def test_straight_segments_among_arcs_are_the_same_as_alone(follow, setting):
+    figure, rng = star(30), np.random.default_rng(5)
+    mixed = dataclasses.replace(figure, control=(figure.start + figure.end) / 2, weight=np.ones(30))
+    origins, directions = rng.normal(size=(100, 2)), rng.normal(size=(100, 2))
+    one, other = (follow(segments, origins, directions, max_depth=3) for segments in (figure, mixed))
+    assert (one.hits == other.hits).all()
+    assert np.nanmax(np.abs(one.points - other.points)) < 1e3 * setting.roundoff
+
+
+# Bad input -----------------------------------------------------------------------------------------------------
+
+
+GOOD = {"start": [(0.0, 0.0)], "end": [(1.0, 0.0)], "n_left": [1.5], "n_right": [1.0]}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"n_left": [0.0]}, "n_left[0] = 0.0: accepted: more than 0"),
+        ({"n_right": [math.nan]}, "n_right[0] = nan: accepted: finite"),
+        ({"end": [(1.0, math.inf)]}, "end[0, 1] = inf: accepted: finite"),
+        ({"end": [(1.0, 0.0), (2.0, 0.0)]}, "end: shape (2, 2); accepted: (1, 2)"),
+        ({"start": "here"}, "start: accepted: numbers"),
+        ({"start": [], "end": [], "n_left": [], "n_right": []}, "none; accepted: at least one"),
+        ({"control": [(0.0, 1.0)]}, "control and weight: accepted: both or neither"),
+        ({"control": [(0.0, 1.0)], "weight": [-1.0]}, "weight[0] = -1.0: accepted: more than 0"),
+    ],
+)
+def test_bad_segments_are_named_in_one_line(change, message):
+    with pytest.raises(ValueError) as error:
+        Segments(**(GOOD | change))
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_segments_that_coincide_are_refused():
+    twice = {"start": [(0, 0), (1, 0)], "end": [(1, 0), (0, 0)], "n_left": [1.5, 1.5], "n_right": [1, 1]}
+    with pytest.raises(ValueError, match="segments 0 and 1 coincide"):
+        Segments(**twice)
+    lens = Segments(**twice, control=[(0.5, 0.5), (0.5, -0.5)], weight=[0.9, 0.9])
+    assert len(lens) == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"max_depth": 0}, "max_depth = 0: accepted: a whole number, 1 or more"),
+        ({"max_depth": 2.5}, "max_depth = 2.5: accepted"),
+        ({"origins": [(0.0, math.nan)]}, "origins[0, 1] = nan: accepted: finite"),
+        ({"directions": [(0.0, 0.0)]}, "directions[0] = (0, 0): accepted: a direction"),
+        ({"directions": [(0.0, 1.0)] * 2}, "directions: shape (2, 2); accepted: (1, 2)"),
+        ({"formula": "sellmeier"}, "formula = 'sellmeier': unknown; accepted: wedge"),
+        ({"precision": "float16"}, "precision = 'float16'; accepted: float32, float64"),
+        ({"backend": "metal"}, "backend = 'metal'; accepted: scalar, llvm, cuda"),
+        ({"method": "bvh"}, "method = 'bvh'; accepted: auto, brute, mesh"),
+        ({"reflect": -1}, "reflect: accepted: a whole number"),
+        ({"reflect": 0.5}, "reflect: accepted: a whole number"),
+        ({"n_start": "air"}, "n_start: accepted: a number"),
+    ],
+)
+def test_bad_arguments_are_named_in_one_line(change, message):
+    arguments = {"origins": [(0.5, 1.0)], "directions": [(0.0, -1.0)], "max_depth": 2} | change
+    with pytest.raises(ValueError) as error:
+        trace(Segments(**GOOD), **arguments)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_no_rays_are_no_paths(follow):
+    paths = follow(polygon(SQUARE), np.zeros((0, 2)), np.zeros((0, 2)), max_depth=3)
+    assert paths.points.shape == (0, 4, 2)
