@@ -15,7 +15,7 @@ from .planar_scene import PlanarScene
 from .walks import REFLECT_BITS
 
 LEAST = 1e-3  # of a ray's power: a partial reflection that would carry no more is not followed
-MOST = 2**24  # legs of one order of reflection: 1 GB of paths
+MOST = 2**25  # legs of paths with as many partial reflections: 1.3 GB
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def follow(
     """Paths with up to `branches` partial reflections, of a share of more than `least` of the power each.
 
     `how`: formula, precision, backend, as for `planar.trace`. A path reflects in part at its first 32 boundaries only.
-    ValueError as there, for a negative number of branches, and for more of them than memory should hold.
+    ValueError as there, for a negative number of branches, and for more paths than memory should hold.
     """
     if branches < 0:
         raise ValueError(f"branches = {branches}: accepted: a whole number from 0")
@@ -79,14 +79,14 @@ def follow(
     rays, reflect = np.arange(len(origins)), np.zeros(len(origins), np.uint32)
     orders: list[Branches] = []
     while True:
+        if rays.size * (max_depth + 1) > MOST:
+            size = f"{rays.size} paths of up to {max_depth} boundaries with {len(orders)} partial reflections"
+            raise ValueError(f"{size}; accepted: fewer rays, branches or boundaries, {MOST} legs altogether")
         paths = trace(origins[rays], directions[rays], max_depth, reflect=reflect, weights=True)
         orders.append(Branches(paths, rays, reflect))
         parent, boundary = np.nonzero(_worth(orders[-1], least))
         if len(orders) > branches or not parent.size:
             return _joined(orders)
-        if parent.size * (max_depth + 1) > MOST:
-            size = f"{parent.size} paths with {len(orders)} partial reflections and max_depth = {max_depth}"
-            raise ValueError(f"branches = {branches}: {size}; accepted: at most {MOST} legs")
         rays, reflect = rays[parent], reflect[parent] | (np.uint32(1) << boundary.astype(np.uint32))
 
 
@@ -143,18 +143,22 @@ def count(traced: Sequence[Branches]) -> Counter[str]:
 def summary(scene: PlanarScene, traced: Sequence[Branches]) -> str:
     """One line: how many rays, and what became of them; what did not happen is left out."""
     n = count(traced)
-    paths = sum(len(branches.rays) for branches in traced)
+    rays, paths = len(scene.origins), sum(len(branches.rays) for branches in traced)
     colours = f" in {len(traced)} colours" if len(traced) > 1 else ""
-    split = f", {paths} paths" if paths > len(scene.origins) * len(traced) else ""
-    ends = {
+    split = [f"{paths} paths"] if paths > rays * len(traced) else []
+    happened = {
         "reflected totally": n["REFLECTED"],
         "escaped": n["ESCAPED"],
         "exhausted": n["EXHAUSTED"],
         "contradicted": n["CONTRADICTED"],
     }
-    met = f"{n['REFRACTED'] + n['REFLECTED'] + n['CONTRADICTED']} boundaries met"
-    said = ", ".join([met, *(f"{number} {what}" for what, number in ends.items() if number)])
-    return f"{len(scene.origins)} rays{colours}{split}, {said}"
+    hits = _plural(n["REFRACTED"] + n["REFLECTED"] + n["CONTRADICTED"], "hit")
+    said = [f"{number} {what}" for what, number in happened.items() if number]
+    return ", ".join([_plural(rays, "ray") + colours, *split, hits, *said])
+
+
+def _plural(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def as_data(scene: PlanarScene, traced: Sequence[Branches]) -> dict[str, Any]:

@@ -115,7 +115,7 @@ def trace(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="A planar scene.")],
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="OUT.svg|.png|.pdf", help="Draw.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the paths as JSON.")] = False,
-    table: Annotated[bool, typer.Option(help="Print focal points and spot sizes.")] = False,
+    table: Annotated[bool, typer.Option("--table", help="Print focal points and spot sizes.")] = False,
     branches: Annotated[int | None, typer.Option(min=0, help="Partial reflections on a path, at most.")] = None,
     rays: Annotated[int | None, typer.Option(min=1, help="Rays of each beam that has several.")] = None,
     max_depth: Annotated[int | None, typer.Option(min=1, help="Boundaries on a path, at most.")] = None,
@@ -123,7 +123,7 @@ def trace(
     formula: Annotated[str | None, typer.Option(help="A formula of refraction; the planar one by default.")] = None,
     arrays: Annotated[str | None, typer.Option("--backend", help="llvm, cuda or scalar; see `doctor`.")] = None,
 ) -> None:
-    """Follow the rays of a planar scene from boundary to boundary; draw them, print what becomes of them."""
+    """Follow the rays of a planar scene; draw them, print their paths, or where they come together."""
     backend.restart_if_needed()
     if output:
         files.writable(output, drawing.FORMATS)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import math
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,10 +27,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FORMATS = (".svg", ".png", ".pdf")
-VECTORS = 2000  # lines that are drawn one by one; of more of them, the density
+# Lines are drawn one by one, as long as there are not more of them and they would not be longer than so many diagonals
+# of the view. Of more the density is drawn.
+LINES, DIAGONALS = 6000, 150
 DPI = {".png": 200, ".svg": 150, ".pdf": 150}  # of what is not lines, in the last two
 RAY, WHITE, INK, MUTED = "#c8102e", "#55504c", "#222222", "#6b6b6b"  # WHITE: of all colours, on paper
-DENSE, THIN = (0.78, 0.88, 0.97), (1.00, 0.93, 0.74)  # tints of the media that differ most from what is around all
+DENSE, THIN = (0.73, 0.85, 0.97), (1.00, 0.92, 0.70)  # tints of the media that differ most from what is around all
 LINE = 0.13  # inches
 NAMED = 5  # media in the legend
 TYPICAL = 0.35  # opacity/(1 − opacity) of the median pixel that rays touch, where their density is drawn
@@ -151,7 +154,7 @@ def _media(panel: Axes, scene: PlanarScene) -> None:
 def _tint(contrast: float) -> tuple[float, float, float]:
     """−1 … 1: how far an index is from that around everything. Denser media are blue, thinner ones yellow."""
     red, green, blue = DENSE if contrast > 0 else THIN
-    share = abs(contrast) and 0.25 + 0.75 * abs(contrast)
+    share = abs(contrast) and 0.15 + 0.85 * abs(contrast) ** 1.5
     return 1 - share * (1 - red), 1 - share * (1 - green), 1 - share * (1 - blue)
 
 
@@ -163,9 +166,10 @@ def _label(indices: Sequence[float]) -> str:
 def _boundaries(panel: Axes, segments: Segments) -> None:
     from matplotlib.collections import LineCollection
 
-    many = len(segments) > VECTORS
+    many = len(segments) > LINES
     lines = curves(segments, 5 if many else 33)
-    style: dict[str, Any] = {"colors": INK, "linewidths": 0.7, "capstyle": "round", "zorder": 1.5}
+    width = 0.7 * max(min(1.0, 8 / len(lines)), 0.15)
+    style: dict[str, Any] = {"colors": INK, "linewidths": width, "capstyle": "round", "zorder": 1.5}
     panel.add_collection(LineCollection(lines, rasterized=many, **style), autolim=False)
     panel.plot(0, 0, "+", color=MUTED, markersize=5, markeredgewidth=0.6, zorder=1.4, scalex=False, scaley=False)
 
@@ -181,10 +185,12 @@ def strength(weight: Any) -> Any:
 def _rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
     names = {SHARED: WHITE} | {i: name or RAY for i, name in enumerate(scene.colours)}
     colours = {i: _rgb(scene, name) for i, name in names.items()}
-    if len(lines) > VECTORS:
+    x0, x1, y0, y1 = *panel.get_xlim(), *panel.get_ylim()
+    crowd = np.hypot(*(lines.end - lines.start).T).sum() / math.hypot(x1 - x0, y1 - y0)
+    if len(lines) > LINES or crowd > DIAGONALS:
         _shade(panel, lines, colours)
     elif len(lines):
-        _stroke(panel, lines, colours)
+        _stroke(panel, lines, colours, min(1.0, (40 / crowd) ** 0.5))
 
 
 def _rgb(scene: PlanarScene, name: str) -> Any:
@@ -196,16 +202,15 @@ def _rgb(scene: PlanarScene, name: str) -> Any:
         raise ValueError(f"{scene.path}: colours: {name!r}; accepted: a colour that matplotlib knows") from None
 
 
-def _stroke(panel: Axes, lines: Legs, colours: dict[int, Any]) -> None:
-    """One line each, thinner and fainter the more there are; the strongest on top."""
+def _stroke(panel: Axes, lines: Legs, colours: dict[int, Any], room: float) -> None:
+    """One line each, thinner and fainter the less room there is; the strongest on top."""
     from matplotlib.collections import LineCollection
 
-    crowd = min(1.0, (120 / len(lines)) ** 0.5)
     order = np.argsort(lines.weight, kind="stable")
-    opacity = np.maximum(strength(lines.weight[order]) * max(crowd, 0.35), 0.02)
+    opacity = np.maximum(strength(lines.weight[order]) * room, 0.02)
     rgba = np.column_stack([np.array([colours[c] for c in lines.colour[order]]), opacity])
     strokes = np.stack([lines.start, lines.end], axis=1)[order]
-    width = 0.45 + 0.75 * crowd
+    width = 0.4 + 0.8 * room
     panel.add_collection(LineCollection(list(strokes), colors=rgba, linewidths=width, zorder=2), autolim=False)
 
 

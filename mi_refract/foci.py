@@ -62,10 +62,8 @@ def closest_point(origins: Array, directions: Array) -> Array | None:
     across = _turned(directions)
     if np.linalg.svd(across, compute_uv=False)[-1] <= PARALLEL * math.sqrt(len(across)) or len(across) < 2:
         return None
-    for _ in range(2):  # the second time from near the point: differences of small numbers lose nothing
-        distances = ((origins - centre) * across).sum(axis=1)
-        centre = centre + np.linalg.lstsq(across, distances, rcond=None)[0]
-    return centre
+    distances = ((origins - centre) * across).sum(axis=1)
+    return centre + np.linalg.lstsq(across, distances, rcond=None)[0]
 
 
 def crossing(origin: Array, direction: Array, other: Array, along: Array) -> Point | None:

@@ -77,19 +77,19 @@ def test_no_leg_is_counted_twice():
     traced = follow_scene(given)
     # The direct path meets 2 boundaries, that with a reflection inside meets one more.
     assert count(traced) == {"REFRACTED": 3, "ESCAPED": 3, "NONE": 0, "REFLECTED": 0, "EXHAUSTED": 0, "CONTRADICTED": 0}
-    assert summary(given, traced) == "1 rays, 3 paths, 3 boundaries met, 3 escaped"
-    assert summary(given, follow_scene(replace(given, branches=0))) == "1 rays, 2 boundaries met, 1 escaped"
+    assert summary(given, traced) == "1 ray, 3 paths, 3 hits, 3 escaped"
+    assert summary(given, follow_scene(replace(given, branches=0))) == "1 ray, 2 hits, 1 escaped"
 
 
 def test_paths_end_in_every_way():
     square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
     inside = scene(polygon(square, 2.0), [[0.5, 0.25]], (1, 1.1), max_depth=6)
-    assert summary(inside, follow_scene(inside)) == "1 rays, 6 boundaries met, 6 reflected totally, 1 exhausted"
+    assert summary(inside, follow_scene(inside)) == "1 ray, 6 hits, 6 reflected totally, 1 exhausted"
     wrong = polygon(square, 2.0)
     wrong = replace(wrong, n_left=np.array([2.0, 1.7, 2.0, 2.0]))
     given = scene(wrong, [[-1, 0.5]], (1, 0))
     traced = follow_scene(given)
-    assert summary(given, traced) == "1 rays, 2 boundaries met, 1 contradicted"
+    assert summary(given, traced) == "1 ray, 2 hits, 1 contradicted"
     np.testing.assert_allclose(traced[0].tips, [[1, 0.5]])
 
 
@@ -97,7 +97,7 @@ def test_too_many_branches_are_refused(monkeypatch):
     with pytest.raises(ValueError, match="branches = -1: accepted"):
         through_slab(-1)
     monkeypatch.setattr(branches, "MOST", 30)
-    with pytest.raises(ValueError, match="branches = 1: 2 paths with 1 partial reflections and max_depth = 20;"):
+    with pytest.raises(ValueError, match="2 paths of up to 20 boundaries with 1 partial reflections; accepted: fewer"):
         through_slab(1)
 
 

@@ -25,12 +25,13 @@ def test_rays_through_a_point(distance, virtual):
 
 
 def test_a_far_focus_keeps_its_digits():
-    """Lines that part by 1e-6 meet 1e6 away; there their distance is as small as rounding lets it be."""
-    tilt = 1e-6 * np.array([-1.0, -0.3, 0.4, 1.0])
+    """Of rays 1e-5 rad apart: 1024 away they are as near to one another as rounding lets them be."""
+    tilt = 1e-5 * np.array([-1.0, -0.3, 0.45, 1.0])
     directions = np.column_stack([np.cos(tilt), np.sin(tilt)])
-    found = foci.spread(np.column_stack([np.zeros(4), -1e6 * np.tan(tilt)]), directions)
-    np.testing.assert_allclose(found.spot, [1e6, 0], rtol=1e-9, atol=1e-9)
-    assert found.largest < 1e-9
+    focus = np.array([1000.0, 0.3])
+    found = foci.spread(focus - 1024 * directions, directions)
+    np.testing.assert_allclose([found.focus, found.spot], [focus, focus], rtol=0, atol=2e-11)
+    assert found.largest < 1e-15
 
 
 def test_parallel_rays_have_a_spot_and_no_focus():
