@@ -71,7 +71,16 @@ class Hit:
     to_left: Any  # the ray goes on to the left of the segment
     left: Any  # the vertex on the left of the ray, the one on its right
     right: Any
-    along: Any  # the segment, directed from its left vertex to its right one
+    along: Any  # the segment's direction, from its left vertex to its right one
+    into: Any = None  # of an arc, at its right vertex; `along` is that at its left one
+
+
+def _box(*points: Any) -> tuple[list[float], list[float]]:
+    """Corners of a box half as wide again as what holds the points."""
+    places = np.concatenate(points)
+    low, high = places.min(axis=0), places.max(axis=0)
+    margin = (high - low).max() / 4
+    return (low - margin).tolist(), (high + margin).tolist()
 
 
 def _inside(ray: Ray) -> tuple[Any, Any]:
@@ -82,7 +91,7 @@ class Straight:
     """Straight segments; `vertices` (M × 2) name equal ends by equal numbers."""
 
     def __init__(self, lanes: Lanes, start: Any, end: Any, vertices: Any) -> None:
-        self.lanes, self.count = lanes, len(start)
+        self.lanes, self.count, self.box = lanes, len(start), _box(start, end)
         self.ends = lanes.table(np.concatenate([start, end], 1))
         self.vertices = lanes.table(vertices.astype(np.uint32))
 
@@ -159,6 +168,7 @@ class Arcs(Straight):
 
     def __init__(self, lanes: Lanes, start: Any, end: Any, vertices: Any, control: Any, weight: Any) -> None:
         super().__init__(lanes, start, end, vertices)
+        self.box = _box(start, end, control)
         (ax, ay), (bx, by) = (control - start).T, (end - control).T
         turn = np.where((control == (start + end) / 2).all(1), 0.0, ax * by - ay * bx)
         self.shapes = lanes.table(np.column_stack([control, weight, turn]))
@@ -180,7 +190,7 @@ class Arcs(Straight):
 
     def none(self) -> Hit:
         hit = super().none()
-        hit.left = hit.right = hit.along = None
+        hit.into = hit.along
         return hit
 
     def nearer(self, best: Hit, ray: Ray, start: Start, i: Any, active: Any = True) -> Hit:
@@ -199,16 +209,19 @@ class Arcs(Straight):
         again = own & (a_left == b_left) & (turn != 0) & (ray.left == (turn > 0))
         small = dr.select(own, dr.abs(f_b) * ray.r, dr.abs(h)), dr.select(own, dr.abs(f_a) * ray.s, dr.abs(f_a))
         large = dr.abs(f_b), dr.abs(h)
-        ways = to_a, to_c, to_b
-        for (s, r), valid, to_left in (
+        once = a_left != b_left
+        ends = _ends(once, a_left, vertices, (a, c, b))
+        for root, valid, to_left in (
             (small, again | (crossed & (h_left != a_left)), dr.select(own, turn < 0, a_left)),
             (large, crossed & (h_left != b_left), f_a < 0),
         ):
-            once = dr.select(a_left != b_left, a_left, to_left)
-            best = self._closer(best, ray, i, ways, w, (s, r), valid & active, once)
+            to_left = dr.select(once, a_left, to_left)
+            found, ahead = self._found(ray, i, (to_a, to_c, to_b), w, root, to_left, ends)
+            best = dr.select(valid & active & ahead & self._before(found, best), found, best)
         return best
 
-    def _closer(self, best: Hit, ray: Ray, i: Any, ways: Any, w: Any, root: Any, valid: Any, to_left: Any) -> Hit:
+    def _found(self, ray: Ray, i: Any, ways: Any, w: Any, root: Any, to_left: Any, ends: Any) -> tuple[Hit, Any]:
+        """A root as a hit, and whether it is ahead."""
         s, r = root
         size = s + r
         s, r = quotient(s, size), quotient(r, size)
@@ -217,8 +230,14 @@ class Arcs(Straight):
         e = _tangent(to_a, to_c, to_b, w, s, r)
         distance = dr.dot(way, ray.d)
         ahead = distance * dr.abs(cross(ray.d, e)) > ray.slack * (dr.abs(e.x) + dr.abs(e.y))
-        found = Hit(distance, i, s, r, to_left, None, None, None)
-        return dr.select(valid & ahead & (distance > 0) & (distance < best.distance), found, best)
+        return Hit(distance, i, s, r, to_left, *ends), ahead & (distance > 0)
+
+    def _before(self, hit: Hit, best: Hit) -> Any:
+        """Where both are one place to rounding, a vertex that the arcs share, their directions there decide."""
+        first, second = hit.distance, best.distance
+        tie = dr.abs(first - second) <= 16 * self.lanes.roundoff * dr.abs(first)
+        before = dr.select(tie & (hit.right == best.right), cross(hit.into, best.into) < 0, first < second)
+        return dr.select(tie & (hit.left == best.left), cross(hit.along, best.along) > 0, before)
 
     def place(self, hit: Hit) -> tuple[Any, Any]:
         there = hit.segment != NOWHERE
@@ -226,6 +245,13 @@ class Arcs(Straight):
         s, r = hit.s, hit.r
         point = dr.select(r < s, a + _bend(a, c, b, w, s, r), b + _bend(b, c, a, w, r, s))
         return point, _tangent(a, c, b, w, s, r)
+
+
+def _ends(once: Any, a_left: Any, vertices: Any, points: Any) -> tuple[Any, Any, Any, Any]:
+    """Of an arc that is crossed once: its left and right vertex, and its directions there, from left to right."""
+    a, c, b = points
+    left, right = (dr.select(once, dr.select(a_left, vertices[j], vertices[1 - j]), NOWHERE - 1 - j) for j in (0, 1))
+    return left, right, dr.select(a_left, c - a, c - b), dr.select(a_left, b - c, a - c)
 
 
 def _total(w: Any, s: Any, r: Any) -> Any:

@@ -13,6 +13,7 @@ the rays' media tell, the next strokes are tried, too.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -26,6 +27,10 @@ MARGIN = 2.0**-19
 OFFSET = 2.0**-21
 SHORTEST = 2 * MARGIN
 STEP = 2.0**-22  # past a stroke that was no hit
+BACK = 2.0**-6  # behind a start in the open, which may be within ε of a boundary, down to grazing angles of ε/BACK
+
+Sides = Callable[[Hit, Any], tuple[Any, Any]]
+Found = tuple[Hit, Any, Any]
 
 
 class Extrusion:
@@ -46,32 +51,43 @@ class Extrusion:
         first, around = _around(vertices, len(starts) - len(a))
         self.first, self.around = lanes.table(first), lanes.table(around)
 
-    def nearest(self, boundaries: Straight, ray: Ray, start: Start, active: Any, agrees: Any) -> Hit:
-        """The first boundary ahead. `agrees(hit)`: whether its near side is the medium that the ray is in."""
-        to, own = self.lanes, ray.own != NOWHERE
-        centre = to.vector(*self.centre.tolist())
-        a, b = start.ways
-        e = (b - a) * (1 / self.half)
-        length = dr.norm(e)
-        aside = dr.select(ray.left, OFFSET, -OFFSET) * dr.rcp(length)
-        q = (ray.p - centre) * (1 / self.half)
-        q = dr.select(own, to.vector(q.x - e.y * aside, q.y + e.x * aside), q)
+    def nearest(self, boundaries: Straight, ray: Ray, start: Start, active: Any, sides: Sides, index: Any) -> Found:
+        """The first boundary ahead, and the media before and behind it; `index` is that of the ray's medium."""
+        to = self.lanes
         # The start may lie beyond a neighbour, or the stroke of the vertex between: neighbours are tried by hand.
-        near_a, near_b = to.take(self.narrow, ray.own, active & own)
-        corner = active & own & ((ray.r * length < near_a) | (ray.s * length < near_b))
-        best = self._tried(boundaries.none(), boundaries, ray, start, ray.own, corner)
+        own = active & (ray.own != NOWHERE)
+        near_a, near_b = to.take(self.narrow, ray.own, own)
+        corner = own & ((ray.r < near_a) | (ray.s < near_b))
+        best = self._around(boundaries.none(), boundaries, ray, start, ray.own, corner)
 
-        def query(best: Hit, q: Any, gone: Any, going: Any) -> tuple[Hit, Any, Any, Any]:
+        def query(best: Hit, near: Any, far: Any, q: Any, gone: Any, going: Any) -> Any:
             found, t, stroke = self._stroke(q, ray.d, going)
-            best = self._tried(best, boundaries, ray, start, stroke, found)
+            best = boundaries.nearer(best, ray, start, stroke, found & (stroke < boundaries.count))
+            inside = dr.square(dr.minimum(best.s, best.r)) * dr.squared_norm(best.along) > (4 * MARGIN * self.half) ** 2
+            vague = found & negated((best.segment == stroke) & inside)
+            best = self._around(best, boundaries, ray, start, stroke, vague)
+            some = going & (best.segment != NOWHERE)
+            near, far = sides(best, some)
             t = dr.select(found, t + STEP, 0)
             gone = gone + t
             distance = best.distance * (1 / self.half)
-            settled = (agrees(best) & (distance <= gone + MARGIN)) | (distance + MARGIN < gone)
-            return best, q + ray.d * t, gone, found & negated(settled)
+            agrees = some & (dr.isnan(index) | (near == index))
+            settled = (agrees & (distance <= gone + MARGIN)) | (distance + MARGIN < gone)
+            return best, near, far, q + ray.d * t, gone, found & negated(settled)
 
-        state = best, q, to.number(0), active
-        return dr.while_loop(state, lambda best, q, gone, going: going, query, label="strokes")[0]
+        zero = to.number(0)
+        back = dr.select(ray.own == NOWHERE, -BACK, 0)
+        state = best, zero, zero, dr.fma(ray.d, back, self._aside(ray, start)), zero + back, active
+        return dr.while_loop(state, lambda *state: state[-1], query, label="strokes")[:3]
+
+    def _aside(self, ray: Ray, start: Start) -> Any:
+        """Where to look from: the ray's start, moved off the segment that it is on, to the side to which it goes."""
+        q = (ray.p - self.lanes.vector(*self.centre.tolist())) * (1 / self.half)
+        a, b = start.ways
+        x, y = (self.mi.Float(e) for e in b - a)
+        size = dr.select(ray.left, OFFSET, -OFFSET) * dr.rsqrt(dr.fma(x, x, y * y))
+        number = self.lanes.number
+        return dr.select(ray.own != NOWHERE, type(q)(q.x - number(y * size), q.y + number(x * size)), q)
 
     def _stroke(self, q: Any, d: Any, active: Any) -> tuple[Any, Any, Any]:
         """Whether a stroke is ahead, how far, and its number."""
@@ -80,18 +96,14 @@ class Extrusion:
         seen = self.scene.ray_intersect_preliminary(ray, True, active)
         return active & seen.is_valid(), self.lanes.number(seen.t), self.lanes.index(seen.prim_index)
 
-    def _tried(self, best: Hit, boundaries: Straight, ray: Ray, start: Start, stroke: Any, active: Any) -> Hit:
-        """`best`, or what comes before it of the segments that a stroke names: its own first, others near its ends."""
+    def _around(self, best: Hit, boundaries: Straight, ray: Ray, start: Start, stroke: Any, active: Any) -> Hit:
+        """`best`, or what comes before it of the segments that a stroke names."""
         first, last = (self.lanes.take(self.first, stroke + i, active) for i in (0, 1))
 
-        def test(i: Any, best: Hit, going: Any) -> tuple[Any, Hit, Any]:
-            segment = self.lanes.take(self.around, i, going)
-            best = boundaries.nearer(best, ray, start, segment, going)
-            inside = dr.minimum(best.s, best.r) * dr.norm(best.along) > 4 * MARGIN * self.half
-            i = i + 1
-            return i, best, going & (i < last) & negated((best.segment == stroke) & inside)
+        def test(i: Any, best: Hit) -> tuple[Any, Hit]:
+            return i + 1, boundaries.nearer(best, ray, start, self.lanes.take(self.around, i, active), active)
 
-        return dr.while_loop((first, best, active), lambda i, best, going: going, test, label="around")[1]
+        return dr.while_loop((first, best), lambda i, best: active & (i < last), test, label="around")[1]
 
 
 def _strokes(a: Any, b: Any, vertices: Any) -> tuple[Any, Any]:
@@ -110,7 +122,7 @@ def _strokes(a: Any, b: Any, vertices: Any) -> tuple[Any, Any]:
 
 
 def _narrow(a: Any, b: Any, vertices: Any) -> Any:
-    """How far from either end of each segment the next one at that vertex is no more than 4 MARGIN away, M × 2."""
+    """The share of each segment, from either end, where the next one at that vertex is within 4 MARGIN; M × 2."""
     ways = np.stack([b - a, a - b], 1).reshape(-1, 2)
     angle, number = np.arctan2(ways[:, 1], ways[:, 0]), vertices.ravel()
     order = np.lexsort([angle, number])
@@ -125,7 +137,8 @@ def _narrow(a: Any, b: Any, vertices: Any) -> Any:
     np.minimum.at(least, order, turn)
     np.minimum.at(least, order[after], turn)
     with np.errstate(divide="ignore"):
-        return (4 * MARGIN / np.sin(np.minimum(least, np.pi / 2))).reshape(-1, 2)
+        reach = 4 * MARGIN / np.sin(np.minimum(least, np.pi / 2))
+        return reach.reshape(-1, 2) / np.linalg.norm(b - a, axis=1, keepdims=True)
 
 
 def _upright(of: str, a: Any, b: Any) -> Any:

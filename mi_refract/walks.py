@@ -11,7 +11,7 @@ import drjit as dr
 import numpy as np
 
 from .crossings import NOWHERE, Hit, Ray, Straight, cross
-from .extrusion import Extrusion
+from .extrusion import Extrusion, Found
 from .formulas import FORMULAS, refract_2d
 from .fresnel import powers, refracted_cosine
 from .lanes import Lanes, negated
@@ -72,15 +72,27 @@ class Walker:
             index, bits = (None if table is None else to.take(table, lane) for table in others)
             put("points", 0, p, True)
             walk = self._start(p, d, to.number(dr.nan) if index is None else index)
-            put("directions", 0, self._follow(walk, bits, max_depth, put, weights).ray.d, True)
+            put("directions", 0, _unit(self._follow(walk, bits, max_depth, put, weights).ray.d), True)
 
         return to.run(count, buffers, work)
 
     def _start(self, p: Any, d: Any, index: Any) -> Walk:
-        to = self.to
+        to, d = self.to, _unit(d)
+        p = self._entered(p, d)
         slack = 4 * to.roundoff * (dr.abs(p.x) + dr.abs(p.y))
-        ray = Ray(p, _unit(d), to.index(NOWHERE), to.number(0.5), to.number(0.5), to.mask(False), slack)
+        ray = Ray(p, d, to.index(NOWHERE), to.number(0.5), to.number(0.5), to.mask(False), slack)
         return Walk(ray, index, to.number(1), to.index(0), to.mask(True))
+
+    def _entered(self, p: Any, d: Any) -> Any:
+        """The origin, or from outside the place where the ray enters a box around all boundaries, half as wide again.
+
+        What is far away is rounded once, here, instead of in every difference from a vertex.
+        """
+        low, high = (self.to.vector(*corner) for corner in self.boundaries.box)
+        inverse = dr.rcp(dr.select(d == 0, 1e-30, d))
+        a, b = (low - p) * inverse, (high - p) * inverse
+        enter, leave = dr.max(dr.minimum(a, b)), dr.min(dr.maximum(a, b))
+        return dr.select((enter > 0) & (enter < leave), dr.fma(d, enter, p), p)
 
     def _follow(self, walk: Walk, mirrored: Any, max_depth: int, put: Callable[..., None], weights: bool) -> Walk:
         def step(walk: Walk) -> tuple[Walk]:
@@ -91,9 +103,8 @@ class Walker:
     def _step(self, walk: Walk, mirrored: Any, max_depth: int, put: Callable[..., None], weights: bool) -> Walk:
         """One leg: to the next boundary, and off it."""
         to, ray, j, active = self.to, walk.ray, walk.depth, walk.active
-        hit = self._nearest(ray, walk.index, active)
+        hit, near, far = self._nearest(ray, walk.index, active)
         some = active & (hit.segment != NOWHERE)
-        near, far = self._sides(hit, some)
         index = dr.select(some & dr.isnan(walk.index), near, walk.index)
         p, e = self.boundaries.place(hit)
         l = _unit(e)  # noqa: E741 (the document's name)
@@ -117,7 +128,7 @@ class Walker:
             put("weights", j, power, active)
             power = power * _share(ray.d, l, quotient(near, far), through)
         on = met & (near == index)
-        after = Ray(p, _unit(d), hit.segment, hit.s, hit.r, hit.to_left == through, to.number(0))
+        after = Ray(p, d, hit.segment, hit.s, hit.r, hit.to_left == through, to.number(0))
         index = dr.select(through, far, index)
         return Walk(dr.select(on, after, ray), index, power, j + 1, on)
 
@@ -126,23 +137,19 @@ class Walker:
         left, right = self.to.take(self.media, hit.segment, active)
         return dr.select(hit.to_left, right, left), dr.select(hit.to_left, left, right)
 
-    def _nearest(self, ray: Ray, index: Any, active: Any) -> Hit:
-        """The first boundary ahead."""
+    def _nearest(self, ray: Ray, index: Any, active: Any) -> Found:
+        """The first boundary ahead, and the media before and behind it."""
         start = self.boundaries.start(ray)
         if self.mesh:
-
-            def agrees(hit: Hit) -> Any:
-                some = hit.segment != NOWHERE
-                return some & (dr.isnan(index) | (self._sides(hit, some)[0] == index))
-
-            return self.mesh.nearest(self.boundaries, ray, start, active, agrees)
+            return self.mesh.nearest(self.boundaries, ray, start, active, self._sides, index)
 
         def test(i: Any, best: Hit) -> tuple[Any, Hit]:
             return i + 1, self.boundaries.nearer(best, ray, start, i)
 
         first = self.to.index(0), self.boundaries.none()
-        ahead = dr.while_loop(first, lambda i, best: active & (i < self.boundaries.count), test, label="boundaries")
-        return ahead[1]
+        more = lambda i, best: active & (i < self.boundaries.count)  # noqa: E731
+        _, hit = dr.while_loop(first, more, test, label="boundaries")
+        return hit, *self._sides(hit, active & (hit.segment != NOWHERE))
 
 
 def _unit(v: Any) -> Any:
@@ -168,7 +175,7 @@ def _refraction(to: Lanes, formula: str | None) -> Callable[..., tuple[Any, Any]
 
         def planar(d: Any, l: Any, k: Any) -> tuple[Any, Any]:  # noqa: E741
             b, transmitted = refract_2d(d, l, k)
-            return to.vector(*b), transmitted
+            return to.vector(*b), transmitted  # as long as `d`, to u
 
         return planar
     if formula not in FORMULAS:
@@ -177,6 +184,6 @@ def _refraction(to: Lanes, formula: str | None) -> Callable[..., tuple[Any, Any]
     def spatial(d: Any, l: Any, k: Any) -> tuple[Any, Any]:  # noqa: E741
         zero = 0 * d.x
         b, transmitted = FORMULAS[formula].unchecked(to.vector3(d.x, d.y, zero), to.vector3(-l.y, l.x, zero), k)
-        return to.vector(b.x, b.y), transmitted
+        return _unit(to.vector(b.x, b.y)), transmitted
 
     return spatial

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mi_refract import FORMULAS, refract_2d
+from mi_refract.planar import Segments, trace
 
 Vector = dr.scalar.Array3f64
 SINE, COSINE = 0.6, 0.8
@@ -35,6 +36,20 @@ def test_004_prints_an_intersection_that_is_off_the_boundary():
     assert np.abs(as_printed - (i_s + lam * i_d)).max() > 1
     denominator = i_d[0] * l_d[1] - l_d[0] * i_d[1]
     assert lam == pytest.approx(-(l_d[0] * (l_s[1] - i_s[1]) + l_d[1] * (i_s[0] - l_s[0])) / denominator)
+
+
+def test_004_prints_mu_with_the_wrong_sign():
+    """With the denominator that it shares with λ, μ = −(i_α(i_y − l_y) + i_β(l_x − i_x))/… is that of no crossing."""
+    i_s, i_d = np.array([0.0, 0.0]), np.array([1.0, 1.0])
+    l_s, l_d = np.array([4.0, 0.0]), np.array([0.0, 8.0])
+    _, mu = np.linalg.solve(np.column_stack([i_d, -l_d]), l_s - i_s)
+    printed = -(i_d[0] * (i_s[1] - l_s[1]) + i_d[1] * (l_s[0] - i_s[0])) / (i_d[0] * l_d[1] - l_d[0] * i_d[1])
+    assert printed == pytest.approx(-mu)
+    segments = Segments([l_s], [l_s + l_d], [1.0], [1.0])
+    paths = trace(segments, [i_s], [i_d], 1)
+    assert paths.points[0, 1] == pytest.approx(l_s + mu * l_d)
+    # A segment twice as long the other way is where the printed sign would see a crossing, and a missed one here.
+    assert trace(Segments([l_s], [l_s - l_d], [1.0], [1.0]), [i_s], [i_d], 1).hits[0, 0] == -1
 
 
 def test_004_divides_by_zero_along_the_boundary():

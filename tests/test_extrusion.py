@@ -23,6 +23,19 @@ def spikes(count=40):
     return polygon(np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]), 1.3)
 
 
+def tiles(count=6):
+    """Squares of as many media, in air: four of them meet at each inner corner."""
+    n = np.ones((count + 2, count + 2))
+    n[1:-1, 1:-1] = np.random.default_rng(4).uniform(1.1, 1.9, (count, count))
+    parts = []
+    for i in range(count + 1):
+        for j in range(count):
+            parts.append(((i, j), (i, j + 1), n[i, j + 1], n[i + 1, j + 1]))
+            parts.append(((j, i), (j + 1, i), n[j + 1, i + 1], n[j + 1, i]))
+    start, end, left, right = map(np.array, zip(*parts, strict=True))
+    return Segments(start / count * 2 - 1, end / count * 2 - 1, left, right)
+
+
 def anywhere(rng):
     return rng.normal(size=(RAYS, 2)) * 0.5, rng.normal(size=(RAYS, 2))
 
@@ -64,6 +77,9 @@ CASES = {
     "circle, along segments": (circle(2000), along_segments(circle(2000))),
     "star": (star(300), anywhere),
     "star, at tips": (star(300), at_vertices(star(300))),
+    "tiles": (tiles(), anywhere),
+    "tiles, at corners": (tiles(), at_vertices(tiles())),
+    "tiles, along edges": (tiles(), along_segments(tiles())),
     "spikes": (spikes(), at_vertices(spikes())),
 }
 

@@ -292,6 +292,21 @@ def test_an_arc_is_met_by_rays_that_miss_its_chord(follow):
     assert paths.points[0, 1] == pytest.approx([-math.sqrt(1 - 0.99**2), 0.99], abs=1e-6)
 
 
+def test_arcs_that_meet_in_a_tip_are_met_in_order(follow):
+    """A lens of two arcs, rays at its rim: each enters before it leaves, whichever arc is listed first."""
+    for order in ([0, 1], [1, 0]):
+        start, end = np.array([(0.0, 1.0), (0.0, -1.0)]), np.array([(0.0, -1.0), (0.0, 1.0)])
+        control, weight = np.array([(-0.5, 0.0), (0.5, 0.0)]), np.full(2, 0.8)
+        lens = Segments(start[order], end[order], np.full(2, 1.5), np.ones(2), control[order], weight)
+        angle = np.linspace(0, 2 * np.pi, 61)[:-1] + 0.01
+        origins = np.array([0, 1]) + 3 * np.column_stack([np.cos(angle), np.sin(angle)])
+        paths = follow(lens, origins, [0, 1] - origins, max_depth=8)
+        assert not (paths.events == Event.CONTRADICTED).any()
+        met = (paths.hits[:, 0] >= 0) & (origins[:, 1] > 1)
+        assert met.any()
+        assert (paths.indices[met, 0] == 1).all()
+
+
 def test_straight_segments_among_arcs_are_the_same_as_alone(follow, setting):
     figure, rng = star(30), np.random.default_rng(5)
     mixed = dataclasses.replace(figure, control=(figure.start + figure.end) / 2, weight=np.ones(30))
