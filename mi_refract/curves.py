@@ -86,7 +86,7 @@ class Curve:
 
     def outline(self, count: int = 64) -> Array:
         """Points along the curve: its vertices, and `count` − 1 more on each arc."""
-        along = points(self.between(1, 1), count)[:, :-1]
+        along = _along(self.start, self.end, self.control, self.weight, count)[:, :-1]
         pieces = [p[:1] if straight else p for p, straight in zip(along, self.straight, strict=True)]
         return np.concatenate(pieces if self.closed else [*pieces, self.vertices[-1:]])
 
@@ -99,16 +99,20 @@ class Curve:
 
 def points(segments: Segments, count: int) -> Array:
     """M × (count + 1) × 2: each segment from start to end, its ends exact; equal angles on an arc of a circle."""
-    start, end = segments.start[:, None], segments.end[:, None]
-    s = np.linspace(0, 1, count + 1)[:, None]
-    if segments.control is None or segments.weight is None:
-        return np.where(s < 0.5, start + (end - start) * s, end - (end - start) * (1 - s))
-    weight = segments.weight[:, None, None]
-    angle = np.emath.arccos(weight) / np.pi
+    control, weight = segments.control, segments.weight
+    if control is None or weight is None:
+        control, weight = (segments.start + segments.end) / 2, np.ones(len(segments))
+    return _along(segments.start, segments.end, control, weight, count)
+
+
+def _along(start: Array, end: Array, control: Array, weight: Array, count: int) -> Array:
+    w, s = weight[:, None, None], np.linspace(0, 1, count + 1)[:, None]
+    angle = np.emath.arccos(w) / np.pi
     # sin(φx)/sin φ for w = cos φ, which becomes x where w = 1 and is sinh of the imaginary φ where w > 1.
     b, a = (np.real(x * np.sinc(angle * x) / np.sinc(angle)) for x in (s, 1 - s))
-    middle = 2 * weight * a * b
-    return (a * a * start + middle * segments.control[:, None] + b * b * end) / (a * a + middle + b * b)
+    middle = 2 * w * a * b
+    sums = a * a * start[:, None] + middle * control[:, None] + b * b * end[:, None]
+    return sums / (a * a + middle + b * b)
 
 
 def affine(rotate: float = 0.0, scale: float | Sequence[float] = 1.0) -> Array:

@@ -34,6 +34,7 @@ def boundaries(parts: list[Named]) -> tuple[Segments, ...]:
     weight = np.concatenate([c.weight for c in curves])
     media = np.array([(part.left, part.right) for _, part in parts])[owner]
     kept = first != last
+    _present(parts, np.bincount(owner, kept), np.abs(vertices).max())
     for i, j in _again(_numbers(np.minimum(first, last), np.maximum(first, last), bends)):
         if kept[j]:
             side = int(first[i] != first[j])
@@ -42,6 +43,13 @@ def boundaries(parts: list[Named]) -> tuple[Segments, ...]:
     arcs = () if straight[kept].all() else (control[kept], weight[kept])
     left, right = media[kept].transpose(1, 2, 0)
     return tuple(Segments(start[kept], end[kept], *n, *arcs) for n in zip(left, right, strict=True))
+
+
+def _present(parts: list[Named], pieces: NDArray[Any], largest: float) -> None:
+    """ValueError for a part of which rounding leaves nothing."""
+    for (name, _), left in zip(parts, pieces, strict=True):
+        if not left:
+            raise ValueError(f"{name}: a point, beside coordinates of {largest:g}; accepted: above {NEAR:.0e} of that")
 
 
 def _filled(there: Array, earlier: str, later: str, part: Part) -> Any:

@@ -104,7 +104,8 @@ POINTS = Type("a list of [x, y]", list_of(_pair))
 PAIR = Type("two numbers", _pair)
 DIRECTION = Type("degrees, or [x, y] that is not [0, 0]", _direction)
 DIRECTIONS = Type("a list of degrees or of [x, y] that are not [0, 0]", list_of(_direction))
-SCALE = Type("a number that is not 0, or two of them", _first(_if(bool, _number), _if(all, _pair)))
+_factor = _if(lambda v: 1e-100 <= abs(v) <= 1e100, _number)
+SCALE = Type("a number of size 1e-100 to 1e100, or two of them", _first(_factor, list_of(_factor, 2, 2)))
 BOX = Type("[x0, x1, y0, y1], x0 < x1, y0 < y1", _if(lambda v: v[0] < v[1] and v[2] < v[3], list_of(_number, 4, 4)))
 APEX = Type("degrees, above 0 and below 180", _if(lambda v: v < 180, _positive))
 TABLES = Type("a table or more, in double brackets", list_of(lambda value: value if isinstance(value, dict) else None))
@@ -170,7 +171,7 @@ def per_colour(values: Values, keys: dict[str, Key], where: str, colours: int) -
     found = {name: values[name] for name, key in keys.items() if key.type is INDEX and values[name] is not None}
     for name, indices in found.items():
         if len(indices) not in (1, colours):
-            raise ValueError(f"{where}{name}: {len(indices)} numbers; accepted: 1, or 1 for each of {colours} colours")
+            raise ValueError(f"{where}{name}: {len(indices)} numbers; accepted: 1 for all or each of {colours} colours")
     return values | {name: tuple(n) * (colours // len(n)) for name, n in found.items()}
 
 

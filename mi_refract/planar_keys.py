@@ -91,7 +91,7 @@ SHAPES = {
     ),
     "circle": Kind(
         "around its origin",
-        {"radius": Key(keys.POSITIVE, "")} | SOLID | PLACE | FACETS,
+        {"radius": Key(keys.POSITIVE, "from its origin")} | SOLID | PLACE | FACETS,
         _solid(lambda v: shapes.circle(v["radius"])),
     ),
     "ellipse": Kind(
@@ -122,7 +122,8 @@ SHAPES = {
     ),
     "luneburg": Kind(
         "a ball in concentric layers of index outside × √(2 − (r/radius)²)",
-        {"radius": Key(keys.POSITIVE, ""), "layers": Key(keys.whole(1, 10_000), "how many")} | OUTSIDE | PLACE | FACETS,
+        {"radius": Key(keys.POSITIVE, "of the outermost"), "layers": Key(keys.whole(1, 10_000), "how many")}
+        | OUTSIDE | PLACE | FACETS,
         _luneburg,
     ),
     "boundary": Kind(
@@ -139,8 +140,11 @@ SHAPES = {
 
 
 def _spread(first: Any, last: Any, count: int) -> Array:
-    """Evenly from the first to the last; one is in the middle."""
-    return np.linspace(first, last, count) if count > 1 else np.array([(first + last) / 2])
+    """Evenly from the first to the last; one is in the middle. What falls on whole numbers is exact."""
+    if count == 1:
+        return np.array([(first + last) / 2])
+    steps = np.arange(count).reshape(-1, *[1] * np.ndim(first))
+    return np.concatenate([(first + (last - first) * steps / (count - 1))[:-1], [last]])
 
 
 def _parallel(v: Values) -> tuple[Array, Array]:

@@ -97,6 +97,9 @@ def _scene(path: Path, table: dict[str, Any]) -> PlanarScene:
     )
 
 
+FARTHEST = 1e100  # of all coordinates: products of two stay numbers
+
+
 def _parts(tables: list[dict[str, Any]], ambient: Indices, colours: int) -> list[Named]:
     """The shapes' parts in their places."""
     parts: list[Named] = []
@@ -111,9 +114,12 @@ def _parts(tables: list[dict[str, Any]], ambient: Indices, colours: int) -> list
             media[values["name"]] = values["n"]
         try:
             with np.errstate(all="ignore"):
-                parts += [(where, part) for part in _placed(kind.build(values), values)]
+                placed = _placed(kind.build(values), values)
         except ValueError as error:
             raise ValueError(f"{where}.{error}") from None
+        for part in placed:
+            _check_range(where, part.curve.vertices, part.curve.control)
+            parts.append((where, part))
     return parts
 
 
@@ -135,10 +141,13 @@ def _placed(parts: list[Part], values: dict[str, Any]) -> list[Part]:
     for part in parts:
         curve = part.curve.faceted(facets) if facets else part.curve
         curve = curve.mapped(matrix, values["at"])
-        if not (np.isfinite(curve.vertices).all() and np.isfinite(curve.control).all()):
-            raise ValueError("at: the shape leaves the range of numbers; accepted: coordinates below 1e308")
         placed.append(part._replace(curve=curve))
     return placed
+
+
+def _check_range(where: str, *points: Array) -> None:
+    if not all(np.abs(p).max() <= FARTHEST for p in points):
+        raise ValueError(f"{where}: coordinates beyond {FARTHEST:g}; accepted: up to that")
 
 
 def _rays(tables: list[dict[str, Any]]) -> tuple[Array, Array, NDArray[np.intp]]:
@@ -149,5 +158,6 @@ def _rays(tables: list[dict[str, Any]]) -> tuple[Array, Array, NDArray[np.intp]]
             rays.append(kind.build(values))
         except ValueError as error:
             raise ValueError(f"beam[{j}].{error}") from None
+        _check_range(f"beam[{j}]", rays[-1][0])
     beams = np.repeat(np.arange(len(rays)), [len(origins) for origins, _ in rays])
     return np.concatenate([o for o, _ in rays]), np.concatenate([d for _, d in rays]), beams

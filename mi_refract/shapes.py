@@ -1,11 +1,10 @@
 """Shapes in the plane by their usual parameters: polygons, circles, ellipses, prisms, and lenses of conic surfaces.
 
-Each is a `Curve` around its own origin; `mapped` stretches, turns and moves it.
+Each is a `Curve` around its own origin; `mapped` stretches, turns and moves it. Lengths are above 0.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -47,6 +46,8 @@ def _chain(points: Any, arcs: Sequence[float] | None, closed: bool) -> Curve:
         raise ValueError(f"points: {len(corners)}; accepted: at least 2")
     if len(turns) != pieces or not all(abs(turn) < 360 for turn in turns):
         raise ValueError(f"arcs: {len(turns)} for {pieces} pieces; accepted: one a piece, above -360 and below 360")
+    if not any(turns):
+        return polygonal(corners, closed)
     vertices, control, weight = [corners[0]], [], []
     for p, q, turn in zip(corners, np.roll(corners, -1, 0), turns, strict=False):
         for end, middle, w in _arc(p, q, turn):
@@ -70,16 +71,6 @@ def _arc(p: Array, q: Array, turn: float) -> Iterable[tuple[Array, Array, float]
     return [*_arc(p, between, turn / 2), *_arc(between, q, turn / 2)]
 
 
-def arc(radius: float, start: float, end: float) -> Curve:
-    """Of a circle around the origin, from one angle to another in degrees; counter-clockwise where `end` is larger."""
-    pieces = max(1, math.ceil(abs(end - start) / 90))
-    angles = [start + (end - start) * j / pieces for j in range(pieces + 1)]
-    half = unit((end - start) / pieces / 2)[0]
-    vertices = radius * np.array([unit(angle) for angle in angles])
-    control = radius / half * np.array([unit((a + b) / 2) for a, b in itertools.pairwise(angles)])
-    return Curve(vertices, control, np.full(pieces, half), closed=False)
-
-
 def ellipse(rx: float, ry: float) -> Curve:
     """Around the origin, with these half axes along x and y: four arcs whose vertices and controls are exact."""
     vertices = np.array([(rx, 0.0), (0.0, ry), (-rx, 0.0), (0.0, -ry)])
@@ -88,6 +79,7 @@ def ellipse(rx: float, ry: float) -> Curve:
 
 
 def circle(radius: float) -> Curve:
+    """Around the origin."""
     return ellipse(radius, radius)
 
 
@@ -148,9 +140,11 @@ def lens(
         depths = [float(sag(radius, c, k)) for c, k in zip(curvature, conic, strict=True)]
         rims = [vertex + depths[0], vertex + thickness + depths[1]]
     if math.isnan(rims[0] + rims[1]):
-        raise ValueError(f"radius = {radius:g}: a surface ends before; accepted: at most 1/(|c| √(1 + K)) of either")
+        ends = (1 / (abs(c) * math.sqrt(1 + k)) for c, k in zip(curvature, conic, strict=True) if c and k > -1)
+        raise ValueError(f"radius = {radius:g}: a surface ends before; accepted: at most {min(ends, default=0):g}")
     if rims[1] < rims[0]:
-        raise ValueError(f"radius = {radius:g}: the surfaces meet before; accepted: less, or none for a pointed lens")
+        meet = _tip(curvature, thickness, conic)[1]
+        raise ValueError(f"radius = {radius:g}: the surfaces meet before; accepted: at most {meet:g}, or no radius")
     front = _surface(vertex, rims[0], radius, curvature[0], conic[0])
     back = _surface(vertex + thickness, rims[1], radius, curvature[1], conic[1])
     return joined(front, back.reversed())
@@ -166,7 +160,7 @@ def _tip(curvature: Sequence[float], thickness: float, conic: Sequence[float]) -
         places = [t / 2]
     else:
         terms = [c1 * c2 * (k2 - k1), 2 * (c2 - c1 - c1 * c2 * k2 * t), 2 * c1 * t + c1 * c2 * k2 * t * t]
-        places = [float(z.real) for z in np.roots(terms) if z.imag == 0]
+        places = [float(z.real) for z in np.roots(terms) if z.imag == 0] if np.isfinite(terms).all() else []
     tips = []
     for z in places:
         c, k, depth = (c1, k1, z) if abs(c1) >= abs(c2) else (c2, k2, z - t)
@@ -175,7 +169,7 @@ def _tip(curvature: Sequence[float], thickness: float, conic: Sequence[float]) -
         if square > 0 and 1 - c1 * k1 * z >= -FLAT and 1 - c2 * k2 * (z - t) >= -FLAT:
             tips.append((math.sqrt(square), z))
     if not tips:
-        raise ValueError(f"curvature = {list(curvature)}: the surfaces never meet; accepted: with a radius only")
+        raise ValueError(f"curvature = {list(curvature)}: the surfaces never meet; accepted: only with a radius")
     radius, z = min(tips)
     return z, radius
 
@@ -203,7 +197,10 @@ def document_lens(resolution: float | None = None) -> Curve:
 
     The original draws chords at r = 0, `resolution`, … (0.05 there: 1172 of them) and leaves it open at the tips.
     Here its last vertices are the tips, where the width is 0. Without a resolution: four exact arcs.
+    ValueError for a resolution that is not above 0.
     """
+    if resolution is not None and not resolution > 0:
+        raise ValueError(f"resolution = {resolution}; accepted: above 0")
     c, k, conic = LENS_CURVATURE, LENS_HALF_WIDTH, LENS_CONIC
     whole = lens((-c, c), 2 * k, conic=(conic, conic), vertex=-k)
     whole = whole.mapped(affine(90, (1.0, LENS_STRETCH)))
@@ -211,13 +208,13 @@ def document_lens(resolution: float | None = None) -> Curve:
         return whole
     tip = float(np.abs(whole.vertices[:, 0]).max()) / LENS_STRETCH
     # Summed up as the original sums them.
-    r = np.cumsum(np.full(math.ceil(tip / resolution) + 1, resolution)) - resolution
+    r = np.cumsum([0.0, *[resolution] * math.ceil(tip / resolution)])
     r = r[r < tip][:-1]
     x, y = np.append(LENS_STRETCH * r, LENS_STRETCH * tip), np.append(k + sag(r, c, conic), 0.0)
     quarter = np.stack([x, y], 1)[::-1]
     quarters = [quarter * sign for sign in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
     vertices = [q[:-1] if j % 2 == 0 else q[::-1][:-1] for j, q in enumerate(quarters)]
-    return polygonal(np.concatenate(vertices), closed=True)
+    return polygonal(np.concatenate(vertices) + 0.0, closed=True)
 
 
 def luneburg(radius: float, layers: int) -> list[tuple[Curve, float]]:

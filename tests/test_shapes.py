@@ -123,14 +123,6 @@ def test_arcs_turn_by_what_they_are_told():
         assert np.abs(np.hypot(*(along - centre).T) - radius).max() <= 1e-14 * radius * 10
 
 
-def test_an_arc_of_a_circle_runs_from_angle_to_angle():
-    for start, end, pieces in ((0, 90, 1), (30, 330, 4), (100, -100, 3)):
-        curve = shapes.arc(2, start, end)
-        assert len(curve) == pieces
-        assert np.abs(np.hypot(*points(curve.between(1, 1), 30).reshape(-1, 2).T) - 2).max() <= 8 * ULP
-        assert curve.vertices[[0, -1]].tolist() == [[2 * x for x in unit(start)], [2 * x for x in unit(end)]]
-
-
 def test_smooth_curves_have_one_tangent_at_their_joints():
     lens = shapes.lens((0.02, -0.03), 5, radius=9, conic=(-1.5, 0.4))
     smooth = [(shapes.circle(3), range(4)), (shapes.ellipse(5, 0.1), range(4)), (lens, (1, 4))]
@@ -168,6 +160,7 @@ def test_quarter_turns_are_exact():
     square = shapes.rectangle(0.3, 0.7).vertices
     assert shapes.rectangle(0.3, 0.7).mapped(affine(450)).vertices.tolist() == [[-y, x] for x, y in square.tolist()]
     assert unit(-270) == unit(90 + 360e6) == (0, 1)
+    assert unit(1e17) == unit(10**17 % 360)
     assert unit(45) == (math.sqrt(0.5), math.sqrt(0.5))
     assert all(math.hypot(*unit(x)) == pytest.approx(1, abs=ULP) for x in (1e300, 0.1, -44.9, 123.4))
 
@@ -228,6 +221,12 @@ def test_the_documents_polyline_has_the_originals_vertices_and_closes_at_its_tip
     assert tip[0] == pytest.approx(4 * math.sqrt((-2 * 8.2 + 0.04 * 2.9 * 8.2**2) / -0.04), rel=4 * ULP)
 
 
+@pytest.mark.parametrize("resolution", [0.0, -0.05, math.nan])
+def test_a_polyline_needs_a_resolution(resolution):
+    with pytest.raises(ValueError, match="accepted: above 0"):
+        shapes.document_lens(resolution)
+
+
 def test_the_documents_arcs_are_its_formula():
     x, y = points(shapes.document_lens().between(1, 4.4), 200).reshape(-1, 2).T
     for sign in (1, -1):
@@ -254,13 +253,25 @@ def test_pointed_lenses_end_where_their_surfaces_meet():
         assert off_conic(np.array([z - thickness, r]), curvature[1], conic[1]) <= 8 * ULP * r
 
 
+def test_a_surface_reaches_as_far_as_it_exists():
+    """1/(c √(1 + K)) is rounded: what the sag then takes the root of may be a little below 0."""
+    for c in np.linspace(0.01, 3, 200):
+        for conic in (0, -0.3, 1.9):
+            radius = 1 / (c * math.sqrt(1 + conic))
+            hemisphere = shapes.lens((c, c), 1, radius=radius, conic=(conic, conic))
+            assert off_conic(hemisphere.vertices[0], c, conic) <= 8 * ULP * radius
+            with pytest.raises(ValueError, match="a surface ends before"):
+                shapes.lens((c, c), 1, radius=radius * (1 + 1e-14), conic=(conic, conic))
+
+
 @pytest.mark.parametrize(
     "arguments, found",
     [
         (((0.02, 0.03), 1.0, None), "curvature.*never meet"),
         (((0.0, 0.0), 1.0, None), "curvature.*never meet"),
-        (((0.02, -0.02), 1.0, 60.0), "radius = 60: a surface ends"),
-        (((0.02, -0.02), 1.0, 20.0), "radius = 20: the surfaces meet"),
+        (((0.1, -0.5), 20.5, None), "curvature.*never meet"),  # but their far halves do
+        (((0.02, -0.02), 1.0, 60.0), "radius = 60: a surface ends before; accepted: at most 50"),
+        (((0.02, -0.02), 1.0, 20.0), "radius = 20: the surfaces meet before; accepted: at most 7.05"),
     ],
 )
 def test_impossible_lenses_are_refused(arguments, found):
