@@ -31,6 +31,12 @@ class Branches:
     reflect: NDArray[np.uint32]
 
     @property
+    def weights(self) -> Array:
+        """P × (D+1), as in `paths`."""
+        assert self.paths.weights is not None
+        return self.paths.weights
+
+    @property
     def first(self) -> NDArray[np.intp]:
         """P: the first leg that is the path's own. The ones before it belong to another path of the same ray."""
         return np.frexp(self.reflect.astype(float))[1].astype(np.intp)
@@ -112,8 +118,7 @@ def with_rays(scene: PlanarScene, count: int) -> PlanarScene:
 
 def _worth(branches: Branches, least: float) -> NDArray[np.bool_]:
     """P × D: whether the path refracts at that boundary of its own and reflects more than `least` there."""
-    weights = branches.paths.weights
-    assert weights is not None
+    weights = branches.weights
     refracted = branches.own[:, :-1] & (branches.paths.events[:, :-1] == Event.REFRACTED)
     refracted[:, REFLECT_BITS:] = False
     with np.errstate(invalid="ignore"):
@@ -175,8 +180,8 @@ def as_data(scene: PlanarScene, traced: Sequence[Branches]) -> dict[str, Any]:
 
 
 def _paths(scene: PlanarScene, branches: Branches) -> Iterator[dict[str, Any]]:
-    paths = branches.paths
-    assert paths.weights is not None
+    paths, weights, indices = branches.paths, branches.weights, branches.paths.indices
+    assert indices is not None
     for i, last in enumerate(branches.last):
         ray, points = int(branches.rays[i]), paths.points[i]
         yield {
@@ -187,8 +192,8 @@ def _paths(scene: PlanarScene, branches: Branches) -> Iterator[dict[str, Any]]:
             "direction": paths.directions[i].tolist(),
             "hits": paths.hits[i, paths.hits[i] >= 0].tolist(),
             "events": [Event(event).name.lower() for event in paths.events[i, : last + 1]],
-            "indices": _nullable(paths.indices[i, : last + 1]),
-            "weights": _nullable(paths.weights[i, : last + 1]),
+            "indices": _nullable(indices[i, : last + 1]),
+            "weights": _nullable(weights[i, : last + 1]),
         }
 
 

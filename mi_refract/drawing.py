@@ -35,7 +35,7 @@ RAY, WHITE, INK, MUTED = "#c8102e", "#55504c", "#222222", "#6b6b6b"  # WHITE: of
 DENSE, THIN = (0.73, 0.85, 0.97), (1.00, 0.92, 0.70)  # tints of the media that differ most from what is around all
 LINE = 0.13  # inches
 NAMED = 5  # media in the legend
-TYPICAL = 0.35  # opacity/(1 − opacity) of the median pixel that rays touch, where their density is drawn
+TYPICAL = 0.35  # opacity/(1 − opacity) of a typical density, where that is drawn
 MARKS = {
     Event.EXHAUSTED: ("o", "○ {} stopped after `max_depth` boundaries, with another one ahead"),
     Event.CONTRADICTED: ("x", "× {} stopped: the next boundary does not border on the medium that the ray is in"),
@@ -96,7 +96,8 @@ def figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> Figure
     width, height = _size(view)
     caption = _caption(scene, traced, int(14 * width))
     drawn = Figure((width, height + LINE * len(caption)), dpi, layout="constrained")
-    panel = drawn.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal", title=scene.title)
+    panel = drawn.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal")
+    panel.set_title("\n".join(textwrap.wrap(scene.title, int(10.5 * width))))
     panel.set_xlabel("\n".join(caption), loc="left", fontsize=7.5)
     _media(panel, scene)
     _settle(drawn)
@@ -237,7 +238,9 @@ def _blend(layers: dict[int, Any], colours: dict[int, Any]) -> Any:
     mixed = shared[..., None] * colours[SHARED]
     for part, number in zip(parts - common, layers, strict=True):
         mixed += part[..., None] * colours[number]
-    dense = total * TYPICAL / np.median(total[total > 0]) if total.any() else total
+    lit = total[total > 0]
+    # The median alone makes a beam black beside faint reflections all over the view; the mean makes them white.
+    dense = total * TYPICAL / math.sqrt(lit.mean() * np.median(lit)) if lit.size else total
     colour = np.divide(mixed, total[..., None], out=np.ones_like(mixed), where=total[..., None] > 0)
     pixels = np.dstack([colour, dense / (1 + dense)])  # without saturating as soon as 1 − exp(−dense) does
     return (pixels * 255).round().astype(np.uint8)

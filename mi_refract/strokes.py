@@ -60,9 +60,8 @@ def _legs(branches: Branches, number: int, colours: int, view: View) -> Legs:
     if colours > 1:  # they part at the first boundary
         colour[:, 0] = SHARED
         own[:, 0] &= number == 0
-    assert branches.paths.weights is not None
     start, end, inside = clip(start[own], end[own], view)
-    return Legs(start, end, branches.paths.weights[own], colour[own]).where(inside)
+    return Legs(start, end, branches.weights[own], colour[own]).where(inside)
 
 
 def _ends(branches: Branches, view: View) -> Array:
