@@ -94,6 +94,8 @@ class Straight:
         self.lanes, self.count, self.box = lanes, len(start), _box(start, end)
         self.ends = lanes.table(np.concatenate([start, end], 1))
         self.vertices = lanes.table(vertices.astype(np.uint32))
+        e = end - start
+        self.directions = lanes.table(e / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), np.finfo(float).tiny))
 
     def _of(self, i: Any, active: Any = True) -> tuple[Any, Any, Any]:
         """Start, end and vertices of segment i."""
@@ -141,7 +143,8 @@ class Straight:
         scale = dr.abs(f_a) + dr.abs(f_b)
         reach = dr.select(a_left, -1, 1) * cross(way, e)
         ahead = (a_left != b_left) & (reach > ray.slack * (dr.abs(e.x) + dr.abs(e.y))) & (i != ray.own) & active
-        s, r = quotient(dr.abs(f_b), scale), quotient(dr.abs(f_a), scale)
+        near = quotient(dr.minimum(dr.abs(f_a), dr.abs(f_b)), scale)
+        s, r = (dr.select(dr.abs(f) < 0.5 * scale, near, 1 - near) for f in (f_b, f_a))
         distance = dr.dot(dr.fma(e, r, to_a), ray.d)  # λ again: that quotient would be noise at grazing incidence
         left, right = (dr.select(a_left, vertices[j], vertices[1 - j]) for j in (0, 1))
         along = dr.select(a_left, e, -e)
@@ -153,10 +156,12 @@ class Straight:
         return dr.select(first, found, best)
 
     def place(self, hit: Hit) -> tuple[Any, Any]:
-        """The point of a hit, from the nearer end, and the segment's direction there, not normalised."""
-        a, b, _ = self._of(hit.segment, hit.segment != NOWHERE)
+        """The point of a hit, from the nearer end, and the segment's direction there."""
+        there = hit.segment != NOWHERE
+        a, b, _ = self._of(hit.segment, there)
         e = b - a
-        return dr.select(hit.r < hit.s, dr.fma(e, hit.r, a), dr.fma(e, -hit.s, b)), e
+        point = dr.select(hit.r < hit.s, dr.fma(e, hit.r, a), dr.fma(e, -hit.s, b))
+        return point, self.lanes.take(self.directions, hit.segment, there)
 
 
 class Arcs(Straight):
@@ -244,7 +249,8 @@ class Arcs(Straight):
         (a, b, _), (c, w, _) = self._of(hit.segment, there), self._shape(hit.segment, there)
         s, r = hit.s, hit.r
         point = dr.select(r < s, a + _bend(a, c, b, w, s, r), b + _bend(b, c, a, w, r, s))
-        return point, _tangent(a, c, b, w, s, r)
+        e = _tangent(a, c, b, w, s, r)
+        return point, e * quotient(1, dr.norm(e))
 
 
 def _ends(once: Any, a_left: Any, vertices: Any, points: Any) -> tuple[Any, Any, Any, Any]:

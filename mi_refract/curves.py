@@ -86,8 +86,11 @@ class Curve:
 
     def outline(self, count: int = 64) -> Array:
         """Points along the curve: its vertices, and `count` − 1 more on each arc."""
-        along = _along(self.start, self.end, self.control, self.weight, count)[:, :-1]
-        pieces = [p[:1] if straight else p for p, straight in zip(along, self.straight, strict=True)]
+        bent = ~self.straight
+        if not bent.any():
+            return self.vertices
+        arcs = iter(_along(self.start[bent], self.end[bent], self.control[bent], self.weight[bent], count)[:, :-1])
+        pieces = [next(arcs) if arc else start[None] for start, arc in zip(self.start, bent, strict=True)]
         return np.concatenate(pieces if self.closed else [*pieces, self.vertices[-1:]])
 
     def between(self, n_left: float, n_right: float) -> Segments:

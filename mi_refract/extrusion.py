@@ -13,7 +13,7 @@ the rays' media tell, the next strokes are tried, too.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -29,8 +29,13 @@ SHORTEST = 2 * MARGIN
 STEP = 2.0**-22  # past a stroke that was no hit
 BACK = 2.0**-6  # behind a start in the open, which may be within ε of a boundary, down to grazing angles of ε/BACK
 
-Sides = Callable[[Hit, Any], tuple[Any, Any]]
-Found = tuple[Hit, Any, Any]
+
+@dataclass
+class Look:
+    """How far along a ray it has been looked, and the nearest segment `held` that was found beyond, or NOWHERE."""
+
+    gone: Any
+    held: Any
 
 
 class Extrusion:
@@ -51,34 +56,22 @@ class Extrusion:
         first, around = _around(vertices, len(starts) - len(a))
         self.first, self.around = lanes.table(first), lanes.table(around)
 
-    def nearest(self, boundaries: Straight, ray: Ray, start: Start, active: Any, sides: Sides, index: Any) -> Found:
-        """The first boundary ahead, and the media before and behind it; `index` is that of the ray's medium."""
+    def nearest(self, boundaries: Straight, ray: Ray, start: Start, look: Look, active: Any) -> tuple[Hit, Look, Any]:
+        """The first boundary ahead, from where to look on for what might come before it, and whether nothing does."""
         to = self.lanes
+        found, t, stroke = self._stroke(dr.fma(ray.d, look.gone, self._aside(ray, start)), ray.d, active)
+        best = boundaries.nearer(boundaries.none(), ray, start, stroke, found & (stroke < boundaries.count))
+        inside = dr.square(dr.minimum(best.s, best.r)) * dr.squared_norm(best.along) > (4 * MARGIN * self.half) ** 2
         # The start may lie beyond a neighbour, or the stroke of the vertex between: neighbours are tried by hand.
         own = active & (ray.own != NOWHERE)
         near_a, near_b = to.take(self.narrow, ray.own, own)
-        corner = own & ((ray.r < near_a) | (ray.s < near_b))
-        best = self._around(boundaries.none(), boundaries, ray, start, ray.own, corner)
-
-        def query(best: Hit, near: Any, far: Any, q: Any, gone: Any, going: Any) -> Any:
-            found, t, stroke = self._stroke(q, ray.d, going)
-            best = boundaries.nearer(best, ray, start, stroke, found & (stroke < boundaries.count))
-            inside = dr.square(dr.minimum(best.s, best.r)) * dr.squared_norm(best.along) > (4 * MARGIN * self.half) ** 2
-            vague = found & negated((best.segment == stroke) & inside)
-            best = self._around(best, boundaries, ray, start, stroke, vague)
-            some = going & (best.segment != NOWHERE)
-            near, far = sides(best, some)
-            t = dr.select(found, t + STEP, 0)
-            gone = gone + t
-            distance = best.distance * (1 / self.half)
-            agrees = some & (dr.isnan(index) | (near == index))
-            settled = (agrees & (distance <= gone + MARGIN)) | (distance + MARGIN < gone)
-            return best, near, far, q + ray.d * t, gone, found & negated(settled)
-
-        zero = to.number(0)
-        back = dr.select(ray.own == NOWHERE, -BACK, 0)
-        state = best, zero, zero, dr.fma(ray.d, back, self._aside(ray, start)), zero + back, active
-        return dr.while_loop(state, lambda *state: state[-1], query, label="strokes")[:3]
+        lists = dr.select(found & negated(inside), stroke, NOWHERE), dr.select(
+            own & ((ray.r < near_a) | (ray.s < near_b)), ray.own, NOWHERE
+        )
+        best = self._also(best, boundaries, ray, start, dr.select(active, look.held, NOWHERE), lists)
+        gone = look.gone + t
+        settled = negated(found) | (best.distance * (1 / self.half) <= gone + MARGIN)
+        return best, Look(gone + STEP, best.segment), settled
 
     def _aside(self, ray: Ray, start: Start) -> Any:
         """Where to look from: the ray's start, moved off the segment that it is on, to the side to which it goes."""
@@ -96,14 +89,22 @@ class Extrusion:
         seen = self.scene.ray_intersect_preliminary(ray, True, active)
         return active & seen.is_valid(), self.lanes.number(seen.t), self.lanes.index(seen.prim_index)
 
-    def _around(self, best: Hit, boundaries: Straight, ray: Ray, start: Start, stroke: Any, active: Any) -> Hit:
-        """`best`, or what comes before it of the segments that a stroke names."""
-        first, last = (self.lanes.take(self.first, stroke + i, active) for i in (0, 1))
+    def _also(self, best: Hit, boundaries: Straight, ray: Ray, start: Start, held: Any, strokes: Any) -> Hit:
+        """`best`, or what comes before it: the segment `held`, and those that two strokes name; NOWHERE for none."""
+        later, sooner = strokes
 
-        def test(i: Any, best: Hit) -> tuple[Any, Hit]:
-            return i + 1, boundaries.nearer(best, ray, start, self.lanes.take(self.around, i, active), active)
+        def test(i: Any, stroke: Any, best: Hit, going: Any) -> tuple[Any, Any, Hit, Any]:
+            listed = going & (i > 0) & (stroke != NOWHERE)
+            place = self.lanes.take(self.first, stroke, listed) + i - 1
+            segment = dr.select(i == 0, held, dr.select(listed, self.lanes.take(self.around, place, listed), NOWHERE))
+            best = boundaries.nearer(best, ray, start, segment, going & (segment != NOWHERE))
+            end = (i > 0) & (segment == NOWHERE)
+            more = going & (negated(end) | ((stroke != later) & (later != NOWHERE)))
+            return dr.select(end, 1, i + 1), dr.select(end, later, stroke), best, more
 
-        return dr.while_loop((first, best), lambda i, best: active & (i < last), test, label="around")[1]
+        some = (held != NOWHERE) | (later != NOWHERE) | (sooner != NOWHERE)
+        state = self.lanes.index(0), sooner, best, some
+        return dr.while_loop(state, lambda i, stroke, best, going: going, test, label="also")[2]
 
 
 def _strokes(a: Any, b: Any, vertices: Any) -> tuple[Any, Any]:
@@ -165,20 +166,20 @@ def _upright(of: str, a: Any, b: Any) -> Any:
 
 
 def _around(vertices: Any, strokes_of_vertices: int) -> tuple[Any, Any]:
-    """For stroke i the segments it names: around[first[i] : first[i + 1]]. Itself, and those at its ends."""
+    """For stroke i the segments it names: `around` from first[i] to the next NOWHERE. Itself, and those at its ends."""
     count = len(vertices)
     order = np.argsort(vertices.ravel(), kind="stable")
     at_vertex, degree = order // 2, np.bincount(vertices.ravel(), minlength=strokes_of_vertices)
     begin = np.concatenate([[0], np.cumsum(degree)])
     # Of a segment: itself, then those at either end (itself among them again).
-    sizes = np.concatenate([1 + degree[vertices].sum(1), degree])
-    first = np.concatenate([[0], np.cumsum(sizes)])
-    around = np.empty(first[-1], np.int64)
+    sizes = np.concatenate([1 + degree[vertices].sum(1), degree]) + 1
+    first = np.cumsum(sizes) - sizes
+    around = np.full(sizes.sum(), NOWHERE)
     around[first[:count]] = np.arange(count)
     for column, offset in ((0, np.ones(count, np.int64)), (1, 1 + degree[vertices[:, 0]])):
         v = vertices[:, column]
         _spread(around, first[:count] + offset, at_vertex, begin[v], degree[v])
-    _spread(around, first[count:-1], at_vertex, begin[:-1], degree)
+    _spread(around, first[count:], at_vertex, begin[:-1], degree)
     return first, around
 
 

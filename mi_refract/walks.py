@@ -11,11 +11,10 @@ import drjit as dr
 import numpy as np
 
 from .crossings import NOWHERE, Hit, Ray, Straight, cross
-from .extrusion import Extrusion, Found
+from .extrusion import BACK, Extrusion, Look
 from .formulas import FORMULAS, refract_2d
 from .fresnel import powers, refracted_cosine
 from .lanes import Lanes, negated
-from .numerics import quotient
 
 REFLECT_BITS = 32
 
@@ -33,12 +32,16 @@ class Event(IntEnum):
 
 @dataclass
 class Walk:
-    """Of a lane: its ray, the index of its medium (NaN: unknown), its share of the power, boundaries met."""
+    """Of a lane: its ray, the index of its medium (NaN: unknown), its share of the power, boundaries met.
+
+    `look`: how far it has been looked for the next one.
+    """
 
     ray: Ray
     index: Any
     power: Any
     depth: Any
+    look: Look
     active: Any
 
 
@@ -48,7 +51,7 @@ class Walker:
     def __init__(
         self, to: Lanes, boundaries: Straight, mesh: Extrusion | None, media: Any, formula: str | None
     ) -> None:
-        self.to, self.boundaries, self.mesh, self.media = to, boundaries, mesh, to.table(media)
+        self.to, self.boundaries, self.mesh, self.media = to, boundaries, mesh, to.table(_ratios(media))
         self.refract = _refraction(to, formula)
 
     def __call__(
@@ -81,7 +84,7 @@ class Walker:
         p = self._entered(p, d)
         slack = 4 * to.roundoff * (dr.abs(p.x) + dr.abs(p.y))
         ray = Ray(p, d, to.index(NOWHERE), to.number(0.5), to.number(0.5), to.mask(False), slack)
-        return Walk(ray, index, to.number(1), to.index(0), to.mask(True))
+        return Walk(ray, index, to.number(1), to.index(0), self._look(-BACK), to.mask(True))
 
     def _entered(self, p: Any, d: Any) -> Any:
         """The origin, or from outside the place where the ray enters a box around all boundaries, half as wide again.
@@ -102,13 +105,16 @@ class Walker:
 
     def _step(self, walk: Walk, mirrored: Any, max_depth: int, put: Callable[..., None], weights: bool) -> Walk:
         """One leg: to the next boundary, and off it."""
-        to, ray, j, active = self.to, walk.ray, walk.depth, walk.active
-        hit, near, far = self._nearest(ray, walk.index, active)
+        to, ray, j = self.to, walk.ray, walk.depth
+        hit, look, settled = self._nearest(ray, walk.look, walk.active)
+        active = walk.active & settled
         some = active & (hit.segment != NOWHERE)
+        left, right, to_right, to_left = to.take(self.media, hit.segment, some)
+        near, far = dr.select(hit.to_left, right, left), dr.select(hit.to_left, left, right)
+        k = dr.select(hit.to_left, to_left, to_right)
         index = dr.select(some & dr.isnan(walk.index), near, walk.index)
-        p, e = self.boundaries.place(hit)
-        l = _unit(e)  # noqa: E741 (the document's name)
-        d, transmitted = self.refract(ray.d, l, quotient(near, far))
+        p, l = self.boundaries.place(hit)  # noqa: E741 (the document's name)
+        d, transmitted = self.refract(ray.d, l, k)
         through = transmitted
         if mirrored is not None:
             forced = (j < REFLECT_BITS) & ((mirrored >> dr.minimum(j, REFLECT_BITS - 1)) & 1 == 1)
@@ -126,34 +132,39 @@ class Walker:
         if weights:
             put("indices", j, index, active)
             put("weights", j, power, active)
-            power = power * _share(ray.d, l, quotient(near, far), through)
+            power = power * _share(ray.d, l, k, through)
         on = met & (near == index)
         after = Ray(p, d, hit.segment, hit.s, hit.r, hit.to_left == through, to.number(0))
-        index = dr.select(through, far, index)
-        return Walk(dr.select(on, after, ray), index, power, j + 1, on)
+        onward = Walk(after, dr.select(through, far, index), power, j + 1, self._look(0), on)
+        again = Walk(ray, walk.index, walk.power, j, look, walk.active & negated(settled))
+        selected: Any = dr.select(on, onward, again)
+        return selected
 
-    def _sides(self, hit: Hit, active: Any) -> tuple[Any, Any]:
-        """Index of the medium before the boundary, and behind it."""
-        left, right = self.to.take(self.media, hit.segment, active)
-        return dr.select(hit.to_left, right, left), dr.select(hit.to_left, left, right)
+    def _look(self, gone: float) -> Look:
+        return Look(self.to.number(gone), self.to.index(NOWHERE))
 
-    def _nearest(self, ray: Ray, index: Any, active: Any) -> Found:
-        """The first boundary ahead, and the media before and behind it."""
+    def _nearest(self, ray: Ray, look: Look, active: Any) -> tuple[Hit, Look, Any]:
+        """The first boundary ahead, if it is certain after this look."""
         start = self.boundaries.start(ray)
         if self.mesh:
-            return self.mesh.nearest(self.boundaries, ray, start, active, self._sides, index)
+            return self.mesh.nearest(self.boundaries, ray, start, look, active)
 
         def test(i: Any, best: Hit) -> tuple[Any, Hit]:
             return i + 1, self.boundaries.nearer(best, ray, start, i)
 
         first = self.to.index(0), self.boundaries.none()
         more = lambda i, best: active & (i < self.boundaries.count)  # noqa: E731
-        _, hit = dr.while_loop(first, more, test, label="boundaries")
-        return hit, *self._sides(hit, active & (hit.segment != NOWHERE))
+        return dr.while_loop(first, more, test, label="boundaries")[1], look, self.to.mask(True)
+
+
+def _ratios(media: Any) -> Any:
+    """The indices on the left and on the right, and k from left to right and back, of the indices before rounding."""
+    left, right = media.T
+    return np.column_stack([left, right, left / right, right / left])
 
 
 def _unit(v: Any) -> Any:
-    return v * quotient(1, dr.norm(v))
+    return v * dr.rsqrt(dr.squared_norm(v))
 
 
 def _mirrored(d: Any, l: Any) -> Any:  # noqa: E741
