@@ -79,10 +79,10 @@ def save(path: Path, scene: PlanarScene, traced: Sequence[Branches]) -> None:
 def picture(scene: PlanarScene, traced: Sequence[Branches], suffix: str) -> bytes:
     """The content of such a file. The same arguments give the same bytes. ValueError where matplotlib is missing."""
     require_matplotlib()
-    import matplotlib
+    import matplotlib.style
 
     buffer = io.BytesIO()
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.style.context(["default", STYLE]):  # whatever the user's own style is
         drawn = figure(scene, traced, DPI[suffix])
         drawn.savefig(buffer, format=suffix[1:], dpi="figure", metadata=UNDATED[suffix])
     return buffer.getvalue()
@@ -119,21 +119,21 @@ def _size(view: View) -> tuple[float, float]:
     return max(height * aspect, 3.6) + 0.6, height + 0.95
 
 
-def _settle(figure: Figure) -> None:
+def _settle(drawn: Figure) -> None:
     """From here on everything stays in its place, and an image can have as many pixels as there are for it."""
-    layout = figure.get_layout_engine()
+    layout = drawn.get_layout_engine()
     assert layout is not None
     layout.set(w_pad=0.12, h_pad=0.12)  # type: ignore[call-arg]
     for _ in range(2):  # the first time it is not known yet where the title comes to be
-        figure.draw_without_rendering()
-    figure.set_layout_engine("none")
+        drawn.draw_without_rendering()
+    drawn.set_layout_engine("none")
 
 
 # Media and boundaries ----------------------------------------------------------------------------------------------
 
 
 def _media(panel: Axes, scene: PlanarScene) -> None:
-    """Regions tinted by index, paler the nearer it is to that around everything; a legend, or a scale of many."""
+    """Regions tinted by index, paler the nearer that is to that around everything; a legend of up to NAMED."""
     from matplotlib.patches import Patch, Polygon
 
     around = float(np.mean(scene.index))
@@ -142,7 +142,8 @@ def _media(panel: Axes, scene: PlanarScene) -> None:
     tints = {n: _tint((n - around) / (most or 1)) for n in (around, *means)}
     panel.set_facecolor(tints[around])
     for region, n in zip(scene.regions, means, strict=True):
-        panel.add_patch(Polygon(region.outline, facecolor=tints[n], edgecolor="none", zorder=0.5))
+        style: dict[str, Any] = {"facecolor": tints[n], "edgecolor": "none", "zorder": 0.5}
+        panel.add_patch(Polygon(region.outline, rasterized=len(region.outline) > LINES, **style))
     labels = {around: _label(scene.index)} | {n: _label(r.indices) for r, n in zip(scene.regions, means, strict=True)}
     shown = sorted(labels)
     if len(shown) > NAMED:  # of many layers the ends and some between

@@ -36,12 +36,12 @@ class Legs:
 
 
 def around(scene: PlanarScene, traced: Sequence[Branches]) -> View:
-    """What holds the boundaries and where rays meet them, with a margin; the rays' origins if there are none."""
+    """What holds the boundaries and where rays meet them, with a margin."""
     segments = scene.segments[0]
     places = [segments.start, segments.end, *(region.outline for region in scene.regions)]
     places += [branches.paths.points[:, 1:].reshape(-1, 2) for branches in traced]
     points = np.concatenate(places)
-    points = points[np.isfinite(points).all(axis=1)] if len(segments) else scene.origins
+    points = points[np.isfinite(points).all(axis=1)]
     low, high = points.min(axis=0), points.max(axis=0)
     pad = MARGIN * (float((high - low).max()) or 1.0)
     return float(low[0] - pad), float(high[0] + pad), float(low[1] - pad), float(high[1] + pad)

@@ -138,7 +138,7 @@ def test_a_crowd_is_the_right_way_up(drawn):
     x = figure.axes[0].transData.transform((-2.5, 0))[0]
     above, below = (pixels_of(figure)[int(row), int(x)] for row in y)
     assert above[1] < 0.8
-    assert (below == 1).all()
+    assert below.min() > 0.97  # one reflection inside reaches it
 
 
 def test_faint_crowds_are_not_lost():
@@ -181,6 +181,14 @@ def test_the_same_scene_gives_the_same_bytes(rays, suffix, start):
     content = drawing.picture(given, follow_scene(given), suffix)
     assert content.startswith(start)
     assert drawing.picture(given, follow_scene(given), suffix) == content
+
+
+def test_the_users_style_is_left_out():
+    traced = follow_scene(SLANTED)
+    plain = drawing.picture(SLANTED, traced, ".svg")
+    with matplotlib.rc_context({"axes.facecolor": "black", "font.size": 30, "svg.hashsalt": "mine"}):
+        assert drawing.picture(SLANTED, traced, ".svg") == plain
+        assert matplotlib.rcParams["font.size"] == 30
 
 
 def test_another_scene_gives_other_bytes():

@@ -32,6 +32,7 @@ to = [-3, 0.9]
 direction = [1, 0]
 count = 7
 """
+SCENES = sorted((Path(__file__).parents[1] / "scenes" / "planar").glob("*.toml"))
 FORMATS = {".svg": b"<?xml", ".png": b"\x89PNG", ".pdf": b"%PDF"}
 
 
@@ -272,6 +273,14 @@ files.Path.replace = slow
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=30) == 130, process.stderr.read()
     assert list(ball.parent.iterdir()) == [ball]
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+def test_every_scene_of_ours_is_consistent(trace, path):
+    code, out, err = trace(scene=path)
+    assert (code, err) == (0, "")
+    assert " escaped" in out
+    assert "contradicted" not in out
 
 
 def test_formats_are_those_that_are_drawn():
