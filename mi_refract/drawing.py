@@ -225,7 +225,7 @@ def _shade(panel: Axes, lines: Legs, colours: dict[int, Any]) -> None:
     for number in colours:
         layer = lines.where(lines.colour == number)
         layers[number] = density(layer, strength(layer.weight), view, width, height)
-    style: dict[str, Any] = {"extent": view, "origin": "lower", "interpolation": "none", "aspect": "equal", "zorder": 2}
+    style: dict[str, Any] = {"extent": view, "origin": "lower", "aspect": "equal", "zorder": 2}
     panel.imshow(_blend(layers, colours), **style)
 
 
