@@ -186,7 +186,7 @@ class Tracer:
             raise ValueError(f"directions[{int(np.argmax(still))}] = (0, 0): accepted: a direction")
         if not isinstance(max_depth, int | np.integer) or max_depth < 1:
             raise ValueError(f"max_depth = {max_depth!r}: accepted: a whole number, 1 or more")
-        index = None if n_start is None else _each("n_start", n_start, len(origins), "iuf", np.float64, np.nextafter(0, 1))
+        index = None if n_start is None else _each("n_start", n_start, len(origins), "iuf", float, 5e-324)
         none = np.ndim(reflect) == 0 and reflect == 0
         mirrored = None if none else _each("reflect", reflect, len(origins), "iu", np.uint32, 0)
         found = self.walker(origins, directions, index, mirrored, max_depth, weights)
