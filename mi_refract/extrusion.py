@@ -7,8 +7,9 @@ crosses a segment within ε of a place crosses that segment's stroke, its neighb
 so the strokes met, in their order, name every segment that `crossings` must try; what it says is exact. Lengths here
 are in units of half the scene's extent.
 
-Precondition: no segment is shorter than SHORTEST, and what shares no vertex is no nearer than that; where it is and
-the rays' media tell, the next strokes are tried, too.
+Precondition: no segment is shorter than SHORTEST, and none nearer to another that shares no vertex with it. The first
+is sure, the second is seen at each segment's middle and quarters (`crowded`); where it is broken elsewhere a ray may
+miss a film there, or meet its two sides in the wrong order, and be contradicted.
 """
 
 from __future__ import annotations
@@ -51,8 +52,9 @@ class Extrusion:
         self.centre, self.half = (low + high) / 2, float((high - low).max() / 2)
         a, b = ((x - self.centre) / self.half for x in (start, end))
         starts, ends = _strokes(a, b, vertices)
-        self.narrow = lanes.table(_narrow(a, b, vertices))
         self.scene = _upright(variant, starts, ends)
+        self.crowded = self._crowded(a, b, vertices)
+        self.narrow = lanes.table(_narrow(a, b, vertices))
         first, around = _around(vertices, len(starts) - len(a))
         self.first, self.around = lanes.table(first), lanes.table(around)
 
@@ -72,6 +74,31 @@ class Extrusion:
         gone = look.gone + t
         settled = negated(found) | (best.distance * (1 / self.half) <= gone + MARGIN)
         return best, Look(gone + STEP, best.segment), settled
+
+    def _crowded(self, a: Any, b: Any, vertices: Any) -> tuple[int, int] | None:
+        """A segment and one that shares no vertex with it, less than SHORTEST from its middle or a quarter of it."""
+        e = b - a
+        across = np.column_stack([-e[:, 1], e[:, 0]]) / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), 1e-300)
+        for share in (0.25, 0.5, 0.75):
+            for d in (across, -across):
+                stroke = self._within(a + share * e + OFFSET * d, d)
+                seen = np.flatnonzero(stroke < len(a))
+                other = stroke[seen]
+                apart = (vertices[seen, :, None] != vertices[other][:, None]).all((1, 2))
+                if apart.any():
+                    return int(seen[apart][0]), int(other[apart][0])
+        return None
+
+    def _within(self, q: Any, d: Any) -> Any:
+        """The stroke that a ray meets within SHORTEST, NOWHERE for none: of N rays as numpy arrays, N × 2."""
+        to, nearby = self.lanes, {"nearby": self.lanes.buffer(self.lanes.index, NOWHERE, (1, len(q)))}
+        places, directions = to.table(q), to.table(d)
+
+        def work(lane: Any, put: Any) -> None:
+            found, t, stroke = self._stroke(to.take(places, lane), to.take(directions, lane), to.mask(True))
+            put("nearby", 0, stroke, found & (t < SHORTEST))
+
+        return to.run(len(q), nearby, work)["nearby"][0]
 
     def _aside(self, ray: Ray, start: Start) -> Any:
         """Where to look from: the ray's start, moved off the segment that it is on, to the side to which it goes."""

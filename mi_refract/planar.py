@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from .crossings import Arcs, Straight
 from .extrusion import SHORTEST, Extrusion
-from .lanes import lanes
+from .lanes import Lanes, lanes
 from .walks import Event, Walker
 
 __all__ = ["Event", "Paths", "Segments", "Tracer", "trace"]
@@ -172,7 +172,7 @@ class Tracer:
         ends = segments.start, segments.end, segments.vertices
         shapes = (segments.control, segments.weight) if segments.curved else None
         boundaries = Arcs(to, *ends, *shapes) if shapes else Straight(to, *ends)
-        mesh = Extrusion(to, *ends) if _wants_mesh(segments, method) else None
+        mesh = _mesh(to, segments, method)
         self.walker = Walker(to, boundaries, mesh, np.column_stack([segments.n_left, segments.n_right]), formula)
 
     def __call__(
@@ -186,32 +186,39 @@ class Tracer:
             raise ValueError(f"directions[{int(np.argmax(still))}] = (0, 0): accepted: a direction")
         if not isinstance(max_depth, int | np.integer) or max_depth < 1:
             raise ValueError(f"max_depth = {max_depth!r}: accepted: a whole number, 1 or more")
-        index = None if n_start is None else _each("n_start", n_start, len(origins), "f", np.float64)
+        index = None if n_start is None else _each("n_start", n_start, len(origins), "iuf", float, 5e-324)
         none = np.ndim(reflect) == 0 and reflect == 0
-        mirrored = None if none else _each("reflect", reflect, len(origins), "iu", np.uint32)
+        mirrored = None if none else _each("reflect", reflect, len(origins), "iu", np.uint32, 0)
         found = self.walker(origins, directions, index, mirrored, max_depth, weights)
         found["directions"] = found["directions"][0]
         return Paths(**{name: x if name == "directions" else np.swapaxes(x, 0, 1) for name, x in found.items()})
 
 
-def _each(name: str, values: Any, count: int, kinds: str, kind: Any) -> Any:
+def _each(name: str, values: Any, count: int, kinds: str, kind: Any, least: float) -> Any:
     """One value per ray."""
     array = np.asarray(values)
-    if array.dtype.kind not in kinds + "iu" or array.shape not in ((), (count,)) or not (array >= 0).all():
-        whole = "" if "f" in kinds else "whole "
-        raise ValueError(f"{name}: accepted: a {whole}number ≥ 0, or {count} of them")
+    if array.dtype.kind not in kinds or array.shape not in ((), (count,)) or not (array >= least).all():
+        accepted = "a number above 0" if least else "a whole number, 0 or more"
+        raise ValueError(f"{name}: accepted: {accepted}, or {count} of them")
     return np.ascontiguousarray(np.broadcast_to(array.astype(kind), count))
 
 
-def _wants_mesh(segments: Segments, method: str) -> bool:
+def _mesh(to: Lanes, segments: Segments, method: str) -> Extrusion | None:
+    """What finds candidates, where it can and is faster or asked for."""
     if method not in METHODS:
         raise ValueError(f"method = {method!r}; accepted: {', '.join(METHODS)}")
-    if method == "brute":
-        return False
+    if method == "brute" or (method == "auto" and len(segments) <= FEW):
+        return None
     length = np.hypot(*(segments.end - segments.start).T)
     extent = np.ptp(np.concatenate([segments.start, segments.end]), axis=0).max()
     shortest = length[length > 0].min(initial=np.inf) / (extent / 2 or 1)
-    reason = "arcs" if segments.curved else f"a segment {shortest:.1e} of the extent" if shortest < SHORTEST else ""
-    if reason and method == "mesh":
-        raise ValueError(f"method = 'mesh': accepted: straight segments longer than {SHORTEST:.1e}, not {reason}")
-    return not reason and (method == "mesh" or len(segments) > FEW)
+    reason = "arcs" if segments.curved else f"a segment of {shortest:.1e}" if shortest < SHORTEST else ""
+    if not reason:
+        mesh = Extrusion(to, segments.start, segments.end, segments.vertices)
+        if not mesh.crowded:
+            return mesh
+        reason = "segments {} and {}".format(*mesh.crowded)
+    if method == "mesh":
+        limit = f"longer and farther apart than {SHORTEST:.1e} of half the extent"
+        raise ValueError(f"method = 'mesh': {reason}; accepted: straight segments, {limit}")
+    return None

@@ -365,6 +365,8 @@ def test_segments_that_coincide_are_refused():
         ({"reflect": -1}, "reflect: accepted: a whole number"),
         ({"reflect": 0.5}, "reflect: accepted: a whole number"),
         ({"n_start": "air"}, "n_start: accepted: a number"),
+        ({"n_start": 0}, "n_start: accepted: a number"),
+        ({"n_start": math.nan}, "n_start: accepted: a number"),
     ],
 )
 def test_bad_arguments_are_named_in_one_line(change, message):
