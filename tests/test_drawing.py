@@ -174,9 +174,12 @@ def test_paths_that_end_otherwise_are_marked(drawn, event, mark):
     assert note not in clean.get_xlabel().replace("\n", " ")
 
 
-@pytest.mark.parametrize("suffix, start", [(".svg", b"<?xml"), (".png", b"\x89PNG"), (".pdf", b"%PDF")])
-@pytest.mark.parametrize("rays", [0, 401], ids=["lines", "density"])
-def test_the_same_scene_gives_the_same_bytes(rays, suffix, start):
+@pytest.mark.parametrize(
+    "suffix, start, rays",
+    [(".svg", b"<?xml", 0), (".png", b"\x89PNG", 0), (".pdf", b"%PDF", 0), (".svg", b"<?xml", 401)],
+    ids=["svg", "png", "pdf", "density"],
+)
+def test_the_same_scene_gives_the_same_bytes(suffix, start, rays):
     given = with_rays(CROWD, rays) if rays else SLANTED
     content = drawing.picture(given, follow_scene(given), suffix)
     assert content.startswith(start)
@@ -201,6 +204,16 @@ def test_thousands_of_rays_are_a_small_file():
     assert len(content) < 2_000_000
     assert content.count(b"<image") == 1
     assert content.count(b"<path") < 500
+
+
+@pytest.mark.parametrize("facets", [drawing.LINES - 1, drawing.LINES + 1])
+def test_many_boundaries_are_an_image(drawn, facets):
+    t = 2 * np.pi * np.arange(facets) / facets
+    given = scene(polygon(np.column_stack([np.cos(t), np.sin(t)]), 1.5), [[-1.5, 0.3]], (1, 0), view=VIEW)
+    panel = drawn(given).axes[0]
+    boundaries = min(panel.findobj(LineCollection), key=lambda c: c.zorder)
+    region = min(panel.patches, key=lambda p: p.zorder)
+    assert {bool(boundaries.get_rasterized()), bool(region.get_rasterized())} == {facets > drawing.LINES}
 
 
 def test_titles_are_not_formulas():
