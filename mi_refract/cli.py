@@ -13,6 +13,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,7 +26,8 @@ except ModuleNotFoundError as missing:
     print("mi-refract needs the extra `cli`: pip install 'mi-refract[cli]'", file=sys.stderr)
     sys.exit(2)
 
-from . import __version__, backend, images
+from . import __version__, backend, drawing, files, foci, images, planar_scene
+from .branches import as_data, follow_scene, summary, with_rays
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -106,6 +108,39 @@ def parse_defines(items: list[str]) -> dict[str, str]:
             raise ValueError(f"-D {item}: {name} is given twice; accepted: once")
         defines[name] = value
     return defines
+
+
+@app.command()
+def trace(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="A planar scene.")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="OUT.svg|.png|.pdf", help="Draw.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the paths as JSON.")] = False,
+    table: Annotated[bool, typer.Option("--table", help="Print focal points and spot sizes.")] = False,
+    branches: Annotated[int | None, typer.Option(min=0, help="Partial reflections on a path, at most.")] = None,
+    rays: Annotated[int | None, typer.Option(min=1, help="Rays of each beam that has several.")] = None,
+    max_depth: Annotated[int | None, typer.Option(min=1, help="Boundaries on a path, at most.")] = None,
+    precision: Annotated[str, typer.Option(help="float64 or float32.")] = "float64",
+    formula: Annotated[str | None, typer.Option(help="A formula of refraction; the planar one by default.")] = None,
+    arrays: Annotated[str | None, typer.Option("--backend", help="llvm, cuda or scalar; see `doctor`.")] = None,
+) -> None:
+    """Follow the rays of a planar scene; draw them, print their paths, or where they come together."""
+    backend.restart_if_needed()
+    if output:
+        files.writable(output, drawing.FORMATS)
+        drawing.require_matplotlib()
+    told: dict[str, Any] = {"branches": branches, "max_depth": max_depth}
+    loaded = replace(planar_scene.load(scene), **{name: value for name, value in told.items() if value is not None})
+    if rays:
+        loaded = with_rays(loaded, rays)
+    traced = follow_scene(loaded, formula=formula, precision=precision, backend=arrays)
+    if output:
+        drawing.save(output, loaded, traced)
+    found = foci.groups(loaded, traced) if table else []
+    if as_json:
+        focal = {"foci": [asdict(group) for group in found]} if table else {}
+        print(json.dumps(as_data(loaded, traced) | focal, allow_nan=False))
+    else:
+        print("\n".join([f"{scene.name}: {summary(loaded, traced)}", *([foci.table(found)] if found else [])]))
 
 
 def _spinner(console: Console, text: str) -> contextlib.AbstractContextManager[Any]:

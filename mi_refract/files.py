@@ -2,9 +2,25 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import uuid
+from collections.abc import Sequence
 from pathlib import Path
+
+
+def writable(path: str | os.PathLike[str], suffixes: Sequence[str]) -> Path:
+    """The path, where a file of that kind can be put; otherwise ValueError for its name, OSError for its folder."""
+    path = Path(path)
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"{path}: accepted: a file name that ends in {' or '.join(suffixes)}")
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: is a folder; accepted: the name of a file")
+    if not path.parent.is_dir():
+        raise NotADirectoryError(f"{path}: {path.parent} is not a folder; accepted: an existing one")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise PermissionError(f"{path}: {path.parent} is not writable; accepted: a writable folder")
+    return path
 
 
 def write_atomically(path: str | Path, content: str | bytes) -> None:

@@ -18,7 +18,10 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from .files import writable
+
 Metadata = dict[str, Any]
+SUFFIXES = (".exr",)
 LOADER_OPTIONS = ("path", "parallel", "optimize")  # mi.load_file would take these names for its own
 # Merged meshes come in the order of their addresses, and parallel loading in that of its threads. Then so do emitters,
 # and a seed no longer means a picture.
@@ -37,7 +40,7 @@ def write_exr(
     ValueError for a shape that does not fit `channels`, a name that is not .exr, or an attribute of another type;
     OSError for a folder that cannot be written or a full disk. Nothing is left behind then.
     """
-    path = writable_exr(path)
+    path = writable(path, SUFFIXES)
     pixels = np.ascontiguousarray(pixels, dtype=np.float32)
     if pixels.ndim != 3 or pixels.size == 0 or pixels.shape[2] != len(channels):
         raise ValueError(f"{path}: pixels of shape {pixels.shape}; accepted: H × W × {len(channels)} {tuple(channels)}")
@@ -57,20 +60,6 @@ def temporary_name(path: str | os.PathLike[str]) -> Path:
     """Where this process writes before the rename: in the same folder, and .exr, by which OpenImageIO goes."""
     path = Path(path)
     return path.with_name(f".{path.stem}.{os.getpid()}.exr")
-
-
-def writable_exr(path: str | os.PathLike[str]) -> Path:
-    """The path, where an EXR file can be put; otherwise ValueError for its name, OSError for its folder."""
-    path = Path(path)
-    if path.suffix.lower() != ".exr":
-        raise ValueError(f"{path}: accepted: a file name that ends in .exr")
-    if path.is_dir():
-        raise IsADirectoryError(f"{path}: is a folder; accepted: the name of a file")
-    if not path.parent.is_dir():
-        raise NotADirectoryError(f"{path}: {path.parent} is not a folder; accepted: an existing one")
-    if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise PermissionError(f"{path}: {path.parent} is not writable; accepted: a writable folder")
-    return path
 
 
 def _write(path: Path, pixels: NDArray[np.float32], channels: Sequence[str], attributes: Metadata) -> None:
@@ -178,7 +167,7 @@ def render_to_exr(
         raise ValueError(f"spp = {spp}: accepted: a positive whole number")
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed = {seed}: accepted: a whole number from 0 to 2³² − 1")
-    output = writable_exr(output)
+    output = writable(output, SUFFIXES)
     loaded = load_scene(scene, defines)
     start = time.perf_counter()
     try:

@@ -32,7 +32,6 @@ __all__ = ["Event", "Paths", "Segments", "Tracer", "trace"]
 
 Array = NDArray[np.float64]
 METHODS = "auto", "brute", "mesh"
-LEAST_INDEX = float(np.finfo(np.float32).tiny)  # or it is 0 in float32
 FEW = 48  # segments that are tried sooner than a query takes
 
 SHAPES: dict[str, tuple[int, ...]] = {
@@ -85,8 +84,8 @@ class Segments:
             raise ValueError("segments: control and weight: accepted: both or neither")
         for name in ("n_left", "n_right", "weight"):
             values = getattr(self, name)
-            if values is not None and not (values >= LEAST_INDEX).all():
-                i = int(np.argmin(values >= LEAST_INDEX))
+            if values is not None and not (values > 0).all():
+                i = int(np.argmin(values > 0))
                 raise ValueError(f"segments.{name}[{i}] = {values[i]}: accepted: more than 0")
         self._distinct()
 
@@ -187,7 +186,7 @@ class Tracer:
             raise ValueError(f"directions[{int(np.argmax(still))}] = (0, 0): accepted: a direction")
         if not isinstance(max_depth, int | np.integer) or max_depth < 1:
             raise ValueError(f"max_depth = {max_depth!r}: accepted: a whole number, 1 or more")
-        index = None if n_start is None else _each("n_start", n_start, len(origins), "iuf", np.float64, LEAST_INDEX)
+        index = None if n_start is None else _each("n_start", n_start, len(origins), "iuf", float, 5e-324)
         none = np.ndim(reflect) == 0 and reflect == 0
         mirrored = None if none else _each("reflect", reflect, len(origins), "iu", np.uint32, 0)
         found = self.walker(origins, directions, index, mirrored, max_depth, weights)
@@ -199,8 +198,8 @@ def _each(name: str, values: Any, count: int, kinds: str, kind: Any, least: floa
     """One value per ray."""
     array = np.asarray(values)
     if array.dtype.kind not in kinds or array.shape not in ((), (count,)) or not (array >= least).all():
-        whole = "" if "f" in kinds else "whole "
-        raise ValueError(f"{name}: accepted: a {whole}number of {least:g} or more, or {count} of them")
+        accepted = "a number above 0" if least else "a whole number, 0 or more"
+        raise ValueError(f"{name}: accepted: {accepted}, or {count} of them")
     return np.ascontiguousarray(np.broadcast_to(array.astype(kind), count))
 
 
@@ -220,6 +219,6 @@ def _mesh(to: Lanes, segments: Segments, method: str) -> Extrusion | None:
             return mesh
         reason = "segments {} and {}".format(*mesh.crowded)
     if method == "mesh":
-        limit = f"{SHORTEST:.1e} of half the extent"
-        raise ValueError(f"method = 'mesh': {reason}; accepted: straight segments longer, and farther apart, than {limit}")
+        limit = f"longer and farther apart than {SHORTEST:.1e} of half the extent"
+        raise ValueError(f"method = 'mesh': {reason}; accepted: straight segments, {limit}")
     return None
