@@ -63,10 +63,9 @@ def scene_rows(context: Context, path: Path) -> list[Row]:
         paths = trace(scene, case, spawn)
         values = judge(paths, case, U, offset)
         values |= {f"from planar {p}": apart(paths, other) / case.extent for p, other in planar_paths.items()}
-        budgets = {"error / bound": 1.0, "astray, far": 0.0}
         replay = {"scene": path.name, "walls": len(case.segments), "rays": len(case.origins), "seed": planar.SEED}
         pictures = {"overlay": _picture(context, scene, case, paths)} if name == DRAWN else {}
-        rows.append(Row(STUDY, f"{PLUGIN}, {name}", path.stem, context.variant, values, budgets,
+        rows.append(Row(STUDY, f"{PLUGIN}, {name}", path.stem, context.variant, values, planar.GROWN,
                         replay=replay, pictures=pictures))  # fmt: skip
     return rows
 

@@ -61,8 +61,7 @@ def _mesh(segments: Segments, chosen: Array) -> Any:
 
 
 class Plan:
-    """The plane z = 0 of an extruded scene seen from above, `middle` ± `half`; media by their index, as Mitsuba's rays
-    along x find them."""
+    """The plane z = 0 of an extruded scene from above, `middle` ± `half`: media by index, as rays along x find them."""
 
     def __init__(self, scene: Any, segments: Segments, size: int) -> None:
         import mitsuba as mi
@@ -73,7 +72,7 @@ class Plan:
         x, y = self.middle[:, None] + self.half * np.stack([right, -down])
         si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, 0), mi.Vector3f(1, 0, 0)))
         segment = np.array(si.shape.eval_attribute_1("face_segment", si, si.is_valid())).astype(int)
-        # A ray along x leaves to the right of a wall whose normal, to the left, is against it.
+        # A ray starts on the right of a wall whose normal, which points to the left, is along it.
         index = np.where(np.array(si.n.x) > 0, segments.n_right[segment], segments.n_left[segment])
         least, most = (f(segments.n_left, segments.n_right) for f in (np.minimum, np.maximum))
         index = np.where(np.array(si.is_valid()), index, least.min())
