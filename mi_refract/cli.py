@@ -26,7 +26,7 @@ except ModuleNotFoundError as missing:
     print("mi-refract needs the extra `cli`: pip install 'mi-refract[cli]'", file=sys.stderr)
     sys.exit(2)
 
-from . import __version__, backend, drawing, files, foci, images, planar_scene
+from . import __version__, backend, drawing, files, foci, images, planar_keys, planar_scene
 from .branches import as_data, follow_scene, summary, with_rays
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -110,6 +110,12 @@ def parse_defines(items: list[str]) -> dict[str, str]:
     return defines
 
 
+def _print_keys(asked: bool) -> None:
+    if asked:
+        print(planar_keys.reference())
+        raise typer.Exit
+
+
 @app.command()
 def trace(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="A planar scene.")],
@@ -122,6 +128,9 @@ def trace(
     precision: Annotated[str, typer.Option(help="float64 or float32.")] = "float64",
     formula: Annotated[str | None, typer.Option(help="A formula of refraction; the planar one by default.")] = None,
     arrays: Annotated[str | None, typer.Option("--backend", help="llvm, cuda or scalar; see `doctor`.")] = None,
+    keys: Annotated[
+        bool, typer.Option("--keys", is_eager=True, callback=_print_keys, help="Print what a scene file may hold.")
+    ] = False,
 ) -> None:
     """Follow the rays of a planar scene; draw them, print their paths, or where they come together."""
     backend.restart_if_needed()

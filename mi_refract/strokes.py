@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .branches import Branches
+from .curves import points
 from .planar import Array, Event, Segments
 from .planar_scene import PlanarScene
 
@@ -128,12 +129,6 @@ def _chains(start: Array, end: Array, value: Array, rows: int, columns: int) -> 
 
 def curves(segments: Segments, samples: int = 33) -> list[Array]:
     """The boundaries as polylines, each as long as they follow one another; an arc is sampled at so many points."""
-    if segments.control is None or segments.weight is None:
-        points = np.stack([segments.start, segments.end], axis=1)
-    else:
-        t = np.linspace(0, 1, samples)[:, None]
-        start, middle, end = (p[:, None] for p in (segments.start, segments.control, segments.end))
-        inner = 2 * segments.weight[:, None, None] * t * (1 - t)
-        points = ((1 - t) ** 2 * start + inner * middle + t**2 * end) / ((1 - t) ** 2 + inner + t**2)
+    places = points(segments, samples - 1 if segments.curved else 1)
     breaks = np.flatnonzero((segments.start[1:] != segments.end[:-1]).any(axis=1)) + 1
-    return [np.concatenate([run[:, :-1].reshape(-1, 2), run[-1:, -1]]) for run in np.split(points, breaks)]
+    return [np.concatenate([run[:, :-1].reshape(-1, 2), run[-1:, -1]]) for run in np.split(places, breaks)]

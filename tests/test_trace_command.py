@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_refract import branches, cli, drawing, planar, planar_scene
+from mi_refract import branches, cli, drawing, planar, planar_keys, planar_scene
 from mi_refract.formulas import FORMULAS
 
 BALL = """
@@ -285,3 +285,9 @@ def test_every_scene_of_ours_is_consistent(trace, path):
 
 def test_formats_are_those_that_are_drawn():
     assert set(drawing.FORMATS) == set(FORMATS) == set(drawing.DPI) == set(drawing.UNDATED)
+
+
+def test_the_keys_of_a_scene_are_printed_without_one(capfd):
+    assert cli.main(["trace", "--keys"]) == 0
+    printed = capfd.readouterr().out
+    assert all(f"`{name}`" in printed for name in (*planar_keys.SHAPES, *planar_keys.BEAMS, *planar_keys.SCENE))
