@@ -59,6 +59,8 @@ class Walker:
     ) -> dict[str, Any]:
         """The fields of `planar.Paths`, rows of depths; `index` and `mirrored` may be None."""
         to, count, legs = self.to, len(origins), max_depth + 1
+        if self.mesh:
+            self.mesh.expect(origins, directions)
         rays = [to.table(x) for x in (origins, directions)]
         others = [None if x is None else to.table(x) for x in (index, mirrored)]
         buffers = {

@@ -114,9 +114,9 @@ def test_paths_are_those_of_trying_all(llvm, case, precision):
     assert (brute.hits >= 0).sum() > RAYS / 4
 
 
-def no_neighbours(first, around):
-    """Each stroke names its own segment only; that of a vertex one of its own."""
-    return 2 * np.arange(len(first)), np.column_stack([around[first], np.full(len(first), NOWHERE)]).ravel()
+def no_neighbours(vertices, count):
+    """A stroke names no segment but its own; that of a vertex none."""
+    return np.zeros(len(vertices) + count, int), np.array([NOWHERE])
 
 
 @pytest.mark.parametrize(
@@ -125,13 +125,11 @@ def no_neighbours(first, around):
         ("spikes", ("_narrow", lambda a, b, vertices: np.zeros(a.shape))),
         ("fine circle, along its wall", ("MARGIN", 2.0**-26)),
         ("circle, along segments", ("OFFSET", 2.0**-9)),
-        ("fine circle, along its wall", ("_around", None)),
+        ("fine circle, along its wall", ("_around", no_neighbours)),
     ],
 )
 def test_each_precaution_is_needed(llvm, monkeypatch, case, defect):
-    name, value = defect
-    plain = extrusion._around
-    monkeypatch.setattr(extrusion, name, value or (lambda *given: no_neighbours(*plain(*given))))
+    monkeypatch.setattr(extrusion, *defect)
     with pytest.raises(AssertionError):
         test_paths_are_those_of_trying_all(None, case, "float64")
 
