@@ -179,11 +179,11 @@ def judge(paths: Paths, case: Case, u: float, offset: float = 0.0) -> dict[str, 
     near = undecided(exact, paths, case.segments, points, directions)
     worst = np.maximum(off.max(1) / case.extent, turned)
     return {
-        "boundaries": float(exact.met.max()),
+        "error / bound": _largest(ratio[~astray]),
+        "difference": _largest(worst[~astray]),
         "astray": float(astray.sum()),
         "astray, far": float((astray & ~near).sum()),
-        "difference": _largest(worst[~astray]),
-        "error / bound": _largest(ratio[~astray]),
+        "boundaries": float(exact.met.max()),
     }
 
 
