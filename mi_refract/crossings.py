@@ -142,7 +142,11 @@ class Straight:
         # |d × e| = |f_a| + |f_b| without cancellation, and λ times it, whose sign is right where λ itself is lost.
         scale = dr.abs(f_a) + dr.abs(f_b)
         reach = dr.select(a_left, -1, 1) * cross(way, e)
-        ahead = (a_left != b_left) & (reach > ray.slack * (dr.abs(e.x) + dr.abs(e.y))) & (i != ray.own) & active
+        # The crossing is between the ends: where both are ahead, or both behind, so is it. That decides along a segment,
+        # whose line is less than rounding away, so that the sign of `reach` is noise.
+        t_a, t_b = dr.dot(to_a, ray.d), dr.dot(to_b, ray.d)
+        beyond = (dr.maximum(t_a, t_b) > 0) & (reach > ray.slack * (dr.abs(e.x) + dr.abs(e.y)))
+        ahead = (a_left != b_left) & ((dr.minimum(t_a, t_b) > ray.slack) | beyond) & (i != ray.own) & active
         near = quotient(dr.minimum(dr.abs(f_a), dr.abs(f_b)), scale)
         s, r = (dr.select(dr.abs(f) < 0.5 * scale, near, 1 - near) for f in (f_b, f_a))
         distance = dr.dot(dr.fma(e, r, to_a), ray.d)  # λ again: that quotient would be noise at grazing incidence

@@ -69,20 +69,25 @@ class Extrusion:
 
     def nearest(self, boundaries: Straight, ray: Ray, start: Start, look: Look, active: Any) -> tuple[Hit, Look, Any]:
         """The first boundary ahead, from where to look on for what might come before it, and whether nothing does."""
-        to = self.lanes
         found, t, stroke = self._stroke(dr.fma(ray.d, look.gone, self._aside(ray, start)), ray.d, active)
         best = boundaries.nearer(boundaries.none(), ray, start, stroke, found & (stroke < boundaries.count))
-        inside = dr.square(dr.minimum(best.s, best.r)) * dr.squared_norm(best.along) > (4 * MARGIN * self.half) ** 2
-        # The start may lie beyond a neighbour, or the stroke of the vertex between: neighbours are tried by hand.
+        # Where neighbours are within MARGIN they are tried by hand: they may be met in any order, and the start may lie
+        # beyond one, or beyond the stroke of the vertex between.
         own = active & (ray.own != NOWHERE)
-        near_a, near_b = to.take(self.narrow, ray.own, own)
-        lists = dr.select(found & negated(inside), stroke, NOWHERE), dr.select(
-            own & ((ray.r < near_a) | (ray.s < near_b)), ray.own, NOWHERE
+        lists = (
+            dr.select(found & self._near_end(best.segment, best, found), stroke, NOWHERE),
+            dr.select(own & self._near_end(ray.own, ray, own), ray.own, NOWHERE),
         )
         best = self._also(best, boundaries, ray, start, dr.select(active, look.held, NOWHERE), lists)
         gone = look.gone + t
         settled = negated(found) | (best.distance * (1 / self.half) <= gone + MARGIN)
         return best, Look(gone + STEP, best.segment), settled
+
+    def _near_end(self, segment: Any, at: Hit | Ray, active: Any) -> Any:
+        """Whether a place on a segment is where the next one at either end is near; true of no segment."""
+        some = active & (segment != NOWHERE)
+        near_a, near_b = self.lanes.take(self.narrow, segment, some)
+        return negated(some) | (at.r < near_a) | (at.s < near_b)
 
     def _crowded(self, a: Any, b: Any, vertices: Any) -> tuple[int, int] | None:
         """A segment and one that shares no vertex with it, less than SHORTEST from its middle or a quarter of it."""

@@ -106,41 +106,53 @@ class Walker:
         return dr.while_loop((walk,), lambda walk: walk.active, step, label="planar")[0]
 
     def _step(self, walk: Walk, mirrored: Any, max_depth: int, put: Callable[..., None], weights: bool) -> Walk:
-        """One leg: to the next boundary, and off it."""
-        to, ray, j = self.to, walk.ray, walk.depth
-        hit, look, settled = self._nearest(ray, walk.look, walk.active)
+        """One look for the next boundary, and off it if there it is."""
+        hit, look, settled = self._nearest(walk.ray, walk.look, walk.active)
         active = walk.active & settled
         some = active & (hit.segment != NOWHERE)
-        left, right, to_right, to_left = to.take(self.media, hit.segment, some)
+        self._leg(put, walk, int(Event.ESCAPED), walk.index, active & negated(some), weights)
+        rest = Walk(walk.ray, walk.index, walk.power, walk.depth, look, walk.active & negated(settled))
+
+        def across(walk: Walk, hit: Hit, rest: Walk) -> Walk:
+            return self._cross(walk, hit, mirrored, max_depth, put, weights)
+
+        def on(walk: Walk, hit: Hit, rest: Walk) -> Walk:
+            return rest
+
+        # A branch, since all rays of a beam leave together.
+        return dr.if_stmt((walk, hit, rest), some, across, on, label="boundary")
+
+    def _leg(self, put: Callable[..., None], walk: Walk, event: Any, index: Any, active: Any, weights: bool) -> None:
+        """A leg and how it ends."""
+        put("events", walk.depth, event, active)
+        if weights:
+            put("indices", walk.depth, index, active)
+            put("weights", walk.depth, walk.power, active)
+
+    def _cross(
+        self, walk: Walk, hit: Hit, mirrored: Any, max_depth: int, put: Callable[..., None], weights: bool
+    ) -> Walk:
+        """Off the boundary that is met."""
+        to, d, j = self.to, walk.ray.d, walk.depth
+        left, right, to_right, to_left = to.take(self.media, hit.segment)
         near, far = dr.select(hit.to_left, right, left), dr.select(hit.to_left, left, right)
         k = dr.select(hit.to_left, to_left, to_right)
-        index = dr.select(some & dr.isnan(walk.index), near, walk.index)
+        index = dr.select(dr.isnan(walk.index), near, walk.index)
         p, l = self.boundaries.place(hit)  # noqa: E741 (the document's name)
-        d, transmitted = self.refract(ray.d, l, k)
-        through = transmitted
+        b, through = self.refract(d, l, k)
         if mirrored is not None:
-            forced = (j < REFLECT_BITS) & ((mirrored >> dr.minimum(j, REFLECT_BITS - 1)) & 1 == 1)
-            d = dr.select(forced & transmitted, _mirrored(ray.d, l), d)
-            through = transmitted & negated(forced)
+            forced = through & (j < REFLECT_BITS) & ((mirrored >> dr.minimum(j, REFLECT_BITS - 1)) & 1 == 1)
+            b, through = dr.select(forced, _mirrored(d, l), b), through & negated(forced)
         event = dr.select(through, int(Event.REFRACTED), int(Event.REFLECTED))
         event = dr.select(near == index, event, int(Event.CONTRADICTED))
-        event = dr.select(j < max_depth, event, int(Event.EXHAUSTED))
-        event = dr.select(some, event, int(Event.ESCAPED))
-        met = some & (j < max_depth)
-        put("events", j, event, active)
+        met = j < max_depth
+        self._leg(put, walk, dr.select(met, event, int(Event.EXHAUSTED)), index, True, weights)
         put("points", j + 1, p, met)
         put("hits", j, hit.segment, met)
-        power = walk.power
-        if weights:
-            put("indices", j, index, active)
-            put("weights", j, power, active)
-            power = power * _share(ray.d, l, k, through)
         on = met & (near == index)
-        after = Ray(p, d, hit.segment, hit.s, hit.r, hit.to_left == through, to.number(0))
-        onward = Walk(after, dr.select(through, far, index), power, j + 1, self._look(0), on)
-        again = Walk(ray, walk.index, walk.power, j, look, walk.active & negated(settled))
-        selected: Any = dr.select(on, onward, again)
-        return selected
+        ray = Ray(p, dr.select(on, b, d), hit.segment, hit.s, hit.r, hit.to_left == through, to.number(0))
+        power = walk.power * _share(d, l, k, through) if weights else walk.power
+        return Walk(ray, dr.select(through, far, index), power, j + 1, self._look(0), on)
 
     def _look(self, gone: float) -> Look:
         return Look(self.to.number(gone), self.to.index(NOWHERE))

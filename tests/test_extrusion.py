@@ -39,6 +39,42 @@ def tiles(count=6):
     return Segments(start / count * 2 - 1, end / count * 2 - 1, left, right)
 
 
+def lattice(count=5):
+    """Squares cut in two along a diagonal, half of them of another medium than their other half, in air."""
+    rng = np.random.default_rng(3)
+    below, above = np.ones((2, count + 2, count + 2))
+    below[1:-1, 1:-1], above[1:-1, 1:-1] = rng.choice([1.0, 1.33, 1.5, 2.4], (2, count, count))
+    parts = []
+    for i in range(count + 1):
+        for j in range(count + 1):
+            parts.append(((i, j), (i, j + 1), below[i, j + 1], above[i + 1, j + 1]))
+            parts.append(((i, j), (i + 1, j), below[i + 1, j + 1], above[i + 1, j]))
+            parts.append(((i, j), (i + 1, j + 1), above[i + 1, j + 1], below[i + 1, j + 1]))
+    inside = [part for part in parts if max(*part[0], *part[1]) <= count]
+    start, end, left, right = map(np.array, zip(*inside, strict=True))
+    return Segments(start * 0.1, end * 0.1, left, right)
+
+
+def slivers(count=30):
+    """Triangles whose long sides are within the margin of the strokes for half of their length, around a square."""
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)[:, None]
+    tip, far = np.column_stack([np.cos(angle), np.sin(angle)]), np.column_stack([np.cos(angle), np.sin(angle)]) * 0.2
+    aside = 4e-6 * np.column_stack([-np.sin(angle), np.cos(angle)])
+    return together(*(polygon([t, f - a, f + a][::-1], 1.3) for t, f, a in zip(tip, far, aside, strict=True)))
+
+
+def across(segments):
+    """Through places near the segments' starts, at all angles."""
+
+    def rays(rng):
+        i, share = rng.integers(0, len(segments), RAYS), 10 ** rng.uniform(-5, 0, (RAYS, 1))
+        places = segments.start[i] * (1 - share) + segments.end[i] * share
+        directions = rng.normal(size=(RAYS, 2))
+        return places - directions, directions
+
+    return rays
+
+
 def slab(top):
     """With the outside of its upper side facing what lies above."""
     return polygon([(1, top), (0, top), (0, top - 0.1), (1, top - 0.1)])
@@ -58,6 +94,17 @@ def along_the_wall(rng):
     angle, grazing = rng.uniform(0, 2 * np.pi, RAYS), 10 ** rng.uniform(-6, -1, RAYS)
     away = angle - grazing
     return 0.999999 * np.column_stack([np.cos(angle), np.sin(angle)]), np.column_stack([-np.sin(away), np.cos(away)])
+
+
+def within_segments(segments):
+    """From places on the segments, their ends among them, along them, and from others on the same line."""
+
+    def rays(rng):
+        i, share = rng.integers(0, len(segments), RAYS), rng.choice([-2, -1, 0, 0.3, 0.7, 1], (RAYS, 1))
+        e = segments.end[i] - segments.start[i]
+        return segments.start[i] + share * e, e
+
+    return rays
 
 
 def at_vertices(segments):
@@ -88,7 +135,9 @@ CASES = {
     "tiles": (tiles(), anywhere),
     "tiles, at corners": (tiles(), at_vertices(tiles())),
     "tiles, along edges": (tiles(), along_segments(tiles())),
+    "lattice, along its edges": (lattice(), within_segments(lattice())),
     "spikes": (spikes(), at_vertices(spikes())),
+    "slivers": (slivers(), across(slivers())),
 }
 
 
@@ -122,9 +171,9 @@ def no_neighbours(vertices, count):
 @pytest.mark.parametrize(
     ("case", "defect"),
     [
-        ("spikes", ("_narrow", lambda a, b, vertices: np.zeros(a.shape))),
+        ("slivers", ("_narrow", lambda a, b, vertices: np.zeros(a.shape))),
         ("fine circle, along its wall", ("MARGIN", 2.0**-26)),
-        ("circle, along segments", ("OFFSET", 2.0**-9)),
+        ("star, at tips", ("OFFSET", 2.0**-9)),
         ("fine circle, along its wall", ("_around", no_neighbours)),
     ],
 )
