@@ -142,8 +142,8 @@ class Straight:
         # |d × e| = |f_a| + |f_b| without cancellation, and λ times it, whose sign is right where λ itself is lost.
         scale = dr.abs(f_a) + dr.abs(f_b)
         reach = dr.select(a_left, -1, 1) * cross(way, e)
-        # The crossing is between the ends: where both are ahead, or both behind, so is it. That decides along a segment,
-        # whose line is less than rounding away, so that the sign of `reach` is noise.
+        # The crossing is between the ends: where both are ahead, or both behind, so is it. That decides along a
+        # segment, whose line is no farther than rounding, so that the sign of `reach` is noise.
         t_a, t_b = dr.dot(to_a, ray.d), dr.dot(to_b, ray.d)
         beyond = (dr.maximum(t_a, t_b) > 0) & (reach > ray.slack * (dr.abs(e.x) + dr.abs(e.y)))
         ahead = (a_left != b_left) & ((dr.minimum(t_a, t_b) > ray.slack) | beyond) & (i != ray.own) & active
@@ -179,7 +179,10 @@ class Arcs(Straight):
         super().__init__(lanes, start, end, vertices)
         self.box = _box(start, end, control)
         (ax, ay), (bx, by) = (control - start).T, (end - control).T
-        turn = np.where((control == (start + end) / 2).all(1), 0.0, ax * by - ay * bx)
+        middle = (start + end) / 2
+        turn = np.where((control == middle).all(1), 0.0, ax * by - ay * bx)
+        # A straight one counts along it in equal steps, whatever it says.
+        control, weight = np.where(turn[:, None] == 0, middle, control), np.where(turn == 0, 1.0, weight)
         self.shapes = lanes.table(np.column_stack([control, weight, turn]))
 
     def _shape(self, i: Any, active: Any = True) -> tuple[Any, Any, Any]:

@@ -106,7 +106,9 @@ class Segments:
     def _distinct(self) -> None:
         """Two that coincide have no first one of them."""
         ends = np.sort(self.vertices, axis=1).astype(np.uint64)
-        bulge = np.zeros((len(self), 2)) if self.control is None else self.control
+        bulge = np.zeros((len(self), 3))
+        if self.control is not None and self.weight is not None:
+            bulge = np.column_stack([self.control, self.weight]) + 0.0
         key = np.column_stack([ends[:, 0] << np.uint64(32) | ends[:, 1], bulge.view(np.uint64)])
         order = np.lexsort(key.T)
         same = (np.diff(key[order].astype(np.int64), axis=0) == 0).all(1) & (ends[order[1:], 0] != ends[order[1:], 1])
@@ -181,24 +183,28 @@ class Tracer:
     ) -> Paths:  # fmt: skip
         origins = _numbers("origins", origins, (len(origins), 2) if np.ndim(origins) else (0, 2))
         directions = _numbers("directions", directions, origins.shape)
-        still = (directions[:, 0] == 0) & (directions[:, 1] == 0)
-        if still.any():
-            raise ValueError(f"directions[{int(np.argmax(still))}] = (0, 0): accepted: a direction")
-        if not isinstance(max_depth, int | np.integer) or max_depth < 1:
+        size = np.maximum(*np.abs(directions).T)
+        if not size.all():
+            raise ValueError(f"directions[{int(np.argmin(size))}] = (0, 0): accepted: a direction")
+        if size.min(initial=1) < 1e-15 or size.max(initial=1) > 1e15:  # their squares may be out of float32's range
+            directions = np.ldexp(directions, 1 - np.frexp(size)[1][:, None])
+        if isinstance(max_depth, bool) or not isinstance(max_depth, int | np.integer) or max_depth < 1:
             raise ValueError(f"max_depth = {max_depth!r}: accepted: a whole number, 1 or more")
-        index = None if n_start is None else _each("n_start", n_start, len(origins), "iuf", float, 5e-324)
+        index = None if n_start is None else _each("n_start", n_start, len(origins), "iuf", float)
         none = np.ndim(reflect) == 0 and reflect == 0
-        mirrored = None if none else _each("reflect", reflect, len(origins), "iu", np.uint32, 0)
+        mirrored = None if none else _each("reflect", reflect, len(origins), "iu", np.uint32)
         found = self.walker(origins, directions, index, mirrored, max_depth, weights)
         found["directions"] = found["directions"][0]
         return Paths(**{name: x if name == "directions" else np.swapaxes(x, 0, 1) for name, x in found.items()})
 
 
-def _each(name: str, values: Any, count: int, kinds: str, kind: Any, least: float) -> Any:
+def _each(name: str, values: Any, count: int, kinds: str, kind: Any) -> Any:
     """One value per ray."""
     array = np.asarray(values)
-    if array.dtype.kind not in kinds or array.shape not in ((), (count,)) or not (array >= least).all():
-        accepted = "a number above 0" if least else "a whole number, 0 or more"
+    whole = kind is np.uint32
+    fits = array.dtype.kind in kinds and array.shape in ((), (count,))
+    if not fits or not (((array >= 0) & (array < 2**32)) if whole else ((array > 0) & np.isfinite(array))).all():
+        accepted = "a whole number, 0 or more and below 2³²" if whole else "a number above 0"
         raise ValueError(f"{name}: accepted: {accepted}, or {count} of them")
     return np.ascontiguousarray(np.broadcast_to(array.astype(kind), count))
 
@@ -210,6 +216,8 @@ def _mesh(to: Lanes, segments: Segments, method: str) -> Extrusion | None:
     if method == "brute" or (method == "auto" and len(segments) <= FEW):
         return None
     length = np.hypot(*(segments.end - segments.start).T)
+    if not length.any():  # no boundary at all
+        return None
     extent = np.ptp(np.concatenate([segments.start, segments.end]), axis=0).max()
     shortest = length[length > 0].min(initial=np.inf) / (extent / 2 or 1)
     reason = "arcs" if segments.curved else f"a segment of {shortest:.1e}" if shortest < SHORTEST else ""

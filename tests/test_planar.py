@@ -316,6 +316,12 @@ def test_straight_segments_among_arcs_are_the_same_as_alone(follow, setting):
     assert np.nanmax(np.abs(one.points - other.points)) < 1e3 * setting.roundoff
 
 
+@pytest.mark.parametrize(("control", "weight"), [((0.5, 0.0), 2.0), ((0.3, 0.0), 1.0)])
+def test_a_straight_piece_may_run_along_itself_at_any_pace(follow, setting, control, weight):
+    piece = Segments([(0, 0)], [(1, 0)], [1.5], [1.0], [control], [weight])
+    assert follow(piece, (0.2, 1), (0, -1)).points[0, 1] == pytest.approx([0.2, 0], abs=4 * setting.roundoff)
+
+
 # Bad input -----------------------------------------------------------------------------------------------------
 
 
@@ -346,8 +352,10 @@ def test_segments_that_coincide_are_refused():
     twice = {"start": [(0, 0), (1, 0)], "end": [(1, 0), (0, 0)], "n_left": [1.5, 1.5], "n_right": [1, 1]}
     with pytest.raises(ValueError, match="segments 0 and 1 coincide"):
         Segments(**twice)
-    lens = Segments(**twice, control=[(0.5, 0.5), (0.5, -0.5)], weight=[0.9, 0.9])
-    assert len(lens) == 2
+    for control, weight in (([(0.5, 0.5), (0.5, -0.5)], [0.9, 0.9]), ([(0.5, 0.5)] * 2, [0.8, 0.9])):
+        assert len(Segments(**twice, control=control, weight=weight)) == 2
+    with pytest.raises(ValueError, match="segments 0 and 1 coincide"):
+        Segments(**twice, control=[(0.0, 0.5), (-0.0, 0.5)], weight=[0.9, 0.9])
 
 
 @pytest.mark.parametrize(
@@ -364,6 +372,9 @@ def test_segments_that_coincide_are_refused():
         ({"method": "bvh"}, "method = 'bvh'; accepted: auto, brute, mesh"),
         ({"reflect": -1}, "reflect: accepted: a whole number"),
         ({"reflect": 0.5}, "reflect: accepted: a whole number"),
+        ({"reflect": 2**32}, "reflect: accepted: a whole number, 0 or more and below 2³²"),
+        ({"max_depth": True}, "max_depth = True: accepted: a whole number, 1 or more"),
+        ({"n_start": math.inf}, "n_start: accepted: a number"),
         ({"n_start": "air"}, "n_start: accepted: a number"),
         ({"n_start": 0}, "n_start: accepted: a number"),
         ({"n_start": math.nan}, "n_start: accepted: a number"),
@@ -375,6 +386,18 @@ def test_bad_arguments_are_named_in_one_line(change, message):
         trace(Segments(**GOOD), **arguments)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("length", [1e-300, 1e-30, 1e30, 1e300])
+def test_a_direction_may_have_any_length(follow, length):
+    square = polygon(SQUARE)
+    assert story(follow(square, (-1, 0.5), (length, 0.1 * length))) == story(follow(square, (-1, 0.5), (1, 0.1)))
+
+
+@pytest.mark.parametrize("method", ["auto", "brute", "mesh"])
+def test_nothing_but_segments_of_length_zero_is_no_boundary_either(follow, method):
+    dots = together(*[polygon([(0.5, 0.5)])] * 60)
+    assert story(follow(dots, (0, 0), (1, 1), method=method)) == ([], [ESCAPED])
 
 
 def test_no_rays_are_no_paths(follow):
