@@ -70,15 +70,21 @@ class Extrusion:
     def nearest(self, boundaries: Straight, ray: Ray, start: Start, look: Look, active: Any) -> tuple[Hit, Look, Any]:
         """The first boundary ahead, from where to look on for what might come before it, and whether nothing does."""
         found, t, stroke = self._stroke(dr.fma(ray.d, look.gone, self._aside(ray, start)), ray.d, active)
-        best = boundaries.nearer(boundaries.none(), ray, start, stroke, found & (stroke < boundaries.count))
-        # Where neighbours are within MARGIN they are tried by hand: they may be met in any order, and the start may lie
-        # beyond one, or beyond the stroke of the vertex between.
         own = active & (ray.own != NOWHERE)
-        lists = (
-            dr.select(found & self._near_end(best.segment, best, found), stroke, NOWHERE),
-            dr.select(own & self._near_end(ray.own, ray, own), ray.own, NOWHERE),
-        )
-        best = self._also(best, boundaries, ray, start, dr.select(active, look.held, NOWHERE), lists)
+        corner = own & self._near_end(ray.own, ray, own)
+
+        def tried(best: Hit, stroke: Any, found: Any, corner: Any, held: Any) -> Hit:
+            best = boundaries.nearer(best, ray, start, stroke, found & (stroke < boundaries.count))
+            # Where neighbours are within MARGIN they are tried by hand: they may be met in any order, and the start may
+            # lie beyond one, or beyond the stroke of the vertex between.
+            vague = found & self._near_end(best.segment, best, found)
+            lists = dr.select(vague, stroke, NOWHERE), dr.select(corner, ray.own, NOWHERE)
+            return self._also(best, boundaries, ray, start, held, lists)
+
+        # A branch, since all rays of a beam leave together.
+        held = dr.select(active, look.held, NOWHERE)
+        given = boundaries.none(), stroke, found, corner, held
+        best = dr.if_stmt(given, found | corner | (held != NOWHERE), tried, lambda best, *_: best, label="stroke")
         gone = look.gone + t
         settled = negated(found) | (best.distance * (1 / self.half) <= gone + MARGIN)
         return best, Look(gone + STEP, best.segment), settled
