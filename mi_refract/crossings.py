@@ -24,7 +24,8 @@ from .numerics import quotient
 
 NOWHERE = 0xFFFFFFFF
 UNKNOWN = NOWHERE - 2  # from here on a number is no vertex
-# A start is kept so far from the ends of its own segment, in shares of it, and its sides from 0: both are signs only.
+# A start is kept so far from the ends of its own segment, in shares of it, and its sides from 0, in units
+# of its length: both are signs only.
 LEAST = 1e-14
 SIGN = 1e-22
 
@@ -114,7 +115,7 @@ class Straight:
 
     def _sides(self, ray: Ray, e: Any, s: Any, r: Any) -> tuple[Any, Any]:
         """Seen by a ray that leaves to the left of a segment, its start is on the left and its end on the right."""
-        size = dr.maximum(dr.abs(cross(ray.d, e)), SIGN)
+        size = dr.maximum(dr.abs(cross(ray.d, e)), SIGN * (dr.abs(e.x) + dr.abs(e.y)))
         size = dr.select(ray.left, size, -size)
         return size * r, -size * s
 

@@ -416,6 +416,14 @@ def test_a_direction_may_have_any_length(follow, length):
     assert story(follow(square, (-1, 0.5), (length, 0.1 * length))) == story(follow(square, (-1, 0.5), (1, 0.1)))
 
 
+def test_a_scene_may_be_small(follow, setting):
+    size = 1e-15 if setting.name == "float32" else 1e-60
+    triangle, origin = np.array([(0, 0), (1, 0), (0.3, 1)]), np.array([-1, 0.1])
+    plain, small = (follow(polygon(triangle * s), origin * s, (1, 0.17)) for s in (1, size))
+    assert story(small) == story(plain)
+    assert small.points[0, :3] / size == pytest.approx(plain.points[0, :3], abs=16 * setting.roundoff)
+
+
 @pytest.mark.parametrize("method", ["auto", "brute", "mesh"])
 def test_nothing_but_segments_of_length_zero_is_no_boundary_either(follow, method):
     dots = together(*[polygon([(0.5, 0.5)])] * 60)
