@@ -85,15 +85,19 @@ def follow(
     rays, reflect = np.arange(len(origins)), np.zeros(len(origins), np.uint32)
     orders: list[Branches] = []
     while True:
-        if rays.size * (max_depth + 1) > MOST:
-            size = f"{rays.size} paths of up to {max_depth} boundaries with {len(orders)} partial reflections"
-            raise ValueError(f"{size}; accepted: fewer rays, branches or boundaries, {MOST} legs altogether")
+        _check_size(rays.size, max_depth, len(orders))
         paths = trace(origins[rays], directions[rays], max_depth, reflect=reflect, weights=True)
         orders.append(Branches(paths, rays, reflect))
         parent, boundary = np.nonzero(_worth(orders[-1], least))
         if len(orders) > branches or not parent.size:
             return _joined(orders)
         rays, reflect = rays[parent], reflect[parent] | (np.uint32(1) << boundary.astype(np.uint32))
+
+
+def _check_size(paths: int, max_depth: int, reflections: int) -> None:
+    if paths * (max_depth + 1) > MOST:
+        size = f"{paths} paths of up to {max_depth} boundaries with {reflections} partial reflections"
+        raise ValueError(f"{size}; accepted: fewer rays, branches or boundaries, {MOST} legs altogether")
 
 
 def follow_scene(scene: PlanarScene, **how: Any) -> tuple[Branches, ...]:
@@ -103,7 +107,12 @@ def follow_scene(scene: PlanarScene, **how: Any) -> tuple[Branches, ...]:
 
 
 def with_rays(scene: PlanarScene, count: int) -> PlanarScene:
-    """Every beam of several rays with `count` of them, at places and angles between those that it has."""
+    """Every beam of several rays with `count` of them, at places and angles between those that it has.
+
+    ValueError for more than `follow` takes.
+    """
+    sizes = np.bincount(scene.beams)
+    _check_size(int(np.where(sizes > 1, count, sizes).sum()), scene.max_depth, 0)
     parts = []
     for beam in np.unique(scene.beams):
         origins, directions = scene.origins[scene.beams == beam], scene.directions[scene.beams == beam]

@@ -23,7 +23,9 @@ from .lanes import Lanes
 from .numerics import quotient
 
 NOWHERE = 0xFFFFFFFF
-# A start is kept so far from the ends of its own segment, in shares of it, and its sides from 0: both are signs only.
+UNKNOWN = NOWHERE - 2  # from here on a number is no vertex
+# A start is kept so far from the ends of its own segment, in shares of it, and its sides from 0, in units
+# of its length: both are signs only.
 LEAST = 1e-14
 SIGN = 1e-22
 
@@ -73,6 +75,7 @@ class Hit:
     right: Any
     along: Any  # the segment's direction, from its left vertex to its right one
     into: Any = None  # of an arc, at its right vertex; `along` is that at its left one
+    bend: Any = None  # of an arc: its curvature at a vertex, positive to the left, times the cube of `along` or `into`
 
 
 def _box(*points: Any) -> tuple[list[float], list[float]]:
@@ -112,7 +115,7 @@ class Straight:
 
     def _sides(self, ray: Ray, e: Any, s: Any, r: Any) -> tuple[Any, Any]:
         """Seen by a ray that leaves to the left of a segment, its start is on the left and its end on the right."""
-        size = dr.maximum(dr.abs(cross(ray.d, e)), SIGN)
+        size = dr.maximum(dr.abs(cross(ray.d, e)), SIGN * (dr.abs(e.x) + dr.abs(e.y)))
         size = dr.select(ray.left, size, -size)
         return size * r, -size * s
 
@@ -202,7 +205,7 @@ class Arcs(Straight):
 
     def none(self) -> Hit:
         hit = super().none()
-        hit.into = hit.along
+        hit.into, hit.bend = hit.along, self.lanes.number(0)
         return hit
 
     def nearer(self, best: Hit, ray: Ray, start: Start, i: Any, active: Any = True) -> Hit:
@@ -222,7 +225,7 @@ class Arcs(Straight):
         small = dr.select(own, dr.abs(f_b) * ray.r, dr.abs(h)), dr.select(own, dr.abs(f_a) * ray.s, dr.abs(f_a))
         large = dr.abs(f_b), dr.abs(h)
         once = a_left != b_left
-        ends = _ends(once, a_left, vertices, (a, c, b))
+        ends = *_ends(once, a_left, vertices, (a, c, b)), dr.select(a_left, turn, -turn) * dr.rcp(w * w)
         for root, valid, to_left in (
             (small, again | (crossed & (h_left != a_left)), dr.select(own, turn < 0, a_left)),
             (large, crossed & (h_left != b_left), f_a < 0),
@@ -245,11 +248,23 @@ class Arcs(Straight):
         return Hit(distance, i, s, r, to_left, *ends), ahead & (distance > 0)
 
     def _before(self, hit: Hit, best: Hit) -> Any:
-        """Where both are one place to rounding, a vertex that the arcs share, their directions there decide."""
+        """Where both are one place to rounding, a vertex that the arcs share, their directions there decide.
+
+        Where they touch in it their curvatures do: the one farther to the left, seen from left to right, comes later.
+        """
         first, second = hit.distance, best.distance
         tie = dr.abs(first - second) <= 16 * self.lanes.roundoff * dr.abs(first)
-        before = dr.select(tie & (hit.right == best.right), cross(hit.into, best.into) < 0, first < second)
-        return dr.select(tie & (hit.left == best.left), cross(hit.along, best.along) > 0, before)
+        tie &= hit.left < UNKNOWN
+        right = self._turned(hit.into, best.into, hit, best, 1)
+        left = self._turned(hit.along, best.along, hit, best, -1)
+        before = dr.select(tie & (hit.right == best.right), right, first < second)
+        return dr.select(tie & (hit.left == best.left), left, before)
+
+    def _turned(self, e: Any, other: Any, hit: Hit, best: Hit, sign: int) -> Any:
+        """Whether sign · e × other < 0, by more than rounding, or else whether the hit's curvature is the lesser."""
+        sine, x, y = sign * cross(e, other), dr.norm(e), dr.norm(other)
+        touching = dr.abs(sine) <= 64 * self.lanes.roundoff * x * y
+        return dr.select(touching, hit.bend * y * y * y < best.bend * x * x * x, sine < 0)
 
     def place(self, hit: Hit) -> tuple[Any, Any]:
         there = hit.segment != NOWHERE
@@ -263,7 +278,7 @@ class Arcs(Straight):
 def _ends(once: Any, a_left: Any, vertices: Any, points: Any) -> tuple[Any, Any, Any, Any]:
     """Of an arc that is crossed once: its left and right vertex, and its directions there, from left to right."""
     a, c, b = points
-    left, right = (dr.select(once, dr.select(a_left, vertices[j], vertices[1 - j]), NOWHERE - 1 - j) for j in (0, 1))
+    left, right = (dr.select(once, dr.select(a_left, vertices[j], vertices[1 - j]), UNKNOWN + j) for j in (0, 1))
     return left, right, dr.select(a_left, c - a, c - b), dr.select(a_left, b - c, a - c)
 
 

@@ -4,8 +4,9 @@ Of each segment and of each vertex the mesh holds a triangle upright on the plan
 the segment, longer by MARGIN at either end, and across each vertex a stroke of 2 MARGIN. Mitsuba works in float32, so
 its ray, with the start moved off its segment by OFFSET, is up to ε < MARGIN from the one that is meant. But a ray that
 crosses a segment within ε of a place crosses that segment's stroke, its neighbour's, or that of a vertex between:
-so the strokes met, in their order, name every segment that `crossings` must try; what it says is exact. Lengths here
-are in units of half the scene's extent.
+so the strokes met, in their order, name every segment that `crossings` must try; what it says is exact. In a wedge,
+where neighbours are within 4 MARGIN of one another (`_narrow`), that order means nothing: all of a vertex are tried.
+Lengths here are in units of half the scene's extent.
 
 Precondition: no segment is shorter than SHORTEST, and none nearer to another that shares no vertex with it. The first
 is sure, the second is seen at each segment's middle and quarters (`crowded`); where it is broken elsewhere a ray may

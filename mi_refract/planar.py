@@ -17,7 +17,7 @@ Source: document 004, with its slips corrected (README, Errata).
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -171,6 +171,8 @@ class Tracer:
         method: str = "auto",
     ) -> None:  # fmt: skip
         self.lanes = to = lanes(backend, precision)
+        self.middle = _middle(segments)
+        segments = _moved(segments, -self.middle)
         ends = segments.start, segments.end, segments.vertices
         shapes = (segments.control, segments.weight) if segments.curved else None
         boundaries = Arcs(to, *ends, *shapes) if shapes else Straight(to, *ends)
@@ -193,9 +195,33 @@ class Tracer:
         index = None if n_start is None else _each("n_start", n_start, len(origins), "iuf", float)
         none = np.ndim(reflect) == 0 and reflect == 0
         mirrored = None if none else _each("reflect", reflect, len(origins), "iu", np.uint32)
-        found = self.walker(origins, directions, index, mirrored, max_depth, weights)
+        found = self.walker(origins - self.middle, directions, index, mirrored, max_depth, weights)
+        if self.middle.any():
+            found["points"] = (found["points"] + self.middle).astype(found["points"].dtype)
+            found["points"][0] = origins
         found["directions"] = found["directions"][0]
         return Paths(**{name: x if name == "directions" else np.swapaxes(x, 0, 1) for name, x in found.items()})
+
+
+def _middle(segments: Segments) -> Array:
+    """What coordinates are counted from: 0, or of boundaries that are far from there for their size, their middle.
+
+    |x − middle| < middle/2 there: those differences are exact, and float32 has all its digits for them.
+    """
+    places = [segments.start, segments.end] + ([] if segments.control is None else [segments.control])
+    low, high = (f([f(x, axis=0) for x in places], axis=0) for f in (np.min, np.max))
+    middle = low / 2 + high / 2
+    return np.where(np.abs(middle) > 2 * (high - low).max(), middle, 0.0)
+
+
+def _moved(segments: Segments, by: Array) -> Segments:
+    if not by.any():
+        return segments
+    start, end, control = segments.start + by, segments.end + by, segments.control
+    if control is not None:  # what is straight stays so to the last bit
+        straight = (control == (segments.start + segments.end) / 2).all(1)[:, None]
+        control = np.where(straight, (start + end) / 2, control + by)
+    return replace(segments, start=start, end=end, control=control)
 
 
 def _each(name: str, values: Any, count: int, kinds: str, kind: Any) -> Any:

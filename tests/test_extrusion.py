@@ -75,6 +75,11 @@ def across(segments):
     return rays
 
 
+def far(segments):
+    """The same elsewhere: float32 has there but a thousandth of its extent."""
+    return Segments(segments.start + 2.0**13, segments.end + 2.0**13, segments.n_left, segments.n_right)
+
+
 def slab(top):
     """With the outside of its upper side facing what lies above."""
     return polygon([(1, top), (0, top), (0, top - 0.1), (1, top - 0.1)])
@@ -136,6 +141,7 @@ CASES = {
     "tiles, at corners": (tiles(), at_vertices(tiles())),
     "tiles, along edges": (tiles(), along_segments(tiles())),
     "lattice, along its edges": (lattice(), within_segments(lattice())),
+    "star, far away": (far(star(300)), across(far(star(300)))),
     "spikes": (spikes(), at_vertices(spikes())),
     "slivers": (slivers(), across(slivers())),
 }

@@ -307,6 +307,28 @@ def test_arcs_that_meet_in_a_tip_are_met_in_order(follow):
         assert (paths.indices[met, 0] == 1).all()
 
 
+def moved(segments, x, size, n_outside):
+    shift = np.array([x, 0.0])
+    start, end, control = (size * p + shift for p in (segments.start, segments.end, segments.control))
+    return dataclasses.replace(segments, start=start, end=end, control=control, n_right=np.full(4, n_outside))
+
+
+@pytest.mark.parametrize("inside", [False, True])
+@pytest.mark.parametrize("swapped", [False, True])
+def test_balls_that_touch_are_met_in_order_by_a_ray_through_that_point(follow, inside, swapped):
+    """Their arcs have one direction there; which way each bends says which comes first, whichever is listed first."""
+    one = ball()
+    other = moved(ball(1.3), 0.5, 0.5, 1.5) if inside else moved(ball(1.3), 2.0, 1.0, 1.0)
+    parts = [other, one] if swapped else [one, other]
+    names = [f.name for f in dataclasses.fields(Segments)]
+    both = Segments(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    paths = follow(both, [(-3, 0), (5, 0)], [(1, 0), (-1, 0)])
+    indices = [1, 1.5, 1.3, 1.5, 1] if inside else [1, 1.5, 1.0, 1.3, 1]
+    for i, expected in enumerate([indices, indices[::-1]]):
+        assert story(paths, i)[1] == [REFRACTED] * 4 + [ESCAPED]
+        assert paths.indices[i, :5] == pytest.approx(expected)
+
+
 def test_straight_segments_among_arcs_are_the_same_as_alone(follow, setting):
     figure, rng = star(30), np.random.default_rng(5)
     mixed = dataclasses.replace(figure, control=(figure.start + figure.end) / 2, weight=np.ones(30))
@@ -392,6 +414,14 @@ def test_bad_arguments_are_named_in_one_line(change, message):
 def test_a_direction_may_have_any_length(follow, length):
     square = polygon(SQUARE)
     assert story(follow(square, (-1, 0.5), (length, 0.1 * length))) == story(follow(square, (-1, 0.5), (1, 0.1)))
+
+
+def test_a_scene_may_be_small(follow, setting):
+    size = 1e-15 if setting.name == "float32" else 1e-60
+    triangle, origin = np.array([(0, 0), (1, 0), (0.3, 1)]), np.array([-1, 0.1])
+    plain, small = (follow(polygon(triangle * s), origin * s, (1, 0.17)) for s in (1, size))
+    assert story(small) == story(plain)
+    assert small.points[0, :3] / size == pytest.approx(plain.points[0, :3], abs=16 * setting.roundoff)
 
 
 @pytest.mark.parametrize("method", ["auto", "brute", "mesh"])

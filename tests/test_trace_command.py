@@ -177,6 +177,7 @@ BAD = {
     "backend": (("--backend", "metal"), "backend = 'metal'; accepted: scalar"),
     "option": (("--nonesuch",), "--nonesuch"),
     "too much": (("--rays", "4000000"), "accepted: fewer rays"),
+    "far too much": (("--rays", "1000000000000"), "accepted: fewer rays"),
 }
 
 
