@@ -32,6 +32,7 @@ __all__ = ["Event", "Paths", "Segments", "Tracer", "trace"]
 
 Array = NDArray[np.float64]
 METHODS = "auto", "brute", "mesh"
+FARTHEST = {"float32": 1e15, "float64": 1e100}  # of coordinates, and indices: products of two are numbers
 FEW = 48  # segments that are tried sooner than a query takes
 
 SHAPES: dict[str, tuple[int, ...]] = {
@@ -171,6 +172,9 @@ class Tracer:
         method: str = "auto",
     ) -> None:  # fmt: skip
         self.lanes = to = lanes(backend, precision)
+        self.farthest = FARTHEST[precision]
+        for name in ("start", "end", "n_left", "n_right"):
+            _in_range(f"segments.{name}", getattr(segments, name), self.farthest)
         self.middle = _middle(segments)
         segments = _moved(segments, -self.middle)
         ends = segments.start, segments.end, segments.vertices
@@ -195,12 +199,23 @@ class Tracer:
         index = None if n_start is None else _each("n_start", n_start, len(origins), "iuf", float)
         none = np.ndim(reflect) == 0 and reflect == 0
         mirrored = None if none else _each("reflect", reflect, len(origins), "iu", np.uint32)
-        found = self.walker(origins - self.middle, directions, index, mirrored, max_depth, weights)
-        if self.middle.any():
+        if len(origins) * (max_depth + 1) >= 2**32:
+            raise ValueError(f"{len(origins)} rays, max_depth = {max_depth}: accepted: a product below 2³²")
+        _in_range("origins", origins, self.farthest)
+        moved = self.middle.any()
+        places = origins - self.middle if moved else origins
+        found = self.walker(places, directions, index, mirrored, max_depth, weights)
+        if moved:
             found["points"] = (found["points"] + self.middle).astype(found["points"].dtype)
             found["points"][0] = origins
         found["directions"] = found["directions"][0]
         return Paths(**{name: x if name == "directions" else np.swapaxes(x, 0, 1) for name, x in found.items()})
+
+
+def _in_range(name: str, values: Array, largest: float) -> None:
+    """ValueError for numbers of which products of two would overflow."""
+    if values.size and not (values.max() <= largest and values.min() >= -largest):
+        raise ValueError(f"{name}: a number beyond ±{largest:g}; accepted: up to that")
 
 
 def _middle(segments: Segments) -> Array:

@@ -399,6 +399,9 @@ def test_segments_that_coincide_are_refused():
         ({"n_start": math.inf}, "n_start: accepted: a number"),
         ({"n_start": "air"}, "n_start: accepted: a number"),
         ({"n_start": 0}, "n_start: accepted: a number"),
+        ({"origins": [(0.0, 1e101)]}, "origins: a number beyond ±1e+100; accepted: up to that"),
+        ({"origins": [(0.0, -1e16)], "precision": "float32"}, "origins: a number beyond ±1e+15; accepted: up to that"),
+        ({"max_depth": 2**32}, "1 rays, max_depth = 4294967296: accepted: a product below 2³²"),
         ({"n_start": math.nan}, "n_start: accepted: a number"),
     ],
 )
