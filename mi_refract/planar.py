@@ -48,7 +48,7 @@ def _numbers(name: str, values: Any, shape: tuple[int, ...]) -> Array:
         raise ValueError(f"{name}: accepted: numbers of shape {shape}") from None
     if array.shape != shape:
         raise ValueError(f"{name}: shape {array.shape}; accepted: {shape}")
-    if not np.isfinite(array).all():
+    if array.size and not (np.isfinite(array.min()) and np.isfinite(array.max())):
         place = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise ValueError(f"{name}{list(place)} = {array[place]}: accepted: finite numbers")
     return array
@@ -189,11 +189,7 @@ class Tracer:
     ) -> Paths:  # fmt: skip
         origins = _numbers("origins", origins, (len(origins), 2) if np.ndim(origins) else (0, 2))
         directions = _numbers("directions", directions, origins.shape)
-        size = np.maximum(*np.abs(directions).T)
-        if not size.all():
-            raise ValueError(f"directions[{int(np.argmin(size))}] = (0, 0): accepted: a direction")
-        if size.min(initial=1) < 1e-15 or size.max(initial=1) > 1e15:  # their squares may be out of float32's range
-            directions = np.ldexp(directions, 1 - np.frexp(size)[1][:, None])
+        directions = _in_reach(directions)
         if isinstance(max_depth, bool) or not isinstance(max_depth, int | np.integer) or max_depth < 1:
             raise ValueError(f"max_depth = {max_depth!r}: accepted: a whole number, 1 or more")
         index = None if n_start is None else _each("n_start", n_start, len(origins), "iuf", float)
@@ -210,6 +206,18 @@ class Tracer:
             found["points"][0] = origins
         found["directions"] = found["directions"][0]
         return Paths(**{name: x if name == "directions" else np.swapaxes(x, 0, 1) for name, x in found.items()})
+
+
+def _in_reach(directions: Array) -> Array:
+    """The directions, scaled exactly where squares may be out of float32's range. ValueError for (0, 0)."""
+    with np.errstate(over="ignore", under="ignore"):
+        length2 = np.einsum("ij,ij->i", directions, directions)
+    if length2.min(initial=1) > 1e-30 and length2.max(initial=1) < 1e30:
+        return directions
+    size = np.maximum(*np.abs(directions).T)
+    if not size.all():
+        raise ValueError(f"directions[{int(np.argmin(size))}] = (0, 0): accepted: a direction")
+    return np.ldexp(directions, 1 - np.frexp(size)[1][:, None])
 
 
 def _in_range(name: str, values: Array, largest: float) -> None:

@@ -98,7 +98,7 @@ def field(size: int) -> Field:
 
 def measure(context: Context, setting: Setting, sizes: tuple[int, ...]) -> list[Row]:
     """A row per method and size, and the curves."""
-    count = context.profile.scalar_rays if setting.is_scalar else context.profile.streamed_rays // 8
+    count = context.profile.scalar_rays if setting.is_scalar else context.profile.streamed_rays // 4
     pairs = [(m, s) for s in (0, *sizes) for m in METHODS if m != BRUTE or s in BRUTE_SIZES]
     tracers = functools.cache(functools.partial(_tracer, setting))
     runs = {f"{method}, {size}": Run(tracers, method, size, count) for method, size in pairs}
