@@ -128,3 +128,17 @@ def scalar_context(tmp_path):
     quick = SCALAR_PROFILES["quick"]
     yield lambda **given: Context(dataclasses.replace(quick, **given), tmp_path, "scalar_rgb", backend.detect(), USABLE)
     mi.set_variant(before)
+
+
+@pytest.fixture
+def follow(setting):
+    """`trace` in the setting; paths as lists, without what follows their ends."""
+    import numpy as np
+
+    from mi_refract.planar import trace
+
+    def run(segments, origins, directions, max_depth=16, **options):
+        options = {"precision": setting.name, "backend": setting.backend, "weights": True} | options
+        return trace(segments, np.atleast_2d(origins), np.atleast_2d(directions), max_depth, **options)
+
+    return run

@@ -7,20 +7,38 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refract.planar import Segments
+from mi_refract.planar import Event, Segments
 from mi_refract.planar_scene import PlanarScene, Region
 
 CORNERS = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], float)
+SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
 SLAB = np.array([(0, -50), (1, -50), (1, 50), (0, 50)], float)
 
 
-def polygon(points, n, outside=1.0):
+def polygon(points, n=1.5, outside=1.0):
     """Counter-clockwise: the inside is on the left."""
-    count = len(points)
-    return Segments(points, np.roll(points, -1, axis=0), np.full(count, n), np.full(count, outside))
+    start = np.array(points, float)
+    return Segments(start, np.roll(start, -1, axis=0), np.full(len(start), n), np.full(len(start), outside))
 
 
-def ball(n):
+def together(*parts):
+    names = ("start", "end", "n_left", "n_right")
+    return Segments(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def star(count, seed=1, n=1.7):
+    rng = np.random.default_rng(seed)
+    angle, radius = np.sort(rng.uniform(0, 2 * np.pi, count)), rng.uniform(0.3, 1, count)
+    return polygon(np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]), n)
+
+
+def story(paths, i=0):
+    """Of a path: the segments it meets, and its events."""
+    hits, events = paths.hits[i], paths.events[i]
+    return hits[hits >= 0].tolist(), [Event(e) for e in events if e != Event.NONE]
+
+
+def ball(n=1.5):
     """The unit circle, of four arcs."""
     start, control = CORNERS[::2], CORNERS[1::2]
     return Segments(start, np.roll(start, -1, axis=0), np.full(4, n), np.ones(4), control, np.full(4, math.sqrt(0.5)))

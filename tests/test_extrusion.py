@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from test_planar import polygon, star, together
+from planar_scenes import polygon, star, together
 
 from mi_refract import extrusion
 from mi_refract.crossings import NOWHERE
