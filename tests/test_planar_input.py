@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from planar_scenes import SQUARE, polygon, story, together
 
-from mi_refract.planar import Segments, trace
+from mi_refract.planar import Event, Segments, trace
 
 GOOD = {"start": [(0.0, 0.0)], "end": [(1.0, 0.0)], "n_left": [1.5], "n_right": [1.0]}
 
