@@ -44,7 +44,6 @@ ORIGINAL = 0.05  # its resolution, 1172 segments
 SIZES = (10, 100, 1000, 10_000, 100_000, 1_000_000)
 BRUTE_SIZES = (0, 10, 100, 1000)
 ROUNDS = {"quick": 7, "full": 21}
-LARGEST = {"quick": 5, "full": 6}  # of the sizes: a million segments take seconds to set up
 GOALS = {  # with two cores
     ("llvm float32", "document 004"): {"µs per path": 0.1},
     ("llvm float32", "M = 1000000"): {"µs per path": 1.0},
@@ -63,7 +62,7 @@ def tasks(context: Context) -> list[Task]:
 def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
         return [Row(STUDY, "trace", "every size", setting.label, reason=setting.reason)]
-    return measure(context, setting, SIZES[:1] if setting.is_scalar else SIZES[: LARGEST[context.profile.name]])
+    return measure(context, setting, SIZES[:1] if setting.is_scalar else SIZES)
 
 
 @dataclass(frozen=True)
