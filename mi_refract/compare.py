@@ -1,13 +1,182 @@
-"""Comparing pictures: same-seed differences, Welch's t-test on tiles, relMSE. Pictures are (height, width, channels).
+"""Are two pictures the same? Gates first, then one of five methods; each gives a verdict with its numbers.
 
-Fails closed: pictures of different shapes are an error, and a pixel that is not finite equals nothing.
+Fails closed: what cannot be compared is an error, a value that is not finite equals nothing, and a method that could
+not have seen a difference says "inconclusive".
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import enum
+import inspect
+import typing
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 import numpy as np
+
+from .images import Image
+
+Maps = dict[str, np.ndarray]
+
+
+class Verdict(enum.StrEnum):
+    EQUAL = "equal"
+    DIFFERENT = "different"
+    INCONCLUSIVE = "inconclusive"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A number of a judgement; where it has a threshold, `value <= bound` holds for equal pictures."""
+
+    name: str
+    value: float
+    bound: float | None = None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What a method found. `detectable`: the smallest relative difference that it would have seen, NaN if unknown.
+
+    `maps`: H × W or H × W × C float32 by name, of the pictures' size.
+    """
+
+    method: str
+    verdict: Verdict
+    reason: str
+    figures: tuple[Figure, ...] = ()
+    detectable: float = np.nan
+    maps: Maps = field(default_factory=dict)
+
+
+def gates(reference: Image, test: Image, allow_nonfinite: bool = False) -> str | None:
+    """Why the two differ before any method is asked: the first values that are not finite; None if there are none.
+
+    ValueError, in one line, where they cannot be compared: other size, channels (by name), or data window.
+    With `allow_nonfinite` such a value is allowed where the other picture has the same one: NaN, Inf or -Inf.
+    """
+    raise NotImplementedError
+
+
+def exact(reference: Image, test: Image, *, allow_nonfinite: bool = False) -> Comparison:
+    """Every value is the same."""
+    raise NotImplementedError
+
+
+def tolerance(
+    reference: Image,
+    test: Image,
+    *,
+    allow_nonfinite: bool = False,
+    fail: Annotated[float, "a value may differ by this much"] = 0.004,
+    fail_relative: Annotated[float, "or by this share of the mean of both"] = 0.001,
+    fail_percent: Annotated[float, "of the pixels, this many percent may differ by more"] = 0.02,
+    hard_fail: Annotated[float, "no value may differ by more than this"] = np.inf,
+    warn: Annotated[float, "a difference worth a warning"] = np.inf,
+    warn_relative: Annotated[float, "or this share of the mean of both"] = 0.0,
+    warn_percent: Annotated[float, "of the pixels, this many percent may differ so without one"] = 0.0,
+    hard_warn: Annotated[float, "any value that differs by more is worth one"] = np.inf,
+) -> Comparison:
+    """Differences within absolute and relative thresholds, but for a share of the pixels: the meaning of `idiff`."""
+    raise NotImplementedError
+
+
+def paired_images(
+    reference: Image,
+    test: Image,
+    *,
+    allow_nonfinite: bool = False,
+    threshold: Annotated[float, "a pixel is changed where a channel differs by more"] = 1e-4,
+    changed: Annotated[float, "share of the pixels that may be changed"] = 0.001,
+    largest: Annotated[float, "largest change that is allowed"] = np.inf,
+) -> Comparison:
+    """Renders of the same random numbers: the share of changed pixels and the largest change."""
+    raise NotImplementedError
+
+
+def welch_images(
+    reference: Sequence[Image],
+    test: Sequence[Image],
+    *,
+    allow_nonfinite: bool = False,
+    tile: Annotated[int, "side of a tile in pixels"] = 16,
+    family_error: Annotated[float, "probability that equal pictures are called different"] = 0.001,
+    correction: Annotated[str, "for the number of tiles: sidak or holm"] = "sidak",
+    margin: Annotated[float, "relative difference of a tile that is as good as none"] = 0.001,
+    resolution: Annotated[float, "relative difference that must have been seen, or the verdict is inconclusive"] = 0.05,
+    spp: Annotated[int, "samples per pixel of pictures with variance channels; 0: as their headers say"] = 0,
+) -> Comparison:
+    """Independent renders: Welch's t-test on the means of tiles and channels.
+
+    Two or more renders a side, or one a side with the variance or second moment of every channel.
+    """
+    raise NotImplementedError
+
+
+def flip(
+    reference: Image,
+    test: Image,
+    *,
+    allow_nonfinite: bool = False,
+    mean: Annotated[float, "mean FLIP error that is allowed, 0 to 1"] = 0.01,
+    largest: Annotated[float, "FLIP error that no pixel may exceed, 0 to 1"] = 1.0,
+    hdr: Annotated[str, "auto (by the file's format), yes or no"] = "auto",
+    ppd: Annotated[float, "pixels per degree of the viewer's field"] = 67.0,
+) -> Comparison:
+    """What a person who flips between the two would see: FLIP, for LDR and HDR pictures."""
+    raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Option:
+    name: str
+    type: type
+    default: Any
+    help: str
+
+
+@dataclass(frozen=True)
+class Method:
+    """`samples`: takes a sequence of independent renders on either side instead of one picture."""
+
+    function: Callable[..., Comparison]
+    samples: bool = False
+
+    @property
+    def summary(self) -> str:
+        return (self.function.__doc__ or "").partition("\n")[0]
+
+    @property
+    def options(self) -> dict[str, Option]:
+        """The keyword arguments but `allow_nonfinite`, which every method has."""
+        hints = typing.get_type_hints(self.function, include_extras=True)
+        given = inspect.signature(self.function).parameters
+        return {
+            name: Option(name, typing.get_args(hint)[0], given[name].default, hint.__metadata__[0])
+            for name, hint in hints.items()
+            if typing.get_origin(hint) is Annotated
+        }
+
+
+METHODS = {
+    "exact": Method(exact),
+    "tolerance": Method(tolerance),
+    "paired": Method(paired_images),
+    "welch": Method(welch_images, samples=True),
+    "flip": Method(flip),
+}
+
+
+def compare(
+    method: str, reference: Image | Sequence[Image], test: Image | Sequence[Image], **options: Any
+) -> Comparison:
+    """One comparison by the table; "auto" is welch where it can be, else tolerance.
+
+    ValueError for an unknown method or option, an option of another type or out of its range, several renders for a
+    method that takes one, and pictures that cannot be compared.
+    """
+    raise NotImplementedError
 
 
 @dataclass(frozen=True)
