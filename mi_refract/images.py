@@ -132,7 +132,7 @@ def read(path: str | os.PathLike[str]) -> Image:
 
 
 def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Image]:
-    """Several pictures, two at a time: decompression takes most of the time of a comparison. Errors: those of `read`."""
+    """Several pictures, two at a time: unpacking takes most of the time of a comparison. Errors: those of `read`."""
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(read, paths))
 
