@@ -90,13 +90,14 @@ def paired_images(
 ) -> Comparison:
     """Renders of the same random numbers: the share of changed pixels and the largest change.
 
-    Changes are relative to the reference's value, or to the mean of its absolute values where that is larger.
+    Changes are relative to the reference's value, or to the mean of its channel where that is larger.
     """
     _not_negative(locals())
     a, b, found = entered("paired", reference, test, allow_nonfinite)
     if found:
         return found
-    scale = np.maximum(np.abs(a), np.abs(a).mean() or 1.0)
+    usual = np.abs(a).mean((0, 1))
+    scale = np.maximum(np.abs(a), np.where(usual > 0, usual, usual.mean() or 1.0))
     measured = paired(a / scale, b / scale, threshold)
     figures = (
         Figure("share of changed pixels", measured.changed, changed),
