@@ -7,15 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from mi_refract import compare
+from mi_refract import compare, tiles
 from mi_refract.compare import METHODS, Verdict, gates
 from mi_refract.images import Image
 
 SMOOTH = np.dstack([np.linspace(0.1, 0.9, 48 * 40).reshape(40, 48) ** k for k in (1, 2, 3)]).astype(np.float32)
 SHAPE = (64, 64, 3)
 EQUAL, DIFFERENT, INCONCLUSIVE = Verdict.EQUAL, Verdict.DIFFERENT, Verdict.INCONCLUSIVE
-RNG: np.random.Generator
+RNG = np.random.default_rng(7)
 
 
 @pytest.fixture(autouse=True)
@@ -267,6 +268,15 @@ def test_the_same_seed_twice_is_an_error():
     side = renders(3)
     with pytest.raises(ValueError, match="accepted: independent renders"):
         judge("welch", [*side, replace(side[0], path=Path("b.exr"))], renders(4))
+
+
+def test_corrections_are_those_of_the_papers():
+    """Benjamini and Hochberg against SciPy; Holm on an example worked by hand: 0.05/4, /3, /2, /1."""
+    p = RNG.random((5, 4, 3)) ** 3
+    np.testing.assert_allclose(tiles.benjamini_hochberg(p), stats.false_discovery_control(p, axis=None))
+    assert tiles.holm(np.array([0.03, 0.01, 0.016, 0.9]), 0.05) == 0.016
+    assert tiles.holm(np.array([0.013, 0.02, 0.9, 0.04]), 0.05) == 0.0125
+    assert tiles.sidak(0.05, 2) == pytest.approx(1 - np.sqrt(0.95))
 
 
 def with_spread(count, kind, gain=1.0):
