@@ -26,7 +26,7 @@ except ModuleNotFoundError as missing:
     print("mi-refract needs the extra `cli`: pip install 'mi-refract[cli]'", file=sys.stderr)
     sys.exit(2)
 
-from . import __version__, backend, drawing, files, foci, images, planar_keys, planar_scene
+from . import __version__, backend, drawing, files, foci, images, planar_keys, planar_scene, rendering
 from .branches import as_data, follow_scene, summary, with_rays
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -62,7 +62,7 @@ def diagnose() -> dict[str, Any]:
     return {
         "variants": backend.usable_variants(),
         "libllvm": {library.path: library.defect or "works" for library in backend.libraries()},
-        "versions": versions | {name: images.version(name) for name in names},
+        "versions": versions | {name: rendering.version(name) for name in names},
         "advice": backend.advice(),
     }
 
@@ -91,7 +91,7 @@ def render(
     chosen = backend.activate(variant, may_restart=True)
     console = Console(stderr=True)
     with _interruptible(console, images.temporary_name(output)), _spinner(console, f"{scene.name}, {chosen}"):
-        header = images.render_to_exr(scene, output, defines=defines, spp=spp, seed=seed)
+        header = rendering.render_to_exr(scene, output, defines=defines, spp=spp, seed=seed)
     print(f"{output}: {chosen}, {header['mi_refract:spp']} spp, {header['mi_refract:render_seconds']:.2f} s")
     if variant is None and not backend.llvm().usable:
         print(f"mi-refract: {chosen} is slow; {backend.summary()}", file=sys.stderr)

@@ -205,13 +205,13 @@ INTERRUPTED = """
 import signal, sys
 if sys.argv[1] == "ignored":
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-from mi_refract import cli, images
-load = images.load_scene
+from mi_refract import cli, rendering
+load = rendering.load_scene
 def load_and_tell(*arguments):
     scene = load(*arguments)
     print("loaded", flush=True)
     return scene
-images.load_scene = load_and_tell
+rendering.load_scene = load_and_tell
 sys.exit(cli.main(["render", sys.argv[2], "-o", sys.argv[3], "--spp", "20000000", "--variant", sys.argv[4]]))
 """
 

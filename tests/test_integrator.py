@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refract import compare, images, integrator, needs, strata, trace
+from mi_refract import compare, integrator, needs, rendering, strata, trace
 from validation.plan import SCENES
 
 LLVM = "llvm_ad_rgb"
@@ -31,7 +31,7 @@ def llvm(needs_variant):
 
 
 def load(name, resolution=32, **parameters):
-    return mi.load_file(str(SCENES / f"{name}.xml"), **images.REPRODUCIBLE, res=resolution, **parameters)
+    return mi.load_file(str(SCENES / f"{name}.xml"), **rendering.REPRODUCIBLE, res=resolution, **parameters)
 
 
 def render(scene, spp=16, seed=0, **parameters):

@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract import images
+from mi_refract import rendering
 from mi_refract.bsdf import PLUGIN
 
 DIELECTRIC = "dielectric"
@@ -75,7 +75,7 @@ def opened(path: Path, bsdf: str, resolution: int, **parameters: Any) -> Any:
     """A scene file with its glass; the same seed means the same picture."""
     import mitsuba as mi
 
-    return mi.load_file(str(path), **images.REPRODUCIBLE, bsdf=bsdf, res=resolution, **parameters)
+    return mi.load_file(str(path), **rendering.REPRODUCIBLE, bsdf=bsdf, res=resolution, **parameters)
 
 
 def camera(path: Path, method: Method, resolution: int, **parameters: Any) -> Camera:

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mi_refract import images
+from mi_refract import images, rendering
 
 from .plan import SCENES
 
@@ -34,7 +34,7 @@ class View:
         import mitsuba as mi
 
         path = str(SCENES / f"{scene}.xml")
-        self.scene = mi.load_file(path, **images.REPRODUCIBLE, bsdf=plugin, res=size, **parameters)
+        self.scene = mi.load_file(path, **rendering.REPRODUCIBLE, bsdf=plugin, res=size, **parameters)
         self.picture = np.array(mi.render(self.scene, spp=spp, seed=0), dtype=np.float64)
         fov = _number(mi.traverse(self.scene.sensors()[0])["x_fov"])
         self.half = math.tan(math.radians(fov) / 2)

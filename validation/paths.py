@@ -18,7 +18,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract import compare, images
+from mi_refract import compare, rendering
 from mi_refract.bsdf import PLUGIN
 from mi_refract.formulas import FORMULAS, automatic
 from mi_refract.rows import Row
@@ -208,7 +208,7 @@ def _points(x: Any, y: Any) -> list[tuple[float, float]]:
 def _deviations(layers: Layers, rays: Bundle, exact: list[Path], plugin: str, steps: int) -> list[Deviation]:
     import mitsuba as mi
 
-    scene = mi.load_file(str(SCENES / f"{layers.scene}.xml"), **images.REPRODUCIBLE, bsdf=plugin)
+    scene = mi.load_file(str(SCENES / f"{layers.scene}.xml"), **rendering.REPRODUCIBLE, bsdf=plugin)
     segments = trace(scene, layers, rays, steps)
     return [deviation(layers, path, segments[:, :, i]) for i, path in enumerate(exact)]
 
