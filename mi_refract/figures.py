@@ -122,6 +122,24 @@ def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str) -> str:
         return _page_svg(figure)
 
 
+def histogram_svg(values: Any, x: str, y: str, *, salt: str, bins: int = 20) -> str:
+    """Shares of values from 0 to 1 in equal bins, and a dashed line where all would be the same. "" without values."""
+    if not len(values):
+        return ""
+    import matplotlib
+    import numpy as np
+
+    counts, edges = np.histogram(values, bins, (0, 1))
+    with matplotlib.rc_context(_style(salt)):
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(5.3, 2.4), layout="constrained", dpi=72)
+        panel = figure.add_subplot(xlabel=x, ylabel=y, xlim=(0, 1))
+        panel.stairs(counts / len(values), edges, fill=True, color=SERIES[0])
+        panel.axhline(1 / bins, color=MUTED, linewidth=1, linestyle=(0, (4, 3)))
+        return _page_svg(figure)
+
+
 @dataclass
 class Scatter:
     """A panel: points by subject, (subject, low x, high x, y) of the intervals, and the x of the floor."""

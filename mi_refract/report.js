@@ -77,7 +77,7 @@ const paneOf = (canvas) => canvas.closest(".pane");
 const isMap = (canvas) => paneOf(canvas).querySelector(".gain") !== null;
 function paintMap(canvas) {
   const slider = paneOf(canvas).querySelector(".gain"), gain = 10 ** slider.value, { scale } = pictureOf(canvas);
-  slider.nextElementSibling.value = scale === 1 ? "×" + (gain < 1e4 ? Math.round(gain * 10) / 10 : "1e" + slider.value) : "full at " + shown(scale / gain);
+  slider.nextElementSibling.value = "full at " + shown(scale / gain);
   paint(canvas, paneOf(canvas).dataset.paint === "heat" ? heat(gain) : deviation(gain, root.dataset.sign === "signed"));
 }
 function paintAll(which = () => true) {
