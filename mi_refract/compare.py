@@ -23,6 +23,7 @@ __all__ = ["METHODS", "Comparison", "Figure", "Image", "Method", "Option", "Pair
 __all__ += ["exact", "flip", "gates", "paired", "paired_images", "relative_mse", "tolerance", "welch", "welch_images"]
 __all__ += ["encoding", "flip_map"]
 
+RGB = ("R", "G", "B")
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear Rec. 709
 
 
@@ -31,12 +32,12 @@ def exact(reference: Image, test: Image, *, allow_nonfinite: bool = False) -> Co
     a, b, found = entered("exact", reference, test, allow_nonfinite)
     if found:
         return found
-    difference = np.abs(b - a)
+    difference = _difference(a, b)
     changed = int((a != b).any(-1).sum())
     verdict = Verdict.DIFFERENT if changed else Verdict.EQUAL
     reason = f"{changed} of {a[..., 0].size} pixels differ" if changed else "every value is the same"
     figures = (Figure("changed pixels", changed, 0.0), Figure("largest difference", float(difference.max()), 0.0))
-    return Comparison("exact", verdict, reason, figures, 0.0, {"difference": difference.astype(np.float32)})
+    return Comparison("exact", verdict, reason, figures, 0.0, {"difference": difference})
 
 
 def tolerance(
@@ -74,7 +75,7 @@ def tolerance(
     reason = f"{failed:.3g} % of the pixels beyond the tolerance; largest difference {result.maxerror:.3g} at {place}"
     if warned > warn_percent or result.maxerror > hard_warn:
         reason += f"; warning: {warned:.3g} % of the pixels"
-    maps = {"difference": np.abs(b - a).astype(np.float32)}
+    maps = {"difference": _difference(a, b)}
     return Comparison("tolerance", _verdict(figures), reason, figures, maps=maps)
 
 
@@ -104,7 +105,7 @@ def paired_images(
         Figure("ratio of the means", float(b.mean() / a.mean()) if a.any() else 1.0 + float(b.mean())),
     )
     reason = f"{measured.changed:.3%} of the pixels are changed, the largest by {measured.largest:.3g} of its value"
-    maps = {"difference": np.abs(b - a).astype(np.float32)}
+    maps = {"difference": _difference(a, b)}
     return Comparison("paired", _verdict(figures), reason, figures, threshold, maps)
 
 
@@ -165,7 +166,7 @@ def encoding(image: Image) -> str:
 
 def _linear(image: Image) -> np.ndarray:
     names = _colours(image)
-    if len(names) not in (1, 3):
+    if names != RGB and len(names) != 1:
         raise ValueError(f"{image.path}: channels {', '.join(names)}; accepted by FLIP: R, G, B, or one")
     pixels = np.nan_to_num(image.select(names).astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
     if encoding(image) == "sRGB":
@@ -174,7 +175,12 @@ def _linear(image: Image) -> np.ndarray:
 
 
 def _colours(image: Image) -> tuple[str, ...]:
-    return ("R", "G", "B") if set("RGB") <= set(image.channels) else image.channels
+    return RGB if set(RGB) <= set(image.channels) else image.channels
+
+
+def _difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    difference = b - a
+    return np.abs(difference, out=difference).astype(np.float32, copy=False)
 
 
 def _buffer(pixels: np.ndarray) -> Any:

@@ -156,7 +156,7 @@ def _judged(
         verdict, reason = Verdict.DIFFERENT, f"{asked.alarms} of {p.size} tests of tiles and channels differ"
     elif off or asked.doubtful:
         verdict = Verdict.INCONCLUSIVE
-        reason = f"differences only where a t-test knows little: {off} tiles without noise, {asked.doubtful} heavy-tailed"
+        reason = f"differences only where a t-test knows little: {off} tiles noise-free, {asked.doubtful} heavy-tailed"
     elif not p.size:
         verdict, reason = Verdict.EQUAL, "no noise, and no tile differs beyond the margin"
     elif not visible <= resolution:

@@ -71,20 +71,25 @@ def from_renders(renders: Sequence[Array], tile: int) -> Side:
     height, width = renders[0].shape[:2]
     columns = np.arange(0, width, tile)
 
-    def band(top: int) -> tuple[Array, ...]:
-        rows = np.stack([render[top : top + tile] for render in renders]).astype(np.float64)
-        variance = rows.var(0, ddof=1) / len(rows)
-        totals = (rows.sum(1), variance.sum(0), np.square(variance).sum(0))
-        return tuple(np.add.reduceat(total, columns, -2) for total in totals)
+    def band(top: int) -> tuple[Array, Array]:
+        rows = np.empty((len(renders), *renders[0][top : top + tile].shape))
+        for row, render in zip(rows, renders, strict=True):
+            row[...] = render[top : top + tile]
+        each = np.add.reduceat(rows.sum(1), columns, -2)
+        with np.errstate(invalid="ignore"):
+            rows -= rows.mean(0)
+        variance = np.einsum("n...,n...->...", rows, rows) / (len(rows) * (len(rows) - 1))
+        noise = np.stack([variance.sum(0), np.einsum("y...,y...->...", variance, variance)])
+        return each, np.add.reduceat(noise, columns, -2)
 
-    with np.errstate(invalid="ignore"), ThreadPoolExecutor(WORKERS) as pool:
-        each, variance, squares = (np.stack(x, -3) for x in zip(*pool.map(band, range(0, height, tile)), strict=True))
-    return Side(_area(height, width, tile), each.mean(0), variance, squares, len(renders) - 1.0, each)
+    with ThreadPoolExecutor(WORKERS) as pool:
+        each, noise = (np.stack(x, -3) for x in zip(*pool.map(band, range(0, height, tile)), strict=True))
+    return Side(_area(height, width, tile), each.mean(0), noise[0], noise[1], len(renders) - 1.0, each)
 
 
 def from_variances(mean: Array, variance: Array, freedom: float, tile: int) -> Side:
     """One side from a picture and the variance of its pixels, both H × W × C."""
-    area = _area(*mean.shape[:2], tile)
+    area = _area(mean.shape[0], mean.shape[1], tile)
     squares = np.square(variance, dtype=np.float64)
     return Side(area, fold(mean, tile), fold(variance, tile), fold(squares, tile), freedom)
 
@@ -158,18 +163,21 @@ def sidak(family_error: float, count: int) -> float:
 
 
 def holm(p: Array, family_error: float) -> float:
-    """The largest p that Holm's step-down rejects (1979); below every p where it rejects none."""
+    """The p below which a test is an alarm by Holm's step-down (1979): its first step, or the last one rejected."""
+    first = family_error / max(p.size, 1)
     ordered = np.sort(p, axis=None)
     kept = np.flatnonzero(ordered > family_error / np.arange(ordered.size, 0, -1))
-    rejected = kept[0] if kept.size else ordered.size
-    return float(ordered[rejected - 1]) if rejected else -1.0
+    rejected = ordered[: kept[0]] if kept.size else ordered
+    return max(first, float(rejected[-1])) if rejected.size else first
 
 
 def benjamini_hochberg(p: Array) -> Array:
     """Adjusted p: tiles below q are, but for a share q of them, different (Benjamini and Hochberg 1995)."""
-    from scipy import stats
-
-    return np.reshape(stats.false_discovery_control(p, axis=None), p.shape)
+    order = np.argsort(p, axis=None)
+    scaled = p.ravel()[order] * p.size / np.arange(1, p.size + 1)
+    adjusted = np.empty(p.size)
+    adjusted[order] = np.minimum.accumulate(scaled[::-1])[::-1]
+    return np.minimum(adjusted, 1).reshape(p.shape)
 
 
 @dataclass(frozen=True)
