@@ -6,62 +6,37 @@ not have seen a difference says "inconclusive".
 
 from __future__ import annotations
 
-import enum
 import inspect
 import typing
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
 
 from .images import Image
+from .judgement import Comparison, Figure, Verdict, entered, gates
+from .samples import spreads, welch_images
+from .tiles import relative_mse, same_shape, welch
 
-Maps = dict[str, np.ndarray]
+__all__ = ["METHODS", "Comparison", "Figure", "Image", "Method", "Option", "Paired", "Verdict", "automatic", "compare"]
+__all__ += ["exact", "flip", "gates", "paired", "paired_images", "relative_mse", "tolerance", "welch", "welch_images"]
+__all__ += ["encoding", "flip_map"]
 
-
-class Verdict(enum.StrEnum):
-    EQUAL = "equal"
-    DIFFERENT = "different"
-    INCONCLUSIVE = "inconclusive"
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A number of a judgement; where it has a threshold, `value <= bound` holds for equal pictures."""
-
-    name: str
-    value: float
-    bound: float | None = None
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """What a method found. `detectable`: the smallest relative difference that it would have seen, NaN if unknown.
-
-    `maps`: H × W or H × W × C float32 by name, of the pictures' size.
-    """
-
-    method: str
-    verdict: Verdict
-    reason: str
-    figures: tuple[Figure, ...] = ()
-    detectable: float = np.nan
-    maps: Maps = field(default_factory=dict)
-
-
-def gates(reference: Image, test: Image, allow_nonfinite: bool = False) -> str | None:
-    """Why the two differ before any method is asked: the first values that are not finite; None if there are none.
-
-    ValueError, in one line, where they cannot be compared: other size, channels (by name), or data window.
-    With `allow_nonfinite` such a value is allowed where the other picture has the same one: NaN, Inf or -Inf.
-    """
-    raise NotImplementedError
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear Rec. 709
 
 
 def exact(reference: Image, test: Image, *, allow_nonfinite: bool = False) -> Comparison:
     """Every value is the same."""
-    raise NotImplementedError
+    a, b, found = entered("exact", reference, test, allow_nonfinite)
+    if found:
+        return found
+    difference = np.abs(b - a)
+    changed = int((a != b).any(-1).sum())
+    verdict = Verdict.DIFFERENT if changed else Verdict.EQUAL
+    reason = f"{changed} of {a[..., 0].size} pixels differ" if changed else "every value is the same"
+    figures = (Figure("changed pixels", changed, 0.0), Figure("largest difference", float(difference.max()), 0.0))
+    return Comparison("exact", verdict, reason, figures, 0.0, {"difference": difference.astype(np.float32)})
 
 
 def tolerance(
@@ -79,7 +54,28 @@ def tolerance(
     hard_warn: Annotated[float, "any value that differs by more is worth one"] = np.inf,
 ) -> Comparison:
     """Differences within absolute and relative thresholds, but for a share of the pixels: the meaning of `idiff`."""
-    raise NotImplementedError
+    _not_negative(locals())
+    a, b, found = entered("tolerance", reference, test, allow_nonfinite)
+    if found:
+        return found
+    import OpenImageIO as oiio
+
+    result = oiio.ImageBufAlgo.compare(_buffer(a), _buffer(b), fail, warn, fail_relative, warn_relative)
+    size = a[..., 0].size
+    failed, warned = 100 * result.nfail / size, 100 * result.nwarn / size
+    figures = (
+        Figure("pixels beyond the tolerance, %", failed, fail_percent),
+        Figure("largest difference", result.maxerror, hard_fail),
+        Figure("mean difference", result.meanerror),
+        Figure("RMS difference", result.rms_error),
+        Figure("pixels worth a warning, %", warned),
+    )
+    place = f"x = {result.maxx + reference.origin[0]}, y = {result.maxy + reference.origin[1]}"
+    reason = f"{failed:.3g} % of the pixels beyond the tolerance; largest difference {result.maxerror:.3g} at {place}"
+    if warned > warn_percent or result.maxerror > hard_warn:
+        reason += f"; warning: {warned:.3g} % of the pixels"
+    maps = {"difference": np.abs(b - a).astype(np.float32)}
+    return Comparison("tolerance", _verdict(figures), reason, figures, maps=maps)
 
 
 def paired_images(
@@ -87,31 +83,29 @@ def paired_images(
     test: Image,
     *,
     allow_nonfinite: bool = False,
-    threshold: Annotated[float, "a pixel is changed where a channel differs by more"] = 1e-4,
+    threshold: Annotated[float, "a pixel is changed where a channel differs by more than this share"] = 1e-4,
     changed: Annotated[float, "share of the pixels that may be changed"] = 0.001,
     largest: Annotated[float, "largest change that is allowed"] = np.inf,
 ) -> Comparison:
-    """Renders of the same random numbers: the share of changed pixels and the largest change."""
-    raise NotImplementedError
+    """Renders of the same random numbers: the share of changed pixels and the largest change.
 
-
-def welch_images(
-    reference: Sequence[Image],
-    test: Sequence[Image],
-    *,
-    allow_nonfinite: bool = False,
-    tile: Annotated[int, "side of a tile in pixels"] = 16,
-    family_error: Annotated[float, "probability that equal pictures are called different"] = 0.001,
-    correction: Annotated[str, "for the number of tiles: sidak or holm"] = "sidak",
-    margin: Annotated[float, "relative difference of a tile that is as good as none"] = 0.001,
-    resolution: Annotated[float, "relative difference that must have been seen, or the verdict is inconclusive"] = 0.05,
-    spp: Annotated[int, "samples per pixel of pictures with variance channels; 0: as their headers say"] = 0,
-) -> Comparison:
-    """Independent renders: Welch's t-test on the means of tiles and channels.
-
-    Two or more renders a side, or one a side with the variance or second moment of every channel.
+    Changes are relative to the reference's value, or to the mean of its absolute values where that is larger.
     """
-    raise NotImplementedError
+    _not_negative(locals())
+    a, b, found = entered("paired", reference, test, allow_nonfinite)
+    if found:
+        return found
+    scale = np.maximum(np.abs(a), np.abs(a).mean() or 1.0)
+    measured = paired(a / scale, b / scale, threshold)
+    figures = (
+        Figure("share of changed pixels", measured.changed, changed),
+        Figure("largest change", measured.largest, largest),
+        Figure("RMS change", measured.rmse),
+        Figure("ratio of the means", float(b.mean() / a.mean()) if a.any() else 1.0 + float(b.mean())),
+    )
+    reason = f"{measured.changed:.3%} of the pixels are changed, the largest by {measured.largest:.3g} of its value"
+    maps = {"difference": np.abs(b - a).astype(np.float32)}
+    return Comparison("paired", _verdict(figures), reason, figures, threshold, maps)
 
 
 def flip(
@@ -125,11 +119,84 @@ def flip(
     ppd: Annotated[float, "pixels per degree of the viewer's field"] = 67.0,
 ) -> Comparison:
     """What a person who flips between the two would see: FLIP, for LDR and HDR pictures."""
-    raise NotImplementedError
+    _not_negative(locals())
+    if hdr not in ("auto", "yes", "no"):
+        raise ValueError(f"hdr = {hdr!r}: accepted: auto, yes, no")
+    _, _, found = entered("flip", reference, test, allow_nonfinite)
+    if found:
+        return found
+    wide = hdr == "yes" or (hdr == "auto" and "linear" in (encoding(reference), encoding(test)))
+    error = flip_map(reference, test, wide, ppd)
+    figures = (
+        Figure("mean FLIP error", float(error.mean()), mean),
+        Figure("largest FLIP error", float(error.max()), largest),
+        Figure("99th percentile of the FLIP error", float(np.percentile(error, 99))),
+    )
+    reason = f"mean FLIP error {error.mean():.3g}, largest {error.max():.3g} ({'HDR' if wide else 'LDR'})"
+    if ignored := [name for name in reference.channels if name not in _colours(reference)]:
+        reason += f"; not looked at: {', '.join(ignored)}"
+    return Comparison("flip", _verdict(figures), reason, figures, maps={"flip": error})
+
+
+def flip_map(reference: Image, test: Image, hdr: bool, ppd: float = 67.0) -> np.ndarray:
+    """FLIP error of every pixel, H × W float32 from 0 to 1, of the channels R, G, B, or of pictures with one channel.
+
+    HDR looks at the picture at the exposures between the reference's median and largest luminance, one FLIP for each.
+    ValueError for pictures without these channels.
+    """
+    import OpenImageIO as oiio
+
+    linear = [_linear(image) for image in (reference, test)]
+    light = linear[0] @ LUMINANCE
+    lit = light[light > 1e-4 * light.max()]  # the rest is black at every exposure, and would ask for many of them
+    median, brightest = (float(np.median(lit)), float(lit.max())) if lit.size else (0.18, 2.0)
+    one, two = map(_buffer, linear)
+    found = oiio.ImageBufAlgo.FLIP_diff(one, two, int(hdr), brightest, median, ppd)
+    if found.has_error:
+        raise ValueError(f"{test.path}: FLIP: {found.geterror()}")
+    return np.asarray(found.get_pixels(), np.float32)[..., 0]
+
+
+def encoding(image: Image) -> str:
+    """ "sRGB" for the formats of displays, by the file's own word or its type; else "linear"."""
+    space = str(image.metadata.get("oiio:ColorSpace", ""))
+    return "sRGB" if "srgb" in space.lower() and not space.lower().startswith("lin") else "linear"
+
+
+def _linear(image: Image) -> np.ndarray:
+    names = _colours(image)
+    if len(names) not in (1, 3):
+        raise ValueError(f"{image.path}: channels {', '.join(names)}; accepted by FLIP: R, G, B, or one")
+    pixels = np.nan_to_num(image.select(names).astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    if encoding(image) == "sRGB":
+        pixels = np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3)))
+
+
+def _colours(image: Image) -> tuple[str, ...]:
+    return ("R", "G", "B") if set("RGB") <= set(image.channels) else image.channels
+
+
+def _buffer(pixels: np.ndarray) -> Any:
+    import OpenImageIO as oiio
+
+    return oiio.ImageBuf(np.ascontiguousarray(pixels))
+
+
+def _verdict(figures: Sequence[Figure]) -> Verdict:
+    return Verdict.EQUAL if all(figure.holds for figure in figures) else Verdict.DIFFERENT
+
+
+def _not_negative(options: dict[str, Any]) -> None:
+    for name, value in options.items():
+        if isinstance(value, float) and not value >= 0:
+            raise ValueError(f"{name} = {value}: accepted: a number of at least 0")
 
 
 @dataclass(frozen=True)
 class Option:
+    """A keyword argument of a method."""
+
     name: str
     type: type
     default: Any
@@ -158,6 +225,15 @@ class Method:
             if typing.get_origin(hint) is Annotated
         }
 
+    def checked(self, method: str, name: str, value: Any) -> Any:
+        """The value of an option; ValueError for an unknown name or a value of another type."""
+        if name not in self.options:
+            raise ValueError(f"{method} has no option {name!r}; accepted: {', '.join(self.options) or 'none'}")
+        kind = self.options[name].type
+        if isinstance(value, bool) or not isinstance(value, (int, float) if kind is float else kind):
+            raise ValueError(f"{method}: {name} = {value!r}: accepted: a value of type {kind.__name__}")
+        return kind(value)
+
 
 METHODS = {
     "exact": Method(exact),
@@ -169,14 +245,41 @@ METHODS = {
 
 
 def compare(
-    method: str, reference: Image | Sequence[Image], test: Image | Sequence[Image], **options: Any
+    method: str,
+    reference: Image | Sequence[Image],
+    test: Image | Sequence[Image],
+    *,
+    allow_nonfinite: bool = False,
+    **options: Any,
 ) -> Comparison:
     """One comparison by the table; "auto" is welch where it can be, else tolerance.
 
     ValueError for an unknown method or option, an option of another type or out of its range, several renders for a
     method that takes one, and pictures that cannot be compared.
     """
-    raise NotImplementedError
+    method = automatic(reference, test) if method == "auto" else method
+    if method not in METHODS:
+        raise ValueError(f"method {method!r}: accepted: auto, {', '.join(METHODS)}")
+    chosen = METHODS[method]
+    checked = {name: chosen.checked(method, name, value) for name, value in options.items()}
+    if allow_nonfinite:
+        checked["allow_nonfinite"] = True
+    sides = [[side] if isinstance(side, Image) else list(side) for side in (reference, test)]
+    if not all(sides):
+        raise ValueError(f"{method}: no picture on one side; accepted: at least one")
+    if chosen.samples:
+        return chosen.function(*sides, **checked)
+    if [len(side) for side in sides] != [1, 1]:
+        raise ValueError(f"{method}: {len(sides[0])} and {len(sides[1])} pictures; accepted: one a side")
+    return chosen.function(sides[0][0], sides[1][0], **checked)
+
+
+def automatic(reference: Image | Sequence[Image], test: Image | Sequence[Image]) -> str:
+    """The method for these: welch where there are several renders a side, or variance channels; else tolerance."""
+    sides = [[side] if isinstance(side, Image) else side for side in (reference, test)]
+    if any(len(side) > 1 for side in sides) or all(spreads(side[0].channels) for side in sides if side):
+        return "welch"
+    return "tolerance"
 
 
 @dataclass(frozen=True)
@@ -191,7 +294,7 @@ class Paired:
 
 def paired(reference: np.ndarray, test: np.ndarray, threshold: float) -> Paired:
     """A pixel is changed where any channel differs by more than `threshold`, or is not finite."""
-    _same_shape(reference, test)
+    same_shape(reference, test)
     with np.errstate(invalid="ignore"):
         difference = np.abs(test - reference).max(-1)
     finite = np.isfinite(test).all(-1) & np.isfinite(reference).all(-1)
@@ -200,86 +303,3 @@ def paired(reference: np.ndarray, test: np.ndarray, threshold: float) -> Paired:
         return Paired(changed, np.inf, np.inf, np.nan)
     return Paired(changed, float(difference.max()), float(np.sqrt(np.square(test - reference).mean())),
                   float(test.mean() / reference.mean()) if reference.any() else 1.0 + float(test.mean()))  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Welch:
-    """`alarms`: tiles and channels that differ, at the given probability of any alarm between equal pictures.
-
-    `smallest_p` is Šidák-adjusted; `detectable` the median over tiles of the smallest relative difference of means
-    that would have been an alarm; `certain` counts tiles without any variance, which a t-test knows nothing of:
-    they are alarms where the means differ beyond the margin.
-    """
-
-    alarms: int
-    smallest_p: float
-    detectable: float
-    certain: int
-
-
-def welch(reference: np.ndarray, test: np.ndarray, tile: int, family_error: float, margin: float = 0.0) -> Welch:
-    """Welch's t-test on tile means of two stacks of independent renders, (renders, height, width, channels).
-
-    Means that differ by no more than `margin`, relative to the tile's or to a thousandth of the picture's, are equal
-    for all practical purposes: the test asks whether they differ by more. It keeps noise-free tiles from turning last
-    bits into certainties.
-
-    The variance of a tile mean is the sum of its pixels' variances over the renders, and its degrees of freedom
-    follow Satterthwaite: pixels are independent under a box filter. ValueError for fewer than 2 renders a side.
-    """
-    from scipy import stats
-
-    _same_shape(reference[0], test[0])
-    if min(len(reference), len(test)) < 2:
-        raise ValueError(f"welch: {len(reference)} and {len(test)} renders: at least 2 a side are needed")
-    with np.errstate(invalid="ignore"):
-        m1, v1, d1 = _tile_moments(reference, tile)
-        m2, v2, d2 = _tile_moments(test, tile)
-    variance = v1 + v2
-    certain = variance == 0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        allowed = margin * np.maximum(np.abs(m1), 1e-3 * np.abs(m1).mean())
-        freedom = np.where(certain, 1.0, variance**2 / (d1 + d2))
-        beyond = np.maximum(np.abs(m1 - m2) - allowed, 0)
-        t = np.where(certain, np.where(beyond == 0, 0.0, np.inf), beyond / np.sqrt(variance))
-    p = np.where(np.isfinite(m1) & np.isfinite(m2), 2 * stats.t.sf(t, freedom), 0.0)
-    threshold = -np.expm1(np.log1p(-family_error) / p.size)  # Šidák
-    critical = stats.t.isf(threshold / 2, freedom[~certain])
-    lit = np.abs(m1[~certain]) > 0
-    detectable = critical[lit] * np.sqrt(variance[~certain][lit]) / np.abs(m1[~certain][lit])
-    return Welch(
-        int((p <= threshold).sum()),
-        float(-np.expm1(p.size * np.log1p(-min(float(p.min()), 1 - 1e-16)))),
-        float(np.median(detectable)) if detectable.size else 0.0,
-        int(certain.sum()),
-    )
-
-
-def _tile_moments(stack: np.ndarray, tile: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Per tile and channel: the mean, its variance, and Satterthwaite's denominator Σ v_i²/(n − 1).
-
-    Tiles at the right and lower edge are as large as what is left.
-    """
-    count, height, width = stack.shape[:3]
-    rows, columns = np.arange(0, height, tile), np.arange(0, width, tile)
-    area = np.outer(np.diff(rows, append=height), np.diff(columns, append=width))[..., None]
-
-    def total(x: np.ndarray) -> np.ndarray:
-        return np.add.reduceat(np.add.reduceat(x, rows, 0), columns, 1)
-
-    variance = stack.var(0, ddof=1) / count
-    mean = total(stack.mean(0)) / area
-    return mean, total(variance) / area**2, total(variance**2) / area**4 / (count - 1)
-
-
-def relative_mse(picture: np.ndarray, references: np.ndarray, epsilon: float = 0.01) -> float:
-    """mean((x − r)²/(r² + ε)) against the mean r of a stack of independent renders, less what r's own noise adds."""
-    r = references.mean(0)
-    _same_shape(r, picture)
-    own = references.var(0, ddof=1) / len(references)
-    return float(((np.square(picture - r) - own) / (np.square(r) + epsilon)).mean())
-
-
-def _same_shape(reference: np.ndarray, test: np.ndarray) -> None:
-    if reference.shape != test.shape:
-        raise ValueError(f"pictures of different shapes: reference {reference.shape}, test {test.shape}")
