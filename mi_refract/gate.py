@@ -32,7 +32,6 @@ FALSE_ALARMS = 0.01  # at most this share of equal pairs
 CONFIDENCE = 0.95  # of the bound on that share, one-sided
 SEED = 2026
 RENDERS = 4  # at least: two a side
-SURELY = 2.0  # times what is detectable: what is just detectable is seen every second time
 TERMS = {
     "size": "of a defect: relative change of a tile's mean, there where it is largest compared with the noise",
     "detectable": "smallest relative difference that `welch` prints, median over the trials",
@@ -199,7 +198,7 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
             cleans.append([_tiles(picture) for picture in trial.clean])
             changes.append(np.mean([_tiles(picture) for picture in spoilt], 0) - np.mean(cleans[-1], 0))
     sizes = _sizes(np.array(changes), np.concatenate(cleans), tallies) if cleans else {}
-    large = sizes.get("size / detectable", 0.0) > SURELY
+    large = sizes.get("size / detectable", 0.0) > 1
     due = [m for m in tallies if always_due or m == "exact" or (large and tallies[m].detectable)]
     values = {method: tally.rate for method, tally in tallies.items()}
     values |= {"missed": float(sum(tallies[m].trials - tallies[m].seen for m in due)), **sizes}
