@@ -1,0 +1,144 @@
+"""The commands `mi-refract diff` and `mi-refract accept`. Words in, words out, as in `cli.py`."""
+
+from __future__ import annotations
+
+import enum
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from . import diff as engine
+from . import diff_output as output
+from . import diff_settings
+from .diff import Results, Status
+from .files import writable
+
+Folder = Annotated[Path, typer.Argument(metavar="REFERENCE", help="A picture, or a folder of them.")]
+Other = Annotated[Path, typer.Argument(metavar="TEST", help="What is compared with it, of the same kind.")]
+Method = Annotated[str, typer.Option(help=f"{'|'.join(diff_settings.ACCEPTED)}; see --methods.")]
+Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="An option of the method.")]
+File = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.toml", help=f"Rules for single pictures; REFERENCE's {diff_settings.FILE} by default."),
+]
+Nonfinite = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME", help="A picture (or pattern) where both sides may have the same NaN or Inf."),
+]
+OUTPUTS = {"report": (".html", ".htm"), "junit": (".xml",), "json": (".json",)}
+
+
+class Inconclusive(enum.StrEnum):
+    PASS = "pass"
+    FAIL = "fail"
+
+
+def _print_methods(asked: bool) -> None:
+    if asked:
+        print(diff_settings.reference())
+        raise typer.Exit
+
+
+def _self_test(asked: bool) -> None:
+    if asked:
+        from . import gate
+
+        raise typer.Exit(gate.self_test())
+
+
+def diff(
+    reference: Folder,
+    test: Other,
+    method: Method = diff_settings.AUTO,
+    options: Set = None,
+    samples: Annotated[bool, typer.Option("--samples", help="Both folders hold renders of one picture.")] = False,
+    settings: File = None,
+    allow_nonfinite: Nonfinite = None,
+    inconclusive: Annotated[Inconclusive | None, typer.Option(help="What it counts as; else exit code 3.")] = None,
+    report: Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write a page to look at.")] = None,
+    junit: Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit's XML.")] = None,
+    json: Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")] = None,
+    github: Annotated[bool, typer.Option("--github", help="Print annotations, write the job's summary.")] = False,
+    methods: Annotated[
+        bool, typer.Option("--methods", is_eager=True, callback=_print_methods, help="Print the methods' options.")
+    ] = False,
+    self_test: Annotated[
+        bool, typer.Option("--self-test", is_eager=True, callback=_self_test, help="Show which defects are caught.")
+    ] = False,
+) -> None:
+    """Compare pictures with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
+    for path, suffixes in zip((report, junit, json), OUTPUTS.values(), strict=True):
+        if path:
+            writable(path, suffixes)
+    chosen = _settings(reference, method, options, settings, allow_nonfinite)
+    found = engine.diff(reference, test, chosen, samples=samples, inconclusive=inconclusive or "", maps=bool(report))
+    _say(found)
+    if report:
+        from . import diff_page
+
+        diff_page.write(report, found)
+    if junit:
+        output.write_junit(junit, found)
+    if json:
+        output.write_json(json, found)
+    if github:
+        print("\n".join(output.workflow_commands(found)))
+        output.append_summary(found)
+    raise typer.Exit(found.exit_code)
+
+
+def accept(
+    reference: Folder,
+    test: Other,
+    method: Method = diff_settings.AUTO,
+    options: Set = None,
+    settings: File = None,
+    allow_nonfinite: Nonfinite = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Copy the pictures that are not equal over their references, after showing them. Nothing is deleted."""
+    chosen = _settings(reference, method, options, settings, allow_nonfinite)
+    found = engine.diff(reference, test, chosen, new=True)
+    _say(found)
+    copies = list(engine.changes(found))
+    for new, old in copies:
+        print(output.printable(f"{new} → {old}{'' if old.exists() else ' (new)'}"))
+    if not copies:
+        print("nothing to accept")
+    elif yes or _agreed(len(copies)):
+        engine.accept(copies)
+        print(f"{len(copies)} accepted")
+    else:
+        print("nothing accepted")
+        raise typer.Exit(1)
+
+
+def _agreed(count: int) -> bool:
+    if not sys.stdin.isatty():
+        raise ValueError("accept asks on a terminal only; accepted elsewhere: --yes")
+    return typer.confirm(f"Accept {count} as the reference{'' if count == 1 else 's'}?")
+
+
+def _settings(
+    reference: Path, method: str, words: list[str] | None, file: Path | None, nonfinite: list[str] | None
+) -> diff_settings.Settings:
+    default = diff_settings.from_words(method, words or [])
+    beside = (reference if reference.is_dir() else reference.parent) / diff_settings.FILE
+    path = file or (beside if beside.exists() else None)
+    rules = diff_settings.load(path) if path else ()
+    return diff_settings.Settings(default, rules, tuple(nonfinite or ()))
+
+
+def _say(found: Results) -> None:
+    """The table on stdout, what could not be compared on stderr, a line each."""
+    for result in found.of(Status.ERROR):
+        print(f"mi-refract: {output.printable(result.error)}", file=sys.stderr)
+    for pattern in found.unused:
+        print(f"mi-refract: {output.printable(pattern)}: matches no picture", file=sys.stderr)
+    if len(found.results) > len(found.of(Status.ERROR)):
+        # As wide as it must be where nobody looks on: no line of a log is a wrapped one.
+        console = Console() if sys.stdout.isatty() else Console(width=10_000)
+        console.print(output.table(found), highlight=False)
