@@ -85,7 +85,7 @@ def diff(
     if json:
         output.write_json(json, found)
     if github:
-        print("\n".join(output.workflow_commands(found)))
+        print(*output.workflow_commands(found), sep="\n", end="\n" if found.exit_code else "")
         output.append_summary(found)
     raise typer.Exit(found.exit_code)
 
