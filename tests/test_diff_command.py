@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import os
 import shlex
@@ -15,7 +16,7 @@ import pytest
 import typer
 from diff_pictures import BROKEN, picture, samples
 
-from mi_refract import cli, compare, diff, diff_output
+from mi_refract import backend, cli, cli_diff, compare, diff, diff_output, gate
 from mi_refract.diff import Result, Results, Status
 
 EVIL = 'a"b<script>alert(1)</script>|`*[x](y)*`,:%0A::error::.exr'
@@ -221,6 +222,71 @@ def test_nothing_is_created_or_overwritten(run, pair, tmp_path):
     run("diff", pair[0] / "none.exr", pair[1] / "added.exr")
     run("diff", tmp_path / "none", pair[1])
     assert tree(tmp_path) == before
+
+
+# Self-test, report ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """A self-test of few trials."""
+    full = gate.self_test
+    monkeypatch.setattr(gate, "self_test", lambda renders, case: full(renders, case, trials=2, null_pairs=4))
+
+
+def test_self_test_of_renders_and_of_one_picture(run, tmp_path, quick):
+    folder = samples(tmp_path / "renders", 8, noise=0.001)
+    for path, number in ((folder, "null pairs 4"), (folder / "0.exr", "null pairs 1")):
+        code, out, err = run("diff", "--self-test", path)
+        assert err == ""
+        assert code == int("not held" in out)
+        assert {"NaN", "blur"} <= {line.split()[0] for line in out.splitlines()}
+        assert number in out
+
+
+def test_self_test_renders_a_scene(run, tmp_path, quick, monkeypatch):
+    text = (Path(cli.__file__).parents[1] / "scenes" / "sphere.xml").read_text()
+    scene = tmp_path / "sphere.xml"
+    scene.write_text(text.replace('name="res" value="128"', 'name="res" value="24"'))
+    monkeypatch.setattr(cli_diff, "SELF_TEST_SPP", 2)
+    monkeypatch.setattr(backend, "activate", lambda **how: None)
+    code, out, err = run("diff", "--self-test", scene)
+    assert (code in (0, 1), err) == (True, "")
+    assert "renders: noise " in out
+
+
+def test_a_self_test_that_misses_something_says_so(run, pair, quick, monkeypatch):
+    monkeypatch.setattr(gate.Row, "verdict", "fail")
+    assert run("diff", "--self-test", pair[0] / "equal.exr")[0] == 1
+    monkeypatch.setattr(gate.Row, "verdict", "pass")
+    assert run("diff", "--self-test", pair[0] / "equal.exr")[0] == 0
+
+
+def test_bad_self_tests(run, pair, tmp_path):
+    picture(tmp_path / "mixed" / "a.exr")
+    picture(tmp_path / "mixed" / "b.exr", shape=(8, 8, 3))
+    picture(tmp_path / "nan.exr", value=np.nan)
+    for words, message in [
+        (pair, "--self-test takes one path"),
+        ([tmp_path / "none.exr"], "none.exr"),
+        ([tmp_path / "none.xml"], "none.xml"),
+        ([tmp_path / "mixed"], "not of the size of"),
+        ([tmp_path / "nan.exr"], "every value of them finite"),
+    ]:
+        code, out, err = run("diff", "--self-test", *words)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert message in err
+
+
+def test_report(run, pair, tmp_path):
+    page = tmp_path / "out.html"
+    code, _, err = run("diff", *pair, "--report", page, "--method", "tolerance", "--set", "fail=0.01")
+    assert (code, err) == (1, "")
+    text = html.unescape(page.read_text())
+    whole = f"mi-refract diff {pair[0]} {pair[1]} --method tolerance --set fail=0.01"
+    one = f"mi-refract accept {pair[0]}/louder.exr {pair[1]}/louder.exr --method tolerance --set fail=0.01"
+    assert whole in text
+    assert one in text
 
 
 # Forms ------------------------------------------------------------------------------------------------------------
