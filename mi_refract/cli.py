@@ -26,7 +26,7 @@ except ModuleNotFoundError as missing:
     print("mi-refract needs the extra `cli`: pip install 'mi-refract[cli]'", file=sys.stderr)
     sys.exit(2)
 
-from . import __version__, backend, drawing, files, foci, images, planar_keys, planar_scene, rendering
+from . import __version__, backend, cli_diff, drawing, files, foci, images, planar_keys, planar_scene, rendering
 from .branches import as_data, follow_scene, summary, with_rays
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -150,6 +150,10 @@ def trace(
         print(json.dumps(as_data(loaded, traced) | focal, allow_nan=False))
     else:
         print("\n".join([f"{scene.name}: {summary(loaded, traced)}", *([foci.table(found)] if found else [])]))
+
+
+app.command()(cli_diff.diff)
+app.command()(cli_diff.accept)
 
 
 def _spinner(console: Console, text: str) -> contextlib.AbstractContextManager[Any]:

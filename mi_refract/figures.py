@@ -1,15 +1,12 @@
-"""What a page shows: numbers as compact text, plots as SVG in the page's theme, pictures as halves."""
+"""What a page shows: numbers as compact text, plots as SVG in the page's theme."""
 
 from __future__ import annotations
 
-import base64
 import io
 import math
 import re
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -122,6 +119,24 @@ def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str) -> str:
             _guide(panel, [points for points in lines.values() if points], axes.slope)
         _ticks(panel, axes.logarithmic)
         panel.legend()
+        return _page_svg(figure)
+
+
+def histogram_svg(values: Any, x: str, y: str, *, salt: str, bins: int = 20) -> str:
+    """Shares of values from 0 to 1 in equal bins, and a dashed line where all would be the same. "" without values."""
+    if not len(values):
+        return ""
+    import matplotlib
+    import numpy as np
+
+    counts, edges = np.histogram(values, bins, (0, 1))
+    with matplotlib.rc_context(_style(salt)):
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(5.3, 2.4), layout="constrained", dpi=72)
+        panel = figure.add_subplot(xlabel=x, ylabel=y, xlim=(0, 1))
+        panel.stairs(counts / len(values), edges, fill=True, color=SERIES[0])
+        panel.axhline(1 / bins, color=MUTED, linewidth=1, linestyle=(0, (4, 3)))
         return _page_svg(figure)
 
 
@@ -261,52 +276,3 @@ def _page_svg(figure: Figure) -> str:
     text = text.replace("xlink:href=", "href=")
     text = re.sub(r"\n\s*", "\n", re.sub(r"\d+\.\d{3,}", lambda m: f"{float(m[0]):.2f}", text))
     return re.sub(r"#0102[01][0-9a-f]", lambda m: f"var({VARIABLES[m[0]]})", text)
-
-
-class Pictures:
-    """The pictures a page embeds: each file once, as base64 of the deflated planes of its half floats.
-
-    A value past 65504 becomes infinite. Errors: see `embed`.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.embedded: dict[str, dict[str, Any]] = {}
-
-    def embed(self, path: str) -> dict[str, Any]:
-        """Key, width, height and data of a picture, by its path relative to the folder.
-
-        Errors: FileNotFoundError where it is missing, ValueError where it is not RGB or gray; both name it.
-        """
-        if path not in self.embedded:
-            pixels = _read_half(self.folder / path)
-            height, width, _ = pixels.shape
-            # High bytes, then low bytes: a tenth to a half smaller than the halves in a row.
-            planes = pixels.view("u1").reshape(-1, 2)[:, ::-1].T.tobytes()
-            data = base64.b64encode(zlib.compress(planes)).decode()
-            key = f"p{len(self.embedded)}"
-            self.embedded[path] = {"key": key, "width": width, "height": height, "data": data}
-        return self.embedded[path]
-
-
-def _read_half(path: Path) -> Any:
-    """The RGB of an image file as little-endian float16, (height, width, 3); gray is repeated."""
-    import numpy as np
-    import OpenImageIO as oiio
-
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such picture")
-    file = oiio.ImageInput.open(str(path))
-    if not file:
-        raise ValueError(f"{path}: {' '.join(oiio.geterror().split())}")
-    try:
-        names, pixels = list(file.spec().channelnames), file.read_image(oiio.FLOAT)
-        if pixels is None:
-            raise ValueError(f"{path}: {' '.join(file.geterror().split())}")
-    finally:
-        file.close()
-    wanted = ["R", "G", "B"] if {"R", "G", "B"} <= set(names) else names[:1] * 3 if len(names) == 1 else []
-    if not wanted:
-        raise ValueError(f"{path}: neither RGB nor gray, but channels {', '.join(names)}")
-    with np.errstate(over="ignore"):
-        return np.ascontiguousarray(pixels[..., [names.index(name) for name in wanted]], dtype="<f2")

@@ -210,5 +210,5 @@ def _default(key: Key) -> str:
     if key.default is REQUIRED or key.default is None:
         return ""
     default = key.default if isinstance(key.default, list) else [key.default]
-    text = ", ".join(f"{x:g}" for x in default)
+    text = ", ".join(x if isinstance(x, str) else f"{x:g}" for x in default)
     return f", default {text if len(default) == 1 else f'[{text}]'}"

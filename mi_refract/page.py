@@ -18,7 +18,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .figures import Axes, Pictures, Scatter, apart, compact, curves_svg, drawable, scatter_svg
+from .figures import Axes, Scatter, apart, compact, curves_svg, drawable, scatter_svg
+from .pictures import Pictures
 from .rows import Row, by_study
 
 STEERING = ("title", "studies", "scatter", "replay")
@@ -194,11 +195,10 @@ def _scatter(scatter: Mapping[str, Any], rows: list[Row], salt: str) -> dict[str
 def _figure(row: Row, pictures: Pictures) -> dict[str, Any]:
     roles = [role for role in ROLES if role in row.pictures]
     roles += [role for role in row.pictures if role not in ROLES]
-    panes = [(role, pictures.embed(row.pictures[role])) for role in roles]
+    panes = [_pane(role) | pictures.embed(row.pictures[role]) for role in roles]
     return {"row": row, "panes": panes, "paired": roles[:2] == ["reference", "test"]}
 
 
-def words(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {words(item)}" for key, item in value.items())
-    return ", ".join(map(words, value)) if isinstance(value, list | tuple) else str(value)
+def _pane(role: str) -> dict[str, Any]:
+    signed = role == "difference"
+    return {"role": role, "paint": "signed" if signed else "light", "gain": 3 if signed else None}

@@ -12,23 +12,32 @@ const halves = Float32Array.from({ length: 65536 }, (_, code) => {
 });
 const sRGB = (v) => 255 * (v <= 0.0031308 ? 12.92 * v : 1.055 * v ** (1 / 2.4) - 0.055);
 const NOT_A_NUMBER = [255, 0, 255]; // magenta, wherever it is
-const tone = new Uint8ClampedArray(65536);
-const expose = (ev) => halves.forEach((v, code) => (tone[code] = sRGB(Math.min(Math.max(v * 2 ** ev, 0), 1))));
+const linear = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+const unit = (v) => Math.min(Math.max(v, 0), 1);
+// Two tables of tones: for pictures of light, and for those whose file holds sRGB codes.
+const tones = { light: new Uint8ClampedArray(65536), code: new Uint8ClampedArray(65536) };
+const expose = (ev) => halves.forEach((v, code) => {
+  tones.light[code] = sRGB(unit(v * 2 ** ev));
+  tones.code[code] = sRGB(unit(linear(unit(v)) * 2 ** ev));
+});
 
 const pictures = {};
 async function load(id) {
-  const deflated = Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
+  const { textContent, dataset } = document.getElementById(id);
+  const deflated = Uint8Array.from(atob(textContent), (c) => c.charCodeAt(0));
   const stream = new Blob([deflated]).stream().pipeThrough(new DecompressionStream("deflate"));
   const planes = new Uint8Array(await new Response(stream).arrayBuffer());
-  const half = planes.length / 2;
-  pictures[id] = Uint16Array.from({ length: half }, (_, i) => (planes[i] << 8) | planes[half + i]);
+  const codes = new Uint16Array(planes.length / 2);
+  for (let i = 0, low = codes.length; i < codes.length; i++) codes[i] = (planes[i] << 8) | planes[low + i];
+  pictures[id] = { codes, channels: +dataset.channels, scale: +dataset.scale };
 }
+const pictureOf = (canvas) => pictures[canvas.dataset.pixels];
 
 function paint(canvas, colour) {
-  const codes = pictures[canvas.dataset.pixels], context = canvas.getContext("2d");
-  const image = context.createImageData(canvas.width, canvas.height), out = image.data;
-  for (let i = 0, o = 0; i < codes.length; i += 3, o += 4) {
-    const r = codes[i], g = codes[i + 1], b = codes[i + 2];
+  const { codes, channels } = pictureOf(canvas), green = channels > 2 ? 1 : 0, blue = 2 * green;
+  const context = canvas.getContext("2d"), image = context.createImageData(canvas.width, canvas.height), out = image.data;
+  for (let i = 0, o = 0; i < codes.length; i += channels, o += 4) {
+    const r = codes[i], g = codes[i + green], b = codes[i + blue];
     if (halves[r] !== halves[r] || halves[g] !== halves[g] || halves[b] !== halves[b]) out.set(NOT_A_NUMBER, o);
     else colour(r, g, b, out, o);
     out[o + 3] = 255;
@@ -36,32 +45,43 @@ function paint(canvas, colour) {
   context.putImageData(image, 0, 0);
 }
 
-function light(r, g, b, out, o) {
+const light = (tone) => (r, g, b, out, o) => {
   out[o] = tone[r];
   out[o + 1] = tone[g];
   out[o + 2] = tone[b];
-}
+};
 
 // The channel that differs most speaks for the pixel: a mean would let two errors cancel.
+function strongest(r, g, b) {
+  let v = halves[r];
+  if (Math.abs(halves[g]) > Math.abs(v)) v = halves[g];
+  return Math.abs(halves[b]) > Math.abs(v) ? halves[b] : v;
+}
 const BLUE = [33, 102, 172], RED = [178, 24, 43], EQUAL = 247;
 function deviation(gain, signed) {
   return (r, g, b, out, o) => {
-    let v = halves[r];
-    if (Math.abs(halves[g]) > Math.abs(v)) v = halves[g];
-    if (Math.abs(halves[b]) > Math.abs(v)) v = halves[b];
-    const size = Math.min(Math.abs(v) * gain, 1), end = v < 0 ? BLUE : RED;
+    const v = strongest(r, g, b), size = Math.min(Math.abs(v) * gain, 1), end = v < 0 ? BLUE : RED;
     for (let c = 0; c < 3; c++) out[o + c] = signed ? EQUAL + (end[c] - EQUAL) * size : 255 * size;
   };
 }
+// Black, violet, orange, pale yellow: lighter is more, in print too.
+const HEAT = [[0, 0, 4], [81, 18, 124], [183, 55, 121], [252, 137, 97], [252, 253, 191]];
+function heat(gain) {
+  return (r, g, b, out, o) => {
+    const place = 4 * unit(strongest(r, g, b) * gain), step = Math.min(Math.floor(place), 3), part = place - step;
+    for (let c = 0; c < 3; c++) out[o + c] = HEAT[step][c] + (HEAT[step + 1][c] - HEAT[step][c]) * part;
+  };
+}
 
-const isDifference = (canvas) => canvas.closest(".pane").dataset.role === "difference";
-function paintDifference(canvas) {
-  const slider = canvas.closest(".pane").querySelector(".gain"), gain = 10 ** slider.value;
-  slider.nextElementSibling.value = "×" + (gain < 1e4 ? Math.round(gain * 10) / 10 : "1e" + slider.value);
-  paint(canvas, deviation(gain, root.dataset.sign === "signed"));
+const paneOf = (canvas) => canvas.closest(".pane");
+const isMap = (canvas) => paneOf(canvas).querySelector(".gain") !== null;
+function paintMap(canvas) {
+  const slider = paneOf(canvas).querySelector(".gain"), gain = 10 ** slider.value, { scale } = pictureOf(canvas);
+  slider.nextElementSibling.value = "full at " + shown(scale / gain);
+  paint(canvas, paneOf(canvas).dataset.paint === "heat" ? heat(gain) : deviation(gain, root.dataset.sign === "signed"));
 }
 function paintAll(which = () => true) {
-  for (const canvas of all("canvas").filter(which)) isDifference(canvas) ? paintDifference(canvas) : paint(canvas, light);
+  for (const canvas of all("canvas").filter(which)) isMap(canvas) ? paintMap(canvas) : paint(canvas, light(tones[paneOf(canvas).dataset.paint]));
 }
 
 // Every study has the same bar; they move together.
@@ -73,12 +93,12 @@ function setExposure(ev) {
     slider.nextElementSibling.value = (exposure > 0 ? "+" : "") + exposure + " EV";
   }
   expose(exposure);
-  paintAll((canvas) => !isDifference(canvas));
+  paintAll((canvas) => !isMap(canvas));
 }
 function setSign(sign) {
   root.dataset.sign = sign;
   for (const select of all("select[name=sign]")) select.value = sign;
-  paintAll(isDifference);
+  paintAll(isMap);
 }
 const still = matchMedia("(prefers-reduced-motion: reduce)");
 let timer = 0;
@@ -100,6 +120,14 @@ function setSplit(percent) {
   root.style.setProperty("--split", split + "%");
 }
 
+// The next failure or picture below the bars that stay on top, or the one before.
+function go(step) {
+  const places = all(".failure, .compare:not(.failure *)"), top = 120;
+  const offset = (place) => place.getBoundingClientRect().top - top;
+  const next = step > 0 ? places.find((p) => offset(p) > 2) : places.findLast((p) => offset(p) < -2);
+  if (next) scrollBy({ top: offset(next), behavior: still.matches ? "auto" : "smooth" });
+}
+
 const KEYS = {
   "[": () => setExposure(exposure - 0.5),
   "]": () => setExposure(exposure + 0.5),
@@ -109,23 +137,27 @@ const KEYS = {
   f: () => toggleMode("flicker"),
   s: () => toggleMode("slider"),
   " ": () => root.dataset.mode === "flicker" && (clearInterval(timer), blink()),
+  j: () => go(1),
+  k: () => go(-1),
   ArrowLeft: () => root.dataset.mode === "slider" && setSplit(split - 2),
   ArrowRight: () => root.dataset.mode === "slider" && setSplit(split + 2),
 };
 
 const shown = (v) => (Number.isFinite(v) && v !== 0 && Math.abs(v) < 1e-3 ? v.toExponential(2) : Number.isFinite(v) ? +v.toPrecision(4) + "" : String(v));
+const LARGEST = 0x7bff; // stands for itself and all beyond it
+const reading = (code, scale) => ((code & 0x7fff) !== LARGEST ? "" : code > LARGEST ? "≤ " : "≥ ") + shown(halves[code] * scale);
 function probe(figure, x, y) {
   figure.toggleAttribute("data-probed", x !== undefined);
   figure.style.setProperty("--x", x * 100 + "%");
   figure.style.setProperty("--y", y * 100 + "%");
   for (const pane of all(".pane", figure)) {
-    const canvas = pane.querySelector("canvas"), codes = pictures[canvas.dataset.pixels];
+    const canvas = pane.querySelector("canvas"), { codes, channels, scale } = pictureOf(canvas);
     const column = Math.min(Math.floor(x * canvas.width), canvas.width - 1);
     const line = Math.min(Math.floor(y * canvas.height), canvas.height - 1);
-    const at = 3 * (line * canvas.width + column);
-    const text = x === undefined ? "" : [0, 1, 2].map((c) => shown(halves[codes[at + c]])).join("  ");
-    pane.querySelector(".pixel").value = text;
-    canvas.title = x === undefined ? "" : `${column}, ${line}`;
+    const at = channels * (line * canvas.width + column);
+    const values = x === undefined ? [] : [...codes.subarray(at, at + channels)];
+    pane.querySelector(".pixel").value = values.map((code) => reading(code, scale)).join("  ");
+    pane.querySelector(".place").value = x === undefined || isMap(canvas) ? "" : `${column}, ${line}`;
   }
 }
 
@@ -138,7 +170,7 @@ function listen() {
       if (target.name === "sign") setSign(target.value);
     });
   }
-  for (const slider of all(".gain")) slider.addEventListener("input", () => paintDifference(slider.closest(".pane").querySelector("canvas")));
+  for (const slider of all(".gain")) slider.addEventListener("input", () => paintMap(paneOf(slider).querySelector("canvas")));
   for (const figure of all(".compare")) {
     const track = (e) => {
       const frame = e.target.closest(".frame");

@@ -16,8 +16,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import page
-from .figures import Pictures, apart, compact
+from .figures import apart
 from .files import write_atomically
+from .html import write_page
+from .pictures import Pictures
 from .rows import SCHEMA, Row, by_study, strict
 
 if TYPE_CHECKING:
@@ -173,18 +175,9 @@ def summary(rows: Sequence[Row]) -> RenderableType:
 def write_html(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any], folder: str | Path) -> None:
     """Write one page that needs no other file; `folder` is what the rows' picture paths are relative to.
 
-    Pictures are embedded whole, three halves a pixel (a value past 65504 becomes infinite), each file once.
+    Pictures are embedded whole, three halves a pixel (a finite value past 65504 becomes 65504), each file once.
     Errors: FileNotFoundError or ValueError naming a picture that is missing or not RGB or gray; OSError.
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
-
-    here = Path(__file__).parent
-    options: Any = {"autoescape": True, "undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
-    environment = Environment(loader=FileSystemLoader(here), **options)
-    environment.filters |= {"compact": compact, "words": page.words}
     pictures = Pictures(Path(folder))
     content = page.prepare(rows, context, pictures) | {"sentence": verdict(rows)}
-    inline = {name: Markup((here / f"report.{name}").read_text("utf-8")) for name in ("css", "js")}
-    text = environment.get_template("report.html.j2").render(**content, **inline, pictures=pictures.embedded)
-    write_atomically(path, text.encode("utf-8", "replace"))
+    write_page(path, "report.html.j2", content, pictures)

@@ -1,0 +1,178 @@
+"""The commands `mi-refract diff` and `mi-refract accept`. Words in, words out, as in `cli.py`."""
+
+from __future__ import annotations
+
+import enum
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from . import backend, diff_page, diff_settings, gate, images
+from . import diff as engine
+from . import diff_output as output
+from .diff import Results, Status
+from .files import writable
+from .rendering import load_scene, provenance
+
+Folder = Annotated[Path, typer.Argument(metavar="REFERENCE", help="A picture, or a folder of them.")]
+Other = Annotated[Path, typer.Argument(metavar="TEST", help="What is compared with it, of the same kind.")]
+NotWithSelfTest = Annotated[Path | None, typer.Argument(metavar="TEST", help="What is compared with it.")]
+Method = Annotated[str, typer.Option(help=f"{'|'.join(diff_settings.ACCEPTED)}; see --methods.")]
+Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="An option of the method.")]
+File = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.toml", help=f"Rules for single pictures; REFERENCE's {diff_settings.FILE} by default."),
+]
+Nonfinite = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME", help="A picture (or pattern) where both sides may have the same NaN or Inf."),
+]
+OUTPUTS = ((".html", ".htm"), (".xml",), (".json",))  # of --report, --junit, --json
+SELF_TEST_RENDERS, SELF_TEST_SPP = 8, 16
+
+
+class Inconclusive(enum.StrEnum):
+    PASS = "pass"
+    FAIL = "fail"
+
+
+def _print_methods(asked: bool) -> None:
+    if asked:
+        print(diff_settings.reference())
+        raise typer.Exit
+
+
+def diff(
+    reference: Folder,
+    test: NotWithSelfTest = None,
+    method: Method = diff_settings.AUTO,
+    options: Set = None,
+    samples: Annotated[bool, typer.Option("--samples", help="Both folders hold renders of one picture.")] = False,
+    settings: File = None,
+    allow_nonfinite: Nonfinite = None,
+    inconclusive: Annotated[Inconclusive | None, typer.Option(help="What it counts as; else exit code 3.")] = None,
+    report: Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write a page to look at.")] = None,
+    junit: Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit's XML.")] = None,
+    json: Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")] = None,
+    github: Annotated[bool, typer.Option("--github", help="Print annotations, write the job's summary.")] = False,
+    methods: Annotated[
+        bool, typer.Option("--methods", is_eager=True, callback=_print_methods, help="Print the methods' options.")
+    ] = False,
+    self_test: Annotated[
+        bool,
+        typer.Option("--self-test", help="Which defects planted in REFERENCE are seen? A picture, renders, a scene."),
+    ] = False,
+) -> None:
+    """Compare pictures with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
+    if self_test:
+        raise typer.Exit(_self_test(reference, test))
+    if test is None:
+        raise ValueError("TEST is missing; accepted: mi-refract diff REFERENCE TEST")
+    for path, suffixes in zip((report, junit, json), OUTPUTS, strict=True):
+        if path:
+            writable(path, suffixes)
+    chosen = _settings(reference, method, options, settings, allow_nonfinite)
+    found = engine.diff(reference, test, chosen, samples=samples, inconclusive=inconclusive or "", maps=bool(report))
+    _say(found)
+    if report:
+        flags = chosen.default.flags + _flags("--allow-nonfinite", chosen.allow_nonfinite)
+        flags += _flags("--settings", [settings] if settings else []) + ["--samples"] * samples
+        replay = shlex.join(["mi-refract", "diff", str(reference), str(test), *flags])
+        diff_page.write(report, found, provenance(), replay)
+    if junit:
+        output.write_junit(junit, found)
+    if json:
+        output.write_json(json, found)
+    if github:
+        for line in output.workflow_commands(found):
+            print(line)
+        output.append_summary(found)
+    raise typer.Exit(found.exit_code)
+
+
+def accept(
+    reference: Folder,
+    test: Other,
+    method: Method = diff_settings.AUTO,
+    options: Set = None,
+    settings: File = None,
+    allow_nonfinite: Nonfinite = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Copy the pictures that are not equal over their references, after showing them. Nothing is deleted."""
+    chosen = _settings(reference, method, options, settings, allow_nonfinite)
+    found = engine.diff(reference, test, chosen, new=True)
+    _say(found)
+    copies = list(engine.changes(found))
+    for new, old in copies:
+        print(output.printable(f"{new} → {old}{'' if old.exists() else ' (new)'}"))
+    if not copies:
+        print("nothing to accept")
+    elif yes or _agreed(len(copies)):
+        engine.accept(copies)
+        print(f"{len(copies)} accepted")
+    else:
+        print("nothing accepted")
+        raise typer.Exit(1)
+
+
+def _agreed(count: int) -> bool:
+    if not sys.stdin.isatty():
+        raise ValueError("accept asks on a terminal only; accepted elsewhere: --yes")
+    return typer.confirm(f"Accept {count} as the reference{'' if count == 1 else 's'}?")
+
+
+def _flags(name: str, values: Sequence[Any]) -> list[str]:
+    return [word for value in values for word in (name, str(value))]
+
+
+def _self_test(path: Path, other: Path | None) -> int:
+    """Prints what is seen of the defects; 1 where one that was due is not."""
+    if other:
+        raise ValueError(f"{other}: --self-test takes one path; accepted: a picture, a folder of renders, a scene")
+    rows = gate.self_test(_renders(path), path.name)
+    print(gate.text(rows))
+    return int(any(row.verdict == "fail" for row in rows))
+
+
+def _renders(path: Path) -> np.ndarray:
+    """Independent renders of one picture: of a scene, the files of a folder, or one file."""
+    if path.suffix == ".xml":
+        backend.activate(may_restart=True)
+        import mitsuba as mi
+
+        scene = load_scene(path)
+        return np.stack([np.array(mi.render(scene, spp=SELF_TEST_SPP, seed=i)) for i in range(SELF_TEST_RENDERS)])
+    pictures = engine.sample_pictures(path) if path.is_dir() else [images.read(path)]
+    for picture in pictures:
+        if picture.pixels.shape != pictures[0].pixels.shape:
+            raise ValueError(f"{picture.path}: not of the size of {pictures[0].path}; accepted: renders of one picture")
+    return np.stack([picture.pixels for picture in pictures])
+
+
+def _settings(
+    reference: Path, method: str, words: list[str] | None, file: Path | None, nonfinite: list[str] | None
+) -> diff_settings.Settings:
+    default = diff_settings.from_words(method, words or [])
+    beside = (reference if reference.is_dir() else reference.parent) / diff_settings.FILE
+    path = file or (beside if beside.exists() else None)
+    rules = diff_settings.load(path) if path else ()
+    return diff_settings.Settings(default, rules, tuple(nonfinite or ()))
+
+
+def _say(found: Results) -> None:
+    """The table on stdout, what could not be compared on stderr, a line each."""
+    for result in found.of(Status.ERROR):
+        print(f"mi-refract: {output.printable(result.error)}", file=sys.stderr)
+    for pattern in found.unused:
+        print(f"mi-refract: {output.printable(pattern)}: matches no picture", file=sys.stderr)
+    if len(found.results) > len(found.of(Status.ERROR)):
+        # As wide as it must be where nobody looks on: no line of a log is a wrapped one.
+        console = Console() if sys.stdout.isatty() else Console(width=10_000)
+        console.print(output.table(found), highlight=False)

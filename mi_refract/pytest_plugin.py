@@ -1,0 +1,114 @@
+"""Fixtures for pytest that compare pictures: `assert_image_equal` and `assert_image_unbiased`.
+
+In the conftest.py of the tests: `pytest_plugins = ["mi_refract.pytest_plugin"]`. It is no entry point, because that
+would load Mitsuba, and with it a libLLVM, into every pytest run of the environment, before any conftest.py could choose
+one. A picture is a file, or an array (height, width, channels) or (height, width). Nothing is ever written, and a
+reference that is not there fails the test.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pytest
+
+Picture = str | os.PathLike[str] | Any  # a file, or what numpy makes an array of
+RUNS = 8
+REFERENCE_SEED = 1 << 16  # the first of a rendered reference: both sides must not share a seed
+
+
+class AssertEqual(Protocol):
+    def __call__(self, test: Picture, reference: Picture, method: str = "auto", **options: Any) -> Any: ...
+
+
+class AssertUnbiased(Protocol):
+    def __call__(
+        self, render: Callable[[int], Any], reference: Picture | Callable[[int], Any], runs: int = RUNS,
+        seed: int = 0, **options: Any,
+    ) -> Any: ...  # fmt: skip
+
+
+@pytest.fixture
+def assert_image_equal() -> AssertEqual:
+    """`assert_image_equal(test, reference, method="auto", **options)`: the verdict must be equal.
+
+    The methods and their options are those of `mi-refract diff`. Inconclusive fails, too. Returns the comparison.
+    """
+    return _assert_equal
+
+
+@pytest.fixture
+def assert_image_unbiased() -> AssertUnbiased:
+    """`assert_image_unbiased(render, reference, runs=8, seed=0, **options)`: the means of renders must be equal.
+
+    `render(seed)` gives a picture; it is called with `runs` seeds from `seed` on. `reference` is a folder of independent
+    renders, or a function like `render`, called with as many other seeds. Welch's t-test with its options; inconclusive
+    fails, too: more runs or samples are needed then. Returns the comparison.
+    """
+    return _assert_unbiased
+
+
+def _assert_equal(test: Picture, reference: Picture, method: str = "auto", **options: Any) -> Any:
+    __tracebackhide__ = True
+    return _judge(method, lambda: (_image("reference", reference), _image("test", test)), options)
+
+
+def _assert_unbiased(
+    render: Callable[[int], Any], reference: Picture | Callable[[int], Any], runs: int = RUNS, seed: int = 0,
+    **options: Any,
+) -> Any:  # fmt: skip
+    __tracebackhide__ = True
+    if runs < 2:
+        raise ValueError(f"runs = {runs}: accepted: at least 2, or the noise is not known")
+
+    def sides() -> tuple[list[Any], list[Any]]:
+        if callable(reference):
+            first = seed + REFERENCE_SEED
+            references = [_image(f"reference {i}", reference(i)) for i in range(first, first + runs)]
+        else:
+            references = [_image("", path) for path in _files(Path(reference))]
+        return references, [_image(f"test {i}", render(i)) for i in range(seed, seed + runs)]
+
+    return _judge("welch", sides, options)
+
+
+def _judge(method: str, sides: Callable[[], tuple[Any, Any]], options: dict[str, Any]) -> Any:
+    __tracebackhide__ = True
+    from .compare import compare
+    from .judgement import Verdict
+
+    try:
+        found = compare(method, *sides(), **options)
+    except (ValueError, OSError) as error:
+        pytest.fail(f"could not compare: {error}", pytrace=False)
+    if found.verdict is not Verdict.EQUAL:
+        numbers = [f"  {x.name}: {x.value:.6g}" + _bound(x.bound) for x in found.figures]
+        pytest.fail("\n".join([f"{found.method}: {found.verdict}: {found.reason}", *numbers]), pytrace=False)
+    return found
+
+
+def _bound(bound: float | None) -> str:
+    return "" if bound is None else f", at most {bound:.6g}"
+
+
+def _files(folder: Path) -> list[Path]:
+    """The files in a folder of renders, hidden ones left out."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder of reference renders")
+    return sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+
+
+def _image(name: str, picture: Picture) -> Any:
+    from . import images
+
+    if isinstance(picture, str | os.PathLike):
+        return images.read(picture)
+    pixels = np.array(picture)
+    if pixels.ndim not in (2, 3) or not pixels.size or pixels.dtype.kind not in "fiub":
+        raise ValueError(f"{name}: array of shape {pixels.shape}; accepted: numbers, height × width × channels")
+    pixels = pixels.astype(np.float64 if pixels.dtype == np.float64 else np.float32)
+    return images.named(name, pixels)
