@@ -130,6 +130,21 @@ def read(path: str | os.PathLike[str]) -> Image:
         source.close()
 
 
+def named(name: str, pixels: Any) -> Image:
+    """An array, height × width × channels or height × width, as a picture with a name instead of a file.
+
+    Channels are R, G, B (A) where there are three or four, else channel0 and so on. Integers are kept as they are.
+    ValueError for another shape, or what are no numbers.
+    """
+    pixels = np.asarray(pixels)
+    if pixels.ndim not in (2, 3) or not pixels.size or pixels.dtype.kind not in "fiu":
+        raise ValueError(f"{name}: {pixels.dtype} {pixels.shape}; accepted: numbers, height × width × channels")
+    pixels = pixels.reshape(*pixels.shape[:2], -1).astype(np.float64 if pixels.dtype == np.float64 else np.float32)
+    count = pixels.shape[2]
+    channels = tuple("RGBA"[:count]) if 3 <= count <= 4 else tuple(f"channel{i}" for i in range(count))
+    return Image(Path(name), pixels, channels)
+
+
 def _picture(path: Path, source: Any, kind: str) -> Image:
     spec = source.spec()
     found = source.format_name()
