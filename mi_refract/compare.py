@@ -23,6 +23,7 @@ __all__ = ["METHODS", "Comparison", "Figure", "Image", "Method", "Option", "Pair
 __all__ += ["exact", "flip", "gates", "paired", "paired_images", "relative_mse", "tolerance", "welch", "welch_images"]
 __all__ += ["encoding", "flip_map"]
 
+RGB = ("R", "G", "B")
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear Rec. 709
 
 
@@ -165,7 +166,7 @@ def encoding(image: Image) -> str:
 
 def _linear(image: Image) -> np.ndarray:
     names = _colours(image)
-    if len(names) not in (1, 3):
+    if names != RGB and len(names) != 1:
         raise ValueError(f"{image.path}: channels {', '.join(names)}; accepted by FLIP: R, G, B, or one")
     pixels = np.nan_to_num(image.select(names).astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
     if encoding(image) == "sRGB":
@@ -174,7 +175,7 @@ def _linear(image: Image) -> np.ndarray:
 
 
 def _colours(image: Image) -> tuple[str, ...]:
-    return ("R", "G", "B") if set("RGB") <= set(image.channels) else image.channels
+    return RGB if set(RGB) <= set(image.channels) else image.channels
 
 
 def _buffer(pixels: np.ndarray) -> Any:

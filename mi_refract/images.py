@@ -121,7 +121,7 @@ def read(path: str | os.PathLike[str]) -> Image:
     config.attribute("oiio:UnassociatedAlpha", 1)  # else colours under a transparent alpha are read as black
     source = oiio.ImageInput.open(str(path), config)
     if source is None:
-        raise ValueError(f"{path}: corrupt {kind} file: {one_line(oiio.geterror())}")
+        raise ValueError(f"{path}: corrupt {kind} file: {_without(path, oiio.geterror())}")
     try:
         return _picture(path, source, kind)
     except MemoryError:
@@ -159,13 +159,18 @@ def _picture(path: Path, source: Any, kind: str) -> Image:
         raise ValueError(f"{path}: integers of 64 bits; accepted: up to 32")
     wide = formats & {"double", "uint32", "int32", "uint", "int"}
     pixels = source.read_image("double" if wide else "float")
-    if message := one_line(source.geterror()) or ("" if pixels is not None else "no pixels"):
+    if message := _without(path, source.geterror()) or ("" if pixels is not None else "no pixels"):
         raise ValueError(f"{path}: corrupt {kind} file: {message}")
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
     if source.seek_subimage(1, 0):
         raise ValueError(f"{path}: several parts in one file; accepted: one picture")
     metadata = {attribute.name: attribute.value for attribute in spec.extra_attribs}
     return Image(path, pixels, tuple(spec.channelnames), (spec.x, spec.y), metadata)
+
+
+def _without(path: Path, message: str) -> str:
+    """OpenImageIO's words on one line, without the path that some of its readers put into them."""
+    return one_line(message.replace(f"EXR Error ({path}): ", "").replace(str(path), path.name))
 
 
 def _endings(name: str) -> list[str]:

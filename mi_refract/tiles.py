@@ -76,12 +76,13 @@ def from_renders(renders: Sequence[Array], tile: int) -> Side:
         for row, render in zip(rows, renders, strict=True):
             row[...] = render[top : top + tile]
         each = np.add.reduceat(rows.sum(1), columns, -2)
-        rows -= rows.mean(0)
+        with np.errstate(invalid="ignore"):
+            rows -= rows.mean(0)
         variance = np.einsum("n...,n...->...", rows, rows) / (len(rows) * (len(rows) - 1))
         noise = np.stack([variance.sum(0), np.einsum("y...,y...->...", variance, variance)])
         return each, np.add.reduceat(noise, columns, -2)
 
-    with np.errstate(invalid="ignore"), ThreadPoolExecutor(WORKERS) as pool:
+    with ThreadPoolExecutor(WORKERS) as pool:
         each, noise = (np.stack(x, -3) for x in zip(*pool.map(band, range(0, height, tile)), strict=True))
     return Side(_area(height, width, tile), each.mean(0), noise[0], noise[1], len(renders) - 1.0, each)
 
@@ -162,11 +163,12 @@ def sidak(family_error: float, count: int) -> float:
 
 
 def holm(p: Array, family_error: float) -> float:
-    """The largest p that Holm's step-down rejects (1979); below every p where it rejects none."""
+    """The p below which a test is an alarm by Holm's step-down (1979): its first step, or the last one rejected."""
+    first = family_error / max(p.size, 1)
     ordered = np.sort(p, axis=None)
     kept = np.flatnonzero(ordered > family_error / np.arange(ordered.size, 0, -1))
-    rejected = kept[0] if kept.size else ordered.size
-    return float(ordered[rejected - 1]) if rejected else -1.0
+    rejected = ordered[: kept[0]] if kept.size else ordered
+    return max(first, float(rejected[-1])) if rejected.size else first
 
 
 def benjamini_hochberg(p: Array) -> Array:
