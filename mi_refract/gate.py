@@ -38,7 +38,7 @@ OWN_RENDERS, OWN_SPP = 16, 16
 TERMS = {
     "size": "of a defect: relative change of a tile's mean, there where it is largest compared with the noise",
     "detectable": "smallest relative difference that `welch` prints, median over the trials",
-    "size / detectable": "detectable being what is printed, times the noise of that tile over the median tile's",
+    "size / detectable": "detectable being what is printed, more in tiles noisier than the median one",
     "missed": "trials in which a method missed what was due: see the introduction",
     "bound": f"{CONFIDENCE:.0%} upper bound of a rate, exact binomial (Clopper and Pearson)",
     "noise": "standard deviation of a pixel over its mean, median over the picture",
@@ -210,7 +210,7 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
 def _sizes(changes: np.ndarray, clean: np.ndarray, tallies: dict[str, Tally]) -> dict[str, float]:
     """Of the tile and channel where the change is largest compared with what could be detected there.
 
-    What is printed is a median over tiles; where a tile is noisier than the median tile, it is so much more.
+    What is printed is a median over tiles; in a tile noisier than the median one it is so much more.
     """
     printed = [x for method, tally in tallies.items() if METHODS[method].samples for x in tally.detectable]
     if not printed or len(clean) < 2:
@@ -221,7 +221,8 @@ def _sizes(changes: np.ndarray, clean: np.ndarray, tallies: dict[str, Tally]) ->
         return {}
     relative, noise = np.abs(changes.mean(0))[noisy] / np.abs(mean[noisy]), deviation[noisy] / np.abs(mean[noisy])
     detectable = float(np.median(printed))
-    share = relative / (detectable * noise / np.median(noise))
+    # A tile that is quieter than the median one gets no credit: few renders make some look quiet by chance.
+    share = relative / (detectable * np.maximum(noise / np.median(noise), 1))
     return {"size": float(relative[share.argmax()]), "size / detectable": float(share.max()), "detectable": detectable}
 
 

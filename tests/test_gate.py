@@ -15,7 +15,7 @@ from validation import gate as study
 PICTURE = 0.2 + 0.8 * np.random.default_rng(5).random((32, 32, 3))
 
 
-def renders(count, seed=1, spread=0.04):
+def renders(count, seed=1, spread=0.02):
     """Independent noisy renders of one picture, of a skewed distribution."""
     shape = spread**-2
     return PICTURE * np.random.default_rng(seed).gamma(shape, 1 / shape, (count, *PICTURE.shape))
@@ -42,9 +42,9 @@ def test_what_is_due_is_seen(found, name):
 
 def test_the_size_of_a_defect_is_measured(found):
     assert found["gain"].values["size"] == pytest.approx(0.01, rel=1e-3)
-    assert found["gain"].values["size / detectable"] > 1  # 0.04/√(256 × 6) a tile: due
+    assert found["gain"].values["size / detectable"] > 1  # 0.02/√(256 × 6) a tile: due
     assert found["gain"].values["welch"] == 1
-    assert found["renders"].values["noise"] == pytest.approx(0.04, rel=0.1)
+    assert found["renders"].values["noise"] == pytest.approx(0.02, rel=0.1)
 
 
 def test_equal_pairs_alarm_nowhere(found):
