@@ -259,7 +259,7 @@ def _null_row(method: str, tally: Tally, case: str, setting: str, independent: b
     if independent and METHODS[method].samples:
         budget = "bound"
         values[budget] = tally.bound
-    if tally.detectable:
+    if tally.detectable and METHODS[method].samples:
         values["detectable"] = float(np.median(tally.detectable))
     return Row(STUDY, f"null pairs, {method}", case, setting, values, {budget: FALSE_ALARMS})
 
