@@ -140,7 +140,7 @@ def named(name: str, pixels: Any) -> Image:
     pixels = np.asarray(pixels)
     if pixels.ndim not in (2, 3) or not pixels.size or pixels.dtype.kind not in "fiu":
         raise ValueError(f"{name}: {pixels.dtype} {pixels.shape}; accepted: numbers, height × width × channels")
-    pixels = pixels.reshape(*pixels.shape[:2], -1).astype(np.float64 if pixels.dtype == np.float64 else np.float32)
+    pixels = pixels.reshape(*pixels.shape[:2], -1).astype(np.result_type(pixels.dtype, np.float32))
     count = pixels.shape[2]
     channels = tuple("RGBA"[:count]) if 3 <= count <= 4 else tuple(f"channel{i}" for i in range(count))
     return Image(Path(name), pixels, channels)
