@@ -5,7 +5,7 @@ takes samples, about clean renders and spoilt ones of other seeds. Seen is what 
 compare; "inconclusive" is counted as not seen. A row per defect: the share of trials in which each method saw it.
 
 Due, so that missing it fails the row: what is not finite, not of the same size, or not readable, for every method; a
-change of any bit, for `exact`; and for a method that prints what it can detect, a defect larger than that.
+change of any bit, for `exact`; and for a method that knows noise, a defect larger than what it prints as detectable.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from . import compare, images
-from .compare import METHODS, Verdict
+from .compare import METHODS
+from .diff import sample_pictures
+from .judgement import Verdict
 from .rows import Row
 
 Renders = np.ndarray | list[np.ndarray]  # of one picture; a list where one of them is of another size
@@ -32,10 +34,11 @@ FALSE_ALARMS = 0.01  # at most this share of equal pairs
 CONFIDENCE = 0.95  # of the bound on that share, one-sided
 SEED = 2026
 RENDERS = 4  # at least: two a side
+OWN_RENDERS, OWN_SPP = 16, 16
 TERMS = {
     "size": "of a defect: relative change of a tile's mean, there where it is largest compared with the noise",
     "detectable": "smallest relative difference that `welch` prints, median over the trials",
-    "size / detectable": "detectable being what is printed, times the noise of that tile over the median tile's",
+    "size / detectable": "detectable being what is printed, more in tiles noisier than the median one",
     "missed": "trials in which a method missed what was due: see the introduction",
     "bound": f"{CONFIDENCE:.0%} upper bound of a rate, exact binomial (Clopper and Pearson)",
     "noise": "standard deviation of a pixel over its mean, median over the picture",
@@ -89,11 +92,18 @@ def _in_8_bits(picture: np.ndarray) -> np.ndarray:
 
 def _truncated(picture: np.ndarray) -> np.ndarray:
     """Through a file that lost its second half."""
+    return _through_a_file(picture, share=0.5)
+
+
+def _through_a_file(picture: np.ndarray, share: float = 1.0) -> np.ndarray:
+    """Written, cut to a share of the bytes, and read again. ValueError for what cannot be read."""
+    channels = images.named("", picture).channels
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "truncated.exr"
-        images.write_exr(path, picture, _names(picture))
-        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-        return images.read(path).pixels
+        path = Path(folder) / "picture.exr"
+        images.write_exr(path, picture, channels)
+        written = path.read_bytes()
+        path.write_bytes(written[: int(share * len(written))])
+        return images.read(path).select(channels)
 
 
 DEFECTS = {
@@ -148,7 +158,7 @@ class Tally:
 
     def ask(self, method: str, reference: Renders, test: Renders) -> None:
         """Of the first picture a side, or of all where the method takes samples. A refusal counts as seen."""
-        sides = [[_image(name, x) for x in side] for name, side in (("reference", reference), ("test", test))]
+        sides = [[images.named(name, x) for x in side] for name, side in (("reference", reference), ("test", test))]
         whole = METHODS[method].samples
         self.trials += 1
         try:
@@ -160,15 +170,6 @@ class Tally:
         self.inconclusive += found.verdict is Verdict.INCONCLUSIVE
         if math.isfinite(found.detectable):
             self.detectable.append(found.detectable)
-
-
-def _image(name: str, picture: np.ndarray) -> images.Image:
-    return images.Image(Path(f"{name}.exr"), np.asarray(picture, dtype=np.float32), _names(picture))
-
-
-def _names(picture: np.ndarray) -> tuple[str, ...]:
-    count = picture.shape[2]
-    return ("R", "G", "B", "A")[:count] if 3 <= count <= 4 else tuple(f"channel{i}" for i in range(count))
 
 
 def _asked(renders: np.ndarray) -> list[str]:
@@ -199,7 +200,7 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
             changes.append(np.mean([_tiles(picture) for picture in spoilt], 0) - np.mean(cleans[-1], 0))
     sizes = _sizes(np.array(changes), np.concatenate(cleans), tallies) if cleans else {}
     large = sizes.get("size / detectable", 0.0) > 1
-    due = [m for m in tallies if always_due or m == "exact" or (large and tallies[m].detectable)]
+    due = [m for m in tallies if always_due or m == "exact" or (large and METHODS[m].samples)]
     values = {method: tally.rate for method, tally in tallies.items()}
     values |= {"missed": float(sum(tallies[m].trials - tallies[m].seen for m in due)), **sizes}
     replay = {"trials": len(trials), "renders a side": len(trials[0].clean), "due": due}
@@ -209,9 +210,9 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
 def _sizes(changes: np.ndarray, clean: np.ndarray, tallies: dict[str, Tally]) -> dict[str, float]:
     """Of the tile and channel where the change is largest compared with what could be detected there.
 
-    What is printed is a median over tiles; where a tile is noisier than the median tile, it is so much more.
+    What is printed is a median over tiles; in a tile noisier than the median one it is so much more.
     """
-    printed = [x for tally in tallies.values() for x in tally.detectable]
+    printed = [x for method, tally in tallies.items() if METHODS[method].samples for x in tally.detectable]
     if not printed or len(clean) < 2:
         return {}
     mean, deviation = clean.mean(0), clean.std(0, ddof=1)
@@ -220,7 +221,8 @@ def _sizes(changes: np.ndarray, clean: np.ndarray, tallies: dict[str, Tally]) ->
         return {}
     relative, noise = np.abs(changes.mean(0))[noisy] / np.abs(mean[noisy]), deviation[noisy] / np.abs(mean[noisy])
     detectable = float(np.median(printed))
-    share = relative / (detectable * noise / np.median(noise))
+    # A tile that is quieter than the median one gets no credit: few renders make some look quiet by chance.
+    share = relative / (detectable * np.maximum(noise / np.median(noise), 1))
     return {"size": float(relative[share.argmax()]), "size / detectable": float(share.max()), "detectable": detectable}
 
 
@@ -257,7 +259,7 @@ def _null_row(method: str, tally: Tally, case: str, setting: str, independent: b
     if independent and METHODS[method].samples:
         budget = "bound"
         values[budget] = tally.bound
-    if tally.detectable:
+    if tally.detectable and METHODS[method].samples:
         values["detectable"] = float(np.median(tally.detectable))
     return Row(STUDY, f"null pairs, {method}", case, setting, values, {budget: FALSE_ALARMS})
 
@@ -265,15 +267,64 @@ def _null_row(method: str, tally: Tally, case: str, setting: str, independent: b
 # Given pictures ------------------------------------------------------------------------------------------------
 
 
-def self_test(renders: np.ndarray, case: str, trials: int = TRIALS, null_pairs: int = NULL_PAIRS) -> list[Row]:
-    """Every defect and the null pairs on given renders of one picture (number, height, width, channels), finite.
+def self_test(path: Path | None = None) -> int:
+    """Prints what is seen in the renders of a folder, in one picture, or in our own; 1 where anything due is missed."""
+    if path is None:
+        renders = _own_renders()
+    else:
+        pictures = sample_pictures(path) if path.is_dir() else [images.read(path)]
+        renders = _stacked(pictures)
+    rows = examine(renders, str(path or "a glass ball"))
+    print(text(rows))
+    return int(any(row.verdict == "fail" for row in rows))
+
+
+def _stacked(pictures: list[images.Image]) -> np.ndarray:
+    first = pictures[0]
+    for picture in pictures[1:]:
+        if picture.pixels.shape[:2] != first.pixels.shape[:2] or set(picture.channels) != set(first.channels):
+            raise ValueError(f"{picture.path}: size or channels differ from those of {first.path}")
+    return np.stack([picture.select(first.channels) for picture in pictures])
+
+
+def _own_renders() -> np.ndarray:
+    """A glass ball on a floor under a sky and a lamp."""
+    from . import backend
+
+    backend.activate(may_restart=True)
+    import mitsuba as mi
+
+    look = mi.ScalarTransform4f().look_at
+    scene = mi.load_dict({
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 16, "rr_depth": 16},
+        "sensor": {
+            "type": "perspective", "fov": 40, "to_world": look([0, -5, 2.5], [0, 0, 0.8], [0, 0, 1]),
+            "film": {"type": "hdrfilm", "width": 64, "height": 64, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
+        },
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.6, 0.8, 1.0]}},
+        "lamp": {
+            "type": "rectangle", "to_world": look([3, -2, 5], [0, 0, 0], [0, 0, 1]),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [3.0, 2.5, 2.0]}},
+        },
+        "floor": {
+            "type": "rectangle", "to_world": mi.ScalarTransform4f().scale(8),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}},
+        },
+        "ball": {"type": "sphere", "center": [0, 0, 1], "bsdf": {"type": "refract"}},
+    })  # fmt: skip
+    return np.stack([np.array(mi.render(scene, spp=OWN_SPP, seed=seed)) for seed in range(OWN_RENDERS)])
+
+
+def examine(renders: np.ndarray, case: str, trials: int = TRIALS, null_pairs: int = NULL_PAIRS) -> list[Row]:
+    """Every defect and the null pairs on given renders of one picture (number, height, width, channels).
 
     Four or more of them, of independent seeds, are split in halves at random; fewer are asked of one by one. ValueError
     for renders that are not finite: what is planted in them could not be told from what was there.
     """
     if not len(renders) or not np.isfinite(renders).all():
         raise ValueError(f"{case}: accepted for a self-test: one or more renders, every value of them finite")
-    rng = np.random.default_rng(SEED)
+    rng, renders = np.random.default_rng(SEED), renders.astype(np.float32)  # as files hold them
     half = len(renders) // 2 if len(renders) >= RENDERS else 0
     setting = f"{len(renders)} renders" if len(renders) > 1 else "1 render"
     rows = []
@@ -281,10 +332,11 @@ def self_test(renders: np.ndarray, case: str, trials: int = TRIALS, null_pairs: 
         planted = [_split(renders, half, defect, rng) for _ in range(trials)]
         rows.append(detection(name, defect.always_due, planted, case, setting))
     splits = (_halves(renders, half, rng) for _ in range(null_pairs if half else 0))
-    repeats = ((renders[[i]], _rewritten(renders[i])[None]) for i in range(len(renders)))
+    repeats = ((renders[[i]], _through_a_file(renders[i])[None]) for i in range(len(renders)))
     rows += false_alarms(splits, repeats, case, setting, independent=False)
-    values = {"noise": noise(renders)} if half else {}
-    return [*rows, Row(STUDY, "renders", case, setting, values, reason="noise is not known of fewer than four renders")]
+    if half:
+        return [*rows, Row(STUDY, "renders", case, setting, {"noise": noise(renders)})]
+    return [*rows, Row(STUDY, "renders", case, setting, reason="of fewer than four renders the noise is not known")]
 
 
 def noise(renders: np.ndarray) -> float:
@@ -307,15 +359,8 @@ def _halves(renders: np.ndarray, half: int, rng: np.random.Generator) -> tuple[n
     return renders[order[:half]], renders[order[half : 2 * half]]
 
 
-def _rewritten(picture: np.ndarray) -> np.ndarray:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "again.exr"
-        images.write_exr(path, picture, _names(picture))
-        return images.read(path).select(_names(picture))
-
-
 def text(rows: Sequence[Row]) -> str:
-    """A table of what `self_test` found: a line per defect, a column per method, and what did not hold."""
+    """A table of what `examine` found: a line per defect, a column per method, and what did not hold."""
     methods = list(METHODS)
     lines = [f"{'seen':18}" + "".join(f"{name:>11}" for name in methods) + f"{'size':>11}"]
     for row in rows:

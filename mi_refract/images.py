@@ -131,6 +131,21 @@ def read(path: str | os.PathLike[str]) -> Image:
         source.close()
 
 
+def named(name: str, pixels: Any) -> Image:
+    """An array, height × width × channels or height × width, as a picture with a name instead of a file.
+
+    Channels are R, G, B (A) where there are three or four, else channel0 and so on. Integers are kept as they are.
+    ValueError for another shape, or what are no numbers.
+    """
+    pixels = np.asarray(pixels)
+    if pixels.ndim not in (2, 3) or not pixels.size or pixels.dtype.kind not in "fiu":
+        raise ValueError(f"{name}: {pixels.dtype} {pixels.shape}; accepted: numbers, height × width × channels")
+    pixels = pixels.reshape(*pixels.shape[:2], -1).astype(np.result_type(pixels.dtype, np.float32))
+    count = pixels.shape[2]
+    channels = tuple("RGBA"[:count]) if 3 <= count <= 4 else tuple(f"channel{i}" for i in range(count))
+    return Image(Path(name), pixels, channels)
+
+
 def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Image]:
     """Several pictures, two at a time: unpacking takes most of the time of a comparison. Errors: those of `read`."""
     with ThreadPoolExecutor(2) as pool:

@@ -13,10 +13,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
 import pytest
 
-Picture = str | os.PathLike[str] | Any  # a file, or what numpy makes an array of
+Picture = Any  # the path of a file, or what numpy makes an array of
 RUNS = 8
 REFERENCE_SEED = 1 << 16  # the first of a rendered reference: both sides must not share a seed
 
@@ -45,9 +44,9 @@ def assert_image_equal() -> AssertEqual:
 def assert_image_unbiased() -> AssertUnbiased:
     """`assert_image_unbiased(render, reference, runs=8, seed=0, **options)`: the means of renders must be equal.
 
-    `render(seed)` gives a picture; it is called with `runs` seeds from `seed` on. `reference` is a folder of independent
-    renders, or a function like `render`, called with as many other seeds. Welch's t-test with its options; inconclusive
-    fails, too: more runs or samples are needed then. Returns the comparison.
+    `render(seed)` gives a picture; it is called with `runs` seeds from `seed` on. `reference` is a folder of
+    independent renders, or a function like `render`, called with as many other seeds. Welch's t-test with its options;
+    inconclusive fails, too: more runs or samples are needed then. Returns the comparison.
     """
     return _assert_unbiased
 
@@ -65,12 +64,14 @@ def _assert_unbiased(
     if runs < 2:
         raise ValueError(f"runs = {runs}: accepted: at least 2, or the noise is not known")
 
+    from .diff import sample_pictures
+
     def sides() -> tuple[list[Any], list[Any]]:
         if callable(reference):
             first = seed + REFERENCE_SEED
             references = [_image(f"reference {i}", reference(i)) for i in range(first, first + runs)]
         else:
-            references = [_image("", path) for path in _files(Path(reference))]
+            references = sample_pictures(Path(reference))
         return references, [_image(f"test {i}", render(i)) for i in range(seed, seed + runs)]
 
     return _judge("welch", sides, options)
@@ -95,20 +96,7 @@ def _bound(bound: float | None) -> str:
     return "" if bound is None else f", at most {bound:.6g}"
 
 
-def _files(folder: Path) -> list[Path]:
-    """The files in a folder of renders, hidden ones left out."""
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder of reference renders")
-    return sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-
-
 def _image(name: str, picture: Picture) -> Any:
     from . import images
 
-    if isinstance(picture, str | os.PathLike):
-        return images.read(picture)
-    pixels = np.array(picture)
-    if pixels.ndim not in (2, 3) or not pixels.size or pixels.dtype.kind not in "fiub":
-        raise ValueError(f"{name}: array of shape {pixels.shape}; accepted: numbers, height × width × channels")
-    pixels = pixels.astype(np.float64 if pixels.dtype == np.float64 else np.float32)
-    return images.named(name, pixels)
+    return images.read(picture) if isinstance(picture, str | os.PathLike) else images.named(name, picture)

@@ -1,0 +1,103 @@
+"""The fixtures for pytest: here, and in a run of pytest of their own."""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mi_refract import images
+
+pytest_plugins = ["pytester", "mi_refract.pytest_plugin"]
+PICTURE = np.linspace(0.2, 1, 32 * 32 * 3).reshape(32, 32, 3)
+NANS = np.full((4, 4, 3), np.nan)
+
+
+def render(seed, gain=1.0):
+    return gain * PICTURE * np.random.default_rng(seed).gamma(400, 1 / 400, PICTURE.shape)
+
+
+def test_what_is_equal_passes(assert_image_equal, assert_image_unbiased, tmp_path):
+    assert assert_image_equal(PICTURE, PICTURE).method == "tolerance"
+    assert_image_equal(PICTURE + 1e-5, PICTURE, "tolerance")
+    assert_image_equal(PICTURE[..., 0], PICTURE[..., 0], "exact")
+    images.write_exr(tmp_path / "picture.exr", PICTURE)
+    assert_image_equal(PICTURE, tmp_path / "picture.exr", "paired")
+    assert_image_equal(str(tmp_path / "picture.exr"), tmp_path / "picture.exr", "exact")
+    assert assert_image_unbiased(render, render).method == "welch"
+    (tmp_path / "renders").mkdir()
+    for i in range(8):
+        images.write_exr(tmp_path / "renders" / f"{i}.exr", render(100 + i))
+    assert_image_unbiased(render, tmp_path / "renders", runs=6)
+
+
+@pytest.mark.parametrize(("test", "method", "options", "reason"), [
+    (PICTURE + 1e-5, "exact", {}, "exact: different: "),
+    (1.1 * PICTURE, "auto", {}, "tolerance: different: "),
+    (1.1 * PICTURE, "paired", {}, r"paired: different: (.|\n)*, at most "),
+    (PICTURE * np.nan, "exact", {}, "exact: different: "),
+    (PICTURE[:-1], "auto", {}, "could not compare: "),
+    ("missing.exr", "auto", {}, "could not compare: .*missing.exr"),
+    (["no numbers"], "auto", {}, "could not compare: "),
+    (PICTURE, "telepathy", {}, "could not compare: method 'telepathy': accepted: "),
+    (PICTURE, "exact", {"threshold": 1}, "could not compare: "),
+])  # fmt: skip
+def test_what_is_not_equal_fails_and_says_why(assert_image_equal, test, method, options, reason):
+    with pytest.raises(pytest.fail.Exception, match=reason):
+        assert_image_equal(test, PICTURE, method, **options)
+
+
+def test_not_even_nan_equals_itself_and_no_reference_is_made(assert_image_equal, tmp_path):
+    with pytest.raises(pytest.fail.Exception, match="different"):
+        assert_image_equal(NANS, NANS, "exact")
+    with pytest.raises(pytest.fail.Exception, match="could not compare: "):
+        assert_image_equal(PICTURE, tmp_path / "missing.exr")
+    assert not list(tmp_path.iterdir())
+
+
+def test_bias_fails_and_so_does_what_cannot_be_told(assert_image_unbiased, tmp_path):
+    with pytest.raises(pytest.fail.Exception, match="welch: different: "):
+        assert_image_unbiased(lambda seed: render(seed, 1.03), render)
+    with pytest.raises(pytest.fail.Exception, match="welch: inconclusive: "):
+        assert_image_unbiased(render, render, runs=2, resolution=1e-6)
+    for folder in (tmp_path, tmp_path / "none"):
+        with pytest.raises(pytest.fail.Exception, match="could not compare: "):
+            assert_image_unbiased(render, folder)
+    with pytest.raises(ValueError, match="runs = 1: accepted: at least 2"):
+        assert_image_unbiased(render, render, runs=1)
+
+
+def test_no_seed_is_rendered_on_both_sides(assert_image_unbiased):
+    seeds = {"test": [], "reference": []}
+
+    def watched(side):
+        return lambda seed: seeds[side].append(seed) or render(seed)
+
+    assert_image_unbiased(watched("test"), watched("reference"), runs=5, seed=7)
+    assert seeds["test"] == list(range(7, 12))
+    assert len(seeds["reference"]) == 5
+    assert not set(seeds["test"]) & set(seeds["reference"])
+
+
+def test_a_project_names_the_plugin_in_its_conftest(pytester):
+    """In a process of its own: a run inside this one would import extensions a second time, which they do not bear."""
+    pytester.makeconftest('pytest_plugins = ["mi_refract.pytest_plugin"]')
+    pytester.makepyfile("""
+        import numpy as np
+
+        def test_equal(assert_image_equal):
+            assert_image_equal(np.ones((8, 8, 3)), np.ones((8, 8, 3)))
+
+        def test_different(assert_image_equal):
+            assert_image_equal(np.ones((8, 8, 3)), np.zeros((8, 8, 3)))
+    """)
+    result = pytester.runpytest_subprocess("-p", "no:cacheprovider")
+    result.assert_outcomes(passed=1, failed=1)
+    result.stdout.fnmatch_lines(["*tolerance: different: *"])
+
+
+def test_the_plugin_itself_imports_no_renderer():
+    body = ast.parse(Path(images.__file__).with_name("pytest_plugin.py").read_text()).body
+    found = {alias.name for node in body if isinstance(node, ast.Import) for alias in node.names}
+    found |= {f"{'.' * node.level}{node.module}" for node in body if isinstance(node, ast.ImportFrom)}
+    assert found <= {"__future__", "collections.abc", "typing", "os", "pathlib", "pytest"}
