@@ -32,12 +32,12 @@ def exact(reference: Image, test: Image, *, allow_nonfinite: bool = False) -> Co
     a, b, found = entered("exact", reference, test, allow_nonfinite)
     if found:
         return found
-    difference = np.abs(b - a)
+    difference = _difference(a, b)
     changed = int((a != b).any(-1).sum())
     verdict = Verdict.DIFFERENT if changed else Verdict.EQUAL
     reason = f"{changed} of {a[..., 0].size} pixels differ" if changed else "every value is the same"
     figures = (Figure("changed pixels", changed, 0.0), Figure("largest difference", float(difference.max()), 0.0))
-    return Comparison("exact", verdict, reason, figures, 0.0, {"difference": difference.astype(np.float32)})
+    return Comparison("exact", verdict, reason, figures, 0.0, {"difference": difference})
 
 
 def tolerance(
@@ -75,7 +75,7 @@ def tolerance(
     reason = f"{failed:.3g} % of the pixels beyond the tolerance; largest difference {result.maxerror:.3g} at {place}"
     if warned > warn_percent or result.maxerror > hard_warn:
         reason += f"; warning: {warned:.3g} % of the pixels"
-    maps = {"difference": np.abs(b - a).astype(np.float32)}
+    maps = {"difference": _difference(a, b)}
     return Comparison("tolerance", _verdict(figures), reason, figures, maps=maps)
 
 
@@ -90,13 +90,14 @@ def paired_images(
 ) -> Comparison:
     """Renders of the same random numbers: the share of changed pixels and the largest change.
 
-    Changes are relative to the reference's value, or to the mean of its absolute values where that is larger.
+    Changes are relative to the reference's value, or to the mean of its channel where that is larger.
     """
     _not_negative(locals())
     a, b, found = entered("paired", reference, test, allow_nonfinite)
     if found:
         return found
-    scale = np.maximum(np.abs(a), np.abs(a).mean() or 1.0)
+    usual = np.abs(a).mean((0, 1))
+    scale = np.maximum(np.abs(a), np.where(usual > 0, usual, usual.mean() or 1.0))
     measured = paired(a / scale, b / scale, threshold)
     figures = (
         Figure("share of changed pixels", measured.changed, changed),
@@ -105,7 +106,7 @@ def paired_images(
         Figure("ratio of the means", float(b.mean() / a.mean()) if a.any() else 1.0 + float(b.mean())),
     )
     reason = f"{measured.changed:.3%} of the pixels are changed, the largest by {measured.largest:.3g} of its value"
-    maps = {"difference": np.abs(b - a).astype(np.float32)}
+    maps = {"difference": _difference(a, b)}
     return Comparison("paired", _verdict(figures), reason, figures, threshold, maps)
 
 
@@ -176,6 +177,11 @@ def _linear(image: Image) -> np.ndarray:
 
 def _colours(image: Image) -> tuple[str, ...]:
     return RGB if set(RGB) <= set(image.channels) else image.channels
+
+
+def _difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    difference = b - a
+    return np.abs(difference, out=difference).astype(np.float32, copy=False)
 
 
 def _buffer(pixels: np.ndarray) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -21,10 +22,18 @@ VARIANCES = ("{}.variance", "{}.Variance", "variance.{}", "Variance.{}", "varian
 
 @dataclass(frozen=True)
 class _Asked:
-    """What the levels of tiles say at one family error."""
+    """What the levels of tiles say at one family error; `p` of all tiles with noise."""
 
     levels: list[tiles.Level]
-    threshold: float
+    p: np.ndarray
+    family_error: float
+    correction: str
+
+    @cached_property
+    def threshold(self) -> float:
+        if self.correction == "holm":
+            return tiles.holm(self.p, self.family_error)
+        return tiles.sidak(self.family_error, self.p.size)
 
     def lit(self, level: tiles.Level) -> np.ndarray:
         return (level.beyond <= self.threshold) & ~level.silent
@@ -69,11 +78,13 @@ def welch_images(
             return refused("welch", reason, reference[0].pixels, aligned(reference[0], image)[1])
     one, two, channels = _sides(reference, test, tile, spp)
     levels = list(tiles.levels(one, two, margin))
-    p = np.concatenate([level.beyond[~level.silent] for level in levels])
-    threshold = tiles.sidak(family_error, p.size) if correction == "sidak" else tiles.holm(p, family_error)
-    asked = _Asked(levels, threshold)
-    untested = [name for name in reference[0].channels if name not in channels]
-    return _judged(asked, p, family_error, resolution, tile, reference[0].pixels.shape, untested)
+    asked = _Asked(levels, np.concatenate([level.beyond[~level.silent] for level in levels]), family_error, correction)
+    verdict, reason = _verdict(asked, resolution)
+    if untested := [name for name in reference[0].channels if name not in channels]:
+        reason += f"; not tested: {', '.join(untested)}"
+    maps = _maps(levels[0], tile, reference[0].pixels.shape)
+    figures = _figures(asked, family_error, resolution)
+    return Comparison("welch", verdict, reason, figures, asked.detectable(0), maps)
 
 
 def _check(tile: int, family_error: float, correction: str, margin: float, resolution: float) -> None:
@@ -144,42 +155,35 @@ def _moments(image: Image, pairs: dict[str, tuple[str, bool]], tile: int, spp: i
     return tiles.from_variances(mean, np.maximum(variance, 0), spp - 1.0, tile)
 
 
-def _judged(
-    asked: _Asked, p: np.ndarray, family_error: float, resolution: float, tile: int, shape: tuple[int, ...],
-    untested: Sequence[str],
-) -> Comparison:  # fmt: skip
-    finest = asked.levels[0]
-    off, heavy = int(finest.off.sum()), int(finest.heavy.sum())
-    visible = asked.detectable(0)
-    count = finest.t.size
+def _verdict(asked: _Asked, resolution: float) -> tuple[Verdict, str]:
+    off, visible = int(asked.levels[0].off.sum()), asked.detectable(0)
     if asked.alarms:
-        verdict, reason = Verdict.DIFFERENT, f"{asked.alarms} of {p.size} tests of tiles and channels differ"
-    elif off or asked.doubtful:
-        verdict = Verdict.INCONCLUSIVE
-        reason = f"differences only where a t-test knows little: {off} tiles noise-free, {asked.doubtful} heavy-tailed"
-    elif not p.size:
-        verdict, reason = Verdict.EQUAL, "no noise, and no tile differs beyond the margin"
-    elif not visible <= resolution:
-        verdict = Verdict.INCONCLUSIVE
-        reason = f"no difference is seen, but the noise would hide one of {visible:.2g} in a tile"
-    else:
-        verdict, reason = Verdict.EQUAL, f"no difference; one of {visible:.2g} in a tile would have been seen"
-    if untested:
-        reason += f"; not tested: {', '.join(untested)}"
-    smallest = float(p.min()) if p.size else 1.0
-    figures = (
+        return Verdict.DIFFERENT, f"{asked.alarms} of {asked.p.size} tests of tiles and channels differ"
+    if off or asked.doubtful:
+        where = f"{off} tiles noise-free, {asked.doubtful} heavy-tailed"
+        return Verdict.INCONCLUSIVE, f"differences only where a t-test knows little: {where}"
+    if not asked.p.size:
+        return Verdict.EQUAL, "no noise, and no tile differs beyond the margin"
+    if not visible <= resolution:
+        return Verdict.INCONCLUSIVE, f"no difference is seen, but the noise would hide one of {visible:.2g} in a tile"
+    return Verdict.EQUAL, f"no difference; one of {visible:.2g} in a tile would have been seen"
+
+
+def _figures(asked: _Asked, family_error: float, resolution: float) -> tuple[Figure, ...]:
+    finest, p = asked.levels[0], asked.p
+    smallest = min(float(p.min()), 1 - 1e-16) if p.size else 1 - 1e-16
+    return (
         Figure("tests of tiles and channels that differ", asked.alarms, 0.0),
-        Figure("probability of such a smallest p, or smaller, for equal pictures",
-               float(-np.expm1(p.size * np.log1p(-min(smallest, 1 - 1e-16))))),
+        Figure("smallest p, adjusted for the number of tests", float(-np.expm1(p.size * np.log1p(-smallest)))),
         Figure("family error", family_error),
-        Figure("tiles and channels", count),
+        Figure("tiles and channels", finest.t.size),
         Figure("tiles without noise", int(finest.silent.sum())),
-        Figure("tiles without noise that differ", off, 0.0),
-        Figure("heavy-tailed tiles", heavy),
-        Figure("detectable relative difference in a tile", visible, resolution),
+        Figure("tiles without noise that differ", int(finest.off.sum()), 0.0),
+        Figure("heavy-tailed tiles", int(finest.heavy.sum())),
+        Figure("heavy-tailed tiles and blocks that differ", asked.doubtful, 0.0),
+        Figure("detectable relative difference in a tile", asked.detectable(0), resolution),
         Figure("detectable relative difference of the whole picture", asked.detectable(-1)),
-    )  # fmt: skip
-    return Comparison("welch", verdict, reason, figures, visible, _maps(finest, tile, shape))
+    )
 
 
 def _maps(level: tiles.Level, tile: int, shape: tuple[int, ...]) -> Maps:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-DARK = 1e-3  # a tile darker than this share of the picture's mean counts as that bright where shares are asked for
+DARK = 1e-3  # a tile darker than this share of its channel's mean counts as that bright where shares are asked for
 GROWTH = 4  # from one level of tiles to the next
 HEAVY = 4.0  # a tile whose noise comes from fewer pixels than this is heavy-tailed: its t is not a Student's
 POOLED = 30  # tiles from which the correlation of pixels is estimated, at least
@@ -121,7 +121,7 @@ class Level:
         """Relative differences seen with probability 1 − MISSED at that p, of the tiles with light and noise."""
         from scipy import special
 
-        asked = ~self.silent & (self.mean > DARK * self.mean.mean())
+        asked = ~self.silent & (self.mean > DARK * self.mean.mean((0, 1)))
         freedom = self.freedom[asked]
         reach = -special.stdtrit(freedom, threshold / 2) - special.stdtrit(freedom, MISSED)
         return (reach * self.error[asked] + self.allowed[asked]) / self.mean[asked]
@@ -146,7 +146,7 @@ def compare_tiles(one: Side, two: Side, margin: float, inflations: tuple[float, 
         m1, m2 = one.mean / one.area, two.mean / two.area
         v1, d1 = one.spread(inflations[0])
         v2, d2 = two.spread(inflations[1])
-        variance, allowed = v1 + v2, margin * np.maximum(np.abs(m1), DARK * np.abs(m1).mean())
+        variance, allowed = v1 + v2, margin * np.maximum(np.abs(m1), DARK * np.abs(m1).mean((0, 1)))
         silent, error, difference = variance == 0, np.sqrt(variance), m2 - m1
         freedom = np.where(silent, 1.0, variance**2 / (d1 + d2))
         t = np.where(silent, 0.0, difference / error)
@@ -198,7 +198,7 @@ class Welch:
 def welch(reference: Array, test: Array, tile: int, family_error: float, margin: float = 0.0) -> Welch:
     """The test of single tiles of two stacks of independent renders, (renders, height, width, channels).
 
-    Means that differ by no more than `margin`, relative to the tile's or to a thousandth of the picture's, are equal
+    Means that differ by no more than `margin`, relative to the tile's or to a thousandth of the channel's, are equal
     for all practical purposes: the test asks whether they differ by more. It keeps noise-free tiles from turning last
     bits into certainties. Pixels are taken for independent, as under a box filter.
 

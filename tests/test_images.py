@@ -9,6 +9,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from mi_refract import images
 from mi_refract.images import read, write_exr
 
 PIXELS = np.random.default_rng(1).random((48, 40, 3)).astype(np.float32)
@@ -34,6 +35,14 @@ def test_formats(tmp_path, name, kind, error):
     assert image.pixels.dtype == np.float32
     assert image.channels == ("R", "G", "B")
     np.testing.assert_allclose(image.pixels, PIXELS, atol=error, rtol=0)
+
+
+def test_several_at_once_keep_their_order_and_their_errors(tmp_path):
+    paths = [save(tmp_path / f"{i}.exr", PIXELS + i) for i in range(5)]
+    assert [image.path for image in images.read_all(paths)] == paths
+    paths[3].write_bytes(b"")
+    with pytest.raises(ValueError, match=r"3\.exr: corrupt"):
+        images.read_all(paths)
 
 
 def test_channels_window_and_header(tmp_path):

@@ -7,15 +7,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from mi_refract import compare
+from mi_refract import compare, tiles
 from mi_refract.compare import METHODS, Verdict, gates
 from mi_refract.images import Image
 
-RNG = np.random.default_rng(7)
 SMOOTH = np.dstack([np.linspace(0.1, 0.9, 48 * 40).reshape(40, 48) ** k for k in (1, 2, 3)]).astype(np.float32)
 SHAPE = (64, 64, 3)
 EQUAL, DIFFERENT, INCONCLUSIVE = Verdict.EQUAL, Verdict.DIFFERENT, Verdict.INCONCLUSIVE
+RNG = np.random.default_rng(7)
+
+
+@pytest.fixture(autouse=True)
+def seed(monkeypatch):
+    """Every test draws the same numbers, alone or among others."""
+    monkeypatch.setitem(globals(), "RNG", np.random.default_rng(7))
 
 
 def image(pixels, channels=("R", "G", "B"), **rest):
@@ -141,6 +148,19 @@ def test_paired_sees_many_small_changes_at_any_brightness():
     assert judge("paired", image(SMOOTH), few, largest=0.5).verdict is DIFFERENT
 
 
+@pytest.mark.parametrize("method", ["paired", "welch"])
+def test_a_channel_of_another_scale_hides_nothing(method):
+    reference, test = renders(8, deviation=0.1, shape=(64, 64, 1)), renders(8, deviation=0.1, shape=(64, 64, 1))
+    if method == "paired":
+        reference, test = reference[:1], [image(reference[0].pixels * 1.001, ("Y",))]
+    for each in test:
+        each.pixels[:] *= 1.3 if method == "welch" else 1
+    depth = np.full((64, 64, 1), 1e6)
+    two = [[image(np.dstack([each.pixels, depth]), ("Y", "Z")) for each in side] for side in (reference, test)]
+    assert compare.compare(method, *two).verdict is DIFFERENT
+    assert compare.compare(method, two[0], two[0]).verdict is EQUAL
+
+
 @pytest.mark.parametrize("hdr", ["yes", "no"])
 def test_flip_sees_a_shift_and_a_gain(hdr):
     lines = np.repeat((np.indices((40, 48))[1] // 4 % 2)[..., None], 3, 2) * 0.8 + 0.1
@@ -201,8 +221,9 @@ def test_a_tile_off_by_more_than_the_detectable_difference_is_seen(correction):
 
 
 def test_a_gain_too_small_for_a_tile_is_seen_in_the_whole_picture():
-    found = judge("welch", renders(8), renders(8, gain=1.02))
-    assert found.detectable > 0.02
+    found = judge("welch", renders(8), renders(8, gain=1.02), tile=4)
+    assert found.detectable > 0.1
+    assert np.abs(found.maps["t"]).max() < 5
     assert found.verdict is DIFFERENT
 
 
@@ -247,6 +268,15 @@ def test_the_same_seed_twice_is_an_error():
     side = renders(3)
     with pytest.raises(ValueError, match="accepted: independent renders"):
         judge("welch", [*side, replace(side[0], path=Path("b.exr"))], renders(4))
+
+
+def test_corrections_are_those_of_the_papers():
+    """Benjamini and Hochberg against SciPy; Holm on an example worked by hand: 0.05/4, /3, /2, /1."""
+    p = RNG.random((5, 4, 3)) ** 3
+    np.testing.assert_allclose(tiles.benjamini_hochberg(p), stats.false_discovery_control(p, axis=None))
+    assert tiles.holm(np.array([0.03, 0.01, 0.016, 0.9]), 0.05) == 0.016
+    assert tiles.holm(np.array([0.013, 0.02, 0.9, 0.04]), 0.05) == 0.0125
+    assert tiles.sidak(0.05, 2) == pytest.approx(1 - np.sqrt(0.95))
 
 
 def with_spread(count, kind, gain=1.0):
