@@ -92,7 +92,7 @@ def _line(result: Result) -> dict[str, Any]:
 
 def _figure(figure: compare.Figure) -> dict[str, str]:
     value, bound = figure.value, figure.bound
-    if bound is None:
+    if bound is None or value <= bound == math.inf:
         return {"name": figure.name, "text": compact(value), "limit": "", "state": "info"}
     text, limit = apart(value, bound)
     state, sign = ("pass", "≤") if value <= bound else ("fail", ">" if value > bound else "≰")

@@ -157,7 +157,7 @@ function probe(figure, x, y) {
     const at = channels * (line * canvas.width + column);
     const values = x === undefined ? [] : [...codes.subarray(at, at + channels)];
     pane.querySelector(".pixel").value = values.map((code) => reading(code, scale)).join("  ");
-    canvas.title = x === undefined ? "" : `${column}, ${line}`;
+    pane.querySelector(".place").value = x === undefined || isMap(canvas) ? "" : `${column}, ${line}`;
   }
 }
 

@@ -7,13 +7,12 @@ import itertools
 import json
 import math
 import re
-import shutil
-import subprocess
 import xml.etree.ElementTree as xml
 import zlib
 
 import numpy as np
 import pytest
+from browser import CHROMIUM, browse
 
 from mi_refract import report
 from mi_refract.figures import Axes, apart, compact, curves_svg, pareto
@@ -285,7 +284,6 @@ def test_a_broken_budget_never_looks_kept():
 
 # In a browser
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 PROBE = """<script>
 const wait = setInterval(() => {
   if (!root.dataset.ready) return;
@@ -310,18 +308,6 @@ const wait = setInterval(() => {
   root.dataset.seen = JSON.stringify(seen);
 }, 20);
 </script></body>"""
-
-
-def browse(page, profile):
-    """The page's DOM after its scripts ran, and whatever the console said."""
-    quiet = ("background-networking", "component-update", "sync", "gpu", "dev-shm-usage")
-    done = subprocess.run(
-        [CHROMIUM, "--headless", "--no-sandbox", *(f"--disable-{q}" for q in quiet), "--no-first-run",
-         f"--user-data-dir={profile}", "--enable-logging=stderr", "--virtual-time-budget=10000", "--dump-dom",
-         page.as_uri()],
-        capture_output=True, text=True, timeout=120, check=True,
-    )  # fmt: skip
-    return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PATH: the page's script was not run")
