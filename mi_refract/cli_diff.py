@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import importlib.util
 import shlex
 import sys
 from collections.abc import Sequence
@@ -70,6 +71,7 @@ def diff(
     ] = False,
 ) -> None:
     """Compare pictures with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
+    _require_extra()
     if self_test:
         raise typer.Exit(_self_test(reference, test))
     if test is None:
@@ -106,6 +108,7 @@ def accept(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
     """Copy the pictures that are not equal over their references, after showing them. Nothing is deleted."""
+    _require_extra()
     chosen = _settings(reference, method, options, settings, allow_nonfinite)
     found = engine.diff(reference, test, chosen, new=True)
     _say(found)
@@ -120,6 +123,12 @@ def accept(
     else:
         print("nothing accepted")
         raise typer.Exit(1)
+
+
+def _require_extra() -> None:
+    """ValueError where the packages that methods and report use are not installed: before anything is compared."""
+    if not all(map(importlib.util.find_spec, ("scipy", "jinja2"))):
+        raise ValueError("comparing needs the extra `diff`: pip install 'mi-refract[diff]'")
 
 
 def _agreed(count: int) -> bool:

@@ -242,7 +242,8 @@ def sample_pictures(folder: Path) -> list[Image]:
         raise OSError(failed[0][1])
     if not found:
         raise ValueError(f"{folder}: holds no picture; accepted: several renders of one")
-    pictures = [images.read(path) for path in found.values()]
+    with ThreadPoolExecutor(WORKERS) as pool:
+        pictures = list(pool.map(images.read, found.values()))
     sums: dict[float, Image] = {}
     for picture in pictures:
         other = sums.setdefault(float(picture.pixels.sum(dtype=np.float64)), picture)

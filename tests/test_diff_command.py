@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import importlib.util
 import json
 import os
 import shlex
@@ -212,6 +213,15 @@ def test_bad_words(run, pair, tmp_path, verb, words, message):
     assert err.startswith("mi-refract: ")
     assert message in err
     assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("verb", ["diff", "accept"])
+def test_without_the_extra(run, pair, monkeypatch, verb):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "jinja2" else find(name))
+    code, out, err = run(verb, *pair)
+    assert (code, out) == (2, "")
+    assert err == "mi-refract: comparing needs the extra `diff`: pip install 'mi-refract[diff]'\n"
 
 
 def test_nothing_is_created_or_overwritten(run, pair, tmp_path):
