@@ -10,16 +10,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 from rich.console import Console
 
-from . import backend, diff_page, diff_settings, gate, images
 from . import diff as engine
 from . import diff_output as output
+from . import diff_page, diff_settings, gate
 from .diff import Results, Status
 from .files import writable
-from .rendering import load_scene, provenance
+from .rendering import provenance
 
 Folder = Annotated[Path, typer.Argument(metavar="REFERENCE", help="A picture, or a folder of them.")]
 Other = Annotated[Path, typer.Argument(metavar="TEST", help="What is compared with it, of the same kind.")]
@@ -50,7 +49,7 @@ def _print_methods(asked: bool) -> None:
 
 
 def diff(
-    reference: Folder,
+    reference: NotWithSelfTest = None,
     test: NotWithSelfTest = None,
     method: Method = diff_settings.AUTO,
     options: Set = None,
@@ -74,8 +73,8 @@ def diff(
     _require_extra()
     if self_test:
         raise typer.Exit(_self_test(reference, test))
-    if test is None:
-        raise ValueError("TEST is missing; accepted: mi-refract diff REFERENCE TEST")
+    if reference is None or test is None:
+        raise ValueError("two paths are needed; accepted: mi-refract diff REFERENCE TEST")
     for path, suffixes in zip((report, junit, json), OUTPUTS, strict=True):
         if path:
             writable(path, suffixes)
@@ -141,28 +140,11 @@ def _flags(name: str, values: Sequence[Any]) -> list[str]:
     return [word for value in values for word in (name, str(value))]
 
 
-def _self_test(path: Path, other: Path | None) -> int:
+def _self_test(path: Path | None, other: Path | None) -> int:
     """Prints what is seen of the defects; 1 where one that was due is not."""
     if other:
         raise ValueError(f"{other}: --self-test takes one path; accepted: a picture, a folder of renders, a scene")
-    rows = gate.self_test(_renders(path), path.name)
-    print(gate.text(rows))
-    return int(any(row.verdict == "fail" for row in rows))
-
-
-def _renders(path: Path) -> np.ndarray:
-    """Independent renders of one picture: of a scene, the files of a folder, or one file."""
-    if path.suffix == ".xml":
-        backend.activate(may_restart=True)
-        import mitsuba as mi
-
-        scene = load_scene(path)
-        return np.stack([np.array(mi.render(scene, spp=SELF_TEST_SPP, seed=i)) for i in range(SELF_TEST_RENDERS)])
-    pictures = engine.sample_pictures(path) if path.is_dir() else [images.read(path)]
-    for picture in pictures:
-        if picture.pixels.shape != pictures[0].pixels.shape:
-            raise ValueError(f"{picture.path}: not of the size of {pictures[0].path}; accepted: renders of one picture")
-    return np.stack([picture.pixels for picture in pictures])
+    return gate.self_test(path)
 
 
 def _settings(

@@ -271,12 +271,25 @@ def self_test(path: Path | None = None) -> int:
     """Prints what is seen in the renders of a folder, in one picture, or in our own; 1 where anything due is missed."""
     if path is None:
         renders = _own_renders()
+    elif path.suffix == ".xml":
+        renders = _renders_of(path)
     else:
         pictures = sample_pictures(path) if path.is_dir() else [images.read(path)]
         renders = _stacked(pictures)
     rows = examine(renders, str(path or "a glass ball"))
     print(text(rows))
     return int(any(row.verdict == "fail" for row in rows))
+
+
+def _renders_of(scene: Path) -> np.ndarray:
+    from . import backend
+    from .rendering import load_scene
+
+    backend.activate(may_restart=True)
+    import mitsuba as mi
+
+    loaded = load_scene(scene)
+    return np.stack([np.array(mi.render(loaded, spp=OWN_SPP, seed=seed)) for seed in range(OWN_RENDERS)])
 
 
 def _stacked(pictures: list[images.Image]) -> np.ndarray:

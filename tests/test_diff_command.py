@@ -240,8 +240,8 @@ def test_nothing_is_created_or_overwritten(run, pair, tmp_path):
 @pytest.fixture
 def quick(monkeypatch):
     """A self-test of few trials."""
-    full = gate.self_test
-    monkeypatch.setattr(gate, "self_test", lambda renders, case: full(renders, case, trials=2, null_pairs=4))
+    full = gate.examine
+    monkeypatch.setattr(gate, "examine", lambda renders, case: full(renders, case, trials=2, null_pairs=4))
 
 
 def test_self_test_of_renders_and_of_one_picture(run, tmp_path, quick):
