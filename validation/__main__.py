@@ -50,7 +50,7 @@ class _OneLine(argparse.ArgumentParser):
 def _parser() -> argparse.ArgumentParser:
     parser = _OneLine(prog="validation", description="Measure the formulas and the plugin; write the report.")
     parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"of {', '.join(STUDIES)}; all by default")
-    parser.add_argument("--profile", default="quick", choices=("quick", "full"), help="a minute, or half an hour")
+    parser.add_argument("--profile", default="quick", choices=("quick", "full"), help="minutes, or hours")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder of the report (default: out)")
     parser.add_argument("--readme", type=Path, help="write the tables and the gallery of this Markdown file, too")
     return parser
