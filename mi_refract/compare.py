@@ -86,7 +86,7 @@ def paired_images(
     allow_nonfinite: bool = False,
     threshold: Annotated[float, "a pixel is changed where a channel differs by more than this share"] = 1e-4,
     changed: Annotated[float, "share of the pixels that may be changed"] = 0.001,
-    largest: Annotated[float, "largest change that is allowed"] = np.inf,
+    largest: Annotated[float, "largest change that is allowed, as a share"] = 100.0,
 ) -> Comparison:
     """Renders of the same random numbers: the share of changed pixels and the largest change.
 
@@ -107,7 +107,7 @@ def paired_images(
     )
     reason = f"{measured.changed:.3%} of the pixels are changed, the largest by {measured.largest:.3g} of its value"
     maps = {"difference": _difference(a, b)}
-    return Comparison("paired", _verdict(figures), reason, figures, threshold, maps)
+    return Comparison("paired", _verdict(figures), reason, figures, maps=maps)
 
 
 def flip(

@@ -280,7 +280,7 @@ def test_bad_self_tests(run, pair, tmp_path):
         (pair, "--self-test takes one path"),
         ([tmp_path / "none.exr"], "none.exr"),
         ([tmp_path / "none.xml"], "none.xml"),
-        ([tmp_path / "mixed"], "not of the size of"),
+        ([tmp_path / "mixed"], "size or channels differ from"),
         ([tmp_path / "nan.exr"], "every value of them finite"),
     ]:
         code, out, err = run("diff", "--self-test", *words)
