@@ -71,8 +71,9 @@ def tolerance(
         Figure("RMS difference", result.rms_error),
         Figure("pixels worth a warning, %", warned),
     )
-    place = f"x = {result.maxx + reference.origin[0]}, y = {result.maxy + reference.origin[1]}"
-    reason = f"{failed:.3g} % of the pixels beyond the tolerance; largest difference {result.maxerror:.3g} at {place}"
+    reason = f"{failed:.3g} % of the pixels beyond the tolerance; largest difference {result.maxerror:.3g}"
+    if result.maxerror:
+        reason += f" at x = {result.maxx + reference.origin[0]}, y = {result.maxy + reference.origin[1]}"
     if warned > warn_percent or result.maxerror > hard_warn:
         reason += f"; warning: {warned:.3g} % of the pixels"
     maps = {"difference": _difference(a, b)}
