@@ -90,7 +90,8 @@ def diff(
         flags = chosen.default.flags + _flags("--allow-nonfinite", chosen.allow_nonfinite)
         flags += _flags("--settings", [settings] if settings else []) + ["--samples"] * samples
         replay = shlex.join(["mi-refract", "diff", str(reference), str(test), *flags])
-        diff_page.write(report, found, provenance(), replay)
+        software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
+        diff_page.write(report, found, software, replay)
     if junit:
         output.write_junit(junit, found)
     if json:
