@@ -180,6 +180,20 @@ def double_gauss_data() -> dict[str, Any]:
     return json.loads(PRINT.read_text())
 
 
+def printed_rays() -> tuple[Array, Array]:
+    """Where the nine rays are on the first surface, and their directions before it."""
+    rays = double_gauss_data()["rays"]
+    angle = np.deg2rad(np.array([FIELDS[ray["object"][4]] for ray in rays], np.longdouble))
+    first = np.array([ray["surfaces"][0][:3] for ray in rays], np.longdouble)
+    return first, vectors(np.zeros(len(rays)), np.sin(angle), np.cos(angle))
+
+
+def printed() -> tuple[Array, Array]:
+    """Positions (surfaces, 9, 3) and tangents (surfaces, 9, 2) behind the surfaces."""
+    numbers = np.array([ray["surfaces"] for ray in double_gauss_data()["rays"]]).swapaxes(0, 1)
+    return numbers[..., :3], numbers[..., 3:5]
+
+
 def meet(p: Array, d: Array, curvature: float) -> tuple[Array, Array]:
     """Where rays meet the surface c (x² + y² + z²) = 2 z next to its vertex, and its unit normal; NaN if they miss."""
     p = p - d * (p[:, 2:] / d[:, 2:])  # on the vertex plane, where the smaller root is the near one
@@ -192,10 +206,7 @@ def meet(p: Array, d: Array, curvature: float) -> tuple[Array, Array]:
 
 def retrace(refract: Refract, prescription: Any = None) -> tuple[Array, Array]:
     """Positions (surfaces, 9, 3), each from its vertex, and directions (surfaces, 9, 3) of the printed rays."""
-    rays = double_gauss_data()["rays"]
-    first = np.array([ray["surfaces"][0][:3] for ray in rays], np.longdouble)
-    angle = np.deg2rad(np.array([FIELDS[ray["object"][4]] for ray in rays], np.longdouble))
-    p, b, index = first, vectors(0, np.sin(angle), np.cos(angle)), 1.0
+    (p, b), index = printed_rays(), 1.0
     positions, directions = [], []
     for curvature, thickness, after in prescription or double_gauss_data()["prescription"]:
         p, n = meet(p, unit(b), curvature)
@@ -209,9 +220,8 @@ def retrace(refract: Refract, prescription: Any = None) -> tuple[Array, Array]:
 def off_print(refract: Refract, prescription: Any = None) -> float:
     """The largest deviation from the print, over what printing rounds to: 1 is within the print."""
     positions, directions = retrace(refract, prescription)
-    printed = np.array([ray["surfaces"] for ray in double_gauss_data()["rays"]]).swapaxes(0, 1)
-    tangents = directions[..., :2] / directions[..., 2:]
-    deviations = (positions - printed[..., :3]) / POSITION, (tangents - printed[..., 3:5]) / TANGENT
+    said, tangents = printed(), directions[..., :2] / directions[..., 2:]
+    deviations = (positions - said[0]) / POSITION, (tangents - said[1]) / TANGENT
     return float(max(np.abs(x).max() for x in deviations))
 
 
@@ -281,7 +291,11 @@ def _nudged(call: int, what: str, way: int) -> Refract:
 
 def _aside(x: Array, way: int) -> Array:
     """Each vector, moved by NUDGE of its length in one of two directions at right angles to it."""
+    return x + NUDGE * np.sqrt(dot(x, x)) * across(x, way)
+
+
+def across(x: Array, way: int) -> Array:
+    """One of two unit vectors at right angles to each vector and to each other."""
     smallest = np.eye(3, dtype=np.longdouble)[np.abs(x).argmin(axis=1)]
-    across = unit(np.cross(x, smallest))
-    across = np.cross(unit(x), across) if way else across
-    return x + NUDGE * np.sqrt(dot(x, x)) * across
+    aside = unit(np.cross(x, smallest))
+    return np.cross(unit(x), aside) if way else aside

@@ -1,0 +1,207 @@
+"""Rays through bodies in a scene of Mitsuba, boundary by boundary, and what its float32 may make of them.
+
+A bench is described in coordinates of its own. Mitsuba has it turned by `systems.ASKEW`, so that no axis is special;
+its intersections and its samples, of the lobe that is asked for, are turned back in extended precision. A ray goes on
+along itself, STEP further: Mitsuba's own way, which is measured beside it, sets it off along the normal by 1500 ε
+(1 + |p|), and that is more than everything else here.
+
+The bound is of first order. Each boundary is given its share of roundings; what a change of any of them does to the
+answer is taken from differences of the exact path, and all of them add up. In units of u = 2⁻²⁴:
+
+- INTO: wi, three dot products of unit vectors (3u each, √3 · 3u in all) in a frame that Gram-Schmidt leaves orthogonal
+  and unit to 4u.
+- NORMAL: of a face, by corners after a rounded turn (3u · |v|/|e| twice, |v| ≤ |e|), their cross product (2u) and its
+  length (2u), or as a given one that is turned (3u), and the rounded turn itself (2u). A sphere's is off by less, its
+  rounded radius (1u) among it; and by what its place is off, over the radius.
+- PLACE: across the ray, of the largest length S that comes in: the ray's way, a coordinate, or the shape's extent. A
+  sphere's root: centre plane (2u), half the difference of squares (2u), distance and place on it (3u), back on the
+  sphere (2u), the shape's own place (1u), and two more turns for an instance (2 · 3u). A triangle's, by determinants
+  of products of two differences: 6u each coordinate of two, 12u, and interpolation (4u). All over cos θ.
+- ONWARD: wo by the formula (1u), three sums of products (√3 · 3u).
+- The first ray: as rounded, √3/2 u of its direction and of its origin, and as Mitsuba turned it, exact.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from .systems import ASKEW, Array, across, dot, snell, unit, vectors
+
+U = 2.0**-24
+INTO, NORMAL, PLACE, ONWARD, FIRST = 10.0, 16.0, 16.0, 7.0, 1.0
+STEP = 1e-2  # mm
+NUDGE = 1e-8  # mm, and radians
+
+Answers = dict[str, Array]
+Moved = Callable[[int, str, Array, Array], Array]
+
+@dataclass(frozen=True)
+class Plane:
+    """Through `point`, with a unit `normal`."""
+
+    point: Array
+    normal: Array
+    bend = 0.0
+
+    def meet(self, p: Array, d: Array) -> tuple[Array, Array]:
+        return p + d * (dot(self.normal, self.point - p) / dot(self.normal, d)), np.broadcast_to(self.normal, p.shape)
+
+@dataclass(frozen=True)
+class Ball:
+    """An ellipsoid along the axes, or a sphere; `far`: met from within."""
+
+    centre: Array
+    axes: Array
+    far: bool = False
+
+    @property
+    def bend(self) -> float:
+        """The most that its normal turns a mm."""
+        return float(self.axes.max() / self.axes.min() ** 2)
+
+    def meet(self, p: Array, d: Array) -> tuple[Array, Array]:
+        q, e = (p - self.centre) / self.axes, d / self.axes
+        b, square = dot(q, e), dot(e, e)
+        root = np.sqrt(b * b - square * (dot(q, q) - 1))
+        p = p + d * ((root if self.far else -root) - b) / square
+        return p, unit((p - self.centre) / self.axes**2)
+
+@dataclass(frozen=True)
+class Boundary:
+    """`k` = n_from/n_to; None: reflected. `size`: the extent of its shape from the origin, mm. Behind it, places
+    count from `thickness` further along z."""
+
+    surface: Plane | Ball
+    k: Any
+    size: float
+    thickness: float = 0.0
+
+    def turn(self, a: Array, n: Array) -> Array:
+        return a - 2 * dot(n, a) * n if self.k is None else snell(a, n, self.k)
+
+@dataclass(frozen=True)
+class Path:
+    """Of N rays at B boundaries: places, and unit directions behind each, B × N × 3."""
+
+    places: Array
+    directions: Array
+
+@dataclass(frozen=True)
+class Bench:
+    """Rays (N × 3, extended precision, lengths in mm), the boundaries that they meet one after the other, and their
+    scenes: `scenes(plugin)`, one a boundary or one for all, shapes by name as Mitsuba describes them.
+
+    `off(path)`: by answer, what the path says less the closed form, N × A × components. `printed`: how far from the
+    truth the other side of that may itself be, by answer.
+    """
+
+    origins: Array
+    directions: Array
+    boundaries: tuple[Boundary, ...]
+    scenes: Callable[[str], list[dict[str, Any]]]
+    off: Callable[[Path], Answers]
+
+    turn: Array = field(default_factory=lambda: ASKEW)
+    printed: dict[str, float] = field(default_factory=dict)
+
+    def exact(self, moved: Moved = lambda boundary, what, x, axis: x) -> Path:
+        """In extended precision; `moved` may disturb anything on the way."""
+        met = list(self._walk(moved))
+        return Path(np.array([p for _, p, _, _, _ in met]), np.array([unit(b) for _, _, _, _, b in met]))
+
+    def _walk(self, moved: Moved) -> Iterator[tuple[Array, ...]]:
+        """At each boundary: where the rays come from, place, normal, directions before and behind."""
+        b = moved(-1, "onward", self.directions, self.directions)
+        p = moved(-1, "place", self.origins, b)
+        for j, boundary in enumerate(self.boundaries):
+            start, (p, n) = p, boundary.surface.meet(p, b)
+            a = moved(j, "into", b, b)
+            b = boundary.turn(a, moved(j, "normal", n, n))
+            b = moved(j, "onward", b, b)
+            p = moved(j, "place", p, b)
+            yield start, p, n, a, b
+            p = p - vectors(0, 0, boundary.thickness)
+
+    def roundings(self) -> dict[tuple[int, str], Array]:
+        """How far each value may be off: N × 1, of places in mm."""
+        one = np.ones((len(self.origins), 1))
+        sizes = {(-1, "place"): FIRST * length(self.origins), (-1, "onward"): FIRST * one}
+        for j, (start, p, n, a, _) in enumerate(self._walk(lambda boundary, what, x, axis: x)):
+            surface, size = self.boundaries[j].surface, self.boundaries[j].size
+            longest = np.max([length(start), length(p), length(p - start), size * one], axis=0)
+            place = PLACE * longest / np.abs(dot(n, a))
+            sizes |= {(j, "place"): place, (j, "normal"): NORMAL + surface.bend * place}
+            sizes |= {(j, "into"): INTO * one, (j, "onward"): ONWARD * one}
+        return {key: U * size for key, size in sizes.items()}
+
+    @functools.cached_property
+    def bounds(self) -> Answers:
+        """Of the norm of each answer's deviation, N × A: roundings, and what was printed."""
+        exact = self.off(self.exact())
+        totals = {name: np.full(x.shape[:2], self.printed.get(name, 0), np.longdouble) for name, x in exact.items()}
+        for (boundary, what), size in self.roundings().items():
+            for way in range(3 if what == "place" else 2):
+                moved = self.off(self.exact(_nudged(boundary, what, way)))
+                for name, total in totals.items():
+                    total += size / NUDGE * length(moved[name] - exact[name])[..., 0]
+        return totals
+
+    def traced(self, plugin: str, spawned: bool = False) -> Path:
+        """By Mitsuba, in its present variant. `spawned`: rays go on as Mitsuba would have them."""
+        import mitsuba as mi
+
+        scenes = [mi.load_dict({"type": "scene", **shapes}) for shapes in self.scenes(plugin)]
+        scenes *= len(self.boundaries) // len(scenes)
+        given = [(x @ self.turn).astype(np.float32) for x in (self.origins, self.directions)]
+        if dr.is_jit_v(mi.Float):
+            path = _through(scenes, self.boundaries, *(x.T for x in given), spawned)
+            places, directions = (np.moveaxis(_numbers(x), 1, 2) for x in path)
+        else:
+            rays = [_through(scenes, self.boundaries, o, d, spawned) for o, d in zip(*given, strict=True)]
+            places, directions = (np.moveaxis([_numbers(y) for y in x], 0, 1) for x in zip(*rays, strict=True))
+        return Path(places @ self.turn.T, unit(directions @ self.turn.T))
+
+    def deviations(self, path: Path) -> Answers:
+        """The norm of each answer's deviation, N × A; a ray that did not get there is off by infinity."""
+        return {name: np.nan_to_num(length(x)[..., 0], nan=np.inf) for name, x in self.off(path).items()}
+
+def _numbers(vectors: list[Any]) -> Array:
+    return np.array([np.array(x, np.longdouble) for x in vectors])
+
+
+def length(x: Array) -> Array:
+    return np.sqrt(dot(x, x))
+
+def _nudged(boundary: int, what: str, way: int) -> Moved:
+    """Moves one value by NUDGE across its axis, or along it."""
+
+    def moved(j: int, name: str, x: Array, axis: Array) -> Array:
+        if (j, name) != (boundary, what):
+            return x
+        return x + NUDGE * (across(axis, way) if way < 2 else unit(axis))
+
+    return moved
+
+def _through(scenes: list[Any], boundaries: tuple[Boundary, ...], o: Array, d: Array, spawned: bool) -> Any:
+    """Places and directions behind the boundaries, of Mitsuba's types; one kernel where there are any."""
+    import mitsuba as mi
+
+    ray, places, directions = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), [], []
+    asked = mi.BSDFContext()
+    for scene, boundary in zip(scenes, boundaries, strict=True):
+        si = scene.ray_intersect(ray)
+        asked.component = int(boundary.k is not None)  # of both plugins: 0 reflects, 1 transmits
+        onward = si.to_world(si.bsdf().sample(asked, si, 0.5, [0.5, 0.5])[0].wo)
+        onward = dr.select(si.is_valid(), onward, dr.nan)
+        places.append(si.p)
+        directions.append(onward)
+        ray = si.spawn_ray(onward) if spawned else mi.Ray3f(dr.fma(STEP, onward, si.p), onward)
+        ray.o.z -= boundary.thickness
+    dr.eval(places, directions)
+    return places, directions
