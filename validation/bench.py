@@ -158,22 +158,18 @@ class Bench:
 
         scenes = [mi.load_dict({"type": "scene", **shapes}) for shapes in self.scenes(plugin)]
         scenes *= len(self.boundaries) // len(scenes)
-        given = [(x @ self.turn).astype(np.float32) for x in (self.origins, self.directions)]
+        origins, directions = ((x @ self.turn).astype(np.float32) for x in (self.origins, self.directions))
         if dr.is_jit_v(mi.Float):
-            path = _through(scenes, self.boundaries, *(x.T for x in given), spawned)
-            places, directions = (np.moveaxis(_numbers(x), 1, 2) for x in path)
+            found = np.moveaxis(_through(scenes, self.boundaries, origins.T, directions.T, spawned), 2, 3)
         else:
-            rays = [_through(scenes, self.boundaries, o, d, spawned) for o, d in zip(*given, strict=True)]
-            places, directions = (np.moveaxis([_numbers(y) for y in x], 0, 1) for x in zip(*rays, strict=True))
+            rays = zip(origins, directions, strict=True)
+            found = np.stack([_through(scenes, self.boundaries, o, d, spawned) for o, d in rays], axis=2)
+        places, directions = found
         return Path(places @ self.turn.T, unit(directions @ self.turn.T))
 
     def deviations(self, path: Path) -> Answers:
         """The norm of each answer's deviation, N × A; a ray that did not get there is off by infinity."""
         return {name: np.nan_to_num(length(x)[..., 0], nan=np.inf) for name, x in self.off(path).items()}
-
-def _numbers(vectors: list[Any]) -> Array:
-    return np.array([np.array(x, np.longdouble) for x in vectors])
-
 
 def length(x: Array) -> Array:
     return np.sqrt(dot(x, x))
@@ -188,20 +184,23 @@ def _nudged(boundary: int, what: str, way: int) -> Moved:
 
     return moved
 
-def _through(scenes: list[Any], boundaries: tuple[Boundary, ...], o: Array, d: Array, spawned: bool) -> Any:
-    """Places and directions behind the boundaries, of Mitsuba's types; one kernel where there are any."""
+def _through(scenes: list[Any], boundaries: tuple[Boundary, ...], o: Array, d: Array, spawned: bool) -> Array:
+    """Places and directions behind the boundaries, 2 × B × 3 (× N); one kernel where there are any."""
     import mitsuba as mi
 
     ray, places, directions = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), [], []
     asked = mi.BSDFContext()
     for scene, boundary in zip(scenes, boundaries, strict=True):
         si = scene.ray_intersect(ray)
+        met = si.is_valid()
+        if met is False:  # a scalar variant has no BSDF to ask then, and ends the process
+            return np.full((2, len(boundaries), 3), np.nan)
         asked.component = int(boundary.k is not None)  # of both plugins: 0 reflects, 1 transmits
         onward = si.to_world(si.bsdf().sample(asked, si, 0.5, [0.5, 0.5])[0].wo)
-        onward = dr.select(si.is_valid(), onward, dr.nan)
+        onward = dr.select(met, onward, dr.nan)
         places.append(si.p)
         directions.append(onward)
         ray = si.spawn_ray(onward) if spawned else mi.Ray3f(dr.fma(STEP, onward, si.p), onward)
         ray.o.z -= boundary.thickness
     dr.eval(places, directions)
-    return places, directions
+    return np.array([[np.array(x, np.longdouble) for x in vectors] for vectors in (places, directions)])

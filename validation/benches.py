@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from . import closed, systems
-from .bench import Answers, Ball, Bench, Boundary, Path, Plane, length
+from .bench import Answers, Ball, Bench, Boundary, Path, Plane
 from .plan import SCENES
 from .systems import ASKEW, BK7, Array, degrees, dot, unit, vectors
 
 APEX = closed.HALF_TURN / 3
 SIDE = 60  # of the prism's section
-RADIUS = np.longdouble(50)
-BUBBLE = np.longdouble(5)
+RADIUS = 50.0
+BUBBLE = 5.0
 WATER = np.longdouble(1.333)
 
 
@@ -33,7 +33,7 @@ def placed(scale: Any = 1.0) -> Any:
 
     matrix = np.eye(4)
     matrix[:3, :3] = ASKEW.T * np.asarray(scale, float)
-    return mi.ScalarTransform4f(matrix)
+    return mi.ScalarTransform4f(matrix.tolist())
 
 
 def _as_angle(chord: Array) -> Answers:
@@ -114,7 +114,7 @@ def aplanatic() -> Bench:
     ball = Boundary(Ball(vectors([0], 0, 0), RADIUS * vectors([1], 1, 1)), 1 / BK7, RADIUS)
 
     def scenes(plugin: str) -> list[dict[str, Any]]:
-        return [{"ball": {"type": "sphere", "radius": float(RADIUS), "bsdf": glass(plugin, BK7)}}]
+        return [{"ball": {"type": "sphere", "radius": RADIUS, "bsdf": glass(plugin, BK7)}}]
 
     return Bench(p - 60 * a, a, (ball,), scenes, lambda path: _miss(path, RADIUS * vectors([0], 0, 1 / BK7)))
 
@@ -133,7 +133,8 @@ def ellipsoid() -> Bench:
 
     def scenes(plugin: str) -> list[dict[str, Any]]:
         ball = {"type": "sphere", "bsdf": glass(plugin, BK7)}
-        bubble = {"type": "sphere", "center": (focus[0] @ ASKEW).astype(float).tolist(), "radius": float(BUBBLE), "bsdf": glass(plugin, 1, BK7)}
+        centre = (focus[0] @ ASKEW).astype(float).tolist()
+        bubble = {"type": "sphere", "center": centre, "radius": BUBBLE, "bsdf": glass(plugin, 1, BK7)}
         stretched = {"type": "instance", "group": {"type": "ref", "id": "ball"}, "to_world": placed(axes[0])}
         return [{"ball": {"type": "shapegroup", "shape": ball}, "front": stretched, "bubble": bubble}]
 
@@ -150,7 +151,7 @@ def drop(order: int) -> Bench:
     boundaries = tuple(Boundary(surface, k, RADIUS) for surface, k in surfaces)
 
     def scenes(plugin: str) -> list[dict[str, Any]]:
-        return [{"drop": {"type": "sphere", "radius": float(RADIUS), "bsdf": glass(plugin, WATER)}}]
+        return [{"drop": {"type": "sphere", "radius": RADIUS, "bsdf": glass(plugin, WATER)}}]
 
     after = vectors(-np.sin(d), 0, np.cos(d))
     return Bench(p - 40 * a, a, boundaries, scenes, lambda path: _as_angle(path.directions[-1] - after))
