@@ -1,12 +1,13 @@
 """Benches and the rainbow: their answers without Mitsuba, their bounds, and planted defects that break every row."""
 
+import dataclasses
 import math
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from validation import benches, bow, closed, systems, truth
+from validation import bench, benches, bow, closed, systems, truth
 
 DEFECT = 1e-4  # of an index
 NAMES = [*benches.BENCHES]
@@ -25,23 +26,23 @@ def scalar(scalar_context):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_exact_path_has_the_closed_answer(name, made):
-    bench = made[name]
-    for answer, x in bench.deviations(bench.exact()).items():
+    case = made[name]
+    for answer, x in case.deviations(case.exact()).items():
         # Of the print, √3 and √2 times what it rounds to.
-        assert x.max() <= bench.printed.get(answer, 1e-15)
+        assert x.max() <= case.printed.get(answer, 1e-15)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_bounds_hold_whatever_is_rounded_and_are_not_idle(name, made):
-    bench, rng, ratios = made[name], np.random.default_rng(5), []
-    sizes, exact = bench.roundings(), bench.off(bench.exact())
+    case, rng, ratios = made[name], np.random.default_rng(5), []
+    sizes, exact = case.roundings(), case.off(case.exact())
     for _ in range(30):
         # Each value off by all that it may, in a direction of its own.
         shifts = {key: size * systems.unit(rng.normal(size=(len(size), 3))) for key, size in sizes.items()}
-        off = bench.off(bench.exact(lambda j, what, x, axis, shifts=shifts: x + shifts[j, what]))
+        off = case.off(case.exact(lambda j, what, x, axis, shifts=shifts: x + shifts[j, what]))
         ratios += [
             systems.dot(x - exact[answer], x - exact[answer])[..., 0] ** 0.5
-            / (bench.bounds[answer] - bench.printed.get(answer, 0))
+            / (case.bounds[answer] - case.printed.get(answer, 0))
             for answer, x in off.items()
         ]
     worst = max(float(x.max()) for x in ratios)
@@ -81,11 +82,15 @@ def test_normals_of_the_wrong_sign_break_every_row(name, made, scalar, monkeypat
     assert truth.bench_row(name, made[name], "refract", "scalar_rgb").broken == {"error / bound": 1.0}
 
 
+def test_a_bound_that_would_hold_whatever_comes_fails(scalar, monkeypatch):
+    monkeypatch.setattr(bench, "PLACE", 100 * bench.PLACE)
+    assert truth.bench_row("slab", benches.slab(), "refract", "scalar_rgb").broken == {"index seen": truth.SEEN}
+
+
 def test_a_ray_that_misses_is_off_by_infinity(made, scalar, monkeypatch):
-    bench = benches.aplanatic()
     sphere = {"type": "sphere", "radius": 1.0, "bsdf": benches.glass("refract", benches.BK7)}
-    object.__setattr__(bench, "scenes", lambda plugin: [{"ball": sphere}])
-    assert truth.bench_row("aplanatic ball", bench, "refract", "scalar_rgb").values["miss / mm"] == math.inf
+    missed = dataclasses.replace(benches.aplanatic(), scenes=lambda plugin: [{"ball": sphere}])
+    assert truth.bench_row("aplanatic ball", missed, "refract", "scalar_rgb").values["miss / mm"] == math.inf
 
 
 def test_what_does_not_run_says_why(scalar):
@@ -97,10 +102,9 @@ def test_what_does_not_run_says_why(scalar):
 def test_compiled_rays_are_those_of_the_scalar_variant(made, needs_variant, scalar):
     """To roundings: a mistake in the order of rays or components would be of the size of the bodies."""
     needs_variant("llvm_ad_rgb")
-    bench = made["slab"]
-    one = bench.traced("refract")
+    one = made["slab"].traced("refract")
     mi.set_variant("llvm_ad_rgb")
-    other = bench.traced("refract")
+    other = made["slab"].traced("refract")
     assert np.abs(one.places - other.places).max() < 1e-4
     assert np.abs(one.directions - other.directions).max() < 1e-5
 

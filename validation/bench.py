@@ -8,21 +8,23 @@ along itself, STEP further: Mitsuba's own way, which is measured beside it, sets
 The bound is of first order. Each boundary is given its share of roundings; what a change of any of them does to the
 answer is taken from differences of the exact path, and all of them add up. In units of u = 2⁻²⁴:
 
-- INTO: wi, three dot products of unit vectors (3u each, √3 · 3u in all) in a frame that Gram-Schmidt leaves orthogonal
-  and unit to 4u.
-- NORMAL: of a face, by corners after a rounded turn (3u · |v|/|e| twice, |v| ≤ |e|), their cross product (2u) and its
-  length (2u), or as a given one that is turned (3u), and the rounded turn itself (2u). A sphere's is off by less, its
-  rounded radius (1u) among it; and by what its place is off, over the radius.
-- PLACE: across the ray, of the largest length S that comes in: the ray's way, a coordinate, or the shape's extent. A
-  sphere's root: centre plane (2u), half the difference of squares (2u), distance and place on it (3u), back on the
-  sphere (2u), the shape's own place (1u), and two more turns for an instance (2 · 3u). A triangle's, by determinants
-  of products of two differences: 6u each coordinate of two, 12u, and interpolation (4u). All over cos θ.
-- ONWARD: wo by the formula (1u), three sums of products (√3 · 3u).
-- The first ray: as rounded, √3/2 u of its direction and of its origin, and as Mitsuba turned it, exact.
+- FIRST: the first ray's direction and origin, rounded: 1u of each component.
+- INTO: wi, three dot products of unit vectors, 3u each, √3 · 3u in all; a frame that Gram-Schmidt leaves orthogonal and
+  unit to 7u turns by half of that.
+- NORMAL: of a face, edges between turned corners (6u each), their product (3u), its length (2u), the turn's own entries
+  (2u); or a given normal by the inverse of a turn (6u), product and length (5u), interpolated (5u). A sphere's is off
+  by less; and by its place's error over its radius.
+- PLACE, of the largest length S in play: the ray's way, a coordinate, the shape's extent. A sphere: nearest point to
+  the centre (2u), half the difference of squares (2.5u) and its root (3u), way and place (2u), back on the sphere (4u);
+  its own place, the step onward and the next vertex (4u); of an instance, the ray and the place turned (12u) and no own
+  place. A triangle, by Möller and Trumbore: a numerator 7u and the denominator 6u in two directions (√2 · 13u), its
+  inverse (1u), corners (3u), interpolation (3u), the step (1u). All over cos θ.
+- ONWARD: wo by the formula (1u), three sums of products (√3 · 3u), the frame again (3.5u).
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -34,12 +36,13 @@ import numpy as np
 from .systems import ASKEW, Array, across, dot, snell, unit, vectors
 
 U = 2.0**-24
-INTO, NORMAL, PLACE, ONWARD, FIRST = 10.0, 16.0, 16.0, 7.0, 1.0
+FIRST, INTO, NORMAL, PLACE, ONWARD = 1.0, 9.0, 20.0, 28.0, 10.0
 STEP = 1e-2  # mm
 NUDGE = 1e-8  # mm, and radians
 
 Answers = dict[str, Array]
 Moved = Callable[[int, str, Array, Array], Array]
+
 
 @dataclass(frozen=True)
 class Plane:
@@ -51,6 +54,7 @@ class Plane:
 
     def meet(self, p: Array, d: Array) -> tuple[Array, Array]:
         return p + d * (dot(self.normal, self.point - p) / dot(self.normal, d)), np.broadcast_to(self.normal, p.shape)
+
 
 @dataclass(frozen=True)
 class Ball:
@@ -72,6 +76,7 @@ class Ball:
         p = p + d * ((root if self.far else -root) - b) / square
         return p, unit((p - self.centre) / self.axes**2)
 
+
 @dataclass(frozen=True)
 class Boundary:
     """`k` = n_from/n_to; None: reflected. `size`: the extent of its shape from the origin, mm. Behind it, places
@@ -85,12 +90,19 @@ class Boundary:
     def turn(self, a: Array, n: Array) -> Array:
         return a - 2 * dot(n, a) * n if self.k is None else snell(a, n, self.k)
 
+    def denser(self, share: float) -> Boundary:
+        """With more in the index of its denser side."""
+        more = 1.0 if self.k is None or self.k == 1 else 1 + share if self.k > 1 else 1 / (1 + share)
+        return self if self.k is None else dataclasses.replace(self, k=self.k * more)
+
+
 @dataclass(frozen=True)
 class Path:
     """Of N rays at B boundaries: places, and unit directions behind each, B × N × 3."""
 
     places: Array
     directions: Array
+
 
 @dataclass(frozen=True)
 class Bench:
@@ -106,7 +118,6 @@ class Bench:
     boundaries: tuple[Boundary, ...]
     scenes: Callable[[str], list[dict[str, Any]]]
     off: Callable[[Path], Answers]
-
     turn: Array = field(default_factory=lambda: ASKEW)
     printed: dict[str, float] = field(default_factory=dict)
 
@@ -152,6 +163,14 @@ class Bench:
                     total += size / NUDGE * length(moved[name] - exact[name])[..., 0]
         return totals
 
+    @property
+    def index_seen(self) -> float:
+        """The least error, relative, of the index of the denser side everywhere that takes an answer to its bound."""
+        exact = self.off(self.exact())
+        wrong = dataclasses.replace(self, boundaries=tuple(x.denser(NUDGE) for x in self.boundaries))
+        off = {name: length(x - exact[name])[..., 0] / NUDGE for name, x in wrong.off(wrong.exact()).items()}
+        return 1 / max(float((x / self.bounds[name]).max()) for name, x in off.items())
+
     def traced(self, plugin: str, spawned: bool = False) -> Path:
         """By Mitsuba, in its present variant. `spawned`: rays go on as Mitsuba would have them."""
         import mitsuba as mi
@@ -171,8 +190,10 @@ class Bench:
         """The norm of each answer's deviation, N × A; a ray that did not get there is off by infinity."""
         return {name: np.nan_to_num(length(x)[..., 0], nan=np.inf) for name, x in self.off(path).items()}
 
+
 def length(x: Array) -> Array:
     return np.sqrt(dot(x, x))
+
 
 def _nudged(boundary: int, what: str, way: int) -> Moved:
     """Moves one value by NUDGE across its axis, or along it."""
@@ -183,6 +204,7 @@ def _nudged(boundary: int, what: str, way: int) -> Moved:
         return x + NUDGE * (across(axis, way) if way < 2 else unit(axis))
 
     return moved
+
 
 def _through(scenes: list[Any], boundaries: tuple[Boundary, ...], o: Array, d: Array, spawned: bool) -> Array:
     """Places and directions behind the boundaries, 2 × B × 3 (× N); one kernel where there are any."""

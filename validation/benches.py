@@ -5,7 +5,6 @@ Lengths are in mm, of the order of 100, and bodies of BK7 in air where nothing e
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -143,7 +142,6 @@ def ellipsoid() -> Bench:
 
 
 def drop(order: int) -> Bench:
-    """A drop of index 1.333, rays at 2 … 80° of incidence, reflected within: deflected by mπ + 2i − 2(m + 1) r."""
     i = degrees(2, 80)
     a, p, d = vectors(0 * i, 0, 1), RADIUS * vectors(np.sin(i), 0, -np.cos(i)), closed.deflection(i, WATER, order)
     near, far = (Ball(vectors([0], 0, 0), RADIUS * vectors([1], 1, 1), far=x) for x in (False, True))
@@ -155,6 +153,16 @@ def drop(order: int) -> Bench:
 
     after = vectors(-np.sin(d), 0, np.cos(d))
     return Bench(p - 40 * a, a, boundaries, scenes, lambda path: _as_angle(path.directions[-1] - after))
+
+
+def reflected_once() -> Bench:
+    """A drop of index 1.333, R = 50 mm, rays at 2 … 80°, one reflection within: deflected by π + 2i − 4r."""
+    return drop(1)
+
+
+def reflected_twice() -> Bench:
+    """The same with two reflections: 2π + 2i − 6r."""
+    return drop(2)
 
 
 # The double Gauss ----------------------------------------------------------------------------------------------
@@ -207,7 +215,7 @@ BENCHES: dict[str, Callable[[], Bench]] = {
     "prism, 32 … 85°": deviated,
     "aplanatic ball": aplanatic,
     "ellipsoid lens": ellipsoid,
-    "drop, one reflection": functools.partial(drop, 1),
-    "drop, two reflections": functools.partial(drop, 2),
+    "drop, one reflection": reflected_once,
+    "drop, two reflections": reflected_twice,
     "double Gauss": double_gauss,
 }
