@@ -36,7 +36,8 @@ TERMS = {name: " ".join((make.__doc__ or "").split()) for name, make in BENCHES.
     "direction / °": "largest |d − exact|, as an angle",
     "tangent": "largest deviation of (dx/dz, dy/dz)",
     "error / bound": "largest of all of these over its own bound: the sum of what every rounding on the way may do, "
-    "and, of the double Gauss, half a unit of the last printed digit",
+    "and, of the double Gauss, what its print is off; of the rainbow, as many standard errors as Student's t exceeds "
+    "once in ten thousand times, and the blur of pixels",
     "index seen": "the least relative error of every index that takes a ray to its bound: a bound that holds whatever "
     "comes would be no test",
     "…, spawned": "the same if rays go on as in a render, set off by Mitsuba along the normal: the same for any plugin",
