@@ -9,7 +9,7 @@ import pytest
 from flint import arb, ctx, fmpq
 
 from mi_refract import FORMULAS, backend, oracle
-from validation import chains, stability, systems
+from validation import chains, closed, stability, systems
 from validation.chains import air, carry, enter, exact_ratios, pipe
 from validation.plan import SCALAR_PROFILES, Context
 from validation.settings import BUILTIN
@@ -167,19 +167,17 @@ def test_the_law_in_extended_precision_is_the_oracles():
 def test_rainbows_and_the_prism_stand_at_the_extreme_of_the_deflection():
     index = np.longdouble(4) / 3
     for order, bow in ((1, 180 - 42.03), (2, 180 + 50.98)):
-        i = systems.rainbow_incidence(index, order)
-        d = [float(systems.deflection(x, index, order)) for x in (i - 1e-3, i, i + 1e-3)]
+        i = closed.rainbow_incidence(index, order)
+        d = [float(closed.deflection(x, index, order)) for x in (i - 1e-3, i, i + 1e-3)]
         assert math.degrees(d[1]) == pytest.approx(bow, abs=0.01)
         assert 1e-7 < d[0] - d[1] < 1e-5
         assert 1e-7 < d[2] - d[1] < 1e-5
     apex, n = np.deg2rad(np.longdouble(60)), systems.BK7
-
-    def deviation(first):
-        return float(first + np.arcsin(n * np.sin(apex - np.arcsin(np.sin(first) / n))) - apex)
-
-    first = np.arcsin(n * np.sin(apex / 2))
-    assert deviation(first) == pytest.approx(float(2 * first - apex), abs=1e-15)
-    assert all(1e-7 < deviation(first + x) - deviation(first) < 1e-5 for x in (-1e-3, 1e-3))
+    first = closed.least_deviated(apex, n)
+    before, least, after = (float(closed.deviation(first + x, apex, n)) for x in (-1e-3, 0, 1e-3))
+    assert least == pytest.approx(float(2 * first - apex), abs=1e-15)
+    assert 1e-7 < before - least < 1e-5
+    assert 1e-7 < after - least < 1e-5
 
 
 @pytest.mark.parametrize("name", systems.SYSTEMS)

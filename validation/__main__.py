@@ -22,6 +22,7 @@ STUDIES = {
     "efficiency": ("efficiency", "scaling"),
     "planar": ("planar", "planar_closed", "extrusion", "planar_times"),
     "gate": ("gate", "diff_times"),
+    "truth": ("truth",),
 }
 
 

@@ -21,7 +21,7 @@ from mi_refract.curves import Curve
 from mi_refract.planar import Event, Paths, Segments
 from mi_refract.rows import Row
 
-from . import planar
+from . import closed, planar
 from .plan import Context, Task
 from .planar import Case, budgets, judge, unit
 from .retrace import Array, Retraced
@@ -207,16 +207,15 @@ def rainbow(rays: int) -> Closed:
     """A drop of index 4/3, its rays reflected once within."""
     n, b = 4 / 3, 0.98 * np.linspace(-1, 1, 2 * (rays // 2))
     case = _case("rainbow", shapes.circle(1.0), n, *_along_x(b), depth=3, reflect=2)
-    exact = b.astype(np.longdouble)
-    return Closed(case, _unit_at(4 * np.arcsin(exact / np.longdouble(n)) - 2 * np.arcsin(exact) - np.longdouble(np.pi)))
+    return Closed(case, _unit_at(-closed.deflection(np.arcsin(b.astype(np.longdouble)), n, 1)))
 
 
 @functools.cache
 def prism(rays: int) -> Closed:
     """Apex 60°, from 32° of incidence (nearly total reflection within) to 85°; the least deviation is at 48.6°."""
-    curve, apex = shapes.prism(60.0, 2.0), np.longdouble(np.pi) / 3
+    curve, apex = shapes.prism(60.0, 2.0), closed.HALF_TURN / 3
     i = np.deg2rad(np.linspace(32, 85, rays)).astype(np.longdouble)
-    deviation = i + np.arcsin(INDEX * np.sin(apex - np.arcsin(np.sin(i) / INDEX))) - apex
+    deviation = closed.deviation(i, apex, INDEX)
     directions = _unit_at(i - apex / 2).astype(float)
     # Through a place on the left side, high enough that all leave by the right one.
     origins = 0.75 * curve.vertices[2] + 0.25 * curve.vertices[0] - directions

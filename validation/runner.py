@@ -72,7 +72,8 @@ def _recall(kept: Path) -> list[Row] | None:
 def _fingerprint(context: Context) -> str:
     """Rows are taken up again only for the same sources, scenes, profile, variant and versions."""
     digest = hashlib.sha256(repr((context.profile, context.variant, describe(context, 0))).encode())
-    sources = [Path(mi_refract.__file__).parent.glob("*.py"), Path(__file__).parent.glob("*.py"), SCENES.rglob("*")]
+    here = Path(__file__).parent
+    sources = [Path(mi_refract.__file__).parent.glob("*.py"), here.glob("*.py"), here.glob("*.json"), SCENES.rglob("*")]
     for path in sorted(path for group in sources for path in group if path.is_file()):
         digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -5,8 +5,8 @@ asked at every boundary; a, n, b (N, 3), k = n_from/n_to. Intersections and clos
 whatever the precision of `refract`: they are geometry, not refraction. All systems stand askew, so that no normal is
 an axis, and have the unit of length 1. Directions are compared by their chord, a small angle in radians.
 
-Closed forms: Born and Wolf, Principles of Optics, 4.2.3 (aplanatic points), 4.7.2 (prism); Descartes, La Dioptrique,
-1637 (ellipsoid), Les Météores, 1637 (rainbow).
+Closed forms: `closed`, and Born and Wolf, Principles of Optics, 4.2.3 (aplanatic points); Descartes, La Dioptrique,
+1637 (ellipsoid).
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from . import closed
+
 Array = NDArray[Any]
 Refract = Callable[[Array, Array, Any], Array]
 Trace = Callable[[Refract], Array]
@@ -27,7 +29,7 @@ Trace = Callable[[Refract], Array]
 RAYS = 32
 BK7 = np.longdouble(1.5168)  # a crown glass
 WATER = 1.331, 1.344  # for red and for violet
-PRINT = Path(__file__).parents[1] / "tests" / "data" / "double_gauss_codev.json"
+PRINT = Path(__file__).with_name("double_gauss_codev.json")
 # What printing rounds to: see "digits" in the file.
 TANGENT, POSITION = 5e-7, 2.3e-6
 FIELDS = {0.0: 0.0, 0.176327: 10.0, 0.249328: 14.0}  # printed tangent: degrees
@@ -90,9 +92,7 @@ def slab(refract: Refract) -> Array:
     p = inside / dot(inside, n)
     out = refract(inside, n, BK7)
     shift = np.sqrt(dot(np.cross(p, a), np.cross(p, a)))
-    within = np.arcsin(np.sin(angle) / BK7)
-    exact = np.sin(angle - within) / np.cos(within)
-    return np.concatenate([shift - exact[:, None], unit(out) - a], axis=1)
+    return np.concatenate([shift - closed.lateral_shift(angle, BK7)[:, None], unit(out) - a], axis=1)
 
 
 @askew
@@ -113,7 +113,7 @@ def prism(refract: Refract) -> Array:
     Apex angles A of 10 … 80 degrees, BK7; the first incidence is asin(n sin(A/2)). (deviation − closed form).
     """
     half = degrees(5, 40)
-    incidence = np.arcsin(BK7 * np.sin(half))
+    incidence = closed.least_deviated(2 * half, BK7)
     left, right = vectors(np.cos(half), 0, -np.sin(half)), vectors(np.cos(half), 0, np.sin(half))
     angle = incidence - half  # inside, the ray runs along x
     a = vectors(np.cos(angle), 0, np.sin(angle))
@@ -152,17 +152,6 @@ def ellipsoid(refract: Refract) -> Array:
     return unit(b) - unit(vectors([e], 0, 0) - p)
 
 
-def rainbow_incidence(index: Any, order: Any) -> Array:
-    """Where the deflection by m reflections within is stationary: cos i = √((n² − 1)/((m + 1)² − 1))."""
-    return np.arccos(np.sqrt((index - 1) * (index + 1) / (order * (order + 2))))
-
-
-def deflection(incidence: Array, index: Any, order: Any) -> Array:
-    """D = mπ + 2i − 2(m + 1) r of a ray through a sphere with m reflections within, sin r = sin i / n."""
-    half_turn = np.arccos(np.longdouble(-1))
-    return order * half_turn + 2 * incidence - 2 * (order + 1) * np.arcsin(np.sin(incidence) / index)
-
-
 @askew
 def rainbow(refract: Refract) -> Array:
     """The rainbows of order 1 … 4 in a drop of water: rays at the stationary angle, D = mπ + 2i − 2(m + 1) r.
@@ -171,8 +160,8 @@ def rainbow(refract: Refract) -> Array:
     """
     order = np.arange(RAYS) % 4 + 1
     index = np.linspace(*WATER, RAYS).astype(np.longdouble)
-    incidence = rainbow_incidence(index, order)
-    d = deflection(incidence, index, order)
+    incidence = closed.rainbow_incidence(index, order)
+    d = closed.deflection(incidence, index, order)
     a, p = vectors(np.ones(RAYS), 0, 0), vectors(-np.cos(incidence), 0, np.sin(incidence))
     b = unit(refract(a, p, 1 / index))
     for reflection in range(1 + order.max()):
@@ -191,6 +180,20 @@ def double_gauss_data() -> dict[str, Any]:
     return json.loads(PRINT.read_text())
 
 
+def printed_rays() -> tuple[Array, Array]:
+    """Where the nine rays are on the first surface, and their directions before it."""
+    rays = double_gauss_data()["rays"]
+    angle = np.deg2rad(np.array([FIELDS[ray["object"][4]] for ray in rays], np.longdouble))
+    first = np.array([ray["surfaces"][0][:3] for ray in rays], np.longdouble)
+    return first, vectors(np.zeros(len(rays)), np.sin(angle), np.cos(angle))
+
+
+def printed() -> tuple[Array, Array]:
+    """Positions (surfaces, 9, 3) and tangents (surfaces, 9, 2) behind the surfaces."""
+    numbers = np.array([ray["surfaces"] for ray in double_gauss_data()["rays"]]).swapaxes(0, 1)
+    return numbers[..., :3], numbers[..., 3:5]
+
+
 def meet(p: Array, d: Array, curvature: float) -> tuple[Array, Array]:
     """Where rays meet the surface c (x² + y² + z²) = 2 z next to its vertex, and its unit normal; NaN if they miss."""
     p = p - d * (p[:, 2:] / d[:, 2:])  # on the vertex plane, where the smaller root is the near one
@@ -203,10 +206,7 @@ def meet(p: Array, d: Array, curvature: float) -> tuple[Array, Array]:
 
 def retrace(refract: Refract, prescription: Any = None) -> tuple[Array, Array]:
     """Positions (surfaces, 9, 3), each from its vertex, and directions (surfaces, 9, 3) of the printed rays."""
-    rays = double_gauss_data()["rays"]
-    first = np.array([ray["surfaces"][0][:3] for ray in rays], np.longdouble)
-    angle = np.deg2rad(np.array([FIELDS[ray["object"][4]] for ray in rays], np.longdouble))
-    p, b, index = first, vectors(0, np.sin(angle), np.cos(angle)), 1.0
+    (p, b), index = printed_rays(), 1.0
     positions, directions = [], []
     for curvature, thickness, after in prescription or double_gauss_data()["prescription"]:
         p, n = meet(p, unit(b), curvature)
@@ -220,9 +220,8 @@ def retrace(refract: Refract, prescription: Any = None) -> tuple[Array, Array]:
 def off_print(refract: Refract, prescription: Any = None) -> float:
     """The largest deviation from the print, over what printing rounds to: 1 is within the print."""
     positions, directions = retrace(refract, prescription)
-    printed = np.array([ray["surfaces"] for ray in double_gauss_data()["rays"]]).swapaxes(0, 1)
-    tangents = directions[..., :2] / directions[..., 2:]
-    deviations = (positions - printed[..., :3]) / POSITION, (tangents - printed[..., 3:5]) / TANGENT
+    said, tangents = printed(), directions[..., :2] / directions[..., 2:]
+    deviations = (positions - said[0]) / POSITION, (tangents - said[1]) / TANGENT
     return float(max(np.abs(x).max() for x in deviations))
 
 
@@ -292,7 +291,11 @@ def _nudged(call: int, what: str, way: int) -> Refract:
 
 def _aside(x: Array, way: int) -> Array:
     """Each vector, moved by NUDGE of its length in one of two directions at right angles to it."""
+    return x + NUDGE * np.sqrt(dot(x, x)) * across(x, way)
+
+
+def across(x: Array, way: int) -> Array:
+    """One of two unit vectors at right angles to each vector and to each other."""
     smallest = np.eye(3, dtype=np.longdouble)[np.abs(x).argmin(axis=1)]
-    across = unit(np.cross(x, smallest))
-    across = np.cross(unit(x), across) if way else across
-    return x + NUDGE * np.sqrt(dot(x, x)) * across
+    aside = unit(np.cross(x, smallest))
+    return np.cross(unit(x), aside) if way else aside
