@@ -131,7 +131,7 @@ def given(precision: str) -> RaySet:
 
 def _made(kind: Set, precision: type, number: int) -> regimes.Rays:
     rng = np.random.default_rng([SEED, number])
-    normal = regimes.normalised(rng.normal(size=(kind.count, 3))).astype(precision)
+    normal: np.ndarray = regimes.normalised(rng.normal(size=(kind.count, 3))).astype(precision)
     a, n, k = regimes.rays_at(kind.draw, rng, normal)
     return regimes.Rays(a.astype(precision), n.astype(precision), k.astype(precision))
 
