@@ -1,0 +1,24 @@
+"""Radiance, by the programs in pyradiance's wheel."""
+
+from .system import Call, Pip, System, noted
+
+SYSTEM = System(
+    "radiance",
+    "Radiance",
+    "BSD (pyradiance), Radiance Software License",
+    Pip(("pyradiance==1.3.1", "numpy")),
+    megabytes=120,
+    small=True,
+    draws=True,
+    calls=(
+        Call(
+            "Radiance, rtrace",
+            "f64",
+            "radiance_rays.py",
+            noted(5e-15, 4e-13, 1e-16, 3e-16),
+            "reflected",
+            gives_up=1e-6,
+            remark="takes cos²θ_t below 1e-6 for total reflection, and misses a surface met at less than 1e-6 rad",
+        ),
+    ),
+)
