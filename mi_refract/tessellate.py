@@ -22,7 +22,8 @@ def sphere(level: int) -> Triangles:
     corners = np.array([[-1, GOLDEN, 0], [1, GOLDEN, 0], [-1, -GOLDEN, 0], [1, -GOLDEN, 0]])
     corners = np.concatenate([np.roll(corners, shift, axis=1) for shift in (0, 1, 2)])
     near = np.isclose(np.linalg.norm(corners[:, None] - corners, axis=-1), 2)
-    faces = [ijk for ijk in itertools.combinations(range(12), 3) if all(near[p] for p in itertools.combinations(ijk, 2))]
+    triples = itertools.combinations(range(12), 3)
+    faces = [(i, j, k) for i, j, k in triples if near[i, j] and near[j, k] and near[k, i]]
     triangles = corners[np.array(faces)] / np.hypot(1, GOLDEN)
     inward = np.linalg.det(triangles) < 0
     triangles[inward] = triangles[inward, ::-1]
