@@ -36,7 +36,8 @@ def render(options, seed, path):
         own["native.threads.count"] = options.threads
     for key, value in own.items():
         config.Set(pyluxcore.Property(key, value))
-    scene = pyluxcore.Scene(pyluxcore.Properties("scene.scn"))
+    scene = pyluxcore.Scene()
+    scene.Parse(pyluxcore.Properties("scene.scn"))
     session = pyluxcore.RenderSession(pyluxcore.RenderConfig(config, scene))
     session.Start()
     while not session.HasDone():
