@@ -83,9 +83,9 @@ def _camera(sensor: Node) -> Camera:
             raise child.refused(f"a {child.kind.lower()} of a sensor", "a film and a sampler")
     sensor.ignore("near_clip", "far_clip", "focus_distance")
     origin, axes = frame[:3, 3], frame[:3, :3] / np.linalg.norm(frame[:3, :3], axis=0)
-    camera = Camera(_triple(origin), _triple(origin + axes[:, 2]), _triple(axes[:, 1]), _fov_x(sensor, width, height), width, height)
+    fov = _fov_x(sensor, width, height)
     sensor.done()
-    return camera
+    return Camera(_triple(origin), _triple(origin + axes[:, 2]), _triple(axes[:, 1]), fov, width, height)
 
 
 def _triple(vector: Any) -> tuple[float, float, float]:
@@ -133,7 +133,7 @@ def _sky(emitter: Node) -> Colour | Environment:
 
 def _pixels(emitter: Node, path: Path) -> Any:
     try:
-        pixels, metadata = read_exr(path)
+        pixels = read_exr(path)[0]
     except (OSError, ValueError) as error:
         raise emitter.refused(str(error), "an OpenEXR file") from None
     if pixels.shape[2] != 3 or min(pixels.shape[:2]) < 2 or not np.isfinite(pixels).all() or (pixels < 0).any():

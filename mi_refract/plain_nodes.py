@@ -42,7 +42,7 @@ class Node:
 
     def children(self) -> Iterator[Node]:
         """Its nested plugins without a meaning in their names, taken."""
-        for name in [name for name in self.props.keys() if re.fullmatch(r"_arg_\d+", name)]:
+        for name in sorted((name for name in self.left if re.fullmatch(r"_arg_\d+", name)), key=lambda x: int(x[5:])):
             yield self.take(name)
 
     def done(self) -> None:
@@ -70,7 +70,8 @@ class Node:
         """4 × 4, affine, of positive determinant."""
         value = self.take(name)
         matrix = np.eye(4) if value is None else np.array(value.matrix, float)
-        if not np.isfinite(matrix).all() or not (np.linalg.det(matrix[:3, :3]) > 0 and (matrix[3] == [0, 0, 0, 1]).all()):
+        affine = np.isfinite(matrix).all() and (matrix[3] == [0, 0, 0, 1]).all()
+        if not affine or not np.linalg.det(matrix[:3, :3]) > 0:
             raise self.refused(f"{name} mirrors or flattens", "a transform that keeps left and right")
         return matrix
 

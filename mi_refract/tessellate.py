@@ -5,6 +5,8 @@ Curved shapes are inscribed: their vertices lie on the surface. A `level` more h
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,12 +19,12 @@ GOLDEN = (1 + 5**0.5) / 2
 
 def sphere(level: int) -> Triangles:
     """The unit sphere: an icosahedron, each face of it divided into 4^level."""
-    vertices = np.array([[-1, GOLDEN, 0], [1, GOLDEN, 0], [-1, -GOLDEN, 0], [1, -GOLDEN, 0]])
-    vertices = np.concatenate([np.roll(vertices, shift, axis=1) for shift in (0, 1, 2)])
-    distance = np.linalg.norm(vertices[:, None] - vertices, axis=-1)
-    near = np.isclose(distance, 2)
-    faces = [(i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[k, i]]
-    triangles = vertices[np.array(faces)] / np.hypot(1, GOLDEN)
+    corners = np.array([[-1, GOLDEN, 0], [1, GOLDEN, 0], [-1, -GOLDEN, 0], [1, -GOLDEN, 0]])
+    corners = np.concatenate([np.roll(corners, shift, axis=1) for shift in (0, 1, 2)])
+    near = np.isclose(np.linalg.norm(corners[:, None] - corners, axis=-1), 2)
+    triples = itertools.combinations(range(12), 3)
+    faces = [(i, j, k) for i, j, k in triples if near[i, j] and near[j, k] and near[k, i]]
+    triangles = corners[np.array(faces)] / np.hypot(1, GOLDEN)
     inward = np.linalg.det(triangles) < 0
     triangles[inward] = triangles[inward, ::-1]
     for _ in range(level):
@@ -44,7 +46,7 @@ def welded(triangles: NDArray[np.float64]) -> Triangles:
 
 
 def is_closed(faces: Faces) -> bool:
-    """Each edge borders two faces, once in either direction. Counts vertices of the same position as one only if welded."""
+    """Each edge borders two faces, once in either direction; vertices of the same position must be one."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     there = {(int(a), int(b)) for a, b in edges}
     return len(there) == len(edges) and all((b, a) in there for a, b in there)
@@ -67,7 +69,8 @@ def rectangle() -> Triangles:
 def checkerboard(scale_u: float, scale_v: float) -> tuple[Triangles, Triangles]:
     """The rectangle's two parts, of `color0` and of `color1`, where the texture's uv are scaled by these numbers."""
     u, v = _cuts(scale_u), _cuts(scale_v)
-    odd_u, odd_v = (np.floor((edges[:-1] + edges[1:]) * scale) % 2 == 1 for edges, scale in ((u, scale_u), (v, scale_v)))
+    # The middle of a cell in half units of the scaled coordinate, whose parity is Mitsuba's "beyond one half".
+    odd_u, odd_v = (np.floor((x[:-1] + x[1:]) * scale) % 2 == 1 for x, scale in ((u, scale_u), (v, scale_v)))
     same = odd_u[:, None] == odd_v
     return grid(2 * u - 1, 2 * v - 1, same), grid(2 * u - 1, 2 * v - 1, ~same)
 
@@ -81,7 +84,7 @@ def _cuts(scale: float) -> NDArray[np.float64]:
 def cube() -> Triangles:
     """[−1, 1]³."""
     face, order = rectangle()
-    face = face + [0, 0, 1]
+    face = face + np.array([0.0, 0.0, 1.0])
     turns = [np.roll(face, shift, axis=1) for shift in (0, 1, 2)]
     # A half turn keeps the orientation, and takes each of the three to the face opposite.
     turns += [turn * mirror for turn, mirror in zip(turns, ([1, -1, -1], [-1, 1, -1], [-1, -1, 1]), strict=True)]
@@ -110,7 +113,7 @@ def cylinder(level: int) -> Triangles:
     count = len(rim)
     i, j = np.arange(count), (np.arange(count) + 1) % count
     faces = np.concatenate([np.stack([i, j, j + count], axis=1), np.stack([i, j + count, i + count], axis=1)])
-    return np.concatenate([rim, rim + [0, 0, 1]]), faces
+    return np.concatenate([rim, rim + np.array([0.0, 0.0, 1.0])]), faces
 
 
 def _circle(level: int) -> Vertices:
