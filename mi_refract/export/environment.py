@@ -12,7 +12,7 @@ from ..plain_data import Environment
 Array = NDArray[np.float64]
 # The other renderers take texels at their centres, which Mitsuba's rows are not. Between texels a map is linear, and so
 # is the finer one between its own, except where a texel of the first lies within one of its cells.
-FINER = 4
+FINER = 16
 
 
 def radiance(environment: Environment, directions: Array) -> Array:
