@@ -22,7 +22,7 @@ from .plain_nodes import Node, Reader
 
 __all__ = ["Camera", "Colour", "Diffuse", "Environment", "Glass", "Light", "Material", "Mesh", "Plain", "load"]
 
-LEVEL = 4  # of the tessellation: spheres of 5120 triangles, circles of 128 segments
+LEVEL = 5  # of the tessellation: spheres of 20480 triangles, circles of 256 segments
 LEVELS = range(9)
 INTEGRATORS = ("path", "refract_path", "prb", "volpath", "prbvolpath")
 

@@ -5,6 +5,7 @@ Curved shapes are inscribed: their vertices lie on the surface. A `level` more h
 
 from __future__ import annotations
 
+import functools
 import itertools
 
 import numpy as np
@@ -17,6 +18,7 @@ Triangles = tuple[Vertices, Faces]
 GOLDEN = (1 + 5**0.5) / 2
 
 
+@functools.cache
 def sphere(level: int) -> Triangles:
     """The unit sphere: an icosahedron, each face of it divided into 4^level."""
     corners = np.array([[-1, GOLDEN, 0], [1, GOLDEN, 0], [-1, -GOLDEN, 0], [1, -GOLDEN, 0]])
@@ -29,7 +31,9 @@ def sphere(level: int) -> Triangles:
     triangles[inward] = triangles[inward, ::-1]
     for _ in range(level):
         triangles = _halved(triangles)
-    return welded(triangles)
+    vertices, order = welded(triangles)
+    vertices.flags.writeable = order.flags.writeable = False  # they are everybody's
+    return vertices, order
 
 
 def _halved(triangles: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,11 +9,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ..plain_data import Plain
-from . import mitsuba
+from . import mitsuba, radiance
 from .common import Files
 
 TARGETS: dict[str, Callable[[Plain], Files]] = {
     "mitsuba": mitsuba.files,
+    "radiance": radiance.files,
 }
 
 
