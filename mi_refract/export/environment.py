@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..plain_data import Environment
 
 Array = NDArray[np.float64]
+Lookup = Callable[[Array, Array], Array]
 # The other renderers take texels at their centres, which Mitsuba's rows are not. Between texels a map is linear, and so
 # is the finer one between its own, except where a texel of the first lies within one of its cells.
 FINER = 16
@@ -30,7 +31,7 @@ def radiance(environment: Environment, directions: Array) -> Array:
     return (1 - b) * upper + b * lower
 
 
-def longitude_latitude(environment: Environment, direction: Callable[[Array, Array], Array]) -> NDArray[np.float32]:
+def longitude_latitude(environment: Environment, direction: Lookup) -> NDArray[np.float32]:
     """H × W × 3. `direction(u, v)` is where the renderer's picture holds (u, v) in [0, 1]², v from its top row down."""
     height = FINER * (environment.pixels.shape[0] - 1)
     width = FINER * environment.pixels.shape[1]

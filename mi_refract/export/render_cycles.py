@@ -1,4 +1,4 @@
-"""Render `scene.json` and `scene.obj` by Cycles: `python render.py --spp 256 --seeds 0 1 2 3 --out .`
+"""Render `scene.json` by Cycles: `python render.py --spp 256 --seeds 0 1 2 3 --out .`
 
 Run by the Python that has bpy, never imported by mi_refract. One `seedN.exr` per seed. The settings that make Cycles a
 plain path tracer: box filter, no clamping, no blurred caustics, no adaptive sampling, no denoising, one limit of depth.
@@ -7,9 +7,11 @@ plain path tracer: box filter, no clamping, no blurred caustics, no adaptive sam
 import argparse
 import json
 import math
+import re
 from pathlib import Path
 
 import bpy
+import numpy as np
 from mathutils import Matrix, Vector
 
 
@@ -36,30 +38,22 @@ def main():
 
 def build(plain, folder):
     materials = {name: material(name, entry) for name, entry in plain["materials"].items()}
-    for name, (vertices, faces, used) in meshes(folder / "scene.obj").items():
+    for name, entry in plain["meshes"].items():
+        vertices, faces = triangles(folder / entry["file"])
         mesh = bpy.data.meshes.new(name)
         mesh.from_pydata(vertices, [], faces)
-        mesh.materials.append(materials[used])
+        mesh.materials.append(materials[entry["material"]])
         bpy.context.scene.collection.objects.link(bpy.data.objects.new(name, mesh))
     world(plain["sky"], folder)
     camera(plain["camera"])
 
 
-def meshes(path):
-    """{name: (vertices, faces, material)} of an OBJ file whose numbers run on from one object to the next."""
-    found, first, count = {}, 0, 0
-    for words in map(str.split, path.read_text().splitlines()):
-        if words[:1] == ["o"]:
-            first, current = count, [[], [], ""]
-            found[words[1]] = current
-        elif words[:1] == ["usemtl"]:
-            current[2] = words[1]
-        elif words[:1] == ["v"]:
-            current[0].append([float(x) for x in words[1:4]])
-            count += 1
-        elif words[:1] == ["f"]:
-            current[1].append([int(word.partition("/")[0]) - 1 - first for word in words[1:]])
-    return found
+def triangles(path):
+    """Vertices and faces of a binary PLY file of float32 positions and triangles."""
+    header, _, data = path.read_bytes().partition(b"end_header\n")
+    vertices, faces = (int(re.search(rf"element {name} (\d+)".encode(), header)[1]) for name in ("vertex", "face"))
+    corners = np.frombuffer(data, [("count", "u1"), ("index", "<i4", 3)], faces, vertices * 12)
+    return np.frombuffer(data, "<f4", vertices * 3).reshape(-1, 3).tolist(), corners["index"].tolist()
 
 
 def material(name, entry):
