@@ -15,6 +15,7 @@ import pyradiance
 import table
 
 RADIUS, START = 1e-3, 1e-2
+OPTIONS = "-w -h -fdd -lr 1 -lw 0 -otdW".split()  # one reflection deep, no ray too weak; see `answers`
 RECORD = 48  # bytes: a direction and a weight of three channels
 FOLDER = Path(pyradiance.__file__).parent
 # An interface: colour and index of its inside, then of its outside, where the normal points.
@@ -35,8 +36,8 @@ def scene(rays, centres):
     )
 
 
-def transmitted(out, rays):
-    """The child on the far side of each ray's ring, NaN where there is none.
+def answers(out, rays):
+    """The child on the far side of each ray's ring, else the reflected one where it carries all; NaN where is neither.
 
     `-t` prints children before their parent, with a tab before each of them in binary output, too. A ray's own record
     is the one that is unturned and of weight 1.
@@ -47,7 +48,7 @@ def transmitted(out, rays):
             if out[position : position + 1] != b"\t":
                 raise SystemExit(f"rtrace: ray {i} of {len(rays)} did not come back")
             child = _record(out, position + 1)
-            if child[:3] @ n < 0:
+            if child[:3] @ n < 0 or child[3] == 1:
                 b[i] = child[:3]
             position += 1 + RECORD
         position += RECORD
@@ -70,5 +71,5 @@ with tempfile.TemporaryDirectory() as folder:
     (Path(folder) / "scene.rad").write_text(scene(rays, centres))
     (Path(folder) / "scene.oct").write_bytes(run("oconv", f"{folder}/scene.rad"))
     starts = np.concatenate([centres - START * rays.a, rays.a], axis=1)
-    out = run("rtrace", "-w", "-h", "-fdd", "-lr", "1", "-lw", "0", "-otdW", f"{folder}/scene.oct", given=starts.tobytes())
-table.write(rays, transmitted(out, rays), f"Radiance, pyradiance {version('pyradiance')}")
+    out = run("rtrace", *OPTIONS, f"{folder}/scene.oct", given=starts.tobytes())
+table.write(rays, answers(out, rays), f"Radiance, pyradiance {version('pyradiance')}")

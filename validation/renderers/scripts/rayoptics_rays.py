@@ -1,4 +1,4 @@
-"""`bend` of rayoptics, a lens designer's ray tracer in double precision, ray by ray; its exception is answered as NaN."""
+"""`bend` of rayoptics, a lens designer's ray tracer in double precision, ray by ray; its exception becomes NaN."""
 
 from importlib.metadata import version
 
