@@ -49,6 +49,13 @@ _EXR_IDS = 2**24  # float32 knows whole numbers up to here
 _ATTRIBUTE = "mi_refract:rays"
 
 
+def indices(k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(n_from, n_to), each (N,) and at least 1; their ratio is k, exactly."""
+    _, exponent = np.frexp(k)
+    n_to = np.ldexp(np.ones_like(k), np.maximum(1 - exponent, 0))
+    return k * n_to, n_to
+
+
 @dataclass(frozen=True)
 class RaySet:
     """Rays with their ids (N,), the name of the regime of each (N,), and what the file says of them all."""
@@ -73,10 +80,8 @@ class RaySet:
 
     @property
     def indices(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n_from, n_to), each (N,) and at least 1; their ratio is k, exactly."""
-        _, exponent = np.frexp(self.rays.k)
-        n_to = np.ldexp(np.ones_like(self.rays.k), np.maximum(1 - exponent, 0))
-        return self.rays.k * n_to, n_to
+        """`indices` of the rays' k."""
+        return indices(self.rays.k)
 
     @property
     def numbers(self) -> np.ndarray:

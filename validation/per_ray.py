@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mi_refract import rays as ray_files
 from mi_refract import measures, rays_check, regimes
+from mi_refract import rays as ray_files
 from mi_refract.rays import Answers, RaySet
 from mi_refract.rays_check import PROBLEMS, Figures, Findings
 from mi_refract.rows import Row
@@ -77,7 +77,7 @@ SETS = {
 TERMS = {name: f"{rays.count} rays: {rays.text}" for name, rays in SETS.items()} | {
     "worst rad": "the largest angle to the certified direction, of the rays that were decided rightly",
     "noted": "the largest such angle that was noted of this system before",
-    "off the noted": "the factor between the two, whichever is larger; 1 where the noted figure is a range that holds it",
+    "off the noted": "the factor between the two, whichever is larger; 1 inside a range that was noted",
     "error / bound": "the largest share that an error takes of its ray's a-priori bound, that of the textbook formula",
     "misjudged": "rays whose total internal reflection was decided wrongly",
     "wrong": "rays beyond the bound, misjudged although the bound decides them, or without a direction",
@@ -133,15 +133,10 @@ def _made(kind: Set, precision: type, number: int) -> regimes.Rays:
 
 
 def _gathered(parts: dict[str, regimes.Rays], precision: str) -> RaySet:
-    counts = [len(part) for part in parts.values()]
-    last = np.cumsum(counts)
-    header = {
-        "precision": precision,
-        "seed": SEED,
-        "regimes": {name: [int(end - count), int(end - 1)] for name, count, end in zip(parts, counts, last, strict=True)},
-    }
-    names = np.repeat(np.array(list(parts), dtype=object), counts)
-    rays = RaySet(regimes.Rays.joined(list(parts.values())), np.arange(len(names)), names, header)
+    regime = np.concatenate([np.full(len(part), name, dtype=object) for name, part in parts.items()])
+    ends = {name: np.flatnonzero(regime == name)[[0, -1]].tolist() for name in parts}
+    header = {"precision": precision, "seed": SEED, "regimes": ends}
+    rays = RaySet(regimes.Rays.joined(list(parts.values())), np.arange(len(regime)), regime, header)
     return replace(rays, header=header | {"checksum": ray_files.checksum(rays)})
 
 

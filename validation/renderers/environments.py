@@ -38,12 +38,13 @@ def folder(system: System) -> Path:
 
 def absent(system: System) -> str:
     """"" where the system is installed in its pinned version; otherwise the command that brings it."""
-    needs = system.needs
-    if isinstance(needs, Apt):
-        there = shutil.which(needs.program) is not None
-    else:
-        there = needs is None or _marked(system)
-    return "" if there else f"{COMMAND} {system.name}"
+    return "" if _present(system) else f"{COMMAND} {system.name}"
+
+
+def _present(system: System) -> bool:
+    if isinstance(system.needs, Apt):
+        return shutil.which(system.needs.program) is not None
+    return system.needs is None or _marked(system)
 
 
 def _marked(system: System) -> bool:
@@ -84,9 +85,11 @@ def install(system: System) -> None:
     if isinstance(needs, Npm):
         _do(system, ["npm", "install", "--silent", "--no-audit", "--prefix", str(folder(system)), *needs.packages])
     elif isinstance(needs, Pip):
-        _do(system, [_interpreter(system, needs.python), "-m", "venv", str(folder(system))])
-        pip = [python(system), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-input"]
-        _do(system, [*pip, *(["--no-deps"] if needs.bare else []), *needs.requirements])
+        # This environment's pip for the other one: to make one there costs more than most of what it would install.
+        _do(system, [_interpreter(system, needs.python), "-m", "venv", "--without-pip", str(folder(system))])
+        pip = [sys.executable, "-m", "pip", "--python", python(system), "install"]
+        options = ["--quiet", "--disable-pip-version-check", "--no-input", "--no-compile"]
+        _do(system, [*pip, *options, *(["--no-deps"] if needs.bare else []), *needs.requirements])
     _marker(system).write_text(json.dumps(_mark(system)))
 
 

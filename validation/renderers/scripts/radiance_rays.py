@@ -15,7 +15,7 @@ import pyradiance
 import table
 
 RADIUS, START = 1e-3, 1e-2
-OPTIONS = "-w -h -fdd -lr 1 -lw 0 -otdW".split()  # one reflection deep, no ray too weak; see `answers`
+OPTIONS = ["-w", "-h", "-fdd", "-lr", "1", "-lw", "0", "-otdW"]  # children of rays only, however weak
 RECORD = 48  # bytes: a direction and a weight of three channels
 FOLDER = Path(pyradiance.__file__).parent
 # An interface: colour and index of its inside, then of its outside, where the normal points.
