@@ -133,7 +133,7 @@ def _mixed(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
     return angle[chosen], k[chosen]
 
 
-def _rays_at(draw: Draw, rng: Generator, n: Array) -> Triple:
+def rays_at(draw: Draw, rng: Generator, n: Array) -> Triple:
     """Rays at the drawn angles from ±n, in a random plane of incidence."""
     angle, k = draw(rng, len(n), float(np.finfo(n.dtype).eps))
     wide = n.astype(np.float64)
@@ -147,21 +147,21 @@ def _length(v: Array) -> Array:
 
 
 def _at(draw: Draw) -> Callable[[Generator, Array], Triple]:
-    return functools.partial(_rays_at, draw)
+    return functools.partial(rays_at, draw)
 
 
 # Lengths and components ----------------------------------------------------------------------------------------
 
 
 def _lengths(rng: Generator, n: Array) -> Triple:
-    a, n, k = _rays_at(_mixed, rng, n)
+    a, n, k = rays_at(_mixed, rng, n)
     of_a, of_n = (_log_uniform(rng, 1e-18, 1e18, len(n))[:, None] for _ in range(2))
     return a * of_a, n * of_n, k
 
 
 def _off_unit(rng: Generator, n: Array) -> Triple:
     """What a change of frame leaves: every vector times a matrix, both rounded, in the precision's own arithmetic."""
-    a, n, k = _rays_at(_mixed, rng, n)
+    a, n, k = rays_at(_mixed, rng, n)
     turn = np.linalg.qr(rng.normal(size=(len(n), 3, 3)))[0].astype(n.dtype)
     return np.einsum("nij,nj->ni", turn, a.astype(n.dtype)), np.einsum("nij,nj->ni", turn, n), k
 
@@ -176,7 +176,7 @@ def _keep_some(rng: Generator, v: Array, most: int) -> Array:
 
 
 def _zeros(rng: Generator, n: Array) -> Triple:
-    a, n, k = _rays_at(_mixed, rng, _keep_some(rng, n, 2).astype(n.dtype))
+    a, n, k = rays_at(_mixed, rng, _keep_some(rng, n, 2).astype(n.dtype))
     some = rng.random(len(n)) < 0.5
     a = np.where(some[:, None], _keep_some(rng, a, 2), a)
     return np.where((a * n).sum(1, keepdims=True) == 0, n, a), n, k

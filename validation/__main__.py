@@ -1,4 +1,4 @@
-"""`python -m validation [STUDY …] [--profile quick|full] [--out DIR]`.
+"""`python -m validation [STUDY …] [--profile quick|full] [--out DIR]`, or `python -m validation renderers …`.
 
 Exit code 0 where every budget held, 1 where one was broken, 2 for misuse, 130 where it was interrupted.
 """
@@ -22,10 +22,16 @@ STUDIES = {
     "efficiency": ("efficiency", "scaling"),
     "planar": ("planar", "planar_closed", "extrusion", "planar_times"),
     "gate": ("gate",),
+    "suite": ("per_ray",),
 }
 
 
 def main(arguments: list[str] | None = None) -> int:
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments[:1] == ["renderers"]:
+        from .renderers import command
+
+        return command.main(arguments[1:])
     options = _parser().parse_args(arguments)
     try:
         _check(options)

@@ -17,6 +17,7 @@ from mi_refract.files import write_atomically
 from mi_refract.rows import Row
 
 from .plan import SCENES, Context, Task
+from .renderers import SYSTEMS, environments
 
 
 def run(tasks: list[Task], context: Context) -> list[Row]:
@@ -70,9 +71,10 @@ def _recall(kept: Path) -> list[Row] | None:
 
 
 def _fingerprint(context: Context) -> str:
-    """Rows are taken up again only for the same sources, scenes, profile, variant and versions."""
-    digest = hashlib.sha256(repr((context.profile, context.variant, describe(context, 0))).encode())
-    sources = [Path(mi_refract.__file__).parent.glob("*.py"), Path(__file__).parent.glob("*.py"), SCENES.rglob("*")]
+    """Rows are taken up again only for the same sources, scenes, profile, variant, versions and other renderers."""
+    installed = [name for name, system in SYSTEMS.items() if not environments.absent(system)]
+    digest = hashlib.sha256(repr((context.profile, context.variant, installed, describe(context, 0))).encode())
+    sources = [Path(mi_refract.__file__).parent.glob("*.py"), Path(__file__).parent.rglob("*.py"), SCENES.rglob("*")]
     for path in sorted(path for group in sources for path in group if path.is_file()):
         digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -1,0 +1,13 @@
+"""Blender's Cycles, by its Python module, which needs Python 3.11. Under the GPL: run, never imported here."""
+
+from .system import NOTED_F32, Call, Pip, System
+
+SYSTEM = System(
+    "cycles",
+    "Cycles",
+    "GPL-3.0-or-later (Blender); Cycles itself Apache-2.0",
+    Pip(("bpy==5.0.1", "numpy<2"), python="3.11"),
+    megabytes=970,
+    draws=True,
+    calls=(Call("Cycles, refraction closure", "f32", "cycles_rays.py", NOTED_F32, "zero"),),
+)

@@ -1,0 +1,18 @@
+"""Mitsuba's own refraction: its functions, and its `dielectric`."""
+
+from .system import Call, System, noted
+
+_NOTED = noted(1.4e-6, 4.3e-4, 2e-7, 1.2e-6)
+SYSTEM = System(
+    "mitsuba",
+    "Mitsuba",
+    "BSD-3-Clause",
+    None,
+    megabytes=0,
+    small=True,
+    draws=True,
+    calls=(
+        Call("Mitsuba, mi.fresnel + mi.refract", "f32", "mitsuba_rays.py", _NOTED, "flag", ("functions",)),
+        Call("Mitsuba, dielectric", "f32", "mitsuba_rays.py", _NOTED, "flag", ("dielectric",)),
+    ),
+)

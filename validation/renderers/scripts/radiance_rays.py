@@ -1,0 +1,75 @@
+"""Radiance's `rtrace`: every ray meets a ring of its own between the two media, and `-otdW` tells what it becomes.
+
+A ring takes its normal as it is given, where a polygon would compute one from its corners. The rings stand apart on a
+grid, each no larger than a thousandth of the distance to the next.
+"""
+
+import os
+import subprocess
+import tempfile
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pyradiance
+import table
+
+RADIUS, START = 1e-3, 1e-2
+OPTIONS = ["-w", "-h", "-fdd", "-lr", "1", "-lw", "0", "-otdW"]  # children of rays only, however weak
+RECORD = 48  # bytes: a direction and a weight of three channels
+FOLDER = Path(pyradiance.__file__).parent
+# An interface: colour and index of its inside, then of its outside, where the normal points.
+RING = """void interface m{i}\n0\n0\n8 1 1 1 {n_to!r} 1 1 1 {n_from!r}
+m{i} ring r{i}\n0\n0\n8 {x} {y} {z} {nx!r} {ny!r} {nz!r} 0 {radius}\n"""
+
+
+def run(command, *arguments, given=None):
+    program = [str(FOLDER / "bin" / command), *arguments]
+    return subprocess.run(program, input=given, stdout=subprocess.PIPE, check=True).stdout
+
+
+def scene(rays, centres):
+    rows = zip(rays.n.tolist(), rays.n_from.tolist(), rays.n_to.tolist(), centres.tolist(), strict=True)
+    return "".join(
+        RING.format(i=i, n_from=n_from, n_to=n_to, nx=n[0], ny=n[1], nz=n[2], x=c[0], y=c[1], z=c[2], radius=RADIUS)
+        for i, (n, n_from, n_to, c) in enumerate(rows)
+    )
+
+
+def answers(out, rays):
+    """The child on the far side of each ray's ring, else the reflected one where it carries all; NaN where is neither.
+
+    `-t` prints children before their parent, with a tab before each of them in binary output, too. A ray's own record
+    is the one that is unturned and of weight 1.
+    """
+    b, position = np.full((len(rays), 3), np.nan), 0
+    for i, (a, n) in enumerate(zip(rays.a, rays.n, strict=True)):
+        while not _is(_record(out, position), a):
+            if out[position : position + 1] != b"\t":
+                raise SystemExit(f"rtrace: ray {i} of {len(rays)} did not come back")
+            child = _record(out, position + 1)
+            if child[:3] @ n < 0 or child[3] == 1:
+                b[i] = child[:3]
+            position += 1 + RECORD
+        position += RECORD
+    return b
+
+
+def _record(out, position):
+    return np.frombuffer(out[position : position + RECORD].ljust(RECORD, b"\0"))
+
+
+def _is(record, a):
+    return record[3] == 1 and np.abs(record[:3] - a).max() < 1e-9
+
+
+os.environ["RAYPATH"] = str(FOLDER / "lib")
+rays = table.Rays("float64")
+side = int(np.ceil(len(rays) ** (1 / 3)))
+centres = np.stack(np.unravel_index(np.arange(len(rays)), (side,) * 3), axis=1)
+with tempfile.TemporaryDirectory() as folder:
+    (Path(folder) / "scene.rad").write_text(scene(rays, centres))
+    (Path(folder) / "scene.oct").write_bytes(run("oconv", f"{folder}/scene.rad"))
+    starts = np.concatenate([centres - START * rays.a, rays.a], axis=1)
+    out = run("rtrace", *OPTIONS, f"{folder}/scene.oct", given=starts.tobytes())
+table.write(rays, answers(out, rays), f"Radiance, pyradiance {version('pyradiance')}")

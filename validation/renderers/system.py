@@ -1,0 +1,81 @@
+"""What is known of a system: what it can be asked, what brings it, and what it was seen to do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+SCRIPTS = Path(__file__).parent / "scripts"
+
+# Where the rays of `validation.per_ray` come from; the names of its sets.
+RANDOM, CRITICAL, GRAZING, MATCHED, TOTAL = "random", "near-critical", "grazing", "η ≈ 1", "total reflection"
+Noted = Mapping[str, tuple[float, float]]  # worst angle in radians by set, from … to
+
+
+def noted(random: float, critical: float, grazing: float | tuple, matched: float | tuple) -> Noted:
+    figures = zip((RANDOM, CRITICAL, GRAZING, MATCHED), (random, critical, grazing, matched), strict=True)
+    return {name: x if isinstance(x, tuple) else (x, x) for name, x in figures}
+
+
+# Everyone who writes down GLSL's formula in that precision.
+NOTED_F32 = noted(3e-6, 6e-4, (1e-7, 3e-7), (5e-7, 1e-6))
+NOTED_F64 = noted(9e-15, 1.9e-12, 2e-16, 1e-15)
+
+
+@dataclass(frozen=True)
+class Pip:
+    """A virtual environment of its own. `bare`: without what these packages say they depend on."""
+
+    requirements: tuple[str, ...]
+    python: str = ""  # the one version that there are wheels for, as "3.11"
+    bare: bool = False
+
+
+@dataclass(frozen=True)
+class Npm:
+    """A folder of its own with `node_modules`."""
+
+    packages: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Apt:
+    """A program of the whole machine; found wherever it is in PATH."""
+
+    program: str
+    packages: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Call:
+    """A function of refraction in one precision: `script` of scripts/ reads rays and writes answers, both as CSV.
+
+    `told`: how total internal reflection is, one of `mi_refract.rays_judge.TIR`. `gives_up`: the cos²θ_t below which it
+    takes a ray for totally reflected, by its own word.
+    """
+
+    title: str
+    precision: str  # "f32" or "f64"
+    script: str
+    noted: Noted
+    told: str
+    arguments: tuple[str, ...] = ()
+    gives_up: float = 0.0
+
+
+@dataclass(frozen=True)
+class System:
+    """Another renderer or library. `needs` is None where this package's own environment has it.
+
+    `small`: fit for every run. A program under the GPL is run, never imported nor passed on.
+    """
+
+    name: str
+    title: str
+    licence: str
+    needs: Pip | Npm | Apt | None
+    megabytes: int  # on disk
+    small: bool = False
+    calls: tuple[Call, ...] = field(default=())
+    draws: bool = False  # whether it renders pictures
