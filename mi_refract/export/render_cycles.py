@@ -1,0 +1,156 @@
+"""Render `scene.json` by Cycles: `python render.py --spp 256 --seeds 0 1 2 3 --out .`
+
+Run by the Python that has bpy, never imported by mi_refract. One `seedN.exr` per seed. The settings that make Cycles a
+plain path tracer: box filter, no clamping, no blurred caustics, no adaptive sampling, no denoising, one limit of depth.
+"""
+
+import argparse
+import json
+import math
+import re
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Vector
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--spp", type=int, default=256)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--width", type=int, help="of the square picture; default: the scene's")
+    parser.add_argument("--threads", type=int, default=0, help="0: all")
+    parser.add_argument("--out", type=Path, default=Path())
+    options = parser.parse_args()
+    folder = Path(__file__).resolve().parent
+    plain = json.loads((folder / "scene.json").read_text())
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    build(plain, folder)
+    settings(plain, options)
+    scene = bpy.context.scene
+    for seed in options.seeds:
+        scene.cycles.seed = seed
+        scene.render.filepath = str(options.out.resolve() / f"seed{seed}.exr")
+        bpy.ops.render.render(write_still=True)
+        print(scene.render.filepath, flush=True)
+
+
+def build(plain, folder):
+    materials = {name: material(name, entry) for name, entry in plain["materials"].items()}
+    for name, entry in plain["meshes"].items():
+        vertices, faces = triangles(folder / entry["file"])
+        mesh = bpy.data.meshes.new(name)
+        mesh.from_pydata(vertices, [], faces)
+        mesh.materials.append(materials[entry["material"]])
+        bpy.context.scene.collection.objects.link(bpy.data.objects.new(name, mesh))
+    world(plain["sky"], folder)
+    camera(plain["camera"])
+
+
+def triangles(path):
+    """Vertices and faces of a binary PLY file of float32 positions and triangles."""
+    header, _, data = path.read_bytes().partition(b"end_header\n")
+    vertices, faces = (int(re.search(rf"element {name} (\d+)".encode(), header)[1]) for name in ("vertex", "face"))
+    corners = np.frombuffer(data, [("count", "u1"), ("index", "<i4", 3)], faces, vertices * 12)
+    return np.frombuffer(data, "<f4", vertices * 3).reshape(-1, 3).tolist(), corners["index"].tolist()
+
+
+def material(name, entry):
+    made = bpy.data.materials.new(name)
+    made.use_nodes = True
+    nodes, links = made.node_tree.nodes, made.node_tree.links
+    nodes.clear()
+    surface = SHADERS[entry["type"]](nodes, links, entry)
+    links.new(surface, nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
+    return made
+
+
+def glass(nodes, links, entry):
+    node = nodes.new("ShaderNodeBsdfGlass")
+    node.inputs["Color"].default_value = (1, 1, 1, 1)
+    node.inputs["Roughness"].default_value = 0
+    node.inputs["IOR"].default_value = entry["int_ior"] / entry["ext_ior"]
+    return node.outputs[0]
+
+
+def diffuse(nodes, links, entry):
+    node = nodes.new("ShaderNodeBsdfDiffuse")
+    node.inputs["Color"].default_value = (*entry["reflectance"], 1)
+    node.inputs["Roughness"].default_value = 0
+    return node.outputs[0]
+
+
+def light(nodes, links, entry):
+    """Emission from the side that the normal points to; the other side is black."""
+    front, back, mix = (nodes.new(f"ShaderNode{kind}") for kind in ("Emission", "BsdfDiffuse", "MixShader"))
+    front.inputs["Color"].default_value = (*entry["radiance"], 1)
+    front.inputs["Strength"].default_value = 1
+    back.inputs["Color"].default_value = (0, 0, 0, 1)
+    links.new(nodes.new("ShaderNodeNewGeometry").outputs["Backfacing"], mix.inputs[0])
+    links.new(front.outputs[0], mix.inputs[1])
+    links.new(back.outputs[0], mix.inputs[2])
+    return mix.outputs[0]
+
+
+SHADERS = {"glass": glass, "diffuse": diffuse, "light": light}
+
+
+def world(sky, folder):
+    made = bpy.data.worlds.new("sky")
+    made.use_nodes = True
+    bpy.context.scene.world = made
+    nodes = made.node_tree.nodes
+    nodes.clear()
+    background = nodes.new("ShaderNodeBackground")
+    if "environment" in sky:
+        picture = nodes.new("ShaderNodeTexEnvironment")
+        picture.image = bpy.data.images.load(str(folder / sky["environment"]))
+        picture.image.colorspace_settings.name = "Non-Color"
+        made.node_tree.links.new(picture.outputs[0], background.inputs["Color"])
+    else:
+        background.inputs["Color"].default_value = (*sky["radiance"], 1)
+    made.node_tree.links.new(background.outputs[0], nodes.new("ShaderNodeOutputWorld").inputs["Surface"])
+
+
+def camera(entry):
+    origin, target, up = (Vector(entry[key]) for key in ("origin", "target", "up"))
+    back = (origin - target).normalized()
+    right = up.cross(back).normalized()
+    lens = bpy.data.cameras.new("camera")
+    lens.sensor_fit = "HORIZONTAL"
+    lens.angle = math.radians(entry["fov_x_degrees"])
+    lens.clip_start, lens.clip_end = 1e-3, 1e6
+    placed = bpy.data.objects.new("camera", lens)
+    axes = Matrix((right, back.cross(right), back)).transposed().to_4x4()
+    placed.matrix_world = Matrix.Translation(origin) @ axes
+    bpy.context.scene.collection.objects.link(placed)
+    bpy.context.scene.camera = placed
+
+
+def settings(plain, options):
+    scene = bpy.context.scene
+    render, cycles, view = scene.render, scene.cycles, plain["camera"]
+    render.engine = "CYCLES"
+    render.resolution_x = options.width or view["width"]
+    render.resolution_y = options.width or view["height"]
+    render.resolution_percentage = 100
+    if options.threads:
+        render.threads_mode, render.threads = "FIXED", options.threads
+    render.use_compositing = render.use_sequencer = False
+    render.image_settings.file_format = "OPEN_EXR"
+    render.image_settings.color_mode, render.image_settings.color_depth = "RGB", "32"
+    cycles.device, cycles.samples, cycles.seed = "CPU", options.spp, 0
+    cycles.pixel_filter_type, cycles.filter_width = "BOX", 1.0
+    cycles.blur_glossy = cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0
+    cycles.light_sampling_threshold = 0
+    cycles.caustics_reflective = cycles.caustics_refractive = True
+    cycles.use_adaptive_sampling = cycles.use_denoising = False
+    # Mitsuba's depth N counts the camera's ray and the last emitter: N − 2 bounces between them.
+    bounces = plain["max_depth"] - 2
+    for limit in ("max_bounces", "diffuse_bounces", "glossy_bounces", "transmission_bounces", "min_light_bounces"):
+        setattr(cycles, limit, min(bounces, 1024))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,54 @@
+"""Render `scene.cfg` by LuxCore: `python render.py --spp 256 --seeds 1 2 3 4 --out .`
+
+Run by the Python that has pyluxcore, never imported by mi_refract. One `seedN.exr` per seed.
+"""
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+
+import pyluxcore
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--spp", type=int, default=256)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
+    parser.add_argument("--width", type=int, help="of the square picture; default: the scene's")
+    parser.add_argument("--threads", type=int, default=0, help="0: all")
+    parser.add_argument("--out", type=Path, default=Path())
+    options = parser.parse_args()
+    out = options.out.resolve()
+    os.chdir(Path(__file__).resolve().parent)
+    pyluxcore.Init(lambda text: None)
+    for seed in options.seeds:
+        render(options, seed, out / f"seed{seed}.exr")
+
+
+def render(options, seed, path):
+    config = pyluxcore.Properties("scene.cfg")
+    own = {"batch.haltspp": options.spp, "renderengine.seed": max(seed, 1), "film.outputs.0.filename": str(path)}
+    if options.width:
+        own |= {"film.width": options.width, "film.height": options.width}
+    if options.threads:
+        own["native.threads.count"] = options.threads
+    for key, value in own.items():
+        config.Set(pyluxcore.Property(key, value))
+    scene = pyluxcore.Scene()
+    scene.Parse(pyluxcore.Properties("scene.scn"))
+    session = pyluxcore.RenderSession(pyluxcore.RenderConfig(config, scene))
+    session.Start()
+    while not session.HasDone():
+        time.sleep(0.05)
+        session.UpdateStats()
+    session.Stop()
+    session.GetFilm().Save()
+    print(path, flush=True)
+
+
+if __name__ == "__main__":
+    main()
+    sys.stdout.flush()
+    os._exit(0)  # with a log handler it would die when Python ends

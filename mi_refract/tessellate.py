@@ -1,0 +1,125 @@
+"""Mitsuba's shapes as flat triangles in their own coordinates, counterclockwise seen from where the normal points.
+
+Curved shapes are inscribed: their vertices lie on the surface. A `level` more halves the length of their edges.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vertices = NDArray[np.float64]  # V × 3
+Faces = NDArray[np.int64]  # F × 3
+Triangles = tuple[Vertices, Faces]
+
+GOLDEN = (1 + 5**0.5) / 2
+
+
+@functools.cache
+def sphere(level: int) -> Triangles:
+    """The unit sphere: an icosahedron, each face of it divided into 4^level."""
+    corners = np.array([[-1, GOLDEN, 0], [1, GOLDEN, 0], [-1, -GOLDEN, 0], [1, -GOLDEN, 0]])
+    corners = np.concatenate([np.roll(corners, shift, axis=1) for shift in (0, 1, 2)])
+    near = np.isclose(np.linalg.norm(corners[:, None] - corners, axis=-1), 2)
+    triples = itertools.combinations(range(12), 3)
+    faces = [(i, j, k) for i, j, k in triples if near[i, j] and near[j, k] and near[k, i]]
+    triangles = corners[np.array(faces)] / np.hypot(1, GOLDEN)
+    inward = np.linalg.det(triangles) < 0
+    triangles[inward] = triangles[inward, ::-1]
+    for _ in range(level):
+        triangles = _halved(triangles)
+    vertices, order = welded(triangles)
+    vertices.flags.writeable = order.flags.writeable = False  # they are everybody's
+    return vertices, order
+
+
+def _halved(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    a, b, c = triangles.swapaxes(0, 1)
+    ab, bc, ca = ((p + q) / np.linalg.norm(p + q, axis=-1, keepdims=True) for p, q in ((a, b), (b, c), (c, a)))
+    corners = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+    return np.concatenate([np.stack(corner, axis=1) for corner in corners])
+
+
+def welded(triangles: NDArray[np.float64]) -> Triangles:
+    """F × 3 × 3 corners as vertices and faces: corners of the same position are one vertex."""
+    vertices, index = np.unique(triangles.reshape(-1, 3) + 0.0, axis=0, return_inverse=True)
+    return vertices, index.reshape(-1, 3).astype(np.int64)
+
+
+def is_closed(faces: Faces) -> bool:
+    """Each edge borders two faces, once in either direction; vertices of the same position must be one."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    there = {(int(a), int(b)) for a, b in edges}
+    return len(there) == len(edges) and all((b, a) in there for a, b in there)
+
+
+def grid(u: NDArray[np.float64], v: NDArray[np.float64], chosen: NDArray[np.bool_]) -> Triangles:
+    """Two triangles for each chosen cell [i, j] between u[i], u[i + 1], v[j], v[j + 1] in the plane z = 0."""
+    vertices = np.stack([*np.meshgrid(u, v, indexing="ij"), np.zeros((len(u), len(v)))], axis=-1)
+    a, b, c, d = vertices[:-1, :-1], vertices[1:, :-1], vertices[1:, 1:], vertices[:-1, 1:]
+    triangles = np.stack([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)], axis=2)
+    return welded(triangles[chosen].reshape(-1, 3, 3))
+
+
+def rectangle() -> Triangles:
+    """[−1, 1]² in the plane z = 0."""
+    ends = np.array([-1.0, 1.0])
+    return grid(ends, ends, np.ones((1, 1), bool))
+
+
+def checkerboard(scale_u: float, scale_v: float) -> tuple[Triangles, Triangles]:
+    """The rectangle's two parts, of `color0` and of `color1`, where the texture's uv are scaled by these numbers."""
+    u, v = _cuts(scale_u), _cuts(scale_v)
+    # The middle of a cell in half units of the scaled coordinate, whose parity is Mitsuba's "beyond one half".
+    odd_u, odd_v = (np.floor((x[:-1] + x[1:]) * scale) % 2 == 1 for x, scale in ((u, scale_u), (v, scale_v)))
+    same = odd_u[:, None] == odd_v
+    return grid(2 * u - 1, 2 * v - 1, same), grid(2 * u - 1, 2 * v - 1, ~same)
+
+
+def _cuts(scale: float) -> NDArray[np.float64]:
+    """0, 1 and where between them a cell ends; cells are half a unit of the scaled coordinate."""
+    lines = np.arange(1, np.ceil(2 * scale)) / (2 * scale)
+    return np.concatenate([[0.0], lines, [1.0]])
+
+
+def cube() -> Triangles:
+    """[−1, 1]³."""
+    face, order = rectangle()
+    face = face + np.array([0.0, 0.0, 1.0])
+    turns = [np.roll(face, shift, axis=1) for shift in (0, 1, 2)]
+    # A half turn keeps the orientation, and takes each of the three to the face opposite.
+    turns += [turn * mirror for turn, mirror in zip(turns, ([1, -1, -1], [-1, 1, -1], [-1, -1, 1]), strict=True)]
+    return welded(np.concatenate([turn[order] for turn in turns]))
+
+
+def segments(level: int) -> int:
+    """Of a circle."""
+    return 8 << level
+
+
+def disk(level: int) -> Triangles:
+    """The unit disk in the plane z = 0."""
+    rim = _circle(level)
+    return np.concatenate([rim, np.zeros((1, 3))]), _fan(len(rim))
+
+
+def _fan(count: int) -> Faces:
+    i = np.arange(count)
+    return np.stack([i, (i + 1) % count, np.full(count, count)], axis=1)
+
+
+def cylinder(level: int) -> Triangles:
+    """The open cylinder of radius 1 from z = 0 to z = 1."""
+    rim = _circle(level)
+    count = len(rim)
+    i, j = np.arange(count), (np.arange(count) + 1) % count
+    faces = np.concatenate([np.stack([i, j, j + count], axis=1), np.stack([i, j + count, i + count], axis=1)])
+    return np.concatenate([rim, rim + np.array([0.0, 0.0, 1.0])]), faces
+
+
+def _circle(level: int) -> Vertices:
+    angle = 2 * np.pi * np.arange(segments(level)) / segments(level)
+    return np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))], axis=1)

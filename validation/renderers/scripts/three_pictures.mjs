@@ -1,0 +1,48 @@
+// Render scene.json by three-gpu-pathtracer in a headless browser, WebGL2 on the processor:
+//   node three_pictures.mjs NPM_FOLDER CHROMIUM SCENE_FOLDER OUT_FOLDER WIDTH SPP MIS SEED…
+// One seedN.f32 per seed: rows from the top, three float32 a pixel. MIS: 1 as the library's default, 0 without.
+import { createServer } from "node:http";
+import { readFile, writeFile } from "node:fs/promises";
+import { createRequire } from "node:module";
+import { extname, join, resolve } from "node:path";
+
+const [npm, chromium, scene, out, width, spp, mis, ...seeds] = process.argv.slice(2);
+const puppeteer = createRequire(join(resolve(npm), "package.json"))("puppeteer-core");
+const page = new URL("three_pictures.html", import.meta.url);
+const types = { ".js": "text/javascript", ".html": "text/html", ".json": "application/json" };
+const roots = { "/modules/": join(npm, "node_modules"), "/scene/": scene };
+
+const server = createServer(async (request, response) => {
+  const path = decodeURIComponent(new URL(request.url, "http://localhost").pathname);
+  const root = Object.keys(roots).find((prefix) => path.startsWith(prefix));
+  try {
+    const data = await readFile(root ? join(roots[root], path.slice(root.length)) : page);
+    response.writeHead(200, { "Content-Type": root ? types[extname(path)] ?? "application/octet-stream" : "text/html" });
+    response.end(data);
+  } catch {
+    response.writeHead(404).end();
+  }
+});
+await new Promise((done) => server.listen(0, "127.0.0.1", done));
+
+const browser = await puppeteer.launch({
+  executablePath: chromium,
+  args: ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"],
+  protocolTimeout: 3_600_000,
+});
+try {
+  const tab = await browser.newPage();
+  tab.on("console", (message) => console.error(message.text()));
+  tab.on("pageerror", (error) => console.error(error.message));
+  await tab.goto(`http://127.0.0.1:${server.address().port}/`);
+  await tab.waitForFunction("window.prepare");
+  await tab.evaluate((width, mis) => window.prepare(width, mis), Number(width), mis === "1");
+  for (const seed of seeds) {
+    const pixels = await tab.evaluate((spp, seed) => window.render(spp, seed), Number(spp), Number(seed));
+    await writeFile(join(out, `seed${seed}.f32`), Buffer.from(pixels, "base64"));
+    console.log(join(out, `seed${seed}.f32`));
+  }
+} finally {
+  await browser.close();
+  server.close();
+}
