@@ -29,11 +29,8 @@ from . import (
     __version__,
     backend,
     cli_diff,
-<<<<<<< HEAD
     cli_rays,
-=======
     cli_scene,
->>>>>>> export
     drawing,
     files,
     foci,
@@ -156,11 +153,8 @@ def trace(
 
 app.command()(cli_diff.diff)
 app.command()(cli_diff.accept)
-<<<<<<< HEAD
 app.add_typer(cli_rays.app, name="rays")
-=======
 app.add_typer(cli_scene.app, name="scene")
->>>>>>> export
 
 
 def _spinner(console: Console, text: str) -> contextlib.AbstractContextManager[Any]:
