@@ -74,8 +74,8 @@ def _fingerprint(context: Context) -> str:
     """Rows are taken up again only for the same sources, scenes, profile, variant, versions and other renderers."""
     installed = [name for name, system in SYSTEMS.items() if not environments.absent(system)]
     digest = hashlib.sha256(repr((context.profile, context.variant, installed, describe(context, 0))).encode())
-    here = Path(__file__).parent
-    sources = [Path(mi_refract.__file__).parent.rglob("*.py"), here.rglob("*.py"), here.glob("*.json"), SCENES.rglob("*")]
+    ours, here = Path(mi_refract.__file__).parent, Path(__file__).parent
+    sources = [ours.rglob("*.py"), here.rglob("*.py"), here.glob("*.json"), SCENES.rglob("*")]
     for path in sorted(path for group in sources for path in group if path.is_file()):
         digest.update(path.read_bytes())
     return digest.hexdigest()
