@@ -23,7 +23,7 @@ STUDIES = {
     "planar": ("planar", "planar_closed", "extrusion", "planar_times"),
     "gate": ("gate", "diff_times"),
     "truth": ("truth",),
-    "suite": ("per_ray",),
+    "suite": ("matrix", "per_ray", "pictures"),
 }
 
 
@@ -89,6 +89,8 @@ def _run(options: argparse.Namespace) -> int:
     names = [module for study in options.studies or STUDIES for module in STUDIES[study]]
     studies: dict[str, ModuleType] = {name: import_module(f"validation.{name}") for name in names}
     rows = runner.run([task for study in studies.values() for task in study.tasks(context)], context)
+    for study in studies.values():
+        rows = study.with_summary(rows) if hasattr(study, "with_summary") else rows
     described = runner.describe(context, time.perf_counter() - start)
     described["studies"] = {
         name: {"title": study.TITLE, "text": " ".join(study.TEXT.split()), "terms": study.TERMS}
