@@ -9,12 +9,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ..plain_data import Plain
-from . import mitsuba, radiance
+from . import cycles, luxcore, mitsuba, radiance
 from .common import Files
 
 TARGETS: dict[str, Callable[[Plain], Files]] = {
     "mitsuba": mitsuba.files,
     "radiance": radiance.files,
+    "cycles": cycles.files,
+    "luxcore": luxcore.files,
 }
 
 
