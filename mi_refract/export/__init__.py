@@ -9,10 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ..plain_data import Plain
-from . import cycles, luxcore, mitsuba, radiance
+from . import cycles, luxcore, mitsuba, povray, radiance
 from .common import Files
 
 TARGETS: dict[str, Callable[[Plain], Files]] = {
+    "povray": povray.files,
     "mitsuba": mitsuba.files,
     "radiance": radiance.files,
     "cycles": cycles.files,
