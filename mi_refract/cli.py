@@ -26,7 +26,19 @@ except ModuleNotFoundError as missing:
     print("mi-refract needs the extra `cli`: pip install 'mi-refract[cli]'", file=sys.stderr)
     sys.exit(2)
 
-from . import __version__, backend, cli_diff, drawing, files, foci, images, planar_keys, planar_scene, rendering
+from . import (
+    __version__,
+    backend,
+    cli_diff,
+    cli_rays,
+    drawing,
+    files,
+    foci,
+    images,
+    planar_keys,
+    planar_scene,
+    rendering,
+)
 from .branches import as_data, follow_scene, summary, with_rays
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -154,6 +166,7 @@ def trace(
 
 app.command()(cli_diff.diff)
 app.command()(cli_diff.accept)
+app.add_typer(cli_rays.app, name="rays")
 
 
 def _spinner(console: Console, text: str) -> contextlib.AbstractContextManager[Any]:
