@@ -44,7 +44,9 @@ batch.haltspp = 256
 
 
 def files(plain: Plain) -> Files:
-    sky: Files = {"sky.exr": exr(longitude_latitude(plain.sky, looked_up))} if isinstance(plain.sky, Environment) else {}
+    sky: Files = {}
+    if isinstance(plain.sky, Environment):
+        sky = {"sky.exr": exr(longitude_latitude(plain.sky, looked_up))}
     return {
         "scene.scn": _scene(plain).encode(),
         "scene.cfg": CONFIG.format(camera=plain.camera, depth=plain.max_depth).encode(),

@@ -50,7 +50,7 @@ def build(plain, folder):
 def triangles(path):
     """Vertices and faces of a binary PLY file of float32 positions and triangles."""
     header, _, data = path.read_bytes().partition(b"end_header\n")
-    vertices, faces = (int(re.search(rf"element {name} (\d+)".encode(), header)[1]) for name in ("vertex", "face"))
+    vertices, faces = (int(count) for count in re.findall(rb"element \w+ (\d+)", header))
     corners = np.frombuffer(data, [("count", "u1"), ("index", "<i4", 3)], faces, vertices * 12)
     return np.frombuffer(data, "<f4", vertices * 3).reshape(-1, 3).tolist(), corners["index"].tolist()
 

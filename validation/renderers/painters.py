@@ -51,13 +51,14 @@ def _radiance(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> lis
     export.write(plain, "radiance", folder / "scene")
     camera = plain.camera
     sizes = map(str, (camera.width, spp, plain.max_depth, *seeds))
-    script = environments.script(SYSTEMS["radiance"], "radiance_pictures.py", str(folder / "scene"), str(folder), *sizes)
+    places = str(folder / "scene"), str(folder)
+    script = environments.script(SYSTEMS["radiance"], "radiance_pictures.py", *places, *sizes)
     environments.run(script, timeout=HOURS)
     return [_raw(folder / f"seed{seed}.f32", plain) for seed in seeds]
 
 
 def _povray(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-    """One sample a pixel and run, at the same random place in all pixels: for the tiles as good as places of their own."""
+    """One sample a pixel and run, at the same random place in all of them: pixels correlate, which the test allows."""
     export.write(plain, "povray", folder / "scene")
     camera = plain.camera
     made = []
