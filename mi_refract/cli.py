@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import re
 import signal
 import sys
 import threading
@@ -31,6 +30,7 @@ from . import (
     backend,
     cli_diff,
     cli_rays,
+    cli_scene,
     drawing,
     files,
     foci,
@@ -99,7 +99,7 @@ def render(
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the sampler.")] = 0,
 ) -> None:
     """Render a scene that may use the plugin `refract`, which Mitsuba's own executable cannot see."""
-    defines = parse_defines(define or [])
+    defines = rendering.parse_defines(define or [])
     chosen = backend.activate(variant, may_restart=True)
     console = Console(stderr=True)
     with _interruptible(console, images.temporary_name(output)), _spinner(console, f"{scene.name}, {chosen}"):
@@ -107,19 +107,6 @@ def render(
     print(f"{output}: {chosen}, {header['mi_refract:spp']} spp, {header['mi_refract:render_seconds']:.2f} s")
     if variant is None and not backend.llvm().usable:
         print(f"mi-refract: {chosen} is slow; {backend.summary()}", file=sys.stderr)
-
-
-def parse_defines(items: list[str]) -> dict[str, str]:
-    """`["bsdf=dielectric"]` → `{"bsdf": "dielectric"}`. ValueError for another syntax, or a name given twice."""
-    defines: dict[str, str] = {}
-    for item in items:
-        name, equals, value = item.partition("=")
-        if not equals or not re.fullmatch(r"[A-Za-z_]\w*", name):
-            raise ValueError(f"-D {item}: accepted: NAME=VALUE")
-        if name in defines:
-            raise ValueError(f"-D {item}: {name} is given twice; accepted: once")
-        defines[name] = value
-    return defines
 
 
 def _print_keys(asked: bool) -> None:
@@ -167,6 +154,7 @@ def trace(
 app.command()(cli_diff.diff)
 app.command()(cli_diff.accept)
 app.add_typer(cli_rays.app, name="rays")
+app.add_typer(cli_scene.app, name="scene")
 
 
 def _spinner(console: Console, text: str) -> contextlib.AbstractContextManager[Any]:

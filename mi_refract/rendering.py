@@ -8,7 +8,7 @@ import json
 import os
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,6 +21,19 @@ LOADER_OPTIONS = ("path", "parallel", "optimize")  # mi.load_file would take the
 # Merged meshes come in the order of their addresses, and parallel loading in that of its threads. Then so do emitters,
 # and a seed no longer means a picture.
 REPRODUCIBLE: Any = {"parallel": False, "optimize": False}
+
+
+def parse_defines(items: Sequence[str]) -> dict[str, str]:
+    """`["bsdf=dielectric"]` → `{"bsdf": "dielectric"}`. ValueError for another syntax, or a name given twice."""
+    defines: dict[str, str] = {}
+    for item in items:
+        name, equals, value = item.partition("=")
+        if not equals or not re.fullmatch(r"[A-Za-z_]\w*", name):
+            raise ValueError(f"-D {item}: accepted: NAME=VALUE")
+        if name in defines:
+            raise ValueError(f"-D {item}: {name} is given twice; accepted: once")
+        defines[name] = value
+    return defines
 
 
 def load_scene(path: str | os.PathLike[str], defines: Mapping[str, str] | None = None) -> Any:

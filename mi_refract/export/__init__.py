@@ -9,15 +9,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ..plain_data import Plain
-from . import cycles, luxcore, mitsuba, povray, radiance
+from . import cycles, luxcore, mitsuba, obj, povray, radiance
 from .common import Files
 
 TARGETS: dict[str, Callable[[Plain], Files]] = {
-    "povray": povray.files,
-    "mitsuba": mitsuba.files,
-    "radiance": radiance.files,
     "cycles": cycles.files,
     "luxcore": luxcore.files,
+    "radiance": radiance.files,
+    "povray": povray.files,
+    "mitsuba": mitsuba.files,
+    "obj+json": obj.files,
 }
 
 
@@ -29,29 +30,30 @@ def write(plain: Plain, target: str, folder: str | os.PathLike[str]) -> list[Pat
     """
     if target not in TARGETS:
         raise ValueError(f"target {target!r}: accepted: {', '.join(TARGETS)}")
-    folder = Path(folder)
-    _require_free(folder)
+    place = _free(folder)
     files = TARGETS[target](plain)
-    temporary = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.part")
+    temporary = place.with_name(f".{place.name}.{uuid.uuid4().hex}.part")
     try:
         temporary.mkdir()
         for name, content in files.items():
             (temporary / name).write_bytes(content)
-        temporary.replace(folder)
+        temporary.replace(place)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
-    return [folder / name for name in sorted(files)]
+    return [Path(folder) / name for name in sorted(files)]
 
 
-def _require_free(folder: Path) -> None:
-    if folder.is_dir():
-        if any(folder.iterdir()):
+def _free(folder: str | os.PathLike[str]) -> Path:
+    """The folder without links in its path; an error unless it can be made or is empty."""
+    place = Path(folder).resolve()
+    if place.is_dir():
+        if any(place.iterdir()):
             raise FileExistsError(f"{folder}: holds files already; accepted: a new folder or an empty one")
-    elif folder.exists() or folder.is_symlink():
+    elif place.exists():
         raise NotADirectoryError(f"{folder}: is no folder; accepted: a new folder or an empty one")
-    parent = folder.absolute().parent
-    if not parent.is_dir():
-        raise NotADirectoryError(f"{folder}: {parent} is not a folder; accepted: a new folder in an existing one")
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise PermissionError(f"{folder}: {parent} is not writable; accepted: a writable folder")
+    if not place.parent.is_dir():
+        raise NotADirectoryError(f"{folder}: {place.parent} is not a folder; accepted: a new folder in an existing one")
+    if not os.access(place.parent, os.W_OK | os.X_OK):
+        raise PermissionError(f"{folder}: {place.parent} is not writable; accepted: a writable folder")
+    return place

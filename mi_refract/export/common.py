@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from .. import __version__
 from ..images import write_exr
-from ..plain_data import Environment, Mesh, Plain
+from ..plain_data import Mesh, Plain
 
 Files = dict[str, bytes]
-ROWS = 8  # of a map with pixel centres, for each of one with rows on the poles
 
 
 def ply(mesh: Mesh) -> bytes:
@@ -35,20 +34,6 @@ def exr(pixels: NDArray[np.floating]) -> bytes:
         path = Path(folder) / "map.exr"
         write_exr(path, pixels)
         return path.read_bytes()
-
-
-def centred(environment: Environment) -> NDArray[np.float32]:
-    """The map with its rows' centres at θ = π (i + ½) / H, as everybody but Mitsuba has them; columns as they are.
-
-    Linear interpolation between the new rows is that between the old ones but for the half row around each old one:
-    ROWS of the new for each of the old keep that small.
-    """
-    pixels = environment.pixels
-    gaps = len(pixels) - 1
-    place = (np.arange(ROWS * gaps) + 0.5) / ROWS
-    row = np.minimum(place.astype(int), gaps - 1)
-    share = (place - row)[:, None, None]
-    return ((1 - share) * pixels[row] + share * pixels[row + 1]).astype(np.float32)
 
 
 def numbers(values: Iterable[float], separator: str = " ") -> str:

@@ -7,8 +7,9 @@ from importlib.resources import files as resources
 import numpy as np
 
 from ..plain_data import Camera, Colour, Environment, Glass, Light, Material, Plain
-from .common import Files, exr, numbers, ply, readme
-from .environment import Array, longitude_latitude
+from . import described
+from .common import Files, numbers, ply, readme
+from .environment import Array
 
 COMMAND = """
 pip install pyluxcore==2.11.2
@@ -44,15 +45,12 @@ batch.haltspp = 256
 
 
 def files(plain: Plain) -> Files:
-    sky: Files = {}
-    if isinstance(plain.sky, Environment):
-        sky = {"sky.exr": exr(longitude_latitude(plain.sky, looked_up))}
     return {
         "scene.scn": _scene(plain).encode(),
         "scene.cfg": CONFIG.format(camera=plain.camera, depth=plain.max_depth).encode(),
         "render.py": resources(__package__).joinpath("render_luxcore.py").read_bytes(),
         "README.txt": readme(plain, "LuxCore", COMMAND, ASSUMED),
-    } | sky | {f"{mesh.name}.ply": ply(mesh) for mesh in plain.meshes}  # fmt: skip
+    } | described.sky(plain, looked_up) | {f"{mesh.name}.ply": ply(mesh) for mesh in plain.meshes}  # fmt: skip
 
 
 def looked_up(u: Array, v: Array) -> Array:
@@ -62,7 +60,7 @@ def looked_up(u: Array, v: Array) -> Array:
 
 
 def _scene(plain: Plain) -> str:
-    names = {material: f"material{number}" for number, material in enumerate(plain.materials)}
+    names = described.material_names(plain)
     lines = _camera(plain.camera) + _sky(plain.sky)
     for material, name in names.items():
         lines += [f"scene.materials.{name}.{line}" for line in _material(material)]

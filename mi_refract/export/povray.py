@@ -1,4 +1,4 @@
-"""The plain scene for POV-Ray: emission and glass only, for it does not follow light from one diffuse surface to another."""
+"""The plain scene for POV-Ray: lamps and glass only, for it does not follow light between diffuse surfaces."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ import numpy as np
 
 from ..plain_data import Camera, Colour, Diffuse, Environment, Glass, Light, Material, Mesh, Plain
 from ..tessellate import is_closed
-from .common import Files, centred, exr, numbers, readme
+from . import described
+from .common import LIGHT_INSIDE, Files, numbers, readme
+from .environment import Array
 
 COMMANDS = """
     povray +Iscene.pov +Oimage.exr +FE +W{width} +H{height} -A -D File_Gamma=1.0 Declare=dx=0.5 Declare=dy=0.5
@@ -20,26 +22,34 @@ ASSUMPTIONS = (
     "is below 1e-7 (adc_bailout).",
     "A ray is inside those bodies whose surface it has met once and not twice. Glass must be closed, and bodies inside "
     "one another must not touch.",
-    "Mesh vertices are float32.",
+    "A sky that is a map is resampled: POV-Ray's first column is seen toward +x.",
+    "Mesh vertices are float32, and the picture's numbers are half floats.",
+    LIGHT_INSIDE,
 )
 BAILOUT = "1e-7"
 
 
 def files(plain: Plain) -> Files:
     for mesh in plain.meshes:
+        place = f"{plain.name}: {mesh.name}"
         if isinstance(mesh.material, Glass) and not is_closed(mesh.faces):
-            raise ValueError(f"{plain.name}: {mesh.name}: an open glass surface; accepted by POV-Ray: a closed one")
+            raise ValueError(f"{place}: glass with an open surface; accepted for POV-Ray: a closed one")
         if isinstance(mesh.material, Diffuse) and any(mesh.material.reflectance):
-            raise ValueError(f"{plain.name}: {mesh.name}: a diffuse surface; accepted for POV-Ray: glass and lamps only")
+            raise ValueError(f"{place}: a diffuse surface; accepted for POV-Ray: glass and lamps only")
     camera = plain.camera
-    maps: Files = {"sky.exr": exr(centred(plain.sky))} if isinstance(plain.sky, Environment) else {}
     outside = _outside(plain)
     parts = [_settings(plain), _camera(camera), _sky(plain.sky), *(_mesh(mesh, outside) for mesh in plain.meshes)]
     commands = COMMANDS.format(width=camera.width, height=camera.height)
-    return maps | {
+    return described.sky(plain, looked_up) | {
         "scene.pov": "\n".join(parts).encode(),
         "README.txt": readme(plain, "POV-Ray 3.7", commands, ASSUMPTIONS),
     }
+
+
+def looked_up(u: Array, v: Array) -> Array:
+    """The direction whose radiance POV-Ray finds at (u, v) of a picture, v from the top."""
+    phi, theta = 2 * np.pi * u, np.pi * v
+    return np.stack([np.cos(phi) * np.sin(theta), np.cos(theta), np.sin(phi) * np.sin(theta)], axis=-1)
 
 
 def _settings(plain: Plain) -> str:
@@ -78,12 +88,7 @@ def _camera(camera: Camera) -> str:
 def _sky(sky: Colour | Environment) -> str:
     if not isinstance(sky, Environment):
         return f"background {{ rgb {_vector(sky)} }}\n"
-    # POV-Ray's column 0 is seen toward +x and not toward -z. Its matrices act on rows.
-    rows = ", ".join(numbers(row, ", ") for row in (sky.rotation @ [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]).T)
-    return (
-        'sky_sphere { pigment { image_map { exr "sky.exr" gamma 1.0 map_type 1 interpolate 2 } }\n'
-        f"  matrix <{rows}, 0, 0, 0> }}\n"
-    )
+    return 'sky_sphere { pigment { image_map { exr "sky.exr" gamma 1.0 map_type 1 interpolate 2 } } }\n'
 
 
 def _mesh(mesh: Mesh, outside: float) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ..plain_data import Camera, Diffuse, Environment, Glass, Material, Mesh, Plain
+from . import described
 from .common import Files, numbers, readme
 
 COMMANDS = """
@@ -30,7 +31,7 @@ def files(plain: Plain) -> Files:
     sky, maps = _sky(plain)
     camera = plain.camera
     commands = COMMANDS.format(width=camera.width, height=camera.height, depth=plain.max_depth)
-    materials = {material: f"material_{i}" for i, material in enumerate(plain.materials)}
+    materials = described.material_names(plain)
     parts = ["".join(f"void {_material(material, name)}" for material, name in materials.items())]
     parts += ["".join(_polygons(mesh, materials[mesh.material])) for mesh in plain.meshes]
     return maps | {
@@ -55,9 +56,8 @@ def _polygons(mesh: Mesh, material: str) -> Iterator[str]:
 
 def _view(camera: Camera) -> str:
     ahead = np.subtract(camera.target, camera.origin)
-    fov_y = math.degrees(
-        2 * math.atan(math.tan(math.radians(camera.fov_x_degrees) / 2) * camera.height / camera.width)
-    )
+    wide = math.tan(math.radians(camera.fov_x_degrees) / 2)
+    fov_y = math.degrees(2 * math.atan(wide * camera.height / camera.width))
     where = f"-vp {numbers(camera.origin)} -vd {numbers(ahead)} -vu {numbers(camera.up)}"
     return f"VIEW= -vtv {where} -vh {camera.fov_x_degrees!r} -vv {fov_y!r}\n"
 
@@ -72,7 +72,7 @@ def _sky(plain: Plain) -> tuple[str, Files]:
     pixels = np.concatenate([sky.pixels, sky.pixels[:, :1]], axis=1)
     head = f"2\n0 {height - 1} {height}\n0 {width} {width + 1}\n"
     maps = {f"sky_{c}.dat": (head + _table(pixels[..., i])).encode() for i, c in enumerate("rgb")}
-    x, y, z = (" + ".join(f"({n!r})*{d}" for n, d in zip(axis, ("Dx", "Dy", "Dz"), strict=True)) for axis in sky.rotation.T.tolist())
+    x, y, z = (f"({a!r})*Dx + ({b!r})*Dy + ({c!r})*Dz" for a, b, c in sky.rotation.T.tolist())
     functions = (
         f"x = {x};\ny = {y};\nz = {z};\nturn = atan2(x, -z)/(2*PI) - {0.5 / width!r};\n"
         f"row = Acos(y)/PI*{height - 1};\ncolumn = (turn - floor(turn))*{width};\n"
