@@ -107,12 +107,11 @@ WHY = {
 
 
 def tasks(context: Context) -> list[Task]:
-    """One per renderer and scene; the furnace, in which most renderers have no noise to judge by, for one of them."""
+    """One per renderer and scene."""
     return [
         Task(f"pictures: {title}, {scene}", functools.partial(pair_rows, context, title, scene))
-        for title in PAINTERS
-        for scene in SCENES
-        if scene != "furnace" or title.startswith(THREE)
+        for title, painter in PAINTERS.items()
+        for scene in painter.spp
     ]
 
 
@@ -128,7 +127,7 @@ def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
     if reason:
         return [Row(STUDY, title, scene, setting, reason=reason)]
     given, seeds = SCENES[scene].load(size.resolution), range(1, RENDERS + 1)
-    spp = max(painter.spp // size.less, 1)
+    spp = max(painter.spp[scene] // size.less, 1)
     try:
         with tempfile.TemporaryDirectory() as folder:
             test = painter.draw(given, Path(folder), spp, seeds)

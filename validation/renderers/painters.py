@@ -6,7 +6,7 @@ A picture is height × width × 3, linear, row 0 at the top.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,12 +26,13 @@ HOURS = 4 * 3600.0  # after which a renderer hangs
 class Painter:
     """`draw(plain, folder, spp, seeds)` leaves one picture a seed, from what it puts into an empty folder.
 
-    `spp`: samples a pixel and picture that make a difference of 1 % visible; `assumed`: in what the models differ.
+    `spp`: by scene of the study, the samples a pixel and picture that make a difference of 1 % visible where four
+    pictures are judged; `assumed`: in what the models differ.
     """
 
     system: str
     draw: Callable[[Plain, Path, int, Sequence[int]], list[Image]]
-    spp: int
+    spp: Mapping[str, int]
     assumed: Sequence[str]
 
 
@@ -115,11 +116,17 @@ THREE = (
     "and a black back.",
     "bounces and transmissiveBounces are Mitsuba's max_depth.",
 )
+
+
+def _spp(sphere: int, prism: int, environment: int) -> dict[str, int]:
+    return {"sphere": sphere, "prism": prism, "environment": environment}
+
+
 PAINTERS: dict[str, Painter] = {
-    "Radiance": Painter("radiance", _radiance, 128, radiance.ASSUMPTIONS),
-    "Cycles": Painter("cycles", _by_script("cycles"), 128, cycles.ASSUMED),
-    "LuxCore": Painter("luxcore", _by_script("luxcore"), 384, luxcore.ASSUMED),
-    "POV-Ray": Painter("povray", _povray, 16, povray.ASSUMPTIONS),
-    "three-gpu-pathtracer": Painter("three", _three("1"), 64, THREE),
-    "three-gpu-pathtracer, no MIS": Painter("three", _three("0"), 64, THREE),
+    "Radiance": Painter("radiance", _radiance, _spp(104, 72, 4), radiance.ASSUMPTIONS),
+    "Cycles": Painter("cycles", _by_script("cycles"), _spp(128, 128, 32), cycles.ASSUMED),
+    "LuxCore": Painter("luxcore", _by_script("luxcore"), _spp(320, 400, 288), luxcore.ASSUMED),
+    "POV-Ray": Painter("povray", _povray, _spp(16, 16, 16), povray.ASSUMPTIONS),
+    "three-gpu-pathtracer": Painter("three", _three("1"), {"prism": 8, "furnace": 8}, THREE),
+    "three-gpu-pathtracer, no MIS": Painter("three", _three("0"), {"prism": 8, "furnace": 8}, THREE),
 }
