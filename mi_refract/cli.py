@@ -29,6 +29,7 @@ from . import (
     __version__,
     backend,
     cli_diff,
+    cli_rays,
     cli_scene,
     drawing,
     files,
@@ -152,6 +153,7 @@ def trace(
 
 app.command()(cli_diff.diff)
 app.command()(cli_diff.accept)
+app.add_typer(cli_rays.app, name="rays")
 app.add_typer(cli_scene.app, name="scene")
 
 

@@ -36,7 +36,7 @@ ANSWER_COLUMNS = ("id", "bx", "by", "bz")
 FLAG = "transmitted"
 # Vectors are unit there, up to the rounding of their components, as documented formulas demand.
 DEFAULT = tuple(name for name, regime in regimes.REGIMES.items() if regime.unit and not regime.rests_on_denormals)
-COUNT = 1000
+COUNT, PRECISION = 1000, "f32"
 CONVENTIONS = {
     "a": "incident direction, pointing toward the surface",
     "n": "normal, on the side that the ray comes from: n.a <= 0",
@@ -107,7 +107,7 @@ class Answers:
 def make(
     names: Iterable[str] = DEFAULT,
     count: int = COUNT,
-    precision: str = "f32",
+    precision: str = PRECISION,
     seed: int = 0,
     *,
     two_sided: bool = False,
@@ -263,7 +263,7 @@ def read_answers(path: str | Path) -> Answers:
     return _answers(str(path), *_read(path, {"b": 3, FLAG: 1}, ANSWER_COLUMNS, FLAG))
 
 
-def parse_answers(text: str, name: str = "answers") -> Answers:
+def parse_answers(text: str | bytes, name: str = "answers") -> Answers:
     """The same of the text of a CSV file."""
     return _answers(name, *table(name, text, ANSWER_COLUMNS, FLAG))
 

@@ -266,8 +266,9 @@ def _single(judged: Judged) -> Explanation:
     bound = judged.budget.chord(u, k, exact.cos_t, exact.transmitted, cos_i=exact.cos_i)
     lost = judged.misjudged & (radicand(judged.rays) <= judged.budget.margin(u, k))
     everywhere = judged.compared.any() and np.median(judged.angle[judged.compared]) > F32 / 50
+    holds, claimed = _within(judged, bound) | lost, judged.roundoff < F32
     text = "errors are those of float32"
-    return _share("f32 where f64 was claimed", text, judged, judged.wrong, _within(judged, bound) | lost, bool(judged.roundoff < F32 and everywhere))
+    return _share("f32 where f64 was claimed", text, judged, judged.wrong, holds, bool(claimed and everywhere))
 
 
 def _digits(judged: Judged) -> Explanation:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from mi_refract.rays import indices
+
 
 def dot(u, v):
     return (u * v).sum(1, keepdims=True)
@@ -87,7 +89,7 @@ BAD = {
         lambda a, n, k: with_mirror(a, n, 1 / k),
         lambda a, n, k: with_nan(a, n, 1 / k),
     ],
-    "an index ignored": [lambda a, n, k: glsl(a, n, np.where(k < 1, k * 2.0 ** np.ceil(-np.log2(k)), k).astype(k.dtype))],
+    "an index ignored": [lambda a, n, k: glsl(a, n, indices(k)[0]), lambda a, n, k: glsl(a, n, 1 / indices(k)[1])],
     "normal flipped": [lambda a, n, k: glsl(a, -n, k), lambda a, n, k: with_mirror(a, -n, k)],
     "direction reversed": [
         lambda a, n, k: glsl(-a, n, k),

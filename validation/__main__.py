@@ -22,7 +22,7 @@ STUDIES = {
     "efficiency": ("efficiency", "scaling"),
     "planar": ("planar", "planar_closed", "extrusion", "planar_times"),
     "gate": ("gate",),
-    "suite": ("per_ray",),
+    "suite": ("per_ray", "pictures"),
 }
 
 

@@ -116,24 +116,25 @@ def script(system: System, name: str, *arguments: str) -> list[str]:
     return [python(system), str(SCRIPTS / name), *arguments]
 
 
-def run(command: Sequence[str], given: str = "", timeout: float = TIMEOUT, where: Path | None = None) -> str:
+def run(command: Sequence[str], given: str = "", timeout: float | None = None, where: Path | None = None) -> str:
     """What a program prints, `given` on its stdin; it and all it started are gone when this returns.
 
     Unable: it exits with CANNOT, for the reason that is its last line on stderr. Broken: it is not there, exits with
-    another code than 0, is killed, prints no text, or runs for longer than `timeout` seconds.
+    another code than 0, is killed, prints no text, or runs for longer than `timeout` seconds (TIMEOUT by default).
     """
     kept = {name: value for name, value in os.environ.items() if name not in _FOREIGN}
-    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    pipe, alone = subprocess.PIPE, kept | {"PYTHONNOUSERSITE": "1", "PYTHONUTF8": "1"}
+    limit = TIMEOUT if timeout is None else timeout
     try:
         process = subprocess.Popen(
-            command, **pipes, cwd=where, env=kept | {"PYTHONNOUSERSITE": "1", "PYTHONUTF8": "1"}, start_new_session=True
+            command, stdin=pipe, stdout=pipe, stderr=pipe, cwd=where, env=alone, start_new_session=True
         )
     except OSError as error:
         raise Broken(f"{command[0]}: {error.strerror}") from None
     try:
-        out, said = process.communicate(given.encode(), timeout)
+        out, said = process.communicate(given.encode(), limit)
     except subprocess.TimeoutExpired:
-        raise Broken(f"no end after {timeout:g} s") from None
+        raise Broken(f"no end after {limit:g} s") from None
     finally:
         _end(process)
     if process.returncode == 0:

@@ -25,8 +25,12 @@ void main() {
 precision = sys.argv[1] if len(sys.argv) > 1 else "float32"
 names = {"float32": ("float", "vec3"), "float64": ("double", "dvec3")}[precision]
 rays = table.Rays(precision)
-context = moderngl.create_context(standalone=True, backend="egl", require=430)
-shader = context.compute_shader(SOURCE.replace("FLOAT", names[0]).replace("VEC3", names[1]))
+try:
+    context = moderngl.create_context(standalone=True, backend="egl", require=430)
+    shader = context.compute_shader(SOURCE.replace("FLOAT", names[0]).replace("VEC3", names[1]))
+except Exception as error:  # of whatever kind: libraries that are missing, a driver that is too old
+    print(f"no {precision} in OpenGL 4.3 by EGL ({error}); Debian: libegl1 libgl1-mesa-dri", file=sys.stderr)
+    sys.exit(77)
 given = context.buffer(np.column_stack([rays.a, rays.n, rays.k]).astype(precision).tobytes())
 answer = context.buffer(reserve=3 * len(rays) * np.dtype(precision).itemsize)
 given.bind_to_storage_buffer(0)

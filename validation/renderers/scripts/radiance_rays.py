@@ -1,7 +1,7 @@
 """Radiance's `rtrace`: every ray meets a ring of its own between the two media, and `-otdW` tells what it becomes.
 
 A ring takes its normal as it is given, where a polygon would compute one from its corners. The rings stand apart on a
-grid, each no larger than a thousandth of the distance to the next.
+grid, so small that none is in another ray's way.
 """
 
 import os
@@ -14,12 +14,13 @@ import numpy as np
 import pyradiance
 import table
 
-RADIUS, START = 1e-3, 1e-2
+RADIUS, START = 1e-5, 1e-2
 OPTIONS = ["-w", "-h", "-fdd", "-lr", "1", "-lw", "0", "-otdW"]  # children of rays only, however weak
 RECORD = 48  # bytes: a direction and a weight of three channels
 FOLDER = Path(pyradiance.__file__).parent
-# An interface: colour and index of its inside, then of its outside, where the normal points.
-RING = """void interface m{i}\n0\n0\n8 1 1 1 {n_to!r} 1 1 1 {n_from!r}
+# An interface: colour and index of its inside, then of its outside, where the ring's normal points. Rays come from the
+# inside: there rtrace divides n_from by n_to, and from the outside it takes the reciprocal of the other ratio.
+RING = """void interface m{i}\n0\n0\n8 1 1 1 {n_from!r} 1 1 1 {n_to!r}
 m{i} ring r{i}\n0\n0\n8 {x} {y} {z} {nx!r} {ny!r} {nz!r} 0 {radius}\n"""
 
 
@@ -29,7 +30,7 @@ def run(command, *arguments, given=None):
 
 
 def scene(rays, centres):
-    rows = zip(rays.n.tolist(), rays.n_from.tolist(), rays.n_to.tolist(), centres.tolist(), strict=True)
+    rows = zip((-rays.n).tolist(), rays.n_from.tolist(), rays.n_to.tolist(), centres.tolist(), strict=True)
     return "".join(
         RING.format(i=i, n_from=n_from, n_to=n_to, nx=n[0], ny=n[1], nz=n[2], x=c[0], y=c[1], z=c[2], radius=RADIUS)
         for i, (n, n_from, n_to, c) in enumerate(rows)
