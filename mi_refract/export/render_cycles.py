@@ -1,4 +1,4 @@
-"""Render `scene.json` by Cycles: `python render.py --spp 256 --seeds 0 1 2 3 --out .`
+"""Render `scene.json` by Cycles: `python render.py --spp 256 --seeds 1 2 3 4 --out .`
 
 Run by the Python that has bpy, never imported by mi_refract. One `seedN.exr` per seed. The settings that make Cycles a
 plain path tracer: box filter, no clamping, no blurred caustics, no adaptive sampling, no denoising, one limit of depth.
@@ -18,8 +18,7 @@ from mathutils import Matrix, Vector
 def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--spp", type=int, default=256)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--width", type=int, help="of the square picture; default: the scene's")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--threads", type=int, default=0, help="0: all")
     parser.add_argument("--out", type=Path, default=Path())
     options = parser.parse_args()
@@ -51,7 +50,7 @@ def build(plain, folder):
 def triangles(path):
     """Vertices and faces of a binary PLY file of float32 positions and triangles."""
     header, _, data = path.read_bytes().partition(b"end_header\n")
-    vertices, faces = (int(re.search(rf"element {name} (\d+)".encode(), header)[1]) for name in ("vertex", "face"))
+    vertices, faces = (int(count) for count in re.findall(rb"element \w+ (\d+)", header))
     corners = np.frombuffer(data, [("count", "u1"), ("index", "<i4", 3)], faces, vertices * 12)
     return np.frombuffer(data, "<f4", vertices * 3).reshape(-1, 3).tolist(), corners["index"].tolist()
 
@@ -132,8 +131,7 @@ def settings(plain, options):
     scene = bpy.context.scene
     render, cycles, view = scene.render, scene.cycles, plain["camera"]
     render.engine = "CYCLES"
-    render.resolution_x = options.width or view["width"]
-    render.resolution_y = options.width or view["height"]
+    render.resolution_x, render.resolution_y = view["width"], view["height"]
     render.resolution_percentage = 100
     if options.threads:
         render.threads_mode, render.threads = "FIXED", options.threads

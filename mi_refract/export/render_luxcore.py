@@ -16,7 +16,6 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--spp", type=int, default=256)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
-    parser.add_argument("--width", type=int, help="of the square picture; default: the scene's")
     parser.add_argument("--threads", type=int, default=0, help="0: all")
     parser.add_argument("--out", type=Path, default=Path())
     options = parser.parse_args()
@@ -29,9 +28,7 @@ def main():
 
 def render(options, seed, path):
     config = pyluxcore.Properties("scene.cfg")
-    own = {"batch.haltspp": options.spp, "renderengine.seed": max(seed, 1), "film.outputs.0.filename": str(path)}
-    if options.width:
-        own |= {"film.width": options.width, "film.height": options.width}
+    own = {"batch.haltspp": options.spp, "renderengine.seed": seed, "film.outputs.0.filename": str(path)}
     if options.threads:
         own["native.threads.count"] = options.threads
     for key, value in own.items():

@@ -4,10 +4,10 @@ What runs there is a script of scripts/ that imports nothing of this project. A 
 says why in a line on stderr and exits with 77.
 """
 
-from . import cycles, glsl, mitsuba_builtin, optiland, pyglm, radiance, rayoptics
+from . import cycles, glsl, luxcore, mitsuba_builtin, optiland, povray, pyglm, radiance, rayoptics, three
 from .system import System
 
 SYSTEMS: dict[str, System] = {
     module.SYSTEM.name: module.SYSTEM
-    for module in (mitsuba_builtin, pyglm, glsl, rayoptics, optiland, radiance, cycles)
+    for module in (mitsuba_builtin, pyglm, glsl, rayoptics, optiland, radiance, cycles, luxcore, povray, three)
 }

@@ -27,7 +27,7 @@ await new Promise((done) => server.listen(0, "127.0.0.1", done));
 
 const browser = await puppeteer.launch({
   executablePath: chromium,
-  args: ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"],
+  args: ["--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"],
   protocolTimeout: 3_600_000,
 });
 try {
