@@ -47,6 +47,8 @@ def meshes(shape: Node, level: int) -> Iterator[Mesh]:
     if surface.one_sided and (flipped or not all(tessellate.is_closed(faces) for _, faces in parts)):
         raise shape.refused("diffuse on one side of an open surface", "its BSDF in a `twosided`, or a closed shape")
     for i, ((vertices, faces), material) in enumerate(zip(parts, surface.materials, strict=True)):
+        if not len(faces):  # a checkerboard of one cell
+            continue
         name = shape.props.id() or shape.type
         placed = vertices @ frame[:3, :3].T + frame[:3, 3]
         yield Mesh(f"{name}_{i}" if i else name, placed, faces[:, ::-1] if flipped else faces, material)

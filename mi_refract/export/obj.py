@@ -8,7 +8,7 @@ import numpy as np
 
 from ..plain_data import Diffuse, Glass, Material, Plain
 from . import described
-from .common import LIGHT_INSIDE, Files, numbers, readme
+from .common import Files, numbers, readme
 from .environment import Array
 
 COMMAND = """
@@ -24,7 +24,8 @@ ASSUMED = (
     "max_depth counts the segments of a path from the camera: 2 is light, one surface, camera.",
     "sky.exr: +y is the zenith; the pixel in row j and column i of H and W has its centre at theta = pi (j + 1/2) / H, "
     "phi = 2 pi (i + 1/2) / W, and is seen in direction (sin(phi) sin(theta), cos(theta), -cos(phi) sin(theta)).",
-    LIGHT_INSIDE,
+    "Whether radiance is scaled by the square of the index at a boundary is left to you: it shows only where a camera, "
+    "a light or a diffuse surface is inside glass.",
 )
 
 

@@ -18,8 +18,8 @@ COMMANDS = """
 0 <= dx, dy < 1: where in each pixel its only sample is; the mean over pictures with random dx and dy is the box filter.
 """
 ASSUMPTIONS = (
-    "max_trace_level counts as Mitsuba's max_depth does; both rays are followed at a boundary, until the share of one "
-    "is below 1e-7 (adc_bailout).",
+    "max_trace_level counts as Mitsuba's max_depth does, to 256 at most; both rays are followed at a boundary, until "
+    "the share of one is below 1e-7 (adc_bailout).",
     "A ray is inside those bodies whose surface it has met once and not twice. Glass must be closed, and bodies inside "
     "one another must not touch.",
     "A sky that is a map is resampled: POV-Ray's first column is seen toward +x.",

@@ -17,6 +17,7 @@ COMMANDS = """
         rtrace -h -w -u+ -fdf -ab {depth} -aa 0 -ad 1 -as 0 -lr {depth} -lw 1e-7 \\
         scene.oct | total -if3 -of -m -1024 > image.f32
 
+RAYPATH must name both this folder and Radiance's lib.
 image.f32: {height} rows of {width} pixels of 3 float32, the top row first. 1024 is the number of samples per pixel.
 """
 ASSUMPTIONS = (
