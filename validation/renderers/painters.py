@@ -126,7 +126,7 @@ PAINTERS: dict[str, Painter] = {
     "Radiance": Painter("radiance", _radiance, _spp(104, 72, 4), radiance.ASSUMPTIONS),
     "Cycles": Painter("cycles", _by_script("cycles"), _spp(128, 128, 32), cycles.ASSUMED),
     "LuxCore": Painter("luxcore", _by_script("luxcore"), _spp(320, 400, 288), luxcore.ASSUMED),
-    "POV-Ray": Painter("povray", _povray, _spp(16, 16, 16), povray.ASSUMPTIONS),
+    "POV-Ray": Painter("povray", _povray, _spp(4, 4, 4), povray.ASSUMPTIONS),
     "three-gpu-pathtracer": Painter("three", _three("1"), {"prism": 8, "furnace": 8}, THREE),
     "three-gpu-pathtracer, no MIS": Painter("three", _three("0"), {"prism": 8, "furnace": 8}, THREE),
 }
