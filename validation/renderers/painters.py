@@ -82,7 +82,7 @@ def _three(mis: str) -> Callable[[Plain, Path, int, Sequence[int]], list[Image]]
         if not (chromium and node):
             raise environments.Unable("no node or no Chromium in PATH")
         (folder / "scene").mkdir()
-        for name, content in described.files(plain, _equirectangular).items():
+        for name, content in described.files(plain, equirectangular).items():
             (folder / "scene" / name).write_bytes(content)
         script = environments.SCRIPTS / "three_pictures.mjs"
         places = [str(script), str(environments.folder(SYSTEMS["three"])), chromium, str(folder / "scene"), str(folder)]
@@ -93,7 +93,7 @@ def _three(mis: str) -> Callable[[Plain, Path, int, Sequence[int]], list[Image]]
     return draw
 
 
-def _equirectangular(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def equirectangular(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """The direction whose radiance three finds at (u, v), v from the top."""
     phi, theta = 2 * np.pi * (u - 0.5), np.pi * v
     return np.stack([np.cos(phi) * np.sin(theta), np.cos(theta), np.sin(phi) * np.sin(theta)], axis=-1)
@@ -126,7 +126,7 @@ PAINTERS: dict[str, Painter] = {
     "Radiance": Painter("radiance", _radiance, _spp(104, 72, 4), radiance.ASSUMPTIONS),
     "Cycles": Painter("cycles", _by_script("cycles"), _spp(128, 128, 32), cycles.ASSUMED),
     "LuxCore": Painter("luxcore", _by_script("luxcore"), _spp(320, 400, 288), luxcore.ASSUMED),
-    "POV-Ray": Painter("povray", _povray, _spp(16, 16, 16), povray.ASSUMPTIONS),
+    "POV-Ray": Painter("povray", _povray, _spp(4, 4, 4), povray.ASSUMPTIONS),
     "three-gpu-pathtracer": Painter("three", _three("1"), {"prism": 8, "furnace": 8}, THREE),
     "three-gpu-pathtracer, no MIS": Painter("three", _three("0"), {"prism": 8, "furnace": 8}, THREE),
 }

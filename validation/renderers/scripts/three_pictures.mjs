@@ -28,6 +28,7 @@ await new Promise((done) => server.listen(0, "127.0.0.1", done));
 const browser = await puppeteer.launch({
   executablePath: chromium,
   args: ["--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"],
+  env: { ...process.env, LIBGL_ALWAYS_SOFTWARE: "1" },
   protocolTimeout: 3_600_000,
 });
 try {
@@ -35,6 +36,11 @@ try {
   tab.on("console", (message) => console.error(message.text()));
   tab.on("pageerror", (error) => console.error(error.message));
   await tab.goto(`http://127.0.0.1:${server.address().port}/`);
+  if (!(await tab.evaluate(() => document.createElement("canvas").getContext("webgl2") !== null))) {
+    console.error("no WebGL2 in this browser; Debian has it in libegl1 and libgl1-mesa-dri");
+    process.exitCode = 77;
+    throw undefined;
+  }
   await tab.waitForFunction("window.prepare");
   await tab.evaluate((width, mis) => window.prepare(width, mis), Number(width), mis === "1");
   for (const seed of seeds) {
@@ -42,6 +48,8 @@ try {
     await writeFile(join(out, `seed${seed}.f32`), Buffer.from(pixels, "base64"));
     console.log(join(out, `seed${seed}.f32`));
   }
+} catch (error) {
+  if (process.exitCode !== 77) throw error;
 } finally {
   await browser.close();
   server.close();
