@@ -45,10 +45,8 @@ class Judged:
 
     @functools.cached_property
     def share(self) -> np.ndarray:
-        """Error over bound of the rays compared, infinite where neither is a number."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            share = np.maximum(self.angle, self.norm) / self.bound
-        return np.where(self.compared, np.nan_to_num(share, nan=np.inf), 0.0)
+        """Error over bound of the rays compared, 0 elsewhere."""
+        return np.where(self.compared, np.maximum(self.angle, self.norm) / self.bound, 0.0)
 
     @functools.cached_property
     def exact_to_rounding(self) -> np.ndarray:
@@ -64,7 +62,7 @@ class Judged:
 
     @functools.cached_property
     def wrong(self) -> np.ndarray:
-        return (self.share > 1) | self.far | self.blank
+        return ~(self.share <= 1) | self.far | self.blank
 
 
 def judge(

@@ -80,6 +80,14 @@ def test_the_exact_answers_are_exact(precision, names):
     assert (flagged.exit_code, flagged.tir) == (0, "flag")
 
 
+def test_the_shortest_decimals_of_float32_will_do():
+    """Read as float64 they are up to half an ulp from the number that was printed."""
+    to, (_, answers) = some(), exact("f32")
+    printed = np.array([[float(str(x)) for x in row] for row in answers.b.astype(np.float32)])
+    assert (printed != answers.b).any()
+    assert check(to, Answers(to.ids, printed), budget="promoted").exit_code == 0
+
+
 def test_figures_are_what_they_say():
     """A turn by a known angle in half of one regime; the worst ray is called by its id."""
     to, (certified, answers) = some("f64"), exact("f64")
@@ -220,6 +228,22 @@ def test_told_in_several_ways():
     found = check(to, changed(answers, rows, np.nan))
     assert (found.exit_code, found.tir) == (1, rays_judge.UNCLEAR)
     assert {each.kind for each in found.problems} == {"zero", "non-finite"}
+
+
+def test_a_mirror_direction_is_judged_too():
+    to, (certified, _) = some(), exact("f32")
+    answers = answered(to, programs.with_mirror)
+    row = int(np.flatnonzero(~certified.transmitted & (to.regime == "k ≫ 1"))[0])
+    found = check(to, changed(answers, row, answers.b[row] + [0, 1e-3, 0]))
+    assert (found.exit_code, found.wrong) == (1, 1)
+
+
+def test_who_thinks_a_ray_in_doubt_reflected_may_say_so():
+    to = some("f64", ("exactly critical",), 100)
+    answers = answered(to, programs.with_normals_made_unit)
+    assert 0 < (answers.b == 0).all(1).sum() < len(to)
+    found = check(to, answers)
+    assert (found.exit_code, found.tir, found.problems) == (0, rays_judge.NONE, ())
 
 
 def test_a_flag_goes_before_the_direction():
