@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import importlib.util
 
 import mitsuba as mi
 import numpy as np
@@ -150,3 +151,26 @@ def test_a_renderer_finds_the_sky_where_it_looks(renderer):
     texel = picture[np.minimum((v * rows).astype(int), rows - 1), np.minimum((u * columns).astype(int), columns - 1)]
     assert np.abs(texel - radiance(sky, seen)).max() < 0.01  # half a texel is 0.003 rad, the sky's slope below 2
     assert np.abs(texel - radiance(sky, seen * [1, 1, -1])).max() > 0.1
+
+
+# Cameras -----------------------------------------------------------------------------------------------------------
+
+
+def test_radiance_is_given_mitsubas_rays(tmp_path):
+    path = environments.SCRIPTS / "radiance_pictures.py"
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    given = pictures.SCENES["prism"].load(16)
+    within = np.random.default_rng(1).random((16, 16, 2))
+    view = export.TARGETS["radiance"](given)["camera.vf"].decode()
+    bundle = script.rays(view, within).reshape(-1, 6)
+
+    export.write(given, "mitsuba", tmp_path / "scene")
+    [sensor] = rendering.load_scene(tmp_path / "scene" / "scene.xml").sensors()
+    place = (np.stack(np.meshgrid(np.arange(16), np.arange(16)), -1) + within).reshape(-1, 2) / 16
+    ray, _ = sensor.sample_ray(0, 0.5, mi.Point2f(place.T), mi.Point2f(0.5))
+    directions = bundle[:, 3:] / np.linalg.norm(bundle[:, 3:], axis=1, keepdims=True)
+    assert np.abs(np.array(ray.d).T - directions).max() < 1e-6
+    assert np.abs(np.array(ray.d).T - directions[::-1]).max() > 0.1  # rows from the bottom would be seen
+    assert np.abs(np.array(ray.o).T - bundle[:, :3]).max() < 0.1  # Mitsuba's begin at its near plane
