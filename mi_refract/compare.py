@@ -9,13 +9,13 @@ from __future__ import annotations
 import inspect
 import typing
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
 
 from .images import Image
-from .judgement import Comparison, Figure, Verdict, entered, gates
+from .judgement import Comparison, Figure, Verdict, aligned, entered, gates
 from .samples import spreads, welch_images
 from .tiles import relative_mse, same_shape, welch
 
@@ -59,24 +59,27 @@ def tolerance(
     a, b, found = entered("tolerance", reference, test, allow_nonfinite)
     if found:
         return found
-    import OpenImageIO as oiio
-
-    result = oiio.ImageBufAlgo.compare(_buffer(a), _buffer(b), fail, warn, fail_relative, warn_relative)
-    size = a[..., 0].size
-    failed, warned = 100 * result.nfail / size, 100 * result.nwarn / size
+    # Not OpenImageIO's own `compare`: it rounds to float32, and what that does not hold would be equal.
+    with np.errstate(over="ignore"):
+        difference, mean = np.abs(b - a), np.abs(a) / 2 + np.abs(b) / 2
+        failed = _percent((difference > fail) & (difference > fail_relative * mean))
+        warned = _percent((difference > warn) & (difference > warn_relative * mean))
+        rms = float(np.sqrt(np.square(difference, dtype=np.float64).mean()))
+        maps = {"difference": difference.astype(np.float32, copy=False)}
+    largest = float(difference.max())
     figures = (
         Figure("pixels beyond the tolerance, %", failed, fail_percent),
-        Figure("largest difference", result.maxerror, hard_fail),
-        Figure("mean difference", result.meanerror),
-        Figure("RMS difference", result.rms_error),
+        Figure("largest difference", largest, hard_fail),
+        Figure("mean difference", float(difference.mean(dtype=np.float64))),
+        Figure("RMS difference", rms),
         Figure("pixels worth a warning, %", warned),
     )
-    reason = f"{failed:.3g} % of the pixels beyond the tolerance; largest difference {result.maxerror:.3g}"
-    if result.maxerror:
-        reason += f" at x = {result.maxx + reference.origin[0]}, y = {result.maxy + reference.origin[1]}"
-    if warned > warn_percent or result.maxerror > hard_warn:
+    reason = f"{failed:.3g} % of the pixels beyond the tolerance; largest difference {largest:.3g}"
+    if largest:
+        y, x, _ = np.unravel_index(int(difference.argmax()), difference.shape)
+        reason += f" at x = {x + reference.origin[0]}, y = {y + reference.origin[1]}"
+    if warned > warn_percent or largest > hard_warn:
         reason += f"; warning: {warned:.3g} % of the pixels"
-    maps = {"difference": _difference(a, b)}
     return Comparison("tolerance", _verdict(figures), reason, figures, maps=maps)
 
 
@@ -91,20 +94,21 @@ def paired_images(
 ) -> Comparison:
     """Renders of the same random numbers: the share of changed pixels and the largest change.
 
-    Changes are relative to the reference's value, or to the mean of its channel where that is larger.
+    Changes are relative to the reference's value, or to the median of its channel where that is larger, black left out.
     """
     _not_negative(locals())
     a, b, found = entered("paired", reference, test, allow_nonfinite)
     if found:
         return found
-    usual = np.abs(a).mean((0, 1))
-    scale = np.maximum(np.abs(a), np.where(usual > 0, usual, usual.mean() or 1.0))
+    # Not the mean: next to one firefly every other pixel would be dark, and no change of it one.
+    usual = _medians(a)
+    scale = np.maximum(np.abs(a), np.where(usual > 0, usual, usual.mean() or _medians(b).mean() or 1.0))
     measured = paired(a / scale, b / scale, threshold)
     figures = (
         Figure("share of changed pixels", measured.changed, changed),
         Figure("largest change", measured.largest, largest),
         Figure("RMS change", measured.rmse),
-        Figure("ratio of the means", float(b.mean() / a.mean()) if a.any() else 1.0 + float(b.mean())),
+        Figure("ratio of the means", _mean_ratio(a, b)),
     )
     reason = f"{measured.changed:.3%} of the pixels are changed, the largest by {measured.largest:.3g} of its value"
     maps = {"difference": _difference(a, b)}
@@ -125,6 +129,8 @@ def flip(
     _not_negative(locals())
     if hdr not in ("auto", "yes", "no"):
         raise ValueError(f"hdr = {hdr!r}: accepted: auto, yes, no")
+    if not 1 <= ppd <= 1000:  # below, its filters see nothing; above, they are larger than any picture
+        raise ValueError(f"ppd = {ppd}: accepted: 1 to 1000")
     _, _, found = entered("flip", reference, test, allow_nonfinite)
     if found:
         return found
@@ -144,15 +150,16 @@ def flip(
 def flip_map(reference: Image, test: Image, hdr: bool, ppd: float = 67.0) -> np.ndarray:
     """FLIP error of every pixel, H × W float32 from 0 to 1, of the channels R, G, B, or of pictures with one channel.
 
-    HDR looks at the picture at the exposures between the reference's median and largest luminance, one FLIP for each.
-    ValueError for pictures without these channels.
+    HDR looks at the picture at the exposures between the reference's median luminance, black left out, and that of its
+    brightest thousandth, one FLIP for each. ValueError for pictures without these channels.
     """
     import OpenImageIO as oiio
 
     linear = [_linear(image) for image in (reference, test)]
     light = linear[0] @ LUMINANCE
-    lit = light[light > 1e-4 * light.max()]  # the rest is black at every exposure, and would ask for many of them
-    median, brightest = (float(np.median(lit)), float(lit.max())) if lit.size else (0.18, 2.0)
+    lit = light[light > 0]
+    # Not the very largest: one firefly would ask for many exposures at which all else is black.
+    median, brightest = map(float, np.quantile(lit, (0.5, 0.999))) if lit.size else (0.18, 2.0)
     one, two = map(_buffer, linear)
     found = oiio.ImageBufAlgo.FLIP_diff(one, two, int(hdr), brightest, median, ppd)
     if found.has_error:
@@ -170,7 +177,10 @@ def _linear(image: Image) -> np.ndarray:
     names = _colours(image)
     if names != RGB and len(names) != 1:
         raise ValueError(f"{image.path}: channels {', '.join(names)}; accepted by FLIP: R, G, B, or one")
-    pixels = np.nan_to_num(image.select(names).astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    pixels = np.nan_to_num(image.select(names), nan=0.0, posinf=0.0, neginf=0.0)
+    if np.abs(pixels).max() > np.finfo(np.float32).max:
+        raise ValueError(f"{image.path}: values beyond those of float32; accepted by FLIP: up to 3.4e38")
+    pixels = pixels.astype(np.float32, copy=False)
     if encoding(image) == "sRGB":
         pixels = np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4).astype(np.float32)
     return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3)))
@@ -181,8 +191,20 @@ def _colours(image: Image) -> tuple[str, ...]:
 
 
 def _difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    difference = b - a
-    return np.abs(difference, out=difference).astype(np.float32, copy=False)
+    with np.errstate(over="ignore"):
+        difference = b - a
+        return np.abs(difference, out=difference).astype(np.float32, copy=False)
+
+
+def _medians(pixels: np.ndarray) -> np.ndarray:
+    """Of the sizes in each channel that are not 0; 0 where there are none."""
+    sizes = np.abs(pixels).reshape(-1, pixels.shape[2]).T
+    return np.array([np.median(size[size > 0].astype(np.float64)) if size.any() else 0.0 for size in sizes])
+
+
+def _percent(beyond: np.ndarray) -> float:
+    """Of the pixels, those with a channel that is."""
+    return 100 * int(beyond.any(-1).sum()) / beyond[..., 0].size
 
 
 def _buffer(pixels: np.ndarray) -> Any:
@@ -279,7 +301,20 @@ def compare(
         return chosen.function(*sides, **checked)
     if [len(side) for side in sides] != [1, 1]:
         raise ValueError(f"{method}: {len(sides[0])} and {len(sides[1])} pictures; accepted: one a side")
-    return chosen.function(sides[0][0], sides[1][0], **checked)
+    found = chosen.function(sides[0][0], sides[1][0], **checked)
+    if found.verdict is Verdict.EQUAL and _blind(chosen.function, sides[0][0], sides[1][0], checked):
+        reason = f"an all-black picture would pass, too, with these options; {found.reason}"
+        return replace(found, verdict=Verdict.INCONCLUSIVE, reason=reason)
+    return found
+
+
+def _blind(method: Callable[..., Comparison], reference: Image, test: Image, options: dict[str, Any]) -> bool:
+    """Whether the method would see no difference if the test were black. Never where both are the same, or black."""
+    a, b = aligned(reference, test)
+    a, b = np.nan_to_num(a, posinf=0, neginf=0), np.nan_to_num(b, posinf=0, neginf=0)
+    if not a.any() or np.array_equal(a, b):
+        return False
+    return method(replace(reference, pixels=a), replace(test, pixels=0 * b), **options).verdict is Verdict.EQUAL
 
 
 def automatic(reference: Image | Sequence[Image], test: Image | Sequence[Image]) -> str:
@@ -310,4 +345,9 @@ def paired(reference: np.ndarray, test: np.ndarray, threshold: float) -> Paired:
     if not finite.all():
         return Paired(changed, np.inf, np.inf, np.nan)
     return Paired(changed, float(difference.max()), float(np.sqrt(np.square(test - reference).mean())),
-                  float(test.mean() / reference.mean()) if reference.any() else 1.0 + float(test.mean()))  # fmt: skip
+                  _mean_ratio(reference, test))  # fmt: skip
+
+
+def _mean_ratio(reference: np.ndarray, test: np.ndarray) -> float:
+    one, two = (float(x.mean(dtype=np.float64)) for x in (reference, test))
+    return two / one if one else 1.0 + two

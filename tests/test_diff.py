@@ -253,6 +253,15 @@ def test_a_rule_goes_before_the_command_line(rules):
     assert silent.of("a") == How("exact", {"allow_nonfinite": True}, "NaN")
 
 
+def test_a_rule_that_allows_no_nan_holds_and_its_command_says_the_same(rules):
+    settings = Settings(
+        rules=rules('[[image]]\nname = "a"\nreason = "never"\nallow_nonfinite = false'), allow_nonfinite=("*",)
+    )
+    assert settings.of("a").options == {"allow_nonfinite": False}
+    assert settings.of("a").flags == []
+    assert settings.of("b").flags == ["--allow-nonfinite", "*"]
+
+
 def test_what_is_set_is_what_is_compared_by(folders, rules):
     settings = Settings(rules=rules(RULES))
     by_name = {result.name: result for result in diff.diff(*folders, settings).results}
