@@ -17,7 +17,7 @@ import numpy as np
 from .images import Image
 from .judgement import Comparison, Figure, Verdict, aligned, entered, gates
 from .samples import spreads, welch_images
-from .tiles import relative_mse, same_shape, welch
+from .tiles import relative_mse, same_shape, usual, welch
 
 __all__ = ["METHODS", "Comparison", "Figure", "Image", "Method", "Option", "Paired", "Verdict", "automatic", "compare"]
 __all__ += ["exact", "flip", "gates", "paired", "paired_images", "relative_mse", "tolerance", "welch", "welch_images"]
@@ -100,9 +100,8 @@ def paired_images(
     a, b, found = entered("paired", reference, test, allow_nonfinite)
     if found:
         return found
-    # Not the mean: next to one firefly every other pixel would be dark, and no change of it one.
-    usual = _medians(a)
-    scale = np.maximum(np.abs(a), np.where(usual > 0, usual, usual.mean() or _medians(b).mean() or 1.0))
+    floor = usual(np.abs(a))
+    scale = np.maximum(np.abs(a), np.where(floor > 0, floor, floor.mean() or usual(np.abs(b)).mean() or 1.0))
     measured = paired(a / scale, b / scale, threshold)
     figures = (
         Figure("share of changed pixels", measured.changed, changed),
@@ -194,12 +193,6 @@ def _difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     with np.errstate(over="ignore"):
         difference = b - a
         return np.abs(difference, out=difference).astype(np.float32, copy=False)
-
-
-def _medians(pixels: np.ndarray) -> np.ndarray:
-    """Of the sizes in each channel that are not 0; 0 where there are none."""
-    sizes = np.abs(pixels).reshape(-1, pixels.shape[2]).T
-    return np.array([np.median(size[size > 0].astype(np.float64)) if size.any() else 0.0 for size in sizes])
 
 
 def _percent(beyond: np.ndarray) -> float:

@@ -95,3 +95,45 @@ def test_a_change_against_black_is_a_change_at_any_brightness():
 def test_flip_is_not_asked_from_where_nothing_is_seen(ppd):
     with pytest.raises(ValueError, match="accepted: 1 to 1000"):
         compare("flip", image(SMOOTH), image(1 - SMOOTH), ppd=ppd)
+
+
+# Samples -------------------------------------------------------------------------------------------------------
+
+
+def renders(count, shape=(32, 32, 3), deviation=0.1, blur=0):
+    """Independent renders; with `blur`, of pixels that a filter of 2 · blur + 1 correlates."""
+    found = 1 + deviation * (RNG.gamma(2.0, 1.0, (count, *shape)) - 2) / np.sqrt(2)
+    steps = range(-blur, blur + 1)
+    return [image(np.mean([np.roll(x, (i, j), (0, 1)) for i in steps for j in steps], 0)) for x in found]
+
+
+@pytest.mark.parametrize("count", [2, 8])
+@pytest.mark.parametrize("shape", [(64, 64, 1), (32, 32, 3), (16, 16, 3)])
+def test_a_wide_filter_makes_no_false_alarms_in_small_pictures(shape, count):
+    """40 null pairs at 0.1 %: more than 2 has probability 1e-5. Taken for independent, half or more of them alarm."""
+    pairs = (compare("welch", *(renders(count, shape, blur=1) for _ in range(2))) for _ in range(40))
+    assert sum(found.verdict is DIFFERENT for found in pairs) <= 2
+
+
+def test_a_lamp_in_the_picture_makes_no_tile_dark():
+    reference, test = renders(8, (64, 64, 3)), renders(8, (64, 64, 3))
+    for each in (*reference, *test):
+        each.pixels[:16, :16] *= 1e7
+    assert compare("welch", reference, test).verdict is EQUAL
+    for each in test:
+        each.pixels[32:48, 32:48] *= 1.2
+    assert compare("welch", reference, test).verdict is DIFFERENT
+
+
+def test_without_noise_what_moves_within_a_tile_is_seen():
+    board = np.where(np.indices((32, 32)).sum(0) % 2, 1.0, 0.5)[..., None] * np.ones(3)
+    one, other = [image(board)] * 3, [image(np.roll(board, 1, 1))] * 3
+    assert compare("welch", one, one).verdict is EQUAL
+    assert compare("welch", one, other).verdict is INCONCLUSIVE
+
+
+def test_a_tile_larger_than_the_picture_is_the_picture():
+    reference, test = renders(8), renders(8)
+    found = compare("welch", reference, test, tile=10**30)
+    assert found.verdict is compare("welch", reference, test, tile=32).verdict
+    assert found.maps["t"].shape == (32, 32, 3)
