@@ -182,10 +182,9 @@ def _verdict(asked: _Asked, resolution: float) -> tuple[Verdict, str]:
 
 def _figures(asked: _Asked, family_error: float, resolution: float) -> tuple[Figure, ...]:
     finest, p = asked.levels[0], asked.p
-    smallest = min(float(p.min()), 1 - 1e-16) if p.size else 1 - 1e-16
     return (
         Figure("tests of tiles and channels that differ", asked.alarms, 0.0),
-        Figure("smallest p, adjusted for the number of tests", float(-np.expm1(p.size * np.log1p(-smallest)))),
+        Figure("smallest p, adjusted for the number of tests", tiles.adjusted(p)),
         Figure("family error", family_error),
         Figure("tiles and channels", finest.t.size),
         Figure("tiles without noise", int(finest.silent.sum())),

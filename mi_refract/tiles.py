@@ -183,6 +183,11 @@ def sidak(family_error: float, count: int) -> float:
     return float(-np.expm1(np.log1p(-family_error) / max(count, 1)))
 
 
+def adjusted(p: Array) -> float:
+    """The smallest p after Šidák; 1 of no tests."""
+    return float(-np.expm1(p.size * np.log1p(-min(float(p.min()), 1 - 1e-16)))) if p.size else 1.0
+
+
 def holm(p: Array, family_error: float) -> float:
     """The p below which a test is an alarm by Holm's step-down (1979): its first step, or the last one rejected."""
     first = family_error / max(p.size, 1)
@@ -234,7 +239,7 @@ def welch(reference: Array, test: Array, tile: int, family_error: float, margin:
     detectable = found.detectable(threshold)
     return Welch(
         int((p <= threshold).sum()),
-        float(-np.expm1(p.size * np.log1p(-min(float(p.min()), 1 - 1e-16)))),
+        adjusted(p),
         float(np.median(detectable)) if detectable.size else 0.0,
         int(found.silent.sum()),
     )
