@@ -304,10 +304,12 @@ def compare(
 def _blind(method: Callable[..., Comparison], reference: Image, test: Image, options: dict[str, Any]) -> bool:
     """Whether the method would see no difference if the test were black. Never where both are the same, or black."""
     a, b = aligned(reference, test)
-    a, b = np.nan_to_num(a, posinf=0, neginf=0), np.nan_to_num(b, posinf=0, neginf=0)
+    if options.get("allow_nonfinite"):
+        a, b = np.nan_to_num(a, posinf=0, neginf=0), np.nan_to_num(b, posinf=0, neginf=0)
     if not a.any() or np.array_equal(a, b):
         return False
-    return method(replace(reference, pixels=a), replace(test, pixels=0 * b), **options).verdict is Verdict.EQUAL
+    reference, test = replace(reference, pixels=a), replace(reference, pixels=np.zeros_like(b))
+    return method(reference, test, **options).verdict is Verdict.EQUAL
 
 
 def automatic(reference: Image | Sequence[Image], test: Image | Sequence[Image]) -> str:
