@@ -74,6 +74,9 @@ def diff(
     """Compare pictures with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
     _require_extra("scipy", *(("jinja2", "matplotlib") if report else ()))
     if self_test:
+        others = (options, samples, settings, allow_nonfinite, inconclusive, report, junit, json, github)
+        if any(others) or method != diff_settings.AUTO:
+            raise ValueError("--self-test asks every method and prints; accepted: no other option")
         raise typer.Exit(_self_test(reference, test))
     if reference is None or test is None:
         raise ValueError("two paths are needed; accepted: mi-refract diff REFERENCE TEST")
@@ -89,7 +92,7 @@ def diff(
     if report:
         flags = chosen.default.flags + _flags("--allow-nonfinite", chosen.allow_nonfinite)
         flags += _flags("--settings", [settings] if settings else []) + ["--samples"] * samples
-        replay = shlex.join(["mi-refract", "diff", str(reference), str(test), *flags])
+        replay = shlex.join(["mi-refract", "diff", engine.as_word(reference), engine.as_word(test), *flags])
         software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
         diff_page.write(report, found, software, replay)
     if junit:

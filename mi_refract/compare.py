@@ -9,21 +9,22 @@ from __future__ import annotations
 import inspect
 import typing
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
 
 from .images import Image
-from .judgement import Comparison, Figure, Verdict, entered, gates
+from .judgement import Comparison, Figure, Verdict, aligned, entered, gates
 from .samples import spreads, welch_images
-from .tiles import relative_mse, same_shape, welch
+from .tiles import relative_mse, same_shape, usual, welch
 
 __all__ = ["METHODS", "Comparison", "Figure", "Image", "Method", "Option", "Paired", "Verdict", "automatic", "compare"]
 __all__ += ["exact", "flip", "gates", "paired", "paired_images", "relative_mse", "tolerance", "welch", "welch_images"]
 __all__ += ["encoding", "flip_map"]
 
 RGB = ("R", "G", "B")
+ROWS = 16  # every so many show whether a method would see that a picture is black
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear Rec. 709
 
 
@@ -59,24 +60,25 @@ def tolerance(
     a, b, found = entered("tolerance", reference, test, allow_nonfinite)
     if found:
         return found
-    import OpenImageIO as oiio
-
-    result = oiio.ImageBufAlgo.compare(_buffer(a), _buffer(b), fail, warn, fail_relative, warn_relative)
-    size = a[..., 0].size
-    failed, warned = 100 * result.nfail / size, 100 * result.nwarn / size
+    # Not OpenImageIO's own `compare`: it rounds to float32, and what that does not hold would be equal.
+    with np.errstate(over="ignore"):
+        difference = np.abs(b - a)
+        maps = {"difference": difference.astype(np.float32, copy=False)}
+    failed, warned = (_percent(difference, a, b, *x) for x in ((fail, fail_relative), (warn, warn_relative)))
+    largest = float(difference.max())
     figures = (
         Figure("pixels beyond the tolerance, %", failed, fail_percent),
-        Figure("largest difference", result.maxerror, hard_fail),
-        Figure("mean difference", result.meanerror),
-        Figure("RMS difference", result.rms_error),
+        Figure("largest difference", largest, hard_fail),
+        Figure("mean difference", float(difference.mean(dtype=np.float64))),
+        Figure("RMS difference", float(np.sqrt(np.einsum("ijk,ijk->", *2 * [difference], dtype=float) / a.size))),
         Figure("pixels worth a warning, %", warned),
     )
-    reason = f"{failed:.3g} % of the pixels beyond the tolerance; largest difference {result.maxerror:.3g}"
-    if result.maxerror:
-        reason += f" at x = {result.maxx + reference.origin[0]}, y = {result.maxy + reference.origin[1]}"
-    if warned > warn_percent or result.maxerror > hard_warn:
+    reason = f"{failed:.3g} % of the pixels beyond the tolerance; largest difference {largest:.3g}"
+    if largest:
+        y, x, _ = np.unravel_index(int(difference.argmax()), difference.shape)
+        reason += f" at x = {x + reference.origin[0]}, y = {y + reference.origin[1]}"
+    if warned > warn_percent or largest > hard_warn:
         reason += f"; warning: {warned:.3g} % of the pixels"
-    maps = {"difference": _difference(a, b)}
     return Comparison("tolerance", _verdict(figures), reason, figures, maps=maps)
 
 
@@ -91,20 +93,20 @@ def paired_images(
 ) -> Comparison:
     """Renders of the same random numbers: the share of changed pixels and the largest change.
 
-    Changes are relative to the reference's value, or to the mean of its channel where that is larger.
+    Changes are relative to the reference's value, or to the median of its channel where that is larger, black left out.
     """
     _not_negative(locals())
     a, b, found = entered("paired", reference, test, allow_nonfinite)
     if found:
         return found
-    usual = np.abs(a).mean((0, 1))
-    scale = np.maximum(np.abs(a), np.where(usual > 0, usual, usual.mean() or 1.0))
+    floor = usual(np.abs(a))
+    scale = np.maximum(np.abs(a), np.where(floor > 0, floor, floor.mean() or usual(np.abs(b)).mean() or 1.0))
     measured = paired(a / scale, b / scale, threshold)
     figures = (
         Figure("share of changed pixels", measured.changed, changed),
         Figure("largest change", measured.largest, largest),
         Figure("RMS change", measured.rmse),
-        Figure("ratio of the means", float(b.mean() / a.mean()) if a.any() else 1.0 + float(b.mean())),
+        Figure("ratio of the means", _mean_ratio(a, b)),
     )
     reason = f"{measured.changed:.3%} of the pixels are changed, the largest by {measured.largest:.3g} of its value"
     maps = {"difference": _difference(a, b)}
@@ -125,6 +127,8 @@ def flip(
     _not_negative(locals())
     if hdr not in ("auto", "yes", "no"):
         raise ValueError(f"hdr = {hdr!r}: accepted: auto, yes, no")
+    if not 1 <= ppd <= 1000:  # below, its filters see nothing; above, they are larger than any picture
+        raise ValueError(f"ppd = {ppd}: accepted: 1 to 1000")
     _, _, found = entered("flip", reference, test, allow_nonfinite)
     if found:
         return found
@@ -144,15 +148,16 @@ def flip(
 def flip_map(reference: Image, test: Image, hdr: bool, ppd: float = 67.0) -> np.ndarray:
     """FLIP error of every pixel, H × W float32 from 0 to 1, of the channels R, G, B, or of pictures with one channel.
 
-    HDR looks at the picture at the exposures between the reference's median and largest luminance, one FLIP for each.
-    ValueError for pictures without these channels.
+    HDR looks at the picture at the exposures between the reference's median luminance, black left out, and that of its
+    brightest thousandth, one FLIP for each. ValueError for pictures without these channels.
     """
     import OpenImageIO as oiio
 
     linear = [_linear(image) for image in (reference, test)]
     light = linear[0] @ LUMINANCE
-    lit = light[light > 1e-4 * light.max()]  # the rest is black at every exposure, and would ask for many of them
-    median, brightest = (float(np.median(lit)), float(lit.max())) if lit.size else (0.18, 2.0)
+    lit = light[light > 0]
+    # Not the very largest: one firefly would ask for many exposures at which all else is black.
+    median, brightest = map(float, np.quantile(lit, (0.5, 0.999))) if lit.size else (0.18, 2.0)
     one, two = map(_buffer, linear)
     found = oiio.ImageBufAlgo.FLIP_diff(one, two, int(hdr), brightest, median, ppd)
     if found.has_error:
@@ -170,7 +175,10 @@ def _linear(image: Image) -> np.ndarray:
     names = _colours(image)
     if names != RGB and len(names) != 1:
         raise ValueError(f"{image.path}: channels {', '.join(names)}; accepted by FLIP: R, G, B, or one")
-    pixels = np.nan_to_num(image.select(names).astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    pixels = np.nan_to_num(image.select(names), nan=0.0, posinf=0.0, neginf=0.0)
+    if np.abs(pixels).max() > np.finfo(np.float32).max:
+        raise ValueError(f"{image.path}: values beyond those of float32; accepted by FLIP: up to 3.4e38")
+    pixels = pixels.astype(np.float32, copy=False)
     if encoding(image) == "sRGB":
         pixels = np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4).astype(np.float32)
     return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3)))
@@ -181,8 +189,16 @@ def _colours(image: Image) -> tuple[str, ...]:
 
 
 def _difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    difference = b - a
-    return np.abs(difference, out=difference).astype(np.float32, copy=False)
+    with np.errstate(over="ignore"):
+        difference = b - a
+        return np.abs(difference, out=difference).astype(np.float32, copy=False)
+
+
+def _percent(difference: np.ndarray, a: np.ndarray, b: np.ndarray, most: float, share: float) -> float:
+    """Of the pixels, those with a channel that differs by more than `most`, and than that share of the mean of both."""
+    pixels = np.flatnonzero((difference > most).any(-1))  # few: the rest is cheaper there
+    x, y, z = (each.reshape(-1, a.shape[2])[pixels] for each in (difference, a, b))
+    return 100 * int((x > np.maximum(most, share * (np.abs(y) / 2 + np.abs(z) / 2))).any(-1).sum()) / a[..., 0].size
 
 
 def _buffer(pixels: np.ndarray) -> Any:
@@ -279,7 +295,27 @@ def compare(
         return chosen.function(*sides, **checked)
     if [len(side) for side in sides] != [1, 1]:
         raise ValueError(f"{method}: {len(sides[0])} and {len(sides[1])} pictures; accepted: one a side")
-    return chosen.function(sides[0][0], sides[1][0], **checked)
+    found = chosen.function(sides[0][0], sides[1][0], **checked)
+    if found.verdict is Verdict.EQUAL and _blind(chosen.function, sides[0][0], sides[1][0], checked):
+        reason = f"an all-black picture would pass, too, with these options; {found.reason}"
+        return replace(found, verdict=Verdict.INCONCLUSIVE, reason=reason)
+    return found
+
+
+def _blind(method: Callable[..., Comparison], reference: Image, test: Image, options: dict[str, Any]) -> bool:
+    """Whether the method would see no difference if the test were black. Never where both are the same, or black."""
+    a, b = aligned(reference, test)
+    if options.get("allow_nonfinite"):
+        a, b = np.nan_to_num(a, posinf=0, neginf=0), np.nan_to_num(b, posinf=0, neginf=0)
+    if not a.any() or np.array_equal(a, b):
+        return False
+
+    def black_is_equal(a: np.ndarray) -> bool:
+        one, other = replace(reference, pixels=a), replace(reference, pixels=np.zeros_like(a))
+        return method(one, other, **options).verdict is Verdict.EQUAL
+
+    # Where it would be seen in some of the rows, the others need not be asked: this is to cost little.
+    return black_is_equal(a[::ROWS]) and black_is_equal(a)
 
 
 def automatic(reference: Image | Sequence[Image], test: Image | Sequence[Image]) -> str:
@@ -310,4 +346,9 @@ def paired(reference: np.ndarray, test: np.ndarray, threshold: float) -> Paired:
     if not finite.all():
         return Paired(changed, np.inf, np.inf, np.nan)
     return Paired(changed, float(difference.max()), float(np.sqrt(np.square(test - reference).mean())),
-                  float(test.mean() / reference.mean()) if reference.any() else 1.0 + float(test.mean()))  # fmt: skip
+                  _mean_ratio(reference, test))  # fmt: skip
+
+
+def _mean_ratio(reference: np.ndarray, test: np.ndarray) -> float:
+    one, two = (float(x.mean(dtype=np.float64)) for x in (reference, test))
+    return two / one if one else 1.0 + two

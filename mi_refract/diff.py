@@ -125,7 +125,12 @@ class Results:
 
 
 def _line(verb: str, reference: Path, test: Path | None, flags: Sequence[str]) -> str:
-    return shlex.join(["mi-refract", verb, str(reference), str(test), *flags]) if test else ""
+    return shlex.join(["mi-refract", verb, as_word(reference), as_word(test), *flags]) if test else ""
+
+
+def as_word(path: Path) -> str:
+    """Of a command line: a name that begins with a dash would be read as an option."""
+    return f"./{path}" if str(path).startswith("-") else str(path)
 
 
 # Comparing --------------------------------------------------------------------------------------------------------
@@ -200,7 +205,7 @@ def pairs(reference: Path, test: Path) -> list[Result]:
 def pictures_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
     """The files whose names end as a picture's, by their path inside; (name, error) of folders that cannot be read.
 
-    Names that begin with a dot are left out, and so are links to folders.
+    Names that begin with a dot are left out. Links to folders are not followed, and an error: nobody would look there.
     """
     found: dict[str, Path] = {}
     failed: list[tuple[str, str]] = []
@@ -210,6 +215,9 @@ def pictures_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
 
     for parent, folders, names in os.walk(folder, onerror=note):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for path in (Path(parent, name) for name in folders):
+            if path.is_symlink():
+                failed.append((path.relative_to(folder).as_posix(), f"{path}: a link to a folder; accepted: a folder"))
         for name in names:
             path = Path(parent, name)
             if path.suffix[1:].lower() in endings() and not name.startswith("."):
@@ -268,7 +276,8 @@ def sample_pictures(folder: Path) -> list[Image]:
 def changes(results: Results) -> Iterator[tuple[Path, Path]]:
     """(new, reference) for each picture that is not equal to its reference, or has none.
 
-    ValueError or OSError for a new picture that is no reference: unreadable, or with values that are not finite.
+    ValueError or OSError for a new picture that is no reference: unreadable, with values that are not finite, or of
+    another format than the reference's name says.
     """
     for result in results.of(Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE):
         if result.test is None:
@@ -278,7 +287,10 @@ def changes(results: Results) -> Iterator[tuple[Path, Path]]:
         picture = images.read(result.test)
         if not result.how.options.get("allow_nonfinite") and not np.isfinite(picture.pixels).all():
             raise ValueError(f"{result.test}: values that are not finite; accepted with --allow-nonfinite")
-        yield result.test, results.target(result)
+        target = results.target(result)
+        if target.suffix.lower() != result.test.suffix.lower():
+            raise ValueError(f"{target}: accepted: a name that ends in {result.test.suffix}, as {result.test} does")
+        yield result.test, target
 
 
 def accept(copies: Sequence[tuple[Path, Path]], shown: int) -> None:

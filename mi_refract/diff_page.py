@@ -140,7 +140,7 @@ def _map_makers(maps: dict[str, np.ndarray], *sides: Image) -> list[Maker]:
     if len(sides) == 2 and sides[0].pixels.shape == sides[1].pixels.shape:
         with np.errstate(invalid="ignore"):
             made["difference"] = functools.partial(_map, "difference", sides[1].pixels - sides[0].pixels)
-        if "flip" not in maps and all(np.isfinite(side.pixels).all() for side in sides):
+        if "flip" not in maps and all(np.isfinite(side.pixels.astype(np.float32)).all() for side in sides):
             made["flip"] = functools.partial(_flip, *sides)
     if "q" in maps:
         maps["−log₁₀ q"] = -np.log10(np.maximum(maps.pop("q"), 1e-30))
@@ -175,5 +175,5 @@ def _flip(reference: Image, test: Image) -> dict[str, Any]:
     """The FLIP map of the pictures made as small as it is shown: whole, they would take it seconds."""
     side = -(-reference.pixels.shape[1] // FLIP_WIDTH)
     small = [replace(each, pixels=means(each.pixels, side)) for each in (reference, test)]
-    found = _map("flip", compare.flip(*small, ppd=PPD / side).maps["flip"])
+    found = _map("flip", compare.flip(*small, ppd=max(PPD / side, 1.0)).maps["flip"])
     return found | ({"note": f"of means of {side} × {side} pixels"} if side > 1 else {})

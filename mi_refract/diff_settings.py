@@ -63,7 +63,10 @@ class How:
         """The words that say the same on the command line."""
         words = [] if self.method == AUTO else ["--method", self.method]
         for name, value in self.options.items():
-            words += ["--allow-nonfinite", "*"] if name == "allow_nonfinite" else ["--set", f"{name}={value}"]
+            if name != "allow_nonfinite":
+                words += ["--set", f"{name}={value}"]
+            elif value:
+                words += ["--allow-nonfinite", "*"]
         return words
 
 
@@ -81,7 +84,7 @@ class Settings:
         if how.method in (AUTO, self.default.method):
             how = replace(how, method=self.default.method, options={**self.default.options, **how.options})
         if any(fnmatchcase(name, pattern) for pattern in self.allow_nonfinite):
-            how = replace(how, options={**how.options, "allow_nonfinite": True})
+            how = replace(how, options={"allow_nonfinite": True, **how.options})
         return how
 
     def unused(self, names: Sequence[str]) -> list[str]:

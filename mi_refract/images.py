@@ -115,6 +115,12 @@ def read(path: str | os.PathLike[str]) -> Image:
 
     path = Path(path)
     kind = path.suffix[1:].upper() or "image"
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise ValueError(f"{path}: accepted: a name in UTF-8") from None
+    if path.exists() and not (path.is_file() or path.is_dir()):  # reading a pipe might never end
+        raise ValueError(f"{path}: accepted: a regular file")
     with path.open("rb") as file:  # the operating system's own words for what is missing or forbidden
         if not file.read(1):
             raise ValueError(f"{path}: corrupt {kind} file: it is empty")
@@ -155,7 +161,7 @@ def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Image]:
 def _picture(path: Path, source: Any, kind: str) -> Image:
     spec = source.spec()
     found = source.format_name()
-    if path.suffix[1:].lower() not in _endings(found):
+    if path.suffix[1:].lower() not in _endings(found) or found == "null":  # which is black, whatever the file holds
         raise ValueError(f"{path}: holds a picture of format {found}; accepted: the format that the name says")
     if spec.deep:
         raise ValueError(f"{path}: accepted: a picture without deep samples")

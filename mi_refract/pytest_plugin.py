@@ -66,13 +66,16 @@ def _assert_unbiased(
 
     from .diff import sample_pictures
 
+    first = seed + REFERENCE_SEED
+    known = [reference(i) for i in range(first, first + runs)] if callable(reference) else Path(reference)
+    rendered = [render(i) for i in range(seed, seed + runs)]
+
     def sides() -> tuple[list[Any], list[Any]]:
-        if callable(reference):
-            first = seed + REFERENCE_SEED
-            references = [_image(f"reference {i}", reference(i)) for i in range(first, first + runs)]
+        if isinstance(known, Path):
+            references = sample_pictures(known)
         else:
-            references = sample_pictures(Path(reference))
-        return references, [_image(f"test {i}", render(i)) for i in range(seed, seed + runs)]
+            references = [_image(f"reference {first + i}", picture) for i, picture in enumerate(known)]
+        return references, [_image(f"test {seed + i}", picture) for i, picture in enumerate(rendered)]
 
     return _judge("welch", sides, options)
 

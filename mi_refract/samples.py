@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated
 
@@ -76,8 +76,10 @@ def welch_images(
     for image in (*reference[1:], *test):
         if reason := gates(reference[0], image, allow_nonfinite):
             return refused("welch", reason, reference[0].pixels, aligned(reference[0], image)[1])
+    tile = min(tile, max(reference[0].pixels.shape[:2]))
     one, two, channels = _sides(reference, test, tile, spp)
     levels = list(tiles.levels(one, two, margin))
+    levels[0] = _with_silent_pixels(levels[0], reference[0].select(channels), test[0].select(channels), margin, tile)
     asked = _Asked(levels, np.concatenate([level.beyond[~level.silent] for level in levels]), family_error, correction)
     verdict, reason = _verdict(asked, resolution)
     if untested := [name for name in reference[0].channels if name not in channels]:
@@ -114,6 +116,15 @@ def _sides(
         f"welch: {len(reference)} and {len(test)} renders; accepted: at least 2 a side, or one a side with channels "
         f"of its variance, as {', '.join(form.format('R') for form in (*MOMENTS[:1], *VARIANCES[:1]))}"
     )
+
+
+def _with_silent_pixels(level: tiles.Level, a: np.ndarray, b: np.ndarray, margin: float, tile: int) -> tiles.Level:
+    """Without noise a tile is off where a pixel is, too: its mean knows nothing of what was moved about inside."""
+    if not level.silent.any():
+        return level
+    a, b = _finite(a).astype(np.float64), _finite(b)
+    allowed = margin * np.maximum(np.abs(a), tiles.DARK * tiles.usual(np.abs(a)))
+    return replace(level, off=level.off | (level.silent & (tiles.fold(np.abs(b - a) > allowed, tile) > 0)))
 
 
 def _distinct(side: Sequence[Image]) -> None:
@@ -171,10 +182,9 @@ def _verdict(asked: _Asked, resolution: float) -> tuple[Verdict, str]:
 
 def _figures(asked: _Asked, family_error: float, resolution: float) -> tuple[Figure, ...]:
     finest, p = asked.levels[0], asked.p
-    smallest = min(float(p.min()), 1 - 1e-16) if p.size else 1 - 1e-16
     return (
         Figure("tests of tiles and channels that differ", asked.alarms, 0.0),
-        Figure("smallest p, adjusted for the number of tests", float(-np.expm1(p.size * np.log1p(-smallest)))),
+        Figure("smallest p, adjusted for the number of tests", tiles.adjusted(p)),
         Figure("family error", family_error),
         Figure("tiles and channels", finest.t.size),
         Figure("tiles without noise", int(finest.silent.sum())),

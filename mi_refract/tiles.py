@@ -14,14 +14,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-DARK = 1e-3  # a tile darker than this share of its channel's mean counts as that bright where shares are asked for
+DARK = 1e-3  # a tile darker than this share of its channel's `usual` counts as that bright where shares are asked for
 GROWTH = 4  # from one level of tiles to the next
 HEAVY = 4.0  # a tile whose noise comes from fewer pixels than this is heavy-tailed: its t is not a Student's
-POOLED = 30  # tiles from which the correlation of pixels is estimated, at least
+POOLED = 30  # blocks of tiles from which the correlation of pixels is estimated again, at least
 MISSED = 0.01  # a difference of the detectable size is missed with this probability
 WORKERS = 2
 
 Array = np.ndarray
+
+
+@dataclass(frozen=True, order=True)
+class Inflation:
+    """By how much tile means vary more than with independent pixels, at least 1: those of a wide filter correlate.
+
+    `freedom`: degrees of freedom of that estimate. Few tiles make it a guess, which t-tests have to know.
+    """
+
+    factor: float = 1.0
+    freedom: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -43,21 +54,22 @@ class Side:
         renders = None if self.renders is None else fold(self.renders, GROWTH)
         return Side(area, mean, variance, squares, self.freedom, renders)
 
-    def spread(self, inflation: float) -> tuple[Array, Array]:
+    def spread(self, inflation: Inflation) -> tuple[Array, Array]:
         """The variance of the tile means, and its square over its degrees of freedom, summed over pixels."""
-        freedom = self.freedom / inflation  # correlated pixels are fewer
-        return self.variance * inflation / self.area**2, self.squares * inflation**2 / self.area**4 / freedom
+        variance = self.variance * inflation.factor / self.area**2
+        freedom = self.freedom / inflation.factor  # correlated pixels are fewer
+        squares = self.squares * inflation.factor**2 / self.area**4 / freedom
+        return variance, squares + variance**2 / inflation.freedom
 
-    def inflation(self) -> float:
-        """By how much tile means vary more than with independent pixels: those of a wide filter correlate. At least 1.
-
-        One number for all tiles of a picture; 1 where there are too few of them to tell.
-        """
+    def inflation(self) -> Inflation:
+        """One for all tiles of a picture. Of pictures without `renders` it is not known, and 1."""
         noisy = self.variance > 0
-        if self.renders is None or noisy.sum() < POOLED:
-            return 1.0
+        if self.renders is None or not noisy.any():
+            return Inflation()
         between = self.renders.var(0, ddof=1)[noisy] / len(self.renders)
-        return max(1.0, float((between / self.variance[noisy]).mean()))
+        # The channels of a tile may share their noise: tiles count, not tiles and channels.
+        freedom = self.freedom * int(noisy.any(-1).sum())
+        return Inflation(max(1.0, float((between / self.variance[noisy]).mean())), freedom)
 
 
 def fold(x: Array, size: int) -> Array:
@@ -121,7 +133,7 @@ class Level:
         """Relative differences seen with probability 1 − MISSED at that p, of the tiles with light and noise."""
         from scipy import special
 
-        asked = ~self.silent & (self.mean > DARK * self.mean.mean((0, 1)))
+        asked = ~self.silent & (self.mean > DARK * usual(self.mean))
         freedom = self.freedom[asked]
         reach = -special.stdtrit(freedom, threshold / 2) - special.stdtrit(freedom, MISSED)
         return (reach * self.error[asked] + self.allowed[asked]) / self.mean[asked]
@@ -129,16 +141,19 @@ class Level:
 
 def levels(reference: Side, test: Side, margin: float) -> Iterator[Level]:
     """The test of single tiles, then of blocks GROWTH times as wide, and so on to the whole picture."""
-    inflations = 1.0, 1.0
+    inflations = reference.inflation(), test.inflation()
     while True:
-        inflations = max(inflations[0], reference.inflation()), max(inflations[1], test.inflation())
         yield compare_tiles(reference, test, margin, inflations)
         if reference.area.size == 1:
             return
         reference, test = reference.coarser(), test.coarser()
+        if reference.area.size >= POOLED:
+            inflations = max(inflations[0], reference.inflation()), max(inflations[1], test.inflation())
 
 
-def compare_tiles(one: Side, two: Side, margin: float, inflations: tuple[float, float] = (1.0, 1.0)) -> Level:
+def compare_tiles(
+    one: Side, two: Side, margin: float, inflations: tuple[Inflation, Inflation] = (Inflation(), Inflation())
+) -> Level:
     """Welch's test of every tile. Differences up to `margin`, relative to the tile's mean, are as good as none."""
     from scipy import special
 
@@ -146,7 +161,7 @@ def compare_tiles(one: Side, two: Side, margin: float, inflations: tuple[float, 
         m1, m2 = one.mean / one.area, two.mean / two.area
         v1, d1 = one.spread(inflations[0])
         v2, d2 = two.spread(inflations[1])
-        variance, allowed = v1 + v2, margin * np.maximum(np.abs(m1), DARK * np.abs(m1).mean((0, 1)))
+        variance, allowed = v1 + v2, margin * np.maximum(np.abs(m1), DARK * usual(np.abs(m1)))
         silent, error, difference = variance == 0, np.sqrt(variance), m2 - m1
         freedom = np.where(silent, 1.0, variance**2 / (d1 + d2))
         t = np.where(silent, 0.0, difference / error)
@@ -157,9 +172,20 @@ def compare_tiles(one: Side, two: Side, margin: float, inflations: tuple[float, 
     return Level(t, p, p_beyond, silent, off, few & ~silent, np.abs(m1), allowed, error, freedom)
 
 
+def usual(sizes: Array) -> Array:
+    """Of each channel the median of what is not black. Not the mean: next to a lamp everything else would be dark."""
+    channels = sizes.reshape(-1, sizes.shape[-1]).T
+    return np.array([np.median(x[x > 0].astype(np.float64)) if (x > 0).any() else 0.0 for x in channels])
+
+
 def sidak(family_error: float, count: int) -> float:
     """The p below which one of `count` independent tests is an alarm."""
     return float(-np.expm1(np.log1p(-family_error) / max(count, 1)))
+
+
+def adjusted(p: Array) -> float:
+    """The smallest p after Šidák; 1 of no tests."""
+    return float(-np.expm1(p.size * np.log1p(-min(float(p.min()), 1 - 1e-16)))) if p.size else 1.0
 
 
 def holm(p: Array, family_error: float) -> float:
@@ -213,7 +239,7 @@ def welch(reference: Array, test: Array, tile: int, family_error: float, margin:
     detectable = found.detectable(threshold)
     return Welch(
         int((p <= threshold).sum()),
-        float(-np.expm1(p.size * np.log1p(-min(float(p.min()), 1 - 1e-16)))),
+        adjusted(p),
         float(np.median(detectable)) if detectable.size else 0.0,
         int(found.silent.sum()),
     )

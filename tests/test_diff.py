@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -117,6 +118,14 @@ def test_a_picture_is_not_compared_with_itself(folders, link):
     results = diff.diff(old, new)
     assert found(results)["same.exr"] == ("error", "unknown")
     assert "the same file" in results.results[0].error
+
+
+def test_a_link_to_a_folder_is_not_passed_over(folders):
+    for side in folders:
+        (side / "linked").symlink_to(side / "inner")
+    results = diff.diff(*folders)
+    assert [(r.name, r.status) for r in results.results[:2]] == [("linked", "error")] * 2
+    assert results.exit_code == 2
 
 
 def test_nothing_to_compare(folders, tmp_path):
@@ -251,6 +260,15 @@ def test_a_rule_goes_before_the_command_line(rules):
     assert exact.of("other.exr") == How("exact")
     silent = Settings(How("exact"), rules('[[image]]\nname = "a"\nreason = "NaN"\nallow_nonfinite = true'))
     assert silent.of("a") == How("exact", {"allow_nonfinite": True}, "NaN")
+
+
+def test_a_rule_that_allows_no_nan_holds_and_its_command_says_the_same(rules):
+    settings = Settings(
+        rules=rules('[[image]]\nname = "a"\nreason = "never"\nallow_nonfinite = false'), allow_nonfinite=("*",)
+    )
+    assert settings.of("a").options == {"allow_nonfinite": False}
+    assert settings.of("a").flags == []
+    assert settings.of("b").flags == ["--allow-nonfinite", "*"]
 
 
 def test_what_is_set_is_what_is_compared_by(folders, rules):
@@ -412,6 +430,13 @@ def test_a_bad_added_picture_becomes_no_reference(folders):
         list(diff.changes(diff.diff(*folders)))
 
 
+@pytest.mark.parametrize("name", ["ref.png", "folder"])
+def test_a_reference_is_of_the_format_that_its_name_says(folders, tmp_path, name):
+    results = diff.diff(tmp_path / name, folders[1] / "same.exr", new=True)
+    with pytest.raises(ValueError, match=r"accepted: a name that ends in \.exr"):
+        list(diff.changes(results))
+
+
 def test_a_bad_reference_can_be_replaced(folders):
     old, new = folders
     BROKEN["truncated"](old / "same.exr")
@@ -435,6 +460,15 @@ def test_a_copy_that_fails_leaves_the_old_reference(folders, monkeypatch):
         diff.accept([(new / "inner/changed.exr", old / "inner/changed.exr")], time.time_ns())
     assert (old / "inner/changed.exr").read_bytes() == before
     assert not list(old.rglob("*.part"))
+
+
+def test_a_name_with_a_dash_is_no_option_of_the_command(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    picture(Path("-a.exr"))
+    picture(Path("-b.exr"), gain=1.1)
+    results = diff.diff("-a.exr", "-b.exr")
+    assert results.reproduce(results.results[0]) == "mi-refract diff ./-a.exr ./-b.exr"
+    assert results.accept(results.results[0]) == "mi-refract accept ./-a.exr ./-b.exr"
 
 
 def test_the_commands_do_what_they_say(folders):

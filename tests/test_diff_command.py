@@ -281,6 +281,8 @@ def test_bad_self_tests(run, pair, tmp_path):
     picture(tmp_path / "nan.exr", value=np.nan)
     for words, message in [
         (pair, "--self-test takes one path"),
+        ([pair[0] / "equal.exr", "--report", tmp_path / "a.html"], "accepted: no other option"),
+        ([pair[0] / "equal.exr", "--method", "flip"], "accepted: no other option"),
         ([tmp_path / "none.exr"], "none.exr"),
         ([tmp_path / "none.xml"], "none.xml"),
         ([tmp_path / "mixed"], "size or channels differ from"),

@@ -118,6 +118,8 @@ BAD = {
     "zero.exr": lambda path: window(path, -1, -1),
     "huge.exr": lambda path: window(path, 2**30, 2**30),
     "big.exr": lambda path: window(path, 2**16, 2**16),
+    "black.null": lambda path: path.write_text("read as black, whatever it holds"),
+    "pipe.exr": os.mkfifo,
     "header.tif": lambda path: path.write_bytes(b"II*\0\x08\0\0\0"),
 }
 
@@ -142,6 +144,12 @@ def test_truncated_files(tmp_path, name, kind, keep):
     with pytest.raises(ValueError, match=f"{name}: corrupt") as error:
         read(path)
     assert "\n" not in str(error.value)
+
+
+def test_a_name_that_is_no_utf8(tmp_path):
+    save(tmp_path / "a.exr", PIXELS).rename(path := tmp_path / "a\udcff.exr")
+    with pytest.raises(ValueError, match="accepted: a name in UTF-8"):
+        read(path)
 
 
 def test_what_the_system_does_not_give(tmp_path):

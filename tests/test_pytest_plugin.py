@@ -67,6 +67,15 @@ def test_bias_fails_and_so_does_what_cannot_be_told(assert_image_unbiased, tmp_p
         assert_image_unbiased(render, render, runs=1)
 
 
+def test_an_error_of_the_users_own_code_is_shown_as_it_is(assert_image_unbiased):
+    def broken(seed):
+        raise ValueError("my own")
+
+    for sides in ((broken, lambda seed: PICTURE), (lambda seed: PICTURE, broken)):
+        with pytest.raises(ValueError, match="my own"):
+            assert_image_unbiased(*sides)
+
+
 def test_no_seed_is_rendered_on_both_sides(assert_image_unbiased):
     seeds = {"test": [], "reference": []}
 
