@@ -176,8 +176,8 @@ def _verdict(asked: _Asked, resolution: float) -> tuple[Verdict, str]:
     if not asked.p.size:
         return Verdict.EQUAL, "no noise, and no tile differs beyond the margin"
     if not visible <= resolution:
-        return Verdict.INCONCLUSIVE, f"no difference is seen, but the noise would hide one of {visible:.2g} in a tile"
-    return Verdict.EQUAL, f"no difference; one of {visible:.2g} in a tile would have been seen"
+        return Verdict.INCONCLUSIVE, f"no difference is seen, but in a tile of median noise one of {visible:.2g} is hidden"
+    return Verdict.EQUAL, f"no difference; one of {visible:.2g} would have been seen in a tile of median noise"
 
 
 def _figures(asked: _Asked, family_error: float, resolution: float) -> tuple[Figure, ...]:
