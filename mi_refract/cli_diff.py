@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import importlib.util
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.progress import Progress
 
 from . import diff as engine
 from . import diff_output as output
@@ -70,7 +72,7 @@ def diff(
     ] = False,
 ) -> None:
     """Compare pictures with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
-    _require_extra()
+    _require_extra("scipy", *(("jinja2", "matplotlib") if report else ()))
     if self_test:
         raise typer.Exit(_self_test(reference, test))
     if reference is None or test is None:
@@ -79,13 +81,17 @@ def diff(
         if path:
             writable(path, suffixes)
     chosen = _settings(reference, method, options, settings, allow_nonfinite)
-    found = engine.diff(reference, test, chosen, samples=samples, inconclusive=inconclusive or "", maps=bool(report))
+    with _progress() as tell:
+        found = engine.diff(
+            reference, test, chosen, samples=samples, inconclusive=inconclusive or "", maps=bool(report), tell=tell
+        )
     _say(found)
     if report:
         flags = chosen.default.flags + _flags("--allow-nonfinite", chosen.allow_nonfinite)
         flags += _flags("--settings", [settings] if settings else []) + ["--samples"] * samples
         replay = shlex.join(["mi-refract", "diff", str(reference), str(test), *flags])
-        diff_page.write(report, found, provenance(), replay)
+        software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
+        diff_page.write(report, found, software, replay)
     if junit:
         output.write_junit(junit, found)
     if json:
@@ -107,9 +113,10 @@ def accept(
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
     """Copy the pictures that are not equal over their references, after showing them. Nothing is deleted."""
-    _require_extra()
+    _require_extra("scipy")
     chosen = _settings(reference, method, options, settings, allow_nonfinite)
-    found = engine.diff(reference, test, chosen, new=True)
+    with _progress() as tell:
+        found = engine.diff(reference, test, chosen, new=True, tell=tell)
     _say(found)
     copies = list(engine.changes(found))
     for new, old in copies:
@@ -117,17 +124,25 @@ def accept(
     if not copies:
         print("nothing to accept")
     elif yes or _agreed(len(copies)):
-        engine.accept(copies)
+        engine.accept(copies, found.began)
         print(f"{len(copies)} accepted")
     else:
         print("nothing accepted")
         raise typer.Exit(1)
 
 
-def _require_extra() -> None:
-    """ValueError where the packages that methods and report use are not installed: before anything is compared."""
-    if not all(map(importlib.util.find_spec, ("scipy", "jinja2"))):
+def _require_extra(*packages: str) -> None:
+    """ValueError where one that methods or report use is not installed: before anything is compared."""
+    if not all(map(importlib.util.find_spec, packages)):
         raise ValueError("comparing needs the extra `diff`: pip install 'mi-refract[diff]'")
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Callable[[int, int], None]]:
+    """What to call with the numbers of pictures done and in all; shown on a terminal, and gone at the end."""
+    with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
+        task = progress.add_task("comparing", total=None)
+        yield lambda done, of: progress.update(task, completed=done, total=of)
 
 
 def _agreed(count: int) -> bool:

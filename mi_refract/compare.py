@@ -71,8 +71,9 @@ def tolerance(
         Figure("RMS difference", result.rms_error),
         Figure("pixels worth a warning, %", warned),
     )
-    place = f"x = {result.maxx + reference.origin[0]}, y = {result.maxy + reference.origin[1]}"
-    reason = f"{failed:.3g} % of the pixels beyond the tolerance; largest difference {result.maxerror:.3g} at {place}"
+    reason = f"{failed:.3g} % of the pixels beyond the tolerance; largest difference {result.maxerror:.3g}"
+    if result.maxerror:
+        reason += f" at x = {result.maxx + reference.origin[0]}, y = {result.maxy + reference.origin[1]}"
     if warned > warn_percent or result.maxerror > hard_warn:
         reason += f"; warning: {warned:.3g} % of the pixels"
     maps = {"difference": _difference(a, b)}
@@ -86,7 +87,7 @@ def paired_images(
     allow_nonfinite: bool = False,
     threshold: Annotated[float, "a pixel is changed where a channel differs by more than this share"] = 1e-4,
     changed: Annotated[float, "share of the pixels that may be changed"] = 0.001,
-    largest: Annotated[float, "largest change that is allowed"] = np.inf,
+    largest: Annotated[float, "largest change that is allowed, as a share"] = 100.0,
 ) -> Comparison:
     """Renders of the same random numbers: the share of changed pixels and the largest change.
 
@@ -107,7 +108,7 @@ def paired_images(
     )
     reason = f"{measured.changed:.3%} of the pixels are changed, the largest by {measured.largest:.3g} of its value"
     maps = {"difference": _difference(a, b)}
-    return Comparison("paired", _verdict(figures), reason, figures, threshold, maps)
+    return Comparison("paired", _verdict(figures), reason, figures, maps=maps)
 
 
 def flip(

@@ -9,7 +9,8 @@ import enum
 import functools
 import os
 import shlex
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -83,7 +84,10 @@ class Result:
 
 @dataclass(frozen=True)
 class Results:
-    """What `diff` found, failures first. `reference`, `test`: as given. `unused`: patterns that matched no picture."""
+    """What `diff` found, failures first. `reference`, `test`: as given. `unused`: patterns that matched no picture.
+
+    `began`: when the comparison did, in ns since the epoch.
+    """
 
     reference: Path
     test: Path
@@ -91,6 +95,7 @@ class Results:
     samples: bool = False
     inconclusive: str = ""
     unused: tuple[str, ...] = ()
+    began: int = 0
 
     def of(self, *statuses: Status) -> list[Result]:
         return [result for result in self.results if result.status in statuses]
@@ -135,14 +140,15 @@ def diff(
     inconclusive: str = "",
     maps: bool = False,
     new: bool = False,
+    tell: Callable[[int, int], None] = lambda done, of: None,
 ) -> Results:
     """Compare two files, two folders by the names of their pictures, or, with `samples`, two folders as one picture.
 
-    `maps`: keep those of pictures that are not equal. `new`: the reference need not exist yet. ValueError or OSError,
-    in one line, where there is nothing to compare: a path that does not exist, a file against a folder, an empty
-    folder, a path within the other.
+    `maps`: keep those of pictures that are not equal. `new`: the reference need not exist yet. `tell(done, of)` after
+    each picture. ValueError or OSError, in one line, where there is nothing to compare: a path that does not exist, a
+    file against a folder, an empty folder, a path within the other.
     """
-    reference, test = Path(reference), Path(test)
+    began, reference, test = time.time_ns(), Path(reference), Path(test)
     require_apart(reference, test, new)
     if samples:
         if not (reference.is_dir() and test.is_dir()):
@@ -155,10 +161,14 @@ def diff(
     def work(result: Result) -> Result:
         return result if result.error or not (result.reference and result.test) else judge(result, samples, maps)
 
+    found = []
     with ThreadPoolExecutor(WORKERS) as pool:
-        found = sorted(pool.map(work, asked), key=lambda result: list(Status).index(result.status))
+        for result in pool.map(work, asked):
+            found.append(result)
+            tell(len(found), len(asked))
+    found.sort(key=lambda result: list(Status).index(result.status))
     unused = settings.unused([result.name for result in paired]) if reference.is_dir() and not samples else []
-    return Results(reference, test, tuple(found), samples, inconclusive, tuple(unused))
+    return Results(reference, test, tuple(found), samples, inconclusive, tuple(unused), began)
 
 
 def require_apart(reference: Path, test: Path, new: bool = False) -> None:
@@ -271,8 +281,14 @@ def changes(results: Results) -> Iterator[tuple[Path, Path]]:
         yield result.test, results.target(result)
 
 
-def accept(copies: Sequence[tuple[Path, Path]]) -> None:
-    """Copy each first file over the second; every one is replaced as a whole or stays. OSError ends it."""
+def accept(copies: Sequence[tuple[Path, Path]], shown: int) -> None:
+    """Copy each first file over the second; every one is replaced as a whole or stays. OSError ends it.
+
+    `shown`: the time in ns since the epoch when they were compared; OSError, before any copy, for a file changed since.
+    """
+    for new, _ in copies:
+        if max(new.stat().st_mtime_ns, new.stat().st_ctime_ns) > shown:
+            raise OSError(f"{new}: changed since it was compared; accepted: what was shown")
     for new, reference in copies:
         reference.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(reference, new.read_bytes())

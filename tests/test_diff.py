@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 
 import numpy as np
 import pytest
@@ -365,12 +366,13 @@ def test_an_option_out_of_its_range_is_no_verdict(folders):
 
 def test_what_is_accepted(folders):
     old, new = folders
-    copies = list(diff.changes(diff.diff(old, new)))
+    results = diff.diff(old, new)
+    copies = list(diff.changes(results))
     assert copies == [(new / n, old / n) for n in ("added.exr", "inner/changed.exr")]
     before = (old / "inner/changed.exr").read_bytes()
     assert {p.name for p in old.rglob("*.exr")} == {"same.exr", "changed.exr", "removed.exr"}
     assert (old / "inner/changed.exr").read_bytes() == before
-    diff.accept(copies)
+    diff.accept(copies, results.began)
     assert found(diff.diff(old, new)) == {
         "removed.exr": ("different", "removed"),
         "added.exr": ("equal", "unchanged"),
@@ -382,13 +384,14 @@ def test_what_is_accepted(folders):
 
 def test_a_reference_that_is_not_there_yet(folders, tmp_path):
     old, new = folders
-    diff.accept(list(diff.changes(diff.diff(tmp_path / "first", new, new=True))))
+    results = diff.diff(tmp_path / "first", new, new=True)
+    diff.accept(list(diff.changes(results)), results.began)
     assert diff.diff(tmp_path / "first", new).exit_code == 0
     assert not (tmp_path / "first" / "notes.txt").exists()
     one = tmp_path / "deep" / "one.exr"
     results = diff.diff(one, new / "same.exr", new=True)
     assert results.results[0].category is Category.ADDED
-    diff.accept(list(diff.changes(results)))
+    diff.accept(list(diff.changes(results)), results.began)
     assert one.read_bytes() == (new / "same.exr").read_bytes()
     assert diff.diff(old, new, new=True).exit_code == 1
 
@@ -429,7 +432,7 @@ def test_a_copy_that_fails_leaves_the_old_reference(folders, monkeypatch):
     before = (old / "inner/changed.exr").read_bytes()
     monkeypatch.setattr("pathlib.Path.replace", lambda *a: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):
-        diff.accept([(new / "inner/changed.exr", old / "inner/changed.exr")])
+        diff.accept([(new / "inner/changed.exr", old / "inner/changed.exr")], time.time_ns())
     assert (old / "inner/changed.exr").read_bytes() == before
     assert not list(old.rglob("*.part"))
 

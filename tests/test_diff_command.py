@@ -215,11 +215,14 @@ def test_bad_words(run, pair, tmp_path, verb, words, message):
     assert tree(tmp_path) == before
 
 
-@pytest.mark.parametrize("verb", ["diff", "accept"])
-def test_without_the_extra(run, pair, monkeypatch, verb):
+@pytest.mark.parametrize(
+    ("verb", "package"), [("diff", "scipy"), ("accept", "scipy"), ("report", "jinja2"), ("report", "matplotlib")]
+)
+def test_without_the_extra(run, pair, monkeypatch, tmp_path, verb, package):
     find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "jinja2" else find(name))
-    code, out, err = run(verb, *pair)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else find(name))
+    words = ["diff", "--report", tmp_path / "out.html"] if verb == "report" else [verb]
+    code, out, err = run(*words, *pair)
     assert (code, out) == (2, "")
     assert err == "mi-refract: comparing needs the extra `diff`: pip install 'mi-refract[diff]'\n"
 
@@ -280,7 +283,7 @@ def test_bad_self_tests(run, pair, tmp_path):
         (pair, "--self-test takes one path"),
         ([tmp_path / "none.exr"], "none.exr"),
         ([tmp_path / "none.xml"], "none.xml"),
-        ([tmp_path / "mixed"], "not of the size of"),
+        ([tmp_path / "mixed"], "size or channels differ from"),
         ([tmp_path / "nan.exr"], "every value of them finite"),
     ]:
         code, out, err = run("diff", "--self-test", *words)
@@ -445,6 +448,21 @@ def test_accept(run, pair):
     assert out.splitlines()[-1] == "2 accepted"
     assert tree(old) == tree(new)
     assert run("accept", old, new, "--yes")[1].splitlines()[-1] == "nothing to accept"
+
+
+def test_accept_takes_nothing_that_changed_since(run, pair, monkeypatch):
+    before = tree(pair[0])
+
+    def late(count):
+        picture(pair[1] / "louder.exr", value=0.1)
+        return True
+
+    monkeypatch.setattr(cli_diff, "_agreed", late)
+    code, out, err = run("accept", *pair)
+    assert code == 2
+    assert "accepted\n" not in out
+    assert "louder.exr: changed since it was compared; accepted: what was shown\n" in err
+    assert tree(pair[0]) == before
 
 
 def test_accept_asks_first(run, pair, terminal):

@@ -10,10 +10,24 @@ import numpy as np
 import pytest
 
 from mi_refract import FORMULAS, bsdf, oracle, regimes
+from mi_refract.compare import METHODS
+from mi_refract.gate import DEFECTS
 from mi_refract.report import read_json
 from mi_refract.rows import Row
 from validation import __main__ as command
-from validation import directions, judge, methods, paths, readme, renders, runner, samples, scenes, settings
+from validation import (
+    directions,
+    gate,
+    judge,
+    methods,
+    paths,
+    readme,
+    renders,
+    runner,
+    samples,
+    scenes,
+    settings,
+)  # fmt: skip
 from validation.plan import SCENES, Task
 
 
@@ -226,6 +240,8 @@ def test_a_readme_is_not_written_from_a_run_that_measured_too_little():
         readme.efficiency([])
     with pytest.raises(ValueError, match="no planar paths were traced"):
         readme.planar([])
+    with pytest.raises(ValueError, match="no defects were planted"):
+        readme.seen([])
 
 
 def test_the_readme_holds_its_tables_and_shows_pictures_that_exist():
@@ -234,10 +250,12 @@ def test_the_readme_holds_its_tables_and_shows_pictures_that_exist():
     scenes = [path.stem for path in SCENES.glob("*.xml")]
     ways = [method.name for method in methods.METHODS]
     planar = [path.stem for path in SCENES.glob("planar/*.toml")]
-    tables = {
-        "accuracy": FORMULAS, "renders": scenes, "paths": paths.plugins(), "efficiency": ways, "planar": planar
+    words_of = {
+        "accuracy": FORMULAS, "renders": scenes, "paths": paths.plugins(), "efficiency": ways, "planar": planar,
+        "gate": [*gate.GLASSES, *DEFECTS, *METHODS],
     }  # fmt: skip
-    for marker, words in tables.items():
+    assert words_of.keys() == readme.TABLES.keys()
+    for marker, words in words_of.items():
         table = text.partition(f"<!-- begin: {marker} -->")[2].partition(f"<!-- end: {marker} -->")[0]
         assert [word for word in words if word not in table] == []
     pictures = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)

@@ -21,7 +21,7 @@ STUDIES = {
     "renders": ("scenes", "renders", "features"),
     "efficiency": ("efficiency", "scaling"),
     "planar": ("planar", "planar_closed", "extrusion", "planar_times"),
-    "gate": ("gate",),
+    "gate": ("gate", "diff_times"),
 }
 
 

@@ -36,7 +36,7 @@ LAMP = """
     </shape>
 </scene>"""
 RESOLUTION, SPP, TRIALS, RENDERS = 64, 16, 8, 6  # of the detection: renders a side
-NULL_RESOLUTION, NULL_SPP, NULL_RENDERS = 32, 8, 4
+NULL_RESOLUTION, NULL_SPP, NULL_RENDERS = 32, 4, 4
 NULL_PAIRS = {"quick": 640, "full": 2000}  # with 640 two alarms may be: their bound is 0.98 %
 SHEET = 80  # pictures of a render: it costs less than as many renders
 PARTS = ("sensor", "film", "sampler")

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refract import images
+from mi_refract import gate, images
 from mi_refract.bsdf import PLUGIN
+from mi_refract.compare import METHODS
 from mi_refract.figures import compact
 from mi_refract.files import update_between, write_atomically
 from mi_refract.formulas import FORMULAS
@@ -27,11 +28,8 @@ def update(path: Path, rows: list[Row], context: Context) -> None:
 
     ValueError where a marker is missing or the run has not measured what the README quotes.
     """
-    update_between(path, "accuracy", accuracy(rows))
-    update_between(path, "renders", renders(rows))
-    update_between(path, "paths", paths(rows))
-    update_between(path, "efficiency", efficiency(rows))
-    update_between(path, "planar", planar(rows))
+    for marker, table in TABLES.items():
+        update_between(path, marker, table(rows))
     write_atomically(GALLERY, gallery(rows, context))
 
 
@@ -167,6 +165,40 @@ def planar(rows: list[Row]) -> str:
         _table("µs per path of two boundaries, with 95 % intervals.",
                ["segments", "float32", "float64", "float32, rays shuffled", "float32, every segment tried"], times),
     ])  # fmt: skip
+
+
+def seen(rows: list[Row]) -> str:
+    """Markdown: in how many trials each method of comparison saw each planted defect, and its false alarms."""
+    found = [row for row in rows if row.study == gate.STUDY and row.values]
+    defects: dict[str, list[Row]] = {}
+    for row in found:
+        if "missed" in row.values:
+            defects.setdefault(row.subject, []).append(row)
+    alarms = {name: [row for row in found if row.subject == f"null pairs, {name}"] for name in METHODS}
+    if not defects or not all(alarms.values()):
+        raise ValueError("README: no defects were planted; its table needs a compiled variant")
+    cells = [[name, *(_percent([row.values[method] for row in trials]) for method in METHODS)]
+             for name, trials in defects.items()]  # fmt: skip
+    cells.append(["nothing: other seeds, or the same", *(
+        f"{sum(r.values['false alarms'] * r.values['null pairs'] for r in each):.0f} of "
+        f"{sum(r.values['null pairs'] for r in each):.0f}" for each in alarms.values())])  # fmt: skip
+    trials = next(iter(defects.values()))
+    detectable = _percent([row.values["detectable"] for row in trials], digits=1)
+    replay, scenes = trials[0].replay, ", ".join(row.case for row in trials)
+    text = f"{scenes}; {replay['trials']} trials each of {replay['renders a side']} renders a side. "
+    text += f"Detectable in a tile: {detectable}."
+    return _table(text, ["planted", *(f"`{name}`" for name in METHODS)], cells)
+
+
+def _percent(shares: list[float], digits: int = 0) -> str:
+    """Of several scenes: one number where they are the same, else the smallest and the largest."""
+    ends = list(dict.fromkeys(f"{100 * x:.{digits}f}" for x in (min(shares), max(shares))))
+    return "–".join(ends) + " %"
+
+
+TABLES = {
+    "accuracy": accuracy, "renders": renders, "paths": paths, "efficiency": efficiency, "planar": planar, "gate": seen,
+}  # fmt: skip
 
 
 def gallery(rows: list[Row], context: Context) -> bytes:
