@@ -73,6 +73,10 @@ class Findings:
         return sum(each.rays for each in self.regimes)
 
     @property
+    def judged(self) -> int:
+        return sum(each.judged for each in self.regimes)
+
+    @property
     def wrong(self) -> int:
         return sum(each.wrong for each in self.regimes)
 
@@ -93,10 +97,13 @@ class Findings:
 
     @property
     def exit_code(self) -> int:
-        """0: all within the budget. 1: some refraction is wrong. 2: answers are missing, doubled, or to other rays."""
+        """0: all within the budget. 1: some refraction is wrong. 2: answers are missing, doubled, or to other rays.
+
+        1 too where no direction was compared: of rays that anyone may decide either way, all were given up.
+        """
         if not self.answered or any(PROBLEMS[problem.kind] for problem in self.problems):
             return 2
-        return int(self.wrong > 0 or self.tir == UNCLEAR or bool(self.problems))
+        return int(self.wrong > 0 or self.tir == UNCLEAR or bool(self.problems) or not self.judged)
 
 
 def check(rays: RaySet, answers: Answers, *, tir: str = AUTO, budget: str = LOOSEST) -> Findings:

@@ -73,11 +73,15 @@ def judge(
     with np.errstate(over="ignore"):
         rounded = b.astype(PRECISIONS[precision])
     seen = _Seen(rounded.astype(np.float64), rays, exact, u)
-    tir = FLAG if tir == AUTO and flag is not None else _detected(seen) if tir == AUTO else tir
-    reflected = ~flag if tir == FLAG and flag is not None else TELLERS[tir](seen) if tir in TELLERS else seen.never
+    if tir == AUTO:
+        tir = _detected(seen) if flag is None else FLAG
     decided = _decided(rays, exact, u, budget)
-    if tir == NONE:  # but those who think of the rays in doubt that they have it must say so somehow
+    if flag is not None and tir == FLAG:
+        reflected = ~flag
+    elif tir == NONE:  # but those who think of the rays in doubt that they have it must say so somehow
         reflected = ~seen.directed & ~decided
+    else:
+        reflected = TELLERS[tir](seen) if tir in TELLERS else np.zeros(len(b), bool)
     blank = ~seen.directed & ~(reflected & (tir != "reflected") & (tir != "tangent"))
     misjudged = (exact.transmitted == reflected) & ~blank
     bound = _bound(rays, exact, u, budget)
@@ -121,7 +125,6 @@ class _Seen:
 
     def __init__(self, b: np.ndarray, rays: Rays, exact: oracle.Certified, u: float) -> None:
         self.b, self.rays, self.exact, self.u = b, rays, exact, u
-        self.never = np.zeros(len(b), bool)
         with np.errstate(invalid="ignore"):
             self.directed = np.isfinite(b).all(axis=1) & b.any(axis=1)
 

@@ -254,7 +254,7 @@ def _share(name: str, text: str, judged: Judged, among: np.ndarray, holds: np.nd
     share = float(holds[among].mean()) if among.any() else 0.0
     compared = judged.compared & among
     median = float(np.median(judged.angle[compared])) if compared.any() else math.nan
-    return Explanation(name, text, share, median, enough and share >= ALL and among.sum() >= FEWEST)
+    return Explanation(name, text, share, median, bool(enough and share >= ALL and among.sum() >= FEWEST))
 
 
 def _lengths(judged: Judged) -> Explanation:
@@ -275,7 +275,7 @@ def _single(judged: Judged) -> Explanation:
     everywhere = judged.compared.any() and np.median(judged.angle[judged.compared]) > F32 / 50
     holds, claimed = _within(judged, bound) | lost, judged.roundoff < F32
     text = "errors are those of float32"
-    return _share("f32 where f64 was claimed", text, judged, judged.wrong, holds, bool(claimed and everywhere))
+    return _share("f32 where f64 was claimed", text, judged, judged.wrong, holds, claimed and bool(everywhere))
 
 
 def _digits(judged: Judged) -> Explanation:

@@ -72,7 +72,7 @@ def sentence(found: Findings) -> str:
     if found.wrong or found.tir == UNCLEAR:
         return f"{found.wrong} of {whole} are wrong"
     if found.exit_code:
-        return f"{whole}, but not those to the rays"
+        return f"{whole}, but not those to the rays" if found.judged else f"{whole}, none of them a direction"
     if found.limit == found.answered:
         return f"{whole}, all exact but for rounding"
     worst = f"{compact(found.farthest.worst)} rad off at most ({found.farthest.regime})"
@@ -198,8 +198,9 @@ def _complain(case: Any, tag: str, lines: list[str]) -> None:
 
 def write_html(path: str | Path, found: Findings, context: Mapping[str, Any], replay: str = "") -> None:
     """Write the page; `context` is shown on top, `replay` is the command that repeats the check. OSError."""
+    texts = {name: regime.text for name, regime in REGIMES.items()}
     rows = [
-        {"name": each.regime, "text": REGIMES[each.regime].text, "wrong": each.wrong, "far": each.far,
+        {"name": each.regime, "text": texts.get(each.regime, ""), "wrong": each.wrong, "far": each.far,
          "grade": grade(each), "over": each.share > 1, "cells": _cells(each, found.ulp),
          "replay": json.dumps(strict(each.replay), indent=1)}
         for each in found.regimes

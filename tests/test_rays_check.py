@@ -276,6 +276,14 @@ def test_only_nan_passes_nothing():
 # Answers that are not those to the rays
 
 
+@pytest.mark.parametrize("regime", ["exactly critical", "tangential"])
+@pytest.mark.parametrize("value", [np.nan, 0.0])
+def test_nothing_but_doubt_is_no_pass(regime, value):
+    to = some("f32", (regime,))
+    found = check(to, Answers(to.ids, np.full((len(to), 3), value)))
+    assert (found.exit_code, found.judged, found.wrong) == (1, 0, 0)
+
+
 def test_missing_duplicate_and_unknown():
     to = some()
     answers = answered(to, programs.glsl)
