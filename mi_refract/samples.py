@@ -176,7 +176,7 @@ def _verdict(asked: _Asked, resolution: float) -> tuple[Verdict, str]:
     if not asked.p.size:
         return Verdict.EQUAL, "no noise, and no tile differs beyond the margin"
     if not visible <= resolution:
-        return Verdict.INCONCLUSIVE, f"no difference is seen, but in a tile of median noise one of {visible:.2g} is hidden"
+        return Verdict.INCONCLUSIVE, f"no difference is seen, but noise hides one of {visible:.2g} in the median tile"
     return Verdict.EQUAL, f"no difference; one of {visible:.2g} would have been seen in a tile of median noise"
 
 
