@@ -29,6 +29,8 @@ from validation import (
     settings,
 )  # fmt: skip
 from validation.plan import SCENES, Task
+from validation.renderers import SYSTEMS
+from validation.renderers.painters import PAINTERS
 
 
 @pytest.fixture
@@ -242,6 +244,8 @@ def test_a_readme_is_not_written_from_a_run_that_measured_too_little():
         readme.planar([])
     with pytest.raises(ValueError, match="no defects were planted"):
         readme.seen([])
+    with pytest.raises(ValueError, match="no other renderer was run"):
+        readme.suite([])
 
 
 def test_the_readme_holds_its_tables_and_shows_pictures_that_exist():
@@ -255,7 +259,8 @@ def test_the_readme_holds_its_tables_and_shows_pictures_that_exist():
         "gate": [*gate.GLASSES, *DEFECTS, *METHODS],
     }  # fmt: skip
     assert words_of.keys() == readme.TABLES.keys()
-    for marker, words in words_of.items():
+    others = [call.title for system in SYSTEMS.values() for call in system.calls]
+    for marker, words in (words_of | {"suite": [*others, *PAINTERS]}).items():
         table = text.partition(f"<!-- begin: {marker} -->")[2].partition(f"<!-- end: {marker} -->")[0]
         assert [word for word in words if word not in table] == []
     pictures = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)

@@ -15,6 +15,7 @@ from mi_refract.files import update_between, write_atomically
 from mi_refract.formulas import FORMULAS
 from mi_refract.rows import Row
 
+from . import matrix
 from .layered import MIRAGE
 from .plan import SCENES, Context
 from .settings import PLAIN
@@ -26,8 +27,12 @@ COLUMNS = 6
 def update(path: Path, rows: list[Row], context: Context) -> None:
     """Write the tables between their markers in `path`, and the gallery beside the scenes.
 
-    ValueError where a marker is missing or the run has not measured what the README quotes.
+    A run of nothing but the suite writes the table of other renderers, any other run all the rest. ValueError where a
+    marker is missing or the run has not measured what the README quotes.
     """
+    if {row.study for row in rows} <= {matrix.STUDY, *matrix.CHECKS}:
+        update_between(path, "suite", suite(rows))
+        return
     for marker, table in TABLES.items():
         update_between(path, marker, table(rows))
     write_atomically(GALLERY, gallery(rows, context))
@@ -188,6 +193,28 @@ def seen(rows: list[Row]) -> str:
     text = f"{scenes}; {replay['trials']} trials each of {replay['renders a side']} renders a side. "
     text += f"Detectable in a tile: {detectable}."
     return _table(text, ["planted", *(f"`{name}`" for name in METHODS)], cells)
+
+
+def suite(rows: list[Row]) -> str:
+    """Markdown: how far every system is off at most, check by check."""
+    cells: dict[str, dict[str, Row]] = {}
+    for row in rows:
+        if row.study == matrix.STUDY:
+            cells.setdefault(row.subject, {})[row.case] = row
+    if not any(row.values for each in cells.values() for row in each.values()):
+        raise ValueError("README: no other renderer was run; its table needs some")
+    checks = [check for each in matrix.CHECKS.values() for check in each]
+    lines = [[system, *(_off(found.get(check)) for check in checks)] for system, found in cells.items()]
+    return _table("Rays: radians; pictures: share of the mean.", ["", *checks], lines)
+
+
+def _off(row: Row | None) -> str:
+    if row is None or not row.values:
+        return "not run" if row else ""
+    if matrix.OFF not in row.values:
+        return "✗" if row.broken else "✓"
+    word = " **different**" if row.values.get("differs") else ""
+    return compact(row.values[matrix.OFF]) + word + (" ✗" if row.broken else "")
 
 
 def _percent(shares: list[float], digits: int = 0) -> str:
