@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import shlex
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -90,9 +89,8 @@ class Wanted:
         from . import rays_check, rays_output
 
         found = rays_check.check(rays, answers, tir=self.tir, budget=self.formula or rays_check.LOOSEST)
-        # As wide as it must be where nobody looks on: no line of a log is a wrapped one.
-        console = Console() if sys.stdout.isatty() else Console(width=10_000)
-        console.print(rays_output.table(found), highlight=False)
+        # As wide as its numbers are: a wrapped line is read more easily than a squeezed column.
+        Console(width=10_000).print(rays_output.table(found), highlight=False)
         if self.report:
             about = {"answers": name} | {key: rays.header[key] for key in ("seed", "checksum")} | provenance()
             rays_output.write_html(self.report, found, about, shlex.join(["mi-refract", "rays", *replay]))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -219,6 +220,7 @@ def write_html(path: str | Path, found: Findings, context: Mapping[str, Any], re
         "head": HEAD,
         "rows": rows,
         "terms": TERMS,
+        "pi": math.pi,
         "command": replay,
     }
     write_page(path, "rays.html.j2", content, Pictures())
