@@ -14,16 +14,17 @@ from .common import Files, numbers, readme
 COMMANDS = """
     oconv scene.rad > scene.oct
     vwrays -fd -x {width} -y {height} -pa 0 -pj 1 -c 1024 -vf camera.vf |
-        rtrace -h -w -u+ -fdf -ab {depth} -aa 0 -ad 1 -as 0 -lr {depth} -lw 1e-7 \\
+        rtrace -h -w -u+ -fdf -ab {depth} -aa 0 -ad 1 -as 0 -lr -{depth} -lw 1e-2 \\
         scene.oct | total -if3 -of -m -1024 > image.f32
 
 RAYPATH must name both this folder and Radiance's lib.
 image.f32: {height} rows of {width} pixels of 3 float32, the top row first. 1024 is the number of samples per pixel.
 """
 ASSUMPTIONS = (
-    "At a boundary both rays are followed, until the share of one is below 1e-7 (-lw).",
-    "-lr and -ab count reflections only, and Mitsuba's max_depth boundaries too: paths of more reflections than that, "
-    "or of fewer reflections and more boundaries, must not matter to the picture.",
+    "At a boundary both rays are followed while their share is above a hundredth (-lw); below it, Russian roulette (a "
+    "negative -lr) decides, without a bias.",
+    "-lr and -ab count reflections, Mitsuba's max_depth refractions too: Radiance has light that Mitsuba cuts off. Where "
+    "that shows, raise Mitsuba's max_depth: `nested` gains 0.2 % of its mean from 48 to 400.",
     "Lights and sky are `glow` of radius 0: no shadow ray is sent to one, so that caustics are complete.",
 )
 
