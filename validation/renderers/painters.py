@@ -128,7 +128,7 @@ def _spp(sphere: int, prism: int, environment: int) -> dict[str, int]:
 
 
 PAINTERS: dict[str, Painter] = {
-    "Radiance": Painter("radiance", _radiance, _spp(104, 72, 4), radiance.ASSUMPTIONS),
+    "Radiance": Painter("radiance", _radiance, _spp(160, 112, 4), radiance.ASSUMPTIONS),
     "Cycles": Painter("cycles", _by_script("cycles"), _spp(128, 128, 32), cycles.ASSUMED),
     "LuxCore": Painter("luxcore", _by_script("luxcore"), _spp(320, 400, 288), luxcore.ASSUMED),
     "POV-Ray": Painter("povray", _povray, _spp(16, 16, 16), povray.ASSUMPTIONS),

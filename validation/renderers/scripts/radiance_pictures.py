@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-# Every diffuse reflection sends one random ray, and nothing is remembered or sampled besides: a path tracer.
-RTRACE = "-h -w -u+ -fdf -ov -aa 0 -ad 1 -as 0 -av 0 0 0 -dj 0 -st 0 -ss 1 -lw 1e-7"
+# Every diffuse reflection sends one random ray, and nothing is remembered or sampled besides: a path tracer. Weak rays
+# are played for by Russian roulette, which a negative -lr asks for.
+RTRACE = "-h -w -u+ -fdf -ov -aa 0 -ad 1 -as 0 -av 0 0 0 -dj 0 -st 0 -ss 1 -lw 1e-2"
 
 
 def main():
@@ -24,7 +25,7 @@ def main():
     os.environ["RAYPATH"] = f".:{home / 'lib'}"
     octree = Path(out, "scene.oct")
     octree.write_bytes(subprocess.run([home / "bin/oconv", "-w", "scene.rad"], check=True, stdout=-1).stdout)
-    rtrace = [home / "bin/rtrace", *RTRACE.split(), "-ab", depth, "-lr", depth, octree]
+    rtrace = [home / "bin/rtrace", *RTRACE.split(), "-ab", depth, "-lr", f"-{depth}", octree]
     view = Path("camera.vf").read_text()
     for seed in seeds:
         rng = np.random.default_rng(int(seed))
