@@ -83,8 +83,8 @@ def furnace(resolution: int) -> Plain:
     """The ball on a white floor that absorbs nothing, in a white sky: a correct picture is 1 everywhere."""
     given, white = _scene("sphere", resolution), Diffuse((1.0, 1.0, 1.0))
     kept = [mesh for mesh in given.meshes if not isinstance(mesh.material, Light)]
-    meshes = [dataclasses.replace(mesh, material=white) if isinstance(mesh.material, Diffuse) else mesh for mesh in kept]
-    return dataclasses.replace(given, name="furnace", meshes=tuple(meshes), sky=(1.0, 1.0, 1.0))
+    meshes = tuple(dataclasses.replace(x, material=white) if isinstance(x.material, Diffuse) else x for x in kept)
+    return dataclasses.replace(given, name="furnace", meshes=meshes, sky=(1.0, 1.0, 1.0))
 
 
 def askew() -> Environment:
