@@ -78,8 +78,8 @@ def _povray(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> list[
     return made
 
 
-def _three(how: str) -> Callable[[Plain, Path, int, Sequence[int]], list[Image]]:
-    """As the library comes ("default"), or "plain": by path tracing alone."""
+def _three(mis: str) -> Callable[[Plain, Path, int, Sequence[int]], list[Image]]:
+    """With multiple importance sampling of the sky ("1"), as the library comes, or without ("0")."""
 
     def draw(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
         chromium, node = three.browser(), shutil.which("node")
@@ -90,7 +90,7 @@ def _three(how: str) -> Callable[[Plain, Path, int, Sequence[int]], list[Image]]
             (folder / "scene" / name).write_bytes(content)
         script = environments.SCRIPTS / "three_pictures.mjs"
         places = [str(script), str(environments.folder(SYSTEMS["three"])), chromium, str(folder / "scene"), str(folder)]
-        sizes = map(str, (plain.camera.width, spp, how, *seeds))
+        sizes = map(str, (plain.camera.width, spp, mis, *seeds))
         environments.run([node, *places, *sizes], timeout=HOURS)
         return [_raw(folder / f"seed{seed}.f32", plain) for seed in seeds]
 
@@ -115,8 +115,8 @@ def _rgb(image: Image) -> Image:
 THREE = (
     "A glass has one index, the quotient of the two; radiance is not scaled by the square of the index.",
     "The tent filter of its pixels is replaced by a box.",
-    "Without MIS: path tracing alone, that is, without multiple importance sampling of the sky and without Russian "
-    "roulette, and with random numbers of a seed (PCG) instead of strata.",
+    "Its Russian roulette is off, and its random numbers are those of a seed (PCG), for those of its strata are the same "
+    "in all pixels. MIS is its multiple importance sampling of the sky, on by default.",
     "A diffuse surface is its Disney lobe at roughness 0 and index 1, which is Lambert's; a lamp is a front that emits "
     "and a black back.",
     "bounces and transmissiveBounces are Mitsuba's max_depth.",
@@ -132,6 +132,6 @@ PAINTERS: dict[str, Painter] = {
     "Cycles": Painter("cycles", _by_script("cycles"), _spp(128, 128, 32), cycles.ASSUMED),
     "LuxCore": Painter("luxcore", _by_script("luxcore"), _spp(320, 400, 288), luxcore.ASSUMED),
     "POV-Ray": Painter("povray", _povray, _spp(16, 16, 16), povray.ASSUMPTIONS),
-    "three-gpu-pathtracer": Painter("three", _three("default"), {"prism": 8, "furnace": 8}, THREE),
-    "three-gpu-pathtracer, no MIS": Painter("three", _three("plain"), {"prism": 8, "furnace": 8}, THREE),
+    "three-gpu-pathtracer": Painter("three", _three("1"), {"prism": 8, "furnace": 8}, THREE),
+    "three-gpu-pathtracer, no MIS": Painter("three", _three("0"), {"prism": 8, "furnace": 8}, THREE),
 }
