@@ -115,8 +115,8 @@ def _rgb(image: Image) -> Image:
 THREE = (
     "A glass has one index, the quotient of the two; radiance is not scaled by the square of the index.",
     "The tent filter of its pixels is replaced by a box.",
-    "Its Russian roulette is off, and its random numbers are those of a seed (PCG), for those of its strata are the same "
-    "in all pixels. MIS is its multiple importance sampling of the sky, on by default.",
+    "Its Russian roulette is off, and its random numbers are those of a seed (PCG): its strata are the same in all "
+    "pixels. MIS is its multiple importance sampling of the sky, on by default.",
     "A diffuse surface is its Disney lobe at roughness 0 and index 1, which is Lambert's; a lamp is a front that emits "
     "and a black back.",
     "bounces and transmissiveBounces are Mitsuba's max_depth.",
