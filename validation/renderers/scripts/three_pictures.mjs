@@ -9,6 +9,7 @@ import { extname, join, resolve } from "node:path";
 
 const [npm, chromium, scene, out, width, spp, mis, ...seeds] = process.argv.slice(2);
 const puppeteer = createRequire(join(resolve(npm), "package.json"))("puppeteer-core");
+const PATIENCE = 3_600_000; // ms: a busy machine is slow
 const page = new URL("three_pictures.html", import.meta.url);
 const types = { ".js": "text/javascript", ".html": "text/html", ".json": "application/json" };
 const roots = { "/modules/": join(npm, "node_modules"), "/scene/": scene };
@@ -30,10 +31,12 @@ const browser = await puppeteer.launch({
   executablePath: chromium,
   args: ["--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"],
   env: { ...process.env, LIBGL_ALWAYS_SOFTWARE: "1" },
-  protocolTimeout: 3_600_000,
+  timeout: PATIENCE,
+  protocolTimeout: PATIENCE,
 });
 try {
   const tab = await browser.newPage();
+  tab.setDefaultTimeout(PATIENCE);
   tab.on("console", (message) => console.error(message.text()));
   tab.on("pageerror", (error) => console.error(error.message));
   await tab.goto(`http://127.0.0.1:${server.address().port}/`);
@@ -50,7 +53,8 @@ try {
     console.log(join(out, `seed${seed}.f32`));
   }
 } catch (error) {
-  if (process.exitCode !== 77) throw error;
+  if (process.exitCode !== 77) console.error(error.message);
+  process.exitCode ??= 1;
 } finally {
   await browser.close();
   server.close();
