@@ -1,8 +1,8 @@
 """Suite: every system against every check, out of the rows of Per ray and Pictures.
 
 A number is how far off a system is at most: of rays the largest angle to the certified direction in radians, of
-pictures the difference of the means, as a share. A cell fails where the study that it comes from does. What a system
-does otherwise than it should, or than `refract` does, is said in a sentence beside its row.
+pictures the difference of the means, as a share. A cell fails where the study that it comes from does. Beside each row
+stand the version, and what the system does otherwise than it should, or than `refract` does.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _cells(row: Row) -> list[Row]:
     values["disagrees"] = float(bool(row.broken))
     if row.study == pictures.STUDY:
         values["differs"] = float(differs)
-    said = row.reason if row.broken or differs or row.values.get("misjudged") else ""
+    said = "; ".join(filter(None, (row.replay.get("renderer", ""), row.reason)))
     return [Row(STUDY, _system(row), case, "", values, {"disagrees": 0.0}, reason=said) for case in cases]
 
 

@@ -22,7 +22,7 @@ from mi_refract import compare, export, images, plain, rendering
 from mi_refract.bsdf import PLUGIN
 from mi_refract.compare import Comparison, Verdict
 from mi_refract.images import Image
-from mi_refract.plain import Diffuse, Environment, Light, Plain
+from mi_refract.plain import Diffuse, Environment, Light, Mesh, Plain
 from mi_refract.rows import Row
 
 from .methods import Camera
@@ -65,7 +65,7 @@ SIZES = {"quick": Size(64, 64, 32, 0.1), "full": Size(128, 512, 1, 0.01)}
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """`differs`: by the renderers that are known to disagree, and how; the suite must see it."""
+    """`known`: the renderers that are known to disagree on it; the suite must see it."""
 
     load: Callable[[int], Plain]
     known: tuple[str, ...] = ()
@@ -81,10 +81,13 @@ def environment(resolution: int) -> Plain:
 
 def furnace(resolution: int) -> Plain:
     """The ball on a white floor that absorbs nothing, in a white sky: a correct picture is 1 everywhere."""
-    given, white = _scene("sphere", resolution), Diffuse((1.0, 1.0, 1.0))
-    kept = [mesh for mesh in given.meshes if not isinstance(mesh.material, Light)]
-    meshes = tuple(dataclasses.replace(x, material=white) if isinstance(x.material, Diffuse) else x for x in kept)
-    return dataclasses.replace(given, name="furnace", meshes=meshes, sky=(1.0, 1.0, 1.0))
+    given, white = _scene("sphere", resolution), (1.0, 1.0, 1.0)
+
+    def bright(mesh: Mesh) -> Mesh:
+        return dataclasses.replace(mesh, material=Diffuse(white)) if isinstance(mesh.material, Diffuse) else mesh
+
+    meshes = tuple(bright(mesh) for mesh in given.meshes if not isinstance(mesh.material, Light))
+    return dataclasses.replace(given, name="furnace", meshes=meshes, sky=white)
 
 
 def askew() -> Environment:
@@ -173,7 +176,7 @@ def _row(context: Context, title: str, scene: str, ours: Sequence[Image], theirs
     if title in WHY and found.verdict is Verdict.DIFFERENT:
         reason += f"; {WHY[title]}"
     replay = {"verdict": str(found.verdict), "scene": scene, "resolution": size.resolution, "reference spp": size.spp}
-    replay |= about | {"renderer": repr(SYSTEMS[PAINTERS[title].system].needs)}
+    replay |= about | {"renderer": SYSTEMS[PAINTERS[title].system].source}
     pictures = _saved(context, title, scene, ours, theirs)
     return Row(STUDY, title, scene, f"{size.resolution}²", values, budgets, goals, reason, replay, pictures)
 

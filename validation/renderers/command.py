@@ -10,7 +10,7 @@ import sys
 from typing import NoReturn
 
 from . import SYSTEMS, environments
-from .system import Apt, Npm, Pip, System
+from .system import System
 
 
 class _OneLine(argparse.ArgumentParser):
@@ -38,7 +38,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _install(system: System) -> int:
-    print(f"{system.name}: {_source(system)}", file=sys.stderr)
+    print(f"{system.name}: {system.source}", file=sys.stderr)
     try:
         environments.install(system)
     except OSError as error:
@@ -50,15 +50,4 @@ def _install(system: System) -> int:
 def _line(system: System) -> str:
     does = " and ".join(word for word, able in (("rays", system.calls), ("pictures", system.draws)) if able)
     state = "absent" if environments.absent(system) else "here"
-    return f"{system.name:10} {state:7} {does:18} {system.megabytes:5} MB  {_source(system)}  [{system.licence}]"
-
-
-def _source(system: System) -> str:
-    match system.needs:
-        case Pip(requirements=given):
-            return f"pip install {' '.join(given)}"
-        case Npm(packages=given):
-            return f"npm install {' '.join(given)}"
-        case Apt(packages=given):
-            return f"apt-get install {' '.join(given)}"
-    return "with this package"
+    return f"{system.name:10} {state:7} {does:18} {system.megabytes:5} MB  {system.source}  [{system.licence}]"

@@ -61,25 +61,23 @@ def _radiance(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> lis
 
 
 def _povray(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-    """Deterministic but for where the grid of samples lies, √spp on a side of each pixel: by chance in each picture."""
+    """The same picture for every seed, for it has no noise: the means over grids of samples, √spp on a side of a pixel.
+
+    Random grids would not do: they move all pixels together, and a tile knows nothing of its noise then.
+    """
     side, camera = math.isqrt(spp), plain.camera
     width, height = side * camera.width, side * camera.height
     finer = dataclasses.replace(plain, camera=dataclasses.replace(camera, width=width, height=height))
     export.write(finer, "povray", folder / "scene")
-    made = []
-    for seed in seeds:
-        dx, dy = np.random.default_rng(seed).random(2)
-        sizes = [f"+W{width}", f"+H{height}", f"Declare=dx={dx:.9f}", f"Declare=dy={dy:.9f}"]
-        command = ["povray", "+Iscene.pov", "+Oimage.exr", "+FE", "-A", "-D", "File_Gamma=1.0", *sizes]
-        environments.run(command, timeout=HOURS, where=folder / "scene")
-        fine = _rgb(images.read(folder / "scene" / "image.exr")).pixels
-        coarse = fine.reshape(camera.height, side, camera.width, side, 3).mean((1, 3), dtype=np.float64)
-        made.append(images.named(f"seed {seed}", coarse.astype(np.float32)))
-    return made
+    command = ["povray", "+Iscene.pov", "+Oimage.exr", "+FE", f"+W{width}", f"+H{height}", "-A", "-D", "File_Gamma=1.0"]
+    environments.run(command, timeout=HOURS, where=folder / "scene")
+    fine = _rgb(images.read(folder / "scene" / "image.exr")).pixels
+    coarse = fine.reshape(camera.height, side, camera.width, side, 3).mean((1, 3), dtype=np.float64)
+    return [images.named(f"seed {seed}", coarse.astype(np.float32)) for seed in seeds]
 
 
-def _three(how: str) -> Callable[[Plain, Path, int, Sequence[int]], list[Image]]:
-    """As the library comes ("default"), or "plain": by path tracing alone."""
+def _three(mis: str) -> Callable[[Plain, Path, int, Sequence[int]], list[Image]]:
+    """With multiple importance sampling of the sky ("1"), as the library comes, or without ("0")."""
 
     def draw(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
         chromium, node = three.browser(), shutil.which("node")
@@ -90,7 +88,7 @@ def _three(how: str) -> Callable[[Plain, Path, int, Sequence[int]], list[Image]]
             (folder / "scene" / name).write_bytes(content)
         script = environments.SCRIPTS / "three_pictures.mjs"
         places = [str(script), str(environments.folder(SYSTEMS["three"])), chromium, str(folder / "scene"), str(folder)]
-        sizes = map(str, (plain.camera.width, spp, how, *seeds))
+        sizes = map(str, (plain.camera.width, spp, mis, *seeds))
         environments.run([node, *places, *sizes], timeout=HOURS)
         return [_raw(folder / f"seed{seed}.f32", plain) for seed in seeds]
 
@@ -115,8 +113,8 @@ def _rgb(image: Image) -> Image:
 THREE = (
     "A glass has one index, the quotient of the two; radiance is not scaled by the square of the index.",
     "The tent filter of its pixels is replaced by a box.",
-    "Without MIS: path tracing alone, that is, without multiple importance sampling of the sky and without Russian "
-    "roulette, and with random numbers of a seed (PCG) instead of strata.",
+    "Its Russian roulette is off, and its random numbers are those of a seed (PCG): its strata are the same in all "
+    "pixels. MIS is its multiple importance sampling of the sky, on by default.",
     "A diffuse surface is its Disney lobe at roughness 0 and index 1, which is Lambert's; a lamp is a front that emits "
     "and a black back.",
     "bounces and transmissiveBounces are Mitsuba's max_depth.",
@@ -127,11 +125,12 @@ def _spp(sphere: int, prism: int, environment: int) -> dict[str, int]:
     return {"sphere": sphere, "prism": prism, "environment": environment}
 
 
+POVRAY = ("Each pixel is the mean of a grid of 4 × 4 samples, without noise.", *povray.ASSUMPTIONS)
 PAINTERS: dict[str, Painter] = {
     "Radiance": Painter("radiance", _radiance, _spp(160, 112, 4), radiance.ASSUMPTIONS),
     "Cycles": Painter("cycles", _by_script("cycles"), _spp(128, 128, 32), cycles.ASSUMED),
     "LuxCore": Painter("luxcore", _by_script("luxcore"), _spp(320, 400, 288), luxcore.ASSUMED),
-    "POV-Ray": Painter("povray", _povray, _spp(16, 16, 16), povray.ASSUMPTIONS),
-    "three-gpu-pathtracer": Painter("three", _three("default"), {"prism": 8, "furnace": 8}, THREE),
-    "three-gpu-pathtracer, no MIS": Painter("three", _three("plain"), {"prism": 8, "furnace": 8}, THREE),
+    "POV-Ray": Painter("povray", _povray, _spp(16, 16, 16), POVRAY),
+    "three-gpu-pathtracer": Painter("three", _three("1"), {"prism": 8, "furnace": 8}, THREE),
+    "three-gpu-pathtracer, no MIS": Painter("three", _three("0"), {"prism": 8, "furnace": 8}, THREE),
 }

@@ -80,3 +80,15 @@ class System:
     small: bool = False
     calls: tuple[Call, ...] = field(default=())
     draws: bool = False  # whether it renders pictures
+
+    @property
+    def source(self) -> str:
+        """What brings it, in its pinned version."""
+        match self.needs:
+            case Pip(requirements=given):
+                return f"pip install {' '.join(given)}"
+            case Npm(packages=given):
+                return f"npm install {' '.join(given)}"
+            case Apt(packages=given):
+                return f"apt-get install {' '.join(given)}"
+        return "with this package"
