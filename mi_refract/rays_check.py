@@ -37,6 +37,7 @@ class Figures:
     far: int  # those of them that are farther from the critical angle than the budget leaves open
     share: float  # the largest share that an error takes of its ray's budget
     wrong: int  # rays beyond their budget: too far off, misjudged far, or without a direction
+    limit: int  # rays whose answer is the exact one but for rounding
     replay: dict[str, Any]  # the ray with the largest share, in hexadecimal floats
 
 
@@ -74,6 +75,15 @@ class Findings:
     @property
     def wrong(self) -> int:
         return sum(each.wrong for each in self.regimes)
+
+    @property
+    def limit(self) -> int:
+        return sum(each.limit for each in self.regimes)
+
+    @property
+    def farthest(self) -> Figures:
+        """The regime with the largest angle. ValueError where nothing was answered."""
+        return max(self.regimes, key=lambda each: (each.judged > 0, each.worst))
 
     @property
     def diagnosis(self) -> Explanation | None:
@@ -174,5 +184,6 @@ def _of_regime(name: str, ids: np.ndarray, judged: Judged, index: np.ndarray) ->
         name, len(index), len(compared),
         worst=float(angle.max()), p99=float(np.quantile(angle, 0.99)), mean=float(angle.mean()), norm=float(norm.max()),
         misjudged=int(judged.misjudged[index].sum()), far=int(judged.far[index].sum()),
-        share=float(judged.share[index].max()), wrong=int(judged.wrong[index].sum()), replay=replay,
+        share=float(judged.share[index].max()), wrong=int(judged.wrong[index].sum()),
+        limit=int(judged.exact_to_rounding[index].sum()), replay=replay,
     )  # fmt: skip

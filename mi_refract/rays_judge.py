@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import oracle
-from .budgets import NEGLIGIBLE, Budget
+from .budgets import NEGLIGIBLE, ROUNDING, Budget
 from .measures import errors, lengths, margin, radicand
 from .rays import PRECISIONS
 from .regimes import Rays
@@ -49,6 +49,14 @@ class Judged:
         with np.errstate(invalid="ignore", divide="ignore"):
             share = np.maximum(self.angle, self.norm) / self.bound
         return np.where(self.compared, np.nan_to_num(share, nan=np.inf), 0.0)
+
+    @functools.cached_property
+    def exact_to_rounding(self) -> np.ndarray:
+        """Where rounding the exact answer could have given this one."""
+        bound = _bound(self.rays, self.exact, self.roundoff, ROUNDING)
+        decided = _decided(self.rays, self.exact, self.roundoff, ROUNDING)
+        near = ~self.compared | (np.maximum(self.angle, self.norm) <= bound)
+        return near & ~self.blank & ~(self.misjudged & decided)
 
     @property
     def far(self) -> np.ndarray:

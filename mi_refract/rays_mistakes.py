@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from . import oracle
 from .measures import lengths, radicand
 from .rays import indices
 from .rays_judge import Judged
@@ -41,27 +40,34 @@ class Explanation:
     explains: bool
 
 
+def refract(a: np.ndarray, n: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """The textbook's, two-sided, for unit vectors: (N, 3), NaN where nothing is transmitted."""
+    k, c = k[:, None], (a * n).sum(1, keepdims=True)
+    across = np.cross(n, a)
+    root = np.sqrt(c * c - (k * k - 1) * (across * across).sum(1, keepdims=True))
+    return k * a + n * (np.copysign(root, c) - k * c)
+
+
 @dataclass(frozen=True)
 class Case:
     """What mistakes are made from: unit `a` and `n`, the rays as they are, and the right answers to them."""
 
     a: np.ndarray
     n: np.ndarray
+    k: np.ndarray
     rays: Rays
     right: np.ndarray
     transmitted: np.ndarray
 
     @staticmethod
-    def of(rays: Rays) -> Case:
-        exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    def of(judged: Judged, index: np.ndarray) -> Case:
+        rays = judged.rays[index]
         a, n = (v.astype(float) / lengths(v).astype(float)[:, None] for v in (rays.a, rays.n))
-        return Case(a, n, rays, exact.direction, exact.transmitted)
-
-    def with_rays(self, **changed: np.ndarray) -> Case:
-        return Case.of(replace(self.rays, **changed))
+        exact = judged.exact
+        return Case(a, n, rays.k.astype(float), rays, exact.direction[index], exact.transmitted[index])
 
     def with_k(self, k: np.ndarray) -> np.ndarray:
-        return self.with_rays(k=k).refracted
+        return refract(self.a, self.n, k)
 
     @property
     def refracted(self) -> np.ndarray:
@@ -70,7 +76,7 @@ class Case:
 
     @property
     def inverted(self) -> np.ndarray:
-        return self.with_k(1 / self.rays.k.astype(float))
+        return self.with_k(1 / self.k)
 
     @property
     def one_sided(self) -> np.ndarray:
@@ -101,7 +107,7 @@ def _by_angle(change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Predict
         c = (case.a * case.n).sum(1, keepdims=True)
         tangent = case.a - c * case.n
         length = lengths(tangent).astype(float)[:, None]
-        angle = change(np.arctan2(length, np.abs(c)), case.rays.k.astype(float)[:, None])
+        angle = change(np.arctan2(length, np.abs(c)), case.k[:, None])
         return np.cos(angle) * np.sign(c) * case.n + np.sin(angle) * tangent / np.where(length > 0, length, 1)
 
     return predict
@@ -117,7 +123,7 @@ def _as_given(vector: str) -> Predict:
     def predict(case: Case) -> np.ndarray:
         a = case.rays.a.astype(float) if "a" in vector else case.a
         n = case.rays.n.astype(float) if "n" in vector else case.n
-        k, c = case.rays.k.astype(float)[:, None], (a * n).sum(1, keepdims=True)
+        k, c = case.k[:, None], (a * n).sum(1, keepdims=True)
         b = k * a + n * (np.copysign(np.sqrt(1 - k * k * (1 - c * c)), c) - k * c)
         return b / lengths(b).astype(float)[:, None]
 
@@ -128,9 +134,10 @@ def _misread(vector: str, matrix: np.ndarray) -> Predict:
     """Where the normal is still on the side that the ray comes from: elsewhere codes differ."""
 
     def predict(case: Case) -> np.ndarray:
-        found = case.with_rays(**{vector: getattr(case.rays, vector) @ matrix.T})
-        facing = (found.a * found.n).sum(1) * (case.a * case.n).sum(1) > 0
-        return np.where(facing[:, None], found.refracted, np.nan)
+        turned = {"a": case.a, "n": case.n}
+        turned[vector] = turned[vector] @ matrix.T
+        facing = (turned["a"] * turned["n"]).sum(1) * (case.a * case.n).sum(1) > 0
+        return np.where(facing[:, None], refract(**turned, k=case.k), np.nan)
 
     return predict
 
@@ -163,8 +170,8 @@ MISTAKES: dict[str, dict[str, Predict]] = {
         "k = n_to / n_from was used, or the normal's side chose it": lambda case: case.inverted,
     },
     "an index ignored": {
-        "n_to was taken for 1": lambda case: case.with_k(indices(case.rays.k)[0]),
-        "n_from was taken for 1": lambda case: case.with_k(1 / indices(case.rays.k)[1]),
+        "n_to was taken for 1": lambda case: case.with_k(indices(case.k)[0]),
+        "n_from was taken for 1": lambda case: case.with_k(1 / indices(case.k)[1]),
     },
     "normal flipped": {
         "the answer goes back to the side that the ray comes from": lambda case: _across(case.refracted, case.n),
@@ -199,7 +206,7 @@ MISTAKES: dict[str, dict[str, Predict]] = {
 def explain(judged: Judged) -> list[Explanation]:
     """Every mistake, and how much of the answers it explains. Precondition: some are wrong."""
     index = _sample(judged)
-    case, wrong = Case.of(judged.rays[index]), judged.wrong[index]
+    case, wrong = Case.of(judged, index), judged.wrong[index]
     with np.errstate(all="ignore"):
         found = [_gross(name, table, case, judged.b[index], wrong) for name, table in MISTAKES.items()]
         lengthy, printed, narrow = _lengths(judged), _digits(judged), _single(judged)

@@ -26,6 +26,11 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 SCHEMA = 1
+HEAD = (
+    "rays", "worst / rad", "worst / ulp", "p99 / ulp", "mean / ulp", "misjudged", "beyond doubt", "length",
+    "of the budget", "exact", "wrong",
+)  # fmt: skip
+STYLES = {"wrong": "bold red", "fair": "", "exact": "green"}
 TERMS = {
     "ulp": "the spacing of numbers at 1: 2⁻²³ in f32, 2⁻⁵² in f64",
     "worst, p99, mean": "angles to the certified direction, of the rays whose total internal reflection was decided "
@@ -35,6 +40,7 @@ TERMS = {
     "length": "how far the length of an answer is from 1, or from that of a",
     "of the budget": "the largest share that an error takes of what the formula that is the measure may be off by, an "
     "a-priori bound for that very ray",
+    "exact": "answers that are the certified ones but for rounding: no formula does better",
     "wrong": "answers beyond their budget, misjudged beyond doubt, or without a direction",
 }
 TELLING = {
@@ -65,8 +71,12 @@ def sentence(found: Findings) -> str:
         return f"{found.wrong} of {whole} are wrong: {found.diagnosis.mistake}"
     if found.wrong or found.tir == UNCLEAR:
         return f"{found.wrong} of {whole} are wrong"
-    right = f"{whole}, all as good as `{found.budget}` or better"
-    return f"{right}, but not to the rays that were asked" if found.exit_code else right
+    if found.exit_code:
+        return f"{whole}, but not those to the rays"
+    if found.limit == found.answered:
+        return f"{whole}, all exact but for rounding"
+    worst = f"{compact(found.farthest.worst)} rad off at most ({found.farthest.regime})"
+    return f"{whole}, all as good as the formula {found.budget} or better, {worst}"
 
 
 def counted(problem: Problem) -> str:
@@ -93,6 +103,11 @@ def _line(each: Explanation) -> str:
     return f"{each.mistake}: {each.text} ({each.share:.1%} of the answers where it shows)"
 
 
+def grade(each: Figures) -> str:
+    """ "exact", "fair" or "wrong"."""
+    return "wrong" if each.wrong else "exact" if each.limit == each.rays else "fair"
+
+
 # Terminal ----------------------------------------------------------------------------------------------------------
 
 
@@ -102,25 +117,23 @@ def table(found: Findings) -> RenderableType:
     from rich.table import Table
     from rich.text import Text
 
-    head = ("", "regime", "rays", "worst / rad", "worst / ulp", "p99", "mean", "misjudged", "length", "budget", "wrong")
-    rows = Table(*head, box=None, pad_edge=False)
+    rows = Table("", "regime", *HEAD, box=None, pad_edge=False)
     for column in rows.columns[2:]:
         column.justify = "right"
     for each in found.regimes:
-        word = Text("wrong" if each.wrong else "right", style="bold red" if each.wrong else "green")
-        rows.add_row(word, each.regime, *_cells(each, found.ulp).values())
+        rows.add_row(Text(grade(each), style=STYLES[grade(each)]), each.regime, *_cells(each, found.ulp).values())
     notes = [*map(counted, found.problems), telling(found), *explained(found)]
     return Group(*([rows] if found.regimes else []), *(Text(printable(note)) for note in notes), Text(sentence(found)))
 
 
 def _cells(each: Figures, ulp: float) -> dict[str, str]:
     """The numbers of a regime as text; "–" where no direction was compared."""
-    angles = {"worst / rad": each.worst, **{name: getattr(each, name) / ulp for name in ("worst", "p99", "mean")}}
-    shown = {name: compact(x) if each.judged else "–" for name, x in angles.items()}
-    misjudged = f"{each.misjudged} ({each.far} beyond doubt)" if each.far else str(each.misjudged)
+    ulps = {f"{name} / ulp": getattr(each, name) / ulp for name in ("worst", "p99", "mean")}
+    shown = {name: compact(x) if each.judged else "–" for name, x in ({"worst / rad": each.worst} | ulps).items()}
     return {
-        "rays": str(each.rays), **shown, "misjudged": misjudged,
-        "length": compact(each.norm) if each.judged else "–", "budget": compact(each.share), "wrong": str(each.wrong),
+        "rays": str(each.rays), **shown, "misjudged": str(each.misjudged), "beyond doubt": str(each.far),
+        "length": compact(each.norm) if each.judged else "–", "of the budget": compact(each.share),
+        "exact": f"{each.limit / each.rays:.1%}", "wrong": str(each.wrong),
     }  # fmt: skip
 
 
@@ -187,7 +200,7 @@ def write_html(path: str | Path, found: Findings, context: Mapping[str, Any], re
     """Write the page; `context` is shown on top, `replay` is the command that repeats the check. OSError."""
     rows = [
         {"name": each.regime, "text": REGIMES[each.regime].text, "wrong": each.wrong, "far": each.far,
-         "state": "fail" if each.wrong else "pass", "over": each.share > 1, "cells": _cells(each, found.ulp),
+         "grade": grade(each), "over": each.share > 1, "cells": _cells(each, found.ulp),
          "replay": json.dumps(strict(each.replay), indent=1)}
         for each in found.regimes
     ]  # fmt: skip
@@ -202,6 +215,7 @@ def write_html(path: str | Path, found: Findings, context: Mapping[str, Any], re
         "unclear": found.tir == UNCLEAR,
         "explained": explained(found),
         "explanations": found.explanations,
+        "head": HEAD,
         "rows": rows,
         "terms": TERMS,
         "command": replay,

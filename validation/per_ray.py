@@ -151,7 +151,7 @@ def rows(call: Call, rays: RaySet, answers: Answers) -> list[Row]:
     """One per set."""
     left_out = measures.radicand(rays.rays) < call.gives_up
     findings = rays_check.check(_only(rays, ~left_out), _without(answers, rays.ids[left_out]))
-    about = _remark(findings, str(answers.header.get("system", "")))
+    about = _remark(findings, str(answers.header.get("system", "")), call.remark)
     made = []
     for name in SETS:
         figures = next((each for each in findings.regimes if each.regime == name), None)
@@ -176,11 +176,11 @@ def _without(answers: Answers, ids: np.ndarray) -> Answers:
     return replace(answers, ids=answers.ids[kept], b=answers.b[kept], transmitted=flags)
 
 
-def _remark(findings: Findings, system: str) -> str:
+def _remark(findings: Findings, system: str, known: str) -> str:
     """Who answered, how total internal reflection was told, what is wrong with the answers, and what explains them."""
     problems = [f"{each.kind} {each.text}" for each in findings.problems]
     mistake = [findings.diagnosis.text] if findings.diagnosis else []
-    return "; ".join(filter(None, (system, f"total internal reflection: {findings.tir}", *problems, *mistake)))
+    return "; ".join(filter(None, (system, f"total internal reflection: {findings.tir}", known, *problems, *mistake)))
 
 
 def _measured(name: str, call: Call, findings: Findings, figures: Figures | None) -> tuple[Numbers, Numbers, Numbers]:

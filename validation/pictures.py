@@ -2,7 +2,8 @@
 
 Both sides have the same flat triangles, the same camera, a box filter, and several independent renders; the glossary
 says how each renderer's model is brought to Mitsuba's. `refract` renders by Mitsuba's `path`. The balls of the scene
-`environment` are those of `balls` under a smooth sky without symmetry, whose map lies askew. A verdict is "equal",
+`environment` are those of `balls` under a smooth sky without symmetry, whose map lies askew; in the scene `furnace`,
+a ball on a floor that absorbs nothing under a sky of radiance 1, nothing should be visible. A verdict is "equal",
 "different", or "inconclusive", where the noise hides what would matter or a difference lies only where a t-test knows
 little. Renderers other than the small ones run where they are installed, in the full profile.
 """
@@ -21,7 +22,7 @@ from mi_refract import compare, export, images, plain, rendering
 from mi_refract.bsdf import PLUGIN
 from mi_refract.compare import Comparison, Verdict
 from mi_refract.images import Image
-from mi_refract.plain import Environment, Plain
+from mi_refract.plain import Diffuse, Environment, Light, Mesh, Plain
 from mi_refract.rows import Row
 
 from .methods import Camera
@@ -64,7 +65,7 @@ SIZES = {"quick": Size(64, 64, 32, 0.1), "full": Size(128, 512, 1, 0.01)}
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """`differs`: by the renderers that are known to disagree, and how; the suite must see it."""
+    """`known`: the renderers that are known to disagree on it; the suite must see it."""
 
     load: Callable[[int], Plain]
     known: tuple[str, ...] = ()
@@ -76,6 +77,17 @@ def _scene(name: str, resolution: int) -> Plain:
 
 def environment(resolution: int) -> Plain:
     return dataclasses.replace(_scene("balls", resolution), name="environment", sky=askew())
+
+
+def furnace(resolution: int) -> Plain:
+    """The ball on a white floor that absorbs nothing, in a white sky: a correct picture is 1 everywhere."""
+    given, white = _scene("sphere", resolution), (1.0, 1.0, 1.0)
+
+    def bright(mesh: Mesh) -> Mesh:
+        return dataclasses.replace(mesh, material=Diffuse(white)) if isinstance(mesh.material, Diffuse) else mesh
+
+    meshes = tuple(bright(mesh) for mesh in given.meshes if not isinstance(mesh.material, Light))
+    return dataclasses.replace(given, name="furnace", meshes=meshes, sky=white)
 
 
 def askew() -> Environment:
@@ -97,12 +109,12 @@ SCENES = {
     "sphere": Scene(functools.partial(_scene, "sphere")),
     "prism": Scene(functools.partial(_scene, "prism"), (THREE,)),
     "environment": Scene(environment),
-    "furnace": Scene(functools.partial(_scene, "furnace"), (THREE,)),
+    "furnace": Scene(furnace, (THREE,)),
 }
 # What makes a renderer disagree.
 WHY = {
-    THREE: "where it samples the sky from glass, it takes the transmitted lobe for 1 in every direction beneath the "
-    "surface, and so adds light that no refracted ray brings; see the same without multiple importance sampling (MIS)"
+    THREE: "its shadow rays to the sky pass straight through glass, beside the refracted rays that find the same sky, "
+    "so that this light counts twice; see the same without multiple importance sampling (MIS)"
 }
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
-import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+
+from mi_refract import programs
 
 from .system import SCRIPTS, Apt, Npm, Pip, System
 
@@ -122,45 +122,26 @@ def run(command: Sequence[str], given: str = "", timeout: float | None = None, w
     Unable: it exits with CANNOT, for the reason that is its last line on stderr. Broken: it is not there, exits with
     another code than 0, is killed, prints no text, or runs for longer than `timeout` seconds (TIMEOUT by default).
     """
-    kept = {name: value for name, value in os.environ.items() if name not in _FOREIGN}
-    pipe, alone = subprocess.PIPE, kept | {"PYTHONNOUSERSITE": "1", "PYTHONUTF8": "1"}
+    own = {name: value for name, value in os.environ.items() if name not in _FOREIGN}
+    own |= {"PYTHONNOUSERSITE": "1", "PYTHONUTF8": "1"}
     limit = TIMEOUT if timeout is None else timeout
     try:
-        process = subprocess.Popen(
-            command, stdin=pipe, stdout=pipe, stderr=pipe, cwd=where, env=alone, start_new_session=True
-        )
+        ended = programs.run(command, given.encode(), limit, keep_stderr=True, cwd=where, env=own)
+    except TimeoutError as error:
+        raise Broken(str(error)) from None
     except OSError as error:
         raise Broken(f"{command[0]}: {error.strerror}") from None
+    if ended.status == CANNOT:
+        raise Unable(_last_word(ended.said))
+    if ended.status:
+        raise Broken(f"{ended.how}: {_last_word(ended.said)}")
     try:
-        out, said = process.communicate(given.encode(), limit)
-    except subprocess.TimeoutExpired:
-        raise Broken(f"no end after {limit:g} s") from None
-    finally:
-        _end(process)
-    if process.returncode == 0:
-        return _text(out)
-    raise (Unable if process.returncode == CANNOT else Broken)(_reason(process.returncode, said))
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    try:
-        os.killpg(process.pid, signal.SIGKILL)
-    except ProcessLookupError:
-        return
-    process.wait()
-
-
-def _text(out: bytes) -> str:
-    try:
-        return out.decode()
+        return ended.out.decode()
     except UnicodeDecodeError:
-        raise Broken(f"{len(out)} bytes that are no text") from None
+        raise Broken(f"wrote {len(ended.out)} bytes that are no text") from None
 
 
-def _reason(code: int, said: bytes) -> str:
-    """The last line on stderr, which is the one that says what is wrong, and how the program ended."""
+def _last_word(said: bytes) -> str:
+    """The last line on stderr: the one that says what is wrong."""
     lines = [line.strip() for line in said.decode(errors="replace").splitlines() if line.strip()]
-    last = lines[-1] if lines else "no word on stderr"
-    if code == CANNOT:
-        return last
-    return f"{f'signal {-code}' if code < 0 else f'exit code {code}'}: {last}"
+    return lines[-1] if lines else "no word on stderr"

@@ -5,6 +5,8 @@ A picture is height × width × 3, linear, row 0 at the top.
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -59,30 +61,32 @@ def _radiance(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> lis
 
 
 def _povray(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-    """One sample a pixel and run, at the same random place in all of them: pixels correlate, which the test allows."""
-    export.write(plain, "povray", folder / "scene")
-    camera = plain.camera
+    """Deterministic but for where the grid of samples lies, √spp on a side of each pixel: by chance in each picture."""
+    side, camera = math.isqrt(spp), plain.camera
+    width, height = side * camera.width, side * camera.height
+    finer = dataclasses.replace(plain, camera=dataclasses.replace(camera, width=width, height=height))
+    export.write(finer, "povray", folder / "scene")
     made = []
     for seed in seeds:
-        total = np.zeros((camera.height, camera.width, 3))
-        for dx, dy in np.random.default_rng(seed).random((spp, 2)):
-            sizes = [f"+W{camera.width}", f"+H{camera.height}", f"Declare=dx={dx:.9f}", f"Declare=dy={dy:.9f}"]
-            command = ["povray", "+Iscene.pov", "+Oimage.exr", "+FE", "-A", "-D", "File_Gamma=1.0", *sizes]
-            environments.run(command, timeout=HOURS, where=folder / "scene")
-            total += _rgb(images.read(folder / "scene" / "image.exr")).pixels
-        made.append(images.named(f"seed {seed}", (total / spp).astype(np.float32)))
+        dx, dy = np.random.default_rng(seed).random(2)
+        sizes = [f"+W{width}", f"+H{height}", f"Declare=dx={dx:.9f}", f"Declare=dy={dy:.9f}"]
+        command = ["povray", "+Iscene.pov", "+Oimage.exr", "+FE", "-A", "-D", "File_Gamma=1.0", *sizes]
+        environments.run(command, timeout=HOURS, where=folder / "scene")
+        fine = _rgb(images.read(folder / "scene" / "image.exr")).pixels
+        coarse = fine.reshape(camera.height, side, camera.width, side, 3).mean((1, 3), dtype=np.float64)
+        made.append(images.named(f"seed {seed}", coarse.astype(np.float32)))
     return made
 
 
 def _three(mis: str) -> Callable[[Plain, Path, int, Sequence[int]], list[Image]]:
-    """With (1) or without (0) multiple importance sampling: with it as the library comes."""
+    """With multiple importance sampling of the sky ("1"), as the library comes, or without ("0")."""
 
     def draw(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
         chromium, node = three.browser(), shutil.which("node")
         if not (chromium and node):
             raise environments.Unable("no node or no Chromium in PATH")
         (folder / "scene").mkdir()
-        for name, content in described.files(plain, _equirectangular).items():
+        for name, content in described.files(plain, equirectangular).items():
             (folder / "scene" / name).write_bytes(content)
         script = environments.SCRIPTS / "three_pictures.mjs"
         places = [str(script), str(environments.folder(SYSTEMS["three"])), chromium, str(folder / "scene"), str(folder)]
@@ -93,7 +97,7 @@ def _three(mis: str) -> Callable[[Plain, Path, int, Sequence[int]], list[Image]]
     return draw
 
 
-def _equirectangular(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def equirectangular(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """The direction whose radiance three finds at (u, v), v from the top."""
     phi, theta = 2 * np.pi * (u - 0.5), np.pi * v
     return np.stack([np.cos(phi) * np.sin(theta), np.cos(theta), np.sin(phi) * np.sin(theta)], axis=-1)
@@ -110,8 +114,9 @@ def _rgb(image: Image) -> Image:
 
 THREE = (
     "A glass has one index, the quotient of the two; radiance is not scaled by the square of the index.",
-    "The tent filter of its pixels is replaced by a box, its Russian roulette, which is clamped, switched off, and its "
-    "random numbers are those of a seed (PCG).",
+    "The tent filter of its pixels is replaced by a box.",
+    "Its Russian roulette is off, and its random numbers are those of a seed (PCG): its strata are the same in all "
+    "pixels. MIS is its multiple importance sampling of the sky, on by default.",
     "A diffuse surface is its Disney lobe at roughness 0 and index 1, which is Lambert's; a lamp is a front that emits "
     "and a black back.",
     "bounces and transmissiveBounces are Mitsuba's max_depth.",
@@ -123,7 +128,7 @@ def _spp(sphere: int, prism: int, environment: int) -> dict[str, int]:
 
 
 PAINTERS: dict[str, Painter] = {
-    "Radiance": Painter("radiance", _radiance, _spp(104, 72, 4), radiance.ASSUMPTIONS),
+    "Radiance": Painter("radiance", _radiance, _spp(160, 112, 4), radiance.ASSUMPTIONS),
     "Cycles": Painter("cycles", _by_script("cycles"), _spp(128, 128, 32), cycles.ASSUMED),
     "LuxCore": Painter("luxcore", _by_script("luxcore"), _spp(320, 400, 288), luxcore.ASSUMED),
     "POV-Ray": Painter("povray", _povray, _spp(16, 16, 16), povray.ASSUMPTIONS),

@@ -11,8 +11,14 @@ SYSTEM = System(
     small=True,
     draws=True,
     calls=(
-        # FTINY: a smaller cos²θ_t is no refraction to it.
-        Call("Radiance, rtrace", "f64", "radiance_rays.py", noted(5e-15, 4e-13, 1e-16, 3e-16), "reflected",
-             gives_up=1e-6),
+        Call(
+            "Radiance, rtrace",
+            "f64",
+            "radiance_rays.py",
+            noted(5e-15, 4e-13, 1e-16, 3e-16),
+            "reflected",
+            gives_up=1e-6,
+            remark="takes cos²θ_t below 1e-6 for total reflection, and misses a surface met at less than 1e-6 rad",
+        ),
     ),
-)  # fmt: skip
+)

@@ -52,7 +52,7 @@ class Call:
     """A function of refraction in one precision: `script` of scripts/ reads rays and writes answers, both as CSV.
 
     `told`: how total internal reflection is, one of `mi_refract.rays_judge.TIR`. `gives_up`: the cos²θ_t below which it
-    takes a ray for totally reflected, by its own word.
+    takes a ray for totally reflected, by its own word. `remark`: where it is known to differ, and how.
     """
 
     title: str
@@ -62,6 +62,7 @@ class Call:
     told: str
     arguments: tuple[str, ...] = ()
     gives_up: float = 0.0
+    remark: str = ""
 
 
 @dataclass(frozen=True)

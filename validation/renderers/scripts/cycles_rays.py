@@ -15,7 +15,7 @@ import bpy
 import numpy as np
 import table
 
-START, SIZE, APART = 0.25, 1e-3, 1.0
+START, SIZE = 0.25, 1e-3
 WIDTH = 128
 CAMERA = """
 shader camera(output point position = 0.0, output vector direction = 0.0, output color throughput = 1.0)
@@ -104,8 +104,7 @@ def settings(scene, width, height):
 
 def render(rays, folder):
     height = -(-len(rays) // WIDTH)
-    side = int(np.ceil(len(rays) ** (1 / 3)))
-    centres = APART * np.stack(np.unravel_index(np.arange(len(rays)), (side,) * 3), axis=1).astype(float)
+    centres = table.apart(rays)
     exr(folder / "origins.exr", padded(centres - START * rays.a, height))
     exr(folder / "directions.exr", padded(rays.a, height))
     constants = {"WIDTH": f"{WIDTH}.0", "HEIGHT": f"{height}.0"}

@@ -10,47 +10,51 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pyradiance
 
-HOME = Path(pyradiance.__file__).parent
-# Every diffuse reflection sends one random ray, and nothing is remembered or sampled besides: a path tracer.
-RTRACE = "-h -w -u+ -fdf -ov -aa 0 -ad 1 -as 0 -av 0 0 0 -dj 0 -st 0 -ss 1 -lw 1e-7"
+# Every diffuse reflection sends one random ray, and nothing is remembered or sampled besides: a path tracer. Weak rays
+# are played for by Russian roulette, which a negative -lr asks for.
+RTRACE = "-h -w -u+ -fdf -ov -aa 0 -ad 1 -as 0 -av 0 0 0 -dj 0 -st 0 -ss 1 -lw 1e-2"
 
 
 def main():
+    import pyradiance
+
+    home = Path(pyradiance.__file__).parent
     folder, out, width, spp, depth, *seeds = sys.argv[1:]
     os.chdir(folder)
-    os.environ["RAYPATH"] = f".:{HOME / 'lib'}"
-    octree = subprocess.run([HOME / "bin/oconv", "-w", "scene.rad"], check=True, capture_output=True).stdout
-    Path(out, "scene.oct").write_bytes(octree)
+    os.environ["RAYPATH"] = f".:{home / 'lib'}"
+    octree = Path(out, "scene.oct")
+    octree.write_bytes(subprocess.run([home / "bin/oconv", "-w", "scene.rad"], check=True, stdout=-1).stdout)
+    rtrace = [home / "bin/rtrace", *RTRACE.split(), "-ab", depth, "-lr", f"-{depth}", octree]
+    view = Path("camera.vf").read_text()
     for seed in seeds:
-        picture = np.zeros((int(width), int(width), 3))
         rng = np.random.default_rng(int(seed))
-        for _ in range(int(spp)):
-            picture += traced(Path(out, "scene.oct"), rays(int(width), rng), depth).reshape(picture.shape)
+        places = (rng.random((int(width), int(width), 2)) for _ in range(int(spp)))
+        picture = sum(traced(rtrace, rays(view, within)) for within in places) / int(spp)
         path = Path(out, f"seed{seed}.f32")
-        path.write_bytes((picture / int(spp)).astype("<f4").tobytes())
+        path.write_bytes(picture.astype("<f4").tobytes())
         print(path, flush=True)
 
 
-def rays(width, rng):
-    """Origin and direction of one ray a pixel, uniform in it; rows from the top."""
-    view = Path("camera.vf").read_text().split()
-    origin, ahead, up = (np.array(view[view.index(key) + 1 :][:3], float) for key in ("-vp", "-vd", "-vu"))
-    wide = np.tan(np.radians(float(view[view.index("-vh") + 1])) / 2)
+def rays(view, within):
+    """Origin and direction of a ray a pixel, H × W × 6, rows from the top; `within`: (x, y) in it, 0 to 1."""
+    words = view.split()
+    origin, ahead, up = (np.array(words[words.index(key) + 1 :][:3], float) for key in ("-vp", "-vd", "-vu"))
+    wide, tall = (np.tan(np.radians(float(words[words.index(key) + 1])) / 2) for key in ("-vh", "-vv"))
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, up)
     right /= np.linalg.norm(right)
-    x, y = np.moveaxis((np.indices((width, width))[::-1].T.swapaxes(0, 1) + rng.random((width, width, 2))), -1, 0)
-    x, y = (wide * (2 * each / width - 1) for each in (x, y))
-    directions = ahead + x[..., None] * right - y[..., None] * np.cross(right, ahead)
+    height, width = within.shape[:2]
+    y, x = np.mgrid[:height, :width] + np.moveaxis(within[..., ::-1], -1, 0)
+    x, y = wide * (2 * x / width - 1), tall * (1 - 2 * y / height)
+    directions = ahead + x[..., None] * right + y[..., None] * np.cross(right, ahead)
     return np.concatenate([np.broadcast_to(origin, directions.shape), directions], -1)
 
 
-def traced(octree, bundle, depth):
-    command = [HOME / "bin/rtrace", *RTRACE.split(), "-ab", depth, "-lr", depth, octree]
-    done = subprocess.run(command, input=bundle.astype("<f8").tobytes(), stdout=subprocess.PIPE, check=True)
-    return np.frombuffer(done.stdout, "<f4")
+def traced(rtrace, bundle):
+    """The radiance of each ray, float64."""
+    done = subprocess.run(rtrace, input=bundle.astype("<f8").tobytes(), stdout=-1, check=True)
+    return np.frombuffer(done.stdout, "<f4").reshape(*bundle.shape[:-1], 3).astype(float)
 
 
 if __name__ == "__main__":

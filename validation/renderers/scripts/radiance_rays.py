@@ -1,7 +1,7 @@
 """Radiance's `rtrace`: every ray meets a ring of its own between the two media, and `-otdW` tells what it becomes.
 
-A ring takes its normal as it is given, where a polygon would compute one from its corners. The rings stand apart on a
-grid, so small that none is in another ray's way.
+A ring takes its normal as it is given, where a polygon would compute one from its corners. The rings stand apart, so
+small that none is in another ray's way.
 """
 
 import os
@@ -21,7 +21,7 @@ FOLDER = Path(pyradiance.__file__).parent
 # An interface: colour and index of its inside, then of its outside, where the ring's normal points. Rays come from the
 # inside: there rtrace divides n_from by n_to, and from the outside it takes the reciprocal of the other ratio.
 RING = """void interface m{i}\n0\n0\n8 1 1 1 {n_from!r} 1 1 1 {n_to!r}
-m{i} ring r{i}\n0\n0\n8 {x} {y} {z} {nx!r} {ny!r} {nz!r} 0 {radius}\n"""
+m{i} ring r{i}\n0\n0\n8 {x!r} {y!r} {z!r} {nx!r} {ny!r} {nz!r} 0 {radius}\n"""
 
 
 def run(command, *arguments, given=None):
@@ -61,13 +61,12 @@ def _record(out, position):
 
 
 def _is(record, a):
-    return record[3] == 1 and np.abs(record[:3] - a).max() < 1e-9
+    return record[3] == 1 and np.abs(record[:3] - a / np.linalg.norm(a)).max() < 1e-9
 
 
 os.environ["RAYPATH"] = str(FOLDER / "lib")
 rays = table.Rays("float64")
-side = int(np.ceil(len(rays) ** (1 / 3)))
-centres = np.stack(np.unravel_index(np.arange(len(rays)), (side,) * 3), axis=1)
+centres = table.apart(rays)
 with tempfile.TemporaryDirectory() as folder:
     (Path(folder) / "scene.rad").write_text(scene(rays, centres))
     (Path(folder) / "scene.oct").write_bytes(run("oconv", f"{folder}/scene.rad"))

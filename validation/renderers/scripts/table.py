@@ -29,6 +29,13 @@ class Rays:
         return len(self.ids)
 
 
+def apart(rays):
+    """(N, 3) places for as many small things: about 1 from each other, and in no row that a ray could run along."""
+    side = int(np.ceil(len(rays) ** (1 / 3)))
+    grid = np.stack(np.unravel_index(np.arange(len(rays)), (side,) * 3), axis=1)
+    return grid + np.random.default_rng(0).uniform(-0.25, 0.25, grid.shape)
+
+
 def write(rays, b, system, transmitted=None):
     """Answers to stdout, to the last bit. `system`: the name and version of what computed them.
 

@@ -1,6 +1,7 @@
 // Render scene.json by three-gpu-pathtracer in a headless browser, WebGL2 on the processor:
 //   node three_pictures.mjs NPM_FOLDER CHROMIUM SCENE_FOLDER OUT_FOLDER WIDTH SPP MIS SEED…
-// One seedN.f32 per seed: rows from the top, three float32 a pixel. MIS: 1 as the library's default, 0 without.
+// One seedN.f32 per seed: rows from the top, three float32 a pixel. MIS: 1 for multiple importance
+// sampling of the sky, as the library comes, 0 without.
 import { createServer } from "node:http";
 import { readFile, writeFile } from "node:fs/promises";
 import { createRequire } from "node:module";
@@ -8,6 +9,7 @@ import { extname, join, resolve } from "node:path";
 
 const [npm, chromium, scene, out, width, spp, mis, ...seeds] = process.argv.slice(2);
 const puppeteer = createRequire(join(resolve(npm), "package.json"))("puppeteer-core");
+const PATIENCE = 3_600_000; // ms: a busy machine is slow
 const page = new URL("three_pictures.html", import.meta.url);
 const types = { ".js": "text/javascript", ".html": "text/html", ".json": "application/json" };
 const roots = { "/modules/": join(npm, "node_modules"), "/scene/": scene };
@@ -28,13 +30,21 @@ await new Promise((done) => server.listen(0, "127.0.0.1", done));
 const browser = await puppeteer.launch({
   executablePath: chromium,
   args: ["--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist"],
-  protocolTimeout: 3_600_000,
+  env: { ...process.env, LIBGL_ALWAYS_SOFTWARE: "1" },
+  timeout: PATIENCE,
+  protocolTimeout: PATIENCE,
 });
 try {
   const tab = await browser.newPage();
+  tab.setDefaultTimeout(PATIENCE);
   tab.on("console", (message) => console.error(message.text()));
   tab.on("pageerror", (error) => console.error(error.message));
   await tab.goto(`http://127.0.0.1:${server.address().port}/`);
+  if (!(await tab.evaluate(() => document.createElement("canvas").getContext("webgl2") !== null))) {
+    console.error("no WebGL2 in this browser; Debian has it in libegl1 and libgl1-mesa-dri");
+    process.exitCode = 77;
+    throw undefined;
+  }
   await tab.waitForFunction("window.prepare");
   await tab.evaluate((width, mis) => window.prepare(width, mis), Number(width), mis === "1");
   for (const seed of seeds) {
@@ -42,6 +52,9 @@ try {
     await writeFile(join(out, `seed${seed}.f32`), Buffer.from(pixels, "base64"));
     console.log(join(out, `seed${seed}.f32`));
   }
+} catch (error) {
+  if (process.exitCode !== 77) console.error(error.message);
+  process.exitCode ??= 1;
 } finally {
   await browser.close();
   server.close();
