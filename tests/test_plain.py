@@ -240,7 +240,9 @@ REFUSED = {
     "no radius": ('type="sphere" id="ball">', 'type="sphere"><float name="radius" value="0"/>', "radius = 0"),
     "infinite": ('type="sphere" id="ball">', 'type="sphere"><float name="radius" value="inf"/>', "radius = inf"),
     "no point": ('type="sphere" id="ball">', 'type="sphere"><float name="center" value="1"/>', "center = 1"),
-    "no transform": ('<transform name="to_world"><translate x="3"/></transform>', '<float name="to_world" value="1"/>', "to_world"),
+    "no transform": (
+        '<transform name="to_world"><translate x="3"/></transform>', '<float name="to_world" value="1"/>', "to_world"
+    ),
     "missing mesh": ('type="sphere" id="ball">', 'type="ply"><string name="filename" value="no.ply"/>', "no.ply"),
 }  # fmt: skip
 
