@@ -16,7 +16,8 @@ def ray(subject="A", case="random", budget=None, **values):
 def picture(subject="B", verdict="equal", differing=0.0, **more):
     values = {"mean difference": -0.02, "tests that differ": differing}
     budgets = {"tests that differ": 0.0} | more
-    return Row(pictures.STUDY, subject, "prism", "64²", values, budgets, reason="why", replay={"verdict": verdict, "renderer": "B 3"})
+    replay = {"verdict": verdict, "renderer": "B 3"}
+    return Row(pictures.STUDY, subject, "prism", "64²", values, budgets, reason="why", replay=replay)
 
 
 def test_numbers_and_verdicts_are_those_of_the_rows():
