@@ -60,14 +60,14 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) ->
 def _max_depth(integrator: Node) -> int:
     if integrator.type not in INTEGRATORS:
         raise integrator.refused("an integrator of another kind", ", ".join(INTEGRATORS))
-    depth = integrator.take("max_depth", -1)
+    depth = integrator.of(int, "max_depth", -1)
     if depth < 1:
         raise integrator.refused(f"max_depth = {depth}", "a positive whole number")
-    if integrator.take("hide_emitters", False):
+    if integrator.of(bool, "hide_emitters", False):
         raise integrator.refused("hide_emitters", "false")
     integrator.ignore("rr_depth")
     integrator.done()
-    return int(depth)
+    return depth
 
 
 def _camera(sensor: Node) -> Camera:
@@ -95,9 +95,9 @@ def _triple(vector: Any) -> tuple[float, float, float]:
 
 def _fov_x(sensor: Node, width: int, height: int) -> float:
     """The angle between the left and the right border, in degrees."""
-    fov, axis = sensor.take("fov"), sensor.take("fov_axis", "x")
-    if fov is None:
-        raise sensor.refused("no fov", "an angle in degrees")
+    fov, axis = sensor.of(float, "fov"), sensor.of(str, "fov_axis", "x")
+    if not 0 < fov < 180:
+        raise sensor.refused(f"fov = {fov}", "an angle of 0 to 180 degrees")
     lengths = {"x": width, "y": height, "diagonal": math.hypot(width, height)}
     lengths |= {"smaller": min(width, height), "larger": max(width, height)}
     if axis not in lengths:
@@ -110,16 +110,18 @@ def _film(film: Node) -> tuple[int, int]:
         if child.type != "box":
             raise child.refused("a reconstruction filter", "box")
     film.ignore("pixel_format", "component_format", "file_format")
-    size = int(film.take("width", 768)), int(film.take("height", 576))
+    width, height = film.of(int, "width", 768), film.of(int, "height", 576)
+    if min(width, height) < 1:
+        raise film.refused(f"{width} × {height} pixels", "at least one")
     film.done()
-    return size
+    return width, height
 
 
 def _sky(emitter: Node) -> Colour | Environment:
     if emitter.type == "constant":
         sky: Colour | Environment = emitter.colour("radiance", 1.0)
     elif emitter.type == "envmap":
-        path, scale = emitter.scene.beside(emitter.take("filename")), emitter.take("scale", 1.0)
+        path, scale = emitter.scene.beside(emitter.of(str, "filename")), emitter.of(float, "scale", 1.0)
         turn = emitter.transform()[:3, :3]
         if not np.allclose(turn.T @ turn, np.eye(3), atol=1e-9):
             raise emitter.refused("to_world is no rotation", "a rotation")

@@ -41,7 +41,7 @@ class Surface:
 def meshes(shape: Node, level: int) -> Iterator[Mesh]:
     """The shape's meshes: two for a checkerboard, else one. ValueError for what they cannot say."""
     surface, frame = _surface(shape), _frame(shape)
-    flipped = bool(shape.take("flip_normals", False))
+    flipped = shape.of(bool, "flip_normals", False)
     parts = _parts(shape, surface, level)
     shape.done()
     if surface.one_sided and (flipped or not all(tessellate.is_closed(faces) for _, faces in parts)):
@@ -83,7 +83,7 @@ def _parts(shape: Node, surface: Surface, level: int) -> tuple[Triangles, ...]:
 
 
 def _from_file(shape: Node) -> Triangles:
-    path, flat = shape.scene.beside(shape.take("filename")), bool(shape.take("face_normals", False))
+    path, flat = shape.scene.beside(shape.of(str, "filename")), shape.of(bool, "face_normals", False)
     try:
         mesh = mi.load_dict({"type": shape.type, "filename": str(path), "face_normals": flat})
     except RuntimeError as error:
@@ -98,11 +98,11 @@ def _frame(shape: Node) -> np.ndarray:
     """From the coordinates of `_parts` to the scene's, 4 × 4."""
     frame, local = shape.transform(), np.eye(4)
     if shape.type == "sphere":
-        local[:3, 3] = shape.take("center", (0, 0, 0))
-        local[:3, :3] *= _positive(shape, "radius", shape.take("radius", 1.0))
+        local[:3, 3] = shape.point("center", (0, 0, 0))
+        local[:3, :3] *= _positive(shape, "radius", shape.of(float, "radius", 1.0))
     elif shape.type == "cylinder":
-        start, end = (np.array(shape.take(name, (0, 0, z)), float) for name, z in (("p0", 0), ("p1", 1)))
-        radius = _positive(shape, "radius", shape.take("radius", 1.0))
+        start, end = (shape.point(name, (0, 0, z)) for name, z in (("p0", 0), ("p1", 1)))
+        radius = _positive(shape, "radius", shape.of(float, "radius", 1.0))
         length = _positive(shape, "length", float(np.linalg.norm(end - start)))
         local[:3, 3] = start
         local[:3, :3] = _basis((end - start) / length) * [radius, radius, length]
@@ -110,8 +110,8 @@ def _frame(shape: Node) -> np.ndarray:
 
 
 def _positive(shape: Node, name: str, value: float) -> float:
-    if not 0 < value < np.inf:
-        raise shape.refused(f"{name} = {value}", "a positive finite number")
+    if value <= 0:
+        raise shape.refused(f"{name} = {value}", "a positive number")
     return value
 
 
@@ -166,10 +166,9 @@ def _scattering(bsdf: Node) -> Surface:
 
 def _paint(node: Node, name: str, default: float | None) -> tuple[tuple[Colour, ...], tuple[float, float] | None]:
     """One colour, or the two of a checkerboard and the scale of its uv."""
-    texture = node.props.get(name)
-    if type(texture).__name__ != "ResolvedReference":
-        return (node.colour(name, default),), None
     texture = node.take(name)
+    if not isinstance(texture, Node):
+        return (node.colour(name, default),), None
     if texture.type != "checkerboard":
         raise texture.refused(f"a texture for the {name}", "checkerboard")
     colours = texture.colour("color0", 0.4), texture.colour("color1", 0.2)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import mitsuba as mi
 import numpy as np
@@ -15,13 +15,17 @@ from numpy.typing import NDArray
 from .images import one_line
 from .plain_data import Colour
 
+Kind = TypeVar("Kind", int, float, str, bool)
+REFERENCE = "ResolvedReference"  # to another node; Mitsuba does not export the class
+
 
 class Node:
     """A plugin of the parsed scene: its parameters, each to be taken; what is left at the end is refused."""
 
     def __init__(self, scene: Reader, node: Any) -> None:
         self.scene, self._node, self.props, self.type = scene, node, node.props, node.props.plugin_name()
-        self.left = set(node.props.keys())
+        self.names = list(node.props.keys())
+        self.left = set(self.names)
 
     @property
     def kind(self) -> str:
@@ -34,16 +38,17 @@ class Node:
     def take(self, name: str, default: Any = None) -> Any:
         self.left.discard(name)
         value = self.props.get(name, default)
-        return self.scene.node(value.index()) if type(value).__name__ == "ResolvedReference" else value
+        return self.scene.node(value.index()) if type(value).__name__ == REFERENCE else value
 
     def ignore(self, *names: str) -> None:
         """Parameters without an effect on what is rendered in the end."""
         self.left.difference_update(names)
 
     def children(self) -> Iterator[Node]:
-        """Its nested plugins without a meaning in their names, taken."""
-        for name in sorted((name for name in self.left if re.fullmatch(r"_arg_\d+", name)), key=lambda x: int(x[5:])):
-            yield self.take(name)
+        """Its nested plugins that are not yet taken, whatever their names, in the order of the file."""
+        for name in [name for name in self.names if name in self.left]:
+            if type(self.props[name]).__name__ == REFERENCE:
+                yield self.take(name)
 
     def done(self) -> None:
         if self.left:
@@ -51,6 +56,21 @@ class Node:
 
     def refused(self, what: str, accepted: str) -> ValueError:
         return ValueError(f"{self.scene.path}: {self}: {what}; accepted: {accepted}")
+
+    def of(self, kind: type[Kind], name: str, default: Kind | None = None) -> Kind:
+        """A number, a text or a truth value; refused where it is of another kind, missing, or not finite."""
+        value = self.take(name, default)
+        if kind is float and type(value) is int:
+            value = float(value)
+        if type(value) is not kind or (isinstance(value, float) and not math.isfinite(value)):
+            raise self.refused(f"{name} = {value}", f"one of type {kind.__name__}")
+        return value
+
+    def point(self, name: str, default: Sequence[float]) -> NDArray[np.float64]:
+        value = np.array(self.take(name, default), dtype=object)
+        if value.shape != (3,) or not all(isinstance(x, (int, float)) and math.isfinite(x) for x in value):
+            raise self.refused(f"{name} = {value}", "three finite numbers")
+        return value.astype(float)
 
     def colour(self, name: str, default: float | None) -> Colour:
         """Three finite numbers of at least 0."""
@@ -69,6 +89,8 @@ class Node:
     def transform(self, name: str = "to_world") -> NDArray[np.float64]:
         """4 × 4, affine, of positive determinant."""
         value = self.take(name)
+        if value is not None and not hasattr(value, "matrix"):
+            raise self.refused(f"{name} = {value}", "a transform")
         matrix = np.eye(4) if value is None else np.array(value.matrix, float)
         affine = np.isfinite(matrix).all() and (matrix[3] == [0, 0, 0, 1]).all()
         if not affine or not np.linalg.det(matrix[:3, :3]) > 0:

@@ -228,11 +228,21 @@ REFUSED = {
         '<shape type="disk"><emitter type="area"><texture type="checkerboard" name="radiance"/>',
         "a checkerboard",
     ),
-    "medium": ("<bsdf", '<medium type="homogeneous" name="interior"/><bsdf', "interior"),
+    "medium": ("<bsdf", '<medium type="homogeneous" name="interior"/><bsdf', "a medium of a shape"),
     "reflecting lamp": ("<emitter type=\"area\">", '<bsdf type="diffuse"/><emitter type="area">', "BSDF of a lamp"),
     "unknown parameter": ('<translate x="3"/>', '<nonsense x="3"/>', "nonsense"),
     "syntax": ("</scene>", "", "scene.xml"),
     "negative": ('"0.5, 0.25, 1"', '"0.5, -0.25, 1"', "at least 0"),
+    "text for a number": ('<float name="fov" value="40"/>', '<string name="fov" value="40"/>', "fov = 40"),
+    "no angle": ('<float name="fov" value="40"/>', "", "fov = None"),
+    "flat angle": ('name="fov" value="40"', 'name="fov" value="180"', "fov = 180"),
+    "no pixel": ('name="width" value="16"', 'name="width" value="0"', "0 × 8"),
+    "no radius": ('type="sphere" id="ball">', 'type="sphere"><float name="radius" value="0"/>', "radius = 0"),
+    "infinite": ('type="sphere" id="ball">', 'type="sphere"><float name="radius" value="inf"/>', "radius = inf"),
+    "no point": ('type="sphere" id="ball">', 'type="sphere"><float name="center" value="1"/>', "center = 1"),
+    "no transform": (
+        '<transform name="to_world"><translate x="3"/></transform>', '<float name="to_world" value="1"/>', "to_world"
+    ),
     "missing mesh": ('type="sphere" id="ball">', 'type="ply"><string name="filename" value="no.ply"/>', "no.ply"),
 }  # fmt: skip
 
@@ -267,6 +277,11 @@ def test_other_errors(scene):
         plain.load(scene(), level=9)
     with pytest.raises(ValueError, match="oops"):
         plain.load(scene(), oops="1")
+
+
+def test_children_may_have_names(scene):
+    path = scene('<shape type="cube"', '<shape name="second" type="cube"', "<bsdf", '<bsdf name="glass"')
+    assert [mesh.name for mesh in plain.load(path, level=0).meshes] == ["ball", "box", "rectangle"]
 
 
 def test_names_are_unique(scene):

@@ -23,8 +23,8 @@ image.f32: {height} rows of {width} pixels of 3 float32, the top row first. 1024
 ASSUMPTIONS = (
     "At a boundary both rays are followed while their share is above a hundredth (-lw); below it, Russian roulette (a "
     "negative -lr) decides, without a bias.",
-    "-lr and -ab count reflections, Mitsuba's max_depth refractions too: Radiance has light that Mitsuba cuts off. Where "
-    "that shows, raise Mitsuba's max_depth: `nested` gains 0.2 % of its mean from 48 to 400.",
+    "-lr and -ab count reflections, Mitsuba's max_depth refractions too: Radiance has light that Mitsuba cuts off. "
+    "Where that shows, raise Mitsuba's max_depth: `nested` gains 0.2 % of its mean from 48 to 400.",
     "Lights and sky are `glow` of radius 0: no shadow ray is sent to one, so that caustics are complete.",
 )
 
