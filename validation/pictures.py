@@ -40,7 +40,8 @@ TERMS = {
     "tiles that differ without noise": "of those where neither side has noise",
     "detectable difference": "relative to the tile's mean, median over the tiles; of the picture: of its mean",
     "mean difference": "of the picture's mean, relative: what the other renderer has more",
-    "RMSE / noise": "of the two means by pixel, over what the spread between renders predicts: 1 for equal pictures",
+    "RMSE / noise": "of the two means by pixel, over what the spread between renders predicts: 1 for equal pictures "
+    "whose noise is all in that spread, which it is not for a fixed grid of samples",
     "reference, test, difference": f"`{PLUGIN}`, the other renderer, test − reference: means over the renders",
 } | {f"{title}, assumed": " ".join(painter.assumed) for title, painter in PAINTERS.items()}
 FAMILY_ERROR = 1e-4
