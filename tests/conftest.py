@@ -142,3 +142,44 @@ def follow(setting):
         return trace(segments, np.atleast_2d(origins), np.atleast_2d(directions), max_depth, **options)
 
     return run
+
+
+@pytest.fixture
+def pair(tmp_path):
+    """A folder with a pair that is equal and a pair that differs by 10 %."""
+    from diff_pictures import picture
+
+    for name, gain in (("equal.exr", 1.0), ("louder.exr", 1.1)):
+        picture(tmp_path / "old" / name)
+        picture(tmp_path / "new" / name, gain=gain)
+    return tmp_path / "old", tmp_path / "new"
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Same, changed, removed and added pictures, one of them in a folder inside; and files that are none."""
+    from diff_pictures import picture
+
+    old, new = tmp_path / "old", tmp_path / "new"
+    for folder in (old, new):
+        picture(folder / "same.exr")
+        picture(folder / "inner" / "changed.exr", gain=1.0 if folder is old else 1.1)
+        (folder / "notes.txt").write_text(folder.name)
+    picture(old / "removed.exr")
+    picture(new / "added.exr")
+    picture(new / ".hidden.exr")
+    return old, new
+
+
+@pytest.fixture
+def run(capfd):
+    """`run("diff", old, new, "--samples")`: exit code, stdout, stderr."""
+    from mi_refract import cli
+
+
+    def call(*words):
+        capfd.readouterr()
+        code = cli.main([*map(str, words)])
+        return code, *capfd.readouterr()
+
+    return call

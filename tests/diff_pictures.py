@@ -97,3 +97,13 @@ def _png(path):
     buffer = oiio.ImageBuf(np.full(SIZE, 0.5, np.float32))
     assert buffer.write(str(other), "uint8"), buffer.geterror()
     other.replace(path)
+
+
+def tree(folder):
+    """Every file with what it holds."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def found(results):
+    """Status and category by name."""
+    return {result.name: (str(result.status), str(result.category)) for result in results.results}

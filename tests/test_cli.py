@@ -286,3 +286,13 @@ def test_without_the_extra():
         out, err = process.communicate(timeout=60)
     assert (process.returncode, out) == (2, "")
     assert err.splitlines()[-1] == "mi-refract needs the extra `cli`: pip install 'mi-refract[cli]'"
+
+
+def test_diff_in_a_process_of_its_own(pair):
+    """The exit code arrives, and no line of a log is wrapped."""
+    root = Path(cli.__file__).parents[1]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(root), *filter(None, sys.path)]), "COLUMNS": "40"}
+    command = [sys.executable, "-m", "mi_refract.cli", "diff", *map(str, pair)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stderr) == (1, "")
+    assert len(done.stdout.splitlines()) == 4

@@ -3,34 +3,14 @@
 from __future__ import annotations
 
 import os
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
-from diff_pictures import BROKEN, picture, samples
+from diff_pictures import BROKEN, found, picture, samples
 
 from mi_refract import compare, diff, diff_settings, images
-from mi_refract.diff import Category, Result, Results, Status
+from mi_refract.diff import Result, Results, Status
 from mi_refract.diff_settings import How, Settings
-
-
-@pytest.fixture
-def folders(tmp_path):
-    """Same, changed, removed and added pictures, one of them in a folder inside; and files that are none."""
-    old, new = tmp_path / "old", tmp_path / "new"
-    for folder in (old, new):
-        picture(folder / "same.exr")
-        picture(folder / "inner" / "changed.exr", gain=1.0 if folder is old else 1.1)
-        (folder / "notes.txt").write_text(folder.name)
-    picture(old / "removed.exr")
-    picture(new / "added.exr")
-    picture(new / ".hidden.exr")
-    return old, new
-
-
-def found(results):
-    return {result.name: (str(result.status), str(result.category)) for result in results.results}
 
 
 def test_folders_are_matched_by_name(folders):
@@ -173,6 +153,11 @@ def test_maps_are_kept_on_request_and_where_pictures_differ(folders):
     assert not any(r.comparison and r.comparison.maps for r in diff.diff(*folders).results)
     kept = {r.name: bool(r.comparison.maps) for r in diff.diff(*folders, maps=True).results if r.comparison}
     assert kept == {"inner/changed.exr": True, "same.exr": False}
+
+
+def test_the_order_of_the_table_is_that_of_the_results(pair):
+    statuses = [result.status for result in diff.diff(*pair).results]
+    assert statuses == sorted(statuses, key=list(Status).index) == [Status.DIFFERENT, Status.EQUAL]
 
 
 # Samples ----------------------------------------------------------------------------------------------------------
@@ -377,107 +362,3 @@ def test_bad_options_in_words(method, words, message):
 def test_an_option_out_of_its_range_is_no_verdict(folders):
     results = diff.diff(*folders, Settings(How("tolerance", {"fail": -1.0})))
     assert {result.status for result in results.results if None not in (result.reference, result.test)} == {"error"}
-
-
-# Accepting --------------------------------------------------------------------------------------------------------
-
-
-def test_what_is_accepted(folders):
-    old, new = folders
-    results = diff.diff(old, new)
-    copies = list(diff.changes(results))
-    assert copies == [(new / n, old / n) for n in ("added.exr", "inner/changed.exr")]
-    before = (old / "inner/changed.exr").read_bytes()
-    assert {p.name for p in old.rglob("*.exr")} == {"same.exr", "changed.exr", "removed.exr"}
-    assert (old / "inner/changed.exr").read_bytes() == before
-    diff.accept(copies, results.began)
-    assert found(diff.diff(old, new)) == {
-        "removed.exr": ("different", "removed"),
-        "added.exr": ("equal", "unchanged"),
-        "inner/changed.exr": ("equal", "unchanged"),
-        "same.exr": ("equal", "unchanged"),
-    }
-    assert not list(old.rglob("*.part"))
-
-
-def test_a_reference_that_is_not_there_yet(folders, tmp_path):
-    old, new = folders
-    results = diff.diff(tmp_path / "first", new, new=True)
-    diff.accept(list(diff.changes(results)), results.began)
-    assert diff.diff(tmp_path / "first", new).exit_code == 0
-    assert not (tmp_path / "first" / "notes.txt").exists()
-    one = tmp_path / "deep" / "one.exr"
-    results = diff.diff(one, new / "same.exr", new=True)
-    assert results.results[0].category is Category.ADDED
-    diff.accept(list(diff.changes(results)), results.began)
-    assert one.read_bytes() == (new / "same.exr").read_bytes()
-    assert diff.diff(old, new, new=True).exit_code == 1
-
-
-@pytest.mark.parametrize("name", ["truncated", "empty", "text", "several parts", "deep", "zero size"])
-def test_a_bad_picture_becomes_no_reference(folders, name):
-    old, new = folders
-    bad = new / "same.exr"
-    bad.unlink()
-    BROKEN[name](bad)
-    with pytest.raises(ValueError, match=r"same\.exr"):
-        list(diff.changes(diff.diff(old, new)))
-
-
-def test_a_bad_added_picture_becomes_no_reference(folders):
-    BROKEN["truncated"](folders[1] / "added.exr")
-    with pytest.raises(ValueError, match=r"added\.exr"):
-        list(diff.changes(diff.diff(*folders)))
-
-
-@pytest.mark.parametrize("name", ["ref.png", "folder"])
-def test_a_reference_is_of_the_format_that_its_name_says(folders, tmp_path, name):
-    results = diff.diff(tmp_path / name, folders[1] / "same.exr", new=True)
-    with pytest.raises(ValueError, match=r"accepted: a name that ends in \.exr"):
-        list(diff.changes(results))
-
-
-def test_a_bad_reference_can_be_replaced(folders):
-    old, new = folders
-    BROKEN["truncated"](old / "same.exr")
-    copies = list(diff.changes(diff.diff(old, new)))
-    assert (new / "same.exr", old / "same.exr") in copies
-
-
-def test_values_that_are_not_finite_become_no_reference(folders):
-    picture(folders[1] / "same.exr", value=np.inf)
-    with pytest.raises(ValueError, match="not finite; accepted with --allow-nonfinite"):
-        list(diff.changes(diff.diff(*folders)))
-    named = Settings(allow_nonfinite=("same.exr",))
-    assert len(list(diff.changes(diff.diff(*folders, named)))) == 3
-
-
-def test_a_copy_that_fails_leaves_the_old_reference(folders, monkeypatch):
-    old, new = folders
-    before = (old / "inner/changed.exr").read_bytes()
-    monkeypatch.setattr("pathlib.Path.replace", lambda *a: (_ for _ in ()).throw(OSError("disk full")))
-    with pytest.raises(OSError, match="disk full"):
-        diff.accept([(new / "inner/changed.exr", old / "inner/changed.exr")], time.time_ns())
-    assert (old / "inner/changed.exr").read_bytes() == before
-    assert not list(old.rglob("*.part"))
-
-
-def test_a_name_with_a_dash_is_no_option_of_the_command(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    picture(Path("-a.exr"))
-    picture(Path("-b.exr"), gain=1.1)
-    results = diff.diff("-a.exr", "-b.exr")
-    assert results.reproduce(results.results[0]) == "mi-refract diff ./-a.exr ./-b.exr"
-    assert results.accept(results.results[0]) == "mi-refract accept ./-a.exr ./-b.exr"
-
-
-def test_the_commands_do_what_they_say(folders):
-    old, new = folders
-    results = diff.diff(old, new, Settings(How("tolerance", {"fail": 0.01})))
-    by_name = {result.name: result for result in results.results}
-    pair = f"{old}/inner/changed.exr {new}/inner/changed.exr --method tolerance --set fail=0.01"
-    assert results.reproduce(by_name["inner/changed.exr"]) == f"mi-refract diff {pair}"
-    assert results.accept(by_name["inner/changed.exr"]) == f"mi-refract accept {pair}"
-    assert results.reproduce(by_name["added.exr"]) == ""
-    assert results.accept(by_name["added.exr"]).startswith(f"mi-refract accept {old}/added.exr {new}/added.exr")
-    assert results.accept(by_name["removed.exr"]) == results.accept(by_name["same.exr"]) == ""

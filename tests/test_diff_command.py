@@ -7,46 +7,17 @@ import importlib.util
 import json
 import os
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import typer
-from diff_pictures import BROKEN, picture, samples
+from diff_pictures import BROKEN, picture, samples, tree
 
-from mi_refract import backend, cli, cli_diff, compare, diff, diff_output, gate
+from mi_refract import backend, cli, cli_diff, compare, diff_output, gate
 from mi_refract.diff import Result, Results, Status
 
 EVIL = 'a"b<script>alert(1)</script>|`*[x](y)*`,:%0A::error::.exr'
-
-
-@pytest.fixture
-def pair(tmp_path):
-    """A folder with a pair that is equal and a pair that differs by 10 %."""
-    for name, gain in (("equal.exr", 1.0), ("louder.exr", 1.1)):
-        picture(tmp_path / "old" / name)
-        picture(tmp_path / "new" / name, gain=gain)
-    return tmp_path / "old", tmp_path / "new"
-
-
-@pytest.fixture
-def run(capfd):
-    """`run("diff", old, new, "--samples")`: exit code, stdout, stderr."""
-
-    def call(*words):
-        capfd.readouterr()
-        code = cli.main([*map(str, words)])
-        return code, *capfd.readouterr()
-
-    return call
-
-
-def tree(folder):
-    """Every file with what it holds."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 # Verdicts ---------------------------------------------------------------------------------------------------------
@@ -422,106 +393,3 @@ def test_a_long_summary_is_cut(tmp_path):
     text = diff_output.markdown(Results(tmp_path, tmp_path, results))
     assert text.count("| error |") == diff_output.SUMMARY_ROWS
     assert text.endswith("\n\n… and 7 more\n\n")
-
-
-# Accepting --------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def terminal(monkeypatch):
-    """`terminal(True)`: a person at a terminal who says yes."""
-
-    def sit(answer):
-        asked = []
-        monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
-        monkeypatch.setattr(typer, "confirm", lambda text: asked.append(text) or answer)
-        return asked
-
-    return sit
-
-
-def test_accept(run, pair):
-    old, new = pair
-    picture(new / "inner" / "added.exr")
-    code, out, err = run("accept", old, new, "--yes")
-    assert (code, err) == (0, "")
-    assert f"{new}/louder.exr → {old}/louder.exr\n" in out
-    assert f"{new}/inner/added.exr → {old}/inner/added.exr (new)\n" in out
-    assert out.splitlines()[-1] == "2 accepted"
-    assert tree(old) == tree(new)
-    assert run("accept", old, new, "--yes")[1].splitlines()[-1] == "nothing to accept"
-
-
-def test_accept_takes_nothing_that_changed_since(run, pair, monkeypatch):
-    before = tree(pair[0])
-
-    def late(count):
-        picture(pair[1] / "louder.exr", value=0.1)
-        return True
-
-    monkeypatch.setattr(cli_diff, "_agreed", late)
-    code, out, err = run("accept", *pair)
-    assert code == 2
-    assert "accepted\n" not in out
-    assert "louder.exr: changed since it was compared; accepted: what was shown\n" in err
-    assert tree(pair[0]) == before
-
-
-def test_accept_asks_first(run, pair, terminal):
-    old, new = pair
-    before = tree(old)
-    asked = terminal(False)
-    code, out, _ = run("accept", old, new)
-    assert (code, out.splitlines()[-1]) == (1, "nothing accepted")
-    assert asked == ["Accept 1 as the reference?"]
-    assert tree(old) == before
-    terminal(True)
-    assert run("accept", old, new)[0] == 0
-    assert tree(old) == tree(new)
-
-
-def test_accept_does_not_ask_a_script(run, pair, monkeypatch):
-    before = tree(pair[0])
-    monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
-    code, out, err = run("accept", *pair)
-    assert (code, err) == (2, "mi-refract: accept asks on a terminal only; accepted elsewhere: --yes\n")
-    assert "louder.exr" in out
-    assert tree(pair[0]) == before
-
-
-def test_accept_judges_like_diff(run, pair):
-    before = tree(pair[0])
-    tolerant = ["--method", "tolerance", "--set", "fail=0.2"]
-    assert run("accept", *pair, "--yes", *tolerant)[1].splitlines()[-1] == "nothing to accept"
-    assert tree(pair[0]) == before
-
-
-def test_accept_takes_all_or_nothing(run, pair):
-    BROKEN["truncated"](pair[1] / "equal.exr")
-    before = tree(pair[0])
-    code, _, err = run("accept", *pair, "--yes")
-    assert code == 2
-    assert "equal.exr" in err
-    assert tree(pair[0]) == before
-
-
-def test_accept_keeps_what_was_removed(run, pair):
-    (pair[1] / "equal.exr").unlink()
-    assert run("accept", *pair, "--yes")[0] == 0
-    assert (pair[0] / "equal.exr").exists()
-    assert run("diff", *pair)[0] == 1
-
-
-def test_in_a_process_of_its_own(pair):
-    """The exit code arrives, and no line of a log is wrapped."""
-    root = Path(cli.__file__).parents[1]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(root), *filter(None, sys.path)]), "COLUMNS": "40"}
-    command = [sys.executable, "-m", "mi_refract.cli", "diff", *map(str, pair)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
-    assert (done.returncode, done.stderr) == (1, "")
-    assert len(done.stdout.splitlines()) == 4
-
-
-def test_the_order_of_the_table_is_that_of_the_results(pair):
-    statuses = [result.status for result in diff.diff(*pair).results]
-    assert statuses == sorted(statuses, key=list(Status).index) == [Status.DIFFERENT, Status.EQUAL]
