@@ -24,6 +24,9 @@ from .rendering import provenance
 
 Folder = Annotated[Path, typer.Argument(metavar="REFERENCE", help="A picture, or a folder of them.")]
 Other = Annotated[Path, typer.Argument(metavar="TEST", help="What is compared with it, of the same kind.")]
+NotAlways = Annotated[
+    Path | None, typer.Argument(metavar="REFERENCE", help="A picture, or a folder of them; no need for --self-test.")
+]
 NotWithSelfTest = Annotated[Path | None, typer.Argument(metavar="TEST", help="What is compared with it.")]
 Method = Annotated[str, typer.Option(help=f"{'|'.join(diff_settings.ACCEPTED)}; see --methods.")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="An option of the method.")]
@@ -51,7 +54,7 @@ def _print_methods(asked: bool) -> None:
 
 
 def diff(
-    reference: NotWithSelfTest = None,
+    reference: NotAlways = None,
     test: NotWithSelfTest = None,
     method: Method = diff_settings.AUTO,
     options: Set = None,

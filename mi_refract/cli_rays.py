@@ -133,8 +133,9 @@ def check(
     """
     wanted = Wanted(tir, formula, report, junit, json)
     given = sets.read_answers(answers)
-    rays = sets.read(file) if file else sets.remake(given.header) if "checksum" in given.header else sets.make()
-    print(f"{answers}: {_summary(rays)}")
+    known = file or "checksum" in given.header
+    rays = sets.read(file) if file else sets.remake(given.header) if known else sets.make()
+    print(f"{answers}: {_summary(rays)}{'' if known else ', as `export` without options; others with --rays FILE'}")
     replay = ["check", str(answers), *(["--rays", str(file)] if file else []), *wanted.options]
     raise typer.Exit(wanted.judge(rays, given, str(answers), replay))
 

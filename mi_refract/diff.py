@@ -178,8 +178,9 @@ def diff(
 
 def require_apart(reference: Path, test: Path, new: bool = False) -> None:
     """ValueError where one path is the other or lies within it, OSError where one does not exist."""
-    for path in (test,) if new else (reference, test):
-        path.stat()
+    for role, path in {"test": test, **({} if new else {"reference": reference})}.items():
+        if not path.exists():
+            raise FileNotFoundError(f"{path}: no such {role}; accepted: a picture, or a folder of them")
     if reference.exists() and reference.samefile(test):
         raise ValueError(f"{test}: the same as the reference {reference}; accepted: two")
     inner, outer = reference.resolve(), test.resolve()

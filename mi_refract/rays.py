@@ -278,7 +278,8 @@ def _known(path: str | Path) -> Path:
 def _answers(name: str, header: dict[str, Any], numbers: np.ndarray) -> Answers:
     ids = numbers[:, 0]
     if (wrong := ~(np.abs(ids) < 2**53) | (np.rint(ids) != ids)).any():
-        raise ValueError(f"{name}: {wrong.sum()} ids are no whole numbers, {ids[wrong][0]} first; accepted: the rays'")
+        found = f"{wrong.sum()}, {ids[wrong][0]:g} first"
+        raise ValueError(f"{name}: ids that no ray can have: {found}; accepted: the rays'")
     flags = numbers[:, 4] if numbers.shape[1] > 4 else None
     if flags is not None and (wrong := ~np.isin(flags, (0, 1))).any():
         raise ValueError(f"{name}: {FLAG} is {flags[wrong][0]} of {wrong.sum()} rays; accepted: 0 or 1")

@@ -70,10 +70,12 @@ def sentence(found: Findings) -> str:
     whole = f"{found.answered} answers"
     if found.diagnosis:
         return f"{found.wrong} of {whole} are wrong: {found.diagnosis.mistake}"
+    if found.exit_code > 1:
+        return f"{whole}, but not those to the rays" + (f"; {found.wrong} of them are wrong" if found.wrong else "")
     if found.wrong or found.tir == UNCLEAR:
         return f"{found.wrong} of {whole} are wrong"
     if found.exit_code:
-        return f"{whole}, but not those to the rays" if found.judged else f"{whole}, none of them a direction"
+        return f"{whole}, none of them a direction"
     if found.limit == found.answered:
         return f"{whole}, all exact but for rounding"
     worst = f"{compact(found.farthest.worst)} rad off at most ({found.farthest.regime})"
@@ -94,6 +96,8 @@ def explained(found: Findings) -> list[str]:
     if not found.explanations:
         return []
     certain = [each for each in found.explanations if each.explains]
+    if not certain and found.exit_code > 1:  # to other rays, it may be; nothing is known of them
+        return []
     if not certain:
         nearest = max(found.explanations, key=lambda each: each.share)
         return ["none of the usual mistakes explains the answers", *([_line(nearest)] if nearest.share > 0 else [])]

@@ -40,8 +40,8 @@ def table(name: str, content: str | bytes, columns: Sequence[str], *more: str) -
             break
     accepted = [tuple(columns), *([(*columns, *more)] if more else [])]
     if names not in accepted:
-        found = ",".join(names)[:_SHOWN] or "none"
-        raise ValueError(f"{name}: header line {found!r}; accepted: {' or '.join(map(','.join, accepted))}")
+        found = f"header line {','.join(names)[:_SHOWN]!r}" if names else "nothing in it"
+        raise ValueError(f"{name}: {found}; accepted, in this order: {' or '.join(map(','.join, accepted))}")
     return header, _numbers(name, list(lines), len(names))
 
 

@@ -188,15 +188,15 @@ def test_answers_as_people_write_them():
 @pytest.mark.parametrize(
     "text, message",
     [
-        ("", "header line 'none'; accepted: id,bx,by,bz or id,bx,by,bz,transmitted"),
+        ("", "nothing in it; accepted, in this order: id,bx,by,bz or id,bx,by,bz,transmitted"),
         ("1,2,3,4\n", "header line '1,2,3,4'"),
         ("bx,by,bz\n", "header line 'bx,by,bz'"),
         ("id,by,bx,bz\n", "header line 'id,by,bx,bz'"),
         ("id,bx,by,bz\n1,2,3,4\n2,3,4\n3,x,1,2\n", "2 lines are no row, first line 3, '2,3,4'; accepted: 4 numbers"),
         ("id,bx,by,bz\n1,2,3,4,1\n", "1 lines are no row, first line 2"),
         ("id,bx,by,bz\n1,,,\n", "1 lines are no row"),
-        ("id,bx,by,bz\n1.5,2,3,4\n", "1 ids are no whole numbers, 1.5 first"),
-        ("id,bx,by,bz\nnan,2,3,4\ninf,2,3,4\n1e300,2,3,4\n", "3 ids are no whole numbers, nan first"),
+        ("id,bx,by,bz\n1.5,2,3,4\n", "ids that no ray can have: 1, 1.5 first"),
+        ("id,bx,by,bz\nnan,2,3,4\ninf,2,3,4\n1e300,2,3,4\n", "ids that no ray can have: 3, nan first"),
         ("id,bx,by,bz,transmitted\n1,2,3,4,2\n2,2,3,4,nan\n", "transmitted is 2.0 of 2 rays; accepted: 0 or 1"),
         (b"\xff\xfe\x00id", "no text; accepted: CSV in UTF-8"),
     ],

@@ -136,7 +136,7 @@ def test_the_measure_can_be_chosen(call):
 
 DAMAGE = {
     "no file": (None, 2, "No such file"),
-    "an empty file": ("", 2, "header line 'none'"),
+    "an empty file": ("", 2, "nothing in it"),
     "other columns": ("id,x,y,z\n0,1,2,3\n", 2, "header line 'id,x,y,z'"),
     "a short row": ("id,bx,by,bz\n0,0,1,0\n1,0,1", 2, "1 lines are no row, first line 3"),
     "no text": (b"\xfe\xff\x00", 2, "no text"),
@@ -236,7 +236,7 @@ def test_a_program_that_is_wrong(call, program):
 BAD_PROGRAMS = {
     "a status": ("import sys; sys.stdin.read(); print('id,bx,by,bz'); sys.exit(3)", "ended with status 3; accepted"),
     "a signal": ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "was killed by SIGSEGV; accepted"),
-    "nothing": ("pass", "header line 'none'"),
+    "nothing": ("pass", "nothing in it"),
     "a remark": ("print('hello'); print('id,bx,by,bz')", "header line 'hello'"),
     "bytes": ("import os; os.write(1, bytes(range(256)))", "no text"),
 }

@@ -52,8 +52,7 @@ def readme(plain: Plain, target: str, commands: str, assumptions: Sequence[str])
         "",
         textwrap.indent(textwrap.dedent(commands).strip(), "    "),
         "",
-        "What is assumed, and where the models differ:",
-        "",
+        *(["What is assumed, and where the models differ:", ""] if assumptions else []),
     ]
     for assumption in assumptions:
         lines += textwrap.wrap(assumption, 100, initial_indent="- ", subsequent_indent="  ")
