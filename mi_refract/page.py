@@ -101,7 +101,7 @@ def _matrix(rows: list[Row], metrics: list[str], scale: tuple[float, float] | No
 
 
 def _shade(row: Row | None, metric: str, scale: tuple[float, float]) -> dict[str, Any]:
-    """A cell of the matrix: its number, how deep its colour is on the logarithmic scale, what it broke."""
+    """A cell of the matrix: its number, how deep its colour is on the logarithmic scale, what it broke or missed."""
     if row is None or not row.values:
         text, state, hint = ("not run", "not-run", row.reason) if row else ("·", "none", "")
         return {"text": text, "state": state, "depth": 0, "hint": hint, "broken": []}
@@ -110,7 +110,7 @@ def _shade(row: Row | None, metric: str, scale: tuple[float, float]) -> dict[str
     place = (math.log(value) - low) / (high - low) if 0 < value < math.inf and high > low else 0
     depth = round(place, 3) if value < math.inf else 1  # NaN is no small error
     hint = "\n".join(_phrase(row, m) for m in row.values)
-    broken = [_bound(row, m) if m == metric else _phrase(row, m) for m in row.broken]
+    broken = [_bound(row, m) if m == metric else _phrase(row, m) for m in (*row.broken, *row.missed)]
     cell = _cell(row, metric)
     return {
         "text": cell["text"] if cell else "·",

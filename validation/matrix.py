@@ -44,10 +44,11 @@ def _cells(row: Row) -> list[Row]:
     differs = row.replay.get("verdict") == "different"
     values = {} if off is None else {OFF: off}
     values["disagrees"] = float(bool(row.broken))
+    goals = {}
     if row.study == pictures.STUDY:
-        values["differs"] = float(differs)
+        values["differs"], goals["differs"] = float(differs), 0.0
     said = "; ".join(filter(None, (row.replay.get("renderer", ""), row.reason)))
-    return [Row(STUDY, _system(row), case, "", values, {"disagrees": 0.0}, reason=said) for case in cases]
+    return [Row(STUDY, _system(row), case, "", values, {"disagrees": 0.0}, goals, said) for case in cases]
 
 
 def _system(row: Row) -> str:
