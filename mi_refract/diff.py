@@ -180,7 +180,7 @@ def require_apart(reference: Path, test: Path, new: bool = False) -> None:
     """ValueError where one path is the other or lies within it, OSError where one does not exist."""
     for role, path in {"test": test, **({} if new else {"reference": reference})}.items():
         if not path.exists():
-            raise FileNotFoundError(f"{path}: no such {role}; accepted: a picture, or a folder of them")
+            raise FileNotFoundError(f"{path}: no such {role} file or folder; accepted: one that is there")
     if reference.exists() and reference.samefile(test):
         raise ValueError(f"{test}: the same as the reference {reference}; accepted: two")
     inner, outer = reference.resolve(), test.resolve()
