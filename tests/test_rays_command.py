@@ -121,7 +121,8 @@ def test_answers_may_say_what_they_answer(call):
 def test_without_a_word_they_are_to_the_default(call):
     answer("answers.csv", rays.make())
     code, out, _ = call("check", "answers.csv")
-    assert (code, out.splitlines()[0]) == (0, "answers.csv: 13000 rays, 13 regimes, f32, seed 0")
+    told = "as `export` without options; others with --rays FILE"
+    assert (code, out.splitlines()[0]) == (0, f"answers.csv: 13000 rays, 13 regimes, f32, seed 0, {told}")
     answer("answers.csv", rays.make(seed=1))
     assert call("check", "answers.csv")[0] == 1
 
