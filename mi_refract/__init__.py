@@ -17,9 +17,10 @@ Conventions, everywhere in this package:
 
 import mitsuba as _mi
 
-from . import bsdf as _bsdf
-from . import integrator as _integrator
-from .formulas import FORMULAS, reflect, reflect_sandwich, refract_2d
+from mi_refract.formulas.documented import FORMULAS, reflect, reflect_sandwich, refract_2d
+
+from .plugins import refract as _bsdf
+from .plugins import refract_path as _integrator
 
 __all__ = ["FORMULAS", "reflect", "reflect_sandwich", "refract_2d"]
 __version__ = "0.1.0"

@@ -64,7 +64,7 @@ def _assert_unbiased(
     if runs < 2:
         raise ValueError(f"runs = {runs}: accepted: at least 2, or the noise is not known")
 
-    from .diff import sample_pictures
+    from mi_refract.image_diff.folders import sample_pictures
 
     first = seed + REFERENCE_SEED
     known = [reference(i) for i in range(first, first + runs)] if callable(reference) else Path(reference)
@@ -82,8 +82,8 @@ def _assert_unbiased(
 
 def _judge(method: str, sides: Callable[[], tuple[Any, Any]], options: dict[str, Any]) -> Any:
     __tracebackhide__ = True
-    from .compare import compare
-    from .judgement import Verdict
+    from mi_refract.image_diff.comparison import Verdict
+    from mi_refract.image_diff.methods import compare
 
     try:
         found = compare(method, *sides(), **options)
@@ -100,6 +100,6 @@ def _bound(bound: float | None) -> str:
 
 
 def _image(name: str, picture: Picture) -> Any:
-    from . import images
+    from .io import image_file
 
-    return images.read(picture) if isinstance(picture, str | os.PathLike) else images.named(name, picture)
+    return image_file.read(picture) if isinstance(picture, str | os.PathLike) else image_file.named(name, picture)

@@ -121,7 +121,7 @@ def scalar_context(tmp_path):
 
     import mitsuba as mi
 
-    from validation.plan import SCALAR_PROFILES, Context
+    from validation.run.context import SCALAR_PROFILES, Context
 
     before = mi.variant()
     mi.set_variant("scalar_rgb")
@@ -135,7 +135,7 @@ def follow(setting):
     """`trace` in the setting; paths as lists, without what follows their ends."""
     import numpy as np
 
-    from mi_refract.planar import trace
+    from mi_refract.planar.tracer import trace
 
     def run(segments, origins, directions, max_depth=16, **options):
         options = {"precision": setting.name, "backend": setting.backend, "weights": True} | options
@@ -147,7 +147,7 @@ def follow(setting):
 @pytest.fixture
 def pair(tmp_path):
     """A folder with a pair that is equal and a pair that differs by 10 %."""
-    from diff_pictures import picture
+    from support.diff_images import picture
 
     for name, gain in (("equal.exr", 1.0), ("louder.exr", 1.1)):
         picture(tmp_path / "old" / name)
@@ -158,7 +158,7 @@ def pair(tmp_path):
 @pytest.fixture
 def folders(tmp_path):
     """Same, changed, removed and added pictures, one of them in a folder inside; and files that are none."""
-    from diff_pictures import picture
+    from support.diff_images import picture
 
     old, new = tmp_path / "old", tmp_path / "new"
     for folder in (old, new):
@@ -174,12 +174,12 @@ def folders(tmp_path):
 @pytest.fixture
 def run(capfd):
     """`run("diff", old, new, "--samples")`: exit code, stdout, stderr."""
-    from mi_refract import cli
+    from mi_refract.cli import app
 
 
     def call(*words):
         capfd.readouterr()
-        code = cli.main([*map(str, words)])
+        code = app.main([*map(str, words)])
         return code, *capfd.readouterr()
 
     return call

@@ -16,21 +16,41 @@ from typing import Any
 
 # Each study by name, and the modules that make it up.
 STUDIES = {
-    "directions": ("directions", "mutants", "samples", "sweep", "search"),
-    "stability": ("stability", "energy", "derivatives", "paths"),
-    "renders": ("scenes", "renders", "features"),
-    "efficiency": ("efficiency", "scaling"),
-    "planar": ("planar", "planar_closed", "extrusion", "planar_times"),
-    "gate": ("gate", "diff_times"),
-    "truth": ("truth",),
-    "suite": ("matrix", "per_ray", "pictures"),
+    "directions": {
+        "directions": "directions.per_formula",
+        "mutants": "directions.planted_defects",
+        "samples": "directions.bsdf_samples",
+        "sweep": "directions.sweep",
+        "search": "directions.search",
+    },
+    "stability": {
+        "stability": "stability.optical_chains",
+        "energy": "stability.energy",
+        "derivatives": "stability.derivatives",
+        "paths": "stability.layered_paths",
+    },
+    "renders": {
+        "scenes": "renders.scene_needs",
+        "renders": "renders.against_dielectric",
+        "features": "renders.unused_features",
+    },
+    "efficiency": {"efficiency": "efficiency.error_against_time", "scaling": "efficiency.scaling"},
+    "planar": {
+        "planar": "planar.against_retrace",
+        "planar_closed": "planar.closed_paths",
+        "extrusion": "planar.extruded_scenes",
+        "planar_times": "planar.times",
+    },
+    "gate": {"gate": "diff.planted_defects", "diff_times": "diff.times"},
+    "truth": {"truth": "ground_truth.traced_bodies"},
+    "suite": {"matrix": "suite.matrix", "per_ray": "suite.per_ray", "pictures": "suite.rendered_images"},
 }
 
 
 def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments[:1] == ["renderers"]:
-        from .renderers import command
+        from validation.suite.renderers import command
 
         return command.main(arguments[1:])
     options = _parser().parse_args(arguments)
@@ -76,18 +96,19 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from mi_refract import backend, report
+    from mi_refract import backend
+    from mi_refract.report import run_report
+    from validation.run.context import PROFILES, SCALAR_PROFILES, Context
 
-    from . import readme, runner
-    from .plan import PROFILES, SCALAR_PROFILES, Context
+    from . import readme_tables, runner
 
     start = time.perf_counter()
     variant = backend.activate(may_restart=True)
     print(f"validation: {backend.summary()}", file=sys.stderr)
     profiles = SCALAR_PROFILES if variant.startswith("scalar") else PROFILES
     context = Context(profiles[options.profile], options.out, variant, backend.detect(), backend.usable_variants())
-    names = [module for study in options.studies or STUDIES for module in STUDIES[study]]
-    studies: dict[str, ModuleType] = {name: import_module(f"validation.{name}") for name in names}
+    modules = {name: module for study in options.studies or STUDIES for name, module in STUDIES[study].items()}
+    studies: dict[str, ModuleType] = {name: import_module(f"validation.{module}") for name, module in modules.items()}
     rows = runner.run([task for study in studies.values() for task in study.tasks(context)], context)
     for study in studies.values():
         rows = study.with_summary(rows) if hasattr(study, "with_summary") else rows
@@ -98,13 +119,13 @@ def _run(options: argparse.Namespace) -> int:
         for name, study in studies.items()
     }
     described["scatter"] = [scatter for study in studies.values() for scatter in getattr(study, "SCATTER", [])]
-    report.write_json(options.out / "rows.json", rows, described)
-    report.write_junit(options.out / "junit.xml", rows, described)
-    report.write_html(options.out / "report.html", rows, described, options.out)
+    run_report.write_json(options.out / "rows.json", rows, described)
+    run_report.write_junit(options.out / "junit.xml", rows, described)
+    run_report.write_html(options.out / "report.html", rows, described, options.out)
     if options.readme:
-        readme.update(options.readme, rows, context)
+        readme_tables.update(options.readme, rows, context)
     runner.forget(context)
-    _print_summary(report.summary(rows), options.out / "report.html")
+    _print_summary(run_report.summary(rows), options.out / "report.html")
     return 1 if any(row.verdict == "fail" for row in rows) else 0
 
 

@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import mi_refract
-from mi_refract.files import write_atomically
-from mi_refract.rows import Row
-
-from .plan import SCENES, Context, Task
-from .renderers import SYSTEMS, environments
+from mi_refract.io.atomic import write_atomically
+from mi_refract.report.row import Row
+from validation.run.context import SCENES, Context, Task
+from validation.suite.renderers import SYSTEMS, environments
 
 
 def run(tasks: list[Task], context: Context) -> list[Row]:

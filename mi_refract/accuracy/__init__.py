@@ -1,0 +1,1 @@
+"""How far a direction is from the certified one."""

@@ -1,0 +1,267 @@
+"""One pure Dr.Jit function per documented formula of refraction, and the FORMULAS table.
+
+Every formula is `f(a, n, k) -> (b, transmitted)` in the conventions of the package docstring: `a` travels toward
+the surface, `n` is a normal on either side, k = n_from / n_to, and `b` leaves the boundary with the length of `a`.
+Where `transmitted` is False (total internal reflection, or a tangential ray) `b` is the mirror direction.
+
+The entries of FORMULAS are total functions without branches on data: input that is not a refraction (a zero or
+non-finite vector, a ratio outside 1e-9 … 1e9) gives NaN and False. The functions themselves leave
+that check out (NaN still gives NaN), for callers that have made it, as the plugin has. `a` and `n` are 3-vectors of
+any Dr.Jit backend and precision, `k` a number or an array of that precision; a wider `k` is rounded to it, once.
+The documented formulas take unit `a` and `n`; what those are off by, the result is off by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from mi_refract.numerics.error_free import component_of, near_unit, quotient
+
+from .bounds import CONTRASTING, ROUNDING, Budget, cancelling
+from .well_conditioned import Refracted, refract_compensated, refract_promoted
+
+# Shared by all formulas ----------------------------------------------------------------------------------------
+
+
+def _conclude(a: Any, n: Any, c: Any, radicand: Any, b: Any) -> Refracted:
+    """Choose between the transmitted direction `b` and the mirror direction."""
+    transmitted = (radicand >= 0) & (c != 0)
+    return dr.select(transmitted, b, a - n * quotient(2 * c, dr.dot(n, n))), transmitted
+
+
+def _root(radicand: Any) -> Any:
+    """√max(radicand, 0), with a finite derivative at 0 (the mirror direction is chosen below 0)."""
+    return dr.safe_sqrt(radicand)
+
+
+# Reflection ----------------------------------------------------------------------------------------------------
+
+
+def wedge(n: Any, a: Any) -> Any:
+    """n ∧ a, as its components on the basis bivectors (yz, zx, xy); in three dimensions these are those of n × a."""
+    return dr.cross(n, a)
+
+
+def contract(n: Any, bivector: Any) -> Any:
+    """n ⌋ B, the vector part of the geometric product n B. For B = n ∧ a it is n² a − n (n·a)."""
+    return dr.cross(bivector, n)
+
+
+def reflect(a: Any, n: Any) -> Any:
+    """b = a − 2 n (n·a). Source: document 000, "Reflection". Unit `n`; shapes (3,) and (3,) to (3,)."""
+    return a - n * (2 * dr.dot(n, a))
+
+
+def reflect_sandwich(a: Any, n: Any) -> Any:
+    """b = −n a n, with the geometric product n a = n·a + n∧a multiplied once more by n from the right.
+
+    (n·a) n + (n∧a) n, and (n∧a) n = −n ⌋ (n∧a) because n anticommutes with a bivector that contains it.
+    Source: document 000, boxed form of "Reflection". Unit `n`; shapes (3,) and (3,) to (3,).
+    """
+    return contract(n, wedge(n, a)) - n * dr.dot(n, a)
+
+
+# The documented formulas ---------------------------------------------------------------------------------------
+
+
+def refract_wedge(a: Any, n: Any, k: Any) -> Refracted:
+    """b = k n(n∧a) + s n √(a² + k² (n∧a)²),  s = sign(n·a).
+
+    Source: document 000, boxed form of "Refraction" (there n·a < 0), made two-sided. Unit `n`.
+    Weak near the critical angle, for k near 1 at grazing incidence and for k ≫ 1: the radicand cancels.
+    """
+    k = component_of(a, k)
+    c, bivector = dr.dot(n, a), wedge(n, a)
+    radicand = dr.dot(a, a) - k * k * dr.dot(bivector, bivector)  # (n∧a)² = −|n×a|²
+    b = k * contract(n, bivector) + n * dr.mulsign(_root(radicand), c)
+    return _conclude(a, n, c, radicand, b)
+
+
+def refract_wedge_contrast(a: Any, n: Any, k: Any) -> Refracted:
+    """b = k n(n∧a) + s n √((n·a)² + (n∧a)² (k² − 1)),  s = sign(n·a).
+
+    Source: document 000, last form of "Refraction", made two-sided. Unit `n`.
+    Weak where k² − 1 loses digits (k near 1) and where two large terms cancel near the critical angle.
+    """
+    k = component_of(a, k)
+    c, bivector = dr.dot(n, a), wedge(n, a)
+    radicand = c * c - dr.dot(bivector, bivector) * (k * k - 1)
+    b = k * contract(n, bivector) + n * dr.mulsign(_root(radicand), c)
+    return _conclude(a, n, c, radicand, b)
+
+
+def refract_cross(a: Any, n: Any, k: Any) -> Refracted:
+    """t = n × c + sgn(i·n) √(1 − ‖c‖²) n,  c = k (i × n).
+
+    Source: document 001, eq. 6; its ‖c‖ (n × ĉ) is 0/0 at normal incidence, n × c is the same and safe.
+    Unit `a`, `n`. Weak near the critical angle, for k near 1 at grazing incidence and for k ≫ 1.
+    """
+    k = component_of(a, k)
+    cos, c = dr.dot(a, n), k * dr.cross(a, n)
+    radicand = 1 - dr.dot(c, c)
+    t = dr.cross(n, c) + n * dr.mulsign(_root(radicand), cos)
+    return _conclude(a, n, cos, radicand, t)
+
+
+def refract_decomposed(a: Any, n: Any, k: Any) -> Refracted:
+    """Split `a` along `n`, scale the tangent by k, restore the length.
+
+    b = k a − n (k c + s √(1 − k²(1 − c²))),   c = n·a,  s = −sign(c)
+    Source: document 002, eq. 1, made two-sided. Unit `a`, `n`.
+    Weak near the critical angle, for k near 1 at grazing incidence and for k ≫ 1: the radicand cancels.
+    """
+    k = component_of(a, k)
+    c = dr.dot(n, a)
+    radicand = 1 - k * k * (1 - c * c)
+    b = k * a - n * (k * c - dr.mulsign(_root(radicand), c))
+    return _conclude(a, n, c, radicand, b)
+
+
+def refract_2d(i: Any, l: Any, k: Any) -> tuple[list[Any], Any]:  # noqa: E741 (the document's names)
+    """Refract a 2D direction `i` at a boundary with direction `l`, by a change of basis.
+
+    B = [[−l_y, l_x], [l_x, l_y]] turns `l` into (0, 1); B is its own inverse. With i_B = B i,
+    X = k |i_Bβ| / |i_B|,  b_B = |i| (sign(i_Bα) √(1 − X²), sign(i_Bβ) X); (−i_Bα, i_Bβ) where X > 1.
+    Source: document 004, with X = k R/√(1 + R²) in place of the printed k R/(1 + R²), and R = i_Bβ/i_Bα, infinite
+    along the boundary, multiplied out. `i`, `l`: two components each, `l` unit; `b` keeps the length of `i`.
+    """
+    along_n, along_l = l[0] * i[1] - l[1] * i[0], l[0] * i[0] + l[1] * i[1]
+    length = dr.sqrt(i[0] * i[0] + i[1] * i[1])
+    x = quotient(k * dr.abs(along_l), length)
+    scale = (l[0] * l[0] + l[1] * l[1]) * length * k
+    valid = (scale > 0) & (scale < dr.inf)
+    transmitted = valid & (x <= 1) & (along_n != 0)
+    b_n = dr.select(transmitted, dr.mulsign(_root(1 - x * x) * length, along_n), -along_n)
+    b_l = dr.select(transmitted, dr.mulsign(x * length, along_l), along_l)
+    b = [l[0] * b_l - l[1] * b_n, l[0] * b_n + l[1] * b_l]
+    return [dr.select(valid, b_j, dr.nan) for b_j in b], transmitted
+
+
+def refract_rotated(a: Any, n: Any, k: Any) -> Refracted:
+    """`refract_2d` lifted into the plane of incidence, spanned by n and t = (a − n (n·a)) / |a − n (n·a)|.
+
+    There the boundary is (0, 1) and i = (−n·a, |a − n (n·a)|), because B turns n into −x. At normal incidence t
+    is any unit vector, times 0. Source: document 004. Unit `n`.
+    Weak near the critical angle: √(1 − X²) magnifies the rounding of X.
+    """
+    k = component_of(a, k)
+    c = dr.dot(n, a)
+    tangent = a - n * c
+    sine = dr.norm(tangent)
+    (b_n, b_t), transmitted = refract_2d((c, sine), (0, 1), k)
+    # Where the tangent is 0 its factor is the limit k, for the derivative's sake.
+    factor = dr.select(sine > 0, quotient(b_t, sine), dr.select(transmitted, k, 1))
+    b = n * b_n + tangent * factor
+    return _conclude(a, n, c, dr.select(transmitted, 1, -1), b)
+
+
+# The table -----------------------------------------------------------------------------------------------------
+
+
+# Ratios between them leave k², κ and Fresnel's terms within the range of float32.
+SMALLEST_RATIO, LARGEST_RATIO = 1e-9, 1e9
+
+
+@dataclass(frozen=True)
+class Formula:
+    """A formula of refraction, `entry(a, n, k) -> (b, transmitted)`, with its source and its error budget.
+
+    `takes_contrast`: `contrast` is used, not ignored. `scales`: the function wants lengths near 1. `automatic_for`:
+    the kinds of array it is the default on. `time_goal`: what a ray in float32, streamed through a CPU, may take as
+    a multiple of the plain form's time.
+    """
+
+    function: Callable[..., Refracted]
+    source: str
+    equation: str
+    budget: Budget
+    takes_contrast: bool = False
+    scales: bool = False
+    automatic_for: tuple[str, ...] = ()
+    time_goal: float | None = None
+
+    def __call__(self, a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
+        """The formula as a total function: NaN and False for what is no refraction.
+
+        That is: `a` or `n` zero or not finite, `k` outside 1e-9 … 1e9, `contrast` not finite or not above −1.
+        """
+        n, k = type(a)(n), component_of(a, k)
+        scale: Any = 1
+        if self.scales:
+            (a, scale), (n, _) = near_unit(a), near_unit(n)
+        b, transmitted = self.unchecked(a, n, k, contrast)
+        # `b` has the length of `a`, and a zero or non-finite `n` makes it NaN: one length tells of both.
+        b, length2 = b * scale, dr.dot(b, b)
+        valid = (k >= SMALLEST_RATIO) & (k <= LARGEST_RATIO) & (length2 > 0) & (length2 < dr.inf)
+        if contrast is not None:
+            valid &= (contrast > -1) & (contrast < dr.inf)
+        return dr.select(valid, b, dr.nan), valid & transmitted
+
+    def unchecked(self, a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
+        """The formula alone. Precondition: what `__call__` tests; NaN gives NaN and False."""
+        if self.takes_contrast:
+            return self.function(a, n, k, contrast)
+        return self.function(a, n, k)
+
+
+FORMULAS = {
+    "wedge": Formula(
+        refract_wedge, "000, boxed", "b = k n(n∧a) + s n √(a² + k²(n∧a)²)", budget=cancelling(1)
+    ),
+    "wedge_contrast": Formula(
+        refract_wedge_contrast,
+        "000, last form",
+        "b = k n(n∧a) + s n √((n·a)² + (n∧a)²(k² − 1))",
+        budget=CONTRASTING,
+    ),
+    "cross": Formula(
+        refract_cross, "001, eq. 6", "t = n×c + s √(1 − ‖c‖²) n, c = k (i×n)", budget=cancelling(1)
+    ),
+    "decomposed": Formula(
+        refract_decomposed, "002, eq. 1", "b = k a − n (k c − s √(1 − k²(1 − c²))), c = n·a", budget=cancelling(2)
+    ),
+    "rotated": Formula(
+        refract_rotated, "004", "b = B (s √(1 − X²), X), X = k R/√(1 + R²)", budget=cancelling(1)
+    ),
+    "compensated": Formula(
+        refract_compensated,
+        "this project",
+        "b = (k w×n + s n √((n·a)² − κ w²))/n², w = n×a, κ = k² − 1; error-free transforms",
+        budget=ROUNDING,
+        takes_contrast=True,
+        scales=True,
+        automatic_for=("cuda",),
+        time_goal=2.0,
+    ),
+    "promoted": Formula(
+        refract_promoted,
+        "this project",
+        "the form of `compensated`, one precision up, rounded once",
+        budget=ROUNDING,
+        takes_contrast=True,
+        automatic_for=("scalar", "llvm"),
+        time_goal=1.1,
+    ),
+}
+
+
+def automatic(backend: dr.JitBackend) -> str:
+    """The key of the cheapest formula at the rounding limit in a local frame, where the normal is a literal axis.
+
+    On CPUs float64 has half the throughput of float32, and the promoted form a third of the operations. A consumer's
+    GPU has a 64th.
+    """
+    kind = {dr.JitBackend.CUDA: "cuda", dr.JitBackend.LLVM: "llvm"}.get(backend, "scalar")
+    return next(key for key, formula in FORMULAS.items() if kind in formula.automatic_for)
+
+
+def resolve(name: str, backend: dr.JitBackend) -> tuple[str, Formula]:
+    """The key and entry behind `name`, a key of FORMULAS or "auto". ValueError otherwise."""
+    key = automatic(backend) if name == "auto" else name
+    if key not in FORMULAS:
+        raise ValueError(f"formula = {name!r}: unknown; accepted: auto, {', '.join(FORMULAS)}")
+    return key, FORMULAS[key]

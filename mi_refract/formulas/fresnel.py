@@ -1,0 +1,239 @@
+"""Fresnel's equations for a boundary of two dielectrics, to the last bits of R and of 1 − R.
+
+With the absolute cosines cᵢ, cₜ, the ratio k = n_from / n_to and the contrast κ = k² − 1, Snell's law turns every
+difference in the amplitudes into a product, and both powers into sums of positive terms:
+
+    d_s = k cᵢ + cₜ,   r_s = (k cᵢ − cₜ)/d_s = κ/d_s²
+    d_p = cᵢ + k cₜ,   r_p = (cᵢ − k cₜ)/d_p = κ (k² sin²θᵢ − cᵢ²)/d_p²
+    R : T = κ² (P² + Q²) : 2 k P (d_s² + d_p²),   R + T ∝ (d_s d_p)²,   P = cᵢ cₜ,  Q = sin θᵢ sin θₜ = k sin²θᵢ
+
+so R keeps its relative accuracy as k → 1 and T keeps it at grazing incidence and near the critical angle; the length
+of the incident vector cancels. Signs follow Verdet's convention, as in Mitsuba. Sources: Born and Wolf, Principles of
+Optics, 1.5; R : T, from cos(θᵢ ± θₜ) = P ∓ Q and r_p/r_s = −(P − Q)/(P + Q): this project.
+
+float32 is computed in float64 and rounded once; float64 in double words. Arguments are Dr.Jit numbers of one precision
+and any backend, or Python floats, which are float64. NaN in gives NaN out. Precondition: k from 1e-9
+to 1e9; in float64 cosines above 1e-150, or 0.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+
+from mi_refract.numerics.error_free import Double, component_of, quotient, two_prod, two_sum
+
+from .well_conditioned import local_root
+
+
+def _is_single(x: Any) -> bool:
+    return dr.type_v(x) == dr.VarType.Float32
+
+
+def _wide(x: Any) -> Any:
+    """float64 of whatever precision."""
+    wide: Any = dr.float64_array_t(type(x))
+    return wide(x)
+
+
+def _fma(x: Any, y: Any, z: Any) -> Any:
+    return x * y + z if isinstance(x, Double) else dr.fma(x, y, z)
+
+
+def _divide(x: Any, y: Any) -> Any:
+    """x / y; of `Double`s, rounded once."""
+    if not isinstance(x, Double):
+        return quotient(x, y)
+    q = quotient(x.hi, y.hi)
+    return q + quotient(dr.fma(-q, y.hi, x.hi) + dr.fma(-q, y.lo, x.lo), y.hi)
+
+
+# Powers --------------------------------------------------------------------------------------------------------
+
+
+def powers(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: Any = None) -> tuple[Any, Any]:
+    """(R, T) for unpolarised light, both between 0 and 1; (1, 0) where the ray is not transmitted.
+
+    `cos_i`, `cos_t` absolute cosines, `transmitted` a mask, as a formula of refraction or `refracted_cosine`
+    gives them. `contrast`: κ where it is known better than k.
+    """
+    lift = _wide if _is_single(cos_i) else Double
+    c, ratio = lift(cos_i), lift(k)
+    kappa = ratio * ratio - 1 if contrast is None else lift(contrast)
+    number = type(cos_i)
+    r, t = _powers(c, *_through(lift, transmitted, cos_t), _fma(-c, c, 1), ratio, kappa)
+    return number(r), number(t)
+
+
+def local_powers(a: Any, transmitted: Any, k: Any, contrast: Any) -> tuple[Any, Any]:
+    """(R, T) as `powers` gives them, of a float32 ray `a` that meets a boundary whose normal is the z axis."""
+    r, t = local_odds(a, transmitted, k, contrast)
+    return component_of(a, quotient(r, r + t)), component_of(a, quotient(t, r + t))
+
+
+def local_odds(a: Any, transmitted: Any, k: Any, contrast: Any) -> tuple[Any, Any]:
+    """R : T of a float32 ray `a` that meets a boundary whose normal is the z axis, in float64: R = r/(r + t).
+
+    `a`: a 3-vector, of any length from 1e-30 to 1e30. 1 : 0 where not `transmitted`; a mask, as a formula of
+    refraction gives it. The cosine of the refracted ray is that of the exact problem, before it is rounded to float32:
+    so R and T are right to 1.01u, but for what an error ε of the radicand does, ε/2ρ (see `exact`).
+    """
+    x, y, c, ratio, kappa = _wide(a.x), _wide(a.y), _wide(dr.abs(a.z)), _wide(k), _wide(contrast)
+    cos_t, sin2 = local_root(a.x, a.y, a.z, kappa)[0], dr.fma(x, x, y * y)
+    d_s, d_p = dr.fma(ratio, c, cos_t), dr.fma(ratio, cos_t, c)
+    p, q = c * cos_t, ratio * sin2
+    # κ = 0 is always transmitted, or tangential: without the 1 that would be 0 : 0.
+    mirror, power = (dr.select(transmitted, *x) for x in ((0 * p, 1), (2 * ratio * p, 0)))
+    return dr.fma(kappa * kappa, dr.fma(q, q, p * p), mirror), power * dr.fma(d_s, d_s, d_p * d_p)
+
+
+def reflectance(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: Any = None) -> Any:
+    """Unpolarised reflectance R = (r_s² + r_p²)/2; see `powers`."""
+    return powers(cos_i, cos_t, transmitted, k, contrast)[0]
+
+
+def transmittance(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: Any = None) -> Any:
+    """Unpolarised transmittance T = 1 − R, formed without that subtraction; see `powers`."""
+    return powers(cos_i, cos_t, transmitted, k, contrast)[1]
+
+
+def _through(lift: Any, transmitted: Any, cos_t: Any) -> tuple[Any, Any]:
+    """(cos_t or 0, about 0 or 1) where light is transmitted or not. NaN stays.
+
+    Of float32 the 1e-300 leaves nothing: R ≤ 1e-300/16c⁴ at k = 1. It is there for a cos_t that underflowed to 0.
+    """
+    wide: Any = dr.float64_array_t(type(cos_t))
+    return lift(dr.select(transmitted, cos_t, 0 * cos_t)), dr.select(transmitted, wide(1e-300), wide(1))
+
+
+def _powers(c: Any, y: Any, mirror: Any, sin2: Any, k: Any, kappa: Any) -> tuple[Any, Any]:
+    """R and T from cos_i = `c` and cos_t = `y`, in twice the precision wanted.
+
+    `mirror` is 1 where nothing is transmitted, `y` being 0 there: so R is 1 and T is 0 at k = 1 and c = 0, too.
+
+    What is left is the rounding of cₜ, and of the result: |∂ log R/∂ log cₜ| ≤ 2.12 and |∂ log T/∂ log cₜ| ≤ 1, so R is
+    right to 3.12u and T to 2u. For this the denominator of R is a sum (the square it is equal to would make it 4),
+    and that of T the square (the sum: 3, and sin²θᵢ would count, which a cosine near 1 does not know).
+    """
+    if isinstance(c, Double):
+        # Of float64 cosines below 1e-75 have fourth powers that underflow. Where κ = 0 they do not matter.
+        c, y = (Double(dr.select((kappa.hi == 0) & (x.hi > 0), 1, x.hi), x.lo) for x in (c, y))
+    p, q = c * y, k * sin2
+    d_s, d_p = _fma(k, c, y), _fma(k, y, c)
+    r = _fma(kappa * kappa, _fma(q, q, p * p), mirror)
+    kp = k * p
+    t = (kp + kp) * _fma(d_s, d_s, d_p * d_p)
+    root = _fma(d_s, d_p, mirror)
+    whole, square = r + t, root * root
+    if isinstance(r, Double):
+        return _divide(r, whole), _divide(t, square)
+    # One division for both: it takes as long as eight other operations. Cosines of 1e-38 leave the product 1e-302.
+    inverse = quotient(1, whole * square)
+    return (r * square) * inverse, (t * whole) * inverse
+
+
+# Cosines and amplitudes ----------------------------------------------------------------------------------------
+
+
+def refracted_cosine(cos_i: Any, k: Any, contrast: Any = None) -> tuple[Any, Any]:
+    """(|cos θ_t|, transmitted): √|cos²θ_t|, cos²θ_t = k² cos²θ_i − κ, which is positive where the ray is transmitted.
+
+    Under total internal reflection the cosine is imaginary; its modulus is returned. 0 ≤ cos_i ≤ 1. Of the exact
+    cos_i and k (or κ) both are right to the last bit, however near to the critical angle.
+    """
+    radicand, _ = _differences(cos_i, k, contrast)
+    return type(cos_i)(_root(radicand)), (radicand.hi >= 0) & (cos_i > 0)
+
+
+def amplitudes(cos_i: Any, k: Any, contrast: Any = None) -> tuple[Any, Any]:
+    """Complex amplitudes (r_s, r_p) of the reflected wave, with the phase under total internal reflection.
+
+    There cos_t = −i γ, γ = √(κ − k² cos²θ_i), and both have modulus 1:
+    r_s = (k cos_i + i γ)² / κ,   r_p = (cos_i + i k γ)² / (cos_i² + k² γ²). A tangential ray has r_s = r_p = −1.
+    0 ≤ cos_i ≤ 1; shapes: complex numbers of the type of `cos_i`.
+    """
+    radicand, brewster = _differences(cos_i, k, contrast)
+    transmitted = (radicand.hi >= 0) & (cos_i > 0)
+    c, y, k = _wide(cos_i), _root(radicand), _wide(k)
+    kappa = dr.fma(k, k, -1) if contrast is None else _wide(contrast)
+    # 1 where no wave is transmitted and the quotients below are not used: a tangential ray would divide by 0.
+    d_s, d_p = (dr.select(transmitted, d, 1) for d in (dr.fma(k, c, y), dr.fma(k, y, c)))
+    # Of float64 each term is a few roundings: κ and the defect u, each d² 4u, products and quotient 3u.
+    r_s, r_p = kappa / (d_s * d_s), kappa * brewster / (d_p * d_p)
+    number = _complex_type(cos_i)
+    (s_re, s_im), (p_re, p_im) = _phase(k * c, y), _phase(c, k * y)
+    return (
+        number(dr.select(transmitted, r_s, s_re), dr.select(transmitted, 0, s_im)),
+        number(dr.select(transmitted, r_p, p_re), dr.select(transmitted, 0, p_im)),
+    )
+
+
+def mueller_reflection(cos_i: Any, k: Any, contrast: Any = None) -> list[list[Any]]:
+    """Mueller matrix of the reflection in the plane of incidence (4 × 4 numbers), phase included."""
+    r_s, r_p = amplitudes(cos_i, k, contrast)
+    s2, p2 = dr.squared_norm(r_s), dr.squared_norm(r_p)
+    return _mueller(s2, p2, r_p * dr.conj(r_s))
+
+
+def mueller_transmission(cos_i: Any, cos_t: Any, transmitted: Any, k: Any) -> list[list[Any]]:
+    """Mueller matrix of the transmission in the plane of incidence (4 × 4 numbers); 0 where not transmitted."""
+    c, y, ratio, number = _wide(cos_i), _wide(cos_t), _wide(k), type(cos_i)
+    d_s, d_p = (dr.select(transmitted, d, 1) for d in (dr.fma(ratio, c, y), dr.fma(ratio, y, c)))
+    power = 4 * ratio * (c * y)
+    pairs = (d_s, d_s), (d_p, d_p), (d_s, d_p)
+    t_s, t_p, cross = (dr.select(transmitted, number(power / (x * y)), 0) for x, y in pairs)
+    return _mueller(t_s, t_p, (cross, 0))
+
+
+def _differences(cos_i: Any, k: Any, contrast: Any) -> tuple[Double, Any]:
+    """cos²θ_t = k² cos²θ_i − κ and k² sin²θ_i − cos²θ_i of exact arguments, each to the last bit and in float64.
+
+    They cancel near the critical angle and near Brewster's; there double words would leave 5u²/|difference|.
+    """
+    if _is_single(cos_i):
+        # Squares of float32 are exact in float64, and an fma rounds once. Where the second cancels, so are 1 − cos²
+        # (k > 1: cos² > 1/2) and k² − cos² (k < 1: within a factor of 2); where the first does, κ is (k > 1).
+        c2 = _wide(cos_i) * _wide(cos_i)
+        k2 = _wide(k) * _wide(k) if contrast is None else _wide(contrast) + 1
+        kappa = k2 - 1 if contrast is None else _wide(contrast)
+        brewster = dr.select(k2 > 1, dr.fma(k2, 1 - c2, -c2), dr.fma(-k2, c2, k2 - c2))
+        return Double(dr.fma(k2, c2, -kappa)), brewster
+    c2 = two_prod(cos_i, cos_i)
+    k2 = two_prod(k, k) if contrast is None else (contrast, 1)
+    products = [part for x in c2 for y in k2 for part in two_prod(x, y)]
+    radicand = _sum([1, -k2[0], -k2[1], *products] if contrast is None else [-contrast, *products])
+    return radicand, _sum([*k2, -c2[0], -c2[1], *(-x for x in products)]).rounded()
+
+
+def _sum(terms: list[Any]) -> Double:
+    """Σ terms: error ≤ u² |sum| + O(u³) Σ|terms|. Source: Ogita, Rump, Oishi 2005, SumK with K = 3."""
+    for _ in range(2):
+        for i in range(1, len(terms)):
+            terms[i], terms[i - 1] = two_sum(terms[i], terms[i - 1])
+    return Double(terms[-1], sum(terms[:-1]))
+
+
+def _root(radicand: Double) -> Any:
+    """√|radicand|, rounded once, with a finite derivative at 0."""
+    size = Double(dr.abs(radicand.hi), dr.mulsign(radicand.lo, radicand.hi))
+    return dr.safe_sqrt(size.hi) if radicand.is_plain else size.sqrt().rounded()
+
+
+def _mueller(s2: Any, p2: Any, cross: Any) -> list[list[Any]]:
+    """From the powers of both waves and their interference a_p a_s*."""
+    mean, half, re, im = 0.5 * (s2 + p2), 0.5 * (s2 - p2), cross[0], cross[1]
+    return [[mean, half, 0, 0], [half, mean, 0, 0], [0, 0, re, -im], [0, 0, im, re]]
+
+
+def _phase(x: Any, y: Any) -> tuple[Any, Any]:
+    """(x + i y)² / |x + i y|², real and imaginary part; −1 for x = 0, y = 0 included."""
+    length = dr.sqrt(x * x + y * y)
+    x, y = dr.select(length > 0, quotient(x, length), 0 * length), dr.select(length > 0, quotient(y, length), 1)
+    return (x - y) * (x + y), 2 * x * y
+
+
+def _complex_type(number: Any) -> Any:
+    if isinstance(number, float):
+        return dr.scalar.Complex2f64
+    return dr.replace_shape_t(type(number), (2, -1), "complex")

@@ -1,0 +1,186 @@
+"""The two forms at the rounding limit: `refract_promoted` and `refract_compensated`, `f(a, n, k) -> (b, transmitted)`.
+
+Both solve, for `a` and `n` of any length, with w = n × a and κ = k² − 1,
+
+    n × b = k w,   n·b = s √radicand,   radicand = (n·a)² − κ w²,   s = sign(n·a)
+
+and the mirror direction as the same with k = 1 and −(n·a) in place of s √radicand. Near the critical angle the
+two terms of the radicand cancel, and √ makes of an error ε one of √ε: so the radicand must be right to a few u²,
+not to a few u. A literal normal along an axis, as in a local frame, leaves nothing to add up: w are the other two
+components of `a`, and each component of b is one product, or the root.
+
+Write ρ for |radicand| over the larger of its terms, and ε for its error over that term. Total internal reflection is
+decided as the exact inputs decide it wherever ρ > ε, and the root is off by ε cosθ/(√ρ + √(ρ + ε)) ≤ √ε cosθ:
+
+    compensated   ε ≤ 500u³ (the largest ever seen is 9u³): in float32 1e-19, and the root is off by 0.006u at most,
+                  however near the critical angle
+    promoted      ε ≤ 10·2⁻⁵³ < 2⁻⁴⁹ in float32, so 0.08u where ρ > 2⁻⁴⁴ and 0.6u at the critical angle itself;
+                  in float64 it is the compensated form
+
+so both are at the rounding limit wherever ρ > 2⁻⁴⁴, and the first everywhere. That is for an exact k; a `contrast` that
+is wider than a pair is rounded to one, and then ε ≤ u². It takes inputs made for it to be nearer: of random ones near
+the critical angle one in 10⁹. There the refracted ray is within 2⁻²² cosθ of the surface and carries
+T ≈ 2 (k + 1/k) √ρ of the power, less than 2e-6 for k ≤ 2.5.
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+from typing import Any
+
+import drjit as dr
+
+from mi_refract.numerics import error_free
+from mi_refract.numerics.error_free import Double, Expansion, attach, component_of, differentiated, quotient, two_sum
+
+Refracted = tuple[Any, Any]
+
+
+def _axis(n: Any) -> tuple[int, int] | None:
+    """(index, ±1) of a normal along an axis that is known while a kernel is traced and has no derivative; else None.
+
+    Known are literals, and Python floats.
+    """
+    if dr.is_jit_v(n):
+        if differentiated(n) or not all(x.state == dr.VarState.Literal for x in n):
+            return None
+        n = [x[0] for x in n]
+    x, y, z = n
+    if not x and not y and abs(z) == 1:
+        return 2, int(z)
+    if sorted(map(abs, (x, y, z))) != [0, 0, 1]:
+        return None
+    return (0, int(x)) if x else (1, int(y))
+
+
+def _along_axis(a: Any, axis: tuple[int, int], scale: Any, along: Any) -> Any:
+    """The b with n·b = `along` and the other components of `a` times `scale`, for a literal axis n."""
+    index, sign = axis
+    return type(a)(*((along if sign > 0 else -along) if i == index else a[i] * scale for i in range(3)))
+
+
+def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
+    """The well-conditioned form above, one precision up and rounded once: b = k a + n (n·b − k n·a)/n².
+
+    float32 is computed in float64. float64 has no wider type: there the form is `refract_compensated`'s, whose
+    double-word steps are that wider type. `contrast`: κ where it is known better than k, for the radicand; `k`
+    itself still scales the tangent. Source: this project. `a`, `n` of any length from 1e-18 to 1e18.
+    Weak nowhere for k ≤ 1e6; slow where float64 is (consumer GPUs).
+    """
+    if dr.type_v(a) != dr.VarType.Float32:
+        return refract_compensated(a, n, k, contrast)
+    if axis := _axis(n):
+        return _promoted_along(a, axis, k, contrast)
+    wide: Any = dr.float64_array_t(type(a))
+    number = dr.value_t(wide)
+    d, m, k2 = wide(a), wide(n), number(component_of(a, k))
+    # k² has 48 bits: the difference is rounded at most once.
+    kappa = dr.fma(k2, k2, -1) if contrast is None else number(contrast)
+    # Products of components are exact in float64. Each w is off by 2⁻⁵³ of itself, and so is c, twice: at grazing
+    # incidence the sum of its first two products is much larger than c, and what rounding it loses is put back.
+    (partial, lost), w = two_sum(m.x * d.x, m.y * d.y), dr.cross(m, d)
+    c = dr.fma(m.z, d.z, partial) + lost
+    # c²: 4·2⁻⁵³; κ w²: 2 from w, 3 from their squares and sum, 1 from the product.
+    radicand = dr.fma(c, c, -kappa * dr.dot(w, w))
+    transmitted = (radicand >= 0) & (c != 0)
+    along, scale = dr.select(transmitted, dr.mulsign(dr.safe_sqrt(radicand), c), -c), dr.select(transmitted, k2, 1)
+    # κ = 0 leaves b = a to the last bit: √(c²) is |c| exactly, so the factor of n is 0. So it is for c = 0.
+    # Else k a + n (…) cancels to 4k·2⁻⁵³ |a|, which is u/128 for k = 1e6.
+    return type(a)(dr.fma(m, quotient(dr.fma(-scale, c, along), dr.dot(m, m)), d * scale)), transmitted
+
+
+def _promoted_along(a: Any, axis: tuple[int, int], k: Any, contrast: Any) -> Refracted:
+    """`refract_promoted` for a literal axis: only the radicand and its root need float64."""
+    index, sign = axis
+    wide: Any = dr.float64_array_t(dr.value_t(type(a)))
+    k, along = component_of(a, k), a[index] if sign > 0 else -a[index]
+    kappa = dr.fma(wide(k), wide(k), -1) if contrast is None else wide(contrast)
+    x, y = (a[i] for i in range(3) if i != index)
+    root, radicand = local_root(x, y, along, kappa)
+    transmitted = (radicand >= 0) & (along != 0)
+    onward = dr.select(transmitted, dr.mulsign(component_of(a, root), along), -along)
+    return _along_axis(a, axis, dr.select(transmitted, k, 1), onward), transmitted
+
+
+def local_root(x: Any, y: Any, z: Any, kappa: Any) -> tuple[Any, Any]:
+    """(√|radicand|, radicand = z² − κ (x² + y²)) in float64, of float32 components in a frame whose axis is the normal.
+
+    Who asks for it twice, as the plugin does for the direction and for Fresnel's equations, pays once: Dr.Jit knows an
+    operation that it has seen.
+    """
+    wide: Any = dr.float64_array_t(type(x))
+    x, y, z = wide(x), wide(y), wide(z)
+    # z² is exact; κ (x² + y²): 1·2⁻⁵³ each for a square and the sum, 1 for the product.
+    radicand = dr.fma(z, z, -kappa * dr.fma(x, x, y * y))
+    # Below 0 the root means nothing, and nobody takes it: |x| is shorter than max(x, 0). At 0 its derivative is finite.
+    return dr.safe_sqrt(radicand) if differentiated(radicand) else dr.sqrt(dr.abs(radicand)), radicand
+
+
+def _radicand(c: Expansion, w: list[Expansion], kappa: Double) -> Double:
+    """c² − κ w²; its error ε over the larger term, in u³.
+
+    c is off by 3/cosθ and κ by none for 1 ≤ k < 2²³. Each w is off by 6, each square by 100 at most, their sums,
+    the product with κ and the difference by as much: 500 where cosθ > 0.1. At grazing incidence 12/cosθ more.
+    """
+    return (c.squared() - functools.reduce(operator.add, (w_i.squared() for w_i in w)).times(kappa)).double()
+
+
+def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
+    """The well-conditioned form above with error-free transforms, in the arrays' own precision.
+
+    A plain evaluation b₀ (a few u off) is corrected by its exact defect in the two equations that define b, so the
+    sum b₀ + δ is rounded once. `contrast`: κ where it is known better than k, for the radicand; `k` itself still
+    scales the tangent. Source: this project. Weak nowhere for k ≤ 1e6.
+    Precondition in float32: lengths of 1e-3 to 1e3, so that no product of four over- or underflows
+    (`numerics.near_unit` sees to it, in the entries of FORMULAS).
+    """
+    k, axis = component_of(a, k), _axis(n)
+    kappa = Double.product(k, k) - 1 if contrast is None else _split(a, contrast)
+    if axis:
+        index, sign = axis
+        c, w = Expansion(a[index] if sign > 0 else -a[index]), [Expansion(a[i]) for i in range(3) if i != index]
+    else:
+        c, w = error_free.dot(n, a), error_free.cross(n, a)
+    radicand = _radicand(c, w, kappa)
+    transmitted = (radicand.hi >= 0) & (c.hi != 0)
+    root, scale = radicand.sqrt(), dr.select(transmitted, k, 1)
+    if axis:
+        onward = dr.mulsign(root.rounded(), c.hi)
+        # c² may have underflowed: κ = 0 leaves c to the last bit, but with the derivative of the root.
+        exact = dr.select(kappa.hi == 0, c.hi, onward)
+        along = dr.select(transmitted, attach(exact, onward) if differentiated(onward) else exact, -c.hi)
+        return _along_axis(a, axis, scale, along), transmitted
+    root = Double(dr.mulsign(root.hi, c.hi), dr.mulsign(root.lo, c.hi))
+    b = _correct(type(a), n, [w_i.pair * scale for w_i in w], error_free.select(transmitted, root, -c.pair))
+    # To the last bit where the answer is `a`, but with the derivative of b, which is not that of `a`. Where `n` is no
+    # normal b is NaN, and stays so.
+    exact = dr.select(((kappa.hi == 0) | (c.hi == 0)) & (b[0] == b[0]), a, b)
+    return (attach(exact, b) if differentiated(b) else exact), transmitted
+
+
+def _correct(vector: type, n: Any, around: list[Double], along: Double) -> Any:
+    """The b with n × b = `around` and n·b = `along`: b = (around × n + along n)/n², rounded once.
+
+    |b₀ − b| ≤ 8u |b|, and δ from the exact defects is right to 8u of itself: b₀ + δ is b to 64u² before it is
+    rounded, so the final error is that of rounding, half an ulp a component.
+    """
+    inverse = quotient(1, dr.dot(n, n))
+
+    def solve(around: list[Any], along: Any) -> Any:
+        return dr.fma(n, along, dr.cross(vector(*around), n)) * inverse
+
+    b = solve([x.hi for x in around], along.hi)
+    missing = [
+        error_free.defect(around[m], (n[i], b[j]), (-n[j], b[i])) for i, j, m in ((1, 2, 0), (2, 0, 1), (0, 1, 2))
+    ]
+    return b + solve(missing, error_free.defect(along, *zip(n, b, strict=True)))
+
+
+def _split(a: Any, x: Any) -> Double:
+    """A number of any precision as a pair in the precision of the components of `a`."""
+    hi = component_of(a, x)
+    if dr.is_array_v(x) and type(x) is type(hi):
+        return Double(hi)
+    wide: Any = dr.float64_array_t(dr.value_t(type(a)))
+    return Double(hi, component_of(a, wide(x) - wide(hi)))

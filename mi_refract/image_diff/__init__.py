@@ -1,0 +1,1 @@
+"""Compare images and folders of images: verdict, reports, self-test."""

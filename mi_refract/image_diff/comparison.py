@@ -1,0 +1,121 @@
+"""What a comparison of pictures says, and the gates before every method.
+
+Fails closed: what cannot be compared is an error, and a value that is not finite equals nothing.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_refract.io.image_file import Image
+
+Maps = dict[str, np.ndarray]
+Pixels = NDArray[np.floating[Any]]
+
+
+class Verdict(enum.StrEnum):
+    EQUAL = "equal"
+    DIFFERENT = "different"
+    INCONCLUSIVE = "inconclusive"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A number of a judgement; where it has a threshold, `value <= bound` holds for equal pictures."""
+
+    name: str
+    value: float
+    bound: float | None = None
+
+    @property
+    def holds(self) -> bool:
+        return self.bound is None or self.value <= self.bound
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What a method found. `detectable`: the smallest relative difference that it would have seen, NaN if unknown.
+
+    `maps`: H × W or H × W × C float32 by name, of the pictures' size.
+    """
+
+    method: str
+    verdict: Verdict
+    reason: str
+    figures: tuple[Figure, ...] = ()
+    detectable: float = np.nan
+    maps: Maps = field(default_factory=dict)
+
+
+def gates(reference: Image, test: Image, allow_nonfinite: bool = False) -> str | None:
+    """Why the two differ before any method is asked: values that are not finite, counted and located; else None.
+
+    ValueError, in one line, where they cannot be compared: other size, channels (by name), or data window.
+    With `allow_nonfinite` such a value is allowed where the other picture has the same one: NaN, Inf or -Inf.
+    """
+    a, b = aligned(reference, test)
+    if np.isfinite(a).all() and np.isfinite(b).all():
+        return None
+    if not allow_nonfinite:
+        found = [_located(image, values, ~np.isfinite(values)) for image, values in ((reference, a), (test, b))]
+        return "; ".join(text for text in found if text)
+    lone = ~(np.isfinite(a) & np.isfinite(b)) & ~_same(a, b)
+    return f"not finite in one picture only, or otherwise: {_located(reference, a, lone)}" if lone.any() else None
+
+
+def aligned(reference: Image, test: Image) -> tuple[Pixels, Pixels]:
+    """The pixels of both, in the reference's order of channels. ValueError where they cannot be compared."""
+    for name, of in {"size": _size, "channels": _channels, "data window": _window}.items():
+        if of(reference) != of(test):
+            raise ValueError(f"{test.path}: {name} {of(test)}; accepted: {of(reference)}, as in {reference.path}")
+    same_order = reference.channels == test.channels
+    return reference.pixels, test.pixels if same_order else test.select(reference.channels)
+
+
+def entered(method: str, reference: Image, test: Image, allow: bool) -> tuple[Pixels, Pixels, Comparison | None]:
+    """The pixels of both, finite; or the judgement of the gates. Allowed values that are not finite become 0."""
+    reason = gates(reference, test, allow)
+    a, b = aligned(reference, test)
+    if reason:
+        return a, b, refused(method, reason, a, b)
+    if allow:
+        a, b = np.where(np.isfinite(a), a, 0), np.where(np.isfinite(b), b, 0)
+    return a, b, None
+
+
+def refused(method: str, reason: str, *pixels: Pixels) -> Comparison:
+    """The judgement on pictures with values that are not finite; they are marked in the map "nonfinite"."""
+    bad = sum((~np.isfinite(each) for each in pixels), np.zeros(pixels[0].shape, np.float32))
+    figures = (Figure("values that are not finite", float(bad.sum()), 0.0),)
+    return Comparison(method, Verdict.DIFFERENT, reason, figures, maps={"nonfinite": (bad > 0).astype(np.float32)})
+
+
+def _same(a: Pixels, b: Pixels) -> Any:
+    return (a == b) | (np.isnan(a) & np.isnan(b))
+
+
+def _located(image: Image, values: Pixels, bad: NDArray[np.bool_]) -> str:
+    if not bad.any():
+        return ""
+    y, x, c = np.unravel_index(int(bad.argmax()), bad.shape)
+    kinds = {"NaN": np.isnan(values[bad]).sum(), "Inf": np.isinf(values[bad]).sum()}
+    counts = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count) or f"{bad.sum()} finite"
+    place = f"x = {x + image.origin[0]}, y = {y + image.origin[1]}, channel {image.channels[c]}"
+    return f"{image.path}: {counts}, the first at {place}"
+
+
+def _size(image: Image) -> str:
+    return f"{image.pixels.shape[1]} × {image.pixels.shape[0]}"
+
+
+def _channels(image: Image) -> str:
+    return ", ".join(sorted(image.channels))
+
+
+def _window(image: Image) -> str:
+    return "from x = {}, y = {}".format(*image.origin)

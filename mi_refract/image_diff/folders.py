@@ -1,0 +1,309 @@
+"""Pairs of picture files, and folders of them: who is compared with whom, what came out, and what may be accepted.
+
+One pair that cannot be compared does not keep the others from it. Nothing here writes a file but `accept`.
+"""
+
+from __future__ import annotations
+
+import enum
+import functools
+import os
+import shlex
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from mi_refract.io import image_file
+from mi_refract.io.atomic import write_atomically
+from mi_refract.io.image_file import Image
+
+from . import methods
+from .methods import Comparison, Verdict
+from .settings import How, Settings
+
+
+class Status(enum.StrEnum):
+    """A verdict, or ERROR where there is none. In the order of what a person must see first."""
+
+    ERROR = "error"
+    DIFFERENT = "different"
+    INCONCLUSIVE = "inconclusive"
+    EQUAL = "equal"
+
+
+class Category(enum.StrEnum):
+    """What happened to a picture between the two folders; UNKNOWN where no verdict says so."""
+
+    ADDED = "added"
+    REMOVED = "removed"
+    CHANGED = "changed"
+    UNCHANGED = "unchanged"
+    UNKNOWN = "unknown"
+
+
+STATUSES = {Verdict.EQUAL: Status.EQUAL, Verdict.DIFFERENT: Status.DIFFERENT, Verdict.INCONCLUSIVE: Status.INCONCLUSIVE}
+CATEGORIES = {Status.EQUAL: Category.UNCHANGED, Status.DIFFERENT: Category.CHANGED}
+AS_ASKED = Settings()
+WORKERS = min(os.cpu_count() or 1, 8)  # each holds a pair of pictures in memory
+INCONCLUSIVE = {"": 3, "pass": 0, "fail": 1}  # exit codes by what the user wants of it
+
+
+@dataclass(frozen=True)
+class Result:
+    """One picture: its name, and what was found. `error` is the line that says why there is no verdict.
+
+    `reference`, `test`: its files, or with samples its folders; None where that side has none. `how`: what was asked.
+    """
+
+    name: str
+    status: Status
+    reference: Path | None
+    test: Path | None
+    how: How = field(default_factory=How)
+    comparison: Comparison | None = None
+    error: str = ""
+
+    @property
+    def category(self) -> Category:
+        if self.status is Status.ERROR:
+            return Category.UNKNOWN
+        if self.reference is None or self.test is None:
+            return Category.ADDED if self.reference is None else Category.REMOVED
+        return CATEGORIES.get(self.status, Category.UNKNOWN)
+
+    @property
+    def reason(self) -> str:
+        """One sentence why the status is what it is."""
+        if self.comparison:
+            return self.comparison.reason
+        sides = {Category.ADDED: "only among the new pictures", Category.REMOVED: "only among the references"}
+        return self.error or sides[self.category]
+
+
+@dataclass(frozen=True)
+class Results:
+    """What `diff` found, failures first. `reference`, `test`: as given. `unused`: patterns that matched no picture.
+
+    `began`: when the comparison did, in ns since the epoch.
+    """
+
+    reference: Path
+    test: Path
+    results: tuple[Result, ...]
+    samples: bool = False
+    inconclusive: str = ""
+    unused: tuple[str, ...] = ()
+    began: int = 0
+
+    def of(self, *statuses: Status) -> list[Result]:
+        return [result for result in self.results if result.status in statuses]
+
+    @property
+    def exit_code(self) -> int:
+        """2: something could not be compared, or nothing was; 1: different; 3: inconclusive; 0: all equal."""
+        if self.of(Status.ERROR) or not self.results:
+            return 2
+        if self.of(Status.DIFFERENT):
+            return 1
+        return INCONCLUSIVE[self.inconclusive] if self.of(Status.INCONCLUSIVE) else 0
+
+    def target(self, result: Result) -> Path:
+        """Where the reference is, or would be."""
+        return result.reference or (self.reference / result.name if self.test.is_dir() else self.reference)
+
+    def reproduce(self, result: Result) -> str:
+        """The command that compares this picture again; "" where one side has none."""
+        flags = (["--samples"] if self.samples else []) + result.how.flags
+        return _line("diff", result.reference, result.test, flags) if result.reference else ""
+
+    def accept(self, result: Result) -> str:
+        """The command that makes the new picture the reference; "" where there is none, or no need."""
+        flags = [] if self.samples else result.how.flags
+        return _line("accept", self.target(result), result.test, flags) if result.status is not Status.EQUAL else ""
+
+
+def _line(verb: str, reference: Path, test: Path | None, flags: Sequence[str]) -> str:
+    return shlex.join(["mi-refract", verb, as_word(reference), as_word(test), *flags]) if test else ""
+
+
+def as_word(path: Path) -> str:
+    """Of a command line: a name that begins with a dash would be read as an option."""
+    return f"./{path}" if str(path).startswith("-") else str(path)
+
+
+# Comparing --------------------------------------------------------------------------------------------------------
+
+
+def diff(
+    reference: str | Path,
+    test: str | Path,
+    settings: Settings = AS_ASKED,
+    *,
+    samples: bool = False,
+    inconclusive: str = "",
+    maps: bool = False,
+    new: bool = False,
+    tell: Callable[[int, int], None] = lambda done, of: None,
+) -> Results:
+    """Compare two files, two folders by the names of their pictures, or, with `samples`, two folders as one picture.
+
+    `maps`: keep those of pictures that are not equal. `new`: the reference need not exist yet. `tell(done, of)` after
+    each picture. ValueError or OSError, in one line, where there is nothing to compare: a path that does not exist, a
+    file against a folder, an empty folder, a path within the other.
+    """
+    began, reference, test = time.time_ns(), Path(reference), Path(test)
+    require_apart(reference, test, new)
+    if samples:
+        if not (reference.is_dir() and test.is_dir()):
+            raise NotADirectoryError(f"{test if reference.is_dir() else reference}: accepted with --samples: a folder")
+        paired: list[Result] = [_unjudged(reference.resolve().name, reference, test)]
+    else:
+        paired = pairs(reference, test)
+    asked = [replace(result, how=settings.of(result.name)) for result in paired]
+
+    def work(result: Result) -> Result:
+        return result if result.error or not (result.reference and result.test) else judge(result, samples, maps)
+
+    found = []
+    with ThreadPoolExecutor(WORKERS) as pool:
+        for result in pool.map(work, asked):
+            found.append(result)
+            tell(len(found), len(asked))
+    found.sort(key=lambda result: list(Status).index(result.status))
+    unused = settings.unused([result.name for result in paired]) if reference.is_dir() and not samples else []
+    return Results(reference, test, tuple(found), samples, inconclusive, tuple(unused), began)
+
+
+def require_apart(reference: Path, test: Path, new: bool = False) -> None:
+    """ValueError where one path is the other or lies within it, OSError where one does not exist."""
+    for role, path in {"test": test, **({} if new else {"reference": reference})}.items():
+        if not path.exists():
+            raise FileNotFoundError(f"{path}: no such {role} file or folder; accepted: one that is there")
+    if reference.exists() and reference.samefile(test):
+        raise ValueError(f"{test}: the same as the reference {reference}; accepted: two")
+    inner, outer = reference.resolve(), test.resolve()
+    if inner.is_relative_to(outer) or outer.is_relative_to(inner):
+        raise ValueError(f"{test}: one within the other, {reference}; accepted: two apart")
+
+
+def pairs(reference: Path, test: Path) -> list[Result]:
+    """The pictures of both sides by name, not yet judged; those of one side only are different."""
+    known = reference.exists()
+    if known and reference.is_dir() != test.is_dir():
+        raise ValueError(f"{reference}, {test}: a folder and a file; accepted: two of a kind")
+    if not test.is_dir():
+        return [_unjudged(reference.name, reference if known else None, test)]
+    (old, lost), (new, missed) = pictures_in(reference) if known else ({}, []), pictures_in(test)
+    for folder, nothing in ((reference, known and not old and not lost), (test, not new and not missed)):
+        if nothing:
+            raise ValueError(f"{folder}: holds no picture; accepted: at least one")
+    found = [_unjudged(name, old.get(name), new.get(name)) for name in sorted(old | new)]
+    return [*found, *(Result(name, Status.ERROR, None, None, error=error) for name, error in lost + missed)]
+
+
+def pictures_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
+    """The files whose names end as a picture's, by their path inside; (name, error) of folders that cannot be read.
+
+    Names that begin with a dot are left out. Links to folders are not followed, and an error: nobody would look there.
+    """
+    found: dict[str, Path] = {}
+    failed: list[tuple[str, str]] = []
+
+    def note(error: OSError) -> None:
+        failed.append((Path(error.filename).relative_to(folder).as_posix(), str(error)))
+
+    for parent, folders, names in os.walk(folder, onerror=note):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for path in (Path(parent, name) for name in folders):
+            if path.is_symlink():
+                failed.append((path.relative_to(folder).as_posix(), f"{path}: a link to a folder; accepted: a folder"))
+        for name in names:
+            path = Path(parent, name)
+            if path.suffix[1:].lower() in endings() and not name.startswith("."):
+                found[path.relative_to(folder).as_posix()] = path
+    return found, failed
+
+
+@functools.cache
+def endings() -> frozenset[str]:
+    """The file name endings, lower case without the dot, of the pictures that OpenImageIO reads."""
+    import OpenImageIO as oiio
+
+    formats = (each.split(":") for each in oiio.get_string_attribute("extension_list").split(";") if each)
+    return frozenset(e for name, listed in formats if name not in ("null", "term", "zfile") for e in listed.split(","))
+
+
+def _unjudged(name: str, reference: Path | None, test: Path | None) -> Result:
+    return Result(name, Status.DIFFERENT, reference, test)
+
+
+def judge(result: Result, samples: bool = False, maps: bool = False) -> Result:
+    """The result of comparing its two sides; with ERROR for what is wrong with either."""
+    assert result.reference and result.test
+    try:
+        if result.reference.samefile(result.test):
+            raise ValueError(f"{result.test}: the same file as the reference {result.reference}; accepted: two")
+        read = sample_pictures if samples else image_file.read
+        found = methods.compare(result.how.method, read(result.reference), read(result.test), **result.how.options)
+    except (ValueError, OSError) as error:
+        return replace(result, status=Status.ERROR, error=image_file.one_line(str(error)))
+    if not maps or found.verdict is Verdict.EQUAL:
+        found = replace(found, maps={})  # a thousand pictures' maps would fill the memory
+    return replace(result, status=STATUSES[found.verdict], comparison=found)
+
+
+def sample_pictures(folder: Path) -> list[Image]:
+    """The renders of one picture in a folder. ValueError where two are the same, seed and all; otherwise as `read`."""
+    found, failed = pictures_in(folder)
+    if failed:
+        raise OSError(failed[0][1])
+    if not found:
+        raise ValueError(f"{folder}: holds no picture; accepted: several renders of one")
+    with ThreadPoolExecutor(WORKERS) as pool:
+        pictures = list(pool.map(image_file.read, found.values()))
+    sums: dict[float, Image] = {}
+    for picture in pictures:
+        other = sums.setdefault(float(picture.pixels.sum(dtype=np.float64)), picture)
+        if other is not picture and np.array_equal(picture.pixels, other.pixels):
+            raise ValueError(f"{picture.path}: the same pixels as {other.path}; accepted: renders of different seeds")
+    return pictures
+
+
+# Accepting --------------------------------------------------------------------------------------------------------
+
+
+def changes(results: Results) -> Iterator[tuple[Path, Path]]:
+    """(new, reference) for each picture that is not equal to its reference, or has none.
+
+    ValueError or OSError for a new picture that is no reference: unreadable, with values that are not finite, or of
+    another format than the reference's name says.
+    """
+    for result in results.of(Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE):
+        if result.test is None:
+            if result.error:
+                raise ValueError(result.error)
+            continue
+        picture = image_file.read(result.test)
+        if not result.how.options.get("allow_nonfinite") and not np.isfinite(picture.pixels).all():
+            raise ValueError(f"{result.test}: values that are not finite; accepted with --allow-nonfinite")
+        target = results.target(result)
+        if target.suffix.lower() != result.test.suffix.lower():
+            raise ValueError(f"{target}: accepted: a name that ends in {result.test.suffix}, as {result.test} does")
+        yield result.test, target
+
+
+def accept(copies: Sequence[tuple[Path, Path]], shown: int) -> None:
+    """Copy each first file over the second; every one is replaced as a whole or stays. OSError ends it.
+
+    `shown`: the time in ns since the epoch when they were compared; OSError, before any copy, for a file changed since.
+    """
+    for new, _ in copies:
+        if max(new.stat().st_mtime_ns, new.stat().st_ctime_ns) > shown:
+            raise OSError(f"{new}: changed since it was compared; accepted: what was shown")
+    for new, reference in copies:
+        reference.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(reference, new.read_bytes())

@@ -1,0 +1,158 @@
+"""How each picture is compared: what the command line says for all of them, and `mi-refract.toml` for some.
+
+The file holds `[[image]]` tables. Of those that match a picture's name the last one holds, before the command line:
+
+    [[image]]
+    name = "glass/caustic*.exr"
+    method = "tolerance"
+    fail = 0.02
+    reason = "single-precision caustic: last bits differ between processors"
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+from mi_refract.io.toml_schema import TABLES, TEXT, Key, Type, key_table, read
+
+from .methods import METHODS
+
+FILE = "mi-refract.toml"
+AUTO = "auto"
+ACCEPTED = (AUTO, *METHODS)
+BOOL = Type("true or false", lambda value: value if isinstance(value, bool) else None)
+METHOD = Type(", ".join(ACCEPTED), lambda value: value if isinstance(value, str) and value in ACCEPTED else None)
+COMMON = {
+    "name": Key(TEXT, "the picture's path inside its folder; `*` stands for anything, `/` included"),
+    "reason": Key(TEXT, "why this picture is not compared like the others"),
+    "method": Key(METHOD, "how; by default as the command line says", None),
+    "allow_nonfinite": Key(BOOL, "whether NaN or Inf is allowed where the other picture has the same", None),
+}
+
+
+def _finite_or_inf(value: Any) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        return float(value) if value == value else None
+    except OverflowError:
+        return None
+
+
+TYPES: dict[type, Type] = {
+    float: Type("a number or inf", _finite_or_inf),
+    int: Type("a whole number", lambda value: value if type(value) is int else None),
+    str: TEXT,
+}
+
+
+@dataclass(frozen=True)
+class How:
+    """A method, those of its options that are not left to it, and `reason`: why, where a file says so."""
+
+    method: str = AUTO
+    options: Mapping[str, Any] = field(default_factory=dict)
+    reason: str = ""
+
+    @property
+    def flags(self) -> list[str]:
+        """The words that say the same on the command line."""
+        words = [] if self.method == AUTO else ["--method", self.method]
+        for name, value in self.options.items():
+            if name != "allow_nonfinite":
+                words += ["--set", f"{name}={value}"]
+            elif value:
+                words += ["--allow-nonfinite", "*"]
+        return words
+
+
+@dataclass(frozen=True)
+class Settings:
+    """`default` for all pictures, `rules` by pattern of names, and the patterns whose values need not be finite."""
+
+    default: How = How()
+    rules: tuple[tuple[str, How], ...] = ()
+    allow_nonfinite: tuple[str, ...] = ()
+
+    def of(self, name: str) -> How:
+        """How the picture of this name is compared."""
+        how = next((how for pattern, how in reversed(self.rules) if fnmatchcase(name, pattern)), self.default)
+        if how.method in (AUTO, self.default.method):
+            how = replace(how, method=self.default.method, options={**self.default.options, **how.options})
+        if any(fnmatchcase(name, pattern) for pattern in self.allow_nonfinite):
+            how = replace(how, options={"allow_nonfinite": True, **how.options})
+        return how
+
+    def unused(self, names: Sequence[str]) -> list[str]:
+        """The patterns that match none of these names."""
+        patterns = [*(pattern for pattern, _ in self.rules), *self.allow_nonfinite]
+        return [pattern for pattern in patterns if not any(fnmatchcase(name, pattern) for name in names)]
+
+
+def load(path: str | Path) -> tuple[tuple[str, How], ...]:
+    """The rules of a settings file: pattern, and how. Images count from 0 in its errors.
+
+    ValueError, one line with file and key, for what it cannot be; OSError as the system raises it.
+    """
+    path = Path(path)
+    try:
+        table = tomllib.loads(path.read_bytes().decode())
+        images = read(table, {"image": Key(TABLES, "", [])})["image"]
+        return tuple(_rule(image, f"image[{i}].") for i, image in enumerate(images))
+    except (ValueError, RecursionError) as error:
+        text = str(error) if isinstance(error, ValueError) else "brackets nested too deeply; accepted: TOML"
+        raise ValueError(" ".join(f"{path}: {text}".split())) from None
+
+
+def _rule(table: dict[str, Any], where: str) -> tuple[str, How]:
+    method = read({k: v for k, v in table.items() if k == "method"}, {"method": COMMON["method"]}, where)["method"]
+    values = read(table, COMMON | keys_of(method or AUTO), where)
+    options = {name: values[name] for name in table if name not in ("name", "reason", "method")}
+    return values["name"], How(method or AUTO, options, values["reason"])
+
+
+def keys_of(method: str) -> dict[str, Key]:
+    """The options of a method as keys; none for "auto", which chooses by the pictures."""
+    options = METHODS[method].options if method != AUTO else {}
+    return {name: Key(TYPES[option.type], option.help, option.default) for name, option in options.items()}
+
+
+def from_words(method: str, words: Sequence[str]) -> How:
+    """Of the command line: a method, and `NAME=VALUE` for its options. ValueError for what it does not take."""
+    if method not in ACCEPTED:
+        raise ValueError(f"--method {method}: accepted: {METHOD.accepted}")
+    if words and method == AUTO:
+        raise ValueError(f"--set {words[0]}: the options of which method? accepted: after --method {'|'.join(METHODS)}")
+    keys = keys_of(method)
+    table: dict[str, Any] = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not equals or name in table:
+            raise ValueError(f"--set {word}: accepted: NAME=VALUE, each name once")
+        table[name] = _value(text, keys[name].type) if name in keys else text
+    values = read(table, keys, "--set ")
+    return How(method, {name: values[name] for name in table})
+
+
+def _value(text: str, kind: Type) -> Any:
+    """A number where the option is one; the text itself where that fails, for `read` to refuse."""
+    for numeric in (int, float) if kind is not TEXT else ():
+        try:
+            return numeric(text)
+        except ValueError:
+            continue
+    return text
+
+
+def reference() -> str:
+    """What a settings file may hold and each method takes, in Markdown."""
+    parts = [key_table("`[[image]]`", COMMON)]
+    for name, method in METHODS.items():
+        parts.append(f"`{name}`: {method.summary}")
+        parts += [key_table("option", keys_of(name))] if keys_of(name) else []
+    return "\n\n".join(parts)

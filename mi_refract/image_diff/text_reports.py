@@ -1,0 +1,208 @@
+"""What `diff` found, laid out for a terminal, scripts (JSON), test runners (JUnit) and GitHub. Nothing is judged here.
+
+Names of files and the texts of errors are strangers' words: each form escapes what would be read as more than text.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mi_refract.io.atomic import write_atomically
+from mi_refract.report.plots import apart, compact
+from mi_refract.report.row import strict
+
+from .folders import Result, Results, Status
+from .methods import Figure
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+SCHEMA = 1
+UNPRINTABLE = re.compile("[^\x20-\x7e\xa0-\u2027\u202f-\u2065\u206a-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+FEW = 20  # equal pictures that are listed one by one
+SUMMARY_ROWS = 500  # GitHub cuts a summary at 1 MiB
+WORDS = {
+    Status.ERROR: "could not be compared",
+    Status.DIFFERENT: "different",
+    Status.INCONCLUSIVE: "inconclusive",
+    Status.EQUAL: "equal",
+}
+STYLES = {Status.ERROR: "bold red", Status.DIFFERENT: "bold red", Status.INCONCLUSIVE: "yellow", Status.EQUAL: "green"}
+
+
+def printable(text: Any) -> str:
+    """On one line, without control characters (terminal escapes, say) and what has no form in UTF-8 or XML 1.0."""
+    return UNPRINTABLE.sub("\ufffd", str(text))
+
+
+def sentence(results: Results) -> str:
+    """All statuses in one line: "12 pictures: 1 different, 11 equal"."""
+    counts = Counter(result.status for result in results.results)
+    told = ", ".join(f"{counts[status]} {WORDS[status]}" for status in Status if counts[status])
+    number = len(results.results)
+    return f"{number} picture{'' if number == 1 else 's'}: {told}"
+
+
+def table(results: Results) -> RenderableType:
+    """Failures first, then the equal ones as far as they are few, then the sentence; for rich's console."""
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    judged = results.of(Status.DIFFERENT, Status.INCONCLUSIVE)
+    equal = results.of(Status.EQUAL)
+    rows = Table("verdict", "picture", "method", "why", box=None, pad_edge=False)
+    for result in [*judged, *equal[:FEW]]:
+        status = Text(_word(result), style=STYLES[result.status])
+        rows.add_row(status, *(Text(printable(text)) for text in (result.name, _method(result), why(result))))
+    more = [Text(f"… and {len(equal) - FEW} more that are equal", style="dim")] if len(equal) > FEW else []
+    return Group(*([rows] if rows.row_count else []), *more, Text(sentence(results)))
+
+
+def why(result: Result) -> str:
+    """The reason, and why the picture is compared in a way of its own where it is."""
+    return result.reason + (f" [{result.how.reason}]" if result.how.reason else "")
+
+
+def _word(result: Result) -> str:
+    return str(result.category) if None in (result.reference, result.test) else str(result.status)
+
+
+def _method(result: Result) -> str:
+    return result.comparison.method if result.comparison else result.how.method
+
+
+def write_json(path: str | Path, results: Results) -> None:
+    """Write `as_data` as strict JSON: NaN and the infinities become words. OSError."""
+    write_atomically(path, json.dumps(strict(as_data(results)), indent=1, allow_nan=False) + "\n")
+
+
+def as_data(results: Results) -> dict[str, Any]:
+    """`{"schema": 1, "exit_code", "sentence", "reference", "test", "counts", "results": [...]}`."""
+    counts = Counter(result.status for result in results.results)
+    return {
+        "schema": SCHEMA,
+        "exit_code": results.exit_code,
+        "sentence": sentence(results),
+        "reference": results.reference,
+        "test": results.test,
+        "samples": results.samples,
+        "counts": {str(status): counts[status] for status in Status},
+        "results": [_entry(results, result) for result in results.results],
+    }
+
+
+def _entry(results: Results, result: Result) -> dict[str, Any]:
+    found = result.comparison
+    return {
+        "name": result.name,
+        "status": str(result.status),
+        "category": str(result.category),
+        "reason": result.reason,
+        "error": result.error,
+        "reference": result.reference,
+        "test": result.test,
+        "method": _method(result),
+        "options": dict(result.how.options),
+        "why_so": result.how.reason,
+        "figures": [{"name": f.name, "value": f.value, "bound": f.bound} for f in (found.figures if found else ())],
+        "detectable": found.detectable if found else math.nan,
+        "reproduce": results.reproduce(result),
+        "accept": results.accept(result),
+    }
+
+
+def write_junit(path: str | Path, results: Results) -> None:
+    """One case a picture. Different is a failure; inconclusive too, unless it is to pass; no verdict is an error."""
+    from xml.etree import ElementTree as xml
+
+    root = xml.Element("testsuites", name="mi-refract diff")
+    suite = xml.SubElement(root, "testsuite", name=printable(results.test))
+    for result in results.results:
+        case = xml.SubElement(suite, "testcase", classname=printable(_method(result)), name=printable(result.name))
+        if kind := _kind(results, result):
+            tag = xml.SubElement(case, kind, type=_word(result), message=printable(why(result)))
+            tag.text = "\n".join(map(printable, _details(results, result)))
+    counts = Counter(child.tag for case in suite for child in case)
+    tally = {"tests": len(suite), "failures": counts["failure"], "errors": counts["error"], "skipped": 0}
+    for element in (root, suite):
+        element.attrib.update({key: str(count) for key, count in tally.items()})
+    xml.indent(root)
+    write_atomically(path, xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
+
+
+def _kind(results: Results, result: Result) -> str:
+    """ "error", "failure", or "" for what does not fail the run."""
+    if result.status is Status.ERROR:
+        return "error"
+    passes = result.status is Status.EQUAL or (result.status is Status.INCONCLUSIVE and results.inconclusive == "pass")
+    return "" if passes else "failure"
+
+
+def _details(results: Results, result: Result) -> list[str]:
+    figures = [figure_text(figure) for figure in (result.comparison.figures if result.comparison else ())]
+    commands = {"reproduce": results.reproduce(result), "accept": results.accept(result)}
+    return [*figures, *(f"{verb}: {line}" for verb, line in commands.items() if line)]
+
+
+def figure_text(figure: Figure) -> str:
+    """ "largest change 0.12 (allowed 0.1)"."""
+    if figure.bound is None:
+        return f"{figure.name} {compact(figure.value)}"
+    value, bound = apart(figure.value, figure.bound)
+    return f"{figure.name} {value} (allowed {bound})"
+
+
+# GitHub -----------------------------------------------------------------------------------------------------------
+
+
+def workflow_commands(results: Results) -> list[str]:
+    """A workflow command for each picture that is not equal."""
+    lines = []
+    for result in results.results:
+        if result.status is not Status.EQUAL:
+            level = "error" if _kind(results, result) else "warning"
+            file = _property(result.test or result.reference or result.name)
+            title = _property(f"{result.name}: {_word(result)}")
+            lines.append(f"::{level} file={file},title={title}::{_message(why(result))}")
+    return lines
+
+
+def _message(text: Any) -> str:
+    return printable(text).replace("%", "%25")
+
+
+def _property(text: Any) -> str:
+    return _message(text).replace(":", "%3A").replace(",", "%2C")
+
+
+def append_summary(results: Results) -> None:
+    """Append the Markdown to the file that GitHub names in $GITHUB_STEP_SUMMARY, where it does. OSError."""
+    if path := os.environ.get("GITHUB_STEP_SUMMARY"):
+        with Path(path).open("a", encoding="utf-8") as file:
+            file.write(markdown(results))
+
+
+def markdown(results: Results) -> str:
+    """A heading with the sentence and a table of the pictures that are not equal."""
+    failed = results.of(Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE)
+    lines = [f"### mi-refract diff: {sentence(results)}", ""]
+    if failed:
+        lines += ["| verdict | picture | method | why |", "|---|---|---|---|"]
+    for result in failed[:SUMMARY_ROWS]:
+        cells = (_word(result), result.name, _method(result), why(result))
+        lines.append(f"| {' | '.join(map(_literal, cells))} |")
+    if len(failed) > SUMMARY_ROWS:
+        lines += ["", f"… and {len(failed) - SUMMARY_ROWS} more"]
+    return "\n".join(lines) + "\n\n"
+
+
+def _literal(text: str) -> str:
+    """Markdown that shows the text as it is."""
+    return re.sub(r"[!-,/:-@\[-`{-~]", lambda match: f"&#{ord(match[0])};", printable(text))

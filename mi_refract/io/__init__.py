@@ -1,0 +1,1 @@
+"""Files, images, processes and TOML tables."""

@@ -1,0 +1,212 @@
+"""Pictures in files, through OpenImageIO: reading any format it knows, writing OpenEXR.
+
+A pixel array is H × W × C float32, row 0 at the top. A file appears complete or not at all.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .atomic import writable
+
+Metadata = dict[str, Any]
+SUFFIXES = (".exr",)
+
+
+def write_exr(
+    path: str | os.PathLike[str],
+    pixels: NDArray[np.floating[Any]],
+    channels: Sequence[str] = ("R", "G", "B"),
+    metadata: Mapping[str, str | int | float] | None = None,
+) -> None:
+    """Write H × W × C pixels as float32. One header attribute for each entry of `metadata`.
+
+    Attributes keep str, int of 32 bits and float (to 24 bits); any other int becomes text. Replaces an existing file.
+    ValueError for a shape that does not fit `channels`, a name that is not .exr, or an attribute of another type;
+    OSError for a folder that cannot be written or a full disk. Nothing is left behind then.
+    """
+    path = writable(path, SUFFIXES)
+    pixels = np.ascontiguousarray(pixels, dtype=np.float32)
+    if pixels.ndim != 3 or pixels.size == 0 or pixels.shape[2] != len(channels):
+        raise ValueError(f"{path}: pixels of shape {pixels.shape}; accepted: H × W × {len(channels)} {tuple(channels)}")
+    if len(set(channels)) != len(channels):
+        raise ValueError(f"{path}: channels {tuple(channels)}: accepted: distinct names")
+    temporary = temporary_name(path)
+    try:
+        _write(temporary, pixels, channels, _attributes(path, metadata or {}))
+        temporary.replace(path)
+    except OSError as error:
+        raise OSError(f"{path}: cannot be written: {error.strerror or error}") from None
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def temporary_name(path: str | os.PathLike[str]) -> Path:
+    """Where this process writes before the rename: in the same folder, and .exr, by which OpenImageIO goes."""
+    path = Path(path)
+    return path.with_name(f".{path.stem}.{os.getpid()}.exr")
+
+
+def _write(path: Path, pixels: NDArray[np.float32], channels: Sequence[str], attributes: Metadata) -> None:
+    import OpenImageIO as oiio
+
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "float")
+    spec.channelnames = tuple(channels)
+    for name, value in attributes.items():
+        spec.attribute(name, value)
+    output = oiio.ImageOutput.create(str(path))
+    if output is None:
+        raise OSError(one_line(oiio.geterror()))
+    done = output.open(str(path), spec) and output.write_image(pixels)
+    message = output.geterror()
+    if not (output.close() and done):
+        raise OSError(one_line(message or output.geterror()) or "OpenImageIO gives no reason")
+    # On a full disk `close` is True all the same when the image was small enough for a buffer.
+    try:
+        complete = read_exr(path)[0].shape == pixels.shape
+    except ValueError:
+        complete = False
+    if not complete:
+        raise OSError("what was written cannot be read; is the disk full?")
+
+
+def _attributes(path: Path, metadata: Mapping[str, str | int | float]) -> Metadata:
+    for name, value in metadata.items():
+        if not isinstance(value, (str, int, float)):
+            raise ValueError(f"{path}: attribute {name} = {value!r}: accepted: str, int, float")
+    return {n: str(v) if isinstance(v, int) and not -(2**31) <= v < 2**31 else v for n, v in metadata.items()}
+
+
+@dataclass(frozen=True)
+class Image:
+    """One picture of a file: H × W × C pixels, the channels' names, where its data window begins (x, y), its header.
+
+    float32; float64 where the file holds numbers that float32 does not. Integers of a file are mapped to 0 … 1.
+    """
+
+    path: Path
+    pixels: NDArray[np.floating[Any]]
+    channels: tuple[str, ...]
+    origin: tuple[int, int] = (0, 0)
+    metadata: Metadata = field(default_factory=dict)
+
+    def select(self, channels: Sequence[str]) -> NDArray[np.floating[Any]]:
+        """The pixels of these channels, in this order. ValueError for a name that is not there."""
+        if missing := [name for name in channels if name not in self.channels]:
+            raise ValueError(f"{self.path}: no channel {missing[0]!r}; accepted: {', '.join(self.channels)}")
+        return self.pixels[..., [self.channels.index(name) for name in channels]]
+
+
+def read(path: str | os.PathLike[str]) -> Image:
+    """The one picture in a file of any format that OpenImageIO reads, its format told by the name's ending.
+
+    OSError for a file that cannot be read; ValueError for one that is empty, truncated, of another type than its
+    name says, of several parts, deep, or without pixels. Both are one line that begins with the path.
+    """
+    import OpenImageIO as oiio
+
+    path = Path(path)
+    kind = path.suffix[1:].upper() or "image"
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise ValueError(f"{path}: accepted: a name in UTF-8") from None
+    if path.exists() and not (path.is_file() or path.is_dir()):  # reading a pipe might never end
+        raise ValueError(f"{path}: accepted: a regular file")
+    with path.open("rb") as file:  # the operating system's own words for what is missing or forbidden
+        if not file.read(1):
+            raise ValueError(f"{path}: corrupt {kind} file: it is empty")
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)  # else colours under a transparent alpha are read as black
+    source = oiio.ImageInput.open(str(path), config)
+    if source is None:
+        raise ValueError(f"{path}: corrupt {kind} file: {_without(path, oiio.geterror())}")
+    try:
+        return _picture(path, source, kind)
+    except MemoryError:
+        raise ValueError(f"{path}: corrupt {kind} file: more pixels than there is memory for") from None
+    finally:
+        source.close()
+
+
+def named(name: str, pixels: Any) -> Image:
+    """An array, height × width × channels or height × width, as a picture with a name instead of a file.
+
+    Channels are R, G, B (A) where there are three or four, else channel0 and so on. Integers are kept as they are.
+    ValueError for another shape, or what are no numbers.
+    """
+    pixels = np.asarray(pixels)
+    if pixels.ndim not in (2, 3) or not pixels.size or pixels.dtype.kind not in "fiu":
+        raise ValueError(f"{name}: {pixels.dtype} {pixels.shape}; accepted: numbers, height × width × channels")
+    pixels = pixels.reshape(*pixels.shape[:2], -1).astype(np.result_type(pixels.dtype, np.float32))
+    count = pixels.shape[2]
+    channels = tuple("RGBA"[:count]) if 3 <= count <= 4 else tuple(f"channel{i}" for i in range(count))
+    return Image(Path(name), pixels, channels)
+
+
+def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Image]:
+    """Several pictures, two at a time: unpacking takes most of the time of a comparison. Errors: those of `read`."""
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(read, paths))
+
+
+def _picture(path: Path, source: Any, kind: str) -> Image:
+    spec = source.spec()
+    found = source.format_name()
+    if path.suffix[1:].lower() not in _endings(found) or found == "null":  # which is black, whatever the file holds
+        raise ValueError(f"{path}: holds a picture of format {found}; accepted: the format that the name says")
+    if spec.deep:
+        raise ValueError(f"{path}: accepted: a picture without deep samples")
+    if min(spec.width, spec.height, spec.nchannels) < 1 or spec.depth > 1:
+        raise ValueError(f"{path}: {spec.width} × {spec.height} × {spec.depth} pixels; accepted: a plane with pixels")
+    formats = {str(each) for each in (spec.channelformats or [spec.format])}
+    if formats & {"uint64", "int64"}:
+        raise ValueError(f"{path}: integers of 64 bits; accepted: up to 32")
+    wide = formats & {"double", "uint32", "int32", "uint", "int"}
+    pixels = source.read_image("double" if wide else "float")
+    if message := _without(path, source.geterror()) or ("" if pixels is not None else "no pixels"):
+        raise ValueError(f"{path}: corrupt {kind} file: {message}")
+    pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
+    if source.seek_subimage(1, 0):
+        raise ValueError(f"{path}: several parts in one file; accepted: one picture")
+    metadata = {attribute.name: attribute.value for attribute in spec.extra_attribs}
+    return Image(path, pixels, tuple(spec.channelnames), (spec.x, spec.y), metadata)
+
+
+def _without(path: Path, message: str) -> str:
+    """OpenImageIO's words on one line, without the path that some of its readers put into them."""
+    return one_line(message.replace(f"EXR Error ({path}): ", "").replace(str(path), path.name))
+
+
+def _endings(name: str) -> list[str]:
+    """The file name endings of a format, in OpenImageIO's own list: "openexr:exr,sxr;png:png;…"."""
+    import OpenImageIO as oiio
+
+    formats = dict(each.split(":") for each in oiio.get_string_attribute("extension_list").split(";") if each)
+    return formats.get(name, name).split(",")
+
+
+def read_exr(path: str | os.PathLike[str]) -> tuple[NDArray[np.float32], Metadata]:
+    """(pixels, metadata): H × W × C float32, and the header attributes with the channels' names under "channels".
+
+    The order of channels is the file's as OpenImageIO gives it: R, G, B, A first, then by name.
+    FileNotFoundError or OSError for a file that cannot be read, ValueError for one that is not a complete EXR image.
+    """
+    path = Path(path)
+    with path.open("rb") as file:
+        if file.read(4) != b"\x76\x2f\x31\x01":
+            raise ValueError(f"{path}: not an EXR file")
+    image = read(path)
+    return image.pixels.astype(np.float32, copy=False), image.metadata | {"channels": image.channels}
+
+
+def one_line(text: str) -> str:
+    return " ".join(text.split())

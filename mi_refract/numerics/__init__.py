@@ -1,0 +1,1 @@
+"""Error-free transforms and float expansions. No optics."""

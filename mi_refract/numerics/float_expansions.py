@@ -1,0 +1,99 @@
+"""Numbers as unevaluated sums of floats: what judges a formula computes with, next to the exact oracle.
+
+An *expansion* is a list of floats, largest first, whose exact sum is the number. Only the operators + − × / are
+used, so the same source serves numpy arrays and Dr.Jit arrays, and nothing is shared with the compensated formula
+but `two_sum`. Nothing may over- or underflow. Sources: Dekker 1971 (two_prod without a fused multiply-add);
+Ogita, Rump, Oishi 2005 (repeated VecSum).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from .error_free import two_sum
+
+Expansion = list[Any]
+# Splits the 53 bits of a float64 in two halves, whose products are exact.
+_SPLITTER = 2.0**27 + 1
+
+
+def two_prod(x: Any, y: Any) -> tuple[Any, Any]:
+    """p = fl(x y) and e with p + e = x y exactly. float64 only."""
+    (x_hi, x_lo), (y_hi, y_lo) = _split(x), _split(y)
+    p = x * y
+    return p, ((x_hi * y_hi - p) + x_hi * y_lo + x_lo * y_hi) + x_lo * y_lo
+
+
+def _split(x: Any) -> tuple[Any, Any]:
+    c = _SPLITTER * x
+    hi = c - (c - x)
+    return hi, x - hi
+
+
+def distil(terms: Sequence[Any], words: int = 3) -> Expansion:
+    """The sum of m `terms` in `words` floats: error ≤ (m u)^words Σ|terms|, and nothing at all where it is short.
+
+    Every pass takes the float sum out and leaves its exact rounding errors behind.
+    """
+    taken, rest = [], list(terms)
+    for _ in range(words):
+        total, errors = rest[0], []
+        for term in rest[1:]:
+            total, error = two_sum(total, term)
+            errors.append(error)
+        taken.append(total)
+        if not errors:
+            break
+        rest = errors
+    # Where the first sums cancelled, the next one leads.
+    for _ in taken:
+        for j in reversed(range(len(taken) - 1)):
+            taken[j], taken[j + 1] = two_sum(taken[j], taken[j + 1])
+    return taken
+
+
+def product(x: Any, y: Any, words: int = 3) -> Expansion:
+    """x y of two expansions: relative error ≤ 16 u^words."""
+    terms: list[Any] = []
+    for i, x_i in enumerate(x):
+        for j, y_j in enumerate(y):
+            if i + j < words:
+                terms += two_prod(x_i, y_j)
+    return distil(terms, words)
+
+
+def negated(x: Any) -> Expansion:
+    return [-x_i for x_i in x]
+
+
+def quotient(x: Any, y: Any, words: int = 2) -> Expansion:
+    """x / y of two expansions, by long division: relative error ≤ 16 u^words."""
+    digits, rest = [], list(x)
+    for _ in range(words):
+        digit = rest[0] / y[0]
+        digits.append(digit)
+        rest = distil([*rest, *negated(product(y, [digit], words + 1))], words)
+    return distil(digits, words)
+
+
+def dot(x: Any, y: Any, words: int = 3) -> Expansion:
+    """x · y of two vectors of floats, and 0 where it is 0. One word more than asked for is kept for what cancels."""
+    return distil([part for x_i, y_i in zip(x, y, strict=True) for part in two_prod(x_i, y_i)], words + 1)[:words]
+
+
+def cross(x: Any, y: Any, words: int = 3) -> list[Expansion]:
+    """x × y of two 3-vectors of floats, each component as `dot` has it."""
+    return [dot((x[i], x[j]), (y[j], -y[i]), words) for i, j in ((1, 2), (2, 0), (0, 1))]
+
+
+def radicand(a: Any, n: Any, k: Any) -> tuple[Expansion, Expansion, Any]:
+    """(n·a, D, T): D = (n·a)² − κ |n×a|², κ = k² − 1, which is negative under total internal reflection.
+
+    `a`, `n`: three components each. T = (n·a)² + |κ| |n×a|², to a few u; the error of D is at most 2⁻¹⁴⁰ T.
+    """
+    c = dot(n, a)
+    kappa = distil([*two_prod(k, k), 0 * k - 1])
+    w2 = distil([part for w in cross(n, a) for part in product(w, w)])
+    first, second = product(c, c), product(kappa, w2)
+    return c, distil([*first, *negated(second)]), first[0] + abs(second[0])

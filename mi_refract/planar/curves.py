@@ -1,0 +1,159 @@
+"""Curves in the plane, of straight pieces and exact arcs of conics. No optics: media come last, with `between`.
+
+A closed curve runs counter-clockwise: its inside is on the left. An arc is a rational quadratic Bézier curve, which
+is the conic itself: its control point lies where the end tangents meet, and an affine map of start, control and end
+is an affine map of the arc, the weight unchanged. Arcs turn by at most 90° as they are made; a stretch may change
+that. Each vertex is computed once, so that neighbours share it to the last bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from .tracer import Array, Segments
+
+
+@dataclass(frozen=True)
+class Curve:
+    """M pieces from vertex to vertex (M + 1 of them, M where `closed`); `control` M × 2, `weight` M.
+
+    A piece is straight where its weight is 1 and its control is the middle of its ends.
+    """
+
+    vertices: Array
+    control: Array
+    weight: Array
+    closed: bool
+
+    def __len__(self) -> int:
+        return len(self.weight)
+
+    @property
+    def start(self) -> Array:
+        return self.vertices[: len(self)]
+
+    @property
+    def end(self) -> Array:
+        return np.roll(self.vertices, -1, 0)[: len(self)]
+
+    @property
+    def straight(self) -> Any:
+        """Which pieces are."""
+        return (self.weight == 1) & (self.control == (self.start + self.end) / 2).all(1)
+
+    def _piece(self, j: int) -> Curve:
+        vertices = np.stack([self.start[j], self.end[j]])
+        return Curve(vertices, self.control[j : j + 1], self.weight[j : j + 1], closed=False)
+
+    def reversed(self) -> Curve:
+        """The same places, run through the other way; a closed curve keeps its first vertex."""
+        vertices = np.roll(self.vertices[::-1], 1, 0) if self.closed else self.vertices[::-1]
+        return replace(self, vertices=vertices, control=self.control[::-1], weight=self.weight[::-1])
+
+    def mapped(self, matrix: Any, at: Any = (0.0, 0.0)) -> Curve:
+        """The curve under p → matrix · p + at. Under a reflection it is reversed: what was on its left stays there.
+
+        ValueError for a matrix that is singular or not finite.
+        """
+        matrix, at = np.asarray(matrix, float), np.asarray(at, float)
+        determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
+        if not (math.isfinite(determinant) and determinant and np.isfinite(at).all()):
+            raise ValueError(f"matrix = {matrix.tolist()}, at = {at.tolist()}; accepted: finite, determinant not 0")
+        # By columns: a product with 0 and 1 rounds nothing, in whatever order a library would sum.
+        x, y = matrix.T
+        vertices, control = (p[:, :1] * x + p[:, 1:] * y + at for p in (self.vertices, self.control))
+        mapped = replace(self, vertices=vertices, control=control)
+        mapped.control[self.straight] = ((mapped.start + mapped.end) / 2)[self.straight]
+        return mapped if determinant > 0 else mapped.reversed()
+
+    def faceted(self, facets: int) -> Curve:
+        """Chords in place of the arcs, `facets` altogether, shared out evenly; straight pieces stay.
+
+        ValueError where there is no arc, or fewer chords than arcs.
+        """
+        arcs = np.flatnonzero(~self.straight)
+        if not 0 < len(arcs) <= facets:
+            raise ValueError(f"facets: {facets}, for {len(arcs)} arcs; accepted: an arc at least, and a facet for each")
+        steps = np.ones(len(self), int)
+        steps[arcs] = np.diff(np.arange(len(arcs) + 1) * facets // len(arcs))
+        chords = [self._piece(j).outline(int(n))[:-1] for j, n in enumerate(steps)]
+        return polygonal(np.concatenate(chords if self.closed else [*chords, self.vertices[-1:]]), self.closed)
+
+    def outline(self, count: int = 64) -> Array:
+        """Points along the curve: its vertices, and `count` − 1 more on each arc."""
+        bent = ~self.straight
+        if not bent.any():
+            return self.vertices
+        arcs = iter(_along(self.start[bent], self.end[bent], self.control[bent], self.weight[bent], count)[:, :-1])
+        pieces = [next(arcs) if arc else start[None] for start, arc in zip(self.start, bent, strict=True)]
+        return np.concatenate(pieces if self.closed else [*pieces, self.vertices[-1:]])
+
+    def between(self, n_left: float, n_right: float) -> Segments:
+        """The curve as boundaries between two media."""
+        left, right = np.full(len(self), float(n_left)), np.full(len(self), float(n_right))
+        arcs = () if self.straight.all() else (self.control, self.weight)
+        return Segments(self.start, self.end, left, right, *arcs)
+
+
+def points(segments: Segments, count: int) -> Array:
+    """M × (count + 1) × 2: each segment from start to end, its ends exact; equal angles on an arc of a circle."""
+    control, weight = segments.control, segments.weight
+    if control is None or weight is None:
+        control, weight = (segments.start + segments.end) / 2, np.ones(len(segments))
+    return _along(segments.start, segments.end, control, weight, count)
+
+
+def _along(start: Array, end: Array, control: Array, weight: Array, count: int) -> Array:
+    w, s = weight[:, None, None], np.linspace(0, 1, count + 1)[:, None]
+    angle = np.emath.arccos(w) / np.pi
+    # sin(φx)/sin φ for w = cos φ, which becomes x where w = 1 and is sinh of the imaginary φ where w > 1.
+    b, a = (np.real(x * np.sinc(angle * x) / np.sinc(angle)) for x in (s, 1 - s))
+    middle = 2 * w * a * b
+    sums = a * a * start[:, None] + middle * control[:, None] + b * b * end[:, None]
+    return sums / (a * a + middle + b * b)
+
+
+def affine(rotate: float = 0.0, scale: float | Sequence[float] = 1.0) -> Array:
+    """The matrix that stretches by `scale`, or by its two numbers along x and y, and then turns by degrees."""
+    cosine, sine = unit(rotate)
+    x, y = np.broadcast_to(scale, 2)
+    return np.array([[cosine * x, -sine * y], [sine * x, cosine * y]])
+
+
+def unit(degrees: float) -> tuple[float, float]:
+    """Cosine and sine, exact for multiples of 90° and equal for odd ones of 45°."""
+    degrees = math.fmod(degrees, 360)
+    quarters = round(degrees / 90)
+    rest = degrees - 90 * quarters
+    x, y = math.cos(math.radians(rest)), math.sin(math.radians(rest))
+    if abs(rest) == 45:
+        x, y = math.sqrt(0.5), math.copysign(math.sqrt(0.5), rest)
+    return ((x, y), (-y, x), (-x, -y), (y, -x))[quarters % 4]
+
+
+def polygonal(vertices: Array, closed: bool) -> Curve:
+    """Straight pieces from vertex to vertex."""
+    following = np.roll(vertices, -1, 0)
+    pieces = len(vertices) - (not closed)
+    return Curve(vertices, ((vertices + following) / 2)[:pieces], np.ones(pieces), closed)
+
+
+def joined(*curves: Curve) -> Curve:
+    """One closed curve of open ones, each led to the next by a straight piece where it does not end there."""
+    parts = []
+    for curve, following in zip(curves, [*curves[1:], curves[0]], strict=True):
+        gap = polygonal(np.stack([curve.vertices[-1], following.vertices[0]]), closed=False)
+        parts += [curve] if (gap.start == gap.end).all() else [curve, gap]
+    vertices, control = np.concatenate([p.start for p in parts]), np.concatenate([p.control for p in parts])
+    return Curve(vertices, control, np.concatenate([p.weight for p in parts]), closed=True)
+
+
+def area(curve: Curve) -> float:
+    """Signed, positive where counter-clockwise; of arcs as of chords by the hundred."""
+    x, y = curve.outline().T
+    return float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2

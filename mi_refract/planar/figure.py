@@ -1,0 +1,266 @@
+"""Pictures of planar scenes: media shaded by index, boundaries, and rays as strong as they are bright.
+
+A few rays are drawn as lines. Of many, what is drawn is their density, accumulated in floating point: a line of
+little power among thousands has an opacity of less than the 1/255 that graphics libraries know.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import math
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mi_refract.io.atomic import write_atomically
+
+from .figure_geometry import SHARED, Legs, View, around, curves, density, legs
+from .path_tree import Branches, count, summary
+from .scene_file import PlanarScene
+from .tracer import Event, Segments
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FORMATS = (".svg", ".png", ".pdf")
+# Lines are drawn one by one, as long as there are not more of them and they would not be longer than so many diagonals
+# of the view. Of more the density is drawn.
+LINES, DIAGONALS = 6000, 150
+DPI = {".png": 200, ".svg": 150, ".pdf": 150}  # of what is not lines, in the last two
+RAY, WHITE, INK, MUTED = "#c8102e", "#55504c", "#222222", "#6b6b6b"  # WHITE: of all colours, on paper
+DENSE, THIN = (0.73, 0.85, 0.97), (1.00, 0.92, 0.70)  # tints of the media that differ most from what is around all
+LINE = 0.13  # inches
+NAMED = 5  # media in the legend
+TYPICAL = 0.35  # opacity/(1 − opacity) of a typical density, where that is drawn
+MARKS = {
+    Event.EXHAUSTED: ("o", "○ {} stopped after `max_depth` boundaries, with another one ahead"),
+    Event.CONTRADICTED: ("x", "× {} stopped: the next boundary does not border on the medium that the ray is in"),
+}
+UNDATED: dict[str, Any] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}, ".png": {}}
+STYLE: Any = {
+    "svg.hashsalt": "mi_refract",  # the same scene gives the same bytes
+    "text.parse_math": False,
+    "font.size": 9,
+    "axes.edgecolor": "#b5b5b5",
+    "axes.linewidth": 0.6,
+    "axes.labelcolor": MUTED,
+    "axes.titlecolor": INK,
+    "axes.titlesize": 11,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 21,
+    "xtick.color": "#b5b5b5",
+    "ytick.color": "#b5b5b5",
+    "xtick.labelcolor": MUTED,
+    "ytick.labelcolor": MUTED,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "legend.labelcolor": INK,
+}
+
+
+def save(path: Path, scene: PlanarScene, traced: Sequence[Branches]) -> None:
+    """Write the picture, in the format of the path's suffix, one of FORMATS.
+
+    ValueError as for `picture`; OSError for what cannot be written. Then no file is there, or the old one.
+    """
+    content = picture(scene, traced, path.suffix.lower())
+    try:
+        write_atomically(path, content)
+    except OSError as error:
+        raise OSError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def picture(scene: PlanarScene, traced: Sequence[Branches], suffix: str) -> bytes:
+    """The content of such a file. The same arguments give the same bytes. ValueError where matplotlib is missing."""
+    require_matplotlib()
+    import matplotlib.style
+
+    buffer = io.BytesIO()
+    with matplotlib.style.context(["default", STYLE]):  # whatever the user's own style is
+        drawn = figure(scene, traced, DPI[suffix])
+        drawn.savefig(buffer, format=suffix[1:], dpi="figure", metadata=UNDATED[suffix])
+    return buffer.getvalue()
+
+
+def figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> Figure:
+    """The picture, in matplotlib's present style; its only axes are in the scene's units."""
+    from matplotlib.figure import Figure
+
+    view = scene.view or around(scene, traced)
+    width, height = _size(view)
+    caption = _caption(scene, traced, int(14 * width))
+    drawn = Figure((width, height + LINE * len(caption)), dpi, layout="constrained")
+    panel = drawn.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal")
+    panel.set_title("\n".join(textwrap.wrap(scene.title, int(10.5 * width))))
+    panel.set_xlabel("\n".join(caption), loc="left", fontsize=7.5)
+    _media(panel, scene)
+    _settle(drawn)
+    _boundaries(panel, scene.segments[0])
+    _rays(panel, scene, legs(traced, view))
+    _ends(panel, traced)
+    return drawn
+
+
+def require_matplotlib() -> None:
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ValueError("pictures need the extra `plot`: pip install 'mi-refract[plot]'")
+
+
+def _size(view: View) -> tuple[float, float]:
+    """Of the figure without its caption, in inches: about as large a picture whatever its shape."""
+    aspect = min(max((view[1] - view[0]) / (view[3] - view[2]), 0.25), 4)
+    height = min(5.2 / aspect**0.5, 7.0)
+    return max(height * aspect, 3.6) + 0.6, height + 0.95
+
+
+def _settle(drawn: Figure) -> None:
+    """From here on everything stays in its place, and an image can have as many pixels as there are for it."""
+    layout = drawn.get_layout_engine()
+    assert layout is not None
+    layout.set(w_pad=0.12, h_pad=0.12)  # type: ignore[call-arg]
+    for _ in range(2):  # the first time it is not known yet where the title comes to be
+        drawn.draw_without_rendering()
+    drawn.set_layout_engine("none")
+
+
+# Media and boundaries ----------------------------------------------------------------------------------------------
+
+
+def _media(panel: Axes, scene: PlanarScene) -> None:
+    """Regions tinted by index, paler the nearer that is to that around everything; a legend of up to NAMED."""
+    from matplotlib.patches import Patch, Polygon
+
+    around = float(np.mean(scene.index))
+    means = [float(np.mean(region.indices)) for region in scene.regions]
+    most = max((abs(n - around) for n in means), default=0)
+    tints = {n: _tint((n - around) / (most or 1)) for n in (around, *means)}
+    panel.set_facecolor(tints[around])
+    for region, n in zip(scene.regions, means, strict=True):
+        style: dict[str, Any] = {"facecolor": tints[n], "edgecolor": "none", "zorder": 0.5}
+        panel.add_patch(Polygon(region.outline, rasterized=len(region.outline) > LINES, **style))
+    labels = {around: _label(scene.index)} | {n: _label(r.indices) for r, n in zip(scene.regions, means, strict=True)}
+    shown = sorted(labels)
+    if len(shown) > NAMED:  # of many layers the ends and some between
+        shown = [shown[round(i * (len(shown) - 1) / (NAMED - 1))] for i in range(NAMED)]
+    patches = [Patch(facecolor=tints[n], edgecolor="#999999", linewidth=0.5, label=labels[n]) for n in shown]
+    place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.1, "borderpad": 0.2}
+    panel.legend(handles=patches, ncols=len(patches), handlelength=1.2, columnspacing=1.2, **place)
+
+
+def _tint(contrast: float) -> tuple[float, float, float]:
+    """−1 … 1: how far an index is from that around everything. Denser media are blue, thinner ones yellow."""
+    red, green, blue = DENSE if contrast > 0 else THIN
+    share = abs(contrast) and 0.15 + 0.85 * abs(contrast) ** 1.5
+    return 1 - share * (1 - red), 1 - share * (1 - green), 1 - share * (1 - blue)
+
+
+def _label(indices: Sequence[float]) -> str:
+    low, high = (f"{n:.4g}" for n in (min(indices), max(indices)))
+    return f"n = {low}" if low == high else f"n = {low} – {high}"
+
+
+def _boundaries(panel: Axes, segments: Segments) -> None:
+    from matplotlib.collections import LineCollection
+
+    many = len(segments) > LINES
+    lines = curves(segments, 5 if many else 33)
+    width = 0.7 * max(min(1.0, 8 / len(lines)), 0.15)
+    style: dict[str, Any] = {"colors": INK, "linewidths": width, "capstyle": "round", "zorder": 1.5}
+    panel.add_collection(LineCollection(lines, rasterized=many, **style), autolim=False)
+    panel.plot(0, 0, "+", color=MUTED, markersize=5, markeredgewidth=0.6, zorder=1.4, scalex=False, scaley=False)
+
+
+# Rays ------------------------------------------------------------------------------------------------------------
+
+
+def strength(weight: Any) -> Any:
+    """How strongly a ray is drawn: the square root of its share of the power, or 4 % would not be seen."""
+    return np.sqrt(weight)
+
+
+def _rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
+    names = {SHARED: WHITE} | {i: name or RAY for i, name in enumerate(scene.colours)}
+    colours = {i: _rgb(scene, name) for i, name in names.items()}
+    x0, x1, y0, y1 = *panel.get_xlim(), *panel.get_ylim()
+    crowd = np.hypot(*(lines.end - lines.start).T).sum() / math.hypot(x1 - x0, y1 - y0)
+    if len(lines) > LINES or crowd > DIAGONALS:
+        _shade(panel, lines, colours)
+    elif len(lines):
+        _stroke(panel, lines, colours, min(1.0, (40 / crowd) ** 0.5))
+
+
+def _rgb(scene: PlanarScene, name: str) -> Any:
+    from matplotlib.colors import to_rgb
+
+    try:
+        return np.array(to_rgb(name))
+    except ValueError:
+        raise ValueError(f"{scene.path}: colours: {name!r}; accepted: a colour that matplotlib knows") from None
+
+
+def _stroke(panel: Axes, lines: Legs, colours: dict[int, Any], room: float) -> None:
+    """One line each, thinner and fainter the less room there is; the strongest on top."""
+    from matplotlib.collections import LineCollection
+
+    order = np.argsort(lines.weight, kind="stable")
+    opacity = np.maximum(strength(lines.weight[order]) * room, 0.02)
+    rgba = np.column_stack([np.array([colours[c] for c in lines.colour[order]]), opacity])
+    strokes = np.stack([lines.start, lines.end], axis=1)[order]
+    width = 0.4 + 0.8 * room
+    panel.add_collection(LineCollection(list(strokes), colors=rgba, linewidths=width, zorder=2), autolim=False)
+
+
+def _shade(panel: Axes, lines: Legs, colours: dict[int, Any]) -> None:
+    """The density as an image, with as many pixels as the panel has in this figure."""
+    box = panel.get_window_extent()
+    view = *panel.get_xlim(), *panel.get_ylim()
+    width, height = max(round(box.width), 1), max(round(box.height), 1)
+    layers = {}
+    for number in colours:
+        layer = lines.where(lines.colour == number)
+        layers[number] = density(layer, strength(layer.weight), view, width, height)
+    style: dict[str, Any] = {"extent": view, "origin": "lower", "aspect": "equal", "zorder": 2}
+    panel.imshow(_blend(layers, colours), **style)
+
+
+def _blend(layers: dict[int, Any], colours: dict[int, Any]) -> Any:
+    """Densities by colour → RGBA in bytes. As much of all colours is the colour of what they have in common."""
+    shared = layers.pop(SHARED)
+    parts = np.stack(list(layers.values())) / len(layers)
+    common = parts.min(axis=0) * (len(layers) > 1)
+    shared = shared + common * len(layers)
+    total = shared + (parts - common).sum(axis=0)
+    mixed = shared[..., None] * colours[SHARED]
+    for part, number in zip(parts - common, layers, strict=True):
+        mixed += part[..., None] * colours[number]
+    lit = total[total > 0]
+    # The median alone makes a beam black beside faint reflections all over the view; the mean makes them white.
+    dense = total * TYPICAL / math.sqrt(lit.mean() * np.median(lit)) if lit.size else total
+    colour = np.divide(mixed, total[..., None], out=np.ones_like(mixed), where=total[..., None] > 0)
+    pixels = np.dstack([colour, dense / (1 + dense)])  # without saturating as soon as 1 − exp(−dense) does
+    return (pixels * 255).round().astype(np.uint8)
+
+
+def _ends(panel: Axes, traced: Sequence[Branches]) -> None:
+    """A mark where a path ended otherwise than by escaping."""
+    for event, (mark, _) in MARKS.items():
+        ends = np.concatenate([branches.tips[branches.end == event] for branches in traced])
+        if len(ends):
+            size = min(1.0, (40 / len(ends)) ** 0.5)
+            style: dict[str, Any] = {"markersize": 1 + 4 * size, "markeredgewidth": 0.9 * size, "fillstyle": "none"}
+            panel.plot(*ends.T, mark, color=INK, zorder=3, scalex=False, scaley=False, **style)
+
+
+def _caption(scene: PlanarScene, traced: Sequence[Branches], width: int) -> list[str]:
+    """Lines of at most `width` characters."""
+    numbers = count(traced)
+    notes = [text.format(numbers[event.name]) for event, (_, text) in MARKS.items() if numbers[event.name]]
+    lines = [f"{scene.path.name}: {summary(scene, traced)}", *notes]
+    return [part for line in lines for part in textwrap.wrap(line, width)]

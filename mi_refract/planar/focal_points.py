@@ -1,0 +1,186 @@
+"""Where the rays of a planar scene come together: focal points and spot sizes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .path_loop import REFLECT_BITS
+from .path_tree import Branches
+from .scene_file import PlanarScene
+from .tracer import Array, Event
+
+Point = tuple[float, float]
+PARALLEL = 1e-9  # sine of an angle: two lines below that have no crossing worth naming
+SYMMETRIC = 1e-3  # sine of an angle: by how much two rays may fail to be mirror images of one another
+STEEPEST = math.radians(89)  # off the mean direction: rays that still have a spot in a plane across it
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Rays that leave together. Lengths are in the scene's units; None where there is no such thing.
+
+    `focus`: the point of least RMS distance from all the rays' lines, `virtual` where it lies behind most of them.
+    `spot`: where the rays' mean meets the plane across it in which their RMS distance from their centre, `rms`, is
+    smallest; `largest` is the largest such distance. None where a ray is more than 89° off the mean direction.
+    `marginal`, `paraxial`: where the outermost and the innermost pair of rays cross that are mirror images.
+    """
+
+    rays: int
+    focus: Point | None
+    virtual: bool
+    spot: Point | None = None
+    rms: float | None = None
+    largest: float | None = None
+    marginal: Point | None = None
+    paraxial: Point | None = None
+
+
+def spread(origins: Array, directions: Array) -> Spread:
+    """Of the lines through `origins` along unit `directions` (N × 2, N ≥ 1)."""
+    focus = closest_point(origins, directions)
+    behind = focus is not None and bool(np.median(((focus - origins) * directions).sum(axis=1)) < 0)
+    found = Spread(len(origins), _point(focus), behind)
+    if len(origins) > 1 and (spot := _spot(origins, directions)):
+        place, offsets = spot
+        rms, largest = float(np.sqrt(np.mean(offsets**2))), float(np.abs(offsets).max())
+        return replace(found, spot=_point(place), rms=rms, largest=largest)
+    return found
+
+
+def closest_point(origins: Array, directions: Array) -> Array | None:
+    """The point of least squared distance from the lines: Σ nᵢ nᵢᵀ p = Σ nᵢ nᵢᵀ oᵢ, nᵢ across the i-th line.
+
+    None where all are parallel.
+    """
+    centre = origins.mean(axis=0)
+    across = _turned(directions)
+    if np.linalg.svd(across, compute_uv=False)[-1] <= PARALLEL * math.sqrt(len(across)) or len(across) < 2:
+        return None
+    distances = ((origins - centre) * across).sum(axis=1)
+    return centre + np.linalg.lstsq(across, distances, rcond=None)[0]
+
+
+def crossing(origin: Array, direction: Array, other: Array, along: Array) -> Point | None:
+    """Of two lines; None where they are parallel."""
+    sine = _cross(direction, along)
+    if abs(sine) <= PARALLEL:
+        return None
+    return _point(origin + direction * (_cross(other - origin, along) / sine))
+
+
+def _spot(origins: Array, directions: Array) -> tuple[Array, Array] | None:
+    """The mean's place in the plane of least RMS spot, and how far from it each ray meets that plane."""
+    mean = directions.mean(axis=0)
+    length = math.hypot(*mean)
+    if length == 0 or (forward := directions @ mean / length).min() < math.cos(STEEPEST):
+        return None
+    axis, across = mean / length, _turned(mean / length)
+    slopes = directions @ across / forward
+    lean = slopes - slopes.mean()
+    centre = origins.mean(axis=0)
+
+    def heights() -> Array:
+        arms = origins - centre
+        return arms @ across - slopes * (arms @ axis)
+
+    if np.ptp(slopes) > PARALLEL:
+        for _ in range(2):  # the second time from near the spot: differences of small numbers lose nothing
+            y = heights()
+            # var(y + s slope) is least at s = −cov(y, slope)/var(slope)
+            centre = centre + across * y.mean() - axis * (y @ lean / (lean @ lean))
+    y = heights()
+    return centre + across * y.mean(), y - y.mean()
+
+
+# Of a scene ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Group:
+    """Rays of a colour and beam that met a boundary and escaped, by their partial reflections, as bits."""
+
+    colour: str
+    beam: int
+    reflect: int
+    spread: Spread
+
+
+def groups(scene: PlanarScene, traced: Sequence[Branches]) -> list[Group]:
+    """By colour, beam and partial reflections. Rays from different sides of a shape are in one group all the same."""
+    return [
+        Group(colour, beam, reflect, _of_group(scene, branches, np.flatnonzero(inside)))
+        for colour, branches in zip(scene.colours, traced, strict=True)
+        for beam in range(int(scene.beams.max()) + 1)
+        for reflect in np.unique(branches.reflect).tolist()
+        if (inside := _members(scene, branches, beam, reflect)).any()
+    ]
+
+
+def _members(scene: PlanarScene, branches: Branches, beam: int, reflect: int) -> NDArray[np.bool_]:
+    escaped = (branches.end == Event.ESCAPED) & (branches.last > 0)
+    return escaped & (scene.beams[branches.rays] == beam) & (branches.reflect == reflect)
+
+
+def _of_group(scene: PlanarScene, branches: Branches, members: NDArray[np.intp]) -> Spread:
+    origins, directions = branches.tips[members], branches.paths.directions[members]
+    directions = directions / np.hypot(*directions.T)[:, None]  # float32 is not unit to the last bit
+    found = spread(origins, directions)
+    pairs = list(_pairs(scene, branches.rays[members], directions))
+    if not pairs:
+        return found
+    outer, inner = (crossing(origins[i], directions[i], origins[j], directions[j]) for i, j in (pairs[0], pairs[-1]))
+    return replace(found, marginal=outer, paraxial=inner)
+
+
+def _pairs(scene: PlanarScene, rays: NDArray[np.intp], directions: Array) -> Iterator[tuple[int, int]]:
+    """Mirror images, from the outermost inward: as many rays from either end of the beam, and deflected oppositely."""
+    beam = np.flatnonzero(scene.beams == scene.beams[rays[0]])
+    known = {ray: i for i, ray in enumerate(rays.tolist())}
+    deflection = _cross(scene.directions[rays], directions)
+    for one, other in zip(beam[: len(beam) // 2].tolist(), beam[::-1].tolist(), strict=False):
+        if one in known and other in known:
+            i, j = known[one], known[other]
+            if abs(deflection[i] + deflection[j]) < SYMMETRIC:
+                yield i, j
+
+
+def table(found: Sequence[Group]) -> str:
+    """One line per group."""
+    heads = ("colour", "beam", "reflected at", "rays", "focus", "spot at", "rms", "largest", "marginal", "paraxial")
+    lines = [heads, *(_cells(group) for group in found)]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(heads))]
+    return "\n".join("  ".join(f"{c:{w}}" for c, w in zip(line, widths, strict=True)).rstrip() for line in lines)
+
+
+def _cells(group: Group) -> tuple[str, ...]:
+    s = group.spread
+    bits = ", ".join(str(j) for j in range(REFLECT_BITS) if group.reflect >> j & 1)
+    names = group.colour or "–", str(group.beam), bits or "–", str(s.rays)
+    focus = _text(s.focus) + (" (virtual)" if s.virtual else "")
+    return *names, focus, _text(s.spot), _text(s.rms), _text(s.largest), _text(s.marginal), _text(s.paraxial)
+
+
+def _text(value: Point | float | None) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, tuple):  # a coordinate that is 0 but for roundoff is 0
+        return ", ".join(_text(x if abs(x) > 1e-12 * max(map(abs, value)) else 0.0) for x in value)
+    return f"{value:.6g}"
+
+
+def _turned(v: Array) -> Array:
+    return np.stack([-v[..., 1], v[..., 0]], axis=-1)
+
+
+def _cross(a: Array, b: Array) -> Any:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _point(p: Array | None) -> Point | None:
+    return None if p is None else (float(p[0]), float(p[1]))

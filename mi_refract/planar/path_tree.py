@@ -1,0 +1,210 @@
+"""What becomes of the rays of a planar scene: the tree of paths into which partial reflections split each of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .path_loop import REFLECT_BITS
+from .scene_file import PlanarScene
+from .tracer import Array, Event, Paths, Segments, Tracer
+
+LEAST = 1e-3  # of a ray's power: a partial reflection that would carry no more is not followed
+MOST = 2**25  # legs of paths with as many partial reflections: 1.3 GB
+
+
+@dataclass(frozen=True)
+class Branches:
+    """P paths of N rays, by their number of partial reflections. `paths` has their weights.
+
+    `rays` P: the ray's number. `reflect` P: bit j is set where the path takes the partial reflection at the j-th
+    boundary it meets; no two paths of a ray have the same bits.
+    """
+
+    paths: Paths
+    rays: NDArray[np.intp]
+    reflect: NDArray[np.uint32]
+
+    @property
+    def weights(self) -> Array:
+        """P × (D+1), as in `paths`."""
+        assert self.paths.weights is not None
+        return self.paths.weights
+
+    @property
+    def first(self) -> NDArray[np.intp]:
+        """P: the first leg that is the path's own. The ones before it belong to another path of the same ray."""
+        return np.frexp(self.reflect.astype(float))[1].astype(np.intp)
+
+    @property
+    def own(self) -> NDArray[np.bool_]:
+        """P × (D+1): whether a leg, and the event at its end, is there and is the path's own."""
+        events = self.paths.events
+        return (events != Event.NONE) & (np.arange(events.shape[1]) >= self.first[:, None])
+
+    @property
+    def last(self) -> NDArray[np.intp]:
+        """P: the number of the last leg."""
+        return np.count_nonzero(self.paths.events, axis=1) - 1
+
+    @property
+    def end(self) -> NDArray[np.uint8]:
+        """P: the event that ended the path."""
+        return self.paths.events[np.arange(len(self.rays)), self.last]
+
+    @property
+    def tips(self) -> Array:
+        """P × 2: the last place where the path met a boundary, or its origin."""
+        places = np.isfinite(self.paths.points[..., 0]).sum(axis=1)
+        return self.paths.points[np.arange(len(self.rays)), places - 1]
+
+
+def follow(
+    segments: Segments,
+    origins: Array,
+    directions: Array,
+    max_depth: int,
+    branches: int = 0,
+    *,
+    least: float = LEAST,
+    **how: Any,
+) -> Branches:
+    """Paths with up to `branches` partial reflections, of a share of more than `least` of the power each.
+
+    `how`: formula, precision, backend, as for `planar.trace`. A path reflects in part at its first 32 boundaries only.
+    ValueError as there, for a negative number of branches, and for more paths than memory should hold.
+    """
+    if branches < 0:
+        raise ValueError(f"branches = {branches}: accepted: a whole number from 0")
+    trace = Tracer(segments, **how)
+    rays, reflect = np.arange(len(origins)), np.zeros(len(origins), np.uint32)
+    orders: list[Branches] = []
+    while True:
+        _check_size(rays.size, max_depth, len(orders))
+        paths = trace(origins[rays], directions[rays], max_depth, reflect=reflect, weights=True)
+        orders.append(Branches(paths, rays, reflect))
+        parent, boundary = np.nonzero(_worth(orders[-1], least))
+        if len(orders) > branches or not parent.size:
+            return _joined(orders)
+        rays, reflect = rays[parent], reflect[parent] | (np.uint32(1) << boundary.astype(np.uint32))
+
+
+def _check_size(paths: int, max_depth: int, reflections: int) -> None:
+    if paths * (max_depth + 1) > MOST:
+        size = f"{paths} paths of up to {max_depth} boundaries with {reflections} partial reflections"
+        raise ValueError(f"{size}; accepted: fewer rays, branches or boundaries, {MOST} legs altogether")
+
+
+def follow_scene(scene: PlanarScene, **how: Any) -> tuple[Branches, ...]:
+    """The paths of a scene, for each of its colours; see `follow`."""
+    rays = scene.origins, scene.directions, scene.max_depth, scene.branches
+    return tuple(follow(segments, *rays, **how) for segments in scene.segments)
+
+
+def with_rays(scene: PlanarScene, count: int) -> PlanarScene:
+    """Every beam of several rays with `count` of them, at places and angles between those that it has.
+
+    ValueError for more than `follow` takes.
+    """
+    sizes = np.bincount(scene.beams)
+    _check_size(int(np.where(sizes > 1, count, sizes).sum()), scene.max_depth, 0)
+    parts = []
+    for beam in np.unique(scene.beams):
+        origins, directions = scene.origins[scene.beams == beam], scene.directions[scene.beams == beam]
+        have = np.arange(len(origins))
+        want = np.linspace(0, have[-1], count) if len(have) > 1 else have
+        angle = np.interp(want, have, np.unwrap(np.arctan2(directions[:, 1], directions[:, 0])))
+        places = np.column_stack([np.interp(want, have, x) for x in origins.T])
+        parts.append((places, np.column_stack([np.cos(angle), np.sin(angle)]), np.full(len(want), beam)))
+    origins, directions, beams = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return replace(scene, origins=origins, directions=directions, beams=beams)
+
+
+def _worth(branches: Branches, least: float) -> NDArray[np.bool_]:
+    """P × D: whether the path refracts at that boundary of its own and reflects more than `least` there."""
+    weights = branches.weights
+    refracted = branches.own[:, :-1] & (branches.paths.events[:, :-1] == Event.REFRACTED)
+    refracted[:, REFLECT_BITS:] = False
+    with np.errstate(invalid="ignore"):
+        return refracted & (weights[:, :-1] - weights[:, 1:] > least)
+
+
+def _joined(orders: Sequence[Branches]) -> Branches:
+    if len(orders) == 1:
+        return orders[0]
+    columns = {f.name: np.concatenate([getattr(o.paths, f.name) for o in orders]) for f in fields(Paths)}
+    rays, reflect = (np.concatenate([getattr(o, name) for o in orders]) for name in ("rays", "reflect"))
+    return Branches(Paths(**columns), rays, reflect)
+
+
+# In words and numbers --------------------------------------------------------------------------------------------
+
+
+def count(traced: Sequence[Branches]) -> Counter[str]:
+    """Events by name, each once though it be on several paths; REFLECTED are those that leave no choice."""
+    total: Counter[str] = Counter()
+    for branches in traced:
+        events = branches.paths.events[branches.own]
+        total.update({event.name: int(np.count_nonzero(events == event)) for event in Event})
+    return total
+
+
+def summary(scene: PlanarScene, traced: Sequence[Branches]) -> str:
+    """One line: how many rays, and what became of them; what did not happen is left out."""
+    n = count(traced)
+    rays, paths = len(scene.origins), sum(len(branches.rays) for branches in traced)
+    colours = f" in {len(traced)} colours" if len(traced) > 1 else ""
+    split = [f"{paths} paths"] if paths > rays * len(traced) else []
+    happened = {
+        "reflected totally": n["REFLECTED"],
+        "escaped": n["ESCAPED"],
+        "exhausted": n["EXHAUSTED"],
+        "contradicted": n["CONTRADICTED"],
+    }
+    hits = _plural(n["REFRACTED"] + n["REFLECTED"] + n["CONTRADICTED"], "hit")
+    said = [f"{number} {what}" for what, number in happened.items() if number]
+    return ", ".join([_plural(rays, "ray") + colours, *split, hits, *said])
+
+
+def _plural(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def as_data(scene: PlanarScene, traced: Sequence[Branches]) -> dict[str, Any]:
+    """What `mi-refract trace --json` prints: per colour the paths, each as long as it is; null for what is unknown."""
+    colours = zip(scene.colours, traced, strict=True)
+    return {
+        "scene": str(scene.path),
+        "title": scene.title,
+        "max_depth": scene.max_depth,
+        "branches": scene.branches,
+        "counts": {name.lower(): number for name, number in count(traced).items() if name != "NONE"},
+        "colours": [{"colour": colour or None, "paths": list(_paths(scene, b))} for colour, b in colours],
+    }
+
+
+def _paths(scene: PlanarScene, branches: Branches) -> Iterator[dict[str, Any]]:
+    paths, weights, indices = branches.paths, branches.weights, branches.paths.indices
+    assert indices is not None
+    for i, last in enumerate(branches.last):
+        ray, points = int(branches.rays[i]), paths.points[i]
+        yield {
+            "ray": ray,
+            "beam": int(scene.beams[ray]),
+            "reflect": int(branches.reflect[i]),
+            "points": points[np.isfinite(points[:, 0])].tolist(),
+            "direction": paths.directions[i].tolist(),
+            "hits": paths.hits[i, paths.hits[i] >= 0].tolist(),
+            "events": [Event(event).name.lower() for event in paths.events[i, : last + 1]],
+            "indices": _nullable(indices[i, : last + 1]),
+            "weights": _nullable(weights[i, : last + 1]),
+        }
+
+
+def _nullable(numbers: Array) -> list[float | None]:
+    return [x if np.isfinite(x) else None for x in numbers.tolist()]

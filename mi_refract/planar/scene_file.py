@@ -1,0 +1,164 @@
+"""Planar scenes in TOML files: shapes, the media between them, and the rays to follow."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_refract.io.toml_schema import per_colour, read, read_kind, shown
+
+from .curves import affine
+from .scene_schema import BEAMS, SCENE, SHAPES, Indices, Part
+from .shared_boundaries import Named, boundaries
+from .tracer import Array, Segments
+
+
+@dataclass(frozen=True)
+class Region:
+    """A closed outline (K × 2, counter-clockwise, arcs sampled finely enough to look smooth) and the index inside."""
+
+    outline: Array
+    indices: tuple[float, ...]  # one per colour
+
+
+@dataclass(frozen=True)
+class PlanarScene:
+    """What a scene file says, ready for `planar.trace` (once per colour) and for a picture.
+
+    `colours`: one entry per wavelength, matplotlib's names of colours; ("",) where there is no dispersion.
+    `segments`: one per colour, the same geometry with other indices. `regions`: in drawing order, inner ones later.
+    `index`: of the medium around everything, per colour. `origins`, `directions`: N × 2, directions of length 1;
+    `beams`: N, the number of the `[[beam]]` (from 0) that a ray belongs to. `branches`: the most partial reflections
+    on a path; 0: refracted wherever possible. `view`: x0, x1, y0, y1; None: whatever holds the shapes.
+    """
+
+    path: Path
+    title: str
+    colours: tuple[str, ...]
+    segments: tuple[Segments, ...]
+    regions: tuple[Region, ...]
+    index: tuple[float, ...]
+    origins: Array
+    directions: Array
+    beams: NDArray[np.intp]
+    max_depth: int
+    branches: int
+    view: tuple[float, float, float, float] | None
+
+
+def load(path: str | Path) -> PlanarScene:
+    """Read a scene file. Shapes and beams count from 0 in its errors.
+
+    ValueError, one line with file and key, for what it cannot be; OSError as the system raises it.
+    """
+    path = Path(path)
+    content = path.read_bytes()
+    try:
+        return _scene(path, _parsed(content))
+    except ValueError as error:
+        raise ValueError(" ".join(f"{path}: {error}".split())) from None
+
+
+def _parsed(content: bytes) -> dict[str, Any]:
+    try:
+        return tomllib.loads(content.decode())
+    except UnicodeDecodeError as error:
+        raise ValueError(f"byte {error.start} is no UTF-8; accepted: TOML") from None
+    except RecursionError:
+        raise ValueError("brackets nested too deeply; accepted: TOML") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{error}; accepted: TOML") from None
+
+
+def _scene(path: Path, table: dict[str, Any]) -> PlanarScene:
+    values = read(table, SCENE)
+    colours = tuple(values["colours"] or ("",))
+    values = per_colour(values, SCENE, "", len(colours))
+    parts = _parts(values["shape"], values["index"], len(colours))
+    origins, directions, beams = _rays(values["beam"])
+    regions = tuple(Region(part.curve.outline(), part.left) for _, part in parts if part.curve.closed)
+    return PlanarScene(
+        path,
+        values["title"] or path.stem,
+        colours,
+        boundaries(parts),
+        regions,
+        values["index"],
+        origins,
+        directions,
+        beams,
+        values["max_depth"],
+        values["branches"],
+        tuple(values["view"]) if values["view"] else None,
+    )
+
+
+FARTHEST = 1e100  # of all coordinates: products of two stay numbers
+
+
+def _parts(tables: list[dict[str, Any]], ambient: Indices, colours: int) -> list[Named]:
+    """The shapes' parts in their places."""
+    parts: list[Named] = []
+    media: dict[str, Indices] = {}
+    for j, table in enumerate(tables):
+        where = f"shape[{j}]"
+        kind, values = read_kind(table, SHAPES, f"{where}.", colours)
+        values["outside"] = _outside(values, media, where) or ambient
+        if values.get("name") in media:
+            raise ValueError(f"{where}.name: {shown(values['name'])} is another shape's; accepted: a new one")
+        if values.get("name"):
+            media[values["name"]] = values["n"]
+        try:
+            with np.errstate(all="ignore"):
+                placed = _placed(kind.build(values), values)
+        except ValueError as error:
+            raise ValueError(f"{where}.{error}") from None
+        for part in placed:
+            _check_range(where, part.curve.vertices, part.curve.control)
+            parts.append((where, part))
+    return parts
+
+
+def _outside(values: dict[str, Any], media: dict[str, Indices], where: str) -> Indices | None:
+    name = values.get("within")
+    if name is None:
+        return values.get("outside")
+    if values["outside"]:
+        raise ValueError(f"{where}.within: {shown(name)}, beside `outside`; accepted: one of them")
+    if name not in media:
+        known = ", ".join(map(shown, media)) or "none so far"
+        raise ValueError(f"{where}.within: {shown(name)}; accepted: the name of a shape above: {known}")
+    return media[name]
+
+
+def _placed(parts: list[Part], values: dict[str, Any]) -> list[Part]:
+    matrix, facets = affine(values["rotate"], values["scale"]), values.get("facets")
+    placed = []
+    for part in parts:
+        curve = part.curve.faceted(facets) if facets else part.curve
+        curve = curve.mapped(matrix, values["at"])
+        placed.append(part._replace(curve=curve))
+    return placed
+
+
+def _check_range(where: str, *points: Array) -> None:
+    if not all(np.abs(p).max() <= FARTHEST for p in points):
+        raise ValueError(f"{where}: coordinates beyond {FARTHEST:g}; accepted: up to that")
+
+
+def _rays(tables: list[dict[str, Any]]) -> tuple[Array, Array, NDArray[np.intp]]:
+    rays = []
+    for j, table in enumerate(tables):
+        kind, values = read_kind(table, BEAMS, f"beam[{j}].", 1)
+        try:
+            rays.append(kind.build(values))
+        except ValueError as error:
+            raise ValueError(f"beam[{j}].{error}") from None
+        _check_range(f"beam[{j}]", rays[-1][0])
+    beams = np.repeat(np.arange(len(rays)), [len(origins) for origins, _ in rays])
+    return np.concatenate([o for o, _ in rays]), np.concatenate([d for _, d in rays]), beams

@@ -1,0 +1,226 @@
+"""Shapes in the plane by their usual parameters: polygons, circles, ellipses, prisms, and lenses of conic surfaces.
+
+Each is a `Curve` around its own origin; `mapped` stretches, turns and moves it. Lengths are above 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from .curves import Curve, affine, area, joined, polygonal, unit
+from .tracer import Array
+
+# 1 − (1 + K) c² r² within so much of 0 is 0: the rim of a half sphere, whose curvature is a rounded 1/R.
+FLAT = 8 * 2.0**-53
+
+
+def polyline(points: Any, arcs: Sequence[float] | None = None) -> Curve:
+    """From point to point (K × 2). `arcs`: degrees by which each piece turns left, a circle's arc; 0: straight.
+
+    ValueError for fewer than 2 points, another number of pieces, or |degrees| ≥ 360.
+    """
+    return _chain(points, arcs, closed=False)
+
+
+def polygon(points: Any, arcs: Sequence[float] | None = None) -> Curve:
+    """The same, closed by one more piece from the last point to the first; turned counter-clockwise where it is not.
+
+    ValueError as for `polyline`, and for a polygon without area. Whether it crosses itself is not looked at.
+    """
+    curve = _chain(points, arcs, closed=True)
+    size = area(curve)
+    if abs(size) <= 1e-12 * np.ptp(curve.vertices, 0).max() ** 2:
+        raise ValueError("points: they enclose no area; accepted: three that are not on a line, or an arc")
+    return curve if size > 0 else curve.reversed()
+
+
+def _chain(points: Any, arcs: Sequence[float] | None, closed: bool) -> Curve:
+    corners = np.array(points, float).reshape(-1, 2)
+    pieces = len(corners) - (not closed)
+    turns = [0.0] * pieces if arcs is None else [float(turn) for turn in arcs]
+    if len(corners) < 2:
+        raise ValueError(f"points: {len(corners)}; accepted: at least 2")
+    if len(turns) != pieces or not all(abs(turn) < 360 for turn in turns):
+        raise ValueError(f"arcs: {len(turns)} for {pieces} pieces; accepted: one a piece, above -360 and below 360")
+    if not any(turns):
+        return polygonal(corners, closed)
+    vertices, control, weight = [corners[0]], [], []
+    for p, q, turn in zip(corners, np.roll(corners, -1, 0), turns, strict=False):
+        for end, middle, w in _arc(p, q, turn):
+            vertices.append(end)
+            control.append(middle)
+            weight.append(w)
+    return Curve(np.array(vertices[: len(vertices) - closed]), np.array(control), np.array(weight), closed)
+
+
+def _arc(p: Array, q: Array, turn: float) -> Iterable[tuple[Array, Array, float]]:
+    """End, control and weight of the pieces of a circle's arc from p to q that turns left by `turn` degrees.
+
+    It passes its chord at tan(turn/4)/2 of the chord's length on the right; the tangents meet at tan(turn/2)/2.
+    """
+    middle, aside = (p + q) / 2, np.array([q[1] - p[1], p[0] - q[0]]) / 2
+    if abs(turn) <= 90:
+        cosine, sine = unit(turn / 2)
+        return [(q, middle + sine / cosine * aside, cosine)]
+    cosine, sine = unit(turn / 4)
+    between = middle + sine / cosine * aside
+    return [*_arc(p, between, turn / 2), *_arc(between, q, turn / 2)]
+
+
+def ellipse(rx: float, ry: float) -> Curve:
+    """Around the origin, with these half axes along x and y: four arcs whose vertices and controls are exact."""
+    vertices = np.array([(rx, 0.0), (0.0, ry), (-rx, 0.0), (0.0, -ry)])
+    control = np.array([(rx, ry), (-rx, ry), (-rx, -ry), (rx, -ry)], float)
+    return Curve(vertices, control, np.full(4, math.sqrt(0.5)), closed=True)
+
+
+def circle(radius: float) -> Curve:
+    """Around the origin."""
+    return ellipse(radius, radius)
+
+
+def rectangle(width: float, height: float) -> Curve:
+    """Around the origin."""
+    x, y = width / 2, height / 2
+    return polygon([(-x, -y), (x, -y), (x, y), (-x, y)])
+
+
+def prism(apex: float, side: float) -> Curve:
+    """A triangle with its apex up, of `apex` degrees between two sides of length `side`; centroid at the origin."""
+    cosine, sine = unit(apex / 2)
+    x, y = side * sine, side * cosine / 3
+    return polygon([(-x, -y), (x, -y), (0.0, 2 * y)])
+
+
+# Conic surfaces ---------------------------------------------------------------------------------------------------
+
+
+def sag(r: Any, curvature: float, conic: float = 0.0) -> Any:
+    """z = c r² / (1 + √(1 − (1 + K) c² r²)); NaN where the surface does not reach."""
+    r = np.asarray(r, float)
+    square = 1 - (1 + conic) * (curvature * r) ** 2
+    square = np.where(np.abs(square) <= FLAT, 0.0, square)
+    return curvature * r * r / (1 + np.sqrt(np.where(square < 0, np.nan, square)))
+
+
+def _surface(vertex: float, rim: float, radius: float, curvature: float, conic: float) -> Curve:
+    """The conic surface from (rim, radius) over (vertex, 0) to (rim, −radius), in two arcs.
+
+    With q = 1 − (1 + K) c z at the rim, which is the root in the sag, the tangents of either arc meet at
+    (vertex, ±radius/(1 + q)), and w² = (1 + q)/2: for every K, and c = 0, where the arcs are straight.
+    """
+    q = 1 - (1 + conic) * curvature * (rim - vertex)
+    meeting = radius / (1 + q)
+    vertices = np.array([(rim, radius), (vertex, 0.0), (rim, -radius)])
+    return Curve(vertices, np.array([(vertex, meeting), (vertex, -meeting)]), np.full(2, math.sqrt((1 + q) / 2)), False)
+
+
+def lens(
+    curvature: Sequence[float],
+    thickness: float,
+    *,
+    radius: float | None = None,
+    conic: Sequence[float] = (0.0, 0.0),
+    vertex: float = 0.0,
+) -> Curve:
+    """Two conic surfaces on the x axis, `curvature` and conic constant of each, with a rim at ±`radius`.
+
+    Curvatures are positive where the centre lies toward +x. The front surface passes through (`vertex`, 0), the
+    other through (`vertex` + `thickness`, 0). Without a radius the lens ends in the tips in which they meet.
+    ValueError where a surface does not reach the rim, or they meet before it, or never.
+    """
+    if radius is None:
+        rim, radius = _tip(curvature, thickness, conic)
+        rims = [vertex + rim] * 2
+    else:
+        depths = [float(sag(radius, c, k)) for c, k in zip(curvature, conic, strict=True)]
+        rims = [vertex + depths[0], vertex + thickness + depths[1]]
+    if math.isnan(rims[0] + rims[1]):
+        ends = (1 / (abs(c) * math.sqrt(1 + k)) for c, k in zip(curvature, conic, strict=True) if c and k > -1)
+        raise ValueError(f"radius = {radius:g}: a surface ends before; accepted: at most {min(ends, default=0):g}")
+    if rims[1] < rims[0]:
+        meet = _tip(curvature, thickness, conic)[1]
+        raise ValueError(f"radius = {radius:g}: the surfaces meet before; accepted: at most {meet:g}, or no radius")
+    front = _surface(vertex, rims[0], radius, curvature[0], conic[0])
+    back = _surface(vertex + thickness, rims[1], radius, curvature[1], conic[1])
+    return joined(front, back.reversed())
+
+
+def _tip(curvature: Sequence[float], thickness: float, conic: Sequence[float]) -> tuple[float, float]:
+    """(z, r) of the nearest point off the axis in which the surfaces meet; ValueError where they never do.
+
+    Both obey c r² = 2 z − c (1 + K) z², the other one with z − thickness for z. Without r² that is a quadratic in z.
+    """
+    (c1, c2), (k1, k2), t = curvature, (1 + k for k in conic), thickness
+    if c1 == -c2 and k1 == k2 and c1:
+        places = [t / 2]
+    else:
+        terms = [c1 * c2 * (k2 - k1), 2 * (c2 - c1 - c1 * c2 * k2 * t), 2 * c1 * t + c1 * c2 * k2 * t * t]
+        places = [float(z.real) for z in np.roots(terms) if z.imag == 0] if np.isfinite(terms).all() else []
+    tips = []
+    for z in places:
+        c, k, depth = (c1, k1, z) if abs(c1) >= abs(c2) else (c2, k2, z - t)
+        square = 2 * depth / c - k * depth * depth if c else 0.0
+        # On the near half of either conic only: the sag knows no other.
+        if square > 0 and 1 - c1 * k1 * z >= -FLAT and 1 - c2 * k2 * (z - t) >= -FLAT:
+            tips.append((math.sqrt(square), z))
+    if not tips:
+        raise ValueError(f"curvature = {list(curvature)}: the surfaces never meet; accepted: only with a radius")
+    radius, z = min(tips)
+    return z, radius
+
+
+def ellipse_lens(n: float, focal_length: float, thickness: float, radius: float) -> Curve:
+    """A lens that focuses rays along +x exactly into the origin; n = n_inside / n_outside > 1.
+
+    Its front is an ellipse of eccentricity 1/n whose far focus is the origin, its back a circle around that, which
+    the rays meet at right angles. ValueError for n ≤ 1, a thickness not below the focal length, and as for `lens`.
+    """
+    if not n > 1 or not 0 < thickness < focal_length:
+        raise ValueError(f"n = {n:g}, thickness = {thickness:g}; accepted: n > 1, 0 < thickness < {focal_length:g}")
+    eccentricity = 1 / n
+    curvature = 1 / (focal_length * (1 - eccentricity)), 1 / (focal_length - thickness)
+    return lens(curvature, thickness, radius=radius, conic=(-(eccentricity**2), 0.0), vertex=-focal_length)
+
+
+# Document 004's lens, in its own coordinates but for the place: its axis is y, its tips lie on x.
+LENS_INDEX = 4.4
+LENS_CURVATURE, LENS_HALF_WIDTH, LENS_CONIC, LENS_STRETCH = -0.04, 8.2, 1.9, 4.0
+
+
+def document_lens(resolution: float | None = None) -> Curve:
+    """The lens of document 004: y = ±(k + sag(r)) with k = 8.2, c = −0.04, K = 1.9 and x = 4 r, around the origin.
+
+    The original draws chords at r = 0, `resolution`, … (0.05 there: 1172 of them) and leaves it open at the tips.
+    Here its last vertices are the tips, where the width is 0. Without a resolution: four exact arcs.
+    ValueError for a resolution that is not above 0.
+    """
+    if resolution is not None and not resolution > 0:
+        raise ValueError(f"resolution = {resolution}; accepted: above 0")
+    c, k, conic = LENS_CURVATURE, LENS_HALF_WIDTH, LENS_CONIC
+    whole = lens((-c, c), 2 * k, conic=(conic, conic), vertex=-k)
+    whole = whole.mapped(affine(90, (1.0, LENS_STRETCH)))
+    if resolution is None:
+        return whole
+    tip = float(np.abs(whole.vertices[:, 0]).max()) / LENS_STRETCH
+    # Summed up as the original sums them.
+    r = np.cumsum([0.0, *[resolution] * math.ceil(tip / resolution)])
+    r = r[r < tip][:-1]
+    x, y = np.append(LENS_STRETCH * r, LENS_STRETCH * tip), np.append(k + sag(r, c, conic), 0.0)
+    quarter = np.stack([x, y], 1)[::-1]
+    quarters = [quarter * sign for sign in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
+    vertices = [q[:-1] if j % 2 == 0 else q[::-1][:-1] for j, q in enumerate(quarters)]
+    return polygonal(np.concatenate(vertices) + 0.0, closed=True)
+
+
+def luneburg(radius: float, layers: int) -> list[tuple[Curve, float]]:
+    """Concentric circles, the largest first, and the index inside each over that outside of all.
+
+    n(r) = √(2 − (r/R)²) in steps of equal n², each layer with the value in the middle of its n².
+    """
+    circles = [circle(radius * math.sqrt(1 - j / layers)) for j in range(layers)]
+    return [(curve, math.sqrt(1 + (j + 0.5) / layers)) for j, curve in enumerate(circles)]

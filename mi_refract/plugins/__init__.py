@@ -1,0 +1,1 @@
+"""The Mitsuba plugins: the BSDF `refract` and the integrator `refract_path`."""

@@ -1,0 +1,316 @@
+"""The paths of `refract_path`, a lane each: a loop over vertices, and a stack of what is left for later.
+
+A plugin belongs to one variant, so everything here is given that variant's module, `v`. Paths go depth first: of a pair
+of delta lobes one is followed and the other put aside, and where a path ends the last one put aside is taken up. So a
+lane has no more on its stack than levels are split, however many paths it follows.
+"""
+
+from __future__ import annotations
+
+import operator
+from dataclasses import dataclass, make_dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .emitter_sampling import Everything, Lamps
+from .keyed_sampler import ONE
+
+# Samples near either end of the unit interval pick the one lobe and the other. What has less power is not followed.
+FIRST, LAST = 2.0**-25, ONE
+LOBES = mi.BSDFFlags
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is traced: of what the scene needs, what the parameters leave."""
+
+    max_depth: int
+    rr_depth: int
+    hide_emitters: bool
+    split_depth: int
+    split_weight: float
+    deterministic: bool
+    emitter_sampling: bool
+    lamps_only: bool  # of what is sampled: not a constant environment
+    area: bool
+    environment: bool
+    first_number: bool  # of a BSDF sample, beside the other two
+    second_number: bool  # those two: delta lobes need none
+    all_of_hit: bool  # or only its shading frame
+
+    @property
+    def roulette(self) -> bool:
+        return self.rr_depth < self.max_depth and not self.deterministic
+
+    @property
+    def once(self) -> bool:
+        """Whether the environment is looked up once, after the loop: a lane has one path only."""
+        return self.environment and not self.split_depth
+
+
+@dataclass
+class State:
+    """Of a lane. None is what the plan leaves out."""
+
+    ray: Any
+    throughput: Any
+    result: Any
+    depth: Any
+    active: Any
+    valid: Any
+    sampler: Any
+    eta: Any
+    escaped: Any = None
+    previous: Any = None  # of the vertex before: the interaction, and the density and the kind of its sample
+    pdf: Any = None
+    delta: Any = None
+    seen: Any = None  # from the camera by delta lobes only: it splits no farther than that
+    share: Any = None  # of the light of the pixel: the product of the powers of the lobes that were split
+    node: Any = None  # the lobes taken so far
+    waiting: Any = None  # branches on the stack
+    stack: Any = None
+    truncated: Any = None
+
+
+def branch_class(v: Any) -> type:
+    """What is left of a path for later; it starts at a delta lobe. A type, as local memory is told what it holds."""
+    fields = {
+        "o": v.Point3f, "d": v.Vector3f, "throughput": v.Spectrum, "depth": v.UInt32, "eta": v.Float, "share": v.Float,
+        "node": v.UInt32,
+    }  # fmt: skip
+    return make_dataclass("Branch", fields.items())
+
+
+class Pile:
+    """`dr.alloc_local` for scalar variants, which have no local memory."""
+
+    def __init__(self) -> None:
+        self.branches: list[Any] = []
+
+    def write(self, branch: Any, index: int, active: bool) -> None:
+        self.branches[index:] = [branch]
+
+    def read(self, index: int, active: bool) -> Any:
+        return self.branches[index]
+
+
+def power_heuristic(a: Any, b: Any) -> Any:
+    """Of the technique with density `a` beside that with `b`; 0 where neither has any."""
+    a, b = dr.square(a), dr.square(b)
+    some = (a + b > 0) & dr.isfinite(a)
+    return dr.select(some, a / dr.select(some, a + b, 1), 0)
+
+
+class Trace:
+    """One call of `sample`. In scalar variants a pointer may be None; elsewhere its lanes are masked."""
+
+    def __init__(self, v: Any, scene: Any, plan: Plan, numbers: Any) -> None:
+        self.v, self.scene, self.plan, self.numbers = v, scene, plan, numbers
+        self.vectorised, self.branch, self.context = dr.is_jit_v(v.Float), branch_class(v), mi.BSDFContext()
+        self.emitters = (Lamps if plan.lamps_only else Everything)(v, scene)
+        self.flags = +(mi.RayFlags.All if plan.all_of_hit else mi.RayFlags.ShadingFrame)
+
+    def run(self, ray: Any, sampler: Any, active: Any) -> State:
+        if self.plan.hide_emitters and self.plan.area:
+            ray = self._past_emitters(ray, active)
+        start = self._start(ray, sampler, active)
+        (end,) = dr.while_loop((start,), lambda s: s.active, self._step, label="refract_path")
+        if self.plan.once:
+            self._add_environment(end)
+        return end
+
+    def _start(self, ray: Any, sampler: Any, active: Any) -> State:
+        v, plan = self.v, self.plan
+        valid = v.Bool(plan.environment and not plan.hide_emitters)
+        s = State(ray, v.Spectrum(1), v.Spectrum(0), v.UInt32(0), active, valid, sampler, v.Float(1))
+        if plan.once:
+            s.escaped = v.Bool(False)
+        if plan.emitter_sampling:
+            s.previous, s.pdf, s.delta = dr.zeros(v.Interaction3f), v.Float(1), v.Bool(True)
+        if plan.split_depth:
+            s.share, s.node, s.waiting, s.seen = v.Float(1), v.UInt32(1), v.UInt32(0), v.Bool(True)
+            s.stack = dr.alloc_local(self.branch, plan.split_depth) if self.vectorised else Pile()
+        if plan.deterministic:
+            s.truncated = v.Float(0)
+        return s
+
+    def _past_emitters(self, ray: Any, active: Any) -> Any:
+        """The ray from behind the area lights that it meets first."""
+
+        def step(ray: Any, active: Any) -> tuple[Any, Any]:
+            si = self.scene.ray_intersect(ray, +mi.RayFlags.Minimal, True, active)
+            if self.vectorised or si.is_valid():
+                active = active & si.is_valid() & operator.ne(si.shape.emitter(), None)
+            else:
+                active = False
+            ray.o = dr.select(active, si.spawn_ray(ray.d).o, ray.o)
+            return ray, active
+
+        return dr.while_loop((self.v.Ray3f(ray), active), lambda _, active: active, step)[0]
+
+    # One vertex ----------------------------------------------------------------------------------------------------
+
+    def _step(self, s: State) -> tuple[State]:
+        si = self.scene.ray_intersect(s.ray, self.flags, s.depth == 0)
+        hit = si.is_valid()
+        self._add_emission(s, si, hit)
+        onward = hit & (s.depth + 1 < self.plan.max_depth)
+        if self.plan.deterministic:
+            self._truncate(s, hit & (onward ^ True), 1)
+        if self.vectorised or onward:
+            onward = self._scatter(s, si, si.bsdf(), hit, onward)
+        else:
+            s.valid = s.valid or hit
+        if self.plan.split_depth:
+            onward = self._resume(s, onward)
+        s.active = onward
+        return (s,)
+
+    def _scatter(self, s: State, si: Any, bsdf: Any, hit: Any, onward: Any) -> Any:
+        """Emitter sampling, the next ray, and whether there is one."""
+        plan = self.plan
+        key = (s.node * 0x9E3779B9 + s.depth) * 4 if plan.split_depth else 0
+        if plan.emitter_sampling:
+            self._add_direct(s, si, bsdf, onward, key)
+        first = self.numbers.one(s.sampler, key + 1) if plan.first_number else None
+        second = self.numbers.two(s.sampler, key + 2) if plan.second_number else self.v.Point2f(0.5)
+        first = second.x if first is None else first
+        bs, weight = bsdf.sample(self.context, si, first, second, onward)
+        ray, throughput = self._next(s, si, bs, weight)
+        s.valid = s.valid | (hit & (mi.has_flag(bs.sampled_type, LOBES.Null) ^ True))
+        s.depth = s.depth + 1
+        if plan.split_depth:
+            throughput = self._split(s, si, bsdf, bs, second, throughput, onward)
+        s.eta = s.eta * bs.eta
+        # A ray that left the scene keeps all that the environment asks for.
+        s.ray, s.throughput = dr.select(hit, ray, s.ray), dr.select(hit, throughput, s.throughput)
+        if plan.emitter_sampling:
+            s.previous, s.pdf = dr.select(hit, self.v.Interaction3f(si), s.previous), dr.select(hit, bs.pdf, s.pdf)
+            s.delta = dr.select(hit, mi.has_flag(bs.sampled_type, LOBES.Delta), s.delta)
+        return self._roulette(s, onward, key)
+
+    def _next(self, s: State, si: Any, bs: Any, weight: Any) -> tuple[Any, Any]:
+        if self.v.is_polarized:
+            weight = si.to_world_mueller(weight, -bs.wo, si.wi)
+        return si.spawn_ray(si.to_world(bs.wo)), self._times(s.throughput, weight)
+
+    def _roulette(self, s: State, onward: Any, key: Any) -> Any:
+        brightest = dr.max(self.v.unpolarized_spectrum(s.throughput))
+        onward = onward & (brightest != 0)
+        if not self.plan.roulette:
+            return onward
+        # A branch is not to be ended for being one of several: as if there had been no split.
+        whole = brightest / s.share if self.plan.split_depth else brightest
+        survival = dr.detach(dr.minimum(whole * dr.square(s.eta), 0.95))
+        late = onward & (s.depth >= self.plan.rr_depth)
+        ends = late & (self.numbers.one(s.sampler, key + 3) >= survival)
+        s.throughput = dr.select(late, s.throughput * dr.rcp(survival), s.throughput)
+        return onward & (ends ^ True)
+
+    def _times(self, a: Any, b: Any) -> Any:
+        return a @ b if self.v.is_polarized else a * b
+
+    # Emitters ------------------------------------------------------------------------------------------------------
+
+    def _add_emission(self, s: State, si: Any, hit: Any) -> None:
+        plan = self.plan
+        if plan.once:
+            s.escaped = hit ^ True
+        if plan.environment and not plan.once:
+            emitter, met = si.emitter(self.scene), self.v.Bool(True)
+        elif plan.area and (self.vectorised or hit):
+            emitter, met = si.shape.emitter(), hit
+        else:
+            return
+        if self.vectorised or emitter is not None:
+            s.result += self._times(s.throughput, self._emission(s, si, emitter, met))
+
+    def _add_environment(self, s: State) -> None:
+        si = dr.zeros(self.v.SurfaceInteraction3f)
+        si.t, si.time, si.wavelengths, si.wi = dr.inf, s.ray.time, s.ray.wavelengths, -s.ray.d
+        found = self._emission(s, si, self.scene.environment(), s.escaped)
+        s.result += dr.select(s.escaped, self._times(s.throughput, found), 0)
+
+    def _emission(self, s: State, si: Any, emitter: Any, active: Any) -> Any:
+        radiance = emitter.eval(si, active)
+        if not self.plan.emitter_sampling:
+            return radiance
+        ds = self.v.DirectionSample3f(self.scene, si, s.previous)
+        pdf = self.emitters.pdf(s.previous, ds, active & (s.delta ^ True))
+        return radiance * dr.select(s.delta, 1, power_heuristic(s.pdf, pdf))
+
+    def _add_direct(self, s: State, si: Any, bsdf: Any, onward: Any, key: Any) -> None:
+        smooth = onward & mi.has_flag(bsdf.flags(), LOBES.Smooth)
+        if not self.vectorised and not smooth:
+            return
+        ds, radiance = self.emitters.sample(si, self.numbers.two(s.sampler, key), smooth)
+        wo = si.to_local(ds.d)
+        value, pdf = bsdf.eval_pdf(self.context, si, wo, smooth)
+        # What reflects nothing needs no shadow ray.
+        lit = smooth & (ds.pdf != 0) & (dr.max(dr.abs(self.v.unpolarized_spectrum(value))) > 0)
+        lit = lit & (self.scene.ray_test(si.spawn_ray_to(ds.p), lit) ^ True)
+        if self.v.is_polarized:
+            value = si.to_world_mueller(value, -wo, si.wi)
+        found = self._times(self._times(s.throughput, value), radiance)
+        found *= dr.select(ds.delta, 1, power_heuristic(ds.pdf, pdf))
+        s.result = dr.select(lit, s.result + found, s.result)
+
+    # Both lobes ----------------------------------------------------------------------------------------------------
+
+    def _split(self, s: State, si: Any, bsdf: Any, bs: Any, second: Any, throughput: Any, onward: Any) -> Any:
+        """Put the other lobe aside where both are worth following; the throughput of the one that was sampled."""
+        plan, p = self.plan, dr.detach(bs.pdf)
+        pair = onward & s.seen & self._is_pair(bsdf.flags())
+        s.seen = s.seen & mi.has_flag(bs.sampled_type, LOBES.Delta)
+        both = pair & (s.depth <= plan.split_depth) & (s.share * dr.minimum(p, 1 - p) > plan.split_weight)
+        if self.vectorised or both:
+            both = self._put_aside(s, si, bsdf, bs, second, both)
+        if plan.deterministic:
+            # The sample 1/2 has picked the stronger lobe; the other one is lost.
+            self._truncate(s, pair & (both ^ True), 1 - p)
+            both = pair
+        return dr.select(both, throughput * bs.pdf, throughput)
+
+    def _truncate(self, s: State, where: Any, share: Any) -> None:
+        # η²: what radiance lost where the path entered a denser medium it regains where it leaves.
+        lost = dr.max(self.v.unpolarized_spectrum(s.throughput)) * dr.square(s.eta) * share
+        s.truncated = dr.select(where, s.truncated + lost, s.truncated)
+
+    @staticmethod
+    def _is_pair(flags: Any) -> Any:
+        """Whether a BSDF has a reflected and a transmitted direction, and no others."""
+        pair = mi.has_flag(flags, LOBES.DeltaReflection) & mi.has_flag(flags, LOBES.DeltaTransmission)
+        return pair & ((mi.has_flag(flags, LOBES.Smooth) | mi.has_flag(flags, LOBES.Null)) ^ True)
+
+    def _put_aside(self, s: State, si: Any, bsdf: Any, bs: Any, second: Any, both: Any) -> Any:
+        reflected = mi.has_flag(bs.sampled_type, LOBES.DeltaReflection)
+        other, weight = bsdf.sample(self.context, si, dr.select(reflected, LAST, FIRST), second, both)
+        both = both & (other.sampled_type != bs.sampled_type)
+        ray, throughput = self._next(s, si, other, weight * other.pdf)
+        # The lobe that was sampled has the odd number.
+        branch = self.branch(
+            ray.o, ray.d, throughput, s.depth, s.eta * other.eta, s.share * dr.detach(other.pdf), 2 * s.node
+        )
+        # The index of an idle lane must be in range as well: local memory is accessed there.
+        s.stack.write(branch, dr.select(both, s.waiting, 0), both)
+        s.waiting = dr.select(both, s.waiting + 1, s.waiting)
+        s.node = dr.select(both, 2 * s.node + 1, s.node)
+        s.share = dr.select(both, s.share * dr.detach(bs.pdf), s.share)
+        return both
+
+    def _resume(self, s: State, onward: Any) -> Any:
+        """Where a path ends, take up the last branch put aside."""
+        found = (onward ^ True) & (s.waiting > 0)
+        if not self.vectorised and not found:
+            return onward
+        s.waiting = dr.select(found, s.waiting - 1, s.waiting)
+        branch = s.stack.read(dr.select(found, s.waiting, 0), found)
+        s.ray.o, s.ray.d = dr.select(found, branch.o, s.ray.o), dr.select(found, branch.d, s.ray.d)
+        for name in ("throughput", "depth", "eta", "share", "node"):
+            setattr(s, name, dr.select(found, getattr(branch, name), getattr(s, name)))
+        if self.plan.emitter_sampling:
+            s.pdf, s.delta = dr.select(found, 1, s.pdf), s.delta | found
+        s.seen = s.seen | found
+        return onward | found

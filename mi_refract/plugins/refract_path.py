@@ -1,0 +1,142 @@
+"""The integrator `refract_path`: Mitsuba's `path`, less what the scene does not need, and with both lobes of glass.
+
+Parameters: `max_depth`, `rr_depth`, `hide_emitters` as in `path`. `split_depth` (0): so many boundaries deep both
+lobes of glass are followed, each with its power, instead of one of them by chance; `split_weight` (0.01): but no lobe
+whose share of the light is less. `deterministic` (False): no lobe is left to chance, and those of a smaller share are
+dropped; the channel `truncated` says how much that is. Times the brightest radiance it bounds the error.
+
+Derivatives are attached: rays move with the index, but edges that move are not seen. A render that is differentiated
+does not split.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .keyed_sampler import Sampled, Strata
+from .path_loop import Plan, Trace
+from .scene_features import Needs, inspect
+
+INTEGRATOR = "refract_path"
+MOST_PATHS = 4096  # of one sample, at once
+DEEPEST = 64  # split_depth: memory is set aside in every lane
+UNLIMITED = 2**32 - 1
+
+
+def read_count(props: Any, name: str, default: int, least: int) -> int:
+    """An integer parameter. ValueError naming it and what is accepted."""
+    value = props.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        what = "-1 (no limit) or an integer ≥ 0" if least < 0 else f"an integer ≥ {least}"
+        raise ValueError(f"{INTEGRATOR}: {name} = {value!r}: accepted: {what}")
+    return value
+
+
+def read_flag(props: Any, name: str) -> bool:
+    value = props.get(name, False)
+    if not isinstance(value, bool):
+        raise ValueError(f"{INTEGRATOR}: {name} = {value!r}: accepted: true or false")
+    return value
+
+
+def read_split(props: Any, deterministic: bool) -> tuple[int, float]:
+    """`split_depth` and `split_weight`. ValueError where one sample could have more than MOST_PATHS paths at once."""
+    depth = read_count(props, "split_depth", DEEPEST if deterministic else 0, 0)
+    weight = props.get("split_weight", 1e-3 if deterministic else 1e-2)
+    if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not 0 <= weight <= 1:
+        raise ValueError(f"{INTEGRATOR}: split_weight = {weight!r}: accepted: a number from 0 to 1")
+    # Every path has a share above the weight, and all of them together have 1.
+    paths = min(2.0**depth, 1 / weight if weight else math.inf)
+    if depth > DEEPEST or paths > MOST_PATHS:
+        raise ValueError(
+            f"{INTEGRATOR}: split_depth = {depth}, split_weight = {weight}: up to {paths:.3g} paths of a sample at "
+            f"once; accepted: up to {MOST_PATHS}, bounded by 2^split_depth and by 1/split_weight, and a split_depth "
+            f"up to {DEEPEST}"
+        )
+    return depth, float(weight)
+
+
+def integrator_class(v: Any) -> type:
+    """The class of the integrator for one variant, given its module."""
+    vectorised = dr.is_jit_v(v.Float)
+
+    class RefractPath(v.SamplingIntegrator):
+        """See the module docstring."""
+
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            depth = read_count(props, "max_depth", -1, -1)
+            self.max_depth = depth if depth >= 0 else UNLIMITED
+            self.rr_depth = read_count(props, "rr_depth", 5, 1)
+            self.deterministic = read_flag(props, "deterministic")
+            self.split_depth, self.split_weight = read_split(props, self.deterministic)
+            self.seed: Any = 0
+            self.seen: tuple[Any, Needs] | None = None
+
+        def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, *more: Any, **named: Any) -> Any:
+            self.seed, self.seen = seed, None
+            return super().render(scene, sensor, seed, *more, **named)
+
+        def aov_names(self) -> list[str]:
+            return ["truncated"] if self.deterministic else []
+
+        def sample(
+            self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
+        ) -> tuple[Any, Any, list[Any]]:
+            if self.max_depth == 0:
+                return v.Spectrum(0), v.Bool(False), [v.Float(0)] * len(self.aov_names())
+            plan = self.plan(scene)
+            numbers = Strata(v, sampler, self.seed) if vectorised and plan.split_depth else Sampled()
+            end = Trace(v, scene, plan, numbers).run(v.Ray3f(ray), sampler, v.Bool(active))
+            return dr.select(end.valid, end.result, 0), end.valid, [end.truncated] if self.deterministic else []
+
+        def plan(self, scene: Any) -> Plan:
+            """What is traced of a scene. ValueError where a deterministic render would leave something to chance."""
+            needs = self._needs(scene)
+            # Local memory has no derivatives, and the evaluated loops that derivatives need have no local memory.
+            symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
+            if self.deterministic and (needs.both_numbers or needs.null or not needs.only_glass):
+                raise ValueError(f"{INTEGRATOR}: deterministic: accepted: scenes of smooth dielectrics and conductors")
+            if self.deterministic and not symbolic:
+                raise ValueError(f"{INTEGRATOR}: deterministic: accepted: renders that are not differentiated")
+            return Plan(
+                self.max_depth, self.rr_depth, self.hide_emitters,
+                self.split_depth if symbolic else 0, self.split_weight, self.deterministic,
+                emitter_sampling=needs.smooth and (needs.lamps if needs.plain_environment else needs.sampleable),
+                lamps_only=needs.plain_environment,
+                area=needs.area,
+                environment=needs.environment,
+                first_number=needs.both_numbers or not (needs.smooth or self.deterministic),
+                second_number=needs.smooth,
+                all_of_hit=needs.smooth or needs.textured,
+            )  # fmt: skip
+
+        def _needs(self, scene: Any) -> Needs:
+            """Looked up once a render, as an edit of the scene can change them."""
+            if self.seen is None or self.seen[0] is not scene:
+                self.seen = scene, inspect(scene)
+                mi.Log(mi.LogLevel.Info, f"{INTEGRATOR}: left out: {self.left_out()}")  # type: ignore[operator]
+            return self.seen[1]
+
+        def left_out(self) -> str:
+            """Of the scene seen last, feature by feature with the reason."""
+            if self.seen is None:
+                return "no scene seen yet"
+            return "; ".join(f"{feature} ({reason})" for feature, reason in self.seen[1].left_out.items()) or "nothing"
+
+        def to_string(self) -> str:
+            depth = -1 if self.max_depth == UNLIMITED else self.max_depth
+            lines = [f"max_depth = {depth}", f"rr_depth = {self.rr_depth}", f"hide_emitters = {self.hide_emitters}"]
+            lines += [f"{name} = {getattr(self, name)}" for name in ("split_depth", "split_weight", "deterministic")]
+            return "RefractPath[\n" + "".join(f"  {x},\n" for x in [*lines, f"left out = {self.left_out()}"]) + "]"
+
+    return RefractPath
+
+
+def register(variant: Any) -> None:
+    """Make `refract_path` known to one variant, given its module. Registering again is harmless."""
+    variant.register_integrator(INTEGRATOR, integrator_class(variant))

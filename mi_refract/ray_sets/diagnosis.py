@@ -1,0 +1,292 @@
+"""The usual mistakes: what each would have answered, and whether that is what was answered.
+
+A mistake shows where it moves a direction by more than VISIBLE; there, answers that are within SAME of what it gives
+are explained by it. Slips of precision have no direction of their own: they are known by the bound that holds.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mi_refract.accuracy.direction_errors import lengths, radicand
+from mi_refract.regimes import Rays
+
+from .ray_set import indices
+from .tir_signal import Judged
+
+VISIBLE, SAME = 0.1, 5e-3  # radians
+MOST, ALL = 0.9, 0.99  # of the answers that a mistake, or a slip of precision, must explain
+FEWEST = 10  # answers that say anything
+SAMPLE = 150  # wrong answers, and as many others
+# A wider bound than this leaves nothing to explain.
+TELLING = 1e-3
+F32 = 2.0**-24
+DIGITS = {2.0**-24: 7, 2.0**-53: 15}  # fewer than it takes to tell numbers of this roundoff apart
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A usual mistake; of a sample of the answers the share that it explains, and the median angle to what it gives."""
+
+    mistake: str
+    text: str
+    share: float
+    median: float  # radians
+    explains: bool
+
+
+def refract(a: np.ndarray, n: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """The textbook's, two-sided, for unit vectors: (N, 3), NaN where nothing is transmitted."""
+    k, c = k[:, None], (a * n).sum(1, keepdims=True)
+    across = np.cross(n, a)
+    root = np.sqrt(c * c - (k * k - 1) * (across * across).sum(1, keepdims=True))
+    return k * a + n * (np.copysign(root, c) - k * c)
+
+
+@dataclass(frozen=True)
+class Case:
+    """What mistakes are made from: unit `a` and `n`, the rays as they are, and the right answers to them."""
+
+    a: np.ndarray
+    n: np.ndarray
+    k: np.ndarray
+    rays: Rays
+    right: np.ndarray
+    transmitted: np.ndarray
+
+    @staticmethod
+    def of(judged: Judged, index: np.ndarray) -> Case:
+        rays = judged.rays[index]
+        a, n = (v.astype(float) / lengths(v).astype(float)[:, None] for v in (rays.a, rays.n))
+        exact = judged.exact
+        return Case(a, n, rays.k.astype(float), rays, exact.direction[index], exact.transmitted[index])
+
+    def with_k(self, k: np.ndarray) -> np.ndarray:
+        return refract(self.a, self.n, k)
+
+    @property
+    def refracted(self) -> np.ndarray:
+        """(N, 3), NaN where nothing is transmitted."""
+        return np.where(self.transmitted[:, None], self.right, np.nan)
+
+    @property
+    def inverted(self) -> np.ndarray:
+        return self.with_k(1 / self.k)
+
+    @property
+    def one_sided(self) -> np.ndarray:
+        """Of code for normals that face the ray."""
+        facing = (self.a * self.n).sum(1, keepdims=True) < 0
+        return np.where(facing, self.refracted, _across(self.refracted, self.n))
+
+    @property
+    def mirrored(self) -> np.ndarray:
+        """Where something is transmitted."""
+        return np.where(self.transmitted[:, None], _across(self.a, self.n), np.nan)
+
+
+def _across(v: np.ndarray, n: np.ndarray) -> np.ndarray:
+    """`v` with its part along n reversed."""
+    return v - 2 * (v * n).sum(1, keepdims=True) * n
+
+
+# What mistakes give: name → (text, function) -----------------------------------------------------------------------
+
+Predict = Callable[[Case], np.ndarray]
+
+
+def _by_angle(change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Predict:
+    """Of code that computes with angles: `change(angle of incidence, k)` is the angle after the surface."""
+
+    def predict(case: Case) -> np.ndarray:
+        c = (case.a * case.n).sum(1, keepdims=True)
+        tangent = case.a - c * case.n
+        length = lengths(tangent).astype(float)[:, None]
+        angle = change(np.arctan2(length, np.abs(c)), case.k[:, None])
+        return np.cos(angle) * np.sign(c) * case.n + np.sin(angle) * tangent / np.where(length > 0, length, 1)
+
+    return predict
+
+
+def _refracted(theta: np.ndarray, k: np.ndarray) -> np.ndarray:
+    return np.arcsin(k * np.sin(theta))
+
+
+def _as_given(vector: str) -> Predict:
+    """The textbook's formula, right for unit vectors, with this vector, or both, as long as it is."""
+
+    def predict(case: Case) -> np.ndarray:
+        a = case.rays.a.astype(float) if "a" in vector else case.a
+        n = case.rays.n.astype(float) if "n" in vector else case.n
+        k, c = case.k[:, None], (a * n).sum(1, keepdims=True)
+        b = k * a + n * (np.copysign(np.sqrt(1 - k * k * (1 - c * c)), c) - k * c)
+        return b / lengths(b).astype(float)[:, None]
+
+    return predict
+
+
+def _misread(vector: str, matrix: np.ndarray) -> Predict:
+    """Where the normal is still on the side that the ray comes from: elsewhere codes differ."""
+
+    def predict(case: Case) -> np.ndarray:
+        turned = {"a": case.a, "n": case.n}
+        turned[vector] = turned[vector] @ matrix.T
+        facing = (turned["a"] * turned["n"]).sum(1) * (case.a * case.n).sum(1) > 0
+        return np.where(facing[:, None], refract(**turned, k=case.k), np.nan)
+
+    return predict
+
+
+def _axes() -> Iterator[tuple[str, np.ndarray]]:
+    """All ways to name three axes but the right one, and the reversal of all three, which has a name of its own."""
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1, -1), repeat=3):
+            if order != (0, 1, 2) or len(set(signs)) > 1:
+                matrix = np.zeros((3, 3))
+                matrix[range(3), order] = signs
+                yield ", ".join(f"{'-' if s < 0 else ''}{'xyz'[i]}" for i, s in zip(order, signs, strict=True)), matrix
+
+
+def _handed() -> dict[str, Predict]:
+    table: dict[str, Predict] = {}
+    for name, matrix in _axes():
+        table[f"the answer's x, y, z are the right one's {name}"] = functools.partial(_turned, matrix)
+        for vector in ("a", "n"):
+            table[f"{vector} was read as its {name}"] = _misread(vector, matrix)
+    return table
+
+
+def _turned(matrix: np.ndarray, case: Case) -> np.ndarray:
+    return case.refracted @ matrix.T
+
+
+MISTAKES: dict[str, dict[str, Predict]] = {
+    "eta inverted": {
+        "k = n_to / n_from was used, or the normal's side chose it": lambda case: case.inverted,
+    },
+    "an index ignored": {
+        "n_to was taken for 1": lambda case: case.with_k(indices(case.k)[0]),
+        "n_from was taken for 1": lambda case: case.with_k(1 / indices(case.k)[1]),
+    },
+    "normal flipped": {
+        "the answer goes back to the side that the ray comes from": lambda case: _across(case.refracted, case.n),
+        "n was taken to face the ray, where it does not": lambda case: case.one_sided,
+    },
+    "direction reversed": {
+        "a was taken to point away from the surface": lambda case: -_across(case.refracted, case.n),
+        "a was taken to point away from the surface, and its side chose the ratio": lambda case: -case.inverted,
+        "the answer points toward the surface": lambda case: -case.refracted,
+    },
+    "reflected instead of refracted": {
+        "the answer is the mirror direction": lambda case: case.mirrored,
+    },
+    "degrees and radians": {
+        "the angle of refraction was turned into degrees": _by_angle(lambda t, k: np.degrees(_refracted(t, k))),
+        "the angle of refraction was taken for degrees": _by_angle(lambda t, k: np.radians(_refracted(t, k))),
+        "the angle of incidence was turned into degrees": _by_angle(lambda t, k: _refracted(np.degrees(t), k)),
+        "the angle of incidence was taken for degrees": _by_angle(lambda t, k: _refracted(np.radians(t), k)),
+    },
+    "handedness": _handed(),
+    "missing normalisation": {
+        "a and n were taken for unit vectors": _as_given("an"),
+        "a was taken for a unit vector": _as_given("a"),
+        "n was taken for a unit vector": _as_given("n"),
+    },
+}
+
+
+# What was answered -------------------------------------------------------------------------------------------------
+
+
+def explain(judged: Judged) -> list[Explanation]:
+    """Every mistake, and how much of the answers it explains. Precondition: some are wrong."""
+    index = _sample(judged)
+    case, wrong = Case.of(judged, index), judged.wrong[index]
+    with np.errstate(all="ignore"):
+        found = [_gross(name, table, case, judged.b[index], wrong) for name, table in MISTAKES.items()]
+        lengthy, printed, narrow = _lengths(judged), _digits(judged), _single(judged)
+    found[-1] = max(found[-1], lengthy, key=_strength)
+    # Numbers of few digits are within what float32 would be off by, too.
+    return [*found, replace(narrow, explains=narrow.explains and not printed.explains), printed]
+
+
+def _sample(judged: Judged) -> np.ndarray:
+    """Wrong answers and others, evenly over the set, but for rays so near to the critical angle that anyone may err."""
+    telling = judged.decided & (judged.bound <= TELLING)
+    return np.concatenate([_evenly(telling & mask, SAMPLE) for mask in (judged.wrong, ~judged.wrong)])
+
+
+def _evenly(mask: np.ndarray, count: int) -> np.ndarray:
+    index = np.flatnonzero(mask)
+    return index[:: max(1, -(-len(index) // count))]
+
+
+def _gross(name: str, table: dict[str, Predict], case: Case, b: np.ndarray, wrong: np.ndarray) -> Explanation:
+    """The best of the variants of a mistake that moves directions visibly."""
+    variants = []
+    for text, predict in table.items():
+        given = predict(case)
+        visible = _angle(given, case.right) > VISIBLE
+        angle = np.nan_to_num(_angle(b, given)[visible], nan=np.inf)
+        share = float(np.mean(angle <= SAME)) if len(angle) else 0.0
+        median = float(np.median(angle)) if len(angle) else math.nan
+        enough = (visible & wrong).sum() >= FEWEST and share >= MOST
+        variants.append(Explanation(name, text, share, median, bool(enough)))
+    return max(variants, key=_strength)
+
+
+def _strength(each: Explanation) -> tuple[bool, float]:
+    return each.explains, each.share
+
+
+def _angle(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Between vectors (N, 3) of any length, radians; NaN where one is no direction."""
+    across, along = lengths(np.cross(u, v)).astype(float), (u * v).sum(1)
+    return np.where((across == 0) & (along == 0), np.nan, np.arctan2(across, along))
+
+
+def _share(name: str, text: str, judged: Judged, among: np.ndarray, holds: np.ndarray, enough: bool) -> Explanation:
+    share = float(holds[among].mean()) if among.any() else 0.0
+    compared = judged.compared & among
+    median = float(np.median(judged.angle[compared])) if compared.any() else math.nan
+    return Explanation(name, text, share, median, bool(enough and share >= ALL and among.sum() >= FEWEST))
+
+
+def _lengths(judged: Judged) -> Explanation:
+    holds = judged.compared & (judged.angle <= judged.bound)
+    text = "directions are right, but not of length 1"
+    return _share("missing normalisation", text, judged, judged.wrong, holds, True)
+
+
+def _within(judged: Judged, bound: np.ndarray) -> np.ndarray:
+    return judged.compared & (np.maximum(judged.angle, judged.norm) <= bound)
+
+
+def _single(judged: Judged) -> Explanation:
+    """float32 where float64 was claimed: errors of its size nearly everywhere, and none that is larger."""
+    u, k, exact = 2 * F32, judged.rays.k.astype(float), judged.exact  # u of the inputs, u of the formula
+    bound = judged.budget.chord(u, k, exact.cos_t, exact.transmitted, cos_i=exact.cos_i)
+    lost = judged.misjudged & (radicand(judged.rays) <= judged.budget.margin(u, k))
+    everywhere = judged.compared.any() and np.median(judged.angle[judged.compared]) > F32 / 50
+    holds, claimed = _within(judged, bound) | lost, judged.roundoff < F32
+    text = "errors are those of float32"
+    return _share("f32 where f64 was claimed", text, judged, judged.wrong, holds, claimed and bool(everywhere))
+
+
+def _digits(judged: Judged) -> Explanation:
+    """Numbers that lost their last digits on the way into a file."""
+    values = judged.raw[_evenly(judged.compared, SAMPLE)].ravel()
+    values = values[np.rint(values) != values].tolist()
+    told = range(1, DIGITS[judged.roundoff] + 1) if len(values) >= FEWEST else range(0)
+    for digits, (form, word) in itertools.product(told, (("f", "decimals"), ("g", "significant digits"))):
+        if all(float(f"{x:.{digits}{form}}") == x for x in values):
+            # Half a unit of the last digit in each of three components.
+            bound, text = judged.bound + 10.0**-digits, f"numbers are rounded to {digits} {word}"
+            return _share("too few digits", text, judged, judged.wrong, _within(judged, bound), True)
+    return Explanation("too few digits", "numbers have all their digits", 0.0, math.nan, False)

@@ -1,0 +1,1 @@
+"""Render scene files into EXR files that say how they were made."""

@@ -1,0 +1,132 @@
+"""Rendering a scene file into an EXR file that says how it was made."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import json
+import os
+import re
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from mi_refract.io.atomic import writable
+from mi_refract.io.image_file import SUFFIXES, Metadata, one_line, write_exr
+
+LOADER_OPTIONS = ("path", "parallel", "optimize")  # mi.load_file would take these names for its own
+# Merged meshes come in the order of their addresses, and parallel loading in that of its threads. Then so do emitters,
+# and a seed no longer means a picture.
+REPRODUCIBLE: Any = {"parallel": False, "optimize": False}
+
+
+def parse_defines(items: Sequence[str]) -> dict[str, str]:
+    """`["bsdf=dielectric"]` → `{"bsdf": "dielectric"}`. ValueError for another syntax, or a name given twice."""
+    defines: dict[str, str] = {}
+    for item in items:
+        name, equals, value = item.partition("=")
+        if not equals or not re.fullmatch(r"[A-Za-z_]\w*", name):
+            raise ValueError(f"-D {item}: accepted: NAME=VALUE")
+        if name in defines:
+            raise ValueError(f"-D {item}: {name} is given twice; accepted: once")
+        defines[name] = value
+    return defines
+
+
+def load_scene(path: str | os.PathLike[str], defines: Mapping[str, str] | None = None) -> Any:
+    """The Mitsuba scene in an XML file, under the present variant; `defines` replace its `<default>`s.
+
+    FileNotFoundError for a missing file; ValueError, in one line, for anything Mitsuba does not accept in it.
+    """
+    import mitsuba as mi
+
+    defines = dict(defines or {})
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such scene file")
+    if taken := [name for name in LOADER_OPTIONS if name in defines]:
+        raise ValueError(f"define {taken[0]!r}: taken by Mitsuba's loader; accepted: any name but {LOADER_OPTIONS}")
+    try:
+        scene = mi.load_file(str(path), **REPRODUCIBLE, **cast(Any, defines))
+    except Exception as error:  # RuntimeError from the parser; whatever a Python plugin raises
+        raise ValueError(_naming(path, error)) from None
+    if not isinstance(scene, mi.Scene):
+        raise ValueError(f"{path}: holds a {type(scene).__name__}; accepted: a <scene>")
+    if not scene.sensors():
+        raise ValueError(f"{path}: a scene without a sensor; accepted: at least one")
+    return scene
+
+
+def render_to_exr(
+    scene: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    defines: Mapping[str, str] | None = None,
+    spp: int | None = None,
+    seed: int = 0,
+) -> Metadata:
+    """Render a scene file by one `mi.render(scene, spp=spp, seed=seed)` in the present variant; the metadata written.
+
+    `spp`: samples per pixel, the scene's own where None. ValueError or OSError in one line, before the rendering
+    wherever possible, InterruptedError for a rendering that was cut short; then no file is written.
+    """
+    import mitsuba as mi
+
+    if spp is not None and spp < 1:
+        raise ValueError(f"spp = {spp}: accepted: a positive whole number")
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"seed = {seed}: accepted: a whole number from 0 to 2³² − 1")
+    output = writable(output, SUFFIXES)
+    loaded = load_scene(scene, defines)
+    start = time.perf_counter()
+    try:
+        pixels = np.array(mi.render(loaded, spp=spp or 0, seed=seed))
+    except Exception as error:
+        raise ValueError(_naming(scene, error)) from None
+    seconds = time.perf_counter() - start
+    # On Ctrl-C the C++ integrators return what they have, and so they do after their `timeout`.
+    if loaded.integrator().should_stop():
+        raise InterruptedError(f"{scene}: the rendering was stopped before its last sample; nothing is written")
+    sensor = loaded.sensors()[0]
+    channels = [str(field.name) for field in sensor.film().bitmap().struct_()]
+    metadata = provenance() | {
+        "mi_refract:variant": mi.variant(),
+        "mi_refract:spp": spp or sensor.sampler().sample_count(),
+        "mi_refract:seed": seed,
+        "mi_refract:scene": str(scene),
+        "mi_refract:defines": json.dumps(dict(defines or {}), sort_keys=True),
+        "mi_refract:formulas": ", ".join(formulas_in(loaded)) or "none",
+        "mi_refract:render_seconds": seconds,
+    }
+    write_exr(output, pixels, channels, metadata)
+    return metadata
+
+
+def formulas_in(scene: Any) -> list[str]:
+    """The formulas that the `refract` BSDFs of a scene use, sorted; "promoted (auto)" where it was not asked for."""
+    texts = (str(shape.bsdf()) for shape in scene.shapes())
+    return sorted({name for text in texts for name in re.findall(r"Refract\[.*?formula = (.+?),\n", text, re.DOTALL)})
+
+
+def provenance() -> Metadata:
+    """Header attributes that say which software made an image."""
+    from mi_refract import __version__
+
+    versions = {"mi_refract": __version__, "mitsuba": version("mitsuba"), "drjit": version("drjit")}
+    return {"Software": f"mi_refract {__version__}"} | {f"mi_refract:version:{n}": v for n, v in versions.items()}
+
+
+def version(distribution: str) -> str:
+    """The installed version; "unknown" where it runs without being installed."""
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        return importlib.metadata.version(distribution)
+    return "unknown"
+
+
+def _naming(path: str | os.PathLike[str], error: Exception) -> str:
+    """One line that names the file; without the place in Mitsuba's source."""
+    text = re.sub(r"\[\w+\.(cpp|h):\d+\] ", "", one_line(str(error)))
+    text = re.sub(r"Traceback \(most recent call last\):.* (\w+Error: )", "", text)
+    return text if str(path) in text else f"{path}: {text}"

@@ -1,0 +1,1 @@
+"""Rows of measurements, and the files that show them."""

@@ -1,0 +1,33 @@
+"""One HTML page that needs no other file and no network: a template with style, script and pictures inlined."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mi_refract.io.atomic import write_atomically
+
+from .embedded_images import Pictures
+from .plots import compact
+
+HERE = Path(__file__).parent / "templates"
+
+
+def write_page(path: str | Path, template: str, content: Mapping[str, Any], pictures: Pictures) -> None:
+    """Write `template`, one of this package's, filled with `content`; every text of it is escaped. Errors: OSError."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+
+    options: Any = {"autoescape": True, "undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(loader=FileSystemLoader(HERE), **options)
+    environment.filters |= {"compact": compact, "words": words}
+    inline = {name: Markup((HERE / f"report.{name}").read_text("utf-8")) for name in ("css", "js")}
+    text = environment.get_template(template).render(**content, **inline, pictures=pictures.embedded)
+    write_atomically(path, text.encode("utf-8", "replace"))
+
+
+def words(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {words(item)}" for key, item in value.items())
+    return ", ".join(map(words, value)) if isinstance(value, list | tuple) else str(value)

@@ -1,0 +1,184 @@
+"""Rows → `rows.json`, `junit.xml`, one offline `report.html`, and a table for the terminal.
+
+Everything here lays out what the rows already say; nothing is measured, averaged or judged.
+
+`context` is what all rows share; `page.py` says which of its entries steer the page.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mi_refract.io.atomic import write_atomically
+
+from . import study_page
+from .embedded_images import Pictures
+from .html_page import write_page
+from .plots import apart
+from .row import SCHEMA, Row, by_study, strict
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+VERDICTS = ("fail", "not run", "pass", "info")
+WORDS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+
+
+def write_json(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]) -> None:
+    """Write the document `rows.py` describes, as strict JSON: NaN and the infinities become words.
+
+    Errors: TypeError for a value JSON has no form for; OSError.
+    """
+    document = {"schema": SCHEMA, "context": context, "rows": [row.as_dict() for row in rows]}
+    text = json.dumps(strict(document), indent=1, allow_nan=False)
+    write_atomically(path, text + "\n")
+
+
+def read_json(path: str | Path) -> tuple[list[Row], dict[str, Any]]:
+    """Read what `write_json` wrote. In `replay` and the context, non-finite numbers stay words.
+
+    Errors: a one-line ValueError naming the file for another schema, a malformed document, or a verdict that
+    does not follow from its row; OSError.
+    """
+    try:
+        document = json.loads(Path(path).read_bytes(), parse_constant=_no_constant)
+        found = document.get("schema") if isinstance(document, dict) else None
+        if found != SCHEMA:
+            raise ValueError(f"schema {found!r}, expected {SCHEMA}")
+        rows = [_row(number, data) for number, data in enumerate(document["rows"])]
+        return rows, dict(document["context"])
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        what = f"missing {error}" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"{path}: {' '.join(what.split())}") from error
+
+
+def _no_constant(word: str) -> float:
+    raise ValueError(f"{word} is not strict JSON")
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, str) and value in WORDS:
+        return WORDS[value]
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return value
+    raise ValueError(f"{value!r} is not a number")
+
+
+def _row(number: int, data: dict[str, Any]) -> Row:
+    try:
+        numbers = {f: {m: _number(v) for m, v in data[f].items()} for f in ("values", "budgets", "goals")}
+        curves = {name: [(_number(x), _number(y)) for x, y in pts] for name, pts in data["curves"].items()}
+        row = Row.from_dict(data | numbers | {"curves": curves})
+        if data["verdict"] != row.verdict:
+            raise ValueError(f"verdict {data['verdict']!r} does not follow from the values")
+        return row
+    except KeyError as error:
+        raise ValueError(f"row {number}: missing {error}") from error
+    except (ValueError, TypeError, AttributeError) as error:
+        raise ValueError(f"row {number}: {error}") from error
+
+
+def verdict(rows: Sequence[Row]) -> str:
+    """One sentence: budgets measured and broken, goals missed, rows not run."""
+    measured = sum(len(row.budgets) for row in rows if row.values)
+    broken = sum(len(row.broken) for row in rows)
+    missing = sum(row.verdict == "not run" for row in rows)
+    if not measured:
+        sentence = "No budget was measured"
+    elif broken:
+        sentence = f"{broken} of {_count(measured, 'budget')} broken"
+    else:
+        sentence = f"All {measured} budgets held" if measured > 1 else "The one budget held"
+    missed = sum(len(row.missed) for row in rows)
+    goals = sum(len(row.goals) for row in rows if row.values)
+    sentence += f", {missed} of {_count(goals, 'goal')} missed" if missed else ""
+    return sentence + (f", {_count(missing, 'row')} not run" if missing else "")
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" + ("" if number == 1 else "s")
+
+
+def write_junit(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]) -> None:
+    """One suite per study, one case per measured budget, one skipped case per row that was not run.
+
+    Rows that demand nothing are left out: a case that cannot fail is no test. Errors: OSError.
+    """
+    from xml.etree import ElementTree as xml
+
+    root = xml.Element("testsuites", name=_xml(context.get("title", "mi_refract")))
+    for study, members in by_study(rows).items():
+        suite = xml.SubElement(root, "testsuite", name=_xml(study))
+        for row in members:
+            _junit_cases(suite, row)
+        counts = Counter(child.tag for case in suite for child in case)
+        tally = {"tests": len(suite), "failures": counts["failure"], "skipped": counts["skipped"]}
+        suite.attrib.update({key: str(count) for key, count in tally.items()}, errors="0")
+    for key in ("tests", "failures", "skipped", "errors"):
+        root.set(key, str(sum(int(suite.get(key, "0")) for suite in root)))
+    xml.indent(root)
+    write_atomically(path, xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
+
+
+def _junit_cases(suite: Any, row: Row) -> None:
+    from xml.etree import ElementTree as xml
+
+    name = " / ".join((row.subject, row.case, row.setting))
+    if not row.values:
+        case = xml.SubElement(suite, "testcase", classname=_xml(row.study), name=_xml(name))
+        xml.SubElement(case, "skipped", message=_xml(row.reason))
+    for metric, budget in row.budgets.items() if row.values else ():
+        case = xml.SubElement(suite, "testcase", classname=_xml(row.study), name=_xml(f"{name}: {metric}"))
+        if metric in row.broken:
+            text, limit = apart(row.values[metric], budget)
+            failure = xml.SubElement(case, "failure", message=_xml(f"{metric} {text}, budget {limit}"))
+            parts = (f"value {row.values[metric]!r}, budget {budget!r}", row.reason, row.replay_text)
+            failure.text = _xml("\n".join(filter(None, parts)))
+
+
+def _xml(text: Any) -> str:
+    """Text in the characters XML 1.0 has; the others (terminal escapes, say) become U+FFFD."""
+    return re.sub("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", str(text))
+
+
+def summary(rows: Sequence[Row]) -> RenderableType:
+    """Broken budgets and missed goals first, then verdicts by study, then the sentence, for rich's console."""
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    broken, missed = ([(row, m) for row in rows for m in getattr(row, kind)] for kind in ("broken", "missed"))
+    parts: list[RenderableType] = []
+    for heading, exceeded, style in (("broken budget", broken, "bold red"), ("missed goal", missed, "yellow")):
+        table = Table(heading, "metric", box=None, title_justify="left", pad_edge=False)
+        table.add_column("value", justify="right", style=style)
+        table.add_column("bound", justify="right")
+        for row, metric in exceeded:
+            table.add_row(Text(row.name), Text(metric), *apart(row.values[metric], row.bounds[metric]))
+        parts += [table, Text()] if exceeded else []
+    counts = Table("study", box=None, pad_edge=False)
+    for word in VERDICTS:
+        counts.add_column(word, justify="right")
+    for study, members in by_study(rows).items():
+        tally = Counter(row.verdict for row in members)
+        styles = {"fail": "bold red", "not run": "yellow", "pass": "green", "info": ""}
+        cells = [Text(str(tally[w] or "·"), style=styles[w] if tally[w] else "dim") for w in VERDICTS]
+        counts.add_row(Text(study), *cells)
+    return Group(*parts, counts, Text(), Text(verdict(rows), style="bold red" if broken else "bold"))
+
+
+def write_html(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any], folder: str | Path) -> None:
+    """Write one page that needs no other file; `folder` is what the rows' picture paths are relative to.
+
+    Pictures are embedded whole, three halves a pixel (a finite value past 65504 becomes 65504), each file once.
+    Errors: FileNotFoundError or ValueError naming a picture that is missing or not RGB or gray; OSError.
+    """
+    pictures = Pictures(Path(folder))
+    content = study_page.prepare(rows, context, pictures) | {"sentence": verdict(rows)}
+    write_page(path, "report.html.j2", content, pictures)

@@ -1,0 +1,204 @@
+"""What the page shows, laid out from the rows: panels, tables, plots, pictures. Nothing is measured or judged here.
+
+`context` is what all rows share. Every entry is shown as it is, except four that steer the page:
+
+- `title`: the page's name;
+- `studies`: {study: {"title", "text", "terms", "axes"}}, all optional: heading, introduction and glossary of a study,
+  and the fields of `figures.Axes`, which say how the curves of its rows are drawn;
+- `scatter`: [{"study", "x", "y", "title", "interval", "floor", "front"}]: plots of one metric against another, a panel
+  per setting; all but the first three optional. `interval` are two metrics between which x lies, `floor` the subject
+  whose x is a line (it has no y), `front` steps along the points that no other one of the panel beats in x and y;
+- `replay`: the command that repeats the whole run, shown on top.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from .embedded_images import Pictures
+from .plots import Axes, Scatter, apart, compact, curves_svg, drawable, scatter_svg
+from .row import Row, by_study
+
+STEERING = ("title", "studies", "scatter", "replay")
+ROLES = ("reference", "test", "overlay", "difference")
+
+
+def prepare(rows: Sequence[Row], context: Mapping[str, Any], pictures: Pictures) -> dict[str, Any]:
+    verdicts = Counter(row.verdict for row in rows)
+    return {
+        "title": context.get("title", "mi_refract"),
+        "state": "fail" if verdicts["fail"] else "pass" if verdicts["pass"] else "empty",
+        "counts": [(word, verdicts[word]) for word in ("pass", "fail", "not run", "info")],
+        "context": {key: value for key, value in context.items() if key not in STEERING},
+        "command": context.get("replay", ""),
+        "failures": [{"row": r, "broken": [(m, _cell(r, m)) for m in r.broken],
+                      "others": [_phrase(r, m) for m in r.values if m not in r.broken],
+                      "replay": r.replay_text} for r in rows if r.broken],
+        "missing": _missing(rows),
+        "absent": verdicts["not run"],
+        "studies": [
+            _study(name, members, context, pictures, f"study-{number}")
+            for number, (name, members) in enumerate(by_study(rows).items(), 1)
+        ],
+    }  # fmt: skip
+
+
+def _missing(rows: Sequence[Row]) -> list[tuple[str, str, list[Row]]]:
+    """The rows that were not run, one entry per study and reason."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        if row.verdict == "not run":
+            groups.setdefault((row.study, row.reason), []).append(row)
+    return [(*key, members) for key, members in groups.items()]
+
+
+def _study(name: str, rows: list[Row], context: Mapping[str, Any], pictures: Pictures, key: str) -> dict[str, Any]:
+    about = context.get("studies", {}).get(name, {})
+    metrics = list(dict.fromkeys(metric for row in rows for metric in row.values))
+    axes = Axes(**about.get("axes", {}))
+    plots = [(row, curves_svg(row.curves, axes, salt=f"{key}-{number}"), _left_out(row, axes))
+             for number, row in enumerate(rows) if row.curves]  # fmt: skip
+    scatters = [scatter for scatter in context.get("scatter", ()) if scatter["study"] == name]
+    return {
+        "key": key,
+        "title": about.get("title", name),
+        "text": about.get("text", ""), "terms": about.get("terms", {}),
+        "failures": sum(row.verdict == "fail" for row in rows),
+        "scale": (scale := _scale(rows, metrics)),
+        "panels": _panels(rows, metrics, scale),
+        "scatters": [s for i, each in enumerate(scatters) if (s := _scatter(each, rows, f"{key}-scatter-{i}"))],
+        "plots": plots,
+        "figures": [_figure(row, pictures) for row in rows if row.pictures],
+    }
+
+
+def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> list[dict[str, Any]]:
+    """A table per setting, under a matrix of subjects by cases, where there is enough to see."""
+    settings = list(dict.fromkeys(row.setting for row in rows))
+    parts = {setting: [row for row in rows if row.setting == setting] for setting in settings}
+    matrices = {setting: _matrix(part, metrics, scale) for setting, part in parts.items()}
+    if not any(matrices.values()):
+        return [{"heading": "", "matrix": None, "table": _table(rows, metrics)}]
+    return [
+        {"heading": s, "matrix": matrices[s],
+         "table": _table(parts[s], metrics, s) if any(row.values for row in parts[s]) else None,
+         "reasons": list(dict.fromkeys(row.reason for row in parts[s]))}
+        for s in settings
+    ]  # fmt: skip
+
+
+def _matrix(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> dict[str, Any] | None:
+    subjects = list(dict.fromkeys(row.subject for row in rows))
+    cases = list(dict.fromkeys(row.case for row in rows))
+    cells = {(row.subject, row.case): row for row in rows}
+    if len(subjects) < 3 or len(cases) < 3 or len(cells) < len(rows) or scale is None:
+        return None
+    lines = [(s, [_shade(cells.get((s, c)), metrics[0], scale) for c in cases]) for s in subjects]
+    return {"metric": metrics[0], "cases": cases, "lines": lines}
+
+
+def _shade(row: Row | None, metric: str, scale: tuple[float, float]) -> dict[str, Any]:
+    """A cell of the matrix: its number, how deep its colour is on the logarithmic scale, what it broke or missed."""
+    if row is None or not row.values:
+        text, state, hint = ("not run", "not-run", row.reason) if row else ("·", "none", "")
+        return {"text": text, "state": state, "depth": 0, "hint": hint, "broken": []}
+    low, high = map(math.log, scale)
+    value = row.values.get(metric, 0)
+    place = (math.log(value) - low) / (high - low) if 0 < value < math.inf and high > low else 0
+    depth = round(place, 3) if value < math.inf else 1  # NaN is no small error
+    hint = "\n".join(_phrase(row, m) for m in row.values)
+    broken = [_bound(row, m) if m == metric else _phrase(row, m) for m in (*row.broken, *row.missed)]
+    cell = _cell(row, metric)
+    return {
+        "text": cell["text"] if cell else "·",
+        "state": row.verdict,
+        "depth": depth,
+        "hint": hint,
+        "broken": broken,
+    }
+
+
+def _scale(rows: list[Row], metrics: list[str]) -> tuple[float, float] | None:
+    values = [row.values[metrics[0]] for row in rows if metrics and metrics[0] in row.values]
+    positive = [value for value in values if 0 < value < math.inf]
+    return (min(positive), max(positive)) if positive else None
+
+
+def _phrase(row: Row, metric: str) -> str:
+    if metric not in row.bounds:
+        return f"{metric} {compact(row.values[metric])}"
+    return f"{metric} {apart(row.values[metric], row.bounds[metric])[0]} {_bound(row, metric)}"
+
+
+def _bound(row: Row, metric: str) -> str:
+    """The budget or goal with how the value stands to it; NaN is neither above nor below."""
+    value, budget = row.values[metric], row.bounds[metric]
+    sign = "≤" if value <= budget else ">" if value > budget else "≰"
+    return f"{sign} {apart(value, budget)[1]}"
+
+
+def _table(rows: list[Row], metrics: list[str], heading: str = "") -> dict[str, Any]:
+    """Columns: what tells the rows apart, then every metric; a label equal to the one above is marked."""
+    keys = [k for k in ("subject", "case", "setting") if len({getattr(row, k) for row in rows}) > 1]
+    keys = keys or ["subject"]
+    used = [m for m in metrics if any(m in row.values for row in rows)]
+    lines, above = [], [""] * len(keys)
+    for row in rows:
+        labels = [getattr(row, key) for key in keys]
+        again = [labels[: i + 1] == above[: i + 1] for i in range(len(keys))]
+        cells = [_cell(row, metric) for metric in used]
+        lines.append({"row": row, "labels": list(zip(labels, again, strict=True)), "cells": cells,
+                      "replay": row.replay_text})  # fmt: skip
+        above = labels
+    shared = [getattr(rows[0], k) for k in ("subject", "case", "setting") if k not in keys]
+    shared = [label for label in shared if label and label != heading]
+    return {"keys": keys, "metrics": used, "lines": lines, "shared": " · ".join(shared)}
+
+
+def _cell(row: Row, metric: str) -> dict[str, str] | None:
+    if metric not in row.values:
+        return None
+    if metric not in row.bounds:
+        return {"state": "info", "text": compact(row.values[metric]), "budget": ""}
+    text = apart(row.values[metric], row.bounds[metric])[0]
+    state = "fail" if metric in row.broken else "missed" if metric in row.missed else "pass"
+    return {"state": state, "text": text, "budget": _bound(row, metric)}
+
+
+def _left_out(row: Row, axes: Axes) -> int:
+    return sum(len(points) - len(drawable(points, axes)) for points in row.curves.values())
+
+
+def _scatter(scatter: Mapping[str, Any], rows: list[Row], salt: str) -> dict[str, Any] | None:
+    x, y = scatter["x"], scatter["y"]
+    panels: dict[str, Scatter] = {}
+    for row in rows:
+        panel = panels.setdefault(row.setting, Scatter())
+        if x in row.values and y in row.values:
+            panel.points.setdefault(row.subject, []).append((row.values[x], row.values[y]))
+            low, high = (row.values.get(metric, math.nan) for metric in scatter.get("interval", (x, x)))
+            panel.intervals.append((row.subject, low, high, row.values[y]))
+        elif x in row.values and row.subject == scatter.get("floor"):
+            panel.floor = row.values[x]
+    points = [point for panel in panels.values() for each in panel.points.values() for point in each]
+    if not points:
+        return None
+    axes = Axes(x, y, x_scale="linear")
+    svg = scatter_svg(panels, axes, floor=scatter.get("floor", ""), front=scatter.get("front", False), salt=salt)
+    omitted = len(points) - len(drawable(points, axes))
+    return {"title": scatter.get("title", f"{y} against {x}"), "svg": svg, "omitted": omitted}
+
+
+def _figure(row: Row, pictures: Pictures) -> dict[str, Any]:
+    roles = [role for role in ROLES if role in row.pictures]
+    roles += [role for role in row.pictures if role not in ROLES]
+    panes = [_pane(role) | pictures.embed(row.pictures[role]) for role in roles]
+    return {"row": row, "panes": panes, "paired": roles[:2] == ["reference", "test"]}
+
+
+def _pane(role: str) -> dict[str, Any]:
+    signed = role == "difference"
+    return {"role": role, "paint": "signed" if signed else "light", "gain": 3 if signed else None}

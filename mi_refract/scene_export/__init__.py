@@ -1,0 +1,1 @@
+"""Export a Mitsuba scene as plain data to other renderers."""

@@ -1,0 +1,180 @@
+"""Mitsuba's shapes as flat meshes of one material each, in the scene's coordinates."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import mitsuba as mi
+import numpy as np
+
+from mi_refract.formulas.documented import FORMULAS
+from mi_refract.plugins.refract import PLUGIN, read_ior
+
+from . import tessellation
+from .mitsuba_nodes import Node
+from .plain_scene import Colour, Diffuse, Glass, Light, Material, Mesh
+from .tessellation import Triangles
+
+GLASSES = ("dielectric", PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS))
+FILES = ("obj", "ply")
+SHAPES: dict[str, Callable[[int], Triangles]] = {
+    "cube": lambda level: tessellation.cube(),
+    "cylinder": tessellation.cylinder,
+    "disk": tessellation.disk,
+    "rectangle": lambda level: tessellation.rectangle(),
+    "sphere": tessellation.sphere,
+}
+BLACK = (0.0, 0.0, 0.0)
+DEFAULT = (0.5, 0.5, 0.5)  # Mitsuba's reflectance
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A material, or two by a checkerboard of uv with these scales; `one_sided`: black from behind."""
+
+    materials: tuple[Material, ...]
+    scales: tuple[float, float] | None = None
+    one_sided: bool = False
+
+
+def meshes(shape: Node, level: int) -> Iterator[Mesh]:
+    """The shape's meshes: two for a checkerboard, else one. ValueError for what they cannot say."""
+    surface, frame = _surface(shape), _frame(shape)
+    flipped = shape.of(bool, "flip_normals", False)
+    parts = _parts(shape, surface, level)
+    shape.done()
+    if surface.one_sided and (flipped or not all(tessellation.is_closed(faces) for _, faces in parts)):
+        raise shape.refused("diffuse on one side of an open surface", "its BSDF in a `twosided`, or a closed shape")
+    for i, ((vertices, faces), material) in enumerate(zip(parts, surface.materials, strict=True)):
+        if not len(faces):  # a checkerboard of one cell
+            continue
+        name = shape.props.id() or shape.type
+        placed = vertices @ frame[:3, :3].T + frame[:3, 3]
+        yield Mesh(f"{name}_{i}" if i else name, placed, faces[:, ::-1] if flipped else faces, material)
+
+
+def named(found: Iterable[Mesh]) -> tuple[Mesh, ...]:
+    """The meshes with names of letters, digits and underscores that are unique whatever the case."""
+    taken: set[str] = set()
+    result = []
+    for mesh in found:
+        name = stem = re.sub(r"\W", "_", mesh.name, flags=re.ASCII)
+        count = 1
+        while name.lower() in taken:
+            count += 1
+            name = f"{stem}_{count}"
+        taken.add(name.lower())
+        result.append(replace(mesh, name=name))
+    return tuple(result)
+
+
+def _parts(shape: Node, surface: Surface, level: int) -> tuple[Triangles, ...]:
+    """In the shape's own coordinates, one for each material."""
+    if surface.scales:
+        if shape.type != "rectangle":
+            raise shape.refused("a checkerboard", "one on a rectangle")
+        return tessellation.checkerboard(*surface.scales)
+    if shape.type in FILES:
+        return (_from_file(shape),)
+    if shape.type not in SHAPES:
+        raise shape.refused("a shape without triangles here", f"{', '.join((*SHAPES, *FILES))}")
+    return (SHAPES[shape.type](level),)
+
+
+def _from_file(shape: Node) -> Triangles:
+    path, flat = shape.scene.beside(shape.of(str, "filename")), shape.of(bool, "face_normals", False)
+    try:
+        mesh = mi.load_dict({"type": shape.type, "filename": str(path), "face_normals": flat})
+    except RuntimeError as error:
+        raise shape.refused(f"{path}: {error}", "a mesh that Mitsuba reads") from None
+    if mesh.has_vertex_normals():
+        raise shape.refused("smooth normals", "face_normals = true")
+    vertices = np.array(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)
+    return vertices, np.array(mesh.faces_buffer(), np.int64).reshape(-1, 3)
+
+
+def _frame(shape: Node) -> np.ndarray:
+    """From the coordinates of `_parts` to the scene's, 4 × 4."""
+    frame, local = shape.transform(), np.eye(4)
+    if shape.type == "sphere":
+        local[:3, 3] = shape.point("center", (0, 0, 0))
+        local[:3, :3] *= _positive(shape, "radius", shape.of(float, "radius", 1.0))
+    elif shape.type == "cylinder":
+        start, end = (shape.point(name, (0, 0, z)) for name, z in (("p0", 0), ("p1", 1)))
+        radius = _positive(shape, "radius", shape.of(float, "radius", 1.0))
+        length = _positive(shape, "length", float(np.linalg.norm(end - start)))
+        local[:3, 3] = start
+        local[:3, :3] = _basis((end - start) / length) * [radius, radius, length]
+    return frame @ local
+
+
+def _positive(shape: Node, name: str, value: float) -> float:
+    if value <= 0:
+        raise shape.refused(f"{name} = {value}", "a positive number")
+    return value
+
+
+def _basis(z: np.ndarray) -> np.ndarray:
+    """An orthonormal, right-handed one whose last column is `z`; the identity for (0, 0, 1). Duff et al. 2017."""
+    x, y, _ = z
+    sign = np.copysign(1.0, z[2])
+    a = -1 / (sign + z[2])
+    b = x * y * a
+    return np.stack([[1 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y], z], axis=1)
+
+
+def _surface(shape: Node) -> Surface:
+    bsdf = emitter = None
+    for child in shape.children():
+        if child.kind == "BSDF" and not bsdf:
+            bsdf = child
+        elif child.kind == "Emitter" and not emitter:
+            emitter = child
+        else:
+            raise child.refused(f"a {child.kind.lower()} of a shape", "one BSDF, one area emitter")
+    if emitter is None:
+        return _scattering(bsdf) if bsdf else Surface((Diffuse(DEFAULT),), one_sided=True)
+    if emitter.type != "area":
+        raise emitter.refused("an emitter of a shape", "area")
+    if bsdf and _scattering(bsdf).materials != (Diffuse(BLACK),):
+        raise bsdf.refused("the BSDF of a lamp", "none, or a black diffuse one")
+    colours, scales = _paint(emitter, "radiance", None)
+    emitter.ignore("sampling_weight")
+    emitter.done()
+    return Surface(tuple(map(Light, colours)), scales)
+
+
+def _scattering(bsdf: Node) -> Surface:
+    if bsdf.type == "twosided":
+        inner = list(bsdf.children())
+        bsdf.done()
+        if len(inner) != 1:
+            raise bsdf.refused("two BSDFs", "the same on both sides")
+        return replace(_scattering(inner[0]), one_sided=False)
+    if bsdf.type in GLASSES:
+        glass = Glass(read_ior(bsdf.props, "int_ior", "bk7"), read_ior(bsdf.props, "ext_ior", "air"))
+        bsdf.ignore("int_ior", "ext_ior", "formula")
+        bsdf.done()
+        return Surface((glass,))
+    if bsdf.type == "diffuse":
+        colours, scales = _paint(bsdf, "reflectance", DEFAULT[0])
+        bsdf.done()
+        return Surface(tuple(map(Diffuse, colours)), scales, one_sided=any(colour != BLACK for colour in colours))
+    raise bsdf.refused("a BSDF of another kind", f"diffuse, twosided, {', '.join(GLASSES)}")
+
+
+def _paint(node: Node, name: str, default: float | None) -> tuple[tuple[Colour, ...], tuple[float, float] | None]:
+    """One colour, or the two of a checkerboard and the scale of its uv."""
+    texture = node.take(name)
+    if not isinstance(texture, Node):
+        return (node.colour(name, default),), None
+    if texture.type != "checkerboard":
+        raise texture.refused(f"a texture for the {name}", "checkerboard")
+    colours = texture.colour("color0", 0.4), texture.colour("color1", 0.2)
+    matrix = texture.transform("to_uv")
+    texture.done()
+    if not (matrix == np.diag(matrix.diagonal())).all() or not (matrix[[0, 1], [0, 1]] > 0).all():
+        raise texture.refused("to_uv turns or moves", "a scale")
+    return colours, (float(matrix[0, 0]), float(matrix[1, 1]))

@@ -1,0 +1,106 @@
+"""The plain scene for LuxCore: `scene.scn`, `scene.cfg`, a PLY file per mesh, and the script that renders them."""
+
+from __future__ import annotations
+
+from importlib.resources import files as resources
+
+import numpy as np
+
+from mi_refract.scene_export.plain_scene import Camera, Colour, Environment, Glass, Light, Material, Plain
+
+from . import scene_json
+from .environment_map import Array
+from .shared_files import Files, numbers, ply, readme
+
+COMMAND = """
+pip install pyluxcore==2.11.2
+python render.py --spp 256 --seeds 1 2 3 4 --out .
+"""
+ASSUMED = (
+    "path.pathdepth.* is Mitsuba's max_depth; no Russian roulette before it, no clamping, no light tracing.",
+    "A box filter of one pixel. LuxCore's film is one row off, so the screen window is moved down by two over the "
+    "height.",
+    "A sky that is a map is resampled: LuxCore's zenith is +z, its longitudes run the other way, its rows have their "
+    "centres between the poles.",
+    "Radiance is scaled by the square of the index at a boundary, as in Mitsuba.",
+)
+# Random numbers of their own in every sample, so that renders of two seeds are independent.
+CONFIG = """renderengine.type = "PATHCPU"
+sampler.type = "RANDOM"
+scene.file = "scene.scn"
+film.width = {camera.width}
+film.height = {camera.height}
+film.filter.type = "BOX"
+film.filter.width = 0.5
+film.outputs.0.type = "RGB"
+film.outputs.0.filename = "scene.exr"
+path.pathdepth.total = {depth}
+path.pathdepth.diffuse = {depth}
+path.pathdepth.glossy = {depth}
+path.pathdepth.specular = {depth}
+path.russianroulette.depth = {depth}
+path.clamping.variance.maxvalue = 0
+path.hybridbackforward.enable = 0
+batch.haltspp = 256
+"""
+
+
+def files(plain: Plain) -> Files:
+    return {
+        "scene.scn": _scene(plain).encode(),
+        "scene.cfg": CONFIG.format(camera=plain.camera, depth=plain.max_depth).encode(),
+        "render.py": resources(__package__).joinpath("render_luxcore.py").read_bytes(),
+        "README.txt": readme(plain, "LuxCore", COMMAND, ASSUMED),
+    } | scene_json.sky(plain, looked_up) | {f"{mesh.name}.ply": ply(mesh) for mesh in plain.meshes}  # fmt: skip
+
+
+def looked_up(u: Array, v: Array) -> Array:
+    """The direction whose radiance LuxCore finds at (u, v) of a picture, v from the top."""
+    phi, theta = 2 * np.pi * u, np.pi * v
+    return np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], axis=-1)
+
+
+def _scene(plain: Plain) -> str:
+    names = scene_json.material_names(plain)
+    lines = _camera(plain.camera) + _sky(plain.sky)
+    for material, name in names.items():
+        lines += [f"scene.materials.{name}.{line}" for line in _material(material)]
+    for mesh in plain.meshes:
+        lines.append(f'scene.objects.{mesh.name}.ply = "{mesh.name}.ply"')
+        lines.append(f'scene.objects.{mesh.name}.material = "{names[mesh.material]}"')
+    return "\n".join(lines) + "\n"
+
+
+def _camera(camera: Camera) -> list[str]:
+    tall, row = camera.height / camera.width, 2 / camera.width
+    own = {
+        "lookat.orig": camera.origin,
+        "lookat.target": camera.target,
+        "up": camera.up,
+        "fieldofview": [camera.fov_x_degrees],
+        "screenwindow": [-1, 1, -tall - row, tall - row],
+        "cliphither": [1e-3],
+        "clipyon": [1e6],
+        "autofocus.enable": [0],
+    }
+    return ['scene.camera.type = "perspective"', *(f"scene.camera.{key} = {numbers(own[key])}" for key in own)]
+
+
+def _sky(sky: Colour | Environment) -> list[str]:
+    if isinstance(sky, Environment):
+        # Without the clamp a pole is mixed with the other one.
+        own = {"type": '"infinite"', "file": '"sky.exr"', "gamma": "1", "storage": '"float"', "wrap": '"clamp"'}
+    elif any(sky):
+        own = {"type": '"constantinfinite"', "color": numbers(sky)}
+    else:
+        own = {}
+    return [f"scene.lights.sky.{key} = {value}" for key, value in own.items()]
+
+
+def _material(material: Material) -> list[str]:
+    if isinstance(material, Glass):
+        inside, outside = numbers([material.int_ior]), numbers([material.ext_ior])
+        return ['type = "glass"', "kr = 1 1 1", "kt = 1 1 1", f"interiorior = {inside}", f"exteriorior = {outside}"]
+    if isinstance(material, Light):
+        return ['type = "matte"', "kd = 0 0 0", f"emission = {numbers(material.radiance)}"]
+    return ['type = "matte"', f"kd = {numbers(material.reflectance)}"]

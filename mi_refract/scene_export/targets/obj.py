@@ -1,0 +1,64 @@
+"""The plain scene for anyone: Wavefront OBJ with a material library, and all that these cannot say as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from mi_refract.scene_export.plain_scene import Diffuse, Glass, Material, Plain
+
+from . import scene_json
+from .environment_map import Array
+from .shared_files import Files, numbers, readme
+
+COMMAND = """
+scene.obj    the triangles, an object per mesh        scene.mtl    a hint for programs that read one
+scene.json   camera, sky, materials and max_depth; the materials of the objects by name
+sky.exr      where the sky is a map: longitude and latitude
+"""
+ASSUMED = (
+    "Right-handed coordinates. Triangles are counterclockwise seen from the medium of a glass's ext_ior, and from the "
+    "side to which a light shines; lights are black from behind. All shading is flat.",
+    "The camera is a pinhole that looks from origin to target, up is up in the picture, fov_x_degrees is from the left "
+    "border to the right one; a pixel is the mean over its square.",
+    "max_depth counts the segments of a path from the camera: 2 is light, one surface, camera.",
+    "sky.exr: +y is the zenith; the pixel in row j and column i of H and W has its centre at theta = pi (j + 1/2) / H, "
+    "phi = 2 pi (i + 1/2) / W, and is seen in direction (sin(phi) sin(theta), cos(theta), -cos(phi) sin(theta)).",
+    "Whether radiance is scaled by the square of the index at a boundary is left to you: it shows only where a camera, "
+    "a light or a diffuse surface is inside glass.",
+)
+
+
+def files(plain: Plain) -> Files:
+    return scene_json.sky(plain, looked_up) | {
+        "scene.obj": "".join(_objects(plain)).encode(),
+        "scene.mtl": "".join(map(_material, *zip(*scene_json.material_names(plain).items(), strict=True))).encode(),
+        "scene.json": scene_json.document(plain, {mesh.name: {"object": mesh.name} for mesh in plain.meshes}),
+        "README.txt": readme(plain, "a program of your own", COMMAND, ASSUMED),
+    }
+
+
+def looked_up(u: Array, v: Array) -> Array:
+    """Mitsuba's own coordinates, with pixels at their centres."""
+    phi, theta = 2 * np.pi * u, np.pi * v
+    return np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], axis=-1)
+
+
+def _objects(plain: Plain) -> Iterator[str]:
+    """OBJ counts vertices from 1, through all objects."""
+    names, first = scene_json.material_names(plain), 1
+    yield "mtllib scene.mtl\n"
+    for mesh in plain.meshes:
+        yield f"o {mesh.name}\nusemtl {names[mesh.material]}\n"
+        yield "".join(f"v {numbers(vertex)}\n" for vertex in mesh.vertices.tolist())
+        yield "".join(f"f {a} {b} {c}\n" for a, b, c in (mesh.faces + first).tolist())
+        first += len(mesh.vertices)
+
+
+def _material(material: Material, name: str) -> str:
+    if isinstance(material, Glass):
+        return f"newmtl {name}\nillum 7\nKd 0 0 0\nKs 1 1 1\nTf 1 1 1\nNi {material.int_ior / material.ext_ior!r}\n"
+    if isinstance(material, Diffuse):
+        return f"newmtl {name}\nillum 1\nKd {numbers(material.reflectance)}\n"
+    return f"newmtl {name}\nillum 1\nKd 0 0 0\nKe {numbers(material.radiance)}\n"

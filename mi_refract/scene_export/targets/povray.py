@@ -1,0 +1,122 @@
+"""The plain scene for POV-Ray: lamps and glass only, for it does not follow light between diffuse surfaces."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from mi_refract.scene_export.plain_scene import (
+    Camera,
+    Colour,
+    Diffuse,
+    Environment,
+    Glass,
+    Light,
+    Material,
+    Mesh,
+    Plain,
+)
+from mi_refract.scene_export.tessellation import is_closed
+
+from . import scene_json
+from .environment_map import Array
+from .shared_files import LIGHT_INSIDE, Files, numbers, readme
+
+COMMANDS = """
+    povray +Iscene.pov +Oimage.exr +FE +W{width} +H{height} -A -D File_Gamma=1.0 Declare=dx=0.5 Declare=dy=0.5
+
+0 <= dx, dy < 1: where in each pixel its only sample is; the mean over pictures with random dx and dy is the box filter.
+"""
+ASSUMPTIONS = (
+    "max_trace_level counts as Mitsuba's max_depth does, to 256 at most; both rays are followed at a boundary, until "
+    "the share of one is below 1e-7 (adc_bailout).",
+    "A ray is inside those bodies whose surface it has met once and not twice. Glass must be closed, and bodies inside "
+    "one another must not touch.",
+    "A sky that is a map is resampled: POV-Ray's first column is seen toward +x.",
+    "Mesh vertices are float32, and the picture's numbers are half floats.",
+    LIGHT_INSIDE,
+)
+BAILOUT = "1e-7"
+
+
+def files(plain: Plain) -> Files:
+    for mesh in plain.meshes:
+        place = f"{plain.name}: {mesh.name}"
+        if isinstance(mesh.material, Glass) and not is_closed(mesh.faces):
+            raise ValueError(f"{place}: glass with an open surface; accepted for POV-Ray: a closed one")
+        if isinstance(mesh.material, Diffuse) and any(mesh.material.reflectance):
+            raise ValueError(f"{place}: a diffuse surface; accepted for POV-Ray: glass and lamps only")
+    camera = plain.camera
+    outside = _outside(plain)
+    parts = [_settings(plain), _camera(camera), _sky(plain.sky), *(_mesh(mesh, outside) for mesh in plain.meshes)]
+    commands = COMMANDS.format(width=camera.width, height=camera.height)
+    return scene_json.sky(plain, looked_up) | {
+        "scene.pov": "\n".join(parts).encode(),
+        "README.txt": readme(plain, "POV-Ray 3.7", commands, ASSUMPTIONS),
+    }
+
+
+def looked_up(u: Array, v: Array) -> Array:
+    """The direction whose radiance POV-Ray finds at (u, v) of a picture, v from the top."""
+    phi, theta = 2 * np.pi * u, np.pi * v
+    return np.stack([np.cos(phi) * np.sin(theta), np.cos(theta), np.sin(phi) * np.sin(theta)], axis=-1)
+
+
+def _settings(plain: Plain) -> str:
+    return (
+        "#version 3.7;\n"
+        f"global_settings {{ assumed_gamma 1.0 max_trace_level {min(plain.max_depth, 256)} adc_bailout {BAILOUT} }}\n"
+    )
+
+
+def _outside(plain: Plain) -> float:
+    """The index of the outermost medium: POV-Ray's is 1, so that its indices are relative to this one."""
+    glasses = [mesh for mesh in plain.meshes if isinstance(mesh.material, Glass)]
+    outer = max(glasses, key=lambda mesh: mesh.vertices[:, 0].max(), default=None)
+    return outer.material.ext_ior if outer and isinstance(outer.material, Glass) else 1.0
+
+
+def _vector(values: np.ndarray | tuple[float, ...]) -> str:
+    return f"<{numbers(values, ', ')}>"
+
+
+def _camera(camera: Camera) -> str:
+    """Right-handed: `right` is where the picture's right is. Shifted by (dx − ½, dy − ½) pixels."""
+    ahead = np.subtract(camera.target, camera.origin)
+    ahead = ahead / np.linalg.norm(ahead)
+    right = np.cross(ahead, camera.up)
+    right *= 2 * math.tan(math.radians(camera.fov_x_degrees) / 2) / np.linalg.norm(right)
+    up = np.cross(right, ahead) * camera.height / camera.width
+    return (
+        "#ifndef (dx) #declare dx = 0.5; #end\n#ifndef (dy) #declare dy = 0.5; #end\n"
+        f"#declare Right = {_vector(right)};\n#declare Up = {_vector(up)};\n"
+        f"camera {{ perspective location {_vector(camera.origin)} right Right up Up\n"
+        f"  direction {_vector(ahead)} + Right*(dx - 0.5)/{camera.width} - Up*(dy - 0.5)/{camera.height} }}\n"
+    )
+
+
+def _sky(sky: Colour | Environment) -> str:
+    if not isinstance(sky, Environment):
+        return f"background {{ rgb {_vector(sky)} }}\n"
+    return 'sky_sphere { pigment { image_map { exr "sky.exr" gamma 1.0 map_type 1 interpolate 2 } } }\n'
+
+
+def _mesh(mesh: Mesh, outside: float) -> str:
+    vertices = ",\n".join(map(_vector, mesh.vertices))
+    # Counterclockwise in these right-handed coordinates is clockwise in POV-Ray's.
+    faces = ",\n".join(f"<{c}, {b}, {a}>" for a, b, c in mesh.faces.tolist())
+    return (
+        f"mesh2 {{ // {mesh.name}\n  vertex_vectors {{ {len(mesh.vertices)},\n{vertices} }}\n"
+        f"  face_indices {{ {len(mesh.faces)},\n{faces} }}\n  {_material(mesh.material, outside)}\n}}\n"
+    )
+
+
+def _material(material: Material, outside: float) -> str:
+    dark = "ambient 0 diffuse 0"
+    if isinstance(material, Glass):
+        finish = f"finish {{ {dark} reflection {{ 0, 1 fresnel on }} conserve_energy }}"
+        return f"texture {{ pigment {{ rgbt 1 }} {finish} }} interior {{ ior {material.int_ior / outside!r} }}"
+    colour = material.radiance if isinstance(material, Light) else (0.0, 0.0, 0.0)
+    front = f"texture {{ pigment {{ rgb {_vector(colour)} }} finish {{ {dark} emission 1 }} }}"
+    return f"{front} interior_texture {{ pigment {{ rgb 0 }} finish {{ {dark} }} }}"

@@ -1,0 +1,88 @@
+"""The plain scene for Radiance, traced as by a path tracer that finds every light by chance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from mi_refract.scene_export.plain_scene import Camera, Diffuse, Environment, Glass, Material, Mesh, Plain
+
+from . import scene_json
+from .shared_files import Files, numbers, readme
+
+COMMANDS = """
+    oconv scene.rad > scene.oct
+    vwrays -fd -x {width} -y {height} -pa 0 -pj 1 -c 1024 -vf camera.vf |
+        rtrace -h -w -u+ -fdf -ab {depth} -aa 0 -ad 1 -as 0 -lr -{depth} -lw 1e-2 \\
+        scene.oct | total -if3 -of -m -1024 > image.f32
+
+RAYPATH must name both this folder and Radiance's lib.
+image.f32: {height} rows of {width} pixels of 3 float32, the top row first. 1024 is the number of samples per pixel.
+"""
+ASSUMPTIONS = (
+    "At a boundary both rays are followed while their share is above a hundredth (-lw); below it, Russian roulette (a "
+    "negative -lr) decides, without a bias.",
+    "-lr and -ab count reflections, Mitsuba's max_depth refractions too: Radiance has light that Mitsuba cuts off. "
+    "Where that shows, raise Mitsuba's max_depth: `nested` gains 0.2 % of its mean from 48 to 400.",
+    "Lights and sky are `glow` of radius 0: no shadow ray is sent to one, so that caustics are complete.",
+)
+
+
+def files(plain: Plain) -> Files:
+    sky, maps = _sky(plain)
+    camera = plain.camera
+    commands = COMMANDS.format(width=camera.width, height=camera.height, depth=plain.max_depth)
+    materials = scene_json.material_names(plain)
+    parts = ["".join(f"void {_material(material, name)}" for material, name in materials.items())]
+    parts += ["".join(_polygons(mesh, materials[mesh.material])) for mesh in plain.meshes]
+    return maps | {
+        "scene.rad": "\n".join([*parts, sky]).encode(),
+        "camera.vf": _view(camera).encode(),
+        "README.txt": readme(plain, "Radiance", commands, ASSUMPTIONS),
+    }
+
+
+def _material(material: Material, name: str) -> str:
+    if isinstance(material, Glass):  # an interface names the medium behind the normal first
+        return f"interface {name} 0 0 8 1 1 1 {material.int_ior!r} 1 1 1 {material.ext_ior!r}\n"
+    if isinstance(material, Diffuse):
+        return f"plastic {name} 0 0 5 {numbers(material.reflectance)} 0 0\n"
+    return f"glow {name} 0 0 4 {numbers(material.radiance)} 0\n"
+
+
+def _polygons(mesh: Mesh, material: str) -> Iterator[str]:
+    for i, corners in enumerate(mesh.triangles()):
+        yield f"{material} polygon {mesh.name}.{i} 0 0 9 {numbers(corners.ravel())}\n"
+
+
+def _view(camera: Camera) -> str:
+    ahead = np.subtract(camera.target, camera.origin)
+    wide = math.tan(math.radians(camera.fov_x_degrees) / 2)
+    fov_y = math.degrees(2 * math.atan(wide * camera.height / camera.width))
+    where = f"-vp {numbers(camera.origin)} -vd {numbers(ahead)} -vu {numbers(camera.up)}"
+    return f"VIEW= -vtv {where} -vh {camera.fov_x_degrees!r} -vv {fov_y!r}\n"
+
+
+def _sky(plain: Plain) -> tuple[str, Files]:
+    """The sky's lines in the scene, and the files that they name."""
+    sky = plain.sky
+    source = "sky source everywhere 0 0 4 0 0 1 360\n"
+    if not isinstance(sky, Environment):
+        return f"void glow sky 0 0 4 {numbers(sky)} 0\n{source}" if any(sky) else "", {}
+    height, width = sky.pixels.shape[:2]
+    pixels = np.concatenate([sky.pixels, sky.pixels[:, :1]], axis=1)
+    head = f"2\n0 {height - 1} {height}\n0 {width} {width + 1}\n"
+    maps = {f"sky_{c}.dat": (head + _table(pixels[..., i])).encode() for i, c in enumerate("rgb")}
+    x, y, z = (f"({a!r})*Dx + ({b!r})*Dy + ({c!r})*Dz" for a, b, c in sky.rotation.T.tolist())
+    functions = (
+        f"x = {x};\ny = {y};\nz = {z};\nturn = atan2(x, -z)/(2*PI) - {0.5 / width!r};\n"
+        f"row = Acos(y)/PI*{height - 1};\ncolumn = (turn - floor(turn))*{width};\n"
+    )
+    lines = "void colordata map 9 noop noop noop sky_r.dat sky_g.dat sky_b.dat sky.cal row column 0 0\n"
+    return f"{lines}map glow sky 0 0 4 1 1 1 0\n{source}", maps | {"sky.cal": functions.encode()}
+
+
+def _table(values: np.ndarray) -> str:
+    return "\n".join(" ".join(map(repr, row)) for row in values.astype(float).tolist()) + "\n"

@@ -1,0 +1,47 @@
+"""A plain scene as JSON beside its meshes: `scene.json`, a PLY file per mesh, `sky.exr` where the sky is a map."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from mi_refract.scene_export.plain_scene import Environment, Material, Plain
+
+from .environment_map import Lookup, longitude_latitude
+from .shared_files import Files, exr, ply
+
+
+def files(plain: Plain, looked_up: Lookup) -> Files:
+    """The sky's map is for a renderer that finds the direction `looked_up(u, v)` at (u, v), v from the top."""
+    meshes = {f"{mesh.name}.ply": ply(mesh) for mesh in plain.meshes}
+    places = {mesh.name: {"file": f"{mesh.name}.ply"} for mesh in plain.meshes}
+    return {"scene.json": document(plain, places)} | meshes | sky(plain, looked_up)
+
+
+def document(plain: Plain, places: Mapping[str, Mapping[str, str]]) -> bytes:
+    """The JSON; `places`: of each mesh, where its triangles are."""
+    names = material_names(plain)
+    shown: dict[str, Any] = {
+        "name": plain.name,
+        "max_depth": plain.max_depth,
+        "camera": dataclasses.asdict(plain.camera),
+        "sky": {"environment": "sky.exr"} if isinstance(plain.sky, Environment) else {"radiance": plain.sky},
+        "materials": {
+            name: {"type": type(material).__name__.lower()} | dataclasses.asdict(material)
+            for material, name in names.items()
+        },
+        "meshes": {mesh.name: {**places[mesh.name], "material": names[mesh.material]} for mesh in plain.meshes},
+    }
+    return json.dumps(shown, indent=1).encode()
+
+
+def material_names(plain: Plain) -> dict[Material, str]:
+    return {material: f"material{number}" for number, material in enumerate(plain.materials)}
+
+
+def sky(plain: Plain, looked_up: Lookup) -> Files:
+    if not isinstance(plain.sky, Environment):
+        return {}
+    return {"sky.exr": exr(longitude_latitude(plain.sky, looked_up))}

@@ -1,0 +1,65 @@
+"""What several targets write: meshes, environment maps, the text that goes with them."""
+
+from __future__ import annotations
+
+import tempfile
+import textwrap
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_refract import __version__
+from mi_refract.io.image_file import write_exr
+from mi_refract.scene_export.plain_scene import Mesh, Plain
+
+Files = dict[str, bytes]
+
+
+def ply(mesh: Mesh) -> bytes:
+    """Binary PLY, little-endian, float32, without normals."""
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(mesh.vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", 3)])
+    faces["count"], faces["index"] = 3, mesh.faces
+    return header.encode() + mesh.vertices.astype("<f4").tobytes() + faces.tobytes()
+
+
+def exr(pixels: NDArray[np.floating]) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map.exr"
+        write_exr(path, pixels)
+        return path.read_bytes()
+
+
+def numbers(values: Iterable[float], separator: str = " ") -> str:
+    """The shortest decimals that give the float64 numbers back."""
+    return separator.join(repr(float(value)) for value in values)
+
+
+def readme(plain: Plain, target: str, commands: str, assumptions: Sequence[str]) -> bytes:
+    """README.txt: how to render, and in what the renderer's model differs."""
+    camera = plain.camera
+    lines = [
+        f"{plain.name}: {len(plain.meshes)} flat-shaded meshes of {sum(len(m.faces) for m in plain.meshes)} triangles,",
+        f"{camera.width} x {camera.height} pixels, box filter, linear Rec. 709. Written by mi_refract {__version__}.",
+        "",
+        f"To render with {target}:",
+        "",
+        textwrap.indent(textwrap.dedent(commands).strip(), "    "),
+        "",
+        *(["What is assumed, and where the models differ:", ""] if assumptions else []),
+    ]
+    for assumption in assumptions:
+        lines += textwrap.wrap(assumption, 100, initial_indent="- ", subsequent_indent="  ")
+    return ("\n".join(lines) + "\n").encode()
+
+
+LIGHT_INSIDE = (
+    "Radiance is not scaled by the square of the index inside glass: the same picture as long as camera, lights and "
+    "diffuse surfaces are all in the outermost medium."
+)

@@ -1,0 +1,398 @@
+"""`mi-refract diff` and `mi-refract accept`: every option, every bad input, what is printed and what is written."""
+
+from __future__ import annotations
+
+import html
+import importlib.util
+import json
+import os
+import shlex
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from support.diff_images import BROKEN, picture, samples, tree
+
+from mi_refract import backend
+from mi_refract.cli import app
+from mi_refract.cli import diff as cli_diff
+from mi_refract.image_diff import methods, self_test, text_reports
+from mi_refract.image_diff.folders import Result, Results, Status
+
+EVIL = 'a"b<script>alert(1)</script>|`*[x](y)*`,:%0A::error::.exr'
+
+
+# Verdicts ---------------------------------------------------------------------------------------------------------
+
+
+def test_equal(run, pair):
+    old, new = pair
+    code, out, err = run("diff", old / "equal.exr", new / "equal.exr")
+    assert (code, err) == (0, "")
+    assert out.splitlines()[-1] == "1 picture: 1 equal"
+
+
+def test_different(run, pair):
+    code, out, err = run("diff", *pair)
+    assert (code, err) == (1, "")
+    lines = out.splitlines()
+    assert lines[1].split()[:3] == ["different", "louder.exr", "tolerance"]
+    assert lines[2].split()[:3] == ["equal", "equal.exr", "tolerance"]
+    assert lines[3] == "2 pictures: 1 different, 1 equal"
+    assert len(lines) == 4
+
+
+def test_inconclusive(run, tmp_path):
+    folders = samples(tmp_path / "old", 2, noise=1.0), samples(tmp_path / "new", 2, 100, noise=1.0)
+    codes = {"": 3, "pass": 0, "fail": 1}
+    for word, expected in codes.items():
+        how = ["--inconclusive", word] if word else []
+        junit = tmp_path / "out.xml"
+        code, out, err = run("diff", *folders, "--samples", "--method", "welch", "--junit", junit, *how)
+        assert (code, err) == (expected, "")
+        assert out.splitlines()[-1] == "1 picture: 1 inconclusive"
+        failures = ElementTree.parse(junit).findall(".//failure")
+        assert [each.get("type") for each in failures] == ([] if word == "pass" else ["inconclusive"])
+
+
+def test_samples(run, tmp_path):
+    old, new = samples(tmp_path / "old"), samples(tmp_path / "new", first=100, gain=1.3)
+    code, out, _ = run("diff", old, new, "--samples")
+    assert code == 1
+    assert out.splitlines()[1].split()[:3] == ["different", "old", "welch"]
+    assert run("diff", old, samples(tmp_path / "same", first=200), "--samples")[0] == 0
+
+
+@pytest.mark.parametrize("method", methods.METHODS)
+def test_every_method(run, pair, tmp_path, method):
+    old, new = pair
+    more = []
+    if methods.METHODS[method].samples:
+        old, new = samples(tmp_path / "s"), samples(tmp_path / "t", first=100, gain=2.0)
+        more = ["--samples"]
+    out = tmp_path / "out.json"
+    assert run("diff", old, new, "--method", method, "--json", out, *more)[0] == 1
+    assert json.loads(out.read_text())["results"][0]["method"] == method
+
+
+def test_an_option_of_the_method(run, pair):
+    assert run("diff", *pair, "--method", "tolerance", "--set", "fail=0.2", "--set", "hard_fail=1")[0] == 0
+    assert run("diff", *pair, "--method", "tolerance", "--set", "fail=0.2", "--set", "hard_fail=0.01")[0] == 1
+
+
+def test_settings_lie_beside_the_references(run, pair, tmp_path):
+    old, new = pair
+    rule = '[[image]]\nname = "louder.exr"\nmethod = "tolerance"\nfail = 0.2\nreason = "known to be louder"\n'
+    (old / "mi-refract.toml").write_text(rule)
+    code, out, err = run("diff", old, new)
+    assert (code, err) == (0, "")
+    assert "[known to be louder]" in out
+    assert run("diff", old / "louder.exr", new / "louder.exr")[0] == 0
+    other = tmp_path / "strict.toml"
+    other.write_text(rule.replace("0.2", "0.001"))
+    assert run("diff", old, new, "--settings", other)[0] == 1
+    other.write_text(rule.replace("louder.exr", "lauder.exr"))
+    code, _, err = run("diff", old, new, "--settings", other)
+    assert (code, err) == (1, "mi-refract: lauder.exr: matches no picture\n")
+
+
+def test_nan_has_to_be_named(run, pair):
+    for folder in pair:
+        picture(folder / "louder.exr", value=np.nan)
+    assert run("diff", *pair)[0] == 1
+    assert run("diff", *pair, "--allow-nonfinite", "equal.exr")[0] == 1
+    assert run("diff", *pair, "--allow-nonfinite", "louder.exr")[0] == 0
+    picture(pair[1] / "louder.exr", value=np.inf)
+    assert run("diff", *pair, "--allow-nonfinite", "louder.exr")[0] == 1
+
+
+def test_the_methods_are_printed_without_pictures(run):
+    code, out, err = run("diff", "--methods")
+    assert (code, err) == (0, "")
+    for name, method in methods.METHODS.items():
+        assert f"`{name}`: {method.summary}" in out
+        assert all(f"| `{option}` |" in out for option in method.options)
+
+
+# Bad input --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", BROKEN)
+@pytest.mark.parametrize("side", [0, 1])
+def test_bad_pictures(run, pair, tmp_path, name, side):
+    bad = pair[side] / "equal.exr"
+    bad.unlink()
+    BROKEN[name](bad)
+    files = [tmp_path / "out.json", tmp_path / "out.xml"]
+    code, out, err = run("diff", *pair, "--json", files[0], "--junit", files[1])
+    assert (code, err.count("\n")) == (2, 1)
+    assert err.startswith("mi-refract: ")
+    assert "equal.exr" in err
+    assert out.splitlines()[1].split()[:2] == ["different", "louder.exr"]
+    assert out.splitlines()[-1] == "2 pictures: 1 could not be compared, 1 different"
+    assert {r["name"]: r["status"] for r in json.loads(files[0].read_text())["results"]} == {
+        "equal.exr": "error",
+        "louder.exr": "different",
+    }
+    assert [each.get("type") for each in ElementTree.parse(files[1]).findall(".//error")] == ["error"]
+    alone = run("diff", pair[0] / "equal.exr", pair[1] / "equal.exr")
+    assert (alone[0], alone[1], alone[2].count("\n")) == (2, "", 1)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
+def test_a_picture_without_permission(run, pair):
+    (pair[1] / "equal.exr").chmod(0)
+    code, out, err = run("diff", *pair)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "Permission denied" in err
+    assert "louder.exr" in out
+
+
+BAD = {
+    "no file": (["{}/old", "{}/none"], "none"),
+    "file and folder": (["{}/old", "{}/new/equal.exr"], "a folder and a file"),
+    "nothing in it": (["{}/old", "{}/empty"], "empty: holds no picture"),
+    "nothing to refer to": (["{}/empty", "{}/new"], "empty: holds no picture"),
+    "twice the folder": (["{}/old", "{}/old"], "the same as the reference"),
+    "twice the file": (["{}/old/equal.exr", "{}/old/../old/equal.exr"], "the same as the reference"),
+    "within": (["{}", "{}/new"], "one within the other"),
+    "samples of files": (["{}/old/equal.exr", "{}/new/equal.exr", "--samples"], "accepted with --samples: a folder"),
+    "method": (["{}/old", "{}/new", "--method", "idiff"], "--method idiff: accepted: auto, exact"),
+    "option": (["{}/old", "{}/new", "--method", "exact", "--set", "fail=1"], "--set fail: unknown"),
+    "option of none": (["{}/old", "{}/new", "--set", "fail=1"], "the options of which method?"),
+    "inconclusive": (["{}/old", "{}/new", "--inconclusive", "maybe"], "maybe"),
+    "no settings": (["{}/old", "{}/new", "--settings", "{}/none.toml"], "none.toml"),
+    "bad settings": (["{}/old", "{}/new", "--settings", "{}/bad.toml"], "bad.toml: image[0].fale: unknown"),
+    "report's name": (["{}/old", "{}/new", "--report", "{}/out.exr"], "accepted: a file name that ends in .html"),
+    "report's folder": (["{}/old", "{}/new", "--report", "{}/none/out.html"], "is not a folder"),
+    "junit's name": (["{}/old", "{}/new", "--junit", "{}/out.json"], "accepted: a file name that ends in .xml"),
+    "json's name": (["{}/old", "{}/new", "--json", "{}/old/equal.exr"], "accepted: a file name that ends in .json"),
+    "one path": (["{}/old"], "TEST"),
+    "no path": ([], "REFERENCE"),
+    "unknown option": (["{}/old", "{}/new", "--nonesuch"], "--nonesuch"),
+}
+
+
+@pytest.mark.parametrize("words, message", BAD.values(), ids=BAD)
+@pytest.mark.parametrize("verb", ["diff", "accept"])
+def test_bad_words(run, pair, tmp_path, verb, words, message):
+    if verb == "accept" and {"--samples", "--inconclusive", "--report", "--junit", "--json"} & {*words}:
+        pytest.skip("not one of its options")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bad.toml").write_text('[[image]]\nname = "a"\nreason = "r"\nfale = 1')
+    before = tree(tmp_path)
+    code, out, err = run(verb, *(word.format(tmp_path) for word in words))
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith("mi-refract: ")
+    assert message in err
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("verb", "package"), [("diff", "scipy"), ("accept", "scipy"), ("report", "jinja2"), ("report", "matplotlib")]
+)
+def test_without_the_extra(run, pair, monkeypatch, tmp_path, verb, package):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else find(name))
+    words = ["diff", "--report", tmp_path / "out.html"] if verb == "report" else [verb]
+    code, out, err = run(*words, *pair)
+    assert (code, out) == (2, "")
+    assert err == "mi-refract: comparing needs the extra `diff`: pip install 'mi-refract[diff]'\n"
+
+
+def test_nothing_is_created_or_overwritten(run, pair, tmp_path):
+    picture(pair[1] / "added.exr")
+    picture(pair[0] / "removed.exr")
+    before = tree(tmp_path)
+    run("diff", *pair)
+    run("diff", pair[0] / "none.exr", pair[1] / "added.exr")
+    run("diff", tmp_path / "none", pair[1])
+    assert tree(tmp_path) == before
+
+
+# Self-test, report ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """A self-test of few trials."""
+    full = self_test.examine
+    monkeypatch.setattr(self_test, "examine", lambda renders, case: full(renders, case, trials=2, null_pairs=4))
+
+
+def test_self_test_of_renders_and_of_one_picture(run, tmp_path, quick):
+    folder = samples(tmp_path / "renders", 8, noise=0.001)
+    for path, number in ((folder, "null pairs 4"), (folder / "0.exr", "null pairs 1")):
+        code, out, err = run("diff", "--self-test", path)
+        assert err == ""
+        assert code == int("not held" in out)
+        assert {"NaN", "blur"} <= {line.split()[0] for line in out.splitlines()}
+        assert number in out
+
+
+def test_self_test_renders_a_scene(run, tmp_path, quick, monkeypatch):
+    text = (Path(app.__file__).parents[2] / "scenes" / "sphere.xml").read_text()
+    scene = tmp_path / "sphere.xml"
+    scene.write_text(text.replace('name="res" value="128"', 'name="res" value="24"'))
+    monkeypatch.setattr(cli_diff, "SELF_TEST_SPP", 2)
+    monkeypatch.setattr(backend, "activate", lambda **how: None)
+    code, out, err = run("diff", "--self-test", scene)
+    assert (code in (0, 1), err) == (True, "")
+    assert "renders: noise " in out
+
+
+def test_a_self_test_that_misses_something_says_so(run, pair, quick, monkeypatch):
+    monkeypatch.setattr(self_test.Row, "verdict", "fail")
+    assert run("diff", "--self-test", pair[0] / "equal.exr")[0] == 1
+    monkeypatch.setattr(self_test.Row, "verdict", "pass")
+    assert run("diff", "--self-test", pair[0] / "equal.exr")[0] == 0
+
+
+def test_bad_self_tests(run, pair, tmp_path):
+    picture(tmp_path / "mixed" / "a.exr")
+    picture(tmp_path / "mixed" / "b.exr", shape=(8, 8, 3))
+    picture(tmp_path / "nan.exr", value=np.nan)
+    for words, message in [
+        (pair, "--self-test takes one path"),
+        ([pair[0] / "equal.exr", "--report", tmp_path / "a.html"], "accepted: no other option"),
+        ([pair[0] / "equal.exr", "--method", "flip"], "accepted: no other option"),
+        ([tmp_path / "none.exr"], "none.exr"),
+        ([tmp_path / "none.xml"], "none.xml"),
+        ([tmp_path / "mixed"], "size or channels differ from"),
+        ([tmp_path / "nan.exr"], "every value of them finite"),
+    ]:
+        code, out, err = run("diff", "--self-test", *words)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert message in err
+
+
+def test_report(run, pair, tmp_path):
+    page = tmp_path / "out.html"
+    code, _, err = run("diff", *pair, "--report", page, "--method", "tolerance", "--set", "fail=0.01")
+    assert (code, err) == (1, "")
+    text = html.unescape(page.read_text())
+    whole = f"mi-refract diff {pair[0]} {pair[1]} --method tolerance --set fail=0.01"
+    one = f"mi-refract accept {pair[0]}/louder.exr {pair[1]}/louder.exr --method tolerance --set fail=0.01"
+    assert whole in text
+    assert one in text
+
+
+# Forms ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def strange(pair):
+    """The pair with a third whose name is anything but text, added."""
+    name = EVIL.replace("/", "∕")
+    picture(pair[1] / "inner.exr")
+    (pair[1] / "inner.exr").rename(pair[1] / name)
+    return pair, name
+
+
+def test_json(run, strange, tmp_path):
+    (old, new), name = strange
+    out = tmp_path / "out.json"
+    assert run("diff", old, new, "--json", out)[0] == 1
+
+    def refuse(word):
+        raise AssertionError(f"{word} is no JSON")
+
+    data = json.loads(out.read_text(), parse_constant=refuse)
+    assert data["schema"] == 1
+    assert data["exit_code"] == 1
+    assert data["counts"] == {"error": 0, "different": 2, "inconclusive": 0, "equal": 1}
+    by_name = {result["name"]: result for result in data["results"]}
+    assert by_name[name]["category"] == "added"
+    assert by_name[name]["reference"] is None
+    changed = by_name["louder.exr"]
+    assert (changed["status"], changed["category"]) == ("different", "changed")
+    assert changed["test"] == str(new / "louder.exr")
+    assert any(figure["bound"] is not None and figure["value"] > figure["bound"] for figure in changed["figures"])
+    assert changed["reproduce"] == shlex.join(["mi-refract", "diff", f"{old}/louder.exr", f"{new}/louder.exr"])
+    assert run(*shlex.split(changed["reproduce"])[1:])[0] == 1
+
+
+def test_junit(run, strange, tmp_path):
+    (old, new), name = strange
+    (new / "equal.exr").unlink()
+    out = tmp_path / "out.xml"
+    assert run("diff", old, new, "--junit", out)[0] == 1
+    root = ElementTree.parse(out).getroot()
+    assert [root.get(key) for key in ("tests", "failures", "errors", "skipped")] == ["3", "3", "0", "0"]
+    failures = {case.get("name"): case.find("failure") for case in root.iter("testcase")}
+    assert {name: failure.get("type") for name, failure in failures.items()} == {
+        name: "added",
+        "equal.exr": "removed",
+        "louder.exr": "different",
+    }
+    assert "reproduce: mi-refract diff " in failures["louder.exr"].text
+
+
+def test_github(run, strange, tmp_path, monkeypatch):
+    (old, new), _ = strange
+    BROKEN["empty"](new / "equal.exr")
+    summary = tmp_path / "summary.md"
+    summary.write_text("before\n")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(summary))
+    code, out, _ = run("diff", old, new, "--github")
+    assert code == 2
+    commands = [line for line in out.splitlines() if line.startswith("::")]
+    assert len(commands) == 3
+    assert all(line.startswith(f"::error file={new}/") for line in commands)
+    assert sum("title=louder.exr%3A different::" in line for line in commands) == 1
+    (evil,) = [line for line in commands if "script" in line]
+    file, _, rest = evil.removeprefix("::error ").partition("::")
+    assert rest == "only among the new pictures"
+    assert file.count(",") == 1 and ":" not in file and "%250A" in file
+    text = summary.read_text()
+    assert text.startswith("before\n### mi-refract diff: 3 pictures: 1 could not be compared, 2 different\n")
+    assert "<script>" not in text and "`" not in text
+    rows = [line for line in text.splitlines() if line.startswith("| ")]
+    assert len(rows) == 4
+    assert all(row.count("|") == 5 for row in rows)
+
+
+def test_github_without_a_summary(run, pair, monkeypatch):
+    monkeypatch.delenv("GITHUB_STEP_SUMMARY", raising=False)
+    code, out, err = run("diff", *pair, "--github")
+    assert (code, err) == (1, "")
+    assert sum(line.startswith("::error ") for line in out.splitlines()) == 1
+    (pair[1] / "louder.exr").write_bytes((pair[0] / "louder.exr").read_bytes())
+    code, out, err = run("diff", *pair, "--github")
+    assert (code, out.splitlines()[-1]) == (0, "2 pictures: 2 equal")
+
+
+def test_strangers_words_stay_text(tmp_path):
+    """Line ends and terminal escapes in names, surrogates of names that are no UTF-8, characters XML lacks."""
+    name = "a\n::error::b\x1b[31m\udcff\uffff\u2028\u202e.exr"
+    result = Result(name, Status.ERROR, tmp_path, tmp_path, error=name)
+    results = Results(tmp_path, tmp_path, (result,))
+    forms = [*text_reports.workflow_commands(results), text_reports.markdown(results).partition("|---|\n")[2]]
+    text_reports.write_junit(tmp_path / "out.xml", results)
+    text_reports.write_json(tmp_path / "out.json", results)
+    forms.append(ElementTree.parse(tmp_path / "out.xml").find(".//testcase").get("name"))
+    for form in forms:
+        form.encode()
+        assert not {"\x1b", "\u202e", "\u2028", "\uffff"} & {*form}
+        assert "\n" not in form.strip()
+    assert json.loads((tmp_path / "out.json").read_text())["results"][0]["name"] == name
+
+
+def test_many_equal_pictures_are_counted_and_not_listed(tmp_path, run):
+    for i in range(text_reports.FEW + 2):
+        for side in ("old", "new"):
+            picture(tmp_path / side / f"{i}.exr", shape=(4, 4, 3))
+    code, out, _ = run("diff", tmp_path / "old", tmp_path / "new")
+    lines = out.splitlines()
+    assert code == 0
+    assert len(lines) == text_reports.FEW + 3
+    assert lines[-2:] == ["… and 2 more that are equal", f"{text_reports.FEW + 2} pictures: {text_reports.FEW + 2} equal"]
+
+
+def test_a_long_summary_is_cut(tmp_path):
+    number = text_reports.SUMMARY_ROWS + 7
+    results = tuple(Result(f"{i}.exr", Status.ERROR, tmp_path, tmp_path, error="bad") for i in range(number))
+    text = text_reports.markdown(Results(tmp_path, tmp_path, results))
+    assert text.count("| error |") == text_reports.SUMMARY_ROWS
+    assert text.endswith("\n\n… and 7 more\n\n")

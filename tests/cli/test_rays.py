@@ -1,0 +1,343 @@
+"""`mi-refract rays`: what it prints, and other people's programs."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from support.ray_programs import glsl
+
+from mi_refract.cli import app
+from mi_refract.ray_sets import ray_set, run_program
+
+# A renderer's side of it, with nothing of ours: the comment on stderr must get through.
+PROGRAM = """
+import sys, numpy as np
+rows = [line for line in sys.stdin if not line.startswith("#")][1:]
+x = np.array([row.split(",") for row in rows]).astype(np.float32)
+a, n, k = x[:, 1:4], x[:, 4:7], x[:, 7:8] / x[:, 8:9]
+if "inverted" in sys.argv:
+    k = 1 / k
+c = (n * a).sum(1, keepdims=True)
+radicand = 1 - k * k * (1 - c * c)
+b = np.where(radicand < 0, 0, k * a - (k * c + np.sqrt(np.maximum(radicand, 0))) * n)
+print("traced", len(b), file=sys.stderr)
+print("id,bx,by,bz")
+for i, row in zip(x[:, 0], b):
+    print("%d,%r,%r,%r" % (i, *map(float, row)))
+"""
+FEW = ("--regime", "generic", "--regime", "critical", "--count", "60")
+
+
+@pytest.fixture
+def program(tmp_path):
+    path = tmp_path / "refract.py"
+    path.write_text(PROGRAM)
+    return [sys.executable, str(path)]
+
+
+@pytest.fixture
+def call(tmp_path, monkeypatch, capfd):
+    """`call("check", …)`: exit code, stdout, stderr of `mi-refract rays …` in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        capfd.readouterr()
+        code = app.main(["rays", *map(str, arguments)])
+        return code, *capfd.readouterr()
+
+    return run
+
+
+def answer(path, to, program=glsl, lines=()):
+    b = program(to.rays.a, to.rays.n, to.rays.k).astype(float)
+    rows = [f"{i},{x!r},{y!r},{z!r}" for i, (x, y, z) in zip(to.ids, b.tolist(), strict=True)]
+    Path(path).write_text("\n".join([*lines, "id,bx,by,bz", *rows, ""]))
+
+
+def header(to):
+    return [line for line in ray_set.as_csv(to).splitlines() if line.startswith("#")]
+
+
+# export and check
+
+
+def test_export_and_check(call):
+    code, out, err = call("export", *FEW, "--precision", "f64", "--seed", 3, "-o", "rays.csv")
+    assert (code, out, err) == (0, "rays.csv: 120 rays, 2 regimes, f64, seed 3\n", "")
+    to = ray_set.read("rays.csv")
+    assert (len(to), to.precision, to.header["seed"]) == (120, "f64", 3)
+    answer("answers.csv", to)
+    code, out, err = call("check", "answers.csv", "--rays", "rays.csv")
+    assert (code, err) == (0, "")
+    assert "120 answers, all as good as the formula decomposed or better" in out
+    assert "told by the zero vector (detected)" in out
+
+
+def test_export_in_every_format_is_the_same_set(call):
+    for ending in ("csv", "npz", "exr"):
+        assert call("export", "--count", 5, "--two-sided", "-o", f"rays.{ending}")[0] == 0
+    found = [ray_set.read(f"rays.{ending}") for ending in ("csv", "npz", "exr")]
+    assert len({each.header["checksum"] for each in found}) == 1
+    assert found[0].header["two_sided"] is True
+
+
+def test_the_regimes(call):
+    code, out, err = call("export", "--regimes")
+    assert (code, err) == (0, "")
+    assert len(out.splitlines()) == 18
+    assert "only where it is asked for" in out
+    assert call("export", "--regime", "k >> 1", "--count", 2, "-o", "rays.csv")[0] == 0
+    assert set(ray_set.read("rays.csv").regime) == {"k ≫ 1"}
+
+
+def test_wrong_answers(call):
+    to = ray_set.make(["generic"], 50)
+    ray_set.write("rays.csv", to)
+    answer("answers.csv", to, lambda a, n, k: glsl(a, n, 1 / k))
+    code, out, err = call("check", "answers.csv", "--rays", "rays.csv")
+    assert (code, err) == (1, "")
+    assert out.splitlines()[-1] == "50 of 50 answers are wrong: eta inverted"
+
+
+def test_answers_may_say_what_they_answer(call):
+    to = ray_set.make(["Brewster"], 40, "f64", 8)
+    answer("answers.csv", to, lines=header(to))
+    code, out, _ = call("check", "answers.csv")
+    assert (code, out.splitlines()[0]) == (0, "answers.csv: 40 rays, 1 regimes, f64, seed 8")
+    ray_set.write("rays.csv", to)
+    answer("answers.csv", to, lines=[line.replace("sha256:", "sha256:0") for line in header(to)])
+    code, _, err = call("check", "answers.csv", "--rays", "rays.csv")
+    assert (code, "the answers are to rays with the checksum sha256:0" in err) == (2, True)
+    code, _, err = call("check", "answers.csv")
+    assert (code, "cannot make again; accepted: with --rays FILE" in err) == (2, True)
+
+
+def test_without_a_word_they_are_to_the_default(call):
+    answer("answers.csv", ray_set.make())
+    code, out, _ = call("check", "answers.csv")
+    told = "as `export` without options; others with --rays FILE"
+    assert (code, out.splitlines()[0]) == (0, f"answers.csv: 13000 rays, 13 regimes, f32, seed 0, {told}")
+    answer("answers.csv", ray_set.make(seed=1))
+    assert call("check", "answers.csv")[0] == 1
+
+
+def test_the_measure_can_be_chosen(call):
+    to = ray_set.make(["generic"], 50)
+    answer("answers.csv", to, lines=header(to))
+    assert call("check", "answers.csv", "--as-good-as", "wedge")[0] == 0
+    code, out, _ = call("check", "answers.csv", "--as-good-as", "promoted")
+    assert (code, "none of the usual mistakes explains the answers" in out) == (1, True)
+
+
+DAMAGE = {
+    "no file": (None, 2, "No such file"),
+    "an empty file": ("", 2, "nothing in it"),
+    "other columns": ("id,x,y,z\n0,1,2,3\n", 2, "header line 'id,x,y,z'"),
+    "a short row": ("id,bx,by,bz\n0,0,1,0\n1,0,1", 2, "1 lines are no row, first line 3"),
+    "no text": (b"\xfe\xff\x00", 2, "no text"),
+    "a flag of 2": ("id,bx,by,bz,transmitted\n0,0,1,0,2\n", 2, "transmitted is 2.0"),
+}
+
+
+@pytest.mark.parametrize("content, code, message", DAMAGE.values(), ids=DAMAGE)
+def test_files_that_are_no_answers(call, content, code, message):
+    ray_set.write("rays.csv", ray_set.make(["generic"], 4))
+    if content is not None:
+        Path("answers.csv").write_bytes(content if isinstance(content, bytes) else content.encode())
+    found, out, err = call("check", "answers.csv", "--rays", "rays.csv")
+    assert (found, out) == (code, "")
+    assert err.startswith("mi-refract: ")
+    assert err.count("\n") == 1
+    assert message in err
+
+
+def test_answers_that_are_not_those_to_the_rays(call):
+    to = ray_set.make(["generic"], 50)
+    ray_set.write("rays.csv", to)
+    answer("answers.csv", to)
+    text = Path("answers.csv").read_text().splitlines()
+    Path("answers.csv").write_text("\n".join([*text[:41], text[5], "77,0,0,1"]))
+    code, out, err = call("check", "answers.csv", "--rays", "rays.csv", "--json", "out.json")
+    assert (code, err) == (2, "")
+    assert "10 without an answer: ids 40, 41, 42, 43, 44, …" in out
+    assert "1 answered more than once: id 4\n" in out
+    assert "1 answers to rays that were not asked: id 77\n" in out
+    assert out.splitlines()[-1] == "40 answers, but not those to the rays"
+    data = json.loads(Path("out.json").read_text())
+    assert [(each["kind"], each["count"]) for each in data["problems"]] == [
+        ("missing", 10), ("duplicate", 1), ("unknown", 1)
+    ]  # fmt: skip
+
+
+def test_rays_that_somebody_edited(call):
+    path = ray_set.write("rays.csv", to := ray_set.make(["generic"], 50))
+    answer("answers.csv", to)
+    path.write_text(path.read_text().replace("0.3", "0.4", 1))
+    code, out, err = call("check", "answers.csv", "--rays", "rays.csv")
+    assert (code, out) == (2, "")
+    assert "rays.csv: the checksum does not fit" in err
+
+
+BAD_OPTIONS = {
+    "a regime": (("export", "--regime", "generc", "-o", "r.csv"), "regime 'generc': unknown"),
+    "a precision": (("export", "--precision", "f16", "-o", "r.csv"), "precision 'f16': unknown"),
+    "a count": (("export", "--count", "0", "-o", "r.csv"), "--count"),
+    "an ending": (("export", "-o", "r.txt"), "accepted: a file name that ends in .csv or .npz or .exr"),
+    "a folder": (("export", "-o", "none/r.csv"), "is not a folder"),
+    "no file": (("export",), "--output"),
+    "a way to tell": (("check", "a.csv", "--tir", "zeros"), "--tir zeros: unknown; accepted: auto, zero, nan"),
+    "a formula": (("check", "a.csv", "--as-good-as", "glsl"), "--as-good-as glsl: unknown; accepted: wedge"),
+    "a report": (("check", "a.csv", "--report", "r.pdf"), "r.pdf: accepted"),
+    "no command": (("run",), "COMMAND"),
+    "rays twice": (("run", "--rays", "r.csv", "--count", "5", "--", "true"), "accepted: without --count"),
+    "nothing": ((), "Missing command"),
+}
+
+
+@pytest.mark.parametrize("words, message", BAD_OPTIONS.values(), ids=BAD_OPTIONS)
+def test_options_that_cannot_be(call, words, message):
+    code, _, err = call(*words)
+    assert code == 2
+    assert err.startswith("mi-refract: ")
+    assert message in err
+    assert not list(Path.cwd().iterdir())
+
+
+@pytest.mark.parametrize("package, words", [("flint", ()), ("jinja2", ("--report", "out.html"))])
+def test_what_is_not_installed_is_named(call, monkeypatch, package, words):
+    find = app.cli_rays.importlib.util.find_spec
+    monkeypatch.setattr(app.cli_rays.importlib.util, "find_spec", lambda name: None if name == package else find(name))
+    code, _, err = call("check", "answers.csv", *words)
+    assert (code, "pip install 'mi-refract[validation]'" in err) == (2, True)
+
+
+# run
+
+
+def test_a_program_that_is_right(call, program):
+    code, out, err = call("run", *FEW, "--json", "out.json", "--", *program)
+    assert (code, err) == (0, "traced 120\n")
+    assert json.loads(Path("out.json").read_text())["exit_code"] == 0
+    assert "120 rays, 2 regimes, f32, seed 0" in out
+
+
+def test_a_program_that_is_wrong(call, program):
+    ray_set.write("rays.npz", ray_set.make(["generic"], 50, "f32", 3))
+    code, out, _ = call("run", "--rays", "rays.npz", "--", *program, "inverted")
+    assert code == 1
+    assert out.splitlines()[-1] == "50 of 50 answers are wrong: eta inverted"
+
+
+BAD_PROGRAMS = {
+    "a status": ("import sys; sys.stdin.read(); print('id,bx,by,bz'); sys.exit(3)", "ended with status 3; accepted"),
+    "a signal": ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "was killed by SIGSEGV; accepted"),
+    "nothing": ("pass", "nothing in it"),
+    "a remark": ("print('hello'); print('id,bx,by,bz')", "header line 'hello'"),
+    "bytes": ("import os; os.write(1, bytes(range(256)))", "no text"),
+}
+
+
+@pytest.mark.parametrize("code, message", BAD_PROGRAMS.values(), ids=BAD_PROGRAMS)
+def test_programs_that_fail(call, code, message):
+    found, out, err = call("run", *FEW, "--", sys.executable, "-c", code)
+    assert (found, out) == (2, "")
+    assert err.startswith(f"mi-refract: {sys.executable} -c ")
+    assert message in err
+
+
+def test_a_program_without_answers(call):
+    code, out, _ = call("run", *FEW, "--", sys.executable, "-c", "print('id,bx,by,bz')")
+    assert (code, out.splitlines()[-1]) == (2, "no ray was answered")
+
+
+def test_a_program_that_is_not_there(call):
+    code, _, err = call("run", *FEW, "--", "./no-such-program", "x")
+    assert (code, "./no-such-program x: cannot be started: No such file" in err) == (2, True)
+
+
+def alive(pid):
+    """Whether it runs; a killed one may wait for whoever collects it."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+CHILD = """
+import os, sys, time
+with open(sys.argv[1] + ".part", "w") as file:
+    file.write(str(os.getpid()))
+os.rename(sys.argv[1] + ".part", sys.argv[1])
+time.sleep(600)
+"""
+asks_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="asks /proc who runs")
+
+
+def parent(path, rest, **streams):
+    """A program that starts CHILD, which leaves its number in `path`."""
+    pipes = "".join(f", {name}=subprocess.{value}" for name, value in streams.items())
+    code = f"p = subprocess.Popen([sys.executable, '-c', {CHILD!r}, {str(path)!r}]{pipes})"
+    return [sys.executable, "-c", f"import os, subprocess, sys, time\n{code}\n{rest}"]
+
+
+def assert_ended(path):
+    pid, deadline = int(path.read_text()), time.monotonic() + 60
+    while alive(pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not alive(pid)
+
+
+@asks_proc
+@pytest.mark.parametrize("rest", ["p.wait()", ""], ids=["that waits for it", "that does not"])
+def test_a_timeout_ends_the_whole_group(call, tmp_path, rest):
+    """A program whose child holds on to its stdout."""
+    for timeout in (2, 20, 100):  # a busy machine takes its time to start two of them
+        code, _, err = call("run", *FEW, "--timeout", timeout, "--", *parent(tmp_path / "child", rest))
+        assert (code, f"no answer within {timeout} s; accepted: a longer --timeout" in err) == (2, True)
+        if (tmp_path / "child").exists():
+            break
+    assert_ended(tmp_path / "child")
+
+
+@asks_proc
+def test_what_a_program_leaves_behind_is_ended(tmp_path):
+    """Also where it answered: its child let go of stdout and sleeps."""
+    rest = f"while not os.path.exists({str(tmp_path / 'child')!r}):\n    time.sleep(0.01)\nprint('id,bx,by,bz')"
+    command = parent(tmp_path / "child", rest, stdin="DEVNULL", stdout="DEVNULL")
+    assert len(run_program.answers_of(command, ray_set.make(["generic"], 3)).ids) == 0
+    assert_ended(tmp_path / "child")
+
+
+def test_rays_and_answers_larger_than_a_pipe(tmp_path):
+    """A program that answers before it has read everything; and one that reads nothing."""
+    to = ray_set.make(["generic"], 3000)
+    echo = "import sys; print('id,bx,by,bz')\nfor i in range(3000): print(f'{i},0,0,{i}' + ' ' * 50)\n"
+    for rest in ("sys.stdin.read()", ""):
+        found = run_program.answers_of([sys.executable, "-u", "-c", echo + rest], to)
+        np.testing.assert_array_equal(found.b[:, 2], np.arange(3000))
+
+
+def test_environment_and_folder_are_the_callers(tmp_path):
+    code = "import os; print('id,bx,by,bz'); print('0,0,0,' + os.environ['Z']); open('here', 'w')"
+    env = {**os.environ, "Z": "7"}
+    found = run_program.answers_of([sys.executable, "-c", code], ray_set.make(["generic"], 1), cwd=tmp_path, env=env)
+    assert found.b[0, 2] == 7
+    assert (tmp_path / "here").exists()
+
+
+def test_everything_at_once(call, program):
+    words = ("--report", "out.html", "--junit", "out.xml", "--json", "out.json")
+    code, out, _ = call("run", *FEW, *words, "--", *program, "inverted")
+    assert code == 1
+    assert "eta inverted" in out
+    page = Path("out.html").read_text()
+    assert "mi-refract rays run --regime generic --regime critical --count 60 -- " in page
+    assert ElementTree.parse("out.xml").getroot().get("failures") == "3"
+    assert json.loads(Path("out.json").read_text())["diagnosis"] == "eta inverted"

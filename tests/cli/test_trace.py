@@ -1,0 +1,295 @@
+"""`mi-refract trace`: what each option does, what bad input says, and what is left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mi_refract.cli import app
+from mi_refract.formulas.documented import FORMULAS
+from mi_refract.planar import figure, path_tree, scene_file, scene_schema, tracer
+
+BALL = """
+title = "A glass ball"
+branches = 0
+
+[[shape]]
+kind = "circle"
+radius = 1.0
+n = 1.5
+
+[[beam]]
+kind = "parallel"
+from = [-3, -0.9]
+to = [-3, 0.9]
+direction = [1, 0]
+count = 7
+"""
+SCENES = sorted((Path(__file__).parents[2] / "scenes" / "planar").glob("*.toml"))
+FORMATS = {".svg": b"<?xml", ".png": b"\x89PNG", ".pdf": b"%PDF"}
+
+
+@pytest.fixture
+def ball(tmp_path):
+    path = tmp_path / "ball.toml"
+    path.write_text(BALL)
+    return path
+
+
+@pytest.fixture
+def trace(ball, capfd, monkeypatch):
+    """`trace("--table")`: exit code, stdout, stderr of tracing `ball`, or another scene."""
+    monkeypatch.setattr(os, "execv", lambda *arguments: pytest.fail(f"restarted: {arguments}"))
+
+    def run(*options, scene=ball):
+        capfd.readouterr()
+        code = app.main(["trace", str(scene), *map(str, options)])
+        return code, *capfd.readouterr()
+
+    return run
+
+
+def paths_of(result):
+    code, out, err = result
+    assert (code, err) == (0, "")
+
+    def refuse(name):
+        raise AssertionError(f"{name} is no JSON")
+
+    return [path for colour in json.loads(out, parse_constant=refuse)["colours"] for path in colour["paths"]]
+
+
+def test_without_an_output_a_line_is_printed(trace, ball):
+    assert trace() == (0, "ball.toml: 7 rays, 14 hits, 7 escaped\n", "")
+    assert list(ball.parent.iterdir()) == [ball]
+
+
+@pytest.mark.parametrize("suffix", [*FORMATS, ".SVG"])
+def test_a_picture_of_each_kind(trace, ball, suffix):
+    output = ball.with_name(f"picture{suffix}")
+    assert trace("-o", output) == (0, "ball.toml: 7 rays, 14 hits, 7 escaped\n", "")
+    assert output.read_bytes().startswith(FORMATS[suffix.lower()])
+    assert sorted(ball.parent.iterdir()) == sorted([ball, output])
+
+
+def test_a_picture_is_replaced(trace, ball):
+    output = ball.with_name("picture.svg")
+    trace("-o", output)
+    first = output.read_bytes()
+    trace("-o", output)
+    assert output.read_bytes() == first
+    trace("-o", output, "--rays", 3)
+    assert output.read_bytes() != first
+
+
+def test_json_is_the_paths(trace, ball):
+    scene = scene_file.load(ball)
+    expected = tracer.trace(scene.segments[0], scene.origins, scene.directions, scene.max_depth, weights=True)
+    paths = paths_of(trace("--json"))
+    assert len(paths) == 7
+    for i, path in enumerate(paths):
+        np.testing.assert_array_equal(path["points"], expected.points[i, :3])
+        np.testing.assert_array_equal(path["direction"], expected.directions[i])
+        np.testing.assert_array_equal(path["weights"], expected.weights[i, :3])
+        assert path["hits"] == expected.hits[i, :2].tolist()
+        assert path["events"] == ["refracted", "refracted", "escaped"]
+        assert path["indices"] == [1.0, 1.5, 1.0]
+
+
+def test_json_and_a_picture(trace, ball):
+    output = ball.with_name("picture.png")
+    assert len(paths_of(trace("--json", "-o", output))) == 7
+    assert output.exists()
+
+
+def test_the_table(trace):
+    code, out, err = trace("--table")
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert lines[0] == "ball.toml: 7 rays, 14 hits, 7 escaped"
+    assert lines[1].split()[-4:] == ["rms", "largest", "marginal", "paraxial"]
+    assert len(lines) == 3
+    assert "1.10445, 0" in lines[2]  # sin i / sin 2(i − r) for sin i = 0.9, sin r = 0.6
+    data = json.loads(trace("--table", "--json")[1])
+    assert data["foci"][0]["spread"]["marginal"][0] == pytest.approx(1.1044455683692647, abs=1e-12)
+    assert "foci" not in json.loads(trace("--json")[1])
+
+
+def test_branches_override_the_file(trace, ball):
+    assert {path["reflect"] for path in paths_of(trace("--json"))} == {0}
+    assert {path["reflect"] for path in paths_of(trace("--json", "--branches", 2))} == {0, 1, 2, 6}
+    ball.write_text(BALL.replace("branches = 0", "branches = 1"))
+    assert {path["reflect"] for path in paths_of(trace("--json"))} == {0, 1, 2}
+    assert {path["reflect"] for path in paths_of(trace("--json", "--branches", 0))} == {0}
+
+
+def test_rays_and_depth(trace):
+    assert trace("--rays", 101)[1] == "ball.toml: 101 rays, 202 hits, 101 escaped\n"
+    assert trace("--max-depth", 1)[1] == "ball.toml: 7 rays, 7 hits, 7 exhausted\n"
+
+
+def test_the_precision(trace):
+    double, single = (paths_of(trace("--json", "--precision", p)) for p in ("float64", "float32"))
+    a, b = (np.array([path["points"] for path in paths]) for paths in (double, single))
+    assert 0 < np.abs(a - b).max() < 1e-5
+    np.testing.assert_array_equal(b, b.astype(np.float32))
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_every_formula(trace, name):
+    found = np.array([path["direction"] for path in paths_of(trace("--json", "--formula", name))])
+    default = np.array([path["direction"] for path in paths_of(trace("--json"))])
+    np.testing.assert_allclose(found, default, atol=1e-12)
+
+
+def test_the_formula_is_the_one_asked_for(trace, monkeypatch):
+    asked = []
+    follow = path_tree.Tracer
+    monkeypatch.setattr(path_tree, "Tracer", lambda *a, **how: asked.append(how) or follow(*a, **how))
+    trace("--formula", "cross", "--backend", "scalar", "--precision", "float32")
+    assert asked == [{"formula": "cross", "backend": "scalar", "precision": "float32"}]
+
+
+def test_a_backend(trace):
+    scalar, best = (paths_of(trace("--json", *options)) for options in (("--backend", "scalar"), ()))
+    for one, other in zip(scalar, best, strict=True):
+        np.testing.assert_allclose(one["points"], other["points"], atol=1e-14)
+
+
+BAD = {
+    "suffix": (("-o", "{}/picture.gif"), "accepted: a file name that ends in .svg or .png or .pdf"),
+    "no suffix": (("-o", "{}/picture"), "accepted: a file name that ends in"),
+    "no folder": (("-o", "{}/none/picture.svg"), "is not a folder"),
+    "folder": (("-o", "{}/folder.svg"), "is a folder"),
+    "branches": (("--branches", "-1"), "--branches"),
+    "branches, no number": (("--branches", "some"), "--branches"),
+    "no rays": (("--rays", "0"), "--rays"),
+    "no depth": (("--max-depth", "0"), "--max-depth"),
+    "precision": (("--precision", "half"), "precision = 'half'; accepted: float32, float64"),
+    "formula": (("--formula", "snell"), "formula = 'snell': unknown; accepted: wedge"),
+    "backend": (("--backend", "metal"), "backend = 'metal'; accepted: scalar"),
+    "option": (("--nonesuch",), "--nonesuch"),
+    "too much": (("--rays", "4000000"), "accepted: fewer rays"),
+    "far too much": (("--rays", "1000000000000"), "accepted: fewer rays"),
+}
+
+
+@pytest.mark.parametrize("options, message", BAD.values(), ids=BAD)
+def test_bad_options(trace, ball, options, message):
+    ball.with_name("folder.svg").mkdir()
+    if "-o" not in options:
+        options = (*options, "-o", str(ball.with_name("picture.svg")))
+    code, out, err = trace(*(option.format(ball.parent) for option in options))
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith("mi-refract: ")
+    assert message in err
+    assert {path.name for path in ball.parent.iterdir()} == {"ball.toml", "folder.svg"}
+
+
+@pytest.mark.parametrize(
+    "old, new, message",
+    [
+        ("radius = 1.0", "radius = nan", "radius"),
+        ("radius = 1.0", "radios = 1.0", "radios"),
+        ("n = 1.5", "n = -1.5", "n"),
+        ("n = 1.5", "n = [1.5, 1.6]", "n"),
+        ("branches = 0", "max_depth = 0", "max_depth"),
+        ('title = "A glass ball"', "title = 3", "title"),
+        ("[[beam]]", "[[bean]]", "bean"),
+        (BALL, "", "shape"),
+        (BALL, "[[", "TOML"),
+        ("branches = 0", 'colours = ["ultraviolent"]', "ultraviolent"),
+    ],
+)
+def test_bad_scenes(trace, ball, old, new, message):
+    ball.write_text(BALL.replace(old, new))
+    code, out, err = trace("-o", ball.with_name("picture.svg"), "--json")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"mi-refract: {ball}")
+    assert message in err
+    assert list(ball.parent.iterdir()) == [ball]
+
+
+def test_no_scene(trace, ball):
+    code, out, err = trace("-o", ball.with_name("picture.svg"), scene=ball.with_name("none.toml"))
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "none.toml" in err
+
+
+def test_without_matplotlib(trace, ball, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert trace()[0] == 0
+    monkeypatch.setattr(scene_file, "load", lambda path: pytest.fail("said too late"))
+    code, out, err = trace("-o", ball.with_name("picture.svg"))
+    assert (code, out) == (2, "")
+    assert err == "mi-refract: pictures need the extra `plot`: pip install 'mi-refract[plot]'\n"
+
+
+def test_a_failed_picture_keeps_the_old_one(trace, ball, monkeypatch):
+    output = ball.with_name("picture.svg")
+    output.write_text("old")
+    ball.write_text(BALL.replace("n = 1.5", "n = 0"))
+    assert trace("-o", output)[0] == 2
+    assert output.read_text() == "old"
+
+
+PYTHON = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(app.__file__).parents[2]), *filter(None, sys.path)])}
+
+
+def shell(before, *arguments):
+    """The command in a process of its own, with something done `before`."""
+    code = f"import sys\nfrom mi_refract import cli\nfrom mi_refract.io import atomic\n{before}\nsys.exit(cli.main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.Popen(command, env=PYTHON, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def test_matplotlib_is_only_loaded_for_pictures(ball):
+    more = "import atexit; atexit.register(lambda: print('matplotlib' in sys.modules))"
+    with shell(more, "trace", ball, "--table") as process:
+        out, err = process.communicate(timeout=120)
+    assert (process.returncode, err) == (0, "")
+    assert out.splitlines()[-1] == "False"
+
+
+def test_ctrl_c_leaves_nothing_half_written(ball):
+    """Interrupted while the temporary file is there and the renaming is still to come."""
+    more = """
+import time
+def slow(self, target):
+    print("written", flush=True)
+    time.sleep(60)
+atomic.Path.replace = slow
+"""
+    with shell(more, "trace", ball, "-o", ball.with_name("picture.svg")) as process:
+        assert process.stdout.readline() == "written\n"
+        assert len(list(ball.parent.iterdir())) == 2
+        time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=30) == 130, process.stderr.read()
+    assert list(ball.parent.iterdir()) == [ball]
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+def test_every_scene_of_ours_is_consistent(trace, path):
+    code, out, err = trace(scene=path)
+    assert (code, err) == (0, "")
+    assert " escaped" in out
+    assert "contradicted" not in out
+
+
+def test_formats_are_those_that_are_drawn():
+    assert set(figure.FORMATS) == set(FORMATS) == set(figure.DPI) == set(figure.UNDATED)
+
+
+def test_the_keys_of_a_scene_are_printed_without_one(capfd):
+    assert app.main(["trace", "--keys"]) == 0
+    printed = capfd.readouterr().out
+    assert all(f"`{name}`" in printed for name in (*scene_schema.SHAPES, *scene_schema.BEAMS, *scene_schema.SCENE))

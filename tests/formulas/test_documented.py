@@ -1,0 +1,275 @@
+"""Every formula against the certified answer in every regime, its edges, its bad inputs, and planted defects."""
+
+import functools
+import math
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from mi_refract import oracle, reflect, reflect_sandwich, refract_2d
+from mi_refract.formulas.documented import FORMULAS
+from mi_refract.regimes import REGIMES, Rays, make
+from validation.directions.judge import BUDGETS, evaluate, judge
+from validation.run.array_settings import Setting
+
+COUNTS = {"scalar": 25, "llvm": 4000, "cuda": 4000}
+EXACT = [name for name, formula in FORMULAS.items() if formula.budget.at_the_limit]
+# The regimes that do not choose or change their normals.
+AROUND_A_NORMAL = [name for name, entry in REGIMES.items() if isinstance(entry.build, functools.partial)]
+Z = [0.0, 0.0, 1.0]
+
+
+@pytest.fixture(scope="module")
+def certified():
+    answers = {}
+
+    def ask(regime, count, precision):
+        key = regime, count, precision
+        if key not in answers:
+            rays = make(regime, count, precision, seed=7)
+            answers[key] = rays, oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+        return answers[key]
+
+    return ask
+
+
+def broken(subject, rays, exact, setting, budget):
+    """The metrics of the judgement that break their budgets."""
+    found = judge(subject, rays, exact, setting.vector, budget).values()
+    return {metric: found[metric] for metric, bound in BUDGETS.items() if not found[metric] <= bound}
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+@pytest.mark.parametrize("name", FORMULAS)
+def test_within_its_budget_in_every_regime(name, regime, setting, certified):
+    measured = Setting(setting.backend, setting.precision, setting.vector)
+    if reason := measured.no_budget(FORMULAS[name].budget, regime):
+        pytest.skip(reason)
+    rays, exact = certified(regime, COUNTS[setting.backend], setting.precision)
+    assert broken(FORMULAS[name], rays, exact, setting, FORMULAS[name].budget) == {}
+
+
+# Edges ---------------------------------------------------------------------------------------------------------
+
+
+def one(setting, formula, a, n, k, **kwargs):
+    """(b, transmitted) of a single ray, as a numpy array and a bool."""
+    vector = setting.vector
+    k = dr.value_t(vector)(k)
+    b, transmitted = formula(vector(*map(float, a)), vector(*map(float, n)), k, **kwargs)
+    return np.array(b, dtype=float).ravel(), bool(np.array(transmitted).ravel()[0])
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("k", [0.5, 1.0, 1.5])
+def test_normal_incidence_goes_straight_through(name, side, k, setting):
+    b, transmitted = one(setting, FORMULAS[name], (0, 0, side), Z, k)
+    assert transmitted
+    assert b.tolist() == [0, 0, side]
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+@pytest.mark.parametrize("k", [0.5, 1.0, 1.5])
+def test_a_tangential_ray_goes_on_and_is_not_transmitted(name, k, setting):
+    b, transmitted = one(setting, FORMULAS[name], (0.6, 0.8, 0), Z, k)
+    assert not transmitted
+    assert b.tolist() == [setting.precision(0.6), setting.precision(0.8), 0]
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_the_critical_angle_is_transmitted_along_the_surface_and_the_next_ratio_is_not(name, setting):
+    # sin θ = 4/5 and k = 5/4: the radicand is exactly 0.
+    b, transmitted = one(setting, FORMULAS[name], (4, 0, -3), Z, 1.25)
+    assert transmitted
+    assert b == pytest.approx([5, 0, 0], abs=0)
+    above = np.nextafter(setting.precision(1.25), setting.precision(2))
+    b, transmitted = one(setting, FORMULAS[name], (4, 0, -3), Z, above)
+    assert not transmitted
+    assert b.tolist() == [4, 0, 3]
+
+
+@pytest.mark.parametrize("axis", [(0, 0, 1), (0, -1, 0)])
+@pytest.mark.parametrize("regime", AROUND_A_NORMAL)
+@pytest.mark.parametrize("name", EXACT)
+def test_a_literal_axis_is_folded_away_and_nothing_else_changes(name, regime, axis, setting):
+    """As in a local frame. A literal normal takes shorter ways through both formulas."""
+    rays = make(regime, COUNTS[setting.backend], setting.precision, seed=8, normal=axis)
+    assert (rays.n == axis).all()
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    literal = setting.vector(*map(float, axis))
+    assert broken(lambda a, _, k: FORMULAS[name](a, literal, k), rays, exact, setting, FORMULAS[name].budget) == {}
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_a_matched_boundary_returns_the_same_bits(name, setting):
+    rays = make("generic", COUNTS[setting.backend], setting.precision, seed=3)
+    matched = Rays(rays.a, rays.n, np.ones_like(rays.k))
+    b, transmitted = evaluate(FORMULAS[name], matched, setting.vector)
+    assert transmitted.all()
+    assert (b.astype(setting.precision) == rays.a).all()
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_a_matched_boundary_along_an_axis_returns_the_same_bits_at_any_angle(name, setting):
+    """The square of the cosine loses its low part below 1e-12 in float32, and underflows below 1e-19."""
+    cosine = np.geomspace(1e-30, 1, COUNTS[setting.backend])
+    a = np.stack([np.sqrt(1 - cosine**2), 0 * cosine, -cosine], 1).astype(setting.precision)
+    matched = Rays(a, np.tile(np.array(Z, setting.precision), (len(a), 1)), np.ones(len(a), setting.precision))
+    axis = setting.vector(*Z)
+    b, transmitted = evaluate(lambda x, _, k: FORMULAS[name].unchecked(x, axis, k), matched, setting.vector)
+    assert transmitted.all()
+    assert (b.astype(setting.precision) == a).all()
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_a_known_contrast_is_used_where_the_ratio_has_lost_it(name, setting):
+    contrast = 1e-9 if setting.precision is np.float32 else 1e-17
+    a = np.array([[1.0, 0.0, -1e-3]], dtype=setting.precision)
+    n = np.array([Z], dtype=setting.precision)
+    k = np.ones(1, dtype=setting.precision)
+    exact = oracle.refract(a, n, k, contrast=np.array([contrast]), progress=False)
+    b, transmitted = one(setting, FORMULAS[name], a[0], Z, 1, contrast=contrast)
+    assert transmitted == exact.transmitted[0]
+    length = math.sqrt(sum(float(x) ** 2 for x in a[0]))
+    error = np.linalg.norm(b / length - exact.direction[0]) / setting.roundoff
+    assert error <= 1.5
+    moved = np.abs(exact.direction[0] * length - a[0]).max() / setting.roundoff
+    assert moved > 1e-3  # the contrast does move the exact direction
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+@pytest.mark.parametrize(
+    ("a", "n", "k"),
+    [
+        ((math.nan, 0, -1), Z, 1.5),
+        ((0, 0, math.inf), Z, 1.5),
+        ((0, -math.inf, -1), Z, 1.5),
+        ((0, 0, 0), Z, 1.5),
+        ((0.6, 0, -0.8), (0, 0, 0), 1.5),
+        ((0.6, 0, -0.8), (0, math.nan, 1), 1.5),
+        ((0.6, 0, -0.8), (0, 0, math.inf), 1.5),
+        ((0.6, 0, -0.8), Z, 0.0),
+        ((0.6, 0, -0.8), Z, -1.5),
+        ((0.6, 0, -0.8), Z, math.nan),
+        ((0.6, 0, -0.8), Z, math.inf),
+        ((0.6, 0, -0.8), Z, 1e300),
+        ((0.6, 0, -0.8), Z, 1e-300),
+    ],
+)
+def test_what_is_no_refraction_gives_nan_and_false(name, a, n, k, setting):
+    b, transmitted = one(setting, FORMULAS[name], a, n, k)
+    assert np.isnan(b).all()
+    assert not transmitted
+
+
+@pytest.mark.parametrize("name", EXACT)
+@pytest.mark.parametrize("contrast", [math.nan, math.inf, -1.0, -2.0])
+def test_a_contrast_that_is_none_gives_nan_and_false(name, contrast, setting):
+    b, transmitted = one(setting, FORMULAS[name], (0.6, 0, -0.8), Z, 0.7, contrast=contrast)
+    assert np.isnan(b).all()
+    assert not transmitted
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_numbers_of_numpy_and_vectors_of_another_precision_are_taken(name, setting):
+    other = getattr(getattr(dr, setting.backend), "Array3f64" if setting.precision is np.float32 else "Array3f")
+    a = setting.vector(0.6, 0, -0.8)
+    b, transmitted = FORMULAS[name](a, other(0, 0, 1), np.float32(0.75))
+    assert type(b) is setting.vector
+    assert np.array(transmitted).all()
+    assert np.array(b).ravel()[0] == pytest.approx(0.45)
+
+
+# Reflection, the plane, derivatives ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", [reflect, reflect_sandwich])
+def test_reflection_turns_the_normal_part_round(form, setting):
+    rng = np.random.default_rng(5)
+    vector = setting.vector
+    for _ in range(20):
+        n = rng.normal(size=3)
+        n, a = n / np.linalg.norm(n), rng.normal(size=3)
+        b = np.array(form(vector(*map(float, a)), vector(*map(float, n))), dtype=float).ravel()
+        assert b == pytest.approx(a - 2 * n * (n @ a), abs=12 * setting.roundoff * np.linalg.norm(a))
+
+
+def test_the_2d_core_obeys_snell_on_both_sides_of_a_slanted_boundary(setting):
+    number = dr.value_t(setting.vector)
+    for degrees in (10.0, 100.0, 190.0, 280.0):
+        t = math.radians(degrees)
+        line = math.cos(t), math.sin(t)
+        for incidence in (20.0, 50.0, 160.0, 200.0, 330.0):
+            s = t + math.radians(incidence)
+            i = math.cos(s), math.sin(s)
+            (x, y), transmitted = refract_2d((number(i[0]), number(i[1])), line, number(0.75))
+            b = np.array([x, y], dtype=float).ravel()
+            along, across = b @ line, line[0] * b[1] - line[1] * b[0]
+            expected = 0.75 * (i[0] * line[0] + i[1] * line[1])
+            assert bool(np.array(transmitted).ravel()[0])
+            assert along == pytest.approx(expected, abs=8 * setting.roundoff)
+            assert across * (line[0] * i[1] - line[1] * i[0]) > 0
+            assert np.linalg.norm(b) == pytest.approx(1, abs=8 * setting.roundoff)
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_derivative_in_the_ratio_matches_the_closed_form(name, vectorised):
+    vector = dr.diff_array_t(vectorised.vector)
+    k = dr.value_t(vector)(0.7)
+    dr.enable_grad(k)
+    b, _ = FORMULAS[name](vector(0.6, 0, -0.8), vector(0, 0, 1), k)
+    dr.forward(k)
+    # b = (k sin, 0, −√(1 − k² sin²)), with sin = 0.6
+    expected = [0.6, 0, 0.7 * 0.36 / math.sqrt(1 - (0.7 * 0.6) ** 2)]
+    assert np.array(dr.grad(b)).ravel() == pytest.approx(expected, rel=0, abs=30 * vectorised.roundoff)
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_derivative_is_finite_where_the_ray_is_reflected(name, vectorised):
+    vector = dr.diff_array_t(vectorised.vector)
+    k = dr.value_t(vector)(1.5)
+    dr.enable_grad(k)
+    b, transmitted = FORMULAS[name](vector(0.8, 0, -0.6), vector(0, 0, 1), k)
+    dr.forward(k)
+    assert not np.array(transmitted).any()
+    assert np.array(dr.grad(b)).ravel().tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_derivative_in_the_direction_at_normal_incidence_is_the_ratio(name, vectorised):
+    vector = dr.diff_array_t(vectorised.vector)
+    a = vector(0, 0, -1)
+    dr.enable_grad(a)
+    b, _ = FORMULAS[name](a, vector(0, 0, 1), 0.75)
+    dr.backward(b.x)
+    assert np.array(dr.grad(a)).ravel().tolist() == pytest.approx([0.75, 0, 0], abs=8 * vectorised.roundoff)
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+@pytest.mark.parametrize("opaque", [False, True])
+def test_derivative_in_the_normal_survives_a_literal(name, opaque, vectorised):
+    vector = dr.diff_array_t(vectorised.vector)
+    n = vector(0, 0, 1)
+    if opaque:
+        dr.make_opaque(n)
+    dr.enable_grad(n)
+    b, _ = FORMULAS[name](vector(0.6, 0, -0.8), n, 0.75)
+    dr.backward(b.x)
+    # ∂b_x/∂n_x = −(k cos θ_i − cos θ_t), by the formula b = k a + n (…) at n = z
+    expected = 0.75 * 0.8 - math.sqrt(1 - 0.45**2)
+    assert np.array(dr.grad(n)).ravel()[0] == pytest.approx(expected, abs=40 * vectorised.roundoff)
+
+
+@pytest.mark.parametrize("name", EXACT)
+@pytest.mark.parametrize("opaque", [False, True])
+def test_derivative_at_a_matched_boundary_is_not_that_of_the_identity(name, opaque, vectorised):
+    vector = dr.diff_array_t(vectorised.vector)
+    n, k = vector(0, 0, 1), dr.value_t(vector)(1.0)
+    if opaque:
+        dr.make_opaque(n)
+    dr.enable_grad(k)
+    b, _ = FORMULAS[name](vector(0.6, 0, -0.8), n, k)
+    dr.forward(k)
+    assert np.array(dr.grad(b)).ravel() == pytest.approx([0.6, 0, 0.36 / 0.8], abs=40 * vectorised.roundoff)

@@ -1,0 +1,398 @@
+"""Fresnel's equations against certified answers and against their textbook form: 4u for powers, 8u for amplitudes."""
+
+import zlib
+
+import drjit as dr
+import numpy as np
+import pytest
+from flint import acb, arb, ctx
+
+from mi_refract import oracle
+from mi_refract.formulas import fresnel
+from mi_refract.formulas.documented import FORMULAS
+from mi_refract.numerics.error_free import Double
+
+COUNT = {"scalar": 60, "llvm": 4000, "cuda": 4000}
+
+
+# Rays: (cos θ_i, k) ----------------------------------------------------------------------------------------------
+
+
+def log_uniform(rng, low, high, count):
+    return np.exp(rng.uniform(np.log(low), np.log(high), count))
+
+
+def aside(rng, x, precision, most=4):
+    """A few ulps, or many."""
+    count = len(x)
+    ulps = np.where(rng.random(count) < 0.6, rng.integers(-most, most + 1, count),
+                    log_uniform(rng, 1, 1e5, count) * rng.choice([-1, 1], count))  # fmt: skip
+    x = x.astype(precision)
+    return x.astype(np.longdouble) + np.rint(ulps) * np.spacing(x).astype(np.longdouble)
+
+
+def generic(rng, count, precision):
+    return rng.random(count), log_uniform(rng, 0.3, 3, count)
+
+
+def near_normal(rng, count, precision):
+    return np.cos(log_uniform(rng, 1e-12, 0.1, count)), rng.uniform(0.4, 2.5, count)
+
+
+def grazing(rng, count, precision):
+    return log_uniform(rng, 1e-30, 1e-2, count), rng.uniform(0.1, 1, count)
+
+
+def critical(rng, count, precision):
+    k = log_uniform(rng, 1.0001, 1e6, count).astype(precision).astype(np.longdouble)
+    return aside(rng, np.sqrt((k - 1) * (k + 1)) / k, precision), k
+
+
+def brewster(rng, count, precision):
+    k = log_uniform(rng, 1e-3, 1e3, count).astype(precision).astype(np.longdouble)
+    return aside(rng, k / np.sqrt(1 + k * k), precision, most=1), k
+
+
+def matched(rng, count, precision):
+    cosines = np.where(rng.random(count) < 0.5, rng.random(count), log_uniform(rng, 1e-8, 1, count))
+    return cosines, 1 + log_uniform(rng, np.finfo(precision).eps, 0.1, count) * rng.choice([-1, 1], count)
+
+
+def steep(rng, count, precision):
+    k = log_uniform(rng, 3, 1e6, count)
+    return np.sqrt(np.maximum(0, 1 - (rng.uniform(0, 1.05, count) / k) ** 2)), k
+
+
+def dense(rng, count, precision):
+    return rng.random(count), log_uniform(rng, 1e-6, 0.3, count)
+
+
+DRAWS = {f.__name__: f for f in (generic, near_normal, grazing, critical, brewster, matched, steep, dense)}
+# Where hill-climbing on the bits came to rest, from the worst of 10⁶ rays in each of eleven regimes: R, R, T, r_p.
+WORST = {
+    "float32": [
+        ("0x1.66e34ep-3", "0x1.f71f70p-1"), ("0x1.c81bbap-3", "0x1.fc2786p-1"),
+        ("0x1.011ddap-18", "0x1.ffeff8p-1"), ("0x1.80031cp-7", "0x1.818ad6p-7"),
+    ],
+    "float64": [
+        ("0x1.e898ee75f23cfp-3", "0x1.c844d6fedd815p-1"), ("0x1.044677cde968cp-3", "0x1.fffffffde5f77p-1"),
+        ("0x1.064d256c22f3ep-25", "0x1.b7d121d98bfe6p-1"), ("0x1.528f43a801557p-26", "0x1.ffffffffffbfbp-1"),
+    ],
+}  # fmt: skip
+
+
+def drawn(name, setting):
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    cos_i, k = DRAWS[name](rng, COUNT[setting.backend], setting.precision)
+    return np.clip(cos_i, 0, 1).astype(setting.precision), k.astype(setting.precision)
+
+
+# Evaluation ------------------------------------------------------------------------------------------------------
+
+
+def ask(c, k):
+    """R, T, r_s, r_p and which are transmitted, of Dr.Jit numbers."""
+    cos_t, transmitted = fresnel.refracted_cosine(c, k)
+    return *fresnel.powers(c, cos_t, transmitted, k), *fresnel.amplitudes(c, k), transmitted
+
+
+def plain(x):
+    if dr.is_complex_v(x):
+        return np.array(x.real, np.longdouble) + 1j * np.array(x.imag, np.longdouble)
+    return np.array(x) if np.array(x).dtype == bool else np.array(x).astype(np.longdouble)
+
+
+def evaluate(setting, cos_i, k):
+    if setting.backend == "scalar":
+        each = [[plain(x) for x in ask(float(c), float(x))] for c, x in zip(cos_i, k, strict=True)]
+        return [np.array(column) for column in zip(*each, strict=True)]
+    number = dr.value_t(setting.vector)
+    return [np.broadcast_to(plain(x), len(k)) for x in ask(number(cos_i), number(k))]
+
+
+def relative(x, exact, low, setting):
+    error = np.abs((x - exact) - low) / np.maximum(np.abs(exact), np.finfo(setting.precision).tiny)
+    return np.nan_to_num(error.astype(float), nan=np.inf).max(initial=0) / setting.roundoff
+
+
+def errors(setting, cos_i, k):
+    """The worst errors in u of R, of T and of the amplitudes."""
+    r, t, s, p, transmitted = evaluate(setting, cos_i, k)
+    exact = oracle.fresnel(cos_i, k)
+    assert (transmitted == exact.transmitted).all()
+    worst = [relative(r, exact.reflectance, exact.reflectance_low, setting),
+             relative(t, exact.transmittance, exact.transmittance_low, setting)]  # fmt: skip
+    return *worst, max(relative(x, y, 0, setting) for x, y in ((s, exact.amplitude_s), (p, exact.amplitude_p)))
+
+
+@pytest.mark.parametrize("name", DRAWS)
+def test_powers_are_within_4u_and_amplitudes_within_8u(name, setting):
+    r, t, amplitude = errors(setting, *drawn(name, setting))
+    assert r <= 4
+    assert t <= 4
+    assert amplitude <= 8
+
+
+def test_the_worst_that_was_found(setting):
+    cos_i, k = (np.array([float.fromhex(x) for x in column], setting.precision)
+                for column in zip(*WORST[setting.name], strict=True))  # fmt: skip
+    r, t, amplitude = errors(setting, cos_i, k)
+    assert 2.9 < r <= 4
+    assert 1.9 < t <= 4
+    assert amplitude <= 8
+
+
+def textbook(cos_i, k):
+    """(r_s, r_p) as printed in books, with the square root on the branch of a decaying wave, at 400 bits."""
+    with ctx.workprec(400):
+        c, k = acb(arb(float(cos_i))), acb(arb(float(k)))
+        radicand = 1 - k**2 * (1 - c**2)
+        cos_t = radicand.sqrt() if radicand.real >= 0 else -acb(0, 1) * (-radicand).sqrt()
+        return (k * c - cos_t) / (k * c + cos_t), (c - k * cos_t) / (c + k * cos_t)
+
+
+@pytest.mark.parametrize("name", DRAWS)
+def test_the_oracle_of_cosines_is_the_textbook(name):
+    cos_i, k = DRAWS[name](np.random.default_rng(3), 50, np.float64)
+    cos_i, k = np.clip(cos_i, 0, 1).astype(float), k.astype(float)
+    exact = oracle.fresnel(cos_i, k)
+    for i in range(len(k)):
+        s, p = textbook(cos_i[i], k[i])
+        with ctx.workprec(400):
+            r = (abs(s) ** 2 + abs(p) ** 2) / 2
+            for ours, low, theirs in (
+                (exact.reflectance[i], exact.reflectance_low[i], r),
+                (exact.transmittance[i], exact.transmittance_low[i], 1 - r),
+            ):
+                assert abs(arb(ours) + arb(low) - theirs) <= 2.0**-95 * abs(theirs) + 2.0**-390
+            for a, theirs in ((exact.amplitude_s[i], s), (exact.amplitude_p[i], p)):
+                assert abs(acb(a.real, a.imag) - theirs) <= 3e-16 * abs(theirs)
+
+
+def test_the_oracle_of_cosines_refuses_what_is_no_cosine():
+    exact = oracle.fresnel(np.array([-0.1, 1.1, np.nan, 0.5, 0.0]), np.array([1.5, 1.5, 1.5, -1.0, 1.5]))
+    assert np.isnan(exact.reflectance).tolist() == [True] * 4 + [False]
+    assert (exact.reflectance[4], exact.transmittance[4]) == (1, 0)
+
+
+# Planted defects -------------------------------------------------------------------------------------------------
+
+
+def swapped_k(powers):
+    return lambda c, y, mirror, sin2, k, kappa: powers(c, y, mirror, sin2 * k, k, kappa)
+
+
+def off(powers):
+    return lambda c, y, mirror, sin2, k, kappa: powers(c, y, mirror, sin2, k, kappa * 1.0000005)
+
+
+def without_a_factor(powers):
+    """k cᵢ + cₜ with k left out where it multiplies the powers, as if étendue were shared 1 : 1."""
+
+    def one_to_one(c, y, mirror, sin2, k, kappa):
+        r, t = powers(c, y, mirror, sin2, k, kappa)
+        return r, t * k.hi if isinstance(k, Double) else t * k
+
+    return one_to_one
+
+
+def in_one_precision(powers):
+    """The same sums, with the square in place of the sum, in the precision of the arguments."""
+
+    def plain_powers(c, y, mirror, sin2, k, kappa):
+        c, y, sin2, k, kappa = (x.hi if isinstance(x, Double) else x for x in (c, y, sin2, k, kappa))
+        s, p = k * c + y, c + k * y
+        square = (s * p) * (s * p)
+        r = kappa * kappa * ((k * sin2) * (k * sin2) + (c * y) * (c * y)) / square
+        t = 2 * k * (c * y) * (s * s + p * p) / square
+        return r, t
+
+    return plain_powers
+
+
+def as_printed(powers):
+    """r_s = (k cᵢ − cₜ)/(k cᵢ + cₜ), r_p alike: differences of rounded cosines."""
+
+    def printed(c, y, mirror, sin2, k, kappa):
+        c, y, k = (x.hi if isinstance(x, Double) else x for x in (c, y, k))
+        s, p = (k * c - y) / (k * c + y), (c - k * y) / (c + k * y)
+        r = (s * s + p * p) / 2
+        return r, 1 - r
+
+    return printed
+
+
+MUTANTS = {
+    "sine of the other side": (swapped_k, "generic"),
+    "a factor dropped": (without_a_factor, "generic"),
+    "contrast off by 5e-7": (off, "generic"),
+    "one precision, float64": (in_one_precision, "matched"),
+    "differences as printed, k → 1": (as_printed, "matched"),
+    "differences as printed, grazing": (as_printed, "grazing"),
+}
+
+
+@pytest.mark.parametrize("name", MUTANTS)
+def test_defects_are_seen(name, vectorised, monkeypatch):
+    if name.endswith("float64") and vectorised.name == "float32":
+        pytest.skip("float32 is computed in float64: there this is no defect")
+    mutate, draw = MUTANTS[name]
+    monkeypatch.setattr(fresnel, "_powers", mutate(fresnel._powers))
+    r, t, _ = errors(vectorised, *drawn(draw, vectorised))
+    assert max(r, t) > 4
+
+
+@pytest.mark.parametrize("name", ["critical", "brewster"])
+def test_double_words_do_not_suffice_to_the_ulp(name, vectorised, monkeypatch):
+    """What an exact sum is for: of the plain one, and of pairs in float64, too little is left."""
+
+    def differences(cos_i, k, contrast):
+        lift = fresnel._wide if vectorised.name == "float32" else Double
+        c2, k2 = lift(cos_i) * lift(cos_i), lift(k) * lift(k)
+        radicand, defect = k2 * c2 - (k2 - 1), k2 * (-c2 + 1) - c2
+        return (radicand, defect.rounded()) if vectorised.name == "float64" else (Double(radicand), defect)
+
+    cos_i, k = drawn(name, vectorised)
+    exact = oracle.fresnel(cos_i, k)
+    monkeypatch.setattr(fresnel, "_differences", differences)
+    _, t, _, p, _ = evaluate(vectorised, cos_i, k)
+    lost = relative(t, exact.transmittance, exact.transmittance_low, vectorised) if name == "critical" else relative(
+        p[exact.transmitted], exact.amplitude_p[exact.transmitted], 0, vectorised)  # fmt: skip
+    assert lost > 4 if vectorised.name == "float64" else lost > 1.01
+
+
+# Edges -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cos_i", [1.0, 0.3, 1e-12, 1e-30, 1e-76, 1e-90, 1e-140])
+def test_nothing_reflects_where_nothing_differs(cos_i, setting):
+    cos_i, k = np.array([cos_i], setting.precision), np.array([1], setting.precision)
+    if cos_i == 0:
+        pytest.skip("below the smallest float32")
+    r, t, s, p, transmitted = evaluate(setting, cos_i, k)
+    assert (t, s, p, transmitted) == (1, 0, 0, True)
+    assert r == 0 if setting.name == "float32" else r <= 1e-170
+
+
+@pytest.mark.parametrize("k", [0.5, 1.0, 1.5])
+def test_a_tangential_ray_is_reflected(k, setting):
+    r, t, s, p, transmitted = evaluate(setting, np.zeros(1, setting.precision), np.array([k], setting.precision))
+    assert (r, t, s, p, transmitted) == (1, 0, -1, -1, False)
+
+
+def test_between_two_cosines_the_critical_angle_is_found(setting):
+    """Of a cosine and its neighbours some are transmitted, others not, as the exact numbers say."""
+    k = np.array([5 / 3], setting.precision)
+    exact = np.sqrt(1 - 1 / k.astype(np.longdouble) ** 2).astype(setting.precision)
+    around = np.concatenate([np.nextafter(exact, 0), exact, np.nextafter(exact, 1)]).astype(setting.precision)
+    certified = oracle.fresnel(around, np.repeat(k, 3))
+    _, t, _, _, transmitted = evaluate(setting, around, np.repeat(k, 3))
+    assert 0 < certified.transmitted.sum() < 3
+    assert (transmitted == certified.transmitted).all()
+    assert ((t > 0) == certified.transmitted).all()
+
+
+def test_contrast_counts_where_k_has_lost_it(setting):
+    """Δn = 3e-8: float32 sees k = 1."""
+    kappa, number = 6e-8, float if setting.backend == "scalar" else dr.value_t(setting.vector)
+    c, k, contrast = number(0.001), number(1.0), number(kappa)
+    cos_t, transmitted = fresnel.refracted_cosine(c, k, contrast)
+    r, t = fresnel.powers(c, cos_t, transmitted, k, contrast)
+    given = [np.array([float(plain(x).ravel()[0])]) for x in (c, contrast)]
+    exact = oracle.fresnel(given[0], np.ones(1), contrast=given[1])
+    assert float(plain(r).ravel()[0]) == pytest.approx(exact.reflectance[0], rel=1e-6)
+    assert float(plain(t).ravel()[0]) == pytest.approx(exact.transmittance[0], rel=1e-6)
+    assert exact.reflectance[0] > 1e-5
+
+
+def test_nan_is_neither_a_mirror_nor_a_window(setting):
+    number = float if setting.backend == "scalar" else dr.value_t(setting.vector)
+    nan, half, k = number(float("nan")), number(0.5), number(1.5)
+    for cos_i, cos_t, ratio in ((nan, half, k), (half, nan, k), (half, half, nan)):
+        for transmitted in (False, True):
+            for value in fresnel.powers(cos_i, cos_t, transmitted, ratio):
+                assert np.isnan(np.array(value, float)).all()
+    for cos_i, ratio in ((nan, k), (half, nan)):
+        assert all(np.isnan(plain(x)).all() for x in fresnel.amplitudes(cos_i, ratio))
+
+
+def test_derivatives_are_finite_wherever_they_exist_and_at_the_edges(vectorised):
+    number = dr.diff_array_t(dr.value_t(vectorised.vector))
+    cos_i = np.array([1, 0.3, 0, 0, 0.5, 1e-30, 0.9], vectorised.precision)
+    k = np.array([1, 1, 1, 1.5, 1.5, 0.5, 0.7], vectorised.precision)
+    for x, y in ((number(cos_i), number(k)), (number(cos_i), number(k))):
+        dr.enable_grad(x, y)
+        cos_t, transmitted = fresnel.refracted_cosine(x, y)
+        r, t = fresnel.powers(x, cos_t, transmitted, y)
+        s, p = fresnel.amplitudes(x, y)
+        dr.backward(r + t + dr.real(s) + dr.imag(p))
+        assert np.isfinite(np.array(dr.grad(x))).all()
+        assert np.isfinite(np.array(dr.grad(y))).all()
+
+
+# Polarised -------------------------------------------------------------------------------------------------------
+
+
+def matrices(c, ratio):
+    cos_t, transmitted = fresnel.refracted_cosine(c, ratio)
+    found = fresnel.mueller_reflection(c, ratio), fresnel.mueller_transmission(c, cos_t, transmitted, ratio)
+    return [np.array([[plain(x).ravel()[0] for x in row] for row in m], float) for m in found]
+
+
+@pytest.mark.parametrize("name", ["generic", "critical", "matched"])
+def test_mueller_matrices_are_those_of_the_certified_amplitudes(name, setting):
+    number = float if setting.backend == "scalar" else dr.value_t(setting.vector)
+    cos_i, k = (x[:8] for x in drawn(name, setting))
+    exact, u = oracle.fresnel(cos_i, k), setting.roundoff
+    for i in range(len(k)):
+        r, t = matrices(number(float(cos_i[i])), number(float(k[i])))
+        s, p = exact.amplitude_s[i], exact.amplitude_p[i]
+        powers, cross = (abs(s) ** 2, abs(p) ** 2), p * np.conj(s)
+        # Two amplitudes of 8u each, their product and the mean: 18u of what they are taken from.
+        assert r[0, 0] == pytest.approx(sum(powers) / 2, rel=18 * u)
+        assert r[0, 1] == pytest.approx((powers[0] - powers[1]) / 2, abs=18 * u * sum(powers) / 2)
+        assert r[2, 2] + 1j * r[3, 2] == pytest.approx(cross, abs=18 * u * abs(cross))
+        assert t[0, 0] == pytest.approx(exact.transmittance[i], rel=18 * u)
+        for m in (r, t):
+            # Lossless boundaries keep a fully polarised beam fully polarised.
+            assert m[0, 0] ** 2 - m[0, 1] ** 2 == pytest.approx(m[2, 2] ** 2 + m[3, 2] ** 2, abs=40 * u * m[0, 0] ** 2)
+
+
+# In the plugin ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("formula", ["promoted", "compensated"])
+@pytest.mark.parametrize("name", DRAWS)
+def test_powers_of_rays_that_are_unit_only_up_to_rounding(name, formula, vectorised):
+    if vectorised.name != "float32":
+        pytest.skip("the plugin's precision is float32")
+    cos_i, k = drawn(name, vectorised)
+    azimuth = np.random.default_rng(5).uniform(0, 2 * np.pi, len(k))
+    sine = np.sqrt((1 - cos_i.astype(float)) * (1 + cos_i.astype(float)))
+    a = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cos_i], axis=1).astype(vectorised.precision)
+    exact = oracle.refract(a, np.tile(np.array([0, 0, 1], a.dtype), (len(k), 1)), k)
+    ray, wide = vectorised.vector(a.T), dr.float64_array_t(dr.value_t(vectorised.vector))(k)
+    contrast = dr.fma(wide, wide, -1)
+    _, transmitted = FORMULAS[formula].unchecked(ray, vectorised.vector(0, 0, 1), wide, contrast)
+    r, t = (plain(x) for x in fresnel.local_powers(ray, transmitted, wide, contrast))
+    # Off by ε ≤ 10·2⁻⁵³ of its larger term, a radicand moves T by ε/2ρ: nearer to the critical angle by more than u/2.
+    scale = np.maximum(cos_i.astype(float) ** 2, np.abs(k.astype(float) ** 2 - 1) * sine**2)
+    far = (exact.cos_t**2 > 10 * 2.0**-53 / vectorised.roundoff * scale) | ~exact.transmitted
+    far &= np.array(transmitted) == exact.transmitted
+    assert far.mean() > 0.99
+    assert relative(r[far], exact.reflectance[far], exact.reflectance_low[far], vectorised) <= 2
+    assert relative(t[far], exact.transmittance[far], exact.transmittance_low[far], vectorised) <= 2
+
+
+def test_length_of_the_ray_cancels(vectorised):
+    """A length off by 1e-3 changes nothing; the textbook's κ/(k cᵢ + cₜ)² would be off by twice that."""
+    if vectorised.name != "float32":
+        pytest.skip("the plugin's precision is float32")
+    number = dr.value_t(vectorised.vector)
+    k, contrast = number(1.5), number(1.25)
+    found = []
+    for length in (1.0, 1.001):
+        a = vectorised.vector(0.28 * length, 0, 0.96 * length)
+        _, transmitted = FORMULAS["promoted"](a, vectorised.vector(0, 0, 1), k, contrast)
+        found.append([float(plain(x).ravel()[0]) for x in fresnel.local_powers(a, transmitted, k, contrast)])
+    assert found[1] == pytest.approx(found[0], rel=8 * vectorised.roundoff)

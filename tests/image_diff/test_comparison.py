@@ -1,0 +1,342 @@
+"""Gates and methods of image comparison: each sees a planted defect, and none calls what it cannot know equal."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from mi_refract.image_diff import methods, tile_statistics
+from mi_refract.image_diff.methods import METHODS, Verdict, gates
+from mi_refract.io.image_file import Image
+
+SMOOTH = np.dstack([np.linspace(0.1, 0.9, 48 * 40).reshape(40, 48) ** k for k in (1, 2, 3)]).astype(np.float32)
+SHAPE = (64, 64, 3)
+EQUAL, DIFFERENT, INCONCLUSIVE = Verdict.EQUAL, Verdict.DIFFERENT, Verdict.INCONCLUSIVE
+RNG = np.random.default_rng(7)
+
+
+@pytest.fixture(autouse=True)
+def seed(monkeypatch):
+    """Every test draws the same numbers, alone or among others."""
+    monkeypatch.setitem(globals(), "RNG", np.random.default_rng(7))
+
+
+def image(pixels, channels=("R", "G", "B"), **rest):
+    return Image(Path("a.exr"), np.asarray(pixels, np.float32), channels, **rest)
+
+
+def renders(count, gain=1.0, deviation=0.3, shape=SHAPE, mean=1.0):
+    """Independent noisy renders with a skewed distribution, as light has."""
+    noise = (RNG.gamma(2.0, 1.0, (count, *shape)) - 2) / np.sqrt(2)
+    return [image(gain * (mean + deviation * each)) for each in noise]
+
+
+def judge(method, reference, test, **options):
+    if method == "welch" and isinstance(reference, Image):
+        reference, test = [reference] * 2, [test] * 2
+    return methods.compare(method, reference, test, **options)
+
+
+def altered(value, y=3, x=5, c=1):
+    pixels = SMOOTH.copy()
+    pixels[y, x, c] = value
+    return image(pixels)
+
+
+# Gates ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_equals_nothing_not_even_itself(method, bad):
+    broken, whole = altered(bad), image(SMOOTH)
+    for reference, test in ((whole, broken), (broken, whole), (broken, broken)):
+        found = judge(method, reference, test)
+        assert found.verdict is DIFFERENT
+        assert ("1 NaN" if np.isnan(bad) else "1 Inf") in found.reason
+        assert "x = 5, y = 3, channel G" in found.reason
+        assert found.maps["nonfinite"].sum() == 1
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_allowed_values_must_be_the_same_ones(method):
+    assert judge(method, altered(np.nan), altered(np.nan), allow_nonfinite=True).verdict is EQUAL
+    for other in (np.inf, 0.5):
+        assert judge(method, altered(np.nan), altered(other), allow_nonfinite=True).verdict is DIFFERENT
+    assert judge(method, altered(np.inf), altered(-np.inf), allow_nonfinite=True).verdict is DIFFERENT
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "other, what",
+    [
+        (image(SMOOTH[:20]), "size"),
+        (image(SMOOTH[..., :1], ("R",)), "channels"),
+        (image(SMOOTH, ("R", "G", "Z")), "channels"),
+        (image(SMOOTH, origin=(0, 1)), "data window"),
+    ],
+    ids=["size", "count", "name", "window"],
+)
+def test_what_cannot_be_compared_is_an_error(method, other, what):
+    for pair in ((image(SMOOTH), other), (other, image(SMOOTH))):
+        with pytest.raises(ValueError, match=f"{what} .*; accepted: ") as error:
+            judge(method, *pair)
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_channels_are_matched_by_name(method):
+    assert judge(method, image(SMOOTH), image(SMOOTH[..., ::-1], ("B", "G", "R"))).verdict is EQUAL
+    if method != "welch":
+        assert judge(method, image(SMOOTH), image(SMOOTH[..., ::-1])).verdict is DIFFERENT
+
+
+def test_gates_pass_what_is_whole():
+    assert gates(image(SMOOTH), image(0 * SMOOTH)) is None
+
+
+# Pictures ------------------------------------------------------------------------------------------------------
+
+
+def test_exact_sees_the_last_bit():
+    assert judge("exact", image(SMOOTH), image(SMOOTH)).verdict is EQUAL
+    found = judge("exact", image(SMOOTH), altered(np.nextafter(SMOOTH[3, 5, 1], np.float32(1))))
+    assert (found.verdict, found.figures[0].value) == (DIFFERENT, 1)
+    assert np.count_nonzero(found.maps["difference"]) == 1
+
+
+@pytest.mark.parametrize(
+    "by, options, verdict",
+    [
+        (0.01, {}, EQUAL),
+        (0.01, {"fail": 0.02}, EQUAL),
+        (0.01, {"fail": 0.005}, DIFFERENT),
+        (0.01, {"fail": 0.005, "fail_relative": 0.5}, EQUAL),
+        (0.01, {"fail": 0.005, "fail_relative": 0.001}, DIFFERENT),
+        (0.01, {"fail": 0.005, "fail_percent": 0.051}, DIFFERENT),
+        (0.01, {"fail": 0.005, "fail_percent": 0.053}, EQUAL),
+        (0.01, {"fail": 0.005, "fail_percent": 0.053, "hard_fail": 0.005}, DIFFERENT),
+        (0.01, {"fail": 1.0, "hard_fail": 0.02}, EQUAL),
+    ],
+)
+def test_tolerance_means_what_idiff_means(by, options, verdict):
+    """One pixel of 1920 is 0.052 %."""
+    options = {"fail": 0.02, "fail_relative": 0.0, "fail_percent": 0.0} | options
+    assert judge("tolerance", image(SMOOTH), altered(SMOOTH[3, 5, 1] + by), **options).verdict is verdict
+
+
+def test_a_warning_is_said_and_is_no_failure():
+    found = judge("tolerance", image(SMOOTH), altered(SMOOTH[3, 5, 1] + 0.01), fail=0.02, warn=0.005)
+    assert found.verdict is EQUAL
+    assert "warning: 0.0521 %" in found.reason
+    assert "warning" not in judge("tolerance", image(SMOOTH), image(SMOOTH), fail=0.02, warn=0.005).reason
+
+
+def test_paired_sees_many_small_changes_at_any_brightness():
+    for scale in (1e-6, 1.0, 1e6):
+        reference = image(scale * SMOOTH)
+        assert judge("paired", reference, image(scale * SMOOTH * (1 + 1e-6))).verdict is EQUAL
+        found = judge("paired", reference, image(scale * SMOOTH * 1.001))
+        assert found.verdict is DIFFERENT
+        assert 0.3 < found.figures[0].value <= 1
+    few = altered(0.9)
+    assert judge("paired", image(SMOOTH), few).verdict is EQUAL
+    assert judge("paired", image(SMOOTH), few, largest=0.5).verdict is DIFFERENT
+
+
+@pytest.mark.parametrize("method", ["paired", "welch"])
+def test_a_channel_of_another_scale_hides_nothing(method):
+    reference, test = renders(8, deviation=0.1, shape=(64, 64, 1)), renders(8, deviation=0.1, shape=(64, 64, 1))
+    if method == "paired":
+        reference, test = reference[:1], [image(reference[0].pixels * 1.001, ("Y",))]
+    for each in test:
+        each.pixels[:] *= 1.3 if method == "welch" else 1
+    depth = np.full((64, 64, 1), 1e6)
+    two = [[image(np.dstack([each.pixels, depth]), ("Y", "Z")) for each in side] for side in (reference, test)]
+    assert methods.compare(method, *two).verdict is DIFFERENT
+    assert methods.compare(method, two[0], two[0]).verdict is EQUAL
+
+
+@pytest.mark.parametrize("hdr", ["yes", "no"])
+def test_flip_sees_a_shift_and_a_gain(hdr):
+    lines = np.repeat((np.indices((40, 48))[1] // 4 % 2)[..., None], 3, 2) * 0.8 + 0.1
+    assert judge("flip", image(lines), image(lines), hdr=hdr).figures[0].value == 0
+    for other in (np.roll(lines, 1, 1), lines * 1.3):
+        found = judge("flip", image(lines), image(other), hdr=hdr)
+        assert found.verdict is DIFFERENT
+        assert found.maps["flip"].shape == (40, 48)
+
+
+def test_flip_of_hdr_sees_what_is_too_bright_for_a_display():
+    bright, other = image(50 * (1 + SMOOTH)), image(60 * (1 + SMOOTH))
+    assert judge("flip", bright, other, hdr="yes").verdict is DIFFERENT
+    assert judge("flip", bright, other, hdr="no").figures[0].value == 0
+
+
+def test_flip_says_what_it_does_not_look_at():
+    four = image(np.dstack([SMOOTH, SMOOTH[..., :1]]), ("R", "G", "B", "A"))
+    assert judge("flip", four, four).reason.endswith("not looked at: A")
+    with pytest.raises(ValueError, match="accepted by FLIP"):
+        judge("flip", image(SMOOTH, ("X", "Y", "Z")), image(SMOOTH, ("X", "Y", "Z")))
+
+
+# Samples -------------------------------------------------------------------------------------------------------
+
+
+def test_equal_renders_are_called_different_no_more_often_than_stated():
+    """300 null pairs at a family error of 5 %: 15 expected; more than 34 has probability below 1e-5."""
+    pairs = (judge("welch", renders(4, shape=(32, 32, 3)), renders(4, shape=(32, 32, 3)), tile=8, family_error=0.05,
+                   margin=0.0) for _ in range(300))  # fmt: skip
+    assert sum(found.verdict is DIFFERENT for found in pairs) <= 34
+
+
+def test_pixels_that_a_filter_correlates_make_no_false_alarms():
+    """100 null pairs at 5 %: more than 17 has probability below 1e-5. Without the correction nearly all alarm."""
+
+    def filtered(count):
+        found = (each.pixels for each in renders(count, shape=(64, 64, 1)))
+        return [image(sum(np.roll(x, (i, j), (0, 1)) for i in range(3) for j in range(3)), ("Y",)) for x in found]
+
+    pairs = [judge("welch", filtered(8), filtered(8), tile=8, family_error=0.05, margin=0.0) for _ in range(100)]
+    assert sum(found.verdict is DIFFERENT for found in pairs) <= 17
+
+
+@pytest.mark.parametrize("correction", ["sidak", "holm"])
+def test_a_tile_off_by_more_than_the_detectable_difference_is_seen(correction):
+    reference, test = renders(8, deviation=0.1), renders(8, deviation=0.1)
+    found = judge("welch", reference, test, correction=correction)
+    assert found.verdict is EQUAL
+    assert 0 < found.detectable < 0.05
+    for pixels in (each.pixels for each in test):
+        pixels[16:32, 32:48, 2] *= 1 + 1.5 * found.detectable
+    seen = judge("welch", reference, test, correction=correction)
+    assert seen.verdict is DIFFERENT
+    strongest = np.unravel_index(np.abs(seen.maps["t"]).argmax(), SHAPE)
+    assert (strongest[0] // 16, strongest[1] // 16, strongest[2]) == (1, 2, 2)
+    assert seen.maps["q"][20, 40] < 0.01 < seen.maps["q"][0, 0]
+
+
+def test_a_gain_too_small_for_a_tile_is_seen_in_the_whole_picture():
+    found = judge("welch", renders(8), renders(8, gain=1.02), tile=4)
+    assert found.detectable > 0.1
+    assert np.abs(found.maps["t"]).max() < 5
+    assert found.verdict is DIFFERENT
+
+
+def test_noise_that_hides_too_much_is_inconclusive_and_a_margin_hides_on_purpose():
+    found = judge("welch", renders(2, deviation=2.0), renders(2, deviation=2.0))
+    assert found.verdict is INCONCLUSIVE
+    assert found.detectable > 0.05
+    assert judge("welch", renders(8), renders(8, gain=1.02), margin=0.05).verdict is not DIFFERENT
+
+
+def test_tiles_without_noise_are_never_certain():
+    reference, test = renders(8, deviation=0.1), renders(8, deviation=0.1)
+    for each in (*reference, *test):
+        each.pixels[:16, :16] = 0.5
+    assert judge("welch", reference, test).verdict is EQUAL
+    for each in test:
+        each.pixels[:16, :16] = 0.6
+    found = judge("welch", reference, test)
+    flagged = found.maps["flags"][:16, :16]
+    assert (flagged == 2).all()
+    assert {figure.name: figure.value for figure in found.figures}["tiles without noise that differ"] == 3
+
+
+def test_a_picture_without_noise_is_not_called_equal_when_it_differs():
+    flat = [image(np.ones(SHAPE))] * 3
+    assert judge("welch", flat, flat).verdict is EQUAL
+    assert judge("welch", flat, [image(np.full(SHAPE, 1.1))] * 3).verdict is INCONCLUSIVE
+
+
+def test_a_tile_with_the_noise_of_one_pixel_is_flagged():
+    reference, test = renders(8, deviation=0.0), renders(8, deviation=0.0)
+    for each in (*reference, *test):
+        each.pixels[5, 5] = RNG.random(3)
+    found = judge("welch", reference, test)
+    assert (found.maps["flags"][:16, :16] == 1).all()
+    for each in test:
+        each.pixels[5, 5] += 100
+    assert judge("welch", reference, test).verdict is INCONCLUSIVE
+
+
+def test_the_same_seed_twice_is_an_error():
+    side = renders(3)
+    with pytest.raises(ValueError, match="accepted: independent renders"):
+        judge("welch", [*side, replace(side[0], path=Path("b.exr"))], renders(4))
+
+
+def test_corrections_are_those_of_the_papers():
+    """Benjamini and Hochberg against SciPy; Holm on an example worked by hand: 0.05/4, /3, /2, /1."""
+    p = RNG.random((5, 4, 3)) ** 3
+    np.testing.assert_allclose(tile_statistics.benjamini_hochberg(p).ravel(), stats.false_discovery_control(p, axis=None))
+    assert tile_statistics.holm(np.array([0.03, 0.01, 0.016, 0.9]), 0.05) == 0.016
+    assert tile_statistics.holm(np.array([0.013, 0.02, 0.9, 0.04]), 0.05) == 0.0125
+    assert tile_statistics.sidak(0.05, 2) == pytest.approx(1 - np.sqrt(0.95))
+
+
+def with_spread(count, kind, gain=1.0):
+    """One picture of `count` samples a pixel, with a channel of their second moments or of their variance."""
+    samples = gain * np.stack([each.pixels for each in renders(count, shape=(64, 64, 1))]).astype(np.float64)
+    spread = np.square(samples).mean(0) if kind == "m2_Y" else samples.var(0, ddof=1)
+    return image(np.dstack([samples.mean(0), spread, samples.mean(0)]), ("Y", kind, "Z"))
+
+
+@pytest.mark.parametrize("kind", ["m2_Y", "Y.variance"])
+def test_variance_channels_take_the_place_of_several_renders(kind):
+    one, two, off = with_spread(16, kind), with_spread(16, kind), with_spread(16, kind, gain=1.1)
+    found = methods.compare("auto", one, two, spp=16)
+    assert (found.method, found.verdict) == ("welch", EQUAL)
+    assert "not tested" in found.reason and found.reason.endswith("Z")
+    assert methods.compare("welch", one, off, spp=16).verdict is DIFFERENT
+    with pytest.raises(ValueError, match="spp"):
+        methods.compare("welch", one, two)
+    told = [replace(each, metadata={"mi_refract:spp": 16}) for each in (one, two)]
+    assert methods.compare("welch", *told).detectable == pytest.approx(found.detectable)
+
+
+# The table -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "method, options, match",
+    [
+        ("psnr", {}, "accepted: auto, exact"),
+        ("exact", {"fail": 1.0}, "has no option 'fail'"),
+        ("tolerance", {"fail": "1"}, "type float"),
+        ("tolerance", {"fail": float("nan")}, "at least 0"),
+        ("paired", {"threshold": -1}, "at least 0"),
+        ("flip", {"hdr": "perhaps"}, "auto, yes, no"),
+        ("welch", {"tile": 0}, "positive"),
+        ("welch", {"tile": True}, "type int"),
+        ("welch", {"family_error": 1.0}, "less than 1"),
+        ("welch", {"correction": "none"}, "sidak, holm"),
+        ("welch", {"margin": float("nan")}, "at least 0"),
+    ],
+)
+def test_options_that_do_not_fit(method, options, match):
+    with pytest.raises(ValueError, match=match):
+        judge(method, image(SMOOTH), image(SMOOTH), **options)
+
+
+def test_the_number_of_pictures_must_fit_the_method():
+    one, two = image(SMOOTH), [image(SMOOTH)] * 2
+    assert methods.automatic(one, one) == "tolerance"
+    assert methods.automatic(two, two) == "welch"
+    for sides in ((one, one), (two, one), (one, two)):
+        with pytest.raises(ValueError, match="at least 2 a side"):
+            methods.compare("welch", *sides)
+    with pytest.raises(ValueError, match="one a side"):
+        methods.compare("exact", two, two)
+    with pytest.raises(ValueError, match="no picture"):
+        methods.compare("exact", [], one)
+
+
+def test_every_option_says_what_it_means():
+    for method in METHODS.values():
+        assert method.summary.endswith((".", ":", "`."))
+        assert all(option.help for option in method.options.values())

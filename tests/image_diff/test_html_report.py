@@ -1,0 +1,247 @@
+"""The page of `mi-refract diff`: failures first, true to the pixels, nothing executable, nothing fetched."""
+
+import base64
+import json
+import math
+import re
+import zlib
+
+import numpy as np
+import pytest
+from support.browser import CHROMIUM, browse
+
+from mi_refract.image_diff import folders, html_report
+from mi_refract.image_diff.folders import Result, Results, Status
+from mi_refract.image_diff.methods import Comparison, Figure, Verdict
+from mi_refract.io.image_file import write_exr
+from mi_refract.report.embedded_images import ROUNDED, Pictures, encoded, strongest
+
+EVIL = "glass/<script>alert(1)</script>.exr"
+EQUAL = Comparison("tolerance", Verdict.EQUAL, "Within <b>bounds</b>.", (Figure("mean", 1e-5, 1e-3),))
+
+
+def picture(path, value, shape=(4, 6, 3), channels=("R", "G", "B")):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_exr(path, np.full(shape, value, np.float32) if np.isscalar(value) else value, channels)
+    return path
+
+
+def results(folder):
+    """A pair that differs, one that cannot be compared, a removed picture, one that is equal."""
+    reference = picture(folder / "reference" / "a.exr", 0.25)
+    test = picture(folder / "test" / "a.exr", 0.5)
+    p = np.linspace(0, 1, 24, dtype=np.float32).reshape(4, 6)
+    figures = (Figure("tiles that differ", 12.0, 0.0), Figure("odd", math.nan, 1.0), Figure("smallest p", 1e-9))
+    maps = {"t": 8 * p - 4, "p": p, "q": p, "flags": 0 * p}
+    found = Comparison("welch", Verdict.DIFFERENT, "12 tiles differ.", figures, 0.013, maps)
+    return Results(folder / "reference", folder / "test", (
+        Result("gone.exr", Status.ERROR, folder / "gone.exr", test, error="gone.exr: <i>corrupt</i>"),
+        Result(EVIL, Status.DIFFERENT, reference, test, comparison=found),
+        Result("old.exr", Status.DIFFERENT, reference, None),
+        Result("same.exr", Status.EQUAL, reference, test, comparison=EQUAL),
+    ))  # fmt: skip
+
+
+def html(folder, found=None):
+    html_report.write(folder / "report.html", found or results(folder), {"version": "1 & 2"}, "mi-refract diff a b")
+    return (folder / "report.html").read_text("utf-8")
+
+
+def roles(text):
+    return re.findall('data-role="([^"]*)" data-paint="([^"]*)"', text)
+
+
+# The text
+
+
+def test_failures_come_first_with_numbers_thresholds_and_commands(tmp_path):
+    text = html(tmp_path)
+    places = ("<h1>4 pictures: ", 'id="pair-1"', 'id="pair-3"', 'id="equal"', "same.exr")
+    order = [text.index(place) for place in places]
+    assert order == sorted(order)
+    numbers = ("<td class=\"fail\">12</td><td class=\"limit\">&gt; 0", "≰ 1", "1e-9", "0.013", "≤ 1e-3")
+    for words in (*numbers, "1 &amp; 2", "12 tiles differ.", "removed", "No such file", "p-value"):
+        assert words in text, words
+    assert "mi-refract diff a b" in text
+    found = results(tmp_path)
+    for result in found.results[:2]:
+        for command in (found.reproduce(result), found.accept(result)):
+            assert f"<dd><code>{command}</code></dd>" in text
+    assert "mi-refract accept" not in text[text.index('id="equal"') :]
+
+
+def test_the_page_asks_for_nothing_and_runs_no_name(tmp_path):
+    text = html(tmp_path)
+    assert not re.findall(r"https?:|@import|url\((?!#)|\bsrc=|<link|<iframe", text)
+    assert "default-src 'none'" in text
+    assert "&lt;script&gt;alert(1)" in text and "&lt;i&gt;corrupt" in text and "Within &lt;b&gt;bounds" in text
+    assert not re.findall("<script>alert|<i>corrupt|<b>bounds", text)
+    ids = re.findall(r'\bid="([^"]*)"', text)
+    assert len(ids) == len(set(ids))
+
+
+def test_panes_of_a_pair_are_in_order_and_an_equal_one_has_none(tmp_path):
+    found = results(tmp_path)
+    text = html(tmp_path, Results(found.reference, found.test, found.results[1:2]))
+    names = [("reference", "light"), ("test", "light"), ("difference", "signed"), ("flip", "heat"), ("t", "signed")]
+    assert roles(text) == [*names, ("−log₁₀ q", "heat")]  # no flags: none is up
+    assert "compare pair paired" in text
+    text = html(tmp_path, Results(found.reference, found.test, found.results[3:]))
+    assert roles(text) == [] and "Picture viewer" not in text
+
+
+def test_pictures_of_different_sizes_stand_side_by_side_and_are_not_laid_over_each_other(tmp_path):
+    sides = picture(tmp_path / "r" / "a.exr", 1.0), picture(tmp_path / "t" / "a.exr", 1.0, (4, 5, 3))
+    text = html(tmp_path, folders.diff(*sides))
+    assert roles(text) == [("reference", "light"), ("test", "light")]
+    assert "compare pair paired" not in text
+
+
+def test_renders_in_a_folder_are_shown_as_their_mean(tmp_path):
+    for side in "rt":
+        for i in range(4):
+            noise = np.random.default_rng([i, ord(side)]).normal(1 + (side == "t"), 0.01, (8, 8, 3))
+            picture(tmp_path / side / f"{i}.exr", noise.astype(np.float32))
+    found = folders.diff(tmp_path / "r", tmp_path / "t", samples=True, maps=True)
+    assert found.exit_code == 1
+    pictures = re.findall(r'data-channels="3" data-scale="1.0">([^<]*)<', html(tmp_path, found))
+    means = [decoded(data).astype(float).mean() for data in pictures]
+    assert means == pytest.approx([1, 2], abs=0.01)
+
+
+def test_a_full_page_keeps_the_numbers_and_says_what_is_left_out(tmp_path, monkeypatch):
+    found = results(tmp_path)
+    monkeypatch.setattr(html_report, "PAGE", 1)
+    text = html(tmp_path, Results(found.reference, found.test, found.results[1:2] * 3))
+    assert len(roles(text)) == 6 and text.count("the page is full") == 2 and text.count("12 tiles differ.") == 3
+
+
+# The pixels
+
+
+def decoded(data):
+    high, low = np.frombuffer(zlib.decompress(base64.b64decode(data)), "u1").reshape(2, -1).astype("<u2")
+    return (high << 8 | low).view("<f2")
+
+
+@pytest.mark.parametrize("share", [2, 0.75])
+def test_a_finite_value_never_becomes_infinite_and_nan_stays(share):
+    pixels = np.random.default_rng(5).gamma(2, 1, (64, 64, 3)).astype(np.float32)
+    pixels[0, :3] = [np.nan, np.inf, -np.inf], [1e9, -1e9, 65504], [1.0, -0.0, 65503]
+    found = encoded(pixels, share * len(encoded(pixels)["data"]))
+    assert ("within" in found["note"]) == (share < 1)
+    read = decoded(found["data"])[:9].reshape(3, 3)
+    assert np.isnan(read[0, 0]) and list(read[0, 1:]) == [np.inf, -np.inf]
+    assert np.isfinite(read[1:]).all() and abs(read[1]).min() > 6e4 and read[2, 0] == 1
+
+
+def test_what_does_not_fit_is_rounded_then_made_smaller_and_the_page_says_so():
+    noise = np.random.default_rng(5).gamma(2, 1, (256, 256, 3)).astype(np.float32)
+    whole = encoded(noise)
+    assert whole["note"] == "" and np.array_equal(decoded(whole["data"]), noise.astype(np.float16).ravel())
+    rounded = encoded(noise, 0.75 * len(whole["data"]))
+    assert len(rounded["data"]) <= 0.77 * len(whole["data"])
+    share = float(re.search("within (.*) %", rounded["note"])[1]) / 100
+    assert np.allclose(decoded(rounded["data"]), noise.ravel(), rtol=share, atol=1e-7)
+    assert not np.allclose(decoded(rounded["data"]), noise.ravel(), rtol=share / 4, atol=1e-7)
+    small = encoded(noise, 0.2 * len(whole["data"]))
+    assert (small["width"], small["height"]) == (128, 128) and small["note"].startswith("means of 2 × 2 pixels")
+    means = noise.reshape(128, 2, 128, 2, 3).mean((1, 3))
+    assert np.allclose(decoded(small["data"]).reshape(128, 128, 3), means, rtol=2.0 ** (max(ROUNDED) - 11), atol=1e-7)
+
+
+def test_one_pixel_and_one_nan_survive_a_smaller_map():
+    values = np.zeros((100, 1000, 3), np.float32)
+    values[10, 501, 1], values[10, 500, 0], values[99, 999, 2] = -3, 2, np.nan
+    small = strongest(values, 100)
+    assert small.shape == (10, 100, 1) and small[1, 50] == -3 and np.isnan(small[9, 99]) and (small != 0).sum() == 2
+
+
+def test_pictures_of_a_page_have_keys_of_their_own():
+    page = Pictures()
+    keys = [page.add(encoded(np.ones((2, 2, 1))))["key"] for _ in range(3)]
+    assert keys == ["p0", "p1", "p2"] and page.size == sum(len(each["data"]) for each in page.embedded)
+
+
+def test_a_noisy_full_size_pair_stays_within_its_bytes(tmp_path):
+    rng = np.random.default_rng(1)
+    sides = [picture(tmp_path / f"{side}.exr", rng.gamma(2, 1, (1080, 1920, 3)).astype(np.float32)) for side in "rt"]
+    text = html(tmp_path, folders.diff(*sides, maps=True))
+    assert len(roles(text)) >= 4
+    assert (tmp_path / "report.html").stat().st_size <= 15e6
+
+
+# In a browser
+
+SCRIPT = """<script>
+const wait = setInterval(async () => {
+  if (!root.dataset.ready) return;
+  clearInterval(wait);
+  const $ = (selector) => document.querySelector(selector);
+  const pixel = (role) => {
+    const copy = document.createElement("canvas").getContext("2d");
+    copy.drawImage($(`[data-role=${role}] canvas`), 0, 0);
+    return [...copy.getImageData(0, 0, 1, 1).data].slice(0, 3);
+  };
+  const press = (key) => document.body.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
+  const clip = () => getComputedStyle($("[data-role=test] canvas")).clipPath;
+  const seen = { test: pixel("test"), difference: pixel("difference") };
+  press("]");
+  press("]");
+  seen.brighter = pixel("test");
+  const gain = $("[data-role=difference] .gain");
+  gain.value = 1;
+  gain.dispatchEvent(new Event("input", { bubbles: true }));
+  seen.full = gain.nextElementSibling.value;
+  press("s");
+  seen.clip = [clip()];
+  press("ArrowRight");
+  seen.clip.push(clip());
+  const box = $("[data-role=reference] .frame").getBoundingClientRect();
+  const at = { bubbles: true, clientX: box.left + box.width / 4, clientY: box.top + 1 };
+  $("[data-role=reference] canvas").dispatchEvent(new PointerEvent("pointermove", at));
+  seen.read = ["reference", "test", "difference"].map((role) => $(`[data-role=${role}] .pixel`).value);
+  seen.place = $("[data-role=test] .place").value;
+  press("f");
+  seen.mode = root.dataset.mode;
+  seen.requests = performance.getEntriesByType("resource").length;
+  seen.scripts = [...document.scripts].filter((each) => each.textContent.startsWith("alert")).length;
+  root.dataset.seen = JSON.stringify(seen);
+}, 20);
+</script></body>"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PATH: the page's script was not run")
+def test_the_page_works_from_a_file(tmp_path):
+    found = results(tmp_path)
+    text = html(tmp_path, Results(found.reference, found.test, found.results[1:]))
+    page = tmp_path / "report.html"
+    page.write_text(text.replace("</body>", SCRIPT), "utf-8")
+    dom, console = browse(page, tmp_path / "profile")
+    assert console == []
+    tag = re.search("<html[^>]*>", dom)[0]
+    assert 'data-ready="1"' in tag and "data-error" not in tag
+    seen = json.loads(re.search('data-seen="([^"]*)"', tag)[1].replace("&quot;", '"'))
+    assert seen == {
+        "test": [188, 188, 188],  # sRGB of 0.5
+        "difference": [178, 24, 43],  # the test is brighter: red
+        "brighter": [255, 255, 255],
+        "full": "full at 0.025",
+        "clip": ["inset(0px 0px 0px 50%)", "inset(0px 0px 0px 52%)"],
+        "read": ["0.25  0.25  0.25", "0.5  0.5  0.5", "0.25"],
+        "place": "1, 0",
+        "mode": "flicker",
+        "requests": 0,
+        "scripts": 0,
+    }
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PATH: the page's script was not run")
+def test_the_browser_sees_a_request_and_an_error(tmp_path):
+    """What the test above would miss if it could not fail."""
+    page = tmp_path / "report.html"
+    planted = "<script>fetch('https://example.invalid/x'); undefinedName()</script>" + SCRIPT
+    page.write_text(html(tmp_path).replace("</body>", planted), "utf-8")
+    _, console = browse(page, tmp_path / "profile")
+    assert any("undefinedName" in line for line in console)
+    assert any("Content Security Policy" in line for line in console)

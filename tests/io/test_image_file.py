@@ -1,0 +1,165 @@
+"""Pictures in files of any format: what is read, and that every bad file is one line."""
+
+from __future__ import annotations
+
+import os
+import struct
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from mi_refract.io import image_file
+from mi_refract.io.image_file import read, write_exr
+
+PIXELS = np.random.default_rng(1).random((48, 40, 3)).astype(np.float32)
+
+
+def save(path, pixels, kind="float", **attributes):
+    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
+    for name, value in attributes.items():
+        setattr(spec, name, value)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec), output.geterror()
+    assert output.write_image(pixels)
+    assert output.close()
+    return path
+
+
+@pytest.mark.parametrize(
+    "name, kind, error",
+    [("a.exr", "float", 0), ("a.tif", "float", 0), ("a.png", "uint8", 1 / 509), ("a.hdr", "float", 0.01)],
+)
+def test_formats(tmp_path, name, kind, error):
+    image = read(save(tmp_path / name, PIXELS, kind))
+    assert image.pixels.dtype == np.float32
+    assert image.channels == ("R", "G", "B")
+    np.testing.assert_allclose(image.pixels, PIXELS, atol=error, rtol=0)
+
+
+def test_several_at_once_keep_their_order_and_their_errors(tmp_path):
+    paths = [save(tmp_path / f"{i}.exr", PIXELS + i) for i in range(5)]
+    assert [image.path for image in image_file.read_all(paths)] == paths
+    paths[3].write_bytes(b"")
+    with pytest.raises(ValueError, match=r"3\.exr: corrupt"):
+        image_file.read_all(paths)
+
+
+def test_channels_window_and_header(tmp_path):
+    image = read(save(tmp_path / "a.exr", PIXELS, x=-3, y=5, channelnames=("B", "Z", "a.X")))
+    assert image.origin == (-3, 5)
+    assert sorted(image.channels) == ["B", "Z", "a.X"]
+    np.testing.assert_array_equal(image.select(("B", "Z", "a.X")), PIXELS)
+    with pytest.raises(ValueError, match=r"a\.exr: no channel 'R'; accepted: .*Z"):
+        image.select(["R"])
+    write_exr(tmp_path / "b.exr", PIXELS, metadata={"mi_refract:spp": 7})
+    assert read(tmp_path / "b.exr").metadata["mi_refract:spp"] == 7
+
+
+def test_colour_under_a_transparent_alpha_is_kept(tmp_path):
+    pixels = np.dstack([PIXELS, np.zeros((48, 40))]).astype(np.float32)
+    path = tmp_path / "a.png"
+    spec = oiio.ImageSpec(40, 48, 4, "uint8")
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec)
+    assert output.write_image(pixels)
+    assert output.close()
+    np.testing.assert_allclose(read(path).pixels, pixels, atol=1 / 509)
+
+
+def test_numbers_that_float32_does_not_hold_stay_apart(tmp_path):
+    wide = np.array([[[1.0], [1 + 2.0**-40]]])
+    values = read(save(tmp_path / "a.tif", wide, "double")).pixels
+    assert values.dtype == np.float64
+    assert values[0, 0, 0] != values[0, 1, 0]
+
+
+def multipart(path):
+    spec = oiio.ImageSpec(40, 48, 3, "float")
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), [spec, spec])
+    assert output.write_image(PIXELS)
+    assert output.open(str(path), spec, "AppendSubimage")
+    assert output.write_image(PIXELS)
+    assert output.close()
+
+
+def deep(path):
+    spec = oiio.ImageSpec(2, 2, 1, "float")
+    spec.channelnames = ("Z",)
+    spec.deep = True
+    data = oiio.DeepData()
+    data.init(4, 1, ["float"], ["Z"])
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec)
+    assert output.write_deep_image(data)
+    assert output.close()
+
+
+def window(path, x, y):
+    """An EXR whose header says another data window."""
+    data = bytearray(save(path, PIXELS).read_bytes())
+    begin = data.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
+    data[begin : begin + 16] = struct.pack("<4i", 0, 0, x, y)
+    path.write_bytes(data)
+
+
+BAD = {
+    "empty.exr": lambda path: path.write_bytes(b""),
+    "empty.png": lambda path: path.write_bytes(b""),
+    "text.exr": lambda path: path.write_text("<scene/>"),
+    "text.png": lambda path: path.write_text("<scene/>"),
+    "noise.hdr": lambda path: path.write_bytes(bytes(range(256)) * 9),
+    "wrong.exr": lambda path: save(path.with_suffix(".png"), PIXELS, "uint8").rename(path),
+    "wrong.png": lambda path: save(path.with_suffix(".exr"), PIXELS).rename(path),
+    "parts.exr": multipart,
+    "deep.exr": deep,
+    "zero.exr": lambda path: window(path, -1, -1),
+    "huge.exr": lambda path: window(path, 2**30, 2**30),
+    "big.exr": lambda path: window(path, 2**16, 2**16),
+    "black.null": lambda path: path.write_text("read as black, whatever it holds"),
+    "pipe.exr": os.mkfifo,
+    "header.tif": lambda path: path.write_bytes(b"II*\0\x08\0\0\0"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_are_one_line_that_names_them(tmp_path, name):
+    path = tmp_path / name
+    BAD[name](path)
+    with pytest.raises(ValueError) as error:
+        read(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert str(error.value).count(str(tmp_path)) == 1
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name, kind", [("a.exr", "float"), ("a.png", "uint8"), ("a.hdr", "float"), ("a.tif", "float")])
+@pytest.mark.parametrize("keep", [0, 6, 0.3, 0.7, 0.97])
+def test_truncated_files(tmp_path, name, kind, keep):
+    path = save(tmp_path / name, PIXELS, kind)
+    data = path.read_bytes()
+    path.write_bytes(data[: keep if isinstance(keep, int) else int(keep * len(data))])
+    with pytest.raises(ValueError, match=f"{name}: corrupt") as error:
+        read(path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_name_that_is_no_utf8(tmp_path):
+    save(tmp_path / "a.exr", PIXELS).rename(path := tmp_path / "a\udcff.exr")
+    with pytest.raises(ValueError, match="accepted: a name in UTF-8"):
+        read(path)
+
+
+def test_what_the_system_does_not_give(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.exr"):
+        read(tmp_path / "none.exr")
+    with pytest.raises(OSError, match=str(tmp_path)):
+        read(tmp_path)
+    path = save(tmp_path / "a.exr", PIXELS)
+    path.chmod(0)
+    if os.access(path, os.R_OK):
+        pytest.skip("this user may read everything")
+    with pytest.raises(PermissionError, match=r"a\.exr"):
+        read(path)

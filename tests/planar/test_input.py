@@ -1,0 +1,99 @@
+"""Bad input of the planar system: each kind is named in one line; what is no bad input is taken."""
+
+import math
+
+import numpy as np
+import pytest
+from support.planar_scenes import SQUARE, polygon, story, together
+
+from mi_refract.planar.tracer import Event, Segments, trace
+
+GOOD = {"start": [(0.0, 0.0)], "end": [(1.0, 0.0)], "n_left": [1.5], "n_right": [1.0]}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"n_left": [0.0]}, "n_left[0] = 0.0: accepted: more than 0"),
+        ({"n_right": [math.nan]}, "n_right[0] = nan: accepted: finite"),
+        ({"end": [(1.0, math.inf)]}, "end[0, 1] = inf: accepted: finite"),
+        ({"end": [(1.0, 0.0), (2.0, 0.0)]}, "end: shape (2, 2); accepted: (1, 2)"),
+        ({"start": "here"}, "start: accepted: numbers"),
+        ({"start": [], "end": [], "n_left": [], "n_right": []}, "none; accepted: at least one"),
+        ({"control": [(0.0, 1.0)]}, "control and weight: accepted: both or neither"),
+        ({"control": [(0.0, 1.0)], "weight": [-1.0]}, "weight[0] = -1.0: accepted: more than 0"),
+    ],
+)
+def test_bad_segments_are_named_in_one_line(change, message):
+    with pytest.raises(ValueError) as error:
+        Segments(**(GOOD | change))
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_segments_that_coincide_are_refused():
+    twice = {"start": [(0, 0), (1, 0)], "end": [(1, 0), (0, 0)], "n_left": [1.5, 1.5], "n_right": [1, 1]}
+    with pytest.raises(ValueError, match="segments 0 and 1 coincide"):
+        Segments(**twice)
+    for control, weight in (([(0.5, 0.5), (0.5, -0.5)], [0.9, 0.9]), ([(0.5, 0.5)] * 2, [0.8, 0.9])):
+        assert len(Segments(**twice, control=control, weight=weight)) == 2
+    with pytest.raises(ValueError, match="segments 0 and 1 coincide"):
+        Segments(**twice, control=[(0.0, 0.5), (-0.0, 0.5)], weight=[0.9, 0.9])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"max_depth": 0}, "max_depth = 0: accepted: a whole number, 1 or more"),
+        ({"max_depth": 2.5}, "max_depth = 2.5: accepted"),
+        ({"origins": [(0.0, math.nan)]}, "origins[0, 1] = nan: accepted: finite"),
+        ({"directions": [(0.0, 0.0)]}, "directions[0] = (0, 0): accepted: a direction"),
+        ({"directions": [(0.0, 1.0)] * 2}, "directions: shape (2, 2); accepted: (1, 2)"),
+        ({"formula": "sellmeier"}, "formula = 'sellmeier': unknown; accepted: wedge"),
+        ({"precision": "float16"}, "precision = 'float16'; accepted: float32, float64"),
+        ({"backend": "metal"}, "backend = 'metal'; accepted: scalar, llvm, cuda"),
+        ({"method": "bvh"}, "method = 'bvh'; accepted: auto, brute, mesh"),
+        ({"reflect": -1}, "reflect: accepted: a whole number"),
+        ({"reflect": 0.5}, "reflect: accepted: a whole number"),
+        ({"reflect": 2**32}, "reflect: accepted: a whole number, 0 or more and below 2³²"),
+        ({"max_depth": True}, "max_depth = True: accepted: a whole number, 1 or more"),
+        ({"n_start": math.inf}, "n_start: accepted: a number"),
+        ({"n_start": "air"}, "n_start: accepted: a number"),
+        ({"n_start": 0}, "n_start: accepted: a number"),
+        ({"origins": [(0.0, 1e101)]}, "origins: a number beyond ±1e+100; accepted: up to that"),
+        ({"origins": [(0.0, -1e16)], "precision": "float32"}, "origins: a number beyond ±1e+15; accepted: up to that"),
+        ({"max_depth": 2**32}, "1 rays, max_depth = 4294967296: accepted: a product below 2³²"),
+        ({"n_start": math.nan}, "n_start: accepted: a number"),
+    ],
+)
+def test_bad_arguments_are_named_in_one_line(change, message):
+    arguments = {"origins": [(0.5, 1.0)], "directions": [(0.0, -1.0)], "max_depth": 2} | change
+    with pytest.raises(ValueError) as error:
+        trace(Segments(**GOOD), **arguments)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("length", [1e-300, 1e-30, 1e30, 1e300])
+def test_a_direction_may_have_any_length(follow, length):
+    square = polygon(SQUARE)
+    assert story(follow(square, (-1, 0.5), (length, 0.1 * length))) == story(follow(square, (-1, 0.5), (1, 0.1)))
+
+
+def test_a_scene_may_be_small(follow, setting):
+    size = 1e-15 if setting.name == "float32" else 1e-60
+    triangle, origin = np.array([(0, 0), (1, 0), (0.3, 1)]), np.array([-1, 0.1])
+    plain, small = (follow(polygon(triangle * s), origin * s, (1, 0.17)) for s in (1, size))
+    assert story(small) == story(plain)
+    assert small.points[0, :3] / size == pytest.approx(plain.points[0, :3], abs=16 * setting.roundoff)
+
+
+@pytest.mark.parametrize("method", ["auto", "brute", "mesh"])
+def test_nothing_but_segments_of_length_zero_is_no_boundary_either(follow, method):
+    dots = together(*[polygon([(0.5, 0.5)])] * 60)
+    assert story(follow(dots, (0, 0), (1, 1), method=method)) == ([], [Event.ESCAPED])
+
+
+def test_no_rays_are_no_paths(follow):
+    paths = follow(polygon(SQUARE), np.zeros((0, 2)), np.zeros((0, 2)), max_depth=3)
+    assert paths.points.shape == (0, 4, 2)

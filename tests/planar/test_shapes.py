@@ -1,0 +1,314 @@
+"""Shapes: arcs lie on their conics, curves close with their inside on the left, and an affine map keeps both."""
+
+import math
+
+import numpy as np
+import pytest
+
+from mi_refract.planar import shapes
+from mi_refract.planar.curves import Curve, affine, area, points, unit
+
+ULP = 2.0**-52
+# Curvature, conic constant and half aperture: every kind of conic, up to the rim of a half sphere and a half ellipse.
+SURFACES = [
+    (0.02, 0.0, 12.0),
+    (1 / 3, 0.0, 3.0),
+    (1 / 49, 0.0, 49.0),
+    (-0.04, 1.9, 14.6),
+    (0.75, -4 / 9, 1.5),
+    (0.1, -1.0, 7.0),
+    (-0.3, -2.5, 4.0),
+    (0.0, 0.0, 5.0),
+]
+
+
+def off_conic(p, curvature, conic):
+    """Distance from c r² − 2 z + c (1 + K) z² = 0, to first order."""
+    z, r = p[..., 0], p[..., 1]
+    value = curvature * r * r - 2 * z + curvature * (1 + conic) * z * z
+    return np.abs(value) / (2 * np.hypot(curvature * r, curvature * (1 + conic) * z - 1))
+
+
+def every_shape():
+    yield "polygon", shapes.polygon([(0, 0), (3, 0), (1, 2)], [0, 30, -40])
+    yield "clockwise", shapes.polygon([(0, 0), (1, 2), (3, 0)])
+    yield "half disc", shapes.polygon([(0, 1), (0, -1)], [180, 0])
+    yield "segment of a disc", shapes.polygon([(0, 1), (0, -1)], [60, 0])
+    yield "rectangle", shapes.rectangle(3, 2)
+    yield "prism", shapes.prism(60, 2)
+    yield "circle", shapes.circle(1.7)
+    yield "ellipse", shapes.ellipse(3, 0.5)
+    yield "lens", shapes.lens((0.02, -0.03), 5, radius=9, conic=(-1.5, 0.4))
+    yield "meniscus", shapes.lens((0.03, 0.02), 2, vertex=7)
+    yield "flat lens", shapes.lens((0, -0.05), 3)
+    yield "concave lens", shapes.lens((-0.05, 0.05), 1, radius=8)
+    yield "ellipse lens", shapes.ellipse_lens(1.5, 4, 1.5, 1.5)
+    yield "document's lens", shapes.document_lens()
+    yield "document's polyline", shapes.document_lens(0.05)
+    yield "faceted circle", shapes.circle(1).faceted(37)
+
+
+MAPS = {
+    "as it is": (affine(), (0, 0)),
+    "turned, stretched, moved": (affine(30, (2, 0.7)), (3, -1)),
+    "mirrored": (affine(-75, (-1, 1)), (0.1, 0)),
+    "sheared": (np.array([[1, 0.4], [0.1, 1]]), (0, 5)),
+}
+
+
+def around(outline, p):
+    """How often a closed outline runs around p, counter-clockwise."""
+    x, y = (outline - p).T
+    turn = np.diff(np.unwrap(np.arctan2(y, x), axis=0), append=np.nan)[:-1].sum()
+    first = math.atan2(x[-1] * y[0] - y[-1] * x[0], x[-1] * x[0] + y[-1] * y[0])
+    return round((turn + first) / (2 * math.pi))
+
+
+def assert_closed(curve: Curve):
+    """Every vertex is once a start and once an end, to the last bit, and the inside is on the left of every piece."""
+    assert curve.closed
+    starts, ends = ({tuple(p) for p in places.tolist()} for places in (curve.start, curve.end))
+    assert starts == ends
+    assert len(starts) == len(curve)
+    outline = curve.outline()
+    assert area(curve) > 0
+    along = points(curve.between(1, 1), 4)
+    middle, ahead = along[:, 2], along[:, 3] - along[:, 1]
+    left = 1e-3 * np.stack([-ahead[:, 1], ahead[:, 0]], 1)
+    step = max(1, len(curve) // 40)
+    for p, aside in zip(middle[::step], left[::step], strict=True):
+        assert (around(outline, p + aside), around(outline, p - aside)) == (1, 0)
+
+
+@pytest.mark.parametrize("curve", [pytest.param(curve, id=name) for name, curve in every_shape()])
+def test_shapes_are_closed_with_their_inside_on_the_left_under_any_map(curve):
+    for matrix, at in MAPS.values():
+        assert_closed(curve.mapped(matrix, at))
+    with pytest.raises(AssertionError):
+        assert_closed(curve.reversed())
+
+
+@pytest.mark.parametrize("curvature, conic, radius", SURFACES)
+def test_surfaces_lie_on_their_conic(curvature, conic, radius):
+    curve = shapes.lens((curvature, curvature), 1.0, radius=radius, conic=(conic, conic))
+    front = points(curve.between(1, 1), 100)[:2]
+    assert off_conic(front, curvature, conic).max() <= 4 * ULP * radius
+    back = points(curve.between(1, 1), 100)[3:5] - [1.0, 0]
+    assert off_conic(back, curvature, conic).max() <= 8 * ULP * radius
+    assert np.abs(front[..., 0] - shapes.sag(front[..., 1], curvature, conic))[:, 1:-1].max() <= 1e-13 * radius
+    if curvature:
+        for defect in (curve.weight * (1 + 1e-13), curve.weight * (1 - 1e-13)):
+            bent = points(Curve(curve.vertices, curve.control, defect, True).between(1, 1), 100)[:2]
+            assert off_conic(bent, curvature, conic).max() > 4 * ULP * radius
+
+
+@pytest.mark.parametrize("rx, ry", [(1, 1), (3, 0.5), (1e-3, 1e3)])
+def test_ellipses_lie_on_theirs(rx, ry):
+    x, y = points(shapes.ellipse(rx, ry).between(1, 1), 100).reshape(-1, 2).T
+    assert np.abs(np.hypot(x / rx, y / ry) - 1).max() <= 4 * ULP
+
+
+def test_arcs_turn_by_what_they_are_told():
+    for turn in (-350, -90, 45, 90.5, 180, 270):
+        curve = shapes.polyline([(1, 2), (4, 3)], [turn])
+        chord, along = np.array([3, 1]), points(curve.between(1, 1), 90).reshape(-1, 2)
+        start, end = curve.control[0] - curve.start[0], curve.end[-1] - curve.control[-1]
+        for direction, angle in ((start, -turn / 2), (end, turn / 2)):
+            c, s = unit(angle)
+            expected = np.array([[c, -s], [s, c]]) @ chord / math.hypot(*chord)
+            assert direction / math.hypot(*direction) == pytest.approx(expected, abs=1e-14)
+        radius = abs(math.hypot(*chord) / 2 / math.sin(math.radians(turn / 2)))
+        normal = np.array([-chord[1], chord[0]]) / math.hypot(*chord)
+        centre = np.array([2.5, 2.5]) + normal * math.hypot(*chord) / 2 / math.tan(math.radians(turn / 2))
+        assert np.abs(np.hypot(*(along - centre).T) - radius).max() <= 1e-14 * radius * 10
+
+
+def test_smooth_curves_have_one_tangent_at_their_joints():
+    lens = shapes.lens((0.02, -0.03), 5, radius=9, conic=(-1.5, 0.4))
+    smooth = [(shapes.circle(3), range(4)), (shapes.ellipse(5, 0.1), range(4)), (lens, (1, 4))]
+    smooth.append((shapes.document_lens(), (1, 3)))
+    bend = shapes.polyline([(0, 0), (4, 0), (7, 3), (7, 9)], [0, 90, 0])
+    for curve, joints in (*smooth, (bend, (1, 2))):
+        before, after = curve.end - curve.control, curve.control - curve.start
+        for j in joints:
+            (ax, ay), (bx, by) = before[j - 1], after[j]
+            assert abs(ax * by - ay * bx) <= 2 * ULP * math.hypot(ax, ay) * math.hypot(bx, by)
+            assert ax * bx + ay * by > 0
+
+
+def test_a_map_of_a_curve_is_a_map_of_its_points():
+    lens = shapes.lens((0.02, -0.3), 5, radius=2.5, conic=(-1.5, 0.4))
+    for matrix, at in MAPS.values():
+        expected = lens.outline(9) @ np.asarray(matrix).T + at
+        found = lens.mapped(matrix, at)
+        found = found if np.linalg.det(matrix) > 0 else found.reversed()
+        assert np.abs(found.outline(9) - expected).max() <= 8 * ULP * np.abs(expected).max()
+        assert found.straight.tolist() == lens.straight.tolist()
+
+
+def test_a_mirrored_boundary_keeps_what_is_on_either_side():
+    """The left of the x axis is y > 0; seen in a mirror on the y axis it still is, so the direction stays."""
+    boundary = shapes.polyline([(1, 0), (2, 0)])
+    assert boundary.mapped(affine(0, (-1, 1))).vertices.tolist() == [[-2, 0], [-1, 0]]
+    assert boundary.mapped(affine(0, (1, -1))).vertices.tolist() == [[2, 0], [1, 0]]
+    for singular in (np.zeros((2, 2)), [[1, 2], [2, 4]], [[math.nan, 0], [0, 1]]):
+        with pytest.raises(ValueError, match="determinant"):
+            boundary.mapped(singular)
+
+
+def test_quarter_turns_are_exact():
+    square = shapes.rectangle(0.3, 0.7).vertices
+    assert shapes.rectangle(0.3, 0.7).mapped(affine(450)).vertices.tolist() == [[-y, x] for x, y in square.tolist()]
+    assert unit(-270) == unit(90 + 360e6) == (0, 1)
+    assert unit(1e17) == unit(10**17 % 360)
+    assert unit(45) == (math.sqrt(0.5), math.sqrt(0.5))
+    assert all(math.hypot(*unit(x)) == pytest.approx(1, abs=ULP) for x in (1e300, 0.1, -44.9, 123.4))
+
+
+# Facets -----------------------------------------------------------------------------------------------------------
+
+
+def test_facets_are_as_many_as_asked_for_and_lie_on_the_curve():
+    for facets in (4, 6, 1001):
+        polygon = shapes.circle(2).faceted(facets)
+        assert len(polygon) == facets
+        assert polygon.straight.all()
+        assert np.abs(np.hypot(*polygon.vertices.T) - 2).max() <= 4 * ULP
+    sides = np.hypot(*(shapes.circle(1).faceted(8).end - shapes.circle(1).faceted(8).start).T)
+    assert np.ptp(sides) <= 4 * ULP
+    rimmed = shapes.lens((0.02, -0.03), 5, radius=9)
+    assert len(rimmed.faceted(40)) == 42  # and two straight rims
+    hyperbola = shapes.lens((0.5, 0.5), 1.0, radius=4, conic=(-3, -3)).faceted(30)
+    assert off_conic(hyperbola.vertices[:16], 0.5, -3).max() <= 4 * ULP * 4
+    with pytest.raises(ValueError, match="facets: 3, for 4 arcs"):
+        shapes.circle(2).faceted(3)
+    with pytest.raises(ValueError, match="for 0 arcs"):
+        shapes.rectangle(1, 1).faceted(100)
+
+
+# The document's lens ----------------------------------------------------------------------------------------------
+
+
+def original_samples(resolution=0.05, c=-0.04, k=8.2, conic=1.9):
+    """Radii and half widths at which the program of document 004 samples its lens."""
+
+    def width(r):
+        square = 1 - (conic + 1) * c * c * r * r
+        return -1.0 if square < 0 else k + (c * r * r) / (1 + math.sqrt(square))
+
+    found, r = [], 0.0
+    while width(r) > 0:
+        found.append((r, width(r)))
+        r += resolution
+    return np.array(found)
+
+
+def test_the_documents_polyline_has_the_originals_vertices_and_closes_at_its_tips():
+    samples = original_samples()
+    assert len(samples) == 294
+    assert samples[-1, 1] > 0.1  # where the original leaves it open
+    lens = shapes.document_lens(0.05)
+    assert len(lens) == 1172
+    quarter = lens.vertices[(lens.vertices >= 0).all(1)]
+    quarter = quarter[np.argsort(quarter[:, 0])]
+    assert quarter[:-1, 0].tolist() == (4 * samples[:-1, 0]).tolist()
+    assert np.abs(quarter[:-1, 1] - samples[:-1, 1]).max() <= 1e-13
+    tip, exact = quarter[-1], shapes.document_lens()
+    assert tip.tolist() == exact.vertices[2].tolist()
+    assert tip[1] == 0
+    assert 4 * samples[-1, 0] < tip[0] < 4 * (samples[-1, 0] + 0.05)
+    # From its own equation at width 0: c r² = −2 k − c (1 + K) k².
+    assert tip[0] == pytest.approx(4 * math.sqrt((-2 * 8.2 + 0.04 * 2.9 * 8.2**2) / -0.04), rel=4 * ULP)
+
+
+@pytest.mark.parametrize("resolution", [0.0, -0.05, math.nan])
+def test_a_polyline_needs_a_resolution(resolution):
+    with pytest.raises(ValueError, match="accepted: above 0"):
+        shapes.document_lens(resolution)
+
+
+def test_the_documents_arcs_are_its_formula():
+    x, y = points(shapes.document_lens().between(1, 4.4), 200).reshape(-1, 2).T
+    for sign in (1, -1):
+        half = np.stack([sign * y - 8.2, x / 4], 1)[sign * y >= 0]
+        assert off_conic(half, -0.04, 1.9).max() <= 4 * ULP * 16
+    c, s = -0.04, original_samples()[:, 0]
+    assert np.abs(8.2 + shapes.sag(s, c, 1.9) - original_samples()[:, 1]).max() <= 1e-13
+
+
+# Lenses -----------------------------------------------------------------------------------------------------------
+
+
+def test_pointed_lenses_end_where_their_surfaces_meet():
+    for curvature, conic, thickness in (
+        ((0.02, -0.03), (-1.5, 0.4), 5),
+        ((0.03, 0.02), (0, 0), 2),
+        ((0, -0.05), (0, 0), 3),
+        ((0.1, 0.0), (-1, 0), 2),
+    ):
+        curve = shapes.lens(curvature, thickness, conic=conic)
+        z, r = curve.vertices[0]
+        assert len(curve) == 4
+        assert off_conic(np.array([z, r]), curvature[0], conic[0]) <= 8 * ULP * r
+        assert off_conic(np.array([z - thickness, r]), curvature[1], conic[1]) <= 8 * ULP * r
+
+
+def test_a_surface_reaches_as_far_as_it_exists():
+    """1/(c √(1 + K)) is rounded: what the sag then takes the root of may be a little below 0."""
+    for c in np.linspace(0.01, 3, 200):
+        for conic in (0, -0.3, 1.9):
+            radius = 1 / (c * math.sqrt(1 + conic))
+            hemisphere = shapes.lens((c, c), 1, radius=radius, conic=(conic, conic))
+            assert off_conic(hemisphere.vertices[0], c, conic) <= 8 * ULP * radius
+            with pytest.raises(ValueError, match="a surface ends before"):
+                shapes.lens((c, c), 1, radius=radius * (1 + 1e-14), conic=(conic, conic))
+
+
+@pytest.mark.parametrize(
+    "arguments, found",
+    [
+        (((0.02, 0.03), 1.0, None), "curvature.*never meet"),
+        (((0.0, 0.0), 1.0, None), "curvature.*never meet"),
+        (((0.1, -0.5), 20.5, None), "curvature.*never meet"),  # but their far halves do
+        (((0.02, -0.02), 1.0, 60.0), "radius = 60: a surface ends before; accepted: at most 50"),
+        (((0.02, -0.02), 1.0, 20.0), "radius = 20: the surfaces meet before; accepted: at most 7.05"),
+    ],
+)
+def test_impossible_lenses_are_refused(arguments, found):
+    curvature, thickness, radius = arguments
+    with pytest.raises(ValueError, match=found):
+        shapes.lens(curvature, thickness, radius=radius)
+
+
+def test_the_ellipse_lens_has_one_optical_path_to_its_focus():
+    n = 1.7
+    lens = shapes.ellipse_lens(n, 4, 1.5, 1.5)
+    along = points(lens.between(n, 1), 50)
+    front, back = along[:2].reshape(-1, 2), along[3:5].reshape(-1, 2)
+    assert np.ptp(front[:, 0] + n * np.hypot(*front.T)) <= 8 * ULP * 4
+    assert np.ptp(np.hypot(*back.T)) <= 4 * ULP * 4
+    for bad in ((1.0, 4, 1.5, 1), (1.5, 4, 4, 1)):
+        with pytest.raises(ValueError, match="accepted: n > 1, 0 < thickness < 4"):
+            shapes.ellipse_lens(*bad)
+
+
+def test_luneburg_layers_step_through_the_profile():
+    layers = shapes.luneburg(3, 40)
+    radii = [curve.vertices[0, 0] for curve, _ in layers] + [0.0]
+    for (_, n), outer, inner in zip(layers, radii[:-1], radii[1:], strict=True):
+        assert math.sqrt(2 - (outer / 3) ** 2) < n < math.sqrt(2 - (inner / 3) ** 2)
+    assert radii[0] == 3
+
+
+@pytest.mark.parametrize(
+    "corners, arcs, found",
+    [
+        ([(0, 0)], None, "points: 1"),
+        ([(0, 0), (1, 1), (2, 2)], None, "no area"),
+        ([(0, 0), (1, 0), (0, 1)], [0, 0], "arcs: 2 for 3 pieces"),
+        ([(0, 0), (1, 0), (0, 1)], [0, 360, 0], "above -360"),
+    ],
+)
+def test_impossible_polygons_are_refused(corners, arcs, found):
+    with pytest.raises(ValueError, match=found):
+        shapes.polygon(corners, arcs)

@@ -1,0 +1,373 @@
+"""The plugin: what Mitsuba's tests ask of its own dielectric, what a drop-in must keep, and what ours does better."""
+
+import math
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import mi_refract  # noqa: F401  (registers the plugin)
+from mi_refract import backend
+from mi_refract.formulas.documented import FORMULAS
+
+mi = pytest.importorskip("mitsuba")
+
+BOTH, REFLECTION, TRANSMISSION = 0xFFFFFFFF, 0, 1
+
+
+def load(**parameters):
+    return mi.load_dict({"type": "refract"} | parameters)
+
+
+def tinted():
+    return load(int_ior=1.5, ext_ior=1.0, specular_reflectance=0.3, specular_transmittance=0.6)
+
+
+def interaction(wi):
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = mi.Vector3f(*map(float, wi))
+    return si
+
+
+def sample(bsdf, wi, sample1, mode="Radiance", component=BOTH, type_mask=None):
+    context = mi.BSDFContext(getattr(mi.TransportMode, mode))
+    context.component = component
+    if type_mask is not None:
+        context.type_mask = type_mask
+    bs, weight = bsdf.sample(context, interaction(wi), sample1, [0, 0])
+    return bs, np.array(mi.unpolarized_spectrum(weight), dtype=float).ravel()
+
+
+def number(x):
+    return float(np.array(x, dtype=float).ravel()[0])
+
+
+def vector(x):
+    return np.array(x, dtype=float).ravel()
+
+
+# As Mitsuba tests its dielectric -------------------------------------------------------------------------------
+
+
+def test_flags_and_components_are_those_of_the_built_in(each_variant):
+    ours, theirs = load(), mi.load_dict({"type": "dielectric"})
+    assert ours.component_count() == theirs.component_count()
+    assert [ours.flags(i) for i in range(2)] == [theirs.flags(i) for i in range(2)]
+    assert ours.flags() == theirs.flags()
+
+
+@pytest.mark.parametrize("mode", ["Radiance", "Importance"])
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_normal_incidence_from_both_sides(each_variant, mode, side):
+    eta = 1.5**side
+    bs, weight = sample(tinted(), (0, 0, side), 0.0, mode)
+    assert (number(bs.pdf), number(bs.eta)) == pytest.approx((0.04, 1))
+    assert vector(bs.wo) == pytest.approx([0, 0, side])
+    assert weight == pytest.approx(0.3)
+    assert (number(bs.sampled_component), number(bs.sampled_type)) == (0, mi.BSDFFlags.DeltaReflection)
+    bs, weight = sample(tinted(), (0, 0, side), 0.05, mode)
+    assert (number(bs.pdf), number(bs.eta)) == pytest.approx((0.96, eta))
+    assert vector(bs.wo) == pytest.approx([0, 0, -side])
+    assert weight == pytest.approx(0.6 / eta**2 if mode == "Radiance" else 0.6)
+    assert (number(bs.sampled_component), number(bs.sampled_type)) == (1, mi.BSDFFlags.DeltaTransmission)
+
+
+@pytest.mark.parametrize("sample1", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("by_mask", [False, True])
+def test_one_lobe_alone(each_variant, sample1, by_mask):
+    flags = {REFLECTION: mi.BSDFFlags.DeltaReflection, TRANSMISSION: mi.BSDFFlags.DeltaTransmission}
+    expected = {REFLECTION: (0.3 * 0.04, 1, [0, 0, 1]), TRANSMISSION: (0.6 * 0.96, 1.5, [0, 0, -1])}
+    for lobe, (value, eta, wo) in expected.items():
+        choice = {"type_mask": flags[lobe]} if by_mask else {"component": lobe}
+        bs, weight = sample(tinted(), (0, 0, 1), sample1, "Importance", **choice)
+        assert weight == pytest.approx(value)
+        assert (number(bs.pdf), number(bs.eta)) == pytest.approx((1, eta))
+        assert vector(bs.wo) == pytest.approx(wo)
+        assert number(bs.sampled_component) == lobe
+
+
+def test_a_component_that_does_not_exist_gives_nothing(each_variant):
+    bs, weight = sample(tinted(), (0, 0, 1), 0.0, component=3)
+    assert (weight == 0).all()
+    assert number(bs.pdf) == 0
+
+
+def test_spot_value_at_80_degrees_and_back(each_variant):
+    angle, inside = math.radians(80), math.radians(41.03641052520335)
+    wi = math.sin(angle), 0, math.cos(angle)
+    bs, _ = sample(tinted(), wi, 0.0)
+    assert number(bs.pdf) == pytest.approx(0.387704354691473, rel=1e-5)
+    assert vector(bs.wo) == pytest.approx([-wi[0], 0, wi[2]])
+    bs, _ = sample(tinted(), wi, 1.0)
+    assert number(bs.pdf) == pytest.approx(1 - 0.387704354691473, rel=1e-5)
+    assert vector(bs.wo) == pytest.approx([-math.sin(inside), 0, -math.cos(inside)], abs=1e-6)
+    bs, _ = sample(tinted(), vector(bs.wo), 1.0)
+    assert vector(bs.wo) == pytest.approx(wi, abs=2e-6)
+
+
+def test_attached_sampling_has_the_derivative_of_the_reflectance(each_variant):
+    if not dr.is_diff_v(mi.Float):
+        pytest.skip(f"{each_variant}: no automatic differentiation")
+    angle = mi.Float(math.radians(10))
+    dr.enable_grad(angle)
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.n = mi.Normal3f(dr.sin(angle), 0, dr.cos(angle))
+    si.sh_frame = mi.Frame3f(si.n)
+    si.wi = si.sh_frame.to_local(mi.Vector3f(0, 0, 1))
+    _, weight = load().sample(mi.BSDFContext(), si, 0, [0, 0])
+    dr.forward(angle)
+    assert vector(mi.unpolarized_spectrum(dr.grad(weight))) == pytest.approx(0.008912204764783382, rel=1e-4)
+
+
+# As a drop-in --------------------------------------------------------------------------------------------------
+
+
+def test_delta_lobes_have_no_density(each_variant):
+    bsdf, context, si = load(), mi.BSDFContext(), interaction((0, 0, 1))
+    wo = mi.Vector3f(0, 0, -1)
+    value, pdf = bsdf.eval_pdf(context, si, wo)
+    for x in (value, pdf, bsdf.eval(context, si, wo), bsdf.pdf(context, si, wo)):
+        assert not np.array(x).any()
+
+
+@pytest.mark.parametrize("formula", ["auto", *FORMULAS])
+def test_every_formula_bends_the_ray_and_is_named(each_variant, formula):
+    bsdf = load(int_ior=1.5, ext_ior=1, formula=formula)
+    assert f"formula = {formula if formula != 'auto' else ''}" in str(bsdf)
+    bs, _ = sample(bsdf, (0.6, 0, 0.8), 0.9)
+    assert vector(bs.wo) == pytest.approx([-0.4, 0, -math.sqrt(1 - 0.16)], abs=1e-6)
+
+
+def test_automatic_choice_is_written_out(each_variant):
+    name = "compensated" if each_variant.startswith("cuda") else "promoted"
+    assert f"formula = {name} (auto)" in str(load())
+
+
+def test_a_plugin_named_after_its_formula(each_variant):
+    assert "formula = cross" in str(mi.load_dict({"type": "refract_cross"}))
+
+
+@pytest.mark.parametrize(
+    ("parameters", "eta"),
+    [
+        ({}, 1.5046 / 1.000277),
+        ({"int_ior": "water", "ext_ior": "vacuum"}, 1.333),
+        ({"int_ior": "Diamond", "ext_ior": 1}, 2.419),
+        ({"int_ior": 2, "ext_ior": 1}, 2.0),
+        ({"int_ior": 1, "ext_ior": 1.25}, 0.8),
+        ({"int_ior": 0.9, "ext_ior": 1.0}, 0.9),
+    ],
+)
+def test_index_from_names_numbers_and_ints(each_variant, parameters, eta):
+    bs, _ = sample(load(**parameters), (0, 0, 1), 1.0)
+    assert number(bs.eta) == np.float32(eta)
+
+
+def test_contrast_is_formed_in_double_and_rounded_once(each_variant):
+    """Indices that differ by 3e-8: float32 sees no difference in their ratio, the contrast keeps all of it."""
+    inside = 1.0003 + 3e-8
+    bsdf = load(int_ior=inside, ext_ior=1.0003, formula="promoted")
+    exact = inside / 1.0003
+    wi = math.sqrt(1 - 1e-4**2), 0, 1e-4
+    bs, _ = sample(bsdf, wi, 0.9999999, component=TRANSMISSION)
+    c = float(np.float32(1e-4))
+    expected = math.sqrt(c * c + (exact * exact - 1) * float(np.float32(wi[0])) ** 2)
+    assert -vector(bs.wo)[2] == pytest.approx(expected / exact, rel=1e-5)
+    assert expected / exact > 2 * c  # so the contrast does count
+
+
+def test_eta_can_be_read_edited_and_is_an_attribute(each_variant):
+    bsdf = load(int_ior=1.5, ext_ior=1)
+    params = mi.traverse(bsdf)
+    assert number(params["eta"]) == 1.5
+    params["eta"] = 1.25
+    params.update()
+    bs, _ = sample(bsdf, (0.6, 0, 0.8), 0.9)
+    assert vector(bs.wo) == pytest.approx([-0.48, 0, -math.sqrt(1 - 0.48**2)], abs=1e-6)
+    assert np.array(bsdf.has_attribute("eta")).all()
+    assert not np.array(bsdf.has_attribute("roughness")).any()
+    assert number(bsdf.eval_attribute_1("eta", interaction((0, 0, 1)))) == 1.25
+    assert vector(bsdf.eval_attribute_3("eta", interaction((0, 0, 1)))) == pytest.approx([1.25] * 3)
+
+
+def test_textures_are_traversed_and_tint_their_lobe_only(each_variant):
+    bsdf = tinted()
+    names = {key.partition(".")[0] for key in mi.traverse(bsdf).keys()}  # noqa: SIM118
+    assert {"specular_reflectance", "specular_transmittance"} <= names
+    only_reflected = load(int_ior=1.5, ext_ior=1, specular_reflectance=0.25)
+    _, reflected = sample(only_reflected, (0, 0, 1), 0.0, "Importance")
+    _, transmitted = sample(only_reflected, (0, 0, 1), 0.9, "Importance")
+    assert reflected == pytest.approx(0.25)
+    assert transmitted == pytest.approx(1)
+
+
+def test_nothing_reflects_where_nothing_differs(each_variant):
+    """Index-matched, and the sample that is exactly 0: the built-in reflects with density 0 there."""
+    bsdf = load(int_ior=1.3, ext_ior=1.3)
+    for wi in ((0, 0, 1), (0.6, 0, 0.8), (0.6, 0, -0.8)):
+        bs, weight = sample(bsdf, wi, 0.0)
+        assert number(bs.pdf) == 1
+        assert vector(bs.wo).tolist() == [-np.float32(x) for x in wi]
+        assert weight == pytest.approx(1)
+
+
+def test_total_internal_reflection_takes_everything(each_variant):
+    bsdf = load(int_ior=1.5, ext_ior=1)
+    wi = 0.8, 0, -0.6
+    bs, weight = sample(bsdf, wi, 0.999999)
+    assert number(bs.pdf) == 1
+    assert vector(bs.wo) == pytest.approx([-0.8, 0, -0.6])
+    assert weight == pytest.approx(1)
+    _, weight = sample(bsdf, wi, 0.5, component=TRANSMISSION)
+    assert (weight == 0).all()
+
+
+def test_a_direction_that_is_none_stays_none(each_variant):
+    bs, _ = sample(load(), (math.nan, 0, 1), 0.5)
+    assert np.isnan(vector(bs.wo)).any()
+    bs, _ = sample(load(), (0, 0, math.nan), 0.5)
+    assert np.isnan(vector(bs.wo)).any()
+    assert np.isnan(number(bs.pdf))
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"int_ior": 0}, "int_ior = 0: accepted"),
+        ({"int_ior": -1.5}, "int_ior = -1.5: accepted"),
+        ({"ext_ior": math.nan}, "ext_ior = nan: accepted"),
+        ({"ext_ior": math.inf}, "ext_ior = inf: accepted"),
+        ({"int_ior": True}, "int_ior = True: accepted"),
+        ({"int_ior": "unobtainium"}, "int_ior = 'unobtainium': unknown material; accepted: vacuum"),
+        ({"formula": "snell"}, "formula = 'snell': unknown; accepted: auto, wedge"),
+        ({"formula": 3}, "formula = 3: unknown; accepted: auto"),
+        ({"roughness": 0.1}, "roughness"),
+    ],
+)
+def test_bad_parameters_are_named_with_what_is_accepted(each_variant, parameters, words):
+    with pytest.raises(RuntimeError) as error:
+        load(**parameters)
+    assert words in str(error.value).replace("\n", " ")
+
+
+@pytest.mark.parametrize(
+    ("int_ior", "ext_ior"), [(1e300, 1), (1e-50, 1), (1e200, 1e-200), (1e-320, 1)]
+)
+def test_indices_whose_ratio_is_beyond_float32_are_refused(each_variant, int_ior, ext_ior):
+    with pytest.raises(RuntimeError, match=r"int_ior / ext_ior = .*: accepted: a ratio from"):
+        load(int_ior=int_ior, ext_ior=ext_ior)
+
+
+@pytest.mark.parametrize("eta", [0.0, -1.5, math.nan, math.inf])
+def test_an_edit_that_is_no_index_is_refused(each_variant, eta):
+    params = mi.traverse(load())
+    params["eta"] = eta
+    with pytest.raises((ValueError, RuntimeError), match="eta = "):
+        params.update()
+
+
+@pytest.mark.parametrize("z", [0.0, 1e-30, 1e-12, 1e-7, 1e-4])
+@pytest.mark.parametrize("int_ior", [1.3, 1.5])
+def test_weights_and_densities_are_probabilities_down_to_grazing_incidence(each_variant, z, int_ior):
+    bsdf = load(int_ior=int_ior, ext_ior=1.3)
+    for component in (BOTH, REFLECTION, TRANSMISSION):
+        bs, weight = sample(bsdf, (math.sqrt(1 - z * z), 0, z), 0.999, "Importance", component)
+        assert 0 <= number(bs.pdf) <= 1
+        assert (weight >= 0).all()
+        assert (weight <= 1 + 1e-6).all()
+
+
+@pytest.mark.parametrize("z", [0.9, 0.3, -0.9, -0.6, -0.2])
+@pytest.mark.parametrize("sample1", [0.0, 0.999])
+def test_mueller_matrices_are_those_of_the_built_in(each_variant, z, sample1):
+    if not mi.is_polarized:
+        pytest.skip(f"{each_variant}: not polarised")
+    ours, theirs = load(), mi.load_dict({"type": "dielectric"})
+    for mode in ("Radiance", "Importance"):
+        wi = 0.6 * math.sqrt(1 - z * z), 0.8 * math.sqrt(1 - z * z), z
+        context = mi.BSDFContext(getattr(mi.TransportMode, mode))
+        x, y = (np.array(b.sample(context, interaction(wi), sample1, [0, 0])[1]) for b in (ours, theirs))
+        assert x == pytest.approx(y, abs=3e-6)
+        assert np.abs(y).max() > 0.1
+
+
+# Kernels and gradients -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def jit():
+    usable = [name for name, why in backend.usable_variants().items() if why is None and name.endswith("ad_rgb")]
+    if not usable:
+        pytest.skip("no LLVM or CUDA variant runs here")
+    before = mi.variant()
+    mi.set_variant(usable[0])
+    yield usable[0]
+    mi.set_variant(before)
+
+
+def ball(integrator, **parameters):
+    camera = mi.ScalarTransform4f().look_at([0, 0, 400], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+    return mi.load_dict({
+        "type": "scene",
+        "integrator": {"type": integrator, "max_depth": 3},
+        "sensor": {"type": "perspective", "fov": 30, "to_world": camera, "film": film},
+        "ball": {"type": "sphere", "radius": 70, "bsdf": {"type": "refract"} | parameters},
+        "sky": {"type": "constant"},
+    })  # fmt: skip
+
+
+def test_an_edit_of_the_index_compiles_nothing(jit):
+    scene = ball("path", int_ior=1.5, ext_ior=1)
+    params = mi.traverse(scene)
+    key = next(name for name in params.keys() if name.endswith("eta"))  # noqa: SIM118
+
+    def compiled():
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            picture = mi.render(scene, spp=4)
+            dr.eval(picture)
+            return picture, sum(not entry["cache_hit"] for entry in dr.kernel_history() if "cache_hit" in entry)
+
+    before, _ = compiled()
+    _, repeated = compiled()
+    params[key] = 1.7
+    params.update()
+    after, edited = compiled()
+    assert (repeated, edited) == (0, 0)
+    assert np.abs(np.array(after) - np.array(before)).max() > 0.1
+
+
+def test_gradient_of_a_picture_in_the_index_matches_a_finite_difference(jit):
+    scene = ball("volpath", int_ior=1.5, ext_ior=1)
+    params = mi.traverse(scene)
+    key = next(name for name in params.keys() if name.endswith("eta"))  # noqa: SIM118
+
+    def mean(spp, seed):
+        return dr.mean(mi.render(scene, params, spp=spp, seed=seed), axis=None)
+
+    dr.enable_grad(params[key])
+    params.update()
+    dr.backward(mean(4096, 1))
+    gradient = number(dr.grad(params[key]))
+    dr.disable_grad(params[key])
+    means = []
+    for eta in (1.45, 1.55):
+        params[key] = eta
+        params.update()
+        means.append(number(mean(8192, 2)))
+    # The paths' noise is under 2 % of the slope; a detached direction or lobe gives five times it.
+    assert gradient == pytest.approx((means[1] - means[0]) / 0.1, rel=0.08)
+
+
+def test_a_scene_can_be_frozen(jit):
+    scene = ball("path", int_ior=1.5, ext_ior=1)
+    params = mi.traverse(scene)
+
+    @dr.freeze
+    def picture(params, seed):
+        return mi.render(scene, params, spp=4, seed=seed)
+
+    plain = np.array(mi.render(scene, spp=4, seed=mi.UInt32(3)))
+    assert np.array(picture(params, mi.UInt32(2))).shape == plain.shape
+    assert np.array(picture(params, mi.UInt32(3))) == pytest.approx(plain)

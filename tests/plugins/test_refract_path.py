@@ -1,0 +1,348 @@
+"""`refract_path` renders what `path` does, in every variant, with less; it splits without bias and differentiates."""
+
+import dataclasses
+import gc
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refract.image_diff import methods
+from mi_refract.plugins import keyed_sampler, path_loop, refract_path, scene_features
+from mi_refract.rendering import scene_files
+from validation.run.context import SCENES
+
+LLVM = "llvm_ad_rgb"
+MIXED = ("sphere", "nested")
+GLASS_ONLY = ("balls", "slab", "lightpipe")
+AROUND, DOWN = 0.6 + 0.4 * np.sin(np.arange(64) * 2 * np.pi / 64 + 0.3), np.linspace(0, 0.7, 32)
+SKY = (AROUND[None, :, None] + DOWN[:, None, None]).astype(np.float32) * np.ones(3, np.float32)
+
+BOX = {"type": "box"}
+BLACK = {"type": "diffuse", "reflectance": 0.0}
+
+
+@pytest.fixture
+def llvm(needs_variant):
+    needs_variant(LLVM)
+    before = mi.variant()
+    mi.set_variant(LLVM)
+    yield
+    mi.set_variant(before)
+
+
+def load(name, resolution=32, **parameters):
+    return mi.load_file(str(SCENES / f"{name}.xml"), **scene_files.REPRODUCIBLE, res=resolution, **parameters)
+
+
+def render(scene, spp=16, seed=0, **parameters):
+    method = mi.load_dict({"type": "refract_path", "max_depth": 16} | parameters)
+    return np.array(mi.render(scene, integrator=method, spp=spp, seed=seed), dtype=float)
+
+
+def by_path(scene, spp=16, seed=0, **parameters):
+    return render(scene, spp, seed, **parameters, type="path")
+
+
+def glass_ball(resolution=24, sampler=None, **parts):
+    place = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    sensor = {
+        "type": "perspective", "sampler": sampler or {"type": "independent"}, "fov": 30, "to_world": place,
+        "film": {"type": "hdrfilm", "width": resolution, "height": resolution, "pixel_format": "rgb", "rfilter": BOX},
+    }  # fmt: skip
+    ball = {"type": "sphere", "bsdf": {"type": "refract", "int_ior": 1.5, "ext_ior": 1.0}}
+    return mi.load_dict({"type": "scene", "sensor": sensor, "ball": ball} | parts)
+
+
+def sky():
+    return {"type": "envmap", "bitmap": mi.Bitmap(SKY)}
+
+
+# The same picture ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", MIXED)
+def test_where_nothing_is_left_out_the_numbers_and_the_picture_are_those_of_path(name, each_variant, monkeypatch):
+    """With Russian roulette and emitter sampling both integrators draw the same numbers in the same order."""
+
+    def everything(scene):
+        return dataclasses.replace(scene_features.inspect(scene), both_numbers=True, plain_environment=False)
+
+    monkeypatch.setattr(refract_path, "inspect", everything)
+    vectorised = dr.is_jit_v(mi.Float)
+    scene, spp = load(name, 24 if vectorised else 4), 16 if vectorised else 2
+    for parameters in ({}, {"max_depth": 3, "rr_depth": 1}):
+        ours, theirs = render(scene, spp, **parameters), by_path(scene, spp, **parameters)
+        assert theirs.std() > 0
+        assert methods.paired(theirs, ours, 1e-4).changed <= 1e-3
+
+
+@pytest.mark.parametrize("name", [*GLASS_ONLY, *MIXED])
+@pytest.mark.parametrize("parameters", [{}, {"split_depth": 1}, {"split_depth": 4, "rr_depth": 3}], ids=str)
+def test_other_numbers_give_the_same_mean(name, parameters, llvm):
+    """Welch's test on tiles, one false alarm in 1000 pictures."""
+    scene = load(name)
+    theirs = np.stack([by_path(scene, seed=i) for i in range(8)])
+    ours = np.stack([render(scene, seed=100 + i, **parameters) for i in range(8)])
+    assert methods.welch(theirs, ours, 8, 1e-3, 1e-5).alarms == 0
+    assert ours.mean() == pytest.approx(theirs.mean(), rel=2e-2)
+
+
+def lamps():
+    """A wall in a constant sky and three lamps before it, one of them small and bright, one that has no surface."""
+    place = mi.ScalarTransform4f
+    wall = {"type": "rectangle", "to_world": place().translate([0, 0, -2]).scale(4)}
+    sky = {"type": "constant", "radiance": 0.2}
+    found = {"wall": wall, "sky": sky, "spot": {"type": "point", "position": [0, 3, 2], "intensity": 4.0}}
+    for i, (x, size, radiance) in enumerate([(-1.5, 0.6, 3.0), (1.5, 0.1, 40.0)]):
+        emitter = {"type": "area", "radiance": radiance, "sampling_weight": 1.0 + i}
+        where = place().translate([x, 2, 1]).rotate([0, 1, 0], 180).scale(size)
+        found[f"lamp {i}"] = {"type": "rectangle", "to_world": where, "emitter": emitter}
+    return found
+
+
+@pytest.mark.parametrize("parameters", [{}, {"split_depth": 2}], ids=str)
+def test_lamps_are_chosen_by_their_weights_and_the_sky_is_met(parameters, each_variant, monkeypatch):
+    """Welch's test on one tile, one false alarm in 1000; a probability that is off is seen."""
+    vectorised = dr.is_jit_v(mi.Float)
+    scene, spp, count = glass_ball(24 if vectorised else 6, **lamps()), 64 if vectorised else 16, 8
+    theirs = np.stack([by_path(scene, spp, i) for i in range(count)])
+    ours = np.stack([render(scene, spp, 100 + i, **parameters) for i in range(count)])
+    tile = theirs.shape[1]
+    assert methods.welch(theirs, ours, tile, 1e-3, 1e-5).alarms == 0
+    if vectorised:
+        choose = mi.DiscreteDistribution.sample_reuse_pmf
+        slip = lambda *a: (*choose(*a)[:2], mi.Float(0.4))  # noqa: E731
+        monkeypatch.setattr(mi.DiscreteDistribution, "sample_reuse_pmf", slip)
+        wrong = np.stack([render(scene, spp, 100 + i, **parameters) for i in range(count)])
+        assert methods.welch(theirs, wrong, tile, 1e-3, 1e-5).alarms > 0
+
+
+@pytest.mark.parametrize("name", ["area", "environment", "all_of_hit"])
+def test_leaving_out_what_a_scene_needs_is_seen(name, llvm, monkeypatch):
+    scene = load("slab" if name == "all_of_hit" else "sphere")
+    theirs = np.stack([by_path(scene, seed=i) for i in range(8)])
+    monkeypatch.setattr(refract_path, "Plan", lambda *a, **k: path_loop.Plan(*a, **k | {name: False}))
+    ours = np.stack([render(scene, seed=100 + i) for i in range(8)])
+    assert methods.welch(theirs, ours, 8, 1e-3, 1e-5).alarms > 0
+
+
+@pytest.mark.parametrize("name", ["sphere", "slab"])
+@pytest.mark.parametrize("parameters", [{"hide_emitters": True}, {"max_depth": 1}, {"max_depth": 2}], ids=str)
+def test_parameters_mean_what_they_mean_to_path(name, parameters, llvm):
+    scene = load(name)
+    theirs, ours = by_path(scene, 64, **parameters), render(scene, 64, **parameters)
+    assert ((theirs == 0).all(2) == (ours == 0).all(2)).mean() > 0.95
+    assert ours.mean() == pytest.approx(theirs.mean(), rel=0.02)
+    assert by_path(scene, 64).mean() != pytest.approx(theirs.mean(), rel=0.02)
+
+
+def test_nothing_to_see_is_black(each_variant):
+    film = {"type": "hdrfilm", "width": 4, "height": 4, "pixel_format": "rgb"}
+    sensor = {"type": "perspective", "film": film}
+    for parts in ({}, {"ball": {"type": "sphere"}}, {"ball": {"type": "sphere", "bsdf": {"type": "refract"}}}):
+        scene = mi.load_dict({"type": "scene", "sensor": sensor} | parts)
+        for parameters in ({}, {"split_depth": 2}, {"max_depth": -1}):
+            assert (render(scene, 2, **parameters) == 0).all()
+    assert (render(glass_ball(sky=sky()), 2, max_depth=0) == 0).all()
+
+
+# Splitting -----------------------------------------------------------------------------------------------------
+
+
+def test_splitting_takes_noise_away_and_scalars_do_it_too(each_variant):
+    vectorised = dr.is_jit_v(mi.Float)
+    scene, spp, pictures = load("balls", 16 if vectorised else 6), 16 if vectorised else 4, 4 if vectorised else 8
+    noise = {
+        depth: np.var([render(scene, spp, seed, split_depth=depth) for seed in range(pictures)], axis=0).mean()
+        for depth in (0, 3)
+    }
+    assert noise[3] < 0.8 * noise[0]
+
+
+def test_strata_are_those_of_correlated_multi_jitter(llvm):
+    """Of 12 samples of each of 5 pixels every stratum holds one, of rows, columns and cells; keys are independent."""
+    sampler = mi.load_dict({"type": "independent", "sample_count": 12})
+    sampler.seed(3, 60)
+    numbers = keyed_sampler.Strata(mi, sampler, 3)
+    one = np.array(numbers.one(sampler, mi.UInt32(7))).reshape(5, 12)
+    x, y = np.array(numbers.two(sampler, mi.UInt32(8))).reshape(2, 5, 12)
+    for strata_of, count in ((one, 12), (x, 12), (y, 12)):
+        assert (np.sort(np.floor(strata_of * count), axis=1) == np.arange(count)).all()
+    assert (np.sort(np.floor(x * 4) * 3 + np.floor(y * 3), axis=1) == np.arange(12)).all()
+    other = np.array(numbers.one(sampler, mi.UInt32(9))).reshape(5, 12)
+    assert (np.argsort(one, axis=1) != np.argsort(other, axis=1)).any(axis=1).all()
+    assert (np.argsort(one[0]) != np.argsort(one[1])).any()
+    assert (np.array(numbers.one(sampler, mi.UInt32(7))).reshape(5, 12) == one).all()  # whatever was drawn before
+
+
+def test_a_deterministic_picture_errs_by_what_it_says_was_truncated(llvm):
+    """The ball from one point: no noise but the position in the pixel, which is its centre in every sample."""
+    scene = glass_ball(sky=sky(), sampler={"type": "multijitter", "jitter": False})
+    exact, coarse = (
+        render(scene, 1, deterministic=True, split_weight=weight, max_depth=64) for weight in (2.5e-4, 0.05)
+    )
+    assert exact.shape == (24, 24, 4)
+    bound = coarse[..., 3:] * SKY.max()
+    off = np.abs(coarse - exact)[..., :3]
+    assert (off <= bound + exact[..., 3:] * SKY.max() + 1e-5).all()
+    assert coarse[..., 3].max() > 10 * exact[..., 3].max() > 0
+    assert off.max() > 1e-3
+    assert exact[..., 3].max() < 0.01
+
+
+def test_a_white_sky_shows_what_was_truncated(llvm):
+    scene = load("slab", sampler="multijitter")
+    flat = glass_ball(sky={"type": "constant"})
+    picture, truncated = np.split(render(flat, 1, 1, deterministic=True), [3], axis=2)
+    assert (picture <= 1 + 1e-5).all()
+    assert (picture >= 1 - 1e-5 - truncated).all()
+    assert 1e-4 < truncated.max() < 1e-2
+    assert render(scene, 1, deterministic=True).shape == (32, 32, 4)
+
+
+@pytest.mark.parametrize(
+    "bsdf",
+    [
+        {"type": "diffuse"},
+        {"type": "thindielectric"},
+        {"type": "blendbsdf", "weight": 0.5, "a": {"type": "refract"}, "b": {"type": "conductor"}},
+    ],
+    ids=lambda bsdf: bsdf["type"],
+)
+def test_what_would_be_left_to_chance_is_refused(bsdf, llvm):
+    with pytest.raises(RuntimeError) as caught:
+        render(glass_ball(sky=sky(), other={"type": "sphere", "bsdf": bsdf}), 1, deterministic=True)
+    assert "accepted: scenes of smooth dielectrics and conductors" in str(caught.value.__cause__)
+    method = mi.load_dict({"type": "refract_path", "max_depth": 5, "deterministic": True})
+    with pytest.raises(ValueError, match="accepted: renders that are not differentiated"):
+        derivative(glass_ball(sky=sky()), method, "backward")
+
+
+# Derivatives ---------------------------------------------------------------------------------------------------
+
+
+def eta_of(scene):
+    parameters = mi.traverse(scene)
+    return parameters, next(key for key in [*parameters.keys()] if key.endswith(".eta"))
+
+
+def derivative(scene, method, direction):
+    parameters, key = eta_of(scene)
+    dr.enable_grad(parameters[key])
+    if direction == "forward":
+        dr.set_grad(parameters[key], 1)
+    parameters.update()
+    picture = dr.mean(mi.render(scene, parameters, integrator=method, spp=256), axis=None)
+    if direction == "forward":
+        return float(dr.forward_to(picture).array[0])
+    dr.backward(picture)
+    return float(dr.grad(parameters[key])[0])
+
+
+def difference(scene, method, step=0.02):
+    parameters, key = eta_of(scene)
+    means = []
+    for eta in (1.5 - step, 1.5 + step):
+        parameters[key] = mi.Float(eta)
+        parameters.update()
+        means.append(np.array(mi.render(scene, integrator=method, spp=2048)).mean(dtype=float))
+    return (means[1] - means[0]) / (2 * step)
+
+
+@pytest.mark.parametrize("direction", ["forward", "backward"])
+@pytest.mark.parametrize("mixed", [False, True], ids=["glass", "mixed"])
+@pytest.mark.parametrize("split", [0, 2])
+def test_the_derivative_in_the_index_is_that_of_the_picture(direction, mixed, split, llvm):
+    """Smooth light and no edges, so that nothing is discontinuous. Standard errors are below 2 % on either side."""
+
+    def scene():
+        place = mi.ScalarTransform4f().translate([0, -1.2, 0]).rotate([1, 0, 0], -90).scale(4e3)
+        return glass_ball(sky=sky(), **({"floor": {"type": "rectangle", "to_world": place}} if mixed else {}))
+
+    method = mi.load_dict({"type": "refract_path", "max_depth": 5, "rr_depth": 100, "split_depth": split})
+    assert derivative(scene(), method, direction) == pytest.approx(difference(scene(), method), rel=0.12)
+    theirs = mi.load_dict({"type": "path", "max_depth": 5, "rr_depth": 100})
+    assert abs(derivative(scene(), theirs, direction) / difference(scene(), theirs) - 1) > 1
+
+
+# What is left out, and what is refused -------------------------------------------------------------------------
+
+
+def operations(scene, method):
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        dr.eval(mi.render(scene, integrator=method, spp=4))
+        return max(entry.get("operation_count", 0) for entry in dr.kernel_history())
+
+
+def test_what_is_left_out_is_not_in_the_kernel_and_is_said(llvm, monkeypatch):
+    gc.collect()  # Dr.Jit compiles whatever BSDF is alive: differences are compared, not counts
+    scene = load("balls")
+    method, theirs = (mi.load_dict({"type": t, "max_depth": 16, "rr_depth": 16}) for t in ("refract_path", "path"))
+    assert "left out = no scene seen yet" in str(method)
+    lean = operations(scene, method)
+    assert "emitter sampling (every BSDF has delta lobes only)" in str(method)
+    saved = operations(scene, theirs) - lean
+    assert saved > 250
+    full = dataclasses.replace(scene_features.inspect(scene), smooth=True)
+    monkeypatch.setattr(refract_path, "inspect", lambda scene: full)
+    method = mi.load_dict({"type": "refract_path", "max_depth": 16, "rr_depth": 16})
+    assert operations(scene, method) > lean + 0.6 * saved
+
+
+@pytest.mark.parametrize("split_depth", [0, 2])
+def test_a_frozen_render_follows_the_index_and_a_lamp_that_turns_grey(split_depth, llvm):
+    """What is recorded must hold for any value: a lamp's black surface counts as one that may reflect."""
+    lamp = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(9)}
+    scene = glass_ball(sky=sky(), lamp=lamp | {"emitter": {"type": "area"}, "bsdf": BLACK})
+    parameters = mi.traverse(scene)
+    eta = next(key for key in [*parameters.keys()] if key.endswith(".eta"))
+    grey = next(key for key in [*parameters.keys()] if "reflectance" in key)
+    method = mi.load_dict({"type": "refract_path", "max_depth": 5, "rr_depth": 100, "split_depth": split_depth})
+
+    @dr.freeze
+    def frozen(parameters, seed):
+        return mi.render(scene, integrator=method, spp=16, seed=seed)
+
+    seed, before = dr.opaque(mi.UInt32, 3), None
+    for key, value in ((eta, 1.5), (eta, 1.3), (grey, 0.8), (eta, 1.7)):
+        parameters[key] = type(parameters[key])(value)
+        parameters.update()
+        found = np.array(frozen(parameters, seed), dtype=float)
+        # Without the recording a black lamp needs no emitter sample: other numbers, the same mean.
+        traced = render(scene, 16, 3, max_depth=5, rr_depth=100, split_depth=split_depth)
+        assert found.mean() == pytest.approx(traced.mean(), rel=0.01)
+        assert before is None or abs(found.mean() / before - 1) > 0.002
+        before = found.mean()
+    assert frozen.n_recordings <= 2
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        ({"max_depth": -2}, "max_depth = -2: accepted: -1 (no limit) or an integer ≥ 0"),
+        ({"max_depth": 2.5}, "max_depth = 2.5"),
+        ({"max_depth": True}, "max_depth = True"),
+        ({"max_depth": "deep"}, "max_depth = 'deep'"),
+        ({"rr_depth": 0}, "rr_depth = 0: accepted: an integer ≥ 1"),
+        ({"split_depth": -1}, "split_depth = -1: accepted: an integer ≥ 0"),
+        ({"split_depth": 13, "split_weight": 0.0}, "up to 8.19e+03 paths of a sample at once; accepted: up to 4096"),
+        ({"split_depth": 65}, "a split_depth up to 64"),
+        ({"split_weight": 1.5}, "split_weight = 1.5: accepted: a number from 0 to 1"),
+        ({"split_weight": float("nan")}, "split_weight = nan"),
+        ({"deterministic": 1}, "deterministic = 1: accepted: true or false"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_is_refused_in_one_line(parameters, said, each_variant):
+    with pytest.raises(RuntimeError) as caught:
+        mi.load_dict({"type": "refract_path"} | parameters)
+    message = str(caught.value)
+    assert said in message
+
+
+def test_an_unknown_parameter_is_refused():
+    with pytest.raises(RuntimeError, match="unreferenced"):
+        mi.load_dict({"type": "refract_path", "max_dept": 3})

@@ -1,0 +1,171 @@
+"""What a scene needs is seen in every variant, feature by feature; what is not known counts as needed."""
+
+import dataclasses
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refract.plugins.scene_features import inspect
+from validation.run.context import SCENES
+
+GLASS_ONLY = {"balls", "fibre", "furnace", "glasses64", "lightpipe", "mirage", "slab"}
+BLACK = {"type": "diffuse", "reflectance": 0.0}
+LAMP = {"type": "rectangle", "emitter": {"type": "area"}}
+
+
+def facts(**parts):
+    """The names of what is true of a scene of a glass ball and `parts`."""
+    ball = {"type": "sphere", "bsdf": {"type": "refract"}}
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "ball": ball} | parts)
+    return {name for name, value in dataclasses.asdict(inspect(scene)).items() if value is True}
+
+
+def test_a_ball_alone_needs_nothing_but_polarisation(each_variant):
+    assert facts() == {"only_glass", "polarising"}
+    assert facts(ball={"type": "sphere", "bsdf": BLACK}) == {"only_glass"}
+
+
+CHECKERS = {"type": "checkerboard"}
+MEDIUM = {"type": "homogeneous"}
+
+
+@pytest.mark.parametrize(
+    ("part", "seen"),
+    [
+        ({"type": "sphere"}, {"smooth"}),
+        ({"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": 1e-6}}, {"smooth"}),
+        ({"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": CHECKERS}}, {"smooth", "textured"}),
+        ({"type": "sphere", "bsdf": {"type": "twosided", "a": {"type": "diffuse", "reflectance": CHECKERS}}},
+         {"smooth", "textured"}),
+        ({"type": "sphere", "bsdf": {"type": "refract", "specular_reflectance": CHECKERS}}, {"textured"}),
+        ({"type": "sphere", "bsdf": {"type": "mask", "a": {"type": "refract"}}}, {"null", "both_numbers"}),
+        ({"type": "sphere", "bsdf": {"type": "thindielectric"}}, {"null"}),
+        ({"type": "sphere", "bsdf": {"type": "roughdielectric"}}, {"smooth", "both_numbers"}),
+        ({"type": "sphere", "interior": MEDIUM, "bsdf": {"type": "refract"}}, {"media"}),
+        ({"type": "sphere", "bsdf": {"type": "plastic"}}, {"smooth", "both_numbers"}),
+        (LAMP, {"sampleable", "lamps", "area"}),
+        (LAMP | {"bsdf": {"type": "null"}}, {"sampleable", "lamps", "area", "null"}),
+        (LAMP | {"bsdf": {"type": "diffuse"}}, {"sampleable", "lamps", "area", "smooth"}),
+        ({"type": "constant"}, {"sampleable", "environment", "plain_environment"}),
+        ({"type": "envmap", "bitmap": mi.Bitmap(np.ones((2, 4, 3), np.float32))}, {"sampleable", "environment"}),
+        ({"type": "point"}, {"sampleable", "lamps", "delta_emitters"}),
+        ({"type": "directional"}, {"sampleable", "lamps", "delta_emitters"}),
+        (LAMP | {"emitter": {"type": "directionalarea"}}, {"sampleable", "lamps", "area", "delta_emitters"}),
+    ],
+)  # fmt: skip
+def test_each_part_adds_what_it_needs_and_no_more(part, seen):
+    mi.set_variant("scalar_rgb")
+    expected = {"polarising"} | seen | (set() if "smooth" in seen else {"only_glass"})
+    assert facts(part=part) == expected
+
+
+EVERYTHING = {"both_numbers", "smooth", "null", "textured", "polarising", "dispersive"}
+
+
+def test_what_is_not_known_needs_everything():
+    mi.set_variant("scalar_rgb")
+
+    class Refract(mi.BSDF):  # ours by its name, but not by its module
+        def __init__(self, props):
+            super().__init__(props)
+            self.m_flags = mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.FrontSide
+
+        def traverse(self, callback):
+            pass
+
+    mi.register_bsdf("stranger", Refract)
+    part = {"type": "sphere", "bsdf": {"type": "twosided", "nested": {"type": "stranger"}}}
+    assert facts(part=part) == EVERYTHING
+    scene = mi.load_dict({"type": "scene", "part": part})
+    (name,) = inspect(scene).unknown
+    assert name.endswith("Refract")
+    group = {"type": "shapegroup", "id": "group", "a": {"type": "sphere", "bsdf": BLACK}}
+    instance = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    assert facts(group=group, instance=instance) == EVERYTHING | {"area", "media"}
+
+
+def test_an_emitter_that_declares_nothing_may_be_a_delta():
+    mi.set_variant("scalar_rgb")
+
+    class Silent(mi.Emitter):
+        def traverse(self, callback):
+            pass
+
+    mi.register_emitter("silent", Silent)
+    assert facts(part={"type": "silent"}) == {"only_glass", "polarising", "sampleable", "lamps", "delta_emitters"}
+
+
+@pytest.mark.parametrize(("reflectance", "black"), [(0.0, True), ({"type": "rgb", "value": 1e-9}, False)])
+def test_a_spectrum_from_rgb_is_never_exactly_black(reflectance, black):
+    """Mitsuba calls its largest value 0."""
+    mi.set_variant("scalar_spectral")
+    part = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
+    assert ("smooth" in facts(part=part)) != black
+
+
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+def test_the_scenes(variant, needs_variant):
+    needs_variant(variant)
+    mi.set_variant(variant)
+    found = {path.stem: inspect(mi.load_file(str(path), res=4)) for path in SCENES.glob("*.xml")}
+    assert {name for name, needs in found.items() if needs.only_glass} == GLASS_ONLY
+    assert {name for name, needs in found.items() if not needs.environment} == {"fibre", "mirage"}
+    assert all(needs.polarising and not needs.unknown for needs in found.values())
+
+
+def met(scene, rays=512, depth=12):
+    """What paths from the camera meet with a weight, by the BSDFs' own samples and not by what they declare."""
+    rng, context, found = np.random.default_rng(3), mi.BSDFContext(), set()
+    for _ in range(rays):
+        ray, _ = scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(rng.random(2)), mi.Point2f(0.5))
+        for _ in range(depth):
+            si = scene.ray_intersect(ray)
+            if not si.is_valid():
+                found |= {"environment"} if scene.environment() else set()
+                break
+            found |= {"area"} if si.shape.is_emitter() else set()
+            sample, weight = si.bsdf().sample(context, si, rng.random(), mi.Point2f(rng.random(2)))
+            if not np.any(np.array(weight)):
+                break
+            found |= {"smooth"} if mi.has_flag(sample.sampled_type, mi.BSDFFlags.Smooth) else set()
+            ray = si.spawn_ray(si.to_world(sample.wo))
+    return found
+
+
+def unseen(needs, seen):
+    """What was met though the scene does not need it."""
+    return {name for name in seen if not getattr(needs, name)}
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in SCENES.glob("*.xml")))
+def test_no_path_meets_what_the_scene_does_not_need(name):
+    mi.set_variant("scalar_rgb")
+    scene = mi.load_file(str(SCENES / f"{name}.xml"), res=4)
+    needs, seen = inspect(scene), met(scene)
+    assert unseen(needs, seen) == set()
+    wrong = dataclasses.replace(needs, smooth=False, area=False, environment=False)
+    assert seen and unseen(wrong, seen) == seen
+
+
+def test_what_is_left_out_has_its_reason():
+    mi.set_variant("scalar_rgb")
+    found = inspect(mi.load_file(str(SCENES / "slab.xml"), res=4)).left_out
+    assert found["emitter sampling"] == "every BSDF has delta lobes only"
+    assert set(found) == {"emitter sampling", "a random number", "media", "null lobes", "dispersion"}
+    sky = {"type": "scene", "a": {"type": "sphere"}, "sky": {"type": "constant"}}
+    assert "met" in inspect(mi.load_dict(sky)).left_out["sampling the environment"]
+    dark = inspect(mi.load_dict({"type": "scene", "a": {"type": "sphere"}})).left_out
+    assert dark["emitter sampling"] == "no emitter can be sampled"
+    assert {"area lights", "environment", "polarisation"} <= set(dark)
+
+
+def test_an_edit_changes_what_is_needed():
+    """A lamp's own black surface, made grey."""
+    mi.set_variant("scalar_rgb")
+    scene = mi.load_dict({"type": "scene", "lamp": LAMP})
+    assert not inspect(scene).smooth
+    params = mi.traverse(scene)
+    params["lamp.bsdf.reflectance.value"] = 0.1
+    params.update()
+    assert inspect(scene).smooth

@@ -1,0 +1,335 @@
+"""The report says what the rows say: nothing lost on the way, nothing executable, nothing fetched."""
+
+import base64
+import dataclasses
+import io
+import itertools
+import json
+import math
+import re
+import xml.etree.ElementTree as xml
+import zlib
+
+import numpy as np
+import pytest
+from support.browser import CHROMIUM, browse
+
+from mi_refract.report import run_report
+from mi_refract.report.plots import Axes, apart, compact, curves_svg, pareto
+from mi_refract.report.row import Row
+
+NAN, INF = math.nan, math.inf
+GOOD = Row("directions", "promoted", "generic", "llvm float32", {"worst": 5e-8, "time": 1.2}, {"worst": 6e-8})
+BAD = Row("directions", "cross", "generic", "llvm float32", {"worst": NAN, "misjudged": 3.0},
+          {"worst": 1e-3, "misjudged": 0.0}, replay={"k": "0x1.8p+0"})  # fmt: skip
+ABSENT = Row("directions", "cross", "generic", "cuda float32", reason="no CUDA device \x1b[0m")
+INFO = Row("speed", "<script>alert(1)</script>", "$k$ & co", "", {"time": INF, "low": -INF},
+           curves={"a": [(0.1, 1e-2), (1.0, 1e-3)], "b": [(1.0, 0.0), (2.0, NAN)]})  # fmt: skip
+ROWS = [GOOD, BAD, ABSENT, INFO]
+CONTEXT = {
+    "title": "validation",
+    "versions": {"mitsuba": "3.9.1"},
+    "studies": {"speed": {"title": "Speed", "text": "Not <b>bold</b>."}},
+    "scatter": [{"study": "directions", "x": "time", "y": "worst"}],
+}
+
+
+def html(folder, rows=ROWS, context=CONTEXT):
+    run_report.write_html(folder / "report.html", rows, context, folder)
+    return (folder / "report.html").read_text("utf-8")
+
+
+def write_exr(path, pixels, names=("R", "G", "B")):
+    import OpenImageIO as oiio
+
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, oiio.FLOAT)
+    spec.channelnames = names
+    image = oiio.ImageBuf(spec)
+    image.set_pixels(oiio.ROI(), np.ascontiguousarray(pixels, np.float32))
+    assert image.write(str(path)), image.geterror()
+
+
+# JSON
+
+
+def test_json_keeps_every_row_and_is_strict(tmp_path):
+    odd = {"a": np.arange(2), "nan": NAN}
+    numpy = dataclasses.replace(GOOD, values={"worst": np.float32(0.5)}, replay=odd)
+    run_report.write_json(tmp_path / "rows.json", [*ROWS, numpy], CONTEXT)
+    json.loads((tmp_path / "rows.json").read_text(), parse_constant=pytest.fail)
+    rows, context = run_report.read_json(tmp_path / "rows.json")
+    assert repr(rows[:-1]) == repr(ROWS)  # by repr: NaN is not equal to itself
+    assert rows[-1].values == {"worst": 0.5}
+    assert rows[-1].replay == {"a": [0, 1], "nan": "nan"}
+    assert context == CONTEXT
+
+
+@pytest.mark.parametrize(
+    ("damage", "complaint"),
+    [
+        (lambda t: t.replace('"schema": 1', '"schema": 2'), "schema 2, expected 1"),
+        (lambda t: "[]", "schema None"),
+        (lambda t: t[: len(t) // 2], "line"),
+        (lambda t: t.replace('"case"', '"Case"', 1), "row 0: missing 'case'"),
+        (lambda t: t.replace("5e-08", '"small"'), "row 0: 'small' is not a number"),
+        (lambda t: t.replace("5e-08", "NaN"), "NaN is not strict JSON"),
+        (lambda t: t.replace("5e-08", "5"), "row 0: verdict 'pass' does not follow"),
+        (lambda t: t.replace('"rows"', '"row"'), "missing 'rows'"),
+        (lambda t: "\udc80", "decode"),
+    ],
+)
+def test_json_refuses_what_it_did_not_write(tmp_path, damage, complaint):
+    path = tmp_path / "rows.json"
+    run_report.write_json(path, ROWS, CONTEXT)
+    path.write_text(damage(path.read_text()), errors="surrogateescape")
+    with pytest.raises(ValueError, match=re.escape(complaint)) as caught:
+        run_report.read_json(path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+# JUnit and terminal
+
+
+def test_junit_counts_budgets_and_leaves_out_rows_that_cannot_fail(tmp_path):
+    run_report.write_junit(tmp_path / "junit.xml", ROWS, CONTEXT)
+    root = xml.parse(tmp_path / "junit.xml").getroot()
+    assert [root.get(key) for key in ("tests", "failures", "skipped", "errors")] == ["4", "2", "1", "0"]
+    directions, speed = root
+    assert (directions.get("name"), len(directions), len(speed)) == ("directions", 4, 0)
+    cases = {case.get("name"): case for case in directions}
+    assert len(cases["promoted / generic / llvm float32: worst"]) == 0
+    assert cases["cross / generic / llvm float32: worst"][0].get("message") == "worst nan, budget 1e-3"
+    assert "0x1.8p+0" in cases["cross / generic / llvm float32: misjudged"][0].text
+    assert cases["cross / generic / cuda float32"][0].get("message") == "no CUDA device \ufffd[0m"
+
+
+def test_summary_puts_broken_budgets_first_and_takes_names_literally():
+    console = pytest.importorskip("rich.console").Console(width=120, record=True, file=io.StringIO())
+    console.print(run_report.summary([*ROWS, dataclasses.replace(GOOD, study="[red]x")]))
+    text = console.export_text()
+    words = "cross / generic / llvm float32", "[red]x", "2 of 4 budgets broken"
+    order = [text.index(word) for word in words]
+    assert order == sorted(order)
+
+
+@pytest.mark.parametrize(
+    ("rows", "sentence"),
+    [
+        ([GOOD, GOOD], "All 2 budgets held"),
+        ([GOOD], "The one budget held"),
+        ([BAD, GOOD], "2 of 3 budgets broken"),
+        ([GOOD, GOOD, ABSENT], "All 2 budgets held, 1 row not run"),
+        ([INFO], "No budget was measured"),
+        ([], "No budget was measured"),
+    ],
+)
+def test_the_sentence(rows, sentence, tmp_path):
+    assert run_report.verdict(rows) == sentence
+    assert f"<h1>{sentence}</h1>" in html(tmp_path, rows)
+
+
+# HTML
+
+
+def test_html_asks_for_nothing_and_runs_no_name(tmp_path):
+    write_exr(tmp_path / "a.exr", np.zeros((2, 2, 3)))
+    text = html(tmp_path, [*ROWS, dataclasses.replace(INFO, pictures={'"><script>': "a.exr"})])
+    assert not re.findall(r"https?:|@import|url\((?!#)|\bsrc=|<link|<iframe", text)
+    assert {target[0] for target in re.findall(r'href="([^"]*)"', text)} == {"#"}
+    assert "&lt;script&gt;alert(1)" in text
+    assert "<script>alert" not in text
+    assert '"><script>' not in text
+    assert "Not &lt;b&gt;bold" in text
+
+
+def test_html_says_everything(tmp_path):
+    text = html(tmp_path)
+    order = [text.index(f'id="{section}"') for section in ("failures", "study-1", "missing")]
+    assert order == sorted(order)
+    numbers = "≰ 1e-3", "&gt; 0", "≤ 6e-8", "-inf", "0x1.8p+0"
+    for words in (*numbers, "no CUDA device", "mitsuba 3.9.1", "$k$ &amp;"):
+        assert words in text, words
+    assert "Not drawn: 2 points" in text  # of curve b
+
+
+def test_html_is_reproducible_with_unique_ids(tmp_path):
+    twice = [*ROWS, dataclasses.replace(INFO, case="again")]
+    text = html(tmp_path, twice)
+    assert text == html(tmp_path, twice)
+    ids = re.findall(r'\bid="([^"]*)"', text)
+    assert len(ids) == len(set(ids))
+
+
+def test_matrix_marks_a_row_whose_other_metric_broke(tmp_path):
+    rows = [
+        Row("directions", s, c, "llvm", {"worst": 1e-8, "misjudged": 0.0}, {"misjudged": 0.0})
+        for s, c in itertools.product("abc", "xyz")
+    ]
+    assert '<table class="matrix"' in html(tmp_path, rows)
+    assert '<table class="matrix"' not in html(tmp_path, rows[:6])
+    rows[4] = dataclasses.replace(rows[4], values={"worst": 1e-8, "misjudged": 7.0})
+    rows[5] = dataclasses.replace(rows[5], values={"misjudged": 8.0})
+    rows[6] = dataclasses.replace(rows[6], values={"worst": NAN}, budgets={})
+    rows[7] = dataclasses.replace(rows[7], values={}, reason="lost")
+    text = html(tmp_path, rows)
+    assert re.search(r'<td class="fail" [^>]*>1e-8<small>misjudged 7 &gt; 0</small>', text)
+    assert re.search(r'<td class="fail" [^>]*>·<small>misjudged 8 &gt; 0</small>', text)
+    assert re.search(r'<td class="info" style="--depth:1" [^>]*>nan<', text)
+    assert re.search(r'<td class="not-run" [^>]*title="lost">not run<', text)
+
+
+def test_pictures_are_embedded_exactly_and_once(tmp_path):
+    pixels = np.random.default_rng(3).normal(size=(3, 5, 3)) * 10.0 ** np.arange(-3, 2)[:, None]
+    pixels[0, 0] = NAN, 1e9, -0.0
+    write_exr(tmp_path / "a.exr", pixels)
+    write_exr(tmp_path / "gray.exr", pixels[..., :1], names=("Y",))
+    row = dataclasses.replace(GOOD, pictures={"reference": "a.exr", "test": "gray.exr"})
+    text = html(tmp_path, [row, row])
+    data = re.findall(r'<script type="text/plain" id="p\d" data-channels="(\d)" data-scale="1.0">([^<]*)<', text)
+    assert [channels for channels, _ in data] == ["3", "1"]
+    planes = [np.frombuffer(zlib.decompress(base64.b64decode(d)), "u1").reshape(2, -1) for _, d in data]
+    halves = [(high.astype("u2") << 8 | low).view("f2").reshape(3, 5, -1) for high, low in planes]
+    expected = np.clip(pixels.astype(np.float32), -65504, 65504).astype(np.float16)
+    assert re.findall(r'data-pixels="([^"]*)"', text) == ["p0", "p1"] * 2
+    np.testing.assert_array_equal(halves[0], expected)
+    np.testing.assert_array_equal(halves[1], expected[..., :1])
+
+
+def test_a_picture_that_cannot_be_shown_is_an_error_and_the_old_page_stays(tmp_path):
+    before = html(tmp_path)
+    (tmp_path / "text.exr").write_text("no picture")
+    write_exr(tmp_path / "two.exr", np.zeros((2, 2, 2)), names=("R", "G"))
+    for name, error in (("gone.exr", FileNotFoundError), ("text.exr", ValueError), ("two.exr", ValueError)):
+        with pytest.raises(error, match=re.escape(str(tmp_path / name))):
+            html(tmp_path, [dataclasses.replace(GOOD, pictures={"test": name})])
+    assert (tmp_path / "report.html").read_text("utf-8") == before
+
+
+def test_curves_keep_the_guide_and_literal_names():
+    axes = Axes("seconds", "relMSE", slope=-1)
+    svg = curves_svg({"$x$": [(1, 1e-2), (10, 1e-3)]}, axes, salt="s")
+    assert "slope −1" in svg and ">$x$</text>" in svg and "var(--c0)" in svg
+    assert ">seconds</text>" in svg and ">relMSE</text>" in svg
+    assert curves_svg({"x": [(1, 0), (NAN, 1)]}, axes, salt="s") == ""
+
+
+@pytest.mark.parametrize(
+    ("scales", "left_out"),
+    [({}, 2), ({"x_scale": "linear"}, 1), ({"y_scale": "linear"}, 1), ({"x_scale": "linear", "y_scale": "linear"}, 0)],
+)
+def test_what_has_no_place_depends_on_the_scales_a_study_asks_for(scales, left_out, tmp_path):
+    axes = {"x": "height", "y": "turn", **scales}
+    row = dataclasses.replace(INFO, curves={"a": [(-1.0, 1.0), (1.0, -1.0), (1.0, 1.0), (2.0, 3.0)]})
+    text = html(tmp_path, [row], {"studies": {"speed": {"axes": axes}}})
+    assert ">height</text>" in text and ">turn</text>" in text
+    assert [int(n) for n in re.findall(r"Not drawn: (\d+) point", text)] == [left_out] * bool(left_out)
+    assert "slope" not in text
+
+
+def test_the_front_are_the_points_that_nothing_beats():
+    points = [(2.0, 5.0), (1.0, 9.0), (3.0, 5.0), (1.0, 8.0), (4.0, 1.0), (5.0, 2.0)]
+    assert pareto(points) == [(1.0, 8.0), (2.0, 5.0), (4.0, 1.0)]
+    assert pareto([]) == []
+
+
+def test_a_scatter_shows_front_floor_and_intervals_where_asked(tmp_path):
+    def paths(**more):
+        scatter = {"study": "s", "x": "time", "y": "worst", **more}
+        text = html(tmp_path, rows, {"scatter": [scatter, {**scatter, "x": "absent"}]})
+        assert text.count('class="plot wide"') == 1  # what no row has measured is not drawn
+        return text.count("<path"), text
+
+    rows = [Row("s", name, "", "llvm", {"time": x, "low": x - 0.1, "high": x + 0.1, "worst": y})
+            for name, x, y in (("a", 1.0, 1e-3), ("b", 2.0, 1e-6), ("c", 3.0, 1e-5))]  # fmt: skip
+    rows.append(Row("s", "copy", "", "llvm", {"time": 0.9}))
+    plain, text = paths()
+    assert ">copy</text>" not in text
+    assert paths(front=True)[0] == plain + 1
+    floored, text = paths(floor="copy")
+    assert floored == plain + 1 and ">copy</text>" in text
+    wide = paths(interval=["low", "high"])[1]
+    assert wide.count("<path") == plain and wide != text
+
+
+@pytest.mark.parametrize("axes", [{"x_scale": "cubic"}, {"slope": 2, "y_scale": "linear"}])
+def test_axes_that_cannot_be_drawn_are_an_error(axes):
+    with pytest.raises(ValueError, match="axes: "):
+        Axes(**axes)
+
+
+def test_an_overlay_stands_beside_the_other_pictures_in_a_fixed_order(tmp_path):
+    write_exr(tmp_path / "a.exr", np.zeros((2, 2, 3)))
+    pictures = dict.fromkeys(("overlay", "extra", "difference", "test", "reference"), "a.exr")
+    text = html(tmp_path, [dataclasses.replace(GOOD, pictures=pictures)])
+    assert re.findall('data-role="([^"]*)"', text) == ["reference", "test", "overlay", "difference", "extra"]
+    assert 'class="compare paired"' in text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1.234e-7, "1.23e-7"), (0.98, "0.98"), (8056.0, "8056"), (0.0, "0"), (1e-3, "1e-3"), (1234.56, "1235"),
+     (-2.5e-9, "-2.5e-9"), (1e300, "1e300"), (99999.7, "100000"), (INF, "inf"), (NAN, "nan"), (0.01, "0.01")],
+)  # fmt: skip
+def test_compact(value, text):
+    assert compact(value) == text
+
+
+def test_a_broken_budget_never_looks_kept():
+    assert apart(1.3001e-5, 1.3e-5) == ("1.3001e-5", "1.3e-5")
+    value, budget = apart(math.nextafter(1.0, 2), 1.0)
+    assert value != budget
+
+
+# In a browser
+
+PROBE = """<script>
+const wait = setInterval(() => {
+  if (!root.dataset.ready) return;
+  clearInterval(wait);
+  const pixel = (role, x) => {
+    const copy = document.createElement("canvas").getContext("2d");
+    copy.drawImage(document.querySelector(`[data-role=${role}] canvas`), 0, 0);
+    return [...copy.getImageData(x, 0, 1, 1).data].slice(0, 3);
+  };
+  const press = (key) => document.body.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
+  const seen = { test: pixel("test", 0), nan: pixel("test", 1), difference: pixel("difference", 0) };
+  press("x");
+  press("]");
+  press("]");
+  seen.brighter = pixel("test", 0);
+  press("f");
+  seen.mode = root.dataset.mode;
+  const box = document.querySelector("[data-role=reference] .frame").getBoundingClientRect();
+  document.querySelector("[data-role=reference] canvas").dispatchEvent(new PointerEvent("pointermove",
+    { bubbles: true, clientX: box.left + 1, clientY: box.top + 1 }));
+  seen.read = document.querySelector("[data-role=reference] .pixel").value;
+  root.dataset.seen = JSON.stringify(seen);
+}, 20);
+</script></body>"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PATH: the page's script was not run")
+def test_the_page_works_from_a_file(tmp_path):
+    for role, value in (("reference", 0.25), ("test", 0.5), ("difference", -1.0)):
+        pixels = np.full((2, 2, 3), value)
+        pixels[0, 1, 1] = NAN
+        write_exr(tmp_path / f"{role}.exr", pixels)
+    pictures = {role: f"{role}.exr" for role in ("reference", "test", "difference")}
+    page = tmp_path / "report.html"
+    text = html(tmp_path, [*ROWS, dataclasses.replace(GOOD, pictures=pictures)])
+    page.write_text(text.replace("</body>", PROBE), "utf-8")
+    dom, console = browse(page, tmp_path / "profile")
+    assert console == []
+    tag = re.search("<html[^>]*>", dom)[0]
+    assert 'data-ready="1"' in tag and "data-error" not in tag
+    seen = json.loads(re.search('data-seen="([^"]*)"', tag)[1].replace("&quot;", '"'))
+    assert seen == {
+        "test": [188, 188, 188],  # sRGB of 0.5
+        "nan": [255, 0, 255],
+        "difference": [33, 102, 172],  # negative: blue
+        "brighter": [255, 255, 255],  # one stop up
+        "mode": "flicker",
+        "read": "0.25  0.25  0.25",
+    }

@@ -1,0 +1,290 @@
+"""Is a plain scene what Mitsuba has of the scene file, and is refused what it cannot say?
+
+Geometry is judged by rays through the original and through the plain scene as Mitsuba loads it again: they must meet
+the same surface at the same distance from the same side, of the same material, and beyond all of them the same sky.
+"""
+
+import re
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refract.scene_export import from_mitsuba, write_files
+from mi_refract.scene_export.from_mitsuba import Diffuse, Environment, Glass, Light
+from mi_refract.scene_export.targets.environment_map import radiance
+
+SCENES = Path(__file__).parents[2] / "scenes"
+NAMES = sorted(path.stem for path in SCENES.glob("*.xml"))
+PLANE = ["diamond", "lightpipe", "nested", "prism", "slab"]  # nothing in them is curved
+
+
+@pytest.fixture(autouse=True)
+def scalar():
+    before = mi.variant()
+    mi.set_variant("scalar_rgb")
+    yield
+    mi.set_variant(before)
+
+
+SCENE = """<scene version="3.0.0">
+  <default name="bsdf" value="refract"/>
+  <integrator type="path"><integer name="max_depth" value="5"/></integrator>
+  <sensor type="perspective">
+    <transform name="to_world"><lookat origin="0,1,-40" target="0,0,0" up="0,1,0"/></transform>
+    <float name="fov" value="40"/>
+    <film type="hdrfilm">
+      <integer name="width" value="16"/><integer name="height" value="8"/><rfilter type="box"/>
+    </film>
+  </sensor>
+  <emitter type="constant"><rgb name="radiance" value="0.5, 0.25, 1"/></emitter>
+  <shape type="sphere" id="ball"><bsdf type="$bsdf"><string name="int_ior" value="water"/></bsdf></shape>
+  <shape type="cube" id="box"><transform name="to_world"><translate x="3"/></transform></shape>
+  <shape type="rectangle"><emitter type="area"><rgb name="radiance" value="2"/></emitter></shape>
+</scene>"""
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """`scene(old, new, ...)`: the path of SCENE with these replacements."""
+
+    def write(*replacements):
+        text = SCENE
+        for old, new in zip(replacements[::2], replacements[1::2], strict=True):
+            assert old in text
+            text = text.replace(old, new)
+        path = tmp_path / "scene.xml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_what_is_read(scene):
+    found = from_mitsuba.load(scene(), level=1)
+    ball, box, lamp = found.meshes
+    assert (ball.name, box.name, lamp.name) == ("ball", "box", "rectangle")
+    assert ball.material == Glass(1.333, 1.000277) and len(ball.faces) == 80
+    assert box.material == Diffuse((0.5, 0.5, 0.5)) and box.vertices.min(0).tolist() == [2, -1, -1]
+    assert lamp.material == Light((2, 2, 2))
+    assert found.sky == (0.5, 0.25, 1) and found.max_depth == 5
+    assert (found.camera.width, found.camera.height, found.camera.origin) == (16, 8, (0, 1, -40))
+    assert found.name == "scene" and len(found.materials) == 3
+
+
+def test_defines_replace_defaults(scene):
+    assert from_mitsuba.load(scene('value="5"', 'value="$depth"'), depth="7").max_depth == 7
+    for name in ("dielectric", "refract_promoted"):
+        assert from_mitsuba.load(scene(), bsdf=name).meshes[0].material == Glass(1.333, 1.000277)
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "larger", "smaller", "diagonal"])
+def test_field_of_view(scene, axis, tmp_path):
+    path = scene('<float name="fov"', f'<string name="fov_axis" value="{axis}"/><float name="fov"')
+    for corner in ((0, 0), (1, 0.25)):
+        rays = [
+            each.sensors()[0].sample_ray(0, 0.5, mi.Point2f(corner), mi.Point2f(0.5))[0].d
+            for each in (original(path), again(from_mitsuba.load(path), tmp_path / f"plain{corner[0]}"))
+        ]
+        np.testing.assert_allclose(*rays, atol=1e-6)
+
+
+# --- the same geometry, materials and sky ----------------------------------------------------------------
+
+
+def again(found, folder):
+    """The plain scene, loaded by Mitsuba."""
+    write_files.write(found, "mitsuba", folder)
+    return mi.load_file(str(folder / "scene.xml"), optimize=False, parallel=False, bsdf="dielectric")
+
+
+def original(path, **defines):
+    return mi.load_file(str(path), optimize=False, parallel=False, bsdf="dielectric", **defines)
+
+
+def met(scene, ray):
+    """Where a ray arrives; the side and the ratio of indices, a colour, or a radiance."""
+    si = scene.ray_intersect(ray)
+    if not si.is_valid():
+        return [0, 0, 0, 0, *(scene.environment().eval(si) if scene.environment() else (0, 0, 0))]
+    if si.emitter(scene) is not None:
+        return [*si.p, 2, *si.emitter(scene).eval(si)]
+    bsdf = si.bsdf()
+    if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta):
+        eta = float(re.search(r"eta = ([\d.e-]+)", str(bsdf))[1])
+        return [*si.p, np.sign(si.wi.z), eta, 0, 0]
+    return [*si.p, 3, *bsdf.eval_diffuse_reflectance(si)]
+
+
+def disagreements(one, other, count=1500, seed=9, tolerance=1e-3):
+    """The share of rays that meet something else: into the picture, and on from where the first of them arrive."""
+    rng, wrong, seen = np.random.default_rng(seed), 0, 0
+    for u, direction in zip(rng.random((count, 2)), rng.normal(size=(count, 3)), strict=True):
+        ray, _ = one.sensors()[0].sample_ray(0, 0.5, mi.Point2f(u), mi.Point2f(0.5))
+        there, _ = other.sensors()[0].sample_ray(0, 0.5, mi.Point2f(u), mi.Point2f(0.5))
+        si = one.ray_intersect(ray)
+        onward = si.spawn_ray(mi.Vector3f(direction / np.linalg.norm(direction))) if si.is_valid() else ray
+        for a, b in ((ray, there), (onward, onward)):
+            wrong += not np.allclose(met(one, a), met(other, b), rtol=tolerance, atol=tolerance)
+            seen += 1
+    return wrong / seen
+
+
+@pytest.mark.parametrize("name", PLANE)
+def test_plane_scenes_are_the_same(name, tmp_path):
+    path = SCENES / f"{name}.xml"
+    # Rays that graze a shape or an edge of a checkerboard may fall on either side of it.
+    assert disagreements(original(path), again(from_mitsuba.load(path), tmp_path / "plain")) <= 0.004
+
+
+@pytest.mark.parametrize("name", sorted(set(NAMES) - set(PLANE) - {"glasses64", "mirage"}))
+def test_curved_scenes_are_nearly_the_same(name, tmp_path):
+    """Where the shapes are not grazed, and as near as the triangles are to the surface."""
+    path = SCENES / f"{name}.xml"
+    one, other = original(path), again(from_mitsuba.load(path, level=6), tmp_path / "plain")
+    assert disagreements(one, other, tolerance=0.1) < 0.01
+    for a, b in zip(one.shapes(), _united(other, one.shapes()), strict=True):
+        extent = np.array(a.bbox().extents()).max()
+        np.testing.assert_allclose(b, [list(a.bbox().min), list(a.bbox().max)], atol=2e-3 * extent)
+
+
+def _united(scene, shapes):
+    """The bounding boxes of the plain meshes that came from each shape: both parts of a checkerboard."""
+    boxes = {shape.id(): shape.bbox() for shape in scene.shapes()}
+    for shape in shapes:
+        box = boxes[shape.id()]
+        if f"{shape.id()}_1" in boxes and f"{shape.id()}_1" not in [other.id() for other in shapes]:
+            box.expand(boxes[f"{shape.id()}_1"])
+        yield [list(box.min), list(box.max)]
+
+
+@pytest.mark.parametrize(
+    "old, new",
+    [
+        ('<translate y="18"/>', '<translate y="18.2"/>'),
+        ('angle="52"', 'angle="-52"'),
+        ('name="fov" value="33"', 'name="fov" value="33.5"'),
+        ('value="0.88, 0.82, 0.72"', 'value="0.45, 0.12, 0.14"'),
+        ('<scale value="12"/>', '<scale x="12" y="13"/>'),
+        ('value="0.70, 0.78, 0.90"', 'value="0.70, 0.79, 0.90"'),
+        ('<string name="int_ior" value="bk7"/>', '<float name="int_ior" value="1.51"/>'),
+        ('origin="-120, 150, 30" target="0, 0, 0"', 'origin="-120, 150, 30" target="-240, 300, 60"'),
+    ],
+)
+def test_a_difference_is_seen(old, new, tmp_path):
+    text = (SCENES / "prism.xml").read_text()
+    assert old in text
+    (tmp_path / "meshes").symlink_to(SCENES / "meshes")
+    (tmp_path / "prism.xml").write_text(text.replace(old, new))
+    other = again(from_mitsuba.load(tmp_path / "prism.xml"), tmp_path / "plain")
+    assert disagreements(original(SCENES / "prism.xml"), other) > 0.004
+
+
+def test_turned_environment(scene, tmp_path):
+    (tmp_path / "lamps.exr").write_bytes((SCENES / "lamps.exr").read_bytes())
+    turn = '<transform name="to_world"><rotate x="0.6" y="0.8" angle="70"/></transform>'
+    path = scene(
+        '<emitter type="constant"><rgb name="radiance" value="0.5, 0.25, 1"/></emitter>',
+        f'<emitter type="envmap"><string name="filename" value="lamps.exr"/><float name="scale" value="3"/>{turn}'
+        "</emitter>",
+    )
+    sky, emitter = from_mitsuba.load(path).sky, original(path).environment()
+    assert isinstance(sky, Environment)
+    directions = np.random.default_rng(2).normal(size=(500, 3))
+    expected = []
+    for direction in directions:
+        si = mi.SurfaceInteraction3f()
+        si.wi = -mi.Vector3f(direction / np.linalg.norm(direction))
+        expected.append(list(emitter.eval(si)))
+    np.testing.assert_allclose(radiance(sky, directions), expected, rtol=1e-3, atol=1e-3)
+    assert not np.allclose(radiance(sky, directions * [1, 1, -1]), expected, rtol=0.1, atol=0.1)
+
+
+# --- what cannot be said ---------------------------------------------------------------------------------
+
+REFUSED = {
+    "integrator": ('type="path"', 'type="ptracer"', "ptracer"),
+    "endless": ('value="5"', 'value="-1"', "max_depth = -1"),
+    "sensor": ('"perspective"', '"thinlens"', "thinlens"),
+    "filter": ('"box"', '"gaussian"', "gaussian"),
+    "crop": ("<rfilter", '<integer name="crop_width" value="4"/><rfilter', "crop_width"),
+    "two skies": ("</scene>", '<emitter type="constant"/></scene>', "emitter too many"),
+    "point light": ("</scene>", '<emitter type="point"/></scene>', "emitter too many"),
+    "rough": ('type="$bsdf"', 'type="roughdielectric"', "roughdielectric"),
+    "tinted": ("<string", '<float name="specular_transmittance" value="0.5"/><string', "specular_transmittance"),
+    "index": ('"water"', '"nonsense"', "unknown material"),
+    "shape": ('type="cube"', 'type="sdfgrid"', "sdfgrid"),
+    "mirrored": ('<translate x="3"/>', '<scale x="-1"/>', "mirrors"),
+    "flat": ('<translate x="3"/>', '<scale x="0"/>', "mirrors or flattens"),
+    "one-sided": ('type="cube"', 'type="rectangle"', "one side of an open surface"),
+    "texture": (
+        '<rgb name="radiance" value="2"/>',
+        '<texture type="bitmap" name="radiance"><string name="filename" value="x.exr"/></texture>',
+        "bitmap",
+    ),
+    "round board": (
+        '<shape type="rectangle"><emitter type="area"><rgb name="radiance" value="2"/>',
+        '<shape type="disk"><emitter type="area"><texture type="checkerboard" name="radiance"/>',
+        "a checkerboard",
+    ),
+    "medium": ("<bsdf", '<medium type="homogeneous" name="interior"/><bsdf', "a medium of a shape"),
+    "reflecting lamp": ("<emitter type=\"area\">", '<bsdf type="diffuse"/><emitter type="area">', "BSDF of a lamp"),
+    "unknown parameter": ('<translate x="3"/>', '<nonsense x="3"/>', "nonsense"),
+    "syntax": ("</scene>", "", "scene.xml"),
+    "negative": ('"0.5, 0.25, 1"', '"0.5, -0.25, 1"', "at least 0"),
+    "text for a number": ('<float name="fov" value="40"/>', '<string name="fov" value="40"/>', "fov = 40"),
+    "no angle": ('<float name="fov" value="40"/>', "", "fov = None"),
+    "flat angle": ('name="fov" value="40"', 'name="fov" value="180"', "fov = 180"),
+    "no pixel": ('name="width" value="16"', 'name="width" value="0"', "0 × 8"),
+    "no radius": ('type="sphere" id="ball">', 'type="sphere"><float name="radius" value="0"/>', "radius = 0"),
+    "infinite": ('type="sphere" id="ball">', 'type="sphere"><float name="radius" value="inf"/>', "radius = inf"),
+    "no point": ('type="sphere" id="ball">', 'type="sphere"><float name="center" value="1"/>', "center = 1"),
+    "no transform": (
+        '<transform name="to_world"><translate x="3"/></transform>', '<float name="to_world" value="1"/>', "to_world"
+    ),
+    "missing mesh": ('type="sphere" id="ball">', 'type="ply"><string name="filename" value="no.ply"/>', "no.ply"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused(case, scene):
+    old, new, word = REFUSED[case]
+    with pytest.raises(ValueError, match=re.escape(word)) as caught:
+        from_mitsuba.load(scene(old, new))
+    message = str(caught.value)
+    assert "\n" not in message and ("accepted" in message or "scene.xml" in message)
+
+
+def test_smooth_normals_are_refused(scene, tmp_path):
+    (tmp_path / "prism.ply").write_bytes((SCENES / "meshes" / "prism.ply").read_bytes())
+    ply = 'type="ply" id="ball"><string name="filename" value="prism.ply"/>'
+    with pytest.raises(ValueError, match="smooth normals"):
+        from_mitsuba.load(scene('type="sphere" id="ball">', ply))
+    flat = f'{ply}<boolean name="face_normals" value="true"/>'
+    assert len(from_mitsuba.load(scene('type="sphere" id="ball">', flat)).meshes[0].faces) == 8
+
+
+def test_other_errors(scene):
+    without = re.search("<sensor.*</sensor>", SCENE, re.DOTALL)[0]
+    with pytest.raises(ValueError, match="no sensor"):
+        from_mitsuba.load(scene(without, ""))
+    with pytest.raises(ValueError, match="no integrator"):
+        from_mitsuba.load(scene('<integrator type="path"><integer name="max_depth" value="5"/></integrator>', ""))
+    with pytest.raises(FileNotFoundError):
+        from_mitsuba.load("none.xml")
+    with pytest.raises(ValueError, match="level = 9"):
+        from_mitsuba.load(scene(), level=9)
+    with pytest.raises(ValueError, match="oops"):
+        from_mitsuba.load(scene(), oops="1")
+
+
+def test_children_may_have_names(scene):
+    path = scene('<shape type="cube"', '<shape name="second" type="cube"', "<bsdf", '<bsdf name="glass"')
+    assert [mesh.name for mesh in from_mitsuba.load(path, level=0).meshes] == ["ball", "box", "rectangle"]
+
+
+def test_names_are_unique(scene):
+    text = "".join(f'<shape type="sphere" id="{name}"><bsdf type="$bsdf"/></shape>' for name in ("a b", "A.b"))
+    names = [mesh.name for mesh in from_mitsuba.load(scene("</scene>", f"{text}</scene>"), level=0).meshes]
+    assert names[-2:] == ["a_b", "A_b_2"] and len({name.lower() for name in names}) == len(names)

@@ -1,0 +1,70 @@
+"""Planar scenes made by hand, for tests: a slab, a ball of exact arcs, a box."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from mi_refract.planar.scene_file import PlanarScene, Region
+from mi_refract.planar.tracer import Event, Segments
+
+CORNERS = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], float)
+SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
+SLAB = np.array([(0, -50), (1, -50), (1, 50), (0, 50)], float)
+
+
+def polygon(points, n=1.5, outside=1.0):
+    """Counter-clockwise: the inside is on the left."""
+    start = np.array(points, float)
+    return Segments(start, np.roll(start, -1, axis=0), np.full(len(start), n), np.full(len(start), outside))
+
+
+def together(*parts):
+    names = ("start", "end", "n_left", "n_right")
+    return Segments(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def star(count, seed=1, n=1.7):
+    rng = np.random.default_rng(seed)
+    angle, radius = np.sort(rng.uniform(0, 2 * np.pi, count)), rng.uniform(0.3, 1, count)
+    return polygon(np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]), n)
+
+
+def story(paths, i=0):
+    """Of a path: the segments it meets, and its events."""
+    hits, events = paths.hits[i], paths.events[i]
+    return hits[hits >= 0].tolist(), [Event(e) for e in events if e != Event.NONE]
+
+
+def ball(n=1.5):
+    """The unit circle, of four arcs."""
+    start, control = CORNERS[::2], CORNERS[1::2]
+    return Segments(start, np.roll(start, -1, axis=0), np.full(4, n), np.ones(4), control, np.full(4, math.sqrt(0.5)))
+
+
+def scene(segments, origins, directions, **given):
+    """Rays through `segments`, a tuple of them for several colours, around which there is vacuum."""
+    segments = segments if isinstance(segments, tuple) else (segments,)
+    origins = np.array(origins, float)
+    directions = np.broadcast_to(np.array(directions, float), origins.shape)
+    directions = directions / np.hypot(*directions.T)[:, None]
+    outline = segments[0].start if segments[0].control is None else CORNERS
+    default = {
+        "path": Path("test.toml"),
+        "title": "A test",
+        "colours": ("",) * len(segments),
+        "regions": (Region(outline, tuple(s.n_left[0] for s in segments)),),
+        "index": (1.0,) * len(segments),
+        "beams": np.zeros(len(origins), int),
+        "max_depth": 20,
+        "branches": 0,
+        "view": None,
+    }
+    return PlanarScene(segments=segments, origins=origins, directions=directions, **default | given)
+
+
+def beam(count, half, x=-3.0, y=0.0):
+    """Origins of parallel rays."""
+    return np.column_stack([np.full(count, x), y + np.linspace(-half, half, count)])

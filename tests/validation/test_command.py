@@ -1,0 +1,271 @@
+"""The validation sees planted defects, resumes what was interrupted, and refuses misuse in one line."""
+
+import dataclasses
+import re
+import types
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refract import FORMULAS, oracle, regimes
+from mi_refract.image_diff.methods import METHODS
+from mi_refract.image_diff.self_test import DEFECTS
+from mi_refract.plugins import refract as bsdf
+from mi_refract.report.row import Row
+from mi_refract.report.run_report import read_json
+from validation import __main__ as command
+from validation import readme_tables, runner
+from validation.diff import planted_defects
+from validation.directions import bsdf_samples, judge, per_formula
+from validation.renders import against_dielectric
+from validation.renders import scene_needs as scenes
+from validation.run import array_settings as settings
+from validation.run import render_methods
+from validation.run.context import SCENES, Task
+from validation.stability import layered_paths
+from validation.suite.renderers import SYSTEMS
+from validation.suite.renderers.image_renderers import PAINTERS
+
+
+@pytest.fixture
+def context(scalar_context):
+    return scalar_context(scalar_rays=60, resolution=8, spp=4, pairs=8, curve_spp=(1,))
+
+
+def defective(props):
+    """A plugin whose index is off by one part in a hundred."""
+    plugin = bsdf.plugin_class(mi.scalar_rgb)(props)
+    params = mi.traverse(plugin)
+    params["eta"] = 1.01 * float(plugin.eta[0])
+    params.update()
+    return plugin
+
+
+def tinted(props):
+    props["specular_transmittance"] = 0.999
+    return props
+
+
+# Studies -------------------------------------------------------------------------------------------------------
+
+
+def test_errors_are_those_that_were_put_in():
+    rays = regimes.make("generic", 50, np.float64, seed=1)
+    exact = oracle.refract(rays.a, rays.n, rays.k, progress=False)
+    length = np.sqrt((rays.a.astype(np.longdouble) ** 2).sum(1))[:, None]
+    direction = exact.direction.astype(np.longdouble) + exact.direction_low
+    chord, angle, drift = judge.errors(direction * length, rays, exact)
+    assert max(chord.max(), angle.max(), drift.max()) < 1e-18
+    across = np.cross(direction, np.roll(direction, 1, axis=1))
+    across /= np.sqrt((across**2).sum(1))[:, None]
+    chord, angle, _ = judge.errors((direction + 1e-9 * across) * length, rays, exact)
+    assert chord == pytest.approx(1e-9, rel=1e-6)
+    assert angle == pytest.approx(1e-9, rel=1e-6)
+    chord, angle, drift = judge.errors(direction * 1.001 * length, rays, exact)
+    assert (chord, drift) == (pytest.approx(1e-3), pytest.approx(1e-3))
+    assert angle.max() < 1e-18
+    chord, _, _ = judge.errors(direction * np.nan, rays, exact)
+    assert np.isinf(chord).all()
+
+
+def test_directions_name_what_does_not_run_and_hold_what_does(context):
+    rows = [row for task in per_formula.tasks(context) if "scalar" in task.name for row in task.run()]
+    assert {row.verdict for row in rows} == {"info", "pass"}
+    absent = [s for s in settings.settings(context) if s.vector is None]
+    assert all(row.verdict == "not run" and row.reason for s in absent for row in per_formula._setting_rows(context, s))
+    worst = next(row for row in rows if row.subject == "promoted" and row.case == "critical")
+    assert {"error / bound", "misjudged far"} == set(worst.budgets)
+    assert len(worst.replay["largest error"]["a"]) == 3
+
+
+@pytest.mark.parametrize(("constant", "factor"), [("linear", 6), ("radicand", 6), ("linear", 1), ("linear", 0.2)])
+def test_a_budget_that_is_loose_or_too_tight_fails_the_full_sweep(constant, factor, context, monkeypatch):
+    monkeypatch.setattr(per_formula, "TWO_SIDED", 60)
+    formula = FORMULAS["decomposed"]
+    off = dataclasses.replace(formula.budget, **{constant: factor * getattr(formula.budget, constant)})
+    monkeypatch.setitem(FORMULAS, "decomposed", dataclasses.replace(formula, budget=off))
+    setting = settings.settings(context)[0]
+    parts = [per_formula._regime_row("decomposed", formula, r, setting, 3000) for r in ("grazing", "critical", "k ≫ 1")]
+    whole = per_formula._summary("decomposed", parts, setting, {})
+    assert set(whole.budgets) == {"slack, linear", "slack, radicand"}
+    broken = {metric for row in (whole, *parts) for metric in row.broken}
+    assert broken == ({f"slack, {constant}"} if factor > 1 else {"error / bound"} if factor < 1 else set())
+
+
+def test_samples_pass_and_see_an_index_that_is_off(context, monkeypatch):
+    modes = bsdf_samples._modes()
+    assert all(bsdf_samples._mode_row(*mode, 200, "scalar_rgb").verdict == "pass" for mode in modes)
+    load = mi.load_dict
+    monkeypatch.setattr(mi, "load_dict", lambda d: load(d | {"int_ior": 1.501} if d["type"] == "refract" else d))
+    broken = bsdf_samples._mode_row(*modes[0], 200, "scalar_rgb").broken
+    assert {"eta worst", "weight p99", "wo p99"} <= set(broken)
+
+
+@pytest.mark.parametrize(("plugin", "verdict"), [("refract", "pass"), ("refract_defect", "fail")])
+def test_renders_agree_and_see_an_index_that_is_off(context, plugin, verdict):
+    mi.register_bsdf("refract_defect", defective)
+    (row,) = against_dielectric._compare(context, SCENES / "sphere.xml", plugin)
+    assert row.verdict == verdict, row.values
+    assert sorted(path.name for path in (context.out / "pictures/sphere").iterdir()) == sorted(
+        ["dielectric.exr", f"{plugin} difference.exr", f"{plugin} test.exr"]
+    )
+    assert set(row.curves) == ({"refract", "dielectric"} if plugin == "refract" else set())
+
+
+def test_what_is_the_same_is_not_tested_by_chance_and_still_compared(context):
+    """The furnace has no noise: no Welch test, but a picture that is off fails; and NaN is no picture at all."""
+    mi.register_bsdf("refract_tinted", lambda props: bsdf.plugin_class(mi.scalar_rgb)(tinted(props)))
+    right, wrong = (against_dielectric._compare(context, SCENES / "furnace.xml", p)[0] for p in ("refract", "refract_tinted"))
+    assert right.verdict == "pass" and right.reason.startswith("left out: Welch's test")
+    assert "Welch alarms" not in right.values and not right.curves
+    assert {"|mean ratio − 1|", "changed share"} <= set(wrong.broken)
+    quiet, noisy = np.ones((4, 8, 8, 3)), np.random.default_rng(1).random((4, 8, 8, 3))
+    assert against_dielectric._budgets("nested", "").keys() == {"|mean ratio − 1|", "Welch alarms"}
+    assert against_dielectric._budgets("nested", "left out").keys() == {"|mean ratio − 1|", "changed share"}
+    assert against_dielectric._budgets("mirage", "left out") == {}
+    assert "bit for bit" in against_dielectric.no_question(noisy, noisy)
+    assert "independent seeds" in against_dielectric.no_question(quiet + 1e-7, quiet)
+    assert against_dielectric.no_question(quiet * np.nan, quiet) == against_dielectric.no_question(noisy, quiet) == ""
+
+
+def test_scenes_say_what_they_need_and_what_is_left_out(context):
+    (row,) = scenes.scene_rows(context, SCENES / "slab.xml")
+    assert {name for name, value in row.values.items() if value} == {
+        "sampleable", "lamps", "area", "environment", "plain environment", "only glass", "textured", "polarising"
+    }  # fmt: skip
+    assert row.reason == "left out: emitter sampling, a random number, media, null lobes, dispersion"
+    assert row.replay["left out"]["dispersion"] == "no BSDF bends light by its wavelength"
+
+
+# The run -------------------------------------------------------------------------------------------------------
+
+
+def row(**values):
+    return Row("directions", "promoted", "all regimes", "scalar float64", values or {"worst / u": 0.5})
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(context):
+    calls = []
+
+    def work(name):
+        calls.append(name)
+        return [row()]
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    first, last = Task("first", lambda: work("first")), Task("last", lambda: work("last"))
+    with pytest.raises(KeyboardInterrupt):
+        runner.run([first, Task("last", interrupt)], context)
+    assert runner.run([first, last], context) == [row(), row()]
+    assert calls == ["first", "last"]
+    other = dataclasses.replace(context, profile=dataclasses.replace(context.profile, rays=17))
+    runner.run([first], other)
+    assert calls == ["first", "last", "first"]
+    runner.forget(context)
+    runner.run([first], context)
+    assert calls[-2:] == ["first", "first"]
+
+
+def study(*rows):
+    def tasks(context):
+        return [Task("a task", lambda: list(rows))]
+
+    return types.SimpleNamespace(TITLE="A study", TEXT="", TERMS={}, tasks=tasks)
+
+
+@pytest.mark.parametrize(("budget", "code"), [(1.0, 0), (0.4, 1), (float("nan"), 1)])
+def test_the_exit_code_follows_the_budgets(tmp_path, monkeypatch, capsys, budget, code):
+    measured = dataclasses.replace(row(), budgets={"worst / u": budget})
+    monkeypatch.setattr(command, "import_module", lambda name: study(measured))
+    assert command.main(["directions", "--out", str(tmp_path)]) == code
+    assert {path.name for path in tmp_path.iterdir()} == {"rows.json", "junit.xml", "report.html"}
+    rows, context = read_json(tmp_path / "rows.json")
+    assert rows[0].verdict == ("pass" if code == 0 else "fail")
+    assert context["versions"]["mitsuba"] == mi.__version__
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["refractions"], "unknown study 'refractions'; accepted: directions, stability, renders, efficiency, planar"),
+        (["--profile", "slow"], "invalid choice: 'slow'"),
+        (["--out", __file__], "File exists"),
+        (["--speed", "9"], "unrecognized arguments"),
+    ],
+)
+def test_misuse_is_one_line_and_exit_code_2(arguments, words, capsys):
+    try:
+        code = command.main(arguments)
+    except SystemExit as stop:
+        code = stop.code
+    printed = capsys.readouterr().err
+    assert code == 2
+    assert words in printed
+    assert len(printed.splitlines()) == 1
+
+
+# The README ----------------------------------------------------------------------------------------------------
+
+
+def test_the_accuracy_table_holds_the_rows_and_nothing_else():
+    settings = {"llvm float32": {"misjudged": 3.0}, "llvm float64": {}}
+    rows = [
+        Row("directions", "promoted", "all regimes", setting,
+            {"worst chord": 4.97e-8, "worst / u": 0.834, "time / copy": 1.01, "time / copy, low": 0.98,
+             "time / copy, high": 1.2, "time / plain": 1.05} | more, replay={"rays": 28000})
+        for setting, more in settings.items()
+    ]  # fmt: skip
+    floor = [dataclasses.replace(r, subject="copy", values={"time / copy": 1.0}, replay={}) for r in rows]
+    lines = readme_tables.accuracy([*rows, *floor]).splitlines()
+    assert len(lines) == 6
+    assert [cell.strip() for cell in lines[-1].split("|")][1:-1] == [
+        "`promoted`", "this project", "4.97e-8", "0.834", "3", "1.01 (0.98–1.2)", "1.05",
+        "4.97e-8", "0.834", "1.01 (0.98–1.2)",
+    ]  # fmt: skip
+
+
+def test_a_readme_is_not_written_from_a_run_that_measured_too_little():
+    with pytest.raises(ValueError, match="no directions were measured"):
+        readme_tables.accuracy([])
+    with pytest.raises(ValueError, match="no scene was rendered"):
+        readme_tables.renders([])
+    with pytest.raises(ValueError, match="no paths were traced"):
+        readme_tables.paths([])
+    with pytest.raises(ValueError, match="no efficiency was measured"):
+        readme_tables.efficiency([])
+    with pytest.raises(ValueError, match="no planar paths were traced"):
+        readme_tables.planar([])
+    with pytest.raises(ValueError, match="no defects were planted"):
+        readme_tables.seen([])
+    with pytest.raises(ValueError, match="no other renderer was run"):
+        readme_tables.suite([])
+
+
+def test_the_readme_holds_its_tables_and_shows_pictures_that_exist():
+    root = Path(command.__file__).parents[1]
+    text = (root / "README.md").read_text()
+    scenes = [path.stem for path in SCENES.glob("*.xml")]
+    ways = [method.name for method in render_methods.METHODS]
+    planar = [path.stem for path in SCENES.glob("planar/*.toml")]
+    words_of = {
+        "accuracy": FORMULAS, "renders": scenes, "paths": layered_paths.plugins(), "efficiency": ways, "planar": planar,
+        "gate": [*planted_defects.GLASSES, *DEFECTS, *METHODS],
+    }  # fmt: skip
+    assert words_of.keys() == readme_tables.TABLES.keys()
+    others = [call.title for system in SYSTEMS.values() for call in system.calls]
+    for marker, words in (words_of | {"suite": [*others, *PAINTERS]}).items():
+        table = text.partition(f"<!-- begin: {marker} -->")[2].partition(f"<!-- end: {marker} -->")[0]
+        assert [word for word in words if word not in table] == []
+    pictures = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)
+    assert pictures
+    assert all((root / path).is_file() for path in pictures)
+
+
+def test_a_scene_is_loaded_in_the_same_order_every_time(context):
+    """Loading with Mitsuba's defaults gives one of two pictures, about one time in four the other one."""
+    scenes = [render_methods.opened(SCENES / "diamond.xml", "dielectric", 8) for _ in range(12)]
+    pictures = [render_methods.Camera(scene)(1, seed=0)[0] for scene in scenes]
+    assert all((picture == pictures[0]).all() for picture in pictures)

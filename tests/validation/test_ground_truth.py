@@ -1,0 +1,160 @@
+"""Benches and the rainbow: their answers without Mitsuba, their bounds, and planted defects that break every row."""
+
+import dataclasses
+import math
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from validation.ground_truth import rainbow, traced_bodies, traced_system, traced_systems
+from validation.reference import closed_forms, optical_systems
+
+DEFECT = 1e-4  # of an index
+NAMES = [*traced_systems.BENCHES]
+
+
+@pytest.fixture(scope="module")
+def made():
+    """Every bench, with its bounds."""
+    return {name: make() for name, make in traced_systems.BENCHES.items()}
+
+
+@pytest.fixture
+def scalar(scalar_context):
+    return scalar_context()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_exact_path_has_the_closed_answer(name, made):
+    case = made[name]
+    for answer, x in case.deviations(case.exact()).items():
+        # Of the print, √3 and √2 times what it rounds to.
+        assert x.max() <= case.printed.get(answer, 1e-15)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_bounds_hold_whatever_is_rounded_and_are_not_idle(name, made):
+    case, rng, ratios = made[name], np.random.default_rng(5), []
+    sizes, exact = case.roundings(), case.off(case.exact())
+    for _ in range(30):
+        # Each value off by all that it may, in a direction of its own.
+        shifts = {key: size * optical_systems.unit(rng.normal(size=(len(size), 3))) for key, size in sizes.items()}
+        off = case.off(case.exact(lambda j, what, x, axis, shifts=shifts: x + shifts[j, what]))
+        ratios += [
+            optical_systems.dot(x - exact[answer], x - exact[answer])[..., 0] ** 0.5
+            / (case.bounds[answer] - case.printed.get(answer, 0))
+            for answer, x in off.items()
+        ]
+    worst = max(float(x.max()) for x in ratios)
+    assert 0.1 < worst < 1
+
+
+# By Mitsuba ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("plugin", traced_bodies.PLUGINS)
+@pytest.mark.parametrize("name", NAMES)
+def test_both_plugins_keep_within_the_bounds(name, plugin, made, scalar):
+    row = traced_bodies.bench_row(name, made[name], plugin, "scalar_rgb")
+    assert row.verdict == ("pass" if plugin == "refract" else "info")
+    assert row.values["error / bound"] < 0.2
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_index_off_by_1e_4_breaks_every_row(name, made, scalar, monkeypatch):
+    def off(plugin, *indices):
+        return glass(plugin, *(n + DEFECT * (n > 1) for n in indices))
+
+    glass = traced_systems.glass
+    monkeypatch.setattr(traced_systems, "glass", off)
+    assert traced_bodies.bench_row(name, made[name], "refract", "scalar_rgb").broken == {"error / bound": 1.0}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_normals_of_the_wrong_sign_break_every_row(name, made, scalar, monkeypatch):
+    load = mi.load_dict
+
+    def flipped(shape):
+        nested = {key: flipped(x) if isinstance(x, dict) else x for key, x in shape.items()}
+        return nested | ({"flip_normals": True} if shape["type"] in ("sphere", "cube", "ply", "rectangle") else {})
+
+    monkeypatch.setattr(mi, "load_dict", lambda scene: load(flipped(scene)))
+    assert traced_bodies.bench_row(name, made[name], "refract", "scalar_rgb").broken == {"error / bound": 1.0}
+
+
+def test_a_bound_that_would_hold_whatever_comes_fails(scalar, monkeypatch):
+    monkeypatch.setattr(traced_system, "PLACE", 100 * traced_system.PLACE)
+    assert traced_bodies.bench_row("slab", traced_systems.slab(), "refract", "scalar_rgb").broken == {"index seen": traced_bodies.SEEN}
+
+
+def test_a_ray_that_misses_is_off_by_infinity(made, scalar, monkeypatch):
+    sphere = {"type": "sphere", "radius": 1.0, "bsdf": traced_systems.glass("refract", traced_systems.BK7)}
+    missed = dataclasses.replace(traced_systems.aplanatic(), scenes=lambda plugin: [{"ball": sphere}])
+    assert traced_bodies.bench_row("aplanatic ball", missed, "refract", "scalar_rgb").values["miss / mm"] == math.inf
+
+
+def test_what_does_not_run_says_why(scalar):
+    rows = [*traced_bodies.variant_rows(scalar, "cuda_ad_double"), traced_bodies.double_row(), *traced_bodies.bow_rows(scalar)]
+    assert [row.verdict for row in rows] == ["not run"] * 3
+    assert [row.setting for row in rows] == ["cuda_ad_double", "double precision", "scalar_rgb"]
+
+
+def test_compiled_rays_are_those_of_the_scalar_variant(made, needs_variant, scalar):
+    """To roundings: a mistake in the order of rays or components would be of the size of the bodies."""
+    needs_variant("llvm_ad_rgb")
+    one = made["slab"].traced("refract")
+    mi.set_variant("llvm_ad_rgb")
+    other = made["slab"].traced("refract")
+    assert np.abs(one.places - other.places).max() < 1e-4
+    assert np.abs(one.directions - other.directions).max() < 1e-5
+
+
+# The rainbow ---------------------------------------------------------------------------------------------------
+
+
+def picture(index):
+    """Of the light once reflected within, without noise."""
+    entry = np.linspace(0.79, 0.93, 1_000_000)
+    radius = np.tan(np.pi - closed_forms.deflection(np.arcsin(entry), index, 1).astype(float))
+    turn = 2 * np.pi * ((np.arange(len(entry)) * (math.sqrt(5) - 1) / 2) % 1)
+    x, y = (((1 + radius * f(turn)) / 2 * rainbow.SIZE).astype(int) for f in (np.cos, np.sin))
+    return np.bincount(x * rainbow.SIZE + y, entry, rainbow.SIZE**2).reshape(rainbow.SIZE, rainbow.SIZE)
+
+
+def test_the_edge_of_a_bow_without_noise_is_the_rainbow_angle():
+    assert rainbow.angle(4 / 3) == pytest.approx(180 - 42.03, abs=0.01)
+    for index in (1.333, 1.338):
+        assert abs(rainbow.edge(picture(index)) - rainbow.angle(index)) < rainbow.BLUR
+
+
+def test_a_picture_without_an_edge_has_none():
+    assert math.isnan(rainbow.edge(np.zeros((rainbow.SIZE, rainbow.SIZE))))
+    blank = [np.zeros((rainbow.SIZE, rainbow.SIZE))] * 3
+    assert {"error / bound", "standard error / °"} == set(traced_bodies.bow_row("refract", "llvm_ad_rgb", blank, {}).broken)
+
+
+@pytest.mark.parametrize("defect", [0.0, DEFECT])
+def test_the_rainbow_of_a_noisy_bow_sees_an_index_off_by_1e_4(defect):
+    """With as much light as the quick profile renders: 9000 quanta in the first 0.1 degrees of a picture."""
+    rng, exact = np.random.default_rng(11), picture(1.333 + defect)
+    ends, inside, at = rainbow._bins()
+    light = np.bincount(at, exact[inside], len(ends))
+    first = light[(ends > rainbow.angle()) & (ends < rainbow.angle() + 0.1)].sum()
+    noisy = [rng.poisson(exact * 9e3 / first) for _ in range(traced_bodies.RENDERS["quick"])]
+    row = traced_bodies.bow_row("refract", "llvm_ad_rgb", noisy, {})
+    assert row.broken == ({"error / bound": 1.0} if defect else {})
+
+
+@pytest.mark.parametrize(("defect", "verdict"), [(0.0, "pass"), (1e-3, "fail")])
+def test_a_rendered_rainbow_stands_where_it_should(defect, verdict, needs_variant, monkeypatch):
+    """Four renders: with 3 degrees of freedom chance may take 22 standard errors."""
+    needs_variant("llvm_ad_rgb")
+    before = mi.variant()
+    mi.set_variant("llvm_ad_rgb")
+    monkeypatch.setattr(traced_bodies, "RESOLVED", 0.005)
+    try:
+        found = rainbow.pictures(traced_systems.glass("refract", rainbow.INDEX + defect), 4)
+    finally:
+        mi.set_variant(before)
+    assert traced_bodies.bow_row("refract", "llvm_ad_rgb", found, {}).verdict == verdict

@@ -1,0 +1,101 @@
+"""Times: intervals, ratios within a round, kernels that were really compiled."""
+
+import dataclasses
+import time
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from mi_refract import FORMULAS, backend
+from validation.run import kernel_timing
+from validation.run.array_settings import BUILTIN, settings
+from validation.run.context import SCALAR_PROFILES, Context
+
+PROFILE = dataclasses.replace(SCALAR_PROFILES["quick"], scalar_rays=20, streamed_rays=2000, repeats=9)
+
+
+@pytest.fixture
+def context(tmp_path):
+    return Context(PROFILE, tmp_path, mi.variant(), backend.detect(), backend.usable_variants())
+
+
+@pytest.mark.parametrize("count", [9, 11, 21])
+def test_the_interval_of_a_median_covers_it_19_times_in_20(count):
+    """Exact coverage from the ranks it takes; then 2000 samples, false alarm 1e-5 by 4.3σ of the binomial."""
+    found = kernel_timing.interval("t", list(map(float, range(1, count + 1))))
+    rank = int(found["t, low"])
+    assert (found["t"], found["t, high"]) == ((count + 1) / 2, count + 1 - rank)
+    coverage = 1 - 2 * binom.cdf(rank - 1, count, 0.5)
+    assert coverage >= 0.95 > 1 - 2 * binom.cdf(rank, count, 0.5)
+    samples = np.random.default_rng(6).exponential(size=(2000, count))
+    inside = 0
+    for x in samples.tolist():
+        interval = kernel_timing.interval("t", x)
+        inside += interval["t, low"] <= np.log(2) <= interval["t, high"]
+    assert abs(inside - 2000 * coverage) <= 4.3 * np.sqrt(2000 * coverage * (1 - coverage))
+
+
+def test_a_ratio_is_that_of_one_round():
+    """A machine that is twice as slow in some rounds does not move it."""
+    load = [1.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 1.0]
+    ratio = kernel_timing.ratio("t", [3.0 * x for x in load], load)
+    assert ratio == {"t": 3.0, "t, low": 3.0, "t, high": 3.0}
+
+
+def test_every_second_round_runs_backwards_and_the_first_is_thrown_away():
+    calls = []
+
+    def clock(subject):
+        calls.append(subject)
+        return float(len(calls))
+
+    seconds = kernel_timing.rounds({"a": "a", "b": "b"}, clock, 3)
+    assert "".join(calls) == "abbaabba"
+    assert seconds == {"a": [4, 5, 8], "b": [3, 6, 7]}
+
+
+def test_a_slow_subject_is_seen_on_every_backend_that_runs(context):
+    def slow(a, n, k):
+        if not dr.is_jit_v(a):
+            time.sleep(2e-3)
+        b, transmitted = FORMULAS["decomposed"](a, n, k)
+        for _ in range(60):
+            b = dr.sin(b)
+        return b, transmitted
+
+    for setting in settings(context):
+        if setting.vector is None:
+            continue
+        formulas = {"decomposed": FORMULAS["decomposed"], "slow": slow}
+        patched = _With(setting, formulas)
+        found = kernel_timing.measure(context, patched)
+        assert set(found) == {"copy", "decomposed", "slow"}
+        assert found["slow"]["time / plain, low"] > 1.5
+        assert found["decomposed"]["time / plain"] == 1
+        assert found["copy"]["time / copy"] == 1
+        assert ("ns per ray" in found["slow"]) == (setting.backend == "cuda")
+        if not setting.is_scalar:
+            assert found["slow"]["operations"] > found["decomposed"]["operations"]
+            assert found["slow"]["compile ms"] > 1  # NaN where a cache had the kernel
+
+
+class _With:
+    """A setting with other subjects."""
+
+    def __init__(self, setting, subjects):
+        self._setting, self.subjects = setting, subjects
+
+    def __getattr__(self, name):
+        return getattr(self._setting, name)
+
+
+def test_goals_are_those_of_the_table(context):
+    by_label = {setting.label: setting for setting in settings(context)}
+    single, double, scalar = (by_label[label] for label in ("llvm float32", "llvm float64", "scalar float64"))
+    assert kernel_timing.goals("promoted", single) == {"time / plain": FORMULAS["promoted"].time_goal}
+    assert kernel_timing.goals("promoted", double) == {}
+    assert kernel_timing.goals("wedge", double) == {"time / copy": 1 / 0.9}
+    assert kernel_timing.goals("wedge", scalar) == kernel_timing.goals(BUILTIN, single) == {}

@@ -1,0 +1,52 @@
+"""The matrix of systems and checks: what it takes from the rows of other studies."""
+
+from __future__ import annotations
+
+import pytest
+
+from mi_refract.report.row import Row
+from validation.suite import matrix, per_ray, rendered_images
+
+
+def ray(subject="A", case="random", budget=None, **values):
+    values = {"worst rad": 1e-6, "wrong": 0.0, "misjudged": 0.0} | values
+    return Row(per_ray.STUDY, subject, case, "f32", values, {"wrong": 0.0}, reason="A 1.2; zero")
+
+
+def picture(subject="B", verdict="equal", differing=0.0, **more):
+    values = {"mean difference": -0.02, "tests that differ": differing}
+    budgets = {"tests that differ": 0.0} | more
+    replay = {"verdict": verdict, "renderer": "B 3"}
+    return Row(rendered_images.STUDY, subject, "prism", "64²", values, budgets, reason="why", replay=replay)
+
+
+def test_numbers_and_verdicts_are_those_of_the_rows():
+    right, wrong, equal, different = matrix.summary(
+        [ray(), ray(case="near-critical", wrong=3.0), picture(), picture(verdict="different", differing=2.0)]
+    )
+    assert (right.subject, right.case, right.values[matrix.OFF], right.verdict) == ("A, f32", "random", 1e-6, "pass")
+    assert (wrong.verdict, wrong.reason) == ("fail", "A 1.2; zero")
+    assert (equal.subject, equal.values[matrix.OFF], equal.verdict) == ("B", 0.02, "pass")
+    assert (equal.values["differs"], equal.reason) == (0.0, "B 3; why")
+    assert (different.verdict, different.values["differs"], different.reason) == ("fail", 1.0, "B 3; why")
+
+
+def test_a_system_that_is_known_to_differ_passes_and_is_said_to_differ():
+    row = picture(verdict="different", differing=2.0)
+    known = Row(row.study, row.subject, row.case, row.setting, row.values, reason=row.reason, replay=row.replay)
+    (found,) = matrix.summary([known])
+    assert (found.verdict, found.missed, found.reason) == ("pass", {"differs": 0.0}, "B 3; why")
+
+
+@pytest.mark.parametrize(("study", "cases"), [(per_ray.STUDY, per_ray.SETS), (rendered_images.STUDY, rendered_images.SCENES)])
+def test_what_was_not_run_is_not_run_for_every_check(study, cases):
+    found = matrix.summary([Row(study, "A", "every set", "f32", reason="pip install it")])
+    assert [row.case for row in found] == list(cases)
+    assert {row.verdict for row in found} == {"not run"}
+
+
+def test_the_summary_stands_before_what_it_is_taken_from():
+    other = Row("directions", "x", "y", "z", {"v": 1.0})
+    rows = matrix.with_summary([other, ray(), other])
+    assert [row.study for row in rows] == ["directions", matrix.STUDY, per_ray.STUDY, "directions"]
+    assert matrix.with_summary([other]) == [other]

@@ -1,0 +1,357 @@
+"""The planar study: its retrace is right by closed formulas, and its rows see planted defects."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refract.backend import detect
+from mi_refract.planar import path_loop, shapes
+from mi_refract.planar import tracer as tracer
+from mi_refract.planar.tracer import Event, Paths, Segments
+from validation.planar import against_retrace, closed_paths, extruded_scenes, times, wall_scene
+from validation.planar.error_growth import _transfer
+from validation.reference.planar_retrace import retrace
+from validation.run.array_settings import settings
+from validation.run.context import PROFILES, Context
+
+LD = np.longdouble
+THROUGH, MIRRORED = Event.REFRACTED, Event.REFLECTED
+
+
+@pytest.fixture
+def scalar(scalar_context):
+    return settings(scalar_context())[0]
+
+
+def as_paths(exact):
+    return Paths(exact.points, exact.directions, exact.hits, exact.events, exact.indices)
+
+
+# The retrace ---------------------------------------------------------------------------------------------------
+
+
+def test_a_slab_shifts_a_ray():
+    """By t sin(θ − θ')/cos θ', and turns it by nothing."""
+    ends = np.array([[-100.0, 0], [100, 0]])
+    low = ends - [0, 2]
+    slab = Segments(np.array([ends[1], low[0]]), np.array([ends[0], low[1]]), [1.6] * 2, [1.0] * 2)
+    angle = LD(0.7)
+    d = np.array([np.sin(angle), -np.cos(angle)])
+    path = retrace(slab, [[0.0, 1.0]], d[None], 5)
+    inner = np.arcsin(np.sin(angle) / LD(1.6))
+    shift = 2 * np.sin(angle - inner) / np.cos(inner)
+    off = path.points[0, 2] - path.points[0, 0]
+    assert abs(abs(d[0] * off[1] - d[1] * off[0]) - shift) < 1e-17
+    assert np.abs(path.directions[0] - d).max() < 1e-18
+    assert path.events[0].tolist() == [THROUGH, THROUGH, Event.ESCAPED, 0, 0, 0]
+    assert path.hits[0].tolist() == [0, 1, -1, -1, -1]
+    assert path.indices[0, :3].tolist() == [1, LD(1.6), 1]
+
+
+@pytest.mark.parametrize("beyond", [-1e-12, 1e-12])
+def test_total_reflection_begins_at_the_critical_angle(beyond):
+    plane = Segments(np.array([[-9.0, 0]]), np.array([[9.0, 0]]), [1.0], [1.5])
+    angle = np.arcsin(1 / LD(1.5)) + LD(beyond)
+    path = retrace(plane, [[0.0, -1.0]], np.array([[np.sin(angle), np.cos(angle)]]), 1)
+    assert path.events[0, 0] == (MIRRORED if beyond > 0 else THROUGH)
+    if beyond > 0:
+        assert np.abs(path.directions[0] - [np.sin(angle), -np.cos(angle)]).max() < 1e-18
+
+
+def test_ends_of_paths_are_named():
+    wall = Segments(np.array([[0.0, -1]]), np.array([[0.0, 1]]), [1.0], [1.5])
+    start, d = [[-1.0, 0.3]], [[2.0, 0.0]]
+    assert retrace(wall, start, d, 1, n_start=1.3).events[0].tolist() == [Event.CONTRADICTED, 0]
+    assert retrace(wall, start, d, 1, reflect=1).events[0].tolist() == [MIRRORED, Event.ESCAPED]
+    two = Segments(*(x + np.array([[0, 0], [1, 0]]) for x in (wall.start, wall.end)), [1.0, 1.5], [1.5, 1.0])
+    assert retrace(two, start, d, 1).events[0].tolist() == [THROUGH, Event.EXHAUSTED]
+    assert retrace(wall, [[1.0, 0.0]], d, 1).events[0].tolist() == [Event.ESCAPED, 0]
+
+
+@pytest.mark.parametrize("y", [0.0, 1.0, 0.5, 1.0 + 1e-17])
+def test_what_passes_a_vertex_meets_one_of_its_segments(y):
+    """The polyline from (0, 2) to (0, −1) by way of two vertices, and rays through them."""
+    corners = np.array([[0, 2], [0, 1.0], [0.2, 0], [0, -1]])
+    fence = Segments(corners[:-1], corners[1:], np.full(3, 1.5), np.ones(3))
+    path = retrace(fence, [[-1, LD(y)]], [[1.0, 0.0]], 5)
+    assert path.met[0] == 1
+
+
+@pytest.mark.parametrize("name", closed_paths.CLOSED)
+def test_the_retrace_ends_where_closed_answers_do(name):
+    """To the rounding of what describes the shape in double precision."""
+    closed = closed_paths.CLOSED[name](60)
+    assert closed.error(as_paths(closed.case.exact)).max() < 8 * 2.0**-53
+
+
+def test_the_retrace_unfolds_in_the_box():
+    case = closed_paths.box(300, 4)
+    path = retrace(case.segments, case.origins, case.directions, 300)
+    assert (path.hits == case.exact.hits).all() and (path.events == case.exact.events).all()
+    assert np.abs(path.points - case.exact.points).max() < 1e-14
+    assert np.abs(path.legs - case.exact.legs).max() < 1e-16
+
+
+def test_the_transfer_is_the_derivative():
+    """Of place and angle behind three boundaries of a drop, against paths displaced by 1e-9."""
+    closed, step = closed_paths.rainbow(30), LD(1e-9)
+    case, exact = closed.case, closed.case.exact
+    g, h_factor, phi_factor, _ = _transfer(exact)
+    for column, shift in enumerate(np.eye(2)):
+        h, phi = np.full((2, 30), shift[:, None])
+        for j in range(3):
+            h = h + np.hypot(*(exact.points[:, j + 1] - exact.points[:, j]).T) * phi
+            h, phi = h_factor[:, j] * h, g[:, j] * phi + phi_factor[:, j] * h
+        moved = case.origins + step * np.array([0, shift[0]]), case.directions + step * np.array([0, shift[1]])
+        other = retrace(case.segments, *moved, 3, reflect=case.reflect)
+        d, off = exact.directions, other.points[:, 3] - exact.points[:, 3]
+        turned = d[:, 0] * other.directions[:, 1] - d[:, 1] * other.directions[:, 0]
+        assert (turned / step).astype(float) == pytest.approx(phi.astype(float), rel=1e-5), column
+        across = d[:, 0] * off[:, 1] - d[:, 1] * off[:, 0]
+        assert (across / step).astype(float) == pytest.approx(h.astype(float), rel=1e-5), column
+
+
+# Planted defects -----------------------------------------------------------------------------------------------
+
+
+def test_what_is_right_passes(scalar):
+    rows = [closed_paths._row(scalar, name, make(6)) for name, make in closed_paths.CLOSED.items()]
+    rows += [closed_paths._box_row(scalar, 20, 3)]
+    rows += [against_retrace.row_of(against_retrace.case_of(against_retrace.FOLDER / f"{name}.toml", 3), scalar) for name in ("lens", "prism")]
+    assert {row.verdict for row in rows} == {"pass"}
+    assert all(row.values["astray"] == 0 for row in rows)
+
+
+def document_slip(d, l, k):  # noqa: E741
+    """What document 004 prints: X = k R/(1 + R²) for sin(atan R) = R/√(1 + R²)."""
+    along_n, along_l = l[0] * d[1] - l[1] * d[0], l[0] * d[0] + l[1] * d[1]
+    r = along_l / along_n
+    return right(d, l, k / math.sqrt(1 + r * r))
+
+
+def inverted(d, l, k):  # noqa: E741
+    return right(d, l, 1 / k)
+
+
+def off_by_a_little(d, l, k):  # noqa: E741
+    return right(d, l, k * (1 + 1e-8))
+
+
+right = path_loop.refract_2d
+
+
+@pytest.mark.parametrize("defect", [document_slip, inverted, off_by_a_little])
+@pytest.mark.parametrize("name", closed_paths.CLOSED)
+def test_a_wrong_formula_breaks_every_closed_answer(name, defect, scalar, monkeypatch):
+    monkeypatch.setattr(path_loop, "refract_2d", defect)
+    row = closed_paths._row(scalar, name, closed_paths.CLOSED[name](6))
+    assert row.broken, row.values
+
+
+@pytest.mark.parametrize("defect", [document_slip, inverted, off_by_a_little])
+def test_a_wrong_formula_breaks_a_scene(defect, scalar, monkeypatch):
+    case = against_retrace.case_of(against_retrace.FOLDER / "lens.toml", 3)
+    monkeypatch.setattr(path_loop, "refract_2d", defect)
+    assert "error / bound" in against_retrace.row_of(case, scalar).broken or "astray" in against_retrace.row_of(case, scalar).broken
+
+
+def traced_otherwise(case, **changes):
+    """The case, its tracer given other segments."""
+    other = dataclasses.replace(case.segments, **changes)
+    paths = tracer.trace(other, case.origins, case.directions, case.max_depth, reflect=case.reflect, backend="scalar")
+    return against_retrace.judge(paths, case, 2.0**-53)
+
+
+def test_swapped_media_a_moved_vertex_and_a_gap_are_seen():
+    case = against_retrace.case_of(against_retrace.FOLDER / "prism.toml", 3)
+    s = case.segments
+    assert against_retrace.judge(case.trace(settings_of("scalar")), case, 2.0**-53)["astray"] == 0
+    assert traced_otherwise(case, n_left=s.n_right, n_right=s.n_left)["astray"] > 0
+    assert traced_otherwise(case, start=s.start + 1e-9 * case.extent)["error / bound"] > 1e3
+    hit = case.exact.hits[0, 0]
+    gone = s.end.copy()
+    gone[hit] = s.start[hit]
+    assert traced_otherwise(case, end=gone)["astray, far"] > 0
+
+
+def test_a_leak_at_a_vertex_is_seen():
+    """Rays along the axes exactly at the vertices of an octagon, whose sides end short of them for the tracer."""
+    corners = np.array([[3, 1], [1, 3], [-1, 3], [-3, 1], [-3, -1], [-1, -3], [1, -3], [3, -1.0]])
+    octagon = Segments(corners, np.roll(corners, -1, 0), np.full(8, 1.5), np.ones(8))
+    d = np.repeat([[1.0, 0], [-1, 0], [0, 1], [0, -1]], 2, axis=0)
+    origins = -10 * d + np.tile([[-1.0], [1.0]], (4, 1)) * d[:, ::-1]
+    case = against_retrace.Case("octagon", octagon, origins, d, 8, np.zeros(8, int))
+    assert (case.exact.met >= 2).all() and traced_otherwise(case)["astray"] == 0
+    short = 1e-12 * (octagon.end - octagon.start)
+    assert traced_otherwise(case, start=corners + short, end=octagon.end - short)["astray"] > 0
+
+
+def settings_of(backend):
+    import drjit as dr
+
+    from validation.run.array_settings import Setting
+
+    return Setting(backend, np.float64, getattr(dr, backend).Array3f64)
+
+
+@pytest.mark.parametrize("field", ["points", "directions", "hits", "events"])
+def test_what_is_missing_is_not_equal(field):
+    case = against_retrace.case_of(against_retrace.FOLDER / "prism.toml", 3)
+    whole = as_paths(case.exact)
+    assert against_retrace.judge(whole, case, 2.0**-53)["difference"] == 0
+    values = getattr(whole, field).copy()
+    values[0] = -1 if field == "hits" else 0 if field == "events" else np.nan
+    found = against_retrace.judge(dataclasses.replace(whole, **{field: values}), case, 2.0**-53)
+    assert found["astray"] == 1 if field in ("hits", "events") else not found["difference"] < 1
+
+
+def test_a_ray_that_is_far_from_every_vertex_must_not_go_astray():
+    case = against_retrace.case_of(against_retrace.FOLDER / "lens.toml", 3)
+    hits = case.exact.hits.copy()
+    hits[0, 0] = (hits[0, 0] + 1) % len(case.segments)
+    found = against_retrace.judge(dataclasses.replace(as_paths(case.exact), hits=hits), case, 2.0**-24)
+    assert found["astray, far"] == 1
+
+
+@pytest.mark.parametrize("height", [1 - 1e-9, 1 + 1e-9, 1 + 1e-3])
+def test_rounding_may_decide_what_touches_a_circle(height):
+    """A path that passes by, judged by one that meets the circle, or the reverse: right within 1e-6 of the top."""
+    ball = shapes.circle(1.0).between(1.5, 1.0)
+    case = against_retrace.Case("ball", ball, np.array([[-3, height]]), np.array([[1.0, 0]]), 4, np.zeros(1, int))
+    other = retrace(ball, [[-3, 1 - 1e-9 if height > 1 else 1 + 1e-9]], case.directions, 4)
+    found = against_retrace.judge(as_paths(other), case, 2.0**-24)
+    assert (found["astray"], found["astray, far"]) == (1, height == 1 + 1e-3)
+
+
+@pytest.mark.parametrize("beyond", [1e-9, 1e-3])
+def test_rounding_may_decide_at_the_critical_angle(beyond):
+    plane = Segments(np.array([[-9.0, 0]]), np.array([[9.0, 0]]), [1.0], [1.5])
+    angle = np.arcsin(1 / 1.5) + beyond
+    d = np.array([[np.sin(angle), np.cos(angle)]])
+    case = against_retrace.Case("plane", plane, np.array([[0.1, -1]]), d, 1, np.zeros(1, int))
+    through = retrace(plane, case.origins, [[0.0, 1.0]], 1)
+    found = against_retrace.judge(as_paths(dataclasses.replace(through, hits=case.exact.hits)), case, 2.0**-24)
+    assert (found["astray"], found["astray, far"]) == (1, beyond == 1e-3)
+
+
+def test_either_segment_is_right_at_their_vertex():
+    """The axis of document 004's lens passes two vertices: whichever arc is hit there, the path is the same."""
+    case = against_retrace.case_of(against_retrace.FOLDER / "lens.toml", 13)
+    ray = int(np.argmin(np.abs(case.origins[:, 0]) + 1e3 * np.abs(case.directions[:, 0])))
+    hits, met = case.exact.hits.copy(), case.exact.hits[ray, 1]
+    neighbours = np.flatnonzero((case.segments.start == case.segments.end[met]).all(1)
+                                | (case.segments.end == case.segments.start[met]).all(1))  # fmt: skip
+    there = [against_retrace.judge(dataclasses.replace(as_paths(case.exact), hits=put(hits, ray, n)), case, 2.0**-53)["astray"]
+             for n in neighbours]  # fmt: skip
+    assert sorted(there) == [0, 1]
+
+
+def put(hits, ray, segment):
+    hits = hits.copy()
+    hits[ray, 1] = segment
+    return hits
+
+
+# Extruded ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def compiled(needs_variant):
+    needs_variant("llvm_ad_rgb")
+    before = mi.variant()
+    mi.set_variant("llvm_ad_rgb")
+    yield
+    mi.set_variant(before)
+
+
+def extruded(case, spawn="along the ray", segments=None):
+    spawn, offset = extruded_scenes.SPAWNS[spawn]
+    paths = extruded_scenes.trace(wall_scene.extrude(segments or case.segments), case, spawn)
+    return against_retrace.judge(paths, case, extruded_scenes.U, offset)
+
+
+@pytest.mark.parametrize("spawn", extruded_scenes.SPAWNS)
+def test_walls_do_what_segments_do(spawn, compiled):
+    case = extruded_scenes.faceted(against_retrace.case_of(against_retrace.FOLDER / "prism.toml", 30))
+    found = extruded(case, spawn)
+    assert found["astray"] == 0 and found["error / bound"] <= 1
+
+
+def test_wrong_walls_are_seen(compiled):
+    """Rays moved along the normal without leave, swapped media, an index off by 1e-5, and a wall that is not there."""
+    case = extruded_scenes.faceted(against_retrace.case_of(against_retrace.FOLDER / "prism.toml", 30))
+    paths = extruded_scenes.trace(wall_scene.extrude(case.segments), case, extruded_scenes.SPAWNS["spawn_ray"][0])
+    assert against_retrace.judge(paths, case, extruded_scenes.U)["error / bound"] > 1
+    s = case.segments
+    assert extruded(case, segments=Segments(s.start, s.end, s.n_right, s.n_left))["astray, far"] > 0
+    assert extruded(case, segments=Segments(s.start, s.end, s.n_left * (1 + 1e-5), s.n_right))["error / bound"] > 1
+    hit = case.exact.hits[0, 0]
+    kept = np.arange(len(s)) != hit
+    fewer = Segments(*(getattr(s, name)[kept] for name in ("start", "end", "n_left", "n_right")))
+    assert extruded(case, segments=fewer)["astray, far"] > 0
+
+
+def test_extruded_rows_have_a_picture(compiled, tmp_path):
+    context = Context(PROFILES["quick"], tmp_path, "llvm_ad_rgb", detect(), {})
+    rows = extruded_scenes.scene_rows(context, against_retrace.FOLDER / "ellipse.toml")
+    assert {row.verdict for row in rows} == {"pass"}
+    (picture,) = (row.pictures["overlay"] for row in rows if row.pictures)
+    assert (tmp_path / picture).stat().st_size > 1000
+
+
+def test_facets_lie_on_their_arcs():
+    arcs = shapes.circle(2.0).between(1.5, 1.0)
+    chords = wall_scene.facets(arcs, 16)
+    assert len(chords) == 64
+    assert np.abs(np.hypot(*chords.start.T) - 2).max() < 1e-14
+    assert (np.sort(chords.start, 0) == np.sort(chords.end, 0)).all()
+
+
+# Times ---------------------------------------------------------------------------------------------------------
+
+
+def test_methods_that_differ_in_a_bit_are_seen(scalar_context):
+    context = scalar_context(scalar_rays=4)
+    setting = settings(context)[0]
+    rows = times.measure(context, setting, (10,))
+    assert [row.verdict for row in rows if row.budgets] == ["pass", "pass"]
+    tracer, _ = times._tracer(setting, "brute", 10)
+    paths = tracer(*times.field(10).beam(4, shuffled=False), 2)
+    nudged = dataclasses.replace(paths, points=np.nextafter(paths.points, 9))
+    assert times.differing(paths, nudged) == 4
+    assert times.differing(paths, paths) == 0
+
+
+@pytest.mark.parametrize(("size", "side"), [(0, 1), (100, 1), (9000, 3)])
+def test_a_field_of_lenses_is_met_twice_by_every_ray(size, side):
+    field = times.field(size)
+    assert field.side == side
+    rays = field.beam(40, shuffled=False)
+    path = retrace(field.segments, *rays, 2)
+    assert (path.met == 2).all() and (path.events[:, :2] == THROUGH).all()
+    lens = np.round(path.points[:, 1] / field.pitch)
+    assert (np.diff(lens[:, 1] * side + lens[:, 0]) >= 0).all()
+    again = field.beam(40, shuffled=True)[0]
+    assert (np.sort(again, 0) == np.sort(rays[0], 0)).all() and (again != rays[0]).any()
+
+
+# The study -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("study", [against_retrace, closed_paths, extruded_scenes, times])
+def test_what_cannot_run_has_a_reason(study, scalar_context):
+    context = dataclasses.replace(
+        scalar_context(), backends={n: dataclasses.replace(b, usable=False, reason="off") for n, b in detect().items()}
+    )
+    rows = [row for task in study.tasks(context) if "scalar" not in task.name for row in task.run()]
+    assert rows and {row.verdict for row in rows} == {"not run"}
+
+
+def test_every_scene_file_is_in_the_study(scalar_context):
+    setting = settings(scalar_context())[0]
+    cases = {row.case for row in against_retrace._setting_rows(scalar_context(), setting)}
+    assert cases == {path.stem for path in Path(against_retrace.FOLDER).glob("*.toml")} | {"clutter"}

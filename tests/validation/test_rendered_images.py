@@ -1,0 +1,178 @@
+"""The study of pictures: what it says of a renderer that agrees, of one that does not, and of one that is not there."""
+
+import dataclasses
+import functools
+import importlib.util
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refract.io import image_file
+from mi_refract.rendering import scene_files
+from mi_refract.scene_export import write_files
+from mi_refract.scene_export.plain_scene import Glass
+from mi_refract.scene_export.targets import cycles, luxcore
+from mi_refract.scene_export.targets.environment_map import longitude_latitude, radiance
+from validation.run.context import PROFILES, Context
+from validation.run.render_methods import Camera
+from validation.suite import rendered_images
+from validation.suite.renderers import environments, image_renderers
+from validation.suite.renderers.image_renderers import Painter
+
+SMALL = rendered_images.Size(48, 32, 1, 0.2)
+
+
+@pytest.fixture(autouse=True)
+def llvm(needs_variant):
+    needs_variant("llvm_ad_rgb")
+    mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture
+def judged(tmp_path, monkeypatch):
+    """The row of a painter that draws the prism."""
+    context = Context(PROFILES["full"], tmp_path, "llvm_ad_rgb", {}, {})
+    monkeypatch.setitem(rendered_images.SIZES, "full", SMALL)
+
+    def judge(draw, title="Radiance", missing=""):
+        monkeypatch.setattr(environments, "absent", lambda system: missing)
+        monkeypatch.setitem(rendered_images.PAINTERS, title, Painter("radiance", draw, {"prism": 32}, ()))
+        [row] = rendered_images.pair_rows(context, title, "prism")
+        assert all((tmp_path / name).is_file() for name in row.pictures.values())
+        return row
+
+    return judge
+
+
+def by_the_builtin(change, plain, folder, spp, seeds):
+    """Mitsuba's own glass in a scene that is a little different."""
+    write_files.write(change(plain), "mitsuba", folder / "scene")
+    camera = Camera(scene_files.load_scene(folder / "scene" / "scene.xml", {"bsdf": "dielectric"}))
+    return [image_file.named(f"seed {seed}", camera(spp, seed)[0].astype(np.float32)) for seed in seeds]
+
+
+def denser(plain):
+    def glass(mesh):
+        changed = isinstance(mesh.material, Glass)
+        return dataclasses.replace(mesh, material=Glass(2.0, mesh.material.ext_ior)) if changed else mesh
+
+    return dataclasses.replace(plain, meshes=tuple(map(glass, plain.meshes)))
+
+
+def wider(plain):
+    return dataclasses.replace(plain, camera=dataclasses.replace(plain.camera, fov_x_degrees=34.0))
+
+
+def test_another_renderer_of_the_same_scene_is_equal(judged):
+    row = judged(functools.partial(by_the_builtin, lambda plain: plain))
+    assert row.verdict == "pass" and row.replay["verdict"] == "equal" and not row.missed
+    assert row.values["RMSE / noise"] == pytest.approx(1, abs=0.1)
+    assert list(row.pictures) == ["reference", "test", "difference"]
+
+
+@pytest.mark.parametrize("change", [denser, wider])
+def test_another_picture_fails(judged, change):
+    row = judged(functools.partial(by_the_builtin, change))
+    assert row.verdict == "fail" and row.replay["verdict"] == "different"
+    assert row.values["tests that differ"] > 0
+
+
+def test_who_is_known_to_differ_must_be_seen_to(judged):
+    """The same pair is a failure of the suite where it should have shown a difference, and none where it did."""
+    blind = judged(functools.partial(by_the_builtin, lambda plain: plain), rendered_images.THREE)
+    assert blind.verdict == "fail" and blind.broken == {"not seen to differ": 0.0}
+    seen = judged(functools.partial(by_the_builtin, denser), rendered_images.THREE)
+    assert seen.verdict == "pass" and rendered_images.WHY[rendered_images.THREE] in seen.reason
+
+
+def test_what_does_not_render_is_never_a_pass(judged):
+    def raising(error):
+        def draw(*_):
+            raise error
+
+        return draw
+
+    absent = judged(raising(AssertionError("asked all the same")), missing="the command that brings it")
+    assert absent.verdict == "not run" and absent.reason == "the command that brings it"
+    assert judged(raising(ValueError("a diffuse surface"))).verdict == "not run"
+    assert judged(raising(environments.Unable("no browser"))).reason == "no browser"
+    broken = judged(raising(environments.Broken("exit code 1: segmentation fault")))
+    assert broken.verdict == "fail" and "segmentation fault" in broken.reason
+
+
+def test_values_that_are_not_finite_fail(judged):
+    def spoilt(plain, folder, spp, seeds):
+        drawn = by_the_builtin(lambda same: same, plain, folder, spp, seeds)
+        drawn[0].pixels[3, 4] = np.nan
+        return drawn
+
+    row = judged(spoilt)
+    assert row.verdict == "fail" and "1 NaN" not in row.reason and "NaN" in row.reason
+
+
+def test_every_scene_of_a_painter_is_one_of_the_study():
+    assert {scene for painter in image_renderers.PAINTERS.values() for scene in painter.spp} == rendered_images.SCENES.keys()
+    assert set(rendered_images.WHY) <= set(image_renderers.PAINTERS)
+
+
+# Environments ------------------------------------------------------------------------------------------------------
+
+
+def directions(count=4000):
+    drawn = np.random.default_rng(3).normal(size=(count, 3))
+    return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+
+
+def test_an_environment_is_what_mitsuba_makes_of_it():
+    sky, seen = rendered_images.askew(), directions()
+    turn = np.eye(4)
+    turn[:3, :3] = sky.rotation
+    emitter = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(sky.pixels), "to_world": mi.ScalarTransform4f(turn)})
+    si = mi.SurfaceInteraction3f()
+    si.wi = mi.Vector3f((-seen).T)
+    measured = np.array(emitter.eval(si)).T
+    assert np.abs(measured - radiance(sky, seen)).max() < 1e-4
+    assert np.abs(measured - radiance(sky, seen * [-1, 1, 1])).max() > 0.1  # a mirror would be seen
+
+
+# Where each renderer looks a direction up: u to the right, v from the top of the picture.
+LOOKED_UP = {
+    cycles.looked_up: lambda x, y, z: (0.5 - np.arctan2(y, x) / (2 * np.pi), np.arccos(z) / np.pi),
+    luxcore.looked_up: lambda x, y, z: (np.arctan2(y, x) / (2 * np.pi) % 1, np.arccos(z) / np.pi),
+    image_renderers.equirectangular: lambda x, y, z: (0.5 + np.arctan2(z, x) / (2 * np.pi), np.arccos(y) / np.pi),
+}
+
+
+@pytest.mark.parametrize("renderer", LOOKED_UP)
+def test_a_renderer_finds_the_sky_where_it_looks(renderer):
+    sky, seen = rendered_images.askew(), directions()
+    picture = longitude_latitude(sky, renderer)
+    u, v = LOOKED_UP[renderer](*seen.T)
+    rows, columns = picture.shape[:2]
+    texel = picture[np.minimum((v * rows).astype(int), rows - 1), np.minimum((u * columns).astype(int), columns - 1)]
+    assert np.abs(texel - radiance(sky, seen)).max() < 0.01  # half a texel is 0.003 rad, the sky's slope below 2
+    assert np.abs(texel - radiance(sky, seen * [1, 1, -1])).max() > 0.1
+
+
+# Cameras -----------------------------------------------------------------------------------------------------------
+
+
+def test_radiance_is_given_mitsubas_rays(tmp_path):
+    path = environments.SCRIPTS / "radiance_pictures.py"
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    given = rendered_images.SCENES["prism"].load(16)
+    within = np.random.default_rng(1).random((16, 16, 2))
+    view = write_files.TARGETS["radiance"](given)["camera.vf"].decode()
+    bundle = script.rays(view, within).reshape(-1, 6)
+
+    write_files.write(given, "mitsuba", tmp_path / "scene")
+    [sensor] = scene_files.load_scene(tmp_path / "scene" / "scene.xml").sensors()
+    place = (np.stack(np.meshgrid(np.arange(16), np.arange(16)), -1) + within).reshape(-1, 2) / 16
+    ray, _ = sensor.sample_ray(0, 0.5, mi.Point2f(place.T), mi.Point2f(0.5))
+    directions = bundle[:, 3:] / np.linalg.norm(bundle[:, 3:], axis=1, keepdims=True)
+    assert np.abs(np.array(ray.d).T - directions).max() < 1e-6
+    assert np.abs(np.array(ray.d).T - directions[::-1]).max() > 0.1  # rows from the bottom would be seen
+    assert np.abs(np.array(ray.o).T - bundle[:, :3]).max() < 0.1  # Mitsuba's begin at its near plane

@@ -1,0 +1,377 @@
+"""Do the scenes in `scenes/` show what they say they show?
+
+All in `scalar_rgb`, the built-in `dielectric` standing in for `$bsdf`: a scene is judged here, not a BSDF.
+Every check is a function of the thing it judges; the tests named `..._sees_...` hand it a planted defect.
+Seeds are fixed, so a test that passes once passes until the scene, Mitsuba or the check changes.
+"""
+
+import re
+import xml.etree.ElementTree as ET
+from collections import Counter
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+SCENES = Path(__file__).parents[2] / "scenes"
+NAMES = ["balls", "diamond", "fibre", "furnace", "glasses64", "lightpipe", "matched"]
+NAMES += ["mirage", "nested", "prism", "slab", "sphere"]
+DEFAULTS = {"bsdf": "refract", "integrator": "path", "sampler": "independent"}
+DEFAULTS |= {"max_depth": None, "spp": "64", "res": "128"}
+each_scene = pytest.mark.parametrize("name", NAMES)
+
+
+@pytest.fixture(autouse=True)
+def scalar():
+    before = mi.variant()
+    mi.set_variant("scalar_rgb")
+    yield
+    if before:
+        mi.set_variant(before)
+
+
+def load(path, **parameters):
+    # optimize=False: Mitsuba would merge meshes of equal BSDFs, and their ids with them.
+    return mi.load_file(str(path), optimize=False, **{"bsdf": "dielectric", "res": 16, "spp": 4} | parameters)
+
+
+def edited(tmp_path, name, old, new, count=-1):
+    """A copy of scene `name` with `old` replaced: the place where defects are planted."""
+    text = (SCENES / f"{name}.xml").read_text()
+    assert old in text
+    (tmp_path / "meshes").symlink_to(SCENES / "meshes")
+    (tmp_path / f"{name}.xml").write_text(text.replace(old, new, count))
+    return tmp_path / f"{name}.xml"
+
+
+# --- the files -------------------------------------------------------------------------------------------
+
+
+def file_faults(text):
+    """What the text of a scene file lacks of the form all of them share."""
+    root = ET.fromstring(text)
+    comment = re.match(r"<!--(.*?)-->", text, re.S)
+    if not comment or len(comment[1].split()) < 20:
+        yield "no leading comment that says what the scene exercises"
+    defaults = {d.get("name"): d.get("value") for d in root.iter("default")}
+    defaults.pop("fov", None)  # the one parameter that a scene may have of its own
+    if defaults | {"max_depth": None} != DEFAULTS:
+        yield "defaults"
+    if not root.findall(".//bsdf[@type='$bsdf']"):
+        yield "no $bsdf"
+    if "dielectric" in text:
+        yield "a literal dielectric"
+    for bsdf in root.iter("bsdf"):
+        iors = [p for p in bsdf if p.get("name") in ("int_ior", "ext_ior")]
+        if (len(iors) == 2) != (bsdf.get("type") == "$bsdf"):
+            yield "$bsdf without both of its media, or media without $bsdf"
+        if any(p.tag not in ("float", "string") for p in iors):
+            yield "an IOR that is neither a float nor a name"
+
+
+def test_there_are_twelve():
+    assert sorted(p.stem for p in SCENES.glob("*.xml")) == NAMES
+
+
+@each_scene
+def test_file_has_the_common_form(name):
+    assert list(file_faults((SCENES / f"{name}.xml").read_text())) == []
+
+
+@pytest.mark.parametrize(
+    "old, new",
+    [
+        ("<!--", "<!-- --><!--"),
+        ('value="refract"', 'value="rough"'),
+        ("$bsdf", "dielectric"),
+        ("ext_ior", "ior"),
+        ('<string name="int', '<integer name="int'),
+    ],
+)
+def test_form_sees_a_defect(old, new):
+    text = (SCENES / "sphere.xml").read_text()
+    assert old in text and list(file_faults(text.replace(old, new)))
+
+
+def iors(path):
+    """[(int_ior, ext_ior)] of a scene's `$bsdf`s by id, and the BSDF id of each glass shape."""
+
+    def value(p):
+        props = mi.Properties()
+        props["ior"] = p.get("value") if p.tag == "string" else float(p.get("value"))
+        return mi.lookup_ior(props, "ior", 1.0)
+
+    root = ET.parse(path).getroot()
+    media = {
+        b.get("id"): tuple(value(b.find(f"*[@name='{n}']")) for n in ("int_ior", "ext_ior"))
+        for b in root.findall(".//bsdf[@type='$bsdf']")
+    }
+    shapes = {
+        s.get("id"): media[r.get("id")]
+        for s in root.iter("shape")
+        for r in s.findall("ref")
+        if r.get("id") in media
+    }
+    return media, shapes
+
+
+def test_glasses64_has_64_indices():
+    media, shapes = iors(SCENES / "glasses64.xml")
+    expected = [1.30 + 0.02 * k for k in range(64)]
+    assert sorted(i for i, _ in media.values()) == pytest.approx(expected, abs=1e-6)
+    assert len(shapes) == 64
+
+
+def test_matched_is_matched():
+    media, _ = iors(SCENES / "matched.xml")
+    int_ior, ext_ior = media["same"]
+    assert int_ior == ext_ior == media["liquid"][0]
+    assert media["near"][0] - media["near"][1] == pytest.approx(1e-3, rel=1e-3)
+
+
+# --- loading and rendering -------------------------------------------------------------------------------
+
+
+def picture_faults(image, contrast=True):
+    if not np.isfinite(image).all():
+        yield "not finite"
+    if not (image > 1e-3).all():
+        yield "black pixels: light reaches every point of every scene"
+    if contrast and image.std() < 0.05:
+        yield "no contrast"
+
+
+@each_scene
+def test_loads_at_the_size_of_the_notes_and_renders(name):
+    """The ray offset is absolute: a scene a hundred times smaller leaks at its edges."""
+    scene = load(SCENES / f"{name}.xml")
+    box = scene.bbox()
+    assert 30 < np.linalg.norm(box.max - box.min) < 3000
+    film = scene.sensors()[0].film()
+    assert film.rfilter().radius() == 0.5 and "float32" in str(film)
+    image = np.array(mi.render(scene, seed=1))
+    assert image.shape == (16, 16, 3)
+    assert list(picture_faults(image, contrast=name != "furnace")) == []
+
+
+def test_parameters_reach_the_scene():
+    scene = load(SCENES / "sphere.xml", res=8, spp=9, max_depth=3, integrator="volpath")
+    assert tuple(scene.sensors()[0].film().size()) == (8, 8)
+    assert scene.sensors()[0].sampler().sample_count() == 9
+    assert "max_depth = 3" in str(scene.integrator()) and "Volumetric" in str(scene.integrator())
+
+
+def test_picture_sees_a_dark_scene(tmp_path):
+    scene = load(edited(tmp_path, "nested", 'value="0.72, 0.80, 0.90"', 'value="0, 0, 0"'))
+    assert list(picture_faults(np.array(mi.render(scene, seed=1))))
+
+
+def furnace_error(path, seed=1):
+    """Largest |pixel − 1|.
+
+    Each path's weight is 1 up to the rounding of η² in and 1/η² out, so this is no estimate with a variance:
+    it fails only by a path longer than max_depth = 128. Of 8.4e6 paths none was longer than 32 (95 %: fewer
+    than 3.6e-7), so for a seed drawn anew 1024 paths raise a false alarm with probability below 4e-4.
+    """
+    return np.abs(np.array(mi.render(load(path), seed=seed)) - 1).max()
+
+
+def test_furnace_is_white():
+    assert furnace_error(SCENES / "furnace.xml") < 1e-5
+
+
+def test_furnace_sees_a_loss(tmp_path):
+    loss = '<bsdf type="$bsdf" id="core"><float name="specular_transmittance" value="0.999"/>'
+    assert furnace_error(edited(tmp_path, "furnace", '<bsdf type="$bsdf" id="core">', loss)) > 1e-4
+
+
+def test_furnace_sees_a_short_path():
+    scene = load(SCENES / "furnace.xml", max_depth=4)
+    assert np.abs(np.array(mi.render(scene, seed=1)) - 1).max() > 0.1
+
+
+# --- media: a straight line must leave each medium it is in -----------------------------------------------
+
+
+def medium_faults(path, lines=200):
+    """Crossings at which the index on the near side is not that of the medium the line is in.
+
+    Straight lines suffice: whether surfaces nest does not depend on how light bends. Opaque shapes are
+    ignored.
+    """
+    scene, (_, media) = load(path), iors(path)
+    glass = [s for s in scene.shapes() if s.id() in media]
+    assert len(glass) == len(media)
+    boxes = [s.bbox() for s in glass]
+    lo, hi = np.min([b.min for b in boxes], 0), np.max([b.max for b in boxes], 0)
+    radius, centre = np.linalg.norm(hi - lo), (lo + hi) / 2
+    _, outside = media[max(glass, key=lambda s: np.linalg.norm(s.bbox().max - s.bbox().min)).id()]
+    rng = np.random.default_rng(7)
+    crossings = faults = 0
+    for _ in range(lines):
+        d = rng.normal(size=3)
+        d /= np.linalg.norm(d)
+        ray = mi.Ray3f(mi.Point3f(rng.uniform(lo, hi) - radius * d), mi.Vector3f(d))
+        medium = outside
+        while (si := scene.ray_intersect(ray)).is_valid() and np.linalg.norm(si.p - centre) <= 2 * radius:
+            if si.shape.id() in media:
+                inside, beyond = media[si.shape.id()]
+                near, far = (beyond, inside) if np.dot(d, si.n) < 0 else (inside, beyond)
+                crossings += 1
+                faults += near != medium
+                medium = far
+            ray = si.spawn_ray(mi.Vector3f(d))
+        faults += medium != outside
+    assert crossings > lines / 4
+    return faults
+
+
+@each_scene
+def test_media_nest(name):
+    assert medium_faults(SCENES / f"{name}.xml") == 0
+
+
+@pytest.mark.parametrize(
+    "name, old, new",
+    [
+        ("nested", '<string name="ext_ior" value="water"/>', '<string name="ext_ior" value="air"/>'),
+        ("nested", "tumbler_wet.ply", "tumbler_air.ply"),
+        ("matched", '<float name="ext_ior" value="1.501"/>', '<float name="ext_ior" value="1.0"/>'),
+        ("furnace", '<float name="radius" value="17"/>', '<float name="radius" value="29"/>'),
+        ("mirage", '<float name="ext_ior" value="1.0002769"/>', '<float name="ext_ior" value="1.000277"/>'),
+        ("fibre", '<translate z="41.573"/>', '<translate z="41.613"/>'),
+    ],
+)
+def test_media_see_a_wrong_boundary(tmp_path, name, old, new):
+    assert medium_faults(edited(tmp_path, name, old, new)) > 0
+
+
+# --- meshes ----------------------------------------------------------------------------------------------
+
+# A solid is a list of meshes; "-" turns one inside out.
+SOLIDS = {
+    "diamond": ["diamond.ply"],
+    "prism": ["prism.ply"],
+    "tumbler": ["tumbler_air.ply", "tumbler_wet.ply"],
+    "water": ["-tumbler_wet.ply", "water_top.ply"],
+}
+
+
+def read_ply(path):
+    header, body = path.read_text().split("end_header\n")
+    count = int(re.search(r"element vertex (\d+)", header)[1])
+    rows = body.splitlines()
+    vertices = np.array([r.split() for r in rows[:count]], np.float32).astype(float)
+    return vertices, np.array([r.split()[1:] for r in rows[count:]], int)
+
+
+def solid(name):
+    """Vertices and triangles of a solid; vertices with bitwise equal coordinates are one vertex."""
+    parts = [(m[0] == "-", *read_ply(SCENES / "meshes" / m.lstrip("-"))) for m in SOLIDS[name]]
+    points = np.concatenate([v for _, v, _ in parts])
+    starts = np.cumsum([0] + [len(v) for _, v, _ in parts[:-1]])
+    faces = [o + (f[:, ::-1] if turn else f) for o, (turn, _, f) in zip(starts, parts, strict=True)]
+    vertices, index = np.unique(points, axis=0, return_inverse=True)
+    return vertices, index.reshape(-1)[np.concatenate(faces)]
+
+
+def mesh_faults(v, f):
+    edges = Counter((int(a), int(b)) for t in f for a, b in zip(t, np.roll(t, -1), strict=True))
+    if any(n != 1 for n in edges.values()) or any((b, a) not in edges for a, b in edges):
+        yield "not watertight: an edge without its opposite"
+    if len(v) - len(edges) // 2 + len(f) != 2:
+        yield "not a sphere by Euler's formula"
+    if np.einsum("ij,ij->i", v[f[:, 0]], np.cross(v[f[:, 1]], v[f[:, 2]])).sum() <= 0:
+        yield "inside out: the signed volume is not positive"
+
+
+def normals(v, f):
+    n = np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
+    area = np.linalg.norm(n, axis=1)
+    return n / area[:, None], area
+
+
+def facets(v, f):
+    """Triangles gathered by plane, largest first; per facet the largest distance of a vertex from it."""
+    n, area = normals(v, f)
+    left, spread = list(np.argsort(-area)), []
+    while left:
+        t = left[0]
+        distance = {u: abs((v[f[u]] - v[f[t, 0]]) @ n[t]).max() for u in left}
+        same = [u for u in left if n[t] @ n[u] > np.cos(0.01) and distance[u] < 0.01]
+        spread.append(max(distance[u] for u in same))
+        left = [u for u in left if u not in same]
+    return np.array(spread)
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_solid_is_closed(name):
+    assert list(mesh_faults(*solid(name))) == []
+
+
+@pytest.mark.parametrize(
+    "name, count", [("diamond", 57 + 16), ("prism", 5), ("tumbler", 12 + 12 + 3), ("water", 12 + 2)]
+)
+def test_facets_are_plane(name, count):
+    """Plane to the rounding of float32 coordinates: |error| ≤ 3u·size. The rim is one facet, and so are
+    the dry and the wet part of an inner wall."""
+    v, f = solid(name)
+    spread = facets(v, f)
+    assert len(spread) == count
+    assert spread.max() <= 3 * 2**-24 * np.abs(v).max()
+
+
+def test_diamond_is_convex():
+    """With a closed surface of positive volume: every normal points out."""
+    v, f = solid("diamond")
+    n, _ = normals(v, f)
+    assert (n @ v.T - np.einsum("ij,ij->i", n, v[f[:, 0]])[:, None]).max() < 1e-4
+
+
+def test_mesh_sees_a_defect():
+    v, f = solid("diamond")
+    assert list(mesh_faults(v, f[1:]))
+    assert list(mesh_faults(v, f[:, ::-1]))
+    assert list(mesh_faults(v, np.concatenate([f[:1, ::-1], f[1:]])))
+    moved = v.copy()
+    moved[f[0, 0]] += 1e-4
+    assert facets(moved, f).max() > 3 * 2**-24 * np.abs(v).max()
+
+
+# --- light pipe ------------------------------------------------------------------------------------------
+
+
+def internal_reflections(path, rays=40):
+    """Total internal reflections of camera rays that enter a pipe's end, until they leave the pipes."""
+    scene, counts = load(path), []
+    rng = np.random.default_rng(5)
+    eta = iors(path)[0]["glass"]
+    for u in rng.random((40 * rays, 2)):
+        if len(counts) == rays:
+            break
+        ray, _ = scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(u), mi.Point2f(0.5))
+        si = scene.ray_intersect(ray)
+        if not (si.is_valid() and si.shape.id().startswith("pipe") and si.n.z > 0.5):
+            continue
+        count = 0
+        while si.is_valid() and si.shape.id().startswith("pipe") and count < 500:
+            reflectance, cos_t, _, eta_ti = mi.fresnel(si.wi.z, eta[0] / eta[1])
+            total = reflectance == 1
+            count += total
+            wo = mi.reflect(si.wi) if total else mi.refract(si.wi, cos_t, eta_ti)
+            si = scene.ray_intersect(si.spawn_ray(si.to_world(wo)))
+        counts.append(count)
+    assert len(counts) == rays
+    return np.array(counts)
+
+
+def test_light_pipe_reflects_fifty_times():
+    counts = internal_reflections(SCENES / "lightpipe.xml")
+    assert counts.min() >= 50
+    assert counts.max() < 160 / 2  # so that what the far end reflects comes back within max_depth
+
+
+def test_light_pipe_sees_a_short_pipe(tmp_path):
+    short = edited(tmp_path, "lightpipe", 'z="70"/>', 'z="62"/>')
+    assert internal_reflections(short).min() < 50

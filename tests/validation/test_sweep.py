@@ -1,0 +1,240 @@
+"""Screen, sweep and search: they agree with the oracle, find planted defects, and the worst rays are replayed."""
+
+import dataclasses
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from mi_refract import oracle, regimes
+from mi_refract.formulas.documented import FORMULAS
+from mi_refract.numerics import float_expansions
+from mi_refract.regimes import REGIMES, Rays
+from validation.directions import search, sweep, worst_rays
+from validation.directions.judge import errors, evaluate, judge
+from validation.directions.worst_rays import Found
+from validation.reference.fast_reference import Screen
+from validation.run.array_settings import Setting, budget_of
+
+
+@pytest.fixture(scope="module")
+def measured(vectorised):
+    """The setting of the tests as one of the validation."""
+    return Setting(vectorised.backend, vectorised.precision, vectorised.vector)
+
+
+@pytest.fixture
+def replace(monkeypatch):
+    """Put `function` in the place of a formula."""
+
+    def plant(name, function):
+        monkeypatch.setitem(FORMULAS, name, dataclasses.replace(FORMULAS[name], function=function))
+
+    return plant
+
+
+def margin(a, n, k):
+    """How near to the critical angle, for planted defects."""
+    wide = dr.float64_array_t(type(a))
+    _, d, terms = float_expansions.radicand(wide(a), wide(n), dr.value_t(wide)(k))
+    return dr.value_t(type(a))(dr.abs(d[0]) / terms)
+
+
+# The screen ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+def test_the_screen_is_right_where_it_is_certain(regime, measured):
+    rays = regimes.make(regime, 1500, measured.precision, seed=11)
+    screen, exact = Screen(rays, measured.vector), oracle.refract(rays.a, rays.n, rays.k, progress=False)
+    b, transmitted = evaluate(FORMULAS["promoted"], rays, measured.vector)
+    chord, wrong = screen.judge(FORMULAS["promoted"])
+    certain = ~screen.doubtful
+    assert (wrong == (transmitted != exact.transmitted))[certain].all()
+    compared = certain & ~wrong
+    certified = errors(b, rays, exact)[0] / measured.roundoff
+    assert np.abs(chord - certified)[compared].max(initial=0) <= sweep.SCREEN_BUDGET
+    # Neither has terms at k = 1 along the surface; their sum is up to twice the larger one.
+    theirs, ours = oracle.margin(rays.a, rays.n, rays.k)[certain], screen.margin[certain]
+    assert (np.isnan(theirs) == np.isnan(ours)).all()
+    ratio = (ours / theirs)[~np.isnan(theirs) & (theirs != 0)]
+    assert ((ratio >= 0.49) & (ratio <= 1.01)).all()
+    assert certain.all() or regime in ("exactly critical", "on a denormal")
+
+
+def test_the_screen_sees_one_bit_and_calls_nan_infinite(measured):
+    screen = Screen(regimes.make("generic", 400, measured.precision, seed=2), measured.vector)
+
+    def last_bit(a, n, k):
+        b, transmitted = FORMULAS["promoted"](a, n, k)
+        return b * (1 + 2 * dr.epsilon(type(b))), transmitted
+
+    assert screen.judge(FORMULAS["promoted"])[0].max() < 0.8724 < 2 < screen.judge(last_bit)[0].max()
+    assert np.isinf(screen.judge(lambda a, n, k: (a * dr.nan, k > 0))[0]).all()
+
+
+# The sweep -----------------------------------------------------------------------------------------------------
+
+
+def test_the_best_are_the_best_of_all_chunks():
+    rng = np.random.default_rng(1)
+    score = rng.random(1000)
+    rays = Rays(np.repeat(score[:, None], 3, 1), np.zeros((1000, 3)), score)
+    kept = sweep.Best(20)
+    for chunk in np.array_split(np.arange(1000), 7):
+        kept.add(rays[chunk], score[chunk], score[chunk] < 0.9, 2 * score[chunk])
+    expected = np.sort(score[score < 0.9])[-20:]
+    assert np.sort(kept.score).tolist() == expected.tolist() == np.sort(kept.rays.k).tolist()
+    assert (kept.chord == 2 * kept.score).all()
+    assert kept.offered == np.count_nonzero(score < 0.9)
+
+
+def rare(a, n, k, contrast=None):
+    """Wrong in the last digits, of one ray in ten thousand."""
+    b, transmitted = FORMULAS["promoted"].function(a, n, k, contrast)
+    return dr.select(dr.abs(a[0]) < 1e-4, b * (1 + 4 * dr.epsilon(type(b))), b), transmitted
+
+
+def stubborn(a, n, k, contrast=None):
+    """Takes what is next to the critical angle for beyond it."""
+    b, transmitted = FORMULAS["promoted"].function(a, n, k, contrast)
+    return b, transmitted & (margin(a, n, k) > 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("defect", "regime", "broken"),
+    [(rare, "generic", {"error / bound"}), (stubborn, "critical", {"misjudged far"})],
+)
+def test_a_sweep_sees_defects_of_a_few_rays(defect, regime, broken, measured, replace, monkeypatch):
+    monkeypatch.setattr(sweep, "CHUNK", 20_000)
+    sound = {row.subject: row for row in sweep.regime_rows(regime, measured, 50_000, 16)}
+    assert sound["promoted"].verdict == "pass"
+    assert sound["promoted"].values["rays"] == 50_000
+    replace("compensated", defect)
+    row = {row.subject: row for row in sweep.regime_rows(regime, measured, 50_000, 16)}["compensated"]
+    assert set(row.broken) == broken
+    assert {"a", "n", "k"} == set(row.replay["worst ray"])
+
+
+def test_what_the_screen_cannot_resolve_is_certified_or_counted(measured):
+    row = {row.subject: row for row in sweep.regime_rows("exactly critical", measured, 1000, 4)}["promoted"]
+    assert row.verdict == "pass"
+    assert row.values["certified"] == 4 * sweep.UNRESOLVED_SHARE
+    assert row.values["unresolved"] == 1000 - 4 * sweep.UNRESOLVED_SHARE
+
+
+# The search ----------------------------------------------------------------------------------------------------
+
+
+def bump(a, n, k):
+    """2 u off, but only where the radicand is within u/100 of 0."""
+    b, transmitted = FORMULAS["promoted"](a, n, k)
+    width, u = 0.01 * dr.epsilon(type(b)) / 2, dr.epsilon(type(b)) / 2
+    return dr.select(margin(a, n, k) < width, b * (1 + 4 * u), b), transmitted
+
+
+def window(a, n, k):
+    """A decision that is wrong only where the radicand is between u/1000 and u/500 of its terms."""
+    b, transmitted = FORMULAS["promoted"](a, n, k)
+    near = margin(a, n, k) * 1e3 / (dr.epsilon(type(b)) / 2)
+    return b, transmitted ^ ((near > 1) & (near < 2))
+
+
+@pytest.mark.parametrize(("defect", "objective"), [(bump, "chord"), (window, "decision")])
+def test_the_search_finds_a_defect_that_sampling_misses(defect, objective, measured):
+    sample = Screen(regimes.make("critical", search.SAMPLE, measured.precision, search.SEED), measured.vector)
+    chord, wrong = sample.judge(defect)
+    assert chord.max() < 0.8724 and not wrong.any()
+
+    def over(subject):
+        herd = search.climb("promoted", subject, ["critical"], measured, 40)
+        found = search.certify("promoted", subject, herd, measured)
+        return [f for f in found if f.line.objective == objective and f.share > {"chord": 1, "decision": 0}[objective]]
+
+    assert over(defect) and not over(FORMULAS["promoted"])
+
+
+def test_the_herd_stays_in_its_domain_and_gets_no_better(measured):
+    names = ("generic", "lengths", "axes, signed zeros")
+    first, last = (search.climb("promoted", FORMULAS["promoted"], names, measured, g) for g in (0, 12))
+    assert (last.score >= first.score).all() and (last.score > first.score).any()
+    assert search._inside(last.rays, last, np.arange(len(last))).all()
+    again = search.climb("promoted", FORMULAS["promoted"], names, measured, 12)
+    assert again.rays.a.tobytes() == last.rays.a.tobytes()
+
+
+def test_every_formula_has_its_rows(measured, scalar_context, monkeypatch):
+    monkeypatch.setattr(search, "settings", lambda context: [measured])
+    monkeypatch.setattr(sweep, "settings", lambda context: [measured])
+    context = scalar_context(sweep_rays=2000, certified=4, generations=1)
+    rows = [row for study in (sweep, search) for task in study.tasks(context) for row in task.run()]
+    assert {(row.study, row.subject) for row in rows} == {(s, name) for s in ("sweep", "search") for name in FORMULAS}
+    assert [row.name for row in rows if row.verdict not in ("pass", "info")] == []
+    assert {row.case for row in rows if row.verdict == "info"} == {"on a denormal"}
+
+
+# The worst rays ------------------------------------------------------------------------------------------------
+
+
+def line(score=1.0, x=0.5, formula="promoted", objective="chord"):
+    return Found("float32", formula, "generic", objective, score, (float(x).hex(),) * 7)
+
+
+def test_the_file_keeps_the_worst_once_and_sorted(tmp_path):
+    path = tmp_path / "worst.txt"
+    assert worst_rays.read(path) == []
+    assert worst_rays.keep([line(1, 0.1), line(3, 0.3), line(2, 0.2), line(3, 0.3)], path) == worst_rays.MOST == 2
+    assert [found.score for found in worst_rays.read(path)] == [3, 2]
+    before = path.read_bytes()
+    assert worst_rays.keep([line(0.5, 0.4), line(2, 0.2)], path) == 0
+    assert path.read_bytes() == before
+    assert worst_rays.keep([line(1, 0.1, objective="decision"), line(9, 0.9, formula="cross")], path) == 2
+    assert [(f.formula, f.objective) for f in worst_rays.read(path)] == [
+        ("cross", "chord"), ("promoted", "chord"), ("promoted", "chord"), ("promoted", "decision"),
+    ]  # fmt: skip
+    rays = worst_rays.rays_of(worst_rays.read(path), "float32")
+    assert rays.k.dtype == np.float32
+    assert rays.a[0, 0] == np.float32(0.9)
+
+
+@pytest.mark.parametrize("text", ["float32 | promoted", "p|f|r|o|1|0 0|0 0 1|1", "p|f|r|o|1|0 0 nan|0 0 1|1"])
+def test_a_line_that_is_no_ray_is_refused(text, tmp_path):
+    path = tmp_path / "worst.txt"
+    path.write_text(text.replace("|", " | ") + "\n")
+    with pytest.raises(ValueError, match="not"):
+        worst_rays.read(path)
+
+
+def broken(name, subject, lines, setting):
+    """The lines on which `subject` breaks the budget of `name`, and by what."""
+    rays = worst_rays.rays_of(lines, setting.precision.__name__)
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    seen = judge(subject, rays, exact, setting.vector, budget_of(name))
+    counted = [not setting.no_budget(budget_of(name), line.regime) for line in lines]
+    return [
+        (lines[i].line(), "misjudged" if seen.far[i] else f"{seen.share[i]:.3g} of the bound")
+        for i in np.flatnonzero(seen.seen & counted).tolist()
+    ]
+
+
+@pytest.fixture(scope="module")
+def lines(setting):
+    return [found for found in worst_rays.read() if found.precision == setting.name]
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_every_formula_is_within_its_budget_on_the_worst_rays(name, setting, lines):
+    measured = Setting(setting.backend, setting.precision, setting.vector)
+    assert broken(name, FORMULAS[name], lines, measured) == []
+
+
+@pytest.mark.parametrize("mutant", ["decomposed", "cross"])
+def test_the_replay_sees_a_form_that_cancels(mutant, measured):
+    lines = [found for found in worst_rays.read() if found.precision == measured.precision.__name__]
+    assert len(broken("promoted", FORMULAS[mutant], lines, measured)) > len(lines) / 2
+
+
+def test_the_worst_rays_are_of_all_formulas_and_of_most_regimes(setting, lines):
+    assert {found.formula for found in lines} == set(FORMULAS)
+    assert {found.regime for found in lines} <= set(REGIMES)
+    assert len({found.regime for found in lines}) >= len(REGIMES) / 2

@@ -1,0 +1,179 @@
+"""Diff, times: what a verdict costs beside reading the files, how long a page takes, and the memory of it all.
+
+The pictures are smooth ones with the noise of 16 samples per pixel, zip-compressed EXR. Subjects take turns, and
+medians of the rounds count, with 95 % intervals. Seconds are this machine's, so they have goals and no budgets, and
+those only at the sizes they were set for; Python's start and its imports are not in them. What has a budget is the size
+of the page. Memory is the largest of a whole process, which compares, and writes the page.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mi_refract.image_diff import folders, html_report
+from mi_refract.image_diff.methods import METHODS
+from mi_refract.image_diff.settings import AUTO, How, Settings
+from mi_refract.io import image_file
+from mi_refract.report.row import Row
+from validation.run import kernel_timing
+from validation.run.context import Context, Task
+
+TITLE = "Diff, times"
+TEXT = __doc__.partition("\n")[2].strip()
+TERMS = {
+    "seconds": "median, of reading and judging, or of writing the page; low, high: its 95 % interval",
+    "time / reading": "median of the rounds' ratios to reading the same files; low, high: its 95 % interval",
+    "MB of page": "size of the HTML file",
+    "MB of memory": "the largest resident set of the whole process",
+    "8 + 8": "renders of one picture, as many a side",
+    AUTO: "tolerance here: the pictures say nothing of their noise",
+}
+STUDY = "diff_times"
+SEED = 2034
+SPP, GAIN = 16, 1.05  # the noise of the renders; how much brighter a quarter of the other picture is
+SMALL = 256
+RENDERS = 8  # a side
+MEGABYTE = 1e6
+LIMIT = 15.0  # MB of a page
+GOALS = {"tolerance": 0.5, "welch": 3.0, "page": 5.0, AUTO: 60.0}  # seconds with two cores
+MEMORY = 1024.0 * 2**20 / MEGABYTE
+
+
+@dataclass(frozen=True)
+class Size:
+    """Of the large pictures, the number of pairs in the folder of small ones, and the rounds."""
+
+    height: int
+    width: int
+    pairs: int
+    rounds: int
+
+
+SIZES = {"quick": Size(270, 480, 20, 7), "full": Size(1080, 1920, 1000, 7)}
+GOAL_SIZE = SIZES["full"]
+PROCESS = """
+import sys
+from mi_refract.cli import main
+main(sys.argv[1:])
+print([line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")][0])
+"""
+
+
+def tasks(context: Context) -> list[Task]:
+    """One task: its subjects take turns."""
+    return [Task("diff, times", functools.partial(measure, SIZES[context.profile.name], context.variant))]
+
+
+def measure(size: Size, setting: str) -> list[Row]:
+    """A row per subject."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        write(root, size)
+        page = root / "page.html"
+        readings, subjects = _readings(root), _subjects(root, page)
+        seconds = kernel_timing.rounds(readings | subjects, _clock, size.rounds)  # the first round is a warm-up
+        rows = [_row(name, seconds, size, setting) for name in (*readings, *subjects)]
+        rows.append(_page_row(page, size, setting))
+        return [*rows, _memory_row(root, size, setting)]
+
+
+def write(root: Path, size: Size) -> None:
+    """`a`, `b`: renders of one picture; `many_a`, `many_b`: small pictures that are the same but for last bits."""
+    rng = np.random.default_rng(SEED)
+    y, x = np.mgrid[: size.height, : size.width]
+    smooth = ((0.4 + 0.3 * np.sin(x / 90) * np.cos(y / 70))[..., None] * [1, 0.8, 0.6]).astype(np.float32)
+    for side in ("a", "b"):
+        (root / side).mkdir()
+        for seed in range(RENDERS):
+            picture = smooth * rng.gamma(SPP, 1 / SPP, smooth.shape).astype(np.float32)
+            if side == "b":
+                picture[: size.height // 2, : size.width // 2] *= GAIN
+            image_file.write_exr(root / side / f"{seed}.exr", picture)
+    small = smooth[:SMALL, :SMALL]
+    for side, gain in (("many_a", 1.0), ("many_b", 1 + 1e-5)):
+        (root / side).mkdir()
+        for number in range(size.pairs):
+            noise = np.random.default_rng(number).gamma(SPP, 1 / SPP, small.shape).astype(np.float32)
+            image_file.write_exr(root / side / f"{number:04}.exr", np.float32(gain) * small * noise)
+
+
+def _reading(name: str) -> str:
+    """The subject that reads the same files as this one; "" for the page, and for those themselves."""
+    if name == AUTO:
+        return "read the folder"
+    return ("read the renders" if METHODS[name].samples else "read the pair") if name in METHODS else ""
+
+
+def _readings(root: Path) -> dict[str, Callable[[], object]]:
+    renders, many = ([sorted((root / f"{kind}{side}").iterdir()) for side in "ab"] for kind in ("", "many_"))
+
+    def read(sides: list[list[Path]]) -> None:
+        for pair in zip(*sides, strict=True):
+            image_file.read_all(pair)
+
+    pair = [side[:1] for side in renders]
+    files = {"read the pair": pair, "read the renders": renders, "read the folder": many}
+    return {name: functools.partial(read, sides) for name, sides in files.items()}
+
+
+def _subjects(root: Path, page: Path) -> dict[str, Callable[[], object]]:
+    """The verdict of each method, of a folder, and the page of the picture that differs."""
+    a, b = root / "a", root / "b"
+    found = {
+        name: functools.partial(folders.diff, *((a, b) if method.samples else (a / "0.exr", b / "0.exr")),
+                                Settings(How(name)), samples=method.samples)
+        for name, method in METHODS.items()
+    }  # fmt: skip
+    many = functools.partial(folders.diff, root / "many_a", root / "many_b")
+    judged = folders.diff(a / "0.exr", b / "0.exr", Settings(How("tolerance")), maps=True)
+    return found | {AUTO: many, "page": functools.partial(html_report.write, page, judged)}
+
+
+def _clock(subject: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    subject()
+    return time.perf_counter() - start
+
+
+def _case(name: str, size: Size) -> str:
+    reading = _reading(name) or name
+    if reading == "read the folder":
+        return f"{size.pairs} pairs of {SMALL}²"
+    return f"{size.width} × {size.height}" + (f", {RENDERS} + {RENDERS}" if reading == "read the renders" else "")
+
+
+def _row(name: str, seconds: dict[str, list[float]], size: Size, setting: str) -> Row:
+    values = kernel_timing.interval("seconds", seconds[name])
+    if reading := _reading(name):
+        values |= kernel_timing.ratio("time / reading", seconds[name], seconds[reading])
+    goals = {"seconds": GOALS[name]} if size == GOAL_SIZE and name in GOALS else {}
+    replay = {"seed": SEED, "rounds": size.rounds}
+    return Row(STUDY, name, _case(name, size), setting, values, goals=goals, replay=replay)
+
+
+def _page_row(page: Path, size: Size, setting: str) -> Row:
+    values = {"MB of page": page.stat().st_size / MEGABYTE}
+    return Row(STUDY, "size of the page", _case("", size), setting, values, {"MB of page": LIMIT})
+
+
+def _memory_row(root: Path, size: Size, setting: str) -> Row:
+    """Of the process with the most: Welch's test of all renders, with its page."""
+    subject, case = "memory", _case("welch", size)
+    if not Path("/proc/self/status").exists():
+        return Row(STUDY, subject, case, setting, reason="this system does not say a process's peak")
+    words = ["diff", str(root / "a"), str(root / "b"), "--samples", "--report", str(root / "welch.html")]
+    done = subprocess.run([sys.executable, "-c", PROCESS, *words], capture_output=True, text=True)
+    if done.returncode:
+        raise OSError(f"diff, times: {done.stderr.strip()}")
+    values = {"MB of memory": 1024 * json.loads(done.stdout.split()[-1]) / MEGABYTE}
+    return Row(STUDY, subject, case, setting, values, {"MB of memory": MEMORY})

@@ -1,0 +1,119 @@
+"""Samples: `refract` against `dielectric`, one `bsdf.sample` at a time, in every variant of the wheel.
+
+Rays from outside and inside, both lobes together and each alone, radiance and importance. Where both plugins chose
+the same lobe, directions, densities, weights and relative indices are compared entry by entry.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract.formulas.bounds import cancelling
+from mi_refract.report.row import Row
+from validation.run.context import Context, Task
+
+TITLE = "Samples"
+TEXT = __doc__.partition("\n")[2].strip()
+TERMS = {
+    "lobe flips": "rays for which the two plugins chose different lobes",
+    "wo, pdf, eta, weight": "entries of the sample: worst, and what 99 rays of 100 stay below. Of Mueller matrices the "
+    "differences are times the smaller cos²θ: the built-in goes back from wo to the cosine of wi by Snell's law, and "
+    "what that cancels it divides by that cosine's square",
+}
+SEED = 2027
+INT_IOR, EXT_IOR = 1.5, 1.0
+LOBES = {"both lobes": 0xFFFFFFFF, "reflection": 0, "transmission": 1}
+QUANTITIES = ("wo", "pdf", "eta", "weight")
+
+
+def tasks(context: Context) -> list[Task]:
+    return [
+        Task(f"samples: {variant}", functools.partial(_variant_rows, context, variant, reason))
+        for variant, reason in context.variants.items()
+    ]
+
+
+def _variant_rows(context: Context, variant: str, reason: str | None) -> list[Row]:
+    import mitsuba as mi
+
+    if reason is not None:
+        return [Row("samples", "refract − dielectric", "all", variant, reason=reason)]
+    mi.set_variant(variant)
+    try:
+        count = context.profile.rays if dr.is_jit_v(mi.Float) else context.profile.scalar_rays
+        return [_mode_row(mode, name, count, variant) for mode, name in _modes()]
+    finally:
+        mi.set_variant(context.variant)
+
+
+def _modes() -> list[tuple[Any, str]]:
+    import mitsuba as mi
+
+    return [(mi.TransportMode.Radiance, "radiance"), (mi.TransportMode.Importance, "importance")]
+
+
+def _mode_row(mode: Any, mode_name: str, count: int, variant: str) -> Row:
+    import mitsuba as mi
+
+    description = {"int_ior": INT_IOR, "ext_ior": EXT_IOR, "specular_reflectance": 0.9, "specular_transmittance": 0.8}
+    ours, theirs = (mi.load_dict({"type": name, **description}) for name in ("refract", "dielectric"))
+    rng = np.random.default_rng(SEED)
+    wi = rng.normal(size=(count, 3))
+    wi, sample1 = wi / np.linalg.norm(wi, axis=1, keepdims=True), rng.random(count)
+    differences: dict[str, list[np.ndarray]] = {name: [] for name in QUANTITIES}
+    flips = 0
+    for component in LOBES.values():
+        context = mi.BSDFContext(mode)
+        context.component = component
+        x, y = (sample_all(bsdf, context, wi, sample1) for bsdf in (ours, theirs))
+        same = x["type"] == y["type"]
+        flips += int((~same).sum())
+        for name in QUANTITIES:
+            # A lobe that cannot be (transmission under total internal reflection) has weight 0 and no direction.
+            used = same & (np.abs(y["weight"]).max(1) > 0) if name == "wo" else same
+            difference = np.abs(x[name] - y[name]).max(1)
+            if name == "weight" and mi.is_polarized:
+                difference *= np.minimum(wi[:, 2] ** 2, y["wo"][:, 2] ** 2)
+            differences[name].append(difference[used])
+    values = {"lobe flips": float(flips)}
+    for name, parts in differences.items():
+        d = np.nan_to_num(np.concatenate(parts), nan=np.inf)
+        values |= {f"{name} worst": float(d.max()), f"{name} p99": float(np.quantile(d, 0.99))}
+    # The built-in's radicand cancels: the a-priori bound of such a form, and a few roundings for 99 rays of 100.
+    bound = float(cancelling(2).chord(2.0**-24, INT_IOR))
+    budgets = {f"{name} worst": bound for name in ("wo", "pdf", "weight")}
+    budgets |= {"eta worst": 2e-7, "lobe flips": 1e-3 * count}
+    budgets |= {f"{name} p99": 4e-6 for name in ("wo", "pdf", "weight")}
+    if mi.is_polarized:  # a radicand on either side of the boundary, and its error in three factors of the weight
+        budgets["weight worst"] = 6 * float(cancelling(2).margin(2.0**-24, INT_IOR))
+    replay = {"count": 3 * count, "seed": SEED, **description}
+    return Row("samples", "refract − dielectric", mode_name, variant, values, budgets, replay=replay)
+
+
+def sample_all(bsdf: Any, context: Any, wi: np.ndarray, sample1: np.ndarray) -> dict[str, np.ndarray]:
+    """`bsdf.sample` for every ray: arrays (N, entries) of wo, pdf, eta, weight, and (N,) of the sampled type."""
+    import mitsuba as mi
+
+    def ask(w: Any, s: Any, count: int) -> dict[str, np.ndarray]:
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wi = mi.Vector3f(w)
+        bs, weight = bsdf.sample(context, si, s, [0, 0])
+        found = {"wo": bs.wo, "pdf": bs.pdf, "eta": bs.eta, "weight": weight, "type": bs.sampled_type}
+        return {name: _lanes(np.array(x, dtype=float), count) for name, x in found.items()}
+
+    if dr.is_jit_v(mi.Float):
+        found = ask(wi.T, mi.Float(sample1), len(wi))
+    else:
+        each = [ask(w, float(s), 1) for w, s in zip(wi, sample1, strict=True)]
+        found = {name: np.concatenate([x[name] for x in each]) for name in each[0]}
+    return found | {"type": found["type"][:, 0]}
+
+
+def _lanes(x: np.ndarray, count: int) -> np.ndarray:
+    """(count, entries) from an array that has the lanes last (or none, in scalar variants)."""
+    lanes = x if x.ndim and x.shape[-1] in (1, count) and count > 1 else x[..., None]
+    return np.broadcast_to(lanes, (*lanes.shape[:-1], count)).reshape(-1, count).T

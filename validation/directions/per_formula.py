@@ -1,0 +1,156 @@
+"""Directions: every formula against the certified answer, ray by ray, with the time it takes.
+
+The error of a ray is the chord |b/|a| − exact| in units of roundoff u (2⁻²⁴, 2⁻⁵³), and the angle in radians.
+Its bound is an a-priori one for that very ray. Rays whose total internal reflection was decided wrongly are counted,
+and left out of the errors. Times are those of kernels that stream rays from memory, as a multiple of the time of
+copying the same bytes (a + k n). The stepped line joins the formulas that none is both faster and more accurate than.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from mi_refract import oracle, regimes
+from mi_refract.formulas.bounds import ROUNDING
+from mi_refract.formulas.documented import FORMULAS
+from mi_refract.report.row import Row
+from validation.run import kernel_timing
+from validation.run.array_settings import Setting, budget_of, settings
+from validation.run.context import Context, Task
+
+from .judge import BUDGETS, Judgement, Subject, judge, judged, lengths
+
+FLOOR = "exact, rounded"
+TITLE = "Directions"
+TEXT = __doc__.partition("\n")[2].strip()
+TERMS = (
+    {name: f"{formula.equation} (source: {formula.source})" for name, formula in FORMULAS.items()}
+    | {name: regime.text for name, regime in regimes.REGIMES.items()}
+    | {
+        "worst / u": "the largest chord error in units of roundoff; rounding the exact answer costs 0.87",
+        "error / bound": "the largest share that an error takes of its ray's a-priori bound",
+        "misjudged": "rays whose total internal reflection was decided wrongly",
+        "misjudged far": "those of them that are farther from the critical angle than the formula's own error; at the "
+        "rounding limit, those whose radicand exceeds u² of its terms: below, the decision moves b by u at most",
+        FLOOR: "the certified direction times |a|, rounded: no form does better. At most √3/2 u where |a| = 1, and 1 u "
+        "elsewhere, where all components may have just passed a power of two",
+        "other side": "rays within 4u of the surface that a documented formula sends to the other side of it, because "
+        "it knows n·a to no more; their bound is wider by 2 cosθ_t, and their decision is either",
+        "no budget": "the documented formulas demand unit vectors: where those are not, their rows are shown only",
+        "length drift": "how far the length of b is from that of a, relative",
+        "slack": "by how much a constant of the bound could be smaller: of what is linear, of what is under the root",
+    }
+    | kernel_timing.TERMS
+)
+SCATTER = [
+    {
+        "study": "directions", "x": x, "y": "worst / u", "title": f"Worst error against {x}",
+        "front": True, "interval": [f"{x}, low", f"{x}, high"], "floor": kernel_timing.COPY,
+    }
+    for x in ("time / copy", "ns per ray")
+]  # fmt: skip
+SEED = 2026
+# Fewer rays than this need not come near a bound: only from here on a bound that is too wide is a defect.
+TWO_SIDED = 50_000
+LARGEST_SLACK = 4.0
+
+
+def tasks(context: Context) -> list[Task]:
+    """One task per backend and precision."""
+    return [
+        Task(f"directions: {setting.label}", functools.partial(_setting_rows, context, setting))
+        for setting in settings(context)
+    ]
+
+
+@functools.cache
+def certified(regime: str, count: int, precision: type) -> tuple[regimes.Rays, oracle.Certified]:
+    rays = regimes.make(regime, count, precision, SEED)
+    return rays, oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+
+
+def _setting_rows(context: Context, setting: Setting) -> list[Row]:
+    if setting.vector is None:
+        return [
+            Row("directions", name, "all regimes", setting.label, reason=setting.reason)
+            for name in (*FORMULAS, kernel_timing.COPY)
+        ]
+    count = context.profile.scalar_rays if setting.is_scalar else context.profile.rays
+    times = kernel_timing.measure(context, setting)
+    rows = [_floor_row(regime, setting, count) for regime in regimes.REGIMES]
+    for name, subject in setting.subjects.items():
+        parts = [_regime_row(name, subject, regime, setting, count) for regime in regimes.REGIMES]
+        rows += [*parts, _summary(name, parts, setting, times[name])]
+    copying = Row("directions", kernel_timing.COPY, "all regimes", setting.label, times[kernel_timing.COPY])
+    return [*rows, copying]
+
+
+def _floor_row(regime: str, setting: Setting, count: int) -> Row:
+    """The certified answers themselves, rounded."""
+    rays, exact = certified(regime, count, setting.precision)
+    b = (exact.direction + exact.direction_low.astype(np.longdouble)) * lengths(rays.a)[:, None]
+    b = b.astype(setting.precision).astype(np.longdouble)
+    return _row(FLOOR, regime, setting, rays, judged(b, exact.transmitted, rays, exact, ROUNDING))
+
+
+def _regime_row(name: str, subject: Subject, regime: str, setting: Setting, count: int) -> Row:
+    rays, exact = certified(regime, count, setting.precision)
+    found = judge(subject, rays, exact, setting.vector, budget_of(name))
+    return _row(name, regime, setting, rays, found, setting.no_budget(budget_of(name), regime))
+
+
+@np.errstate(over="ignore")
+def _row(name: str, regime: str, setting: Setting, rays: regimes.Rays, found: Judgement, reason: str = "") -> Row:
+    """`reason`: why there is no budget. Then nothing is said of the share of it either."""
+    u, some = setting.roundoff, found.right.any()
+    chord, angle, drift = (x[found.right] if some else np.zeros(1) for x in (found.chord, found.angle, found.drift))
+    values = {
+        "worst / u": float(chord.max()) / u,
+        **({} if reason else found.values()),
+        "worst chord": float(chord.max()),
+        "p99 / u": _p99(chord) / u,
+        "mean / u": float(chord.mean()) / u,
+        "worst rad": float(angle.max()),
+        "p99 rad": _p99(angle),
+        "mean rad": float(angle.mean()),
+        "length drift": float(drift.max()),
+        "misjudged": float(found.misjudged.sum()),
+        "other side": float(found.crossed.sum()),
+    }
+    worst = {"largest error": np.where(found.right, found.chord, -1), "nearest to its bound": found.share}
+    replay = {
+        "regime": regime, "text": regimes.REGIMES[regime].text, "count": len(rays), "seed": SEED,
+        **{title: rays.hexed(int(np.argmax(x))) for title, x in worst.items()},
+        "needed": {"linear": float(found.linear.max()), "radicand": float(found.radicand.max())},
+    }  # fmt: skip
+    budgets = {} if reason else BUDGETS
+    return Row("directions", name, regime, setting.label, values, budgets, reason=reason, replay=replay)
+
+
+def _p99(x: np.ndarray) -> float:
+    """What 99 of 100 stay below; one of the values, which may be infinite."""
+    return float(np.quantile(x, 0.99, method="higher"))
+
+
+def _summary(name: str, parts: list[Row], setting: Setting, times: dict[str, float]) -> Row:
+    """The worst over all regimes with a budget and what it cost: a point in the plane of error and time."""
+    parts = [row for row in parts if row.budgets]
+    metrics = "worst / u", "error / bound", "worst chord", "worst rad", "length drift"
+    values = {m: max(row.values[m] for row in parts) for m in metrics}
+    values |= {m: sum(row.values[m] for row in parts) for m in ("misjudged", "misjudged far", "other side")}
+    budgets = {}
+    if min(row.replay["count"] for row in parts) >= TWO_SIDED:
+        slack = _slack(name, parts)
+        values, budgets = values | slack, dict.fromkeys(slack, LARGEST_SLACK)
+    replay = {"rays": sum(row.replay["count"] for row in parts), "seed": SEED}
+    goals = kernel_timing.goals(name, setting)
+    return Row("directions", name, "all regimes", setting.label, values | times, budgets, goals, replay=replay)
+
+
+def _slack(name: str, parts: list[Row]) -> dict[str, float]:
+    """Constant over what the sweep needs of it, each with the other one as it is."""
+    constants = {"linear": budget_of(name).linear, "radicand": budget_of(name).radicand}
+    needed = {c: max(row.replay["needed"][c] for row in parts) for c in constants}
+    return {f"slack, {c}": x / max(needed[c], 1e-3 * x) for c, x in constants.items() if x}

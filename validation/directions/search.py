@@ -1,0 +1,304 @@
+"""Search: hill-climbing on the bits of rays, against every formula in every regime.
+
+The worst of a sample of each regime are the parents. In every generation each has children with a few numbers changed
+by a power of two of ulps, and the worst child that is no better than its parent takes its place. Climbed are the chord
+error, and the distance from the critical angle at which total internal reflection is still decided wrongly. Some
+children are as near to that angle as a few ulps of their numbers bring them. All stay in the domain: unit vectors stay
+unit up to rounding, lengths within 1e-18 … 1e18, ratios within the regime's.
+
+`python -m validation.search --keep` adds the worst to tests/data/worst_rays.txt, which the tests replay.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+
+from mi_refract import oracle, regimes
+from mi_refract.formulas.documented import FORMULAS
+from mi_refract.regimes import REGIMES, Rays
+from mi_refract.report.row import Row
+from validation.reference.fast_reference import Screen
+from validation.run.array_settings import Setting, budget_of, settings
+from validation.run.context import PROFILES, Context, Profile, Task
+
+from . import worst_rays
+from .judge import BUDGETS, Subject, judge
+from .worst_rays import Found
+
+TITLE = "Search"
+TEXT = __doc__.partition("\n")[2].partition("\n\n`python")[0].strip()
+TERMS = {
+    "error / bound": "the largest share of its ray's a-priori bound that a certified error was found to take",
+    "misjudged far": "rays found whose total internal reflection the formula must decide rightly and does not",
+    "rays tried": "children of all generations",
+}
+SEED = 2037
+SAMPLE, LARGEST_SAMPLE = 4000, 1 << 16
+FAMILIES = 6  # per regime and objective
+CHILDREN = 24
+TRIALS = 1024
+OBJECTIVES = ("chord", "decision")
+# Of what is allowed: above it a ray is worth keeping. Formulas at the limit are near it by rounding alone.
+WORTH_KEEPING = {True: 0.9, False: 0.25}
+
+
+def tasks(context: Context) -> list[Task]:
+    """One per formula, vectorised backend and precision."""
+    return [
+        Task(f"search: {name}, {setting.label}", functools.partial(_rows, context, name, setting))
+        for setting in settings(context)
+        if not setting.is_scalar
+        for name in FORMULAS
+    ]
+
+
+def _rows(context: Context, name: str, setting: Setting) -> list[Row]:
+    if setting.vector is None:
+        return [Row("search", name, "all regimes", setting.label, reason=setting.reason)]
+    generations, sample = context.profile.generations, _sample_size(context.profile)
+    herd = climb(name, FORMULAS[name], domain(name, setting), setting, generations, sample=sample)
+    found = certify(name, FORMULAS[name], herd, setting)
+    chords = [f for f in found if f.line.objective == "chord"]
+    far = [f.line.line() for f in found if f.line.objective == "decision" and f.share > 0]
+    values = {"error / bound": max((f.share for f in chords), default=0.0), "misjudged far": float(len(far))}
+    values["rays tried"] = float(generations * CHILDREN * len(herd))
+    worst_lines = [f.line.line() for f in sorted(chords, key=lambda f: -f.share)[:3]]
+    replay = {"seed": SEED, "sample": sample, "generations": generations, "worst": worst_lines, "misjudged": far[:3]}
+    return [Row("search", name, "all regimes", setting.label, values, BUDGETS, replay=replay)]
+
+
+def _sample_size(profile: Profile) -> int:
+    return min(profile.sweep_rays // 10, LARGEST_SAMPLE)
+
+
+# The herd ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Herd:
+    """Families: a parent each, its regime (an index into `names`), whether it climbs the decision, and its score."""
+
+    rays: Rays
+    regime: np.ndarray
+    decision: np.ndarray
+    score: np.ndarray
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.score)
+
+
+def domain(name: str, setting: Setting) -> tuple[str, ...]:
+    """The regimes in which `name` has a budget on that backend."""
+    return tuple(regime for regime in REGIMES if not setting.no_budget(budget_of(name), regime))
+
+
+def climb(
+    name: str,
+    subject: Subject,
+    names: Iterable[str],
+    setting: Setting,
+    generations: int,
+    seed: int = SEED,
+    sample: int = SAMPLE,
+) -> Herd:
+    """The herd after so many generations. `subject` is evaluated, and held to what `name` is held to."""
+    rng, names = np.random.default_rng(seed), tuple(names)
+    herd = _parents(name, subject, names, setting, seed, sample)
+    rows = np.arange(len(herd))
+    for _ in range(generations):
+        parents = np.repeat(rows, CHILDREN)
+        children = _mutated(rng, herd.rays[parents], _unit_only(herd)[parents])
+        children = _stepped(rng, children, herd.decision[parents])
+        inside = _inside(children, herd, parents)
+        score = _scores(name, subject, Screen(children, setting.vector), herd.decision[parents])
+        score = np.where(inside, score, -np.inf)
+        best = score.reshape(-1, CHILDREN).argmax(1) + rows * CHILDREN
+        # A child as bad as its parent replaces it: a plateau is crossed at random.
+        taken = score[best] >= herd.score
+        rays = Rays.joined([herd.rays, children[best]])[np.where(taken, len(herd) + rows, rows)]
+        herd = Herd(rays, herd.regime, herd.decision, np.where(taken, score[best], herd.score), names)
+    return herd
+
+
+def _parents(
+    name: str, subject: Subject, names: tuple[str, ...], setting: Setting, seed: int, sample: int
+) -> Herd:
+    """The worst of a sample, by either objective, of every regime."""
+    rays, scores = [], []
+    for regime_name in names:
+        screen = _sample(regime_name, setting, seed, sample)
+        for objective in (False, True):
+            score = _scores(name, subject, screen, np.full(sample, objective))
+            worst_ones = np.argsort(-score, kind="stable")[:FAMILIES]
+            rays.append(screen.rays[worst_ones])
+            scores.append(score[worst_ones])
+    regime = np.repeat(np.arange(len(names)), 2 * FAMILIES)
+    decision = np.tile(np.repeat([False, True], FAMILIES), len(names))
+    return Herd(Rays.joined(rays), regime, decision, np.concatenate(scores), names)
+
+
+@functools.cache
+def _sample(name: str, setting: Setting, seed: int, count: int) -> Screen:
+    return Screen(regimes.make(name, count, setting.precision, seed), setting.vector)
+
+
+def _scores(name: str, subject: Subject, screen: Screen, decision: np.ndarray) -> np.ndarray:
+    """The higher the worse. Chord: its share of the bound, of rays that are decided rightly. Decision: the distance
+    from the critical angle where it is wrong, minus that distance where it is right. Rays whose side is open are out.
+    """
+    chord, wrong = screen.judge(subject)
+    far, budget = np.abs(screen.margin), budget_of(name)
+    by_chord = np.where(wrong, -np.inf, chord / screen.bound(budget))
+    score = np.where(decision, np.where(wrong, far, -far), by_chord)
+    score = np.where(budget.side_open(screen.roundoff, screen.cos_i), -np.inf, score)
+    return np.where(screen.doubtful | np.isnan(score), -np.inf, score)
+
+
+def _unit_only(herd: Herd) -> np.ndarray:
+    return np.array([REGIMES[name].unit for name in herd.names])[herd.regime]
+
+
+def _stepped(rng: Generator, rays: Rays, decision: np.ndarray) -> Rays:
+    """One in four of those that climb the decision steps to the critical angle, and one in sixteen of the others."""
+    some = np.flatnonzero(rng.random(len(rays)) < np.where(decision, 1 / 4, 1 / 16))
+    order = np.arange(len(rays))
+    order[some] = len(rays) + np.arange(len(some))
+    return Rays.joined([rays, _to_critical(rng, rays[some])])[order]
+
+
+@np.errstate(over="ignore", invalid="ignore")  # a step may lead out of the domain
+def _to_critical(rng: Generator, rays: Rays) -> Rays:
+    """A Newton step to radicand 0 in one number, then the best of TRIALS combinations of ulps, by its linear part."""
+    rows, precision = np.arange(len(rays)), rays.k.dtype
+    numbers = np.column_stack([rays.a, rays.n, rays.k]).astype(np.float64)
+    d, along = regimes.radicand(numbers[:, :3], numbers[:, 3:6], numbers[:, 6])
+    j = rng.integers(0, 7, len(rays))
+    numbers[rows, j] -= d / along[rows, j]
+    ulps = np.spacing(np.abs(numbers).astype(precision)).astype(np.float64)
+    numbers = numbers.astype(precision).astype(np.float64)
+    d, along = regimes.radicand(numbers[:, :3], numbers[:, 3:6], numbers[:, 6])
+    steps = rng.integers(-3, 4, (TRIALS, 7)) * (rng.random((TRIALS, 7)) < 0.5)
+    best = np.abs(d[:, None] + (along * ulps) @ steps.T).argmin(1)
+    numbers = (numbers + steps[best] * ulps).astype(precision)
+    return Rays(numbers[:, :3], numbers[:, 3:6], numbers[:, 6])
+
+
+def _mutated(rng: Generator, rays: Rays, unit: np.ndarray) -> Rays:
+    """A few numbers are moved by ±2^j ulps, small j mostly; a quarter of the unit vectors are made unit again."""
+    precision = rays.k.dtype
+    limits = np.finfo(precision)
+    bits = np.column_stack([rays.a, rays.n, rays.k]).view(f"i{precision.itemsize}")
+    step = np.exp2(np.floor(limits.nmant * rng.random(bits.shape) ** 2)).astype(bits.dtype)
+    step *= rng.choice(np.array([-1, 1], bits.dtype), bits.shape)
+    # Zeros and denormal numbers stay: those are regimes of their own.
+    chance = rng.choice([0.05, 0.3], (len(rays), 1))
+    moved = (rng.random(bits.shape) < chance) & (np.abs(bits.view(precision)) >= limits.smallest_normal)
+    numbers = np.where(moved, bits + step, bits).view(precision)
+    a, n, k = numbers[:, :3], numbers[:, 3:6], numbers[:, 6]
+    again = (unit & (rng.random(len(k)) < 0.25))[:, None]
+    a, n = (np.where(again, regimes.normalised(v), v).astype(precision) for v in (a, n))
+    return Rays(a, n, k)
+
+
+def _inside(rays: Rays, herd: Herd, parents: np.ndarray) -> np.ndarray:
+    """Which children stay in the domain of their regime."""
+    entries = [REGIMES[name] for name in herd.names]
+    unit = _unit_only(herd)[parents]
+    largest_k = np.array([entry.largest_k for entry in entries])[herd.regime][parents]
+    # Rounding its components moves a length by √3/2 u at most.
+    slack = 3**0.5 / 4 * float(np.finfo(rays.k.dtype).eps)
+    inside = (rays.k >= 1e-6) & (rays.k <= largest_k)
+    for v in (rays.a, rays.n):
+        wide = v.astype(np.longdouble)
+        length = np.sqrt((wide * wide).sum(1))
+        inside &= np.where(unit, np.abs(length - 1) <= slack, (length > 1e-18) & (length < 1e18))
+    return inside
+
+
+# What was found ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Certified:
+    """A line, and its share of what is allowed: of the chord error; for a decision 1 where it had to be right, or 0."""
+
+    line: Found
+    share: float
+
+
+def certify(name: str, subject: Subject, herd: Herd, setting: Setting) -> list[Certified]:
+    """Every parent's certified score, held to the budget of `name`."""
+    rays, u = herd.rays, setting.roundoff
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    seen = judge(subject, rays, exact, setting.vector, budget_of(name))
+    margin = np.abs(oracle.margin(rays.a, rays.n, rays.k)) / u**2
+    found = []
+    for i, wrong in enumerate((seen.misjudged | seen.far).tolist()):
+        objective, score = ("decision", margin[i]) if wrong else ("chord", seen.chord[i] / u)
+        line = Found.at(rays, i, name, herd.names[herd.regime[i]], objective, float(score))
+        found.append(Certified(line, float(seen.far[i] if wrong else seen.share[i])))
+    return found
+
+
+def worth_keeping(found: Iterable[Certified]) -> list[Found]:
+    return [f.line for f in found if f.share > WORTH_KEEPING[budget_of(f.line.formula).at_the_limit]]
+
+
+def rescored(name: str, setting: Setting) -> list[Found]:
+    """The lines of the file for `name` in that precision, with the scores of the formula as it is now."""
+    precision = np.dtype(setting.precision).name
+    lines = [line for line in worst_rays.read() if (line.formula, line.precision) == (name, precision)]
+    rays, u = worst_rays.rays_of(lines, precision), setting.roundoff
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    seen = judge(FORMULAS[name], rays, exact, setting.vector, budget_of(name))
+    far = np.where(seen.misjudged, np.abs(oracle.margin(rays.a, rays.n, rays.k)) / u**2, 0.0)
+    scores = {"chord": seen.chord / u, "decision": far}
+    return [line.scored(float(scores[line.objective][i])) for i, line in enumerate(lines)]
+
+
+# By hand -------------------------------------------------------------------------------------------------------
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="validation.search", description="Try to break the budgets of the formulas.")
+    parser.add_argument("formulas", nargs="*", help="keys of FORMULAS; all by default")
+    parser.add_argument("--generations", type=int, default=PROFILES["full"].generations)
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--keep", action="store_true", help=f"add the worst to {worst_rays.PATH.name}")
+    options = parser.parse_args(arguments)
+    if unknown := [name for name in options.formulas if name not in FORMULAS]:
+        parser.error(f"unknown formula {unknown[0]!r}; accepted: {', '.join(FORMULAS)}")
+    for setting in settings(_context()):
+        if setting.is_scalar or setting.vector is None:
+            continue
+        for name in options.formulas or FORMULAS:
+            start = options.generations, options.seed, LARGEST_SAMPLE
+            herd = climb(name, FORMULAS[name], domain(name, setting), setting, *start)
+            found = certify(name, FORMULAS[name], herd, setting)
+            kept = worth_keeping(found)
+            broken = sum(f.share > 1 if f.line.objective == "chord" else f.share > 0 for f in found)
+            print(f"{setting.label}, {name}: {max(f.share for f in found):.3g} of its bound, {broken} rays over it")
+            if options.keep:
+                print(f"  {worst_rays.keep([*rescored(name, setting), *kept])} new lines")
+    return 0
+
+
+def _context() -> Context:
+    from pathlib import Path
+
+    from mi_refract import backend
+
+    variant = backend.activate(may_restart=True)
+    return Context(PROFILES["full"], Path(), variant, backend.detect(), backend.usable_variants())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,176 @@
+"""Sweep: every regime at full size; the screen finds the worst rays, and the oracle certifies these.
+
+The screen solves every ray a second way, right to 2⁻¹⁴⁰ of the radicand's terms. Certified by ball arithmetic are the
+rays that it finds worst, those whose total internal reflection a formula decides as the screen does not, and those too
+near to the critical angle for the screen. Only certified errors are shown.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_refract import oracle, regimes
+from mi_refract.formulas.bounds import Budget
+from mi_refract.formulas.documented import FORMULAS
+from mi_refract.regimes import Rays
+from mi_refract.report.row import Row
+from validation.reference.fast_reference import Screen
+from validation.run.array_settings import Setting, budget_of, settings
+from validation.run.context import Context, Task
+
+from .judge import BUDGETS, judge
+
+TITLE = "Sweep"
+TEXT = __doc__.partition("\n")[2].strip()
+TERMS = {
+    "worst / u": "the largest certified chord error in units of roundoff, of the rays that were decided rightly",
+    "error / bound": "the largest share that a certified error takes of its ray's a-priori bound",
+    "misjudged": "rays whose total internal reflection was decided wrongly: all that the screen is certain of, and of "
+    "the others those that were certified",
+    "misjudged far": "certified ones that the formula must decide rightly, as in the study of directions",
+    "screen off": "the largest difference between the screen's chord error and the certified one, in u; infinite where "
+    "a decision that the screen is certain of was wrong",
+    "unresolved": "rays nearer to the critical angle than the screen resolves that were not certified either",
+}
+SEED = 2031
+CHUNK = 1 << 16
+# What the screen may be off by: extended precision, which compares with the certified answer, costs as much.
+SCREEN_BUDGET = 0.01
+# Rays nearer to the critical angle than the screen resolves, per kept one.
+UNRESOLVED_SHARE = 50
+
+
+def tasks(context: Context) -> list[Task]:
+    """One per vectorised backend and precision."""
+    return [
+        Task(f"sweep: {setting.label}", functools.partial(_setting_rows, context, setting))
+        for setting in settings(context)
+        if not setting.is_scalar
+    ]
+
+
+def _setting_rows(context: Context, setting: Setting) -> list[Row]:
+    if setting.vector is None:
+        return [Row("sweep", name, "all regimes", setting.label, reason=setting.reason) for name in FORMULAS]
+    profile = context.profile
+    sizes = profile.sweep_rays, profile.certified
+    rows = [row for regime in regimes.REGIMES for row in regime_rows(regime, setting, *sizes)]
+    documented = [name for name in FORMULAS if not budget_of(name).at_the_limit]
+    kept = [row for row in rows if row.subject not in documented]
+    return kept + [_worst_of([row for row in rows if row.subject == name]) for name in documented]
+
+
+def _worst_of(rows: list[Row]) -> Row:
+    """One row for a documented formula, over all regimes it was swept in."""
+    worst = max(rows, key=lambda row: row.values["error / bound"])
+    values = {m: max(row.values[m] for row in rows) for m in ("worst / u", "error / bound", "screen off")}
+    values |= {m: sum(row.values[m] for row in rows) for m in ("misjudged", "misjudged far", "rays", "certified")}
+    case = "all regimes of unit vectors"
+    return Row("sweep", worst.subject, case, worst.setting, values, worst.budgets, replay=worst.replay)
+
+
+# One regime ----------------------------------------------------------------------------------------------------
+
+
+class Best:
+    """The rays with the highest scores so far, at most `size`, with their chords, and how many were offered."""
+
+    def __init__(self, size: int) -> None:
+        self.size, self.offered = size, 0
+        self.score: np.ndarray = np.empty(0)
+        self.chord: np.ndarray = np.empty(0)
+        self._rays: list[Rays] = []
+
+    def add(self, rays: Rays, score: np.ndarray, mask: np.ndarray, chord: np.ndarray) -> None:
+        index = np.flatnonzero(mask)
+        self.offered += len(index)
+        index = index[_largest(score[index], self.size)]
+        score = np.concatenate([self.score, score[index]])
+        best = _largest(score, self.size)
+        self.score, self._rays = score[best], [Rays.joined([*self._rays, rays[index]])[best]]
+        self.chord = np.concatenate([self.chord, chord[index]])[best]
+
+    @property
+    def rays(self) -> Rays:
+        return self._rays[0]
+
+
+def _largest(x: np.ndarray, count: int) -> np.ndarray:
+    """Indices of the `count` largest numbers, or of all."""
+    return np.argpartition(-x, count)[:count] if len(x) > count else np.arange(len(x))
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """What one formula leaves of a regime: of the rays that the screen is certain of and that were decided rightly
+    those nearest to their bounds; the misjudged ones, farthest from the critical angle first; and rays that the screen
+    cannot resolve, those that it would decide differently first.
+    """
+
+    worst: Best
+    misjudged: Best
+    unresolved: Best
+
+    def add(self, screen: Screen, budget: Budget, chord: np.ndarray, wrong: np.ndarray) -> None:
+        rays, certain = screen.rays, ~screen.doubtful
+        self.worst.add(rays, chord / screen.bound(budget), certain & ~wrong, chord)
+        self.misjudged.add(rays, np.abs(screen.margin), certain & wrong, chord)
+        self.unresolved.add(rays, wrong.astype(float), ~certain, chord)
+
+
+def gather(regime: str, setting: Setting, count: int, kept: int) -> dict[str, Gathered]:
+    """Screen `count` rays of a regime in chunks; chunk i has the seed SEED + i. By formula that has a budget there."""
+    budgets = {name: formula.budget for name, formula in FORMULAS.items()}
+    names = [name for name, b in budgets.items() if b.at_the_limit or not setting.no_budget(b, regime)]
+    found = {name: Gathered(Best(kept), Best(kept), Best(UNRESOLVED_SHARE * kept)) for name in names}
+    for i, start in enumerate(range(0, count, CHUNK)):
+        rays = regimes.make(regime, min(CHUNK, count - start), setting.precision, SEED + i)
+        screen = Screen(rays, setting.vector)
+        for name in names:
+            found[name].add(screen, budgets[name], *screen.judge(FORMULAS[name]))
+    return found
+
+
+def regime_rows(regime: str, setting: Setting, count: int, kept: int) -> list[Row]:
+    found = gather(regime, setting, count, kept)
+    return [_certified_row(name, regime, setting, gathered, count) for name, gathered in found.items()]
+
+
+def _certified_row(name: str, regime: str, setting: Setting, found: Gathered, count: int) -> Row:
+    rays = Rays.joined([found.worst.rays, found.misjudged.rays, found.unresolved.rays])
+    certain = np.arange(len(rays)) < len(rays) - len(found.unresolved.rays)
+    entry, reason = regimes.REGIMES[regime], setting.no_budget(budget_of(name), regime)
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    seen = judge(FORMULAS[name], rays, exact, setting.vector, budget_of(name))
+    wrong = seen.misjudged
+    values = {
+        "worst / u": float(np.max(seen.chord, where=seen.right, initial=0)) / setting.roundoff,
+        **({} if reason else seen.values()),
+        "misjudged": float(found.misjudged.offered + (wrong & ~certain).sum()),
+        "screen off": _disagreement(found, seen.chord[certain] / setting.roundoff, wrong[certain]),
+        "rays": float(count),
+        "certified": float(len(rays)),
+        "unresolved": float(found.unresolved.offered - (~certain).sum()),
+    }
+    budgets = {} if reason else {**BUDGETS, "screen off": SCREEN_BUDGET}
+    replay = {
+        "regime": regime, "text": entry.text, "count": count, "chunk": CHUNK, "first seed": SEED,
+        "worst ray": rays.hexed(int(np.argmax(seen.share))),
+        "misjudged": [rays.hexed(int(i)) for i in np.flatnonzero(wrong)[:3]],
+    }  # fmt: skip
+    return Row("sweep", name, regime, setting.label, values, budgets, reason=reason, replay=replay)
+
+
+def _disagreement(found: Gathered, chord: np.ndarray, wrong: np.ndarray) -> float:
+    """How far the screen is off on the worst and the misjudged rays, in u; of errors above 1e6 u, in millionths."""
+    screened = found.worst.chord
+    if wrong[: len(screened)].any() or not wrong[len(screened) :].all():
+        return np.inf
+    finite = np.isfinite(screened)
+    if (finite != np.isfinite(chord[: len(screened)])).any():
+        return np.inf
+    screened, chord = screened[finite], chord[: len(screened)][finite]
+    return float(np.max(np.abs(screened - chord) / np.maximum(1, chord / 1e6), initial=0))

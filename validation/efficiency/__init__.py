@@ -1,0 +1,1 @@
+"""Study of error against run time in renders."""

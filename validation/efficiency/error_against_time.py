@@ -1,0 +1,262 @@
+"""Efficiency: the error of a picture against the time it took, by integrator, BSDF and sampler, in turn in one run.
+
+The error is that against the mean of independent renders by the built-in, path + dielectric with its better stratified
+sampler, at the most samples per pixel measured here; the variance of that mean is subtracted. A ratio is formed within
+a round, in which every method renders the same seed; the median of the rounds counts. Efficiency must not be bought
+with bias: the mean of a method's pictures must agree with the built-in's, or the run fails.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import statistics
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mi_refract.image_diff import methods as compare
+from mi_refract.plugins import scene_features
+from mi_refract.report.row import Row
+from validation.run import kernel_timing
+from validation.run.context import NO_REFERENCE, SCENES, Context, Task
+from validation.run.render_methods import BUILTIN, METHODS, OURS, Camera, Method, camera
+
+TITLE = "Efficiency"
+TEXT = __doc__.partition("\n")[2].strip()
+TERMS = {
+    "time / built-in": "at equal samples per pixel and the same sampler; low, high: its 95 % interval over the rounds",
+    "MSE": "mean over pixels and channels of the squared error; relMSE: over reference² + 0.01",
+    "MSE, trimmed": "without the 0.1 % of pixels where the squared error, or the relative one, is largest",
+    "equal-time MSE": "MSE × time over that of path + dielectric with the same sampler: 1 / relative efficiency",
+    "equal-time MSE / independent": "the same over that of path + dielectric with `independent`, Mitsuba's default",
+    "Welch alarms": "tiles and channels whose mean differs from the reference's; at most one method in 1000 by chance",
+}
+AXES = {"x": "seconds", "y": "RMSE", "slope": -0.5}
+STUDY = "efficiency"
+SCALAR = "needs a compiled variant: a scalar one's time is that of Python"
+INDEPENDENT, STRATIFIED = "independent", ("multijitter", "orthogonal")
+EPSILON, WORST = 0.01, 1e-3
+NOISE = 1e-5  # of float32 pictures: below it independent seeds give the same one
+TILE, FAMILY_ERROR, MARGIN = 16, 1e-3, 1e-5
+FIRST_REFERENCE = 1000  # seed: no method has seen any from here on
+METRICS = ("MSE", "MSE, trimmed", "relMSE", "relMSE, trimmed")
+GLASS_GOALS = {"equal-time MSE": 0.4, "equal-time MSE / independent": 0.12}
+MIXED_GOALS = {"equal-time MSE": 0.8}
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How much is measured.
+
+    `spp` are squares of primes: every sampler takes them as they are. Six rounds are the fewest that have a 95 %
+    interval. The resolution is doubled, up to `LARGEST`, until the built-in takes `seconds`. `scenes`: () is all.
+    """
+
+    spp: tuple[int, ...]
+    rounds: int
+    references: int
+    resolution: int = 128
+    seconds: float = 0.0
+    scenes: tuple[str, ...] = ()
+
+
+EXTENTS = {
+    "quick": Extent((4, 25), 6, 12, scenes=("balls", "furnace", "mirage", "sphere")),
+    "full": Extent((4, 9, 25), 8, 16, seconds=0.25),
+}
+LARGEST = 512
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A method with a sampler, named only where it is not the scene's best stratified one."""
+
+    method: Method
+    sampler: str
+
+    @property
+    def name(self) -> str:
+        return self.method.name + (f", {INDEPENDENT}" if self.sampler == INDEPENDENT else "")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Of one subject at one number of samples: seconds and figures by round; the pictures at the most samples."""
+
+    seconds: list[float]
+    figures: dict[str, list[float]]
+    pictures: list[np.ndarray]
+
+    def cost(self, metric: str) -> list[float]:
+        return [error * seconds for error, seconds in zip(self.figures[metric], self.seconds, strict=True)]
+
+
+Found = dict[str, dict[int, Measured]]  # by subject and samples per pixel
+
+
+def tasks(context: Context) -> list[Task]:
+    """One task per scene."""
+    paths = sorted(SCENES.glob("*.xml"))
+    return [Task(f"efficiency: {path.stem}", functools.partial(scene_rows, context, path)) for path in paths]
+
+
+def scene_rows(context: Context, path: Path, methods: tuple[Method, ...] = METHODS) -> list[Row]:
+    """A row per method and sampler, and one of the curves; a single one with the reason where there is no question."""
+    extent = EXTENTS[context.profile.name]
+    reason = ""
+    if context.variant.startswith("scalar"):
+        reason = SCALAR
+    elif extent.scenes and path.stem not in extent.scenes:
+        reason = f"left out: the profile {context.profile.name} measures {', '.join(extent.scenes)}"
+    elif path.stem in NO_REFERENCE:
+        reason = f"left out: {NO_REFERENCE[path.stem]}"
+    elif (noise := _noise(path, extent)) < NOISE:
+        reason = f"left out: no noise, so no error against time: two seeds differ by {noise:.1e} at most"
+    if reason:
+        return [Row(STUDY, "every method", path.stem, context.variant, reason=reason)]
+    return _measured_rows(context, path, extent, methods)
+
+
+def _measured_rows(context: Context, path: Path, extent: Extent, methods: tuple[Method, ...]) -> list[Row]:
+    resolution = _resolution(path, extent)
+    absent = {method.name: reason for method in methods if (reason := method.missing)}
+    rows = [Row(STUDY, name, path.stem, context.variant, reason=reason) for name, reason in absent.items()]
+    sampler = best_sampler(path, resolution, extent)
+    subjects = [Subject(BUILTIN, INDEPENDENT), Subject(BUILTIN, sampler)]
+    subjects += [Subject(m, sampler) for m in methods if m != BUILTIN and m.name not in absent]
+    cameras = {s.name: _camera(path, s.method, resolution, s.sampler, extent) for s in subjects}
+    references = _references(cameras[subjects[1].name], extent)
+    found = measure(cameras, references, extent)
+    facts = scene_features.inspect(cameras[subjects[1].name].scene)
+    goals = goals_of(subjects, found, facts.only_glass)
+    replay = {
+        "scene": path.name, "resolution": resolution, "spp": extent.spp[-1], "rounds": extent.rounds,
+        "reference renders": extent.references, "reference seeds from": FIRST_REFERENCE, "sampler": sampler,
+    }  # fmt: skip
+    remark = f"the best stratified sampler here: {sampler}"
+    for subject in subjects:
+        values = _values(subject, subjects[:2], found, references)
+        # The reference is the built-in's own.
+        budgets = {} if subject.method == BUILTIN else {"Welch alarms": 0.0}
+        rows.append(Row(STUDY, subject.name, path.stem, context.variant, values, budgets, goals.get(subject.name, {}),
+                        remark, replay | {"method": subject.method.plugin(-1)}))  # fmt: skip
+    own = {"reference variance": float(references.var(0, ddof=1).mean() / len(references))}
+    rows.append(Row(STUDY, "every method", path.stem, context.variant, own, {}, {}, remark, replay, {}, _curves(found)))
+    return rows
+
+
+def _camera(path: Path, method: Method, resolution: int, sampler: str, extent: Extent) -> Camera:
+    return camera(path, method, resolution, sampler=sampler, spp=extent.spp[-1])
+
+
+def _noise(path: Path, extent: Extent) -> float:
+    look = _camera(path, BUILTIN, extent.resolution, INDEPENDENT, extent)
+    return float(np.abs(look(1, seed=0)[0] - look(1, seed=1)[0]).max())
+
+
+def _resolution(path: Path, extent: Extent) -> int:
+    """Of pictures that take long enough for what a render costs beside its samples not to count."""
+    resolution = extent.resolution
+    while resolution < LARGEST and extent.seconds:
+        look = _camera(path, BUILTIN, resolution, INDEPENDENT, extent)
+        if min(look(extent.spp[-1], seed=i)[1] for i in range(2)) >= extent.seconds:
+            break
+        resolution *= 2
+    return resolution
+
+
+def best_sampler(path: Path, resolution: int, extent: Extent, seeds: int = 3) -> str:
+    """The stratified sampler with which the built-in has the least variance × time."""
+    costs = {}
+    for sampler in STRATIFIED:
+        look = _camera(path, BUILTIN, resolution, sampler, extent)
+        shots = [look(extent.spp[-1], seed=FIRST_REFERENCE - 1 - i) for i in range(seeds + 1)][1:]
+        variance = np.stack([picture for picture, _ in shots]).var(0, ddof=1).mean()
+        costs[sampler] = float(variance) * statistics.median(seconds for _, seconds in shots)
+    return min(costs, key=lambda sampler: costs[sampler])
+
+
+def _references(look: Camera, extent: Extent) -> np.ndarray:
+    return np.stack([look(extent.spp[-1], seed=FIRST_REFERENCE + i)[0] for i in range(extent.references)])
+
+
+def measure(cameras: dict[str, Camera], references: np.ndarray, extent: Extent) -> Found:
+    """By subject and samples per pixel."""
+    mean, own = references.mean(0), references.var(0, ddof=1) / len(references)
+    found: Found = {name: {} for name in cameras}
+    for spp in extent.spp:
+        for name, shots in _rounds(cameras, spp, extent.rounds).items():
+            figures = [errors(picture, mean, own) for picture, _ in shots]
+            by_metric = {metric: [figure[metric] for figure in figures] for metric in METRICS}
+            kept = [picture for picture, _ in shots] if spp == extent.spp[-1] else []
+            found[name][spp] = Measured([seconds for _, seconds in shots], by_metric, kept)
+    return found
+
+
+def _rounds(cameras: dict[str, Camera], spp: int, rounds: int) -> dict[str, list[tuple[np.ndarray, float]]]:
+    """A picture a round of each camera; every second round in the reverse order, the first one thrown away."""
+    shots: dict[str, list[tuple[np.ndarray, float]]] = {name: [] for name in cameras}
+    order = list(cameras)
+    for seed in range(rounds + 1):
+        for name in order:
+            shots[name].append(cameras[name](spp, seed))
+        order.reverse()
+    return {name: found[1:] for name, found in shots.items()}
+
+
+def errors(picture: np.ndarray, mean: np.ndarray, own: np.ndarray) -> dict[str, float]:
+    """MSE and relMSE against `mean`, of which `own` is the variance, with and without the worst pixels."""
+    squared = np.square(picture - mean)
+    found: dict[str, float] = {}
+    for metric, scale in (("MSE", np.ones_like(mean)), ("relMSE", np.square(mean) + EPSILON)):
+        by_pixel = (squared / scale).mean(-1).ravel()
+        less = by_pixel - (own / scale).mean(-1).ravel()
+        kept = np.argsort(by_pixel)[: by_pixel.size - math.ceil(WORST * by_pixel.size)]
+        found |= {metric: float(less.mean()), f"{metric}, trimmed": float(less[kept].mean())}
+    return found
+
+
+def _values(subject: Subject, builtins: list[Subject], found: Found, references: np.ndarray) -> dict[str, float]:
+    """At the most samples per pixel. `builtins`: path + dielectric with `independent`, and with the best sampler."""
+    spp = max(found[subject.name])
+    test, default, best = (found[s.name][spp] for s in (subject, *builtins))
+    same = default if subject == builtins[0] else best
+    values = kernel_timing.ratio("equal-time MSE", test.cost("MSE"), same.cost("MSE"))
+    values |= kernel_timing.ratio("equal-time MSE / independent", test.cost("MSE"), default.cost("MSE"))
+    values |= kernel_timing.ratio("time / built-in", test.seconds, same.seconds)
+    values |= {"seconds": statistics.median(test.seconds)}
+    values |= {metric: statistics.fmean(test.figures[metric]) for metric in METRICS}
+    for metric in METRICS[1:]:
+        ratios = [t / s for t, s in zip(test.cost(metric), same.cost(metric), strict=True)]
+        values[f"equal-time {metric}"] = statistics.median(ratios)
+    agreed = compare.welch(references, np.stack(test.pictures), TILE, FAMILY_ERROR, MARGIN)
+    return values | {
+        "Welch alarms": float(agreed.alarms), "smallest p, adjusted": agreed.smallest_p,
+        "detectable difference": agreed.detectable,
+    }  # fmt: skip
+
+
+def goals_of(subjects: list[Subject], found: Found, only_glass: bool) -> dict[str, dict[str, float]]:
+    """By subject: for the best of our methods at equal time, on glass alone the best that splits; and for the time."""
+    ours = [s for s in subjects if s.method.integrator == OURS]
+    rivals = [s for s in ours if s.method.parameters or not only_glass]
+    goals: dict[str, dict[str, float]] = {s.name: {} for s in ours}
+    if rivals:
+        spp = max(found[rivals[0].name])
+        best = min(rivals, key=lambda s: statistics.median(found[s.name][spp].cost("MSE")))
+        goals[best.name] |= GLASS_GOALS if only_glass else MIXED_GOALS
+    for subject in ours:
+        if only_glass and not subject.method.parameters:
+            goals[subject.name]["time / built-in"] = 0.8
+    return goals
+
+
+def _curves(found: Found) -> dict[str, list[tuple[float, float]]]:
+    """RMSE against seconds."""
+    return {
+        name: [(statistics.median(m.seconds), math.sqrt(max(statistics.fmean(m.figures["MSE"]), 0)))
+               for m in by_spp.values()]
+        for name, by_spp in found.items()
+    }  # fmt: skip

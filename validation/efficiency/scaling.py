@@ -1,0 +1,289 @@
+"""Scaling: time to the first image, time of later ones, and memory, as a scene grows in one respect.
+
+Each measurement is a process of its own, whose folder of compiled kernels is empty: the first image is the time from
+the loaded scene to the picture, with all that is traced and compiled for it; the render is the median of those that
+follow; after an edit of one index of refraction comes one image more. Imports and loading do not count. Methods take
+turns, and medians of the processes count.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import os
+import site
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract.report.row import Row
+from validation.run.context import SCENES, Context, Task
+from validation.run.render_methods import BUILTIN, METHODS, Camera, Method, camera
+
+TITLE = "Scaling"
+TEXT = __doc__.partition("\n")[2].strip()
+TERMS = {
+    "first image": "seconds, nothing compiled before; / built-in: over that of path + dielectric",
+    "render": "seconds of a later image, the kernels in memory",
+    "after an edit": "seconds of the image after an edit of one index of refraction",
+    "arrays MB": "most that Dr.Jit held for arrays at once, by its own account; process MB: most of the whole process",
+}
+AXES = {"x": "size", "y": "seconds", "slope": None}
+STUDY = "scaling"
+SCALAR = "needs a compiled variant: a scalar one compiles nothing"
+LIMIT = 600.0  # seconds of a process
+TIMES = ("first image", "render", "after an edit")
+
+
+@dataclass(frozen=True)
+class Knob:
+    """What grows: `make(method, size, resolution)` is the camera, `quick` and `full` are the sizes.
+
+    `every`: also with the methods that split, which differ from each other by their kernels only.
+    """
+
+    make: Callable[[Method, int, int], Camera]
+    quick: tuple[int, ...]
+    full: tuple[int, ...]
+    every: bool = False
+
+    def sizes(self, profile: str) -> tuple[int, ...]:
+        return self.full if profile == "full" else self.quick
+
+
+@dataclass(frozen=True)
+class Job:
+    """One process: `renders` images after the first."""
+
+    variant: str
+    knob: str
+    size: int
+    method: str
+    resolution: int
+    spp: int
+    renders: int
+
+
+# Scenes --------------------------------------------------------------------------------------------------------
+
+
+def _glasses(method: Method, size: int, resolution: int) -> Camera:
+    """Balls in a square, each of its own index from 1.3 to 2.5, in surroundings of radiance 1."""
+    side = math.ceil(math.sqrt(size))
+    parts = {
+        f"ball_{i}": {
+            "type": "sphere", "center": [10 * (i % side - (side - 1) / 2), 10 * (i // side - (side - 1) / 2), 0],
+            "radius": 4.5, "bsdf": {"type": method.bsdf, "int_ior": 1.3 + 1.2 * i / size, "ext_ior": 1.0},
+        }
+        for i in range(size)
+    }  # fmt: skip
+    return _in_memory(method, parts, 10.0 * side, resolution)
+
+
+def _triangles(method: Method, size: int, resolution: int) -> Camera:
+    """A ball of BK7 of about `size` triangles."""
+    import mitsuba as mi
+
+    vertices, faces = ball_mesh(size)
+    properties = mi.Properties()
+    properties["glass"] = mi.load_dict({"type": method.bsdf, "int_ior": "bk7", "ext_ior": "air"})
+    mesh = mi.Mesh("ball", len(vertices), len(faces), props=properties)
+    parameters = mi.traverse(mesh)
+    for key, values in (("positions", 4.5 * vertices), ("faces", faces)):
+        name = next(name for name in parameters.keys() if name.endswith(key))  # noqa: SIM118  no dictionary
+        parameters[name] = type(parameters[name])(values.ravel())
+    parameters.update()
+    return _in_memory(method, {"ball": mesh}, 10.0, resolution)
+
+
+def ball_mesh(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices of a closed unit sphere of rings and its triangles, 4 r (r − 1) of them for r rings, facing out."""
+    rings = max(round((1 + math.sqrt(1 + size)) / 2), 2)
+    around = 2 * rings
+    polar, turn = np.pi * np.arange(1, rings) / rings, 2 * np.pi * np.arange(around) / around
+    circle = np.stack([np.cos(turn), np.sin(turn)], 1)
+    body = [np.column_stack([np.sin(p) * circle, np.full(around, np.cos(p))]) for p in polar]
+    vertices = np.concatenate([*body, [[0, 0, 1], [0, 0, -1]]])
+    i, j = np.arange(around), (np.arange(around) + 1) % around
+    north, south, last = len(vertices) - 2, len(vertices) - 1, (rings - 2) * around
+    faces = [(np.full(around, north), i, j), (np.full(around, south), last + j, last + i)]
+    for a in around * np.arange(rings - 2):
+        b = a + around
+        faces += [(a + i, b + i, b + j), (a + i, b + j, a + j)]
+    return vertices.astype(np.float32), np.concatenate([np.column_stack(x) for x in faces]).astype(np.uint32)
+
+
+def _in_memory(method: Method, parts: dict[str, Any], extent: float, resolution: int) -> Camera:
+    import mitsuba as mi
+
+    film = {"type": "hdrfilm", "width": resolution, "height": resolution, "rfilter": {"type": "box"}}
+    look = mi.ScalarTransform4f().look_at([0, 0, 3 * extent], [0, 0, 0], [0, 1, 0])
+    sensor = {"type": "perspective", "fov": 20, "to_world": look, "film": film, "sampler": {"type": "independent"}}
+    scene = mi.load_dict({"type": "scene", "sensor": sensor, "sky": {"type": "constant"}, **parts})
+    return Camera(scene, mi.load_dict(method.plugin(24)))
+
+
+def _depth(method: Method, size: int, resolution: int) -> Camera:
+    return camera(SCENES / "lightpipe.xml", method, resolution, max_depth=size)
+
+
+def _pixels(method: Method, size: int, resolution: int) -> Camera:
+    return camera(SCENES / "balls.xml", method, math.isqrt(size))
+
+
+def _spp(method: Method, size: int, resolution: int) -> Camera:
+    return camera(SCENES / "balls.xml", method, resolution)
+
+
+KNOBS = {
+    "glasses": Knob(_glasses, (1, 64), (1, 4, 16, 64, 256, 1000)),
+    "triangles": Knob(_triangles, (30_000,), (1000, 10_000, 100_000, 1_000_000)),
+    "depth": Knob(_depth, (4, 64), (4, 16, 64, 256)),
+    "pixels": Knob(_pixels, (128**2,), (32**2, 128**2, 512**2, 1024**2)),
+    "spp": Knob(_spp, (16,), (4, 32, 256), every=True),
+}
+# Ratios to the built-in of the leanest method there is, by knob and size.
+GOALS = {
+    ("glasses", 64): {"first image / built-in": 0.6, "after an edit / built-in": 0.2},
+    ("glasses", 1000): {"first image / built-in": 0.15},
+}
+
+
+# One process ---------------------------------------------------------------------------------------------------
+
+
+def measure(job: Job) -> dict[str, float]:
+    """In this process: seconds of the first image, of later ones and of the one after an edit; bytes held at most."""
+    import mitsuba as mi
+
+    import mi_refract  # noqa: F401  its plugins
+
+    mi.set_variant(job.variant)
+    method = next(method for method in METHODS if method.name == job.method)
+    look = KNOBS[job.knob].make(method, job.size, job.resolution)
+    spp = job.size if job.knob == "spp" else job.spp
+    first, *later = [look(spp, seed)[1] for seed in range(1 + job.renders)]
+    found = {"first image": first, "render": statistics.median(later), "arrays MB": _watermark() / 1e6}
+    parameters = mi.traverse(look.scene)
+    name = next(name for name in parameters.keys() if name.endswith("eta"))  # noqa: SIM118  no dictionary
+    parameters[name] = parameters[name] * 1.01
+    parameters.update()
+    return found | {"after an edit": look(spp, seed=0)[1], "process MB": _peak() / 1e6}
+
+
+def _watermark() -> int:
+    import mitsuba as mi
+
+    return int(dr.detail.malloc_watermark(dr.backend_v(mi.Float)))
+
+
+def _peak() -> float:
+    """Bytes; NaN where the system does not say. `getrusage` would not do: a child inherits its parent's peak."""
+    status = Path("/proc/self/status")
+    lines = status.read_text().splitlines() if status.exists() else []
+    return next((1024 * float(line.split()[1]) for line in lines if line.startswith("VmHWM:")), math.nan)
+
+
+def run(job: Job, home: str) -> dict[str, float]:
+    """`measure` in a process whose kernels go to the folder `home`; no first image (NaN) where it compiled nothing.
+
+    Dr.Jit keeps compiled kernels below the home folder and has no other switch; CUDA and OptiX have their own.
+    RuntimeError, with the last line of what the process said, where it fails.
+    """
+    before = _files(home)
+    environment = dict.fromkeys(("HOME", "CUDA_CACHE_PATH", "OPTIX_CACHE_PATH"), home)
+    environment["PYTHONUSERBASE"] = site.getuserbase()  # packages may be below the home folder, too
+    done = subprocess.run(
+        [sys.executable, "-m", "validation.scaling", json.dumps(vars(job))], cwd=SCENES.parent, check=False,
+        env=os.environ | environment, capture_output=True, text=True, timeout=LIMIT,
+    )  # fmt: skip
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise RuntimeError(f"{job.method}, {job.knob} = {job.size}: exit code {done.returncode}: {last}")
+    found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return found if _files(home) > before else found | {"first image": math.nan}
+
+
+def _files(folder: str) -> int:
+    return sum(path.is_file() for path in Path(folder).rglob("*"))
+
+
+# Rows ----------------------------------------------------------------------------------------------------------
+
+
+def tasks(context: Context) -> list[Task]:
+    """One task per knob."""
+    return [Task(f"scaling: {name}", functools.partial(knob_rows, context, name)) for name in KNOBS]
+
+
+def knob_rows(context: Context, knob: str, methods: tuple[Method, ...] = METHODS) -> list[Row]:
+    """A row per size and method, and the curves of all of them."""
+    if context.variant.startswith("scalar"):
+        return [Row(STUDY, "every method", knob, context.variant, reason=SCALAR)]
+    if not KNOBS[knob].every:
+        methods = tuple(method for method in methods if not method.parameters)
+    absent = {method.name: reason for method in methods if (reason := method.missing)}
+    rows = [Row(STUDY, name, knob, context.variant, reason=reason) for name, reason in absent.items()]
+    present = [method for method in methods if method.name not in absent]
+    sizes = KNOBS[knob].sizes(context.profile.name)
+    by_size = {size: _size_rows(context, knob, size, present) for size in sizes}
+    rows += [row for found in by_size.values() for row in found]
+    for metric in TIMES[:2] if len(sizes) > 1 else ():
+        curves = {
+            method.name: [(float(size), found[i].values[metric]) for size, found in by_size.items()]
+            for i, method in enumerate(present)
+        }
+        processes = {"processes": float(_processes(context))}
+        rows.append(Row(STUDY, "every method", f"{knob}: {metric}", context.variant, processes, curves=curves))
+    return rows
+
+
+def _size_rows(context: Context, knob: str, size: int, methods: list[Method]) -> list[Row]:
+    """In the order of the methods, of which the first is the built-in."""
+    jobs = {method.name: _job(context, knob, size, method) for method in methods}
+    found, rows = _rounds(jobs, _processes(context)), []
+    for name, values in found.items():
+        goals: dict[str, float] = {}
+        if name != BUILTIN.name:
+            values |= {f"{metric} / built-in": values[metric] / found[BUILTIN.name][metric] for metric in TIMES}
+            goals = GOALS.get((knob, size), {})
+        case = f"{knob} = {size}"
+        rows.append(Row(STUDY, name, case, context.variant, values, goals=goals, replay=vars(jobs[name])))
+    return rows
+
+
+def _processes(context: Context) -> int:
+    return 3 if context.profile.name == "full" else 1
+
+
+def _job(context: Context, knob: str, size: int, method: Method) -> Job:
+    full = context.profile.name == "full"
+    return Job(context.variant, knob, size, method.name, 128 if full else 64, 16, 5 if full else 3)
+
+
+def _rounds(jobs: dict[str, Job], rounds: int) -> dict[str, dict[str, float]]:
+    """Medians by method, which take turns; every second round in the reverse order."""
+    measured: dict[str, list[dict[str, float]]] = {name: [] for name in jobs}
+    order = list(jobs)
+    for _ in range(rounds):
+        for name in order:
+            with tempfile.TemporaryDirectory() as home:
+                measured[name].append(run(jobs[name], home))
+        order.reverse()
+    return {
+        name: {metric: statistics.median(values[metric] for values in found) for metric in found[0]}
+        for name, found in measured.items()
+    }
+
+
+if __name__ == "__main__":
+    print(json.dumps(measure(Job(**json.loads(sys.argv[1])))))

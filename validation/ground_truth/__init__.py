@@ -1,0 +1,1 @@
+"""Study of the plugin against closed answers and a printed trace."""

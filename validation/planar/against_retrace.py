@@ -1,0 +1,208 @@
+"""Planar: `planar.trace` against an independent retrace, on every scene file.
+
+Paths are followed once more in extended precision, by implicit curves and momenta. A ray is astray where it meets
+other boundaries than it should, or ends another way. Of the others, every point and the last direction count, and
+stand over what rounding may have grown to: each boundary adds a few roundings of the largest coordinate so far and of
+the angle, a facet's own turn by its rounded ends and 1/cos behind the boundary among them, and the first-order
+transfer of a displaced and tilted ray carries them on (`validation/growth.py`). Rays are the file's, and seeded ones
+scattered around them; `clutter` are scenes by chance, of bodies of every kind, nested and turned. Then the formulas by
+name.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_refract.formulas.documented import FORMULAS
+from mi_refract.planar.scene_file import PlanarScene, load
+from mi_refract.planar.tracer import Paths, Segments, trace
+from mi_refract.report.row import Row
+from validation.reference.planar_retrace import Array, Retraced, retrace
+from validation.run.array_settings import Setting, settings
+from validation.run.context import SCENES, Context, Task
+
+from . import random_scenes
+from .error_growth import growth
+from .rounding_ambiguity import undecided
+
+TITLE = "Planar"
+TEXT = __doc__.partition("\n")[2].strip()
+TERMS = {
+    "difference": "largest distance of a point from the retrace, over the extent of the scene, and |d − exact|",
+    "error / bound": "largest of any point and last direction, over what rounding may have grown to",
+    "astray": "rays that meet other boundaries than they should, or end another way",
+    "astray, far": "of these, how many no rounding excuses: they pass every vertex of their boundaries at more than "
+    "their bound, touch no curve, and are off the critical angle",
+    "boundaries": "the most that a ray meets",
+}
+STUDY = "planar"
+FOLDER = SCENES / "planar"
+SEED = 2031
+RAYS = {"quick": 250, "full": 2000}  # at most so many of the file's own, and as many scattered around them
+SCALAR_RAYS = 2
+CLUTTER = {"quick": (12, 100), "full": (100, 500)}  # scenes, and rays in each
+SPREAD = 1e-2  # of the extent, and in radians
+EQUAL = 1e-9  # in float64, of the extent and in radians
+GROWN = {"error / bound": 1.0, "astray, far": 0.0}
+SHOWN = "lens"  # the scene of the formulas
+
+
+@dataclass(frozen=True)
+class Case:
+    """Rays to follow through `segments`. `exact`: their paths; `extent`: the diagonal around the segments."""
+
+    name: str
+    segments: Segments
+    origins: Array
+    directions: Array
+    max_depth: int
+    reflect: Array
+
+    @functools.cached_property
+    def exact(self) -> Retraced:
+        return retrace(self.segments, self.origins, self.directions, self.max_depth, reflect=self.reflect)
+
+    @functools.cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """Of the errors of points and directions, over u."""
+        return growth(self.exact, self.segments)
+
+    @property
+    def extent(self) -> float:
+        return _extent(self.segments)
+
+    def trace(self, setting: Setting, formula: str | None = None) -> Paths:
+        return trace(
+            self.segments, self.origins, self.directions, self.max_depth, reflect=self.reflect, formula=formula,
+            precision=np.dtype(setting.precision).name, backend=setting.backend,
+        )  # fmt: skip
+
+
+def tasks(context: Context) -> list[Task]:
+    """One task per backend and precision."""
+    return [Task(f"planar: {s.label}", functools.partial(_setting_rows, context, s)) for s in settings(context)]
+
+
+def _setting_rows(context: Context, setting: Setting) -> list[Row]:
+    if setting.vector is None:
+        return [Row(STUDY, "trace", "every scene", setting.label, reason=setting.reason)]
+    rays = SCALAR_RAYS if setting.is_scalar else RAYS[context.profile.name]
+    cases = [case_of(path, rays) for path in sorted(FOLDER.glob("*.toml"))]
+    rows = [row_of(case, setting) for case in cases]
+    rows.append(clutter_row(setting, *((2, 5) if setting.is_scalar else CLUTTER[context.profile.name])))
+    if setting.precision is np.float32:
+        shown = next(case for case in cases if case.name == SHOWN)
+        rows += [row_of(shown, setting, formula) for formula in FORMULAS]
+    return rows
+
+
+def row_of(case: Case, setting: Setting, formula: str | None = None) -> Row:
+    """A scene in a setting, by the default formula or another one."""
+    values = judge(case.trace(setting, formula), case, setting.roundoff)
+    replay = {"scene": f"{case.name}.toml", "rays": len(case.origins), "seed": SEED}
+    return Row(STUDY, formula or "trace", case.name, setting.label, values, budgets(setting), replay=replay)
+
+
+def budgets(setting: Setting) -> dict[str, float]:
+    exact = {"difference": EQUAL, "astray": 0.0} if setting.precision is np.float64 else {}
+    return GROWN | exact
+
+
+def clutter_row(setting: Setting, scenes: int, rays: int) -> Row:
+    """Scenes by chance: counts of all of them, and the worst of the rest."""
+    parts = [judge(case.trace(setting), case, setting.roundoff) for case in _clutter(scenes, rays)]
+    counts = ("astray", "astray, far")
+    values = {name: (sum if name in counts else max)(part[name] for part in parts) for name in parts[0]}
+    replay = {"scenes": scenes, "rays": scenes * rays, "seed": SEED}
+    # Among so many bodies errors may grow beyond any fixed bound: their own one counts.
+    return Row(STUDY, "trace", "clutter", setting.label, values, GROWN, replay=replay)
+
+
+@functools.cache
+def _clutter(scenes: int, rays: int) -> list[Case]:
+    rngs = [np.random.default_rng((SEED, number)) for number in range(scenes)]
+    described = [(random_scenes.bodies(rng), *random_scenes.rays(rng, rays)) for rng in rngs]
+    return [Case("clutter", s, o, d, random_scenes.DEPTH, reflect) for s, o, d, reflect in described]
+
+
+@functools.cache
+def case_of(path: Path, rays: int) -> Case:
+    """The first colour of a scene file: refracted wherever possible, and reflected once where the file has branches."""
+    scene = load(path)
+    origins, directions = rays_of(scene, rays)
+    masks = [0] + [1 << j for j in range(min(2, scene.max_depth))] * bool(scene.branches)
+    reflect = np.repeat(masks, len(origins))
+    origins, directions = (np.tile(x, (len(masks), 1)) for x in (origins, directions))
+    return Case(path.stem, scene.segments[0], origins, directions, scene.max_depth, reflect)
+
+
+def rays_of(scene: PlanarScene, count: int) -> tuple[Array, Array]:
+    """At most `count` of the file's rays, and `count` scattered around any of them."""
+    rng, extent = np.random.default_rng(SEED), _extent(scene.segments[0])
+    own = np.linspace(0, len(scene.origins) - 1, min(count, len(scene.origins))).astype(int)
+    chosen = rng.integers(0, len(scene.origins), count)
+    shift, turn = SPREAD * extent * rng.uniform(-1, 1, (count, 2)), SPREAD * rng.uniform(-1, 1, count)
+    x, y = scene.directions[chosen].T
+    turned = np.stack([x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn)], 1)
+    origins, directions = (np.concatenate(parts) for parts in (
+        (scene.origins[own], scene.origins[chosen] + shift), (scene.directions[own], turned)
+    ))  # fmt: skip
+    return origins, directions
+
+
+def _extent(segments: Segments) -> float:
+    """The diagonal around them."""
+    return float(np.hypot(*np.ptp(np.concatenate([segments.start, segments.end]), axis=0)))
+
+
+def judge(paths: Paths, case: Case, u: float, offset: float = 0.0) -> dict[str, float]:
+    """What became of the rays, against the retrace; u: the roundoff, `offset`: as in `growth`.
+
+    NaN where no ray kept to its boundaries.
+    """
+    exact = case.exact
+    points, directions = (u * x for x in (growth(exact, case.segments, offset) if offset else case.bounds))
+    off = np.hypot(*(paths.points - exact.points).transpose(2, 0, 1)).astype(float)
+    # A point that is missing differs by infinity: only what the retrace does not have may be NaN.
+    off = np.where(np.isnan(exact.points[..., 0]), 0, np.nan_to_num(off, nan=np.inf))
+    turned = np.nan_to_num(np.hypot(*(unit(paths.directions) - exact.directions).T).astype(float), nan=np.inf)
+    ratio = np.maximum(np.nanmax(off / points, axis=1), turned / exact.last(directions))
+    same = paths.hits == exact.hits
+    # Of two segments that share a vertex either is right there, if it does the same to the ray.
+    same |= _at_their_vertex(paths.hits, case) & (ratio <= 1)[:, None]
+    astray = ~same.all(1) | (paths.events != exact.events).any(1)
+    near = undecided(exact, paths, case.segments, points, directions)
+    worst = np.maximum(off.max(1) / case.extent, turned)
+    return {
+        "error / bound": _largest(ratio[~astray]),
+        "difference": _largest(worst[~astray]),
+        "astray": float(astray.sum()),
+        "astray, far": float((astray & ~near).sum()),
+        "boundaries": float(exact.met.max()),
+    }
+
+
+def _at_their_vertex(hits: Array, case: Case) -> Array:
+    """Where (N × D) an exact path passes, but for rounding, the vertex that its segment and that of `hits` share."""
+    start, end = (np.asarray(x) for x in (case.segments.start, case.segments.end))
+    ours, theirs = ([x[ids] for x in (start, end)] for ids in (hits, case.exact.hits))
+    touching = 2.0**-50 * np.abs([start, end]).max()
+    there = np.zeros(hits.shape, bool)
+    for vertex in theirs:
+        shared = (vertex == ours[0]).all(2) | (vertex == ours[1]).all(2)
+        there |= shared & (np.hypot(*(case.exact.points[:, 1:] - vertex).transpose(2, 0, 1)) <= touching)
+    return there & (hits >= 0) & (case.exact.hits >= 0)
+
+
+def _largest(x: Array) -> float:
+    return float(x.max()) if len(x) else float("nan")
+
+
+def unit(d: Any) -> Array:
+    d = np.asarray(d, np.longdouble)
+    return d / np.hypot(*d.T)[:, None]

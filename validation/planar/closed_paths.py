@@ -1,0 +1,244 @@
+"""Planar, closed: paths whose end is known in closed form.
+
+A billiard in a box unfolds into a straight line by mirror images; the corners are whole numbers though no side is
+along an axis. An ellipse of eccentricity 1/n gathers rays along its axis in its far focus, and a circle around that
+lets them out of the glass unbent. A ball sends rays from a point R/n from its centre as though from n R. A prism of
+apex A deviates by i + asin(n sin(A − asin(sin i/n))) − A, a drop by π + 2 asin b − 4 asin(b/n) for its first rainbow.
+Beside the lens of arcs stands the same one in facets, of which each is off in its direction by up to half the angle
+to the next.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_refract.planar import shapes
+from mi_refract.planar.curves import Curve
+from mi_refract.planar.tracer import Event, Paths, Segments
+from mi_refract.report.row import Row
+from validation.reference import closed_forms as closed
+from validation.reference.planar_retrace import Array, Retraced
+from validation.run.array_settings import Setting, settings
+from validation.run.context import Context, Task
+
+from . import against_retrace
+from .against_retrace import Case, budgets, judge, unit
+
+TITLE = "Planar, closed answers"
+TEXT = __doc__.partition("\n")[2].strip()
+TERMS = against_retrace.TERMS | {
+    "error": "largest deviation from the closed answer: of a line from the point that it should meet, over its "
+    "distance; of a direction, |d − exact|",
+    "error / u": "the same in units of roundoff",
+    "box": "total internal reflections in a box of index 1.5, by their number; answers from mirror images",
+}
+AXES = {"x": "reflections, or facets", "y": "deviation", "x_scale": "log", "y_scale": "log", "slope": None}
+STUDY = "planar_closed"
+SEED = 2032
+REFLECTIONS = (20, 200, 2000)
+INDEX, FOCAL_LENGTH = 1.5, 9.0
+FACETS = (100, 1000, 10_000, 100_000)
+# Of the ellipse lens, in u: a place, a normal and a direction at either boundary, each rounded once in x and in y.
+SPOT = 6 * math.sqrt(2)
+
+
+@dataclass(frozen=True)
+class Closed:
+    """A case, and where its paths end: in unit `directions` (N × 2), or on lines through `point`.
+
+    `reach`: how far from the last boundary the point is, at most, and what errors are given over.
+    """
+
+    case: Case
+    directions: Array | None = None
+    point: tuple[float, float] = (0.0, 0.0)
+    reach: float = 1.0
+
+    def error(self, paths: Paths) -> Array:
+        """|d − exact| (N), or the distance of the last line from the point, over `reach`."""
+        d = unit(paths.directions)
+        if self.directions is not None:
+            return np.hypot(*(d - self.directions).T)
+        to = np.array(self.point) - self.case.exact.last(paths.points).astype(np.longdouble)
+        return np.abs(d[:, 0] * to[:, 1] - d[:, 1] * to[:, 0]) / self.reach
+
+    @property
+    def bound(self) -> Array:
+        """Of that error, over u."""
+        point, direction = map(self.case.exact.last, self.case.bounds)
+        return direction if self.directions is not None else point / self.reach + direction
+
+
+def tasks(context: Context) -> list[Task]:
+    """One task per backend and precision."""
+    return [Task(f"planar, closed: {s.label}", functools.partial(_setting_rows, s)) for s in settings(context)]
+
+
+def _setting_rows(setting: Setting) -> list[Row]:
+    if setting.vector is None:
+        return [Row(STUDY, "trace", "every answer", setting.label, reason=setting.reason)]
+    few = setting.is_scalar
+    rows = [_box_row(setting, count, 4 if few else 16) for count in REFLECTIONS]
+    rows += [_row(setting, name, make(8 if few else 500)) for name, make in CLOSED.items()]
+    return rows if few else [*rows, _curves_row(setting), _facet_row(setting)]
+
+
+def _row(setting: Setting, name: str, closed: Closed) -> Row:
+    paths = closed.case.trace(setting)
+    errors = np.nan_to_num(closed.error(paths).astype(float), nan=np.inf) / setting.roundoff
+    values = judge(paths, closed.case, setting.roundoff)
+    values |= {"error": float(errors.max() * setting.roundoff), "error / u": float(errors.max())}
+    values["error / bound"] = max(values["error / bound"], float((errors / closed.bound).max()))
+    bounds = budgets(setting) | ({"error / u": SPOT} if name == "ellipse lens" else {})
+    return Row(STUDY, "trace", name, setting.label, values, bounds, replay={"rays": len(paths.hits)})
+
+
+# The box -------------------------------------------------------------------------------------------------------
+
+SIDES = np.array([[6.0, 8.0], [-4.0, 3.0]])  # at right angles, 10 and 5 long
+
+
+@functools.cache
+def box(count: int, rays: int) -> Case:
+    """`count` total internal reflections of each ray; origins and directions exact in float32."""
+    corners = np.array([[0, 0], SIDES[0], SIDES.sum(0), SIDES[1]])
+    segments = Segments(corners, np.roll(corners, -1, 0), np.full(4, INDEX), np.ones(4))
+    rng = np.random.default_rng(SEED)
+    # Angles of incidence of 43 to 47°, beyond the critical 41.8° at all four walls.
+    angle = math.atan2(8, 6) + np.deg2rad(45 + rng.uniform(-2, 2, rays) + 90 * rng.integers(0, 4, rays))
+    origins = (rng.uniform(0.1, 0.9, (rays, 2)) @ SIDES).astype(np.float32).astype(float)
+    directions = np.stack([np.cos(angle), np.sin(angle)], 1).astype(np.float32).astype(float)
+    return Billiard("box", segments, origins, directions, count, np.zeros(rays, int))
+
+
+class Billiard(Case):
+    """Its exact paths are those of mirror images."""
+
+    @functools.cached_property
+    def exact(self) -> Retraced:
+        return unfold(self.origins, self.directions, self.max_depth)
+
+
+def unfold(origins: Array, directions: Array, count: int) -> Retraced:
+    """The path of mirror images, in extended precision: in the coordinates along SIDES the walls are whole numbers."""
+    size2 = (SIDES**2).sum(1)
+    x, v = (np.asarray(a, np.longdouble) @ SIDES.T / size2 for a in (origins, directions))
+    # When each ray's line meets the walls of either pair; then all in order.
+    walls = np.where(v > 0, 1, 0)[:, None] + np.sign(v)[:, None] * np.arange(count)[None, :, None]
+    times = ((walls - x[:, None]) / v[:, None]).reshape(len(x), -1)
+    order = np.argsort(times, axis=1)[:, :count]
+    axis, wall = order % 2, np.take_along_axis(walls.reshape(len(x), -1), order, 1)
+    straight = x[:, None] + v[:, None] * np.take_along_axis(times, order, 1)[..., None]
+    folded = np.abs((straight + 1) % 2 - 1)
+    flips = np.stack([np.cumsum(axis == i, axis=1) % 2 for i in (0, 1)], 2)
+    legs = np.concatenate([v[:, None], v[:, None] * (1 - 2 * flips)], 1) @ SIDES
+    # Walls by id: 0 and 2 along the first side, 1 and 3 along the second; whole numbers fold to 0 and 1.
+    hits = np.where(axis == 1, np.where(wall % 2 == 0, 0, 2), np.where(wall % 2 == 0, 3, 1)).astype(np.int32)
+    outward = SIDES[axis] / np.sqrt(size2)[axis][..., None] * np.where(wall % 2 == 0, 1, -1)[..., None]
+    events = np.full((len(x), count + 1), Event.REFLECTED, np.uint8)
+    events[:, -1] = Event.EXHAUSTED
+    return Retraced(
+        np.concatenate([np.asarray(origins, np.longdouble)[:, None], folded @ SIDES], 1), hits, events,
+        np.full((len(x), count + 1), np.longdouble(INDEX)), legs / np.hypot(legs[..., :1], legs[..., 1:]),
+        outward.astype(np.longdouble), np.zeros(hits.shape, np.longdouble),
+    )  # fmt: skip
+
+
+def _box_row(setting: Setting, count: int, rays: int) -> Row:
+    case = box(count, rays)
+    values = judge(case.trace(setting), case, setting.roundoff)
+    replay = {"rays": rays, "seed": SEED, "reflections": count}
+    return Row(STUDY, "trace", f"box, {count}", setting.label, values, budgets(setting), replay=replay)
+
+
+def _curves_row(setting: Setting) -> Row:
+    """The median ray's distance from its place, and the worst's, reflection by reflection."""
+    case = box(REFLECTIONS[-1], 16)
+    off = np.hypot(*(case.trace(setting).points - case.exact.points).transpose(2, 0, 1)) / case.extent
+    shown = np.unique(np.geomspace(1, REFLECTIONS[-1], 30).astype(int))
+    curves = {
+        f"place, {name}": [(float(j), float(of(off[:, j]))) for j in shown]
+        for name, of in (("median", np.median), ("worst", np.max))
+    }
+    bound = setting.roundoff / case.extent * case.bounds[0].max(0)
+    curves["bound"] = [(float(j), float(bound[j])) for j in shown]
+    values = {"place after all": curves["place, worst"][-1][1]}
+    return Row(STUDY, "trace", "box, by reflections", setting.label, values, curves=curves)
+
+
+# Lenses and prisms ---------------------------------------------------------------------------------------------
+
+
+def _case(
+    name: str, curve: Curve, index: float, origins: Array, directions: Array, depth: int, reflect: int = 0
+) -> Case:
+    """Rays to follow through a body of an index in air."""
+    segments, mask = curve.between(index, 1.0), np.full(len(origins), reflect)
+    return Case(name, segments, origins, directions, depth, mask)
+
+
+def _along_x(height: Array) -> tuple[Array, Array]:
+    return np.stack([np.full(len(height), -10.0), height], 1), np.tile([1.0, 0.0], (len(height), 1))
+
+
+@functools.cache
+def ellipse_lens(rays: int, facets: int = 0) -> Closed:
+    """Index 3/2, focal length 9, aperture 3."""
+    curve = shapes.ellipse_lens(INDEX, FOCAL_LENGTH, thickness=4.0, radius=3.0)
+    curve = curve.faceted(facets) if facets else curve
+    height = 2.9 * np.linspace(-1, 1, 2 * (rays // 2))
+    return Closed(_case("ellipse lens", curve, INDEX, *_along_x(height), depth=2), reach=FOCAL_LENGTH)
+
+
+@functools.cache
+def ball(rays: int) -> Closed:
+    """Radius 1, from the point 1/n left of the centre to the right; the virtual image is n left of it."""
+    turn = np.deg2rad(np.linspace(-50, 50, 2 * (rays // 2)))
+    origins, directions = np.tile([-1 / INDEX, 0.0], (len(turn), 1)), np.stack([np.cos(turn), np.sin(turn)], 1)
+    case = _case("aplanatic ball", shapes.circle(1.0), INDEX, origins, directions, depth=1)
+    return Closed(case, point=(-INDEX, 0.0), reach=1 + INDEX)
+
+
+@functools.cache
+def rainbow(rays: int) -> Closed:
+    """A drop of index 4/3, its rays reflected once within."""
+    n, b = 4 / 3, 0.98 * np.linspace(-1, 1, 2 * (rays // 2))
+    case = _case("rainbow", shapes.circle(1.0), n, *_along_x(b), depth=3, reflect=2)
+    return Closed(case, _unit_at(-closed.deflection(np.arcsin(b.astype(np.longdouble)), n, 1)))
+
+
+@functools.cache
+def prism(rays: int) -> Closed:
+    """Apex 60°, from 32° of incidence (nearly total reflection within) to 85°; the least deviation is at 48.6°."""
+    curve, apex = shapes.prism(60.0, 2.0), closed.HALF_TURN / 3
+    i = np.deg2rad(np.linspace(32, 85, rays)).astype(np.longdouble)
+    deviation = closed.deviation(i, apex, INDEX)
+    directions = _unit_at(i - apex / 2).astype(float)
+    # Through a place on the left side, high enough that all leave by the right one.
+    origins = 0.75 * curve.vertices[2] + 0.25 * curve.vertices[0] - directions
+    return Closed(_case("prism", curve, INDEX, origins, directions, depth=2), _unit_at(i - apex / 2 - deviation))
+
+
+def _unit_at(angle: Array) -> Array:
+    return np.stack([np.cos(angle), np.sin(angle)], 1)
+
+
+CLOSED = {"ellipse lens": ellipse_lens, "aplanatic ball": ball, "rainbow": rainbow, "prism": prism}
+
+
+def _facet_row(setting: Setting) -> Row:
+    """The spot of the lens in facets, beside that of arcs."""
+    spots = [(float(m), _spot(setting, m)) for m in FACETS]
+    arcs = _spot(setting, 0)
+    curves = {"facets": spots, "arcs": [(m, arcs) for m, _ in spots]}
+    values, case = {"error": spots[-1][1], "arcs": arcs}, "ellipse lens, by facets"
+    return Row(STUDY, "trace", case, setting.label, values, replay={"facets": FACETS}, curves=curves)
+
+
+def _spot(setting: Setting, facets: int) -> float:
+    closed = ellipse_lens(40, facets)
+    return float(np.max(np.nan_to_num(closed.error(closed.case.trace(setting)), nan=np.inf)))

@@ -1,0 +1,84 @@
+"""How far rounding takes a path: what each boundary adds, carried on to first order.
+
+A ray that is off by h across itself (to its left) and by φ in its angle is off, behind a boundary and L farther on, by
+
+    h' = h d'_n/d_n + L φ',    φ' = g φ − (1 − g) κ h/d_n,    g = n d_n/(n' d'_n)
+
+where d and d' are its directions before and behind, the index n stands for normal components (of a reflection g = −1),
+and κ is the curvature. Each boundary adds, in units of ROUNDINGS · u,
+
+    to h: S (1 + |d'_n/d_n| + |d × d'|/|d_n|)          to φ: 1 + |g| + 1/|d'_n| + |1 − g| S/ℓ
+
+S: the largest coordinate so far, of the path and of the segments it met, for coordinates are rounded to u S, and with
+them the ends of a segment of length ℓ, which turns by S/ℓ; 1/|d'_n|: a cosine as √(1 − X²). The sum of the magnitudes
+bounds what they all do. It holds as long as the path meets the boundaries that it should.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mi_refract.planar.tracer import Segments
+from validation.reference.planar_retrace import Array, Retraced
+
+ROUNDINGS = 2  # of the operands, and of the result
+
+
+def growth(path: Retraced, segments: Segments, offset: float = 0.0) -> tuple[Array, Array]:
+    """Bounds of the errors of points and of the legs' directions (N × (D+1) each), over u; NaN after the end.
+
+    `offset`: how far rays are moved along the normal behind a boundary, over u (1 + max |p|).
+    """
+    g, h_factor, phi_factor, cos = (x.astype(float) for x in _transfer(path))
+    unit, size = float(ROUNDINGS), _sizes(path, segments)
+    added_h, added_phi = _added(path, segments, g, size)
+    shift = (1 + np.abs(path.points[:, 1:]).max(2)) * np.abs(_cross(path.normals, path.legs[:, 1:]))
+    shift = offset * shift.astype(float)
+    leg = np.hypot(*np.diff(path.points, axis=1).transpose(2, 0, 1)).astype(float)
+    points, directions = np.full((2, *path.points.shape[:2]), np.nan)
+    points[:, 0], directions[:, 0] = unit * size[:, 0], unit
+    none = np.zeros(len(points))
+    # One column per rounding so far: what it has become.
+    h, phi = np.stack([points[:, 0], none], 1), np.stack([none, directions[:, 0]], 1)
+    for j, met in enumerate((path.hits >= 0).T):
+        if not met.any():
+            break
+        h = h + leg[:, j, None] * phi
+        reach = (np.abs(h).sum(1) + unit * size[:, j + 1] * (1 + cos[:, j])) / cos[:, j]
+        points[:, j + 1] = np.where(met, reach, np.nan)
+        phi = g[:, j, None] * phi + phi_factor[:, j, None] * h
+        h = np.column_stack([h_factor[:, j, None] * h, unit * added_h[:, j] + shift[:, j], none])
+        phi = np.column_stack([phi, none, unit * added_phi[:, j]])
+        directions[:, j + 1] = np.where(met, np.abs(phi).sum(1), np.nan)
+    return points, directions
+
+
+def _transfer(path: Retraced) -> tuple[Array, Array, Array, Array]:
+    """g, what h and φ take from h, and |d_n| (N × D each)."""
+    before, behind = ((legs * path.normals).sum(2) for legs in (path.legs[:, :-1], path.legs[:, 1:]))
+    # A ray that ends where it is contradicted goes on as it came.
+    g = np.nan_to_num(path.indices[:, :-1] * before / (path.indices[:, 1:] * behind), nan=1)
+    return g, behind / before, (g - 1) * path.curvatures / before, np.abs(before)
+
+
+def _added(path: Retraced, segments: Segments, g: Array, size: Array) -> tuple[Array, Array]:
+    """What each boundary adds to h and to φ, in units."""
+    before, behind = path.legs[:, :-1], path.legs[:, 1:]
+    cos, cos_behind = (np.abs((d * path.normals).sum(2)) for d in (before, behind))
+    length = np.hypot(*(np.asarray(segments.end) - segments.start).T)[path.hits]
+    to_h = size[:, 1:] * (1 + (cos_behind + np.abs(_cross(before, behind))) / cos)
+    to_phi = 1 + np.abs(g) + 1 / cos_behind + np.abs(1 - g) * size[:, 1:] / length
+    return to_h.astype(float), to_phi.astype(float)
+
+
+def _sizes(path: Retraced, segments: Segments) -> Array:
+    """The largest coordinate so far, N × (D+1); of the path and of the segments it met."""
+    corners = [np.abs(x).max(1) for x in (segments.start, segments.end, segments.control) if x is not None]
+    largest = np.max([np.nan_to_num(x) for x in corners], axis=0)
+    own = np.abs(path.points).max(2)
+    own[:, 1:] = np.maximum(own[:, 1:], np.where(path.hits >= 0, largest[path.hits], np.nan))
+    return np.maximum.accumulate(own, axis=1).astype(float)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

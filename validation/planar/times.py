@@ -1,0 +1,171 @@
+"""Planar, times: paths through the lens of document 004, against the number of segments.
+
+Parallel rays pass two boundaries each; beyond a thousand segments there are more lenses, and rays through any of them.
+A path is all of `Tracer.__call__`, from arrays of rays to arrays of points.
+Methods and sizes take turns, and medians of the rounds count, with 95 % intervals. Seconds are this machine's, so they
+have goals and no budgets; what has a budget is that both methods return the same bits. Grown like log M, the cost of
+a doubling of the segments is constant: it is what a straight line through the cost against log₂ M says.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_refract.planar import shapes
+from mi_refract.planar.tracer import Array, Paths, Segments, Tracer
+from mi_refract.report.row import Row
+from validation.run import kernel_timing
+from validation.run.array_settings import Setting, settings
+from validation.run.context import Context, Task
+
+TITLE = "Planar, times"
+TEXT = __doc__.partition("\n")[2].strip()
+TERMS = {
+    "µs per path": "median time of a path of two boundaries; low, high: its 95 % interval",
+    "ms to compile": "of the first call, what the later ones do not take; 0 where a kernel was kept",
+    "ms to set up": "of the segments, once: tables, and the mesh",
+    "differing": "paths of which a bit differs between the two methods",
+    "per doubling": "what twice as many segments add to a path, over the path at a thousand; beyond a thousand",
+    "most over a thousand": "the cost of a path among the most segments over that among a thousand",
+    "shuffled": "rays in no order; else they come lens by lens, from one side of each to the other",
+    "M": "segments; 1172 are those of the original program",
+}
+AXES = {"x": "segments", "y": "µs per path", "x_scale": "log", "y_scale": "log", "slope": None}
+STUDY = "planar_times"
+SEED = 2033
+ORIGINAL = 0.05  # its resolution, 1172 segments
+SIZES = (10, 100, 1000, 10_000, 100_000, 1_000_000)
+BRUTE_SIZES = (0, 10, 100, 1000)
+ROUNDS = {"quick": 7, "full": 21}
+GOALS = {  # with two cores
+    ("llvm float32", "document 004"): {"µs per path": 0.1},
+    ("llvm float32", "M = 1000000"): {"µs per path": 1.0},
+}
+MESH, BRUTE = "mesh", "brute"
+# The method, whether rays are shuffled, and how many times fewer of them there are.
+METHODS = {MESH: (MESH, False, 1), "mesh, shuffled": (MESH, True, 16), BRUTE: (BRUTE, False, 64)}
+BOUNDARIES = 2
+
+
+def tasks(context: Context) -> list[Task]:
+    """One task per backend and precision."""
+    return [Task(f"planar, times: {s.label}", functools.partial(_setting_rows, context, s)) for s in settings(context)]
+
+
+def _setting_rows(context: Context, setting: Setting) -> list[Row]:
+    if setting.vector is None:
+        return [Row(STUDY, "trace", "every size", setting.label, reason=setting.reason)]
+    return measure(context, setting, SIZES[:1] if setting.is_scalar else SIZES)
+
+
+@dataclass(frozen=True)
+class Field:
+    """`side`² copies of the lens; their middles are whole multiples of `pitch` (2,)."""
+
+    segments: Segments
+    side: int
+    pitch: Array
+
+    def beam(self, count: int, shuffled: bool) -> tuple[Array, Array]:
+        """Rays along the axis of any of the lenses, all over the aperture in which they meet two boundaries of it."""
+        rng = np.random.default_rng(SEED)
+        lens = np.sort(rng.integers(0, self.side**2, count))
+        x = rng.uniform(-6, 6, count)
+        x = x[np.lexsort([x, lens])] + self.pitch[0] * (lens % self.side)
+        origins = np.stack([x, self.pitch[1] * (lens // self.side - 0.5)], 1)
+        return rng.permutation(origins) if shuffled else origins, np.tile([0.0, 1.0], (count, 1))
+
+
+@functools.cache
+def field(size: int) -> Field:
+    """About `size` segments, on lenses of a thousand; 0: the one lens, as the original cuts it."""
+    side = max(1, round(math.sqrt(size / 1000)))
+    curve = shapes.document_lens().faceted(size // side**2) if size else shapes.document_lens(ORIGINAL)
+    pitch = 1.2 * np.ptp(curve.vertices, axis=0)
+    places = pitch * np.stack(np.meshgrid(*[np.arange(side)] * 2), 2).reshape(-1, 1, 2)
+    start, end = ((places + x).reshape(-1, 2) for x in (curve.start, curve.end))
+    media = np.full(len(start), shapes.LENS_INDEX), np.ones(len(start))
+    return Field(Segments(start, end, *media), side, pitch)
+
+
+def measure(context: Context, setting: Setting, sizes: tuple[int, ...]) -> list[Row]:
+    """A row per method and size, and the curves."""
+    count = context.profile.scalar_rays if setting.is_scalar else context.profile.streamed_rays // 4
+    pairs = [(m, s) for s in (0, *sizes) for m in METHODS if m != BRUTE or s in BRUTE_SIZES]
+    tracers = functools.cache(functools.partial(_tracer, setting))
+    runs = {f"{method}, {size}": Run(tracers, method, size, count) for method, size in pairs}
+    for name, seconds in kernel_timing.rounds(runs, Run.clock, ROUNDS[context.profile.name]).items():
+        runs[name].take(seconds)
+    rows = [_row(setting, run, runs.get(f"{BRUTE}, {run.size}")) for run in runs.values()]
+    return rows if setting.is_scalar else [*rows, _growth_row(setting, list(runs.values()))]
+
+
+def _row(setting: Setting, run: Run, brute: Run | None) -> Row:
+    case, budgets, goals = f"M = {run.size}" if run.size else "document 004", {}, {}
+    if run.method == MESH:
+        goals = GOALS.get((setting.label, case), {})
+        if brute:
+            run.values["differing"] = float(differing(run.tracer(*brute.rays, BOUNDARIES), brute.paths()))
+            budgets = {"differing": 0.0}
+    replay = {"rays": len(run.rays[0]), "seed": SEED, "segments": len(field(run.size).segments)}
+    return Row(STUDY, run.method, case, setting.label, run.values, budgets, goals, replay=replay)
+
+
+def _tracer(setting: Setting, method: str, size: int) -> tuple[Tracer, float]:
+    """And the seconds that it took."""
+    segments, precision, start = field(size).segments, np.dtype(setting.precision).name, time.perf_counter()
+    tracer = Tracer(segments, precision=precision, backend=setting.backend, method=method)
+    return tracer, time.perf_counter() - start
+
+
+class Run:
+    """A tracer called once; `values`: how long it took to set up, and what is measured later."""
+
+    def __init__(self, tracers: Callable[[str, int], tuple[Tracer, float]], method: str, size: int, count: int) -> None:
+        kind, shuffled, fewer = METHODS[method]
+        self.method, self.size = method, size
+        self.rays = field(size).beam(max(count // fewer, 1), shuffled)
+        self.tracer, seconds = tracers(kind, size)
+        self.values = {"ms to set up": seconds * 1e3}
+        self.first = self.clock()
+
+    def take(self, seconds: list[float]) -> None:
+        """The times of later calls."""
+        self.values = kernel_timing.interval("µs per path", [t / len(self.rays[0]) * 1e6 for t in seconds]) | self.values
+        self.values["ms to compile"] = 1e3 * max(0.0, self.first - float(np.median(seconds)))
+
+    def paths(self) -> Paths:
+        return self.tracer(*self.rays, BOUNDARIES)
+
+    def clock(self) -> float:
+        start = time.perf_counter()
+        self.paths()
+        return time.perf_counter() - start
+
+
+def differing(some: Paths, others: Paths) -> int:
+    """Rays of which a point, a direction, a hit or an event is not the same to the bit."""
+    same = np.ones(len(some.hits), bool)
+    for name in ("points", "directions", "hits", "events"):
+        x, y = (np.ascontiguousarray(getattr(paths, name)) for paths in (some, others))
+        bits = np.dtype(f"u{x.dtype.itemsize}")
+        same &= (x.view(bits) == y.view(bits)).reshape(len(same), -1).all(1)
+    return int((~same).sum())
+
+
+def _growth_row(setting: Setting, runs: list[Run]) -> Row:
+    """µs per path against the number of segments, method by method."""
+    curves = {
+        method: [(float(run.size), run.values["µs per path"]) for run in runs if run.method == method and run.size]
+        for method in METHODS
+    }
+    size, cost = np.array([point for point in curves[MESH] if point[0] >= 1000]).T
+    slope = np.polyfit(np.log2(size), cost, 1)[0]
+    found = {"per doubling": float(slope / cost[0]), "most over a thousand": float(cost[-1] / cost[0])}
+    return Row(STUDY, "every method", "µs per path", setting.label, found, curves=curves)

@@ -1,0 +1,81 @@
+"""A second exact answer, a thousand times faster than the certified one: it says which rays are worth certifying.
+
+Snell's law for the exact inputs in unevaluated sums of floats (`expansions`), for float32 and float64 alike, with none
+of the arithmetic of the formulas it judges:
+
+    b = k a + n (s √D − k c)/n²,   b = a − 2 c n/n² under total internal reflection
+    c = n·a,   D = c² − (k² − 1)|n×a|²,   s = sign(c)
+
+D is right to 2⁻¹⁴⁰ of its terms, so √D to 2⁻⁷⁰ of theirs at the critical angle itself; all else to 2⁻⁹⁰ k |a|.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract.formulas.bounds import Budget
+from mi_refract.numerics import float_expansions
+from mi_refract.regimes import Rays
+from validation.directions.judge import Subject
+
+# The screen's own resolution. Below it, and where a component of float64 is denormal and decides, it has guessed.
+RESOLUTION = 2.0**-140
+_UNDERFLOW = 2.0**-900
+
+
+class Screen:
+    """The answers for `rays` as vectors of type `vector`, a Dr.Jit 3-vector of a vectorised backend.
+
+    `margin`: D/(c² + |κ||n×a|²), within a factor of 2 of `oracle.margin`; `cos_i`: |n·a|/|n||a| and `cos_t` to a few
+    u of float64; `doubtful`: transmission was not resolved.
+    """
+
+    def __init__(self, rays: Rays, vector: Any) -> None:
+        self.rays, self.roundoff = rays, float(np.finfo(rays.k.dtype).eps) / 2
+        self._inputs = vector(rays.a.T), vector(rays.n.T), dr.value_t(vector)(rays.k)
+        dr.eval(self._inputs)
+        wide: Any = dr.float64_array_t(vector)
+        # Widened here: Dr.Jit's threads take denormal numbers for 0.
+        a, n, k = (x.T.astype(np.float64) for x in (rays.a, rays.n, rays.k))
+        self._a = wide(a)
+        solved = _solve(self._a, wide(n), dr.value_t(wide)(k))
+        self._high, self._low, self._transmitted, c, root, margin, unresolved = solved
+        dr.eval(solved)
+        tiny = ((np.abs((a, n)) < _UNDERFLOW) & (np.array((a, n)) != 0)).any(axis=(0, 1))
+        self.margin, c = np.array(margin), np.abs(np.array(c))
+        lengths = np.array(dr.norm(self._a) * dr.norm(wide(n)))
+        self.cos_i, self.cos_t = c / lengths, np.array(root) / lengths
+        self.doubtful = np.array(unresolved) | tiny & (c < _UNDERFLOW)
+
+    def judge(self, subject: Subject) -> tuple[np.ndarray, np.ndarray]:
+        """(chord error in u, infinite where it is NaN; whether the decision differs) of every ray."""
+        b, transmitted = subject(*self._inputs)
+        error = dr.norm((type(self._a)(b) - self._high) - self._low) / dr.norm(self._a)
+        chord = np.array(dr.select(dr.isfinite(error), error, dr.inf)) / self.roundoff
+        return chord, np.array(transmitted != self._transmitted)
+
+    def bound(self, budget: Budget) -> np.ndarray:
+        """In u, the bound of every ray's chord, as if it were unit to the last bit."""
+        k, transmitted = self.rays.k.astype(np.float64), np.array(self._transmitted)
+        return budget.chord(self.roundoff, k, self.cos_t, transmitted, cos_i=self.cos_i) / self.roundoff
+
+
+def _solve(a: Any, n: Any, k: Any) -> tuple[Any, ...]:
+    c, d, terms = float_expansions.radicand(a, n, k)
+    transmitted = (d[0] >= 0) & (c[0] != 0)
+    root = dr.sqrt(dr.select(d[0] > 0, d[0], 1))
+    defect = float_expansions.distil([d[0], d[1], *float_expansions.negated(float_expansions.two_prod(root, root))], 2)
+    positive = d[0] > 0
+    roots = [dr.select(positive, root, 0), dr.select(positive, defect[0] / (2 * root), 0)]
+    scale = dr.select(transmitted, k, 1)
+    along = [dr.select(transmitted, dr.mulsign(r, c[0]), -c_i) for r, c_i in zip(roots, c[:2], strict=True)]
+    difference = float_expansions.distil([*along, *float_expansions.negated(float_expansions.product(c, [scale]))], 2)
+    factor = float_expansions.quotient(difference, float_expansions.dot(n, n))
+    parts = [(*float_expansions.two_prod(scale, a[i]), *float_expansions.product(factor, [n[i]])) for i in range(3)]
+    b = [float_expansions.distil(part, 2) for part in parts]
+    unresolved = (c[0] != 0) & (dr.abs(d[0]) <= RESOLUTION * terms)
+    high, low = (type(a)(*(x[i] for x in b)) for i in (0, 1))
+    return high, low, transmitted, c[0], roots[0], d[0] / terms, unresolved

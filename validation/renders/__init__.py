@@ -1,0 +1,1 @@
+"""Study of `refract` against `dielectric` in renders."""

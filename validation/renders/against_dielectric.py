@@ -1,0 +1,179 @@
+"""Renders: every scene with `refract` and with `dielectric`, same seeds and independent seeds, and what it costs.
+
+Same seed: both plugins consume the same random numbers, so pictures agree but for last bits and the lobe decisions
+those flip. Independent seeds: Welch's t-test on tiles. The error of a picture is relMSE against the mean of the
+built-in's other renders, less that mean's own variance. Times are of warm renders of at least a tenth of a second, the
+plugins in turn; below that the time to trace a plugin written in Python, half a millisecond a render, begins to count.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import statistics
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract.formulas.documented import FORMULAS, automatic
+from mi_refract.image_diff import methods as compare
+from mi_refract.io import image_file
+from mi_refract.plugins.refract import PLUGIN
+from mi_refract.report.row import Row
+from validation.run import kernel_timing
+from validation.run.context import NO_REFERENCE, SCENES, Context, Profile, Task
+from validation.run.render_methods import DIELECTRIC as BUILTIN
+from validation.run.render_methods import Camera, opened
+
+TITLE = "Renders"
+TERMS = {
+    "reference, test, difference": "dielectric, refract, refract − dielectric: means over the same seeds",
+    "changed share": "pixels of which any channel differs by more than 1e-5, same seeds",
+    "Welch alarms": "tiles and channels whose means differ, independent seeds; at most one picture in 1000 by chance",
+    "detectable difference": "relative difference of a tile's mean that would have been an alarm, median over tiles",
+    "time / dielectric": "median over alternating warm renders, a goal, not a budget, because a busy machine spoils "
+    "it; with a name: of the plugin with that formula; low, high: the 95 % interval",
+}
+AXES = {"x": "seconds", "y": "relMSE", "slope": -1}  # relMSE is a variance
+TEXT = __doc__.partition("\n")[2].strip()
+# Paths in these scenes are short: a difference in the last bit stays one, unless it flips the choice of a lobe.
+SHORT_PATHS = {"sphere", "slab", "prism", "furnace"}
+Curves = dict[str, list[tuple[float, float]]]
+CHANGED = 1e-5
+TILE = 16
+CURVE_SEEDS = 2
+MARGIN = 1e-5  # relative: float32 pictures that differ by less are equal
+TIMED = 0.1  # seconds of a render whose time counts
+FAMILY_ERROR = 1e-3  # of Welch's test, per scene, after Šidák: 1 false alarm in 1000 pictures that are equal
+
+
+def tasks(context: Context) -> list[Task]:
+    """One task per scene and plugin of ours."""
+    plugins = [PLUGIN] + [f"{PLUGIN}_{name}" for name in FORMULAS if context.profile.every_formula]
+    return [
+        Task(f"renders: {path.stem}, {plugin}", functools.partial(_compare, context, path, plugin))
+        for path in sorted(SCENES.glob("*.xml"))
+        for plugin in plugins
+    ]
+
+
+def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
+    profile, scene = context.profile, path.stem
+    cameras = {name: Camera(opened(path, name, profile.resolution)) for name in (plugin, BUILTIN)}
+    test, reference = _pictures(profile, *cameras.values())
+    half = profile.pairs // 2
+    values, left_out = _paired(test, reference), no_question(test, reference)
+    if not left_out:
+        values |= _independent(test[:half], reference[half:])
+    # Both forms at the rounding limit are timed, whichever of them is the default.
+    others = _at_the_limit() if plugin == PLUGIN else []
+    values |= _times(profile, cameras | {name: Camera(opened(path, name, profile.resolution)) for name in others})
+    # A Python plugin costs a call per operation in scalar variants: its time is demanded of compiled ones only.
+    compiled = not context.variant.startswith("scalar")
+    goals = {metric: 1.0 for metric in values if metric in _metrics([plugin, *others])} if compiled else {}
+    replay = {
+        "scene": path.name, "plugin": plugin, "variant": context.variant, "resolution": profile.resolution,
+        "spp": profile.spp, "seeds": profile.pairs,
+    }  # fmt: skip
+    pictures = _save(context, replay, test.mean(0), reference.mean(0))
+    remark = NO_REFERENCE.get(scene, left_out)
+    noisy = reference.std(0).max() >= CHANGED
+    curves = _curves(context, cameras, reference) if plugin == PLUGIN and noisy and scene not in NO_REFERENCE else {}
+    return [
+        Row("renders", plugin, scene, context.variant, values, _budgets(scene, left_out), goals, remark, replay,
+            pictures, curves)
+    ]  # fmt: skip
+
+
+def _budgets(scene: str, left_out: str) -> dict[str, float]:
+    if scene in NO_REFERENCE:
+        return {}
+    budgets = {"|mean ratio − 1|": 1e-4} | ({} if left_out else {"Welch alarms": 0.0})
+    return budgets | ({"changed share": 1e-3} if left_out or scene in SHORT_PATHS else {})
+
+
+def _pictures(profile: Profile, *cameras: Camera) -> list[np.ndarray]:
+    """Of each camera, one picture a seed."""
+    return [np.stack([camera(profile.spp, seed)[0] for seed in range(profile.pairs)]) for camera in cameras]
+
+
+def _at_the_limit() -> list[str]:
+    """The plugins with those formulas at the rounding limit that are not the default."""
+    import mitsuba as mi
+
+    default = automatic(dr.backend_v(mi.Float))
+    return [f"{PLUGIN}_{name}" for name, formula in FORMULAS.items() if formula.budget.at_the_limit and name != default]
+
+
+def _times(profile: Profile, cameras: dict[str, Camera]) -> dict[str, float]:
+    """Values "time / dielectric" of the first camera, and by name of the others; the built-in's is not shown."""
+    import mitsuba as mi
+
+    _, seconds = cameras[BUILTIN](profile.spp, seed=0)
+    spp = profile.spp
+    if dr.is_jit_v(mi.Float):  # a scalar plugin costs calls per sample: no number of them outweighs those
+        spp *= 2 ** max(0, math.ceil(math.log2(TIMED / seconds)))
+    found = kernel_timing.rounds(cameras, lambda camera: camera(spp, seed=0)[1], profile.repeats)
+    ours = [name for name in cameras if name != BUILTIN]
+    values = {"timed renders": float(profile.repeats), "timed spp": float(spp)}
+    for name, metric in zip(ours, _metrics(ours), strict=True):
+        values |= kernel_timing.ratio(metric, found[name], found[BUILTIN])
+    return values
+
+
+def _metrics(plugins: list[str]) -> list[str]:
+    others = [f"time / {BUILTIN}, {name.removeprefix(PLUGIN + '_')}" for name in plugins[1:]]
+    return [f"time / {BUILTIN}", *others]
+
+
+def _paired(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    """Same seeds, picture by picture."""
+    found = compare.paired(reference.reshape(-1, *reference.shape[2:]), test.reshape(-1, *test.shape[2:]), CHANGED)
+    return {
+        "changed share": found.changed,
+        "largest change": found.largest,
+        "RMSE": found.rmse,
+        "|mean ratio − 1|": abs(found.mean_ratio - 1),
+    }
+
+
+def no_question(test: np.ndarray, reference: np.ndarray) -> str:
+    """Why Welch's test has nothing to ask: what is the same needs no statistics; "" where it has."""
+    if np.array_equal(test, reference):
+        return "left out: Welch's test, because pictures of the same seed are identical bit for bit"
+    if reference.std(0).max() < CHANGED and test.std(0).max() < CHANGED:  # two conditions: NaN is below nothing
+        return "left out: Welch's test and error against time, because independent seeds give the same picture"
+    return ""
+
+
+def _independent(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    found = compare.welch(reference, test, TILE, FAMILY_ERROR, MARGIN)
+    return {
+        "Welch alarms": float(found.alarms),
+        "smallest p, adjusted": found.smallest_p,
+        "detectable difference": found.detectable,
+    }
+
+
+def _curves(context: Context, cameras: dict[str, Camera], reference: np.ndarray) -> Curves:
+    """relMSE against seconds at growing samples per pixel, both plugins in turn; seeds the reference has not seen."""
+    curves: Curves = {name: [] for name in cameras}
+    for spp in context.profile.curve_spp:
+        for name, camera in cameras.items():
+            points = [camera(spp, seed=context.profile.pairs + i) for i in range(CURVE_SEEDS)]
+            error = statistics.fmean(compare.relative_mse(picture, reference) for picture, _ in points)
+            curves[name].append((statistics.median(seconds for _, seconds in points), error))
+    return curves
+
+
+def _save(context: Context, settings: dict[str, Any], test: np.ndarray, reference: np.ndarray) -> dict[str, str]:
+    folder = Path("pictures") / Path(settings["scene"]).stem
+    (context.out / folder).mkdir(parents=True, exist_ok=True)
+    saved = {}
+    for role, picture in (("reference", reference), ("test", test), ("difference", test - reference)):
+        name = f"{BUILTIN}.exr" if role == "reference" else f"{settings['plugin']} {role}.exr"
+        image_file.write_exr(context.out / folder / name, picture.astype(np.float32), metadata=settings | {"role": role})
+        saved[role] = str(folder / name)
+    return saved

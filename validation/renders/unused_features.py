@@ -1,0 +1,391 @@
+"""Features: what each costs in a kernel, what a scene of many glasses costs, and what an edit of the index costs.
+
+A feature that is not used must not be in the kernel: the plugin's `sample` is traced alone, with and without it, and
+Dr.Jit's operations are counted. Renders are of glass balls side by side under a spotted sky, each with an index of its
+own. A first image is one that no cache knows: the scene's `max_depth`, a literal of the kernel, was never used before.
+Dr.Jit compiles what a scene might call for every plugin that is alive, so each scene is measured alone.
+"""
+
+from __future__ import annotations
+
+import functools
+import gc
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract.formulas.documented import FORMULAS
+from mi_refract.plugins.refract import LOBES, PLUGIN
+from mi_refract.report.row import Row
+from validation.run import kernel_timing
+from validation.run.context import SCENES, Context, Task
+from validation.run.render_methods import opened
+
+TITLE = "What a scene does not use"
+TERMS = {
+    "operations": "Dr.Jit's count for the whole kernel; of `sample` alone, or of a render",
+    "added": "operations more than those of the plain plugin, in radiance mode, with both lobes",
+    "compiled": "kernels that no cache had, in all images after the first",
+    "first image": "seconds from a loaded scene to its picture, kernels compiled; over the built-in's, median of "
+    "alternating pairs; low, high: its 95 % interval, or the extremes of a few pairs",
+    "edit": "the same for one index edited, to the next picture",
+    "boundaries": "surfaces that a path from the camera meets on average, without roulette",
+    "call": "seconds of one call of `sample`, over the built-in's",
+    "frozen": "an image by a function under `dr.freeze`, over the same one traced anew; warm",
+    "off after an edit": "largest difference between the two after an index was edited: 0, or the frozen one is stale",
+}
+TEXT = __doc__.partition("\n")[2].strip()
+STUDY = "features"
+BUILTIN = "dielectric"
+RAYS = 1024
+RESOLUTION = 32
+SEED = 2026
+GLASSES = (1, 16, 64, 1000)
+FIRST_IMAGE_GOALS = {64: 0.6, 1000: 0.15}
+EDIT_GOAL = 0.2
+PAIRS = 5
+CALLS = 2000
+STEPS = 4  # of an optimisation
+UNCHANGED = 1e-5  # of a pixel: the order in which samples are added up
+SCALAR = "scalar variants have no kernels"
+
+
+def tasks(context: Context) -> list[Task]:
+    calls = Task("features: scalar calls", functools.partial(scalar_rows, context))
+    if context.variant.startswith("scalar"):
+        return [Task("features", lambda: [Row(STUDY, PLUGIN, "kernels", context.variant, reason=SCALAR)]), calls]
+    return [
+        Task("features: operations", functools.partial(operation_rows, context)),
+        Task("features: glasses", functools.partial(glass_rows, context)),
+        Task("features: optimisation", functools.partial(optimisation_rows, context)),
+        *(Task(f"features: first image, {n} glasses", functools.partial(first_image_rows, context, n))
+          for n in FIRST_IMAGE_GOALS),
+        Task("features: edit", functools.partial(edit_rows, context)),
+        Task("features: frozen", functools.partial(frozen_rows, context)),
+        Task("features: boundaries", functools.partial(boundary_rows, context)),
+        calls,
+    ]  # fmt: skip
+
+
+def kernels(work: Callable[[], Any]) -> list[dict[str, Any]]:
+    """Dr.Jit's record of the kernels that `work` launches."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        dr.eval(work())
+        dr.sync_thread()
+        return [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
+
+
+def compiled(work: Callable[[], Any]) -> float:
+    """How many kernels no cache in memory had."""
+    return float(sum(not entry["cache_hit"] for entry in kernels(work)))
+
+
+def seconds_of(work: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    dr.eval(work())
+    dr.sync_thread()
+    return time.perf_counter() - start
+
+
+# `sample` alone ------------------------------------------------------------------------------------------------
+
+
+def operations(plugin: str, parameters: dict[str, Any] | None = None, component: int | None = None,
+               importance: bool = False, differentiate: bool = False) -> float:  # fmt: skip
+    """Of a kernel that computes all of what `sample` returns, of directions and samples in memory."""
+    import mitsuba as mi
+
+    bsdf = mi.load_dict({"type": plugin, "int_ior": 1.5, "ext_ior": 1.0} | (parameters or {}))
+    if differentiate:
+        params = mi.traverse(bsdf)
+        dr.enable_grad(params["eta"])
+        params.update()
+    asked = mi.BSDFContext(mi.TransportMode.Importance if importance else mi.TransportMode.Radiance)
+    if component is not None:
+        asked.component = component
+    si: Any = dr.zeros(mi.SurfaceInteraction3f)
+    x, y = (dr.linspace(mi.Float, low, 0.6, RAYS) for low in (-0.6, -0.1))
+    si.wi, si.uv = dr.normalize(mi.Vector3f(x, y, 0.5 * x + y)), mi.Point2f(dr.abs(x), dr.abs(y))
+    sample = dr.linspace(mi.Float, 0, 1, RAYS)
+    dr.eval(si.wi, si.uv, sample)
+    return float(max(entry["operation_count"] for entry in kernels(lambda: bsdf.sample(asked, si, sample, [0, 0]))))
+
+
+@contextmanager
+def under(variant: str) -> Iterator[None]:
+    """Another variant of Mitsuba for a while."""
+    import mitsuba as mi
+
+    before: Any = mi.variant()
+    mi.set_variant(variant)
+    try:
+        yield
+    finally:
+        mi.set_variant(before)
+
+
+def scalar_rows(context: Context) -> list[Row]:
+    """What a call of `sample` takes where nothing is compiled: a Python plugin's calls, against the built-in's C++."""
+    import mitsuba as mi
+
+    with under("scalar_rgb"):
+        si: Any = dr.zeros(mi.SurfaceInteraction3f)
+        si.wi = mi.Vector3f(0.6, 0, 0.8)
+        asked = mi.BSDFContext()
+        bsdfs = {name: mi.load_dict({"type": name, "int_ior": 1.5, "ext_ior": 1.0}) for name in (PLUGIN, BUILTIN)}
+
+        def clock(name: str) -> float:
+            bsdf, start = bsdfs[name], time.process_time()
+            for _ in range(CALLS):
+                bsdf.sample(asked, si, 0.5, [0, 0])
+            return time.process_time() - start
+
+        seconds = kernel_timing.rounds({name: name for name in bsdfs}, clock, PAIRS)
+    values = kernel_timing.ratio(f"call / {BUILTIN}", seconds[PLUGIN], seconds[BUILTIN])
+    return [Row(STUDY, PLUGIN, "a call of sample", "scalar_rgb", values, replay={"calls": CALLS})]
+
+
+def bitmap() -> dict[str, Any]:
+    import mitsuba as mi
+
+    return {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32))}
+
+
+def operation_rows(context: Context) -> list[Row]:
+    """One row a feature, with the built-in's own where it has it."""
+    plain = {plugin: operations(plugin) for plugin in (PLUGIN, BUILTIN)}
+
+    def row(case: str, shared: bool = True, less: bool = False, variant: str = context.variant, **asked: Any) -> Row:
+        """`less`: asked for less, the plugin must leave out at least as many operations as the built-in."""
+        values: dict[str, float] = {}
+        for plugin, name in ((PLUGIN, ""), (BUILTIN, f", {BUILTIN}"))[: 2 if shared else 1]:
+            with under(variant):
+                count = operations(plugin, **asked)
+            values |= {f"operations{name}": count, f"added{name}": count - plain[plugin]}
+        budgets = {"added": values[f"added, {BUILTIN}"]} if less else {}
+        goals = {"operations": plain[BUILTIN]} if case == "plain" else {}
+        replay = {"rays": RAYS} | {key: str(value) for key, value in asked.items()}
+        return Row(STUDY, PLUGIN, case, variant, values, budgets, goals, replay=replay)
+
+    rows = [
+        row("plain"),
+        row("reflection only", less=True, component=0),
+        row("transmission only", less=True, component=1),
+        row("importance mode", less=True, importance=True),
+    ]
+    rows += [row(f"{lobe}, a number", parameters={lobe: 0.5}) for lobe in LOBES]
+    rows += [row(f"{lobe}, a bitmap", parameters={lobe: bitmap()}) for lobe in LOBES]
+    rows.append(row("derivative in eta", shared=False, differentiate=True))
+    polarised = context.variant.replace("rgb", "mono_polarized")
+    if reason := context.variants[polarised]:
+        rows.append(Row(STUDY, PLUGIN, "polarised", polarised, reason=reason))
+    else:
+        rows.append(row("polarised", variant=polarised))
+    rows += [row(f"formula {name}", shared=False, parameters={"formula": name}) for name in FORMULAS]
+    return rows
+
+
+# Renders -------------------------------------------------------------------------------------------------------
+
+
+class Balls:
+    """A scene of `count` glass balls of different indices with one plugin.
+
+    Without a `max_depth` it is one that no path reaches, and that no cache has seen.
+    """
+
+    def __init__(self, plugin: str, count: int, integrator: str = "path", max_depth: int = 0) -> None:
+        import mitsuba as mi
+
+        side = int(np.ceil(np.sqrt(count)))
+        sky = np.random.default_rng(SEED).random((8, 16, 3)).astype(np.float32)  # a constant one shows no index
+        fresh = int(np.random.default_rng().integers(1 << 20, 1 << 30))
+        film = {"type": "hdrfilm", "width": RESOLUTION, "height": RESOLUTION, "rfilter": {"type": "box"}}
+        view = mi.ScalarTransform4f().look_at([0, 0, 4 * side], [0, 0, 0], [0, 1, 0])
+        scene: dict[str, Any] = {
+            "type": "scene",
+            "integrator": {"type": integrator, "max_depth": max_depth or fresh},
+            "sensor": {"type": "perspective", "fov": 30, "to_world": view, "film": film},
+            "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky)},
+        }
+        for i in range(count):
+            place = [2 * (i % side) - side + 1, 2 * (i // side) - side + 1, 0]
+            glass = {"type": plugin, "int_ior": 1.3 + 0.5 * i / count, "ext_ior": 1.0}
+            scene[f"ball{i:04}"] = {"type": "sphere", "radius": 0.9, "center": place, "bsdf": glass}
+        self.scene = mi.load_dict(scene)
+        self.params = mi.traverse(self.scene)
+        self.eta = next(name for name in self.params.keys() if name.endswith(".eta"))  # noqa: SIM118
+
+    def image(self, seed: int = 0) -> Any:
+        import mitsuba as mi
+
+        return mi.render(self.scene, spp=4, seed=seed)
+
+    def frozen(self) -> Callable[[Any, Any], Any]:
+        """(params, seed) -> the image, traced once and replayed from then on. The scene must be in its closure."""
+        import mitsuba as mi
+
+        scene = self.scene
+
+        @dr.freeze
+        def image(params: Any, seed: Any) -> Any:
+            return mi.render(scene, params, spp=4, seed=seed)
+
+        return image
+
+    def edit(self, eta: float) -> None:
+        self.params[self.eta] = eta
+        self.params.update()
+
+
+@contextmanager
+def alone(plugin: str, count: int, **more: Any) -> Iterator[Balls]:
+    """Balls, and none of them left afterwards."""
+    gc.collect()
+    balls = Balls(plugin, count, **more)
+    yield balls
+    balls.__dict__.clear()
+    del balls
+    gc.collect()
+
+
+def glass_rows(context: Context) -> list[Row]:
+    """The kernel of a render for growing numbers of glasses, and what an edit compiles.
+
+    Compared to two: a plugin that is the only one is called directly, which saves the six operations of a choice.
+    """
+    rows = []
+    for plugin in (PLUGIN, BUILTIN):
+        with alone(plugin, 2) as balls:
+            two = size_of(balls)
+        for count in GLASSES:
+            with alone(plugin, count) as balls:
+                size = size_of(balls)
+                balls.edit(1.77)
+                values = {"operations": size, "operations, over two glasses": size - two,
+                          "compiled": compiled(balls.image)}  # fmt: skip
+            budgets = {"operations, over two glasses": 0.0, "compiled": 0.0} if plugin == PLUGIN else {}
+            rows.append(Row(STUDY, plugin, f"{count} glasses", context.variant, values, budgets,
+                            replay={"glasses": count}))  # fmt: skip
+    return rows
+
+
+def size_of(balls: Balls) -> float:
+    return float(max(entry["operation_count"] for entry in kernels(balls.image)))
+
+
+def optimisation_rows(context: Context) -> list[Row]:
+    """Gradient steps on an index. The first compiles, with a derivative for the first time; then nothing does."""
+    with alone(PLUGIN, 1, integrator="volpath", max_depth=3) as balls:
+        before = float(balls.params[balls.eta][0])
+        first, *later = (compiled(functools.partial(step, balls)) for _ in range(STEPS))
+        values = {"compiled": sum(later), "compiled, first step": first,
+                  "eta moved": abs(float(balls.params[balls.eta][0]) - before)}  # fmt: skip
+    return [Row(STUDY, PLUGIN, "optimisation of eta", context.variant, values, {"compiled": 0.0},
+                replay={"steps": STEPS})]  # fmt: skip
+
+
+def step(balls: Balls) -> Any:
+    """One step of gradient descent on the mean of a picture."""
+    import mitsuba as mi
+
+    params, key = balls.params, balls.eta
+    dr.enable_grad(params[key])
+    params.update()
+    dr.backward(dr.mean(mi.render(balls.scene, params, spp=4), axis=None))
+    params[key] = dr.detach(params[key]) - 0.1 * dr.grad(params[key])
+    params.update()
+    return params[key]
+
+
+def first_image_rows(context: Context, count: int) -> list[Row]:
+    def clock(plugin: str) -> float:
+        with alone(plugin, count) as balls:
+            return seconds_of(balls.image)
+
+    return [ratio_row(context, f"first image, {count} glasses", "first image", clock, FIRST_IMAGE_GOALS[count])]
+
+
+def edit_rows(context: Context) -> list[Row]:
+    """The built-in's literal is one that no cache has seen."""
+    indices = np.random.default_rng()
+
+    def clock(plugin: str) -> float:
+        with alone(plugin, 16) as balls:
+            dr.eval(balls.image())
+
+            def edited() -> Any:
+                balls.edit(float(indices.uniform(1.2, 1.9)))
+                return balls.image()
+
+            return seconds_of(edited)
+
+    return [ratio_row(context, "edit of one of 16 glasses", "edit", clock, EDIT_GOAL)]
+
+
+def ratio_row(context: Context, case: str, metric: str, clock: Callable[[str], float], goal: float) -> Row:
+    seconds = kernel_timing.rounds({PLUGIN: PLUGIN, BUILTIN: BUILTIN}, clock, PAIRS)
+    values = kernel_timing.ratio(f"{metric} / {BUILTIN}", seconds[PLUGIN], seconds[BUILTIN])
+    values |= {f"{metric}, {plugin}": float(np.median(x)) for plugin, x in seconds.items()}
+    return Row(STUDY, PLUGIN, case, context.variant, values, goals={f"{metric} / {BUILTIN}": goal},
+               replay={"pairs": PAIRS})  # fmt: skip
+
+
+def frozen_rows(context: Context) -> list[Row]:
+    """The steady state of many glasses is tracing each anew; a frozen function replays what was traced."""
+    import mitsuba as mi
+
+    count = GLASSES[-1]
+    values: dict[str, float] = {}
+    for plugin, name in ((PLUGIN, ""), (BUILTIN, f", {BUILTIN}")):
+        with alone(plugin, count) as balls:
+            replay, seed = functools.partial(balls.frozen(), balls.params), dr.opaque(mi.UInt32, 0)
+            subjects = {"frozen": functools.partial(replay, seed), "traced": balls.image}
+            for _ in range(2):  # from two calls Dr.Jit knows what varies
+                dr.eval(replay(seed))
+            seconds = kernel_timing.rounds(subjects, seconds_of, PAIRS)
+            values |= kernel_timing.ratio(f"frozen / traced{name}", seconds["frozen"], seconds["traced"])
+            values |= {f"seconds, {x}{name}": float(np.median(seconds[x])) for x in seconds}
+            balls.edit(1.77)
+            values[f"off after an edit{name}"] = float(np.abs(np.array(replay(seed) - balls.image())).max())
+            del replay, subjects
+    return [Row(STUDY, PLUGIN, f"frozen, {count} glasses", context.variant, values,
+                {"off after an edit": UNCHANGED}, replay={"glasses": count})]  # fmt: skip
+
+
+def boundary_rows(context: Context) -> list[Row]:
+    """Where the built-in's directions are wrong its paths may be shorter, and a render of them cheaper."""
+    rows = []
+    for name in ("furnace", "mirage"):
+        values = {plugin: boundaries(opened(SCENES / f"{name}.xml", plugin, RESOLUTION))
+                  for plugin in (PLUGIN, BUILTIN)}  # fmt: skip
+        values[f"boundaries / {BUILTIN}"] = values[PLUGIN] / values[BUILTIN]
+        rows.append(Row(STUDY, PLUGIN, f"{name}: boundaries", context.variant, values, replay={"seed": SEED}))
+    return rows
+
+
+def boundaries(scene: Any, spp: int = 64, most: int = 192) -> float:
+    """How many surfaces a path from the camera meets, on average, without roulette."""
+    import mitsuba as mi
+
+    count = RESOLUTION**2 * spp
+    sampler: Any = mi.load_dict({"type": "independent"})
+    sampler.seed(SEED, count)
+    pixel = dr.arange(mi.UInt32, count) // spp
+    corner = mi.Point2f(pixel % RESOLUTION, pixel // RESOLUTION)
+    ray, _ = scene.sensors()[0].sample_ray(0, 0, (corner + sampler.next_2d()) / RESOLUTION, mi.Point2f(0.5))
+
+    def bounce(met: Any, active: Any, ray: Any, sampler: Any) -> Any:
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid() & (met < most)
+        bs, _ = si.bsdf().sample(mi.BSDFContext(), si, sampler.next_1d(active), sampler.next_2d(active), active)
+        return met + dr.select(active, 1, 0), active, si.spawn_ray(si.to_world(bs.wo)), sampler
+
+    state = (mi.UInt32(0), mi.Bool(True), ray, sampler)
+    met, *_ = dr.while_loop(state, lambda met, active, ray, sampler: active, bounce)
+    return float(np.array(met).mean())

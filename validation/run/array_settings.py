@@ -1,0 +1,102 @@
+"""Where formulas are measured: backends and precisions, and with them Mitsuba's own functions."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract.formulas.bounds import Budget
+from mi_refract.formulas.documented import FORMULAS
+from mi_refract.regimes import REGIMES
+from validation.directions.judge import Subject
+
+from .context import Context
+
+BUILTIN = "mi.fresnel + mi.refract"
+PLAIN = "decomposed"  # the common form, which the built-in shares: its radicand cancels as the built-in's does
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A backend in a precision: `vector` is its 3-vector type, `None` where it cannot run, for `reason`.
+
+    `mitsuba` is the variant whose functions take these arrays, where there is one.
+    """
+
+    backend: str
+    precision: type
+    vector: Any = None
+    reason: str = ""
+    mitsuba: str | None = None
+
+    @property
+    def label(self) -> str:
+        return f"{self.backend} {np.dtype(self.precision).name}"
+
+    @property
+    def roundoff(self) -> float:
+        return float(np.finfo(self.precision).eps) / 2
+
+    @property
+    def is_scalar(self) -> bool:
+        return self.backend == "scalar"
+
+    @functools.cached_property
+    def flushes(self) -> bool:
+        """Whether denormal numbers are taken for 0, which Dr.Jit's threads do. Asked of the array, not presumed."""
+        if self.is_scalar:
+            return False
+        least = np.full(1 << 16, np.finfo(self.precision).smallest_subnormal)
+        return not np.array(dr.value_t(self.vector)(least) > 0).all()
+
+    def no_budget(self, budget: Budget, regime: str) -> str:
+        """Why a formula is not held to its budget in a regime; "" where it is."""
+        entry = REGIMES[regime]
+        if entry.rests_on_denormals and self.flushes:
+            return "no budget: this backend takes denormal numbers for 0"
+        return "" if entry.unit or budget.at_the_limit else "no budget: a and n are not unit"
+
+    @property
+    def subjects(self) -> dict[str, Subject]:
+        """Every formula, and Mitsuba's functions where they exist in this precision."""
+        formulas: dict[str, Subject] = dict(FORMULAS)
+        return formulas | ({BUILTIN: functools.partial(builtin, variant=self.mitsuba)} if self.mitsuba else {})
+
+
+def settings(context: Context) -> list[Setting]:
+    found = [Setting("scalar", np.float64, dr.scalar.Array3f64)]
+    for backend in ("llvm", "cuda"):
+        entry = context.backends[backend]
+        for precision, name in ((np.float32, "Array3f"), (np.float64, "Array3f64")):
+            if not entry.usable:
+                found.append(Setting(backend, precision, reason=entry.reason))
+                continue
+            variant = f"{backend}_ad_rgb"
+            has_functions = precision is np.float32 and context.variants[variant] is None
+            vector = getattr(getattr(dr, backend), name)
+            found.append(Setting(backend, precision, vector, mitsuba=variant if has_functions else None))
+    return found
+
+
+def budget_of(subject: str) -> Budget:
+    return FORMULAS[subject if subject in FORMULAS else PLAIN].budget
+
+
+def builtin(a: Any, n: Any, k: Any, variant: str | None = None) -> tuple[Any, Any]:
+    """Mitsuba's own functions, those of the present variant or of another one.
+
+    The normal is turned so that they need no reciprocal of k.
+    """
+    import mitsuba
+
+    mi: Any = getattr(mitsuba, variant) if variant else mitsuba
+    wi, n, k = mi.Vector3f(-a), mi.Vector3f(n), mi.Float(k)
+    n = n * dr.sign(dr.dot(-wi, n))
+    _, cos_t, _, eta_ti = mi.fresnel(dr.dot(wi, n), k)
+    transmitted = cos_t != 0
+    m = mi.Normal3f(n)
+    return dr.select(transmitted, mi.refract(wi, m, cos_t, eta_ti), mi.reflect(wi, m)), transmitted

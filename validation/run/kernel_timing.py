@@ -1,0 +1,134 @@
+"""What a formula costs: kernel times of streaming rays from memory, in turn in one run, and the time to compile.
+
+A ratio is formed within a round, in which every subject runs once; the median of the rounds counts, with a
+confidence interval of 95 % or more from its order statistics. On a CPU only ratios are kept: to a copy of the same
+bytes, which is the floor that memory sets, and to the plain form. A GPU has ns per ray as well.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract import regimes
+from mi_refract.formulas.documented import FORMULAS
+from validation.directions.judge import Subject
+
+from .array_settings import PLAIN, Setting
+from .context import Context
+
+COPY = "copy"
+SEED = 2026
+DIFFERENT = 1 << 16  # rays; the rest of a stream repeats them
+TERMS = {
+    "time / copy": "median time of a ray over that of copying its bytes, streaming; low, high: its 95 % interval",
+    "time / plain": f"the same over the time of `{PLAIN}`",
+    "operations": "Dr.Jit's count for the whole kernel",
+    "compile ms": "code generation and compilation of the kernel, by Dr.Jit's record, with a literal no cache can know",
+}
+Clock = Callable[[Subject], float]
+
+
+def copy(a: Any, n: Any, k: Any) -> tuple[Any, Any]:
+    """Reads and writes what a formula does, and computes as little as can be."""
+    return a + n * k, k > 0
+
+
+def measure(context: Context, setting: Setting) -> dict[str, dict[str, float]]:
+    """Values by subject of the setting, and of the copy."""
+    subjects = {COPY: copy, **setting.subjects}
+    rays = context.profile.scalar_rays if setting.is_scalar else context.profile.streamed_rays
+    inputs = _inputs(setting, rays)
+    clock = _scalar_clock(inputs) if setting.is_scalar else _kernel_clock(inputs)
+    seconds = rounds(subjects, clock, context.profile.repeats)
+    found = {name: ratio("time / copy", seconds[name], seconds[COPY]) for name in subjects}
+    for name, subject in subjects.items():
+        found[name] |= ratio("time / plain", seconds[name], seconds[PLAIN])
+        if setting.backend == "cuda":
+            found[name] |= interval("ns per ray", [s / rays * 1e9 for s in seconds[name]])
+        if not setting.is_scalar:
+            found[name] |= _kernel(subject, inputs)
+    return found
+
+
+def goals(subject: str, setting: Setting) -> dict[str, float]:
+    """What times ought to be: nine tenths of the copy's throughput for a documented formula, else its own goal."""
+    if setting.is_scalar or subject not in FORMULAS:
+        return {}
+    if (goal := FORMULAS[subject].time_goal) is None:
+        return {"time / copy": 1 / 0.9}
+    return {"time / plain": goal} if setting.label == "llvm float32" else {}
+
+
+def rounds(subjects: dict[str, Any], clock: Callable[[Any], float], repeats: int) -> dict[str, list[float]]:
+    """Seconds by subject, every second round in the reverse order; the first round is thrown away."""
+    seconds: dict[str, list[float]] = {name: [] for name in subjects}
+    order = list(subjects)
+    for _ in range(repeats + 1):
+        for name in order:
+            seconds[name].append(clock(subjects[name]))
+        order.reverse()
+    return {name: times[1:] for name, times in seconds.items()}
+
+
+def ratio(metric: str, times: list[float], others: list[float]) -> dict[str, float]:
+    return interval(metric, [t / o for t, o in zip(times, others, strict=True)])
+
+
+def interval(metric: str, x: list[float]) -> dict[str, float]:
+    """The median and the order statistics around it: P(median outside) ≤ 2 P(Binomial(n, ½) < rank) ≤ 5 %."""
+    from scipy.stats import binom
+
+    rank = max(int(binom.ppf(0.025, len(x), 0.5)), 1)
+    ordered = sorted(x)
+    return {metric: statistics.median(x), f"{metric}, low": ordered[rank - 1], f"{metric}, high": ordered[-rank]}
+
+
+def _inputs(setting: Setting, count: int) -> Any:
+    """(a, n, k) of generic rays: arrays in memory, or a list of single rays."""
+    rays = regimes.make("generic", min(count, DIFFERENT), setting.precision, SEED)[np.arange(count) % DIFFERENT]
+    vector = setting.vector
+    if setting.is_scalar:
+        return [(vector(a), vector(n), float(k)) for a, n, k in zip(rays.a, rays.n, rays.k, strict=True)]
+    inputs = vector(rays.a.T), vector(rays.n.T), dr.value_t(vector)(rays.k)
+    dr.eval(inputs)
+    return inputs
+
+
+def _scalar_clock(inputs: Any) -> Clock:
+    def clock(subject: Subject) -> float:
+        start = time.perf_counter()
+        for a, n, k in inputs:
+            subject(a, n, k)
+        return time.perf_counter() - start
+
+    return clock
+
+
+def _kernel_clock(inputs: Any) -> Clock:
+    return lambda subject: sum(kernel["execution_time"] for kernel in _history(subject, *inputs)) / 1e3
+
+
+def _kernel(subject: Subject, inputs: Any) -> dict[str, float]:
+    """Operations of the kernel, and ms to compile it anew: k is multiplied by a literal that was never used before."""
+    a, n, k = inputs
+    operations = max(kernel["operation_count"] for kernel in _history(subject, a, n, k))
+    literal = 1 + float(np.random.default_rng().integers(1, 1 << 22)) * 2.0**-23
+    kernels = _history(subject, a, n, k * type(k)(literal))
+    fresh = all(not kernel["cache_hit"] for kernel in kernels)
+    compiled = sum(kernel["codegen_time"] + kernel["backend_time"] for kernel in kernels)
+    return {"operations": float(operations), "compile ms": compiled if fresh else float("nan")}
+
+
+def _history(subject: Subject, a: Any, n: Any, k: Any) -> list[dict[str, Any]]:
+    """Dr.Jit's record of the kernels that `subject` launches."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        dr.eval(subject(a, n, k))
+        dr.sync_thread()
+        return [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]

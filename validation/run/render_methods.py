@@ -1,0 +1,88 @@
+"""The ways to render a scene that are compared, an integrator and a BSDF each, and the camera that times them."""
+
+from __future__ import annotations
+
+import time
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract.plugins.refract import PLUGIN
+from mi_refract.rendering import scene_files
+
+DIELECTRIC = "dielectric"
+OURS = "refract_path"
+
+
+@dataclass(frozen=True)
+class Method:
+    """An integrator with what it takes beyond the depth, and the BSDF of the glass."""
+
+    name: str
+    integrator: str
+    bsdf: str
+    parameters: dict[str, int] = field(default_factory=dict)
+
+    def plugin(self, max_depth: int) -> dict[str, Any]:
+        """For `mi.load_dict`; without Russian roulette, as in the scene files."""
+        return {"type": self.integrator, "max_depth": max_depth, "rr_depth": max_depth, **self.parameters}
+
+    @property
+    def missing(self) -> str:
+        """Why this cannot be run: an integrator that is not registered; "" where it can."""
+        import mitsuba as mi
+
+        try:
+            mi.load_dict(self.plugin(max_depth=2))
+        except RuntimeError as error:
+            if f'Plugin "{self.integrator}" not found' in str(error):
+                return f"the integrator {self.integrator} is not registered"
+            raise
+        return ""
+
+
+BUILTIN = Method("path + dielectric", "path", DIELECTRIC)
+METHODS = (
+    BUILTIN,
+    Method(f"path + {PLUGIN}", "path", PLUGIN),
+    Method(OURS, OURS, PLUGIN),
+    *(Method(f"{OURS}, split {n}", OURS, PLUGIN, {"split_depth": n}) for n in (1, 2, 3)),
+)
+
+
+class Camera:
+    """A loaded scene: renders pictures as numpy arrays and says how long each took."""
+
+    def __init__(self, scene: Any, integrator: Any = None) -> None:
+        self.scene, self.integrator = scene, integrator
+
+    def __call__(self, spp: int, seed: int) -> tuple[np.ndarray, float]:
+        import mitsuba as mi
+
+        start = time.perf_counter()
+        picture = mi.render(self.scene, spp=spp, seed=seed, integrator=self.integrator)
+        dr.eval(picture)
+        dr.sync_thread()
+        seconds = time.perf_counter() - start
+        return np.array(picture, dtype=np.float64), seconds
+
+
+def opened(path: Path, bsdf: str, resolution: int, **parameters: Any) -> Any:
+    """A scene file with its glass; the same seed means the same picture."""
+    import mitsuba as mi
+
+    return mi.load_file(str(path), **scene_files.REPRODUCIBLE, bsdf=bsdf, res=resolution, **parameters)
+
+
+def camera(path: Path, method: Method, resolution: int, **parameters: Any) -> Camera:
+    """A scene file by a method, to the file's own depth where `parameters` have none."""
+    import mitsuba as mi
+
+    defaults = {node.attrib["name"]: node.attrib["value"] for node in ET.parse(path).getroot().iter("default")}
+    depth = int((defaults | parameters)["max_depth"])
+    scene = opened(path, method.bsdf, resolution, **parameters)
+    return Camera(scene, mi.load_dict(method.plugin(depth)))

@@ -1,0 +1,1 @@
+"""Study of formulas at work, boundary after boundary."""

@@ -1,0 +1,221 @@
+"""Derivatives by automatic differentiation, of directions and of the reflectance, against certified ones.
+
+∂b/∂a along two unit vectors at right angles to `a`, in the plane of incidence and across it; k ∂b/∂k; and η ∂R/∂η,
+which is −k ∂R/∂k. The error is relative, or absolute where the derivative is below 1 (below R). At the critical angle
+they diverge as 1/cosθt: the condition, 1 + k² sinθi (sinθi + 2 cosθi)/cos²θt, is what inputs off by u may change the
+derivative by, in u, to first order.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract import oracle, regimes
+from mi_refract.formulas import fresnel
+from mi_refract.formulas.documented import FORMULAS
+from mi_refract.oracle import derivatives
+from mi_refract.report.row import Row
+from validation.directions.judge import lengths
+from validation.run.array_settings import Setting, settings
+from validation.run.context import Context, Task
+
+TITLE = "Derivatives"
+TEXT = __doc__.partition("\n")[2].strip()
+AXES = {
+    "x": "cos²θt, transmitted",
+    "y": "largest error of k ∂b/∂k",
+    "x_scale": "log",
+    "y_scale": "log",
+    "slope": None,
+}
+TERMS = {
+    "∂b/∂k": "times k: the change of the direction with the relative index",
+    "∂b/∂a in the plane": "along the unit vector at right angles to `a` in the plane of incidence",
+    "∂b/∂a across it": "along the unit vector at right angles to that plane",
+    "étendue": "|∂b/∂a × ∂b/∂a'| cosθt, which is k² cosθi: n² cosθ dΩ is the same on both sides; relative",
+    "∂R/∂η": "times η, of `fresnel.powers` with the cosine of `fresnel.refracted_cosine`",
+    "error": "the largest",
+    "error / condition": "the largest, in units of condition · u",
+    "not finite": "rays whose derivative came out NaN or infinite, though it exists",
+}
+SEED = 2029
+BINS = np.geomspace(1e-9, 1, 19)
+# Of a form at the rounding limit, D is right to u, and a derivative is k a′ along the surface and D′/2√D along n. D′ is
+# the difference of two products of four rounded factors, and what they cancel to is what the condition counts: 4u;
+# 1/√D 2u, the last product u, the result u.
+LIMIT = 8.0
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Rays, two directions at right angles to each, and the certified answers."""
+
+    rays: regimes.Rays
+    along: dict[str, np.ndarray]  # by derivative: (N, 3), in the precision of the rays
+    exact: dict[str, np.ndarray]
+    certified: oracle.Certified
+    condition: np.ndarray
+    regime: np.ndarray
+
+
+def tasks(context: Context) -> list[Task]:
+    return [Task(f"derivatives: {s.label}", functools.partial(setting_rows, context, s)) for s in settings(context)]
+
+
+def setting_rows(context: Context, setting: Setting) -> list[Row]:
+    reason = "Dr.Jit differentiates compiled arrays only" if setting.is_scalar else setting.reason
+    if reason:
+        return [Row("derivatives", name, "all", setting.label, reason=reason) for name in (*FORMULAS, "powers")]
+    given = inputs(context.profile.rays // 40, setting.precision)
+    rows, curves = [], {}
+    for name, formula in FORMULAS.items():
+        found, curves[name] = formula_rows(name, formula, given, setting)
+        rows += found
+    curves["condition · u"] = binned(given, given.condition * setting.roundoff)
+    problem = Row("derivatives", "the problem", "∂b/∂k", setting.label, curves=curves,
+                  values={"condition · u": float(given.condition.max()) * setting.roundoff})  # fmt: skip
+    return [*rows, problem, reflectance_row(given, setting)]
+
+
+@functools.cache
+def inputs(count: int, precision: type) -> Inputs:
+    """Unit rays of all regimes that have derivatives: neither tangential nor exactly critical."""
+    names = [name for name, regime in regimes.REGIMES.items()
+             if regime.unit and not regime.rests_on_denormals]  # fmt: skip
+    parts = [regimes.make(name, count, precision, SEED) for name in names]
+    a, n, k = (np.concatenate([getattr(part, x) for part in parts]) for x in ("a", "n", "k"))
+    regime = np.repeat(names, count)
+    certified = oracle.refract(a, n, k, progress=False, fresnel=False)
+    wide = regimes.normalised(a)
+    across = np.cross(n.astype(np.longdouble), wide)
+    normal = (np.abs(across).max(1) == 0)[:, None]
+    across = np.where(normal, np.cross(wide, np.roll(wide, 1, axis=1)), across)
+    for _ in range(2):  # near the normal rounding has left some of `a` in it
+        across /= lengths(across)[:, None]
+        across -= (across * wide).sum(1, keepdims=True) * wide
+    within: Any = np.cross(across, wide)
+    along = {"∂b/∂a in the plane": within.astype(precision), "∂b/∂a across it": across.astype(precision)}
+    exact = {name: derivatives.derivative(a, n, k, e, 0.0) for name, e in along.items()}
+    exact["∂b/∂k"] = derivatives.derivative(a, n, k, np.zeros_like(a), k)
+    kept = np.isfinite(exact["∂b/∂k"]).all(1)
+    along, exact = ({name: x[kept] for name, x in found.items()} for found in (along, exact))
+    condition = condition_of(certified, k)[kept]
+    return Inputs(regimes.Rays(a[kept], n[kept], k[kept]), along, exact, pick(certified, kept), condition, regime[kept])
+
+
+def condition_of(certified: oracle.Certified, k: np.ndarray) -> np.ndarray:
+    """1 + k² sinθi (sinθi + 2 cosθi)/cos²θt: k and both directions, each off by u, move log cosθt by as much u."""
+    cos_i = certified.cos_i
+    sin_i = np.sqrt((1 - cos_i) * (1 + cos_i))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moved = k.astype(float) ** 2 * sin_i * (sin_i + 2 * cos_i) / certified.cos_t**2
+    return 1 + np.where(certified.transmitted, moved, 0)
+
+
+def pick(certified: oracle.Certified, kept: np.ndarray) -> oracle.Certified:
+    return oracle.Certified(**{name: x[kept] for name, x in vars(certified).items()})
+
+
+def forward(function: Callable[[Any], Any], x: Any, direction: Any) -> tuple[Any, Any]:
+    """`function(x)` and its derivative along `direction`."""
+    dr.enable_grad(x)
+    y = function(x)
+    dr.set_grad(x, direction)
+    found = dr.forward_to(y)
+    return dr.detach(y), found
+
+
+def differentiable(setting: Setting) -> Any:
+    """The setting's type of 3-vectors, with derivatives."""
+    vector: Any = dr.diff_array_t(setting.vector)
+    return vector
+
+
+def differentiate(formula: Any, given: Inputs, setting: Setting) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The derivatives of b, (N, 3) in extended precision, and which rays were transmitted."""
+    vector, rays = differentiable(setting), given.rays
+    number = dr.value_t(vector)
+    a, n, k, found = vector(rays.a.T), vector(rays.n.T), number(rays.k), {}
+    for name, e in given.along.items():
+        found[name] = forward(lambda a: formula(a, n, k)[0], vector(a), vector(e.T))[1]
+    found["∂b/∂k"] = forward(lambda k: formula(a, n, k)[0], number(k), k)[1]
+    transmitted = np.array(formula(a, n, k)[1])
+    return {name: np.array(x).T.astype(np.longdouble) for name, x in found.items()}, transmitted
+
+
+def formula_rows(
+    name: str, formula: Any, given: Inputs, setting: Setting
+) -> tuple[list[Row], list[tuple[float, float]]]:
+    found, transmitted = differentiate(formula, given, setting)
+    right, rows = transmitted == given.certified.transmitted, []
+    curve: list[tuple[float, float]] = []
+    budgets = {"error / condition": LIMIT, "not finite": 0.0} if FORMULAS[name].budget.at_the_limit else {}
+    for case, exact in given.exact.items():
+        error = lengths(found[case] - exact) / np.maximum(1, lengths(exact))
+        rows.append(row(name, case, error, given, setting, right, budgets))
+        curve = binned(given, np.where(right, error, 0)) if case == "∂b/∂k" else curve
+    area = np.cross(found["∂b/∂a in the plane"], found["∂b/∂a across it"])
+    cos_t, k = given.certified.cos_t, given.rays.k.astype(np.longdouble)
+    # Rounded, the two directions are off right angles to `a` by u, and the derivatives by u b: the part along b is not.
+    through, along_b = right & given.certified.transmitted, (area * given.certified.direction).sum(1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = np.abs(np.abs(along_b) * cos_t / (k * k * given.certified.cos_i) - 1)
+    rows.append(row(name, "étendue", error, given, setting, through, budgets))
+    return rows, curve
+
+
+def row(
+    subject: str, case: str, error: np.ndarray, given: Inputs, setting: Setting, right: np.ndarray,
+    budgets: dict[str, float],
+) -> Row:  # fmt: skip
+    finite = np.isfinite(error)
+    used = right & finite
+    over = np.where(used, error, 0) / (given.condition * setting.roundoff)
+    worst = int(np.argmax(over))
+    values = {
+        "error / condition": float(over[worst]),
+        "error": float(error[used].max(initial=0)),
+        "not finite": float((right & ~finite).sum()),
+    }
+    a, n = ([float(x).hex() for x in v[worst]] for v in (given.rays.a, given.rays.n))
+    replay = {"seed": SEED, "rays": len(error), "worst": {"regime": str(given.regime[worst]), "a": a, "n": n,
+              "k": float(given.rays.k[worst]).hex()}}  # fmt: skip
+    return Row("derivatives", subject, case, setting.label, values, budgets, replay=replay)
+
+
+def binned(given: Inputs, y: np.ndarray) -> list[tuple[float, float]]:
+    """The largest y of the transmitted rays in each bin of cos²θt."""
+    cos2 = given.certified.cos_t**2
+    bins = [given.certified.transmitted & (cos2 >= low) & (cos2 < 2 * high) & np.isfinite(y) & (y > 0)
+            for low, high in itertools.pairwise(BINS)]  # fmt: skip
+    centres = np.sqrt(BINS[:-1] * BINS[1:])
+    return [(float(x), float(y[inside].max())) for x, inside in zip(centres, bins, strict=True) if inside.any()]
+
+
+def reflectance_row(given: Inputs, setting: Setting) -> Row:
+    """Of exact cosines: those of the rays, rounded."""
+    number = dr.value_t(differentiable(setting))
+    k: Any = given.rays.k
+    cos_i: Any = given.certified.cos_i.astype(setting.precision)
+    exact = derivatives.derivative_of_powers(cos_i, k, 0.0, k)
+    cosine, condition = number(cos_i), condition_of(oracle.fresnel(cos_i, k), k)
+
+    def reflectance(k: Any) -> Any:
+        cos_t, transmitted = fresnel.refracted_cosine(cosine, k)
+        return fresnel.powers(cosine, cos_t, transmitted, k)[0]
+
+    r, found = (np.array(x).astype(np.longdouble) for x in forward(reflectance, number(k), number(k)))
+    with np.errstate(invalid="ignore"):
+        error = np.abs(found - exact) / np.maximum(np.maximum(np.abs(exact), r), np.finfo(setting.precision).tiny)
+    exists = np.isfinite(exact)
+    budgets = {"error / condition": LIMIT, "not finite": 0.0}
+    given = dataclasses.replace(given, condition=condition)  # that of the rounded cosines
+    return row("powers", "∂R/∂η", error, given, setting, exists, budgets)

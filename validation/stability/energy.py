@@ -1,0 +1,332 @@
+"""Energy: reflected and transmitted power against certified values, and the laws they obey.
+
+Errors are relative, in units of roundoff u (2⁻²⁴, 2⁻⁵³), of R, of 1 − R and of both amplitudes; phases are points of
+the unit circle, and their error is the distance. The exact values are those of the very cosine and ratio that were
+given. Mitsuba's `mi.fresnel` stands beside.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract import oracle, regimes
+from mi_refract.formulas import fresnel
+from mi_refract.formulas.documented import resolve
+from mi_refract.report.row import Row
+from validation.directions.bsdf_samples import sample_all
+from validation.directions.judge import lengths
+from validation.reference.diffuse_fresnel import GRADE, hemispherical, nodes
+from validation.run.array_settings import Setting, settings
+from validation.run.context import Context, Task
+
+TITLE = "Energy"
+TEXT = __doc__.partition("\n")[2].strip()
+AXES = {"x": "|k − 1|", "y": "error of R, in u", "x_scale": "log", "y_scale": "log", "slope": -1}
+BUILTIN = "mi.fresnel"
+TERMS = {
+    "powers": "R and T of `fresnel.powers`, with the cosine that `fresnel.refracted_cosine` gives",
+    "pipeline": "R and T as the plugin computes them: from `a`, transmitted where the default formula says so",
+    "amplitudes": "`fresnel.amplitudes`",
+    BUILTIN: "Mitsuba's function of the same cosine and k, from the inside; what it transmits is 1 − R by subtraction",
+    "R / u, 1 − R / u, r_s / u, r_p / u": "the largest relative errors, in units of roundoff",
+    "phase / u": "under total internal reflection, the largest distance from the exact point of the unit circle",
+    "R + T − 1 / u": "the largest deviation from 1",
+    "nearer than rounding": "rays whose radicand is below 0.32u of its larger term, where its own error may move T by "
+    "more than u/2; the errors leave them out",
+    "T there and back / u": "T(θi, k) over T(θt, 1/k), less 1: light takes the same way back",
+    "weights in and out / u": "the plugin's weight of radiance that enters over n², times that of leaving, less 1",
+    "outside, inside": "the share of diffuse light that is reflected or not, relative, against its closed form; from "
+    "the inside with what is reflected totally",
+    "white furnace": "the weights of both lobes times their densities, which must add up to 1",
+}  # fmt: skip
+SEED = 2028
+INDICES = (1.0003, 1.1, 1.33, 1.5, 2.42)
+# What the study holds the forms to; they promise 3.12u of R and 2u of T (see `fresnel._powers`).
+POWERS = {"R / u": 4.0, "1 − R / u": 4.0}
+SUMMED = POWERS | {"R + T − 1 / u": 4.0}  # R · 4u + T · 4u
+AMPLITUDES = {"r_s / u": 8.0, "r_p / u": 8.0, "phase / u": 8.0}
+# Of the larger term of a float32 radicand (see `exact`): the promoted form's error. The compensated one's is less, as
+# κ of a float32 k up to 2²³ is a pair exactly.
+RADICAND = 10 * 2.0**-53
+
+
+def tasks(context: Context) -> list[Task]:
+    found = [Task(f"energy: {s.label}", functools.partial(setting_rows, context, s)) for s in settings(context)]
+    return [*found, Task(f"energy: plugins, {context.variant}", functools.partial(plugin_rows, context))]
+
+
+def setting_rows(context: Context, setting: Setting) -> list[Row]:
+    if setting.vector is None:
+        return [Row("energy", name, "all", setting.label, reason=setting.reason) for name in ("powers", "amplitudes")]
+    count = context.profile.scalar_rays // 3 if setting.is_scalar else context.profile.rays // 8
+    rows = [row for regime in cases() for row in regime_rows(regime, setting, count)]
+    rows += [diffuse_row(setting, index) for index in INDICES]
+    return [*rows, reciprocity_row(setting, count), matched_row(setting)]
+
+
+def cases() -> list[str]:
+    """Regimes but those whose rays rest on denormal numbers: where a backend takes those for 0 they are other rays."""
+    return [name for name, regime in regimes.REGIMES.items() if not regime.rests_on_denormals]
+
+
+# Against certified values --------------------------------------------------------------------------------------
+
+
+@functools.cache
+def given(regime: str, count: int, precision: type) -> tuple[np.ndarray, np.ndarray, oracle.Certified]:
+    """(cos_i, k) of a regime's rays, rounded, and the certified answers for them."""
+    rays = regimes.make(regime, count, precision, SEED)
+    a, n = (v.astype(np.longdouble) for v in (rays.a, rays.n))
+    cos_i = np.abs((a * n).sum(1)) / (lengths(a) * lengths(n))
+    cos_i = np.minimum(cos_i, 1).astype(precision)
+    return cos_i, rays.k, oracle.fresnel(cos_i, rays.k)
+
+
+def each(function: Callable[..., tuple], setting: Setting, *numbers: np.ndarray) -> list[np.ndarray]:
+    """`function` of every lane of the numbers, as numpy arrays: real or complex in extended precision, or masks."""
+    if setting.is_scalar:
+        lanes = [[plain(x) for x in function(*map(float, lane))] for lane in zip(*numbers, strict=True)]
+        return [np.array(x) for x in zip(*lanes, strict=True)]
+    number = dr.value_t(setting.vector)
+    found = function(*(number(x) for x in numbers))
+    dr.eval(found)
+    return [np.broadcast_to(plain(x), len(numbers[0])) for x in found]
+
+
+def plain(x: Any) -> Any:
+    """A number of Dr.Jit as one of numpy, extended."""
+    if dr.is_complex_v(x):
+        return np.array(x.real, np.longdouble) + 1j * np.array(x.imag, np.longdouble)
+    array = np.array(x)
+    return array if array.dtype == bool else array.astype(np.longdouble)
+
+
+def ours(cos_i: Any, k: Any) -> tuple:
+    cos_t, transmitted = fresnel.refracted_cosine(cos_i, k)
+    return *fresnel.powers(cos_i, cos_t, transmitted, k), transmitted
+
+
+def builtin(variant: str | None) -> Callable[[Any, Any], tuple]:
+    import mitsuba
+
+    mi: Any = getattr(mitsuba, variant) if variant else mitsuba
+
+    def powers(cos_i: Any, k: Any) -> tuple:
+        # From the inside, where the index is k and needs no reciprocal.
+        r, cos_t, _, _ = mi.fresnel(-mi.Float(cos_i), mi.Float(k))
+        return r, 1 - r, cos_t != 0
+
+    return powers
+
+
+def regime_rows(regime: str, setting: Setting, count: int) -> list[Row]:
+    cos_i, k, exact = given(regime, count, setting.precision)
+    replay = {"regime": regime, "text": regimes.REGIMES[regime].text, "count": count, "seed": SEED}
+    rows = [
+        power_row("powers", regime, setting, each(ours, setting, cos_i, k), exact, SUMMED, replay),
+        amplitude_row(regime, setting, each(fresnel.amplitudes, setting, cos_i, k), exact, replay),
+    ]
+    if setting.mitsuba:
+        rows.append(pipeline_row(regime, setting, cos_i, k, replay))
+        found = each(builtin(setting.mitsuba), setting, cos_i, k)
+        rows.append(power_row(BUILTIN, regime, setting, found, exact, {}, replay))
+    return rows
+
+
+def power_row(
+    subject: str, case: str, setting: Setting, found: list[np.ndarray], exact: oracle.Certified,
+    budgets: dict[str, float], replay: dict[str, Any], right: Any = True,
+) -> Row:  # fmt: skip
+    r, t, transmitted = found
+    misjudged = transmitted != exact.transmitted
+    right, u = right & ~misjudged, setting.roundoff
+    values = {
+        "R / u": worst(relative(r, exact.reflectance, exact.reflectance_low, setting)[right]) / u,
+        "1 − R / u": worst(relative(t, exact.transmittance, exact.transmittance_low, setting)[right]) / u,
+        "R + T − 1 / u": worst(np.abs(r + t - 1)) / u,
+        "misjudged": float(misjudged.sum()),
+    }
+    return Row("energy", subject, case, setting.label, values, budgets | ({"misjudged": 0.0} if budgets else {}),
+               replay=replay)  # fmt: skip
+
+
+def amplitude_row(
+    case: str, setting: Setting, found: list[np.ndarray], exact: oracle.Certified, replay: dict[str, Any]
+) -> Row:
+    # The certified amplitudes are doubles, right to 2⁻⁵³ of each part: float64 is held to that much more.
+    slack = 1.0 if setting.precision is np.float64 else 0.0
+    values = {}
+    for name, ours, certified in zip("sp", found, (exact.amplitude_s, exact.amplitude_p), strict=True):
+        size = np.maximum(np.abs(certified), np.finfo(setting.precision).tiny)
+        values[f"r_{name} / u"] = worst(np.abs(ours - certified)[exact.transmitted] / size[exact.transmitted])
+        values["phase / u"] = max(values.get("phase / u", 0.0), worst(np.abs(ours - certified)[~exact.transmitted]))
+    values = {name: value / setting.roundoff for name, value in values.items()}
+    budgets = {name: budget + slack for name, budget in AMPLITUDES.items()}
+    return Row("energy", "amplitudes", case, setting.label, values, budgets, replay=replay)
+
+
+def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray, replay: dict[str, Any]) -> Row:
+    """In the local frame, where `a` is unit only up to rounding. The ratio is a double, as in the plugin."""
+    azimuth = np.random.default_rng(SEED).uniform(0, 2 * np.pi, len(k))
+    sine = np.sqrt((1 - cos_i.astype(float)) * (1 + cos_i.astype(float)))
+    a: Any = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cos_i], axis=1).astype(setting.precision)
+    n: Any = np.tile(np.array([[0, 0, 1]], setting.precision), (len(k), 1))
+    exact = oracle.refract(a, n, k, progress=False)
+    formula = resolve("auto", dr.backend_v(setting.vector))[1]
+
+    widened: Any = dr.float64_array_t(dr.value_t(setting.vector))
+
+    def powers(x: Any, y: Any, z: Any, ratio: Any) -> tuple:
+        ray, wide = setting.vector(x, y, z), widened(ratio)
+        contrast = dr.fma(wide, wide, -1)
+        _, transmitted = formula.unchecked(ray, setting.vector(0, 0, 1), wide, contrast)
+        return *fresnel.local_powers(ray, transmitted, wide, contrast), transmitted
+
+    far = resolved(a, k, exact, setting.roundoff) | ~exact.transmitted
+    row = power_row("pipeline", regime, setting, each(powers, setting, *a.T, k), exact, POWERS, replay, far)
+    return dataclasses.replace(row, values=row.values | {"nearer than rounding": float((~far).sum())})
+
+
+def resolved(a: np.ndarray, k: np.ndarray, exact: oracle.Certified, u: float) -> np.ndarray:
+    """Whether an error of RADICAND moves T by less than u/2: by ε/2ρ, ρ the radicand over its larger term."""
+    x, y, z = a.astype(np.longdouble).T
+    terms = np.maximum(z * z, np.abs(k.astype(np.longdouble) ** 2 - 1) * (x * x + y * y))
+    return exact.cos_t**2 * lengths(a) ** 2 > RADICAND / u * terms
+
+
+def relative(x: np.ndarray, exact: np.ndarray, low: np.ndarray, setting: Setting) -> np.ndarray:
+    """|x/exact − 1|; of what is below the smallest normal number, the error over that."""
+    error = np.abs((x - exact) - low) / np.maximum(np.abs(exact), np.finfo(setting.precision).tiny)
+    return np.nan_to_num(error.astype(float), nan=np.inf)
+
+
+def worst(x: np.ndarray) -> float:
+    return float(np.nan_to_num(np.asarray(x, float), nan=np.inf).max(initial=0))
+
+
+# Laws ----------------------------------------------------------------------------------------------------------
+
+
+def reciprocity_row(setting: Setting, count: int) -> Row:
+    """`_powers` is symmetric: cos_i ↔ cos_t, k ↔ 1/k changes no exact value. Left are two roundings of T and that of
+    1/k, which T feels once at most: 3u."""
+    values = {"T there and back / u": 0.0}
+
+    def both(cos_i: Any, k: Any) -> tuple:
+        cos_t, transmitted = fresnel.refracted_cosine(cos_i, k)
+        back = fresnel.transmittance(cos_t, cos_i, transmitted, 1 / k)
+        return fresnel.transmittance(cos_i, cos_t, transmitted, k), back, transmitted
+
+    for regime in cases():
+        cos_i, k, exact = given(regime, count, setting.precision)
+        there, back, transmitted = each(both, setting, cos_i, k)
+        # A cosine of 0 goes no way back; and neither does one that float32 cannot square.
+        used = transmitted & (exact.transmittance > np.finfo(setting.precision).tiny)
+        error = worst(np.abs(there[used] / back[used] - 1)) / setting.roundoff
+        values["T there and back / u"] = max(error, values["T there and back / u"])
+    replay = {"regimes": cases(), "count": count, "seed": SEED}
+    return Row("energy", "powers", "reciprocity", setting.label, values, {"T there and back / u": 3.0}, replay=replay)
+
+
+def diffuse_row(setting: Setting, index: float) -> Row:
+    """A node's two cosines are rounded, and so are k and κ: each moves R by 2.12u at most, next to the 4u of R itself.
+
+    Inside, the cosines of transmitted light hold 1/n² of all étendue; the rest is reflected totally.
+    """
+    outside, inside, weight = nodes(index, setting.precision)
+    values: dict[str, float] = {}
+    contrast = (index - 1) * (index + 1)
+    for side, cosines, k, kappa in (
+        ("outside", (outside, inside), 1 / index, -contrast / index**2),
+        ("inside", (inside, outside), index, contrast),
+    ):
+        r, t = each(lambda c, y, k=k, kappa=kappa: fresnel.powers(c, y, y > 0, k, kappa), setting, *cosines)
+        share = np.longdouble(1) if side == "outside" else 1 / np.longdouble(index) ** 2
+        reflected, exact = share * (weight * r).sum() + (1 - share), hemispherical(index)[side]
+        transmitted = share * (weight * t).sum()
+        values |= {
+            f"{side}: R": float(reflected),
+            f"{side}: R / u": float(abs(reflected / exact - 1)) / setting.roundoff,
+            f"{side}: 1 − R / u": float(abs(transmitted / (1 - exact) - 1)) / setting.roundoff,
+        }
+    budgets = {name: 12.5 for name in values if name.endswith("/ u")}
+    case, replay = f"diffuse light, n = {index}", {"nodes": GRADE}
+    return Row("energy", "powers", case, setting.label, values, budgets, replay=replay)
+
+
+def matched_row(setting: Setting) -> Row:
+    """The error of R against |k − 1|, from an ulp on, at four cosines."""
+    steps = np.geomspace(2 * setting.roundoff, 0.1, 40)
+    cosines = (0.05, 0.3, 0.7, 1.0)
+    given: Any = np.meshgrid(1 - steps, cosines)
+    k, cos_i = (x.ravel().astype(setting.precision) for x in given)
+    exact, curves = oracle.fresnel(cos_i, k), {}
+    subjects = {"powers": ours} | ({BUILTIN: builtin(setting.mitsuba)} if setting.mitsuba else {})
+    for name, subject in subjects.items():
+        r = each(subject, setting, cos_i, k)[0]
+        error = relative(r, exact.reflectance, exact.reflectance_low, setting).reshape(len(cosines), -1).max(0)
+        curves[name] = list(zip(steps.tolist(), (error / setting.roundoff).tolist(), strict=True))
+    values = {"R / u": max(y for _, y in curves["powers"])}
+    replay = {"cosines": cosines}
+    return Row("energy", "powers", "k → 1", setting.label, values, {"R / u": 4.0}, replay=replay, curves=curves)
+
+
+# Plugins -------------------------------------------------------------------------------------------------------
+
+
+def plugin_rows(context: Context) -> list[Row]:
+    return [row(context, plugin) for plugin in ("refract", "dielectric") for row in (furnace_row, radiance_row)]
+
+
+def directions(context: Context) -> np.ndarray:
+    """Uniform, and as many more that graze the surface."""
+    import mitsuba as mi
+
+    rng, count = np.random.default_rng(SEED), context.profile.rays // 4 if dr.is_jit_v(mi.Float) else 30
+    wi = rng.normal(size=(2 * count, 3))
+    wi[count:, 2] *= 10.0 ** rng.uniform(-6, 0, count)
+    return wi / np.linalg.norm(wi, axis=1, keepdims=True)
+
+
+def furnace_row(context: Context, plugin: str) -> Row:
+    """Both weights are 1 where nothing is tinted, so the sum is R + T: right to an ulp of 1."""
+    import mitsuba as mi
+
+    wi, values = directions(context), {"white furnace": 0.0}
+    asked = mi.BSDFContext(mi.TransportMode.Importance)
+    for index in INDICES:
+        bsdf = mi.load_dict({"type": plugin, "int_ior": index, "ext_ior": 1.0})
+        lobes = [sample_all(bsdf, asked, wi, np.full(len(wi), s)) for s in (0.0, 1 - 2.0**-24)]
+        total = sum(x["pdf"] * x["weight"][:, :1] for x in lobes)
+        # Under total internal reflection both samples take the one lobe there is.
+        alone = (lobes[0]["type"] == lobes[1]["type"])[:, None]
+        total = np.where(alone, lobes[0]["pdf"] * lobes[0]["weight"][:, :1], total)
+        values["white furnace"] = max(values["white furnace"], worst(np.abs(total - 1)))
+    budgets = {"white furnace": 2.0**-23} if plugin == "refract" else {}
+    return Row("energy", plugin, "white furnace", context.variant, values, budgets,
+               replay={"indices": INDICES, "directions": len(wi), "seed": SEED})  # fmt: skip
+
+
+def radiance_row(context: Context, plugin: str) -> Row:
+    """Radiance over n² is the same on both sides: weights k² and 1/k², each with k rounded and squared, 3u."""
+    import mitsuba as mi
+
+    values, asked = {"weights in and out / u": 0.0}, mi.BSDFContext(mi.TransportMode.Radiance)
+    for index in INDICES:
+        bsdf = mi.load_dict({"type": plugin, "int_ior": index, "ext_ior": 1.0})
+        wi = np.array([[0.6, 0, 0.8], [0, 0, 1.0]])
+        there = sample_all(bsdf, asked, wi, np.full(2, 1 - 2.0**-24))
+        back = sample_all(bsdf, asked, there["wo"], np.full(2, 1 - 2.0**-24))
+        error = worst(np.abs(there["weight"] * back["weight"] - 1)) / 2.0**-24
+        off = worst(np.abs(there["weight"][:, 0] * index**2 - 1)) / 2.0**-24
+        values = {"weights in and out / u": max(error, values["weights in and out / u"]),
+                  "weight against 1/n² / u": max(off, values.get("weight against 1/n² / u", 0.0))}  # fmt: skip
+    budgets = {"weights in and out / u": 6.0, "weight against 1/n² / u": 3.0} if plugin == "refract" else {}
+    return Row("energy", plugin, "basic radiance", context.variant, values, budgets, replay={"indices": INDICES})
+

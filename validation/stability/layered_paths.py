@@ -1,0 +1,314 @@
+"""Paths: rays through the layers of `scenes/mirage.xml` and `scenes/fibre.xml`, against the exact path.
+
+A ray is traced through Mitsuba's scene with the plugin's own samples, transmitted wherever it can be, and compared
+with straight segments and Snell's law in double precision. Mitsuba's ray offset is part of both: in the mirage it
+moves rays more than anything here, but it turns none. Then the pictures: the mirage in a telescope and to the naked
+eye, and the fibre, with exact paths drawn over them (white, between squares) and the ends of the traced ones (green
+crosses).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract.formulas.documented import FORMULAS, automatic
+from mi_refract.image_diff import methods
+from mi_refract.plugins.refract import PLUGIN
+from mi_refract.rendering import scene_files
+from mi_refract.report.row import Row
+from validation.reference import layered_scenes
+from validation.reference.layered_scenes import FIBRE, MIRAGE, Layers, Path
+from validation.run import path_overlay
+from validation.run.context import SCENES, Context, Task
+from validation.run.path_overlay import View
+
+TITLE = "Paths"
+TEXT = __doc__.partition("\n")[2].strip()
+INDICES, RATIOS = "exact, indices in float32", "exact, ratios in float32"
+TERMS = {
+    "direction": "largest |d − exact| anywhere on a path, over the sine of the angle at which it enters",
+    "direction / condition": "the same, less what the fall of a cosine to a smaller one magnifies of any error",
+    "place": "largest distance from the exact path, over that path's own extent across the layers",
+    INDICES: "Snell's law in double precision for the indices rounded to float32, which the built-in starts from",
+    RATIOS: "the same for the ratio of every two neighbours rounded to float32, which the other formulas start from",
+    "astray": "rays that meet another number of boundaries than they should",
+    "ray offset": "the place, if the exact path were without Mitsuba's ray offset: the same for every plugin",
+    "pixels off": "pixels of which a channel differs by more than 0.1 from the built-in's, same seed",
+    "pixels off, control": "the same between two formulas at the rounding limit: what flipped lobes alone do",
+}
+AXES = {"x": "distance, or mrad of entry", "y": "deviation", "x_scale": "linear", "y_scale": "log", "slope": None}
+STUDY = "paths"
+BUILTIN = "dielectric"
+SCALAR = "needs a compiled variant: on scalar arrays formulas compute in double precision"
+SEED = 2028
+RAYS = 64
+VISIBLE = 0.1
+FLIPPED = 1e-3  # of the pixels: those of which a last bit changes the choice between reflection and refraction
+# The pictures: a scene, what its parameters are, and the name of the view.
+VIEWS: tuple[tuple[str, dict[str, str], str], ...] = (
+    ("mirage", {}, "mirage, telescope"),
+    ("mirage", {"fov": "1.3"}, "mirage, naked eye"),
+    ("fibre", {}, "fibre"),
+)
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """Rays by origin and direction (R × 3, exact in float32) in `media`, and which one the curves show."""
+
+    origins: np.ndarray
+    directions: np.ndarray
+    media: np.ndarray
+    shown: int
+
+    def exact(self, layers: Layers, offset: float = layered_scenes.OFFSET) -> list[Path]:
+        rays = zip(self.origins, self.directions, self.media, strict=True)
+        return [layered_scenes.exact_path(layers, p, d, int(medium), offset) for p, d, medium in rays]
+
+
+def tasks(context: Context) -> list[Task]:
+    """One task per scene for the paths, one per view for the pictures."""
+    paths = [(layers.scene, functools.partial(_path_rows, context, layers)) for layers in (MIRAGE, FIBRE)]
+    views = [(f"picture of the {view[2]}", functools.partial(_view_rows, context, *view)) for view in VIEWS]
+    return [Task(f"paths: {name}", work) for name, work in paths + views]
+
+
+def plugins() -> list[str]:
+    return [BUILTIN, PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS)]
+
+
+# Paths ---------------------------------------------------------------------------------------------------------
+
+
+def bundle(layers: Layers) -> Bundle:
+    """Into the mirage at 0.15 to 9 thousandths of a radian; into the fibre anywhere, at angles that it guides."""
+    if layers is MIRAGE:
+        sine = np.geomspace(1.5e-4, 9e-3, RAYS)
+        directions = np.stack([np.sqrt(1 - sine**2), -sine, 0 * sine], 1)
+        origins, media, shown = np.tile([-layered_scenes.POOL, 0.005, 0.0], (RAYS, 1)), np.zeros(RAYS, int), RAYS * 2 // 5
+    else:
+        rng = np.random.default_rng(SEED)
+        media = rng.integers(2, len(layers.indices) - 1, RAYS)
+        edges = np.array([*layers.boundaries, 0.0])
+        radius, n = (edges[media - 1] + edges[media]) / 2, np.array(layers.indices)[media]
+        turn = rng.uniform(0, 2 * np.pi, RAYS)
+        origins = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(RAYS, -layers.end)], 1)
+        sine = rng.uniform(0.1, 0.9, RAYS) * np.sqrt(n**2 - layers.indices[1] ** 2) / n
+        azimuth = rng.uniform(0, 2 * np.pi, RAYS)
+        directions = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), -np.sqrt(1 - sine**2)], 1)
+        shown = 0
+    return Bundle(origins.astype(np.float32), directions.astype(np.float32), media, shown)
+
+
+def trace(scene: Any, layers: Layers, rays: Bundle, steps: int) -> np.ndarray:
+    """Start, direction and end of each segment as Mitsuba has it, S × 3 × R × 3; NaN after the end of a path.
+
+    The sample 1 − 2⁻²⁴ reflects only where the reflectance is 1: total internal reflection.
+    """
+    import mitsuba as mi
+
+    sampling, axis, sign, count = mi.BSDFContext(), layers.axis, math.copysign(1.0, layers.end), len(rays.media)
+    found = dr.full(mi.Float, dr.nan, steps * 9 * count)
+    ray = mi.Ray3f(mi.Point3f(rays.origins.T), mi.Vector3f(rays.directions.T))
+
+    def step(i: Any, active: Any, ray: Any) -> tuple[Any, Any, Any]:
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        for j, x in enumerate((*ray.o, *ray.d, *si.p)):
+            dr.scatter(found, x, (i * 9 + j) * count + dr.arange(mi.UInt32, count), active)
+        active &= (sign * si.p[axis] < sign * layers.end) & ~si.shape.is_emitter()
+        bs, _ = si.bsdf().sample(sampling, si, 1 - 2.0**-24, [0.5, 0.5], active)
+        return i + 1, active, si.spawn_ray(si.to_world(bs.wo))
+
+    start = dr.zeros(mi.UInt32, count), dr.full(mi.Bool, True, count), ray
+    # One symbolic loop: each step would trace the callables of all media anew.
+    dr.while_loop(start, lambda i, active, ray: active & (i < steps), step)
+    return np.moveaxis(np.array(found, float).reshape(steps, 3, 3, count), 2, 3)
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Of one traced path at the middle of each of its segments, which no ray offset separates from the exact one."""
+
+    along: np.ndarray
+    direction: np.ndarray
+    conditioned: np.ndarray
+    place: np.ndarray
+    boundaries: int
+
+
+def deviation(layers: Layers, exact: Path, segments: np.ndarray) -> Deviation:
+    """`segments`: starts, directions and ends, S × 3 × 3, as far as they are finite.
+
+    A cosine c' behind a boundary obeys c' dc' = c dc: so what is off by ε at the entry is off by ε sin α / c' there,
+    α the angle between ray and layers at the entry.
+    """
+    starts, d, ends = segments[np.isfinite(segments).all((1, 2))].swapaxes(0, 1)
+    d = d / np.linalg.norm(d, axis=1)[:, None]
+    # The last segment ends far beyond the layers.
+    beyond = (layers.end - starts[-1, layers.axis]) / d[-1, layers.axis]
+    middle = np.concatenate([(starts[:-1] + ends[:-1]) / 2, [starts[-1] + d[-1] * beyond / 2]])
+    segment, points = exact.at(layers, middle[:, layers.axis])
+    across = np.delete(exact.starts - exact.starts[0], layers.axis, 1)
+    extent = np.linalg.norm(across, axis=1).max() or math.inf
+    sine = math.sqrt(1 - exact.directions[0, layers.axis] ** 2)
+    direction = np.linalg.norm(d - exact.directions[segment], axis=1) / sine
+    return Deviation(
+        np.abs(middle[:, layers.axis] - exact.starts[0, layers.axis]),
+        direction,
+        direction * np.minimum(exact.cosines(layers)[segment] / sine, 1),
+        np.linalg.norm(middle - points, axis=1) / extent,
+        len(d) - 1,
+    )
+
+
+def _path_rows(context: Context, layers: Layers) -> list[Row]:
+    if context.variant.startswith("scalar"):
+        return [Row(STUDY, plugin, layers.scene, context.variant, reason=SCALAR) for plugin in plugins()]
+    rays = bundle(layers)
+    exact = rays.exact(layers)
+    steps = 4 * max(len(path.media) for path in exact)
+    found = {plugin: _deviations(layers, rays, exact, plugin, steps) for plugin in plugins()}
+    found |= {name: _exact_deviations(other, layers, rays, exact) for name, other in rounded(layers).items()}
+    replay = {"scene": f"{layers.scene}.xml", "rays": RAYS, "seed": SEED, "shown": rays.shown}
+    rows = [
+        Row(STUDY, plugin, f"{layers.scene}: path", context.variant, _values(exact, parts),
+            _budgets(layers, plugin, exact), replay=replay | {"plugin": plugin})
+        for plugin, parts in found.items()
+    ]  # fmt: skip
+    offset = {"ray offset": _moved(layers, rays, exact)}
+    for case, curves in _curves(rays, found).items():
+        case = f"{layers.scene}: {case}"
+        rows.append(Row(STUDY, "every plugin", case, context.variant, offset, replay=replay, curves=curves))
+    return rows
+
+
+def _curves(rays: Bundle, found: dict[str, list[Deviation]]) -> dict[str, dict[str, list[tuple[float, float]]]]:
+    """By case and plugin: along the path that is shown, and at the end of every path."""
+    shown = {plugin: parts[rays.shown] for plugin, parts in found.items()}
+    entry = 1e3 * np.hypot(rays.directions[:, 1], rays.directions[:, 0] if rays.media.any() else 0)
+    end = {plugin: [part.direction[-1] for part in parts] for plugin, parts in found.items()}
+    return {
+        "direction along a path": {p: _points(part.along, part.direction) for p, part in shown.items()},
+        "place along a path": {p: _points(part.along, part.place) for p, part in shown.items()},
+        "direction at the end, by angle of entry": {p: _points(entry, x) for p, x in end.items()},
+    }
+
+
+def _points(x: Any, y: Any) -> list[tuple[float, float]]:
+    return [(float(x_i), float(y_i)) for x_i, y_i in zip(x, y, strict=True)]
+
+
+def _deviations(layers: Layers, rays: Bundle, exact: list[Path], plugin: str, steps: int) -> list[Deviation]:
+    import mitsuba as mi
+
+    scene = mi.load_file(str(SCENES / f"{layers.scene}.xml"), **scene_files.REPRODUCIBLE, bsdf=plugin)
+    segments = trace(scene, layers, rays, steps)
+    return [deviation(layers, path, segments[:, :, i]) for i, path in enumerate(exact)]
+
+
+def rounded(layers: Layers) -> dict[str, Layers]:
+    """What is lost before any formula: the indices in float32, and their ratios, as a plugin may be given them."""
+    n = np.array(layers.indices)
+    ratios = (n[1:] / n[:-1]).astype(np.float32).astype(float)
+    indices = {INDICES: n.astype(np.float32).astype(float), RATIOS: n[0] * np.cumprod([1.0, *ratios])}
+    return {name: dataclasses.replace(layers, indices=tuple(x.tolist())) for name, x in indices.items()}
+
+
+def _exact_deviations(other: Layers, layers: Layers, rays: Bundle, exact: list[Path]) -> list[Deviation]:
+    return [deviation(layers, p, q.segments()) for p, q in zip(exact, rays.exact(other), strict=True)]
+
+
+def _values(exact: list[Path], parts: list[Deviation]) -> dict[str, float]:
+    astray = [part.boundaries != len(path.media) - 1 for path, part in zip(exact, parts, strict=True)]
+    return {
+        "direction": float(max(part.direction.max() for part in parts)),
+        "direction / condition": float(max(part.conditioned.max() for part in parts)),
+        "median direction": float(np.median([part.direction.max() for part in parts])),
+        "place": float(max(part.place.max() for part in parts)),
+        "median place": float(np.median([part.place.max() for part in parts])),
+        "astray": float(sum(astray)),
+    }
+
+
+def _budgets(layers: Layers, plugin: str, exact: list[Path]) -> dict[str, float]:
+    """Of the forms at the rounding limit: no ray goes astray; in the mirage the direction is bounded a priori.
+
+    A boundary rounds the cosine twice (b, and to world coordinates), u each; κ is off by u, and all of them together
+    are no more than sin² α: (2 m + 1) u after m boundaries. A curved boundary adds the rounding of the intersection.
+    """
+    name = plugin.removeprefix(f"{PLUGIN}_")
+    if plugin != PLUGIN and (name not in FORMULAS or not FORMULAS[name].budget.at_the_limit):
+        return {}
+    most = max(len(path.media) - 1 for path in exact)
+    return {"astray": 0.0} | ({} if layers.round else {"direction / condition": (2 * most + 1) * 2.0**-24})
+
+
+def _moved(layers: Layers, rays: Bundle, exact: list[Path]) -> float:
+    """How far the ray offset moves the exact paths, as `place`; the median, for some turn elsewhere without it."""
+    plain = rays.exact(layers, offset=0.0)
+    moved = [deviation(layers, p, q.segments()) for p, q in zip(plain, exact, strict=True)]
+    return float(np.median([part.place.max() for part in moved]))
+
+
+# Pictures ------------------------------------------------------------------------------------------------------
+
+
+def _view_rows(context: Context, scene: str, parameters: dict[str, str], name: str) -> list[Row]:
+    """`refract` and the built-in, picture against picture; and what flipped lobes alone do, as a control."""
+    if context.variant.startswith("scalar"):
+        return [Row(STUDY, PLUGIN, f"{name}: picture", context.variant, reason=SCALAR)]
+    profile, right = context.profile, _other_right_formula()
+    spp = max(1, profile.spp // 4)
+    views = {p: View(scene, p, parameters, profile.resolution, spp) for p in (BUILTIN, PLUGIN, right)}
+    reference, test, control = (view.picture for view in views.values())
+    values = {
+        "pixels off": methods.paired(reference, test, VISIBLE).changed,
+        "pixels off, control": methods.paired(control, test, VISIBLE).changed,
+    }
+    about = {"scene": f"{scene}.xml", "resolution": profile.resolution, "spp": spp, "seed": 0, **parameters}
+    pictures = {
+        role: path_overlay.save(context.out, f"{name} {plugin} with paths", _with_paths(views[plugin], scene), about)
+        for role, plugin in (("reference", BUILTIN), ("test", PLUGIN))
+    }
+    replay = about | {"control": right}
+    budgets = {"pixels off, control": FLIPPED}
+    return [Row(STUDY, PLUGIN, f"{name}: picture", context.variant, values, budgets, replay=replay, pictures=pictures)]
+
+
+def _other_right_formula() -> str:
+    """A plugin at the rounding limit whose formula is not the default's."""
+    import mitsuba as mi
+
+    default = automatic(dr.backend_v(mi.Float))
+    return next(f"{PLUGIN}_{k}" for k, f in FORMULAS.items() if f.budget.at_the_limit and k != default)
+
+
+def _with_paths(view: View, scene: str) -> np.ndarray:
+    """Seven exact paths over the picture, and where the view's own plugin takes the same rays."""
+    layers = layered_scenes.LAYERS[scene]
+    if layers is MIRAGE:
+        places = zip(np.linspace(0.08, 0.92, 7), (0.70, 0.91, 0.60, 0.79, 0.88, 0.74, 0.93), strict=True)
+        origins, directions = np.stack([view.ray(u, v) for u, v in places], 1)
+        rays = Bundle(origins.astype(np.float32), directions.astype(np.float32), np.zeros(7, int), 0)
+    else:
+        every = bundle(layers)
+        rays = Bundle(every.origins[:7], every.directions[:7], every.media[:7], 0)
+    exact = rays.exact(layers)
+    segments = trace(view.scene, layers, rays, 4 * max(len(path.media) for path in exact))
+    ends = np.array([x[np.isfinite(x).all((1, 2))][-1, 2] for x in np.moveaxis(segments, 2, 0)])
+    return path_overlay.draw(view, [_until(layers, path, end) for path, end in zip(exact, ends, strict=True)], ends)
+
+
+def _until(layers: Layers, path: Path, end: np.ndarray) -> np.ndarray:
+    """The corners of a path, and its last segment prolonged to where `end` is along the axis."""
+    p, d = path.starts[-1], path.directions[-1]
+    last = p + d * (end[layers.axis] - p[layers.axis]) / d[layers.axis]
+    return np.concatenate([np.stack([path.starts, path.ends], 1).reshape(-1, 3)[:-1], [last]])

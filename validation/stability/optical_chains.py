@@ -1,0 +1,296 @@
+"""Stability: formulas at work, boundary after boundary, against closed answers.
+
+A formula is fed with inputs rounded to its precision, and its output is carried on; all geometry in between is in
+extended precision. Each error stands next to itself over condition · u: that is what the answer may be off by if
+every rounded input and every direction a formula returns were off by u, the roundoff, to first order. Up to 1 the
+problem is to blame, for rounding the exact answers may do as badly; above 1 the formula. Mitsuba's functions exist in
+float32 only.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract import regimes
+from mi_refract.formulas.documented import FORMULAS
+from mi_refract.report.row import Row
+from validation.directions.judge import Subject, evaluate
+from validation.reference import optical_systems
+from validation.run import array_settings as backends
+from validation.run.array_settings import Setting
+from validation.run.context import Context, Task
+
+from .layer_chains import FEEDS, Array, Fed, Layers, air, carry, cosine, enter, exact_ratios, frame, pipe
+
+TITLE = "Stability"
+TEXT = __doc__.partition("\n")[2].strip()
+AXES = {
+    "x": "layers passed",
+    "y": "relative error of the cosine",
+    "x_scale": "log",
+    "y_scale": "log",
+    "slope": None,
+}
+SEEN_AT = 89.4  # degrees: the ray of the curves
+PASSING, TURNING = (88.0, 89.0, 89.4, 89.55), (89.6, 89.8, 89.95)
+# A normal, and the direction along the layers.
+PLANES = {"upright": np.array([[0, 0, 1], [1, 0, 0]]), "askew": np.array([[0.36, 0.48, 0.8], [0.8, -0.6, 0]])}
+CORE = 1.5  # the index of the light pipe
+PIPE_RAYS = 8
+PROBLEM = "the problem"
+
+TERMS = {
+    "error / condition": "the worst error over condition · u of its ray",
+    "error": "the worst error; of a mirage, relative, of the cosine where the ray ends; of directions, in radians",
+    **{f"{angle}°": f"the same of the ray that enters at {angle}°" for angle in PASSING},
+    "misjudged": "rays that turned where they should have passed or the reverse; reflections that were none",
+    "turning height": "how far the layer in which a ray turned is from the right one, over all layers",
+    "length drift": "how far the length of the direction is from what it was, relative",
+    "over print": "the largest deviation from CODE V's print, over what printing rounds to",
+    "mirage": "air of index 1.0003 at the top and 3e-5 less at the bottom, in layers; entered at 88 … 89.95°, the last "
+    "three turn. Upright: the normal is an axis; askew: it is none",
+    "exact ratios": "250 layers of ratio 1 + 2⁻²³, which float32 holds: nothing is lost before a formula begins",
+    **FEEDS,
+    PROBLEM: f"condition · u of the ray that enters at {SEEN_AT}°, with the error of every formula layer by layer",
+    "light pipe": f"total internal reflections in a square pipe of index {CORE}, askew; only signs may change",
+} | {name: " ".join((trace.__doc__ or "").split()) for name, trace in optical_systems.SYSTEMS.items()}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How much a backend does: scalar arrays cost a Python call per operation."""
+
+    layers: tuple[int, ...]
+    planes: tuple[str, ...]
+    reflections: int
+    angles: tuple[float, ...]
+    curves: bool
+    remark: str = ""
+
+
+def extent(context: Context, setting: Setting) -> Extent:
+    if not setting.is_scalar:
+        return Extent((1000, 100_000), tuple(PLANES), 10_000, PASSING + TURNING, True)
+    if context.profile.name == "full":
+        return Extent((1000, 100_000), ("askew",), 10_000, (89.55, 89.95), False, "two rays: scalar arrays are slow")
+    remark = "two rays, at most 1000 boundaries: scalar arrays are slow"
+    return Extent((1000,), ("askew",), 1000, (89.4, 89.8), False, remark)
+
+
+def settings(context: Context) -> list[Setting]:
+    """Those of the directions, and scalar float32 for Mitsuba alone: Dr.Jit's own scalars compute in double."""
+    return [Setting("scalar", np.float32, dr.scalar.Array3f, mitsuba="scalar_rgb"), *backends.settings(context)]
+
+
+def tasks(context: Context) -> list[Task]:
+    return [
+        Task(f"stability: {setting.label}, {name}", functools.partial(rows, context, setting))
+        for setting in settings(context)
+        for name, rows in (("chains", chain_rows), ("systems", system_rows))
+        if setting.vector is not None or name == "chains"
+    ]
+
+
+def subjects(context: Context, setting: Setting) -> dict[str, Subject]:
+    """Those of the setting that run there."""
+    return {name: subject for name, subject in setting.subjects.items() if name not in absent(context, setting)}
+
+
+def absent(context: Context, setting: Setting) -> dict[str, str]:
+    """Why a formula, or Mitsuba's functions, are not measured in a setting."""
+    if setting.vector is None:
+        return dict.fromkeys([*FORMULAS, backends.BUILTIN], setting.reason)
+    if setting.precision is np.float64:
+        return {backends.BUILTIN: "Mitsuba's wheel has no variant in double precision"}
+    if setting.is_scalar:
+        return dict.fromkeys(FORMULAS, "Dr.Jit's scalar arrays compute in double precision")
+    return {} if setting.mitsuba else {backends.BUILTIN: context.variants[f"{setting.backend}_ad_rgb"] or ""}
+
+
+# Chains --------------------------------------------------------------------------------------------------------
+
+
+def chain_rows(context: Context, setting: Setting) -> list[Row]:
+    rows = [Row("stability", name, "all", setting.label, reason=why) for name, why in absent(context, setting).items()]
+    if setting.vector is None:
+        return rows
+    how, found = extent(context, setting), subjects(context, setting)
+    for case, layers, plane in mirages(how):
+        rows += mirage_rows(found, case, layers, plane, setting, how)
+    return [*rows, *(pipe_row(name, subject, setting, how) for name, subject in found.items())]
+
+
+def mirages(how: Extent) -> list[tuple[str, Layers, Array]]:
+    """(case, layers, normal and direction along them)."""
+    cases = [(f"mirage {plane}, {n} layers", air(n), PLANES[plane]) for n in how.layers for plane in how.planes]
+    return [*cases, ("exact ratios askew, 250 layers", exact_ratios(250), PLANES["askew"])]
+
+
+def feeds(layers: Layers, setting: Setting) -> list[str]:
+    """What float32 holds exactly is told in one way; where nothing is lost, in float64, the way makes no difference."""
+    if layers.exact:
+        return ["ratios"]
+    return [*FEEDS] if setting.precision is np.float32 else ["ratios", "contrasts"]
+
+
+def at_limit(name: str) -> bool:
+    """Whether a subject is a form at the rounding limit: those take a contrast, and have budgets."""
+    return name in FORMULAS and FORMULAS[name].takes_contrast
+
+
+def mirage_rows(
+    found: dict[str, Subject], case: str, layers: Layers, plane: Array, setting: Setting, how: Extent
+) -> list[Row]:
+    """A row per formula and per way to feed it, and one of the problem with the curves of all of them."""
+    drawn = how.curves and plane is PLANES["askew"]
+    seen = np.unique(np.geomspace(1, layers.count, 25).astype(int)) if drawn else np.array([], int)
+    degrees = np.concatenate([how.angles, np.full(len(seen), SEEN_AT)])
+    stop = np.concatenate([np.full(len(how.angles), layers.count), seen])
+    rays = enter(layers, degrees, stop, plane, setting.precision)
+    rows = []
+    for feed in feeds(layers, setting):
+        fed, curves = rays.fed(feed, setting.precision), {}
+        for name, subject in found.items():
+            if feed == "contrasts" and not at_limit(name):
+                continue
+            row, error = mirage_row(name, subject, case, fed, setting, how)
+            rows.append(row)
+            curves[name] = error[len(how.angles) :]
+        if drawn:
+            rows.append(problem_row(case, fed, setting, curves))
+    return rows
+
+
+def mirage_row(name: str, subject: Subject, case: str, fed: Fed, setting: Setting, how: Extent) -> tuple[Row, Array]:
+    """The row, and the relative error of the cosine of every ray: 1 where it turned or passed wrongly."""
+    rays, final = fed.rays, slice(0, len(how.angles))
+    count = rays.layers.count
+    carried = carry(subject, fed.chain, rays.a, rays.stop, setting)
+    right = (carried.place >= rays.stop) == rays.passes
+    error = np.where(right, np.abs(cosine(carried.b, rays.normal) / rays.end - 1), 1)
+    error = np.nan_to_num(error.astype(float), nan=np.inf)
+    turned = np.where(carried.place < 0, carried.passed // 2, rays.stop)
+    length = np.sqrt((carried.b**2).sum(1) / (rays.a.astype(np.longdouble) ** 2).sum(1))
+    values = {
+        "error / condition": worst((error / (fed.condition * setting.roundoff))[final][right[final]]),
+        "error": worst(error[final]),
+        "misjudged": float((~right)[final].sum()),
+        "turning height": worst((np.abs(turned - rays.last) / count)[final][~rays.passes[final]]),
+        "length drift": worst(np.abs(length - 1)[final]),
+    } | {f"{angle}°": float(e) for angle, e in zip(how.angles, error, strict=False) if angle in PASSING}
+    budgets = mirage_budgets(fed, setting.roundoff, final) if at_limit(name) else {}
+    remark = how.remark if budgets or not at_limit(name) else "; ".join(filter(None, (NOTHING, how.remark)))
+    replay = {"layers": count, "n_0": float(rays.layers.index[0]), "n_last": float(rays.layers.index[-1]),
+              "angles": how.angles, "normal": [float(x).hex() for x in rays.normal]}  # fmt: skip
+    case = f"{case}, {fed.feed}"
+    return Row("stability", name, case, setting.label, values, budgets, reason=remark, replay=replay), error
+
+
+# Where ln cos θ changes by x to first order, cos²θ changes by 2x of itself, and |1 − √(1 ± 2x)| ≤ 2x/(1 + √(1 − 2x)).
+# A form at the rounding limit is off by 1.005u a step, where a length has left 1, and by cos θ u/2 ≤ 0.02u for the
+# rounded k that scales the tangent: x ≤ 1.025 condition · u. That is a cosine off by 2 condition · u at most while
+# √(1 − 2x) ≥ 0.025, so while condition · u ≤ 0.487.
+LIMIT = 2.0
+FIRST_ORDER = 0.487
+NOTHING = "no budget: with every input and output off by u, these rays may go anywhere"
+
+
+def mirage_budgets(fed: Fed, u: float, final: slice) -> dict[str, float]:
+    """Of a form at the rounding limit, as far as the problem leaves anything to demand: each of them can be broken.
+
+    Where its bound reaches as far as the decision, a ray may be misjudged.
+    """
+    rays, height = fed.rays, LIMIT * u * fed.height + 1
+    count = rays.layers.count
+    doubtful = np.where(rays.passes, fed.condition * u > FIRST_ORDER, rays.last + height >= count)[final]
+    heights = (height / count)[final][~rays.passes[final]]
+    budgets = {}
+    if (fed.condition[final] * u <= FIRST_ORDER).any():
+        budgets["error / condition"] = LIMIT
+    if not doubtful.all():
+        budgets["misjudged"] = float(doubtful.sum())
+    if len(heights) and worst(heights) < 1:
+        budgets["turning height"] = worst(heights)
+    return budgets
+
+
+def worst(x: Array) -> float:
+    return float(np.nan_to_num(x.astype(float), nan=np.inf).max(initial=0))
+
+
+def problem_row(case: str, fed: Fed, setting: Setting, curves: dict[str, Array]) -> Row:
+    """What the problem itself makes of u, and the error of every formula against the number of layers."""
+    stop = fed.rays.stop
+    seen = len(stop) - len(next(iter(curves.values())))
+    curves = curves | {"condition · u": (fed.condition * setting.roundoff).astype(float)[seen:]}
+    lines = {name: list(zip(stop[seen:].tolist(), y.tolist(), strict=True)) for name, y in curves.items()}
+    values = {"condition · u": lines["condition · u"][-1][1]}
+    return Row("stability", PROBLEM, f"{case}, {fed.feed}", setting.label, values, curves=lines)
+
+
+def pipe_row(name: str, subject: Subject, setting: Setting, how: Extent) -> Row:
+    rays = 2 if setting.is_scalar else PIPE_RAYS
+    a, chain, exact = pipe(how.reflections, rays, CORE, setting.precision)
+    carried = carry(subject, chain, a, np.full(rays, how.reflections), setting)
+    lengths = [np.sqrt((x.astype(np.longdouble) ** 2).sum(1)) for x in (carried.b, a)]
+    chord = np.sqrt(((carried.b - exact) ** 2).sum(1)) / lengths[1]
+    # Every reflection passes on what is wrong with the direction, and adds its own: at most u each.
+    condition = how.reflections
+    values = {
+        "error / condition": worst(chord / (condition * setting.roundoff)),
+        "error": worst(chord),
+        "misjudged": float(carried.passed.sum()),
+        "length drift": worst(np.abs(lengths[0] / lengths[1] - 1)),
+    }
+    limits = {"error / condition": 1.0, "misjudged": 0.0}
+    budgets = limits if at_limit(name) else {}
+    axis = [float(x).hex() for x in frame(setting.precision)[2]]
+    replay = {"reflections": how.reflections, "rays": rays, "axis": axis}
+    case = f"light pipe, {how.reflections} reflections"
+    return Row("stability", name, case, setting.label, values, budgets, reason=how.remark, replay=replay)
+
+
+# Systems -------------------------------------------------------------------------------------------------------
+
+
+class Refractor:
+    """A formula as a system asks for it: inputs rounded to the setting's precision. Counts what it did not transmit."""
+
+    def __init__(self, subject: Subject, setting: Setting) -> None:
+        self.subject, self.setting, self.mirrored = subject, setting, 0
+
+    def __call__(self, a: Array, n: Array, k: Any) -> Array:
+        given = np.broadcast_arrays(a, n, np.reshape(k, (-1, 1)))
+        a, n, k = (x.astype(self.setting.precision) for x in given)
+        b, transmitted = evaluate(self.subject, regimes.Rays(a, n, k[:, 0]), self.setting.vector)
+        self.mirrored += int((~transmitted).sum())
+        return b
+
+
+def system_rows(context: Context, setting: Setting) -> list[Row]:
+    found = subjects(context, setting).items()
+    return [system_row(name, subject, case, setting) for case in optical_systems.SYSTEMS for name, subject in found]
+
+
+def system_row(name: str, subject: Subject, case: str, setting: Setting) -> Row:
+    trace, refractor = optical_systems.SYSTEMS[case], Refractor(subject, setting)
+    error = np.sqrt((trace(refractor) ** 2).sum(1))
+    values = {
+        "error / condition": worst(error / (optical_systems.condition(trace) * setting.roundoff)),
+        "error": worst(error),
+        "misjudged": float(refractor.mirrored),
+    }
+    # The condition counts u for every rounding. Inputs take √3/2 of it, a form at the rounding limit 0.8724, or 1.005
+    # where a length has left 1: that half a hundredth is not granted.
+    budgets = {"error / condition": 1.0, "misjudged": 0.0} if at_limit(name) else {}
+    if case == "double Gauss":
+        values["over print"] = optical_systems.off_print(Refractor(subject, setting))
+        # Angles stay below 45°, where a surface costs any formula 20u, and 11 · 20 · 2⁻⁵³ is far below the print.
+        budgets |= {"over print": 1.0} if setting.precision is np.float64 else {}
+    replay = {"definition": " ".join((trace.__doc__ or "").split()), "rays": len(error)}
+    return Row("stability", name, case, setting.label, values, budgets, replay=replay)

@@ -1,0 +1,1 @@
+"""Study of other people's refraction."""

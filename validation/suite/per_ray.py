@@ -1,0 +1,213 @@
+"""Per ray: other people's refraction, each in its own program, against the certified answer.
+
+A program reads rays as CSV and answers with directions; `mi-refract rays run` hands rays to one in the same way, and
+judges alike. Its answers must keep the bound of the textbook formula in its precision for that very ray. How far each
+is off was noted before, for rays of these kinds whose numbers were not kept: to meet the noted worst error within a
+factor of 3 either way is a goal and no budget. A program that is installed and crashes, hangs, or answers other rays
+than it was given fails; one that says that it cannot run on this machine, or is not installed, is not run.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mi_refract import regimes
+from mi_refract.accuracy import direction_errors
+from mi_refract.ray_sets import check_answers
+from mi_refract.ray_sets import ray_set as ray_files
+from mi_refract.ray_sets.check_answers import PROBLEMS, Figures, Findings
+from mi_refract.ray_sets.ray_set import Answers, RaySet
+from mi_refract.report.row import Row
+from validation.run.context import Context, Task
+from validation.suite.renderers.system import CRITICAL, GRAZING, MATCHED, RANDOM, TOTAL, Call, System
+
+from .renderers import SYSTEMS, environments
+
+Numbers = dict[str, float]
+TITLE = "Per ray"
+TEXT = __doc__.partition("\n")[2].strip()
+STUDY = "per_ray"
+SEED = 2040
+APART = 4e-4  # of cos²θ_t from 0, in random rays
+NEAR = 3.0  # the factor that the worst error may be off the noted one
+
+
+@dataclass(frozen=True)
+class Set:
+    """`count` rays of a kind: `draw` gives their angles from the normal and k, as in `regimes`."""
+
+    count: int
+    draw: regimes.Draw
+    text: str
+
+
+def _random(rng: np.random.Generator, count: int, eps: float) -> tuple[np.ndarray, np.ndarray]:
+    """What is nearer to the critical angle than one in 10⁴ is the next set's: here it would be a matter of luck."""
+    cosine, k = rng.uniform(0, 1, 2 * count), 1.5 ** rng.choice([-1.0, 1.0], 2 * count)
+    apart = np.flatnonzero(np.abs(1 - k * k * (1 - cosine * cosine)) > APART)[:count]
+    return np.arccos(cosine[apart]), k[apart]
+
+
+def _critical(rng: np.random.Generator, count: int, eps: float) -> tuple[np.ndarray, np.ndarray]:
+    k = rng.uniform(1.05, 2.5, count)
+    return np.arcsin(1 / k) - _spread(rng, 1e-7, 1e-3, count), k
+
+
+def _grazing(rng: np.random.Generator, count: int, eps: float) -> tuple[np.ndarray, np.ndarray]:
+    return np.pi / 2 - _spread(rng, 1e-5, 1e-2, count), np.full(count, 1 / 1.5)
+
+
+def _matched(rng: np.random.Generator, count: int, eps: float) -> tuple[np.ndarray, np.ndarray]:
+    return np.arccos(rng.uniform(0.1, 1, count)), 1 + _spread(rng, 1e-7, 1e-3, count) * rng.choice([-1.0, 1.0], count)
+
+
+def _total(rng: np.random.Generator, count: int, eps: float) -> tuple[np.ndarray, np.ndarray]:
+    return rng.uniform(np.arcsin(1 / 1.5) + 0.01, np.pi / 2 - 0.01, count), np.full(count, 1.5)
+
+
+def _spread(rng: np.random.Generator, low: float, high: float, count: int) -> np.ndarray:
+    return np.exp(rng.uniform(np.log(low), np.log(high), count))
+
+
+SETS = {
+    RANDOM: Set(20_000, _random, f"cosine uniform, k = 1.5 or 1/1.5; cos²θ_t at least {APART:g} from 0"),
+    CRITICAL: Set(1000, _critical, "1e-7 … 1e-3 rad short of the critical angle, k in 1.05 … 2.5"),
+    GRAZING: Set(1000, _grazing, "1e-5 … 1e-2 rad from the surface, k = 1/1.5"),
+    MATCHED: Set(1000, _matched, "|k − 1| from 1e-7 to 1e-3, cosine uniform in 0.1 … 1"),
+    TOTAL: Set(1000, _total, "0.01 rad or more beyond the critical angle and from the surface, k = 1.5"),
+}
+TERMS = {name: f"{rays.count} rays: {rays.text}" for name, rays in SETS.items()} | {
+    "worst rad": "the largest angle to the certified direction, of the rays that were decided rightly",
+    "noted": "the largest such angle that was noted of this system before",
+    "off the noted": "the factor between the two, whichever is larger; 1 inside a range that was noted",
+    "error / bound": "the largest share that an error takes of its ray's a-priori bound, that of the textbook formula",
+    "misjudged": "rays whose total internal reflection was decided wrongly",
+    "wrong": "rays beyond the bound, misjudged although the bound decides them, or without a direction",
+    "given up": "rays left out because the system takes what is that near to the critical angle for totally reflected",
+    "unfit": "answers that are missing, doubled, or to rays that were not asked",
+    "told otherwise": "1 where total internal reflection is not told as it was noted to be",
+    "unanswered": "rays that a program which crashed, hung or printed no answers leaves open",
+}
+
+
+def tasks(context: Context) -> list[Task]:
+    """One per function of each system."""
+    return [
+        Task(f"per ray: {call.title}, {call.precision}", functools.partial(call_rows, system, call, context))
+        for system in SYSTEMS.values()
+        for call in system.calls
+    ]
+
+
+def call_rows(system: System, call: Call, context: Context) -> list[Row]:
+    if reason := environments.absent(system):
+        return [_unmeasured(call, reason)]
+    if not system.small and context.profile.name == "quick":
+        return [_unmeasured(call, f"{system.megabytes} MB: in the full profile only")]
+    rays = given(call.precision)
+    try:
+        text = environments.run(environments.script(system, call.script, *call.arguments), ray_files.as_csv(rays))
+        answers = ray_files.parse_answers(text, call.title)
+    except environments.Unable as reason_here:
+        return [_unmeasured(call, f"cannot run here: {reason_here}")]
+    except (environments.Broken, ValueError) as defect:
+        values = {"unanswered": float(len(rays))}
+        return [Row(STUDY, call.title, "every set", call.precision, values, {"unanswered": 0}, reason=str(defect))]
+    return rows(call, rays, answers)
+
+
+def _unmeasured(call: Call, reason: str) -> Row:
+    return Row(STUDY, call.title, "every set", call.precision, reason=reason)
+
+
+@functools.cache
+def given(precision: str) -> RaySet:
+    """All sets, one after the other."""
+    parts = {name: _made(kind, ray_files.PRECISIONS[precision], i) for i, (name, kind) in enumerate(SETS.items())}
+    return _gathered(parts, precision)
+
+
+def _made(kind: Set, precision: type, number: int) -> regimes.Rays:
+    rng = np.random.default_rng([SEED, number])
+    normal: np.ndarray = regimes.normalised(rng.normal(size=(kind.count, 3))).astype(precision)
+    a, n, k = regimes.rays_at(kind.draw, rng, normal)
+    return regimes.Rays(a.astype(precision), n.astype(precision), k.astype(precision))
+
+
+def _gathered(parts: dict[str, regimes.Rays], precision: str) -> RaySet:
+    regime = np.concatenate([np.full(len(part), name, dtype=object) for name, part in parts.items()])
+    ends = {name: np.flatnonzero(regime == name)[[0, -1]].tolist() for name in parts}
+    header = {"precision": precision, "seed": SEED, "regimes": ends}
+    rays = RaySet(regimes.Rays.joined(list(parts.values())), np.arange(len(regime)), regime, header)
+    return replace(rays, header=header | {"checksum": ray_files.checksum(rays)})
+
+
+# Judged ------------------------------------------------------------------------------------------------------------
+
+
+def rows(call: Call, rays: RaySet, answers: Answers) -> list[Row]:
+    """One per set."""
+    left_out = direction_errors.radicand(rays.rays) < call.gives_up
+    findings = check_answers.check(_only(rays, ~left_out), _without(answers, rays.ids[left_out]))
+    about = _remark(findings, str(answers.header.get("system", "")), call.remark)
+    made = []
+    for name in SETS:
+        figures = next((each for each in findings.regimes if each.regime == name), None)
+        values, budgets, goals = _measured(name, call, findings, figures)
+        if call.gives_up:
+            values["given up"] = float(left_out[rays.regime == name].sum())
+        replay = {
+            "set": SETS[name].text, "seed": SEED, "script": " ".join((call.script, *call.arguments)),
+            "worst": figures.replay if figures else None,
+        }  # fmt: skip
+        made.append(Row(STUDY, call.title, name, call.precision, values, budgets, goals, about, replay))
+    return made
+
+
+def _only(rays: RaySet, mask: np.ndarray) -> RaySet:
+    return replace(rays, rays=rays.rays[mask], ids=rays.ids[mask], regime=rays.regime[mask])
+
+
+def _without(answers: Answers, ids: np.ndarray) -> Answers:
+    kept = ~np.isin(answers.ids, ids)
+    flags = None if answers.transmitted is None else answers.transmitted[kept]
+    return replace(answers, ids=answers.ids[kept], b=answers.b[kept], transmitted=flags)
+
+
+def _remark(findings: Findings, system: str, known: str) -> str:
+    """Who answered, how total internal reflection was told, what is wrong with the answers, and what explains them."""
+    problems = [f"{each.kind} {each.text}" for each in findings.problems]
+    mistake = [findings.diagnosis.text] if findings.diagnosis else []
+    return "; ".join(filter(None, (system, f"total internal reflection: {findings.tir}", known, *problems, *mistake)))
+
+
+def _measured(name: str, call: Call, findings: Findings, figures: Figures | None) -> tuple[Numbers, Numbers, Numbers]:
+    """Values, budgets and goals. Where no ray of the set was answered, all that can be said is that it was not."""
+    values = {"unfit": float(sum(each.count for each in findings.problems if PROBLEMS[each.kind]))}
+    budgets = {"unfit": 0.0, "wrong": 0.0}
+    goals: Numbers = {}
+    if figures is None:
+        return values | {"wrong": math.nan}, budgets, goals
+    if figures.judged:
+        values |= {"worst rad": figures.worst, "p99 rad": figures.p99, "mean rad": figures.mean}
+    values |= {
+        "error / bound": figures.share, "misjudged": float(figures.misjudged), "wrong": float(figures.wrong)
+    }  # fmt: skip
+    budgets["error / bound"] = 1.0
+    if name == TOTAL:
+        values["told otherwise"], budgets["told otherwise"] = float(findings.tir != call.told), 0.0
+    if name in call.noted:
+        values |= {"noted": call.noted[name][1], "off the noted": off(figures.worst, *call.noted[name])}
+        goals["off the noted"] = NEAR
+    return values, budgets, goals
+
+
+def off(worst: float, low: float, high: float) -> float:
+    """The factor by which `worst` is outside `low` … `high`, 1 where it is inside; NaN stays NaN."""
+    if not worst > 0:
+        return math.inf if worst == 0 else math.nan
+    return max(worst / high, low / worst, 1.0)

@@ -1,0 +1,211 @@
+"""Pictures: the same plain scene by this plugin and by other renderers, judged by Welch's test.
+
+Both sides have the same flat triangles, the same camera, a box filter, and several independent renders; the glossary
+says how each renderer's model is brought to Mitsuba's. `refract` renders by Mitsuba's `path`. The balls of the scene
+`environment` are those of `balls` under a smooth sky without symmetry, whose map lies askew; in the scene `furnace`,
+a ball on a floor that absorbs nothing under a sky of radiance 1, nothing should be visible. A verdict is "equal",
+"different", or "inconclusive", where the noise hides what would matter or a difference lies only where a t-test knows
+little. Renderers other than the small ones run where they are installed, in the full profile.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mi_refract.image_diff import methods as compare
+from mi_refract.image_diff.methods import Comparison, Verdict
+from mi_refract.io import image_file
+from mi_refract.io.image_file import Image
+from mi_refract.plugins.refract import PLUGIN
+from mi_refract.rendering import scene_files
+from mi_refract.report.row import Row
+from mi_refract.scene_export import from_mitsuba, write_files
+from mi_refract.scene_export.from_mitsuba import Diffuse, Environment, Light, Mesh, Plain
+from validation.run.context import SCENES as FOLDER
+from validation.run.context import Context, Task
+from validation.run.render_methods import Camera
+from validation.suite.renderers.image_renderers import PAINTERS
+
+from .renderers import SYSTEMS, environments
+
+TITLE = "Pictures"
+TEXT = __doc__.partition("\n")[2].strip()
+STUDY = "pictures"
+TERMS = {
+    "tests that differ": "of tiles of 16² pixels by channel, blocks of tiles, and the whole picture; of pairs that are "
+    "equal, one in 10,000 has any",
+    "tiles that differ without noise": "of those where neither side has noise",
+    "detectable difference": "relative to the tile's mean, median over the tiles; of the picture: of its mean",
+    "mean difference": "of the picture's mean, relative: what the other renderer has more",
+    "RMSE / noise": "of the two means by pixel, over what the spread between renders predicts: 1 for equal pictures "
+    "whose noise is all in that spread, which it is not for a fixed grid of samples",
+    "reference, test, difference": f"`{PLUGIN}`, the other renderer, test − reference: means over the renders",
+} | {f"{title}, assumed": " ".join(painter.assumed) for title, painter in PAINTERS.items()}
+FAMILY_ERROR = 1e-4
+RENDERS = 4  # a side
+OURS = 1000  # the first seed of the reference's
+LEVEL = 4  # of the spheres: facets that can be seen, so that both sides must shade them flat
+COMPILED = "needs a compiled variant: millions of samples"
+
+
+@dataclasses.dataclass(frozen=True)
+class Size:
+    """`spp` of each reference render; a painter's own spp is divided by `less`; `wanted`: difference to be seen."""
+
+    resolution: int
+    spp: int
+    less: int
+    wanted: float
+
+
+SIZES = {"quick": Size(64, 64, 32, 0.1), "full": Size(128, 512, 1, 0.01)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """`known`: the renderers that are known to disagree on it; the suite must see it."""
+
+    load: Callable[[int], Plain]
+    known: tuple[str, ...] = ()
+
+
+def _scene(name: str, resolution: int) -> Plain:
+    return from_mitsuba.load(FOLDER / f"{name}.xml", level=LEVEL, res=str(resolution))
+
+
+def environment(resolution: int) -> Plain:
+    return dataclasses.replace(_scene("balls", resolution), name="environment", sky=askew())
+
+
+def furnace(resolution: int) -> Plain:
+    """The ball on a white floor that absorbs nothing, in a white sky: a correct picture is 1 everywhere."""
+    given, white = _scene("sphere", resolution), (1.0, 1.0, 1.0)
+
+    def bright(mesh: Mesh) -> Mesh:
+        return dataclasses.replace(mesh, material=Diffuse(white)) if isinstance(mesh.material, Diffuse) else mesh
+
+    meshes = tuple(bright(mesh) for mesh in given.meshes if not isinstance(mesh.material, Light))
+    return dataclasses.replace(given, name="furnace", meshes=meshes, sky=white)
+
+
+def askew() -> Environment:
+    """A smooth sky that no rotation or mirror takes to itself, turned about two axes."""
+    height, width = 64, 128
+    theta, phi = np.pi * np.arange(height) / (height - 1), 2 * np.pi * (np.arange(width) + 0.5) / width
+    t, p = np.meshgrid(theta, phi, indexing="ij")
+    x, y, z = np.sin(p) * np.sin(t), np.cos(t), -np.cos(p) * np.sin(t)
+    pixels = np.stack([0.9 + 0.5 * x + 0.3 * y * z, 0.8 + 0.4 * y + 0.3 * x * z, 0.7 - 0.4 * z + 0.3 * y * y * x], -1)
+    about_y, about_x = 0.7, 0.4
+    cos, sin = np.cos, np.sin
+    first = [[cos(about_y), 0, sin(about_y)], [0, 1, 0], [-sin(about_y), 0, cos(about_y)]]
+    second = [[1, 0, 0], [0, cos(about_x), -sin(about_x)], [0, sin(about_x), cos(about_x)]]
+    return Environment(pixels.astype(np.float32), np.array(first) @ np.array(second))
+
+
+THREE = "three-gpu-pathtracer"
+SCENES = {
+    "sphere": Scene(functools.partial(_scene, "sphere")),
+    "prism": Scene(functools.partial(_scene, "prism"), (THREE,)),
+    "environment": Scene(environment),
+    "furnace": Scene(furnace, (THREE,)),
+}
+# What makes a renderer disagree.
+WHY = {
+    THREE: "its shadow rays to the sky pass straight through glass, beside the refracted rays that find the same sky, "
+    "so that this light counts twice; see the same without multiple importance sampling (MIS)"
+}
+
+
+def tasks(context: Context) -> list[Task]:
+    """One per renderer and scene."""
+    return [
+        Task(f"pictures: {title}, {scene}", functools.partial(pair_rows, context, title, scene))
+        for title, painter in PAINTERS.items()
+        for scene in painter.spp
+    ]
+
+
+def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
+    painter, size = PAINTERS[title], SIZES[context.profile.name]
+    system = SYSTEMS[painter.system]
+    setting = f"{size.resolution}²"
+    reason = environments.absent(system)
+    if not reason and not system.small and context.profile.name == "quick":
+        reason = f"{system.megabytes} MB: in the full profile only"
+    if not reason and context.variant.startswith("scalar"):
+        reason = COMPILED
+    if reason:
+        return [Row(STUDY, title, scene, setting, reason=reason)]
+    given, seeds = SCENES[scene].load(size.resolution), range(1, RENDERS + 1)
+    spp = max(painter.spp[scene] // size.less, 1)
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            test = painter.draw(given, Path(folder), spp, seeds)
+    except (environments.Unable, ValueError) as why:  # ValueError: a scene that the renderer cannot say
+        return [Row(STUDY, title, scene, setting, reason=" ".join(str(why).split()))]
+    except (environments.Broken, OSError) as defect:
+        values = {"not rendered": float(RENDERS)}
+        return [Row(STUDY, title, scene, setting, values, {"not rendered": 0.0}, reason=str(defect))]
+    return [_row(context, title, scene, reference(scene, size), test, {"spp": spp, "seeds": list(seeds)})]
+
+
+@functools.cache
+def reference(scene: str, size: Size) -> list[Image]:
+    """Of this plugin, in the present variant."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_files.write(SCENES[scene].load(size.resolution), "mitsuba", Path(folder) / "scene")
+        camera = Camera(scene_files.load_scene(Path(folder) / "scene" / "scene.xml", {"bsdf": PLUGIN}))
+        renders = [camera(size.spp, OURS + i)[0] for i in range(RENDERS)]
+    return [image_file.named(f"{PLUGIN} {scene} {i}", each.astype(np.float32)) for i, each in enumerate(renders)]
+
+
+def _row(context: Context, title: str, scene: str, ours: Sequence[Image], theirs: Sequence[Image], about: dict) -> Row:
+    size = SIZES[context.profile.name]
+    found = compare.welch_images(ours, theirs, family_error=FAMILY_ERROR, resolution=size.wanted)
+    values = _values(found, *(np.stack([image.pixels for image in side]) for side in (ours, theirs)))
+    known = title in SCENES[scene].known
+    if known:
+        values["not seen to differ"] = float(found.verdict is not Verdict.DIFFERENT)
+    budgets = {"not seen to differ": 0.0} if known else {}
+    if title not in WHY:
+        budgets = {"tests that differ": 0.0, "tiles that differ without noise": 0.0}
+    goals = {"detectable difference": size.wanted} if title not in WHY else {}
+    reason = f"{found.verdict}: {found.reason}"
+    if title in WHY and found.verdict is Verdict.DIFFERENT:
+        reason += f"; {WHY[title]}"
+    replay = {"verdict": str(found.verdict), "scene": scene, "resolution": size.resolution, "reference spp": size.spp}
+    replay |= about | {"renderer": SYSTEMS[PAINTERS[title].system].source}
+    pictures = _saved(context, title, scene, ours, theirs)
+    return Row(STUDY, title, scene, f"{size.resolution}²", values, budgets, goals, reason, replay, pictures)
+
+
+def _values(found: Comparison, ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
+    """The numbers of a pair; `ours` and `theirs` are renders × height × width × 3."""
+    figures = {figure.name: figure.value for figure in found.figures}
+    noise = sum(side.var(0, ddof=1).mean() / len(side) for side in (ours.astype(float), theirs.astype(float)))
+    rmse = np.sqrt(np.square(theirs.mean(0) - ours.mean(0)).mean())
+    values = {
+        "tests that differ": figures.get("tests of tiles and channels that differ", np.nan),
+        "tiles that differ without noise": figures.get("tiles without noise that differ", np.nan),
+        "detectable difference": found.detectable,
+        "detectable difference, picture": figures.get("detectable relative difference of the whole picture", np.nan),
+        "mean difference": float(theirs.mean() / ours.mean() - 1),
+    }
+    return values | ({"RMSE / noise": float(rmse / np.sqrt(noise))} if noise > 0 else {})
+
+
+def _saved(context: Context, title: str, scene: str, ours: Sequence[Image], theirs: Sequence[Image]) -> dict[str, str]:
+    """Both means and their difference, as EXR files below the output folder."""
+    folder = Path("pictures") / STUDY / scene
+    (context.out / folder).mkdir(parents=True, exist_ok=True)
+    one, two = (np.stack([image.pixels for image in side]).mean(0, dtype=np.float64) for side in (ours, theirs))
+    shown = {"reference": (PLUGIN, one), "test": (title, two), "difference": (f"{title} difference", two - one)}
+    for name, picture in shown.values():
+        image_file.write_exr(context.out / folder / f"{name}.exr", picture.astype(np.float32))
+    return {role: str(folder / f"{name}.exr") for role, (name, _) in shown.items()}

@@ -1,0 +1,147 @@
+"""The private environments of other systems: where they are, what makes them, and how a program in one is run."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from mi_refract.io import process_group
+
+from .system import SCRIPTS, Apt, Npm, Pip, System
+
+COMMAND = "python -m validation renderers --install"
+CANNOT = 77  # the exit code of a script that cannot run on this machine
+TIMEOUT = 600.0  # seconds; a busy machine is slow, a program that hangs is slower
+_INSTALLING = 3600.0
+_FOREIGN = ("PYTHONPATH", "PYTHONHOME", "PYTHONSTARTUP", "VIRTUAL_ENV")
+
+
+class Unable(Exception):
+    """A program that cannot run on this machine; the text says why."""
+
+
+class Broken(Exception):
+    """A program that should run, and crashed or hung; the text says how."""
+
+
+# Where they are --------------------------------------------------------------------------------------------------
+
+
+def folder(system: System) -> Path:
+    """`$XDG_CACHE_HOME/mi_refract/renderers/<name>`, there or not."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mi_refract" / "renderers" / system.name
+
+
+def absent(system: System) -> str:
+    """"" where the system is installed in its pinned version; otherwise the command that brings it."""
+    return "" if _present(system) else f"{COMMAND} {system.name}"
+
+
+def _present(system: System) -> bool:
+    if isinstance(system.needs, Apt):
+        return shutil.which(system.needs.program) is not None
+    return system.needs is None or _marked(system)
+
+
+def _marked(system: System) -> bool:
+    try:
+        return bool(json.loads(_marker(system).read_text()) == _mark(system))
+    except (OSError, ValueError):
+        return False
+
+
+def _marker(system: System) -> Path:
+    """Written once an installation is complete."""
+    return folder(system) / "installed.json"
+
+
+def _mark(system: System) -> list[str]:
+    return [repr(system.needs)]
+
+
+def python(system: System) -> str:
+    """The interpreter that the system's scripts are for."""
+    return str(folder(system) / "bin" / "python") if isinstance(system.needs, Pip) else sys.executable
+
+
+# Making them -----------------------------------------------------------------------------------------------------
+
+
+def install(system: System) -> None:
+    """Make the environment anew, unless it is there. OSError, one line, where that fails."""
+    needs = system.needs
+    if not absent(system):
+        return
+    if isinstance(needs, Apt):
+        root = [] if os.geteuid() == 0 else ["sudo", "-n"]
+        _do(system, [*root, "apt-get", "install", "-y", "-qq", "--no-install-recommends", *needs.packages])
+        return
+    shutil.rmtree(folder(system), ignore_errors=True)
+    folder(system).mkdir(parents=True)
+    if isinstance(needs, Npm):
+        _do(system, ["npm", "install", "--silent", "--no-audit", "--prefix", str(folder(system)), *needs.packages])
+    elif isinstance(needs, Pip):
+        # This environment's pip for the other one: to make one there costs more than most of what it would install.
+        _do(system, [_interpreter(system, needs.python), "-m", "venv", "--without-pip", str(folder(system))])
+        pip = [sys.executable, "-m", "pip", "--python", python(system), "install"]
+        options = ["--quiet", "--disable-pip-version-check", "--no-input", "--no-compile"]
+        _do(system, [*pip, *options, *(["--no-deps"] if needs.bare else []), *needs.requirements])
+    _marker(system).write_text(json.dumps(_mark(system)))
+
+
+def _interpreter(system: System, version: str) -> str:
+    if version in ("", f"{sys.version_info[0]}.{sys.version_info[1]}"):
+        return sys.executable
+    if found := shutil.which(f"python{version}"):
+        return found
+    raise OSError(f"{system.name}: needs Python {version}; accepted: a python{version} in PATH")
+
+
+def _do(system: System, command: Sequence[str]) -> None:
+    try:
+        run(command, timeout=_INSTALLING)
+    except (Broken, Unable) as error:
+        raise OSError(f"{system.name}: {' '.join(command)}: {error}") from None
+
+
+# Running in them ---------------------------------------------------------------------------------------------------
+
+
+def script(system: System, name: str, *arguments: str) -> list[str]:
+    """The command that runs a script of scripts/ in the system's environment."""
+    return [python(system), str(SCRIPTS / name), *arguments]
+
+
+def run(command: Sequence[str], given: str = "", timeout: float | None = None, where: Path | None = None) -> str:
+    """What a program prints, `given` on its stdin; it and all it started are gone when this returns.
+
+    Unable: it exits with CANNOT, for the reason that is its last line on stderr. Broken: it is not there, exits with
+    another code than 0, is killed, prints no text, or runs for longer than `timeout` seconds (TIMEOUT by default).
+    """
+    own = {name: value for name, value in os.environ.items() if name not in _FOREIGN}
+    own |= {"PYTHONNOUSERSITE": "1", "PYTHONUTF8": "1"}
+    limit = TIMEOUT if timeout is None else timeout
+    try:
+        ended = process_group.run(command, given.encode(), limit, keep_stderr=True, cwd=where, env=own)
+    except TimeoutError as error:
+        raise Broken(str(error)) from None
+    except OSError as error:
+        raise Broken(f"{command[0]}: {error.strerror}") from None
+    if ended.status == CANNOT:
+        raise Unable(_last_word(ended.said))
+    if ended.status:
+        raise Broken(f"{ended.how}: {_last_word(ended.said)}")
+    try:
+        return ended.out.decode()
+    except UnicodeDecodeError:
+        raise Broken(f"wrote {len(ended.out)} bytes that are no text") from None
+
+
+def _last_word(said: bytes) -> str:
+    """The last line on stderr: the one that says what is wrong."""
+    lines = [line.strip() for line in said.decode(errors="replace").splitlines() if line.strip()]
+    return lines[-1] if lines else "no word on stderr"

@@ -1,0 +1,137 @@
+"""Renderers that render a plain scene: several independent pictures of it, each in a process of its own.
+
+A picture is height × width × 3, linear, row 0 at the top.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mi_refract.io import image_file
+from mi_refract.io.image_file import Image
+from mi_refract.scene_export import write_files
+from mi_refract.scene_export.plain_scene import Plain
+from mi_refract.scene_export.targets import cycles, luxcore, povray, radiance, scene_json
+
+from . import SYSTEMS, environments, three
+
+HOURS = 4 * 3600.0  # after which a renderer hangs
+
+
+@dataclass(frozen=True)
+class Painter:
+    """`draw(plain, folder, spp, seeds)` leaves one picture a seed, from what it puts into an empty folder.
+
+    `spp`: by scene of the study, the samples a pixel and picture that make a difference of 1 % visible where four
+    pictures are judged; `assumed`: in what the models differ.
+    """
+
+    system: str
+    draw: Callable[[Plain, Path, int, Sequence[int]], list[Image]]
+    spp: Mapping[str, int]
+    assumed: Sequence[str]
+
+
+def _by_script(target: str) -> Callable[[Plain, Path, int, Sequence[int]], list[Image]]:
+    """By the script that is exported with the scene."""
+
+    def draw(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+        write_files.write(plain, target, folder / "scene")
+        program = [environments.python(SYSTEMS[target]), "render.py", "--spp", str(spp), "--out", str(folder)]
+        environments.run([*program, "--seeds", *map(str, seeds)], timeout=HOURS, where=folder / "scene")
+        return [_rgb(image_file.read(folder / f"seed{seed}.exr")) for seed in seeds]
+
+    return draw
+
+
+def _radiance(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+    write_files.write(plain, "radiance", folder / "scene")
+    camera = plain.camera
+    sizes = map(str, (camera.width, spp, plain.max_depth, *seeds))
+    places = str(folder / "scene"), str(folder)
+    script = environments.script(SYSTEMS["radiance"], "radiance_pictures.py", *places, *sizes)
+    environments.run(script, timeout=HOURS)
+    return [_raw(folder / f"seed{seed}.f32", plain) for seed in seeds]
+
+
+def _povray(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+    """The same picture for every seed, for it has no noise: the means over grids of samples, √spp on a side of a pixel.
+
+    Random grids would not do: they move all pixels together, and a tile knows nothing of its noise then.
+    """
+    side, camera = math.isqrt(spp), plain.camera
+    width, height = side * camera.width, side * camera.height
+    finer = dataclasses.replace(plain, camera=dataclasses.replace(camera, width=width, height=height))
+    write_files.write(finer, "povray", folder / "scene")
+    command = ["povray", "+Iscene.pov", "+Oimage.exr", "+FE", f"+W{width}", f"+H{height}", "-A", "-D", "File_Gamma=1.0"]
+    environments.run(command, timeout=HOURS, where=folder / "scene")
+    fine = _rgb(image_file.read(folder / "scene" / "image.exr")).pixels
+    coarse = fine.reshape(camera.height, side, camera.width, side, 3).mean((1, 3), dtype=np.float64)
+    return [image_file.named(f"seed {seed}", coarse.astype(np.float32)) for seed in seeds]
+
+
+def _three(mis: str) -> Callable[[Plain, Path, int, Sequence[int]], list[Image]]:
+    """With multiple importance sampling of the sky ("1"), as the library comes, or without ("0")."""
+
+    def draw(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+        chromium, node = three.browser(), shutil.which("node")
+        if not (chromium and node):
+            raise environments.Unable("no node or no Chromium in PATH")
+        (folder / "scene").mkdir()
+        for name, content in scene_json.files(plain, equirectangular).items():
+            (folder / "scene" / name).write_bytes(content)
+        script = environments.SCRIPTS / "three_pictures.mjs"
+        places = [str(script), str(environments.folder(SYSTEMS["three"])), chromium, str(folder / "scene"), str(folder)]
+        sizes = map(str, (plain.camera.width, spp, mis, *seeds))
+        environments.run([node, *places, *sizes], timeout=HOURS)
+        return [_raw(folder / f"seed{seed}.f32", plain) for seed in seeds]
+
+    return draw
+
+
+def equirectangular(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """The direction whose radiance three finds at (u, v), v from the top."""
+    phi, theta = 2 * np.pi * (u - 0.5), np.pi * v
+    return np.stack([np.cos(phi) * np.sin(theta), np.cos(theta), np.sin(phi) * np.sin(theta)], axis=-1)
+
+
+def _raw(path: Path, plain: Plain) -> Image:
+    shape = (plain.camera.height, plain.camera.width, 3)
+    return image_file.named(path.name, np.frombuffer(path.read_bytes(), "<f4").reshape(shape))
+
+
+def _rgb(image: Image) -> Image:
+    return image_file.named(image.path.name, image.select(("R", "G", "B")))
+
+
+THREE = (
+    "A glass has one index, the quotient of the two; radiance is not scaled by the square of the index.",
+    "The tent filter of its pixels is replaced by a box.",
+    "Its Russian roulette is off, and its random numbers are those of a seed (PCG): its strata are the same in all "
+    "pixels. MIS is its multiple importance sampling of the sky, on by default.",
+    "A diffuse surface is its Disney lobe at roughness 0 and index 1, which is Lambert's; a lamp is a front that emits "
+    "and a black back.",
+    "bounces and transmissiveBounces are Mitsuba's max_depth.",
+)
+
+
+def _spp(sphere: int, prism: int, environment: int) -> dict[str, int]:
+    return {"sphere": sphere, "prism": prism, "environment": environment}
+
+
+POVRAY = ("Each pixel is the mean of a grid of 4 × 4 samples, without noise.", *povray.ASSUMPTIONS)
+PAINTERS: dict[str, Painter] = {
+    "Radiance": Painter("radiance", _radiance, _spp(160, 112, 4), radiance.ASSUMPTIONS),
+    "Cycles": Painter("cycles", _by_script("cycles"), _spp(128, 128, 32), cycles.ASSUMED),
+    "LuxCore": Painter("luxcore", _by_script("luxcore"), _spp(320, 400, 288), luxcore.ASSUMED),
+    "POV-Ray": Painter("povray", _povray, _spp(16, 16, 16), POVRAY),
+    "three-gpu-pathtracer": Painter("three", _three("1"), {"prism": 8, "furnace": 8}, THREE),
+    "three-gpu-pathtracer, no MIS": Painter("three", _three("0"), {"prism": 8, "furnace": 8}, THREE),
+}
