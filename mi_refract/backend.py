@@ -287,9 +287,16 @@ def _probe(name: str, environment: dict[str, str]) -> tuple[str, bool]:
         command = [sys.executable, "-c", _PROBE, name]
         try:
             done = subprocess.run(
-                command, env=os.environ | own | environment, cwd=folder, timeout=TIMEOUT,
-                stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace", check=False,
-            )  # fmt: skip
+                command,
+                env=os.environ | own | environment,
+                cwd=folder,
+                timeout=TIMEOUT,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                check=False,
+            )
         except subprocess.TimeoutExpired:
             return f"a tiny kernel took longer than {TIMEOUT:.0f} s", False
         except OSError as error:

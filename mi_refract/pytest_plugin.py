@@ -26,9 +26,13 @@ class AssertEqual(Protocol):
 
 class AssertUnbiased(Protocol):
     def __call__(
-        self, render: Callable[[int], Any], reference: Picture | Callable[[int], Any], runs: int = RUNS,
-        seed: int = 0, **options: Any,
-    ) -> Any: ...  # fmt: skip
+        self,
+        render: Callable[[int], Any],
+        reference: Picture | Callable[[int], Any],
+        runs: int = RUNS,
+        seed: int = 0,
+        **options: Any,
+    ) -> Any: ...
 
 
 @pytest.fixture
@@ -57,9 +61,12 @@ def _assert_equal(test: Picture, reference: Picture, method: str = "auto", **opt
 
 
 def _assert_unbiased(
-    render: Callable[[int], Any], reference: Picture | Callable[[int], Any], runs: int = RUNS, seed: int = 0,
+    render: Callable[[int], Any],
+    reference: Picture | Callable[[int], Any],
+    runs: int = RUNS,
+    seed: int = 0,
     **options: Any,
-) -> Any:  # fmt: skip
+) -> Any:
     __tracebackhide__ = True
     if runs < 2:
         raise ValueError(f"runs = {runs}: accepted: at least 2, or the noise is not known")

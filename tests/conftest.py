@@ -176,7 +176,6 @@ def run(capfd):
     """`run("diff", old, new, "--samples")`: exit code, stdout, stderr."""
     from mi_refract.cli import app
 
-
     def call(*words):
         capfd.readouterr()
         code = app.main([*map(str, words)])

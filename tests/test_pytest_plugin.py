@@ -31,17 +31,20 @@ def test_what_is_equal_passes(assert_image_equal, assert_image_unbiased, tmp_pat
     assert_image_unbiased(render, tmp_path / "renders", runs=6)
 
 
-@pytest.mark.parametrize(("test", "method", "options", "reason"), [
-    (PICTURE + 1e-5, "exact", {}, "exact: different: "),
-    (1.1 * PICTURE, "auto", {}, "tolerance: different: "),
-    (1.1 * PICTURE, "paired", {}, r"paired: different: (.|\n)*, at most "),
-    (PICTURE * np.nan, "exact", {}, "exact: different: "),
-    (PICTURE[:-1], "auto", {}, "could not compare: "),
-    ("missing.exr", "auto", {}, "could not compare: .*missing.exr"),
-    (["no numbers"], "auto", {}, "could not compare: "),
-    (PICTURE, "telepathy", {}, "could not compare: method 'telepathy': accepted: "),
-    (PICTURE, "exact", {"threshold": 1}, "could not compare: "),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("test", "method", "options", "reason"),
+    [
+        (PICTURE + 1e-5, "exact", {}, "exact: different: "),
+        (1.1 * PICTURE, "auto", {}, "tolerance: different: "),
+        (1.1 * PICTURE, "paired", {}, r"paired: different: (.|\n)*, at most "),
+        (PICTURE * np.nan, "exact", {}, "exact: different: "),
+        (PICTURE[:-1], "auto", {}, "could not compare: "),
+        ("missing.exr", "auto", {}, "could not compare: .*missing.exr"),
+        (["no numbers"], "auto", {}, "could not compare: "),
+        (PICTURE, "telepathy", {}, "could not compare: method 'telepathy': accepted: "),
+        (PICTURE, "exact", {"threshold": 1}, "could not compare: "),
+    ],
+)
 def test_what_is_not_equal_fails_and_says_why(assert_image_equal, test, method, options, reason):
     with pytest.raises(pytest.fail.Exception, match=reason):
         assert_image_equal(test, PICTURE, method, **options)

@@ -76,11 +76,14 @@ def _with_interval(row: Row, metric: str) -> str:
 
 ACCURACY = {
     "llvm float32": {
-        "worst chord": "worst chord", "in u": "worst / u", "misjudged": "misjudged",
-        "time / copy": "time / copy", "time / plain": "time / plain",
+        "worst chord": "worst chord",
+        "in u": "worst / u",
+        "misjudged": "misjudged",
+        "time / copy": "time / copy",
+        "time / plain": "time / plain",
     },
     "llvm float64": {"worst chord": "worst chord", "in u": "worst / u", "time / copy": "time / copy"},
-}  # fmt: skip
+}
 RENDERS = {
     "changed share": "pixels changed",
     "|mean ratio − 1|": "means differ by",
@@ -100,7 +103,7 @@ def renders(rows: list[Row]) -> str:
     cells = [
         [row.case, *(compact(row.values[metric]) if metric in row.values else "–" for metric in RENDERS)]
         for row in found
-    ]  # fmt: skip
+    ]
     return _table(f"{size}.", ["scene", *RENDERS.values()], cells)
 
 
@@ -119,10 +122,12 @@ def paths(rows: list[Row]) -> str:
     if not found:
         raise ValueError("README: no paths were traced; its table needs a compiled variant")
     cells = [
-        [row.subject if row.subject.startswith("exact") else f"`{row.subject}`",
-         *(compact(row.values[metric]) for metric in PATHS)]
+        [
+            row.subject if row.subject.startswith("exact") else f"`{row.subject}`",
+            *(compact(row.values[metric]) for metric in PATHS),
+        ]
         for row in found
-    ]  # fmt: skip
+    ]
     return _table(f"{found[0].replay['rays']} rays, {found[0].setting}.", ["", *PATHS.values()], cells)
 
 
@@ -156,8 +161,16 @@ def planar(rows: list[Row]) -> str:
         exact, narrow = (found.get(("planar", "trace", case, f"llvm {p}")) for p in ("float64", "float32"))
         if setting == "llvm float64" and exact and narrow:
             most = f"{exact.values['boundaries']:.0f}"
-            cells.append([f"`{case}`", str(exact.replay["rays"]), most, compact(exact.values["difference"]),
-                          compact(narrow.values["difference"]), compact(narrow.values["error / bound"])])  # fmt: skip
+            cells.append(
+                [
+                    f"`{case}`",
+                    str(exact.replay["rays"]),
+                    most,
+                    compact(exact.values["difference"]),
+                    compact(narrow.values["difference"]),
+                    compact(narrow.values["error / bound"]),
+                ]
+            )
     for _, subject, case, setting in (key for key in found if key[0] == "planar_times"):
         if subject == "mesh" and setting == "llvm float32":
             columns = [("mesh", "float32"), ("mesh", "float64"), ("mesh, shuffled", "float32"), ("brute", "float32")]
@@ -166,11 +179,16 @@ def planar(rows: list[Row]) -> str:
     if not cells or not times:
         raise ValueError("README: no planar paths were traced on LLVM; its tables need them")
     heading = ["scene", "rays", "boundaries", "float64: off by", "float32: off by", "over its bound"]
-    return "\n\n".join([
-        _table("Largest distance from an independent retrace, over the scene's extent, on LLVM.", heading, cells),
-        _table("µs per path of two boundaries, with 95 % intervals.",
-               ["segments", "float32", "float64", "float32, rays shuffled", "float32, every segment tried"], times),
-    ])  # fmt: skip
+    return "\n\n".join(
+        [
+            _table("Largest distance from an independent retrace, over the scene's extent, on LLVM.", heading, cells),
+            _table(
+                "µs per path of two boundaries, with 95 % intervals.",
+                ["segments", "float32", "float64", "float32, rays shuffled", "float32, every segment tried"],
+                times,
+            ),
+        ]
+    )
 
 
 def seen(rows: list[Row]) -> str:
@@ -183,11 +201,20 @@ def seen(rows: list[Row]) -> str:
     alarms = {name: [row for row in found if row.subject == f"null pairs, {name}"] for name in METHODS}
     if not defects or not all(alarms.values()):
         raise ValueError("README: no defects were planted; its table needs a compiled variant")
-    cells = [[name, *(_percent([row.values[method] for row in trials]) for method in METHODS)]
-             for name, trials in defects.items()]  # fmt: skip
-    cells.append(["nothing: other seeds, or the same", *(
-        f"{sum(r.values['false alarms'] * r.values['null pairs'] for r in each):.0f} of "
-        f"{sum(r.values['null pairs'] for r in each):.0f}" for each in alarms.values())])  # fmt: skip
+    cells = [
+        [name, *(_percent([row.values[method] for row in trials]) for method in METHODS)]
+        for name, trials in defects.items()
+    ]
+    cells.append(
+        [
+            "nothing: other seeds, or the same",
+            *(
+                f"{sum(r.values['false alarms'] * r.values['null pairs'] for r in each):.0f} of "
+                f"{sum(r.values['null pairs'] for r in each):.0f}"
+                for each in alarms.values()
+            ),
+        ]
+    )
     trials = next(iter(defects.values()))
     detectable = _percent([row.values["detectable"] for row in trials], digits=1)
     replay, scenes = trials[0].replay, ", ".join(row.case for row in trials)
@@ -225,8 +252,13 @@ def _percent(shares: list[float], digits: int = 0) -> str:
 
 
 TABLES = {
-    "accuracy": accuracy, "renders": renders, "paths": paths, "efficiency": efficiency, "planar": planar, "gate": seen,
-}  # fmt: skip
+    "accuracy": accuracy,
+    "renders": renders,
+    "paths": paths,
+    "efficiency": efficiency,
+    "planar": planar,
+    "gate": seen,
+}
 
 
 def gallery(rows: list[Row], context: Context) -> bytes:

@@ -99,5 +99,3 @@ def _progress(total: int) -> Iterator[Any]:
             started[0] += 1
 
         yield advance
-
-

@@ -211,4 +211,3 @@ def main(arguments: list[str] | None = None) -> int:
 def _fail(message: str) -> int:
     print(f"mi-refract: {' '.join(message.split())}", file=sys.stderr)
     return 2
-

@@ -39,9 +39,7 @@ Count = Annotated[int, typer.Option(min=1, help="Rays of each regime.")]
 Precision = Annotated[str, typer.Option(help="f32 or f64.")]
 Seed = Annotated[int, typer.Option(min=0, help="Of the rays.")]
 TwoSided = Annotated[bool, typer.Option("--two-sided", help="Normals on either side; else they face the ray.")]
-Regimes = Annotated[
-    bool, typer.Option("--regimes", is_eager=True, callback=_print_regimes, help="Print the regimes.")
-]
+Regimes = Annotated[bool, typer.Option("--regimes", is_eager=True, callback=_print_regimes, help="Print the regimes.")]
 File = Annotated[Path | None, typer.Option("--rays", metavar="FILE", help="The rays, as they were exported.")]
 Tir = Annotated[
     str, typer.Option(help="How total internal reflection is told: auto, zero, nan, reflected, tangent or flag.")
@@ -181,8 +179,10 @@ def _made_by(regime: list[str] | None, count: int, precision: str, seed: int, tw
     """The options that make these rays, as far as they are not the default."""
     words = [word for name in regime or [] for word in ("--regime", name)]
     for option, value, default in (
-        ("--count", count, sets.COUNT), ("--precision", precision, sets.PRECISION), ("--seed", seed, 0),
-    ):  # fmt: skip
+        ("--count", count, sets.COUNT),
+        ("--precision", precision, sets.PRECISION),
+        ("--seed", seed, 0),
+    ):
         words += [option, str(value)] if value != default else []
     return words + ["--two-sided"] * two_sided
 

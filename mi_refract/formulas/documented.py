@@ -209,24 +209,18 @@ class Formula:
 
 
 FORMULAS = {
-    "wedge": Formula(
-        refract_wedge, "000, boxed", "b = k n(n∧a) + s n √(a² + k²(n∧a)²)", budget=cancelling(1)
-    ),
+    "wedge": Formula(refract_wedge, "000, boxed", "b = k n(n∧a) + s n √(a² + k²(n∧a)²)", budget=cancelling(1)),
     "wedge_contrast": Formula(
         refract_wedge_contrast,
         "000, last form",
         "b = k n(n∧a) + s n √((n·a)² + (n∧a)²(k² − 1))",
         budget=CONTRASTING,
     ),
-    "cross": Formula(
-        refract_cross, "001, eq. 6", "t = n×c + s √(1 − ‖c‖²) n, c = k (i×n)", budget=cancelling(1)
-    ),
+    "cross": Formula(refract_cross, "001, eq. 6", "t = n×c + s √(1 − ‖c‖²) n, c = k (i×n)", budget=cancelling(1)),
     "decomposed": Formula(
         refract_decomposed, "002, eq. 1", "b = k a − n (k c − s √(1 − k²(1 − c²))), c = n·a", budget=cancelling(2)
     ),
-    "rotated": Formula(
-        refract_rotated, "004", "b = B (s √(1 − X²), X), X = k R/√(1 + R²)", budget=cancelling(1)
-    ),
+    "rotated": Formula(refract_rotated, "004", "b = B (s √(1 − X²), X), X = k R/√(1 + R²)", budget=cancelling(1)),
     "compensated": Formula(
         refract_compensated,
         "this project",

@@ -45,8 +45,7 @@ def write(path: str | Path, results: Results, context: Mapping[str, Any] | None 
     A picture that cannot be read (any more) is a line on the page. Errors: OSError for the page itself.
     """
     pictures = Pictures()
-    failures = [_failure(number, result, results, pictures)
-                for number, result in enumerate(results.of(*FAILED), 1)]  # fmt: skip
+    failures = [_failure(number, result, results, pictures) for number, result in enumerate(results.of(*FAILED), 1)]
     counts = Counter(result.status for result in results.results)
     content = {
         "title": "mi-refract diff",
@@ -75,9 +74,12 @@ def _failure(number: int, result: Result, results: Results, pictures: Pictures) 
         "paired": len({(pane["width"], pane["height"]) for pane in panes[:2]}) == 1 and len(panes) > 1,
         "note": note,
         "histogram": "" if p_values is None else _histogram(p_values, f"pair-{number}"),
-        "commands": [(verb, command) for verb, command in
-                     (("reproduce", results.reproduce(result)), ("accept", results.accept(result))) if command],
-    }  # fmt: skip
+        "commands": [
+            (verb, command)
+            for verb, command in (("reproduce", results.reproduce(result)), ("accept", results.accept(result)))
+            if command
+        ],
+    }
 
 
 def _line(result: Result) -> dict[str, Any]:

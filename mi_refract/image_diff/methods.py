@@ -346,8 +346,12 @@ def paired(reference: np.ndarray, test: np.ndarray, threshold: float) -> Paired:
     changed = float((~(difference <= threshold) | ~finite).mean())
     if not finite.all():
         return Paired(changed, np.inf, np.inf, np.nan)
-    return Paired(changed, float(difference.max()), float(np.sqrt(np.square(test - reference).mean())),
-                  _mean_ratio(reference, test))  # fmt: skip
+    return Paired(
+        changed,
+        float(difference.max()),
+        float(np.sqrt(np.square(test - reference).mean())),
+        _mean_ratio(reference, test),
+    )
 
 
 def _mean_ratio(reference: np.ndarray, test: np.ndarray) -> float:

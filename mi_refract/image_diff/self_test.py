@@ -236,9 +236,12 @@ def _tiles(picture: np.ndarray) -> np.ndarray:
 
 
 def false_alarms(
-    pairs: Iterable[tuple[np.ndarray, np.ndarray]], repeats: Iterable[tuple[np.ndarray, np.ndarray]],
-    case: str, setting: str, independent: bool = True,
-) -> list[Row]:  # fmt: skip
+    pairs: Iterable[tuple[np.ndarray, np.ndarray]],
+    repeats: Iterable[tuple[np.ndarray, np.ndarray]],
+    case: str,
+    setting: str,
+    independent: bool = True,
+) -> list[Row]:
     """A row per method: how often it called equal pairs different.
 
     `pairs` are renders of other seeds on either side, for methods that take samples; `repeats` are renders of the same
@@ -310,24 +313,36 @@ def _own_renders() -> np.ndarray:
     import mitsuba as mi
 
     look = mi.ScalarTransform4f().look_at
-    scene = mi.load_dict({
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 16, "rr_depth": 16},
-        "sensor": {
-            "type": "perspective", "fov": 40, "to_world": look([0, -5, 2.5], [0, 0, 0.8], [0, 0, 1]),
-            "film": {"type": "hdrfilm", "width": 64, "height": 64, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
-        },
-        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.6, 0.8, 1.0]}},
-        "lamp": {
-            "type": "rectangle", "to_world": look([3, -2, 5], [0, 0, 0], [0, 0, 1]),
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [3.0, 2.5, 2.0]}},
-        },
-        "floor": {
-            "type": "rectangle", "to_world": mi.ScalarTransform4f().scale(8),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}},
-        },
-        "ball": {"type": "sphere", "center": [0, 0, 1], "bsdf": {"type": "refract"}},
-    })  # fmt: skip
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 16, "rr_depth": 16},
+            "sensor": {
+                "type": "perspective",
+                "fov": 40,
+                "to_world": look([0, -5, 2.5], [0, 0, 0.8], [0, 0, 1]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": 64,
+                    "height": 64,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "rgb",
+                },
+            },
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.6, 0.8, 1.0]}},
+            "lamp": {
+                "type": "rectangle",
+                "to_world": look([3, -2, 5], [0, 0, 0], [0, 0, 1]),
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [3.0, 2.5, 2.0]}},
+            },
+            "floor": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().scale(8),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}},
+            },
+            "ball": {"type": "sphere", "center": [0, 0, 1], "bsdf": {"type": "refract"}},
+        }
+    )
     return np.stack([np.array(mi.render(scene, spp=OWN_SPP, seed=seed)) for seed in range(OWN_RENDERS)])
 
 

@@ -119,7 +119,9 @@ def _sides(
     )
 
 
-def _with_silent_pixels(level: tile_statistics.Level, a: np.ndarray, b: np.ndarray, margin: float, tile: int) -> tile_statistics.Level:
+def _with_silent_pixels(
+    level: tile_statistics.Level, a: np.ndarray, b: np.ndarray, margin: float, tile: int
+) -> tile_statistics.Level:
     """Without noise a tile is off where a pixel is, too: its mean knows nothing of what was moved about inside."""
     if not level.silent.any():
         return level

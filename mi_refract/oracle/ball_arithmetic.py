@@ -87,9 +87,7 @@ class Residual:
     width: np.ndarray
 
 
-def refract(
-    a: Any, n: Any, k: Any, *, contrast: Any = None, fresnel: bool = True, progress: bool = True
-) -> Certified:
+def refract(a: Any, n: Any, k: Any, *, contrast: Any = None, fresnel: bool = True, progress: bool = True) -> Certified:
     """Solve Snell's law, sin θt = k sin θi in the plane of a and n, for exactly these numbers.
 
     a: (N, 3) float32 or float64, incident, toward the surface, any length. n: (N, 3), normal on either side,

@@ -30,8 +30,9 @@ def derivative(a: Any, n: Any, k: Any, along_a: Any, along_k: Any) -> np.ndarray
 def derivative_of_powers(cos_i: Any, k: Any, along_cos: Any, along_k: Any) -> np.ndarray:
     """(N,): d/dε of the unpolarised reflectance R, and so of −T, for cos_i + ε along_cos and k + ε along_k."""
     zeros = np.zeros((len(cos_i), 3))
-    return _each(_reflectance, 1, zeros + np.reshape(cos_i, (-1, 1)), zeros, k, zeros + np.reshape(along_cos, (-1, 1)),
-                 along_k)[:, 0]  # fmt: skip
+    return _each(
+        _reflectance, 1, zeros + np.reshape(cos_i, (-1, 1)), zeros, k, zeros + np.reshape(along_cos, (-1, 1)), along_k
+    )[:, 0]
 
 
 def _each(solve: Any, width: int, a: Any, n: Any, k: Any, along_a: Any, along_k: Any) -> np.ndarray:

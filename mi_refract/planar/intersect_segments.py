@@ -138,9 +138,7 @@ class Straight:
         """The crossing of segment i, if it comes before `best`."""
         a, b, vertices = self._of(i, active)
         e = b - a
-        (to_a, f_a), (to_b, f_b) = (
-            self._seen(ray, start, v, x) for v, x in ((vertices[0], a), (vertices[1], b))
-        )
+        (to_a, f_a), (to_b, f_b) = (self._seen(ray, start, v, x) for v, x in ((vertices[0], a), (vertices[1], b)))
         a_left, b_left = f_a >= 0, f_b >= 0
         way = dr.select((vertices[1] == start.vertices[0]) | (vertices[1] == start.vertices[1]), to_b, to_a)
         # |d × e| = |f_a| + |f_b| without cancellation, and λ times it, whose sign is right where λ itself is lost.

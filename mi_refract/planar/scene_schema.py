@@ -29,9 +29,13 @@ class Part(NamedTuple):
 SCENE = {
     "title": Key(toml_schema.TEXT, "what the picture is called; the file's name by default", None),
     "index": Key(toml_schema.INDEX, "of the medium around everything", [1.0]),
-    "colours": Key(toml_schema.TEXTS, "one for each wavelength, as matplotlib calls them; lists of indices are as long", None),
+    "colours": Key(
+        toml_schema.TEXTS, "one for each wavelength, as matplotlib calls them; lists of indices are as long", None
+    ),
     "max_depth": Key(toml_schema.whole(1, 100_000), "the most boundaries that a ray meets", 16),
-    "branches": Key(toml_schema.whole(0, 8), "the most partial reflections on a path; 0: refracted wherever possible", 0),
+    "branches": Key(
+        toml_schema.whole(0, 8), "the most partial reflections on a path; 0: refracted wherever possible", 0
+    ),
     "view": Key(toml_schema.BOX, "what the picture shows; all shapes by default", None),
     "shape": Key(toml_schema.TABLES, "[[shape]]: boundaries between media"),
     "beam": Key(toml_schema.TABLES, "[[beam]]: rays to follow"),
@@ -76,8 +80,13 @@ def _arcs(pieces: str) -> Key:
 SHAPES = {
     "polygon": Kind(
         "a closed chain of straight pieces and arcs of circles",
-        {"points": Key(toml_schema.POINTS, "its corners"), "arcs": _arcs("each piece, the last one to the first corner,")}
-        | SOLID | PLACE | FACETS,
+        {
+            "points": Key(toml_schema.POINTS, "its corners"),
+            "arcs": _arcs("each piece, the last one to the first corner,"),
+        }
+        | SOLID
+        | PLACE
+        | FACETS,
         _solid(lambda v: shapes.polygon(v["points"], v["arcs"])),
     ),
     "rectangle": Kind(
@@ -87,8 +96,12 @@ SHAPES = {
     ),
     "prism": Kind(
         "a triangle with two equal sides, its apex up, its centroid at the origin",
-        {"side": Key(toml_schema.POSITIVE, "length of either side"), "apex": Key(toml_schema.APEX, "the angle between them", 60.0)}
-        | SOLID | PLACE,
+        {
+            "side": Key(toml_schema.POSITIVE, "length of either side"),
+            "apex": Key(toml_schema.APEX, "the angle between them", 60.0),
+        }
+        | SOLID
+        | PLACE,
         _solid(lambda v: shapes.prism(v["apex"], v["side"])),
     ),
     "circle": Kind(
@@ -98,19 +111,23 @@ SHAPES = {
     ),
     "ellipse": Kind(
         "around its origin",
-        {"radii": Key(toml_schema.POSITIVES, "half axes along x and y")}
-        | SOLID | PLACE | FACETS,
+        {"radii": Key(toml_schema.POSITIVES, "half axes along x and y")} | SOLID | PLACE | FACETS,
         _solid(lambda v: shapes.ellipse(*v["radii"])),
     ),
     "lens": Kind(
         "two conic surfaces z = c r² / (1 + √(1 − (1 + K) c² r²)) on the x axis, with a rim between them",
         {
-            "curvature": Key(toml_schema.PAIR, "c of the front and of the back, positive where the centre lies toward +x"),
+            "curvature": Key(
+                toml_schema.PAIR, "c of the front and of the back, positive where the centre lies toward +x"
+            ),
             "conic": Key(toml_schema.PAIR, "K of each", [0.0, 0.0]),
             "thickness": THICKNESS,
             "radius": Key(toml_schema.POSITIVE, "half the aperture; up to where the surfaces meet by default", None),
             "vertex": Key(toml_schema.NUMBER, "where the front meets the axis", 0.0),
-        } | SOLID | PLACE | FACETS,
+        }
+        | SOLID
+        | PLACE
+        | FACETS,
         _solid(_lens),
     ),
     "ellipse_lens": Kind(
@@ -119,13 +136,21 @@ SHAPES = {
             "focal_length": Key(toml_schema.POSITIVE, "from the front to the focus"),
             "thickness": THICKNESS,
             "radius": Key(toml_schema.POSITIVE, "half the aperture"),
-        } | SOLID | PLACE | FACETS,
+        }
+        | SOLID
+        | PLACE
+        | FACETS,
         _solid(_ellipse_lens),
     ),
     "luneburg": Kind(
         "a ball in concentric layers of index outside × √(2 − (r/radius)²)",
-        {"radius": Key(toml_schema.POSITIVE, "of the outermost"), "layers": Key(toml_schema.whole(1, 10_000), "how many")}
-        | OUTSIDE | PLACE | FACETS,
+        {
+            "radius": Key(toml_schema.POSITIVE, "of the outermost"),
+            "layers": Key(toml_schema.whole(1, 10_000), "how many"),
+        }
+        | OUTSIDE
+        | PLACE
+        | FACETS,
         _luneburg,
     ),
     "boundary": Kind(
@@ -135,10 +160,12 @@ SHAPES = {
             "arcs": _arcs("each piece"),
             "n_left": Key(toml_schema.INDEX, "index on the left, seen along it"),
             "n_right": Key(toml_schema.INDEX, "index on the right"),
-        } | PLACE | FACETS,
+        }
+        | PLACE
+        | FACETS,
         lambda v: [Part(shapes.polyline(v["points"], v["arcs"]), v["n_left"], v["n_right"])],
     ),
-}  # fmt: skip
+}
 
 
 def _spread(first: Any, last: Any, count: int) -> Array:
@@ -198,5 +225,8 @@ def reference() -> str:
     """All kinds and keys as tables in Markdown, for the README."""
     shared = SOLID | PLACE | FACETS
     parts = [toml_schema.key_table("key of the scene", SCENE), toml_schema.key_table("key of a shape", shared)]
-    parts += [toml_schema.kind_table("kind of shape", SHAPES, shared), toml_schema.kind_table("kind of beam", BEAMS, {})]
+    parts += [
+        toml_schema.kind_table("kind of shape", SHAPES, shared),
+        toml_schema.kind_table("kind of beam", BEAMS, {}),
+    ]
     return "\n\n".join(parts)

@@ -36,8 +36,13 @@ FARTHEST = {"float32": 1e15, "float64": 1e100}  # of coordinates, and indices: p
 FEW = 48  # segments that are tried sooner than a query takes
 
 SHAPES: dict[str, tuple[int, ...]] = {
-    "start": (2,), "end": (2,), "n_left": (), "n_right": (), "control": (2,), "weight": ()
-}  # fmt: skip
+    "start": (2,),
+    "end": (2,),
+    "n_left": (),
+    "n_right": (),
+    "control": (2,),
+    "weight": (),
+}
 
 
 def _numbers(name: str, values: Any, shape: tuple[int, ...]) -> Array:
@@ -168,9 +173,14 @@ class Tracer:
     """`trace` for one set of segments, set up once; arguments and errors as there."""
 
     def __init__(
-        self, segments: Segments, *, formula: str | None = None, precision: str = "float64", backend: str | None = None,
+        self,
+        segments: Segments,
+        *,
+        formula: str | None = None,
+        precision: str = "float64",
+        backend: str | None = None,
         method: str = "auto",
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.lanes = to = lanes(backend, precision)
         self.farthest = FARTHEST[precision]
         for name in ("start", "end", "n_left", "n_right"):
@@ -184,9 +194,15 @@ class Tracer:
         self.walker = Walker(to, boundaries, mesh, np.column_stack([segments.n_left, segments.n_right]), formula)
 
     def __call__(
-        self, origins: Any, directions: Any, max_depth: int, *, reflect: Any = 0, n_start: Any = None,
+        self,
+        origins: Any,
+        directions: Any,
+        max_depth: int,
+        *,
+        reflect: Any = 0,
+        n_start: Any = None,
         weights: bool = False,
-    ) -> Paths:  # fmt: skip
+    ) -> Paths:
         origins = _numbers("origins", origins, (len(origins), 2) if np.ndim(origins) else (0, 2))
         directions = _numbers("directions", directions, origins.shape)
         directions = _in_reach(directions)

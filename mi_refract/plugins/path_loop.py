@@ -77,9 +77,14 @@ class State:
 def branch_class(v: Any) -> type:
     """What is left of a path for later; it starts at a delta lobe. A type, as local memory is told what it holds."""
     fields = {
-        "o": v.Point3f, "d": v.Vector3f, "throughput": v.Spectrum, "depth": v.UInt32, "eta": v.Float, "share": v.Float,
+        "o": v.Point3f,
+        "d": v.Vector3f,
+        "throughput": v.Spectrum,
+        "depth": v.UInt32,
+        "eta": v.Float,
+        "share": v.Float,
         "node": v.UInt32,
-    }  # fmt: skip
+    }
     return make_dataclass("Branch", fields.items())
 
 

@@ -185,9 +185,14 @@ def plugin_class(v: Any) -> type:
             arrival, departure = (-bs.wo, si.wi) if radiance else (-si.wi, bs.wo)
             axes = [self._perpendicular(direction) for direction in (arrival, departure)]
             return v.mueller.rotate_mueller_basis(
-                matrix, arrival, axes[0], v.mueller.stokes_basis(arrival),
-                departure, axes[1], v.mueller.stokes_basis(departure),
-            )  # fmt: skip
+                matrix,
+                arrival,
+                axes[0],
+                v.mueller.stokes_basis(arrival),
+                departure,
+                axes[1],
+                v.mueller.stokes_basis(departure),
+            )
 
         @staticmethod
         def _perpendicular(direction: Any) -> Any:

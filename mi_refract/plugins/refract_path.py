@@ -104,8 +104,12 @@ def integrator_class(v: Any) -> type:
             if self.deterministic and not symbolic:
                 raise ValueError(f"{INTEGRATOR}: deterministic: accepted: renders that are not differentiated")
             return Plan(
-                self.max_depth, self.rr_depth, self.hide_emitters,
-                self.split_depth if symbolic else 0, self.split_weight, self.deterministic,
+                self.max_depth,
+                self.rr_depth,
+                self.hide_emitters,
+                self.split_depth if symbolic else 0,
+                self.split_weight,
+                self.deterministic,
                 emitter_sampling=needs.smooth and (needs.lamps if needs.plain_environment else needs.sampleable),
                 lamps_only=needs.plain_environment,
                 area=needs.area,
@@ -113,7 +117,7 @@ def integrator_class(v: Any) -> type:
                 first_number=needs.both_numbers or not (needs.smooth or self.deterministic),
                 second_number=needs.smooth,
                 all_of_hit=needs.smooth or needs.textured,
-            )  # fmt: skip
+            )
 
         def _needs(self, scene: Any) -> Needs:
             """Looked up once a render, as an edit of the scene can change them."""

@@ -15,19 +15,40 @@ import drjit as dr
 
 WRAPPERS = {"BlendBSDF", "BumpMap", "MaskBSDF", "NormalMap", "TwoSidedBRDF"}
 DEPOLARISING = {
-    "Hair", "Measured", "Null", "Principled", "PrincipledThin", "RoughDielectric", "RoughPlastic", "SmoothDiffuse",
-    "SmoothPlastic", "ThinDielectric",
-}  # fmt: skip
+    "Hair",
+    "Measured",
+    "Null",
+    "Principled",
+    "PrincipledThin",
+    "RoughDielectric",
+    "RoughPlastic",
+    "SmoothDiffuse",
+    "SmoothPlastic",
+    "ThinDielectric",
+}
 POLARISING = {
-    "CircularPolarizer", "LinearPolarizer", "LinearRetarder", "MeasuredPolarized", "PolarizedPlastic", "Refract",
-    "RoughConductor", "SmoothConductor", "SmoothDielectric",
-}  # fmt: skip
+    "CircularPolarizer",
+    "LinearPolarizer",
+    "LinearRetarder",
+    "MeasuredPolarized",
+    "PolarizedPlastic",
+    "Refract",
+    "RoughConductor",
+    "SmoothConductor",
+    "SmoothDielectric",
+}
 KNOWN = WRAPPERS | DEPOLARISING | POLARISING
 # Their samples take the one number or the two, and none of them all three.
 EITHER = {
-    "Null", "Refract", "RoughConductor", "SmoothConductor", "SmoothDielectric", "SmoothDiffuse", "ThinDielectric",
+    "Null",
+    "Refract",
+    "RoughConductor",
+    "SmoothConductor",
+    "SmoothDielectric",
+    "SmoothDiffuse",
+    "ThinDielectric",
     "TwoSidedBRDF",
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -54,19 +75,23 @@ class Needs:
     def left_out(self) -> dict[str, str]:
         """Feature → why the scene can do without it."""
         reasons = {
-            "emitter sampling": "every BSDF has delta lobes only" if not self.smooth
-            else "" if self.sampleable else "no emitter can be sampled",
+            "emitter sampling": "every BSDF has delta lobes only"
+            if not self.smooth
+            else ""
+            if self.sampleable
+            else "no emitter can be sampled",
             "a random number": "" if self.both_numbers else "no BSDF samples with one number and with two as well",
             "area lights": "" if self.area else "no shape emits",
             "environment": "" if self.environment else "no environment emitter",
             "sampling the environment": "what is the same everywhere is met by the BSDFs' own samples"
-            if self.plain_environment and self.smooth else "",
+            if self.plain_environment and self.smooth
+            else "",
             "media": "" if self.media else "neither a shape, a sensor nor an emitter has a medium",
             "null lobes": "" if self.null else "no BSDF has one",
             "textures": "" if self.textured else "no BSDF and no area light varies over its surface",
             "polarisation": "" if self.polarising else "no BSDF acts on it",
             "dispersion": "" if self.dispersive else "no BSDF bends light by its wavelength",
-        }  # fmt: skip
+        }
         return {feature: reason for feature, reason in reasons.items() if reason}
 
 

@@ -183,15 +183,24 @@ def _of_regime(name: str, ids: np.ndarray, judged: Judged, index: np.ndarray) ->
     angle, norm = (x[compared] if len(compared) else np.full(1, np.nan) for x in (judged.angle, judged.norm))
     worst = index[np.lexsort((judged.share[index], judged.far[index], judged.blank[index]))[-1]]
     replay = {
-        "id": int(ids[worst]), **judged.rays.hexed(int(worst)),
+        "id": int(ids[worst]),
+        **judged.rays.hexed(int(worst)),
         "answer": [float(x).hex() for x in judged.b[worst]],
         "exact": [float(x).hex() for x in judged.exact.direction[worst]],
         "transmitted": bool(judged.exact.transmitted[worst]),
-    }  # fmt: skip
+    }
     return Figures(
-        name, len(index), len(compared),
-        worst=float(angle.max()), p99=float(np.quantile(angle, 0.99)), mean=float(angle.mean()), norm=float(norm.max()),
-        misjudged=int(judged.misjudged[index].sum()), far=int(judged.far[index].sum()),
-        share=float(judged.share[index].max()), wrong=int(judged.wrong[index].sum()),
-        limit=int(judged.exact_to_rounding[index].sum()), replay=replay,
-    )  # fmt: skip
+        name,
+        len(index),
+        len(compared),
+        worst=float(angle.max()),
+        p99=float(np.quantile(angle, 0.99)),
+        mean=float(angle.mean()),
+        norm=float(norm.max()),
+        misjudged=int(judged.misjudged[index].sum()),
+        far=int(judged.far[index].sum()),
+        share=float(judged.share[index].max()),
+        wrong=int(judged.wrong[index].sum()),
+        limit=int(judged.exact_to_rounding[index].sum()),
+        replay=replay,
+    )

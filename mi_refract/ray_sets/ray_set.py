@@ -146,9 +146,15 @@ def _header(names: Sequence[str], count: int, precision: str, seed: int, two_sid
     conventions["n"] = CONVENTIONS["n, two-sided" if two_sided else "n"]
     ids = {name: [i * count, (i + 1) * count - 1] for i, name in enumerate(names)}
     return {
-        "format": FORMAT, "version": __version__, "precision": precision, "seed": seed, "count": count,
-        "two_sided": two_sided, **conventions, "regimes": ids,
-    }  # fmt: skip
+        "format": FORMAT,
+        "version": __version__,
+        "precision": precision,
+        "seed": seed,
+        "count": count,
+        "two_sided": two_sided,
+        **conventions,
+        "regimes": ids,
+    }
 
 
 def _names(header: dict[str, Any], count: int) -> np.ndarray:
@@ -206,9 +212,13 @@ def as_csv(rays: RaySet) -> str:
 def _as_npz(rays: RaySet) -> bytes:
     n_from, n_to = rays.indices
     arrays = {
-        "id": rays.ids, "a": rays.rays.a, "n": rays.rays.n, "n_from": n_from, "n_to": n_to,
+        "id": rays.ids,
+        "a": rays.rays.a,
+        "n": rays.rays.n,
+        "n_from": n_from,
+        "n_to": n_to,
         "header": np.array(json.dumps(rays.header)),
-    }  # fmt: skip
+    }
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, array in arrays.items():

@@ -29,9 +29,18 @@ if TYPE_CHECKING:
 
 SCHEMA = 1
 HEAD = (
-    "rays", "worst / rad", "worst / ulp", "p99 / ulp", "mean / ulp", "misjudged", "beyond doubt", "length",
-    "of the budget", "exact", "wrong",
-)  # fmt: skip
+    "rays",
+    "worst / rad",
+    "worst / ulp",
+    "p99 / ulp",
+    "mean / ulp",
+    "misjudged",
+    "beyond doubt",
+    "length",
+    "of the budget",
+    "exact",
+    "wrong",
+)
 STYLES = {"wrong": "bold red", "fair": "", "exact": "green"}
 TERMS = {
     "ulp": "the spacing of numbers at 1: 2⁻²³ in f32, 2⁻⁵² in f64",
@@ -137,10 +146,15 @@ def _cells(each: Figures, ulp: float) -> dict[str, str]:
     ulps = {f"{name} / ulp": getattr(each, name) / ulp for name in ("worst", "p99", "mean")}
     shown = {name: compact(x) if each.judged else "–" for name, x in ({"worst / rad": each.worst} | ulps).items()}
     return {
-        "rays": str(each.rays), **shown, "misjudged": str(each.misjudged), "beyond doubt": str(each.far),
-        "length": compact(each.norm) if each.judged else "–", "of the budget": compact(each.share),
-        "exact": f"{each.limit / each.rays:.1%}", "wrong": str(each.wrong),
-    }  # fmt: skip
+        "rays": str(each.rays),
+        **shown,
+        "misjudged": str(each.misjudged),
+        "beyond doubt": str(each.far),
+        "length": compact(each.norm) if each.judged else "–",
+        "of the budget": compact(each.share),
+        "exact": f"{each.limit / each.rays:.1%}",
+        "wrong": str(each.wrong),
+    }
 
 
 # Files -------------------------------------------------------------------------------------------------------------
@@ -206,11 +220,18 @@ def write_html(path: str | Path, found: Findings, context: Mapping[str, Any], re
     """Write the page; `context` is shown on top, `replay` is the command that repeats the check. OSError."""
     texts = {name: regime.text for name, regime in REGIMES.items()}
     rows = [
-        {"name": each.regime, "text": texts.get(each.regime, ""), "wrong": each.wrong, "far": each.far,
-         "grade": grade(each), "over": each.share > 1, "cells": _cells(each, found.ulp),
-         "replay": json.dumps(strict(each.replay), indent=1)}
+        {
+            "name": each.regime,
+            "text": texts.get(each.regime, ""),
+            "wrong": each.wrong,
+            "far": each.far,
+            "grade": grade(each),
+            "over": each.share > 1,
+            "cells": _cells(each, found.ulp),
+            "replay": json.dumps(strict(each.replay), indent=1),
+        }
         for each in found.regimes
-    ]  # fmt: skip
+    ]
     content = {
         "title": "mi-refract rays",
         "sentence": sentence(found),

@@ -91,12 +91,21 @@ def judge(
         _, angle, _ = errors(seen.b * (kept / length)[:, None], rays, exact)
         norm = np.fmin(np.abs(length - 1), np.abs(length / kept - 1)).astype(float)
     return Judged(
-        rays, exact, b, seen.b, u, budget, tir, blank,
+        rays,
+        exact,
+        b,
+        seen.b,
+        u,
+        budget,
+        tir,
+        blank,
         compared=~misjudged & ~blank & (exact.transmitted | (tir == "reflected")),
         misjudged=misjudged,
         decided=decided,
-        angle=angle, norm=norm, bound=bound,
-    )  # fmt: skip
+        angle=angle,
+        norm=norm,
+        bound=bound,
+    )
 
 
 def _off_unit(rays: Rays, u: float) -> np.ndarray:

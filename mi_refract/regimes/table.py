@@ -262,11 +262,13 @@ def _exactly_critical(rng: Generator, n: Array) -> Triple:
 def _rotation(w: Array, x: Array, y: Array, z: Array) -> Array:
     """(3, 3, N): the rotation of the quaternion times w² + x² + y² + z²."""
     ww, xx, yy, zz = w * w, x * x, y * y, z * z
-    return np.array([
-        [ww + xx - yy - zz, 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), ww - xx + yy - zz, 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), ww - xx - yy + zz],
-    ])  # fmt: skip
+    return np.array(
+        [
+            [ww + xx - yy - zz, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), ww - xx + yy - zz, 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), ww - xx - yy + zz],
+        ]
+    )
 
 
 # To the last bit -----------------------------------------------------------------------------------------------
@@ -352,7 +354,9 @@ REGIMES = {
     "axes, signed zeros": Regime(_zeros, 1e6, "n, and a of every other ray, with zeros of either sign; not tangential"),
     "denormal": Regime(_denormal, 1e6, "as before, the zeros of a, n or both replaced by denormal numbers"),
     "on a denormal": Regime(
-        _on_a_denormal, 1e6, "n an axis, n·a a denormal number: all that keeps a from being tangential",
+        _on_a_denormal,
+        1e6,
+        "n an axis, n·a a denormal number: all that keeps a from being tangential",
         rests_on_denormals=True,
     ),
     "lengths": Regime(_lengths, 1e6, "|a| and |n| log-uniform in 1e-18 … 1e18, angles and ratios of all sets", False),

@@ -64,8 +64,14 @@ def encoded(pixels: Any, limit: float = np.inf, scale: float = 1.0) -> dict[str,
         notes.append(f"values within {100 * 2.0 ** (bits - 11):.2g} %")
     height, width, channels = codes.shape
     data = base64.b64encode(_deflated(_rounded(codes, bits or 0))).decode()
-    return {"width": width, "height": height, "channels": channels, "scale": float(scale), "data": data,
-            "note": ", ".join(notes)}  # fmt: skip
+    return {
+        "width": width,
+        "height": height,
+        "channels": channels,
+        "scale": float(scale),
+        "data": data,
+        "note": ", ".join(notes),
+    }
 
 
 def shown(pixels: Any, channels: tuple[str, ...]) -> tuple[Any, str]:

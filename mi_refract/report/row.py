@@ -72,7 +72,7 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """"not run", "fail", "pass", or "info" where nothing was demanded."""
+        """ "not run", "fail", "pass", or "info" where nothing was demanded."""
         if not self.values:
             return "not run"
         if self.broken:

@@ -34,16 +34,23 @@ def prepare(rows: Sequence[Row], context: Mapping[str, Any], pictures: Pictures)
         "counts": [(word, verdicts[word]) for word in ("pass", "fail", "not run", "info")],
         "context": {key: value for key, value in context.items() if key not in STEERING},
         "command": context.get("replay", ""),
-        "failures": [{"row": r, "broken": [(m, _cell(r, m)) for m in r.broken],
-                      "others": [_phrase(r, m) for m in r.values if m not in r.broken],
-                      "replay": r.replay_text} for r in rows if r.broken],
+        "failures": [
+            {
+                "row": r,
+                "broken": [(m, _cell(r, m)) for m in r.broken],
+                "others": [_phrase(r, m) for m in r.values if m not in r.broken],
+                "replay": r.replay_text,
+            }
+            for r in rows
+            if r.broken
+        ],
         "missing": _missing(rows),
         "absent": verdicts["not run"],
         "studies": [
             _study(name, members, context, pictures, f"study-{number}")
             for number, (name, members) in enumerate(by_study(rows).items(), 1)
         ],
-    }  # fmt: skip
+    }
 
 
 def _missing(rows: Sequence[Row]) -> list[tuple[str, str, list[Row]]]:
@@ -59,13 +66,17 @@ def _study(name: str, rows: list[Row], context: Mapping[str, Any], pictures: Pic
     about = context.get("studies", {}).get(name, {})
     metrics = list(dict.fromkeys(metric for row in rows for metric in row.values))
     axes = Axes(**about.get("axes", {}))
-    plots = [(row, curves_svg(row.curves, axes, salt=f"{key}-{number}"), _left_out(row, axes))
-             for number, row in enumerate(rows) if row.curves]  # fmt: skip
+    plots = [
+        (row, curves_svg(row.curves, axes, salt=f"{key}-{number}"), _left_out(row, axes))
+        for number, row in enumerate(rows)
+        if row.curves
+    ]
     scatters = [scatter for scatter in context.get("scatter", ()) if scatter["study"] == name]
     return {
         "key": key,
         "title": about.get("title", name),
-        "text": about.get("text", ""), "terms": about.get("terms", {}),
+        "text": about.get("text", ""),
+        "terms": about.get("terms", {}),
         "failures": sum(row.verdict == "fail" for row in rows),
         "scale": (scale := _scale(rows, metrics)),
         "panels": _panels(rows, metrics, scale),
@@ -83,11 +94,14 @@ def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | No
     if not any(matrices.values()):
         return [{"heading": "", "matrix": None, "table": _table(rows, metrics)}]
     return [
-        {"heading": s, "matrix": matrices[s],
-         "table": _table(parts[s], metrics, s) if any(row.values for row in parts[s]) else None,
-         "reasons": list(dict.fromkeys(row.reason for row in parts[s]))}
+        {
+            "heading": s,
+            "matrix": matrices[s],
+            "table": _table(parts[s], metrics, s) if any(row.values for row in parts[s]) else None,
+            "reasons": list(dict.fromkeys(row.reason for row in parts[s])),
+        }
         for s in settings
-    ]  # fmt: skip
+    ]
 
 
 def _matrix(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> dict[str, Any] | None:
@@ -150,8 +164,9 @@ def _table(rows: list[Row], metrics: list[str], heading: str = "") -> dict[str, 
         labels = [getattr(row, key) for key in keys]
         again = [labels[: i + 1] == above[: i + 1] for i in range(len(keys))]
         cells = [_cell(row, metric) for metric in used]
-        lines.append({"row": row, "labels": list(zip(labels, again, strict=True)), "cells": cells,
-                      "replay": row.replay_text})  # fmt: skip
+        lines.append(
+            {"row": row, "labels": list(zip(labels, again, strict=True)), "cells": cells, "replay": row.replay_text}
+        )
         above = labels
     shared = [getattr(rows[0], k) for k in ("subject", "case", "setting") if k not in keys]
     shared = [label for label in shared if label and label != heading]

@@ -387,7 +387,10 @@ def test_many_equal_pictures_are_counted_and_not_listed(tmp_path, run):
     lines = out.splitlines()
     assert code == 0
     assert len(lines) == text_reports.FEW + 3
-    assert lines[-2:] == ["… and 2 more that are equal", f"{text_reports.FEW + 2} pictures: {text_reports.FEW + 2} equal"]
+    assert lines[-2:] == [
+        "… and 2 more that are equal",
+        f"{text_reports.FEW + 2} pictures: {text_reports.FEW + 2} equal",
+    ]
 
 
 def test_a_long_summary_is_cut(tmp_path):

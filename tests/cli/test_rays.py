@@ -172,8 +172,10 @@ def test_answers_that_are_not_those_to_the_rays(call):
     assert out.splitlines()[-1] == "40 answers, but not those to the rays"
     data = json.loads(Path("out.json").read_text())
     assert [(each["kind"], each["count"]) for each in data["problems"]] == [
-        ("missing", 10), ("duplicate", 1), ("unknown", 1)
-    ]  # fmt: skip
+        ("missing", 10),
+        ("duplicate", 1),
+        ("unknown", 1),
+    ]
 
 
 def test_rays_that_somebody_edited(call):

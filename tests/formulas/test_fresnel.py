@@ -25,8 +25,11 @@ def log_uniform(rng, low, high, count):
 def aside(rng, x, precision, most=4):
     """A few ulps, or many."""
     count = len(x)
-    ulps = np.where(rng.random(count) < 0.6, rng.integers(-most, most + 1, count),
-                    log_uniform(rng, 1, 1e5, count) * rng.choice([-1, 1], count))  # fmt: skip
+    ulps = np.where(
+        rng.random(count) < 0.6,
+        rng.integers(-most, most + 1, count),
+        log_uniform(rng, 1, 1e5, count) * rng.choice([-1, 1], count),
+    )
     x = x.astype(precision)
     return x.astype(np.longdouble) + np.rint(ulps) * np.spacing(x).astype(np.longdouble)
 
@@ -71,14 +74,18 @@ DRAWS = {f.__name__: f for f in (generic, near_normal, grazing, critical, brewst
 # Where hill-climbing on the bits came to rest, from the worst of 10⁶ rays in each of eleven regimes: R, R, T, r_p.
 WORST = {
     "float32": [
-        ("0x1.66e34ep-3", "0x1.f71f70p-1"), ("0x1.c81bbap-3", "0x1.fc2786p-1"),
-        ("0x1.011ddap-18", "0x1.ffeff8p-1"), ("0x1.80031cp-7", "0x1.818ad6p-7"),
+        ("0x1.66e34ep-3", "0x1.f71f70p-1"),
+        ("0x1.c81bbap-3", "0x1.fc2786p-1"),
+        ("0x1.011ddap-18", "0x1.ffeff8p-1"),
+        ("0x1.80031cp-7", "0x1.818ad6p-7"),
     ],
     "float64": [
-        ("0x1.e898ee75f23cfp-3", "0x1.c844d6fedd815p-1"), ("0x1.044677cde968cp-3", "0x1.fffffffde5f77p-1"),
-        ("0x1.064d256c22f3ep-25", "0x1.b7d121d98bfe6p-1"), ("0x1.528f43a801557p-26", "0x1.ffffffffffbfbp-1"),
+        ("0x1.e898ee75f23cfp-3", "0x1.c844d6fedd815p-1"),
+        ("0x1.044677cde968cp-3", "0x1.fffffffde5f77p-1"),
+        ("0x1.064d256c22f3ep-25", "0x1.b7d121d98bfe6p-1"),
+        ("0x1.528f43a801557p-26", "0x1.ffffffffffbfbp-1"),
     ],
-}  # fmt: skip
+}
 
 
 def drawn(name, setting):
@@ -120,8 +127,10 @@ def errors(setting, cos_i, k):
     r, t, s, p, transmitted = evaluate(setting, cos_i, k)
     exact = oracle.fresnel(cos_i, k)
     assert (transmitted == exact.transmitted).all()
-    worst = [relative(r, exact.reflectance, exact.reflectance_low, setting),
-             relative(t, exact.transmittance, exact.transmittance_low, setting)]  # fmt: skip
+    worst = [
+        relative(r, exact.reflectance, exact.reflectance_low, setting),
+        relative(t, exact.transmittance, exact.transmittance_low, setting),
+    ]
     return *worst, max(relative(x, y, 0, setting) for x, y in ((s, exact.amplitude_s), (p, exact.amplitude_p)))
 
 
@@ -134,8 +143,10 @@ def test_powers_are_within_4u_and_amplitudes_within_8u(name, setting):
 
 
 def test_the_worst_that_was_found(setting):
-    cos_i, k = (np.array([float.fromhex(x) for x in column], setting.precision)
-                for column in zip(*WORST[setting.name], strict=True))  # fmt: skip
+    cos_i, k = (
+        np.array([float.fromhex(x) for x in column], setting.precision)
+        for column in zip(*WORST[setting.name], strict=True)
+    )
     r, t, amplitude = errors(setting, cos_i, k)
     assert 2.9 < r <= 4
     assert 1.9 < t <= 4
@@ -256,8 +267,11 @@ def test_double_words_do_not_suffice_to_the_ulp(name, vectorised, monkeypatch):
     exact = oracle.fresnel(cos_i, k)
     monkeypatch.setattr(fresnel, "_differences", differences)
     _, t, _, p, _ = evaluate(vectorised, cos_i, k)
-    lost = relative(t, exact.transmittance, exact.transmittance_low, vectorised) if name == "critical" else relative(
-        p[exact.transmitted], exact.amplitude_p[exact.transmitted], 0, vectorised)  # fmt: skip
+    lost = (
+        relative(t, exact.transmittance, exact.transmittance_low, vectorised)
+        if name == "critical"
+        else relative(p[exact.transmitted], exact.amplitude_p[exact.transmitted], 0, vectorised)
+    )
     assert lost > 4 if vectorised.name == "float64" else lost > 1.01
 
 

@@ -82,9 +82,7 @@ def test_the_radicand_keeps_what_its_inequalities_say(kind, setting):
     assert largest_error(radicand, kind, setting) <= 100
 
 
-@pytest.mark.parametrize(
-    "mutant", [radicand_of_plain_contrast, radicand_of_plain_cosine, radicand_of_the_second_order]
-)
+@pytest.mark.parametrize("mutant", [radicand_of_plain_contrast, radicand_of_plain_cosine, radicand_of_the_second_order])
 def test_a_term_of_the_radicand_that_loses_its_low_parts_is_seen(mutant, setting):
     assert largest_error(mutant, "critical", setting) > 1e3
 

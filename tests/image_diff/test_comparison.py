@@ -189,8 +189,12 @@ def test_flip_says_what_it_does_not_look_at():
 
 def test_equal_renders_are_called_different_no_more_often_than_stated():
     """300 null pairs at a family error of 5 %: 15 expected; more than 34 has probability below 1e-5."""
-    pairs = (judge("welch", renders(4, shape=(32, 32, 3)), renders(4, shape=(32, 32, 3)), tile=8, family_error=0.05,
-                   margin=0.0) for _ in range(300))  # fmt: skip
+    pairs = (
+        judge(
+            "welch", renders(4, shape=(32, 32, 3)), renders(4, shape=(32, 32, 3)), tile=8, family_error=0.05, margin=0.0
+        )
+        for _ in range(300)
+    )
     assert sum(found.verdict is DIFFERENT for found in pairs) <= 34
 
 
@@ -273,7 +277,9 @@ def test_the_same_seed_twice_is_an_error():
 def test_corrections_are_those_of_the_papers():
     """Benjamini and Hochberg against SciPy; Holm on an example worked by hand: 0.05/4, /3, /2, /1."""
     p = RNG.random((5, 4, 3)) ** 3
-    np.testing.assert_allclose(tile_statistics.benjamini_hochberg(p).ravel(), stats.false_discovery_control(p, axis=None))
+    np.testing.assert_allclose(
+        tile_statistics.benjamini_hochberg(p).ravel(), stats.false_discovery_control(p, axis=None)
+    )
     assert tile_statistics.holm(np.array([0.03, 0.01, 0.016, 0.9]), 0.05) == 0.016
     assert tile_statistics.holm(np.array([0.013, 0.02, 0.9, 0.04]), 0.05) == 0.0125
     assert tile_statistics.sidak(0.05, 2) == pytest.approx(1 - np.sqrt(0.95))

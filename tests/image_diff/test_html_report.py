@@ -34,12 +34,16 @@ def results(folder):
     figures = (Figure("tiles that differ", 12.0, 0.0), Figure("odd", math.nan, 1.0), Figure("smallest p", 1e-9))
     maps = {"t": 8 * p - 4, "p": p, "q": p, "flags": 0 * p}
     found = Comparison("welch", Verdict.DIFFERENT, "12 tiles differ.", figures, 0.013, maps)
-    return Results(folder / "reference", folder / "test", (
-        Result("gone.exr", Status.ERROR, folder / "gone.exr", test, error="gone.exr: <i>corrupt</i>"),
-        Result(EVIL, Status.DIFFERENT, reference, test, comparison=found),
-        Result("old.exr", Status.DIFFERENT, reference, None),
-        Result("same.exr", Status.EQUAL, reference, test, comparison=EQUAL),
-    ))  # fmt: skip
+    return Results(
+        folder / "reference",
+        folder / "test",
+        (
+            Result("gone.exr", Status.ERROR, folder / "gone.exr", test, error="gone.exr: <i>corrupt</i>"),
+            Result(EVIL, Status.DIFFERENT, reference, test, comparison=found),
+            Result("old.exr", Status.DIFFERENT, reference, None),
+            Result("same.exr", Status.EQUAL, reference, test, comparison=EQUAL),
+        ),
+    )
 
 
 def html(folder, found=None):
@@ -59,7 +63,7 @@ def test_failures_come_first_with_numbers_thresholds_and_commands(tmp_path):
     places = ("<h1>4 pictures: ", 'id="pair-1"', 'id="pair-3"', 'id="equal"', "same.exr")
     order = [text.index(place) for place in places]
     assert order == sorted(order)
-    numbers = ("<td class=\"fail\">12</td><td class=\"limit\">&gt; 0", "≰ 1", "1e-9", "0.013", "≤ 1e-3")
+    numbers = ('<td class="fail">12</td><td class="limit">&gt; 0', "≰ 1", "1e-9", "0.013", "≤ 1e-3")
     for words in (*numbers, "1 &amp; 2", "12 tiles differ.", "removed", "No such file", "p-value"):
         assert words in text, words
     assert "mi-refract diff a b" in text

@@ -90,9 +90,12 @@ def test_expansions_keep_the_third_order(trial, setting, number):
     bound = 100 * Fraction(setting.roundoff) ** 3
     x2, y2 = x.squared(), y.squared()
     for found, expected in (
-        (x2, fx * fx), (x2 + y2, fx * fx + fy * fy), (x2.collected(), fx * fx), (x2.times(k), fx * fx * fk),
+        (x2, fx * fx),
+        (x2 + y2, fx * fx + fy * fy),
+        (x2.collected(), fx * fx),
+        (x2.times(k), fx * fx * fk),
         (x2.times(Double(u[1])), fx * fx * value((u[1], 0))),
-    ):  # fmt: skip
+    ):
         assert abs(value(found) - expected) <= bound * abs(expected)
     difference = (x2 - y2).double()
     larger, left = max(fx * fx, fy * fy), abs(fx * fx - fy * fy)

@@ -279,9 +279,7 @@ def test_k_one_changes_nothing(make):
 
 
 def same(c, d):
-    return all(
-        np.array_equal(getattr(c, f.name), getattr(d, f.name), equal_nan=True) for f in dataclasses.fields(c)
-    )
+    return all(np.array_equal(getattr(c, f.name), getattr(d, f.name), equal_nan=True) for f in dataclasses.fields(c))
 
 
 @pytest.mark.parametrize("make", REGIMES)

@@ -25,9 +25,7 @@ def rays(size=40):
 
 
 def same(c, d):
-    return all(
-        np.array_equal(getattr(c, f.name), getattr(d, f.name), equal_nan=True) for f in dataclasses.fields(c)
-    )
+    return all(np.array_equal(getattr(c, f.name), getattr(d, f.name), equal_nan=True) for f in dataclasses.fields(c))
 
 
 # Exact cases. -----------------------------------------------------------------------------------------------

@@ -102,9 +102,12 @@ def test_opacity_is_the_root_of_the_power(drawn):
 
 def test_colours_part_at_the_first_boundary(drawn):
     given = replace(
-        SLANTED, segments=(polygon(SLAB, 1.4), polygon(SLAB, 1.6)), colours=("red", "blue"), index=(1.0, 1.0),
+        SLANTED,
+        segments=(polygon(SLAB, 1.4), polygon(SLAB, 1.6)),
+        colours=("red", "blue"),
+        index=(1.0, 1.0),
         regions=(replace(SLANTED.regions[0], indices=(1.4, 1.6)),),
-    )  # fmt: skip
+    )
     collection = rays_of(drawn(given))
     colours = {tuple(rgb) for rgb in collection.get_colors()[:, :3].tolist()}
     assert colours == {to_rgb(name) for name in ("red", "blue", drawing.WHITE)}

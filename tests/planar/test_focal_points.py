@@ -109,9 +109,13 @@ def test_a_beam_off_the_axis_has_no_marginal_focus():
 def test_groups_are_by_colour_beam_and_reflections():
     origins = np.concatenate([beam(3, 0.3), beam(2, 0.1, y=0.5), [[-3, 2.0]]])
     given = scene(
-        (ball(1.5), ball(1.6)), origins, (1, 0),
-        beams=np.array([0, 0, 0, 1, 1, 1]), colours=("red", "blue"), branches=1,
-    )  # fmt: skip
+        (ball(1.5), ball(1.6)),
+        origins,
+        (1, 0),
+        beams=np.array([0, 0, 0, 1, 1, 1]),
+        colours=("red", "blue"),
+        branches=1,
+    )
     found = focal_points.groups(given, follow_scene(given))
     named = [(g.colour, g.beam, g.reflect, g.spread.rays) for g in found]
     rays = {0: 3, 1: 2}  # the sixth meets nothing

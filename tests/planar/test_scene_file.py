@@ -52,8 +52,11 @@ def test_scenes_load_and_all_rays_find_their_way_out(path, needs_variant):
     assert np.abs(np.hypot(*scene.directions.T) - 1).max() <= 2 * ULP
     for colour, segments in enumerate(scene.segments):
         assert {Event(e) for e in np.unique(paths(scene, colour).events)} <= {
-            Event.NONE, Event.REFRACTED, Event.REFLECTED, Event.ESCAPED
-        }  # fmt: skip
+            Event.NONE,
+            Event.REFRACTED,
+            Event.REFLECTED,
+            Event.ESCAPED,
+        }
         assert segments.start.tolist() == scene.segments[0].start.tolist()
     for region in scene.regions:
         assert len(region.indices) == len(scene.colours)
@@ -265,7 +268,7 @@ BAD = {  # what is replaced, by what: the key, what was found, what is accepted
     "syntax": ("max_depth = 5", "max_depth = = 5", "(at line 5, column 13); accepted: TOML"),
     "twice": ("max_depth = 5", "max_depth = 5\nmax_depth = 5", "accepted: TOML"),
     "nesting": ("max_depth = 5", f"max_depth = {'[' * 5000}", "accepted: TOML"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("old, new, expected", BAD.values(), ids=BAD)

@@ -12,6 +12,8 @@ from mi_refract.planar import intersect_segments
 from mi_refract.planar.tracer import Event, Segments
 
 REFRACTED, REFLECTED, ESCAPED = Event.REFRACTED, Event.REFLECTED, Event.ESCAPED
+
+
 def test_a_slab_shifts_a_ray_as_snells_law_says(follow, setting):
     angle, n, width = 0.7, 1.5, 2.0
     slab = polygon([(0, -50), (width, -50), (width, 50), (0, 50)], n)

@@ -250,9 +250,7 @@ def test_bad_parameters_are_named_with_what_is_accepted(each_variant, parameters
     assert words in str(error.value).replace("\n", " ")
 
 
-@pytest.mark.parametrize(
-    ("int_ior", "ext_ior"), [(1e300, 1), (1e-50, 1), (1e200, 1e-200), (1e-320, 1)]
-)
+@pytest.mark.parametrize(("int_ior", "ext_ior"), [(1e300, 1), (1e-50, 1), (1e200, 1e-200), (1e-320, 1)])
 def test_indices_whose_ratio_is_beyond_float32_are_refused(each_variant, int_ior, ext_ior):
     with pytest.raises(RuntimeError, match=r"int_ior / ext_ior = .*: accepted: a ratio from"):
         load(int_ior=int_ior, ext_ior=ext_ior)
@@ -308,13 +306,15 @@ def jit():
 def ball(integrator, **parameters):
     camera = mi.ScalarTransform4f().look_at([0, 0, 400], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
-    return mi.load_dict({
-        "type": "scene",
-        "integrator": {"type": integrator, "max_depth": 3},
-        "sensor": {"type": "perspective", "fov": 30, "to_world": camera, "film": film},
-        "ball": {"type": "sphere", "radius": 70, "bsdf": {"type": "refract"} | parameters},
-        "sky": {"type": "constant"},
-    })  # fmt: skip
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": integrator, "max_depth": 3},
+            "sensor": {"type": "perspective", "fov": 30, "to_world": camera, "film": film},
+            "ball": {"type": "sphere", "radius": 70, "bsdf": {"type": "refract"} | parameters},
+            "sky": {"type": "constant"},
+        }
+    )
 
 
 def test_an_edit_of_the_index_compiles_nothing(jit):

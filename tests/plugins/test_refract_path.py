@@ -48,9 +48,12 @@ def by_path(scene, spp=16, seed=0, **parameters):
 def glass_ball(resolution=24, sampler=None, **parts):
     place = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
     sensor = {
-        "type": "perspective", "sampler": sampler or {"type": "independent"}, "fov": 30, "to_world": place,
+        "type": "perspective",
+        "sampler": sampler or {"type": "independent"},
+        "fov": 30,
+        "to_world": place,
         "film": {"type": "hdrfilm", "width": resolution, "height": resolution, "pixel_format": "rgb", "rfilter": BOX},
-    }  # fmt: skip
+    }
     ball = {"type": "sphere", "bsdf": {"type": "refract", "int_ior": 1.5, "ext_ior": 1.0}}
     return mi.load_dict({"type": "scene", "sensor": sensor, "ball": ball} | parts)
 

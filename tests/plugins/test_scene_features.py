@@ -36,8 +36,10 @@ MEDIUM = {"type": "homogeneous"}
         ({"type": "sphere"}, {"smooth"}),
         ({"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": 1e-6}}, {"smooth"}),
         ({"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": CHECKERS}}, {"smooth", "textured"}),
-        ({"type": "sphere", "bsdf": {"type": "twosided", "a": {"type": "diffuse", "reflectance": CHECKERS}}},
-         {"smooth", "textured"}),
+        (
+            {"type": "sphere", "bsdf": {"type": "twosided", "a": {"type": "diffuse", "reflectance": CHECKERS}}},
+            {"smooth", "textured"},
+        ),
         ({"type": "sphere", "bsdf": {"type": "refract", "specular_reflectance": CHECKERS}}, {"textured"}),
         ({"type": "sphere", "bsdf": {"type": "mask", "a": {"type": "refract"}}}, {"null", "both_numbers"}),
         ({"type": "sphere", "bsdf": {"type": "thindielectric"}}, {"null"}),
@@ -53,7 +55,7 @@ MEDIUM = {"type": "homogeneous"}
         ({"type": "directional"}, {"sampleable", "lamps", "delta_emitters"}),
         (LAMP | {"emitter": {"type": "directionalarea"}}, {"sampleable", "lamps", "area", "delta_emitters"}),
     ],
-)  # fmt: skip
+)
 def test_each_part_adds_what_it_needs_and_no_more(part, seen):
     mi.set_variant("scalar_rgb")
     expected = {"polarising"} | seen | (set() if "smooth" in seen else {"only_glass"})

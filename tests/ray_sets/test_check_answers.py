@@ -294,8 +294,10 @@ def test_missing_duplicate_and_unknown():
     assert found.exit_code == 2
     told = {each.kind: (each.count, each.text) for each in found.problems}
     assert told == {
-        "missing": (3, "ids 50, 51, 52"), "duplicate": (2, "ids 7, 9"), "unknown": (2, "ids -4, 1000000000")
-    }  # fmt: skip
+        "missing": (3, "ids 50, 51, 52"),
+        "duplicate": (2, "ids 7, 9"),
+        "unknown": (2, "ids -4, 1000000000"),
+    }
     assert found.answered == len(to) - 3
     assert found.wrong == 0  # the first answer counts
 

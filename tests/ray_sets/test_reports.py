@@ -48,8 +48,10 @@ def test_junit(tmp_path, findings, name, failures, errors):
     root = ElementTree.parse(tmp_path / "out.xml").getroot()
     for element in (root, root[0]):
         assert {key: int(element.get(key)) for key in ("tests", "failures", "errors")} == {
-            "tests": 4, "failures": failures, "errors": errors
-        }  # fmt: skip
+            "tests": 4,
+            "failures": failures,
+            "errors": errors,
+        }
     assert root[0].get("name") == "a & b \ufffd[31m <program>"
     assert [case.get("name") for case in root[0]][1:] == ["generic", "k ≫ 1", "critical"]
     assert len(root.findall(".//failure")) == failures

@@ -196,7 +196,7 @@ def test_products_are_exact_and_quotients_are_long_divisions():
     for i in range(200):
         fx, fy = Fraction(float(x[i])), Fraction(float(y[i]))
         assert Fraction(float(p[i])) + Fraction(float(e[i])) == fx * fy
-        assert abs(sum(Fraction(float(digit[i])) for digit in q) - fx / fy) <= 2 ** -150 * abs(fx / fy)
+        assert abs(sum(Fraction(float(digit[i])) for digit in q) - fx / fy) <= 2**-150 * abs(fx / fy)
 
 
 def test_what_cancels_is_regained_and_the_largest_part_leads():

@@ -20,11 +20,24 @@ from mi_refract.report.row import Row
 
 NAN, INF = math.nan, math.inf
 GOOD = Row("directions", "promoted", "generic", "llvm float32", {"worst": 5e-8, "time": 1.2}, {"worst": 6e-8})
-BAD = Row("directions", "cross", "generic", "llvm float32", {"worst": NAN, "misjudged": 3.0},
-          {"worst": 1e-3, "misjudged": 0.0}, replay={"k": "0x1.8p+0"})  # fmt: skip
+BAD = Row(
+    "directions",
+    "cross",
+    "generic",
+    "llvm float32",
+    {"worst": NAN, "misjudged": 3.0},
+    {"worst": 1e-3, "misjudged": 0.0},
+    replay={"k": "0x1.8p+0"},
+)
 ABSENT = Row("directions", "cross", "generic", "cuda float32", reason="no CUDA device \x1b[0m")
-INFO = Row("speed", "<script>alert(1)</script>", "$k$ & co", "", {"time": INF, "low": -INF},
-           curves={"a": [(0.1, 1e-2), (1.0, 1e-3)], "b": [(1.0, 0.0), (2.0, NAN)]})  # fmt: skip
+INFO = Row(
+    "speed",
+    "<script>alert(1)</script>",
+    "$k$ & co",
+    "",
+    {"time": INF, "low": -INF},
+    curves={"a": [(0.1, 1e-2), (1.0, 1e-3)], "b": [(1.0, 0.0), (2.0, NAN)]},
+)
 ROWS = [GOOD, BAD, ABSENT, INFO]
 CONTEXT = {
     "title": "validation",
@@ -241,8 +254,10 @@ def test_a_scatter_shows_front_floor_and_intervals_where_asked(tmp_path):
         assert text.count('class="plot wide"') == 1  # what no row has measured is not drawn
         return text.count("<path"), text
 
-    rows = [Row("s", name, "", "llvm", {"time": x, "low": x - 0.1, "high": x + 0.1, "worst": y})
-            for name, x, y in (("a", 1.0, 1e-3), ("b", 2.0, 1e-6), ("c", 3.0, 1e-5))]  # fmt: skip
+    rows = [
+        Row("s", name, "", "llvm", {"time": x, "low": x - 0.1, "high": x + 0.1, "worst": y})
+        for name, x, y in (("a", 1.0, 1e-3), ("b", 2.0, 1e-6), ("c", 3.0, 1e-5))
+    ]
     rows.append(Row("s", "copy", "", "llvm", {"time": 0.9}))
     plain, text = paths()
     assert ">copy</text>" not in text
@@ -269,9 +284,21 @@ def test_an_overlay_stands_beside_the_other_pictures_in_a_fixed_order(tmp_path):
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(1.234e-7, "1.23e-7"), (0.98, "0.98"), (8056.0, "8056"), (0.0, "0"), (1e-3, "1e-3"), (1234.56, "1235"),
-     (-2.5e-9, "-2.5e-9"), (1e300, "1e300"), (99999.7, "100000"), (INF, "inf"), (NAN, "nan"), (0.01, "0.01")],
-)  # fmt: skip
+    [
+        (1.234e-7, "1.23e-7"),
+        (0.98, "0.98"),
+        (8056.0, "8056"),
+        (0.0, "0"),
+        (1e-3, "1e-3"),
+        (1234.56, "1235"),
+        (-2.5e-9, "-2.5e-9"),
+        (1e300, "1e300"),
+        (99999.7, "100000"),
+        (INF, "inf"),
+        (NAN, "nan"),
+        (0.01, "0.01"),
+    ],
+)
 def test_compact(value, text):
     assert compact(value) == text
 

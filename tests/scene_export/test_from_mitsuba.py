@@ -229,7 +229,7 @@ REFUSED = {
         "a checkerboard",
     ),
     "medium": ("<bsdf", '<medium type="homogeneous" name="interior"/><bsdf', "a medium of a shape"),
-    "reflecting lamp": ("<emitter type=\"area\">", '<bsdf type="diffuse"/><emitter type="area">', "BSDF of a lamp"),
+    "reflecting lamp": ('<emitter type="area">', '<bsdf type="diffuse"/><emitter type="area">', "BSDF of a lamp"),
     "unknown parameter": ('<translate x="3"/>', '<nonsense x="3"/>', "nonsense"),
     "syntax": ("</scene>", "", "scene.xml"),
     "negative": ('"0.5, 0.25, 1"', '"0.5, -0.25, 1"', "at least 0"),
@@ -241,10 +241,12 @@ REFUSED = {
     "infinite": ('type="sphere" id="ball">', 'type="sphere"><float name="radius" value="inf"/>', "radius = inf"),
     "no point": ('type="sphere" id="ball">', 'type="sphere"><float name="center" value="1"/>', "center = 1"),
     "no transform": (
-        '<transform name="to_world"><translate x="3"/></transform>', '<float name="to_world" value="1"/>', "to_world"
+        '<transform name="to_world"><translate x="3"/></transform>',
+        '<float name="to_world" value="1"/>',
+        "to_world",
     ),
     "missing mesh": ('type="sphere" id="ball">', 'type="ply"><string name="filename" value="no.ply"/>', "no.ply"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", REFUSED)

@@ -222,8 +222,9 @@ def test_maps_are_looked_up_by_unit_directions(module, sky):
     np.testing.assert_allclose(nearest, environment_map.radiance(sky, directions), atol=0.15)
     weights = np.sin(np.pi * (np.arange(height) + 0.5) / height)[:, None, None] * np.ones_like(picture)
     sphere = np.random.default_rng(7).normal(size=(20000, 3))
-    np.testing.assert_allclose(np.average(picture, axis=(0, 1), weights=weights),
-                               environment_map.radiance(sky, sphere).mean(0), atol=0.01)  # fmt: skip
+    np.testing.assert_allclose(
+        np.average(picture, axis=(0, 1), weights=weights), environment_map.radiance(sky, sphere).mean(0), atol=0.01
+    )
 
 
 def test_scripts_for_other_pythons_are_complete(small, tmp_path):

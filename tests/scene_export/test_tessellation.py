@@ -65,10 +65,14 @@ def test_closed_sees_a_defect():
 def colour_faults(scales, triangles, seed=3):
     """How many of 400 points of the two parts have another of the checkerboard's colours."""
     mi.set_variant("scalar_rgb")
-    texture = mi.load_dict({
-        "type": "checkerboard", "to_uv": mi.ScalarTransform4f().scale([*scales, 1]),
-        "color0": {"type": "rgb", "value": 0.25}, "color1": {"type": "rgb", "value": 0.75},
-    })  # fmt: skip
+    texture = mi.load_dict(
+        {
+            "type": "checkerboard",
+            "to_uv": mi.ScalarTransform4f().scale([*scales, 1]),
+            "color0": {"type": "rgb", "value": 0.25},
+            "color1": {"type": "rgb", "value": 0.75},
+        }
+    )
     rng, si, faults = np.random.default_rng(seed), mi.SurfaceInteraction3f(), 0
     for colour, (vertices, faces) in zip((0.25, 0.75), triangles, strict=True):
         for corners in vertices[rng.choice(faces, 200)]:

@@ -112,4 +112,4 @@ BAD = {
         lambda a, n, k: two_sided(swapped(a) * np.array([1, -1, 1], a.dtype), n, k),
     ],
     "missing normalisation": [lambda a, n, k: 1.5 * glsl(a, n, k), lambda a, n, k: glsl(a, n, k) / k[:, None]],
-}  # fmt: skip
+}

@@ -117,7 +117,9 @@ def test_renders_agree_and_see_an_index_that_is_off(context, plugin, verdict):
 def test_what_is_the_same_is_not_tested_by_chance_and_still_compared(context):
     """The furnace has no noise: no Welch test, but a picture that is off fails; and NaN is no picture at all."""
     mi.register_bsdf("refract_tinted", lambda props: bsdf.plugin_class(mi.scalar_rgb)(tinted(props)))
-    right, wrong = (against_dielectric._compare(context, SCENES / "furnace.xml", p)[0] for p in ("refract", "refract_tinted"))
+    right, wrong = (
+        against_dielectric._compare(context, SCENES / "furnace.xml", p)[0] for p in ("refract", "refract_tinted")
+    )
     assert right.verdict == "pass" and right.reason.startswith("left out: Welch's test")
     assert "Welch alarms" not in right.values and not right.curves
     assert {"|mean ratio − 1|", "changed share"} <= set(wrong.broken)
@@ -133,8 +135,15 @@ def test_what_is_the_same_is_not_tested_by_chance_and_still_compared(context):
 def test_scenes_say_what_they_need_and_what_is_left_out(context):
     (row,) = scenes.scene_rows(context, SCENES / "slab.xml")
     assert {name for name, value in row.values.items() if value} == {
-        "sampleable", "lamps", "area", "environment", "plain environment", "only glass", "textured", "polarising"
-    }  # fmt: skip
+        "sampleable",
+        "lamps",
+        "area",
+        "environment",
+        "plain environment",
+        "only glass",
+        "textured",
+        "polarising",
+    }
     assert row.reason == "left out: emitter sampling, a random number, media, null lobes, dispersion"
     assert row.replay["left out"]["dispersion"] == "no BSDF bends light by its wavelength"
 
@@ -213,18 +222,39 @@ def test_misuse_is_one_line_and_exit_code_2(arguments, words, capsys):
 def test_the_accuracy_table_holds_the_rows_and_nothing_else():
     settings = {"llvm float32": {"misjudged": 3.0}, "llvm float64": {}}
     rows = [
-        Row("directions", "promoted", "all regimes", setting,
-            {"worst chord": 4.97e-8, "worst / u": 0.834, "time / copy": 1.01, "time / copy, low": 0.98,
-             "time / copy, high": 1.2, "time / plain": 1.05} | more, replay={"rays": 28000})
+        Row(
+            "directions",
+            "promoted",
+            "all regimes",
+            setting,
+            {
+                "worst chord": 4.97e-8,
+                "worst / u": 0.834,
+                "time / copy": 1.01,
+                "time / copy, low": 0.98,
+                "time / copy, high": 1.2,
+                "time / plain": 1.05,
+            }
+            | more,
+            replay={"rays": 28000},
+        )
         for setting, more in settings.items()
-    ]  # fmt: skip
+    ]
     floor = [dataclasses.replace(r, subject="copy", values={"time / copy": 1.0}, replay={}) for r in rows]
     lines = readme_tables.accuracy([*rows, *floor]).splitlines()
     assert len(lines) == 6
     assert [cell.strip() for cell in lines[-1].split("|")][1:-1] == [
-        "`promoted`", "this project", "4.97e-8", "0.834", "3", "1.01 (0.98–1.2)", "1.05",
-        "4.97e-8", "0.834", "1.01 (0.98–1.2)",
-    ]  # fmt: skip
+        "`promoted`",
+        "this project",
+        "4.97e-8",
+        "0.834",
+        "3",
+        "1.01 (0.98–1.2)",
+        "1.05",
+        "4.97e-8",
+        "0.834",
+        "1.01 (0.98–1.2)",
+    ]
 
 
 def test_a_readme_is_not_written_from_a_run_that_measured_too_little():
@@ -251,9 +281,13 @@ def test_the_readme_holds_its_tables_and_shows_pictures_that_exist():
     ways = [method.name for method in render_methods.METHODS]
     planar = [path.stem for path in SCENES.glob("planar/*.toml")]
     words_of = {
-        "accuracy": FORMULAS, "renders": scenes, "paths": layered_paths.plugins(), "efficiency": ways, "planar": planar,
+        "accuracy": FORMULAS,
+        "renders": scenes,
+        "paths": layered_paths.plugins(),
+        "efficiency": ways,
+        "planar": planar,
         "gate": [*planted_defects.GLASSES, *DEFECTS, *METHODS],
-    }  # fmt: skip
+    }
     assert words_of.keys() == readme_tables.TABLES.keys()
     others = [call.title for system in SYSTEMS.values() for call in system.calls]
     for marker, words in (words_of | {"suite": [*others, *PAINTERS]}).items():

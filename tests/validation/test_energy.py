@@ -104,7 +104,9 @@ def test_the_closed_form_of_diffuse_light():
             exact = acb.integral(integrand, 0, 1).real
             found = diffuse_fresnel.hemispherical(index)["outside"]
             assert abs(float(exact - arb(float(found)) - arb(float(found - np.longdouble(float(found)))))) < 1e-18
-            assert diffuse_fresnel.hemispherical(index)["inside"] == pytest.approx(1 - (1 - float(exact)) / index**2, rel=1e-15)
+            assert diffuse_fresnel.hemispherical(index)["inside"] == pytest.approx(
+                1 - (1 - float(exact)) / index**2, rel=1e-15
+            )
 
 
 def test_energy_holds_on_scalars_and_absent_backends_say_so(context):
@@ -259,6 +261,7 @@ def test_a_contrast_that_is_detached_is_seen(context, monkeypatch):
 def test_misjudged_rays_are_no_rays_of_the_derivative(context):
     setting = compiled(context)[0]
     given = derivatives.inputs(20, setting.precision)
-    values = derivatives.row("x", "y", np.full(len(given.rays.k), np.nan), given, setting,
-                             np.zeros(len(given.rays.k), bool), {}).values  # fmt: skip
+    values = derivatives.row(
+        "x", "y", np.full(len(given.rays.k), np.nan), given, setting, np.zeros(len(given.rays.k), bool), {}
+    ).values
     assert values == {"error / condition": 0, "error": 0, "not finite": 0}

@@ -85,7 +85,9 @@ def test_normals_of_the_wrong_sign_break_every_row(name, made, scalar, monkeypat
 
 def test_a_bound_that_would_hold_whatever_comes_fails(scalar, monkeypatch):
     monkeypatch.setattr(traced_system, "PLACE", 100 * traced_system.PLACE)
-    assert traced_bodies.bench_row("slab", traced_systems.slab(), "refract", "scalar_rgb").broken == {"index seen": traced_bodies.SEEN}
+    assert traced_bodies.bench_row("slab", traced_systems.slab(), "refract", "scalar_rgb").broken == {
+        "index seen": traced_bodies.SEEN
+    }
 
 
 def test_a_ray_that_misses_is_off_by_infinity(made, scalar, monkeypatch):
@@ -95,7 +97,11 @@ def test_a_ray_that_misses_is_off_by_infinity(made, scalar, monkeypatch):
 
 
 def test_what_does_not_run_says_why(scalar):
-    rows = [*traced_bodies.variant_rows(scalar, "cuda_ad_double"), traced_bodies.double_row(), *traced_bodies.bow_rows(scalar)]
+    rows = [
+        *traced_bodies.variant_rows(scalar, "cuda_ad_double"),
+        traced_bodies.double_row(),
+        *traced_bodies.bow_rows(scalar),
+    ]
     assert [row.verdict for row in rows] == ["not run"] * 3
     assert [row.setting for row in rows] == ["cuda_ad_double", "double precision", "scalar_rgb"]
 
@@ -131,7 +137,9 @@ def test_the_edge_of_a_bow_without_noise_is_the_rainbow_angle():
 def test_a_picture_without_an_edge_has_none():
     assert math.isnan(rainbow.edge(np.zeros((rainbow.SIZE, rainbow.SIZE))))
     blank = [np.zeros((rainbow.SIZE, rainbow.SIZE))] * 3
-    assert {"error / bound", "standard error / °"} == set(traced_bodies.bow_row("refract", "llvm_ad_rgb", blank, {}).broken)
+    assert {"error / bound", "standard error / °"} == set(
+        traced_bodies.bow_row("refract", "llvm_ad_rgb", blank, {}).broken
+    )
 
 
 @pytest.mark.parametrize("defect", [0.0, DEFECT])

@@ -38,7 +38,9 @@ def test_a_system_that_is_known_to_differ_passes_and_is_said_to_differ():
     assert (found.verdict, found.missed, found.reason) == ("pass", {"differs": 0.0}, "B 3; why")
 
 
-@pytest.mark.parametrize(("study", "cases"), [(per_ray.STUDY, per_ray.SETS), (rendered_images.STUDY, rendered_images.SCENES)])
+@pytest.mark.parametrize(
+    ("study", "cases"), [(per_ray.STUDY, per_ray.SETS), (rendered_images.STUDY, rendered_images.SCENES)]
+)
 def test_what_was_not_run_is_not_run_for_every_check(study, cases):
     found = matrix.summary([Row(study, "A", "every set", "f32", reason="pip install it")])
     assert [row.case for row in found] == list(cases)

@@ -121,7 +121,10 @@ def test_the_transfer_is_the_derivative():
 def test_what_is_right_passes(scalar):
     rows = [closed_paths._row(scalar, name, make(6)) for name, make in closed_paths.CLOSED.items()]
     rows += [closed_paths._box_row(scalar, 20, 3)]
-    rows += [against_retrace.row_of(against_retrace.case_of(against_retrace.FOLDER / f"{name}.toml", 3), scalar) for name in ("lens", "prism")]
+    rows += [
+        against_retrace.row_of(against_retrace.case_of(against_retrace.FOLDER / f"{name}.toml", 3), scalar)
+        for name in ("lens", "prism")
+    ]
     assert {row.verdict for row in rows} == {"pass"}
     assert all(row.values["astray"] == 0 for row in rows)
 
@@ -156,7 +159,10 @@ def test_a_wrong_formula_breaks_every_closed_answer(name, defect, scalar, monkey
 def test_a_wrong_formula_breaks_a_scene(defect, scalar, monkeypatch):
     case = against_retrace.case_of(against_retrace.FOLDER / "lens.toml", 3)
     monkeypatch.setattr(path_loop, "refract_2d", defect)
-    assert "error / bound" in against_retrace.row_of(case, scalar).broken or "astray" in against_retrace.row_of(case, scalar).broken
+    assert (
+        "error / bound" in against_retrace.row_of(case, scalar).broken
+        or "astray" in against_retrace.row_of(case, scalar).broken
+    )
 
 
 def traced_otherwise(case, **changes):
@@ -243,10 +249,15 @@ def test_either_segment_is_right_at_their_vertex():
     case = against_retrace.case_of(against_retrace.FOLDER / "lens.toml", 13)
     ray = int(np.argmin(np.abs(case.origins[:, 0]) + 1e3 * np.abs(case.directions[:, 0])))
     hits, met = case.exact.hits.copy(), case.exact.hits[ray, 1]
-    neighbours = np.flatnonzero((case.segments.start == case.segments.end[met]).all(1)
-                                | (case.segments.end == case.segments.start[met]).all(1))  # fmt: skip
-    there = [against_retrace.judge(dataclasses.replace(as_paths(case.exact), hits=put(hits, ray, n)), case, 2.0**-53)["astray"]
-             for n in neighbours]  # fmt: skip
+    neighbours = np.flatnonzero(
+        (case.segments.start == case.segments.end[met]).all(1) | (case.segments.end == case.segments.start[met]).all(1)
+    )
+    there = [
+        against_retrace.judge(dataclasses.replace(as_paths(case.exact), hits=put(hits, ray, n)), case, 2.0**-53)[
+            "astray"
+        ]
+        for n in neighbours
+    ]
     assert sorted(there) == [0, 1]
 
 

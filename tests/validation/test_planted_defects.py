@@ -13,7 +13,9 @@ CASES = [(name, formula) for name, mutant in MUTANTS.items() for formula in muta
 
 
 def sample(setting):
-    return planted_defects.draw(planted_defects.SCALAR_COUNT if setting.backend == "scalar" else planted_defects.COUNT, setting.precision)
+    return planted_defects.draw(
+        planted_defects.SCALAR_COUNT if setting.backend == "scalar" else planted_defects.COUNT, setting.precision
+    )
 
 
 @pytest.mark.parametrize(("name", "formula"), CASES)

@@ -112,7 +112,9 @@ def test_values_that_are_not_finite_fail(judged):
 
 
 def test_every_scene_of_a_painter_is_one_of_the_study():
-    assert {scene for painter in image_renderers.PAINTERS.values() for scene in painter.spp} == rendered_images.SCENES.keys()
+    assert {
+        scene for painter in image_renderers.PAINTERS.values() for scene in painter.spp
+    } == rendered_images.SCENES.keys()
     assert set(rendered_images.WHY) <= set(image_renderers.PAINTERS)
 
 

@@ -108,10 +108,7 @@ def iors(path):
         for b in root.findall(".//bsdf[@type='$bsdf']")
     }
     shapes = {
-        s.get("id"): media[r.get("id")]
-        for s in root.iter("shape")
-        for r in s.findall("ref")
-        if r.get("id") in media
+        s.get("id"): media[r.get("id")] for s in root.iter("shape") for r in s.findall("ref") if r.get("id") in media
     }
     return media, shapes
 

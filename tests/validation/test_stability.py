@@ -190,7 +190,9 @@ def test_a_condition_bounds_what_random_errors_do_and_not_by_far(name):
         return x + size * np.sqrt(optical_systems.dot(x, x)) * optical_systems.unit(rng.normal(size=x.shape))
 
     for _ in range(20):
-        error = trace(lambda a, n, k: off(optical_systems.snell(a, off(n), k * (1 + size * rng.choice([-1, 1]))))) - exact
+        error = (
+            trace(lambda a, n, k: off(optical_systems.snell(a, off(n), k * (1 + size * rng.choice([-1, 1]))))) - exact
+        )
         worst = np.maximum(worst, np.sqrt((error**2).sum(1)) / (optical_systems.condition(trace) * size))
     assert 0.2 < worst.max() < 1
 
@@ -260,7 +262,9 @@ def test_a_pipe_passes_and_sees_planted_defects():
 def test_a_system_passes_and_sees_planted_defects(name):
     assert optical_chains.system_row("promoted", promoted, name, SCALAR).verdict == "pass"
     defects = [five_digits, swapped, single_result, not_a_number]
-    assert [d.__name__ for d in defects if optical_chains.system_row("promoted", d, name, SCALAR).verdict != "fail"] == []
+    assert [
+        d.__name__ for d in defects if optical_chains.system_row("promoted", d, name, SCALAR).verdict != "fail"
+    ] == []
 
 
 # Rows ----------------------------------------------------------------------------------------------------------

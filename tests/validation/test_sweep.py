@@ -190,8 +190,11 @@ def test_the_file_keeps_the_worst_once_and_sorted(tmp_path):
     assert path.read_bytes() == before
     assert worst_rays.keep([line(1, 0.1, objective="decision"), line(9, 0.9, formula="cross")], path) == 2
     assert [(f.formula, f.objective) for f in worst_rays.read(path)] == [
-        ("cross", "chord"), ("promoted", "chord"), ("promoted", "chord"), ("promoted", "decision"),
-    ]  # fmt: skip
+        ("cross", "chord"),
+        ("promoted", "chord"),
+        ("promoted", "chord"),
+        ("promoted", "decision"),
+    ]
     rays = worst_rays.rays_of(worst_rays.read(path), "float32")
     assert rays.k.dtype == np.float32
     assert rays.a[0, 0] == np.float32(0.9)

@@ -70,8 +70,11 @@ def test_a_plugin_that_does_not_listen_is_seen(context, monkeypatch):
     nothing_else = dict.fromkeys(context.variants, "no")
     rows = by_case(unused_features.operation_rows(dataclasses.replace(context, variants=nothing_else)))
     assert (rows["polarised"].verdict, rows["polarised"].reason) == ("not run", "no")
-    assert {case for case, row in rows.items() if row.verdict == "fail"} == {"reflection only", "transmission only",
-                                                                             "importance mode"}  # fmt: skip
+    assert {case for case, row in rows.items() if row.verdict == "fail"} == {
+        "reflection only",
+        "transmission only",
+        "importance mode",
+    }
 
 
 def test_glasses_share_a_kernel_and_an_edit_compiles_nothing(context, monkeypatch):

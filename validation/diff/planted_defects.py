@@ -150,7 +150,8 @@ def trials(name: str) -> list[self_test.Trial]:
     camera = opened(name)
     seeds = [2 * RENDERS * trial for trial in range(TRIALS)]
     return [
-        self_test.Trial(_renders(camera, seed), _renders(camera, seed + RENDERS), _later(camera, seed)) for seed in seeds
+        self_test.Trial(_renders(camera, seed), _renders(camera, seed + RENDERS), _later(camera, seed))
+        for seed in seeds
     ]
 
 
@@ -181,7 +182,10 @@ def defect_rows(context: Context, name: str) -> list[Row]:
     rows.append(_row(OTHER_SAMPLER, clean, name, context, opened(name, sampler="multijitter")))
     every = np.concatenate([t.clean for t in clean])
     about = {"resolution": RESOLUTION, "spp": SPP, "renders": len(every)}
-    return [*rows, Row(self_test.STUDY, "renders", name, context.variant, {"noise": self_test.noise(every)}, replay=about)]
+    return [
+        *rows,
+        Row(self_test.STUDY, "renders", name, context.variant, {"noise": self_test.noise(every)}, replay=about),
+    ]
 
 
 def _row(defect: str, clean: list[self_test.Trial], name: str, context: Context, camera: Camera) -> Row:
@@ -190,8 +194,16 @@ def _row(defect: str, clean: list[self_test.Trial], name: str, context: Context,
     row = self_test.detection(defect, False, spoilt, name, context.variant)
     if defect != OTHER_SAMPLER or not row.values:
         return row
-    return Row(row.study, row.subject, row.case, row.setting, row.values, row.budgets | {"welch": ONE_ALARM},
-               reason="no defect: `welch` must not see it", replay=row.replay)  # fmt: skip
+    return Row(
+        row.study,
+        row.subject,
+        row.case,
+        row.setting,
+        row.values,
+        row.budgets | {"welch": ONE_ALARM},
+        reason="no defect: `welch` must not see it",
+        replay=row.replay,
+    )
 
 
 def null_rows(context: Context, name: str) -> list[Row]:

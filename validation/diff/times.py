@@ -130,10 +130,14 @@ def _subjects(root: Path, page: Path) -> dict[str, Callable[[], object]]:
     """The verdict of each method, of a folder, and the page of the picture that differs."""
     a, b = root / "a", root / "b"
     found = {
-        name: functools.partial(folders.diff, *((a, b) if method.samples else (a / "0.exr", b / "0.exr")),
-                                Settings(How(name)), samples=method.samples)
+        name: functools.partial(
+            folders.diff,
+            *((a, b) if method.samples else (a / "0.exr", b / "0.exr")),
+            Settings(How(name)),
+            samples=method.samples,
+        )
         for name, method in METHODS.items()
-    }  # fmt: skip
+    }
     many = functools.partial(folders.diff, root / "many_a", root / "many_b")
     judged = folders.diff(a / "0.exr", b / "0.exr", Settings(How("tolerance")), maps=True)
     return found | {AUTO: many, "page": functools.partial(html_report.write, page, judged)}

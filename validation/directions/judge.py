@@ -63,9 +63,7 @@ def judge(subject: Subject, rays: Rays, exact: oracle.Certified, vector: Any, bu
 
 
 @np.errstate(over="ignore", invalid="ignore")  # a subject may return anything
-def judged(
-    b: np.ndarray, transmitted: np.ndarray, rays: Rays, exact: oracle.Certified, budget: Budget
-) -> Judgement:
+def judged(b: np.ndarray, transmitted: np.ndarray, rays: Rays, exact: oracle.Certified, budget: Budget) -> Judgement:
     """What a subject returned, in extended precision."""
     chord, angle, drift = errors(b, rays, exact)
     misjudged = (transmitted != exact.transmitted) & ~exact.undecided

@@ -46,11 +46,16 @@ TERMS = (
 )
 SCATTER = [
     {
-        "study": "directions", "x": x, "y": "worst / u", "title": f"Worst error against {x}",
-        "front": True, "interval": [f"{x}, low", f"{x}, high"], "floor": kernel_timing.COPY,
+        "study": "directions",
+        "x": x,
+        "y": "worst / u",
+        "title": f"Worst error against {x}",
+        "front": True,
+        "interval": [f"{x}, low", f"{x}, high"],
+        "floor": kernel_timing.COPY,
     }
     for x in ("time / copy", "ns per ray")
-]  # fmt: skip
+]
 SEED = 2026
 # Fewer rays than this need not come near a bound: only from here on a bound that is too wide is a defect.
 TWO_SIDED = 50_000
@@ -121,10 +126,13 @@ def _row(name: str, regime: str, setting: Setting, rays: regimes.Rays, found: Ju
     }
     worst = {"largest error": np.where(found.right, found.chord, -1), "nearest to its bound": found.share}
     replay = {
-        "regime": regime, "text": regimes.REGIMES[regime].text, "count": len(rays), "seed": SEED,
+        "regime": regime,
+        "text": regimes.REGIMES[regime].text,
+        "count": len(rays),
+        "seed": SEED,
         **{title: rays.hexed(int(np.argmax(x))) for title, x in worst.items()},
         "needed": {"linear": float(found.linear.max()), "radicand": float(found.radicand.max())},
-    }  # fmt: skip
+    }
     budgets = {} if reason else BUDGETS
     return Row("directions", name, regime, setting.label, values, budgets, reason=reason, replay=replay)
 

@@ -221,7 +221,9 @@ MUTANTS = {
         "its low part dropped", _patched(error_free.Expansion, "double", _truncated), ("compensated",)
     ),
     "radicand of second order": Mutant(
-        "sums of first order rounded", _patched(error_free.Expansion, "collected", _plainly_collected), ("compensated",),
+        "sums of first order rounded",
+        _patched(error_free.Expansion, "collected", _plainly_collected),
+        ("compensated",),
         rare=True,
     ),
 }
@@ -283,7 +285,7 @@ class Sample:
         return Sample(part(self.rays), part(self.exact), self.regime[mask], self.unit[mask])
 
     def strongest(self, found: Judgement) -> str:
-        """"regime, metric value": a wrong decision before a wrong direction, where most rays see it."""
+        """ "regime, metric value": a wrong decision before a wrong direction, where most rays see it."""
         metric, mask = ("misjudged far", found.far) if found.far.any() else ("error / bound", found.seen)
         names = self.regime if len(mask) == len(self.regime) else self.regime[self.unit]
         regime = max(dict.fromkeys(names), key=lambda name: int(mask[names == name].sum()))

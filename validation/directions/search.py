@@ -128,9 +128,7 @@ def climb(
     return herd
 
 
-def _parents(
-    name: str, subject: Subject, names: tuple[str, ...], setting: Setting, seed: int, sample: int
-) -> Herd:
+def _parents(name: str, subject: Subject, names: tuple[str, ...], setting: Setting, seed: int, sample: int) -> Herd:
     """The worst of a sample, by either objective, of every regime."""
     rays, scores = [], []
     for regime_name in names:

@@ -157,10 +157,14 @@ def _certified_row(name: str, regime: str, setting: Setting, found: Gathered, co
     }
     budgets = {} if reason else {**BUDGETS, "screen off": SCREEN_BUDGET}
     replay = {
-        "regime": regime, "text": entry.text, "count": count, "chunk": CHUNK, "first seed": SEED,
+        "regime": regime,
+        "text": entry.text,
+        "count": count,
+        "chunk": CHUNK,
+        "first seed": SEED,
         "worst ray": rays.hexed(int(np.argmax(seen.share))),
         "misjudged": [rays.hexed(int(i)) for i in np.flatnonzero(wrong)[:3]],
-    }  # fmt: skip
+    }
     return Row("sweep", name, regime, setting.label, values, budgets, reason=reason, replay=replay)
 
 

@@ -132,16 +132,32 @@ def _measured_rows(context: Context, path: Path, extent: Extent, methods: tuple[
     facts = scene_features.inspect(cameras[subjects[1].name].scene)
     goals = goals_of(subjects, found, facts.only_glass)
     replay = {
-        "scene": path.name, "resolution": resolution, "spp": extent.spp[-1], "rounds": extent.rounds,
-        "reference renders": extent.references, "reference seeds from": FIRST_REFERENCE, "sampler": sampler,
-    }  # fmt: skip
+        "scene": path.name,
+        "resolution": resolution,
+        "spp": extent.spp[-1],
+        "rounds": extent.rounds,
+        "reference renders": extent.references,
+        "reference seeds from": FIRST_REFERENCE,
+        "sampler": sampler,
+    }
     remark = f"the best stratified sampler here: {sampler}"
     for subject in subjects:
         values = _values(subject, subjects[:2], found, references)
         # The reference is the built-in's own.
         budgets = {} if subject.method == BUILTIN else {"Welch alarms": 0.0}
-        rows.append(Row(STUDY, subject.name, path.stem, context.variant, values, budgets, goals.get(subject.name, {}),
-                        remark, replay | {"method": subject.method.plugin(-1)}))  # fmt: skip
+        rows.append(
+            Row(
+                STUDY,
+                subject.name,
+                path.stem,
+                context.variant,
+                values,
+                budgets,
+                goals.get(subject.name, {}),
+                remark,
+                replay | {"method": subject.method.plugin(-1)},
+            )
+        )
     own = {"reference variance": float(references.var(0, ddof=1).mean() / len(references))}
     rows.append(Row(STUDY, "every method", path.stem, context.variant, own, {}, {}, remark, replay, {}, _curves(found)))
     return rows
@@ -233,9 +249,10 @@ def _values(subject: Subject, builtins: list[Subject], found: Found, references:
         values[f"equal-time {metric}"] = statistics.median(ratios)
     agreed = compare.welch(references, np.stack(test.pictures), TILE, FAMILY_ERROR, MARGIN)
     return values | {
-        "Welch alarms": float(agreed.alarms), "smallest p, adjusted": agreed.smallest_p,
+        "Welch alarms": float(agreed.alarms),
+        "smallest p, adjusted": agreed.smallest_p,
         "detectable difference": agreed.detectable,
-    }  # fmt: skip
+    }
 
 
 def goals_of(subjects: list[Subject], found: Found, only_glass: bool) -> dict[str, dict[str, float]]:
@@ -256,7 +273,9 @@ def goals_of(subjects: list[Subject], found: Found, only_glass: bool) -> dict[st
 def _curves(found: Found) -> dict[str, list[tuple[float, float]]]:
     """RMSE against seconds."""
     return {
-        name: [(statistics.median(m.seconds), math.sqrt(max(statistics.fmean(m.figures["MSE"]), 0)))
-               for m in by_spp.values()]
+        name: [
+            (statistics.median(m.seconds), math.sqrt(max(statistics.fmean(m.figures["MSE"]), 0)))
+            for m in by_spp.values()
+        ]
         for name, by_spp in found.items()
-    }  # fmt: skip
+    }

@@ -81,11 +81,13 @@ def _glasses(method: Method, size: int, resolution: int) -> Camera:
     side = math.ceil(math.sqrt(size))
     parts = {
         f"ball_{i}": {
-            "type": "sphere", "center": [10 * (i % side - (side - 1) / 2), 10 * (i // side - (side - 1) / 2), 0],
-            "radius": 4.5, "bsdf": {"type": method.bsdf, "int_ior": 1.3 + 1.2 * i / size, "ext_ior": 1.0},
+            "type": "sphere",
+            "center": [10 * (i % side - (side - 1) / 2), 10 * (i // side - (side - 1) / 2), 0],
+            "radius": 4.5,
+            "bsdf": {"type": method.bsdf, "int_ior": 1.3 + 1.2 * i / size, "ext_ior": 1.0},
         }
         for i in range(size)
-    }  # fmt: skip
+    }
     return _in_memory(method, parts, 10.0 * side, resolution)
 
 
@@ -203,9 +205,14 @@ def run(job: Job, home: str) -> dict[str, float]:
     environment = dict.fromkeys(("HOME", "CUDA_CACHE_PATH", "OPTIX_CACHE_PATH"), home)
     environment["PYTHONUSERBASE"] = site.getuserbase()  # packages may be below the home folder, too
     done = subprocess.run(
-        [sys.executable, "-m", "validation.scaling", json.dumps(vars(job))], cwd=SCENES.parent, check=False,
-        env=os.environ | environment, capture_output=True, text=True, timeout=LIMIT,
-    )  # fmt: skip
+        [sys.executable, "-m", "validation.scaling", json.dumps(vars(job))],
+        cwd=SCENES.parent,
+        check=False,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT,
+    )
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
         raise RuntimeError(f"{job.method}, {job.knob} = {job.size}: exit code {done.returncode}: {last}")

@@ -46,19 +46,32 @@ def scene(glass: dict[str, Any]) -> Any:
     film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "pixel_format": "luminance"}
     film |= {"component_format": "float32", "rfilter": {"type": "box"}}
     view = move().look_at(origin=[0, 0, 2], target=[0, 0, -1], up=[0, 1, 0])
-    return mi.load_dict({
-        "type": "scene",
-        "integrator": {"type": "ptracer", "max_depth": 5, "rr_depth": 5},  # in, within, out, and the screen
-        "drop": {"type": "sphere", "bsdf": glass},
-        "sun": {
-            "type": "disk", "to_world": move().translate([0, 0, -2]), "bsdf": {"type": "diffuse", "reflectance": 0.0},
-            "light": {"type": "directionalarea"},
-        },
-        "screen": {"type": "rectangle", "to_world": move().translate([0, 0, -SCREEN]).scale(2 * SCREEN),
-                   "bsdf": {"type": "diffuse"}},
-        "camera": {"type": "perspective", "fov": 90, "near_clip": 1, "far_clip": 10 * SCREEN, "to_world": view,
-                   "film": film},
-    })  # fmt: skip
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "ptracer", "max_depth": 5, "rr_depth": 5},  # in, within, out, and the screen
+            "drop": {"type": "sphere", "bsdf": glass},
+            "sun": {
+                "type": "disk",
+                "to_world": move().translate([0, 0, -2]),
+                "bsdf": {"type": "diffuse", "reflectance": 0.0},
+                "light": {"type": "directionalarea"},
+            },
+            "screen": {
+                "type": "rectangle",
+                "to_world": move().translate([0, 0, -SCREEN]).scale(2 * SCREEN),
+                "bsdf": {"type": "diffuse"},
+            },
+            "camera": {
+                "type": "perspective",
+                "fov": 90,
+                "near_clip": 1,
+                "far_clip": 10 * SCREEN,
+                "to_world": view,
+                "film": film,
+            },
+        }
+    )
 
 
 def pictures(glass: dict[str, Any], seeds: int) -> list[Array]:

@@ -44,7 +44,7 @@ TERMS = {name: " ".join((make.__doc__ or "").split()) for name, make in BENCHES.
     "…, spawned": "the same if rays go on as in a render, set off by Mitsuba along the normal: the same for any plugin",
     "rainbow": "D₀ = π + 2i − 4r, cos i = √((n² − 1)/3), sin r = sin i / n: 137.92° for n = 1.333",
     "standard error / °": "of the mean over renders with seeds of their own",
-}  # fmt: skip
+}
 AXES = {"x": "surface", "y": "mm, or tangent", "x_scale": "linear", "y_scale": "log", "slope": None}
 STUDY = "truth"
 VARIANTS = "scalar_rgb", "llvm_ad_rgb", "cuda_ad_rgb"

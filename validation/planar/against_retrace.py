@@ -78,9 +78,15 @@ class Case:
 
     def trace(self, setting: Setting, formula: str | None = None) -> Paths:
         return trace(
-            self.segments, self.origins, self.directions, self.max_depth, reflect=self.reflect, formula=formula,
-            precision=np.dtype(setting.precision).name, backend=setting.backend,
-        )  # fmt: skip
+            self.segments,
+            self.origins,
+            self.directions,
+            self.max_depth,
+            reflect=self.reflect,
+            formula=formula,
+            precision=np.dtype(setting.precision).name,
+            backend=setting.backend,
+        )
 
 
 def tasks(context: Context) -> list[Task]:
@@ -149,9 +155,10 @@ def rays_of(scene: PlanarScene, count: int) -> tuple[Array, Array]:
     shift, turn = SPREAD * extent * rng.uniform(-1, 1, (count, 2)), SPREAD * rng.uniform(-1, 1, count)
     x, y = scene.directions[chosen].T
     turned = np.stack([x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn)], 1)
-    origins, directions = (np.concatenate(parts) for parts in (
-        (scene.origins[own], scene.origins[chosen] + shift), (scene.directions[own], turned)
-    ))  # fmt: skip
+    origins, directions = (
+        np.concatenate(parts)
+        for parts in ((scene.origins[own], scene.origins[chosen] + shift), (scene.directions[own], turned))
+    )
     return origins, directions
 
 

@@ -142,10 +142,14 @@ def unfold(origins: Array, directions: Array, count: int) -> Retraced:
     events = np.full((len(x), count + 1), Event.REFLECTED, np.uint8)
     events[:, -1] = Event.EXHAUSTED
     return Retraced(
-        np.concatenate([np.asarray(origins, np.longdouble)[:, None], folded @ SIDES], 1), hits, events,
-        np.full((len(x), count + 1), np.longdouble(INDEX)), legs / np.hypot(legs[..., :1], legs[..., 1:]),
-        outward.astype(np.longdouble), np.zeros(hits.shape, np.longdouble),
-    )  # fmt: skip
+        np.concatenate([np.asarray(origins, np.longdouble)[:, None], folded @ SIDES], 1),
+        hits,
+        events,
+        np.full((len(x), count + 1), np.longdouble(INDEX)),
+        legs / np.hypot(legs[..., :1], legs[..., 1:]),
+        outward.astype(np.longdouble),
+        np.zeros(hits.shape, np.longdouble),
+    )
 
 
 def _box_row(setting: Setting, count: int, rays: int) -> Row:

@@ -49,8 +49,10 @@ RAYS = 100  # of the file's, and as many scattered
 
 def tasks(context: Context) -> list[Task]:
     """One task per scene file."""
-    return [Task(f"extruded: {path.stem}", functools.partial(scene_rows, context, path))
-            for path in sorted(FOLDER.glob("*.toml"))]  # fmt: skip
+    return [
+        Task(f"extruded: {path.stem}", functools.partial(scene_rows, context, path))
+        for path in sorted(FOLDER.glob("*.toml"))
+    ]
 
 
 def scene_rows(context: Context, path: Path) -> list[Row]:
@@ -58,16 +60,32 @@ def scene_rows(context: Context, path: Path) -> list[Row]:
         return [Row(STUDY, PLUGIN, path.stem, context.variant, reason=SCALAR)]
     case = faceted(against_retrace.case_of(path, RAYS))
     scene, rows = wall_scene.extrude(case.segments), []
-    planar_paths = {name: case.trace(Setting(context.variant.split("_")[0], np.dtype(name).type))
-                    for name in ("float32", "float64")}  # fmt: skip
+    planar_paths = {
+        name: case.trace(Setting(context.variant.split("_")[0], np.dtype(name).type)) for name in ("float32", "float64")
+    }
     for name, (spawn, offset) in SPAWNS.items():
         paths = trace(scene, case, spawn)
         values = judge(paths, case, U, offset)
         values |= {f"from planar {p}": apart(paths, other) / case.extent for p, other in planar_paths.items()}
-        replay = {"scene": path.name, "walls": len(case.segments), "rays": len(case.origins), "seed": against_retrace.SEED}
+        replay = {
+            "scene": path.name,
+            "walls": len(case.segments),
+            "rays": len(case.origins),
+            "seed": against_retrace.SEED,
+        }
         pictures = {"overlay": _picture(context, scene, case, paths)} if name == DRAWN else {}
-        rows.append(Row(STUDY, f"{PLUGIN}, {name}", path.stem, context.variant, values, against_retrace.GROWN,
-                        replay=replay, pictures=pictures))  # fmt: skip
+        rows.append(
+            Row(
+                STUDY,
+                f"{PLUGIN}, {name}",
+                path.stem,
+                context.variant,
+                values,
+                against_retrace.GROWN,
+                replay=replay,
+                pictures=pictures,
+            )
+        )
     return rows
 
 
@@ -84,8 +102,10 @@ def _picture(context: Context, scene: Any, case: Case, extruded: Paths) -> str:
     shown = np.linspace(0, len(case.origins) // 2 - 1, SHOWN).astype(int)
     exact = case.exact
     ends = exact.points[shown, exact.met[shown]] + case.extent * exact.directions[shown]
-    legs = [_flat(np.concatenate([points[np.isfinite(points[:, 0])], [end]]))
-            for points, end in zip(exact.points[shown], ends, strict=True)]  # fmt: skip
+    legs = [
+        _flat(np.concatenate([points[np.isfinite(points[:, 0])], [end]]))
+        for points, end in zip(exact.points[shown], ends, strict=True)
+    ]
     met = extruded.points[shown, 1:].reshape(-1, 2)
     drawn = path_overlay.draw(view, legs, _flat(met[np.isfinite(met[:, 0])]))
     return path_overlay.save(context.out, f"extruded {case.name}", drawn, {"scene": f"{case.name}.toml"})
@@ -152,7 +172,9 @@ def trace(scene: Any, case: Case, spawn: Spawn) -> Paths:
     last: Any = dr.while_loop(start, lambda *state: state[1], step)
     met = np.array(points, float).reshape(2, depth, count).transpose(2, 1, 0)
     return Paths(
-        np.concatenate([case.origins[:, None], met], 1), np.array(last[2].d, float).T[:, :2],
-        np.array(hits).reshape(depth, count).T, np.array(events).astype(np.uint8).reshape(depth + 1, count).T,
+        np.concatenate([case.origins[:, None], met], 1),
+        np.array(last[2].d, float).T[:, :2],
+        np.array(hits).reshape(depth, count).T,
+        np.array(events).astype(np.uint8).reshape(depth + 1, count).T,
         np.full((count, depth + 1), np.nan),
-    )  # fmt: skip
+    )

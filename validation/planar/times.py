@@ -137,7 +137,9 @@ class Run:
 
     def take(self, seconds: list[float]) -> None:
         """The times of later calls."""
-        self.values = kernel_timing.interval("µs per path", [t / len(self.rays[0]) * 1e6 for t in seconds]) | self.values
+        self.values = (
+            kernel_timing.interval("µs per path", [t / len(self.rays[0]) * 1e6 for t in seconds]) | self.values
+        )
         self.values["ms to compile"] = 1e3 * max(0.0, self.first - float(np.median(seconds)))
 
     def paths(self) -> Paths:

@@ -58,8 +58,10 @@ def retrace(
     bits = np.broadcast_to(reflect, len(p))
     n = np.broadcast_to(np.longdouble(np.nan if n_start is None else n_start), len(p))
     size = max(1, PAIRS // max(1, len(segments)))
-    parts = [_follow(curves, p[i : i + size], d[i : i + size], max_depth, bits[i : i + size], n[i : i + size])
-             for i in range(0, len(p), size)]  # fmt: skip
+    parts = [
+        _follow(curves, p[i : i + size], d[i : i + size], max_depth, bits[i : i + size], n[i : i + size])
+        for i in range(0, len(p), size)
+    ]
     fields = Retraced.__dataclass_fields__
     return Retraced(*(np.concatenate([getattr(part, name) for part in parts]) for name in fields))
 

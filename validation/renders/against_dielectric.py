@@ -74,17 +74,32 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
     compiled = not context.variant.startswith("scalar")
     goals = {metric: 1.0 for metric in values if metric in _metrics([plugin, *others])} if compiled else {}
     replay = {
-        "scene": path.name, "plugin": plugin, "variant": context.variant, "resolution": profile.resolution,
-        "spp": profile.spp, "seeds": profile.pairs,
-    }  # fmt: skip
+        "scene": path.name,
+        "plugin": plugin,
+        "variant": context.variant,
+        "resolution": profile.resolution,
+        "spp": profile.spp,
+        "seeds": profile.pairs,
+    }
     pictures = _save(context, replay, test.mean(0), reference.mean(0))
     remark = NO_REFERENCE.get(scene, left_out)
     noisy = reference.std(0).max() >= CHANGED
     curves = _curves(context, cameras, reference) if plugin == PLUGIN and noisy and scene not in NO_REFERENCE else {}
     return [
-        Row("renders", plugin, scene, context.variant, values, _budgets(scene, left_out), goals, remark, replay,
-            pictures, curves)
-    ]  # fmt: skip
+        Row(
+            "renders",
+            plugin,
+            scene,
+            context.variant,
+            values,
+            _budgets(scene, left_out),
+            goals,
+            remark,
+            replay,
+            pictures,
+            curves,
+        )
+    ]
 
 
 def _budgets(scene: str, left_out: str) -> dict[str, float]:
@@ -174,6 +189,8 @@ def _save(context: Context, settings: dict[str, Any], test: np.ndarray, referenc
     saved = {}
     for role, picture in (("reference", reference), ("test", test), ("difference", test - reference)):
         name = f"{BUILTIN}.exr" if role == "reference" else f"{settings['plugin']} {role}.exr"
-        image_file.write_exr(context.out / folder / name, picture.astype(np.float32), metadata=settings | {"role": role})
+        image_file.write_exr(
+            context.out / folder / name, picture.astype(np.float32), metadata=settings | {"role": role}
+        )
         saved[role] = str(folder / name)
     return saved

@@ -62,13 +62,15 @@ def tasks(context: Context) -> list[Task]:
         Task("features: operations", functools.partial(operation_rows, context)),
         Task("features: glasses", functools.partial(glass_rows, context)),
         Task("features: optimisation", functools.partial(optimisation_rows, context)),
-        *(Task(f"features: first image, {n} glasses", functools.partial(first_image_rows, context, n))
-          for n in FIRST_IMAGE_GOALS),
+        *(
+            Task(f"features: first image, {n} glasses", functools.partial(first_image_rows, context, n))
+            for n in FIRST_IMAGE_GOALS
+        ),
         Task("features: edit", functools.partial(edit_rows, context)),
         Task("features: frozen", functools.partial(frozen_rows, context)),
         Task("features: boundaries", functools.partial(boundary_rows, context)),
         calls,
-    ]  # fmt: skip
+    ]
 
 
 def kernels(work: Callable[[], Any]) -> list[dict[str, Any]]:
@@ -95,8 +97,13 @@ def seconds_of(work: Callable[[], Any]) -> float:
 # `sample` alone ------------------------------------------------------------------------------------------------
 
 
-def operations(plugin: str, parameters: dict[str, Any] | None = None, component: int | None = None,
-               importance: bool = False, differentiate: bool = False) -> float:  # fmt: skip
+def operations(
+    plugin: str,
+    parameters: dict[str, Any] | None = None,
+    component: int | None = None,
+    importance: bool = False,
+    differentiate: bool = False,
+) -> float:
     """Of a kernel that computes all of what `sample` returns, of directions and samples in memory."""
     import mitsuba as mi
 
@@ -267,11 +274,15 @@ def glass_rows(context: Context) -> list[Row]:
             with alone(plugin, count) as balls:
                 size = size_of(balls)
                 balls.edit(1.77)
-                values = {"operations": size, "operations, over two glasses": size - two,
-                          "compiled": compiled(balls.image)}  # fmt: skip
+                values = {
+                    "operations": size,
+                    "operations, over two glasses": size - two,
+                    "compiled": compiled(balls.image),
+                }
             budgets = {"operations, over two glasses": 0.0, "compiled": 0.0} if plugin == PLUGIN else {}
-            rows.append(Row(STUDY, plugin, f"{count} glasses", context.variant, values, budgets,
-                            replay={"glasses": count}))  # fmt: skip
+            rows.append(
+                Row(STUDY, plugin, f"{count} glasses", context.variant, values, budgets, replay={"glasses": count})
+            )
     return rows
 
 
@@ -284,10 +295,14 @@ def optimisation_rows(context: Context) -> list[Row]:
     with alone(PLUGIN, 1, integrator="volpath", max_depth=3) as balls:
         before = float(balls.params[balls.eta][0])
         first, *later = (compiled(functools.partial(step, balls)) for _ in range(STEPS))
-        values = {"compiled": sum(later), "compiled, first step": first,
-                  "eta moved": abs(float(balls.params[balls.eta][0]) - before)}  # fmt: skip
-    return [Row(STUDY, PLUGIN, "optimisation of eta", context.variant, values, {"compiled": 0.0},
-                replay={"steps": STEPS})]  # fmt: skip
+        values = {
+            "compiled": sum(later),
+            "compiled, first step": first,
+            "eta moved": abs(float(balls.params[balls.eta][0]) - before),
+        }
+    return [
+        Row(STUDY, PLUGIN, "optimisation of eta", context.variant, values, {"compiled": 0.0}, replay={"steps": STEPS})
+    ]
 
 
 def step(balls: Balls) -> Any:
@@ -332,8 +347,9 @@ def ratio_row(context: Context, case: str, metric: str, clock: Callable[[str], f
     seconds = kernel_timing.rounds({PLUGIN: PLUGIN, BUILTIN: BUILTIN}, clock, PAIRS)
     values = kernel_timing.ratio(f"{metric} / {BUILTIN}", seconds[PLUGIN], seconds[BUILTIN])
     values |= {f"{metric}, {plugin}": float(np.median(x)) for plugin, x in seconds.items()}
-    return Row(STUDY, PLUGIN, case, context.variant, values, goals={f"{metric} / {BUILTIN}": goal},
-               replay={"pairs": PAIRS})  # fmt: skip
+    return Row(
+        STUDY, PLUGIN, case, context.variant, values, goals={f"{metric} / {BUILTIN}": goal}, replay={"pairs": PAIRS}
+    )
 
 
 def frozen_rows(context: Context) -> list[Row]:
@@ -354,16 +370,26 @@ def frozen_rows(context: Context) -> list[Row]:
             balls.edit(1.77)
             values[f"off after an edit{name}"] = float(np.abs(np.array(replay(seed) - balls.image())).max())
             del replay, subjects
-    return [Row(STUDY, PLUGIN, f"frozen, {count} glasses", context.variant, values,
-                {"off after an edit": UNCHANGED}, replay={"glasses": count})]  # fmt: skip
+    return [
+        Row(
+            STUDY,
+            PLUGIN,
+            f"frozen, {count} glasses",
+            context.variant,
+            values,
+            {"off after an edit": UNCHANGED},
+            replay={"glasses": count},
+        )
+    ]
 
 
 def boundary_rows(context: Context) -> list[Row]:
     """Where the built-in's directions are wrong its paths may be shorter, and a render of them cheaper."""
     rows = []
     for name in ("furnace", "mirage"):
-        values = {plugin: boundaries(opened(SCENES / f"{name}.xml", plugin, RESOLUTION))
-                  for plugin in (PLUGIN, BUILTIN)}  # fmt: skip
+        values = {
+            plugin: boundaries(opened(SCENES / f"{name}.xml", plugin, RESOLUTION)) for plugin in (PLUGIN, BUILTIN)
+        }
         values[f"boundaries / {BUILTIN}"] = values[PLUGIN] / values[BUILTIN]
         rows.append(Row(STUDY, PLUGIN, f"{name}: boundaries", context.variant, values, replay={"seed": SEED}))
     return rows

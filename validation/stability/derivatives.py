@@ -80,16 +80,21 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
         found, curves[name] = formula_rows(name, formula, given, setting)
         rows += found
     curves["condition · u"] = binned(given, given.condition * setting.roundoff)
-    problem = Row("derivatives", "the problem", "∂b/∂k", setting.label, curves=curves,
-                  values={"condition · u": float(given.condition.max()) * setting.roundoff})  # fmt: skip
+    problem = Row(
+        "derivatives",
+        "the problem",
+        "∂b/∂k",
+        setting.label,
+        curves=curves,
+        values={"condition · u": float(given.condition.max()) * setting.roundoff},
+    )
     return [*rows, problem, reflectance_row(given, setting)]
 
 
 @functools.cache
 def inputs(count: int, precision: type) -> Inputs:
     """Unit rays of all regimes that have derivatives: neither tangential nor exactly critical."""
-    names = [name for name, regime in regimes.REGIMES.items()
-             if regime.unit and not regime.rests_on_denormals]  # fmt: skip
+    names = [name for name, regime in regimes.REGIMES.items() if regime.unit and not regime.rests_on_denormals]
     parts = [regimes.make(name, count, precision, SEED) for name in names]
     a, n, k = (np.concatenate([getattr(part, x) for part in parts]) for x in ("a", "n", "k"))
     regime = np.repeat(names, count)
@@ -173,9 +178,14 @@ def formula_rows(
 
 
 def row(
-    subject: str, case: str, error: np.ndarray, given: Inputs, setting: Setting, right: np.ndarray,
+    subject: str,
+    case: str,
+    error: np.ndarray,
+    given: Inputs,
+    setting: Setting,
+    right: np.ndarray,
     budgets: dict[str, float],
-) -> Row:  # fmt: skip
+) -> Row:
     finite = np.isfinite(error)
     used = right & finite
     over = np.where(used, error, 0) / (given.condition * setting.roundoff)
@@ -186,16 +196,21 @@ def row(
         "not finite": float((right & ~finite).sum()),
     }
     a, n = ([float(x).hex() for x in v[worst]] for v in (given.rays.a, given.rays.n))
-    replay = {"seed": SEED, "rays": len(error), "worst": {"regime": str(given.regime[worst]), "a": a, "n": n,
-              "k": float(given.rays.k[worst]).hex()}}  # fmt: skip
+    replay = {
+        "seed": SEED,
+        "rays": len(error),
+        "worst": {"regime": str(given.regime[worst]), "a": a, "n": n, "k": float(given.rays.k[worst]).hex()},
+    }
     return Row("derivatives", subject, case, setting.label, values, budgets, replay=replay)
 
 
 def binned(given: Inputs, y: np.ndarray) -> list[tuple[float, float]]:
     """The largest y of the transmitted rays in each bin of cos²θt."""
     cos2 = given.certified.cos_t**2
-    bins = [given.certified.transmitted & (cos2 >= low) & (cos2 < 2 * high) & np.isfinite(y) & (y > 0)
-            for low, high in itertools.pairwise(BINS)]  # fmt: skip
+    bins = [
+        given.certified.transmitted & (cos2 >= low) & (cos2 < 2 * high) & np.isfinite(y) & (y > 0)
+        for low, high in itertools.pairwise(BINS)
+    ]
     centres = np.sqrt(BINS[:-1] * BINS[1:])
     return [(float(x), float(y[inside].max())) for x, inside in zip(centres, bins, strict=True) if inside.any()]
 

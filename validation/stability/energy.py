@@ -44,7 +44,7 @@ TERMS = {
     "outside, inside": "the share of diffuse light that is reflected or not, relative, against its closed form; from "
     "the inside with what is reflected totally",
     "white furnace": "the weights of both lobes times their densities, which must add up to 1",
-}  # fmt: skip
+}
 SEED = 2028
 INDICES = (1.0003, 1.1, 1.33, 1.5, 2.42)
 # What the study holds the forms to; they promise 3.12u of R and 2u of T (see `fresnel._powers`).
@@ -140,9 +140,15 @@ def regime_rows(regime: str, setting: Setting, count: int) -> list[Row]:
 
 
 def power_row(
-    subject: str, case: str, setting: Setting, found: list[np.ndarray], exact: oracle.Certified,
-    budgets: dict[str, float], replay: dict[str, Any], right: Any = True,
-) -> Row:  # fmt: skip
+    subject: str,
+    case: str,
+    setting: Setting,
+    found: list[np.ndarray],
+    exact: oracle.Certified,
+    budgets: dict[str, float],
+    replay: dict[str, Any],
+    right: Any = True,
+) -> Row:
     r, t, transmitted = found
     misjudged = transmitted != exact.transmitted
     right, u = right & ~misjudged, setting.roundoff
@@ -152,8 +158,9 @@ def power_row(
         "R + T − 1 / u": worst(np.abs(r + t - 1)) / u,
         "misjudged": float(misjudged.sum()),
     }
-    return Row("energy", subject, case, setting.label, values, budgets | ({"misjudged": 0.0} if budgets else {}),
-               replay=replay)  # fmt: skip
+    return Row(
+        "energy", subject, case, setting.label, values, budgets | ({"misjudged": 0.0} if budgets else {}), replay=replay
+    )
 
 
 def amplitude_row(
@@ -309,8 +316,15 @@ def furnace_row(context: Context, plugin: str) -> Row:
         total = np.where(alone, lobes[0]["pdf"] * lobes[0]["weight"][:, :1], total)
         values["white furnace"] = max(values["white furnace"], worst(np.abs(total - 1)))
     budgets = {"white furnace": 2.0**-23} if plugin == "refract" else {}
-    return Row("energy", plugin, "white furnace", context.variant, values, budgets,
-               replay={"indices": INDICES, "directions": len(wi), "seed": SEED})  # fmt: skip
+    return Row(
+        "energy",
+        plugin,
+        "white furnace",
+        context.variant,
+        values,
+        budgets,
+        replay={"indices": INDICES, "directions": len(wi), "seed": SEED},
+    )
 
 
 def radiance_row(context: Context, plugin: str) -> Row:
@@ -325,8 +339,9 @@ def radiance_row(context: Context, plugin: str) -> Row:
         back = sample_all(bsdf, asked, there["wo"], np.full(2, 1 - 2.0**-24))
         error = worst(np.abs(there["weight"] * back["weight"] - 1)) / 2.0**-24
         off = worst(np.abs(there["weight"][:, 0] * index**2 - 1)) / 2.0**-24
-        values = {"weights in and out / u": max(error, values["weights in and out / u"]),
-                  "weight against 1/n² / u": max(off, values.get("weight against 1/n² / u", 0.0))}  # fmt: skip
+        values = {
+            "weights in and out / u": max(error, values["weights in and out / u"]),
+            "weight against 1/n² / u": max(off, values.get("weight against 1/n² / u", 0.0)),
+        }
     budgets = {"weights in and out / u": 6.0, "weight against 1/n² / u": 3.0} if plugin == "refract" else {}
     return Row("energy", plugin, "basic radiance", context.variant, values, budgets, replay={"indices": INDICES})
-

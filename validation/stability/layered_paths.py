@@ -92,7 +92,11 @@ def bundle(layers: Layers) -> Bundle:
     if layers is MIRAGE:
         sine = np.geomspace(1.5e-4, 9e-3, RAYS)
         directions = np.stack([np.sqrt(1 - sine**2), -sine, 0 * sine], 1)
-        origins, media, shown = np.tile([-layered_scenes.POOL, 0.005, 0.0], (RAYS, 1)), np.zeros(RAYS, int), RAYS * 2 // 5
+        origins, media, shown = (
+            np.tile([-layered_scenes.POOL, 0.005, 0.0], (RAYS, 1)),
+            np.zeros(RAYS, int),
+            RAYS * 2 // 5,
+        )
     else:
         rng = np.random.default_rng(SEED)
         media = rng.integers(2, len(layers.indices) - 1, RAYS)
@@ -179,10 +183,17 @@ def _path_rows(context: Context, layers: Layers) -> list[Row]:
     found |= {name: _exact_deviations(other, layers, rays, exact) for name, other in rounded(layers).items()}
     replay = {"scene": f"{layers.scene}.xml", "rays": RAYS, "seed": SEED, "shown": rays.shown}
     rows = [
-        Row(STUDY, plugin, f"{layers.scene}: path", context.variant, _values(exact, parts),
-            _budgets(layers, plugin, exact), replay=replay | {"plugin": plugin})
+        Row(
+            STUDY,
+            plugin,
+            f"{layers.scene}: path",
+            context.variant,
+            _values(exact, parts),
+            _budgets(layers, plugin, exact),
+            replay=replay | {"plugin": plugin},
+        )
         for plugin, parts in found.items()
-    ]  # fmt: skip
+    ]
     offset = {"ray offset": _moved(layers, rays, exact)}
     for case, curves in _curves(rays, found).items():
         case = f"{layers.scene}: {case}"

@@ -58,7 +58,7 @@ TERMS = {
     **FEEDS,
     PROBLEM: f"condition · u of the ray that enters at {SEEN_AT}°, with the error of every formula layer by layer",
     "light pipe": f"total internal reflections in a square pipe of index {CORE}, askew; only signs may change",
-} | {name: " ".join((trace.__doc__ or "").split()) for name, trace in optical_systems.SYSTEMS.items()}  # fmt: skip
+} | {name: " ".join((trace.__doc__ or "").split()) for name, trace in optical_systems.SYSTEMS.items()}
 
 
 @dataclass(frozen=True)
@@ -185,8 +185,13 @@ def mirage_row(name: str, subject: Subject, case: str, fed: Fed, setting: Settin
     } | {f"{angle}°": float(e) for angle, e in zip(how.angles, error, strict=False) if angle in PASSING}
     budgets = mirage_budgets(fed, setting.roundoff, final) if at_limit(name) else {}
     remark = how.remark if budgets or not at_limit(name) else "; ".join(filter(None, (NOTHING, how.remark)))
-    replay = {"layers": count, "n_0": float(rays.layers.index[0]), "n_last": float(rays.layers.index[-1]),
-              "angles": how.angles, "normal": [float(x).hex() for x in rays.normal]}  # fmt: skip
+    replay = {
+        "layers": count,
+        "n_0": float(rays.layers.index[0]),
+        "n_last": float(rays.layers.index[-1]),
+        "angles": how.angles,
+        "normal": [float(x).hex() for x in rays.normal],
+    }
     case = f"{case}, {fed.feed}"
     return Row("stability", name, case, setting.label, values, budgets, reason=remark, replay=replay), error
 

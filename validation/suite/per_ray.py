@@ -161,9 +161,11 @@ def rows(call: Call, rays: RaySet, answers: Answers) -> list[Row]:
         if call.gives_up:
             values["given up"] = float(left_out[rays.regime == name].sum())
         replay = {
-            "set": SETS[name].text, "seed": SEED, "script": " ".join((call.script, *call.arguments)),
+            "set": SETS[name].text,
+            "seed": SEED,
+            "script": " ".join((call.script, *call.arguments)),
             "worst": figures.replay if figures else None,
-        }  # fmt: skip
+        }
         made.append(Row(STUDY, call.title, name, call.precision, values, budgets, goals, about, replay))
     return made
 
@@ -194,9 +196,7 @@ def _measured(name: str, call: Call, findings: Findings, figures: Figures | None
         return values | {"wrong": math.nan}, budgets, goals
     if figures.judged:
         values |= {"worst rad": figures.worst, "p99 rad": figures.p99, "mean rad": figures.mean}
-    values |= {
-        "error / bound": figures.share, "misjudged": float(figures.misjudged), "wrong": float(figures.wrong)
-    }  # fmt: skip
+    values |= {"error / bound": figures.share, "misjudged": float(figures.misjudged), "wrong": float(figures.wrong)}
     budgets["error / bound"] = 1.0
     if name == TOTAL:
         values["told otherwise"], budgets["told otherwise"] = float(findings.tir != call.told), 0.0

@@ -46,12 +46,16 @@ batch.haltspp = 256
 
 
 def files(plain: Plain) -> Files:
-    return {
-        "scene.scn": _scene(plain).encode(),
-        "scene.cfg": CONFIG.format(camera=plain.camera, depth=plain.max_depth).encode(),
-        "render.py": resources(__package__).joinpath("render_luxcore.py").read_bytes(),
-        "README.txt": readme(plain, "LuxCore", COMMAND, ASSUMED),
-    } | scene_json.sky(plain, looked_up) | {f"{mesh.name}.ply": ply(mesh) for mesh in plain.meshes}  # fmt: skip
+    return (
+        {
+            "scene.scn": _scene(plain).encode(),
+            "scene.cfg": CONFIG.format(camera=plain.camera, depth=plain.max_depth).encode(),
+            "render.py": resources(__package__).joinpath("render_luxcore.py").read_bytes(),
+            "README.txt": readme(plain, "LuxCore", COMMAND, ASSUMED),
+        }
+        | scene_json.sky(plain, looked_up)
+        | {f"{mesh.name}.ply": ply(mesh) for mesh in plain.meshes}
+    )
 
 
 def looked_up(u: Array, v: Array) -> Array:

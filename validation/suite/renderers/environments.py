@@ -37,7 +37,7 @@ def folder(system: System) -> Path:
 
 
 def absent(system: System) -> str:
-    """"" where the system is installed in its pinned version; otherwise the command that brings it."""
+    """ "" where the system is installed in its pinned version; otherwise the command that brings it."""
     return "" if _present(system) else f"{COMMAND} {system.name}"
 
 

@@ -2,6 +2,4 @@
 
 from .system import Pip, System
 
-SYSTEM = System(
-    "luxcore", "LuxCore", "Apache-2.0", Pip(("pyluxcore==2.11.2", "numpy")), megabytes=390, draws=True
-)
+SYSTEM = System("luxcore", "LuxCore", "Apache-2.0", Pip(("pyluxcore==2.11.2", "numpy")), megabytes=390, draws=True)
