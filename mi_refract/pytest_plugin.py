@@ -1,8 +1,8 @@
-"""Fixtures for pytest that compare pictures: `assert_image_equal` and `assert_image_unbiased`.
+"""Fixtures for pytest that compare images: `assert_image_equal` and `assert_image_unbiased`.
 
 In the conftest.py of the tests: `pytest_plugins = ["mi_refract.pytest_plugin"]`. It is no entry point, because that
 would load Mitsuba, and with it a libLLVM, into every pytest run of the environment, before any conftest.py could choose
-one. A picture is a file, or an array (height, width, channels) or (height, width). Nothing is ever written, and a
+one. An image is a file, or an array (height, width, channels) or (height, width). Nothing is ever written, and a
 reference that is not there fails the test.
 """
 
@@ -15,20 +15,20 @@ from typing import Any, Protocol
 
 import pytest
 
-Picture = Any  # the path of a file, or what numpy makes an array of
+Image = Any  # the path of a file, or what numpy makes an array of
 RUNS = 8
 REFERENCE_SEED = 1 << 16  # the first of a rendered reference: both sides must not share a seed
 
 
 class AssertEqual(Protocol):
-    def __call__(self, test: Picture, reference: Picture, method: str = "auto", **options: Any) -> Any: ...
+    def __call__(self, test: Image, reference: Image, method: str = "auto", **options: Any) -> Any: ...
 
 
 class AssertUnbiased(Protocol):
     def __call__(
         self,
         render: Callable[[int], Any],
-        reference: Picture | Callable[[int], Any],
+        reference: Image | Callable[[int], Any],
         runs: int = RUNS,
         seed: int = 0,
         **options: Any,
@@ -48,21 +48,21 @@ def assert_image_equal() -> AssertEqual:
 def assert_image_unbiased() -> AssertUnbiased:
     """`assert_image_unbiased(render, reference, runs=8, seed=0, **options)`: the means of renders must be equal.
 
-    `render(seed)` gives a picture; it is called with `runs` seeds from `seed` on. `reference` is a folder of
+    `render(seed)` gives an image; it is called with `runs` seeds from `seed` on. `reference` is a folder of
     independent renders, or a function like `render`, called with as many other seeds. Welch's t-test with its options;
     inconclusive fails, too: more runs or samples are needed then. Returns the comparison.
     """
     return _assert_unbiased
 
 
-def _assert_equal(test: Picture, reference: Picture, method: str = "auto", **options: Any) -> Any:
+def _assert_equal(test: Image, reference: Image, method: str = "auto", **options: Any) -> Any:
     __tracebackhide__ = True
     return _judge(method, lambda: (_image("reference", reference), _image("test", test)), options)
 
 
 def _assert_unbiased(
     render: Callable[[int], Any],
-    reference: Picture | Callable[[int], Any],
+    reference: Image | Callable[[int], Any],
     runs: int = RUNS,
     seed: int = 0,
     **options: Any,
@@ -71,7 +71,7 @@ def _assert_unbiased(
     if runs < 2:
         raise ValueError(f"runs = {runs}: accepted: at least 2, or the noise is not known")
 
-    from mi_refract.image_diff.folders import sample_pictures
+    from mi_refract.image_diff.folders import sample_images
 
     first = seed + REFERENCE_SEED
     known = [reference(i) for i in range(first, first + runs)] if callable(reference) else Path(reference)
@@ -79,10 +79,10 @@ def _assert_unbiased(
 
     def sides() -> tuple[list[Any], list[Any]]:
         if isinstance(known, Path):
-            references = sample_pictures(known)
+            references = sample_images(known)
         else:
-            references = [_image(f"reference {first + i}", picture) for i, picture in enumerate(known)]
-        return references, [_image(f"test {seed + i}", picture) for i, picture in enumerate(rendered)]
+            references = [_image(f"reference {first + i}", image) for i, image in enumerate(known)]
+        return references, [_image(f"test {seed + i}", image) for i, image in enumerate(rendered)]
 
     return _judge("welch", sides, options)
 
@@ -106,7 +106,7 @@ def _bound(bound: float | None) -> str:
     return "" if bound is None else f", at most {bound:.6g}"
 
 
-def _image(name: str, picture: Picture) -> Any:
+def _image(name: str, image: Image) -> Any:
     from .io import image_file
 
-    return image_file.read(picture) if isinstance(picture, str | os.PathLike) else image_file.named(name, picture)
+    return image_file.read(image) if isinstance(image, str | os.PathLike) else image_file.named(name, image)

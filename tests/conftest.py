@@ -147,27 +147,27 @@ def follow(setting):
 @pytest.fixture
 def pair(tmp_path):
     """A folder with a pair that is equal and a pair that differs by 10 %."""
-    from support.diff_images import picture
+    from support.diff_images import image
 
     for name, gain in (("equal.exr", 1.0), ("louder.exr", 1.1)):
-        picture(tmp_path / "old" / name)
-        picture(tmp_path / "new" / name, gain=gain)
+        image(tmp_path / "old" / name)
+        image(tmp_path / "new" / name, gain=gain)
     return tmp_path / "old", tmp_path / "new"
 
 
 @pytest.fixture
 def folders(tmp_path):
-    """Same, changed, removed and added pictures, one of them in a folder inside; and files that are none."""
-    from support.diff_images import picture
+    """Same, changed, removed and added images, one of them in a folder inside; and files that are none."""
+    from support.diff_images import image
 
     old, new = tmp_path / "old", tmp_path / "new"
     for folder in (old, new):
-        picture(folder / "same.exr")
-        picture(folder / "inner" / "changed.exr", gain=1.0 if folder is old else 1.1)
+        image(folder / "same.exr")
+        image(folder / "inner" / "changed.exr", gain=1.0 if folder is old else 1.1)
         (folder / "notes.txt").write_text(folder.name)
-    picture(old / "removed.exr")
-    picture(new / "added.exr")
-    picture(new / ".hidden.exr")
+    image(old / "removed.exr")
+    image(new / "added.exr")
+    image(new / ".hidden.exr")
     return old, new
 
 

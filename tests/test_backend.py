@@ -107,8 +107,8 @@ def test_a_probe_that_ends_badly(monkeypatch, code, defect, lasting):
     assert kept is lasting
 
 
-# The verdict of the tiny kernel is compared with what matters: does a picture come out, or does the process die?
-PICTURE = """
+# The verdict of the tiny kernel is compared with what matters: does an image come out, or does the process die?
+IMAGE = """
 import mitsuba as mi, numpy as np
 mi.set_variant("llvm_ad_rgb")
 scene = mi.cornell_box()
@@ -118,11 +118,11 @@ print(np.isfinite(np.array(mi.render(mi.load_dict(scene), spp=1))).all())
 
 
 @pytest.mark.parametrize("path", backend.candidates() or [None])
-def test_the_verdict_is_the_fate_of_a_picture(path, tmp_path):
+def test_the_verdict_is_the_fate_of_an_image(path, tmp_path):
     if path is None:
         pytest.skip("no libLLVM on this machine")
     environment = PYTHON | {backend.CHOICE: path, "DRJIT_CACHE_DIR": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-c", PICTURE], env=environment, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", IMAGE], env=environment, capture_output=True, text=True)
     drawn = done.returncode == 0 and done.stdout == "True\n"
     assert backend._try(path).works == drawn, done.stderr[-500:]
 

@@ -9,21 +9,21 @@ import pytest
 from mi_refract.io import image_file
 
 pytest_plugins = ["pytester", "mi_refract.pytest_plugin"]
-PICTURE = np.linspace(0.2, 1, 32 * 32 * 3).reshape(32, 32, 3)
+IMAGE = np.linspace(0.2, 1, 32 * 32 * 3).reshape(32, 32, 3)
 NANS = np.full((4, 4, 3), np.nan)
 
 
 def render(seed, gain=1.0):
-    return gain * PICTURE * np.random.default_rng(seed).gamma(400, 1 / 400, PICTURE.shape)
+    return gain * IMAGE * np.random.default_rng(seed).gamma(400, 1 / 400, IMAGE.shape)
 
 
 def test_what_is_equal_passes(assert_image_equal, assert_image_unbiased, tmp_path):
-    assert assert_image_equal(PICTURE, PICTURE).method == "tolerance"
-    assert_image_equal(PICTURE + 1e-5, PICTURE, "tolerance")
-    assert_image_equal(PICTURE[..., 0], PICTURE[..., 0], "exact")
-    image_file.write_exr(tmp_path / "picture.exr", PICTURE)
-    assert_image_equal(PICTURE, tmp_path / "picture.exr", "paired")
-    assert_image_equal(str(tmp_path / "picture.exr"), tmp_path / "picture.exr", "exact")
+    assert assert_image_equal(IMAGE, IMAGE).method == "tolerance"
+    assert_image_equal(IMAGE + 1e-5, IMAGE, "tolerance")
+    assert_image_equal(IMAGE[..., 0], IMAGE[..., 0], "exact")
+    image_file.write_exr(tmp_path / "image.exr", IMAGE)
+    assert_image_equal(IMAGE, tmp_path / "image.exr", "paired")
+    assert_image_equal(str(tmp_path / "image.exr"), tmp_path / "image.exr", "exact")
     assert assert_image_unbiased(render, render).method == "welch"
     (tmp_path / "renders").mkdir()
     for i in range(8):
@@ -34,27 +34,27 @@ def test_what_is_equal_passes(assert_image_equal, assert_image_unbiased, tmp_pat
 @pytest.mark.parametrize(
     ("test", "method", "options", "reason"),
     [
-        (PICTURE + 1e-5, "exact", {}, "exact: different: "),
-        (1.1 * PICTURE, "auto", {}, "tolerance: different: "),
-        (1.1 * PICTURE, "paired", {}, r"paired: different: (.|\n)*, at most "),
-        (PICTURE * np.nan, "exact", {}, "exact: different: "),
-        (PICTURE[:-1], "auto", {}, "could not compare: "),
+        (IMAGE + 1e-5, "exact", {}, "exact: different: "),
+        (1.1 * IMAGE, "auto", {}, "tolerance: different: "),
+        (1.1 * IMAGE, "paired", {}, r"paired: different: (.|\n)*, at most "),
+        (IMAGE * np.nan, "exact", {}, "exact: different: "),
+        (IMAGE[:-1], "auto", {}, "could not compare: "),
         ("missing.exr", "auto", {}, "could not compare: .*missing.exr"),
         (["no numbers"], "auto", {}, "could not compare: "),
-        (PICTURE, "telepathy", {}, "could not compare: method 'telepathy': accepted: "),
-        (PICTURE, "exact", {"threshold": 1}, "could not compare: "),
+        (IMAGE, "telepathy", {}, "could not compare: method 'telepathy': accepted: "),
+        (IMAGE, "exact", {"threshold": 1}, "could not compare: "),
     ],
 )
 def test_what_is_not_equal_fails_and_says_why(assert_image_equal, test, method, options, reason):
     with pytest.raises(pytest.fail.Exception, match=reason):
-        assert_image_equal(test, PICTURE, method, **options)
+        assert_image_equal(test, IMAGE, method, **options)
 
 
 def test_not_even_nan_equals_itself_and_no_reference_is_made(assert_image_equal, tmp_path):
     with pytest.raises(pytest.fail.Exception, match="different"):
         assert_image_equal(NANS, NANS, "exact")
     with pytest.raises(pytest.fail.Exception, match="could not compare: "):
-        assert_image_equal(PICTURE, tmp_path / "missing.exr")
+        assert_image_equal(IMAGE, tmp_path / "missing.exr")
     assert not list(tmp_path.iterdir())
 
 
@@ -74,7 +74,7 @@ def test_an_error_of_the_users_own_code_is_shown_as_it_is(assert_image_unbiased)
     def broken(seed):
         raise ValueError("my own")
 
-    for sides in ((broken, lambda seed: PICTURE), (lambda seed: PICTURE, broken)):
+    for sides in ((broken, lambda seed: IMAGE), (lambda seed: IMAGE, broken)):
         with pytest.raises(ValueError, match="my own"):
             assert_image_unbiased(*sides)
 

@@ -43,7 +43,7 @@ STUDIES = {
     },
     "gate": {"gate": "diff.planted_defects", "diff_times": "diff.times"},
     "truth": {"truth": "ground_truth.traced_bodies"},
-    "suite": {"matrix": "suite.matrix", "per_ray": "suite.per_ray", "pictures": "suite.rendered_images"},
+    "suite": {"matrix": "suite.matrix", "per_ray": "suite.per_ray", "images": "suite.rendered_images"},
 }
 
 

@@ -233,7 +233,7 @@ def suite(rows: list[Row]) -> str:
         raise ValueError("README: no other renderer was run; its table needs some")
     checks = [check for each in matrix.CHECKS.values() for check in each]
     lines = [[system, *(_off(found.get(check)) for check in checks)] for system, found in cells.items()]
-    return _table("Rays: radians; pictures: share of the mean.", ["", *checks], lines)
+    return _table("Rays: radians; images: share of the mean.", ["", *checks], lines)
 
 
 def _off(row: Row | None) -> str:
@@ -265,7 +265,7 @@ def gallery(rows: list[Row], context: Context) -> bytes:
     """A PNG of every scene as `refract` rendered it, side by side; without the furnace, which is white when right."""
     import OpenImageIO as oiio
 
-    paths = [row.pictures["test"] for row in rows if row.study == "renders" and row.subject == PLUGIN]
+    paths = [row.images["test"] for row in rows if row.study == "renders" and row.subject == PLUGIN]
     tiles = [tile for path in paths if (tile := image_file.read_exr(context.out / path)[0]).std() > 1e-3]
     gap = np.ones((tiles[0].shape[0], 4, 3), np.float32)
     strips = []
@@ -278,7 +278,7 @@ def gallery(rows: list[Row], context: Context) -> bytes:
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055).astype(np.float32)
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "gallery.png"
-        picture = oiio.ImageBuf(np.ascontiguousarray(encoded))
-        if not picture.write(str(target), "uint8"):
-            raise OSError(f"{target}: {picture.geterror()}")
+        image = oiio.ImageBuf(np.ascontiguousarray(encoded))
+        if not image.write(str(target), "uint8"):
+            raise OSError(f"{target}: {image.geterror()}")
         return target.read_bytes()

@@ -24,21 +24,21 @@ from mi_refract.image_diff.folders import Results, Status
 from mi_refract.io.atomic import writable
 from mi_refract.rendering.scene_files import provenance
 
-Folder = Annotated[Path, typer.Argument(metavar="REFERENCE", help="A picture, or a folder of them.")]
+Folder = Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")]
 Other = Annotated[Path, typer.Argument(metavar="TEST", help="What is compared with it, of the same kind.")]
 NotAlways = Annotated[
-    Path | None, typer.Argument(metavar="REFERENCE", help="A picture, or a folder of them; no need for --self-test.")
+    Path | None, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them; no need for --self-test.")
 ]
 NotWithSelfTest = Annotated[Path | None, typer.Argument(metavar="TEST", help="What is compared with it.")]
 Method = Annotated[str, typer.Option(help=f"{'|'.join(diff_settings.ACCEPTED)}; see --methods.")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="An option of the method.")]
 File = Annotated[
     Path | None,
-    typer.Option(metavar="FILE.toml", help=f"Rules for single pictures; REFERENCE's {diff_settings.FILE} by default."),
+    typer.Option(metavar="FILE.toml", help=f"Rules for single images; REFERENCE's {diff_settings.FILE} by default."),
 ]
 Nonfinite = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME", help="A picture (or pattern) where both sides may have the same NaN or Inf."),
+    typer.Option(metavar="NAME", help="An image (or pattern) where both sides may have the same NaN or Inf."),
 ]
 OUTPUTS = ((".html", ".htm"), (".xml",), (".json",))  # of --report, --junit, --json
 SELF_TEST_RENDERS, SELF_TEST_SPP = 8, 16
@@ -60,7 +60,7 @@ def diff(
     test: NotWithSelfTest = None,
     method: Method = diff_settings.AUTO,
     options: Set = None,
-    samples: Annotated[bool, typer.Option("--samples", help="Both folders hold renders of one picture.")] = False,
+    samples: Annotated[bool, typer.Option("--samples", help="Both folders hold renders of one image.")] = False,
     settings: File = None,
     allow_nonfinite: Nonfinite = None,
     inconclusive: Annotated[Inconclusive | None, typer.Option(help="What it counts as; else exit code 3.")] = None,
@@ -73,10 +73,10 @@ def diff(
     ] = False,
     self_test: Annotated[
         bool,
-        typer.Option("--self-test", help="Which defects planted in REFERENCE are seen? A picture, renders, a scene."),
+        typer.Option("--self-test", help="Which defects planted in REFERENCE are seen? An image, renders, a scene."),
     ] = False,
 ) -> None:
-    """Compare pictures with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
+    """Compare images with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
     _require_extra("scipy", *(("jinja2", "matplotlib") if report else ()))
     if self_test:
         others = (options, samples, settings, allow_nonfinite, inconclusive, report, junit, json, github)
@@ -120,7 +120,7 @@ def accept(
     allow_nonfinite: Nonfinite = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
-    """Copy the pictures that are not equal over their references, after showing them. Nothing is deleted."""
+    """Copy the images that are not equal over their references, after showing them. Nothing is deleted."""
     _require_extra("scipy")
     chosen = _settings(reference, method, options, settings, allow_nonfinite)
     with _progress() as tell:
@@ -147,7 +147,7 @@ def _require_extra(*packages: str) -> None:
 
 @contextlib.contextmanager
 def _progress() -> Iterator[Callable[[int, int], None]]:
-    """What to call with the numbers of pictures done and in all; shown on a terminal, and gone at the end."""
+    """What to call with the numbers of images done and in all; shown on a terminal, and gone at the end."""
     with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
         task = progress.add_task("comparing", total=None)
         yield lambda done, of: progress.update(task, completed=done, total=of)
@@ -166,7 +166,7 @@ def _flags(name: str, values: Sequence[Any]) -> list[str]:
 def _self_test(path: Path | None, other: Path | None) -> int:
     """Prints what is seen of the defects; 1 where one that was due is not."""
     if other:
-        raise ValueError(f"{other}: --self-test takes one path; accepted: a picture, a folder of renders, a scene")
+        raise ValueError(f"{other}: --self-test takes one path; accepted: an image, a folder of renders, a scene")
     return gate.self_test(path)
 
 
@@ -185,7 +185,7 @@ def _say(found: Results) -> None:
     for result in found.of(Status.ERROR):
         print(f"mi-refract: {output.printable(result.error)}", file=sys.stderr)
     for pattern in found.unused:
-        print(f"mi-refract: {output.printable(pattern)}: matches no picture", file=sys.stderr)
+        print(f"mi-refract: {output.printable(pattern)}: matches no image", file=sys.stderr)
     if len(found.results) > len(found.of(Status.ERROR)):
         # As wide as it must be where nobody looks on: no line of a log is a wrapped one.
         console = Console() if sys.stdout.isatty() else Console(width=10_000)

@@ -19,7 +19,7 @@ from typing import Any
 
 import drjit as dr
 
-from mi_refract.numerics.error_free import component_of, near_unit, quotient
+from mi_refract.numerics.error_free import as_component, ieee_divide, scale_to_unit
 
 from .bounds import CONTRASTING, ROUNDING, Budget, cancelling
 from .well_conditioned import Refracted, refract_compensated, refract_promoted
@@ -30,7 +30,7 @@ from .well_conditioned import Refracted, refract_compensated, refract_promoted
 def _conclude(a: Any, n: Any, c: Any, radicand: Any, b: Any) -> Refracted:
     """Choose between the transmitted direction `b` and the mirror direction."""
     transmitted = (radicand >= 0) & (c != 0)
-    return dr.select(transmitted, b, a - n * quotient(2 * c, dr.dot(n, n))), transmitted
+    return dr.select(transmitted, b, a - n * ieee_divide(2 * c, dr.dot(n, n))), transmitted
 
 
 def _root(radicand: Any) -> Any:
@@ -74,7 +74,7 @@ def refract_wedge(a: Any, n: Any, k: Any) -> Refracted:
     Source: document 000, boxed form of "Refraction" (there n·a < 0), made two-sided. Unit `n`.
     Weak near the critical angle, for k near 1 at grazing incidence and for k ≫ 1: the radicand cancels.
     """
-    k = component_of(a, k)
+    k = as_component(a, k)
     c, bivector = dr.dot(n, a), wedge(n, a)
     radicand = dr.dot(a, a) - k * k * dr.dot(bivector, bivector)  # (n∧a)² = −|n×a|²
     b = k * contract(n, bivector) + n * dr.mulsign(_root(radicand), c)
@@ -87,7 +87,7 @@ def refract_wedge_contrast(a: Any, n: Any, k: Any) -> Refracted:
     Source: document 000, last form of "Refraction", made two-sided. Unit `n`.
     Weak where k² − 1 loses digits (k near 1) and where two large terms cancel near the critical angle.
     """
-    k = component_of(a, k)
+    k = as_component(a, k)
     c, bivector = dr.dot(n, a), wedge(n, a)
     radicand = c * c - dr.dot(bivector, bivector) * (k * k - 1)
     b = k * contract(n, bivector) + n * dr.mulsign(_root(radicand), c)
@@ -100,7 +100,7 @@ def refract_cross(a: Any, n: Any, k: Any) -> Refracted:
     Source: document 001, eq. 6; its ‖c‖ (n × ĉ) is 0/0 at normal incidence, n × c is the same and safe.
     Unit `a`, `n`. Weak near the critical angle, for k near 1 at grazing incidence and for k ≫ 1.
     """
-    k = component_of(a, k)
+    k = as_component(a, k)
     cos, c = dr.dot(a, n), k * dr.cross(a, n)
     radicand = 1 - dr.dot(c, c)
     t = dr.cross(n, c) + n * dr.mulsign(_root(radicand), cos)
@@ -114,7 +114,7 @@ def refract_decomposed(a: Any, n: Any, k: Any) -> Refracted:
     Source: document 002, eq. 1, made two-sided. Unit `a`, `n`.
     Weak near the critical angle, for k near 1 at grazing incidence and for k ≫ 1: the radicand cancels.
     """
-    k = component_of(a, k)
+    k = as_component(a, k)
     c = dr.dot(n, a)
     radicand = 1 - k * k * (1 - c * c)
     b = k * a - n * (k * c - dr.mulsign(_root(radicand), c))
@@ -131,7 +131,7 @@ def refract_2d(i: Any, l: Any, k: Any) -> tuple[list[Any], Any]:  # noqa: E741 (
     """
     along_n, along_l = l[0] * i[1] - l[1] * i[0], l[0] * i[0] + l[1] * i[1]
     length = dr.sqrt(i[0] * i[0] + i[1] * i[1])
-    x = quotient(k * dr.abs(along_l), length)
+    x = ieee_divide(k * dr.abs(along_l), length)
     scale = (l[0] * l[0] + l[1] * l[1]) * length * k
     valid = (scale > 0) & (scale < dr.inf)
     transmitted = valid & (x <= 1) & (along_n != 0)
@@ -148,13 +148,13 @@ def refract_rotated(a: Any, n: Any, k: Any) -> Refracted:
     is any unit vector, times 0. Source: document 004. Unit `n`.
     Weak near the critical angle: √(1 − X²) magnifies the rounding of X.
     """
-    k = component_of(a, k)
+    k = as_component(a, k)
     c = dr.dot(n, a)
     tangent = a - n * c
     sine = dr.norm(tangent)
     (b_n, b_t), transmitted = refract_2d((c, sine), (0, 1), k)
     # Where the tangent is 0 its factor is the limit k, for the derivative's sake.
-    factor = dr.select(sine > 0, quotient(b_t, sine), dr.select(transmitted, k, 1))
+    factor = dr.select(sine > 0, ieee_divide(b_t, sine), dr.select(transmitted, k, 1))
     b = n * b_n + tangent * factor
     return _conclude(a, n, c, dr.select(transmitted, 1, -1), b)
 
@@ -189,10 +189,10 @@ class Formula:
 
         That is: `a` or `n` zero or not finite, `k` outside 1e-9 … 1e9, `contrast` not finite or not above −1.
         """
-        n, k = type(a)(n), component_of(a, k)
+        n, k = type(a)(n), as_component(a, k)
         scale: Any = 1
         if self.scales:
-            (a, scale), (n, _) = near_unit(a), near_unit(n)
+            (a, scale), (n, _) = scale_to_unit(a), scale_to_unit(n)
         b, transmitted = self.unchecked(a, n, k, contrast)
         # `b` has the length of `a`, and a zero or non-finite `n` makes it NaN: one length tells of both.
         b, length2 = b * scale, dr.dot(b, b)

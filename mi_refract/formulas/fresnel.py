@@ -22,7 +22,7 @@ from typing import Any
 
 import drjit as dr
 
-from mi_refract.numerics.error_free import Double, component_of, quotient, two_prod, two_sum
+from mi_refract.numerics.error_free import DoubleWord, as_component, ieee_divide, two_prod, two_sum
 
 from .well_conditioned import local_root
 
@@ -38,15 +38,15 @@ def _wide(x: Any) -> Any:
 
 
 def _fma(x: Any, y: Any, z: Any) -> Any:
-    return x * y + z if isinstance(x, Double) else dr.fma(x, y, z)
+    return x * y + z if isinstance(x, DoubleWord) else dr.fma(x, y, z)
 
 
 def _divide(x: Any, y: Any) -> Any:
     """x / y; of `Double`s, rounded once."""
-    if not isinstance(x, Double):
-        return quotient(x, y)
-    q = quotient(x.hi, y.hi)
-    return q + quotient(dr.fma(-q, y.hi, x.hi) + dr.fma(-q, y.lo, x.lo), y.hi)
+    if not isinstance(x, DoubleWord):
+        return ieee_divide(x, y)
+    q = ieee_divide(x.hi, y.hi)
+    return q + ieee_divide(dr.fma(-q, y.hi, x.hi) + dr.fma(-q, y.lo, x.lo), y.hi)
 
 
 # Powers --------------------------------------------------------------------------------------------------------
@@ -58,7 +58,7 @@ def powers(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: Any = Non
     `cos_i`, `cos_t` absolute cosines, `transmitted` a mask, as a formula of refraction or `refracted_cosine`
     gives them. `contrast`: κ where it is known better than k.
     """
-    lift = _wide if _is_single(cos_i) else Double
+    lift = _wide if _is_single(cos_i) else DoubleWord
     c, ratio = lift(cos_i), lift(k)
     kappa = ratio * ratio - 1 if contrast is None else lift(contrast)
     number = type(cos_i)
@@ -69,7 +69,7 @@ def powers(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: Any = Non
 def local_powers(a: Any, transmitted: Any, k: Any, contrast: Any) -> tuple[Any, Any]:
     """(R, T) as `powers` gives them, of a float32 ray `a` that meets a boundary whose normal is the z axis."""
     r, t = local_odds(a, transmitted, k, contrast)
-    return component_of(a, quotient(r, r + t)), component_of(a, quotient(t, r + t))
+    return as_component(a, ieee_divide(r, r + t)), as_component(a, ieee_divide(t, r + t))
 
 
 def local_odds(a: Any, transmitted: Any, k: Any, contrast: Any) -> tuple[Any, Any]:
@@ -116,9 +116,9 @@ def _powers(c: Any, y: Any, mirror: Any, sin2: Any, k: Any, kappa: Any) -> tuple
     right to 3.12u and T to 2u. For this the denominator of R is a sum (the square it is equal to would make it 4),
     and that of T the square (the sum: 3, and sin²θᵢ would count, which a cosine near 1 does not know).
     """
-    if isinstance(c, Double):
+    if isinstance(c, DoubleWord):
         # Of float64 cosines below 1e-75 have fourth powers that underflow. Where κ = 0 they do not matter.
-        c, y = (Double(dr.select((kappa.hi == 0) & (x.hi > 0), 1, x.hi), x.lo) for x in (c, y))
+        c, y = (DoubleWord(dr.select((kappa.hi == 0) & (x.hi > 0), 1, x.hi), x.lo) for x in (c, y))
     p, q = c * y, k * sin2
     d_s, d_p = _fma(k, c, y), _fma(k, y, c)
     r = _fma(kappa * kappa, _fma(q, q, p * p), mirror)
@@ -126,10 +126,10 @@ def _powers(c: Any, y: Any, mirror: Any, sin2: Any, k: Any, kappa: Any) -> tuple
     t = (kp + kp) * _fma(d_s, d_s, d_p * d_p)
     root = _fma(d_s, d_p, mirror)
     whole, square = r + t, root * root
-    if isinstance(r, Double):
+    if isinstance(r, DoubleWord):
         return _divide(r, whole), _divide(t, square)
     # One division for both: it takes as long as eight other operations. Cosines of 1e-38 leave the product 1e-302.
-    inverse = quotient(1, whole * square)
+    inverse = ieee_divide(1, whole * square)
     return (r * square) * inverse, (t * whole) * inverse
 
 
@@ -186,7 +186,7 @@ def mueller_transmission(cos_i: Any, cos_t: Any, transmitted: Any, k: Any) -> li
     return _mueller(t_s, t_p, (cross, 0))
 
 
-def _differences(cos_i: Any, k: Any, contrast: Any) -> tuple[Double, Any]:
+def _differences(cos_i: Any, k: Any, contrast: Any) -> tuple[DoubleWord, Any]:
     """cos²θ_t = k² cos²θ_i − κ and k² sin²θ_i − cos²θ_i of exact arguments, each to the last bit and in float64.
 
     They cancel near the critical angle and near Brewster's; there double words would leave 5u²/|difference|.
@@ -198,7 +198,7 @@ def _differences(cos_i: Any, k: Any, contrast: Any) -> tuple[Double, Any]:
         k2 = _wide(k) * _wide(k) if contrast is None else _wide(contrast) + 1
         kappa = k2 - 1 if contrast is None else _wide(contrast)
         brewster = dr.select(k2 > 1, dr.fma(k2, 1 - c2, -c2), dr.fma(-k2, c2, k2 - c2))
-        return Double(dr.fma(k2, c2, -kappa)), brewster
+        return DoubleWord(dr.fma(k2, c2, -kappa)), brewster
     c2 = two_prod(cos_i, cos_i)
     k2 = two_prod(k, k) if contrast is None else (contrast, 1)
     products = [part for x in c2 for y in k2 for part in two_prod(x, y)]
@@ -206,17 +206,17 @@ def _differences(cos_i: Any, k: Any, contrast: Any) -> tuple[Double, Any]:
     return radicand, _sum([*k2, -c2[0], -c2[1], *(-x for x in products)]).rounded()
 
 
-def _sum(terms: list[Any]) -> Double:
+def _sum(terms: list[Any]) -> DoubleWord:
     """Σ terms: error ≤ u² |sum| + O(u³) Σ|terms|. Source: Ogita, Rump, Oishi 2005, SumK with K = 3."""
     for _ in range(2):
         for i in range(1, len(terms)):
             terms[i], terms[i - 1] = two_sum(terms[i], terms[i - 1])
-    return Double(terms[-1], sum(terms[:-1]))
+    return DoubleWord(terms[-1], sum(terms[:-1]))
 
 
-def _root(radicand: Double) -> Any:
+def _root(radicand: DoubleWord) -> Any:
     """√|radicand|, rounded once, with a finite derivative at 0."""
-    size = Double(dr.abs(radicand.hi), dr.mulsign(radicand.lo, radicand.hi))
+    size = DoubleWord(dr.abs(radicand.hi), dr.mulsign(radicand.lo, radicand.hi))
     return dr.safe_sqrt(size.hi) if radicand.is_plain else size.sqrt().rounded()
 
 
@@ -229,7 +229,7 @@ def _mueller(s2: Any, p2: Any, cross: Any) -> list[list[Any]]:
 def _phase(x: Any, y: Any) -> tuple[Any, Any]:
     """(x + i y)² / |x + i y|², real and imaginary part; −1 for x = 0, y = 0 included."""
     length = dr.sqrt(x * x + y * y)
-    x, y = dr.select(length > 0, quotient(x, length), 0 * length), dr.select(length > 0, quotient(y, length), 1)
+    x, y = dr.select(length > 0, ieee_divide(x, length), 0 * length), dr.select(length > 0, ieee_divide(y, length), 1)
     return (x - y) * (x + y), 2 * x * y
 
 

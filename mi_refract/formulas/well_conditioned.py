@@ -32,7 +32,15 @@ from typing import Any
 import drjit as dr
 
 from mi_refract.numerics import error_free
-from mi_refract.numerics.error_free import Double, Expansion, attach, component_of, differentiated, quotient, two_sum
+from mi_refract.numerics.error_free import (
+    DoubleWord,
+    TripleWord,
+    as_component,
+    differentiated,
+    ieee_divide,
+    replace_grad,
+    two_sum,
+)
 
 Refracted = tuple[Any, Any]
 
@@ -74,7 +82,7 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
         return _promoted_along(a, axis, k, contrast)
     wide: Any = dr.float64_array_t(type(a))
     number = dr.value_t(wide)
-    d, m, k2 = wide(a), wide(n), number(component_of(a, k))
+    d, m, k2 = wide(a), wide(n), number(as_component(a, k))
     # k² has 48 bits: the difference is rounded at most once.
     kappa = dr.fma(k2, k2, -1) if contrast is None else number(contrast)
     # Products of components are exact in float64. Each w is off by 2⁻⁵³ of itself, and so is c, twice: at grazing
@@ -87,19 +95,19 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     along, scale = dr.select(transmitted, dr.mulsign(dr.safe_sqrt(radicand), c), -c), dr.select(transmitted, k2, 1)
     # κ = 0 leaves b = a to the last bit: √(c²) is |c| exactly, so the factor of n is 0. So it is for c = 0.
     # Else k a + n (…) cancels to 4k·2⁻⁵³ |a|, which is u/128 for k = 1e6.
-    return type(a)(dr.fma(m, quotient(dr.fma(-scale, c, along), dr.dot(m, m)), d * scale)), transmitted
+    return type(a)(dr.fma(m, ieee_divide(dr.fma(-scale, c, along), dr.dot(m, m)), d * scale)), transmitted
 
 
 def _promoted_along(a: Any, axis: tuple[int, int], k: Any, contrast: Any) -> Refracted:
     """`refract_promoted` for a literal axis: only the radicand and its root need float64."""
     index, sign = axis
     wide: Any = dr.float64_array_t(dr.value_t(type(a)))
-    k, along = component_of(a, k), a[index] if sign > 0 else -a[index]
+    k, along = as_component(a, k), a[index] if sign > 0 else -a[index]
     kappa = dr.fma(wide(k), wide(k), -1) if contrast is None else wide(contrast)
     x, y = (a[i] for i in range(3) if i != index)
     root, radicand = local_root(x, y, along, kappa)
     transmitted = (radicand >= 0) & (along != 0)
-    onward = dr.select(transmitted, dr.mulsign(component_of(a, root), along), -along)
+    onward = dr.select(transmitted, dr.mulsign(as_component(a, root), along), -along)
     return _along_axis(a, axis, dr.select(transmitted, k, 1), onward), transmitted
 
 
@@ -117,7 +125,7 @@ def local_root(x: Any, y: Any, z: Any, kappa: Any) -> tuple[Any, Any]:
     return dr.safe_sqrt(radicand) if differentiated(radicand) else dr.sqrt(dr.abs(radicand)), radicand
 
 
-def _radicand(c: Expansion, w: list[Expansion], kappa: Double) -> Double:
+def _radicand(c: TripleWord, w: list[TripleWord], kappa: DoubleWord) -> DoubleWord:
     """c² − κ w²; its error ε over the larger term, in u³.
 
     c is off by 3/cosθ and κ by none for 1 ≤ k < 2²³. Each w is off by 6, each square by 100 at most, their sums,
@@ -135,11 +143,11 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
     Precondition in float32: lengths of 1e-3 to 1e3, so that no product of four over- or underflows
     (`numerics.near_unit` sees to it, in the entries of FORMULAS).
     """
-    k, axis = component_of(a, k), _axis(n)
-    kappa = Double.product(k, k) - 1 if contrast is None else _split(a, contrast)
+    k, axis = as_component(a, k), _axis(n)
+    kappa = DoubleWord.product(k, k) - 1 if contrast is None else _split(a, contrast)
     if axis:
         index, sign = axis
-        c, w = Expansion(a[index] if sign > 0 else -a[index]), [Expansion(a[i]) for i in range(3) if i != index]
+        c, w = TripleWord(a[index] if sign > 0 else -a[index]), [TripleWord(a[i]) for i in range(3) if i != index]
     else:
         c, w = error_free.dot(n, a), error_free.cross(n, a)
     radicand = _radicand(c, w, kappa)
@@ -149,23 +157,23 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
         onward = dr.mulsign(root.rounded(), c.hi)
         # c² may have underflowed: κ = 0 leaves c to the last bit, but with the derivative of the root.
         exact = dr.select(kappa.hi == 0, c.hi, onward)
-        along = dr.select(transmitted, attach(exact, onward) if differentiated(onward) else exact, -c.hi)
+        along = dr.select(transmitted, replace_grad(exact, onward) if differentiated(onward) else exact, -c.hi)
         return _along_axis(a, axis, scale, along), transmitted
-    root = Double(dr.mulsign(root.hi, c.hi), dr.mulsign(root.lo, c.hi))
+    root = DoubleWord(dr.mulsign(root.hi, c.hi), dr.mulsign(root.lo, c.hi))
     b = _correct(type(a), n, [w_i.pair * scale for w_i in w], error_free.select(transmitted, root, -c.pair))
     # To the last bit where the answer is `a`, but with the derivative of b, which is not that of `a`. Where `n` is no
     # normal b is NaN, and stays so.
     exact = dr.select(((kappa.hi == 0) | (c.hi == 0)) & (b[0] == b[0]), a, b)
-    return (attach(exact, b) if differentiated(b) else exact), transmitted
+    return (replace_grad(exact, b) if differentiated(b) else exact), transmitted
 
 
-def _correct(vector: type, n: Any, around: list[Double], along: Double) -> Any:
+def _correct(vector: type, n: Any, around: list[DoubleWord], along: DoubleWord) -> Any:
     """The b with n × b = `around` and n·b = `along`: b = (around × n + along n)/n², rounded once.
 
     |b₀ − b| ≤ 8u |b|, and δ from the exact defects is right to 8u of itself: b₀ + δ is b to 64u² before it is
     rounded, so the final error is that of rounding, half an ulp a component.
     """
-    inverse = quotient(1, dr.dot(n, n))
+    inverse = ieee_divide(1, dr.dot(n, n))
 
     def solve(around: list[Any], along: Any) -> Any:
         return dr.fma(n, along, dr.cross(vector(*around), n)) * inverse
@@ -177,10 +185,10 @@ def _correct(vector: type, n: Any, around: list[Double], along: Double) -> Any:
     return b + solve(missing, error_free.defect(along, *zip(n, b, strict=True)))
 
 
-def _split(a: Any, x: Any) -> Double:
+def _split(a: Any, x: Any) -> DoubleWord:
     """A number of any precision as a pair in the precision of the components of `a`."""
-    hi = component_of(a, x)
+    hi = as_component(a, x)
     if dr.is_array_v(x) and type(x) is type(hi):
-        return Double(hi)
+        return DoubleWord(hi)
     wide: Any = dr.float64_array_t(dr.value_t(type(a)))
-    return Double(hi, component_of(a, wide(x) - wide(hi)))
+    return DoubleWord(hi, as_component(a, wide(x) - wide(hi)))

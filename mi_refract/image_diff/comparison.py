@@ -1,4 +1,4 @@
-"""What a comparison of pictures says, and the gates before every method.
+"""What a comparison of images says, and the gates before every method.
 
 Fails closed: what cannot be compared is an error, and a value that is not finite equals nothing.
 """
@@ -25,8 +25,8 @@ class Verdict(enum.StrEnum):
 
 
 @dataclass(frozen=True)
-class Figure:
-    """A number of a judgement; where it has a threshold, `value <= bound` holds for equal pictures."""
+class Metric:
+    """A number of a judgement; where it has a threshold, `value <= bound` holds for equal images."""
 
     name: str
     value: float
@@ -41,22 +41,22 @@ class Figure:
 class Comparison:
     """What a method found. `detectable`: the smallest relative difference that it would have seen, NaN if unknown.
 
-    `maps`: H × W or H × W × C float32 by name, of the pictures' size.
+    `maps`: H × W or H × W × C float32 by name, of the images' size.
     """
 
     method: str
     verdict: Verdict
     reason: str
-    figures: tuple[Figure, ...] = ()
+    figures: tuple[Metric, ...] = ()
     detectable: float = np.nan
     maps: Maps = field(default_factory=dict)
 
 
-def gates(reference: Image, test: Image, allow_nonfinite: bool = False) -> str | None:
+def preconditions(reference: Image, test: Image, allow_nonfinite: bool = False) -> str | None:
     """Why the two differ before any method is asked: values that are not finite, counted and located; else None.
 
     ValueError, in one line, where they cannot be compared: other size, channels (by name), or data window.
-    With `allow_nonfinite` such a value is allowed where the other picture has the same one: NaN, Inf or -Inf.
+    With `allow_nonfinite` such a value is allowed where the other image has the same one: NaN, Inf or -Inf.
     """
     a, b = aligned(reference, test)
     if np.isfinite(a).all() and np.isfinite(b).all():
@@ -65,7 +65,7 @@ def gates(reference: Image, test: Image, allow_nonfinite: bool = False) -> str |
         found = [_located(image, values, ~np.isfinite(values)) for image, values in ((reference, a), (test, b))]
         return "; ".join(text for text in found if text)
     lone = ~(np.isfinite(a) & np.isfinite(b)) & ~_same(a, b)
-    return f"not finite in one picture only, or otherwise: {_located(reference, a, lone)}" if lone.any() else None
+    return f"not finite in one image only, or otherwise: {_located(reference, a, lone)}" if lone.any() else None
 
 
 def aligned(reference: Image, test: Image) -> tuple[Pixels, Pixels]:
@@ -77,21 +77,21 @@ def aligned(reference: Image, test: Image) -> tuple[Pixels, Pixels]:
     return reference.pixels, test.pixels if same_order else test.select(reference.channels)
 
 
-def entered(method: str, reference: Image, test: Image, allow: bool) -> tuple[Pixels, Pixels, Comparison | None]:
+def checked_pixels(method: str, reference: Image, test: Image, allow: bool) -> tuple[Pixels, Pixels, Comparison | None]:
     """The pixels of both, finite; or the judgement of the gates. Allowed values that are not finite become 0."""
-    reason = gates(reference, test, allow)
+    reason = preconditions(reference, test, allow)
     a, b = aligned(reference, test)
     if reason:
-        return a, b, refused(method, reason, a, b)
+        return a, b, nonfinite_result(method, reason, a, b)
     if allow:
         a, b = np.where(np.isfinite(a), a, 0), np.where(np.isfinite(b), b, 0)
     return a, b, None
 
 
-def refused(method: str, reason: str, *pixels: Pixels) -> Comparison:
-    """The judgement on pictures with values that are not finite; they are marked in the map "nonfinite"."""
+def nonfinite_result(method: str, reason: str, *pixels: Pixels) -> Comparison:
+    """The judgement on images with values that are not finite; they are marked in the map "nonfinite"."""
     bad = sum((~np.isfinite(each) for each in pixels), np.zeros(pixels[0].shape, np.float32))
-    figures = (Figure("values that are not finite", float(bad.sum()), 0.0),)
+    figures = (Metric("values that are not finite", float(bad.sum()), 0.0),)
     return Comparison(method, Verdict.DIFFERENT, reason, figures, maps={"nonfinite": (bad > 0).astype(np.float32)})
 
 

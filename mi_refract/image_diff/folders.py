@@ -1,4 +1,4 @@
-"""Pairs of picture files, and folders of them: who is compared with whom, what came out, and what may be accepted.
+"""Pairs of image files, and folders of them: who is compared with whom, what came out, and what may be accepted.
 
 One pair that cannot be compared does not keep the others from it. Nothing here writes a file but `accept`.
 """
@@ -36,7 +36,7 @@ class Status(enum.StrEnum):
 
 
 class Category(enum.StrEnum):
-    """What happened to a picture between the two folders; UNKNOWN where no verdict says so."""
+    """What happened to an image between the two folders; UNKNOWN where no verdict says so."""
 
     ADDED = "added"
     REMOVED = "removed"
@@ -48,13 +48,13 @@ class Category(enum.StrEnum):
 STATUSES = {Verdict.EQUAL: Status.EQUAL, Verdict.DIFFERENT: Status.DIFFERENT, Verdict.INCONCLUSIVE: Status.INCONCLUSIVE}
 CATEGORIES = {Status.EQUAL: Category.UNCHANGED, Status.DIFFERENT: Category.CHANGED}
 AS_ASKED = Settings()
-WORKERS = min(os.cpu_count() or 1, 8)  # each holds a pair of pictures in memory
+WORKERS = min(os.cpu_count() or 1, 8)  # each holds a pair of images in memory
 INCONCLUSIVE = {"": 3, "pass": 0, "fail": 1}  # exit codes by what the user wants of it
 
 
 @dataclass(frozen=True)
 class Result:
-    """One picture: its name, and what was found. `error` is the line that says why there is no verdict.
+    """One image: its name, and what was found. `error` is the line that says why there is no verdict.
 
     `reference`, `test`: its files, or with samples its folders; None where that side has none. `how`: what was asked.
     """
@@ -80,13 +80,13 @@ class Result:
         """One sentence why the status is what it is."""
         if self.comparison:
             return self.comparison.reason
-        sides = {Category.ADDED: "only among the new pictures", Category.REMOVED: "only among the references"}
+        sides = {Category.ADDED: "only among the new images", Category.REMOVED: "only among the references"}
         return self.error or sides[self.category]
 
 
 @dataclass(frozen=True)
 class Results:
-    """What `diff` found, failures first. `reference`, `test`: as given. `unused`: patterns that matched no picture.
+    """What `diff` found, failures first. `reference`, `test`: as given. `unused`: patterns that matched no image.
 
     `began`: when the comparison did, in ns since the epoch.
     """
@@ -116,12 +116,12 @@ class Results:
         return result.reference or (self.reference / result.name if self.test.is_dir() else self.reference)
 
     def reproduce(self, result: Result) -> str:
-        """The command that compares this picture again; "" where one side has none."""
+        """The command that compares this image again; "" where one side has none."""
         flags = (["--samples"] if self.samples else []) + result.how.flags
         return _line("diff", result.reference, result.test, flags) if result.reference else ""
 
     def accept(self, result: Result) -> str:
-        """The command that makes the new picture the reference; "" where there is none, or no need."""
+        """The command that makes the new image the reference; "" where there is none, or no need."""
         flags = [] if self.samples else result.how.flags
         return _line("accept", self.target(result), result.test, flags) if result.status is not Status.EQUAL else ""
 
@@ -149,10 +149,10 @@ def diff(
     new: bool = False,
     tell: Callable[[int, int], None] = lambda done, of: None,
 ) -> Results:
-    """Compare two files, two folders by the names of their pictures, or, with `samples`, two folders as one picture.
+    """Compare two files, two folders by the names of their images, or, with `samples`, two folders as one image.
 
-    `maps`: keep those of pictures that are not equal. `new`: the reference need not exist yet. `tell(done, of)` after
-    each picture. ValueError or OSError, in one line, where there is nothing to compare: a path that does not exist, a
+    `maps`: keep those of images that are not equal. `new`: the reference need not exist yet. `tell(done, of)` after
+    each image. ValueError or OSError, in one line, where there is nothing to compare: a path that does not exist, a
     file against a folder, an empty folder, a path within the other.
     """
     began, reference, test = time.time_ns(), Path(reference), Path(test)
@@ -191,22 +191,22 @@ def require_apart(reference: Path, test: Path, new: bool = False) -> None:
 
 
 def pairs(reference: Path, test: Path) -> list[Result]:
-    """The pictures of both sides by name, not yet judged; those of one side only are different."""
+    """The images of both sides by name, not yet judged; those of one side only are different."""
     known = reference.exists()
     if known and reference.is_dir() != test.is_dir():
         raise ValueError(f"{reference}, {test}: a folder and a file; accepted: two of a kind")
     if not test.is_dir():
         return [_unjudged(reference.name, reference if known else None, test)]
-    (old, lost), (new, missed) = pictures_in(reference) if known else ({}, []), pictures_in(test)
+    (old, lost), (new, missed) = images_in(reference) if known else ({}, []), images_in(test)
     for folder, nothing in ((reference, known and not old and not lost), (test, not new and not missed)):
         if nothing:
-            raise ValueError(f"{folder}: holds no picture; accepted: at least one")
+            raise ValueError(f"{folder}: holds no image; accepted: at least one")
     found = [_unjudged(name, old.get(name), new.get(name)) for name in sorted(old | new)]
     return [*found, *(Result(name, Status.ERROR, None, None, error=error) for name, error in lost + missed)]
 
 
-def pictures_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
-    """The files whose names end as a picture's, by their path inside; (name, error) of folders that cannot be read.
+def images_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
+    """The files whose names end as an image's, by their path inside; (name, error) of folders that cannot be read.
 
     Names that begin with a dot are left out. Links to folders are not followed, and an error: nobody would look there.
     """
@@ -230,7 +230,7 @@ def pictures_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
 
 @functools.cache
 def endings() -> frozenset[str]:
-    """The file name endings, lower case without the dot, of the pictures that OpenImageIO reads."""
+    """The file name endings, lower case without the dot, of the images that OpenImageIO reads."""
     import OpenImageIO as oiio
 
     formats = (each.split(":") for each in oiio.get_string_attribute("extension_list").split(";") if each)
@@ -247,39 +247,39 @@ def judge(result: Result, samples: bool = False, maps: bool = False) -> Result:
     try:
         if result.reference.samefile(result.test):
             raise ValueError(f"{result.test}: the same file as the reference {result.reference}; accepted: two")
-        read = sample_pictures if samples else image_file.read
+        read = sample_images if samples else image_file.read
         found = methods.compare(result.how.method, read(result.reference), read(result.test), **result.how.options)
     except (ValueError, OSError) as error:
         return replace(result, status=Status.ERROR, error=image_file.one_line(str(error)))
     if not maps or found.verdict is Verdict.EQUAL:
-        found = replace(found, maps={})  # a thousand pictures' maps would fill the memory
+        found = replace(found, maps={})  # a thousand images' maps would fill the memory
     return replace(result, status=STATUSES[found.verdict], comparison=found)
 
 
-def sample_pictures(folder: Path) -> list[Image]:
-    """The renders of one picture in a folder. ValueError where two are the same, seed and all; otherwise as `read`."""
-    found, failed = pictures_in(folder)
+def sample_images(folder: Path) -> list[Image]:
+    """The renders of one image in a folder. ValueError where two are the same, seed and all; otherwise as `read`."""
+    found, failed = images_in(folder)
     if failed:
         raise OSError(failed[0][1])
     if not found:
-        raise ValueError(f"{folder}: holds no picture; accepted: several renders of one")
+        raise ValueError(f"{folder}: holds no image; accepted: several renders of one")
     with ThreadPoolExecutor(WORKERS) as pool:
-        pictures = list(pool.map(image_file.read, found.values()))
+        images = list(pool.map(image_file.read, found.values()))
     sums: dict[float, Image] = {}
-    for picture in pictures:
-        other = sums.setdefault(float(picture.pixels.sum(dtype=np.float64)), picture)
-        if other is not picture and np.array_equal(picture.pixels, other.pixels):
-            raise ValueError(f"{picture.path}: the same pixels as {other.path}; accepted: renders of different seeds")
-    return pictures
+    for image in images:
+        other = sums.setdefault(float(image.pixels.sum(dtype=np.float64)), image)
+        if other is not image and np.array_equal(image.pixels, other.pixels):
+            raise ValueError(f"{image.path}: the same pixels as {other.path}; accepted: renders of different seeds")
+    return images
 
 
 # Accepting --------------------------------------------------------------------------------------------------------
 
 
 def changes(results: Results) -> Iterator[tuple[Path, Path]]:
-    """(new, reference) for each picture that is not equal to its reference, or has none.
+    """(new, reference) for each image that is not equal to its reference, or has none.
 
-    ValueError or OSError for a new picture that is no reference: unreadable, with values that are not finite, or of
+    ValueError or OSError for a new image that is no reference: unreadable, with values that are not finite, or of
     another format than the reference's name says.
     """
     for result in results.of(Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE):
@@ -287,8 +287,8 @@ def changes(results: Results) -> Iterator[tuple[Path, Path]]:
             if result.error:
                 raise ValueError(result.error)
             continue
-        picture = image_file.read(result.test)
-        if not result.how.options.get("allow_nonfinite") and not np.isfinite(picture.pixels).all():
+        image = image_file.read(result.test)
+        if not result.how.options.get("allow_nonfinite") and not np.isfinite(image.pixels).all():
             raise ValueError(f"{result.test}: values that are not finite; accepted with --allow-nonfinite")
         target = results.target(result)
         if target.suffix.lower() != result.test.suffix.lower():

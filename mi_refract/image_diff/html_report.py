@@ -1,7 +1,7 @@
-"""The page that shows a person what `mi-refract diff` found: one offline HTML file, failures first, with pictures.
+"""The page that shows a person what `mi-refract diff` found: one offline HTML file, failures first, with images.
 
 Judgements come from the results; only maps that the method did not ask for (the difference, FLIP) are made here.
-Equal pictures are a line each. Pictures are embedded until the page is full: those further down keep their numbers,
+Equal images are a line each. Images are embedded until the page is full: those further down keep their numbers,
 and the command that shows them alone.
 """
 
@@ -19,16 +19,16 @@ from typing import Any
 import numpy as np
 
 from mi_refract.io.image_file import Image, one_line, read
-from mi_refract.report.embedded_images import Pictures, encoded, means, shown, strongest
+from mi_refract.report.embedded_images import EmbeddedImages, encoded, means, shown, strongest
 from mi_refract.report.html_page import write_page
-from mi_refract.report.plots import apart, compact, histogram_svg
+from mi_refract.report.plots import compact, distinguishable, histogram_svg
 
 from . import folders, methods
 from .folders import Result, Results, Status
 from .text_reports import sentence
 
-PAGE = 14_000_000  # bytes of pictures on a page of at most 15 MB
-PICTURE, MAP = 4_600_000, 1_200_000  # bytes of one: two pictures and three maps are a page
+PAGE = 14_000_000  # bytes of images on a page of at most 15 MB
+IMAGE, MAP = 4_600_000, 1_200_000  # bytes of one: two images and three maps are a page
 MAP_WIDTH, FLIP_WIDTH = 960, 640
 PPD = 67.0  # pixels per degree, as everywhere FLIP is used
 SIGNED = ("difference", "t")
@@ -42,10 +42,10 @@ Maker = Callable[[], dict[str, Any]]
 def write(path: str | Path, results: Results, context: Mapping[str, Any] | None = None, replay: str = "") -> None:
     """Write the page; `context` is shown on top as it is, `replay` is the command that repeats the whole comparison.
 
-    A picture that cannot be read (any more) is a line on the page. Errors: OSError for the page itself.
+    An image that cannot be read (any more) is a line on the page. Errors: OSError for the page itself.
     """
-    pictures = Pictures()
-    failures = [_failure(number, result, results, pictures) for number, result in enumerate(results.of(*FAILED), 1)]
+    images = EmbeddedImages()
+    failures = [_failure(number, result, results, images) for number, result in enumerate(results.of(*FAILED), 1)]
     counts = Counter(result.status for result in results.results)
     content = {
         "title": "mi-refract diff",
@@ -58,13 +58,13 @@ def write(path: str | Path, results: Results, context: Mapping[str, Any] | None 
         "failures": failures,
         "equal": [_line(result) for result in results.of(Status.EQUAL)],
     }
-    write_page(path, "diff.html.j2", content, pictures)
+    write_page(path, "diff.html.j2", content, images)
 
 
-def _failure(number: int, result: Result, results: Results, pictures: Pictures) -> dict[str, Any]:
+def _failure(number: int, result: Result, results: Results, images: EmbeddedImages) -> dict[str, Any]:
     found = result.comparison
     p_values = found.maps.get("p") if found else None
-    panes, note = _panes(result, pictures) if pictures.size < PAGE else ([], "Not embedded: the page is full.")
+    panes, note = _panes(result, images) if images.size < PAGE else ([], "Not embedded: the page is full.")
     return _line(result) | {
         "key": f"pair-{number}",
         "category": str(result.category),
@@ -93,11 +93,11 @@ def _line(result: Result) -> dict[str, Any]:
     }
 
 
-def _figure(figure: methods.Figure) -> dict[str, str]:
+def _figure(figure: methods.Metric) -> dict[str, str]:
     value, bound = figure.value, figure.bound
     if bound is None or value <= bound == math.inf:
         return {"name": figure.name, "text": compact(value), "limit": "", "state": "info"}
-    text, limit = apart(value, bound)
+    text, limit = distinguishable(value, bound)
     state, sign = ("pass", "≤") if value <= bound else ("fail", ">" if value > bound else "≰")
     return {"name": figure.name, "text": text, "limit": f"{sign} {limit}", "state": state}
 
@@ -110,7 +110,7 @@ def _histogram(p_values: np.ndarray, salt: str) -> str:
 # Panes --------------------------------------------------------------------------------------------------------------
 
 
-def _panes(result: Result, pictures: Pictures) -> tuple[list[dict[str, Any]], str]:
+def _panes(result: Result, images: EmbeddedImages) -> tuple[list[dict[str, Any]], str]:
     """What can be shown of a pair, and why the rest cannot."""
     sides: dict[str, Image] = {}
     notes = []
@@ -120,15 +120,15 @@ def _panes(result: Result, pictures: Pictures) -> tuple[list[dict[str, Any]], st
                 sides[role] = _seen(path)
         except (ValueError, OSError) as error:
             notes.append(one_line(str(error)))
-    makers: list[Maker] = [functools.partial(_picture, role, image) for role, image in sides.items()]
+    makers: list[Maker] = [functools.partial(_image, role, image) for role, image in sides.items()]
     makers += _map_makers(dict(result.comparison.maps) if result.comparison else {}, *sides.values())
     with ThreadPoolExecutor(2) as pool:  # deflating is most of the work, and lets go of the interpreter's lock
-        return [pictures.add(pane) for pane in pool.map(lambda make: make(), makers)], " ".join(notes)
+        return [images.add(pane) for pane in pool.map(lambda make: make(), makers)], " ".join(notes)
 
 
 def _seen(path: Path) -> Image:
-    """The picture, or the mean of the renders in a folder, in the channels that can be shown."""
-    several = folders.sample_pictures(path) if path.is_dir() else [read(path)]
+    """The image, or the mean of the renders in a folder, in the channels that can be shown."""
+    several = folders.sample_images(path) if path.is_dir() else [read(path)]
     first = several[0]
     pixels = sum((each.pixels for each in several[1:]), start=first.pixels) / np.float32(len(several))
     seen, name = shown(pixels, first.channels)
@@ -153,11 +153,11 @@ def _map_makers(maps: dict[str, np.ndarray], *sides: Image) -> list[Maker]:
     return [*made.values(), *(functools.partial(_map, name, maps[name]) for name in left)]
 
 
-def _picture(role: str, image: Image) -> dict[str, Any]:
+def _image(role: str, image: Image) -> dict[str, Any]:
     pane = {"role": role, "paint": "code" if methods.encoding(image) == "sRGB" else "light", "gain": None}
-    picture = encoded(image.pixels, PICTURE)
+    embedded = encoded(image.pixels, IMAGE)
     channel = "" if len(image.channels) == 3 else f"channel {image.channels[0]}"
-    return pane | picture | {"note": ", ".join(filter(None, (channel, picture["note"])))}
+    return pane | embedded | {"note": ", ".join(filter(None, (channel, embedded["note"])))}
 
 
 def _map(name: str, values: np.ndarray) -> dict[str, Any]:
@@ -167,15 +167,15 @@ def _map(name: str, values: np.ndarray) -> dict[str, Any]:
     largest = float(sizes.max(initial=0)) or 1.0
     upper = float(np.quantile(sizes, 0.99)) if sizes.size else 0.0
     gain = min(round(2 * math.log10(largest / upper)) / 2, 6) if upper else 0
-    picture = encoded(small, MAP, largest)
+    embedded = encoded(small, MAP, largest)
     side = -(-values.shape[1] // MAP_WIDTH)
     reduced = f"strongest of {side} × {side} pixels" if side > 1 else ""
     pane = {"role": name, "paint": "signed" if name in SIGNED else "heat", "gain": gain}
-    return pane | picture | {"note": ", ".join(filter(None, (reduced, picture["note"])))}
+    return pane | embedded | {"note": ", ".join(filter(None, (reduced, embedded["note"])))}
 
 
 def _flip(reference: Image, test: Image) -> dict[str, Any]:
-    """The FLIP map of the pictures made as small as it is shown: whole, they would take it seconds."""
+    """The FLIP map of the images made as small as it is shown: whole, they would take it seconds."""
     side = -(-reference.pixels.shape[1] // FLIP_WIDTH)
     small = [replace(each, pixels=means(each.pixels, side)) for each in (reference, test)]
     found = _map("flip", methods.flip(*small, ppd=max(PPD / side, 1.0)).maps["flip"])

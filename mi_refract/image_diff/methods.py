@@ -1,4 +1,4 @@
-"""Are two pictures the same? Gates first, then one of five methods; each gives a verdict with its numbers.
+"""Are two images the same? Gates first, then one of five methods; each gives a verdict with its numbers.
 
 Fails closed: what cannot be compared is an error, a value that is not finite equals nothing, and a method that could
 not have seen a difference says "inconclusive".
@@ -16,29 +16,38 @@ import numpy as np
 
 from mi_refract.io.image_file import Image
 
-from .comparison import Comparison, Figure, Verdict, aligned, entered, gates
-from .tile_statistics import relative_mse, same_shape, usual, welch
+from .comparison import Comparison, Metric, Verdict, aligned, checked_pixels
+from .tile_statistics import median_nonblack, relative_mse, same_shape, welch
 from .welch import spreads, welch_images
 
-__all__ = ["METHODS", "Comparison", "Figure", "Image", "Method", "Option", "Paired", "Verdict", "automatic", "compare"]
-__all__ += ["exact", "flip", "gates", "paired", "paired_images", "relative_mse", "tolerance", "welch", "welch_images"]
+__all__ = ["METHODS", "Comparison", "Image", "Method", "Metric", "Option", "Paired", "Verdict", "automatic", "compare"]
+__all__ += [
+    "exact",
+    "flip",
+    "paired",
+    "paired_images",
+    "relative_mse",
+    "tolerance",
+    "welch",
+    "welch_images",
+]
 __all__ += ["encoding", "flip_map"]
 
 RGB = ("R", "G", "B")
-ROWS = 16  # every so many show whether a method would see that a picture is black
+ROWS = 16  # every so many show whether a method would see that an image is black
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear Rec. 709
 
 
 def exact(reference: Image, test: Image, *, allow_nonfinite: bool = False) -> Comparison:
     """Every value is the same."""
-    a, b, found = entered("exact", reference, test, allow_nonfinite)
+    a, b, found = checked_pixels("exact", reference, test, allow_nonfinite)
     if found:
         return found
     difference = _difference(a, b)
     changed = int((a != b).any(-1).sum())
     verdict = Verdict.DIFFERENT if changed else Verdict.EQUAL
     reason = f"{changed} of {a[..., 0].size} pixels differ" if changed else "every value is the same"
-    figures = (Figure("changed pixels", changed, 0.0), Figure("largest difference", float(difference.max()), 0.0))
+    figures = (Metric("changed pixels", changed, 0.0), Metric("largest difference", float(difference.max()), 0.0))
     return Comparison("exact", verdict, reason, figures, 0.0, {"difference": difference})
 
 
@@ -58,7 +67,7 @@ def tolerance(
 ) -> Comparison:
     """Differences within absolute and relative thresholds, but for a share of the pixels: the meaning of `idiff`."""
     _not_negative(locals())
-    a, b, found = entered("tolerance", reference, test, allow_nonfinite)
+    a, b, found = checked_pixels("tolerance", reference, test, allow_nonfinite)
     if found:
         return found
     # Not OpenImageIO's own `compare`: it rounds to float32, and what that does not hold would be equal.
@@ -68,11 +77,11 @@ def tolerance(
     failed, warned = (_percent(difference, a, b, *x) for x in ((fail, fail_relative), (warn, warn_relative)))
     largest = float(difference.max())
     figures = (
-        Figure("pixels beyond the tolerance, %", failed, fail_percent),
-        Figure("largest difference", largest, hard_fail),
-        Figure("mean difference", float(difference.mean(dtype=np.float64))),
-        Figure("RMS difference", float(np.sqrt(np.einsum("ijk,ijk->", *2 * [difference], dtype=float) / a.size))),
-        Figure("pixels worth a warning, %", warned),
+        Metric("pixels beyond the tolerance, %", failed, fail_percent),
+        Metric("largest difference", largest, hard_fail),
+        Metric("mean difference", float(difference.mean(dtype=np.float64))),
+        Metric("RMS difference", float(np.sqrt(np.einsum("ijk,ijk->", *2 * [difference], dtype=float) / a.size))),
+        Metric("pixels worth a warning, %", warned),
     )
     reason = f"{failed:.3g} % of the pixels beyond the tolerance; largest difference {largest:.3g}"
     if largest:
@@ -97,17 +106,17 @@ def paired_images(
     Changes are relative to the reference's value, or to the median of its channel where that is larger, black left out.
     """
     _not_negative(locals())
-    a, b, found = entered("paired", reference, test, allow_nonfinite)
+    a, b, found = checked_pixels("paired", reference, test, allow_nonfinite)
     if found:
         return found
-    floor = usual(np.abs(a))
-    scale = np.maximum(np.abs(a), np.where(floor > 0, floor, floor.mean() or usual(np.abs(b)).mean() or 1.0))
+    floor = median_nonblack(np.abs(a))
+    scale = np.maximum(np.abs(a), np.where(floor > 0, floor, floor.mean() or median_nonblack(np.abs(b)).mean() or 1.0))
     measured = paired(a / scale, b / scale, threshold)
     figures = (
-        Figure("share of changed pixels", measured.changed, changed),
-        Figure("largest change", measured.largest, largest),
-        Figure("RMS change", measured.rmse),
-        Figure("ratio of the means", _mean_ratio(a, b)),
+        Metric("share of changed pixels", measured.changed, changed),
+        Metric("largest change", measured.largest, largest),
+        Metric("RMS change", measured.rmse),
+        Metric("ratio of the means", _mean_ratio(a, b)),
     )
     reason = f"{measured.changed:.3%} of the pixels are changed, the largest by {measured.largest:.3g} of its value"
     maps = {"difference": _difference(a, b)}
@@ -124,21 +133,21 @@ def flip(
     hdr: Annotated[str, "auto (by the file's format), yes or no"] = "auto",
     ppd: Annotated[float, "pixels per degree of the viewer's field"] = 67.0,
 ) -> Comparison:
-    """What a person who flips between the two would see: FLIP, for LDR and HDR pictures."""
+    """What a person who flips between the two would see: FLIP, for LDR and HDR images."""
     _not_negative(locals())
     if hdr not in ("auto", "yes", "no"):
         raise ValueError(f"hdr = {hdr!r}: accepted: auto, yes, no")
-    if not 1 <= ppd <= 1000:  # below, its filters see nothing; above, they are larger than any picture
+    if not 1 <= ppd <= 1000:  # below, its filters see nothing; above, they are larger than any image
         raise ValueError(f"ppd = {ppd}: accepted: 1 to 1000")
-    _, _, found = entered("flip", reference, test, allow_nonfinite)
+    _, _, found = checked_pixels("flip", reference, test, allow_nonfinite)
     if found:
         return found
     wide = hdr == "yes" or (hdr == "auto" and "linear" in (encoding(reference), encoding(test)))
     error = flip_map(reference, test, wide, ppd)
     figures = (
-        Figure("mean FLIP error", float(error.mean()), mean),
-        Figure("largest FLIP error", float(error.max()), largest),
-        Figure("99th percentile of the FLIP error", float(np.percentile(error, 99))),
+        Metric("mean FLIP error", float(error.mean()), mean),
+        Metric("largest FLIP error", float(error.max()), largest),
+        Metric("99th percentile of the FLIP error", float(np.percentile(error, 99))),
     )
     reason = f"mean FLIP error {error.mean():.3g}, largest {error.max():.3g} ({'HDR' if wide else 'LDR'})"
     if ignored := [name for name in reference.channels if name not in _colours(reference)]:
@@ -147,10 +156,10 @@ def flip(
 
 
 def flip_map(reference: Image, test: Image, hdr: bool, ppd: float = 67.0) -> np.ndarray:
-    """FLIP error of every pixel, H × W float32 from 0 to 1, of the channels R, G, B, or of pictures with one channel.
+    """FLIP error of every pixel, H × W float32 from 0 to 1, of the channels R, G, B, or of images with one channel.
 
-    HDR looks at the picture at the exposures between the reference's median luminance, black left out, and that of its
-    brightest thousandth, one FLIP for each. ValueError for pictures without these channels.
+    HDR looks at the image at the exposures between the reference's median luminance, black left out, and that of its
+    brightest thousandth, one FLIP for each. ValueError for images without these channels.
     """
     import OpenImageIO as oiio
 
@@ -208,7 +217,7 @@ def _buffer(pixels: np.ndarray) -> Any:
     return oiio.ImageBuf(np.ascontiguousarray(pixels))
 
 
-def _verdict(figures: Sequence[Figure]) -> Verdict:
+def _verdict(figures: Sequence[Metric]) -> Verdict:
     return Verdict.EQUAL if all(figure.holds for figure in figures) else Verdict.DIFFERENT
 
 
@@ -230,7 +239,7 @@ class Option:
 
 @dataclass(frozen=True)
 class Method:
-    """`samples`: takes a sequence of independent renders on either side instead of one picture."""
+    """`samples`: takes a sequence of independent renders on either side instead of one image."""
 
     function: Callable[..., Comparison]
     samples: bool = False
@@ -280,7 +289,7 @@ def compare(
     """One comparison by the table; "auto" is welch where it can be, else tolerance.
 
     ValueError for an unknown method or option, an option of another type or out of its range, several renders for a
-    method that takes one, and pictures that cannot be compared.
+    method that takes one, and images that cannot be compared.
     """
     method = automatic(reference, test) if method == "auto" else method
     if method not in METHODS:
@@ -291,14 +300,14 @@ def compare(
         checked["allow_nonfinite"] = True
     sides = [[side] if isinstance(side, Image) else list(side) for side in (reference, test)]
     if not all(sides):
-        raise ValueError(f"{method}: no picture on one side; accepted: at least one")
+        raise ValueError(f"{method}: no image on one side; accepted: at least one")
     if chosen.samples:
         return chosen.function(*sides, **checked)
     if [len(side) for side in sides] != [1, 1]:
-        raise ValueError(f"{method}: {len(sides[0])} and {len(sides[1])} pictures; accepted: one a side")
+        raise ValueError(f"{method}: {len(sides[0])} and {len(sides[1])} images; accepted: one a side")
     found = chosen.function(sides[0][0], sides[1][0], **checked)
     if found.verdict is Verdict.EQUAL and _blind(chosen.function, sides[0][0], sides[1][0], checked):
-        reason = f"an all-black picture would pass, too, with these options; {found.reason}"
+        reason = f"an all-black image would pass, too, with these options; {found.reason}"
         return replace(found, verdict=Verdict.INCONCLUSIVE, reason=reason)
     return found
 
@@ -329,7 +338,7 @@ def automatic(reference: Image | Sequence[Image], test: Image | Sequence[Image])
 
 @dataclass(frozen=True)
 class Paired:
-    """Two pictures of the same random numbers: share of changed pixels, largest change, RMSE, ratio of the means."""
+    """Two images of the same random numbers: share of changed pixels, largest change, RMSE, ratio of the means."""
 
     changed: float
     largest: float

@@ -1,6 +1,6 @@
-"""Proof that a comparison can fail: defects planted in pictures, which must be seen, and equal pairs, which must not.
+"""Proof that a comparison can fail: defects planted in images, which must be seen, and equal pairs, which must not.
 
-A method that takes single pictures is asked about two of the same random numbers, one of them spoilt; a method that
+A method that takes single images is asked about two of the same random numbers, one of them spoilt; a method that
 takes samples, about clean renders and spoilt ones of other seeds. Seen is what it calls different, or refuses to
 compare; "inconclusive" is counted as not seen. A row per defect: the share of trials in which each method saw it.
 
@@ -23,10 +23,10 @@ from mi_refract.report.row import Row
 
 from . import methods as compare
 from .comparison import Verdict
-from .folders import sample_pictures
+from .folders import sample_images
 from .methods import METHODS
 
-Renders = np.ndarray | list[np.ndarray]  # of one picture; a list where one of them is of another size
+Renders = np.ndarray | list[np.ndarray]  # of one image; a list where one of them is of another size
 
 STUDY = "gate"
 TILE = METHODS["welch"].options["tile"].default
@@ -43,7 +43,7 @@ TERMS = {
     "size / detectable": "detectable being what is printed, more in tiles noisier than the median one",
     "missed": "trials in which a method missed what was due: see the introduction",
     "bound": f"{CONFIDENCE:.0%} upper bound of a rate, exact binomial (Clopper and Pearson)",
-    "noise": "standard deviation of a pixel over its mean, median over the picture",
+    "noise": "standard deviation of a pixel over its mean, median over the image",
 }
 
 
@@ -52,7 +52,7 @@ TERMS = {
 
 @dataclass(frozen=True)
 class Defect:
-    """`plant` spoils a picture (height, width, channels); it may raise the error of a file that cannot be read.
+    """`plant` spoils an image (height, width, channels); it may raise the error of a file that cannot be read.
 
     `once`: only the first of several renders is spoilt. `always_due`: no noise is an excuse for missing it.
     """
@@ -64,45 +64,45 @@ class Defect:
 
     def spoil(self, renders: np.ndarray) -> Renders:
         if not self.once:
-            return np.stack([self.plant(picture) for picture in renders])
+            return np.stack([self.plant(image) for image in renders])
         return [self.plant(renders[0]), *renders[1:]]
 
 
 def _with_centre(value: Callable[[np.ndarray], float]) -> Callable[[np.ndarray], np.ndarray]:
     """All channels of one pixel replaced."""
 
-    def plant(picture: np.ndarray) -> np.ndarray:
-        spoilt = picture.copy()
-        spoilt[picture.shape[0] // 2, picture.shape[1] // 2] = value(picture)
+    def plant(image: np.ndarray) -> np.ndarray:
+        spoilt = image.copy()
+        spoilt[image.shape[0] // 2, image.shape[1] // 2] = value(image)
         return spoilt
 
     return plant
 
 
-def _blurred(picture: np.ndarray) -> np.ndarray:
-    height, width = picture.shape[:2]
-    padded = np.pad(picture, ((1, 1), (1, 1), (0, 0)), mode="edge")
+def _blurred(image: np.ndarray) -> np.ndarray:
+    height, width = image.shape[:2]
+    padded = np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge")
     return np.mean([padded[y : y + height, x : x + width] for y in range(3) for x in range(3)], 0)
 
 
-def _in_8_bits(picture: np.ndarray) -> np.ndarray:
+def _in_8_bits(image: np.ndarray) -> np.ndarray:
     """Through an 8-bit sRGB file: white is 1, and what is brighter is cut."""
-    x = np.clip(picture, 0, 1)
+    x = np.clip(image, 0, 1)
     code = np.round(255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)) / 255
     return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
 
 
-def _truncated(picture: np.ndarray) -> np.ndarray:
+def _truncated(image: np.ndarray) -> np.ndarray:
     """Through a file that lost its second half."""
-    return _through_a_file(picture, share=0.5)
+    return _through_a_file(image, share=0.5)
 
 
-def _through_a_file(picture: np.ndarray, share: float = 1.0) -> np.ndarray:
+def _through_a_file(image: np.ndarray, share: float = 1.0) -> np.ndarray:
     """Written, cut to a share of the bytes, and read again. ValueError for what cannot be read."""
-    channels = image_file.named("", picture).channels
+    channels = image_file.named("", image).channels
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "picture.exr"
-        image_file.write_exr(path, picture, channels)
+        path = Path(folder) / "image.exr"
+        image_file.write_exr(path, image, channels)
         written = path.read_bytes()
         path.write_bytes(written[: int(share * len(written))])
         return image_file.read(path).select(channels)
@@ -115,10 +115,10 @@ DEFECTS = {
     "blur": Defect("mean of 3 × 3 pixels", _blurred),
     "8 bits": Defect("through an 8-bit sRGB file", _in_8_bits),
     "firefly": Defect("one pixel a thousand times as bright as the mean", _with_centre(lambda x: 1e3 * x.mean())),
-    "NaN": Defect("one pixel of one picture", _with_centre(lambda x: math.nan), once=True, always_due=True),
-    "Inf": Defect("one pixel of one picture", _with_centre(lambda x: math.inf), once=True, always_due=True),
-    "wrong size": Defect("one picture lacks a column", lambda x: x[:, 1:], once=True, always_due=True),
-    "truncated": Defect("half of one picture's file is missing", _truncated, once=True, always_due=True),
+    "NaN": Defect("one pixel of one image", _with_centre(lambda x: math.nan), once=True, always_due=True),
+    "Inf": Defect("one pixel of one image", _with_centre(lambda x: math.inf), once=True, always_due=True),
+    "wrong size": Defect("one image lacks a column", lambda x: x[:, 1:], once=True, always_due=True),
+    "truncated": Defect("half of one image's file is missing", _truncated, once=True, always_due=True),
 }
 
 
@@ -159,7 +159,7 @@ class Tally:
         return float(stats.beta.ppf(CONFIDENCE, self.seen + 1, self.trials - self.seen)) if self.rate < 1 else 1.0
 
     def ask(self, method: str, reference: Renders, test: Renders) -> None:
-        """Of the first picture a side, or of all where the method takes samples. A refusal counts as seen."""
+        """Of the first image a side, or of all where the method takes samples. A refusal counts as seen."""
         sides = [[image_file.named(name, x) for x in side] for name, side in (("reference", reference), ("test", test))]
         whole = METHODS[method].samples
         self.trials += 1
@@ -194,12 +194,12 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
                 tally.seen, tally.trials = tally.seen + 1, tally.trials + 1
             continue
         if np.array_equal(spoilt[0], trial.clean[0]):
-            return Row(STUDY, name, case, setting, reason="left out: it changes nothing in these pictures")
+            return Row(STUDY, name, case, setting, reason="left out: it changes nothing in these images")
         for method, tally in tallies.items():
             tally.ask(method, trial.other if METHODS[method].samples else trial.clean, spoilt)
         if not always_due:
-            cleans.append([_tiles(picture) for picture in trial.clean])
-            changes.append(np.mean([_tiles(picture) for picture in spoilt], 0) - np.mean(cleans[-1], 0))
+            cleans.append([_tiles(image) for image in trial.clean])
+            changes.append(np.mean([_tiles(image) for image in spoilt], 0) - np.mean(cleans[-1], 0))
     sizes = _sizes(np.array(changes), np.concatenate(cleans), tallies) if cleans else {}
     large = sizes.get("size / detectable", 0.0) > 1
     due = [m for m in tallies if always_due or m == "exact" or (large and METHODS[m].samples)]
@@ -228,10 +228,10 @@ def _sizes(changes: np.ndarray, clean: np.ndarray, tallies: dict[str, Tally]) ->
     return {"size": float(relative[share.argmax()]), "size / detectable": float(share.max()), "detectable": detectable}
 
 
-def _tiles(picture: np.ndarray) -> np.ndarray:
+def _tiles(image: np.ndarray) -> np.ndarray:
     """Means of tiles, by channel."""
-    rows, columns = (np.arange(0, n, TILE) for n in picture.shape[:2])
-    sums, count = (np.add.reduceat(np.add.reduceat(x, rows, 0), columns, 1) for x in (picture, np.ones_like(picture)))
+    rows, columns = (np.arange(0, n, TILE) for n in image.shape[:2])
+    sums, count = (np.add.reduceat(np.add.reduceat(x, rows, 0), columns, 1) for x in (image, np.ones_like(image)))
     return sums / count
 
 
@@ -269,18 +269,18 @@ def _null_row(method: str, tally: Tally, case: str, setting: str, independent: b
     return Row(STUDY, f"null pairs, {method}", case, setting, values, {budget: FALSE_ALARMS})
 
 
-# Given pictures ------------------------------------------------------------------------------------------------
+# Given images ------------------------------------------------------------------------------------------------
 
 
 def self_test(path: Path | None = None) -> int:
-    """Prints what is seen in the renders of a folder, in one picture, or in our own; 1 where anything due is missed."""
+    """Prints what is seen in the renders of a folder, in one image, or in our own; 1 where anything due is missed."""
     if path is None:
         renders = _own_renders()
     elif path.suffix == ".xml":
         renders = _renders_of(path)
     else:
-        pictures = sample_pictures(path) if path.is_dir() else [image_file.read(path)]
-        renders = _stacked(pictures)
+        images = sample_images(path) if path.is_dir() else [image_file.read(path)]
+        renders = _stacked(images)
     rows = examine(renders, str(path or "a glass ball"))
     print(text(rows))
     return int(any(row.verdict == "fail" for row in rows))
@@ -297,12 +297,12 @@ def _renders_of(scene: Path) -> np.ndarray:
     return np.stack([np.array(mi.render(loaded, spp=OWN_SPP, seed=seed)) for seed in range(OWN_RENDERS)])
 
 
-def _stacked(pictures: list[image_file.Image]) -> np.ndarray:
-    first = pictures[0]
-    for picture in pictures[1:]:
-        if picture.pixels.shape[:2] != first.pixels.shape[:2] or set(picture.channels) != set(first.channels):
-            raise ValueError(f"{picture.path}: size or channels differ from those of {first.path}")
-    return np.stack([picture.select(first.channels) for picture in pictures])
+def _stacked(images: list[image_file.Image]) -> np.ndarray:
+    first = images[0]
+    for image in images[1:]:
+        if image.pixels.shape[:2] != first.pixels.shape[:2] or set(image.channels) != set(first.channels):
+            raise ValueError(f"{image.path}: size or channels differ from those of {first.path}")
+    return np.stack([image.select(first.channels) for image in images])
 
 
 def _own_renders() -> np.ndarray:
@@ -347,7 +347,7 @@ def _own_renders() -> np.ndarray:
 
 
 def examine(renders: np.ndarray, case: str, trials: int = TRIALS, null_pairs: int = NULL_PAIRS) -> list[Row]:
-    """Every defect and the null pairs on given renders of one picture (number, height, width, channels).
+    """Every defect and the null pairs on given renders of one image (number, height, width, channels).
 
     Four or more of them, of independent seeds, are split in halves at random; fewer are asked of one by one. ValueError
     for renders that are not finite: what is planted in them could not be told from what was there.
@@ -370,7 +370,7 @@ def examine(renders: np.ndarray, case: str, trials: int = TRIALS, null_pairs: in
 
 
 def noise(renders: np.ndarray) -> float:
-    """Standard deviation of a pixel over its mean, median over the lit part of the picture."""
+    """Standard deviation of a pixel over its mean, median over the lit part of the image."""
     mean, deviation = renders.mean(0), renders.std(0, ddof=1)
     lit = mean > 0
     return float(np.median(deviation[lit] / mean[lit])) if lit.any() else 0.0

@@ -1,6 +1,6 @@
-"""How each picture is compared: what the command line says for all of them, and `mi-refract.toml` for some.
+"""How each image is compared: what the command line says for all of them, and `mi-refract.toml` for some.
 
-The file holds `[[image]]` tables. Of those that match a picture's name the last one holds, before the command line:
+The file holds `[[image]]` tables. Of those that match an image's name the last one holds, before the command line:
 
     [[image]]
     name = "glass/caustic*.exr"
@@ -28,10 +28,10 @@ ACCEPTED = (AUTO, *METHODS)
 BOOL = Type("true or false", lambda value: value if isinstance(value, bool) else None)
 METHOD = Type(", ".join(ACCEPTED), lambda value: value if isinstance(value, str) and value in ACCEPTED else None)
 COMMON = {
-    "name": Key(TEXT, "the picture's path inside its folder; `*` stands for anything, `/` included"),
-    "reason": Key(TEXT, "why this picture is not compared like the others"),
+    "name": Key(TEXT, "the image's path inside its folder; `*` stands for anything, `/` included"),
+    "reason": Key(TEXT, "why this image is not compared like the others"),
     "method": Key(METHOD, "how; by default as the command line says", None),
-    "allow_nonfinite": Key(BOOL, "whether NaN or Inf is allowed where the other picture has the same", None),
+    "allow_nonfinite": Key(BOOL, "whether NaN or Inf is allowed where the other image has the same", None),
 }
 
 
@@ -73,14 +73,14 @@ class How:
 
 @dataclass(frozen=True)
 class Settings:
-    """`default` for all pictures, `rules` by pattern of names, and the patterns whose values need not be finite."""
+    """`default` for all images, `rules` by pattern of names, and the patterns whose values need not be finite."""
 
     default: How = How()
     rules: tuple[tuple[str, How], ...] = ()
     allow_nonfinite: tuple[str, ...] = ()
 
     def of(self, name: str) -> How:
-        """How the picture of this name is compared."""
+        """How the image of this name is compared."""
         how = next((how for pattern, how in reversed(self.rules) if fnmatchcase(name, pattern)), self.default)
         if how.method in (AUTO, self.default.method):
             how = replace(how, method=self.default.method, options={**self.default.options, **how.options})
@@ -117,7 +117,7 @@ def _rule(table: dict[str, Any], where: str) -> tuple[str, How]:
 
 
 def keys_of(method: str) -> dict[str, Key]:
-    """The options of a method as keys; none for "auto", which chooses by the pictures."""
+    """The options of a method as keys; none for "auto", which chooses by the images."""
     options = METHODS[method].options if method != AUTO else {}
     return {name: Key(TYPES[option.type], option.help, option.default) for name, option in options.items()}
 

@@ -14,18 +14,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refract.io.atomic import write_atomically
-from mi_refract.report.plots import apart, compact
+from mi_refract.report.plots import compact, distinguishable
 from mi_refract.report.row import strict
 
 from .folders import Result, Results, Status
-from .methods import Figure
+from .methods import Metric
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
 SCHEMA = 1
 UNPRINTABLE = re.compile("[^\x20-\x7e\xa0-\u2027\u202f-\u2065\u206a-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-FEW = 20  # equal pictures that are listed one by one
+FEW = 20  # equal images that are listed one by one
 SUMMARY_ROWS = 500  # GitHub cuts a summary at 1 MiB
 WORDS = {
     Status.ERROR: "could not be compared",
@@ -42,11 +42,11 @@ def printable(text: Any) -> str:
 
 
 def sentence(results: Results) -> str:
-    """All statuses in one line: "12 pictures: 1 different, 11 equal"."""
+    """All statuses in one line: "12 images: 1 different, 11 equal"."""
     counts = Counter(result.status for result in results.results)
     told = ", ".join(f"{counts[status]} {WORDS[status]}" for status in Status if counts[status])
     number = len(results.results)
-    return f"{number} picture{'' if number == 1 else 's'}: {told}"
+    return f"{number} image{'' if number == 1 else 's'}: {told}"
 
 
 def table(results: Results) -> RenderableType:
@@ -57,7 +57,7 @@ def table(results: Results) -> RenderableType:
 
     judged = results.of(Status.DIFFERENT, Status.INCONCLUSIVE)
     equal = results.of(Status.EQUAL)
-    rows = Table("verdict", "picture", "method", "why", box=None, pad_edge=False)
+    rows = Table("verdict", "image", "method", "why", box=None, pad_edge=False)
     for result in [*judged, *equal[:FEW]]:
         status = Text(_word(result), style=STYLES[result.status])
         rows.add_row(status, *(Text(printable(text)) for text in (result.name, _method(result), why(result))))
@@ -66,7 +66,7 @@ def table(results: Results) -> RenderableType:
 
 
 def why(result: Result) -> str:
-    """The reason, and why the picture is compared in a way of its own where it is."""
+    """The reason, and why the image is compared in a way of its own where it is."""
     return result.reason + (f" [{result.how.reason}]" if result.how.reason else "")
 
 
@@ -119,7 +119,7 @@ def _entry(results: Results, result: Result) -> dict[str, Any]:
 
 
 def write_junit(path: str | Path, results: Results) -> None:
-    """One case a picture. Different is a failure; inconclusive too, unless it is to pass; no verdict is an error."""
+    """One case an image. Different is a failure; inconclusive too, unless it is to pass; no verdict is an error."""
     from xml.etree import ElementTree as xml
 
     root = xml.Element("testsuites", name="mi-refract diff")
@@ -151,11 +151,11 @@ def _details(results: Results, result: Result) -> list[str]:
     return [*figures, *(f"{verb}: {line}" for verb, line in commands.items() if line)]
 
 
-def figure_text(figure: Figure) -> str:
+def figure_text(figure: Metric) -> str:
     """ "largest change 0.12 (allowed 0.1)"."""
     if figure.bound is None:
         return f"{figure.name} {compact(figure.value)}"
-    value, bound = apart(figure.value, figure.bound)
+    value, bound = distinguishable(figure.value, figure.bound)
     return f"{figure.name} {value} (allowed {bound})"
 
 
@@ -163,7 +163,7 @@ def figure_text(figure: Figure) -> str:
 
 
 def workflow_commands(results: Results) -> list[str]:
-    """A workflow command for each picture that is not equal."""
+    """A workflow command for each image that is not equal."""
     lines = []
     for result in results.results:
         if result.status is not Status.EQUAL:
@@ -190,11 +190,11 @@ def append_summary(results: Results) -> None:
 
 
 def markdown(results: Results) -> str:
-    """A heading with the sentence and a table of the pictures that are not equal."""
+    """A heading with the sentence and a table of the images that are not equal."""
     failed = results.of(Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE)
     lines = [f"### mi-refract diff: {sentence(results)}", ""]
     if failed:
-        lines += ["| verdict | picture | method | why |", "|---|---|---|---|"]
+        lines += ["| verdict | image | method | why |", "|---|---|---|---|"]
     for result in failed[:SUMMARY_ROWS]:
         cells = (_word(result), result.name, _method(result), why(result))
         lines.append(f"| {' | '.join(map(_literal, cells))} |")

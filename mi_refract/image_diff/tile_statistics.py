@@ -1,4 +1,4 @@
-"""Welch's t-test on the tiles of two sets of independent renders, from single tiles up to the whole picture.
+"""Welch's t-test on the tiles of two sets of independent renders, from single tiles up to the whole image.
 
 Per tile and channel the means m₁, m₂ are compared by t = (m₁ − m₂)/√(v₁ + v₂). The variance v of a tile's mean is the
 sum of its pixels' variances over the renders, and its degrees of freedom follow Satterthwaite: a tile of 16² pixels
@@ -50,8 +50,10 @@ class Side:
     renders: Array | None = None
 
     def coarser(self) -> Side:
-        area, mean, variance, squares = (fold(x, GROWTH) for x in (self.area, self.mean, self.variance, self.squares))
-        renders = None if self.renders is None else fold(self.renders, GROWTH)
+        area, mean, variance, squares = (
+            block_sum(x, GROWTH) for x in (self.area, self.mean, self.variance, self.squares)
+        )
+        renders = None if self.renders is None else block_sum(self.renders, GROWTH)
         return Side(area, mean, variance, squares, self.freedom, renders)
 
     def spread(self, inflation: Inflation) -> tuple[Array, Array]:
@@ -62,7 +64,7 @@ class Side:
         return variance, squares + variance**2 / inflation.freedom
 
     def inflation(self) -> Inflation:
-        """One for all tiles of a picture. Of pictures without `renders` it is not known, and 1."""
+        """One for all tiles of an image. Of images without `renders` it is not known, and 1."""
         noisy = self.variance > 0
         if self.renders is None or not noisy.any():
             return Inflation()
@@ -72,7 +74,7 @@ class Side:
         return Inflation(max(1.0, float((between / self.variance[noisy]).mean())), freedom)
 
 
-def fold(x: Array, size: int) -> Array:
+def block_sum(x: Array, size: int) -> Array:
     """Sums over size × size blocks of the axes −3 and −2; at the right and lower edge of what is left."""
     rows, columns = np.arange(0, x.shape[-3], size), np.arange(0, x.shape[-2], size)
     return np.add.reduceat(np.add.reduceat(x, rows, -3), columns, -2)
@@ -100,14 +102,14 @@ def from_renders(renders: Sequence[Array], tile: int) -> Side:
 
 
 def from_variances(mean: Array, variance: Array, freedom: float, tile: int) -> Side:
-    """One side from a picture and the variance of its pixels, both H × W × C."""
+    """One side from an image and the variance of its pixels, both H × W × C."""
     area = _area(mean.shape[0], mean.shape[1], tile)
     squares = np.square(variance, dtype=np.float64)
-    return Side(area, fold(mean, tile), fold(variance, tile), fold(squares, tile), freedom)
+    return Side(area, block_sum(mean, tile), block_sum(variance, tile), block_sum(squares, tile), freedom)
 
 
 def _area(height: int, width: int, tile: int) -> Array:
-    return fold(np.ones((height, width, 1)), tile)
+    return block_sum(np.ones((height, width, 1)), tile)
 
 
 @dataclass(frozen=True)
@@ -133,14 +135,14 @@ class Level:
         """Relative differences seen with probability 1 − MISSED at that p, of the tiles with light and noise."""
         from scipy import special
 
-        asked = ~self.silent & (self.mean > DARK * usual(self.mean))
+        asked = ~self.silent & (self.mean > DARK * median_nonblack(self.mean))
         freedom = self.freedom[asked]
         reach = -special.stdtrit(freedom, threshold / 2) - special.stdtrit(freedom, MISSED)
         return (reach * self.error[asked] + self.allowed[asked]) / self.mean[asked]
 
 
 def levels(reference: Side, test: Side, margin: float) -> Iterator[Level]:
-    """The test of single tiles, then of blocks GROWTH times as wide, and so on to the whole picture."""
+    """The test of single tiles, then of blocks GROWTH times as wide, and so on to the whole image."""
     inflations = reference.inflation(), test.inflation()
     while True:
         yield compare_tiles(reference, test, margin, inflations)
@@ -161,7 +163,7 @@ def compare_tiles(
         m1, m2 = one.mean / one.area, two.mean / two.area
         v1, d1 = one.spread(inflations[0])
         v2, d2 = two.spread(inflations[1])
-        variance, allowed = v1 + v2, margin * np.maximum(np.abs(m1), DARK * usual(np.abs(m1)))
+        variance, allowed = v1 + v2, margin * np.maximum(np.abs(m1), DARK * median_nonblack(np.abs(m1)))
         silent, error, difference = variance == 0, np.sqrt(variance), m2 - m1
         freedom = np.where(silent, 1.0, variance**2 / (d1 + d2))
         t = np.where(silent, 0.0, difference / error)
@@ -172,7 +174,7 @@ def compare_tiles(
     return Level(t, p, p_beyond, silent, off, few & ~silent, np.abs(m1), allowed, error, freedom)
 
 
-def usual(sizes: Array) -> Array:
+def median_nonblack(sizes: Array) -> Array:
     """Of each channel the median of what is not black. Not the mean: next to a lamp everything else would be dark."""
     channels = sizes.reshape(-1, sizes.shape[-1]).T
     return np.array([np.median(x[x > 0].astype(np.float64)) if (x > 0).any() else 0.0 for x in channels])
@@ -208,7 +210,7 @@ def benjamini_hochberg(p: Array) -> Array:
 
 @dataclass(frozen=True)
 class Welch:
-    """`alarms`: tiles and channels that differ, at the given probability of any alarm between equal pictures.
+    """`alarms`: tiles and channels that differ, at the given probability of any alarm between equal images.
 
     `smallest_p` is Šidák-adjusted; `detectable` the median over tiles of the smallest relative difference of means
     that would have been seen; `certain` counts tiles without any variance, which a t-test knows nothing of:
@@ -245,14 +247,14 @@ def welch(reference: Array, test: Array, tile: int, family_error: float, margin:
     )
 
 
-def relative_mse(picture: Array, references: Array, epsilon: float = 0.01) -> float:
+def relative_mse(image: Array, references: Array, epsilon: float = 0.01) -> float:
     """mean((x − r)²/(r² + ε)) against the mean r of a stack of independent renders, less what r's own noise adds."""
     r = references.mean(0)
-    same_shape(r, picture)
+    same_shape(r, image)
     own = references.var(0, ddof=1) / len(references)
-    return float(((np.square(picture - r) - own) / (np.square(r) + epsilon)).mean())
+    return float(((np.square(image - r) - own) / (np.square(r) + epsilon)).mean())
 
 
 def same_shape(reference: Array, test: Array) -> None:
     if reference.shape != test.shape:
-        raise ValueError(f"pictures of different shapes: reference {reference.shape}, test {test.shape}")
+        raise ValueError(f"images of different shapes: reference {reference.shape}, test {test.shape}")

@@ -13,10 +13,10 @@ import numpy as np
 from mi_refract.io.image_file import Image
 
 from . import tile_statistics
-from .comparison import Comparison, Figure, Maps, Verdict, aligned, gates, refused
+from .comparison import Comparison, Maps, Metric, Verdict, aligned, nonfinite_result, preconditions
 
 CORRECTIONS = ("sidak", "holm")
-# A second picture beside the mean: of the squares of the samples (Mitsuba's `moment`), or of their variance.
+# A second image beside the mean: of the squares of the samples (Mitsuba's `moment`), or of their variance.
 MOMENTS = ("m2_{}", "{}.m2")
 VARIANCES = ("{}.variance", "{}.Variance", "variance.{}", "Variance.{}", "variance_{}")
 
@@ -58,25 +58,25 @@ def welch_images(
     *,
     allow_nonfinite: bool = False,
     tile: Annotated[int, "side of a tile in pixels"] = 16,
-    family_error: Annotated[float, "probability that equal pictures are called different"] = 0.001,
+    family_error: Annotated[float, "probability that equal images are called different"] = 0.001,
     correction: Annotated[str, "for the number of tiles: sidak or holm"] = "sidak",
     margin: Annotated[float, "relative difference of a tile that is as good as none"] = 0.001,
     resolution: Annotated[float, "relative difference that must be visible in a tile, or it is inconclusive"] = 0.05,
-    spp: Annotated[int, "samples per pixel of pictures with variance channels; 0: as their headers say"] = 0,
+    spp: Annotated[int, "samples per pixel of images with variance channels; 0: as their headers say"] = 0,
 ) -> Comparison:
     """Independent renders: Welch's t-test on the means of tiles and channels.
 
     Two or more renders a side, or one a side with the variance or second moment of its channels: then pixels are taken
-    for independent, as under a box filter. Tests single tiles, blocks of them, and the whole picture together.
+    for independent, as under a box filter. Tests single tiles, blocks of them, and the whole image together.
 
     Without noise a tile proves nothing, and with the noise of a few pixels its t is not a Student's: where only such
     tiles differ, the verdict is "inconclusive", and so it is where the noise hides differences of `resolution`.
-    ValueError for fewer renders, the same render twice, options out of range, pictures that cannot be compared.
+    ValueError for fewer renders, the same render twice, options out of range, images that cannot be compared.
     """
     _check(tile, family_error, correction, margin, resolution)
     for image in (*reference[1:], *test):
-        if reason := gates(reference[0], image, allow_nonfinite):
-            return refused("welch", reason, reference[0].pixels, aligned(reference[0], image)[1])
+        if reason := preconditions(reference[0], image, allow_nonfinite):
+            return nonfinite_result("welch", reason, reference[0].pixels, aligned(reference[0], image)[1])
     tile = min(tile, max(reference[0].pixels.shape[:2]))
     one, two, channels = _sides(reference, test, tile, spp)
     levels = list(tile_statistics.levels(one, two, margin))
@@ -126,21 +126,23 @@ def _with_silent_pixels(
     if not level.silent.any():
         return level
     a, b = _finite(a).astype(np.float64), _finite(b)
-    allowed = margin * np.maximum(np.abs(a), tile_statistics.DARK * tile_statistics.usual(np.abs(a)))
-    return replace(level, off=level.off | (level.silent & (tile_statistics.fold(np.abs(b - a) > allowed, tile) > 0)))
+    allowed = margin * np.maximum(np.abs(a), tile_statistics.DARK * tile_statistics.median_nonblack(np.abs(a)))
+    return replace(
+        level, off=level.off | (level.silent & (tile_statistics.block_sum(np.abs(b - a) > allowed, tile) > 0))
+    )
 
 
 def _distinct(side: Sequence[Image]) -> None:
-    """The same seed twice would halve the noise that is seen. Pictures without noise may be the same."""
+    """The same seed twice would halve the noise that is seen. Images without noise may be the same."""
     if all(_identical(side[0], image) for image in side):
         return
     for a, b in itertools.combinations(side, 2):
         if _identical(a, b):
-            raise ValueError(f"{b.path}: the same picture as {a.path}; accepted: independent renders, of other seeds")
+            raise ValueError(f"{b.path}: the same image as {a.path}; accepted: independent renders, of other seeds")
 
 
 def _identical(a: Image, b: Image) -> bool:
-    few = np.s_[::37]  # rows: enough to tell noisy pictures apart, and quicker than all
+    few = np.s_[::37]  # rows: enough to tell noisy images apart, and quicker than all
     return np.array_equal(a.pixels[few], b.pixels[few]) and np.array_equal(a.pixels, b.pixels)
 
 
@@ -183,24 +185,24 @@ def _verdict(asked: _Asked, resolution: float) -> tuple[Verdict, str]:
     return Verdict.EQUAL, f"no difference; one of {visible:.2g} would have been seen in a tile of median noise"
 
 
-def _figures(asked: _Asked, family_error: float, resolution: float) -> tuple[Figure, ...]:
+def _figures(asked: _Asked, family_error: float, resolution: float) -> tuple[Metric, ...]:
     finest, p = asked.levels[0], asked.p
     return (
-        Figure("tests of tiles and channels that differ", asked.alarms, 0.0),
-        Figure("smallest p, adjusted for the number of tests", tile_statistics.adjusted(p)),
-        Figure("family error", family_error),
-        Figure("tiles and channels", finest.t.size),
-        Figure("tiles without noise", int(finest.silent.sum())),
-        Figure("tiles without noise that differ", int(finest.off.sum()), 0.0),
-        Figure("heavy-tailed tiles", int(finest.heavy.sum())),
-        Figure("heavy-tailed tiles and blocks that differ", asked.doubtful, 0.0),
-        Figure("detectable relative difference in a tile", asked.detectable(0), resolution),
-        Figure("detectable relative difference of the whole picture", asked.detectable(-1)),
+        Metric("tests of tiles and channels that differ", asked.alarms, 0.0),
+        Metric("smallest p, adjusted for the number of tests", tile_statistics.adjusted(p)),
+        Metric("family error", family_error),
+        Metric("tiles and channels", finest.t.size),
+        Metric("tiles without noise", int(finest.silent.sum())),
+        Metric("tiles without noise that differ", int(finest.off.sum()), 0.0),
+        Metric("heavy-tailed tiles", int(finest.heavy.sum())),
+        Metric("heavy-tailed tiles and blocks that differ", asked.doubtful, 0.0),
+        Metric("detectable relative difference in a tile", asked.detectable(0), resolution),
+        Metric("detectable relative difference of the whole image", asked.detectable(-1)),
     )
 
 
 def _maps(level: tile_statistics.Level, tile: int, shape: tuple[int, ...]) -> Maps:
-    """In every tile. `t`: signed, by channels. `p`: of no difference at all, by channels; uniform for equal pictures.
+    """In every tile. `t`: signed, by channels. `p`: of no difference at all, by channels; uniform for equal images.
 
     `q`: p adjusted after Benjamini and Hochberg, the smallest of the channels. `flags`: 1 heavy-tailed, 2 no noise.
     """

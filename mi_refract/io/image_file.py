@@ -1,4 +1,4 @@
-"""Pictures in files, through OpenImageIO: reading any format it knows, writing OpenEXR.
+"""Images in files, through OpenImageIO: reading any format it knows, writing OpenEXR.
 
 A pixel array is H × W × C float32, row 0 at the top. A file appears complete or not at all.
 """
@@ -87,7 +87,7 @@ def _attributes(path: Path, metadata: Mapping[str, str | int | float]) -> Metada
 
 @dataclass(frozen=True)
 class Image:
-    """One picture of a file: H × W × C pixels, the channels' names, where its data window begins (x, y), its header.
+    """One image of a file: H × W × C pixels, the channels' names, where its data window begins (x, y), its header.
 
     float32; float64 where the file holds numbers that float32 does not. Integers of a file are mapped to 0 … 1.
     """
@@ -106,7 +106,7 @@ class Image:
 
 
 def read(path: str | os.PathLike[str]) -> Image:
-    """The one picture in a file of any format that OpenImageIO reads, its format told by the name's ending.
+    """The one image in a file of any format that OpenImageIO reads, its format told by the name's ending.
 
     OSError for a file that cannot be read; ValueError for one that is empty, truncated, of another type than its
     name says, of several parts, deep, or without pixels. Both are one line that begins with the path.
@@ -130,7 +130,7 @@ def read(path: str | os.PathLike[str]) -> Image:
     if source is None:
         raise ValueError(f"{path}: corrupt {kind} file: {_without(path, oiio.geterror())}")
     try:
-        return _picture(path, source, kind)
+        return _image(path, source, kind)
     except MemoryError:
         raise ValueError(f"{path}: corrupt {kind} file: more pixels than there is memory for") from None
     finally:
@@ -138,7 +138,7 @@ def read(path: str | os.PathLike[str]) -> Image:
 
 
 def named(name: str, pixels: Any) -> Image:
-    """An array, height × width × channels or height × width, as a picture with a name instead of a file.
+    """An array, height × width × channels or height × width, as an image with a name instead of a file.
 
     Channels are R, G, B (A) where there are three or four, else channel0 and so on. Integers are kept as they are.
     ValueError for another shape, or what are no numbers.
@@ -153,18 +153,18 @@ def named(name: str, pixels: Any) -> Image:
 
 
 def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Image]:
-    """Several pictures, two at a time: unpacking takes most of the time of a comparison. Errors: those of `read`."""
+    """Several images, two at a time: unpacking takes most of the time of a comparison. Errors: those of `read`."""
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(read, paths))
 
 
-def _picture(path: Path, source: Any, kind: str) -> Image:
+def _image(path: Path, source: Any, kind: str) -> Image:
     spec = source.spec()
     found = source.format_name()
     if path.suffix[1:].lower() not in _endings(found) or found == "null":  # which is black, whatever the file holds
-        raise ValueError(f"{path}: holds a picture of format {found}; accepted: the format that the name says")
+        raise ValueError(f"{path}: holds an image of format {found}; accepted: the format that the name says")
     if spec.deep:
-        raise ValueError(f"{path}: accepted: a picture without deep samples")
+        raise ValueError(f"{path}: accepted: an image without deep samples")
     if min(spec.width, spec.height, spec.nchannels) < 1 or spec.depth > 1:
         raise ValueError(f"{path}: {spec.width} × {spec.height} × {spec.depth} pixels; accepted: a plane with pixels")
     formats = {str(each) for each in (spec.channelformats or [spec.format])}
@@ -176,7 +176,7 @@ def _picture(path: Path, source: Any, kind: str) -> Image:
         raise ValueError(f"{path}: corrupt {kind} file: {message}")
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
     if source.seek_subimage(1, 0):
-        raise ValueError(f"{path}: several parts in one file; accepted: one picture")
+        raise ValueError(f"{path}: several parts in one file; accepted: one image")
     metadata = {attribute.name: attribute.value for attribute in spec.extra_attribs}
     return Image(path, pixels, tuple(spec.channelnames), (spec.x, spec.y), metadata)
 

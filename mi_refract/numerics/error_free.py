@@ -18,7 +18,7 @@ import drjit as dr
 Pair = tuple[Any, Any]
 
 
-def component_of(a: Any, k: Any) -> Any:
+def as_component(a: Any, k: Any) -> Any:
     """The number `k` in the precision and backend of the components of the vector `a`, rounded once."""
     component = dr.value_t(type(a))
     if not dr.is_array_v(k):
@@ -28,7 +28,7 @@ def component_of(a: Any, k: Any) -> Any:
     return component(k)
 
 
-def quotient(x: Any, y: Any) -> Any:
+def ieee_divide(x: Any, y: Any) -> Any:
     """x / y by the rules of IEEE 754 on every backend; a Python float would raise where y is 0."""
     if isinstance(y, float) and y == 0:
         return x * dr.rcp(y)
@@ -37,7 +37,7 @@ def quotient(x: Any, y: Any) -> Any:
 
 # Dr.Jit's type stubs say that the first returns an object, and nothing of what the second returns.
 _reinterpret: Any = dr.reinterpret_array
-attach: Any = dr.replace_grad
+replace_grad: Any = dr.replace_grad
 
 
 def differentiated(x: Any) -> bool:
@@ -45,7 +45,7 @@ def differentiated(x: Any) -> bool:
     return dr.is_diff_v(x) and dr.grad_enabled(x)
 
 
-def near_unit(v: Any) -> tuple[Any, Any]:
+def scale_to_unit(v: Any) -> tuple[Any, Any]:
     """(v / p, p), p the power of two for which the largest component of v / p is in [1, 2). Exact.
 
     Where squares could over- or underflow, which is in float32 on Dr.Jit's arrays; every other type has the range
@@ -81,7 +81,7 @@ def two_prod(x: Any, y: Any) -> Pair:
 
 
 @dataclass(frozen=True)
-class Double:
+class DoubleWord:
     """A number of twice the working precision, as the unevaluated sum hi + lo, |lo| ≤ 8u |hi|.
 
     Supports what a formula needs: + − × with another `Double` or a plain number, negation and `sqrt`. Relative error
@@ -98,43 +98,43 @@ class Double:
         return isinstance(self.lo, int)
 
     @staticmethod
-    def product(x: Any, y: Any) -> Double:
+    def product(x: Any, y: Any) -> DoubleWord:
         """x y exactly, for plain numbers x, y."""
-        return Double(*two_prod(x, y))
+        return DoubleWord(*two_prod(x, y))
 
     @staticmethod
-    def of(x: Any) -> Double:
-        return x if isinstance(x, Double) else Double(x)
+    def of(x: Any) -> DoubleWord:
+        return x if isinstance(x, DoubleWord) else DoubleWord(x)
 
-    def __add__(self, other: Any) -> Double:
+    def __add__(self, other: Any) -> DoubleWord:
         # AccurateDWPlusDW, also right where the high parts cancel.
-        other = Double.of(other)
+        other = DoubleWord.of(other)
         s, s_lo = two_sum(self.hi, other.hi)
         if other.is_plain:
-            return Double(*fast_two_sum(s, s_lo + self.lo))
+            return DoubleWord(*fast_two_sum(s, s_lo + self.lo))
         t, t_lo = two_sum(self.lo, other.lo)
         s, s_lo = fast_two_sum(s, s_lo + t)
-        return Double(*fast_two_sum(s, s_lo + t_lo))
+        return DoubleWord(*fast_two_sum(s, s_lo + t_lo))
 
-    def __neg__(self) -> Double:
-        return Double(-self.hi, -self.lo)
+    def __neg__(self) -> DoubleWord:
+        return DoubleWord(-self.hi, -self.lo)
 
-    def __sub__(self, other: Any) -> Double:
-        return self + -Double.of(other)
+    def __sub__(self, other: Any) -> DoubleWord:
+        return self + -DoubleWord.of(other)
 
-    def __mul__(self, other: Any) -> Double:
+    def __mul__(self, other: Any) -> DoubleWord:
         # lo · lo and the last normalisation are left out: |lo| ≤ 3u |hi| for normalised factors.
-        other = Double.of(other)
+        other = DoubleWord.of(other)
         p, e = two_prod(self.hi, other.hi)
         if not self.is_plain:
             e = dr.fma(self.lo, other.hi, e)
-        return Double(p, e if other.is_plain else dr.fma(self.hi, other.lo, e))
+        return DoubleWord(p, e if other.is_plain else dr.fma(self.hi, other.lo, e))
 
     def rounded(self) -> Any:
         """The nearest plain number."""
         return self.hi + self.lo
 
-    def sqrt(self) -> Double:
+    def sqrt(self) -> DoubleWord:
         """√x for x ≥ 0; a finite number that means nothing for x < 0, and a finite derivative everywhere.
 
         r = x·rsqrt(x) is a few u off, whatever rsqrt the backend has; the exact defect of r² corrects it to a few u².
@@ -142,15 +142,15 @@ class Double:
         """
         inverse = dr.rsqrt(dr.select(self.hi > 0, self.hi, 1))
         root = self.hi * inverse
-        return Double(root, (dr.fma(-root, root, self.hi) + self.lo) * (0.5 * inverse))
+        return DoubleWord(root, (dr.fma(-root, root, self.hi) + self.lo) * (0.5 * inverse))
 
 
-def select(mask: Any, x: Double, y: Double) -> Double:
-    return Double(dr.select(mask, x.hi, y.hi), dr.select(mask, x.lo, y.lo))
+def select(mask: Any, x: DoubleWord, y: DoubleWord) -> DoubleWord:
+    return DoubleWord(dr.select(mask, x.hi, y.hi), dr.select(mask, x.lo, y.lo))
 
 
 @dataclass(frozen=True)
-class Expansion:
+class TripleWord:
     """A number to the third order in u: hi, plus the sum of `first`, each of order u, plus `second`, of order u².
 
     Sums and products keep every error of first order as a term of its own and add up those of second order plainly. As
@@ -162,56 +162,56 @@ class Expansion:
     first: tuple[Any, ...] = ()
     second: Any = 0
 
-    def __add__(self, other: Expansion) -> Expansion:
+    def __add__(self, other: TripleWord) -> TripleWord:
         s, e = two_sum(self.hi, other.hi)
-        return Expansion(s, (*self.first, *other.first, e), self.second + other.second)
+        return TripleWord(s, (*self.first, *other.first, e), self.second + other.second)
 
-    def __neg__(self) -> Expansion:
-        return Expansion(-self.hi, tuple(-x for x in self.first), -self.second)
+    def __neg__(self) -> TripleWord:
+        return TripleWord(-self.hi, tuple(-x for x in self.first), -self.second)
 
-    def __sub__(self, other: Expansion) -> Expansion:
+    def __sub__(self, other: TripleWord) -> TripleWord:
         return self + -other
 
-    def collected(self) -> Expansion:
+    def collected(self) -> TripleWord:
         """The same with one term of first order."""
         first, *rest = self.first
         second = self.second
         for x in rest:
             first, e = two_sum(first, x)
             second = second + e
-        return Expansion(self.hi, (first,), second)
+        return TripleWord(self.hi, (first,), second)
 
-    def times(self, x: Double) -> Expansion:
+    def times(self, x: DoubleWord) -> TripleWord:
         y = self.collected()
         (p, e), (q, f) = two_prod(x.hi, y.hi), two_prod(x.hi, y.first[0])
         if x.is_plain:
-            return Expansion(p, (e, q), dr.fma(x.hi, y.second, f))
+            return TripleWord(p, (e, q), dr.fma(x.hi, y.second, f))
         r, g = two_prod(x.lo, y.hi)
-        return Expansion(p, (e, q, r), dr.fma(x.hi, y.second, dr.fma(x.lo, y.first[0], f + g)))
+        return TripleWord(p, (e, q, r), dr.fma(x.hi, y.second, dr.fma(x.lo, y.first[0], f + g)))
 
-    def squared(self) -> Expansion:
+    def squared(self) -> TripleWord:
         """Of a number with at most one term of first order."""
         p, e = two_prod(self.hi, self.hi)
         if not self.first:
-            return Expansion(p, (e,))
+            return TripleWord(p, (e,))
         twice, mid = self.hi + self.hi, self.first[0]
         q, f = two_prod(twice, mid)
-        return Expansion(p, (e, q), dr.fma(twice, self.second, dr.fma(mid, mid, f)))
+        return TripleWord(p, (e, q), dr.fma(twice, self.second, dr.fma(mid, mid, f)))
 
-    def double(self) -> Double:
+    def double(self) -> DoubleWord:
         """Rounded to a pair, also where the terms of hi have cancelled."""
         # hi is a multiple of the last place of the first-order terms, or 0: `fast_two_sum` is exact.
         x = self.collected()
         hi, lo = fast_two_sum(x.hi, x.first[0])
-        return Double(*fast_two_sum(hi, lo + x.second))
+        return DoubleWord(*fast_two_sum(hi, lo + x.second))
 
     @property
-    def pair(self) -> Double:
+    def pair(self) -> DoubleWord:
         """The first two terms, of a number with at most one of first order."""
-        return Double(self.hi, *self.first)
+        return DoubleWord(self.hi, *self.first)
 
 
-def dot(x: Any, y: Any) -> Expansion:
+def dot(x: Any, y: Any) -> TripleWord:
     """x · y of two 3-vectors: error ≤ 3u³ Σ|xᵢ yᵢ|, and hi is 0 only where the sum is less than that."""
     p, e0 = two_prod(x[0], y[0])
     q, e1 = two_prod(x[1], y[1])
@@ -227,15 +227,15 @@ def dot(x: Any, y: Any) -> Expansion:
     s, f = two_sum(s, t)
     mid, lo = two_sum(f, (t0 + t1) + (t2 + v0))
     hi, mid = fast_two_sum(s, mid)
-    return Expansion(hi, (mid,), lo)
+    return TripleWord(hi, (mid,), lo)
 
 
-def cross(x: Any, y: Any) -> list[Expansion]:
+def cross(x: Any, y: Any) -> list[TripleWord]:
     """x × y of two 3-vectors, each component with relative error ≤ 6u³."""
     return [_exact_difference(x[i], y[j], x[j], y[i]) for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
-def _exact_difference(x: Any, y: Any, z: Any, w: Any) -> Expansion:
+def _exact_difference(x: Any, y: Any, z: Any, w: Any) -> TripleWord:
     """x y − z w, relative error ≤ 6u³: its four exact terms are d, d_lo, e, e_lo.
 
     Where p and q cancel, d is exact, and a multiple of the last place of e; elsewhere |d| ≥ max(|p|, |q|)/2, so that
@@ -247,10 +247,10 @@ def _exact_difference(x: Any, y: Any, z: Any, w: Any) -> Expansion:
     e, e_lo = two_sum(p_lo, -q_lo)
     mid, lo = two_sum(d_lo, e)
     hi, mid = fast_two_sum(d, mid)
-    return Expansion(hi, (mid,), lo + e_lo)
+    return TripleWord(hi, (mid,), lo + e_lo)
 
 
-def defect(target: Double, *products: Pair) -> Any:
+def defect(target: DoubleWord, *products: Pair) -> Any:
     """target − Σ xᵢ yᵢ as a plain number: error ≤ u |result| + 4u² Σ|xᵢ yᵢ|, so small defects keep their digits."""
     rest, low = target.hi, target.lo
     for x, y in products[:-1]:

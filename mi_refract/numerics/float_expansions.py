@@ -13,7 +13,7 @@ from typing import Any
 
 from .error_free import two_sum
 
-Expansion = list[Any]
+FloatExpansion = list[Any]
 # Splits the 53 bits of a float64 in two halves, whose products are exact.
 _SPLITTER = 2.0**27 + 1
 
@@ -31,7 +31,7 @@ def _split(x: Any) -> tuple[Any, Any]:
     return hi, x - hi
 
 
-def distil(terms: Sequence[Any], words: int = 3) -> Expansion:
+def distil(terms: Sequence[Any], words: int = 3) -> FloatExpansion:
     """The sum of m `terms` in `words` floats: error ≤ (m u)^words Σ|terms|, and nothing at all where it is short.
 
     Every pass takes the float sum out and leaves its exact rounding errors behind.
@@ -53,7 +53,7 @@ def distil(terms: Sequence[Any], words: int = 3) -> Expansion:
     return taken
 
 
-def product(x: Any, y: Any, words: int = 3) -> Expansion:
+def product(x: Any, y: Any, words: int = 3) -> FloatExpansion:
     """x y of two expansions: relative error ≤ 16 u^words."""
     terms: list[Any] = []
     for i, x_i in enumerate(x):
@@ -63,11 +63,11 @@ def product(x: Any, y: Any, words: int = 3) -> Expansion:
     return distil(terms, words)
 
 
-def negated(x: Any) -> Expansion:
+def negated(x: Any) -> FloatExpansion:
     return [-x_i for x_i in x]
 
 
-def quotient(x: Any, y: Any, words: int = 2) -> Expansion:
+def ieee_divide(x: Any, y: Any, words: int = 2) -> FloatExpansion:
     """x / y of two expansions, by long division: relative error ≤ 16 u^words."""
     digits, rest = [], list(x)
     for _ in range(words):
@@ -77,17 +77,17 @@ def quotient(x: Any, y: Any, words: int = 2) -> Expansion:
     return distil(digits, words)
 
 
-def dot(x: Any, y: Any, words: int = 3) -> Expansion:
+def dot(x: Any, y: Any, words: int = 3) -> FloatExpansion:
     """x · y of two vectors of floats, and 0 where it is 0. One word more than asked for is kept for what cancels."""
     return distil([part for x_i, y_i in zip(x, y, strict=True) for part in two_prod(x_i, y_i)], words + 1)[:words]
 
 
-def cross(x: Any, y: Any, words: int = 3) -> list[Expansion]:
+def cross(x: Any, y: Any, words: int = 3) -> list[FloatExpansion]:
     """x × y of two 3-vectors of floats, each component as `dot` has it."""
     return [dot((x[i], x[j]), (y[j], -y[i]), words) for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
-def radicand(a: Any, n: Any, k: Any) -> tuple[Expansion, Expansion, Any]:
+def radicand(a: Any, n: Any, k: Any) -> tuple[FloatExpansion, FloatExpansion, Any]:
     """(n·a, D, T): D = (n·a)² − κ |n×a|², κ = k² − 1, which is negative under total internal reflection.
 
     `a`, `n`: three components each. T = (n·a)² + |κ| |n×a|², to a few u; the error of D is at most 2⁻¹⁴⁰ T.

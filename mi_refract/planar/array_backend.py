@@ -49,7 +49,7 @@ class Lanes:
         kind = self.index if whole else self.number
         return row, kind(values.ravel().astype(np.uint32 if whole else self.precision, copy=False))
 
-    def take(self, table: Any, i: Any, active: Any = True) -> Any:
+    def gather(self, table: Any, i: Any, active: Any = True) -> Any:
         row, values = table
         return dr.gather(row, values, i, active)
 
@@ -61,13 +61,13 @@ class Lanes:
         """`work(i, put)` for the lanes i < count: `put(name, j, x, active)` sets buffers[name][j, i] = x. As numpy."""
         lane = dr.arange(self.index, count)
 
-        def put(name: str, j: Any, x: Any, active: Any) -> None:
+        def scatter(name: str, j: Any, x: Any, active: Any) -> None:
             values, _ = buffers[name]
             x = x if isinstance(x, self.vector) else type(values)(x)
             dr.scatter(values, x, j * count + lane, active, mode=dr.ReduceMode.NoConflicts)
 
         if count:  # Dr.Jit takes no part in an empty array
-            work(lane, put)
+            work(lane, scatter)
         dr.eval(*(values for values, _ in buffers.values()))
         return {name: values.numpy().reshape(shape) for name, (values, shape) in buffers.items()}
 
@@ -93,17 +93,17 @@ class Scalars(Lanes):
         row = (self._indices if kind is int else self._vectors)[values.shape[1]]
         return [row(*map(kind, line)) for line in values]
 
-    def take(self, table: Any, i: Any, active: Any = True) -> Any:
+    def gather(self, table: Any, i: Any, active: Any = True) -> Any:
         return table[i if i < len(table) else 0]
 
     def run(self, count: int, buffers: dict[str, Buffer], work: Callable[[Any, Callable[..., None]], None]) -> Arrays:
         for lane in range(count):
 
-            def put(name: str, j: Any, x: Any, active: Any, lane: int = lane) -> None:
+            def scatter(name: str, j: Any, x: Any, active: Any, lane: int = lane) -> None:
                 if active:
                     buffers[name][0][j, lane] = x
 
-            work(lane, put)
+            work(lane, scatter)
         return {name: values for name, (values, _) in buffers.items()}
 
     def buffer(self, kind: Any, value: Any, shape: tuple[int, ...]) -> Buffer:

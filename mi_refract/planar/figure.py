@@ -1,4 +1,4 @@
-"""Pictures of planar scenes: media shaded by index, boundaries, and rays as strong as they are bright.
+"""Images of planar scenes: media shaded by index, boundaries, and rays as strong as they are bright.
 
 A few rays are drawn as lines. Of many, what is drawn is their density, accumulated in floating point: a line of
 little power among thousands has an opacity of less than the 1/255 that graphics libraries know.
@@ -38,8 +38,8 @@ LINE = 0.13  # inches
 NAMED = 5  # media in the legend
 TYPICAL = 0.35  # opacity/(1 − opacity) of a typical density, where that is drawn
 MARKS = {
-    Event.EXHAUSTED: ("o", "○ {} stopped after `max_depth` boundaries, with another one ahead"),
-    Event.CONTRADICTED: ("x", "× {} stopped: the next boundary does not border on the medium that the ray is in"),
+    Event.MAX_DEPTH: ("o", "○ {} stopped after `max_depth` boundaries, with another one ahead"),
+    Event.MEDIUM_MISMATCH: ("x", "× {} stopped: the next boundary does not border on the medium that the ray is in"),
 }
 UNDATED: dict[str, Any] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}, ".png": {}}
 STYLE: Any = {
@@ -66,18 +66,18 @@ STYLE: Any = {
 
 
 def save(path: Path, scene: PlanarScene, traced: Sequence[Branches]) -> None:
-    """Write the picture, in the format of the path's suffix, one of FORMATS.
+    """Write the image, in the format of the path's suffix, one of FORMATS.
 
-    ValueError as for `picture`; OSError for what cannot be written. Then no file is there, or the old one.
+    ValueError as for `image`; OSError for what cannot be written. Then no file is there, or the old one.
     """
-    content = picture(scene, traced, path.suffix.lower())
+    content = image(scene, traced, path.suffix.lower())
     try:
         write_atomically(path, content)
     except OSError as error:
         raise OSError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
-def picture(scene: PlanarScene, traced: Sequence[Branches], suffix: str) -> bytes:
+def image(scene: PlanarScene, traced: Sequence[Branches], suffix: str) -> bytes:
     """The content of such a file. The same arguments give the same bytes. ValueError where matplotlib is missing."""
     require_matplotlib()
     import matplotlib.style
@@ -90,7 +90,7 @@ def picture(scene: PlanarScene, traced: Sequence[Branches], suffix: str) -> byte
 
 
 def figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> Figure:
-    """The picture, in matplotlib's present style; its only axes are in the scene's units."""
+    """The image, in matplotlib's present style; its only axes are in the scene's units."""
     from matplotlib.figure import Figure
 
     view = scene.view or around(scene, traced)
@@ -110,11 +110,11 @@ def figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> Figure
 
 def require_matplotlib() -> None:
     if importlib.util.find_spec("matplotlib") is None:
-        raise ValueError("pictures need the extra `plot`: pip install 'mi-refract[plot]'")
+        raise ValueError("images need the extra `plot`: pip install 'mi-refract[plot]'")
 
 
 def _size(view: View) -> tuple[float, float]:
-    """Of the figure without its caption, in inches: about as large a picture whatever its shape."""
+    """Of the figure without its caption, in inches: about as large an image whatever its shape."""
     aspect = min(max((view[1] - view[0]) / (view[3] - view[2]), 0.25), 4)
     height = min(5.2 / aspect**0.5, 7.0)
     return max(height * aspect, 3.6) + 0.6, height + 0.95

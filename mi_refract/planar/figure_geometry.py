@@ -1,4 +1,4 @@
-"""What a picture of a planar scene consists of, as numbers: the legs of paths, their density, curves as polylines."""
+"""What an image of a planar scene consists of, as numbers: the legs of paths, their density, curves as polylines."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .scene_file import PlanarScene
 from .tracer import Array, Event, Segments
 
 View = tuple[float, float, float, float]  # x0, x1, y0, y1
-MARGIN = 0.08  # around what the picture holds, of its larger side
+MARGIN = 0.08  # around what the image holds, of its larger side
 SHARED = -1  # the number of the colour that stands for all of them
 SAMPLES = 2**22  # pixels of lines at a time: 0.3 GB
 

@@ -19,7 +19,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.numerics.error_free import quotient
+from mi_refract.numerics.error_free import ieee_divide
 
 from .array_backend import Lanes
 
@@ -103,8 +103,8 @@ class Straight:
 
     def _of(self, i: Any, active: Any = True) -> tuple[Any, Any, Any]:
         """Start, end and vertices of segment i."""
-        ends, vector = self.lanes.take(self.ends, i, active), self.lanes.vector
-        return vector(ends[0], ends[1]), vector(ends[2], ends[3]), self.lanes.take(self.vertices, i, active)
+        ends, vector = self.lanes.gather(self.ends, i, active), self.lanes.vector
+        return vector(ends[0], ends[1]), vector(ends[2], ends[3]), self.lanes.gather(self.vertices, i, active)
 
     def start(self, ray: Ray) -> Start:
         a, b, vertices = self._of(ray.own, ray.own != NOWHERE)
@@ -149,7 +149,7 @@ class Straight:
         t_a, t_b = dr.dot(to_a, ray.d), dr.dot(to_b, ray.d)
         beyond = (dr.maximum(t_a, t_b) > 0) & (reach > ray.slack * (dr.abs(e.x) + dr.abs(e.y)))
         ahead = (a_left != b_left) & ((dr.minimum(t_a, t_b) > ray.slack) | beyond) & (i != ray.own) & active
-        near = quotient(dr.minimum(dr.abs(f_a), dr.abs(f_b)), scale)
+        near = ieee_divide(dr.minimum(dr.abs(f_a), dr.abs(f_b)), scale)
         s, r = (dr.select(dr.abs(f) < 0.5 * scale, near, 1 - near) for f in (f_b, f_a))
         distance = dr.dot(dr.fma(e, r, to_a), ray.d)  # λ again: that quotient would be noise at grazing incidence
         left, right = (dr.select(a_left, vertices[j], vertices[1 - j]) for j in (0, 1))
@@ -167,7 +167,7 @@ class Straight:
         a, b, _ = self._of(hit.segment, there)
         e = b - a
         point = dr.select(hit.r < hit.s, dr.fma(e, hit.r, a), dr.fma(e, -hit.s, b))
-        return point, self.lanes.take(self.directions, hit.segment, there)
+        return point, self.lanes.gather(self.directions, hit.segment, there)
 
 
 class Arcs(Straight):
@@ -189,7 +189,7 @@ class Arcs(Straight):
 
     def _shape(self, i: Any, active: Any = True) -> tuple[Any, Any, Any]:
         """Control point, weight and turn; the turn of a straight segment is 0."""
-        shape = self.lanes.take(self.shapes, i, active)
+        shape = self.lanes.gather(self.shapes, i, active)
         return self.lanes.vector(shape[0], shape[1]), shape[2], shape[3]
 
     def start(self, ray: Ray) -> Start:
@@ -238,7 +238,7 @@ class Arcs(Straight):
         """A root as a hit, and whether it is ahead."""
         s, r = root
         size = s + r
-        s, r = quotient(s, size), quotient(r, size)
+        s, r = ieee_divide(s, size), ieee_divide(r, size)
         to_a, to_c, to_b = ways
         way = (to_a * (s * s) + to_c * (2 * w * s * r) + to_b * (r * r)) * dr.rcp(_total(w, s, r))
         e = _tangent(to_a, to_c, to_b, w, s, r)
@@ -271,7 +271,7 @@ class Arcs(Straight):
         s, r = hit.s, hit.r
         point = dr.select(r < s, a + _bend(a, c, b, w, s, r), b + _bend(b, c, a, w, r, s))
         e = _tangent(a, c, b, w, s, r)
-        return point, e * quotient(1, dr.norm(e))
+        return point, e * ieee_divide(1, dr.norm(e))
 
 
 def _ends(once: Any, a_left: Any, vertices: Any, points: Any) -> tuple[Any, Any, Any, Any]:

@@ -36,7 +36,7 @@ SAMPLE = 4096  # rays
 
 
 @dataclass
-class Look:
+class SearchState:
     """How far along a ray it has been looked, and the nearest segment `held` that was found beyond, or NOWHERE."""
 
     gone: Any
@@ -69,7 +69,9 @@ class Extrusion:
         steps = (np.abs(np.diff(x, axis=0)).sum(1) for x in (places, turns))
         self.coherent = len(origins) < 2 or float(np.median(sum(steps))) < BESIDE
 
-    def nearest(self, boundaries: Straight, ray: Ray, start: Start, look: Look, active: Any) -> tuple[Hit, Look, Any]:
+    def nearest(
+        self, boundaries: Straight, ray: Ray, start: Start, look: SearchState, active: Any
+    ) -> tuple[Hit, SearchState, Any]:
         """The first boundary ahead, from where to look on for what might come before it, and whether nothing does."""
         found, t, stroke = self._stroke(dr.fma(ray.d, look.gone, self._aside(ray, start)), ray.d, active)
         own = active & (ray.own != NOWHERE)
@@ -89,12 +91,12 @@ class Extrusion:
         best = dr.if_stmt(given, found | corner | (held != NOWHERE), tried, lambda best, *_: best, label="stroke")
         gone = look.gone + t
         settled = negated(found) | (best.distance * (1 / self.half) <= gone + MARGIN)
-        return best, Look(gone + STEP, best.segment), settled
+        return best, SearchState(gone + STEP, best.segment), settled
 
     def _near_end(self, segment: Any, at: Hit | Ray, active: Any) -> Any:
         """Whether a place on a segment is where the next one at either end is near; true of no segment."""
         some = active & (segment != NOWHERE)
-        near_a, near_b = self.lanes.take(self.narrow, segment, some)
+        near_a, near_b = self.lanes.gather(self.narrow, segment, some)
         return negated(some) | (at.r < near_a) | (at.s < near_b)
 
     def _crowded(self, a: Any, b: Any, vertices: Any) -> tuple[int, int] | None:
@@ -116,9 +118,9 @@ class Extrusion:
         to, nearby = self.lanes, {"nearby": self.lanes.buffer(self.lanes.index, NOWHERE, (1, len(q)))}
         places, directions = to.table(q), to.table(d)
 
-        def work(lane: Any, put: Any) -> None:
-            found, t, stroke = self._stroke(to.take(places, lane), to.take(directions, lane), to.mask(True))
-            put("nearby", 0, stroke, found & (t < SHORTEST))
+        def work(lane: Any, scatter: Any) -> None:
+            found, t, stroke = self._stroke(to.gather(places, lane), to.gather(directions, lane), to.mask(True))
+            scatter("nearby", 0, stroke, found & (t < SHORTEST))
 
         return to.run(len(q), nearby, work)["nearby"][0]
 
@@ -141,11 +143,11 @@ class Extrusion:
     def _also(self, best: Hit, boundaries: Straight, ray: Ray, start: Start, held: Any, strokes: Any) -> Hit:
         """`best`, or what comes before it: the segment `held`, and those that two strokes name; NOWHERE for none."""
         later, sooner = strokes
-        take = self.lanes.take
+        gather = self.lanes.gather
 
         def test(i: Any, stroke: Any, best: Hit, going: Any) -> tuple[Any, Any, Hit, Any]:
             listed = going & (i > 0) & (stroke != NOWHERE)
-            named = take(self.around, take(self.first, stroke, listed) + i - 1, listed)
+            named = gather(self.around, gather(self.first, stroke, listed) + i - 1, listed)
             segment = dr.select(i == 0, held, dr.select(listed, named, NOWHERE))
             end = segment == NOWHERE
             best = boundaries.nearer(best, ray, start, segment, going & negated(end))

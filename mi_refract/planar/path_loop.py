@@ -15,7 +15,7 @@ from mi_refract.formulas.fresnel import powers, refracted_cosine
 
 from .array_backend import Lanes, negated
 from .intersect_segments import NOWHERE, Hit, Ray, Straight, cross
-from .mesh_acceleration import BACK, Extrusion, Look
+from .mesh_acceleration import BACK, Extrusion, SearchState
 
 REFLECT_BITS = 32
 
@@ -27,12 +27,12 @@ class Event(IntEnum):
     REFRACTED = 1
     REFLECTED = 2
     ESCAPED = 3  # no boundary left to meet
-    EXHAUSTED = 4  # `max_depth` boundaries met, and another one ahead
-    CONTRADICTED = 5  # met a boundary whose near side is not the ray's medium
+    MAX_DEPTH = 4  # `max_depth` boundaries met, and another one ahead
+    MEDIUM_MISMATCH = 5  # met a boundary whose near side is not the ray's medium
 
 
 @dataclass
-class Walk:
+class PathState:
     """Of a lane: its ray, the index of its medium (NaN: unknown), its share of the power, boundaries met.
 
     `look`: how far it has been looked for the next one.
@@ -42,7 +42,7 @@ class Walk:
     index: Any
     power: Any
     depth: Any
-    look: Look
+    look: SearchState
     active: Any
 
 
@@ -73,21 +73,21 @@ class Walker:
         if weights:
             buffers |= {name: to.buffer(to.number, np.nan, (legs, count)) for name in ("indices", "weights")}
 
-        def work(lane: Any, put: Callable[..., None]) -> None:
-            p, d = (to.take(table, lane) for table in rays)
-            index, bits = (None if table is None else to.take(table, lane) for table in others)
-            put("points", 0, p, True)
+        def work(lane: Any, scatter: Callable[..., None]) -> None:
+            p, d = (to.gather(table, lane) for table in rays)
+            index, bits = (None if table is None else to.gather(table, lane) for table in others)
+            scatter("points", 0, p, True)
             walk = self._start(p, d, to.number(dr.nan) if index is None else index)
-            put("directions", 0, _unit(self._follow(walk, bits, max_depth, put, weights).ray.d), True)
+            scatter("directions", 0, _unit(self._follow(walk, bits, max_depth, scatter, weights).ray.d), True)
 
         return to.run(count, buffers, work)
 
-    def _start(self, p: Any, d: Any, index: Any) -> Walk:
+    def _start(self, p: Any, d: Any, index: Any) -> PathState:
         to, d = self.to, _unit(d)
         p = self._entered(p, d)
         slack = 4 * to.roundoff * (dr.abs(p.x) + dr.abs(p.y))
         ray = Ray(p, d, to.index(NOWHERE), to.number(0.5), to.number(0.5), to.mask(False), slack)
-        return Walk(ray, index, to.number(1), to.index(0), self._look(-BACK), to.mask(True))
+        return PathState(ray, index, to.number(1), to.index(0), self._look(-BACK), to.mask(True))
 
     def _entered(self, p: Any, d: Any) -> Any:
         """The origin, or from outside the place where the ray enters a box around all boundaries, half as wide again.
@@ -100,42 +100,48 @@ class Walker:
         enter, leave = dr.max(dr.minimum(a, b)), dr.min(dr.maximum(a, b))
         return dr.select((enter > 0) & (enter < leave), dr.fma(d, enter, p), p)
 
-    def _follow(self, walk: Walk, mirrored: Any, max_depth: int, put: Callable[..., None], weights: bool) -> Walk:
-        def step(walk: Walk) -> tuple[Walk]:
-            return (self._step(walk, mirrored, max_depth, put, weights),)
+    def _follow(
+        self, walk: PathState, mirrored: Any, max_depth: int, scatter: Callable[..., None], weights: bool
+    ) -> PathState:
+        def step(walk: PathState) -> tuple[PathState]:
+            return (self._step(walk, mirrored, max_depth, scatter, weights),)
 
         return dr.while_loop((walk,), lambda walk: walk.active, step, label="planar")[0]
 
-    def _step(self, walk: Walk, mirrored: Any, max_depth: int, put: Callable[..., None], weights: bool) -> Walk:
+    def _step(
+        self, walk: PathState, mirrored: Any, max_depth: int, scatter: Callable[..., None], weights: bool
+    ) -> PathState:
         """One look for the next boundary, and off it if there it is."""
         hit, look, settled = self._nearest(walk.ray, walk.look, walk.active)
         active = walk.active & settled
         some = active & (hit.segment != NOWHERE)
-        self._leg(put, walk, int(Event.ESCAPED), walk.index, active & negated(some), weights)
-        rest = Walk(walk.ray, walk.index, walk.power, walk.depth, look, walk.active & negated(settled))
+        self._leg(scatter, walk, int(Event.ESCAPED), walk.index, active & negated(some), weights)
+        rest = PathState(walk.ray, walk.index, walk.power, walk.depth, look, walk.active & negated(settled))
 
-        def across(walk: Walk, hit: Hit, rest: Walk) -> Walk:
-            return self._cross(walk, hit, mirrored, max_depth, put, weights)
+        def across(walk: PathState, hit: Hit, rest: PathState) -> PathState:
+            return self._cross(walk, hit, mirrored, max_depth, scatter, weights)
 
-        def on(walk: Walk, hit: Hit, rest: Walk) -> Walk:
+        def on(walk: PathState, hit: Hit, rest: PathState) -> PathState:
             return rest
 
         # A branch, since all rays of a beam leave together.
         return dr.if_stmt((walk, hit, rest), some, across, on, label="boundary")
 
-    def _leg(self, put: Callable[..., None], walk: Walk, event: Any, index: Any, active: Any, weights: bool) -> None:
+    def _leg(
+        self, scatter: Callable[..., None], walk: PathState, event: Any, index: Any, active: Any, weights: bool
+    ) -> None:
         """A leg and how it ends."""
-        put("events", walk.depth, event, active)
+        scatter("events", walk.depth, event, active)
         if weights:
-            put("indices", walk.depth, index, active)
-            put("weights", walk.depth, walk.power, active)
+            scatter("indices", walk.depth, index, active)
+            scatter("weights", walk.depth, walk.power, active)
 
     def _cross(
-        self, walk: Walk, hit: Hit, mirrored: Any, max_depth: int, put: Callable[..., None], weights: bool
-    ) -> Walk:
+        self, walk: PathState, hit: Hit, mirrored: Any, max_depth: int, scatter: Callable[..., None], weights: bool
+    ) -> PathState:
         """Off the boundary that is met."""
         to, d, j = self.to, walk.ray.d, walk.depth
-        left, right, to_right, to_left = to.take(self.media, hit.segment)
+        left, right, to_right, to_left = to.gather(self.media, hit.segment)
         near, far = dr.select(hit.to_left, right, left), dr.select(hit.to_left, left, right)
         k = dr.select(hit.to_left, to_left, to_right)
         index = dr.select(dr.isnan(walk.index), near, walk.index)
@@ -145,20 +151,20 @@ class Walker:
             forced = through & (j < REFLECT_BITS) & ((mirrored >> dr.minimum(j, REFLECT_BITS - 1)) & 1 == 1)
             b, through = dr.select(forced, _mirrored(d, l), b), through & negated(forced)
         event = dr.select(through, int(Event.REFRACTED), int(Event.REFLECTED))
-        event = dr.select(near == index, event, int(Event.CONTRADICTED))
+        event = dr.select(near == index, event, int(Event.MEDIUM_MISMATCH))
         met = j < max_depth
-        self._leg(put, walk, dr.select(met, event, int(Event.EXHAUSTED)), index, True, weights)
-        put("points", j + 1, p, met)
-        put("hits", j, hit.segment, met)
+        self._leg(scatter, walk, dr.select(met, event, int(Event.MAX_DEPTH)), index, True, weights)
+        scatter("points", j + 1, p, met)
+        scatter("hits", j, hit.segment, met)
         on = met & (near == index)
         ray = Ray(p, dr.select(on, b, d), hit.segment, hit.s, hit.r, hit.to_left == through, to.number(0))
         power = walk.power * _share(d, l, k, through) if weights else walk.power
-        return Walk(ray, dr.select(through, far, index), power, j + 1, self._look(0), on)
+        return PathState(ray, dr.select(through, far, index), power, j + 1, self._look(0), on)
 
-    def _look(self, gone: float) -> Look:
-        return Look(self.to.number(gone), self.to.index(NOWHERE))
+    def _look(self, gone: float) -> SearchState:
+        return SearchState(self.to.number(gone), self.to.index(NOWHERE))
 
-    def _nearest(self, ray: Ray, look: Look, active: Any) -> tuple[Hit, Look, Any]:
+    def _nearest(self, ray: Ray, look: SearchState, active: Any) -> tuple[Hit, SearchState, Any]:
         """The first boundary ahead, if it is certain after this look."""
         start = self.boundaries.start(ray)
         if self.mesh:

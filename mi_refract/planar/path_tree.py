@@ -163,10 +163,10 @@ def summary(scene: PlanarScene, traced: Sequence[Branches]) -> str:
     happened = {
         "reflected totally": n["REFLECTED"],
         "escaped": n["ESCAPED"],
-        "exhausted": n["EXHAUSTED"],
-        "contradicted": n["CONTRADICTED"],
+        "stopped at max_depth": n["MAX_DEPTH"],
+        "stopped by a medium mismatch": n["MEDIUM_MISMATCH"],
     }
-    hits = _plural(n["REFRACTED"] + n["REFLECTED"] + n["CONTRADICTED"], "hit")
+    hits = _plural(n["REFRACTED"] + n["REFLECTED"] + n["MEDIUM_MISMATCH"], "hit")
     said = [f"{number} {what}" for what, number in happened.items() if number]
     return ", ".join([_plural(rays, "ray") + colours, *split, hits, *said])
 

@@ -28,7 +28,7 @@ class Region:
 
 @dataclass(frozen=True)
 class PlanarScene:
-    """What a scene file says, ready for `planar.trace` (once per colour) and for a picture.
+    """What a scene file says, ready for `planar.trace` (once per colour) and for an image.
 
     `colours`: one entry per wavelength, matplotlib's names of colours; ("",) where there is no dispersion.
     `segments`: one per colour, the same geometry with other indices. `regions`: in drawing order, inner ones later.

@@ -27,7 +27,7 @@ class Part(NamedTuple):
 
 
 SCENE = {
-    "title": Key(toml_schema.TEXT, "what the picture is called; the file's name by default", None),
+    "title": Key(toml_schema.TEXT, "what the image is called; the file's name by default", None),
     "index": Key(toml_schema.INDEX, "of the medium around everything", [1.0]),
     "colours": Key(
         toml_schema.TEXTS, "one for each wavelength, as matplotlib calls them; lists of indices are as long", None
@@ -36,7 +36,7 @@ SCENE = {
     "branches": Key(
         toml_schema.whole(0, 8), "the most partial reflections on a path; 0: refracted wherever possible", 0
     ),
-    "view": Key(toml_schema.BOX, "what the picture shows; all shapes by default", None),
+    "view": Key(toml_schema.BOX, "what the image shows; all shapes by default", None),
     "shape": Key(toml_schema.TABLES, "[[shape]]: boundaries between media"),
     "beam": Key(toml_schema.TABLES, "[[beam]]: rays to follow"),
 }

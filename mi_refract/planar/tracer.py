@@ -8,7 +8,7 @@ or an arc of a conic. `trace` follows rays through them; conventions:
   anything. So one through a vertex that two segments share crosses exactly one of them, or none or both at a tip.
 - A segment of length zero is no boundary. Where several segments share a vertex (a T-junction) a ray crosses those
   on its path, one after the other. A vertex inside another segment is no junction: one side of that segment has
-  two media then, and a ray that finds another medium than its own is CONTRADICTED there and ends.
+  two media then, and a ray that finds another medium than its own ends there as MEDIUM_MISMATCH.
 - The medium in which a ray starts is that on the near side of the first boundary it meets, unless it is told.
 
 Source: document 004, with its slips corrected (README, Errata).

@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 
 
-class Everything:
+class SceneEmitters:
     """Mitsuba's own choice."""
 
     def __init__(self, v: Any, scene: Any) -> None:
@@ -25,7 +25,7 @@ class Everything:
         return self.scene.pdf_emitter_direction(reference, ds, active)
 
 
-class Lamps:
+class NonConstantEmitters:
     """All emitters but the environment, by their sampling weights."""
 
     def __init__(self, v: Any, scene: Any) -> None:

@@ -24,7 +24,7 @@ class Sampled:
         return sampler.next_2d()
 
 
-class Strata:
+class KeyedMultijitter:
     """Of the lanes of a wavefront, pixel by pixel `sampler.sample_count()` of them; `v` is the variant's module."""
 
     def __init__(self, v: Any, sampler: Any, seed: Any) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .emitter_sampling import Everything, Lamps
+from .emitter_sampling import NonConstantEmitters, SceneEmitters
 from .keyed_sampler import ONE
 
 # Samples near either end of the unit interval pick the one lobe and the other. What has less power is not followed.
@@ -23,7 +23,7 @@ LOBES = mi.BSDFFlags
 
 
 @dataclass(frozen=True)
-class Plan:
+class PathFeatures:
     """What is traced: of what the scene needs, what the parameters leave."""
 
     max_depth: int
@@ -51,7 +51,7 @@ class Plan:
 
 
 @dataclass
-class State:
+class LoopState:
     """Of a lane. None is what the plan leaves out."""
 
     ray: Any
@@ -88,7 +88,7 @@ def branch_class(v: Any) -> type:
     return make_dataclass("Branch", fields.items())
 
 
-class Pile:
+class ScalarStack:
     """`dr.alloc_local` for scalar variants, which have no local memory."""
 
     def __init__(self) -> None:
@@ -111,13 +111,13 @@ def power_heuristic(a: Any, b: Any) -> Any:
 class Trace:
     """One call of `sample`. In scalar variants a pointer may be None; elsewhere its lanes are masked."""
 
-    def __init__(self, v: Any, scene: Any, plan: Plan, numbers: Any) -> None:
+    def __init__(self, v: Any, scene: Any, plan: PathFeatures, numbers: Any) -> None:
         self.v, self.scene, self.plan, self.numbers = v, scene, plan, numbers
         self.vectorised, self.branch, self.context = dr.is_jit_v(v.Float), branch_class(v), mi.BSDFContext()
-        self.emitters = (Lamps if plan.lamps_only else Everything)(v, scene)
+        self.emitters = (NonConstantEmitters if plan.lamps_only else SceneEmitters)(v, scene)
         self.flags = +(mi.RayFlags.All if plan.all_of_hit else mi.RayFlags.ShadingFrame)
 
-    def run(self, ray: Any, sampler: Any, active: Any) -> State:
+    def run(self, ray: Any, sampler: Any, active: Any) -> LoopState:
         if self.plan.hide_emitters and self.plan.area:
             ray = self._past_emitters(ray, active)
         start = self._start(ray, sampler, active)
@@ -126,17 +126,17 @@ class Trace:
             self._add_environment(end)
         return end
 
-    def _start(self, ray: Any, sampler: Any, active: Any) -> State:
+    def _start(self, ray: Any, sampler: Any, active: Any) -> LoopState:
         v, plan = self.v, self.plan
         valid = v.Bool(plan.environment and not plan.hide_emitters)
-        s = State(ray, v.Spectrum(1), v.Spectrum(0), v.UInt32(0), active, valid, sampler, v.Float(1))
+        s = LoopState(ray, v.Spectrum(1), v.Spectrum(0), v.UInt32(0), active, valid, sampler, v.Float(1))
         if plan.once:
             s.escaped = v.Bool(False)
         if plan.emitter_sampling:
             s.previous, s.pdf, s.delta = dr.zeros(v.Interaction3f), v.Float(1), v.Bool(True)
         if plan.split_depth:
             s.share, s.node, s.waiting, s.seen = v.Float(1), v.UInt32(1), v.UInt32(0), v.Bool(True)
-            s.stack = dr.alloc_local(self.branch, plan.split_depth) if self.vectorised else Pile()
+            s.stack = dr.alloc_local(self.branch, plan.split_depth) if self.vectorised else ScalarStack()
         if plan.deterministic:
             s.truncated = v.Float(0)
         return s
@@ -157,7 +157,7 @@ class Trace:
 
     # One vertex ----------------------------------------------------------------------------------------------------
 
-    def _step(self, s: State) -> tuple[State]:
+    def _step(self, s: LoopState) -> tuple[LoopState]:
         si = self.scene.ray_intersect(s.ray, self.flags, s.depth == 0)
         hit = si.is_valid()
         self._add_emission(s, si, hit)
@@ -173,7 +173,7 @@ class Trace:
         s.active = onward
         return (s,)
 
-    def _scatter(self, s: State, si: Any, bsdf: Any, hit: Any, onward: Any) -> Any:
+    def _scatter(self, s: LoopState, si: Any, bsdf: Any, hit: Any, onward: Any) -> Any:
         """Emitter sampling, the next ray, and whether there is one."""
         plan = self.plan
         key = (s.node * 0x9E3779B9 + s.depth) * 4 if plan.split_depth else 0
@@ -196,12 +196,12 @@ class Trace:
             s.delta = dr.select(hit, mi.has_flag(bs.sampled_type, LOBES.Delta), s.delta)
         return self._roulette(s, onward, key)
 
-    def _next(self, s: State, si: Any, bs: Any, weight: Any) -> tuple[Any, Any]:
+    def _next(self, s: LoopState, si: Any, bs: Any, weight: Any) -> tuple[Any, Any]:
         if self.v.is_polarized:
             weight = si.to_world_mueller(weight, -bs.wo, si.wi)
         return si.spawn_ray(si.to_world(bs.wo)), self._times(s.throughput, weight)
 
-    def _roulette(self, s: State, onward: Any, key: Any) -> Any:
+    def _roulette(self, s: LoopState, onward: Any, key: Any) -> Any:
         brightest = dr.max(self.v.unpolarized_spectrum(s.throughput))
         onward = onward & (brightest != 0)
         if not self.plan.roulette:
@@ -219,7 +219,7 @@ class Trace:
 
     # Emitters ------------------------------------------------------------------------------------------------------
 
-    def _add_emission(self, s: State, si: Any, hit: Any) -> None:
+    def _add_emission(self, s: LoopState, si: Any, hit: Any) -> None:
         plan = self.plan
         if plan.once:
             s.escaped = hit ^ True
@@ -232,13 +232,13 @@ class Trace:
         if self.vectorised or emitter is not None:
             s.result += self._times(s.throughput, self._emission(s, si, emitter, met))
 
-    def _add_environment(self, s: State) -> None:
+    def _add_environment(self, s: LoopState) -> None:
         si = dr.zeros(self.v.SurfaceInteraction3f)
         si.t, si.time, si.wavelengths, si.wi = dr.inf, s.ray.time, s.ray.wavelengths, -s.ray.d
         found = self._emission(s, si, self.scene.environment(), s.escaped)
         s.result += dr.select(s.escaped, self._times(s.throughput, found), 0)
 
-    def _emission(self, s: State, si: Any, emitter: Any, active: Any) -> Any:
+    def _emission(self, s: LoopState, si: Any, emitter: Any, active: Any) -> Any:
         radiance = emitter.eval(si, active)
         if not self.plan.emitter_sampling:
             return radiance
@@ -246,7 +246,7 @@ class Trace:
         pdf = self.emitters.pdf(s.previous, ds, active & (s.delta ^ True))
         return radiance * dr.select(s.delta, 1, power_heuristic(s.pdf, pdf))
 
-    def _add_direct(self, s: State, si: Any, bsdf: Any, onward: Any, key: Any) -> None:
+    def _add_direct(self, s: LoopState, si: Any, bsdf: Any, onward: Any, key: Any) -> None:
         smooth = onward & mi.has_flag(bsdf.flags(), LOBES.Smooth)
         if not self.vectorised and not smooth:
             return
@@ -264,7 +264,7 @@ class Trace:
 
     # Both lobes ----------------------------------------------------------------------------------------------------
 
-    def _split(self, s: State, si: Any, bsdf: Any, bs: Any, second: Any, throughput: Any, onward: Any) -> Any:
+    def _split(self, s: LoopState, si: Any, bsdf: Any, bs: Any, second: Any, throughput: Any, onward: Any) -> Any:
         """Put the other lobe aside where both are worth following; the throughput of the one that was sampled."""
         plan, p = self.plan, dr.detach(bs.pdf)
         pair = onward & s.seen & self._is_pair(bsdf.flags())
@@ -278,7 +278,7 @@ class Trace:
             both = pair
         return dr.select(both, throughput * bs.pdf, throughput)
 
-    def _truncate(self, s: State, where: Any, share: Any) -> None:
+    def _truncate(self, s: LoopState, where: Any, share: Any) -> None:
         # η²: what radiance lost where the path entered a denser medium it regains where it leaves.
         lost = dr.max(self.v.unpolarized_spectrum(s.throughput)) * dr.square(s.eta) * share
         s.truncated = dr.select(where, s.truncated + lost, s.truncated)
@@ -289,7 +289,7 @@ class Trace:
         pair = mi.has_flag(flags, LOBES.DeltaReflection) & mi.has_flag(flags, LOBES.DeltaTransmission)
         return pair & ((mi.has_flag(flags, LOBES.Smooth) | mi.has_flag(flags, LOBES.Null)) ^ True)
 
-    def _put_aside(self, s: State, si: Any, bsdf: Any, bs: Any, second: Any, both: Any) -> Any:
+    def _put_aside(self, s: LoopState, si: Any, bsdf: Any, bs: Any, second: Any, both: Any) -> Any:
         reflected = mi.has_flag(bs.sampled_type, LOBES.DeltaReflection)
         other, weight = bsdf.sample(self.context, si, dr.select(reflected, LAST, FIRST), second, both)
         both = both & (other.sampled_type != bs.sampled_type)
@@ -305,7 +305,7 @@ class Trace:
         s.share = dr.select(both, s.share * dr.detach(bs.pdf), s.share)
         return both
 
-    def _resume(self, s: State, onward: Any) -> Any:
+    def _resume(self, s: LoopState, onward: Any) -> Any:
         """Where a path ends, take up the last branch put aside."""
         found = (onward ^ True) & (s.waiting > 0)
         if not self.vectorised and not found:

@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from mi_refract.formulas import fresnel
 from mi_refract.formulas.documented import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, resolve
-from mi_refract.numerics.error_free import attach, differentiated, quotient
+from mi_refract.numerics.error_free import differentiated, ieee_divide, replace_grad
 
 PLUGIN = "refract"
 LOBES = ("specular_reflectance", "specular_transmittance")  # tint of the reflected and of the transmitted lobe
@@ -137,7 +137,7 @@ def plugin_class(v: Any) -> type:
             # the sample that is exactly 0.
             selected_r = (wide(sample1) * whole < ray.r if both else v.Bool(has_r)) & active
             selected_t = (selected_r ^ True) & active
-            value = v.Float(quotient(dr.select(selected_r, ray.r, ray.t), whole))
+            value = v.Float(ieee_divide(dr.select(selected_r, ray.r, ray.t), whole))
             bs.pdf = 1 if not both else dr.detach(value) if differentiated(value) else value
             bs.sampled_component = dr.select(selected_r, v.UInt32(0), v.UInt32(1))
             bs.sampled_type = dr.select(selected_r, v.UInt32(+reflection), v.UInt32(+transmission))
@@ -147,7 +147,7 @@ def plugin_class(v: Any) -> type:
             factor = dr.select(selected_t, dr.square(v.Float(ray.side.k)), 1) if radiance else 1
             if v.is_polarized:
                 # Cosines below 1e-19 have squares of 0 in float32: such a lobe has no density and no weight.
-                scale = dr.select(bs.pdf > 0, quotient(factor, bs.pdf), 0)
+                scale = dr.select(bs.pdf > 0, ieee_divide(factor, bs.pdf), 0)
                 weight = self._mueller(ctx, si, bs, ray, selected_r) * scale
             else:
                 weight = v.Spectrum(self._attached(value) * factor if both else value * factor)
@@ -169,7 +169,7 @@ def plugin_class(v: Any) -> type:
         @staticmethod
         def _attached(value: Any) -> Any:
             """1, with the derivative of log `value`: the choice of a lobe is detached, its probability is not."""
-            return attach(v.Float(1), value / dr.detach(value)) if differentiated(value) else 1
+            return replace_grad(v.Float(1), value / dr.detach(value)) if differentiated(value) else 1
 
         def _mueller(self, ctx: Any, si: Any, bs: Any, ray: Ray, selected_r: Any) -> Any:
             """The Mueller matrix of the selected lobe, turned into the implicit Stokes bases of both directions."""

@@ -17,9 +17,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .keyed_sampler import Sampled, Strata
-from .path_loop import Plan, Trace
-from .scene_features import Needs, inspect
+from .keyed_sampler import KeyedMultijitter, Sampled
+from .path_loop import PathFeatures, Trace
+from .scene_features import SceneFeatures, inspect
 
 INTEGRATOR = "refract_path"
 MOST_PATHS = 4096  # of one sample, at once
@@ -75,7 +75,7 @@ def integrator_class(v: Any) -> type:
             self.deterministic = read_flag(props, "deterministic")
             self.split_depth, self.split_weight = read_split(props, self.deterministic)
             self.seed: Any = 0
-            self.seen: tuple[Any, Needs] | None = None
+            self.seen: tuple[Any, SceneFeatures] | None = None
 
         def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, *more: Any, **named: Any) -> Any:
             self.seed, self.seen = seed, None
@@ -90,11 +90,11 @@ def integrator_class(v: Any) -> type:
             if self.max_depth == 0:
                 return v.Spectrum(0), v.Bool(False), [v.Float(0)] * len(self.aov_names())
             plan = self.plan(scene)
-            numbers = Strata(v, sampler, self.seed) if vectorised and plan.split_depth else Sampled()
+            numbers = KeyedMultijitter(v, sampler, self.seed) if vectorised and plan.split_depth else Sampled()
             end = Trace(v, scene, plan, numbers).run(v.Ray3f(ray), sampler, v.Bool(active))
             return dr.select(end.valid, end.result, 0), end.valid, [end.truncated] if self.deterministic else []
 
-        def plan(self, scene: Any) -> Plan:
+        def plan(self, scene: Any) -> PathFeatures:
             """What is traced of a scene. ValueError where a deterministic render would leave something to chance."""
             needs = self._needs(scene)
             # Local memory has no derivatives, and the evaluated loops that derivatives need have no local memory.
@@ -103,7 +103,7 @@ def integrator_class(v: Any) -> type:
                 raise ValueError(f"{INTEGRATOR}: deterministic: accepted: scenes of smooth dielectrics and conductors")
             if self.deterministic and not symbolic:
                 raise ValueError(f"{INTEGRATOR}: deterministic: accepted: renders that are not differentiated")
-            return Plan(
+            return PathFeatures(
                 self.max_depth,
                 self.rr_depth,
                 self.hide_emitters,
@@ -119,7 +119,7 @@ def integrator_class(v: Any) -> type:
                 all_of_hit=needs.smooth or needs.textured,
             )
 
-        def _needs(self, scene: Any) -> Needs:
+        def _needs(self, scene: Any) -> SceneFeatures:
             """Looked up once a render, as an edit of the scene can change them."""
             if self.seen is None or self.seen[0] is not scene:
                 self.seen = scene, inspect(scene)

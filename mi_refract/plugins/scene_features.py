@@ -52,7 +52,7 @@ EITHER = {
 
 
 @dataclass(frozen=True)
-class Needs:
+class SceneFeatures:
     """Facts about a scene; `unknown` names the plugins of which everything was presumed."""
 
     smooth: bool  # some BSDF has a lobe that is no delta: an emitter sample can matter
@@ -95,7 +95,7 @@ class Needs:
         return {feature: reason for feature, reason in reasons.items() if reason}
 
 
-def inspect(scene: Any) -> Needs:
+def inspect(scene: Any) -> SceneFeatures:
     """What `scene` needs as it is now: an edited parameter can change it."""
     import mitsuba as mi
 
@@ -112,7 +112,7 @@ def inspect(scene: Any) -> Needs:
     lamps = [shape.emitter() for shape in shapes if shape.is_emitter()]
     media = [medium for shape in shapes for medium in (shape.interior_medium(), shape.exterior_medium())]
     media += [end.get_medium() for end in (*emitters, *scene.sensors())]
-    return Needs(
+    return SceneFeatures(
         smooth=everything or bool(flags & +lobes.Smooth),
         sampleable=bool(emitters),  # Mitsuba refuses a scene all of whose emitters have the weight 0
         lamps=any(not emitter.is_environment() and emitter.sampling_weight() > 0 for emitter in emitters),

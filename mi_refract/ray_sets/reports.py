@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from mi_refract.image_diff.text_reports import printable
 from mi_refract.io.atomic import write_atomically
 from mi_refract.regimes import REGIMES
-from mi_refract.report.embedded_images import Pictures
+from mi_refract.report.embedded_images import EmbeddedImages
 from mi_refract.report.html_page import write_page
 from mi_refract.report.plots import compact
 from mi_refract.report.row import strict
@@ -249,4 +249,4 @@ def write_html(path: str | Path, found: Findings, context: Mapping[str, Any], re
         "pi": math.pi,
         "command": replay,
     }
-    write_page(path, "rays.html.j2", content, Pictures())
+    write_page(path, "rays.html.j2", content, EmbeddedImages())

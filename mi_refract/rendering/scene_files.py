@@ -19,7 +19,7 @@ from mi_refract.io.image_file import SUFFIXES, Metadata, one_line, write_exr
 
 LOADER_OPTIONS = ("path", "parallel", "optimize")  # mi.load_file would take these names for its own
 # Merged meshes come in the order of their addresses, and parallel loading in that of its threads. Then so do emitters,
-# and a seed no longer means a picture.
+# and a seed no longer means an image.
 REPRODUCIBLE: Any = {"parallel": False, "optimize": False}
 
 

@@ -1,4 +1,4 @@
-"""The pictures a page embeds: base64 of the deflated planes of half floats, which its script paints and reads."""
+"""The images a page embeds: base64 of the deflated planes of half floats, which its script paints and reads."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy as np
 from mi_refract.io.image_file import read
 
 LARGEST = 65504.0  # of the finite halves
-# Mantissa bits given up, by twos, before a picture is made smaller: at 6 a value is within 1/32 of itself.
+# Mantissa bits given up, by twos, before an image is made smaller: at 6 a value is within 1/32 of itself.
 ROUNDED = (0, 2, 4, 6)
 
 
-class Pictures:
-    """The pictures of one page, each file once. A finite value past ±65504 becomes ±65504. Errors: see `embed`."""
+class EmbeddedImages:
+    """The images of one page, each file once. A finite value past ±65504 becomes ±65504. Errors: see `embed`."""
 
     def __init__(self, folder: Path = Path()) -> None:
         self.folder = folder
@@ -27,10 +27,10 @@ class Pictures:
     @property
     def size(self) -> int:
         """Bytes on the page."""
-        return sum(len(picture["data"]) for picture in self.embedded)
+        return sum(len(image["data"]) for image in self.embedded)
 
     def embed(self, path: str) -> dict[str, Any]:
-        """Key, width, height and data of a picture, whole, by its path relative to the folder.
+        """Key, width, height and data of an image, whole, by its path relative to the folder.
 
         Errors: FileNotFoundError where it is missing, ValueError where it is not RGB or gray; both name it.
         """
@@ -42,9 +42,9 @@ class Pictures:
             self._files[path] = self.add(encoded(pixels))
         return self._files[path]
 
-    def add(self, picture: dict[str, Any]) -> dict[str, Any]:
-        """Put a picture that `encoded` made on the page, under a key of its own."""
-        self.embedded.append(picture | {"key": f"p{len(self.embedded)}"})
+    def add(self, image: dict[str, Any]) -> dict[str, Any]:
+        """Put an image that `encoded` made on the page, under a key of its own."""
+        self.embedded.append(image | {"key": f"p{len(self.embedded)}"})
         return self.embedded[-1]
 
 
@@ -75,7 +75,7 @@ def encoded(pixels: Any, limit: float = np.inf, scale: float = 1.0) -> dict[str,
 
 
 def shown(pixels: Any, channels: tuple[str, ...]) -> tuple[Any, str]:
-    """What a page can show of a picture: its RGB, or its one channel, and their name; (None, "") for neither."""
+    """What a page can show of an image: its RGB, or its one channel, and their name; (None, "") for neither."""
     if {"R", "G", "B"} <= set(channels):
         return pixels[..., [channels.index(name) for name in "RGB"]], "RGB"
     return (pixels, channels[0]) if len(channels) == 1 else (None, "")

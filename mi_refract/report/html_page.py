@@ -1,4 +1,4 @@
-"""One HTML page that needs no other file and no network: a template with style, script and pictures inlined."""
+"""One HTML page that needs no other file and no network: a template with style, script and images inlined."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 
 from mi_refract.io.atomic import write_atomically
 
-from .embedded_images import Pictures
+from .embedded_images import EmbeddedImages
 from .plots import compact
 
 HERE = Path(__file__).parent / "templates"
 
 
-def write_page(path: str | Path, template: str, content: Mapping[str, Any], pictures: Pictures) -> None:
+def write_page(path: str | Path, template: str, content: Mapping[str, Any], images: EmbeddedImages) -> None:
     """Write `template`, one of this package's, filled with `content`; every text of it is escaped. Errors: OSError."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
@@ -23,7 +23,7 @@ def write_page(path: str | Path, template: str, content: Mapping[str, Any], pict
     environment = Environment(loader=FileSystemLoader(HERE), **options)
     environment.filters |= {"compact": compact, "words": words}
     inline = {name: Markup((HERE / f"report.{name}").read_text("utf-8")) for name in ("css", "js")}
-    text = environment.get_template(template).render(**content, **inline, pictures=pictures.embedded)
+    text = environment.get_template(template).render(**content, **inline, images=images.embedded)
     write_atomically(path, text.encode("utf-8", "replace"))
 
 

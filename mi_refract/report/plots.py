@@ -56,7 +56,7 @@ def compact(value: float, digits: int = 3) -> str:
     return f"{mantissa.rstrip('0').rstrip('.') if '.' in mantissa else mantissa}e{int(exponent)}"
 
 
-def apart(value: float, budget: float) -> tuple[str, str]:
+def distinguishable(value: float, budget: float) -> tuple[str, str]:
     """Both as text, with as many digits as it takes to tell them apart when they differ."""
     for digits in range(3, 18):
         texts = compact(value, digits), compact(budget, digits)

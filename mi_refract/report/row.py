@@ -24,7 +24,7 @@ class Row:
     `values` are the numbers by metric name. `budgets` are upper bounds for some of them; a value that is NaN
     breaks its budget. `goals` are upper bounds too, for what a busy machine can spoil (times): a missed goal is
     shown, and decides no verdict. A row without values was not run, and `reason` says why; otherwise `reason` is
-    a remark. `replay` is what repeats the row: seed, sizes, hex floats. `pictures` are EXR paths relative to the output
+    a remark. `replay` is what repeats the row: seed, sizes, hex floats. `images` are EXR paths relative to the output
     folder, by role (`reference`, `test`, `overlay`, `difference`). `curves` are named lists of (x, y) points; what x
     and y are is said once per study, by its `axes` in the context.
     """
@@ -38,7 +38,7 @@ class Row:
     goals: dict[str, float] = field(default_factory=dict)
     reason: str = ""
     replay: dict[str, Any] = field(default_factory=dict)
-    pictures: dict[str, str] = field(default_factory=dict)
+    images: dict[str, str] = field(default_factory=dict)
     curves: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

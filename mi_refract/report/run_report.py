@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 from mi_refract.io.atomic import write_atomically
 
 from . import study_page
-from .embedded_images import Pictures
+from .embedded_images import EmbeddedImages
 from .html_page import write_page
-from .plots import apart
+from .plots import distinguishable
 from .row import SCHEMA, Row, by_study, strict
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ def _junit_cases(suite: Any, row: Row) -> None:
     for metric, budget in row.budgets.items() if row.values else ():
         case = xml.SubElement(suite, "testcase", classname=_xml(row.study), name=_xml(f"{name}: {metric}"))
         if metric in row.broken:
-            text, limit = apart(row.values[metric], budget)
+            text, limit = distinguishable(row.values[metric], budget)
             failure = xml.SubElement(case, "failure", message=_xml(f"{metric} {text}, budget {limit}"))
             parts = (f"value {row.values[metric]!r}, budget {budget!r}", row.reason, row.replay_text)
             failure.text = _xml("\n".join(filter(None, parts)))
@@ -160,7 +160,7 @@ def summary(rows: Sequence[Row]) -> RenderableType:
         table.add_column("value", justify="right", style=style)
         table.add_column("bound", justify="right")
         for row, metric in exceeded:
-            table.add_row(Text(row.name), Text(metric), *apart(row.values[metric], row.bounds[metric]))
+            table.add_row(Text(row.name), Text(metric), *distinguishable(row.values[metric], row.bounds[metric]))
         parts += [table, Text()] if exceeded else []
     counts = Table("study", box=None, pad_edge=False)
     for word in VERDICTS:
@@ -174,11 +174,11 @@ def summary(rows: Sequence[Row]) -> RenderableType:
 
 
 def write_html(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any], folder: str | Path) -> None:
-    """Write one page that needs no other file; `folder` is what the rows' picture paths are relative to.
+    """Write one page that needs no other file; `folder` is what the rows' image paths are relative to.
 
-    Pictures are embedded whole, three halves a pixel (a finite value past 65504 becomes 65504), each file once.
-    Errors: FileNotFoundError or ValueError naming a picture that is missing or not RGB or gray; OSError.
+    Images are embedded whole, three halves a pixel (a finite value past 65504 becomes 65504), each file once.
+    Errors: FileNotFoundError or ValueError naming an image that is missing or not RGB or gray; OSError.
     """
-    pictures = Pictures(Path(folder))
-    content = study_page.prepare(rows, context, pictures) | {"sentence": verdict(rows)}
-    write_page(path, "report.html.j2", content, pictures)
+    images = EmbeddedImages(Path(folder))
+    content = study_page.prepare(rows, context, images) | {"sentence": verdict(rows)}
+    write_page(path, "report.html.j2", content, images)

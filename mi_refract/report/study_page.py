@@ -1,4 +1,4 @@
-"""What the page shows, laid out from the rows: panels, tables, plots, pictures. Nothing is measured or judged here.
+"""What the page shows, laid out from the rows: panels, tables, plots, images. Nothing is measured or judged here.
 
 `context` is what all rows share. Every entry is shown as it is, except four that steer the page:
 
@@ -18,15 +18,15 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .embedded_images import Pictures
-from .plots import Axes, Scatter, apart, compact, curves_svg, drawable, scatter_svg
+from .embedded_images import EmbeddedImages
+from .plots import Axes, Scatter, compact, curves_svg, distinguishable, drawable, scatter_svg
 from .row import Row, by_study
 
 STEERING = ("title", "studies", "scatter", "replay")
 ROLES = ("reference", "test", "overlay", "difference")
 
 
-def prepare(rows: Sequence[Row], context: Mapping[str, Any], pictures: Pictures) -> dict[str, Any]:
+def prepare(rows: Sequence[Row], context: Mapping[str, Any], images: EmbeddedImages) -> dict[str, Any]:
     verdicts = Counter(row.verdict for row in rows)
     return {
         "title": context.get("title", "mi_refract"),
@@ -47,7 +47,7 @@ def prepare(rows: Sequence[Row], context: Mapping[str, Any], pictures: Pictures)
         "missing": _missing(rows),
         "absent": verdicts["not run"],
         "studies": [
-            _study(name, members, context, pictures, f"study-{number}")
+            _study(name, members, context, images, f"study-{number}")
             for number, (name, members) in enumerate(by_study(rows).items(), 1)
         ],
     }
@@ -62,7 +62,7 @@ def _missing(rows: Sequence[Row]) -> list[tuple[str, str, list[Row]]]:
     return [(*key, members) for key, members in groups.items()]
 
 
-def _study(name: str, rows: list[Row], context: Mapping[str, Any], pictures: Pictures, key: str) -> dict[str, Any]:
+def _study(name: str, rows: list[Row], context: Mapping[str, Any], images: EmbeddedImages, key: str) -> dict[str, Any]:
     about = context.get("studies", {}).get(name, {})
     metrics = list(dict.fromkeys(metric for row in rows for metric in row.values))
     axes = Axes(**about.get("axes", {}))
@@ -82,7 +82,7 @@ def _study(name: str, rows: list[Row], context: Mapping[str, Any], pictures: Pic
         "panels": _panels(rows, metrics, scale),
         "scatters": [s for i, each in enumerate(scatters) if (s := _scatter(each, rows, f"{key}-scatter-{i}"))],
         "plots": plots,
-        "figures": [_figure(row, pictures) for row in rows if row.pictures],
+        "figures": [_figure(row, images) for row in rows if row.images],
     }
 
 
@@ -144,14 +144,14 @@ def _scale(rows: list[Row], metrics: list[str]) -> tuple[float, float] | None:
 def _phrase(row: Row, metric: str) -> str:
     if metric not in row.bounds:
         return f"{metric} {compact(row.values[metric])}"
-    return f"{metric} {apart(row.values[metric], row.bounds[metric])[0]} {_bound(row, metric)}"
+    return f"{metric} {distinguishable(row.values[metric], row.bounds[metric])[0]} {_bound(row, metric)}"
 
 
 def _bound(row: Row, metric: str) -> str:
     """The budget or goal with how the value stands to it; NaN is neither above nor below."""
     value, budget = row.values[metric], row.bounds[metric]
     sign = "≤" if value <= budget else ">" if value > budget else "≰"
-    return f"{sign} {apart(value, budget)[1]}"
+    return f"{sign} {distinguishable(value, budget)[1]}"
 
 
 def _table(rows: list[Row], metrics: list[str], heading: str = "") -> dict[str, Any]:
@@ -178,7 +178,7 @@ def _cell(row: Row, metric: str) -> dict[str, str] | None:
         return None
     if metric not in row.bounds:
         return {"state": "info", "text": compact(row.values[metric]), "budget": ""}
-    text = apart(row.values[metric], row.bounds[metric])[0]
+    text = distinguishable(row.values[metric], row.bounds[metric])[0]
     state = "fail" if metric in row.broken else "missed" if metric in row.missed else "pass"
     return {"state": state, "text": text, "budget": _bound(row, metric)}
 
@@ -207,10 +207,10 @@ def _scatter(scatter: Mapping[str, Any], rows: list[Row], salt: str) -> dict[str
     return {"title": scatter.get("title", f"{y} against {x}"), "svg": svg, "omitted": omitted}
 
 
-def _figure(row: Row, pictures: Pictures) -> dict[str, Any]:
-    roles = [role for role in ROLES if role in row.pictures]
-    roles += [role for role in row.pictures if role not in ROLES]
-    panes = [_pane(role) | pictures.embed(row.pictures[role]) for role in roles]
+def _figure(row: Row, images: EmbeddedImages) -> dict[str, Any]:
+    roles = [role for role in ROLES if role in row.images]
+    roles += [role for role in row.images if role not in ROLES]
+    panes = [_pane(role) | images.embed(row.images[role]) for role in roles]
     return {"row": row, "panes": panes, "paired": roles[:2] == ["reference", "test"]}
 
 

@@ -86,7 +86,7 @@ def shell(code, *arguments, **environment):
 # render
 
 
-def test_the_picture_is_mitsubas(render, scene):
+def test_the_image_is_mitsubas(render, scene):
     code, out, err = render("--spp", 9, "--seed", 3)
     assert (code, err) == (0, "")
     assert "out.exr: scalar_rgb, 9 spp" in out
@@ -189,13 +189,13 @@ def test_bad_scene(render, scene, text, message):
     assert list(scene.parent.iterdir()) == [scene]
 
 
-def test_a_failed_rendering_keeps_the_old_picture(render, scene):
+def test_a_failed_rendering_keeps_the_old_image(render, scene):
     scene.with_name("out.exr").write_text("old")
     assert render("-D", "bsdf=nonesuch")[0] == 2
     assert scene.with_name("out.exr").read_text() == "old"
 
 
-def test_a_rendering_cut_short_is_not_a_picture(render, scene):
+def test_a_rendering_cut_short_is_not_an_image(render, scene):
     text = SCENE.replace('value="5"/>', 'value="5"/><float name="timeout" value="0.01"/>')
     scene.write_text(text)
     code, _, err = render("--spp", 100000)
@@ -204,7 +204,7 @@ def test_a_rendering_cut_short_is_not_a_picture(render, scene):
     assert list(scene.parent.iterdir()) == [scene]
 
 
-# What the shell ignores in a background job, Mitsuba does not: it would return a picture of the samples so far.
+# What the shell ignores in a background job, Mitsuba does not: it would return an image of the samples so far.
 INTERRUPTED = """
 import signal, sys
 if sys.argv[1] == "ignored":

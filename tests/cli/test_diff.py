@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from support.diff_images import BROKEN, picture, samples, tree
+from support.diff_images import BROKEN, image, samples, tree
 
 from mi_refract import backend
 from mi_refract.cli import app
@@ -30,7 +30,7 @@ def test_equal(run, pair):
     old, new = pair
     code, out, err = run("diff", old / "equal.exr", new / "equal.exr")
     assert (code, err) == (0, "")
-    assert out.splitlines()[-1] == "1 picture: 1 equal"
+    assert out.splitlines()[-1] == "1 image: 1 equal"
 
 
 def test_different(run, pair):
@@ -39,7 +39,7 @@ def test_different(run, pair):
     lines = out.splitlines()
     assert lines[1].split()[:3] == ["different", "louder.exr", "tolerance"]
     assert lines[2].split()[:3] == ["equal", "equal.exr", "tolerance"]
-    assert lines[3] == "2 pictures: 1 different, 1 equal"
+    assert lines[3] == "2 images: 1 different, 1 equal"
     assert len(lines) == 4
 
 
@@ -51,7 +51,7 @@ def test_inconclusive(run, tmp_path):
         junit = tmp_path / "out.xml"
         code, out, err = run("diff", *folders, "--samples", "--method", "welch", "--junit", junit, *how)
         assert (code, err) == (expected, "")
-        assert out.splitlines()[-1] == "1 picture: 1 inconclusive"
+        assert out.splitlines()[-1] == "1 image: 1 inconclusive"
         failures = ElementTree.parse(junit).findall(".//failure")
         assert [each.get("type") for each in failures] == ([] if word == "pass" else ["inconclusive"])
 
@@ -94,20 +94,20 @@ def test_settings_lie_beside_the_references(run, pair, tmp_path):
     assert run("diff", old, new, "--settings", other)[0] == 1
     other.write_text(rule.replace("louder.exr", "lauder.exr"))
     code, _, err = run("diff", old, new, "--settings", other)
-    assert (code, err) == (1, "mi-refract: lauder.exr: matches no picture\n")
+    assert (code, err) == (1, "mi-refract: lauder.exr: matches no image\n")
 
 
 def test_nan_has_to_be_named(run, pair):
     for folder in pair:
-        picture(folder / "louder.exr", value=np.nan)
+        image(folder / "louder.exr", value=np.nan)
     assert run("diff", *pair)[0] == 1
     assert run("diff", *pair, "--allow-nonfinite", "equal.exr")[0] == 1
     assert run("diff", *pair, "--allow-nonfinite", "louder.exr")[0] == 0
-    picture(pair[1] / "louder.exr", value=np.inf)
+    image(pair[1] / "louder.exr", value=np.inf)
     assert run("diff", *pair, "--allow-nonfinite", "louder.exr")[0] == 1
 
 
-def test_the_methods_are_printed_without_pictures(run):
+def test_the_methods_are_printed_without_images(run):
     code, out, err = run("diff", "--methods")
     assert (code, err) == (0, "")
     for name, method in methods.METHODS.items():
@@ -120,7 +120,7 @@ def test_the_methods_are_printed_without_pictures(run):
 
 @pytest.mark.parametrize("name", BROKEN)
 @pytest.mark.parametrize("side", [0, 1])
-def test_bad_pictures(run, pair, tmp_path, name, side):
+def test_bad_images(run, pair, tmp_path, name, side):
     bad = pair[side] / "equal.exr"
     bad.unlink()
     BROKEN[name](bad)
@@ -130,7 +130,7 @@ def test_bad_pictures(run, pair, tmp_path, name, side):
     assert err.startswith("mi-refract: ")
     assert "equal.exr" in err
     assert out.splitlines()[1].split()[:2] == ["different", "louder.exr"]
-    assert out.splitlines()[-1] == "2 pictures: 1 could not be compared, 1 different"
+    assert out.splitlines()[-1] == "2 images: 1 could not be compared, 1 different"
     assert {r["name"]: r["status"] for r in json.loads(files[0].read_text())["results"]} == {
         "equal.exr": "error",
         "louder.exr": "different",
@@ -141,7 +141,7 @@ def test_bad_pictures(run, pair, tmp_path, name, side):
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
-def test_a_picture_without_permission(run, pair):
+def test_an_image_without_permission(run, pair):
     (pair[1] / "equal.exr").chmod(0)
     code, out, err = run("diff", *pair)
     assert (code, err.count("\n")) == (2, 1)
@@ -152,8 +152,8 @@ def test_a_picture_without_permission(run, pair):
 BAD = {
     "no file": (["{}/old", "{}/none"], "none"),
     "file and folder": (["{}/old", "{}/new/equal.exr"], "a folder and a file"),
-    "nothing in it": (["{}/old", "{}/empty"], "empty: holds no picture"),
-    "nothing to refer to": (["{}/empty", "{}/new"], "empty: holds no picture"),
+    "nothing in it": (["{}/old", "{}/empty"], "empty: holds no image"),
+    "nothing to refer to": (["{}/empty", "{}/new"], "empty: holds no image"),
     "twice the folder": (["{}/old", "{}/old"], "the same as the reference"),
     "twice the file": (["{}/old/equal.exr", "{}/old/../old/equal.exr"], "the same as the reference"),
     "within": (["{}", "{}/new"], "one within the other"),
@@ -202,8 +202,8 @@ def test_without_the_extra(run, pair, monkeypatch, tmp_path, verb, package):
 
 
 def test_nothing_is_created_or_overwritten(run, pair, tmp_path):
-    picture(pair[1] / "added.exr")
-    picture(pair[0] / "removed.exr")
+    image(pair[1] / "added.exr")
+    image(pair[0] / "removed.exr")
     before = tree(tmp_path)
     run("diff", *pair)
     run("diff", pair[0] / "none.exr", pair[1] / "added.exr")
@@ -221,7 +221,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(self_test, "examine", lambda renders, case: full(renders, case, trials=2, null_pairs=4))
 
 
-def test_self_test_of_renders_and_of_one_picture(run, tmp_path, quick):
+def test_self_test_of_renders_and_of_one_image(run, tmp_path, quick):
     folder = samples(tmp_path / "renders", 8, noise=0.001)
     for path, number in ((folder, "null pairs 4"), (folder / "0.exr", "null pairs 1")):
         code, out, err = run("diff", "--self-test", path)
@@ -250,9 +250,9 @@ def test_a_self_test_that_misses_something_says_so(run, pair, quick, monkeypatch
 
 
 def test_bad_self_tests(run, pair, tmp_path):
-    picture(tmp_path / "mixed" / "a.exr")
-    picture(tmp_path / "mixed" / "b.exr", shape=(8, 8, 3))
-    picture(tmp_path / "nan.exr", value=np.nan)
+    image(tmp_path / "mixed" / "a.exr")
+    image(tmp_path / "mixed" / "b.exr", shape=(8, 8, 3))
+    image(tmp_path / "nan.exr", value=np.nan)
     for words, message in [
         (pair, "--self-test takes one path"),
         ([pair[0] / "equal.exr", "--report", tmp_path / "a.html"], "accepted: no other option"),
@@ -285,7 +285,7 @@ def test_report(run, pair, tmp_path):
 def strange(pair):
     """The pair with a third whose name is anything but text, added."""
     name = EVIL.replace("/", "∕")
-    picture(pair[1] / "inner.exr")
+    image(pair[1] / "inner.exr")
     (pair[1] / "inner.exr").rename(pair[1] / name)
     return pair, name
 
@@ -343,10 +343,10 @@ def test_github(run, strange, tmp_path, monkeypatch):
     assert sum("title=louder.exr%3A different::" in line for line in commands) == 1
     (evil,) = [line for line in commands if "script" in line]
     file, _, rest = evil.removeprefix("::error ").partition("::")
-    assert rest == "only among the new pictures"
+    assert rest == "only among the new images"
     assert file.count(",") == 1 and ":" not in file and "%250A" in file
     text = summary.read_text()
-    assert text.startswith("before\n### mi-refract diff: 3 pictures: 1 could not be compared, 2 different\n")
+    assert text.startswith("before\n### mi-refract diff: 3 images: 1 could not be compared, 2 different\n")
     assert "<script>" not in text and "`" not in text
     rows = [line for line in text.splitlines() if line.startswith("| ")]
     assert len(rows) == 4
@@ -360,7 +360,7 @@ def test_github_without_a_summary(run, pair, monkeypatch):
     assert sum(line.startswith("::error ") for line in out.splitlines()) == 1
     (pair[1] / "louder.exr").write_bytes((pair[0] / "louder.exr").read_bytes())
     code, out, err = run("diff", *pair, "--github")
-    assert (code, out.splitlines()[-1]) == (0, "2 pictures: 2 equal")
+    assert (code, out.splitlines()[-1]) == (0, "2 images: 2 equal")
 
 
 def test_strangers_words_stay_text(tmp_path):
@@ -379,17 +379,17 @@ def test_strangers_words_stay_text(tmp_path):
     assert json.loads((tmp_path / "out.json").read_text())["results"][0]["name"] == name
 
 
-def test_many_equal_pictures_are_counted_and_not_listed(tmp_path, run):
+def test_many_equal_images_are_counted_and_not_listed(tmp_path, run):
     for i in range(text_reports.FEW + 2):
         for side in ("old", "new"):
-            picture(tmp_path / side / f"{i}.exr", shape=(4, 4, 3))
+            image(tmp_path / side / f"{i}.exr", shape=(4, 4, 3))
     code, out, _ = run("diff", tmp_path / "old", tmp_path / "new")
     lines = out.splitlines()
     assert code == 0
     assert len(lines) == text_reports.FEW + 3
     assert lines[-2:] == [
         "… and 2 more that are equal",
-        f"{text_reports.FEW + 2} pictures: {text_reports.FEW + 2} equal",
+        f"{text_reports.FEW + 2} images: {text_reports.FEW + 2} equal",
     ]
 
 

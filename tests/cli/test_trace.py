@@ -73,15 +73,15 @@ def test_without_an_output_a_line_is_printed(trace, ball):
 
 
 @pytest.mark.parametrize("suffix", [*FORMATS, ".SVG"])
-def test_a_picture_of_each_kind(trace, ball, suffix):
-    output = ball.with_name(f"picture{suffix}")
+def test_an_image_of_each_kind(trace, ball, suffix):
+    output = ball.with_name(f"image{suffix}")
     assert trace("-o", output) == (0, "ball.toml: 7 rays, 14 hits, 7 escaped\n", "")
     assert output.read_bytes().startswith(FORMATS[suffix.lower()])
     assert sorted(ball.parent.iterdir()) == sorted([ball, output])
 
 
-def test_a_picture_is_replaced(trace, ball):
-    output = ball.with_name("picture.svg")
+def test_an_image_is_replaced(trace, ball):
+    output = ball.with_name("image.svg")
     trace("-o", output)
     first = output.read_bytes()
     trace("-o", output)
@@ -104,8 +104,8 @@ def test_json_is_the_paths(trace, ball):
         assert path["indices"] == [1.0, 1.5, 1.0]
 
 
-def test_json_and_a_picture(trace, ball):
-    output = ball.with_name("picture.png")
+def test_json_and_an_image(trace, ball):
+    output = ball.with_name("image.png")
     assert len(paths_of(trace("--json", "-o", output))) == 7
     assert output.exists()
 
@@ -133,7 +133,7 @@ def test_branches_override_the_file(trace, ball):
 
 def test_rays_and_depth(trace):
     assert trace("--rays", 101)[1] == "ball.toml: 101 rays, 202 hits, 101 escaped\n"
-    assert trace("--max-depth", 1)[1] == "ball.toml: 7 rays, 7 hits, 7 exhausted\n"
+    assert trace("--max-depth", 1)[1] == "ball.toml: 7 rays, 7 hits, 7 stopped at max_depth\n"
 
 
 def test_the_precision(trace):
@@ -165,9 +165,9 @@ def test_a_backend(trace):
 
 
 BAD = {
-    "suffix": (("-o", "{}/picture.gif"), "accepted: a file name that ends in .svg or .png or .pdf"),
-    "no suffix": (("-o", "{}/picture"), "accepted: a file name that ends in"),
-    "no folder": (("-o", "{}/none/picture.svg"), "is not a folder"),
+    "suffix": (("-o", "{}/image.gif"), "accepted: a file name that ends in .svg or .png or .pdf"),
+    "no suffix": (("-o", "{}/image"), "accepted: a file name that ends in"),
+    "no folder": (("-o", "{}/none/image.svg"), "is not a folder"),
     "folder": (("-o", "{}/folder.svg"), "is a folder"),
     "branches": (("--branches", "-1"), "--branches"),
     "branches, no number": (("--branches", "some"), "--branches"),
@@ -186,7 +186,7 @@ BAD = {
 def test_bad_options(trace, ball, options, message):
     ball.with_name("folder.svg").mkdir()
     if "-o" not in options:
-        options = (*options, "-o", str(ball.with_name("picture.svg")))
+        options = (*options, "-o", str(ball.with_name("image.svg")))
     code, out, err = trace(*(option.format(ball.parent) for option in options))
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert err.startswith("mi-refract: ")
@@ -211,7 +211,7 @@ def test_bad_options(trace, ball, options, message):
 )
 def test_bad_scenes(trace, ball, old, new, message):
     ball.write_text(BALL.replace(old, new))
-    code, out, err = trace("-o", ball.with_name("picture.svg"), "--json")
+    code, out, err = trace("-o", ball.with_name("image.svg"), "--json")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert err.startswith(f"mi-refract: {ball}")
     assert message in err
@@ -219,7 +219,7 @@ def test_bad_scenes(trace, ball, old, new, message):
 
 
 def test_no_scene(trace, ball):
-    code, out, err = trace("-o", ball.with_name("picture.svg"), scene=ball.with_name("none.toml"))
+    code, out, err = trace("-o", ball.with_name("image.svg"), scene=ball.with_name("none.toml"))
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "none.toml" in err
 
@@ -228,13 +228,13 @@ def test_without_matplotlib(trace, ball, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert trace()[0] == 0
     monkeypatch.setattr(scene_file, "load", lambda path: pytest.fail("said too late"))
-    code, out, err = trace("-o", ball.with_name("picture.svg"))
+    code, out, err = trace("-o", ball.with_name("image.svg"))
     assert (code, out) == (2, "")
-    assert err == "mi-refract: pictures need the extra `plot`: pip install 'mi-refract[plot]'\n"
+    assert err == "mi-refract: images need the extra `plot`: pip install 'mi-refract[plot]'\n"
 
 
-def test_a_failed_picture_keeps_the_old_one(trace, ball, monkeypatch):
-    output = ball.with_name("picture.svg")
+def test_a_failed_image_keeps_the_old_one(trace, ball, monkeypatch):
+    output = ball.with_name("image.svg")
     output.write_text("old")
     ball.write_text(BALL.replace("n = 1.5", "n = 0"))
     assert trace("-o", output)[0] == 2
@@ -252,7 +252,7 @@ def shell(before, *arguments):
     return subprocess.Popen(command, env=PYTHON, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
-def test_matplotlib_is_only_loaded_for_pictures(ball):
+def test_matplotlib_is_only_loaded_for_images(ball):
     more = "import atexit; atexit.register(lambda: print('matplotlib' in sys.modules))"
     with shell(more, "trace", ball, "--table") as process:
         out, err = process.communicate(timeout=120)
@@ -269,7 +269,7 @@ def slow(self, target):
     time.sleep(60)
 atomic.Path.replace = slow
 """
-    with shell(more, "trace", ball, "-o", ball.with_name("picture.svg")) as process:
+    with shell(more, "trace", ball, "-o", ball.with_name("image.svg")) as process:
         assert process.stdout.readline() == "written\n"
         assert len(list(ball.parent.iterdir())) == 2
         time.sleep(0.1)
@@ -283,7 +283,7 @@ def test_every_scene_of_ours_is_consistent(trace, path):
     code, out, err = trace(scene=path)
     assert (code, err) == (0, "")
     assert " escaped" in out
-    assert "contradicted" not in out
+    assert "mismatch" not in out
 
 
 def test_formats_are_those_that_are_drawn():

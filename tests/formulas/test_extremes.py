@@ -1,4 +1,4 @@
-"""Pictures in which a comparison sees little: fireflies, values past float32, black, and noise it cannot count on."""
+"""Images in which a comparison sees little: fireflies, values past float32, black, and noise it cannot count on."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_method_that_black_would_pass_knows_nothing(method, options):
     dark = 0.004 * SMOOTH
     found = compare(method, image(dark), image(0.9 * dark), **options)
     assert found.verdict is INCONCLUSIVE
-    assert found.reason.startswith("an all-black picture would pass, too")
+    assert found.reason.startswith("an all-black image would pass, too")
     assert compare(method, image(dark), image(dark), **options).verdict is EQUAL
     assert compare(method, image(0 * dark), image(0 * dark), **options).verdict is EQUAL
 
@@ -109,13 +109,13 @@ def renders(count, shape=(32, 32, 3), deviation=0.1, blur=0):
 
 @pytest.mark.parametrize("count", [2, 8])
 @pytest.mark.parametrize("shape", [(64, 64, 1), (32, 32, 3), (16, 16, 3)])
-def test_a_wide_filter_makes_no_false_alarms_in_small_pictures(shape, count):
+def test_a_wide_filter_makes_no_false_alarms_in_small_images(shape, count):
     """40 null pairs at 0.1 %: more than 2 has probability 1e-5. Taken for independent, half or more of them alarm."""
     pairs = (compare("welch", *(renders(count, shape, blur=1) for _ in range(2))) for _ in range(40))
     assert sum(found.verdict is DIFFERENT for found in pairs) <= 2
 
 
-def test_a_lamp_in_the_picture_makes_no_tile_dark():
+def test_a_lamp_in_the_image_makes_no_tile_dark():
     reference, test = renders(8, (64, 64, 3)), renders(8, (64, 64, 3))
     for each in (*reference, *test):
         each.pixels[:16, :16] *= 1e7
@@ -134,7 +134,7 @@ def test_without_noise_what_moves_within_a_tile_is_seen():
     assert {f.name: f.value for f in found.figures}["smallest p, adjusted for the number of tests"] == 1
 
 
-def test_a_tile_larger_than_the_picture_is_the_picture():
+def test_a_tile_larger_than_the_image_is_the_image():
     reference, test = renders(8), renders(8)
     found = compare("welch", reference, test, tile=10**30)
     assert found.verdict is compare("welch", reference, test, tile=32).verdict

@@ -10,7 +10,7 @@ from flint import acb, arb, ctx
 from mi_refract import oracle
 from mi_refract.formulas import fresnel
 from mi_refract.formulas.documented import FORMULAS
-from mi_refract.numerics.error_free import Double
+from mi_refract.numerics.error_free import DoubleWord
 
 COUNT = {"scalar": 60, "llvm": 4000, "cuda": 4000}
 
@@ -202,7 +202,7 @@ def without_a_factor(powers):
 
     def one_to_one(c, y, mirror, sin2, k, kappa):
         r, t = powers(c, y, mirror, sin2, k, kappa)
-        return r, t * k.hi if isinstance(k, Double) else t * k
+        return r, t * k.hi if isinstance(k, DoubleWord) else t * k
 
     return one_to_one
 
@@ -211,7 +211,7 @@ def in_one_precision(powers):
     """The same sums, with the square in place of the sum, in the precision of the arguments."""
 
     def plain_powers(c, y, mirror, sin2, k, kappa):
-        c, y, sin2, k, kappa = (x.hi if isinstance(x, Double) else x for x in (c, y, sin2, k, kappa))
+        c, y, sin2, k, kappa = (x.hi if isinstance(x, DoubleWord) else x for x in (c, y, sin2, k, kappa))
         s, p = k * c + y, c + k * y
         square = (s * p) * (s * p)
         r = kappa * kappa * ((k * sin2) * (k * sin2) + (c * y) * (c * y)) / square
@@ -225,7 +225,7 @@ def as_printed(powers):
     """r_s = (k cᵢ − cₜ)/(k cᵢ + cₜ), r_p alike: differences of rounded cosines."""
 
     def printed(c, y, mirror, sin2, k, kappa):
-        c, y, k = (x.hi if isinstance(x, Double) else x for x in (c, y, k))
+        c, y, k = (x.hi if isinstance(x, DoubleWord) else x for x in (c, y, k))
         s, p = (k * c - y) / (k * c + y), (c - k * y) / (c + k * y)
         r = (s * s + p * p) / 2
         return r, 1 - r
@@ -258,10 +258,10 @@ def test_double_words_do_not_suffice_to_the_ulp(name, vectorised, monkeypatch):
     """What an exact sum is for: of the plain one, and of pairs in float64, too little is left."""
 
     def differences(cos_i, k, contrast):
-        lift = fresnel._wide if vectorised.name == "float32" else Double
+        lift = fresnel._wide if vectorised.name == "float32" else DoubleWord
         c2, k2 = lift(cos_i) * lift(cos_i), lift(k) * lift(k)
         radicand, defect = k2 * c2 - (k2 - 1), k2 * (-c2 + 1) - c2
-        return (radicand, defect.rounded()) if vectorised.name == "float64" else (Double(radicand), defect)
+        return (radicand, defect.rounded()) if vectorised.name == "float64" else (DoubleWord(radicand), defect)
 
     cos_i, k = drawn(name, vectorised)
     exact = oracle.fresnel(cos_i, k)

@@ -8,7 +8,7 @@ import pytest
 
 from mi_refract.formulas import well_conditioned
 from mi_refract.numerics import error_free
-from mi_refract.numerics.error_free import Double, Expansion
+from mi_refract.numerics.error_free import DoubleWord, TripleWord
 
 COUNT = {"scalar": 40, "llvm": 400, "cuda": 400}
 # k of three kinds: the critical angle far from both ends, at grazing, and at almost normal incidence.
@@ -47,23 +47,23 @@ def terms(a, n, k):
 
 
 def radicand(a, n, k):
-    kappa = Double.product(k, k) - 1
+    kappa = DoubleWord.product(k, k) - 1
     return well_conditioned._radicand(error_free.dot(n, a), error_free.cross(n, a), kappa)
 
 
 def radicand_of_plain_contrast(a, n, k):
-    kappa = Double((k - 1) * (k + 1))
+    kappa = DoubleWord((k - 1) * (k + 1))
     return well_conditioned._radicand(error_free.dot(n, a), error_free.cross(n, a), kappa)
 
 
 def radicand_of_plain_cosine(a, n, k):
-    kappa = Double.product(k, k) - 1
-    return well_conditioned._radicand(Expansion(dr.dot(n, a)), error_free.cross(n, a), kappa)
+    kappa = DoubleWord.product(k, k) - 1
+    return well_conditioned._radicand(TripleWord(dr.dot(n, a)), error_free.cross(n, a), kappa)
 
 
 def radicand_of_the_second_order(a, n, k):
     """What pairs keep: the errors of first order, each rounded."""
-    kappa, c, w = Double.product(k, k) - 1, error_free.dot(n, a).pair, [x.pair for x in error_free.cross(n, a)]
+    kappa, c, w = DoubleWord.product(k, k) - 1, error_free.dot(n, a).pair, [x.pair for x in error_free.cross(n, a)]
     return c * c - kappa * (w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
 
 
@@ -94,7 +94,7 @@ LENGTHS = [1e-18, 3e-7, 1.0, 1.9999999, 2.0, 5e9, 1e18]
 def test_lengths_are_brought_near_one_by_a_power_of_two(length, vectorised):
     v = vectorised.vector(*(length * x for x in (0.6, -0.7, 0.1)))
     dr.make_opaque(v)
-    scaled, power = error_free.near_unit(v)
+    scaled, power = error_free.scale_to_unit(v)
     assert (np.array(scaled * power) == np.array(v)).all()
     if vectorised.name == "float32":
         assert 1 <= np.abs(np.array(scaled)).max() < 2
@@ -108,5 +108,5 @@ def test_lengths_are_brought_near_one_by_a_power_of_two(length, vectorised):
 def test_what_has_no_length_is_not_given_one(bad, vectorised):
     v = vectorised.vector(bad, 0.0, 0.0)
     dr.make_opaque(v)
-    scaled = np.array(error_free.near_unit(v)[0]).ravel()
+    scaled = np.array(error_free.scale_to_unit(v)[0]).ravel()
     assert scaled[0] == 0 if bad == 0 else not np.isfinite(scaled).all()

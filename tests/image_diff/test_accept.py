@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from support.diff_images import BROKEN, found, picture, tree
+from support.diff_images import BROKEN, found, image, tree
 
 from mi_refract.cli import diff as cli_diff
 from mi_refract.image_diff import folders as diff
@@ -50,7 +50,7 @@ def test_a_reference_that_is_not_there_yet(folders, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["truncated", "empty", "text", "several parts", "deep", "zero size"])
-def test_a_bad_picture_becomes_no_reference(folders, name):
+def test_a_bad_image_becomes_no_reference(folders, name):
     old, new = folders
     bad = new / "same.exr"
     bad.unlink()
@@ -59,7 +59,7 @@ def test_a_bad_picture_becomes_no_reference(folders, name):
         list(diff.changes(diff.diff(old, new)))
 
 
-def test_a_bad_added_picture_becomes_no_reference(folders):
+def test_a_bad_added_image_becomes_no_reference(folders):
     BROKEN["truncated"](folders[1] / "added.exr")
     with pytest.raises(ValueError, match=r"added\.exr"):
         list(diff.changes(diff.diff(*folders)))
@@ -80,7 +80,7 @@ def test_a_bad_reference_can_be_replaced(folders):
 
 
 def test_values_that_are_not_finite_become_no_reference(folders):
-    picture(folders[1] / "same.exr", value=np.inf)
+    image(folders[1] / "same.exr", value=np.inf)
     with pytest.raises(ValueError, match="not finite; accepted with --allow-nonfinite"):
         list(diff.changes(diff.diff(*folders)))
     named = Settings(allow_nonfinite=("same.exr",))
@@ -99,8 +99,8 @@ def test_a_copy_that_fails_leaves_the_old_reference(folders, monkeypatch):
 
 def test_a_name_with_a_dash_is_no_option_of_the_command(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    picture(Path("-a.exr"))
-    picture(Path("-b.exr"), gain=1.1)
+    image(Path("-a.exr"))
+    image(Path("-b.exr"), gain=1.1)
     results = diff.diff("-a.exr", "-b.exr")
     assert results.reproduce(results.results[0]) == "mi-refract diff ./-a.exr ./-b.exr"
     assert results.accept(results.results[0]) == "mi-refract accept ./-a.exr ./-b.exr"
@@ -136,7 +136,7 @@ def terminal(monkeypatch):
 
 def test_accept(run, pair):
     old, new = pair
-    picture(new / "inner" / "added.exr")
+    image(new / "inner" / "added.exr")
     code, out, err = run("accept", old, new, "--yes")
     assert (code, err) == (0, "")
     assert f"{new}/louder.exr → {old}/louder.exr\n" in out
@@ -150,7 +150,7 @@ def test_accept_takes_nothing_that_changed_since(run, pair, monkeypatch):
     before = tree(pair[0])
 
     def late(count):
-        picture(pair[1] / "louder.exr", value=0.1)
+        image(pair[1] / "louder.exr", value=0.1)
         return True
 
     monkeypatch.setattr(cli_diff, "_agreed", late)

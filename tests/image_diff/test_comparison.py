@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from mi_refract.image_diff import methods, tile_statistics
-from mi_refract.image_diff.methods import METHODS, Verdict, gates
+from mi_refract.image_diff.methods import METHODS, Verdict, preconditions
 from mi_refract.io.image_file import Image
 
 SMOOTH = np.dstack([np.linspace(0.1, 0.9, 48 * 40).reshape(40, 48) ** k for k in (1, 2, 3)]).astype(np.float32)
@@ -96,10 +96,10 @@ def test_channels_are_matched_by_name(method):
 
 
 def test_gates_pass_what_is_whole():
-    assert gates(image(SMOOTH), image(0 * SMOOTH)) is None
+    assert preconditions(image(SMOOTH), image(0 * SMOOTH)) is None
 
 
-# Pictures ------------------------------------------------------------------------------------------------------
+# Images ------------------------------------------------------------------------------------------------------
 
 
 def test_exact_sees_the_last_bit():
@@ -224,7 +224,7 @@ def test_a_tile_off_by_more_than_the_detectable_difference_is_seen(correction):
     assert seen.maps["q"][20, 40] < 0.01 < seen.maps["q"][0, 0]
 
 
-def test_a_gain_too_small_for_a_tile_is_seen_in_the_whole_picture():
+def test_a_gain_too_small_for_a_tile_is_seen_in_the_whole_image():
     found = judge("welch", renders(8), renders(8, gain=1.02), tile=4)
     assert found.detectable > 0.1
     assert np.abs(found.maps["t"]).max() < 5
@@ -251,7 +251,7 @@ def test_tiles_without_noise_are_never_certain():
     assert {figure.name: figure.value for figure in found.figures}["tiles without noise that differ"] == 3
 
 
-def test_a_picture_without_noise_is_not_called_equal_when_it_differs():
+def test_an_image_without_noise_is_not_called_equal_when_it_differs():
     flat = [image(np.ones(SHAPE))] * 3
     assert judge("welch", flat, flat).verdict is EQUAL
     assert judge("welch", flat, [image(np.full(SHAPE, 1.1))] * 3).verdict is INCONCLUSIVE
@@ -286,7 +286,7 @@ def test_corrections_are_those_of_the_papers():
 
 
 def with_spread(count, kind, gain=1.0):
-    """One picture of `count` samples a pixel, with a channel of their second moments or of their variance."""
+    """One image of `count` samples a pixel, with a channel of their second moments or of their variance."""
     samples = gain * np.stack([each.pixels for each in renders(count, shape=(64, 64, 1))]).astype(np.float64)
     spread = np.square(samples).mean(0) if kind == "m2_Y" else samples.var(0, ddof=1)
     return image(np.dstack([samples.mean(0), spread, samples.mean(0)]), ("Y", kind, "Z"))
@@ -329,7 +329,7 @@ def test_options_that_do_not_fit(method, options, match):
         judge(method, image(SMOOTH), image(SMOOTH), **options)
 
 
-def test_the_number_of_pictures_must_fit_the_method():
+def test_the_number_of_images_must_fit_the_method():
     one, two = image(SMOOTH), [image(SMOOTH)] * 2
     assert methods.automatic(one, one) == "tolerance"
     assert methods.automatic(two, two) == "welch"
@@ -338,7 +338,7 @@ def test_the_number_of_pictures_must_fit_the_method():
             methods.compare("welch", *sides)
     with pytest.raises(ValueError, match="one a side"):
         methods.compare("exact", two, two)
-    with pytest.raises(ValueError, match="no picture"):
+    with pytest.raises(ValueError, match="no image"):
         methods.compare("exact", [], one)
 
 

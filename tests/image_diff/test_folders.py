@@ -1,4 +1,4 @@
-"""Pairs of pictures: who is compared with whom, settings, samples, exit codes, and what accepting writes."""
+"""Pairs of images: who is compared with whom, settings, samples, exit codes, and what accepting writes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 
 import numpy as np
 import pytest
-from support.diff_images import BROKEN, found, picture, samples
+from support.diff_images import BROKEN, found, image, samples
 
 from mi_refract.image_diff import folders as diff
 from mi_refract.image_diff import methods
@@ -27,7 +27,7 @@ def test_folders_are_matched_by_name(folders):
     assert results.exit_code == 1
     assert results.results[-1].name == "same.exr"  # failures first
     assert {r.name: r.reason for r in results.results if not r.comparison} == {
-        "added.exr": "only among the new pictures",
+        "added.exr": "only among the new images",
         "removed.exr": "only among the references",
     }
 
@@ -40,16 +40,16 @@ def test_the_pair_is_the_one_of_that_name(folders):
 
 
 def test_two_files_of_any_names(tmp_path):
-    picture(tmp_path / "a.exr")
-    picture(tmp_path / "b.exr")
-    picture(tmp_path / "c.exr", gain=1.1)
+    image(tmp_path / "a.exr")
+    image(tmp_path / "b.exr")
+    image(tmp_path / "c.exr", gain=1.1)
     assert found(diff.diff(tmp_path / "a.exr", tmp_path / "b.exr")) == {"a.exr": ("equal", "unchanged")}
     assert found(diff.diff(tmp_path / "a.exr", tmp_path / "c.exr")) == {"a.exr": ("different", "changed")}
 
 
 @pytest.mark.parametrize("spoil", BROKEN.values(), ids=BROKEN)
 @pytest.mark.parametrize("side", [0, 1])
-def test_one_bad_picture_keeps_no_other_from_being_compared(folders, side, spoil):
+def test_one_bad_image_keeps_no_other_from_being_compared(folders, side, spoil):
     bad = folders[side] / "same.exr"
     bad.unlink()
     spoil(bad)
@@ -94,7 +94,7 @@ def test_a_folder_inside_without_permission(folders, monkeypatch):
 
 
 @pytest.mark.parametrize("link", [os.symlink, os.link])
-def test_a_picture_is_not_compared_with_itself(folders, link):
+def test_an_image_is_not_compared_with_itself(folders, link):
     old, new = folders
     (new / "same.exr").unlink()
     link(old / "same.exr", new / "same.exr")
@@ -115,11 +115,11 @@ def test_nothing_to_compare(folders, tmp_path):
     old, new = folders
     empty = tmp_path / "empty"
     empty.mkdir()
-    (empty / "notes.txt").write_text("no picture")
+    (empty / "notes.txt").write_text("no image")
     (tmp_path / "link").symlink_to(old)
     for reference, test, error, message in [
-        (old, empty, ValueError, "empty: holds no picture"),
-        (empty, new, ValueError, "empty: holds no picture"),
+        (old, empty, ValueError, "empty: holds no image"),
+        (empty, new, ValueError, "empty: holds no image"),
         (old, old, ValueError, "the same as the reference"),
         (old, tmp_path / "link", ValueError, "the same as the reference"),
         (old / "same.exr", old / "same.exr", ValueError, "the same as the reference"),
@@ -152,7 +152,7 @@ def test_exit_codes(tmp_path, statuses, inconclusive, code):
     assert Results(tmp_path, tmp_path, results, inconclusive=inconclusive).exit_code == code
 
 
-def test_maps_are_kept_on_request_and_where_pictures_differ(folders):
+def test_maps_are_kept_on_request_and_where_images_differ(folders):
     assert not any(r.comparison and r.comparison.maps for r in diff.diff(*folders).results)
     kept = {r.name: bool(r.comparison.maps) for r in diff.diff(*folders, maps=True).results if r.comparison}
     assert kept == {"inner/changed.exr": True, "same.exr": False}
@@ -193,7 +193,7 @@ def test_bad_samples(tmp_path):
     for folder, message in [
         (twice, r"the same pixels as .*; accepted: renders of different seeds"),
         (samples(tmp_path / "one", 1, 200), "one"),
-        (empty, "empty: holds no picture"),
+        (empty, "empty: holds no image"),
     ]:
         results = diff.diff(good, folder, samples=True)
         assert results.exit_code == 2
@@ -279,8 +279,8 @@ def test_patterns_that_match_nothing_are_told(folders, rules):
 
 def test_nan_is_allowed_where_it_is_named(tmp_path):
     for side in ("old", "new"):
-        picture(tmp_path / side / "a.exr", value=np.nan)
-        picture(tmp_path / side / "b.exr", value=np.nan)
+        image(tmp_path / side / "a.exr", value=np.nan)
+        image(tmp_path / side / "b.exr", value=np.nan)
     settings = Settings(allow_nonfinite=("a.exr",))
     statuses = found(diff.diff(tmp_path / "old", tmp_path / "new", settings))
     assert statuses == {"a.exr": ("equal", "unchanged"), "b.exr": ("different", "changed")}

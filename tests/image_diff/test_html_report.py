@@ -12,26 +12,26 @@ from support.browser import CHROMIUM, browse
 
 from mi_refract.image_diff import folders, html_report
 from mi_refract.image_diff.folders import Result, Results, Status
-from mi_refract.image_diff.methods import Comparison, Figure, Verdict
+from mi_refract.image_diff.methods import Comparison, Metric, Verdict
 from mi_refract.io.image_file import write_exr
-from mi_refract.report.embedded_images import ROUNDED, Pictures, encoded, strongest
+from mi_refract.report.embedded_images import ROUNDED, EmbeddedImages, encoded, strongest
 
 EVIL = "glass/<script>alert(1)</script>.exr"
-EQUAL = Comparison("tolerance", Verdict.EQUAL, "Within <b>bounds</b>.", (Figure("mean", 1e-5, 1e-3),))
+EQUAL = Comparison("tolerance", Verdict.EQUAL, "Within <b>bounds</b>.", (Metric("mean", 1e-5, 1e-3),))
 
 
-def picture(path, value, shape=(4, 6, 3), channels=("R", "G", "B")):
+def image(path, value, shape=(4, 6, 3), channels=("R", "G", "B")):
     path.parent.mkdir(parents=True, exist_ok=True)
     write_exr(path, np.full(shape, value, np.float32) if np.isscalar(value) else value, channels)
     return path
 
 
 def results(folder):
-    """A pair that differs, one that cannot be compared, a removed picture, one that is equal."""
-    reference = picture(folder / "reference" / "a.exr", 0.25)
-    test = picture(folder / "test" / "a.exr", 0.5)
+    """A pair that differs, one that cannot be compared, a removed image, one that is equal."""
+    reference = image(folder / "reference" / "a.exr", 0.25)
+    test = image(folder / "test" / "a.exr", 0.5)
     p = np.linspace(0, 1, 24, dtype=np.float32).reshape(4, 6)
-    figures = (Figure("tiles that differ", 12.0, 0.0), Figure("odd", math.nan, 1.0), Figure("smallest p", 1e-9))
+    figures = (Metric("tiles that differ", 12.0, 0.0), Metric("odd", math.nan, 1.0), Metric("smallest p", 1e-9))
     maps = {"t": 8 * p - 4, "p": p, "q": p, "flags": 0 * p}
     found = Comparison("welch", Verdict.DIFFERENT, "12 tiles differ.", figures, 0.013, maps)
     return Results(
@@ -60,7 +60,7 @@ def roles(text):
 
 def test_failures_come_first_with_numbers_thresholds_and_commands(tmp_path):
     text = html(tmp_path)
-    places = ("<h1>4 pictures: ", 'id="pair-1"', 'id="pair-3"', 'id="equal"', "same.exr")
+    places = ("<h1>4 images: ", 'id="pair-1"', 'id="pair-3"', 'id="equal"', "same.exr")
     order = [text.index(place) for place in places]
     assert order == sorted(order)
     numbers = ('<td class="fail">12</td><td class="limit">&gt; 0', "≰ 1", "1e-9", "0.013", "≤ 1e-3")
@@ -91,11 +91,11 @@ def test_panes_of_a_pair_are_in_order_and_an_equal_one_has_none(tmp_path):
     assert roles(text) == [*names, ("−log₁₀ q", "heat")]  # no flags: none is up
     assert "compare pair paired" in text
     text = html(tmp_path, Results(found.reference, found.test, found.results[3:]))
-    assert roles(text) == [] and "Picture viewer" not in text
+    assert roles(text) == [] and "Image viewer" not in text
 
 
-def test_pictures_of_different_sizes_stand_side_by_side_and_are_not_laid_over_each_other(tmp_path):
-    sides = picture(tmp_path / "r" / "a.exr", 1.0), picture(tmp_path / "t" / "a.exr", 1.0, (4, 5, 3))
+def test_images_of_different_sizes_stand_side_by_side_and_are_not_laid_over_each_other(tmp_path):
+    sides = image(tmp_path / "r" / "a.exr", 1.0), image(tmp_path / "t" / "a.exr", 1.0, (4, 5, 3))
     text = html(tmp_path, folders.diff(*sides))
     assert roles(text) == [("reference", "light"), ("test", "light")]
     assert "compare pair paired" not in text
@@ -105,11 +105,11 @@ def test_renders_in_a_folder_are_shown_as_their_mean(tmp_path):
     for side in "rt":
         for i in range(4):
             noise = np.random.default_rng([i, ord(side)]).normal(1 + (side == "t"), 0.01, (8, 8, 3))
-            picture(tmp_path / side / f"{i}.exr", noise.astype(np.float32))
+            image(tmp_path / side / f"{i}.exr", noise.astype(np.float32))
     found = folders.diff(tmp_path / "r", tmp_path / "t", samples=True, maps=True)
     assert found.exit_code == 1
-    pictures = re.findall(r'data-channels="3" data-scale="1.0">([^<]*)<', html(tmp_path, found))
-    means = [decoded(data).astype(float).mean() for data in pictures]
+    images = re.findall(r'data-channels="3" data-scale="1.0">([^<]*)<', html(tmp_path, found))
+    means = [decoded(data).astype(float).mean() for data in images]
     assert means == pytest.approx([1, 2], abs=0.01)
 
 
@@ -161,15 +161,15 @@ def test_one_pixel_and_one_nan_survive_a_smaller_map():
     assert small.shape == (10, 100, 1) and small[1, 50] == -3 and np.isnan(small[9, 99]) and (small != 0).sum() == 2
 
 
-def test_pictures_of_a_page_have_keys_of_their_own():
-    page = Pictures()
+def test_images_of_a_page_have_keys_of_their_own():
+    page = EmbeddedImages()
     keys = [page.add(encoded(np.ones((2, 2, 1))))["key"] for _ in range(3)]
     assert keys == ["p0", "p1", "p2"] and page.size == sum(len(each["data"]) for each in page.embedded)
 
 
 def test_a_noisy_full_size_pair_stays_within_its_bytes(tmp_path):
     rng = np.random.default_rng(1)
-    sides = [picture(tmp_path / f"{side}.exr", rng.gamma(2, 1, (1080, 1920, 3)).astype(np.float32)) for side in "rt"]
+    sides = [image(tmp_path / f"{side}.exr", rng.gamma(2, 1, (1080, 1920, 3)).astype(np.float32)) for side in "rt"]
     text = html(tmp_path, folders.diff(*sides, maps=True))
     assert len(roles(text)) >= 4
     assert (tmp_path / "report.html").stat().st_size <= 15e6

@@ -1,4 +1,4 @@
-"""Comparison of pictures: what must be seen, what must not, and how often equal pictures alarm."""
+"""Comparison of images: what must be seen, what must not, and how often equal images alarm."""
 
 import numpy as np
 import pytest
@@ -27,12 +27,12 @@ def test_paired_counts_pixels_not_channels():
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_pixel_that_is_not_finite_equals_nothing_not_even_itself(bad):
-    picture = np.ones(SHAPE)
-    picture[3, 4, 0] = bad
-    found = paired(picture, picture, 1e-5)
+    image = np.ones(SHAPE)
+    image[3, 4, 0] = bad
+    found = paired(image, image, 1e-5)
     assert found.changed == 1 / 1024
     assert not found.largest <= 1e30
-    stack = np.stack([picture] * 3)
+    stack = np.stack([image] * 3)
     assert welch(stack, stack, 16, 1e-3).alarms > 0
 
 
@@ -45,7 +45,7 @@ def test_shapes_must_agree():
         welch(np.ones((1, 16, 16, 3)), np.ones((3, 16, 16, 3)), 8, 1e-3)
 
 
-def test_equal_pictures_alarm_no_more_often_than_stated():
+def test_equal_images_alarm_no_more_often_than_stated():
     """400 null pairs at a family error of 5 %: 20 expected; more than 40 has probability below 2e-5."""
     alarms = sum(welch(renders(5), renders(5), 16, 0.05).alarms > 0 for _ in range(400))
     assert alarms <= 40
@@ -90,8 +90,8 @@ def test_tiles_without_noise_are_counted_and_compared_within_the_margin():
 
 def test_relative_mse_leaves_out_the_references_own_noise():
     references = renders(32)
-    picture = renders(1)[0]
+    image = renders(1)[0]
     expected = 0.3**2 / 1.01
-    assert relative_mse(picture, references) == pytest.approx(expected, rel=0.15)
-    assert relative_mse(picture + 0.5, references) == pytest.approx(expected + 0.25 / 1.01, rel=0.15)
+    assert relative_mse(image, references) == pytest.approx(expected, rel=0.15)
+    assert relative_mse(image + 0.5, references) == pytest.approx(expected + 0.25 / 1.01, rel=0.15)
     assert relative_mse(np.ones(SHAPE), references) == pytest.approx(0, abs=0.1 * expected)

@@ -1,4 +1,4 @@
-"""Pictures in files of any format: what is read, and that every bad file is one line."""
+"""Images in files of any format: what is read, and that every bad file is one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of planar scenes: read back pixel by pixel, and for what matplotlib was told to draw."""
+"""Images of planar scenes: read back pixel by pixel, and for what matplotlib was told to draw."""
 
 from __future__ import annotations
 
@@ -161,16 +161,16 @@ def test_all_colours_together_are_none():
     assert red[:3].tolist() == [255, 0, 0]
 
 
-@pytest.mark.parametrize("event, mark", [(Event.EXHAUSTED, "o"), (Event.CONTRADICTED, "x")])
+@pytest.mark.parametrize("event, mark", [(Event.MAX_DEPTH, "o"), (Event.MEDIUM_MISMATCH, "x")])
 def test_paths_that_end_otherwise_are_marked(drawn, event, mark):
     square = polygon(np.array([(0, -1), (1, -1), (1, 1), (0, 1)], float), 1.5)
     wrong = replace(square, n_left=np.array([1.5, 1.4, 1.5, 1.5]))
     given = scene(wrong, [[-1.0, 0.1]], (1, 0), view=VIEW)
-    given = given if event == Event.CONTRADICTED else replace(given, segments=(square,), max_depth=1)
+    given = given if event == Event.MEDIUM_MISMATCH else replace(given, segments=(square,), max_depth=1)
     panel = drawn(given).axes[0]
     marks = [line for line in panel.lines if line.get_marker() == mark]
     assert len(marks) == 1
-    np.testing.assert_allclose(marks[0].get_xydata(), [[0 if event == Event.EXHAUSTED else 1, 0.1]], atol=1e-12)
+    np.testing.assert_allclose(marks[0].get_xydata(), [[0 if event == Event.MAX_DEPTH else 1, 0.1]], atol=1e-12)
     note = drawing.MARKS[event][1].format(1)
     assert note in panel.get_xlabel().replace("\n", " ")
     clean = drawn(replace(given, segments=(square,), max_depth=5)).axes[0]
@@ -185,26 +185,26 @@ def test_paths_that_end_otherwise_are_marked(drawn, event, mark):
 )
 def test_the_same_scene_gives_the_same_bytes(suffix, start, rays):
     given = with_rays(CROWD, rays) if rays else SLANTED
-    content = drawing.picture(given, follow_scene(given), suffix)
+    content = drawing.image(given, follow_scene(given), suffix)
     assert content.startswith(start)
-    assert drawing.picture(given, follow_scene(given), suffix) == content
+    assert drawing.image(given, follow_scene(given), suffix) == content
 
 
 def test_the_users_style_is_left_out():
     traced = follow_scene(SLANTED)
-    plain = drawing.picture(SLANTED, traced, ".svg")
+    plain = drawing.image(SLANTED, traced, ".svg")
     with matplotlib.rc_context({"axes.facecolor": "black", "font.size": 30, "svg.hashsalt": "mine"}):
-        assert drawing.picture(SLANTED, traced, ".svg") == plain
+        assert drawing.image(SLANTED, traced, ".svg") == plain
         assert matplotlib.rcParams["font.size"] == 30
 
 
 def test_another_scene_gives_other_bytes():
     traced = follow_scene(SLANTED)
-    assert drawing.picture(SLANTED, traced, ".svg") != drawing.picture(replace(SLANTED, title="Other"), traced, ".svg")
+    assert drawing.image(SLANTED, traced, ".svg") != drawing.image(replace(SLANTED, title="Other"), traced, ".svg")
 
 
 def test_thousands_of_rays_are_a_small_file():
-    content = drawing.picture(CROWD, follow_scene(CROWD), ".svg")
+    content = drawing.image(CROWD, follow_scene(CROWD), ".svg")
     assert len(content) < 2_000_000
     assert content.count(b"<image") == 1
     assert content.count(b"<path") < 500
@@ -223,29 +223,29 @@ def test_many_boundaries_are_an_image(drawn, facets):
 def test_titles_are_not_formulas():
     """This one would not be understood."""
     given = replace(SLANTED, title=r"5 & <6 $\undefined$")
-    assert drawing.picture(given, follow_scene(given), ".svg")
+    assert drawing.image(given, follow_scene(given), ".svg")
 
 
 @pytest.mark.parametrize("view", [(0, 1, 0, 100), (0, 1e-9, 0, 1e-9), (0, 1e6, 0, 1)])
 def test_views_of_any_shape(view):
     given = replace(SLANTED, view=view)
-    assert drawing.picture(given, follow_scene(given), ".png")
+    assert drawing.image(given, follow_scene(given), ".png")
 
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("view", [(100, 101, 100, 101), (-1e5, 1e5, -1e5, 1e5)], ids=["elsewhere", "from afar"])
 def test_nothing_to_be_seen(view):
     given = replace(with_rays(CROWD, drawing.LINES + 1), view=view, branches=0, max_depth=1)
-    assert drawing.picture(given, follow_scene(given), ".png")
+    assert drawing.image(given, follow_scene(given), ".png")
 
 
 def test_without_matplotlib(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ValueError, match=r"pip install 'mi-refract\[plot\]'"):
-        drawing.picture(SLANTED, follow_scene(SLANTED), ".svg")
+        drawing.image(SLANTED, follow_scene(SLANTED), ".svg")
 
 
-def test_a_failed_write_leaves_the_old_picture(monkeypatch, tmp_path):
+def test_a_failed_write_leaves_the_old_image(monkeypatch, tmp_path):
     path = tmp_path / "old.svg"
     path.write_text("old")
 

@@ -1,4 +1,4 @@
-"""What pictures are made of: lines in the view, their density, arcs as polylines."""
+"""What images are made of: lines in the view, their density, arcs as polylines."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def test_a_closed_outline_is_left_as_often_as_it_is_entered(follow):
     figure, rng = star(60), np.random.default_rng(3)
     origins = rng.normal(size=(200, 2)) * 0.3 + [3, 0]
     paths = follow(figure, origins, figure.start[rng.integers(0, 60, 200)] - origins, max_depth=40)
-    assert not (paths.events == Event.CONTRADICTED).any()
+    assert not (paths.events == Event.MEDIUM_MISMATCH).any()
     last = (paths.events != Event.NONE).sum(1) - 1
     ends = paths.events[np.arange(200), last]
     assert (paths.indices[np.arange(200), last][(ends == ESCAPED) & (last > 0)] == 1).all()
@@ -140,7 +140,7 @@ def test_the_first_boundary_tells_the_medium_unless_it_is_told(follow):
     assert follow(square, (0.5, 0.5), (1, 0)).indices[0, :2].tolist() == [1.5, 1]
     assert follow(square, (0.5, 0.5), (1, 0), n_start=1.5).indices[0, :2].tolist() == [1.5, 1]
     told = follow(square, (0.5, 0.5), (1, 0), n_start=1.25)
-    assert story(told) == ([1], [Event.CONTRADICTED])
+    assert story(told) == ([1], [Event.MEDIUM_MISMATCH])
     assert told.points[0, 1].tolist() == [1, 0.5]
     nowhere = follow(square, (2, 2), (1, 0))
     assert story(nowhere) == ([], [ESCAPED])
@@ -166,9 +166,9 @@ def test_at_a_junction_boundaries_are_crossed_one_after_the_other(follow):
     angle = np.linspace(0, 2 * np.pi, 41)[:-1] + 0.05
     origins = 2 * np.column_stack([np.cos(angle), np.sin(angle)])
     paths = follow(junction(), origins, -origins, max_depth=8)
-    assert not (paths.events == Event.CONTRADICTED).any()
+    assert not (paths.events == Event.MEDIUM_MISMATCH).any()
     assert (paths.events == ESCAPED).any(axis=1).all()
-    # From straight above the upright boundary is passed on its right, which is the left of the picture.
+    # From straight above the upright boundary is passed on its right, which is the left of the image.
     hits, _ = story(follow(junction(), (0, 2), (0, -1)))
     assert hits == [0]
 
@@ -178,7 +178,7 @@ def test_a_vertex_inside_another_segment_is_no_junction(follow):
     whole = Segments(
         np.array([(-9.0, 0.0), (0.0, 0.0)]), np.array([(9.0, 0.0), (0.0, 9.0)]), np.ones(2), np.array([1.5, 1.3])
     )
-    assert story(follow(whole, (3, 1), (-0.1, -1), n_start=1.3)) == ([0], [Event.CONTRADICTED])
+    assert story(follow(whole, (3, 1), (-0.1, -1), n_start=1.3)) == ([0], [Event.MEDIUM_MISMATCH])
     assert story(follow(whole, (-3, 1), (0.1, -1))) == ([0], [REFRACTED, ESCAPED])
 
 
@@ -186,7 +186,7 @@ def test_a_segment_turned_round_is_contradicted(follow):
     square = polygon(SQUARE)
     square.n_left[1], square.n_right[1] = 1.0, 1.5
     paths = follow(square, (-1, 0.5), (1, 0))
-    assert story(paths) == ([3, 1], [REFRACTED, Event.CONTRADICTED])
+    assert story(paths) == ([3, 1], [REFRACTED, Event.MEDIUM_MISMATCH])
     assert paths.directions[0].tolist() == [1, 0]
 
 
@@ -195,7 +195,7 @@ def test_a_segment_turned_round_is_contradicted(follow):
 
 def test_a_path_is_exhausted_only_where_another_boundary_is_ahead(follow):
     square = polygon(SQUARE)
-    assert story(follow(square, (-1, 0.5), (1, 0), max_depth=1)) == ([3], [REFRACTED, Event.EXHAUSTED])
+    assert story(follow(square, (-1, 0.5), (1, 0), max_depth=1)) == ([3], [REFRACTED, Event.MAX_DEPTH])
     assert story(follow(square, (-1, 0.5), (1, 0), max_depth=2)) == ([3, 1], [REFRACTED, REFRACTED, ESCAPED])
 
 
@@ -232,7 +232,7 @@ def test_inside_a_ball_a_ray_turns_by_the_same_angle_each_time(follow, setting, 
     start = np.array([math.cos(0.3), math.sin(0.3)]) * math.cos(grazing)
     along = np.array([-math.sin(0.3), math.cos(0.3)])
     paths = follow(ball(), start, along, max_depth=count)
-    assert story(paths)[1] == [REFLECTED] * count + [Event.EXHAUSTED]
+    assert story(paths)[1] == [REFLECTED] * count + [Event.MAX_DEPTH]
     angle = np.unwrap(np.arctan2(*paths.points[0, 1:, ::-1].T))
     steps = np.diff(angle.astype(float))
     # A chord's own error: u of the place over the grazing angle, and that of the angle adds up as the rays go on.
@@ -260,7 +260,7 @@ def test_arcs_that_meet_in_a_tip_are_met_in_order(follow):
         angle = np.linspace(0, 2 * np.pi, 61)[:-1] + 0.01
         origins = np.array([0, 1]) + 3 * np.column_stack([np.cos(angle), np.sin(angle)])
         paths = follow(lens, origins, [0, 1] - origins, max_depth=8)
-        assert not (paths.events == Event.CONTRADICTED).any()
+        assert not (paths.events == Event.MEDIUM_MISMATCH).any()
         met = (paths.hits[:, 0] >= 0) & (origins[:, 1] > 1)
         assert met.any()
         assert (paths.indices[met, 0] == 1).all()

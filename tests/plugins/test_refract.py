@@ -325,9 +325,9 @@ def test_an_edit_of_the_index_compiles_nothing(jit):
     def compiled():
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
-            picture = mi.render(scene, spp=4)
-            dr.eval(picture)
-            return picture, sum(not entry["cache_hit"] for entry in dr.kernel_history() if "cache_hit" in entry)
+            image = mi.render(scene, spp=4)
+            dr.eval(image)
+            return image, sum(not entry["cache_hit"] for entry in dr.kernel_history() if "cache_hit" in entry)
 
     before, _ = compiled()
     _, repeated = compiled()
@@ -338,7 +338,7 @@ def test_an_edit_of_the_index_compiles_nothing(jit):
     assert np.abs(np.array(after) - np.array(before)).max() > 0.1
 
 
-def test_gradient_of_a_picture_in_the_index_matches_a_finite_difference(jit):
+def test_gradient_of_an_image_in_the_index_matches_a_finite_difference(jit):
     scene = ball("volpath", int_ior=1.5, ext_ior=1)
     params = mi.traverse(scene)
     key = next(name for name in params.keys() if name.endswith("eta"))  # noqa: SIM118
@@ -365,9 +365,9 @@ def test_a_scene_can_be_frozen(jit):
     params = mi.traverse(scene)
 
     @dr.freeze
-    def picture(params, seed):
+    def image(params, seed):
         return mi.render(scene, params, spp=4, seed=seed)
 
     plain = np.array(mi.render(scene, spp=4, seed=mi.UInt32(3)))
-    assert np.array(picture(params, mi.UInt32(2))).shape == plain.shape
-    assert np.array(picture(params, mi.UInt32(3))) == pytest.approx(plain)
+    assert np.array(image(params, mi.UInt32(2))).shape == plain.shape
+    assert np.array(image(params, mi.UInt32(3))) == pytest.approx(plain)

@@ -62,11 +62,11 @@ def sky():
     return {"type": "envmap", "bitmap": mi.Bitmap(SKY)}
 
 
-# The same picture ----------------------------------------------------------------------------------------------
+# The same image ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", MIXED)
-def test_where_nothing_is_left_out_the_numbers_and_the_picture_are_those_of_path(name, each_variant, monkeypatch):
+def test_where_nothing_is_left_out_the_numbers_and_the_image_are_those_of_path(name, each_variant, monkeypatch):
     """With Russian roulette and emitter sampling both integrators draw the same numbers in the same order."""
 
     def everything(scene):
@@ -84,7 +84,7 @@ def test_where_nothing_is_left_out_the_numbers_and_the_picture_are_those_of_path
 @pytest.mark.parametrize("name", [*GLASS_ONLY, *MIXED])
 @pytest.mark.parametrize("parameters", [{}, {"split_depth": 1}, {"split_depth": 4, "rr_depth": 3}], ids=str)
 def test_other_numbers_give_the_same_mean(name, parameters, llvm):
-    """Welch's test on tiles, one false alarm in 1000 pictures."""
+    """Welch's test on tiles, one false alarm in 1000 images."""
     scene = load(name)
     theirs = np.stack([by_path(scene, seed=i) for i in range(8)])
     ours = np.stack([render(scene, seed=100 + i, **parameters) for i in range(8)])
@@ -126,7 +126,7 @@ def test_lamps_are_chosen_by_their_weights_and_the_sky_is_met(parameters, each_v
 def test_leaving_out_what_a_scene_needs_is_seen(name, llvm, monkeypatch):
     scene = load("slab" if name == "all_of_hit" else "sphere")
     theirs = np.stack([by_path(scene, seed=i) for i in range(8)])
-    monkeypatch.setattr(refract_path, "Plan", lambda *a, **k: path_loop.Plan(*a, **k | {name: False}))
+    monkeypatch.setattr(refract_path, "PathFeatures", lambda *a, **k: path_loop.PathFeatures(*a, **k | {name: False}))
     ours = np.stack([render(scene, seed=100 + i) for i in range(8)])
     assert methods.welch(theirs, ours, 8, 1e-3, 1e-5).alarms > 0
 
@@ -156,9 +156,9 @@ def test_nothing_to_see_is_black(each_variant):
 
 def test_splitting_takes_noise_away_and_scalars_do_it_too(each_variant):
     vectorised = dr.is_jit_v(mi.Float)
-    scene, spp, pictures = load("balls", 16 if vectorised else 6), 16 if vectorised else 4, 4 if vectorised else 8
+    scene, spp, images = load("balls", 16 if vectorised else 6), 16 if vectorised else 4, 4 if vectorised else 8
     noise = {
-        depth: np.var([render(scene, spp, seed, split_depth=depth) for seed in range(pictures)], axis=0).mean()
+        depth: np.var([render(scene, spp, seed, split_depth=depth) for seed in range(images)], axis=0).mean()
         for depth in (0, 3)
     }
     assert noise[3] < 0.8 * noise[0]
@@ -168,7 +168,7 @@ def test_strata_are_those_of_correlated_multi_jitter(llvm):
     """Of 12 samples of each of 5 pixels every stratum holds one, of rows, columns and cells; keys are independent."""
     sampler = mi.load_dict({"type": "independent", "sample_count": 12})
     sampler.seed(3, 60)
-    numbers = keyed_sampler.Strata(mi, sampler, 3)
+    numbers = keyed_sampler.KeyedMultijitter(mi, sampler, 3)
     one = np.array(numbers.one(sampler, mi.UInt32(7))).reshape(5, 12)
     x, y = np.array(numbers.two(sampler, mi.UInt32(8))).reshape(2, 5, 12)
     for strata_of, count in ((one, 12), (x, 12), (y, 12)):
@@ -180,7 +180,7 @@ def test_strata_are_those_of_correlated_multi_jitter(llvm):
     assert (np.array(numbers.one(sampler, mi.UInt32(7))).reshape(5, 12) == one).all()  # whatever was drawn before
 
 
-def test_a_deterministic_picture_errs_by_what_it_says_was_truncated(llvm):
+def test_a_deterministic_image_errs_by_what_it_says_was_truncated(llvm):
     """The ball from one point: no noise but the position in the pixel, which is its centre in every sample."""
     scene = glass_ball(sky=sky(), sampler={"type": "multijitter", "jitter": False})
     exact, coarse = (
@@ -198,9 +198,9 @@ def test_a_deterministic_picture_errs_by_what_it_says_was_truncated(llvm):
 def test_a_white_sky_shows_what_was_truncated(llvm):
     scene = load("slab", sampler="multijitter")
     flat = glass_ball(sky={"type": "constant"})
-    picture, truncated = np.split(render(flat, 1, 1, deterministic=True), [3], axis=2)
-    assert (picture <= 1 + 1e-5).all()
-    assert (picture >= 1 - 1e-5 - truncated).all()
+    image, truncated = np.split(render(flat, 1, 1, deterministic=True), [3], axis=2)
+    assert (image <= 1 + 1e-5).all()
+    assert (image >= 1 - 1e-5 - truncated).all()
     assert 1e-4 < truncated.max() < 1e-2
     assert render(scene, 1, deterministic=True).shape == (32, 32, 4)
 
@@ -237,10 +237,10 @@ def derivative(scene, method, direction):
     if direction == "forward":
         dr.set_grad(parameters[key], 1)
     parameters.update()
-    picture = dr.mean(mi.render(scene, parameters, integrator=method, spp=256), axis=None)
+    image = dr.mean(mi.render(scene, parameters, integrator=method, spp=256), axis=None)
     if direction == "forward":
-        return float(dr.forward_to(picture).array[0])
-    dr.backward(picture)
+        return float(dr.forward_to(image).array[0])
+    dr.backward(image)
     return float(dr.grad(parameters[key])[0])
 
 
@@ -257,7 +257,7 @@ def difference(scene, method, step=0.02):
 @pytest.mark.parametrize("direction", ["forward", "backward"])
 @pytest.mark.parametrize("mixed", [False, True], ids=["glass", "mixed"])
 @pytest.mark.parametrize("split", [0, 2])
-def test_the_derivative_in_the_index_is_that_of_the_picture(direction, mixed, split, llvm):
+def test_the_derivative_in_the_index_is_that_of_the_image(direction, mixed, split, llvm):
     """Smooth light and no edges, so that nothing is discontinuous. Standard errors are below 2 % on either side."""
 
     def scene():

@@ -160,7 +160,7 @@ def test_a_truncated_file_is_refused(tmp_path, ending, keep):
     assert "\n" not in str(caught.value)
 
 
-def test_another_picture_is_refused(tmp_path):
+def test_another_image_is_refused(tmp_path):
     image_file.write_exr(tmp_path / "a.exr", np.zeros((2, 2, 3)))
     with pytest.raises(ValueError, match=r"a\.exr: no channel 'id'"):
         ray_set.read(tmp_path / "a.exr")

@@ -15,7 +15,7 @@ import pytest
 from support.browser import CHROMIUM, browse
 
 from mi_refract.report import run_report
-from mi_refract.report.plots import Axes, apart, compact, curves_svg, pareto
+from mi_refract.report.plots import Axes, compact, curves_svg, distinguishable, pareto
 from mi_refract.report.row import Row
 
 NAN, INF = math.nan, math.inf
@@ -148,7 +148,7 @@ def test_the_sentence(rows, sentence, tmp_path):
 
 def test_html_asks_for_nothing_and_runs_no_name(tmp_path):
     write_exr(tmp_path / "a.exr", np.zeros((2, 2, 3)))
-    text = html(tmp_path, [*ROWS, dataclasses.replace(INFO, pictures={'"><script>': "a.exr"})])
+    text = html(tmp_path, [*ROWS, dataclasses.replace(INFO, images={'"><script>': "a.exr"})])
     assert not re.findall(r"https?:|@import|url\((?!#)|\bsrc=|<link|<iframe", text)
     assert {target[0] for target in re.findall(r'href="([^"]*)"', text)} == {"#"}
     assert "&lt;script&gt;alert(1)" in text
@@ -193,12 +193,12 @@ def test_matrix_marks_a_row_whose_other_metric_broke(tmp_path):
     assert re.search(r'<td class="not-run" [^>]*title="lost">not run<', text)
 
 
-def test_pictures_are_embedded_exactly_and_once(tmp_path):
+def test_images_are_embedded_exactly_and_once(tmp_path):
     pixels = np.random.default_rng(3).normal(size=(3, 5, 3)) * 10.0 ** np.arange(-3, 2)[:, None]
     pixels[0, 0] = NAN, 1e9, -0.0
     write_exr(tmp_path / "a.exr", pixels)
     write_exr(tmp_path / "gray.exr", pixels[..., :1], names=("Y",))
-    row = dataclasses.replace(GOOD, pictures={"reference": "a.exr", "test": "gray.exr"})
+    row = dataclasses.replace(GOOD, images={"reference": "a.exr", "test": "gray.exr"})
     text = html(tmp_path, [row, row])
     data = re.findall(r'<script type="text/plain" id="p\d" data-channels="(\d)" data-scale="1.0">([^<]*)<', text)
     assert [channels for channels, _ in data] == ["3", "1"]
@@ -210,13 +210,13 @@ def test_pictures_are_embedded_exactly_and_once(tmp_path):
     np.testing.assert_array_equal(halves[1], expected[..., :1])
 
 
-def test_a_picture_that_cannot_be_shown_is_an_error_and_the_old_page_stays(tmp_path):
+def test_an_image_that_cannot_be_shown_is_an_error_and_the_old_page_stays(tmp_path):
     before = html(tmp_path)
-    (tmp_path / "text.exr").write_text("no picture")
+    (tmp_path / "text.exr").write_text("no image")
     write_exr(tmp_path / "two.exr", np.zeros((2, 2, 2)), names=("R", "G"))
     for name, error in (("gone.exr", FileNotFoundError), ("text.exr", ValueError), ("two.exr", ValueError)):
         with pytest.raises(error, match=re.escape(str(tmp_path / name))):
-            html(tmp_path, [dataclasses.replace(GOOD, pictures={"test": name})])
+            html(tmp_path, [dataclasses.replace(GOOD, images={"test": name})])
     assert (tmp_path / "report.html").read_text("utf-8") == before
 
 
@@ -274,10 +274,10 @@ def test_axes_that_cannot_be_drawn_are_an_error(axes):
         Axes(**axes)
 
 
-def test_an_overlay_stands_beside_the_other_pictures_in_a_fixed_order(tmp_path):
+def test_an_overlay_stands_beside_the_other_images_in_a_fixed_order(tmp_path):
     write_exr(tmp_path / "a.exr", np.zeros((2, 2, 3)))
-    pictures = dict.fromkeys(("overlay", "extra", "difference", "test", "reference"), "a.exr")
-    text = html(tmp_path, [dataclasses.replace(GOOD, pictures=pictures)])
+    images = dict.fromkeys(("overlay", "extra", "difference", "test", "reference"), "a.exr")
+    text = html(tmp_path, [dataclasses.replace(GOOD, images=images)])
     assert re.findall('data-role="([^"]*)"', text) == ["reference", "test", "overlay", "difference", "extra"]
     assert 'class="compare paired"' in text
 
@@ -304,8 +304,8 @@ def test_compact(value, text):
 
 
 def test_a_broken_budget_never_looks_kept():
-    assert apart(1.3001e-5, 1.3e-5) == ("1.3001e-5", "1.3e-5")
-    value, budget = apart(math.nextafter(1.0, 2), 1.0)
+    assert distinguishable(1.3001e-5, 1.3e-5) == ("1.3001e-5", "1.3e-5")
+    value, budget = distinguishable(math.nextafter(1.0, 2), 1.0)
     assert value != budget
 
 
@@ -343,9 +343,9 @@ def test_the_page_works_from_a_file(tmp_path):
         pixels = np.full((2, 2, 3), value)
         pixels[0, 1, 1] = NAN
         write_exr(tmp_path / f"{role}.exr", pixels)
-    pictures = {role: f"{role}.exr" for role in ("reference", "test", "difference")}
+    images = {role: f"{role}.exr" for role in ("reference", "test", "difference")}
     page = tmp_path / "report.html"
-    text = html(tmp_path, [*ROWS, dataclasses.replace(GOOD, pictures=pictures)])
+    text = html(tmp_path, [*ROWS, dataclasses.replace(GOOD, images=images)])
     page.write_text(text.replace("</body>", PROBE), "utf-8")
     dom, console = browse(page, tmp_path / "profile")
     assert console == []

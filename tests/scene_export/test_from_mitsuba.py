@@ -118,7 +118,7 @@ def met(scene, ray):
 
 
 def disagreements(one, other, count=1500, seed=9, tolerance=1e-3):
-    """The share of rays that meet something else: into the picture, and on from where the first of them arrive."""
+    """The share of rays that meet something else: into the image, and on from where the first of them arrive."""
     rng, wrong, seen = np.random.default_rng(seed), 0, 0
     for u, direction in zip(rng.random((count, 2)), rng.normal(size=(count, 3)), strict=True):
         ray, _ = one.sensors()[0].sample_ray(0, 0.5, mi.Point2f(u), mi.Point2f(0.5))

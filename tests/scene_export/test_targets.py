@@ -216,14 +216,14 @@ def test_maps_are_looked_up_by_unit_directions(module, sky):
     u, v = np.random.default_rng(6).random((2, 400))
     directions = module.looked_up(u, v)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1)
-    picture = environment_map.longitude_latitude(sky, module.looked_up)
-    height, width = picture.shape[:2]
-    nearest = picture[(v * height).astype(int), (u * width).astype(int)]
+    image = environment_map.longitude_latitude(sky, module.looked_up)
+    height, width = image.shape[:2]
+    nearest = image[(v * height).astype(int), (u * width).astype(int)]
     np.testing.assert_allclose(nearest, environment_map.radiance(sky, directions), atol=0.15)
-    weights = np.sin(np.pi * (np.arange(height) + 0.5) / height)[:, None, None] * np.ones_like(picture)
+    weights = np.sin(np.pi * (np.arange(height) + 0.5) / height)[:, None, None] * np.ones_like(image)
     sphere = np.random.default_rng(7).normal(size=(20000, 3))
     np.testing.assert_allclose(
-        np.average(picture, axis=(0, 1), weights=weights), environment_map.radiance(sky, sphere).mean(0), atol=0.01
+        np.average(image, axis=(0, 1), weights=weights), environment_map.radiance(sky, sphere).mean(0), atol=0.01
     )
 
 

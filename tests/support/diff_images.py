@@ -1,4 +1,4 @@
-"""Small pictures in files for the tests of `mi-refract diff`, good and bad."""
+"""Small images in files for the tests of `mi-refract diff`, good and bad."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from mi_refract.io.image_file import write_exr
 SIZE = (32, 48, 3)
 
 
-def picture(path, seed=0, *, gain=1.0, noise=0.0, shape=SIZE, value=None, channels=("R", "G", "B")):
-    """A picture written to `path`: the same smooth one for every seed, but for `noise` (σ over mean). Its pixels."""
+def image(path, seed=0, *, gain=1.0, noise=0.0, shape=SIZE, value=None, channels=("R", "G", "B")):
+    """An image written to `path`: the same smooth one for every seed, but for `noise` (σ over mean). Its pixels."""
     path.parent.mkdir(parents=True, exist_ok=True)
     x = np.linspace(0.2, 1.0, shape[1])[None, :, None] * np.ones(shape)
     pixels = gain * x * (1 + noise * np.random.default_rng(seed).standard_normal(shape))
@@ -22,9 +22,9 @@ def picture(path, seed=0, *, gain=1.0, noise=0.0, shape=SIZE, value=None, channe
 
 
 def samples(folder, count=6, first=0, **how):
-    """Independent renders of that picture in a folder."""
+    """Independent renders of that image in a folder."""
     for i in range(count):
-        picture(folder / f"{i}.exr", first + i, **{"noise": 0.1, **how})
+        image(folder / f"{i}.exr", first + i, **{"noise": 0.1, **how})
     return folder
 
 
@@ -60,13 +60,13 @@ def deep(path):
 
 
 def truncated(path):
-    picture(path)
+    image(path)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
 def zero_size(path):
     """A valid header whose data window holds no pixel (xMax = xMin − 1)."""
-    picture(path)
+    image(path)
     data = bytearray(path.read_bytes())
     at = data.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
     data[at : at + 16] = np.array([0, 0, -1, -1], "<i4").tobytes()
@@ -74,20 +74,20 @@ def zero_size(path):
 
 
 def gray(path):
-    picture(path, shape=(32, 48, 1), channels=("Y",))
+    image(path, shape=(32, 48, 1), channels=("Y",))
 
 
 BROKEN = {
     "truncated": truncated,
     "empty": lambda path: path.write_bytes(b""),
-    "text": lambda path: path.write_text("no picture at all\n"),
+    "text": lambda path: path.write_text("no image at all\n"),
     "png by content": lambda path: _png(path),
     "several parts": multipart,
     "deep": deep,
     "zero size": zero_size,
     "one channel": gray,
-    "other size": lambda path: picture(path, shape=(32, 47, 3)),
-    "other channels": lambda path: picture(path, channels=("X", "Y", "Z")),
+    "other size": lambda path: image(path, shape=(32, 47, 3)),
+    "other channels": lambda path: image(path, channels=("X", "Y", "Z")),
     "link to nothing": lambda path: path.symlink_to("nowhere.exr"),
 }
 

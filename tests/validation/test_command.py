@@ -26,7 +26,7 @@ from validation.run import render_methods
 from validation.run.context import SCENES, Task
 from validation.stability import layered_paths
 from validation.suite.renderers import SYSTEMS
-from validation.suite.renderers.image_renderers import PAINTERS
+from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
 
 @pytest.fixture
@@ -108,14 +108,14 @@ def test_renders_agree_and_see_an_index_that_is_off(context, plugin, verdict):
     mi.register_bsdf("refract_defect", defective)
     (row,) = against_dielectric._compare(context, SCENES / "sphere.xml", plugin)
     assert row.verdict == verdict, row.values
-    assert sorted(path.name for path in (context.out / "pictures/sphere").iterdir()) == sorted(
+    assert sorted(path.name for path in (context.out / "images/sphere").iterdir()) == sorted(
         ["dielectric.exr", f"{plugin} difference.exr", f"{plugin} test.exr"]
     )
     assert set(row.curves) == ({"refract", "dielectric"} if plugin == "refract" else set())
 
 
 def test_what_is_the_same_is_not_tested_by_chance_and_still_compared(context):
-    """The furnace has no noise: no Welch test, but a picture that is off fails; and NaN is no picture at all."""
+    """The furnace has no noise: no Welch test, but an image that is off fails; and NaN is no image at all."""
     mi.register_bsdf("refract_tinted", lambda props: bsdf.plugin_class(mi.scalar_rgb)(tinted(props)))
     right, wrong = (
         against_dielectric._compare(context, SCENES / "furnace.xml", p)[0] for p in ("refract", "refract_tinted")
@@ -274,7 +274,7 @@ def test_a_readme_is_not_written_from_a_run_that_measured_too_little():
         readme_tables.suite([])
 
 
-def test_the_readme_holds_its_tables_and_shows_pictures_that_exist():
+def test_the_readme_holds_its_tables_and_shows_images_that_exist():
     root = Path(command.__file__).parents[1]
     text = (root / "README.md").read_text()
     scenes = [path.stem for path in SCENES.glob("*.xml")]
@@ -290,16 +290,16 @@ def test_the_readme_holds_its_tables_and_shows_pictures_that_exist():
     }
     assert words_of.keys() == readme_tables.TABLES.keys()
     others = [call.title for system in SYSTEMS.values() for call in system.calls]
-    for marker, words in (words_of | {"suite": [*others, *PAINTERS]}).items():
+    for marker, words in (words_of | {"suite": [*others, *IMAGE_RENDERERS]}).items():
         table = text.partition(f"<!-- begin: {marker} -->")[2].partition(f"<!-- end: {marker} -->")[0]
         assert [word for word in words if word not in table] == []
-    pictures = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)
-    assert pictures
-    assert all((root / path).is_file() for path in pictures)
+    images = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)
+    assert images
+    assert all((root / path).is_file() for path in images)
 
 
 def test_a_scene_is_loaded_in_the_same_order_every_time(context):
-    """Loading with Mitsuba's defaults gives one of two pictures, about one time in four the other one."""
+    """Loading with Mitsuba's defaults gives one of two images, about one time in four the other one."""
     scenes = [render_methods.opened(SCENES / "diamond.xml", "dielectric", 8) for _ in range(12)]
-    pictures = [render_methods.Camera(scene)(1, seed=0)[0] for scene in scenes]
-    assert all((picture == pictures[0]).all() for picture in pictures)
+    images = [render_methods.Camera(scene)(1, seed=0)[0] for scene in scenes]
+    assert all((image == images[0]).all() for image in images)

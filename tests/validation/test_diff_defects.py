@@ -14,13 +14,13 @@ from mi_refract.image_diff.self_test import DEFECTS
 from mi_refract.io import image_file
 from validation.diff import planted_defects as study
 
-PICTURE = 0.2 + 0.8 * np.random.default_rng(5).random((32, 32, 3))
+IMAGE = 0.2 + 0.8 * np.random.default_rng(5).random((32, 32, 3))
 
 
 def renders(count, seed=1, spread=0.02):
-    """Independent noisy renders of one picture, of a skewed distribution."""
+    """Independent noisy renders of one image, of a skewed distribution."""
     shape = spread**-2
-    return PICTURE * np.random.default_rng(seed).gamma(shape, 1 / shape, (count, *PICTURE.shape))
+    return IMAGE * np.random.default_rng(seed).gamma(shape, 1 / shape, (count, *IMAGE.shape))
 
 
 def by_subject(rows):
@@ -97,21 +97,21 @@ def test_a_defect_that_changes_nothing_is_left_out():
     assert "changes nothing" in rows["swapped channels"].reason
 
 
-def test_the_command_judges_a_folder_a_picture_and_refuses_what_is_not_finite(tmp_path, capsys, monkeypatch):
+def test_the_command_judges_a_folder_an_image_and_refuses_what_is_not_finite(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(gate.examine, "__defaults__", (2, 20))
-    for i, picture in enumerate(renders(4)):
-        image_file.write_exr(tmp_path / f"{i}.exr", picture)
+    for i, image in enumerate(renders(4)):
+        image_file.write_exr(tmp_path / f"{i}.exr", image)
     assert gate.self_test(tmp_path) == 0
     assert "every defect that was due was seen" in capsys.readouterr().out
     assert gate.self_test(tmp_path / "0.exr") == 0
-    assert "–" in capsys.readouterr().out  # no noise is known of one picture: nothing for welch
+    assert "–" in capsys.readouterr().out  # no noise is known of one image: nothing for welch
     monkeypatch.setattr(methods, "compare", lambda m, *sides: Comparison(m, Verdict.EQUAL, ""))
     assert gate.self_test(tmp_path / "0.exr") == 1
     assert "not held: " in capsys.readouterr().out
-    image_file.write_exr(tmp_path / "bad.exr", np.full_like(PICTURE, np.nan))
+    image_file.write_exr(tmp_path / "bad.exr", np.full_like(IMAGE, np.nan))
     with pytest.raises(ValueError, match="finite"):
         gate.self_test(tmp_path / "bad.exr")
-    image_file.write_exr(tmp_path / "bad.exr", PICTURE[1:])
+    image_file.write_exr(tmp_path / "bad.exr", IMAGE[1:])
     with pytest.raises(ValueError, match="differ from"):
         gate.self_test(tmp_path)
 
@@ -159,8 +159,8 @@ def test_cameras_side_by_side_are_independent_renders(scalar_context):
     one, two, three = np.split(sheet, 3, axis=1)
     mean = np.mean([study.opened("prism", resolution=8)(16, seed)[0] for seed in range(8)], 0)
     assert not np.array_equal(one, two)
-    for picture in (one, two, three):
-        assert np.corrcoef(picture.ravel(), mean.ravel())[0, 1] > 0.6
+    for image in (one, two, three):
+        assert np.corrcoef(image.ravel(), mean.ravel())[0, 1] > 0.6
     noise = [x - mean for x in (one, two, three)]
     assert abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1]) < 0.5
 

@@ -13,13 +13,13 @@ SMALL = times.Size(48, 64, 2, 1)
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("pictures")
+    folder = tmp_path_factory.mktemp("images")
     times.write(folder, SMALL)
     return folder
 
 
 def test_what_is_timed_is_told_apart(root):
-    """A picture that differs is what the page shows; the folder's pictures are equal for all that `auto` asks."""
+    """An image that differs is what the page shows; the folder's images are equal for all that `auto` asks."""
     one, other = root / "a" / "0.exr", root / "b" / "0.exr"
     assert folders.diff(one, other, Settings(How("tolerance"))).exit_code == 1
     assert folders.diff(root / "a", root / "b", samples=True).exit_code == 1

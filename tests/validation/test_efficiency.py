@@ -33,9 +33,9 @@ def context(tmp_path, needs_variant, monkeypatch):
 
 def test_errors_are_those_that_were_put_in():
     mean = np.full((40, 50, 3), 2.0)
-    picture = mean + 0.1
-    picture[0, 0] += 100  # one pixel of 2000, all of the worst 0.1 % but one
-    found = error_against_time.errors(picture, mean, np.zeros_like(mean))
+    image = mean + 0.1
+    image[0, 0] += 100  # one pixel of 2000, all of the worst 0.1 % but one
+    found = error_against_time.errors(image, mean, np.zeros_like(mean))
     assert found["MSE"] == pytest.approx(0.01 + (100.1**2 - 0.01) / 2000)
     assert found["MSE, trimmed"] == pytest.approx(0.01)
     assert found["relMSE, trimmed"] == pytest.approx(0.01 / 4.01)
@@ -44,11 +44,11 @@ def test_errors_are_those_that_were_put_in():
 def test_the_variance_of_the_reference_is_not_the_methods_error():
     """Both have the variance 1, the mean of 4 references 1/4: the estimate is 1 within 5 of its standard errors."""
     rng = np.random.default_rng(5)
-    references, picture = rng.normal(size=(4, 100, 100, 3)), rng.normal(size=(100, 100, 3))
+    references, image = rng.normal(size=(4, 100, 100, 3)), rng.normal(size=(100, 100, 3))
     own = references.var(0, ddof=1) / 4
-    found = error_against_time.errors(picture, references.mean(0), own)["MSE"]
+    found = error_against_time.errors(image, references.mean(0), own)["MSE"]
     assert found == pytest.approx(1, abs=5 * math.sqrt((2 * 1.25**2 + 2 / 16 / 3) / 30000))
-    assert error_against_time.errors(picture, references.mean(0), 0 * own)["MSE"] > 1.2
+    assert error_against_time.errors(image, references.mean(0), 0 * own)["MSE"] > 1.2
 
 
 # The study -----------------------------------------------------------------------------------------------------
@@ -69,7 +69,7 @@ def test_efficiency_is_not_bought_with_bias(rows):
     assert "integrator_of_nobody is not registered" in rows[ABSENT.name].reason
 
 
-def test_the_same_picture_has_the_same_error_and_more_samples_less(rows):
+def test_the_same_image_has_the_same_error_and_more_samples_less(rows):
     ours, builtin = rows[METHODS[1].name].values, rows[BUILTIN.name].values
     for metric in error_against_time.METRICS:
         assert ours[metric] == pytest.approx(builtin[metric], rel=1e-2)
@@ -84,7 +84,7 @@ def test_the_same_picture_has_the_same_error_and_more_samples_less(rows):
 
 @pytest.mark.parametrize(("noise", "seconds", "best"), [(2.0, 1.0, 1), (0.5, 1.0, 0), (0.5, 5.0, 1)])
 def test_the_best_sampler_has_the_least_variance_and_time(monkeypatch, noise, seconds, best):
-    """The first one's noise and time are given, the other's are 1; the first picture of each took forever."""
+    """The first one's noise and time are given, the other's are 1; the first image of each took forever."""
 
     def look(path, method, resolution, sampler, extent):
         first = sampler == error_against_time.STRATIFIED[0]
@@ -96,7 +96,7 @@ def test_the_best_sampler_has_the_least_variance_and_time(monkeypatch, noise, se
     assert error_against_time.best_sampler(SCENES / "balls.xml", 8, SMALL) == error_against_time.STRATIFIED[best]
 
 
-def test_pictures_grow_until_their_time_can_be_told(context, monkeypatch):
+def test_images_grow_until_their_time_can_be_told(context, monkeypatch):
     monkeypatch.setattr(error_against_time, "LARGEST", 64)
     path = SCENES / "furnace.xml"
     sizes = [error_against_time._resolution(path, dataclasses.replace(SMALL, seconds=s)) for s in (0.0, 1e-9, 1e9)]
@@ -164,12 +164,12 @@ def test_a_ball_is_closed_convex_and_of_its_size(size):
 
 
 @pytest.mark.parametrize("knob", scaling.KNOBS)
-def test_every_knob_makes_a_picture(knob):
+def test_every_knob_makes_an_image(knob):
     mi.set_variant("scalar_rgb")
     size = {"pixels": 16, "glasses": 5}.get(knob, 8)
-    picture, _ = scaling.KNOBS[knob].make(BUILTIN, size, 4)(1, seed=0)
-    assert picture.shape == (4, 4, 3)
-    assert np.isfinite(picture).all() and picture.any()
+    image, _ = scaling.KNOBS[knob].make(BUILTIN, size, 4)(1, seed=0)
+    assert image.shape == (4, 4, 3)
+    assert np.isfinite(image).all() and image.any()
 
 
 def test_kernels_that_were_there_give_no_first_image(context, tmp_path):

@@ -119,7 +119,7 @@ def test_compiled_rays_are_those_of_the_scalar_variant(made, needs_variant, scal
 # The rainbow ---------------------------------------------------------------------------------------------------
 
 
-def picture(index):
+def image(index):
     """Of the light once reflected within, without noise."""
     entry = np.linspace(0.79, 0.93, 1_000_000)
     radius = np.tan(np.pi - closed_forms.deflection(np.arcsin(entry), index, 1).astype(float))
@@ -131,10 +131,10 @@ def picture(index):
 def test_the_edge_of_a_bow_without_noise_is_the_rainbow_angle():
     assert rainbow.angle(4 / 3) == pytest.approx(180 - 42.03, abs=0.01)
     for index in (1.333, 1.338):
-        assert abs(rainbow.edge(picture(index)) - rainbow.angle(index)) < rainbow.BLUR
+        assert abs(rainbow.edge(image(index)) - rainbow.angle(index)) < rainbow.BLUR
 
 
-def test_a_picture_without_an_edge_has_none():
+def test_an_image_without_an_edge_has_none():
     assert math.isnan(rainbow.edge(np.zeros((rainbow.SIZE, rainbow.SIZE))))
     blank = [np.zeros((rainbow.SIZE, rainbow.SIZE))] * 3
     assert {"error / bound", "standard error / °"} == set(
@@ -144,8 +144,8 @@ def test_a_picture_without_an_edge_has_none():
 
 @pytest.mark.parametrize("defect", [0.0, DEFECT])
 def test_the_rainbow_of_a_noisy_bow_sees_an_index_off_by_1e_4(defect):
-    """With as much light as the quick profile renders: 9000 quanta in the first 0.1 degrees of a picture."""
-    rng, exact = np.random.default_rng(11), picture(1.333 + defect)
+    """With as much light as the quick profile renders: 9000 quanta in the first 0.1 degrees of an image."""
+    rng, exact = np.random.default_rng(11), image(1.333 + defect)
     ends, inside, at = rainbow._bins()
     light = np.bincount(at, exact[inside], len(ends))
     first = light[(ends > rainbow.angle()) & (ends < rainbow.angle() + 0.1)].sum()
@@ -162,7 +162,7 @@ def test_a_rendered_rainbow_stands_where_it_should(defect, verdict, needs_varian
     mi.set_variant("llvm_ad_rgb")
     monkeypatch.setattr(traced_bodies, "RESOLVED", 0.005)
     try:
-        found = rainbow.pictures(traced_systems.glass("refract", rainbow.INDEX + defect), 4)
+        found = rainbow.images(traced_systems.glass("refract", rainbow.INDEX + defect), 4)
     finally:
         mi.set_variant(before)
     assert traced_bodies.bow_row("refract", "llvm_ad_rgb", found, {}).verdict == verdict

@@ -123,7 +123,7 @@ def test_a_path_is_not_run_on_scalar_arrays(context):
     scalar = dataclasses.replace(context, variant="scalar_rgb")
     rows = [row for task in layered_paths.tasks(scalar) for row in task.run()]
     assert {row.verdict for row in rows} == {"not run"}
-    assert {row.case for row in rows} >= {"mirage", "fibre", "mirage, telescope: picture"}
+    assert {row.case for row in rows} >= {"mirage", "fibre", "mirage, telescope: image"}
 
 
 def test_the_built_in_differs_from_both_right_formulas_in_the_telescope(llvm, context):
@@ -131,7 +131,7 @@ def test_the_built_in_differs_from_both_right_formulas_in_the_telescope(llvm, co
     (row,) = layered_paths._view_rows(context, *layered_paths.VIEWS[0])
     assert row.values["pixels off"] > 5e-3
     assert row.verdict == "pass"
-    assert all((context.out / path).is_file() for path in row.pictures.values())
+    assert all((context.out / path).is_file() for path in row.images.values())
 
 
 def test_two_right_formulas_of_which_one_is_none_are_seen(llvm, context, monkeypatch):

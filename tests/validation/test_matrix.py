@@ -13,7 +13,7 @@ def ray(subject="A", case="random", budget=None, **values):
     return Row(per_ray.STUDY, subject, case, "f32", values, {"wrong": 0.0}, reason="A 1.2; zero")
 
 
-def picture(subject="B", verdict="equal", differing=0.0, **more):
+def image(subject="B", verdict="equal", differing=0.0, **more):
     values = {"mean difference": -0.02, "tests that differ": differing}
     budgets = {"tests that differ": 0.0} | more
     replay = {"verdict": verdict, "renderer": "B 3"}
@@ -22,7 +22,7 @@ def picture(subject="B", verdict="equal", differing=0.0, **more):
 
 def test_numbers_and_verdicts_are_those_of_the_rows():
     right, wrong, equal, different = matrix.summary(
-        [ray(), ray(case="near-critical", wrong=3.0), picture(), picture(verdict="different", differing=2.0)]
+        [ray(), ray(case="near-critical", wrong=3.0), image(), image(verdict="different", differing=2.0)]
     )
     assert (right.subject, right.case, right.values[matrix.OFF], right.verdict) == ("A, f32", "random", 1e-6, "pass")
     assert (wrong.verdict, wrong.reason) == ("fail", "A 1.2; zero")
@@ -32,7 +32,7 @@ def test_numbers_and_verdicts_are_those_of_the_rows():
 
 
 def test_a_system_that_is_known_to_differ_passes_and_is_said_to_differ():
-    row = picture(verdict="different", differing=2.0)
+    row = image(verdict="different", differing=2.0)
     known = Row(row.study, row.subject, row.case, row.setting, row.values, reason=row.reason, replay=row.replay)
     (found,) = matrix.summary([known])
     assert (found.verdict, found.missed, found.reason) == ("pass", {"differs": 0.0}, "B 3; why")

@@ -65,10 +65,10 @@ def test_total_reflection_begins_at_the_critical_angle(beyond):
 def test_ends_of_paths_are_named():
     wall = Segments(np.array([[0.0, -1]]), np.array([[0.0, 1]]), [1.0], [1.5])
     start, d = [[-1.0, 0.3]], [[2.0, 0.0]]
-    assert retrace(wall, start, d, 1, n_start=1.3).events[0].tolist() == [Event.CONTRADICTED, 0]
+    assert retrace(wall, start, d, 1, n_start=1.3).events[0].tolist() == [Event.MEDIUM_MISMATCH, 0]
     assert retrace(wall, start, d, 1, reflect=1).events[0].tolist() == [MIRRORED, Event.ESCAPED]
     two = Segments(*(x + np.array([[0, 0], [1, 0]]) for x in (wall.start, wall.end)), [1.0, 1.5], [1.5, 1.0])
-    assert retrace(two, start, d, 1).events[0].tolist() == [THROUGH, Event.EXHAUSTED]
+    assert retrace(two, start, d, 1).events[0].tolist() == [THROUGH, Event.MAX_DEPTH]
     assert retrace(wall, [[1.0, 0.0]], d, 1).events[0].tolist() == [Event.ESCAPED, 0]
 
 
@@ -306,12 +306,12 @@ def test_wrong_walls_are_seen(compiled):
     assert extruded(case, segments=fewer)["astray, far"] > 0
 
 
-def test_extruded_rows_have_a_picture(compiled, tmp_path):
+def test_extruded_rows_have_an_image(compiled, tmp_path):
     context = Context(PROFILES["quick"], tmp_path, "llvm_ad_rgb", detect(), {})
     rows = extruded_scenes.scene_rows(context, against_retrace.FOLDER / "ellipse.toml")
     assert {row.verdict for row in rows} == {"pass"}
-    (picture,) = (row.pictures["overlay"] for row in rows if row.pictures)
-    assert (tmp_path / picture).stat().st_size > 1000
+    (image,) = (row.images["overlay"] for row in rows if row.images)
+    assert (tmp_path / image).stat().st_size > 1000
 
 
 def test_facets_lie_on_their_arcs():

@@ -1,4 +1,4 @@
-"""The study of pictures: what it says of a renderer that agrees, of one that does not, and of one that is not there."""
+"""The study of images: what it says of a renderer that agrees, of one that does not, and of one that is not there."""
 
 import dataclasses
 import functools
@@ -18,7 +18,7 @@ from validation.run.context import PROFILES, Context
 from validation.run.render_methods import Camera
 from validation.suite import rendered_images
 from validation.suite.renderers import environments, image_renderers
-from validation.suite.renderers.image_renderers import Painter
+from validation.suite.renderers.image_renderers import ImageRenderer
 
 SMALL = rendered_images.Size(48, 32, 1, 0.2)
 
@@ -37,9 +37,9 @@ def judged(tmp_path, monkeypatch):
 
     def judge(draw, title="Radiance", missing=""):
         monkeypatch.setattr(environments, "absent", lambda system: missing)
-        monkeypatch.setitem(rendered_images.PAINTERS, title, Painter("radiance", draw, {"prism": 32}, ()))
+        monkeypatch.setitem(rendered_images.IMAGE_RENDERERS, title, ImageRenderer("radiance", draw, {"prism": 32}, ()))
         [row] = rendered_images.pair_rows(context, title, "prism")
-        assert all((tmp_path / name).is_file() for name in row.pictures.values())
+        assert all((tmp_path / name).is_file() for name in row.images.values())
         return row
 
     return judge
@@ -68,11 +68,11 @@ def test_another_renderer_of_the_same_scene_is_equal(judged):
     row = judged(functools.partial(by_the_builtin, lambda plain: plain))
     assert row.verdict == "pass" and row.replay["verdict"] == "equal" and not row.missed
     assert row.values["RMSE / noise"] == pytest.approx(1, abs=0.1)
-    assert list(row.pictures) == ["reference", "test", "difference"]
+    assert list(row.images) == ["reference", "test", "difference"]
 
 
 @pytest.mark.parametrize("change", [denser, wider])
-def test_another_picture_fails(judged, change):
+def test_another_image_fails(judged, change):
     row = judged(functools.partial(by_the_builtin, change))
     assert row.verdict == "fail" and row.replay["verdict"] == "different"
     assert row.values["tests that differ"] > 0
@@ -113,9 +113,9 @@ def test_values_that_are_not_finite_fail(judged):
 
 def test_every_scene_of_a_painter_is_one_of_the_study():
     assert {
-        scene for painter in image_renderers.PAINTERS.values() for scene in painter.spp
+        scene for painter in image_renderers.IMAGE_RENDERERS.values() for scene in painter.spp
     } == rendered_images.SCENES.keys()
-    assert set(rendered_images.WHY) <= set(image_renderers.PAINTERS)
+    assert set(rendered_images.WHY) <= set(image_renderers.IMAGE_RENDERERS)
 
 
 # Environments ------------------------------------------------------------------------------------------------------
@@ -138,7 +138,7 @@ def test_an_environment_is_what_mitsuba_makes_of_it():
     assert np.abs(measured - radiance(sky, seen * [-1, 1, 1])).max() > 0.1  # a mirror would be seen
 
 
-# Where each renderer looks a direction up: u to the right, v from the top of the picture.
+# Where each renderer looks a direction up: u to the right, v from the top of the image.
 LOOKED_UP = {
     cycles.looked_up: lambda x, y, z: (0.5 - np.arctan2(y, x) / (2 * np.pi), np.arccos(z) / np.pi),
     luxcore.looked_up: lambda x, y, z: (np.arctan2(y, x) / (2 * np.pi) % 1, np.arccos(z) / np.pi),
@@ -149,10 +149,10 @@ LOOKED_UP = {
 @pytest.mark.parametrize("renderer", LOOKED_UP)
 def test_a_renderer_finds_the_sky_where_it_looks(renderer):
     sky, seen = rendered_images.askew(), directions()
-    picture = longitude_latitude(sky, renderer)
+    image = longitude_latitude(sky, renderer)
     u, v = LOOKED_UP[renderer](*seen.T)
-    rows, columns = picture.shape[:2]
-    texel = picture[np.minimum((v * rows).astype(int), rows - 1), np.minimum((u * columns).astype(int), columns - 1)]
+    rows, columns = image.shape[:2]
+    texel = image[np.minimum((v * rows).astype(int), rows - 1), np.minimum((u * columns).astype(int), columns - 1)]
     assert np.abs(texel - radiance(sky, seen)).max() < 0.01  # half a texel is 0.003 rad, the sky's slope below 2
     assert np.abs(texel - radiance(sky, seen * [1, 1, -1])).max() > 0.1
 
@@ -161,7 +161,7 @@ def test_a_renderer_finds_the_sky_where_it_looks(renderer):
 
 
 def test_radiance_is_given_mitsubas_rays(tmp_path):
-    path = environments.SCRIPTS / "radiance_pictures.py"
+    path = environments.SCRIPTS / "radiance_images.py"
     spec = importlib.util.spec_from_file_location(path.stem, path)
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)

@@ -14,7 +14,7 @@ from mi_refract.ray_sets import ray_set as ray_files
 from validation import __main__ as command
 from validation.suite import per_ray
 from validation.suite.renderers import SYSTEMS, environments
-from validation.suite.renderers.system import NOTED_F64, SCRIPTS, TOTAL, Apt, Call, Npm, Pip, System
+from validation.suite.renderers.system import RECORDED_F64, SCRIPTS, TOTAL, Apt, Npm, Pip, RefractFunction, System
 
 QUICK, FULL = (SimpleNamespace(profile=SimpleNamespace(name=name)) for name in ("quick", "full"))
 # What every program below does right unless `{defect}` says otherwise.
@@ -67,10 +67,10 @@ def few(monkeypatch):
 def rows_of(few, tmp_path):
     """`rows_of(before, after)`: what the study makes of such a program."""
 
-    def run(before="", after="", noted=NOTED_F64, gives_up=0.0):
+    def run(before="", after="", recorded_error=RECORDED_F64, gives_up=0.0):
         path = tmp_path / "program.py"
         path.write_text(PROGRAM.format(before=before, after=after))
-        call = Call("a program", "f64", str(path), noted, "zero", gives_up=gives_up)
+        call = RefractFunction("a program", "f64", str(path), recorded_error, "zero", gives_up=gives_up)
         return per_ray.call_rows(System("a", "A", "none", None, 0, small=True), call, QUICK)
 
     return run
@@ -116,9 +116,9 @@ def test_what_cannot_run_here_is_not_run(rows_of):
 
 
 def test_a_noted_error_is_a_goal_on_both_sides(rows_of):
-    much, little = (dict.fromkeys(NOTED_F64, (x, x)) for x in (1e-2, 1e-30))
-    for noted in (much, little):
-        rows = [row for row in rows_of(noted=noted) if row.case != TOTAL]
+    much, little = (dict.fromkeys(RECORDED_F64, (x, x)) for x in (1e-2, 1e-30))
+    for recorded_error in (much, little):
+        rows = [row for row in rows_of(recorded_error=recorded_error) if row.case != TOTAL]
         assert all(row.missed == {"off the noted": per_ray.NEAR} and row.verdict == "pass" for row in rows)
     assert [per_ray.off(x, 2, 4) for x in (1, 2, 3, 4, 8)] == [2, 1, 1, 1, 2]
     assert per_ray.off(0, 2, 4) == np.inf and np.isnan(per_ray.off(np.nan, 2, 4))

@@ -130,7 +130,7 @@ def test_matched_is_matched():
 # --- loading and rendering -------------------------------------------------------------------------------
 
 
-def picture_faults(image, contrast=True):
+def image_faults(image, contrast=True):
     if not np.isfinite(image).all():
         yield "not finite"
     if not (image > 1e-3).all():
@@ -149,7 +149,7 @@ def test_loads_at_the_size_of_the_notes_and_renders(name):
     assert film.rfilter().radius() == 0.5 and "float32" in str(film)
     image = np.array(mi.render(scene, seed=1))
     assert image.shape == (16, 16, 3)
-    assert list(picture_faults(image, contrast=name != "furnace")) == []
+    assert list(image_faults(image, contrast=name != "furnace")) == []
 
 
 def test_parameters_reach_the_scene():
@@ -159,9 +159,9 @@ def test_parameters_reach_the_scene():
     assert "max_depth = 3" in str(scene.integrator()) and "Volumetric" in str(scene.integrator())
 
 
-def test_picture_sees_a_dark_scene(tmp_path):
+def test_image_sees_a_dark_scene(tmp_path):
     scene = load(edited(tmp_path, "nested", 'value="0.72, 0.80, 0.90"', 'value="0, 0, 0"'))
-    assert list(picture_faults(np.array(mi.render(scene, seed=1))))
+    assert list(image_faults(np.array(mi.render(scene, seed=1))))
 
 
 def furnace_error(path, seed=1):

@@ -120,7 +120,7 @@ def test_times_are_ratios_with_goals(context):
     assert row.missed == {"edit / dielectric": 0.2}
 
 
-def test_a_frozen_picture_is_the_traced_one_and_follows_an_edit(context):
+def test_a_frozen_image_is_the_traced_one_and_follows_an_edit(context):
     with unused_features.alone(unused_features.PLUGIN, 3) as balls:
         image, seen = balls.frozen(), []
         for seed, eta in ((1, 1.3), (2, 1.3), (3, 1.9), (4, 1.4)):
@@ -132,11 +132,11 @@ def test_a_frozen_picture_is_the_traced_one_and_follows_an_edit(context):
         assert np.abs(seen[2] - seen[1]).max() > 0.1
 
 
-def test_a_frozen_picture_that_does_not_follow_an_edit_is_seen(context, monkeypatch):
+def test_a_frozen_image_that_does_not_follow_an_edit_is_seen(context, monkeypatch):
     monkeypatch.setattr(unused_features, "GLASSES", (3,))
     (row,) = unused_features.frozen_rows(context)
     assert row.verdict == "pass"
-    # The built-in's index is a number that Dr.Jit does not see: its frozen picture is stale.
+    # The built-in's index is a number that Dr.Jit does not see: its frozen image is stale.
     assert row.values["off after an edit, dielectric"] > 0.01
     monkeypatch.setattr(unused_features, "PLUGIN", unused_features.BUILTIN)
     (row,) = unused_features.frozen_rows(context)

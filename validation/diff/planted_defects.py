@@ -1,6 +1,6 @@
 """The gate: what `mi-refract diff` sees of defects in real renders, and how often it alarms at equal ones.
 
-Defects of a renderer are planted in the glass, those of a picture in the pixels. The ball of the scene `sphere` holds a
+Defects of a renderer are planted in the glass, those of an image in the pixels. The ball of the scene `sphere` holds a
 lamp here, off its centre: without one η² on the way in and 1/η² on the way out cancel on every path, and no path is
 totally reflected. A pair of renders by another sampler is equal for a method that knows noise, and for no other. Null
 pairs have seeds that no other pair has, so that their number of alarms is binomial.
@@ -38,7 +38,7 @@ LAMP = """
 RESOLUTION, SPP, TRIALS, RENDERS = 64, 16, 8, 6  # of the detection: renders a side
 NULL_RESOLUTION, NULL_SPP, NULL_RENDERS = 32, 4, 4
 NULL_PAIRS = {"quick": 640, "full": 2000}  # with 640 two alarms may be: their bound is 0.98 %
-SHEET = 80  # pictures of a render: it costs less than as many renders
+SHEET = 80  # images of a render: it costs less than as many renders
 PARTS = ("sensor", "film", "sampler")
 SCALAR = "needs a compiled variant: thousands of renders"
 OTHER_SAMPLER = "other sampler"
@@ -106,7 +106,7 @@ TERMS = (
     self_test.TERMS
     | {name: text for name, (text, _) in GLASSES.items()}
     | {name: defect.text for name, defect in self_test.DEFECTS.items()}
-    | {OTHER_SAMPLER: "multijitter: other random numbers, the same picture"}
+    | {OTHER_SAMPLER: "multijitter: other random numbers, the same image"}
 )
 
 
@@ -221,5 +221,5 @@ def null_rows(context: Context, name: str) -> list[Row]:
 
 
 def _sheet(camera: Camera, seed: int) -> np.ndarray:
-    """One render, cut into its independent pictures."""
+    """One render, cut into its independent images."""
     return np.stack(np.split(camera(NULL_SPP, seed)[0], SHEET, axis=1))

@@ -1,6 +1,6 @@
 """Diff, times: what a verdict costs beside reading the files, how long a page takes, and the memory of it all.
 
-The pictures are smooth ones with the noise of 16 samples per pixel, zip-compressed EXR. Subjects take turns, and
+The images are smooth ones with the noise of 16 samples per pixel, zip-compressed EXR. Subjects take turns, and
 medians of the rounds count, with 95 % intervals. Seconds are this machine's, so they have goals and no budgets, and
 those only at the sizes they were set for; Python's start and its imports are not in them. What has a budget is the size
 of the page. Memory is the largest of a whole process, which compares, and writes the page.
@@ -35,12 +35,12 @@ TERMS = {
     "time / reading": "median of the rounds' ratios to reading the same files; low, high: its 95 % interval",
     "MB of page": "size of the HTML file",
     "MB of memory": "the largest resident set of the whole process",
-    "8 + 8": "renders of one picture, as many a side",
-    AUTO: "tolerance here: the pictures say nothing of their noise",
+    "8 + 8": "renders of one image, as many a side",
+    AUTO: "tolerance here: the images say nothing of their noise",
 }
 STUDY = "diff_times"
 SEED = 2034
-SPP, GAIN = 16, 1.05  # the noise of the renders; how much brighter a quarter of the other picture is
+SPP, GAIN = 16, 1.05  # the noise of the renders; how much brighter a quarter of the other image is
 SMALL = 256
 RENDERS = 8  # a side
 MEGABYTE = 1e6
@@ -51,7 +51,7 @@ MEMORY = 1024.0 * 2**20 / MEGABYTE
 
 @dataclass(frozen=True)
 class Size:
-    """Of the large pictures, the number of pairs in the folder of small ones, and the rounds."""
+    """Of the large images, the number of pairs in the folder of small ones, and the rounds."""
 
     height: int
     width: int
@@ -88,17 +88,17 @@ def measure(size: Size, setting: str) -> list[Row]:
 
 
 def write(root: Path, size: Size) -> None:
-    """`a`, `b`: renders of one picture; `many_a`, `many_b`: small pictures that are the same but for last bits."""
+    """`a`, `b`: renders of one image; `many_a`, `many_b`: small images that are the same but for last bits."""
     rng = np.random.default_rng(SEED)
     y, x = np.mgrid[: size.height, : size.width]
     smooth = ((0.4 + 0.3 * np.sin(x / 90) * np.cos(y / 70))[..., None] * [1, 0.8, 0.6]).astype(np.float32)
     for side in ("a", "b"):
         (root / side).mkdir()
         for seed in range(RENDERS):
-            picture = smooth * rng.gamma(SPP, 1 / SPP, smooth.shape).astype(np.float32)
+            image = smooth * rng.gamma(SPP, 1 / SPP, smooth.shape).astype(np.float32)
             if side == "b":
-                picture[: size.height // 2, : size.width // 2] *= GAIN
-            image_file.write_exr(root / side / f"{seed}.exr", picture)
+                image[: size.height // 2, : size.width // 2] *= GAIN
+            image_file.write_exr(root / side / f"{seed}.exr", image)
     small = smooth[:SMALL, :SMALL]
     for side, gain in (("many_a", 1.0), ("many_b", 1 + 1e-5)):
         (root / side).mkdir()
@@ -127,7 +127,7 @@ def _readings(root: Path) -> dict[str, Callable[[], object]]:
 
 
 def _subjects(root: Path, page: Path) -> dict[str, Callable[[], object]]:
-    """The verdict of each method, of a folder, and the page of the picture that differs."""
+    """The verdict of each method, of a folder, and the page of the image that differs."""
     a, b = root / "a", root / "b"
     found = {
         name: functools.partial(

@@ -142,12 +142,12 @@ def _unfused(x: Any, y: Any, z: Any) -> Any:
     return x * y + z
 
 
-def _truncated(x: error_free.Expansion) -> error_free.Double:
-    return error_free.Double(x.hi, 0 * x.hi)
+def _truncated(x: error_free.TripleWord) -> error_free.DoubleWord:
+    return error_free.DoubleWord(x.hi, 0 * x.hi)
 
 
-def _plainly_collected(x: error_free.Expansion) -> error_free.Expansion:
-    return error_free.Expansion(x.hi, (sum(x.first),), 0 * x.hi)
+def _plainly_collected(x: error_free.TripleWord) -> error_free.TripleWord:
+    return error_free.TripleWord(x.hi, (sum(x.first),), 0 * x.hi)
 
 
 # Slips of the documents, as printed ----------------------------------------------------------------------------
@@ -218,11 +218,11 @@ MUTANTS = {
     "narrow contrast": Mutant("κ = k² − 1 in working precision", _narrow_contrast, EXACT),
     "no fma": Mutant("x y + z rounded twice", _patched(dr, "fma", _unfused), ("compensated",)),
     "truncated radicand": Mutant(
-        "its low part dropped", _patched(error_free.Expansion, "double", _truncated), ("compensated",)
+        "its low part dropped", _patched(error_free.TripleWord, "double", _truncated), ("compensated",)
     ),
     "radicand of second order": Mutant(
         "sums of first order rounded",
-        _patched(error_free.Expansion, "collected", _plainly_collected),
+        _patched(error_free.TripleWord, "collected", _plainly_collected),
         ("compensated",),
         rare=True,
     ),

@@ -1,9 +1,9 @@
-"""Efficiency: the error of a picture against the time it took, by integrator, BSDF and sampler, in turn in one run.
+"""Efficiency: the error of an image against the time it took, by integrator, BSDF and sampler, in turn in one run.
 
 The error is that against the mean of independent renders by the built-in, path + dielectric with its better stratified
 sampler, at the most samples per pixel measured here; the variance of that mean is subtracted. A ratio is formed within
 a round, in which every method renders the same seed; the median of the rounds counts. Efficiency must not be bought
-with bias: the mean of a method's pictures must agree with the built-in's, or the run fails.
+with bias: the mean of a method's images must agree with the built-in's, or the run fails.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ STUDY = "efficiency"
 SCALAR = "needs a compiled variant: a scalar one's time is that of Python"
 INDEPENDENT, STRATIFIED = "independent", ("multijitter", "orthogonal")
 EPSILON, WORST = 0.01, 1e-3
-NOISE = 1e-5  # of float32 pictures: below it independent seeds give the same one
+NOISE = 1e-5  # of float32 images: below it independent seeds give the same one
 TILE, FAMILY_ERROR, MARGIN = 16, 1e-3, 1e-5
 FIRST_REFERENCE = 1000  # seed: no method has seen any from here on
 METRICS = ("MSE", "MSE, trimmed", "relMSE", "relMSE, trimmed")
@@ -83,11 +83,11 @@ class Subject:
 
 @dataclass(frozen=True)
 class Measured:
-    """Of one subject at one number of samples: seconds and figures by round; the pictures at the most samples."""
+    """Of one subject at one number of samples: seconds and figures by round; the images at the most samples."""
 
     seconds: list[float]
     figures: dict[str, list[float]]
-    pictures: list[np.ndarray]
+    images: list[np.ndarray]
 
     def cost(self, metric: str) -> list[float]:
         return [error * seconds for error, seconds in zip(self.figures[metric], self.seconds, strict=True)]
@@ -173,7 +173,7 @@ def _noise(path: Path, extent: Extent) -> float:
 
 
 def _resolution(path: Path, extent: Extent) -> int:
-    """Of pictures that take long enough for what a render costs beside its samples not to count."""
+    """Of images that take long enough for what a render costs beside its samples not to count."""
     resolution = extent.resolution
     while resolution < LARGEST and extent.seconds:
         look = _camera(path, BUILTIN, resolution, INDEPENDENT, extent)
@@ -189,7 +189,7 @@ def best_sampler(path: Path, resolution: int, extent: Extent, seeds: int = 3) ->
     for sampler in STRATIFIED:
         look = _camera(path, BUILTIN, resolution, sampler, extent)
         shots = [look(extent.spp[-1], seed=FIRST_REFERENCE - 1 - i) for i in range(seeds + 1)][1:]
-        variance = np.stack([picture for picture, _ in shots]).var(0, ddof=1).mean()
+        variance = np.stack([image for image, _ in shots]).var(0, ddof=1).mean()
         costs[sampler] = float(variance) * statistics.median(seconds for _, seconds in shots)
     return min(costs, key=lambda sampler: costs[sampler])
 
@@ -204,15 +204,15 @@ def measure(cameras: dict[str, Camera], references: np.ndarray, extent: Extent) 
     found: Found = {name: {} for name in cameras}
     for spp in extent.spp:
         for name, shots in _rounds(cameras, spp, extent.rounds).items():
-            figures = [errors(picture, mean, own) for picture, _ in shots]
+            figures = [errors(image, mean, own) for image, _ in shots]
             by_metric = {metric: [figure[metric] for figure in figures] for metric in METRICS}
-            kept = [picture for picture, _ in shots] if spp == extent.spp[-1] else []
+            kept = [image for image, _ in shots] if spp == extent.spp[-1] else []
             found[name][spp] = Measured([seconds for _, seconds in shots], by_metric, kept)
     return found
 
 
 def _rounds(cameras: dict[str, Camera], spp: int, rounds: int) -> dict[str, list[tuple[np.ndarray, float]]]:
-    """A picture a round of each camera; every second round in the reverse order, the first one thrown away."""
+    """An image a round of each camera; every second round in the reverse order, the first one thrown away."""
     shots: dict[str, list[tuple[np.ndarray, float]]] = {name: [] for name in cameras}
     order = list(cameras)
     for seed in range(rounds + 1):
@@ -222,9 +222,9 @@ def _rounds(cameras: dict[str, Camera], spp: int, rounds: int) -> dict[str, list
     return {name: found[1:] for name, found in shots.items()}
 
 
-def errors(picture: np.ndarray, mean: np.ndarray, own: np.ndarray) -> dict[str, float]:
+def errors(image: np.ndarray, mean: np.ndarray, own: np.ndarray) -> dict[str, float]:
     """MSE and relMSE against `mean`, of which `own` is the variance, with and without the worst pixels."""
-    squared = np.square(picture - mean)
+    squared = np.square(image - mean)
     found: dict[str, float] = {}
     for metric, scale in (("MSE", np.ones_like(mean)), ("relMSE", np.square(mean) + EPSILON)):
         by_pixel = (squared / scale).mean(-1).ravel()
@@ -247,7 +247,7 @@ def _values(subject: Subject, builtins: list[Subject], found: Found, references:
     for metric in METRICS[1:]:
         ratios = [t / s for t, s in zip(test.cost(metric), same.cost(metric), strict=True)]
         values[f"equal-time {metric}"] = statistics.median(ratios)
-    agreed = compare.welch(references, np.stack(test.pictures), TILE, FAMILY_ERROR, MARGIN)
+    agreed = compare.welch(references, np.stack(test.images), TILE, FAMILY_ERROR, MARGIN)
     return values | {
         "Welch alarms": float(agreed.alarms),
         "smallest p, adjusted": agreed.smallest_p,

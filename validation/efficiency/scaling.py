@@ -1,7 +1,7 @@
 """Scaling: time to the first image, time of later ones, and memory, as a scene grows in one respect.
 
 Each measurement is a process of its own, whose folder of compiled kernels is empty: the first image is the time from
-the loaded scene to the picture, with all that is traced and compiled for it; the render is the median of those that
+the loaded scene to the image, with all that is traced and compiled for it; the render is the median of those that
 follow; after an edit of one index of refraction comes one image more. Imports and loading do not count. Methods take
 turns, and medians of the processes count.
 """

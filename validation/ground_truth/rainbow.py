@@ -1,7 +1,7 @@
 """The rainbow of one drop, rendered: sunlight traced onto a screen, and the angle at which its bright edge stands.
 
 A disk of parallel light falls on a drop; a camera beside the drop looks back at a screen ten million radii away, on
-which particle tracing gathers what left the drop. So places on the picture are angles to 3e-7. Near the least
+which particle tracing gathers what left the drop. So places on the image are angles to 3e-7. Near the least
 deflection D₀ a ray's own is D = D₀ + a δ² + …, δ the distance of its entry from that of the stationary ray: the light
 C(D) deflected by less than D is that of two intervals of δ, and odd powers of δ cancel between them. Hence
 
@@ -22,7 +22,7 @@ from validation.reference import closed_forms
 from validation.reference.optical_systems import Array
 
 INDEX = np.longdouble(1.333)
-SIZE = 1536  # pixels across the picture, which holds 90 degrees: 0.041 degrees each at the edge
+SIZE = 1536  # pixels across the image, which holds 90 degrees: 0.041 degrees each at the edge
 SCREEN = 1e7  # radii of the drop
 DARK, LIT = (136.5, 137.7), 140.0  # degrees: a part of the dark band, and where the measured part ends
 STEP = 0.01  # degrees
@@ -74,7 +74,7 @@ def scene(glass: dict[str, Any]) -> Any:
     )
 
 
-def pictures(glass: dict[str, Any], seeds: int) -> list[Array]:
+def images(glass: dict[str, Any], seeds: int) -> list[Array]:
     """SIZE × SIZE, of a light path per pixel and seed."""
     import mitsuba as mi
 
@@ -93,10 +93,10 @@ def _bins() -> tuple[Array, Array, Array]:
     return ends, inside, at[inside]
 
 
-def edge(picture: Array) -> float:
+def edge(image: Array) -> float:
     """Degrees; NaN where there is none."""
     ends, inside, at = _bins()
-    light = np.bincount(at, picture[inside], len(ends))
+    light = np.bincount(at, image[inside], len(ends))
     gathered = np.cumsum(light - light[ends <= DARK[1]].mean())
     found = float(ends[light.argmax()])
     for _ in range(3):

@@ -3,7 +3,7 @@
 Rays are intersected with Mitsuba's shapes and refracted by the plugin's own samples, boundary by boundary, through
 bodies whose answer is known: their errors stand over a bound of what float32 may do on the way (`validation/bench.py`
 counts it), which is of the worst case. The double Gauss is that of a file, `validation/double_gauss_codev.json`, as
-ray-optics (BSD-3-Clause) carries CODE V's listing. The rainbow is measured on a picture (`validation/bow.py`): its
+ray-optics (BSD-3-Clause) carries CODE V's listing. The rainbow is measured on an image (`validation/bow.py`): its
 error stands over what chance leaves once in ten thousand runs. The built-in `dielectric` is shown beside, without
 budgets.
 """
@@ -106,20 +106,20 @@ def bow_rows(context: Context) -> list[Row]:
         reason = "takes millions of light paths: needs a compiled variant"
         return [Row(STUDY, PLUGIN, "rainbow", context.variant, reason=reason)]
     seeds = RENDERS[context.profile.name]
-    found = {plugin: rainbow.pictures(glass(plugin, rainbow.INDEX), seeds) for plugin in PLUGINS}
+    found = {plugin: rainbow.images(glass(plugin, rainbow.INDEX), seeds) for plugin in PLUGINS}
     about = {"index": float(rainbow.INDEX), "seeds": seeds, "resolution": rainbow.SIZE}
-    shown = {plugin: _save(context.out, plugin, pictures, about) for plugin, pictures in found.items()}
+    shown = {plugin: _save(context.out, plugin, images, about) for plugin, images in found.items()}
     roles = {PLUGIN: {"reference": shown[BUILTIN], "test": shown[PLUGIN]}, BUILTIN: {}}
     return [bow_row(plugin, context.variant, found[plugin], about, roles[plugin]) for plugin in PLUGINS]
 
 
 def bow_row(
-    plugin: str, setting: str, pictures: list[Array], replay: dict[str, Any], shown: dict[str, str] | None = None
+    plugin: str, setting: str, images: list[Array], replay: dict[str, Any], shown: dict[str, str] | None = None
 ) -> Row:
     """Student's t of the mean of the edges; pixels may add their blur."""
     from scipy import stats
 
-    edges = np.array([rainbow.edge(picture) for picture in pictures])
+    edges = np.array([rainbow.edge(image) for image in images])
     error, chance = edges.mean() - rainbow.angle(), edges.std(ddof=1) / math.sqrt(len(edges))
     bound = stats.t.isf(FALSE_ALARM / 2, len(edges) - 1) * chance + rainbow.BLUR
     values = {
@@ -130,10 +130,10 @@ def bow_row(
         "error / bound": float(abs(error) / bound),
     }
     budgets = {"error / bound": 1.0, "standard error / °": RESOLVED} if plugin == PLUGIN else {}
-    return Row(STUDY, plugin, "rainbow", setting, values, budgets, replay=replay, pictures=shown or {})
+    return Row(STUDY, plugin, "rainbow", setting, values, budgets, replay=replay, images=shown or {})
 
 
-def _save(folder: Path, plugin: str, pictures: list[Array], about: dict[str, Any]) -> str:
+def _save(folder: Path, plugin: str, images: list[Array], about: dict[str, Any]) -> str:
     """Their mean in squares of 4 pixels, 1 at its brightest."""
-    mean = np.mean(pictures, axis=0).reshape(rainbow.SIZE // 4, 4, rainbow.SIZE // 4, 4).mean((1, 3))
+    mean = np.mean(images, axis=0).reshape(rainbow.SIZE // 4, 4, rainbow.SIZE // 4, 4).mean((1, 3))
     return path_overlay.save(folder, f"rainbow {plugin}", np.repeat(mean[..., None] / mean.max(), 3, axis=2), about)

@@ -140,7 +140,7 @@ def unfold(origins: Array, directions: Array, count: int) -> Retraced:
     hits = np.where(axis == 1, np.where(wall % 2 == 0, 0, 2), np.where(wall % 2 == 0, 3, 1)).astype(np.int32)
     outward = SIDES[axis] / np.sqrt(size2)[axis][..., None] * np.where(wall % 2 == 0, 1, -1)[..., None]
     events = np.full((len(x), count + 1), Event.REFLECTED, np.uint8)
-    events[:, -1] = Event.EXHAUSTED
+    events[:, -1] = Event.MAX_DEPTH
     return Retraced(
         np.concatenate([np.asarray(origins, np.longdouble)[:, None], folded @ SIDES], 1),
         hits,

@@ -43,7 +43,7 @@ U = 2.0**-24
 FACETS = 64  # of an arc, at most
 Spawn = Callable[[Any, Any], Any]
 LARGEST = 1500  # walls; arcs have fewer facets where there are more of them
-DRAWN, SHOWN, PIXELS = "along the ray", 9, 192  # rays in a picture, and its size before it is enlarged
+DRAWN, SHOWN, PIXELS = "along the ray", 9, 192  # rays in an image, and its size before it is enlarged
 RAYS = 100  # of the file's, and as many scattered
 
 
@@ -73,7 +73,7 @@ def scene_rows(context: Context, path: Path) -> list[Row]:
             "rays": len(case.origins),
             "seed": against_retrace.SEED,
         }
-        pictures = {"overlay": _picture(context, scene, case, paths)} if name == DRAWN else {}
+        images = {"overlay": _image(context, scene, case, paths)} if name == DRAWN else {}
         rows.append(
             Row(
                 STUDY,
@@ -83,7 +83,7 @@ def scene_rows(context: Context, path: Path) -> list[Row]:
                 values,
                 against_retrace.GROWN,
                 replay=replay,
-                pictures=pictures,
+                images=images,
             )
         )
     return rows
@@ -96,7 +96,7 @@ def apart(some: Paths, others: Paths) -> float:
     return float(np.nanmax(distance)) if same.any() else float("nan")
 
 
-def _picture(context: Context, scene: Any, case: Case, extruded: Paths) -> str:
+def _image(context: Context, scene: Any, case: Case, extruded: Paths) -> str:
     """The walls from above, the exact paths over them, and where Mitsuba's rays meet the walls."""
     view = wall_scene.Plan(scene, case.segments, PIXELS)
     shown = np.linspace(0, len(case.origins) // 2 - 1, SHOWN).astype(int)
@@ -163,7 +163,7 @@ def trace(scene: Any, case: Case, spawn: Spawn) -> Paths:
         bs, _ = si.bsdf().sample(sampling, si, 1 - 2.0**-24, [0.5, 0.5], inside)
         through = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission)
         event: Any = dr.select(through, mi.UInt32(int(Event.REFRACTED)), int(Event.REFLECTED))
-        event = dr.select(found, dr.select(inside, event, int(Event.EXHAUSTED)), int(Event.ESCAPED))
+        event = dr.select(found, dr.select(inside, event, int(Event.MAX_DEPTH)), int(Event.ESCAPED))
         dr.scatter(events, event, j * count + lane, active)
         return j + 1, inside, dr.select(inside, spawn(si, si.to_world(bs.wo)), ray)
 

@@ -76,7 +76,7 @@ class Plan:
         least, most = (f(segments.n_left, segments.n_right) for f in (np.minimum, np.maximum))
         index = np.where(np.array(si.is_valid()), index, least.min())
         share = (index - least.min()) / max(most.max() - least.min(), 1e-9)
-        self.picture = (0.02 + 0.25 * share.reshape(size, size, 1)) * np.array([0.4, 0.7, 1.0])
+        self.image = (0.02 + 0.25 * share.reshape(size, size, 1)) * np.array([0.4, 0.7, 1.0])
 
     def project(self, points: np.ndarray) -> np.ndarray:
         seen = (points[:, :2] - self.middle) / self.half

@@ -73,7 +73,7 @@ def _solve(a: Any, n: Any, k: Any) -> tuple[Any, ...]:
     scale = dr.select(transmitted, k, 1)
     along = [dr.select(transmitted, dr.mulsign(r, c[0]), -c_i) for r, c_i in zip(roots, c[:2], strict=True)]
     difference = float_expansions.distil([*along, *float_expansions.negated(float_expansions.product(c, [scale]))], 2)
-    factor = float_expansions.quotient(difference, float_expansions.dot(n, n))
+    factor = float_expansions.ieee_divide(difference, float_expansions.dot(n, n))
     parts = [(*float_expansions.two_prod(scale, a[i]), *float_expansions.product(factor, [n[i]])) for i in range(3)]
     b = [float_expansions.distil(part, 2) for part in parts]
     unresolved = (c[0] != 0) & (dr.abs(d[0]) <= RESOLUTION * terms)

@@ -74,7 +74,7 @@ def _follow(curves: Curves, p: Array, d: Array, max_depth: int, bits: Array, n: 
     for j in range(max_depth + 1):
         distance, hit = curves.first(p[alive], d[alive], last[alive])
         ahead = hit >= 0
-        found.events[alive, j] = np.where(ahead, Event.EXHAUSTED, Event.ESCAPED)
+        found.events[alive, j] = np.where(ahead, Event.MAX_DEPTH, Event.ESCAPED)
         if j == max_depth:
             break
         alive, hit, distance = alive[ahead], hit[ahead], distance[ahead]
@@ -91,7 +91,7 @@ def _follow(curves: Curves, p: Array, d: Array, max_depth: int, bits: Array, n: 
         bent, through = _bend(d[alive], normal, near, far, forced)
         event = np.where(through, Event.REFRACTED, Event.REFLECTED)
         found.points[alive, j + 1], found.hits[alive, j] = q, hit
-        found.events[alive, j] = np.where(right, event, Event.CONTRADICTED)
+        found.events[alive, j] = np.where(right, event, Event.MEDIUM_MISMATCH)
         found.normals[alive, j], found.curvatures[alive, j] = normal, curvature
         found.legs[alive, j + 1] = np.where(right[:, None], bent, d[alive])
         p[alive], d[alive], n[alive], last[alive] = q, bent, np.where(through, far, near), hit

@@ -1,7 +1,7 @@
 """Renders: every scene with `refract` and with `dielectric`, same seeds and independent seeds, and what it costs.
 
-Same seed: both plugins consume the same random numbers, so pictures agree but for last bits and the lobe decisions
-those flip. Independent seeds: Welch's t-test on tiles. The error of a picture is relMSE against the mean of the
+Same seed: both plugins consume the same random numbers, so images agree but for last bits and the lobe decisions
+those flip. Independent seeds: Welch's t-test on tiles. The error of an image is relMSE against the mean of the
 built-in's other renders, less that mean's own variance. Times are of warm renders of at least a tenth of a second, the
 plugins in turn; below that the time to trace a plugin written in Python, half a millisecond a render, begins to count.
 """
@@ -31,7 +31,7 @@ TITLE = "Renders"
 TERMS = {
     "reference, test, difference": "dielectric, refract, refract − dielectric: means over the same seeds",
     "changed share": "pixels of which any channel differs by more than 1e-5, same seeds",
-    "Welch alarms": "tiles and channels whose means differ, independent seeds; at most one picture in 1000 by chance",
+    "Welch alarms": "tiles and channels whose means differ, independent seeds; at most one image in 1000 by chance",
     "detectable difference": "relative difference of a tile's mean that would have been an alarm, median over tiles",
     "time / dielectric": "median over alternating warm renders, a goal, not a budget, because a busy machine spoils "
     "it; with a name: of the plugin with that formula; low, high: the 95 % interval",
@@ -44,9 +44,9 @@ Curves = dict[str, list[tuple[float, float]]]
 CHANGED = 1e-5
 TILE = 16
 CURVE_SEEDS = 2
-MARGIN = 1e-5  # relative: float32 pictures that differ by less are equal
+MARGIN = 1e-5  # relative: float32 images that differ by less are equal
 TIMED = 0.1  # seconds of a render whose time counts
-FAMILY_ERROR = 1e-3  # of Welch's test, per scene, after Šidák: 1 false alarm in 1000 pictures that are equal
+FAMILY_ERROR = 1e-3  # of Welch's test, per scene, after Šidák: 1 false alarm in 1000 images that are equal
 
 
 def tasks(context: Context) -> list[Task]:
@@ -62,7 +62,7 @@ def tasks(context: Context) -> list[Task]:
 def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
     profile, scene = context.profile, path.stem
     cameras = {name: Camera(opened(path, name, profile.resolution)) for name in (plugin, BUILTIN)}
-    test, reference = _pictures(profile, *cameras.values())
+    test, reference = _images(profile, *cameras.values())
     half = profile.pairs // 2
     values, left_out = _paired(test, reference), no_question(test, reference)
     if not left_out:
@@ -81,7 +81,7 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
         "spp": profile.spp,
         "seeds": profile.pairs,
     }
-    pictures = _save(context, replay, test.mean(0), reference.mean(0))
+    images = _save(context, replay, test.mean(0), reference.mean(0))
     remark = NO_REFERENCE.get(scene, left_out)
     noisy = reference.std(0).max() >= CHANGED
     curves = _curves(context, cameras, reference) if plugin == PLUGIN and noisy and scene not in NO_REFERENCE else {}
@@ -96,7 +96,7 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
             goals,
             remark,
             replay,
-            pictures,
+            images,
             curves,
         )
     ]
@@ -109,8 +109,8 @@ def _budgets(scene: str, left_out: str) -> dict[str, float]:
     return budgets | ({"changed share": 1e-3} if left_out or scene in SHORT_PATHS else {})
 
 
-def _pictures(profile: Profile, *cameras: Camera) -> list[np.ndarray]:
-    """Of each camera, one picture a seed."""
+def _images(profile: Profile, *cameras: Camera) -> list[np.ndarray]:
+    """Of each camera, one image a seed."""
     return [np.stack([camera(profile.spp, seed)[0] for seed in range(profile.pairs)]) for camera in cameras]
 
 
@@ -144,7 +144,7 @@ def _metrics(plugins: list[str]) -> list[str]:
 
 
 def _paired(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Same seeds, picture by picture."""
+    """Same seeds, image by image."""
     found = compare.paired(reference.reshape(-1, *reference.shape[2:]), test.reshape(-1, *test.shape[2:]), CHANGED)
     return {
         "changed share": found.changed,
@@ -157,9 +157,9 @@ def _paired(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
 def no_question(test: np.ndarray, reference: np.ndarray) -> str:
     """Why Welch's test has nothing to ask: what is the same needs no statistics; "" where it has."""
     if np.array_equal(test, reference):
-        return "left out: Welch's test, because pictures of the same seed are identical bit for bit"
+        return "left out: Welch's test, because images of the same seed are identical bit for bit"
     if reference.std(0).max() < CHANGED and test.std(0).max() < CHANGED:  # two conditions: NaN is below nothing
-        return "left out: Welch's test and error against time, because independent seeds give the same picture"
+        return "left out: Welch's test and error against time, because independent seeds give the same image"
     return ""
 
 
@@ -178,19 +178,17 @@ def _curves(context: Context, cameras: dict[str, Camera], reference: np.ndarray)
     for spp in context.profile.curve_spp:
         for name, camera in cameras.items():
             points = [camera(spp, seed=context.profile.pairs + i) for i in range(CURVE_SEEDS)]
-            error = statistics.fmean(compare.relative_mse(picture, reference) for picture, _ in points)
+            error = statistics.fmean(compare.relative_mse(image, reference) for image, _ in points)
             curves[name].append((statistics.median(seconds for _, seconds in points), error))
     return curves
 
 
 def _save(context: Context, settings: dict[str, Any], test: np.ndarray, reference: np.ndarray) -> dict[str, str]:
-    folder = Path("pictures") / Path(settings["scene"]).stem
+    folder = Path("images") / Path(settings["scene"]).stem
     (context.out / folder).mkdir(parents=True, exist_ok=True)
     saved = {}
-    for role, picture in (("reference", reference), ("test", test), ("difference", test - reference)):
+    for role, image in (("reference", reference), ("test", test), ("difference", test - reference)):
         name = f"{BUILTIN}.exr" if role == "reference" else f"{settings['plugin']} {role}.exr"
-        image_file.write_exr(
-            context.out / folder / name, picture.astype(np.float32), metadata=settings | {"role": role}
-        )
+        image_file.write_exr(context.out / folder / name, image.astype(np.float32), metadata=settings | {"role": role})
         saved[role] = str(folder / name)
     return saved

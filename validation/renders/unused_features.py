@@ -30,9 +30,9 @@ TERMS = {
     "operations": "Dr.Jit's count for the whole kernel; of `sample` alone, or of a render",
     "added": "operations more than those of the plain plugin, in radiance mode, with both lobes",
     "compiled": "kernels that no cache had, in all images after the first",
-    "first image": "seconds from a loaded scene to its picture, kernels compiled; over the built-in's, median of "
+    "first image": "seconds from a loaded scene to its image, kernels compiled; over the built-in's, median of "
     "alternating pairs; low, high: its 95 % interval, or the extremes of a few pairs",
-    "edit": "the same for one index edited, to the next picture",
+    "edit": "the same for one index edited, to the next image",
     "boundaries": "surfaces that a path from the camera meets on average, without roulette",
     "call": "seconds of one call of `sample`, over the built-in's",
     "frozen": "an image by a function under `dr.freeze`, over the same one traced anew; warm",
@@ -306,7 +306,7 @@ def optimisation_rows(context: Context) -> list[Row]:
 
 
 def step(balls: Balls) -> Any:
-    """One step of gradient descent on the mean of a picture."""
+    """One step of gradient descent on the mean of an image."""
     import mitsuba as mi
 
     params, key = balls.params, balls.eta

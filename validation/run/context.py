@@ -10,7 +10,7 @@ from mi_refract.backend import Backend
 from mi_refract.report.row import Row
 
 SCENES = Path(__file__).parents[2] / "scenes"
-# Where the built-in is no reference: pictures are shown, and nothing is demanded of their agreement.
+# Where the built-in is no reference: images are shown, and nothing is demanded of their agreement.
 NO_REFERENCE = {"mirage": "the built-in turns slanting edges into stairs here, so it is no reference: see Paths"}
 
 

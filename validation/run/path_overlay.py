@@ -1,4 +1,4 @@
-"""Pictures with paths drawn over them: a scene from its own camera, and points of it projected as that camera does."""
+"""Images with paths drawn over them: a scene from its own camera, and points of it projected as that camera does."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ MARK = 5  # half the size of a mark, in pixels of the drawing
 
 
 class Seen(Protocol):
-    """A square picture and where points of space are on it, from 0 to 1, y downward."""
+    """A square image and where points of space are on it, from 0 to 1, y downward."""
 
-    picture: np.ndarray
+    image: np.ndarray
 
     def project(self, points: np.ndarray) -> np.ndarray: ...
 
@@ -36,19 +36,19 @@ class View:
 
         path = str(SCENES / f"{scene}.xml")
         self.scene = mi.load_file(path, **scene_files.REPRODUCIBLE, bsdf=plugin, res=size, **parameters)
-        self.picture = np.array(mi.render(self.scene, spp=spp, seed=0), dtype=np.float64)
+        self.image = np.array(mi.render(self.scene, spp=spp, seed=0), dtype=np.float64)
         fov = _number(mi.traverse(self.scene.sensors()[0])["x_fov"])
         self.half = math.tan(math.radians(fov) / 2)
         self.to_world = np.array(self.scene.sensors()[0].world_transform().matrix, float).reshape(4, 4)
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Where the camera sees points (N × 3), on a picture from 0 to 1, y downward; NaN for what is behind it."""
+        """Where the camera sees points (N × 3), on an image from 0 to 1, y downward; NaN for what is behind it."""
         x, y, z = np.linalg.inv(self.to_world[:3, :3]) @ (points - self.to_world[:3, 3]).T
         z = np.where(z > 0, z, np.nan)
         return 0.5 - 0.5 * np.stack([x, y], 1) / (self.half * z)[:, None]
 
     def ray(self, u: float, v: float) -> tuple[np.ndarray, np.ndarray]:
-        """Origin and direction of the ray through a point of the picture."""
+        """Origin and direction of the ray through a point of the image."""
         d = self.to_world[:3, :3] @ [(1 - 2 * u) * self.half, (1 - 2 * v) * self.half, 1.0]
         return self.to_world[:3, 3], d / np.linalg.norm(d)
 
@@ -58,10 +58,10 @@ def _number(x: Any) -> float:
 
 
 def draw(view: Seen, paths: list[np.ndarray], ends: np.ndarray) -> np.ndarray:
-    """The picture, enlarged; the paths (points N × 3 each) in white between two squares, `ends` as green crosses."""
+    """The image, enlarged; the paths (points N × 3 each) in white between two squares, `ends` as green crosses."""
     import OpenImageIO as oiio
 
-    enlarged = np.kron(view.picture, np.ones((UPSCALE, UPSCALE, 1))).astype(np.float32)
+    enlarged = np.kron(view.image, np.ones((UPSCALE, UPSCALE, 1))).astype(np.float32)
     buffer, scale = oiio.ImageBuf(np.ascontiguousarray(enlarged)), enlarged.shape[0]
 
     def polyline(points: np.ndarray, colour: tuple[float, ...]) -> None:
@@ -82,9 +82,9 @@ def draw(view: Seen, paths: list[np.ndarray], ends: np.ndarray) -> np.ndarray:
     return np.asarray(buffer.get_pixels(oiio.FLOAT))
 
 
-def save(folder: Path, name: str, picture: np.ndarray, about: dict[str, Any]) -> str:
+def save(folder: Path, name: str, image: np.ndarray, about: dict[str, Any]) -> str:
     """Write an EXR under `folder`; its path relative to that."""
-    target = Path("pictures") / f"{name}.exr"
+    target = Path("images") / f"{name}.exr"
     (folder / target).parent.mkdir(parents=True, exist_ok=True)
-    image_file.write_exr(folder / target, picture.astype(np.float32), metadata=about)
+    image_file.write_exr(folder / target, image.astype(np.float32), metadata=about)
     return str(target)

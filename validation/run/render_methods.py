@@ -55,7 +55,7 @@ METHODS = (
 
 
 class Camera:
-    """A loaded scene: renders pictures as numpy arrays and says how long each took."""
+    """A loaded scene: renders images as numpy arrays and says how long each took."""
 
     def __init__(self, scene: Any, integrator: Any = None) -> None:
         self.scene, self.integrator = scene, integrator
@@ -64,15 +64,15 @@ class Camera:
         import mitsuba as mi
 
         start = time.perf_counter()
-        picture = mi.render(self.scene, spp=spp, seed=seed, integrator=self.integrator)
-        dr.eval(picture)
+        image = mi.render(self.scene, spp=spp, seed=seed, integrator=self.integrator)
+        dr.eval(image)
         dr.sync_thread()
         seconds = time.perf_counter() - start
-        return np.array(picture, dtype=np.float64), seconds
+        return np.array(image, dtype=np.float64), seconds
 
 
 def opened(path: Path, bsdf: str, resolution: int, **parameters: Any) -> Any:
-    """A scene file with its glass; the same seed means the same picture."""
+    """A scene file with its glass; the same seed means the same image."""
     import mitsuba as mi
 
     return mi.load_file(str(path), **scene_files.REPRODUCIBLE, bsdf=bsdf, res=resolution, **parameters)

@@ -2,7 +2,7 @@
 
 A ray is traced through Mitsuba's scene with the plugin's own samples, transmitted wherever it can be, and compared
 with straight segments and Snell's law in double precision. Mitsuba's ray offset is part of both: in the mirage it
-moves rays more than anything here, but it turns none. Then the pictures: the mirage in a telescope and to the naked
+moves rays more than anything here, but it turns none. Then the images: the mirage in a telescope and to the naked
 eye, and the fibre, with exact paths drawn over them (white, between squares) and the ends of the traced ones (green
 crosses).
 """
@@ -51,7 +51,7 @@ SEED = 2028
 RAYS = 64
 VISIBLE = 0.1
 FLIPPED = 1e-3  # of the pixels: those of which a last bit changes the choice between reflection and refraction
-# The pictures: a scene, what its parameters are, and the name of the view.
+# The images: a scene, what its parameters are, and the name of the view.
 VIEWS: tuple[tuple[str, dict[str, str], str], ...] = (
     ("mirage", {}, "mirage, telescope"),
     ("mirage", {"fov": "1.3"}, "mirage, naked eye"),
@@ -74,9 +74,9 @@ class Bundle:
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per scene for the paths, one per view for the pictures."""
+    """One task per scene for the paths, one per view for the images."""
     paths = [(layers.scene, functools.partial(_path_rows, context, layers)) for layers in (MIRAGE, FIBRE)]
-    views = [(f"picture of the {view[2]}", functools.partial(_view_rows, context, *view)) for view in VIEWS]
+    views = [(f"image of the {view[2]}", functools.partial(_view_rows, context, *view)) for view in VIEWS]
     return [Task(f"paths: {name}", work) for name, work in paths + views]
 
 
@@ -269,29 +269,29 @@ def _moved(layers: Layers, rays: Bundle, exact: list[Path]) -> float:
     return float(np.median([part.place.max() for part in moved]))
 
 
-# Pictures ------------------------------------------------------------------------------------------------------
+# Images ------------------------------------------------------------------------------------------------------
 
 
 def _view_rows(context: Context, scene: str, parameters: dict[str, str], name: str) -> list[Row]:
-    """`refract` and the built-in, picture against picture; and what flipped lobes alone do, as a control."""
+    """`refract` and the built-in, image against image; and what flipped lobes alone do, as a control."""
     if context.variant.startswith("scalar"):
-        return [Row(STUDY, PLUGIN, f"{name}: picture", context.variant, reason=SCALAR)]
+        return [Row(STUDY, PLUGIN, f"{name}: image", context.variant, reason=SCALAR)]
     profile, right = context.profile, _other_right_formula()
     spp = max(1, profile.spp // 4)
     views = {p: View(scene, p, parameters, profile.resolution, spp) for p in (BUILTIN, PLUGIN, right)}
-    reference, test, control = (view.picture for view in views.values())
+    reference, test, control = (view.image for view in views.values())
     values = {
         "pixels off": methods.paired(reference, test, VISIBLE).changed,
         "pixels off, control": methods.paired(control, test, VISIBLE).changed,
     }
     about = {"scene": f"{scene}.xml", "resolution": profile.resolution, "spp": spp, "seed": 0, **parameters}
-    pictures = {
+    images = {
         role: path_overlay.save(context.out, f"{name} {plugin} with paths", _with_paths(views[plugin], scene), about)
         for role, plugin in (("reference", BUILTIN), ("test", PLUGIN))
     }
     replay = about | {"control": right}
     budgets = {"pixels off, control": FLIPPED}
-    return [Row(STUDY, PLUGIN, f"{name}: picture", context.variant, values, budgets, replay=replay, pictures=pictures)]
+    return [Row(STUDY, PLUGIN, f"{name}: image", context.variant, values, budgets, replay=replay, images=images)]
 
 
 def _other_right_formula() -> str:
@@ -303,7 +303,7 @@ def _other_right_formula() -> str:
 
 
 def _with_paths(view: View, scene: str) -> np.ndarray:
-    """Seven exact paths over the picture, and where the view's own plugin takes the same rays."""
+    """Seven exact paths over the image, and where the view's own plugin takes the same rays."""
     layers = layered_scenes.LAYERS[scene]
     if layers is MIRAGE:
         places = zip(np.linspace(0.08, 0.92, 7), (0.70, 0.91, 0.60, 0.79, 0.88, 0.74, 0.93), strict=True)

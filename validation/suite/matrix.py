@@ -1,7 +1,7 @@
-"""Suite: every system against every check, out of the rows of Per ray and Pictures.
+"""Suite: every system against every check, out of the rows of Per ray and Images.
 
 A number is how far off a system is at most: of rays the largest angle to the certified direction in radians, of
-pictures the difference of the means, as a share. A cell fails where the study that it comes from does. Beside each row
+images the difference of the means, as a share. A cell fails where the study that it comes from does. Beside each row
 stand the version, and what the system does otherwise than it should, or than `refract` does.
 """
 
@@ -19,9 +19,9 @@ TEXT = __doc__.partition("\n")[2].strip()
 STUDY = "matrix"
 OFF = "off by"
 TERMS = {
-    OFF: "rays: the largest angle, in radians, of those decided rightly; pictures: |test / reference − 1| of the means",
+    OFF: "rays: the largest angle, in radians, of those decided rightly; images: |test / reference − 1| of the means",
     "disagrees": "1 where a budget of the row that this is taken from is broken",
-    "differs": "1 where the pictures are different, as it is known of this system; see its sentence",
+    "differs": "1 where the images are different, as it is known of this system; see its sentence",
 }
 CHECKS = {per_ray.STUDY: tuple(per_ray.SETS), rendered_images.STUDY: tuple(rendered_images.SCENES)}
 

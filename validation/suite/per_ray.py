@@ -23,7 +23,7 @@ from mi_refract.ray_sets.check_answers import PROBLEMS, Figures, Findings
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.report.row import Row
 from validation.run.context import Context, Task
-from validation.suite.renderers.system import CRITICAL, GRAZING, MATCHED, RANDOM, TOTAL, Call, System
+from validation.suite.renderers.system import CRITICAL, GRAZING, MATCHED, RANDOM, TOTAL, RefractFunction, System
 
 from .renderers import SYSTEMS, environments
 
@@ -103,7 +103,7 @@ def tasks(context: Context) -> list[Task]:
     ]
 
 
-def call_rows(system: System, call: Call, context: Context) -> list[Row]:
+def call_rows(system: System, call: RefractFunction, context: Context) -> list[Row]:
     if reason := environments.absent(system):
         return [_unmeasured(call, reason)]
     if not system.small and context.profile.name == "quick":
@@ -120,7 +120,7 @@ def call_rows(system: System, call: Call, context: Context) -> list[Row]:
     return rows(call, rays, answers)
 
 
-def _unmeasured(call: Call, reason: str) -> Row:
+def _unmeasured(call: RefractFunction, reason: str) -> Row:
     return Row(STUDY, call.title, "every set", call.precision, reason=reason)
 
 
@@ -149,7 +149,7 @@ def _gathered(parts: dict[str, regimes.Rays], precision: str) -> RaySet:
 # Judged ------------------------------------------------------------------------------------------------------------
 
 
-def rows(call: Call, rays: RaySet, answers: Answers) -> list[Row]:
+def rows(call: RefractFunction, rays: RaySet, answers: Answers) -> list[Row]:
     """One per set."""
     left_out = direction_errors.radicand(rays.rays) < call.gives_up
     findings = check_answers.check(_only(rays, ~left_out), _without(answers, rays.ids[left_out]))
@@ -187,7 +187,9 @@ def _remark(findings: Findings, system: str, known: str) -> str:
     return "; ".join(filter(None, (system, f"total internal reflection: {findings.tir}", known, *problems, *mistake)))
 
 
-def _measured(name: str, call: Call, findings: Findings, figures: Figures | None) -> tuple[Numbers, Numbers, Numbers]:
+def _measured(
+    name: str, call: RefractFunction, findings: Findings, figures: Figures | None
+) -> tuple[Numbers, Numbers, Numbers]:
     """Values, budgets and goals. Where no ray of the set was answered, all that can be said is that it was not."""
     values = {"unfit": float(sum(each.count for each in findings.problems if PROBLEMS[each.kind]))}
     budgets = {"unfit": 0.0, "wrong": 0.0}
@@ -200,8 +202,11 @@ def _measured(name: str, call: Call, findings: Findings, figures: Figures | None
     budgets["error / bound"] = 1.0
     if name == TOTAL:
         values["told otherwise"], budgets["told otherwise"] = float(findings.tir != call.told), 0.0
-    if name in call.noted:
-        values |= {"noted": call.noted[name][1], "off the noted": off(figures.worst, *call.noted[name])}
+    if name in call.recorded_error:
+        values |= {
+            "noted": call.recorded_error[name][1],
+            "off the noted": off(figures.worst, *call.recorded_error[name]),
+        }
         goals["off the noted"] = NEAR
     return values, budgets, goals
 

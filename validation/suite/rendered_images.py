@@ -1,4 +1,4 @@
-"""Pictures: the same plain scene by this plugin and by other renderers, judged by Welch's test.
+"""Images: the same plain scene by this plugin and by other renderers, judged by Welch's test.
 
 Both sides have the same flat triangles, the same camera, a box filter, and several independent renders; the glossary
 says how each renderer's model is brought to Mitsuba's. `refract` renders by Mitsuba's `path`. The balls of the scene
@@ -30,23 +30,23 @@ from mi_refract.scene_export.from_mitsuba import Diffuse, Environment, Light, Me
 from validation.run.context import SCENES as FOLDER
 from validation.run.context import Context, Task
 from validation.run.render_methods import Camera
-from validation.suite.renderers.image_renderers import PAINTERS
+from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
 from .renderers import SYSTEMS, environments
 
-TITLE = "Pictures"
+TITLE = "Images"
 TEXT = __doc__.partition("\n")[2].strip()
-STUDY = "pictures"
+STUDY = "images"
 TERMS = {
-    "tests that differ": "of tiles of 16² pixels by channel, blocks of tiles, and the whole picture; of pairs that are "
+    "tests that differ": "of tiles of 16² pixels by channel, blocks of tiles, and the whole image; of pairs that are "
     "equal, one in 10,000 has any",
     "tiles that differ without noise": "of those where neither side has noise",
-    "detectable difference": "relative to the tile's mean, median over the tiles; of the picture: of its mean",
-    "mean difference": "of the picture's mean, relative: what the other renderer has more",
-    "RMSE / noise": "of the two means by pixel, over what the spread between renders predicts: 1 for equal pictures "
+    "detectable difference": "relative to the tile's mean, median over the tiles; of the image: of its mean",
+    "mean difference": "of the image's mean, relative: what the other renderer has more",
+    "RMSE / noise": "of the two means by pixel, over what the spread between renders predicts: 1 for equal images "
     "whose noise is all in that spread, which it is not for a fixed grid of samples",
     "reference, test, difference": f"`{PLUGIN}`, the other renderer, test − reference: means over the renders",
-} | {f"{title}, assumed": " ".join(painter.assumed) for title, painter in PAINTERS.items()}
+} | {f"{title}, assumed": " ".join(painter.assumed) for title, painter in IMAGE_RENDERERS.items()}
 FAMILY_ERROR = 1e-4
 RENDERS = 4  # a side
 OURS = 1000  # the first seed of the reference's
@@ -84,7 +84,7 @@ def environment(resolution: int) -> Plain:
 
 
 def furnace(resolution: int) -> Plain:
-    """The ball on a white floor that absorbs nothing, in a white sky: a correct picture is 1 everywhere."""
+    """The ball on a white floor that absorbs nothing, in a white sky: a correct image is 1 everywhere."""
     given, white = _scene("sphere", resolution), (1.0, 1.0, 1.0)
 
     def bright(mesh: Mesh) -> Mesh:
@@ -125,14 +125,14 @@ WHY = {
 def tasks(context: Context) -> list[Task]:
     """One per renderer and scene."""
     return [
-        Task(f"pictures: {title}, {scene}", functools.partial(pair_rows, context, title, scene))
-        for title, painter in PAINTERS.items()
+        Task(f"images: {title}, {scene}", functools.partial(pair_rows, context, title, scene))
+        for title, painter in IMAGE_RENDERERS.items()
         for scene in painter.spp
     ]
 
 
 def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
-    painter, size = PAINTERS[title], SIZES[context.profile.name]
+    painter, size = IMAGE_RENDERERS[title], SIZES[context.profile.name]
     system = SYSTEMS[painter.system]
     setting = f"{size.resolution}²"
     reason = environments.absent(system)
@@ -180,9 +180,9 @@ def _row(context: Context, title: str, scene: str, ours: Sequence[Image], theirs
     if title in WHY and found.verdict is Verdict.DIFFERENT:
         reason += f"; {WHY[title]}"
     replay = {"verdict": str(found.verdict), "scene": scene, "resolution": size.resolution, "reference spp": size.spp}
-    replay |= about | {"renderer": SYSTEMS[PAINTERS[title].system].source}
-    pictures = _saved(context, title, scene, ours, theirs)
-    return Row(STUDY, title, scene, f"{size.resolution}²", values, budgets, goals, reason, replay, pictures)
+    replay |= about | {"renderer": SYSTEMS[IMAGE_RENDERERS[title].system].source}
+    images = _saved(context, title, scene, ours, theirs)
+    return Row(STUDY, title, scene, f"{size.resolution}²", values, budgets, goals, reason, replay, images)
 
 
 def _values(found: Comparison, ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
@@ -194,7 +194,7 @@ def _values(found: Comparison, ours: np.ndarray, theirs: np.ndarray) -> dict[str
         "tests that differ": figures.get("tests of tiles and channels that differ", np.nan),
         "tiles that differ without noise": figures.get("tiles without noise that differ", np.nan),
         "detectable difference": found.detectable,
-        "detectable difference, picture": figures.get("detectable relative difference of the whole picture", np.nan),
+        "detectable difference, image": figures.get("detectable relative difference of the whole image", np.nan),
         "mean difference": float(theirs.mean() / ours.mean() - 1),
     }
     return values | ({"RMSE / noise": float(rmse / np.sqrt(noise))} if noise > 0 else {})
@@ -202,10 +202,10 @@ def _values(found: Comparison, ours: np.ndarray, theirs: np.ndarray) -> dict[str
 
 def _saved(context: Context, title: str, scene: str, ours: Sequence[Image], theirs: Sequence[Image]) -> dict[str, str]:
     """Both means and their difference, as EXR files below the output folder."""
-    folder = Path("pictures") / STUDY / scene
+    folder = Path("images") / STUDY / scene
     (context.out / folder).mkdir(parents=True, exist_ok=True)
     one, two = (np.stack([image.pixels for image in side]).mean(0, dtype=np.float64) for side in (ours, theirs))
     shown = {"reference": (PLUGIN, one), "test": (title, two), "difference": (f"{title} difference", two - one)}
-    for name, picture in shown.values():
-        image_file.write_exr(context.out / folder / f"{name}.exr", picture.astype(np.float32))
+    for name, image in shown.values():
+        image_file.write_exr(context.out / folder / f"{name}.exr", image.astype(np.float32))
     return {role: str(folder / f"{name}.exr") for role, (name, _) in shown.items()}

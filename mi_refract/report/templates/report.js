@@ -14,14 +14,14 @@ const sRGB = (v) => 255 * (v <= 0.0031308 ? 12.92 * v : 1.055 * v ** (1 / 2.4) -
 const NOT_A_NUMBER = [255, 0, 255]; // magenta, wherever it is
 const linear = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
 const unit = (v) => Math.min(Math.max(v, 0), 1);
-// Two tables of tones: for pictures of light, and for those whose file holds sRGB codes.
+// Two tables of tones: for images of light, and for those whose file holds sRGB codes.
 const tones = { light: new Uint8ClampedArray(65536), code: new Uint8ClampedArray(65536) };
 const expose = (ev) => halves.forEach((v, code) => {
   tones.light[code] = sRGB(unit(v * 2 ** ev));
   tones.code[code] = sRGB(unit(linear(unit(v)) * 2 ** ev));
 });
 
-const pictures = {};
+const images = {};
 async function load(id) {
   const { textContent, dataset } = document.getElementById(id);
   const deflated = Uint8Array.from(atob(textContent), (c) => c.charCodeAt(0));
@@ -29,12 +29,12 @@ async function load(id) {
   const planes = new Uint8Array(await new Response(stream).arrayBuffer());
   const codes = new Uint16Array(planes.length / 2);
   for (let i = 0, low = codes.length; i < codes.length; i++) codes[i] = (planes[i] << 8) | planes[low + i];
-  pictures[id] = { codes, channels: +dataset.channels, scale: +dataset.scale };
+  images[id] = { codes, channels: +dataset.channels, scale: +dataset.scale };
 }
-const pictureOf = (canvas) => pictures[canvas.dataset.pixels];
+const imageOf = (canvas) => images[canvas.dataset.pixels];
 
 function paint(canvas, colour) {
-  const { codes, channels } = pictureOf(canvas), green = channels > 2 ? 1 : 0, blue = 2 * green;
+  const { codes, channels } = imageOf(canvas), green = channels > 2 ? 1 : 0, blue = 2 * green;
   const context = canvas.getContext("2d"), image = context.createImageData(canvas.width, canvas.height), out = image.data;
   for (let i = 0, o = 0; i < codes.length; i += channels, o += 4) {
     const r = codes[i], g = codes[i + green], b = codes[i + blue];
@@ -76,7 +76,7 @@ function heat(gain) {
 const paneOf = (canvas) => canvas.closest(".pane");
 const isMap = (canvas) => paneOf(canvas).querySelector(".gain") !== null;
 function paintMap(canvas) {
-  const slider = paneOf(canvas).querySelector(".gain"), gain = 10 ** slider.value, { scale } = pictureOf(canvas);
+  const slider = paneOf(canvas).querySelector(".gain"), gain = 10 ** slider.value, { scale } = imageOf(canvas);
   slider.nextElementSibling.value = "full at " + shown(scale / gain);
   paint(canvas, paneOf(canvas).dataset.paint === "heat" ? heat(gain) : deviation(gain, root.dataset.sign === "signed"));
 }
@@ -120,7 +120,7 @@ function setSplit(percent) {
   root.style.setProperty("--split", split + "%");
 }
 
-// The next failure or picture below the bars that stay on top, or the one before.
+// The next failure or image below the bars that stay on top, or the one before.
 function go(step) {
   const places = all(".failure, .compare:not(.failure *)"), top = 120;
   const offset = (place) => place.getBoundingClientRect().top - top;
@@ -151,7 +151,7 @@ function probe(figure, x, y) {
   figure.style.setProperty("--x", x * 100 + "%");
   figure.style.setProperty("--y", y * 100 + "%");
   for (const pane of all(".pane", figure)) {
-    const canvas = pane.querySelector("canvas"), { codes, channels, scale } = pictureOf(canvas);
+    const canvas = pane.querySelector("canvas"), { codes, channels, scale } = imageOf(canvas);
     const column = Math.min(Math.floor(x * canvas.width), canvas.width - 1);
     const line = Math.min(Math.floor(y * canvas.height), canvas.height - 1);
     const at = channels * (line * canvas.width + column);

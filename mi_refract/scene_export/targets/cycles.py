@@ -35,6 +35,6 @@ def files(plain: Plain) -> Files:
 
 
 def looked_up(u: Array, v: Array) -> Array:
-    """The direction whose radiance Cycles finds at (u, v) of a picture, v from the top."""
+    """The direction whose radiance Cycles finds at (u, v) of an image, v from the top."""
     phi, theta = np.pi * (1 - 2 * u), np.pi * v
     return np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], axis=-1)

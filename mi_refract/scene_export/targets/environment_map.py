@@ -1,4 +1,4 @@
-"""An environment as the picture another renderer looks it up in: by longitude and latitude of its own convention."""
+"""An environment as the image another renderer looks it up in: by longitude and latitude of its own convention."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def radiance(environment: Environment, directions: Array) -> Array:
 
 
 def longitude_latitude(environment: Environment, direction: Lookup) -> NDArray[np.float32]:
-    """H × W × 3. `direction(u, v)` is where the renderer's picture holds (u, v) in [0, 1]², v from its top row down."""
+    """H × W × 3. `direction(u, v)` is where the renderer's image holds (u, v) in [0, 1]², v from its top row down."""
     height = FINER * (environment.pixels.shape[0] - 1)
     width = FINER * environment.pixels.shape[1]
     v, u = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")

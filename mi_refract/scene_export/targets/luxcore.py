@@ -59,7 +59,7 @@ def files(plain: Plain) -> Files:
 
 
 def looked_up(u: Array, v: Array) -> Array:
-    """The direction whose radiance LuxCore finds at (u, v) of a picture, v from the top."""
+    """The direction whose radiance LuxCore finds at (u, v) of an image, v from the top."""
     phi, theta = 2 * np.pi * u, np.pi * v
     return np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], axis=-1)
 

@@ -20,7 +20,7 @@ sky.exr      where the sky is a map: longitude and latitude
 ASSUMED = (
     "Right-handed coordinates. Triangles are counterclockwise seen from the medium of a glass's ext_ior, and from the "
     "side to which a light shines; lights are black from behind. All shading is flat.",
-    "The camera is a pinhole that looks from origin to target, up is up in the picture, fov_x_degrees is from the left "
+    "The camera is a pinhole that looks from origin to target, up is up in the image, fov_x_degrees is from the left "
     "border to the right one; a pixel is the mean over its square.",
     "max_depth counts the segments of a path from the camera: 2 is light, one surface, camera.",
     "sky.exr: +y is the zenith; the pixel in row j and column i of H and W has its centre at theta = pi (j + 1/2) / H, "

@@ -26,7 +26,7 @@ from .shared_files import LIGHT_INSIDE, Files, numbers, readme
 COMMANDS = """
     povray +Iscene.pov +Oimage.exr +FE +W{width} +H{height} -A -D File_Gamma=1.0 Declare=dx=0.5 Declare=dy=0.5
 
-0 <= dx, dy < 1: where in each pixel its only sample is; the mean over pictures with random dx and dy is the box filter.
+0 <= dx, dy < 1: where in each pixel its only sample is; the mean over images with random dx and dy is the box filter.
 """
 ASSUMPTIONS = (
     "max_trace_level counts as Mitsuba's max_depth does, to 256 at most; both rays are followed at a boundary, until "
@@ -34,7 +34,7 @@ ASSUMPTIONS = (
     "A ray is inside those bodies whose surface it has met once and not twice. Glass must be closed, and bodies inside "
     "one another must not touch.",
     "A sky that is a map is resampled: POV-Ray's first column is seen toward +x.",
-    "Mesh vertices are float32, and the picture's numbers are half floats.",
+    "Mesh vertices are float32, and the image's numbers are half floats.",
     LIGHT_INSIDE,
 )
 BAILOUT = "1e-7"
@@ -58,7 +58,7 @@ def files(plain: Plain) -> Files:
 
 
 def looked_up(u: Array, v: Array) -> Array:
-    """The direction whose radiance POV-Ray finds at (u, v) of a picture, v from the top."""
+    """The direction whose radiance POV-Ray finds at (u, v) of an image, v from the top."""
     phi, theta = 2 * np.pi * u, np.pi * v
     return np.stack([np.cos(phi) * np.sin(theta), np.cos(theta), np.sin(phi) * np.sin(theta)], axis=-1)
 
@@ -82,7 +82,7 @@ def _vector(values: np.ndarray | tuple[float, ...]) -> str:
 
 
 def _camera(camera: Camera) -> str:
-    """Right-handed: `right` is where the picture's right is. Shifted by (dx − ½, dy − ½) pixels."""
+    """Right-handed: `right` is where the image's right is. Shifted by (dx − ½, dy − ½) pixels."""
     ahead = np.subtract(camera.target, camera.origin)
     ahead = ahead / np.linalg.norm(ahead)
     right = np.cross(ahead, camera.up)

@@ -103,10 +103,10 @@ def world(sky, folder):
     nodes.clear()
     background = nodes.new("ShaderNodeBackground")
     if "environment" in sky:
-        picture = nodes.new("ShaderNodeTexEnvironment")
-        picture.image = bpy.data.images.load(str(folder / sky["environment"]))
-        picture.image.colorspace_settings.name = "Non-Color"
-        made.node_tree.links.new(picture.outputs[0], background.inputs["Color"])
+        image = nodes.new("ShaderNodeTexEnvironment")
+        image.image = bpy.data.images.load(str(folder / sky["environment"]))
+        image.image.colorspace_settings.name = "Non-Color"
+        made.node_tree.links.new(image.outputs[0], background.inputs["Color"])
     else:
         background.inputs["Color"].default_value = (*sky["radiance"], 1)
     made.node_tree.links.new(background.outputs[0], nodes.new("ShaderNodeOutputWorld").inputs["Surface"])

@@ -60,6 +60,6 @@ def readme(plain: Plain, target: str, commands: str, assumptions: Sequence[str])
 
 
 LIGHT_INSIDE = (
-    "Radiance is not scaled by the square of the index inside glass: the same picture as long as camera, lights and "
+    "Radiance is not scaled by the square of the index inside glass: the same image as long as camera, lights and "
     "diffuse surfaces are all in the outermost medium."
 )

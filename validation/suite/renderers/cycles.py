@@ -1,6 +1,6 @@
 """Blender's Cycles, by its Python module, which needs Python 3.11. Under the GPL: run, never imported here."""
 
-from .system import NOTED_F32, Call, Pip, System
+from .system import RECORDED_F32, Pip, RefractFunction, System
 
 SYSTEM = System(
     "cycles",
@@ -9,5 +9,5 @@ SYSTEM = System(
     Pip(("bpy==5.0.1", "numpy<2"), python="3.11"),
     megabytes=970,
     draws=True,
-    calls=(Call("Cycles, refraction closure", "f32", "cycles_rays.py", NOTED_F32, "zero"),),
+    calls=(RefractFunction("Cycles, refraction closure", "f32", "cycles_rays.py", RECORDED_F32, "zero"),),
 )

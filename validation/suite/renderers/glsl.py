@@ -1,6 +1,6 @@
 """GLSL's own `refract()`, by the OpenGL driver that EGL finds: Mesa's llvmpipe where there is no other."""
 
-from .system import NOTED_F32, NOTED_F64, Call, Pip, System
+from .system import RECORDED_F32, RECORDED_F64, Pip, RefractFunction, System
 
 SYSTEM = System(
     "glsl",
@@ -10,7 +10,7 @@ SYSTEM = System(
     megabytes=100,
     small=True,
     calls=(
-        Call("GLSL, vec3", "f32", "glsl_rays.py", NOTED_F32, "zero", ("float32",)),
-        Call("GLSL, dvec3", "f64", "glsl_rays.py", NOTED_F64, "zero", ("float64",)),
+        RefractFunction("GLSL, vec3", "f32", "glsl_rays.py", RECORDED_F32, "zero", ("float32",)),
+        RefractFunction("GLSL, dvec3", "f64", "glsl_rays.py", RECORDED_F64, "zero", ("float64",)),
     ),
 )

@@ -1,6 +1,6 @@
-"""Renderers that render a plain scene: several independent pictures of it, each in a process of its own.
+"""Renderers that render a plain scene: several independent images of it, each in a process of its own.
 
-A picture is height × width × 3, linear, row 0 at the top.
+An image is height × width × 3, linear, row 0 at the top.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ HOURS = 4 * 3600.0  # after which a renderer hangs
 
 
 @dataclass(frozen=True)
-class Painter:
-    """`draw(plain, folder, spp, seeds)` leaves one picture a seed, from what it puts into an empty folder.
+class ImageRenderer:
+    """`draw(plain, folder, spp, seeds)` leaves one image a seed, from what it puts into an empty folder.
 
-    `spp`: by scene of the study, the samples a pixel and picture that make a difference of 1 % visible where four
-    pictures are judged; `assumed`: in what the models differ.
+    `spp`: by scene of the study, the samples a pixel and image that make a difference of 1 % visible where four
+    images are judged; `assumed`: in what the models differ.
     """
 
     system: str
@@ -56,13 +56,13 @@ def _radiance(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> lis
     camera = plain.camera
     sizes = map(str, (camera.width, spp, plain.max_depth, *seeds))
     places = str(folder / "scene"), str(folder)
-    script = environments.script(SYSTEMS["radiance"], "radiance_pictures.py", *places, *sizes)
+    script = environments.script(SYSTEMS["radiance"], "radiance_images.py", *places, *sizes)
     environments.run(script, timeout=HOURS)
     return [_raw(folder / f"seed{seed}.f32", plain) for seed in seeds]
 
 
 def _povray(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-    """The same picture for every seed, for it has no noise: the means over grids of samples, √spp on a side of a pixel.
+    """The same image for every seed, for it has no noise: the means over grids of samples, √spp on a side of a pixel.
 
     Random grids would not do: they move all pixels together, and a tile knows nothing of its noise then.
     """
@@ -87,7 +87,7 @@ def _three(mis: str) -> Callable[[Plain, Path, int, Sequence[int]], list[Image]]
         (folder / "scene").mkdir()
         for name, content in scene_json.files(plain, equirectangular).items():
             (folder / "scene" / name).write_bytes(content)
-        script = environments.SCRIPTS / "three_pictures.mjs"
+        script = environments.SCRIPTS / "three_images.mjs"
         places = [str(script), str(environments.folder(SYSTEMS["three"])), chromium, str(folder / "scene"), str(folder)]
         sizes = map(str, (plain.camera.width, spp, mis, *seeds))
         environments.run([node, *places, *sizes], timeout=HOURS)
@@ -127,11 +127,11 @@ def _spp(sphere: int, prism: int, environment: int) -> dict[str, int]:
 
 
 POVRAY = ("Each pixel is the mean of a grid of 4 × 4 samples, without noise.", *povray.ASSUMPTIONS)
-PAINTERS: dict[str, Painter] = {
-    "Radiance": Painter("radiance", _radiance, _spp(160, 112, 4), radiance.ASSUMPTIONS),
-    "Cycles": Painter("cycles", _by_script("cycles"), _spp(128, 128, 32), cycles.ASSUMED),
-    "LuxCore": Painter("luxcore", _by_script("luxcore"), _spp(320, 400, 288), luxcore.ASSUMED),
-    "POV-Ray": Painter("povray", _povray, _spp(16, 16, 16), POVRAY),
-    "three-gpu-pathtracer": Painter("three", _three("1"), {"prism": 8, "furnace": 8}, THREE),
-    "three-gpu-pathtracer, no MIS": Painter("three", _three("0"), {"prism": 8, "furnace": 8}, THREE),
+IMAGE_RENDERERS: dict[str, ImageRenderer] = {
+    "Radiance": ImageRenderer("radiance", _radiance, _spp(160, 112, 4), radiance.ASSUMPTIONS),
+    "Cycles": ImageRenderer("cycles", _by_script("cycles"), _spp(128, 128, 32), cycles.ASSUMED),
+    "LuxCore": ImageRenderer("luxcore", _by_script("luxcore"), _spp(320, 400, 288), luxcore.ASSUMED),
+    "POV-Ray": ImageRenderer("povray", _povray, _spp(16, 16, 16), POVRAY),
+    "three-gpu-pathtracer": ImageRenderer("three", _three("1"), {"prism": 8, "furnace": 8}, THREE),
+    "three-gpu-pathtracer, no MIS": ImageRenderer("three", _three("0"), {"prism": 8, "furnace": 8}, THREE),
 }

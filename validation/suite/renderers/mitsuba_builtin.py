@@ -1,8 +1,8 @@
 """Mitsuba's own refraction: its functions, and its `dielectric`."""
 
-from .system import Call, System, noted
+from .system import RefractFunction, System, recorded_error
 
-FUNCTIONS = noted(1.4e-6, 4.3e-4, 2e-7, 1.2e-6)  # `dielectric` has the rounding of its frame, too
+FUNCTIONS = recorded_error(1.4e-6, 4.3e-4, 2e-7, 1.2e-6)  # `dielectric` has the rounding of its frame, too
 SYSTEM = System(
     "mitsuba",
     "Mitsuba",
@@ -12,7 +12,9 @@ SYSTEM = System(
     small=True,
     draws=True,
     calls=(
-        Call("Mitsuba, mi.fresnel + mi.refract", "f32", "mitsuba_rays.py", FUNCTIONS, "flag", ("functions",)),
-        Call("Mitsuba, dielectric", "f32", "mitsuba_rays.py", {}, "flag", ("dielectric",)),
+        RefractFunction(
+            "Mitsuba, mi.fresnel + mi.refract", "f32", "mitsuba_rays.py", FUNCTIONS, "flag", ("functions",)
+        ),
+        RefractFunction("Mitsuba, dielectric", "f32", "mitsuba_rays.py", {}, "flag", ("dielectric",)),
     ),
 )

@@ -1,6 +1,6 @@
 """optiland: a lens designer's ray tracer."""
 
-from .system import Call, Pip, System, noted
+from .system import Pip, RefractFunction, System, recorded_error
 
 SYSTEM = System(
     "optiland",
@@ -8,5 +8,9 @@ SYSTEM = System(
     "MIT",
     Pip(("optiland==0.6.3",)),
     megabytes=1300,
-    calls=(Call("optiland, RealRays.refract", "f64", "optiland_rays.py", noted(9e-15, 1.9e-12, 3e-16, 1e-15), "nan"),),
+    calls=(
+        RefractFunction(
+            "optiland, RealRays.refract", "f64", "optiland_rays.py", recorded_error(9e-15, 1.9e-12, 3e-16, 1e-15), "nan"
+        ),
+    ),
 )

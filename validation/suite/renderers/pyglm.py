@@ -1,6 +1,6 @@
 """PyGLM: the mathematics library GLM, which follows GLSL, in Python."""
 
-from .system import NOTED_F32, NOTED_F64, Call, Pip, System
+from .system import RECORDED_F32, RECORDED_F64, Pip, RefractFunction, System
 
 SYSTEM = System(
     "pyglm",
@@ -10,7 +10,7 @@ SYSTEM = System(
     megabytes=140,
     small=True,
     calls=(
-        Call("PyGLM, vec3", "f32", "pyglm_rays.py", NOTED_F32, "zero", ("float32",)),
-        Call("PyGLM, dvec3", "f64", "pyglm_rays.py", NOTED_F64, "zero", ("float64",)),
+        RefractFunction("PyGLM, vec3", "f32", "pyglm_rays.py", RECORDED_F32, "zero", ("float32",)),
+        RefractFunction("PyGLM, dvec3", "f64", "pyglm_rays.py", RECORDED_F64, "zero", ("float64",)),
     ),
 )

@@ -1,6 +1,6 @@
 """rayoptics: a lens designer's ray tracer. The function that bends a ray needs none of its windows and plots."""
 
-from .system import Call, Pip, System, noted
+from .system import Pip, RefractFunction, System, recorded_error
 
 SYSTEM = System(
     "rayoptics",
@@ -9,5 +9,9 @@ SYSTEM = System(
     Pip(("rayoptics==0.9.8", "numpy"), bare=True),
     megabytes=140,
     small=True,
-    calls=(Call("rayoptics, bend", "f64", "rayoptics_rays.py", noted(7e-15, 1.9e-12, 2e-16, 1e-15), "nan"),),
+    calls=(
+        RefractFunction(
+            "rayoptics, bend", "f64", "rayoptics_rays.py", recorded_error(7e-15, 1.9e-12, 2e-16, 1e-15), "nan"
+        ),
+    ),
 )

@@ -13,14 +13,14 @@ RANDOM, CRITICAL, GRAZING, MATCHED, TOTAL = "random", "near-critical", "grazing"
 Noted = Mapping[str, tuple[float, float]]  # worst angle in radians by set, from … to
 
 
-def noted(random: float, critical: float, grazing: float | tuple, matched: float | tuple) -> Noted:
+def recorded_error(random: float, critical: float, grazing: float | tuple, matched: float | tuple) -> Noted:
     figures = zip((RANDOM, CRITICAL, GRAZING, MATCHED), (random, critical, grazing, matched), strict=True)
     return {name: x if isinstance(x, tuple) else (x, x) for name, x in figures}
 
 
 # Everyone who writes down GLSL's formula in that precision.
-NOTED_F32 = noted(3e-6, 6e-4, (1e-7, 3e-7), (5e-7, 1e-6))
-NOTED_F64 = noted(9e-15, 1.9e-12, 2e-16, 1e-15)
+RECORDED_F32 = recorded_error(3e-6, 6e-4, (1e-7, 3e-7), (5e-7, 1e-6))
+RECORDED_F64 = recorded_error(9e-15, 1.9e-12, 2e-16, 1e-15)
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Apt:
 
 
 @dataclass(frozen=True)
-class Call:
+class RefractFunction:
     """A function of refraction in one precision: `script` of scripts/ reads rays and writes answers, both as CSV.
 
     `told`: how total internal reflection is, one of `mi_refract.rays_judge.TIR`. `gives_up`: the cos²θ_t below which it
@@ -58,7 +58,7 @@ class Call:
     title: str
     precision: str  # "f32" or "f64"
     script: str
-    noted: Noted
+    recorded_error: Noted
     told: str
     arguments: tuple[str, ...] = ()
     gives_up: float = 0.0
@@ -78,8 +78,8 @@ class System:
     needs: Pip | Npm | Apt | None
     megabytes: int  # on disk
     small: bool = False
-    calls: tuple[Call, ...] = field(default=())
-    draws: bool = False  # whether it renders pictures
+    calls: tuple[RefractFunction, ...] = field(default=())
+    draws: bool = False  # whether it renders images
 
     @property
     def source(self) -> str:

@@ -1,4 +1,4 @@
-"""Render `scene.rad` by Radiance's rtrace: `python radiance_pictures.py FOLDER OUT WIDTH SPP DEPTH SEED…`
+"""Render `scene.rad` by Radiance's rtrace: `python radiance_images.py FOLDER OUT WIDTH SPP DEPTH SEED…`
 
 Run by the Python that has pyradiance. The rays of every pixel are random within it; one `seedN.f32` per seed: rows
 from the top, three float32 a pixel.
@@ -30,9 +30,9 @@ def main():
     for seed in seeds:
         rng = np.random.default_rng(int(seed))
         places = (rng.random((int(width), int(width), 2)) for _ in range(int(spp)))
-        picture = sum(traced(rtrace, rays(view, within)) for within in places) / int(spp)
+        image = sum(traced(rtrace, rays(view, within)) for within in places) / int(spp)
         path = Path(out, f"seed{seed}.f32")
-        path.write_bytes(picture.astype("<f4").tobytes())
+        path.write_bytes(image.astype("<f4").tobytes())
         print(path, flush=True)
 
 

@@ -1,5 +1,5 @@
 // Render scene.json by three-gpu-pathtracer in a headless browser, WebGL2 on the processor:
-//   node three_pictures.mjs NPM_FOLDER CHROMIUM SCENE_FOLDER OUT_FOLDER WIDTH SPP MIS SEED…
+//   node three_images.mjs NPM_FOLDER CHROMIUM SCENE_FOLDER OUT_FOLDER WIDTH SPP MIS SEED…
 // One seedN.f32 per seed: rows from the top, three float32 a pixel. MIS: 1 for multiple importance
 // sampling of the sky, as the library comes, 0 without.
 import { createServer } from "node:http";
@@ -10,7 +10,7 @@ import { extname, join, resolve } from "node:path";
 const [npm, chromium, scene, out, width, spp, mis, ...seeds] = process.argv.slice(2);
 const puppeteer = createRequire(join(resolve(npm), "package.json"))("puppeteer-core");
 const PATIENCE = 3_600_000; // ms: a busy machine is slow
-const page = new URL("three_pictures.html", import.meta.url);
+const page = new URL("three_images.html", import.meta.url);
 const types = { ".js": "text/javascript", ".html": "text/html", ".json": "application/json" };
 const roots = { "/modules/": join(npm, "node_modules"), "/scene/": scene };
 
