@@ -17,7 +17,7 @@ Conventions, everywhere in this package:
 
 import mitsuba as _mi
 
-from mi_refract.formulas.documented import FORMULAS, reflect, reflect_sandwich, refract_2d
+from mi_refract.formulas import FORMULAS, reflect, reflect_sandwich, refract_2d
 
 from .plugins import refract as _bsdf
 from .plugins import refract_path as _integrator

@@ -66,7 +66,7 @@ class Wanted:
         needed = ("flint", "jinja2") if self.report else ("flint",)
         if not all(map(importlib.util.find_spec, needed)):
             raise ValueError("checking rays needs the extra `validation`: pip install 'mi-refract[validation]'")
-        from mi_refract.formulas.documented import FORMULAS
+        from mi_refract.formulas import FORMULAS
         from mi_refract.ray_sets.tir_signal import AUTO, TIR
 
         if self.tir not in (AUTO, *TIR):

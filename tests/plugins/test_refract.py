@@ -8,7 +8,7 @@ import pytest
 
 import mi_refract  # noqa: F401  (registers the plugin)
 from mi_refract import backend
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 
 mi = pytest.importorskip("mitsuba")
 
