@@ -1,4 +1,4 @@
-"""One set of answers, ray by ray: how total internal reflection is told, what is too far off, what is no direction."""
+"""How answers tell total internal reflection: by a flag, zeros, NaN, the mirror direction or one along the surface."""
 
 from __future__ import annotations
 
@@ -8,17 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_refract import oracle
-from mi_refract.accuracy.direction_errors import absolute_radicand, errors, lengths, relative_radicand
-from mi_refract.formulas import NEGLIGIBLE, ROUNDING, Budget
+from mi_refract.accuracy import absolute_radicand, lengths
 from mi_refract.regimes import Rays
 
-from .ray_set import PRECISIONS
-
 AUTO, FLAG = "auto", "flag"
-# Words of `Judged.tir` beside those of TIR: no ray has it, and it is told in no known way.
+# What `recognise` answers beside the words of TIR: no ray has it, and it is told in no known way.
 NONE, UNCLEAR = "none", "unclear"
-# In u: what making `a` and `n` unit in the set's precision leaves of errors, with those of the components.
-NORMALISING = 3.0
 # Rays whose radicand is beyond this are totally reflected in anyone's arithmetic; so many of them must say so alike.
 CERTAIN, ALIKE = 1e-3, 0.9
 # In u: below this a cosine is that of a ray along the surface.
@@ -26,119 +21,18 @@ ALONG = 8.0
 
 
 @dataclass(frozen=True)
-class Judged:
-    """Ray by ray. `compared`: decided rightly, and the answer is a direction."""
+class Seen:
+    """Answers `b` (N, 3) float64, with what tells a reflected ray from a transmitted one; `u`: their roundoff."""
 
+    b: np.ndarray
     rays: Rays
     exact: oracle.Certified
-    raw: np.ndarray  # (N, 3) as they came
-    b: np.ndarray  # (N, 3) in the set's precision
-    roundoff: float
-    budget: Budget
-    tir: str
-    blank: np.ndarray  # NaN, infinite or zero where that means nothing
-    compared: np.ndarray
-    misjudged: np.ndarray
-    decided: np.ndarray  # where the budget leaves no doubt about total internal reflection
-    angle: np.ndarray
-    norm: np.ndarray
-    bound: np.ndarray
+    u: float
 
     @functools.cached_property
-    def share(self) -> np.ndarray:
-        """Error over bound of the rays compared, 0 elsewhere."""
-        return np.where(self.compared, np.maximum(self.angle, self.norm) / self.bound, 0.0)
-
-    @functools.cached_property
-    def exact_to_rounding(self) -> np.ndarray:
-        """Where rounding the exact answer could have given this one."""
-        bound = _bound(self.rays, self.exact, self.roundoff, ROUNDING)
-        decided = _decided(self.rays, self.exact, self.roundoff, ROUNDING)
-        near = ~self.compared | (np.maximum(self.angle, self.norm) <= bound)
-        return near & ~self.blank & ~(self.misjudged & decided)
-
-    @property
-    def far(self) -> np.ndarray:
-        return self.misjudged & self.decided
-
-    @functools.cached_property
-    def wrong(self) -> np.ndarray:
-        return ~(self.share <= 1) | self.far | self.blank
-
-
-def judge(
-    b: np.ndarray, flag: np.ndarray | None, rays: Rays, precision: str, budget: Budget, tir: str = AUTO
-) -> Judged:
-    """Answers b (N, 3) to these rays, and whether they were said to be transmitted."""
-    u, exact = float(np.finfo(PRECISIONS[precision]).eps) / 2, oracle.refract(rays.a, rays.n, rays.k, fresnel=False)
-    with np.errstate(over="ignore"):
-        rounded = b.astype(PRECISIONS[precision])
-    seen = _Seen(rounded.astype(np.float64), rays, exact, u)
-    if tir == AUTO:
-        tir = _detected(seen) if flag is None else FLAG
-    decided = _decided(rays, exact, u, budget)
-    if flag is not None and tir == FLAG:
-        reflected = ~flag
-    elif tir == NONE:  # but those who think of the rays in doubt that they have it must say so somehow
-        reflected = ~seen.directed & ~decided
-    else:
-        reflected = TELLERS[tir](seen) if tir in TELLERS else np.zeros(len(b), bool)
-    blank = ~seen.directed & ~(reflected & (tir != "reflected") & (tir != "tangent"))
-    misjudged = (exact.transmitted == reflected) & ~blank
-    bound = _bound(rays, exact, u, budget)
-    with np.errstate(all="ignore"):
-        length, kept = lengths(seen.b), lengths(rays.a)
-        _, angle, _ = errors(seen.b * (kept / length)[:, None], rays, exact)
-        norm = np.fmin(np.abs(length - 1), np.abs(length / kept - 1)).astype(float)
-    return Judged(
-        rays,
-        exact,
-        b,
-        seen.b,
-        u,
-        budget,
-        tir,
-        blank,
-        compared=~misjudged & ~blank & (exact.transmitted | (tir == "reflected")),
-        misjudged=misjudged,
-        decided=decided,
-        angle=angle,
-        norm=norm,
-        bound=bound,
-    )
-
-
-def _off_unit(rays: Rays, u: float) -> np.ndarray:
-    """The roundoff that a formula for unit vectors is held to: what `a` and `n` are off by, or what unit ones would."""
-    off = np.maximum(*(np.abs(lengths(v) - 1) for v in (rays.a, rays.n)))
-    return np.clip(off, u, NORMALISING * u).astype(float)
-
-
-def _bound(rays: Rays, exact: oracle.Certified, u: float, budget: Budget) -> np.ndarray:
-    wide = u if budget.at_the_limit else _off_unit(rays, u)
-    return np.asarray(budget.chord(wide, rays.k.astype(float), exact.cos_t, exact.transmitted, cos_i=exact.cos_i))
-
-
-def _decided(rays: Rays, exact: oracle.Certified, u: float, budget: Budget) -> np.ndarray:
-    """Where a wrong decision is held against the answers: where the radicand is beyond the budget's own error."""
-    if budget.at_the_limit:
-        return ~(relative_radicand(rays) <= NEGLIGIBLE * u * u)
-    wide = _off_unit(rays, u)
-    return (absolute_radicand(rays) > budget.radicand_error_bound(wide, rays.k.astype(float))) & ~budget.side_open(
-        wide, exact.cos_i
-    )
-
-
-# How total internal reflection is told -----------------------------------------------------------------------------
-
-
-class _Seen:
-    """Answers in float64 with what tells a reflected ray from a transmitted one."""
-
-    def __init__(self, b: np.ndarray, rays: Rays, exact: oracle.Certified, u: float) -> None:
-        self.b, self.rays, self.exact, self.u = b, rays, exact, u
-        with np.errstate(invalid="ignore"):
-            self.directed = np.isfinite(b).all(axis=1) & b.any(axis=1)
+    def directed(self) -> np.ndarray:
+        """(N,) whether b is a direction: finite and not zero."""
+        return np.isfinite(self.b).all(axis=1) & self.b.any(axis=1)
 
     @functools.cached_property
     def ends(self) -> tuple[np.ndarray, np.ndarray]:
@@ -156,7 +50,7 @@ class _Seen:
         return ALONG * self.u * np.maximum(1.0, self.rays.k.astype(float))
 
 
-def _mirrored(seen: _Seen) -> np.ndarray:
+def _mirrored(seen: Seen) -> np.ndarray:
     """Nearer to the mirror direction; the benefit of the doubt where the two ends are one."""
     with np.errstate(all="ignore"):
         unit = seen.b / np.sqrt((seen.b * seen.b).sum(1, keepdims=True))
@@ -165,7 +59,7 @@ def _mirrored(seen: _Seen) -> np.ndarray:
         return np.where(np.abs(to_mirror - to_onward) <= seen.open, ~seen.exact.transmitted, nearer)
 
 
-def _along(seen: _Seen) -> np.ndarray:
+def _along(seen: Seen) -> np.ndarray:
     """Along the surface, of whatever length; where the exact answer is so too, the benefit of the doubt."""
     n = seen.rays.n.astype(float) / lengths(seen.rays.n).astype(float)[:, None]
     with np.errstate(all="ignore"):
@@ -182,8 +76,10 @@ TELLERS = {
 TIR = (*TELLERS, FLAG)
 
 
-def _detected(seen: _Seen) -> str:
-    """How most of the rays that are beyond doubt say it."""
+def recognise(seen: Seen, flag: np.ndarray | None) -> str:
+    """One of TIR: how most of the rays beyond doubt say it, FLAG where there is one; or NONE, or UNCLEAR."""
+    if flag is not None:
+        return FLAG
     total = ~seen.exact.transmitted & (seen.exact.cos_i > 0)
     if not total.any():
         return NONE
@@ -192,3 +88,17 @@ def _detected(seen: _Seen) -> str:
     shares = {name: float(teller(seen)[among].mean()) for name, teller in TELLERS.items()}
     best = max(shares, key=lambda name: shares[name])
     return best if shares[best] >= ALIKE else UNCLEAR
+
+
+def reflected(seen: Seen, flag: np.ndarray | None, tir: str, decided: np.ndarray) -> np.ndarray:
+    """(N,) the rays that are said to be totally reflected. `decided`: where there is no doubt whether they are."""
+    if flag is not None and tir == FLAG:
+        return ~flag
+    if tir == NONE:  # but those who think of the rays in doubt that they have it must say so somehow
+        return ~seen.directed & ~decided
+    return TELLERS[tir](seen) if tir in TELLERS else np.zeros(len(seen.b), bool)
+
+
+def has_direction(tir: str) -> bool:
+    """Whether a totally reflected ray must come with a direction, told so."""
+    return tir in ("reflected", "tangent")

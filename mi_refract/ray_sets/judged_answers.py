@@ -1,0 +1,48 @@
+"""Answers to a ray set, judged: how they tell total internal reflection, and what they are off by."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_refract import oracle
+from mi_refract.accuracy import Judgement, RayBounds, judge
+from mi_refract.formulas import ROUNDING, Budget
+from mi_refract.regimes import Rays
+
+from . import tir_signal
+from .ray_set import PRECISIONS
+
+
+@dataclass(frozen=True)
+class JudgedAnswers:
+    """Answers (N, 3) as they came, the same in the set's precision, how they tell TIR, and the verdict on each."""
+
+    raw: np.ndarray
+    b: np.ndarray
+    tir: str
+    verdict: Judgement
+
+    @functools.cached_property
+    def rounded_exact(self) -> np.ndarray:
+        """(N,) where rounding the exact answer could have given this one."""
+        return self.verdict.meets(ROUNDING)
+
+
+def judge_answers(
+    b: np.ndarray, flag: np.ndarray | None, rays: Rays, precision: str, budget: Budget, tir: str = tir_signal.AUTO
+) -> JudgedAnswers:
+    """Hold `b` (N, 3) and the column `transmitted` (N,), if there is one, against `budget`. `precision`: f32 or f64."""
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False)
+    bounds = RayBounds(rays, exact, budget, float(np.finfo(PRECISIONS[precision]).eps) / 2, normalised=True)
+    with np.errstate(over="ignore"):
+        rounded = b.astype(PRECISIONS[precision]).astype(np.float64)
+    seen = tir_signal.Seen(rounded, rays, exact, bounds.roundoff)
+    if tir == tir_signal.AUTO:
+        tir = tir_signal.recognise(seen, flag)
+    reflected = tir_signal.reflected(seen, flag, tir, bounds.decided)
+    blank = ~seen.directed & (~reflected | tir_signal.has_direction(tir))
+    directed = exact.transmitted | (tir == "reflected")
+    return JudgedAnswers(b, rounded, tir, judge(rounded, ~reflected, bounds, directed, blank))
