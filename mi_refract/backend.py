@@ -239,9 +239,12 @@ def _announce(backend: Backend) -> None:
 
 
 def restart_if_needed() -> None:
-    """For commands: where Dr.Jit was imported with another libLLVM than the one that works, start this process's
-    command line again with the right one, and do not return."""
+    """For commands: have Dr.Jit use the libLLVM that works.
+
+    Where Dr.Jit was imported with another one already, start this process's command line again, and do not return.
+    """
     here = llvm()
+    _announce(here)
     # Where it was set already and did not help, go on without.
     if here.usable or here.library is None or os.environ.get(CHOICE) == here.library:
         return
