@@ -12,11 +12,11 @@ import typer
 from rich.console import Console
 
 from mi_refract.io.atomic import writable
+from mi_refract.io.provenance import provenance
 from mi_refract.ray_sets import ray_set as sets
 from mi_refract.ray_sets import run_program
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.regimes import REGIMES
-from mi_refract.rendering.scene_files import provenance
 
 app = typer.Typer(help="Other people's refraction against the certified answers.", rich_markup_mode=None)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import importlib.metadata
 import json
 import os
 import re
@@ -16,6 +14,7 @@ import numpy as np
 
 from mi_refract.io.atomic import writable
 from mi_refract.io.image_file import SUFFIXES, Metadata, one_line, write_exr
+from mi_refract.io.provenance import provenance
 
 LOADER_OPTIONS = ("path", "parallel", "optimize")  # mi.load_file would take these names for its own
 # Merged meshes come in the order of their addresses, and parallel loading in that of its threads. Then so do emitters,
@@ -108,21 +107,6 @@ def formulas_in(scene: Any) -> list[str]:
     """The formulas that the `refract` BSDFs of a scene use, sorted; "promoted (auto)" where it was not asked for."""
     texts = (str(shape.bsdf()) for shape in scene.shapes())
     return sorted({name for text in texts for name in re.findall(r"Refract\[.*?formula = (.+?),\n", text, re.DOTALL)})
-
-
-def provenance() -> Metadata:
-    """Header attributes that say which software made an image."""
-    from mi_refract import __version__
-
-    versions = {"mi_refract": __version__, "mitsuba": version("mitsuba"), "drjit": version("drjit")}
-    return {"Software": f"mi_refract {__version__}"} | {f"mi_refract:version:{n}": v for n, v in versions.items()}
-
-
-def version(distribution: str) -> str:
-    """The installed version; "unknown" where it runs without being installed."""
-    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-        return importlib.metadata.version(distribution)
-    return "unknown"
 
 
 def _naming(path: str | os.PathLike[str], error: Exception) -> str:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import os
-import shutil
-import uuid
 from collections.abc import Callable
 from pathlib import Path
 
-from mi_refract.scene_export.targets.shared_files import Files
+from mi_refract.io import atomic
 
 from .plain_scene import Plain
 from .targets import cycles, luxcore, mitsuba, obj, povray, radiance
+from .targets.shared_files import Files
 
 TARGETS: dict[str, Callable[[Plain], Files]] = {
     "cycles": cycles.files,
@@ -33,15 +32,10 @@ def write(plain: Plain, target: str, folder: str | os.PathLike[str]) -> list[Pat
         raise ValueError(f"target {target!r}: accepted: {', '.join(TARGETS)}")
     place = _free(folder)
     files = TARGETS[target](plain)
-    temporary = place.with_name(f".{place.name}.{uuid.uuid4().hex}.part")
-    try:
+    with atomic.replacing(place) as temporary:
         temporary.mkdir()
         for name, content in files.items():
             (temporary / name).write_bytes(content)
-        temporary.replace(place)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
     return [Path(folder) / name for name in sorted(files)]
 
 

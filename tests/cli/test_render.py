@@ -1,0 +1,202 @@
+"""`mi-refract render`: the image, its header, what is left behind, and with which exit code."""
+
+from __future__ import annotations
+
+import signal
+import time
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.processes import python
+
+import mi_refract
+from mi_refract import backend
+from mi_refract.cli import app
+from mi_refract.io.image_file import read_exr
+
+SCENE = """<scene version="3.0.0">
+  <default name="bsdf" value="refract"/>
+  <integrator type="path"><integer name="max_depth" value="5"/></integrator>
+  <sensor type="perspective">
+    <transform name="to_world"><lookat origin="0,1,-4" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm">
+      <integer name="width" value="8"/><integer name="height" value="6"/>
+      <rfilter type="box"/>  <!-- with a wider one, the order in which threads finish shows in the last bits -->
+    </film>
+    <sampler type="independent"><integer name="sample_count" value="4"/></sampler>
+  </sensor>
+  <emitter type="constant"/>
+  <shape type="sphere"><bsdf type="$bsdf"/></shape>
+  <shape type="cube"><transform name="to_world"><translate x="1" y="1.5"/></transform></shape>
+</scene>"""
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "scene.xml"
+    path.write_text(SCENE)
+    return path
+
+
+@pytest.fixture
+def render(scene, capfd):
+    """`render("--spp", 2)`: exit code, stdout, stderr of rendering `scene` to out.exr in scalar_rgb."""
+
+    def run(*options, scene=scene, output=None, variant="scalar_rgb"):
+        output = output or scene.with_name("out.exr")
+        capfd.readouterr()
+        chosen = ["--variant", variant] if variant else []
+        code = app.main(["render", str(scene), "-o", str(output), *chosen, *map(str, options)])
+        return code, *capfd.readouterr()
+
+    return run
+
+
+def test_the_image_is_mitsubas(render, scene):
+    code, out, err = render("--spp", 9, "--seed", 3)
+    assert (code, err) == (0, "")
+    assert "out.exr: scalar_rgb, 9 spp" in out
+    pixels, metadata = read_exr(scene.with_name("out.exr"))
+    expected = np.array(mi.render(mi.load_file(str(scene)), spp=9, seed=3))
+    np.testing.assert_array_equal(pixels, expected)
+    assert pixels.std() > 0
+    assert metadata["channels"] == ("R", "G", "B")
+    assert sorted(path.name for path in scene.parent.iterdir()) == ["out.exr", "scene.xml"]
+
+
+def test_the_header_says_how_it_was_made(render, scene):
+    render("--seed", 11, "-D", "bsdf=refract")
+    _, metadata = read_exr(scene.with_name("out.exr"))
+    assert metadata["Software"] == f"mi_refract {mi_refract.__version__}"
+    expected = {
+        "variant": "scalar_rgb",
+        "spp": 4,
+        "seed": 11,
+        "scene": str(scene),
+        "defines": '{"bsdf": "refract"}',
+        "formulas": "promoted (auto)",
+        "version:mi_refract": mi_refract.__version__,
+        "version:mitsuba": mi.__version__,
+        "version:drjit": backend.importlib.metadata.version("drjit"),
+    }
+    assert {name: metadata[f"mi_refract:{name}"] for name in expected} == expected
+    assert metadata["mi_refract:render_seconds"] > 0
+
+
+def test_a_define_swaps_the_plugin(render, scene):
+    assert render("--spp", 2, "-D", "bsdf=diffuse")[0] == 0
+    pixels, metadata = read_exr(scene.with_name("out.exr"))
+    assert metadata["mi_refract:formulas"] == "none"
+    expected = np.array(mi.render(mi.load_file(str(scene), bsdf="diffuse"), spp=2))
+    np.testing.assert_array_equal(pixels, expected)
+    assert not np.array_equal(pixels, np.array(mi.render(mi.load_file(str(scene)), spp=2)))
+
+
+@pytest.mark.parametrize("usable", [True, False])
+def test_the_best_variant_is_the_default(render, scene, monkeypatch, needs_variant, usable):
+    if usable:
+        needs_variant("llvm_ad_rgb")
+    else:
+        monkeypatch.setattr(backend, "llvm", lambda: backend.Backend("llvm", False, "made up"))
+    code, _, err = render(variant=None)
+    _, metadata = read_exr(scene.with_name("out.exr"))
+    assert code == 0
+    assert metadata["mi_refract:variant"] == ("llvm_ad_rgb" if usable else "scalar_rgb")
+    note = "mi-refract: scalar_rgb is slow; only scalar_* variants run: made up\n"
+    assert err == ("" if usable else note)
+
+
+BAD = {
+    "no scene": ({"scene": "none.xml"}, (), "none.xml: no such scene file"),
+    "no variant": ({"variant": "llvm_rgb"}, (), "variant 'llvm_rgb': unknown; accepted: scalar_rgb"),
+    "no folder": ({"output": "none/out.exr"}, (), "is not a folder"),
+    "no EXR": ({"output": "out.png"}, (), "accepted: a file name that ends in .exr"),
+    "define without a value": ({}, ("-D", "bsdf"), "-D bsdf: accepted: NAME=VALUE"),
+    "define without a name": ({}, ("-D", "=dielectric"), "-D =dielectric: accepted: NAME=VALUE"),
+    "define twice": ({}, ("-D", "bsdf=a", "-D", "bsdf=b"), "bsdf is given twice"),
+    "define of nothing": ({}, ("-D", "bdsf=dielectric"), "bdsf"),
+    "define of the loader": ({}, ("-D", "parallel=x"), "taken by Mitsuba's loader"),
+    "no plugin": ({}, ("-D", "bsdf=nonesuch"), "nonesuch"),
+    "no samples": ({}, ("--spp", "0"), "--spp"),
+    "no number": ({}, ("--spp", "many"), "--spp"),
+    "no seed": ({}, ("--seed", "-1"), "--seed"),
+    "no option": ({}, ("--nonesuch",), "--nonesuch"),
+}
+
+
+@pytest.mark.parametrize("paths, options, message", BAD.values(), ids=BAD)
+def test_bad_input(render, scene, paths, options, message):
+    paths = {key: scene.parent / value if key != "variant" else value for key, value in paths.items()}
+    code, out, err = render(*options, **paths)
+    assert (code, out) == (2, "")
+    assert err.startswith("mi-refract: ")
+    assert err.count("\n") == 1
+    assert message in err
+    assert list(scene.parent.iterdir()) == [scene]
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        (SCENE.replace("</shape>", ""), "mismatch"),
+        (SCENE.replace("max_depth", "max_dept"), "max_dept"),
+        ('<bsdf version="3.0.0" type="dielectric"/>', "holds a BSDF; accepted: a <scene>"),
+        ('<scene version="3.0.0"/>', "without a sensor"),
+        ("", "scene.xml"),
+    ],
+    ids=["malformed", "unknown parameter", "no scene", "no sensor", "empty"],
+)
+def test_bad_scene(render, scene, text, message):
+    scene.write_text(text)
+    code, out, err = render()
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith("mi-refract: ")
+    assert message in err
+    assert list(scene.parent.iterdir()) == [scene]
+
+
+def test_a_failed_rendering_keeps_the_old_image(render, scene):
+    scene.with_name("out.exr").write_text("old")
+    assert render("-D", "bsdf=nonesuch")[0] == 2
+    assert scene.with_name("out.exr").read_text() == "old"
+
+
+def test_a_rendering_cut_short_is_not_an_image(render, scene):
+    text = SCENE.replace('value="5"/>', 'value="5"/><float name="timeout" value="0.01"/>')
+    scene.write_text(text)
+    code, _, err = render("--spp", 100000)
+    assert code == 2
+    assert "stopped before its last sample" in err.splitlines()[-1]
+    assert list(scene.parent.iterdir()) == [scene]
+
+
+# What the shell ignores in a background job, Mitsuba does not: it would return an image of the samples so far.
+INTERRUPTED = """
+import signal, sys
+if sys.argv[1] == "ignored":
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+from mi_refract import cli
+from mi_refract.rendering import scene_files as rendering
+load = rendering.load_scene
+def load_and_tell(*arguments):
+    scene = load(*arguments)
+    print("loaded", flush=True)
+    return scene
+rendering.load_scene = load_and_tell
+sys.exit(cli.main(["render", sys.argv[2], "-o", sys.argv[3], "--spp", "20000000", "--variant", sys.argv[4]]))
+"""
+
+
+@pytest.mark.parametrize("handler", ["default", "ignored"])
+@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+def test_ctrl_c(scene, handler, variant, needs_variant):
+    needs_variant(variant)
+    output = scene.with_name("out.exr")
+    with python(INTERRUPTED, handler, scene, output, variant) as process:
+        assert process.stdout.readline() == "loaded\n"
+        time.sleep(0.5)  # into the rendering
+        assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=30) == 130, process.stderr.read()
+    assert list(scene.parent.iterdir()) == [scene]
