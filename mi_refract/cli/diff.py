@@ -22,7 +22,7 @@ from mi_refract.image_diff import settings as diff_settings
 from mi_refract.image_diff import text_reports as output
 from mi_refract.image_diff.folders import Results, Status
 from mi_refract.io.atomic import writable
-from mi_refract.rendering.scene_files import provenance
+from mi_refract.io.provenance import provenance
 
 Folder = Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")]
 Other = Annotated[Path, typer.Argument(metavar="TEST", help="What is compared with it, of the same kind.")]

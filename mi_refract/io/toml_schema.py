@@ -44,6 +44,8 @@ def _positive(value: Any) -> float | None:
 
 
 def list_of(parse: Callable[[Any], Any], least: int = 1, most: float = math.inf) -> Callable[[Any], Any]:
+    """A parser of lists of `least` to `most` items, each of which `parse` accepts."""
+
     def parse_list(value: Any) -> Any:
         items = [parse(item) for item in value] if isinstance(value, list) and least <= len(value) <= most else [None]
         return None if any(item is None for item in items) else items
@@ -72,6 +74,8 @@ def _text(value: Any) -> str | None:
 
 
 def whole(least: int, most: int) -> Type:
+    """The type of the whole numbers from `least` to `most`."""
+
     def parse(value: Any) -> int | None:
         return value if type(value) is int and least <= value <= most else None
 
