@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refract.io.atomic import write_atomically
-from mi_refract.report.plots import compact, distinguishable
+from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.row import strict
 
 from .folders import Result, Results, Status

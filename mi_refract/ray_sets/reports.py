@@ -17,7 +17,7 @@ from mi_refract.io.atomic import write_atomically
 from mi_refract.regimes import REGIMES
 from mi_refract.report.embedded_images import EmbeddedImages
 from mi_refract.report.html_page import write_page
-from mi_refract.report.plots import compact
+from mi_refract.report.number_text import compact
 from mi_refract.report.row import strict
 
 from .check_answers import Figures, Findings, Problem
