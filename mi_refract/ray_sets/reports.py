@@ -15,7 +15,7 @@ from mi_refract.report import junit
 from mi_refract.report.embedded_images import EmbeddedImages
 from mi_refract.report.html_page import write_page
 from mi_refract.report.junit import printable
-from mi_refract.report.plots import compact
+from mi_refract.report.number_text import compact
 from mi_refract.report.row import strict
 
 from .check_answers import Findings, Problem, RegimeErrors
