@@ -14,10 +14,10 @@ from rich.console import Console
 from rich.table import Table
 
 from mi_refract.io.atomic import writable
+from mi_refract.io.provenance import provenance
 from mi_refract.ray_sets import files, ray_set, run_program
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.regimes import REGIMES
-from mi_refract.rendering.scene_files import provenance
 
 app = typer.Typer(help="Check the refraction of other programs against certified answers.", rich_markup_mode=None)
 

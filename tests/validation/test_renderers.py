@@ -104,7 +104,7 @@ def test_reasons_name_what_happened(rows_of, monkeypatch):
     reasons = {name: rows_of(*DEFECTS[name][:2])[0].reason for name in ("exception", "killed", "bytes")}
     assert reasons["exception"] == "ended with status 1: RuntimeError: out of glass"
     assert reasons["killed"].startswith("was killed by SIGKILL")
-    assert "not text" in reasons["bytes"]
+    assert "no text" in reasons["bytes"]
     assert "id 0" in rows_of(*DEFECTS["an id missing"][:2])[0].reason
     monkeypatch.setattr(environments, "TIMEOUT", 2.0)
     assert rows_of(*DEFECTS["hangs"][:2])[0].reason == "no end within 2 s"

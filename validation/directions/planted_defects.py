@@ -21,7 +21,7 @@ from mi_refract.accuracy import Judgement, Subject, judge_formula
 from mi_refract.formulas import FORMULAS, contract, wedge
 from mi_refract.numerics import error_free
 from mi_refract.regimes import Rays
-from mi_refract.report.plots import compact
+from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
 from validation.run.array_settings import Setting, settings
 from validation.run.context import Context, Task
