@@ -22,9 +22,9 @@ from typing import Any
 
 import drjit as dr
 
-from mi_refract.numerics import DoubleWord, as_component, ieee_divide, two_prod, two_sum
+from mi_refract.numerics import DoubleWord, Mask, Number, as_component, ieee_divide, two_prod, two_sum
 
-from .well_conditioned import local_root
+from .well_conditioned import LocalCosines, local_cosines
 
 
 def _is_single(x: Any) -> bool:
@@ -68,21 +68,20 @@ def powers(cos_i: Any, cos_t: Any, transmitted: Any, k: Any, contrast: Any = Non
 
 def local_powers(a: Any, transmitted: Any, k: Any, contrast: Any) -> tuple[Any, Any]:
     """(R, T) as `powers` gives them, of a float32 ray `a` that meets a boundary whose normal is the z axis."""
-    r, t = local_odds(a, transmitted, k, contrast)
+    r, t = local_odds(local_cosines(*a, _wide(contrast)), transmitted, k, contrast)
     return as_component(a, ieee_divide(r, r + t)), as_component(a, ieee_divide(t, r + t))
 
 
-def local_odds(a: Any, transmitted: Any, k: Any, contrast: Any) -> tuple[Any, Any]:
-    """R : T of a float32 ray `a` that meets a boundary whose normal is the z axis, in float64: R = r/(r + t).
+def local_odds(ray: LocalCosines, transmitted: Mask, k: Number, contrast: Number) -> tuple[Number, Number]:
+    """R : T of a float32 ray that meets a boundary whose normal is an axis, in float64: R = r/(r + t).
 
-    `a`: a 3-vector, of any length from 1e-30 to 1e30. 1 : 0 where not `transmitted`; a mask, as a formula of
+    The length of the ray, from 1e-30 to 1e30, cancels. t = 0 where it is not `transmitted`; a mask, as a formula of
     refraction gives it. The cosine of the refracted ray is that of the exact problem, before it is rounded to float32:
-    so R and T are right to 1.01u, but for what an error ε of the radicand does, ε/2ρ (see `exact`).
+    so R and T are right to 1.01u, but for what an error ε of the radicand does, ε/2ρ (see `well_conditioned`).
     """
-    x, y, c, ratio, kappa = _wide(a.x), _wide(a.y), _wide(dr.abs(a.z)), _wide(k), _wide(contrast)
-    cos_t, sin2 = local_root(a.x, a.y, a.z, kappa)[0], dr.fma(x, x, y * y)
-    d_s, d_p = dr.fma(ratio, c, cos_t), dr.fma(ratio, cos_t, c)
-    p, q = c * cos_t, ratio * sin2
+    ratio, kappa = _wide(k), _wide(contrast)
+    d_s, d_p = dr.fma(ratio, ray.cos_i, ray.cos_t), dr.fma(ratio, ray.cos_t, ray.cos_i)
+    p, q = ray.cos_i * ray.cos_t, ratio * ray.sin2
     # κ = 0 is always transmitted, or tangential: without the 1 that would be 0 : 0.
     mirror, power = (dr.select(transmitted, *x) for x in ((0 * p, 1), (2 * ratio * p, 0)))
     return dr.fma(kappa * kappa, dr.fma(q, q, p * p), mirror), power * dr.fma(d_s, d_s, d_p * d_p)

@@ -27,12 +27,13 @@ from __future__ import annotations
 
 import functools
 import operator
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 
 from mi_refract.numerics import (
     DoubleWord,
+    Number,
     TripleWord,
     as_component,
     differentiated,
@@ -68,7 +69,31 @@ def _along_axis(a: Any, axis: tuple[int, int], scale: Any, along: Any) -> Any:
     return type(a)(*((along if sign > 0 else -along) if i == index else a[i] * scale for i in range(3)))
 
 
-def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
+class LocalCosines(NamedTuple):
+    """A ray at a boundary whose normal is an axis: cosines times |a|, in float64."""
+
+    sin2: Number  # |a|² sin²θ_i
+    cos_i: Number  # |a| cos θ_i, on either side
+    radicand: Number  # |a|² cos²θ_t; negative under total internal reflection
+    cos_t: Number  # √|radicand|
+
+
+def local_cosines(x: Number, y: Number, z: Number, contrast: Number) -> LocalCosines:
+    """The cosines of a float32 ray with these components, z along the normal. `contrast`: κ = k² − 1, in float64.
+
+    Error of the radicand: 5·2⁻⁵³ of its larger term.
+    """
+    wide: Any = dr.float64_array_t(type(x))
+    x, y, z = wide(x), wide(y), wide(z)
+    sin2 = dr.fma(x, x, y * y)
+    # z² is exact; κ (x² + y²): 1·2⁻⁵³ each for a square and the sum, 1 for the product.
+    radicand = dr.fma(z, z, -contrast * sin2)
+    # Below 0 the root is not used: |x| takes fewer operations than max(x, 0). At 0 its derivative is finite.
+    cos_t = dr.safe_sqrt(radicand) if differentiated(radicand) else dr.sqrt(dr.abs(radicand))
+    return LocalCosines(sin2, dr.abs(z), radicand, cos_t)
+
+
+def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None, local: LocalCosines | None = None) -> Refracted:
     """The well-conditioned form above, one precision up and rounded once: b = k a + n (n·b − k n·a)/n².
 
     float32 is computed in float64. float64 has no wider type: there the form is `refract_compensated`'s, whose
@@ -79,7 +104,7 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     if dr.type_v(a) != dr.VarType.Float32:
         return refract_compensated(a, n, k, contrast)
     if axis := _axis(n):
-        return _promoted_along(a, axis, k, contrast)
+        return _promoted_along(a, axis, k, contrast, local)
     wide: Any = dr.float64_array_t(type(a))
     number = dr.value_t(wide)
     d, m, k2 = wide(a), wide(n), number(as_component(a, k))
@@ -98,31 +123,17 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     return type(a)(dr.fma(m, ieee_divide(dr.fma(-scale, c, along), dr.dot(m, m)), d * scale)), transmitted
 
 
-def _promoted_along(a: Any, axis: tuple[int, int], k: Any, contrast: Any) -> Refracted:
+def _promoted_along(a: Any, axis: tuple[int, int], k: Any, contrast: Any, local: LocalCosines | None) -> Refracted:
     """`refract_promoted` for a literal axis: only the radicand and its root need float64."""
     index, sign = axis
     wide: Any = dr.float64_array_t(dr.value_t(type(a)))
     k, along = as_component(a, k), a[index] if sign > 0 else -a[index]
-    kappa = dr.fma(wide(k), wide(k), -1) if contrast is None else wide(contrast)
-    x, y = (a[i] for i in range(3) if i != index)
-    root, radicand = local_root(x, y, along, kappa)
-    transmitted = (radicand >= 0) & (along != 0)
-    onward = dr.select(transmitted, dr.mulsign(as_component(a, root), along), -along)
+    if local is None:
+        kappa = dr.fma(wide(k), wide(k), -1) if contrast is None else wide(contrast)
+        local = local_cosines(*(a[i] for i in range(3) if i != index), along, kappa)
+    transmitted = (local.radicand >= 0) & (along != 0)
+    onward = dr.select(transmitted, dr.mulsign(as_component(a, local.cos_t), along), -along)
     return _along_axis(a, axis, dr.select(transmitted, k, 1), onward), transmitted
-
-
-def local_root(x: Any, y: Any, z: Any, kappa: Any) -> tuple[Any, Any]:
-    """(√|radicand|, radicand = z² − κ (x² + y²)) in float64, of float32 components in a frame whose axis is the normal.
-
-    Who asks for it twice, as the plugin does for the direction and for Fresnel's equations, pays once: Dr.Jit knows an
-    operation that it has seen.
-    """
-    wide: Any = dr.float64_array_t(type(x))
-    x, y, z = wide(x), wide(y), wide(z)
-    # z² is exact; κ (x² + y²): 1·2⁻⁵³ each for a square and the sum, 1 for the product.
-    radicand = dr.fma(z, z, -kappa * dr.fma(x, x, y * y))
-    # Below 0 the root means nothing, and nobody takes it: |x| is shorter than max(x, 0). At 0 its derivative is finite.
-    return dr.safe_sqrt(radicand) if differentiated(radicand) else dr.sqrt(dr.abs(radicand)), radicand
 
 
 def _radicand(c: TripleWord, w: list[TripleWord], kappa: DoubleWord) -> DoubleWord:
