@@ -162,7 +162,7 @@ def plugin_class(v: Any) -> type:
             k, eta = (dr.select(outside, *x) for x in ((self.k_outer, self.k_inner), (self.k_inner, self.k_outer)))
             side = Side(k, (k - 1) * (k + 1))
             # Unchecked: the ratio is checked where it is set, and NaN stays NaN.
-            local = local_cosines(*a, side.contrast)
+            local = local_cosines(a.x, a.y, a.z, side.contrast)
             wo, transmitted = self.formula.unchecked(a, v.Vector3f(0, 0, 1), *side, local)
             return Ray(a, side, wo, v.Float(eta), transmitted, *fresnel.local_odds(local, transmitted, *side))
 
