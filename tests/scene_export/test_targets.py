@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from pathlib import Path
 
 import mitsuba as mi
@@ -243,3 +244,8 @@ def test_scripts_for_other_pythons_are_complete(small, tmp_path):
         text = (tmp_path / target / "render.py").read_text()
         compile(text, "render.py", "exec")
         assert "mi_refract import" not in text and "from ." not in text
+
+
+def test_the_readme_lists_every_target():
+    readme = Path(write_files.__file__).with_name("README.md").read_text()
+    assert re.findall(r"^\| `(.*?)` \|", readme, re.MULTILINE)[: len(write_files.TARGETS)] == list(write_files.TARGETS)

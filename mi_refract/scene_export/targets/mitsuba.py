@@ -10,7 +10,7 @@ from mi_refract.scene_export.plain_scene import Colour, Diffuse, Environment, Gl
 
 from .shared_files import Files, exr, numbers, ply, readme
 
-COMMANDS = "mi-refract render scene.xml -o image.exr --spp 1024        (-D bsdf=dielectric for Mitsuba's own)"
+COMMANDS = "mi-refract render scene.xml -o image.exr --spp 1024        (-D bsdf=dielectric for Mitsuba's own glass)"
 
 
 def files(plain: PlainScene) -> Files:

@@ -24,7 +24,7 @@ from .environment_map import Array
 from .shared_files import LIGHT_INSIDE, Files, numbers, readme
 
 COMMANDS = """
-    povray +Iscene.pov +Oimage.exr +FE +W{width} +H{height} -A -D File_Gamma=1.0 Declare=dx=0.5 Declare=dy=0.5
+povray +Iscene.pov +Oimage.exr +FE +W{width} +H{height} -A -D File_Gamma=1.0 Declare=dx=0.5 Declare=dy=0.5
 
 0 <= dx, dy < 1 is the place of the only sample in each pixel. The mean of images with random dx and dy is a box filter.
 """
