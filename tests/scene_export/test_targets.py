@@ -248,4 +248,4 @@ def test_scripts_for_other_pythons_are_complete(small, tmp_path):
 
 def test_the_readme_lists_every_target():
     readme = Path(write_files.__file__).with_name("README.md").read_text()
-    assert re.findall(r"^\| `(.*?)` \|", readme, re.MULTILINE)[: len(write_files.TARGETS)] == list(write_files.TARGETS)
+    assert set(write_files.TARGETS) <= set(re.findall(r"^\| `(.*?)` \|", readme, re.MULTILINE))
