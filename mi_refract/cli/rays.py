@@ -14,10 +14,10 @@ from rich.console import Console
 from rich.table import Table
 
 from mi_refract.io.atomic import writable
+from mi_refract.io.provenance import provenance
 from mi_refract.ray_sets import files, ray_set, run_program
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.regimes import REGIMES
-from mi_refract.rendering.scene_files import provenance
 
 app = typer.Typer(help="Check the refraction of other programs against certified answers.", rich_markup_mode=None)
 
@@ -77,7 +77,7 @@ class CheckOptions:
         needed = ("flint", "jinja2") if self.report else ("flint",)
         if not all(map(importlib.util.find_spec, needed)):
             raise ValueError("checking rays needs the extra `validation`: pip install 'mi-refract[validation]'")
-        from mi_refract.formulas.documented import FORMULAS
+        from mi_refract.formulas import FORMULAS
         from mi_refract.ray_sets.tir_signal import AUTO, TIR
 
         if self.tir not in (AUTO, *TIR):

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 
 from .diagnosis import Explanation, explain
 from .ray_set import Answers, Header, RaySet

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mi_refract.accuracy.direction_errors import lengths, radicand
+from mi_refract.accuracy.direction_errors import absolute_radicand, lengths
 from mi_refract.regimes import Rays
 
 from .ray_set import indices
@@ -278,7 +278,7 @@ def _float32(judged: Judged) -> Explanation:
     """float32 where float64 was claimed: errors of float32's size nearly everywhere, and none that is larger."""
     u, k, exact = 2 * F32, judged.rays.k.astype(float), judged.exact  # u of the inputs, u of the formula
     bound = judged.budget.chord(u, k, exact.cos_t, exact.transmitted, cos_i=exact.cos_i)
-    lost = judged.misjudged & (radicand(judged.rays) <= judged.budget.margin(u, k))
+    lost = judged.misjudged & (absolute_radicand(judged.rays) <= judged.budget.radicand_error_bound(u, k))
     everywhere = judged.compared.any() and np.median(judged.angle[judged.compared]) > F32 / 50
     holds, claimed = _within(judged, bound) | lost, judged.roundoff < F32
     enough = claimed and bool(everywhere)

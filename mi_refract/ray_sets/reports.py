@@ -9,12 +9,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mi_refract.image_diff.text_reports import printable
 from mi_refract.io.atomic import write_atomically
 from mi_refract.regimes import REGIMES
+from mi_refract.report import junit
 from mi_refract.report.embedded_images import EmbeddedImages
 from mi_refract.report.html_page import write_page
-from mi_refract.report.plots import compact
+from mi_refract.report.junit import printable
+from mi_refract.report.number_text import compact
 from mi_refract.report.row import strict
 
 from .check_answers import Findings, Problem, RegimeErrors
@@ -187,33 +188,25 @@ def write_json(path: str | Path, found: Findings) -> None:
 
 def write_junit(path: str | Path, found: Findings, name: str) -> None:
     """One test case per regime, and one for the set of answers: an error where they do not match the rays."""
-    from xml.etree import ElementTree as xml
-
-    root = xml.Element("testsuites", name="mi-refract rays")
-    suite = xml.SubElement(root, "testsuite", name=printable(name))
-    case = xml.SubElement(suite, "testcase", classname="answers", name="complete and understood")
-    if found.problems or found.tir == UNCLEAR or not found.answered:
-        _complain(
-            case, "error" if found.exit_code == 2 else "failure", [*map(problem_text, found.problems), signal(found)]
-        )
-    for each in found.regimes:
-        case = xml.SubElement(suite, "testcase", classname="rays", name=printable(each.regime))
-        if each.wrong:
-            numbers = [f"{key} {text}" for key, text in _cells(each, found.ulp).items()]
-            wrong = f"{each.wrong} of {each.rays} answers are wrong"
-            _complain(case, "failure", [wrong, *explained(found), *numbers, json.dumps(strict(each.replay))])
-    tags = [child.tag for case in suite for child in case]
-    tally = {"tests": len(suite), "failures": tags.count("failure"), "errors": tags.count("error"), "skipped": 0}
-    for element in (root, suite):
-        element.attrib.update({key: str(count) for key, count in tally.items()})
-    xml.indent(root)
-    write_atomically(path, xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
+    suites = {name: [_answers_case(found), *(_regime_case(found, each) for each in found.regimes)]}
+    junit.write_junit(path, "mi-refract rays", suites)
 
 
-def _complain(case: Any, tag: str, lines: list[str]) -> None:
-    from xml.etree import ElementTree as xml
+def _answers_case(found: Findings) -> junit.Case:
+    group, name = "answers", "complete and understood"
+    if found.answered and not found.problems and found.tir != UNCLEAR:
+        return junit.Case(group, name)
+    lines = [*map(problem_text, found.problems), signal(found)]
+    return junit.Case(group, name, "error" if found.exit_code == 2 else "failure", lines[0], lines)
 
-    xml.SubElement(case, tag, message=printable(lines[0])).text = "\n".join(map(printable, lines))
+
+def _regime_case(found: Findings, each: RegimeErrors) -> junit.Case:
+    if not each.wrong:
+        return junit.Case("rays", each.regime)
+    numbers = [f"{key} {text}" for key, text in _cells(each, found.ulp).items()]
+    wrong = f"{each.wrong} of {each.rays} answers are wrong"
+    lines = [wrong, *explained(found), *numbers, json.dumps(strict(each.replay))]
+    return junit.Case("rays", each.regime, "failure", wrong, lines)
 
 
 def write_html(path: str | Path, found: Findings, context: Mapping[str, Any], replay: str = "") -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import mitsuba as mi
 import numpy as np
 
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 from mi_refract.plugins.refract import PLUGIN, read_ior
 
 from . import tessellation

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-import shutil
-import uuid
 from collections.abc import Callable
 from pathlib import Path
+
+from mi_refract.io import atomic
 
 from .plain_scene import PlainScene
 from .targets import cycles, luxcore, mitsuba, obj, povray, radiance
@@ -32,15 +32,10 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
         raise ValueError(f"target {target!r}: unknown; accepted: {', '.join(TARGETS)}")
     place = _new_or_empty(folder)
     files = TARGETS[target](plain)
-    temporary = place.with_name(f".{place.name}.{uuid.uuid4().hex}.part")
-    try:
+    with atomic.replacing(place) as temporary:
         temporary.mkdir()
         for name, content in files.items():
             (temporary / name).write_bytes(content)
-        temporary.replace(place)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
     return [Path(folder) / name for name in sorted(files)]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import sys
@@ -217,8 +218,8 @@ def test_options_that_cannot_be(call, words, message):
 
 @pytest.mark.parametrize("package, words", [("flint", ()), ("jinja2", ("--report", "out.html"))])
 def test_what_is_not_installed_is_named(call, monkeypatch, package, words):
-    find = app.cli_rays.importlib.util.find_spec
-    monkeypatch.setattr(app.cli_rays.importlib.util, "find_spec", lambda name: None if name == package else find(name))
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else find(name))
     code, _, err = call("check", "answers.csv", *words)
     assert (code, "pip install 'mi-refract[validation]'" in err) == (2, True)
 

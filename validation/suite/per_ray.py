@@ -151,7 +151,7 @@ def _gathered(parts: dict[str, regimes.Rays], precision: str) -> RaySet:
 
 def rows(call: RefractFunction, rays: RaySet, answers: Answers) -> list[Row]:
     """One per set."""
-    left_out = direction_errors.radicand(rays.rays) < call.gives_up
+    left_out = direction_errors.absolute_radicand(rays.rays) < call.gives_up
     findings = check_answers.check(_only(rays, ~left_out), _without(answers, rays.ids[left_out]))
     about = _remark(findings, str(answers.header.get("system", "")), call.remark)
     made = []
