@@ -14,7 +14,7 @@ import mi_refract
 PACKAGE = Path(mi_refract.__file__).parent
 ROOMS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
 # Rooms that do not have their `__all__` yet. None may remain.
-PENDING = set(ROOMS) - {"report"}
+PENDING = set(ROOMS) - {"ray_sets", "report", "scene_export"}
 DONE = [room for room in ROOMS if room not in PENDING]
 
 
