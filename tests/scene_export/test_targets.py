@@ -1,4 +1,4 @@
-"""What is written for other renderers: complete or not at all, and the same scene again where that can be told here."""
+"""Exports are written completely or not at all; where this can be checked here, they are the same scene."""
 
 import json
 import os
