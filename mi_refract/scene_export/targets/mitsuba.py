@@ -6,8 +6,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from mi_refract.scene_export.plain_scene import Colour, Diffuse, Environment, Glass, Material, PlainScene
-
+from ..plain_scene import Colour, Diffuse, Environment, Glass, Material, PlainScene
 from .shared_files import Files, exr, numbers, ply, readme
 
 COMMANDS = "mi-refract render scene.xml -o image.exr --spp 1024        (-D bsdf=dielectric for Mitsuba's own glass)"

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from mi_refract.scene_export.plain_scene import (
+from ..plain_scene import (
     Camera,
     Colour,
     Diffuse,
@@ -17,8 +17,7 @@ from mi_refract.scene_export.plain_scene import (
     Mesh,
     PlainScene,
 )
-from mi_refract.scene_export.tessellation import is_closed
-
+from ..tessellation import is_closed
 from . import scene_json
 from .environment_map import Array
 from .shared_files import LIGHT_INSIDE, Files, numbers, readme

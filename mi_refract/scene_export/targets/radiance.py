@@ -7,8 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mi_refract.scene_export.plain_scene import Camera, Diffuse, Environment, Glass, Material, Mesh, PlainScene
-
+from ..plain_scene import Camera, Diffuse, Environment, Glass, Material, Mesh, PlainScene
 from . import scene_json
 from .shared_files import Files, numbers, readme
 
