@@ -6,4 +6,4 @@ fills a template of `templates/`, `embedded_images` puts EXR files on a page, `p
 numbers). Nothing is measured or judged here.
 """
 
-__all__ = ["embedded_images", "html_page", "number_text", "plots", "row", "run_report"]
+__all__ = ["embedded_images", "html_page", "junit", "number_text", "plots", "row", "run_report"]
