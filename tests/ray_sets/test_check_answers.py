@@ -10,7 +10,7 @@ from support import ray_programs as programs
 from support.ray_programs import BAD, GOOD
 
 from mi_refract import oracle
-from mi_refract.accuracy.direction_errors import lengths
+from mi_refract.accuracy import lengths
 from mi_refract.formulas import FORMULAS
 from mi_refract.ray_sets import ray_set, tir_signal
 from mi_refract.ray_sets.check_answers import LOOSEST, check
