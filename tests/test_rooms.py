@@ -14,7 +14,7 @@ import mi_refract
 PACKAGE = Path(mi_refract.__file__).parent
 ROOMS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
 # Rooms that do not have their `__all__` yet. None may remain.
-PENDING = set(ROOMS) - {"report"}
+PENDING = set(ROOMS) - {"ray_sets", "report", "scene_export"}
 DONE = [room for room in ROOMS if room not in PENDING]
 
 
@@ -59,7 +59,8 @@ def test_a_room_says_what_it_is_for_and_what_it_offers(room: str) -> None:
     assert len((module.__doc__ or "").splitlines()) > 1
     assert offered(room)
     for name in offered(room):
-        assert hasattr(module, name) or (PACKAGE / room / f"{name}.py").is_file(), f"{room} has no {name}"
+        files = (PACKAGE / room / f"{name}.py", PACKAGE / room / name / "__init__.py")
+        assert hasattr(module, name) or any(path.is_file() for path in files), f"{room} has no {name}"
 
 
 @pytest.mark.parametrize(
