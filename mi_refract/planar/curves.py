@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .tracer import Array, Segments
+from .segments import Array, Segments
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,9 @@ from mi_refract.io.atomic import write_atomically
 
 from .figure_geometry import SHARED, Legs, View, around, curves, density, legs
 from .path_tree import Branches, count, summary
+from .paths import Event
 from .scene_file import PlanarScene
-from .tracer import Event, Segments
+from .segments import Segments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from .curves import points
 from .path_tree import Branches
+from .paths import Event
 from .scene_file import PlanarScene
-from .tracer import Array, Event, Segments
+from .segments import Array, Segments
 
 View = tuple[float, float, float, float]  # x0, x1, y0, y1
 MARGIN = 0.08  # around what the image holds, of its larger side

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .path_loop import REFLECT_BITS
 from .path_tree import Branches
+from .paths import REFLECT_BITS, Event
 from .scene_file import PlanarScene
-from .tracer import Array, Event
+from .segments import Array
 
 Point = tuple[float, float]
 PARALLEL = 1e-9  # sine of an angle: two lines below that have no crossing worth naming

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .path_loop import REFLECT_BITS
+from .paths import REFLECT_BITS, Event, Paths
 from .scene_file import PlanarScene
-from .tracer import Array, Event, Paths, Segments, Tracer
+from .segments import Array, Segments
+from .tracer import Tracer
 
 LEAST = 1e-3  # of a ray's power: a partial reflection that would carry no more is not followed
 MOST = 2**25  # legs of paths with as many partial reflections: 1.3 GB

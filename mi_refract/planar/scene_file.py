@@ -15,8 +15,8 @@ from mi_refract.io.toml_schema import read, shown
 from .curves import affine
 from .scene_schema import BEAMS, SCENE, SHAPES, Part
 from .scene_values import Indices, per_colour, read_kind
+from .segments import Array, Segments
 from .shared_boundaries import Named, boundaries
-from .tracer import Array, Segments
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from .scene_values import (
     Kind,
     kind_table,
 )
-from .tracer import Array
+from .segments import Array
 
 
 class Part(NamedTuple):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from .curves import Curve, affine, area, joined, polygonal, unit
-from .tracer import Array
+from .segments import Array
 
 # 1 − (1 + K) c² r² within so much of 0 is 0: the rim of a half sphere, whose curvature is a rounded 1/R.
 FLAT = 8 * 2.0**-53

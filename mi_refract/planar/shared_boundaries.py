@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .scene_schema import Part
-from .tracer import Array, Segments
+from .segments import Array, Segments
 
 # Points are one where neither coordinate differs by more than so much of the largest one.
 NEAR = 2.0**-44

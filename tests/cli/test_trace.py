@@ -136,11 +136,22 @@ def test_rays_and_depth(trace):
     assert trace("--max-depth", 1)[1] == "ball.toml: 7 rays, 7 hits, 7 stopped at max_depth\n"
 
 
-def test_the_precision(trace):
+def test_the_precision(trace, needs_variant):
+    needs_variant("llvm_ad_rgb")
     double, single = (paths_of(trace("--json", "--precision", p)) for p in ("float64", "float32"))
     a, b = (np.array([path["points"] for path in paths]) for paths in (double, single))
     assert 0 < np.abs(a - b).max() < 1e-5
     np.testing.assert_array_equal(b, b.astype(np.float32))
+
+
+def test_scalar_arrays_have_no_float32(trace, ball):
+    """They compute in double: float32 is refused in one line, and nothing is written."""
+    output = ball.with_name("image.svg")
+    code, out, err = trace("--backend", "scalar", "--precision", "float32", "-o", output)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith("mi-refract: precision = 'float32': scalar arrays compute in double; accepted: float64")
+    assert not output.exists()
+    assert trace("--backend", "scalar", "--precision", "float64")[0] == 0
 
 
 @pytest.mark.parametrize("name", FORMULAS)

@@ -16,9 +16,9 @@ from matplotlib.image import AxesImage
 from support.planar_scenes import SLAB, ball, beam, polygon, scene
 
 from mi_refract.io import atomic
+from mi_refract.planar import Event
 from mi_refract.planar import figure as drawing
 from mi_refract.planar.path_tree import follow_scene, with_rays
-from mi_refract.planar.tracer import Event
 
 VIEW = (-2.0, 2.0, -1.5, 1.5)
 SLANTED = scene(polygon(SLAB, 1.5), [[-1.5, -0.6]], (1, 0.4), view=VIEW)
