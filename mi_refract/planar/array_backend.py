@@ -14,14 +14,12 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.backend import detect
+from mi_refract.numerics import Mask
 
 PRECISIONS = ("float32", "float64")
 
-# Dr.Jit is untyped. On the scalar backend the first three are Python's float, int and bool.
-Number = Any  # a Dr.Jit array of float32 or float64
-Index = Any  # a Dr.Jit array of uint32
-Mask = Any  # a Dr.Jit array of bool
-Vector2 = Any  # x and y, Numbers
+Index = Any  # a Python int, or a Dr.Jit array of uint32
+Vector2 = Any  # x and y, two Numbers
 Vertices = Any  # the numbers of a start and an end, Indices
 Table = Any  # rows to gather from; see `ArrayBackend.table`
 Buffer = tuple[Any, tuple[int, ...]]  # values and their shape

@@ -17,9 +17,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.numerics.error_free import ieee_divide
+from mi_refract.numerics import Mask, Number, ieee_divide
 
-from .array_backend import ArrayBackend, Index, Mask, Number, Vector2, Vertices
+from .array_backend import ArrayBackend, Index, Vector2, Vertices
 from .intersect_segments import NOWHERE, Hit, LineSegments, Ray, Start, bounding_box, cross, start_shares
 from .segments import Array
 

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from mi_refract.numerics.error_free import ieee_divide
+from mi_refract.numerics import Mask, Number, ieee_divide
 
-from .array_backend import ArrayBackend, Index, Mask, Number, Vector2, Vertices
+from .array_backend import ArrayBackend, Index, Vector2, Vertices
 from .segments import Array
 
 NOWHERE = 0xFFFFFFFF  # the number of no segment

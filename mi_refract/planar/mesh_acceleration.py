@@ -24,8 +24,9 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.backend import activate
+from mi_refract.numerics import Mask, Number
 
-from .array_backend import ArrayBackend, Index, Mask, Number, Scatter, Vector2, negated
+from .array_backend import ArrayBackend, Index, Scatter, Vector2, negated
 from .intersect_segments import NOWHERE, Hit, LineSegments, Ray, Start
 from .segments import Array
 

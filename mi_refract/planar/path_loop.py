@@ -9,10 +9,10 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.formulas.documented import FORMULAS, refract_2d
-from mi_refract.formulas.fresnel import powers, refracted_cosine
+from mi_refract.formulas import FORMULAS, fresnel, refract_2d
+from mi_refract.numerics import Mask, Number
 
-from .array_backend import ArrayBackend, Index, Mask, Number, Scatter, Vector2, negated
+from .array_backend import ArrayBackend, Index, Scatter, Vector2, negated
 from .intersect_segments import NOWHERE, Hit, LineSegments, Ray, cross
 from .mesh_acceleration import BACK, MeshAcceleration, SearchState
 from .paths import REFLECT_BITS, Event
@@ -226,8 +226,8 @@ def _mirrored(d: Vector2, line: Vector2) -> Vector2:
 def _share(d: Vector2, line: Vector2, k: Number, through: Mask) -> Number:
     """The share of the power that goes the way that the ray takes: Fresnel's T where it goes through, R otherwise."""
     cos_i = dr.minimum(dr.abs(cross(line, d)), 1)
-    cos_t, transmitted = refracted_cosine(cos_i, k)
-    r, t = powers(cos_i, cos_t, transmitted, k)
+    cos_t, transmitted = fresnel.refracted_cosine(cos_i, k)
+    r, t = fresnel.powers(cos_i, cos_t, transmitted, k)
     return dr.select(through, t, r)
 
 

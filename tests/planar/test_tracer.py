@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.planar_scenes import SQUARE, ball, polygon, star, story, together
 
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 from mi_refract.planar import Event, Segments, intersect_segments
 
 REFRACTED, REFLECTED, ESCAPED = Event.REFRACTED, Event.REFLECTED, Event.ESCAPED
@@ -224,7 +224,7 @@ def test_a_ball_turns_a_ray_by_twice_the_difference_of_angles(follow, setting):
     assert np.hypot(*paths.points[:, 1:3].T) == pytest.approx(1, abs=4 * setting.roundoff)
 
 
-@pytest.mark.parametrize("grazing", [0.5, 0.1, 1e-2, 1e-3])
+@pytest.mark.parametrize("grazing", [0.5, 1e-2, 1e-3])
 def test_inside_a_ball_a_ray_turns_by_the_same_angle_each_time(follow, setting, grazing):
     """Chords of angle 2 α, many of them within one arc; none is skipped, none leaks at the joints."""
     count = 500
