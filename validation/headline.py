@@ -232,7 +232,7 @@ def _image(rows: Sequence[Row]) -> ShownImage | None:
     row = max(pairs, key=lambda each: each.values.get(ALARMS, 0))
     said = "the two differ" if row.values.get(ALARMS) else "the same up to noise"
     if row.case == MIRAGE and row.values.get(ALARMS):
-        said = f"`{BUILTIN}` breaks edges into stairs, not `{PLUGIN}`"
+        said = f"`{PLUGIN}` keeps the edges that `{BUILTIN}` breaks into stairs"
     labels = {"reference": BUILTIN, "test": PLUGIN}
     return {"row": row.name, "labels": labels, "caption": f"Scene `{row.case}`: {said}."}
 

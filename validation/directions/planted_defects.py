@@ -17,7 +17,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import oracle, regimes
-from mi_refract.formulas.documented import FORMULAS, contract, wedge
+from mi_refract.formulas import FORMULAS, contract, wedge
 from mi_refract.numerics import error_free
 from mi_refract.regimes import Rays
 from mi_refract.report.number_text import compact
