@@ -108,7 +108,7 @@ def _legend_below(figure: Figure, panel: Panel, size: tuple[float, float]) -> No
     """A legend under the axes, where it covers no point, in as many columns as its longest name leaves room for."""
     handles, names = panel.get_legend_handles_labels()
     width, height = size
-    columns = max(1, min(len(names), int(width * 72 // (6 * max(map(len, names)) + 44))))
+    columns = max(1, min(len(names), int(width * 72 // (5 * max(map(len, names)) + 44))))
     figure.set_size_inches(width, height + 0.21 * math.ceil(len(names) / columns))
     figure.legend(handles, names, loc="outside lower left", ncols=columns, borderaxespad=0, columnspacing=1.2)
 

@@ -86,9 +86,9 @@ def _study(name: str, rows: list[Row], context: Mapping[str, Any], images: Embed
 
 
 def _measured(rows: list[Row]) -> list[Row]:
-    """The rows without the settings, and the subjects of a setting, of which nothing was run."""
-    run = {(row.setting, row.subject) for row in rows if row.values}
-    return [row for row in rows if (row.setting, row.subject) in run]
+    """The rows without the subjects and the cases of which, in their setting, nothing was run."""
+    run = {(row.setting, label) for row in rows if row.values for label in (("s", row.subject), ("c", row.case))}
+    return [row for row in rows if {(row.setting, ("s", row.subject)), (row.setting, ("c", row.case))} <= run]
 
 
 def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> list[dict[str, Any]]:
@@ -109,8 +109,9 @@ def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | No
 
 
 def _matrix(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> dict[str, Any] | None:
-    subjects = list(dict.fromkeys(row.subject for row in rows))
-    cases = list(dict.fromkeys(row.case for row in rows))
+    telling = [row for row in rows if metrics[0] in row.values or row.broken]
+    subjects = list(dict.fromkeys(row.subject for row in telling))
+    cases = list(dict.fromkeys(row.case for row in telling))
     cells = {(row.subject, row.case): row for row in rows}
     if len(subjects) < 3 or len(cases) < 3 or len(cells) < len(rows) or scale is None:
         return None
