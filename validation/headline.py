@@ -188,7 +188,12 @@ def _paths_sentence(paths: dict[str, Row]) -> str:
     right = (
         f"loses {lost[PLUGIN]:.0f} of {count} light paths" if lost[PLUGIN] else f"follows all {count} exact light paths"
     )
-    why = ": rounded to single precision, the indices of neighbouring layers merge" if lost.get(ROUNDED) else ""
+    rounded = lost.get(ROUNDED)
+    why = (
+        f". With indices rounded as `{BUILTIN}` rounds them, even exact arithmetic loses {rounded:.0f}"
+        if rounded
+        else ""
+    )
     return f"There `{PLUGIN}` {right}; `{BUILTIN}` loses {lost[BUILTIN]:.0f}{why}."
 
 
