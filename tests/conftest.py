@@ -177,7 +177,7 @@ def follow(setting):
     """`trace` in the setting; paths as lists, without what follows their ends."""
     import numpy as np
 
-    from mi_refract.planar.tracer import trace
+    from mi_refract.planar import trace
 
     def run(segments, origins, directions, max_depth=16, **options):
         options = {"precision": setting.name, "backend": setting.backend, "weights": True} | options
