@@ -1,4 +1,4 @@
-"""Answers to a ray set, judged: how they tell total internal reflection, and what they are off by."""
+"""The judgement of answers to a ray set: which signal total internal reflection, and how large the errors are."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .ray_set import PRECISIONS
 
 @dataclass(frozen=True)
 class JudgedAnswers:
-    """Answers (N, 3) as they came, the same in the set's precision, how they tell TIR, and the verdict on each."""
+    """Answers (N, 3) as given and in the set's precision, how they signal TIR, and the verdict on each."""
 
     raw: np.ndarray
     b: np.ndarray
@@ -34,15 +34,18 @@ class JudgedAnswers:
 def judge_answers(
     b: np.ndarray, flag: np.ndarray | None, rays: Rays, precision: str, budget: Budget, tir: str = tir_signal.AUTO
 ) -> JudgedAnswers:
-    """Hold `b` (N, 3) and the column `transmitted` (N,), if there is one, against `budget`. `precision`: f32 or f64."""
+    """Compare `b` (N, 3) with the certified answers, within `budget`.
+
+    `flag`: the column `transmitted` (N,), if there is one. `precision`: f32 or f64. `tir`: one of TIR, or AUTO.
+    """
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False)
     bounds = RayBounds(rays, exact, budget, float(np.finfo(PRECISIONS[precision]).eps) / 2, normalised=True)
     with np.errstate(over="ignore"):
         rounded = b.astype(PRECISIONS[precision]).astype(np.float64)
-    seen = tir_signal.Seen(rounded, rays, exact, bounds.roundoff)
+    seen = tir_signal.SeenAnswers(rounded, rays, exact, bounds.roundoff)
     if tir == tir_signal.AUTO:
-        tir = tir_signal.recognise(seen, flag)
+        tir = tir_signal.detect(seen, flag)
     reflected = tir_signal.reflected(seen, flag, tir, bounds.decided)
-    blank = ~seen.directed & (~reflected | tir_signal.has_direction(tir))
+    blank = ~seen.is_direction & (~reflected | tir_signal.has_direction(tir))
     directed = exact.transmitted | (tir == "reflected")
     return JudgedAnswers(b, rounded, tir, judge(rounded, ~reflected, bounds, directed, blank))

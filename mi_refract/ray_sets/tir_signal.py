@@ -1,4 +1,4 @@
-"""How answers tell total internal reflection: by a flag, zeros, NaN, the mirror direction or one along the surface."""
+"""Signals of total internal reflection: a flag, zeros, NaN, the mirror direction, or a vector along the surface."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from mi_refract.accuracy import absolute_radicand, lengths
 from mi_refract.regimes import Rays
 
 AUTO, FLAG = "auto", "flag"
-# What `recognise` answers beside the words of TIR: no ray has it, and it is told in no known way.
+# Results of `detect` beside those of TIR: no ray is totally reflected; the rays signal it in no known way.
 NONE, UNCLEAR = "none", "unclear"
-# Rays whose radicand is beyond this are totally reflected in anyone's arithmetic; so many of them must say so alike.
-CERTAIN, ALIKE = 1e-3, 0.9
-# In u: below this a cosine is that of a ray along the surface.
+# Beyond this radicand a ray is totally reflected in any arithmetic. This share of those rays must agree on a signal.
+CERTAIN, AGREEING = 1e-3, 0.9
+# In u: a cosine below this is that of a ray along the surface.
 ALONG = 8.0
 
 
 @dataclass(frozen=True)
-class Seen:
-    """Answers `b` (N, 3) float64, with what tells a reflected ray from a transmitted one; `u`: their roundoff."""
+class SeenAnswers:
+    """Answers `b` (N, 3) float64 with roundoff `u`, and the certified answers that they are compared with."""
 
     b: np.ndarray
     rays: Rays
@@ -30,54 +30,65 @@ class Seen:
     u: float
 
     @functools.cached_property
-    def directed(self) -> np.ndarray:
-        """(N,) whether b is a direction: finite and not zero."""
+    def is_direction(self) -> np.ndarray:
+        """(N,) whether b is finite and not zero."""
         return np.isfinite(self.b).all(axis=1) & self.b.any(axis=1)
 
     @functools.cached_property
-    def ends(self) -> tuple[np.ndarray, np.ndarray]:
-        """The unit mirror direction, and the transmitted one: along the surface where there is none."""
-        a, n = (v.astype(float) / lengths(v).astype(float)[:, None] for v in (self.rays.a, self.rays.n))
-        normal = (a * n).sum(1, keepdims=True) * n
+    def mirror(self) -> np.ndarray:
+        """(N, 3): the unit mirror direction."""
+        a, normal = self._parts
+        return a - 2 * normal
+
+    @functools.cached_property
+    def onward(self) -> np.ndarray:
+        """(N, 3): the transmitted direction; along the surface where nothing is transmitted."""
+        a, normal = self._parts
         tangent = a - normal
         with np.errstate(invalid="ignore"):
             tangent /= np.sqrt((tangent * tangent).sum(1, keepdims=True))
-        return a - 2 * normal, np.where(self.exact.transmitted[:, None], self.exact.direction, tangent)
+        return np.where(self.exact.transmitted[:, None], self.exact.direction, tangent)
+
+    @functools.cached_property
+    def _parts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Unit a, and its part along n; each (N, 3)."""
+        a, n = (v.astype(float) / lengths(v).astype(float)[:, None] for v in (self.rays.a, self.rays.n))
+        return a, (a * n).sum(1, keepdims=True) * n
 
     @property
-    def open(self) -> np.ndarray:
-        """ALONG u, as much more as a formula's linear terms grow with k."""
+    def tolerance(self) -> np.ndarray:
+        """(N,) ALONG u, times k where k > 1: the linear error of a formula grows with k."""
         return ALONG * self.u * np.maximum(1.0, self.rays.k.astype(float))
 
 
-def _mirrored(seen: Seen) -> np.ndarray:
-    """Nearer to the mirror direction; the benefit of the doubt where the two ends are one."""
+def _mirrored(seen: SeenAnswers) -> np.ndarray:
+    """(N,) whether b is nearer to the mirror direction; where the two directions are one, the exact answer decides."""
     with np.errstate(all="ignore"):
         unit = seen.b / np.sqrt((seen.b * seen.b).sum(1, keepdims=True))
-        to_mirror, to_onward = (np.sqrt(((unit - end) ** 2).sum(1)) for end in seen.ends)
+        to_mirror, to_onward = (np.sqrt(((unit - end) ** 2).sum(1)) for end in (seen.mirror, seen.onward))
         nearer = to_mirror < to_onward
-        return np.where(np.abs(to_mirror - to_onward) <= seen.open, ~seen.exact.transmitted, nearer)
+        return np.where(np.abs(to_mirror - to_onward) <= seen.tolerance, ~seen.exact.transmitted, nearer)
 
 
-def _along(seen: Seen) -> np.ndarray:
-    """Along the surface, of whatever length; where the exact answer is so too, the benefit of the doubt."""
+def _along(seen: SeenAnswers) -> np.ndarray:
+    """(N,) whether b is along the surface, at any length; not where the exact transmitted direction is so, too."""
     n = seen.rays.n.astype(float) / lengths(seen.rays.n).astype(float)[:, None]
     with np.errstate(all="ignore"):
-        along = np.abs((n * seen.b).sum(1)) <= seen.open * np.maximum(1, lengths(seen.b).astype(float))
-    return along & seen.directed & ~(seen.exact.transmitted & (seen.exact.cos_t <= 2 * seen.open))
+        along = np.abs((n * seen.b).sum(1)) <= seen.tolerance * np.maximum(1, lengths(seen.b).astype(float))
+    return along & seen.is_direction & ~(seen.exact.transmitted & (seen.exact.cos_t <= 2 * seen.tolerance))
 
 
-TELLERS = {
+DETECTORS = {
     "zero": lambda seen: ~seen.b.any(axis=1),
     "nan": lambda seen: np.isnan(seen.b).any(axis=1),
     "reflected": _mirrored,
     "tangent": _along,
 }
-TIR = (*TELLERS, FLAG)
+TIR = (*DETECTORS, FLAG)
 
 
-def recognise(seen: Seen, flag: np.ndarray | None) -> str:
-    """One of TIR: how most of the rays beyond doubt say it, FLAG where there is one; or NONE, or UNCLEAR."""
+def detect(seen: SeenAnswers, flag: np.ndarray | None) -> str:
+    """FLAG where there is one; otherwise the signal that certainly reflected rays agree on, or NONE, or UNCLEAR."""
     if flag is not None:
         return FLAG
     total = ~seen.exact.transmitted & (seen.exact.cos_i > 0)
@@ -85,20 +96,20 @@ def recognise(seen: Seen, flag: np.ndarray | None) -> str:
         return NONE
     certain = total & (absolute_radicand(seen.rays) > CERTAIN)
     among = certain if certain.any() else total
-    shares = {name: float(teller(seen)[among].mean()) for name, teller in TELLERS.items()}
+    shares = {name: float(detector(seen)[among].mean()) for name, detector in DETECTORS.items()}
     best = max(shares, key=lambda name: shares[name])
-    return best if shares[best] >= ALIKE else UNCLEAR
+    return best if shares[best] >= AGREEING else UNCLEAR
 
 
-def reflected(seen: Seen, flag: np.ndarray | None, tir: str, decided: np.ndarray) -> np.ndarray:
-    """(N,) the rays that are said to be totally reflected. `decided`: where there is no doubt whether they are."""
+def reflected(seen: SeenAnswers, flag: np.ndarray | None, tir: str, decided: np.ndarray) -> np.ndarray:
+    """(N,) the rays that the answers call totally reflected. `decided`: (N,) where the error bound leaves no doubt."""
     if flag is not None and tir == FLAG:
         return ~flag
-    if tir == NONE:  # but those who think of the rays in doubt that they have it must say so somehow
-        return ~seen.directed & ~decided
-    return TELLERS[tir](seen) if tir in TELLERS else np.zeros(len(seen.b), bool)
+    if tir == NONE:  # a program may still take a ray in doubt for reflected, and answer no direction
+        return ~seen.is_direction & ~decided
+    return DETECTORS[tir](seen) if tir in DETECTORS else np.zeros(len(seen.b), bool)
 
 
 def has_direction(tir: str) -> bool:
-    """Whether a totally reflected ray must come with a direction, told so."""
+    """Whether the signal is itself a direction."""
     return tir in ("reflected", "tangent")
