@@ -62,6 +62,17 @@ def each_variant(request: pytest.FixtureRequest):
 
 
 @pytest.fixture
+def scalar_variant():
+    """`scalar_rgb`, which every wheel has."""
+    import mitsuba as mi
+
+    before = mi.variant()
+    mi.set_variant("scalar_rgb")
+    yield
+    mi.set_variant(before)
+
+
+@pytest.fixture
 def typical_variant(each_variant: str) -> str:
     """One variant a family and the one that differs most from it: for what no variant does by itself."""
     return each_variant
