@@ -61,6 +61,23 @@ def each_variant(request: pytest.FixtureRequest):
     mi.set_variant(before)
 
 
+@pytest.fixture
+def scalar_variant():
+    """`scalar_rgb`, which every wheel has."""
+    import mitsuba as mi
+
+    before = mi.variant()
+    mi.set_variant("scalar_rgb")
+    yield
+    mi.set_variant(before)
+
+
+@pytest.fixture
+def typical_variant(each_variant: str) -> str:
+    """One variant a family and the one that differs most from it: for what no variant does by itself."""
+    return each_variant
+
+
 @dataclass(frozen=True)
 class Setting:
     """A Dr.Jit backend in a precision, "float32" or "float64"."""
@@ -109,6 +126,7 @@ def _case(case: str | tuple[str, str]) -> tuple[str, str, str | None]:
     return "-".join(case), case[0], None if entry.usable else entry.reason
 
 
+TYPICAL = [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb", "_ad_spectral_polarized"))]
 CASES = {"each_variant": list(USABLE), "setting": SETTINGS, "vectorised": SETTINGS[1:]}
 
 
@@ -116,7 +134,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """A test for each variant or setting that runs here, and one that is skipped for each backend that does not."""
     for fixture in CASES.keys() & set(metafunc.fixturenames):
         parameters: dict[str, Any] = {}
-        for case in CASES[fixture]:
+        for case in TYPICAL if "typical_variant" in metafunc.fixturenames else CASES[fixture]:
             name, family, reason = _case(case)
             marks = pytest.mark.absent(f"all {family} tests of this file: {reason}") if reason else ()
             parameters[family if reason else name] = pytest.param(case, id=family if reason else name, marks=marks)
@@ -159,7 +177,7 @@ def follow(setting):
     """`trace` in the setting; paths as lists, without what follows their ends."""
     import numpy as np
 
-    from mi_refract.planar.tracer import trace
+    from mi_refract.planar import trace
 
     def run(segments, origins, directions, max_depth=16, **options):
         options = {"precision": setting.name, "backend": setting.backend, "weights": True} | options

@@ -20,6 +20,7 @@ class EmbeddedImages:
     """The images of one page, each file once. A finite value past ±65504 becomes ±65504. Errors: see `embed`."""
 
     def __init__(self, folder: Path = Path()) -> None:
+        """`folder` is what the paths given to `embed` are relative to."""
         self.folder = folder
         self.embedded: list[dict[str, Any]] = []
         self._files: dict[str, dict[str, Any]] = {}
@@ -72,6 +73,11 @@ def encoded(pixels: Any, limit: float = np.inf, scale: float = 1.0) -> dict[str,
         "data": data,
         "note": ", ".join(notes),
     }
+
+
+def packed(text: str) -> str:
+    """Text as base64 of its deflated UTF-8, which the page's script unpacks."""
+    return base64.b64encode(zlib.compress(text.encode(), 9)).decode()
 
 
 def shown(pixels: Any, channels: tuple[str, ...]) -> tuple[Any, str]:

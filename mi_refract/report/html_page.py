@@ -9,7 +9,8 @@ from typing import Any
 from mi_refract.io.atomic import write_atomically
 
 from .embedded_images import EmbeddedImages
-from .plots import compact
+from .first_page import code
+from .number_text import compact
 
 HERE = Path(__file__).parent / "templates"
 
@@ -21,13 +22,15 @@ def write_page(path: str | Path, template: str, content: Mapping[str, Any], imag
 
     options: Any = {"autoescape": True, "undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(loader=FileSystemLoader(HERE), **options)
-    environment.filters |= {"compact": compact, "words": words}
+    filters: dict[str, Any] = {"compact": compact, "words": words, "code": code}
+    environment.filters |= filters
     inline = {name: Markup((HERE / f"report.{name}").read_text("utf-8")) for name in ("css", "js")}
     text = environment.get_template(template).render(**content, **inline, images=images.embedded)
     write_atomically(path, text.encode("utf-8", "replace"))
 
 
 def words(value: Any) -> str:
+    """A value of the context as text: mappings and lists separated by commas."""
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {words(item)}" for key, item in value.items())
     return ", ".join(map(words, value)) if isinstance(value, list | tuple) else str(value)

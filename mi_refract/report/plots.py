@@ -1,4 +1,4 @@
-"""What a page shows: numbers as compact text, plots as SVG in the page's theme."""
+"""Plots as SVG elements in the colours of the page: curves, histograms, scatter plots."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+
+from .number_text import compact
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Panel
@@ -42,29 +44,6 @@ STYLE: dict[str, Any] = {
 }
 
 
-def compact(value: float, digits: int = 3) -> str:
-    """`value` in at most `digits` significant digits, whole numbers below 10⁵ in full: 1.23e-7, 8056."""
-    if not math.isfinite(value):
-        return str(float(value))
-    if value == int(value) and abs(value) < 1e5:
-        return str(int(value))
-    if 1e3 <= abs(value) < 1e5:
-        return f"{value:.{max(digits - 4, 0)}f}"
-    if 1e-2 <= abs(value) < 1e3:
-        return f"{value:.{digits}g}"
-    mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
-    return f"{mantissa.rstrip('0').rstrip('.') if '.' in mantissa else mantissa}e{int(exponent)}"
-
-
-def distinguishable(value: float, budget: float) -> tuple[str, str]:
-    """Both as text, with as many digits as it takes to tell them apart when they differ."""
-    for digits in range(3, 18):
-        texts = compact(value, digits), compact(budget, digits)
-        if texts[0] != texts[1] or value == budget:
-            return texts
-    return repr(value), repr(budget)
-
-
 @dataclass(frozen=True)
 class Axes:
     """Labels and scales, "log" or "linear", of a plot; `slope` is that of a dashed guide, y ~ x^slope.
@@ -79,6 +58,7 @@ class Axes:
     slope: float | None = None
 
     def __post_init__(self) -> None:
+        """Check the scales. Errors: ValueError."""
         if not {self.x_scale, self.y_scale} <= {"log", "linear"}:
             raise ValueError(f"axes: scales {self.x_scale!r}, {self.y_scale!r}; accepted: 'log', 'linear'")
         if self.slope is not None and self.logarithmic != "xy":
@@ -86,6 +66,7 @@ class Axes:
 
     @property
     def logarithmic(self) -> str:
+        """The axes that are logarithmic: "", "x", "y" or "xy"."""
         return ("x" if self.x_scale == "log" else "") + ("y" if self.y_scale == "log" else "")
 
 
@@ -95,11 +76,12 @@ def drawable(points: Points, axes: Axes) -> list[tuple[float, float]]:
     return [(x, y) for x, y in points if x_low < x < math.inf and y_low < y < math.inf]
 
 
-def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str) -> str:
-    """One line per name, and a dashed guide of the axes' slope from the first line's start.
+def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str, size: tuple[float, float] = (5.3, 3.0)) -> str:
+    """One line per name, and a dashed guide of the axes' slope from the first line's start; the legend is below.
 
     Points without a place on the axes are left out. "" where nothing can be drawn.
-    `salt` makes the ids inside the SVG unique on the page; the same arguments give the same bytes.
+    `salt` makes the ids inside the SVG unique on the page; the same arguments give the same bytes. `size` is width and
+    height in inches without the legend.
     """
     lines = {name: drawable(points, axes) for name, points in curves.items()}
     if not any(lines.values()):
@@ -109,7 +91,7 @@ def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str) -> str:
     with matplotlib.rc_context(_style(salt)):
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(5.3, 3.3), layout="constrained", dpi=72)
+        figure = Figure(layout="constrained", dpi=72)
         panel = figure.add_subplot(xscale=axes.x_scale, yscale=axes.y_scale, xlabel=axes.x, ylabel=axes.y)
         for i, (name, points) in enumerate(lines.items()):
             if points:
@@ -118,8 +100,17 @@ def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str) -> str:
         if axes.slope is not None:
             _guide(panel, [points for points in lines.values() if points], axes.slope)
         _ticks(panel, axes.logarithmic)
-        panel.legend()
+        _legend_below(figure, panel, size)
         return _page_svg(figure)
+
+
+def _legend_below(figure: Figure, panel: Panel, size: tuple[float, float]) -> None:
+    """A legend under the axes, where it covers no point, in as many columns as its longest name leaves room for."""
+    handles, names = panel.get_legend_handles_labels()
+    width, height = size
+    columns = max(1, min(len(names), int(width * 72 // (5 * max(map(len, names)) + 44))))
+    figure.set_size_inches(width, height + 0.21 * math.ceil(len(names) / columns))
+    figure.legend(handles, names, loc="outside lower left", ncols=columns, borderaxespad=0, columnspacing=1.2)
 
 
 def histogram_svg(values: Any, x: str, y: str, *, salt: str, bins: int = 20) -> str:
