@@ -32,14 +32,10 @@ def trace(
         int | None, typer.Option(min=0, help="Largest number of partial reflections on a path.")
     ] = None,
     rays: Annotated[int | None, typer.Option(min=1, help="Number of rays of each beam that has several.")] = None,
-    max_depth: Annotated[int | None, typer.Option(min=1, help="Largest number of boundaries on a path.")] = None,
+    max_depth: Annotated[int | None, typer.Option(min=1, help="Boundaries on a path, at most.")] = None,
     precision: Annotated[str, typer.Option(help="float64 or float32.")] = "float64",
-    formula: Annotated[
-        str | None, typer.Option(help="A formula of refraction by name; without it a planar one.")
-    ] = None,
-    arrays: Annotated[
-        str | None, typer.Option("--backend", help="llvm, cuda or scalar; `mi-refract doctor` says which run.")
-    ] = None,
+    formula: Annotated[str | None, typer.Option(help="A formula of refraction; the planar one by default.")] = None,
+    arrays: Annotated[str | None, typer.Option("--backend", help="llvm, cuda or scalar; see `doctor`.")] = None,
     keys: Annotated[
         bool, typer.Option("--keys", is_eager=True, callback=_print_keys, help="Print what a scene file may hold.")
     ] = False,
