@@ -1,4 +1,4 @@
-"""The Mitsuba BSDF `refract`, a drop-in for `dielectric`. Glue only: the mathematics is in formulas and fresnel.
+"""The Mitsuba BSDF `refract`, which takes the place of `dielectric`. The mathematics is in `mi_refract.formulas`.
 
 A plugin class belongs to one variant, so `plugin_class` builds it from that variant's module, and `register`
 makes it known there. Parameters: `int_ior`, `ext_ior` (number or a name from Mitsuba's table),
@@ -22,14 +22,14 @@ LOBES = ("specular_reflectance", "specular_transmittance")  # tint of the reflec
 
 
 class Side(NamedTuple):
-    """What a ray needs to know of the boundary from one side: k = n_from / n_to and κ = k² − 1, in float64."""
+    """The boundary as seen from one side: k = n_from / n_to and κ = k² − 1, in float64."""
 
     k: Any
     contrast: Any
 
 
 class Ray(NamedTuple):
-    """One refraction of `a` = −wi in the local frame: `eta` is n_to / n_from, `r` : `t` are the unpolarised powers."""
+    """A refracted ray in the local frame: a = −wi, `eta` = n_to / n_from, `r` : `t` the unpolarised powers."""
 
     a: Any
     side: Side
@@ -41,9 +41,9 @@ class Ray(NamedTuple):
 
 
 def read_ior(props: Any, name: str, default: str) -> float:
-    """The index of refraction in double precision, from a number or a name of Mitsuba's table.
+    """An index of refraction in double precision, from a number or a name in Mitsuba's table.
 
-    ValueError naming parameter, value and what is accepted, for anything but a positive finite number or a name.
+    ValueError with parameter, value and what is accepted, for all but a positive finite number or such a name.
     """
     value = props.get(name, default)
     if isinstance(value, str):

@@ -333,8 +333,11 @@ def test_a_frozen_render_follows_the_index_and_a_lamp_that_turns_grey(split_dept
         ({"max_depth": "deep"}, "max_depth = 'deep'"),
         ({"rr_depth": 0}, "rr_depth = 0: accepted: an integer ≥ 1"),
         ({"split_depth": -1}, "split_depth = -1: accepted: an integer ≥ 0"),
-        ({"split_depth": 13, "split_weight": 0.0}, "up to 8.19e+03 paths of a sample at once; accepted: up to 4096"),
-        ({"split_depth": 65}, "a split_depth up to 64"),
+        (
+            {"split_depth": 13, "split_weight": 0.0},
+            "split into 8.19e+03 paths; accepted: 2^split_depth or 1/split_weight up to 4096",
+        ),
+        ({"split_depth": 65}, "and split_depth up to 64"),
         ({"split_weight": 1.5}, "split_weight = 1.5: accepted: a number from 0 to 1"),
         ({"split_weight": float("nan")}, "split_weight = nan"),
         ({"deterministic": 1}, "deterministic = 1: accepted: true or false"),
