@@ -11,8 +11,8 @@ import pytest
 from support.browser import CHROMIUM, browse
 
 from mi_refract.image_diff import folders, html_report
+from mi_refract.image_diff.comparison import Comparison, Metric, Verdict
 from mi_refract.image_diff.folders import Result, Results, Status
-from mi_refract.image_diff.methods import Comparison, Metric, Verdict
 from mi_refract.io.image_file import write_exr
 from mi_refract.report.embedded_images import ROUNDED, EmbeddedImages, encoded, strongest
 
@@ -31,9 +31,9 @@ def results(folder):
     reference = image(folder / "reference" / "a.exr", 0.25)
     test = image(folder / "test" / "a.exr", 0.5)
     p = np.linspace(0, 1, 24, dtype=np.float32).reshape(4, 6)
-    figures = (Metric("tiles that differ", 12.0, 0.0), Metric("odd", math.nan, 1.0), Metric("smallest p", 1e-9))
+    metrics = (Metric("tiles that differ", 12.0, 0.0), Metric("odd", math.nan, 1.0), Metric("smallest p", 1e-9))
     maps = {"t": 8 * p - 4, "p": p, "q": p, "flags": 0 * p}
-    found = Comparison("welch", Verdict.DIFFERENT, "12 tiles differ.", figures, 0.013, maps)
+    found = Comparison("welch", Verdict.DIFFERENT, "12 tiles differ.", metrics, 0.013, maps)
     return Results(
         folder / "reference",
         folder / "test",
@@ -106,7 +106,7 @@ def test_renders_in_a_folder_are_shown_as_their_mean(tmp_path):
         for i in range(4):
             noise = np.random.default_rng([i, ord(side)]).normal(1 + (side == "t"), 0.01, (8, 8, 3))
             image(tmp_path / side / f"{i}.exr", noise.astype(np.float32))
-    found = folders.diff(tmp_path / "r", tmp_path / "t", samples=True, maps=True)
+    found = folders.diff(tmp_path / "r", tmp_path / "t", renders=True, maps=True)
     assert found.exit_code == 1
     images = re.findall(r'data-channels="3" data-scale="1.0">([^<]*)<', html(tmp_path, found))
     means = [decoded(data).astype(float).mean() for data in images]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from mi_refract import FORMULAS, oracle, regimes
+from mi_refract.image_diff.defects import DEFECTS
 from mi_refract.image_diff.methods import METHODS
-from mi_refract.image_diff.self_test import DEFECTS
 from mi_refract.plugins import refract as bsdf
 from mi_refract.report.row import Row
 from mi_refract.report.run_report import read_json
