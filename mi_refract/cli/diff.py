@@ -21,6 +21,7 @@ from mi_refract.image_diff import folders, html_report, text_reports
 from mi_refract.image_diff import self_test as self_tests
 from mi_refract.image_diff import settings as diff_settings
 from mi_refract.image_diff.folders import Results, Status
+from mi_refract.image_diff.methods import AUTO
 from mi_refract.io.atomic import writable
 from mi_refract.rendering.scene_files import provenance
 from mi_refract.report.junit import printable
@@ -30,7 +31,7 @@ from . import self_test_scenes
 Folder = Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")]
 Other = Annotated[Path, typer.Argument(metavar="TEST", help="What is compared with it, of the same kind.")]
 NotAlways = Annotated[
-    Path | None, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them; no need for --self-test.")
+    Path | None, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them; --self-test can do without.")
 ]
 NotWithSelfTest = Annotated[Path | None, typer.Argument(metavar="TEST", help="What is compared with it.")]
 Method = Annotated[str, typer.Option(help=f"How: {'|'.join(diff_settings.ACCEPTED)}; see --methods.")]
@@ -58,14 +59,17 @@ class Inconclusive(enum.StrEnum):
 def _print_methods(asked: bool) -> None:
     if asked:
         text = diff_settings.reference()
-        print(text) if not sys.stdout.isatty() else Console().print(Markdown(text))
+        if sys.stdout.isatty():
+            Console().print(Markdown(text))
+        else:
+            print(text)
         raise typer.Exit
 
 
 def diff(
     reference: NotAlways = None,
     test: NotWithSelfTest = None,
-    method: Method = diff_settings.AUTO,
+    method: Method = AUTO,
     options: Set = None,
     renders: Annotated[bool, typer.Option("--renders", help="Each folder holds renders of one image.")] = False,
     samples: Annotated[bool, typer.Option("--samples", hidden=True)] = False,
@@ -96,7 +100,7 @@ def diff(
     renders = renders or samples
     if self_test:
         others = (options, renders, settings, allow_nonfinite, inconclusive, report, junit, json, github)
-        if any(others) or method != diff_settings.AUTO:
+        if any(others) or method != AUTO:
             raise ValueError("--self-test asks every method and prints; accepted: no other option")
         raise typer.Exit(_self_test(reference, test))
     if reference is None or test is None:
@@ -128,7 +132,7 @@ def diff(
 def accept(
     reference: Folder,
     test: Other,
-    method: Method = diff_settings.AUTO,
+    method: Method = AUTO,
     options: Set = None,
     settings: File = None,
     allow_nonfinite: Nonfinite = None,

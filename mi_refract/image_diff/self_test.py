@@ -87,16 +87,20 @@ class Tally:
         found = stats.binomtest(self.seen, self.trials, alternative="less")
         return float(found.proportion_ci(CONFIDENCE, method="exact").high)
 
+    def refuse(self) -> None:
+        """Count a trial whose images could not be compared: that is seen."""
+        self.seen, self.trials = self.seen + 1, self.trials + 1
+
     def ask(self, method: str, reference: Renders, test: Renders) -> None:
         """Compare the first image of each side, or all where the method takes several. A refusal counts as seen."""
         sides = [[image_file.named(name, x) for x in side] for name, side in (("reference", reference), ("test", test))]
         whole = METHODS[method].takes_renders
-        self.trials += 1
         try:
             found = methods.compare(method, *(side if whole else side[0] for side in sides))
         except (ValueError, OSError):
-            self.seen += 1
+            self.refuse()
             return
+        self.trials += 1
         self.seen += found.verdict is Verdict.DIFFERENT
         self.inconclusive += found.verdict is Verdict.INCONCLUSIVE
         if math.isfinite(found.minimum_detectable):
@@ -120,7 +124,7 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
             spoilt = trial.spoil()
         except (ValueError, OSError):
             for tally in tallies.values():
-                tally.seen, tally.trials = tally.seen + 1, tally.trials + 1
+                tally.refuse()
             continue
         if np.array_equal(spoilt[0], trial.clean[0]):
             return Row(STUDY, name, case, setting, reason="left out: it changes nothing in these images")
@@ -130,18 +134,30 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
             cleans.append([block_mean(image, TILE) for image in trial.clean])
             changes.append(np.mean([block_mean(image, TILE) for image in spoilt], 0) - np.mean(cleans[-1], 0))
     sizes = _sizes(np.array(changes), np.concatenate(cleans), tallies) if cleans else {}
+    replay = {"trials": len(trials), "renders a side": len(trials[0].clean)}
+    return _row(name, always_due, tallies, sizes, replay, case, setting)
+
+
+def _row(
+    name: str,
+    always_due: bool,
+    tallies: dict[str, Tally],
+    sizes: dict[str, float],
+    replay: dict[str, int],
+    case: str,
+    setting: str,
+) -> Row:
     large = sizes.get(RATIO, 0.0) > 1
     due = [m for m in tallies if always_due or m == "exact" or (large and METHODS[m].takes_renders)]
     values = {method: tally.rate for method, tally in tallies.items()}
     values |= {"missed": float(sum(tallies[m].trials - tallies[m].seen for m in due)), **sizes}
-    replay = {"trials": len(trials), "renders a side": len(trials[0].clean), "due": due}
-    return Row(STUDY, name, case, setting, values, {"missed": 0.0}, replay=replay)
+    return Row(STUDY, name, case, setting, values, {"missed": 0.0}, replay=replay | {"due": due})
 
 
 def _sizes(changes: Pixels, clean: Pixels, tallies: dict[str, Tally]) -> dict[str, float]:
-    """Of the tile and channel where the change is largest compared with what could be detected there.
+    """Of the tile and channel where the change is largest compared with the noise there.
 
-    What is printed is a median over tiles; in a tile noisier than the median one it is so much more.
+    The minimum detectable difference is printed for the median tile; in a noisier tile it is so much larger.
     """
     printed = [x for method, tally in tallies.items() if METHODS[method].takes_renders for x in tally.detectable]
     if not printed or len(clean) < 2:

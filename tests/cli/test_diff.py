@@ -7,6 +7,7 @@ import importlib.util
 import json
 import os
 import shlex
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -118,6 +119,13 @@ def test_the_methods_are_printed_without_images(run):
     for name, method in methods.METHODS.items():
         assert f"`{name}`: {method.summary}" in out
         assert all(f"| `{option}` |" in out for option in method.options)
+
+
+def test_on_a_terminal_the_methods_are_tables(run, monkeypatch):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    code, out, err = run("diff", "--methods")
+    assert (code, err) == (0, "")
+    assert "fail_relative" in out and "|---|" not in out
 
 
 # Bad input --------------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 
@@ -309,6 +310,20 @@ def test_variance_channels_take_the_place_of_several_renders(kind):
 
 
 # The table -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_method_runs_once(method, monkeypatch):
+    calls = []
+    real = METHODS[method]
+
+    def counted(*sides, **options):
+        calls.append(sides)
+        return real.function(*sides, **options)
+
+    monkeypatch.setitem(METHODS, method, replace(real, function=functools.wraps(real.function)(counted)))
+    assert judge(method, image(SMOOTH), image(SMOOTH * (1 + 1e-7))).verdict in (EQUAL, DIFFERENT)
+    assert len(calls) == 1
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from support.browser import CHROMIUM, browse
 
-from mi_refract.image_diff import folders, html_report
+from mi_refract.image_diff import flip, folders, html_report
 from mi_refract.image_diff.comparison import Comparison, Metric, Verdict
 from mi_refract.image_diff.folders import Result, Results, Status
+from mi_refract.image_diff.settings import How, Settings
+from mi_refract.io import image_file
 from mi_refract.io.image_file import write_exr
 from mi_refract.report.embedded_images import ROUNDED, EmbeddedImages, encoded, strongest
 
@@ -111,6 +113,22 @@ def test_renders_in_a_folder_are_shown_as_their_mean(tmp_path):
     images = re.findall(r'data-channels="3" data-scale="1.0">([^<]*)<', html(tmp_path, found))
     means = [decoded(data).astype(float).mean() for data in images]
     assert means == pytest.approx([1, 2], abs=0.01)
+
+
+@pytest.mark.parametrize("method", ["tolerance", "flip"])
+def test_every_file_is_read_once_and_flip_runs_once_for_verdict_and_page(tmp_path, monkeypatch, method):
+    sides = [image(tmp_path / side / "a.exr", value) for side, value in (("r", 0.25), ("t", 0.5))]
+    reads, runs = [], []
+    read, flip_map = image_file.read, flip.flip_map
+    for module, name in ((image_file, "read"), (html_report, "read")):
+        monkeypatch.setattr(module, name, lambda path: reads.append(path) or read(path))
+    monkeypatch.setattr(flip, "flip_map", lambda *sides: runs.append(sides) or flip_map(*sides))
+    settings = Settings(How(method))
+    whole = html(tmp_path, folders.diff(*sides, settings, maps=True))
+    assert sorted(reads) == sorted(sides) and len(runs) == 1 and "flip" in dict(roles(whole))
+    monkeypatch.setattr(folders, "HELD", 0)
+    again = html(tmp_path, folders.diff(*sides, settings, maps=True))
+    assert len(reads) == 6 and roles(again) == roles(whole)
 
 
 def test_a_full_page_keeps_the_numbers_and_says_what_is_left_out(tmp_path, monkeypatch):

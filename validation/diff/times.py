@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from mi_refract.image_diff import folders, html_report
-from mi_refract.image_diff.methods import METHODS
-from mi_refract.image_diff.settings import AUTO, How, Settings
+from mi_refract.image_diff.methods import AUTO, METHODS
+from mi_refract.image_diff.settings import How, Settings
 from mi_refract.io import image_file
 from mi_refract.report.row import Row
 from validation.run import kernel_timing
