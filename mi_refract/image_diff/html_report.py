@@ -22,7 +22,8 @@ from mi_refract.io.image_file import Image, one_line, read
 from mi_refract.io.pixels import Pixels, block_mean
 from mi_refract.report.embedded_images import EmbeddedImages, encoded, shown, strongest
 from mi_refract.report.html_page import write_page
-from mi_refract.report.plots import compact, distinguishable, histogram_svg
+from mi_refract.report.number_text import compact, distinguishable
+from mi_refract.report.plots import histogram_svg
 
 from . import flip, folders
 from .comparison import Maps, Metric

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from mi_refract.io.atomic import write_atomically
 from mi_refract.report import junit
 from mi_refract.report.junit import printable
-from mi_refract.report.plots import compact, distinguishable
+from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.row import strict
 
 from .comparison import Metric
@@ -25,7 +25,7 @@ from .folders import Result, Results, Status
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-SCHEMA = 2
+SCHEMA = 1
 FEW = 20  # equal images that are listed one by one
 SUMMARY_ROWS = 500  # GitHub cuts a summary at 1 MiB
 WORDS = {
@@ -80,7 +80,7 @@ def write_json(path: str | Path, results: Results) -> None:
 
 
 def as_data(results: Results) -> dict[str, Any]:
-    """`{"schema": 2, "exit_code", "sentence", "reference", "test", "counts", "results": [...]}`."""
+    """`{"schema": 1, "exit_code", "sentence", "reference", "test", "counts", "results": [...]}`."""
     counts = Counter(result.status for result in results.results)
     return {
         "schema": SCHEMA,

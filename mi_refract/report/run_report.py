@@ -19,7 +19,7 @@ from mi_refract.io.atomic import write_atomically
 from . import junit, study_page
 from .embedded_images import EmbeddedImages
 from .html_page import write_page
-from .plots import distinguishable
+from .number_text import distinguishable
 from .row import SCHEMA, Row, by_study, strict
 
 if TYPE_CHECKING:

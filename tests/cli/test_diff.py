@@ -312,7 +312,7 @@ def test_json(run, strange, tmp_path):
         raise AssertionError(f"{word} is no JSON")
 
     data = json.loads(out.read_text(), parse_constant=refuse)
-    assert data["schema"] == 2
+    assert data["schema"] == 1
     assert data["exit_code"] == 1
     assert data["counts"] == {"error": 0, "different": 2, "inconclusive": 0, "equal": 1}
     by_name = {result["name"]: result for result in data["results"]}

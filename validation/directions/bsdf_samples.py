@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.formulas.bounds import cancelling
+from mi_refract.formulas import cancelling
 from mi_refract.report.row import Row
 from validation.run.context import Context, Task
 
@@ -89,7 +89,7 @@ def _mode_row(mode: Any, mode_name: str, count: int, variant: str) -> Row:
     budgets |= {"eta worst": 2e-7, "lobe flips": 1e-3 * count}
     budgets |= {f"{name} p99": 4e-6 for name in ("wo", "pdf", "weight")}
     if mi.is_polarized:  # a radicand on either side of the boundary, and its error in three factors of the weight
-        budgets["weight worst"] = 6 * float(cancelling(2).margin(2.0**-24, INT_IOR))
+        budgets["weight worst"] = 6 * float(cancelling(2).radicand_error_bound(2.0**-24, INT_IOR))
     replay = {"count": 3 * count, "seed": SEED, **description}
     return Row("samples", "refract − dielectric", mode_name, variant, values, budgets, replay=replay)
 

@@ -16,7 +16,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import regimes
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 from validation.directions.judge import Subject
 
 from .array_settings import PLAIN, Setting
