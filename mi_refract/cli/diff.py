@@ -13,7 +13,6 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console, RenderableType
-from rich.markdown import Markdown
 from rich.progress import Progress
 
 from mi_refract.image_diff import accept as accepting
@@ -60,6 +59,8 @@ def _print_methods(asked: bool) -> None:
     if asked:
         text = diff_settings.reference()
         if sys.stdout.isatty():
+            from rich.markdown import Markdown
+
             Console().print(Markdown(text))
         else:
             print(text)
@@ -118,6 +119,12 @@ def diff(
     if report:
         software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
         html_report.write(report, found, software, _replay(found, chosen, settings))
+    _write(found, junit, json, github)
+    raise typer.Exit(found.exit_code)
+
+
+def _write(found: Results, junit: Path | None, json: Path | None, github: bool) -> None:
+    """The forms for programs, as far as they are asked for."""
     if junit:
         text_reports.write_junit(junit, found)
     if json:
@@ -126,7 +133,6 @@ def diff(
         for line in text_reports.workflow_commands(found):
             print(line)
         text_reports.append_summary(found)
-    raise typer.Exit(found.exit_code)
 
 
 def accept(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -284,6 +286,13 @@ def test_nan_is_allowed_where_it_is_named(tmp_path):
     settings = Settings(allow_nonfinite=("a.exr",))
     statuses = found(diff.diff(tmp_path / "old", tmp_path / "new", settings))
     assert statuses == {"a.exr": ("equal", "unchanged"), "b.exr": ("different", "changed")}
+
+
+def test_the_readme_names_every_method_and_its_settings_are_accepted(rules):
+    text = (Path(diff.__file__).parent / "README.md").read_text("utf-8")
+    assert all(f"| `{name}` |" in text for name in methods.METHODS)
+    (example,) = re.findall("```toml\n(.*?)```", text, re.DOTALL)
+    assert rules(example)[0][1].method == "tolerance"
 
 
 BAD_RULES = {
