@@ -100,7 +100,7 @@ def _run(options: argparse.Namespace) -> int:
     from mi_refract.report import run_report
     from validation.run.context import PROFILES, SCALAR_PROFILES, Context
 
-    from . import readme_tables, runner
+    from . import headline, readme_tables, runner
 
     start = time.perf_counter()
     variant = backend.activate(may_restart=True)
@@ -119,13 +119,14 @@ def _run(options: argparse.Namespace) -> int:
         for name, study in studies.items()
     }
     described["scatter"] = [scatter for study in studies.values() for scatter in getattr(study, "SCATTER", [])]
+    described["first_page"] = headline.first_page(rows)
     run_report.write_json(options.out / "rows.json", rows, described)
     run_report.write_junit(options.out / "junit.xml", rows, described)
     run_report.write_html(options.out / "report.html", rows, described, options.out)
     if options.readme:
         readme_tables.update(options.readme, rows, context)
     runner.forget(context)
-    _print_summary(run_report.summary(rows), options.out / "report.html")
+    _print_summary(run_report.summary(rows, described), options.out / "report.html")
     return 1 if any(row.verdict == "fail" for row in rows) else 0
 
 
