@@ -31,6 +31,7 @@ from .folders import Result, Results, Status
 from .text_reports import sentence
 
 PAGE = 14_000_000  # bytes of images on a page of at most 15 MB
+FULL = "Not embedded: the page is full."
 IMAGE, MAP = 4_600_000, 1_200_000  # bytes of one: two images and three maps are a page
 MAP_WIDTH, FLIP_WIDTH = 960, 640
 SIGNED = ("difference", "t")
@@ -47,7 +48,14 @@ def write(path: str | Path, results: Results, context: Mapping[str, Any] | None 
     An image that cannot be read (any more) is a line on the page. Errors: OSError for the page itself.
     """
     images = EmbeddedImages()
-    failures = [_failure(number, result, results, images) for number, result in enumerate(results.of(*FAILED), 1)]
+    failures: list[dict[str, Any]] = []
+    full = False
+    for number, result in enumerate(results.of(*FAILED), 1):
+        panes, note = ([], FULL) if full else _panes(result)
+        # The first pair is shown, however large; after one that does not fit no other is tried.
+        full = full or bool(images.embedded and images.size + _bytes(panes) > PAGE)
+        panes, note = ([], FULL) if full else ([images.add(pane) for pane in panes], note)
+        failures.append(_failure(number, result, results) | _shown_panes(panes, note))
     counts = Counter(result.status for result in results.results)
     content = {
         "title": "mi-refract diff",
@@ -63,18 +71,23 @@ def write(path: str | Path, results: Results, context: Mapping[str, Any] | None 
     write_page(path, "diff.html.j2", content, images)
 
 
-def _failure(number: int, result: Result, results: Results, images: EmbeddedImages) -> dict[str, Any]:
+def _bytes(panes: list[dict[str, Any]]) -> int:
+    return sum(len(pane["data"]) for pane in panes)
+
+
+def _shown_panes(panes: list[dict[str, Any]], note: str) -> dict[str, Any]:
+    one_size = len({(pane["width"], pane["height"]) for pane in panes[:2]}) == 1
+    return {"panes": panes, "paired": one_size and len(panes) > 1, "note": note}
+
+
+def _failure(number: int, result: Result, results: Results) -> dict[str, Any]:
     found = result.comparison
     p_values = found.maps.get("p") if found else None
-    panes, note = _panes(result, images) if images.size < PAGE else ([], "Not embedded: the page is full.")
     return _line(result) | {
         "key": f"pair-{number}",
         "category": str(result.category),
         "asked": result.how.reason,
         "minimum_detectable": found.minimum_detectable if found and math.isfinite(found.minimum_detectable) else None,
-        "panes": panes,
-        "paired": len({(pane["width"], pane["height"]) for pane in panes[:2]}) == 1 and len(panes) > 1,
-        "note": note,
         "histogram": "" if p_values is None else _histogram(p_values, f"pair-{number}"),
         "commands": [
             (verb, command)
@@ -112,13 +125,13 @@ def _histogram(p_values: Pixels, salt: str) -> str:
 # Panes --------------------------------------------------------------------------------------------------------------
 
 
-def _panes(result: Result, images: EmbeddedImages) -> tuple[list[dict[str, Any]], str]:
+def _panes(result: Result) -> tuple[list[dict[str, Any]], str]:
     """What can be shown of a pair, and why the rest cannot."""
     sides, notes = _sides(result)
     makers: list[Maker] = [functools.partial(_image, role, image) for role, image in sides.items()]
     makers += _map_makers(result.comparison.maps if result.comparison else {}, *sides.values())
     with ThreadPoolExecutor(2) as pool:  # deflating is most of the work, and lets go of the interpreter's lock
-        return [images.add(pane) for pane in pool.map(lambda make: make(), makers)], " ".join(notes)
+        return list(pool.map(lambda make: make(), makers)), " ".join(notes)
 
 
 def _sides(result: Result) -> tuple[dict[str, Image], list[str]]:

@@ -131,6 +131,16 @@ def test_every_file_is_read_once_and_flip_runs_once_for_verdict_and_page(tmp_pat
     assert len(reads) == 6 and roles(again) == roles(whole)
 
 
+def test_a_pair_that_does_not_fit_any_more_is_left_out(tmp_path, monkeypatch):
+    found = results(tmp_path)
+    alone = html(tmp_path, Results(found.reference, found.test, found.results[1:2]))
+    size = sum(len(data) for data in re.findall(r'data-scale="[^"]*">([^<]*)<', alone))
+    for pairs, factor in ((1, 1.9), (2, 2.1)):
+        monkeypatch.setattr(html_report, "PAGE", factor * size)
+        text = html(tmp_path, Results(found.reference, found.test, found.results[1:2] * 3))
+        assert len(roles(text)) == 6 * pairs and text.count("the page is full") == 3 - pairs
+
+
 def test_a_full_page_keeps_the_numbers_and_says_what_is_left_out(tmp_path, monkeypatch):
     found = results(tmp_path)
     monkeypatch.setattr(html_report, "PAGE", 1)
