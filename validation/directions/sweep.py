@@ -13,14 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_refract import oracle, regimes
+from mi_refract.accuracy import BUDGETS, judge_formula
 from mi_refract.formulas import FORMULAS, Budget
 from mi_refract.regimes import Rays
 from mi_refract.report.row import Row
 from validation.reference.fast_reference import Screen
 from validation.run.array_settings import Setting, budget_of, settings
 from validation.run.context import Context, Task
-
-from .judge import BUDGETS, judge
 
 TITLE = "Sweep"
 TEXT = __doc__.partition("\n")[2].strip()
@@ -143,10 +142,10 @@ def _certified_row(name: str, regime: str, setting: Setting, found: Gathered, co
     certain = np.arange(len(rays)) < len(rays) - len(found.unresolved.rays)
     entry, reason = regimes.REGIMES[regime], setting.no_budget(budget_of(name), regime)
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-    seen = judge(FORMULAS[name], rays, exact, setting.vector, budget_of(name))
+    seen = judge_formula(FORMULAS[name], rays, exact, setting.vector, budget_of(name))
     wrong = seen.misjudged
     values = {
-        "worst / u": float(np.max(seen.chord, where=seen.right, initial=0)) / setting.roundoff,
+        "worst / u": float(np.max(seen.chord, where=seen.compared, initial=0)) / setting.roundoff,
         **({} if reason else seen.values()),
         "misjudged": float(found.misjudged.offered + (wrong & ~certain).sum()),
         "screen off": _disagreement(found, seen.chord[certain] / setting.roundoff, wrong[certain]),

@@ -16,8 +16,8 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import regimes
+from mi_refract.accuracy import Subject
 from mi_refract.formulas import FORMULAS
-from validation.directions.judge import Subject
 
 from .array_settings import PLAIN, Setting
 from .context import Context
