@@ -96,7 +96,8 @@ class RayBounds:
             return found
         u = self.u[some]
         found[some] = absolute_radicand(rays) > self.budget.radicand_error_bound(u, self.k[some])
-        return found & ~self.side_open
+        decided: Flags = found & ~self.side_open
+        return decided
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,8 @@ class Judgement:
     @functools.cached_property
     def far(self) -> Flags:
         """Misjudged although the radicand exceeds what the bound leaves open; or undecided by the oracle."""
-        return self.bounds.decided_of(self.misjudged) | self.bounds.exact.undecided
+        far: Flags = self.bounds.decided_of(self.misjudged) | self.bounds.exact.undecided
+        return far
 
     @functools.cached_property
     def wrong(self) -> Flags:
@@ -139,7 +141,8 @@ class Judgement:
     def crossed(self) -> Flags:
         """On the other side of the surface, where the bound leaves the side open."""
         exact = self.bounds.exact
-        return self.bounds.side_open & self.compared & exact.transmitted & (self.error > exact.cos_t)
+        crossed: Flags = self.bounds.side_open & self.compared & exact.transmitted & (self.error > exact.cos_t)
+        return crossed
 
     @property
     @np.errstate(over="ignore", invalid="ignore")
