@@ -97,7 +97,7 @@ def _right(rows: Sequence[Row]) -> Answer:
             f"Through {bodies} bodies with a known answer, from a prism to a camera lens, {stay} their error bounds."
         )
     if sentences:
-        sentences.insert(0, "No." if any(row.verdict == "fail" for row in measured) else "Yes.")
+        sentences.insert(0, "No: a check failed." if any(row.verdict == "fail" for row in measured) else "Yes.")
     return _answer(question, " ".join(sentences), measured, DIRECTIONS)
 
 

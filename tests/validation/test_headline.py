@@ -58,7 +58,7 @@ def test_what_is_right_is_said_with_numbers():
 def test_what_is_wrong_is_not_praised(metric, value, words):
     spoilt = dataclasses.replace(OURS, values={**WORST, metric: value}, budgets={metric: 1.0})
     right = answers(spoilt)[0]
-    assert right["state"] == "no" and right["text"].startswith("No.") and words in right["text"]
+    assert right["state"] == "no" and right["text"].startswith("No: a check failed.") and words in right["text"]
     assert metric != "worst / u" or "no more than rounding" not in right["text"]
 
 
