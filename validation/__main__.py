@@ -119,7 +119,7 @@ def _run(options: argparse.Namespace) -> int:
         for name, study in studies.items()
     }
     described["scatter"] = [scatter for study in studies.values() for scatter in getattr(study, "SCATTER", [])]
-    described["first_page"] = headline.first_page(rows)
+    described["first_page"] = headline.first_page(rows, context.profile.name)
     run_report.write_json(options.out / "rows.json", rows, described)
     run_report.write_junit(options.out / "junit.xml", rows, described)
     run_report.write_html(options.out / "report.html", rows, described, options.out)

@@ -25,15 +25,16 @@ EFFICIENCY, INTEGRATOR, EQUAL_TIME, METHODS = "efficiency", "refract_path", "equ
 PATHS, MIRAGE, ASTRAY, ROUNDED = "paths", "mirage", "astray", "exact, indices in float32"
 LAYERS, SHALLOW = 1000, "89.55°"
 INDICES, CONTRASTS = (f"mirage askew, {LAYERS} layers, {given}" for given in ("indices", "contrasts"))
-RENDERERS = "other renderers"
+RENDERERS, QUICK = "other renderers", "quick"
 INSTALL = "python -m validation renderers --install "
 NOT_MEASURED = "Not measured in this run."
 LEAD = "`refract` is this project's drop-in replacement for Mitsuba's material of smooth glass, `dielectric`."
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-# What would bring the rows whose reason begins so.
+# What would bring the rows whose reason says so.
 REMEDIES = {
     "no NVIDIA driver": "an NVIDIA GPU with its driver",
     "left out: the profile": "`--profile full`",
+    "in the full profile only": "`--profile full`",
     INSTALL: RENDERERS,
 }
 
@@ -45,11 +46,11 @@ PLOTTED = {
 }
 
 
-def first_page(rows: Sequence[Row]) -> FirstPage:
+def first_page(rows: Sequence[Row], profile: str = "") -> FirstPage:
     """The questions and their answers, the images of the scene in which the plugins differ, and error against time."""
     page: FirstPage = {
         "lead": LEAD,
-        "answers": [_right(rows), _trusted(rows), _fast(rows), _differ(rows), _missing(rows)],
+        "answers": [_right(rows), _trusted(rows), _fast(rows), _differ(rows), _missing(rows, profile)],
     }
     if image := _image(rows):
         page["image"] = image
@@ -96,7 +97,7 @@ def _right(rows: Sequence[Row]) -> Answer:
             f"Through {bodies} bodies with a known answer, from a prism to a camera lens, {stay} their error bounds."
         )
     if sentences:
-        sentences.insert(0, "No." if any(row.verdict == "fail" for row in measured) else "Yes.")
+        sentences.insert(0, "No: a check failed." if any(row.verdict == "fail" for row in measured) else "Yes.")
     return _answer(question, " ".join(sentences), measured, DIRECTIONS)
 
 
@@ -209,24 +210,28 @@ def _layers_sentence(rows: Sequence[Row]) -> str:
     return f"After {LAYERS} thin layers of air, entered at {SHALLOW}, {off}."
 
 
-def _missing(rows: Sequence[Row]) -> Answer:
+def _missing(rows: Sequence[Row], profile: str) -> Answer:
     question = "What was not run, and what would bring it?"
     groups = not_run(rows)
+    more = (
+        f" The profile `{QUICK}` leaves studies out; `--profile standard` runs every study." if profile == QUICK else ""
+    )
     if not groups:
-        return {"question": question, "text": "Everything was run.", "state": "plain", "study": ""}
+        text = more.strip() or "Everything was run."
+        return {"question": question, "text": text, "state": "plain", "study": ""}
     counts: dict[str, int] = {}
     renderers = []
     for reason, found in groups.items():
         if reason.startswith(INSTALL):
             renderers.append(reason.removeprefix(INSTALL))
-        remedy = next((words for start, words in REMEDIES.items() if reason.startswith(start)), "")
+        remedy = next((words for part, words in REMEDIES.items() if part in reason), "")
         counts[remedy] = counts.get(remedy, 0) + len(found)
     others = counts.pop("", 0)
     parts = [f"{number} need {remedy}" for remedy, number in sorted(counts.items(), key=lambda item: -item[1])]
     parts += [f"{others} have other reasons"] if others else []
     text = f"{sum(map(len, groups.values())):,} of {len(rows):,} measurements: {'; '.join(parts)}."
     text = text.replace(RENDERERS, f"{RENDERERS}, by `{INSTALL}{','.join(sorted(renderers))}`")
-    return {"question": question, "text": text, "state": "plain", "study": NOT_RUN}
+    return {"question": question, "text": text + more, "state": "plain", "study": NOT_RUN}
 
 
 def _image(rows: Sequence[Row]) -> ShownImage | None:

@@ -96,7 +96,8 @@ class RayBounds:
             return found
         u = self.u[some]
         found[some] = absolute_radicand(rays) > self.budget.radicand_error_bound(u, self.k[some])
-        return found & ~self.side_open
+        decided: Flags = found & ~self.side_open
+        return decided
 
 
 @dataclass(frozen=True)

@@ -184,6 +184,16 @@ def test_html_says_everything(tmp_path):
     assert "Not drawn: 2 points" in text  # of curve b
 
 
+def test_every_section_offers_its_rows(tmp_path):
+    text = html(tmp_path)
+    run_report.write_json(tmp_path / "rows.json", ROWS, CONTEXT)
+    written = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    for key, rows in (("study-1", written[:3]), ("study-2", written[3:])):
+        assert f'href="rows.json" download="{key}.json" data-rows="{key}-rows">{len(rows)} row' in text
+        data = re.search(f'id="{key}-rows">([^<]*)<', text)[1]
+        assert json.loads(zlib.decompress(base64.b64decode(data))) == rows
+
+
 def test_html_is_reproducible_with_unique_ids(tmp_path):
     twice = [*ROWS, dataclasses.replace(INFO, case="again")]
     text = html(tmp_path, twice)

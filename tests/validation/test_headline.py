@@ -8,6 +8,11 @@ import pytest
 from mi_refract.report.first_page import STATES
 from mi_refract.report.row import Row
 from validation import headline
+from validation.directions import per_formula
+from validation.efficiency import error_against_time
+from validation.ground_truth import traced_bodies
+from validation.renders import against_dielectric
+from validation.stability import layered_paths, optical_chains
 
 WORST = {"worst rad": 5e-8, "worst / u": 0.9, "misjudged": 0.0, "misjudged far": 0.0}
 OURS = Row(
@@ -20,6 +25,13 @@ SPHERE = Row("renders", "refract", "sphere", "llvm_ad_rgb", RENDER, {"Welch alar
 MIRAGE = dataclasses.replace(SPHERE, case="mirage", values={**RENDER, "Welch alarms": 7.0}, budgets={})
 ABSENT = Row("directions", "promoted", "all", "cuda float32", reason="no NVIDIA driver: libcuda.so.1 not found")
 RENDERER = Row("per_ray", "PyGLM", "every set", "f32", reason="python -m validation renderers --install pyglm")
+
+
+def test_the_metrics_are_those_of_the_studies():
+    assert {headline.ROUNDOFFS, headline.MISJUDGED, headline.FAR, headline.COMMON} <= per_formula.TERMS.keys()
+    assert headline.EQUAL_TIME in error_against_time.TERMS and headline.ASTRAY in layered_paths.TERMS
+    assert {headline.CHANGED, headline.ALARMS, headline.TIME} <= against_dielectric.TERMS.keys()
+    assert headline.BOUNDED in traced_bodies.TERMS and headline.SHALLOW in optical_chains.TERMS
 
 
 def answers(*rows):
@@ -46,7 +58,7 @@ def test_what_is_right_is_said_with_numbers():
 def test_what_is_wrong_is_not_praised(metric, value, words):
     spoilt = dataclasses.replace(OURS, values={**WORST, metric: value}, budgets={metric: 1.0})
     right = answers(spoilt)[0]
-    assert right["state"] == "no" and right["text"].startswith("No.") and words in right["text"]
+    assert right["state"] == "no" and right["text"].startswith("No: a check failed.") and words in right["text"]
     assert metric != "worst / u" or "no more than rounding" not in right["text"]
 
 
@@ -74,6 +86,7 @@ def test_what_was_not_run_is_counted_by_what_would_bring_it():
     assert "1 need other renderers, by `python -m validation renderers --install pyglm`" in text
     assert "1 have other reasons" in text
     assert answers(OURS)[4]["text"] == "Everything was run."
+    assert "`--profile standard` runs every study" in headline.first_page([OURS], "quick")["answers"][4]["text"]
 
 
 def test_the_image_is_of_the_scene_that_differs_and_the_plot_of_methods_in_turn():
