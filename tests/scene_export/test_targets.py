@@ -220,6 +220,12 @@ def test_ply_is_read_by_mitsuba(small, tmp_path):
     np.testing.assert_array_equal(vertices[faces], small.meshes[0].triangles().astype(np.float32))
 
 
+def test_the_map_has_no_date(small, sky, tmp_path):
+    """So that the same scene gives the same bytes."""
+    write_files.write(PlainScene("turned", small.meshes, sky, CAMERA, 12), "mitsuba", tmp_path / "new")
+    assert image_file.read(tmp_path / "new" / "sky.exr").metadata["DateTime"] == "1970:01:01 00:00:00"
+
+
 @pytest.mark.parametrize("module", [cycles, luxcore, povray, obj], ids=lambda module: module.__name__.split(".")[-1])
 def test_maps_are_looked_up_by_unit_directions(module, sky):
     """Every direction is somewhere on the map, and a resampled map shows in each what the sky shows there."""
