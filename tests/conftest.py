@@ -50,26 +50,32 @@ def needs_variant() -> Callable[[str], None]:
     return check
 
 
-@pytest.fixture(scope="module")
-def each_variant(request: pytest.FixtureRequest):
-    """Every variant of the wheel; tests are in the order of variants, because a switch takes a tenth of a second."""
-    import mitsuba as mi
+@pytest.fixture(autouse=True)
+def variant(request: pytest.FixtureRequest) -> str:
+    """The variant of the test: its parameter, else the best that runs here. Switched only where it is another one."""
+    parameters = request.node.callspec.params if hasattr(request.node, "callspec") else {}
+    wanted: str = parameters.get("each_variant", VARIANT)
+    if wanted != VARIANT or "mitsuba" in sys.modules:
+        import mitsuba as mi
 
-    before = mi.variant()
-    mi.set_variant(request.param)
-    yield request.param
-    mi.set_variant(before)
+        if mi.variant() != wanted:
+            mi.set_variant(wanted)
+    return wanted
+
+
+@pytest.fixture(scope="module")
+def each_variant(request: pytest.FixtureRequest) -> str:
+    """Every variant of the wheel; tests are in the order of variants, because a switch takes a tenth of a second."""
+    return request.param
 
 
 @pytest.fixture
-def scalar_variant():
-    """`scalar_rgb`, which every wheel has."""
+def scalar_variant() -> None:
+    """`scalar_rgb` for the test."""
     import mitsuba as mi
 
-    before = mi.variant()
-    mi.set_variant("scalar_rgb")
-    yield
-    mi.set_variant(before)
+    if mi.variant() != "scalar_rgb":
+        mi.set_variant("scalar_rgb")
 
 
 @pytest.fixture(scope="module")
