@@ -50,31 +50,43 @@ def needs_variant() -> Callable[[str], None]:
     return check
 
 
+@pytest.fixture(autouse=True)
+def variant(request: pytest.FixtureRequest) -> str:
+    """The variant of the test: its parameter, else the best that runs here. Switched only where it is another one."""
+    parameters = request.node.callspec.params if hasattr(request.node, "callspec") else {}
+    wanted: str = parameters.get("each_variant", VARIANT)
+    if wanted != VARIANT or "mitsuba" in sys.modules:
+        import mitsuba as mi
+
+        if mi.variant() != wanted:
+            mi.set_variant(wanted)
+    return wanted
+
+
+@pytest.fixture(scope="module")
+def each_variant(request: pytest.FixtureRequest) -> str:
+    """Every variant of the wheel; tests are in the order of variants, because a switch takes a tenth of a second."""
+    return request.param
+
+
 @pytest.fixture
-def each_variant(request: pytest.FixtureRequest):
-    """Every variant of the wheel, skipped with the reason where it cannot run; see `pytest_generate_tests`."""
+def scalar_variant() -> None:
+    """`scalar_rgb` for the test."""
     import mitsuba as mi
 
-    before = mi.variant()
-    mi.set_variant(request.param)
-    yield request.param
-    mi.set_variant(before)
+    if mi.variant() != "scalar_rgb":
+        mi.set_variant("scalar_rgb")
 
 
-@pytest.fixture
-def scalar_variant():
-    """`scalar_rgb`, which every wheel has."""
-    import mitsuba as mi
-
-    before = mi.variant()
-    mi.set_variant("scalar_rgb")
-    yield
-    mi.set_variant(before)
-
-
-@pytest.fixture
+@pytest.fixture(scope="module")
 def typical_variant(each_variant: str) -> str:
     """One variant a family and the one that differs most from it: for what no variant does by itself."""
+    return each_variant
+
+
+@pytest.fixture(scope="module")
+def polarized_variant(each_variant: str) -> str:
+    """Every variant with Mueller matrices."""
     return each_variant
 
 
@@ -126,7 +138,11 @@ def _case(case: str | tuple[str, str]) -> tuple[str, str, str | None]:
     return "-".join(case), case[0], None if entry.usable else entry.reason
 
 
-TYPICAL = [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb", "_ad_spectral_polarized"))]
+# Subsets of the variants, by the fixture that asks for them.
+SUBSETS = {
+    "typical_variant": [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb", "_ad_spectral_polarized"))],
+    "polarized_variant": [name for name in USABLE if name.endswith("_polarized")],
+}
 CASES = {"each_variant": list(USABLE), "setting": SETTINGS, "vectorised": SETTINGS[1:]}
 
 
@@ -134,12 +150,12 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """A test for each variant or setting that runs here, and one that is skipped for each backend that does not."""
     for fixture in CASES.keys() & set(metafunc.fixturenames):
         parameters: dict[str, Any] = {}
-        for case in TYPICAL if "typical_variant" in metafunc.fixturenames else CASES[fixture]:
+        subsets = [cases for name, cases in SUBSETS.items() if name in metafunc.fixturenames]
+        for case in subsets[0] if fixture == "each_variant" and subsets else CASES[fixture]:
             name, family, reason = _case(case)
             marks = pytest.mark.absent(f"all {family} tests of this file: {reason}") if reason else ()
             parameters[family if reason else name] = pytest.param(case, id=family if reason else name, marks=marks)
-        scope = None if fixture == "each_variant" else "module"
-        metafunc.parametrize(fixture, list(parameters.values()), indirect=True, scope=scope)
+        metafunc.parametrize(fixture, list(parameters.values()), indirect=True, scope="module")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -26,10 +26,8 @@ BLACK = {"type": "diffuse", "reflectance": 0.0}
 @pytest.fixture
 def llvm(needs_variant):
     needs_variant(LLVM)
-    before = mi.variant()
-    mi.set_variant(LLVM)
-    yield
-    mi.set_variant(before)
+    if mi.variant() != LLVM:
+        mi.set_variant(LLVM)
 
 
 def load(name, resolution=32, **parameters):
