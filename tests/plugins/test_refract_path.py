@@ -79,8 +79,12 @@ def test_where_nothing_is_left_out_the_numbers_and_the_image_are_those_of_path(n
         assert pixelwise.changes(theirs, ours, 1e-4).share <= 1e-3
 
 
-@pytest.mark.parametrize("name", [*GLASS_ONLY, *MIXED])
-@pytest.mark.parametrize("parameters", [{}, {"split_depth": 1}, {"split_depth": 4, "rr_depth": 3}], ids=str)
+FOLLOWED = [(name, {}) for name in (*GLASS_ONLY, *MIXED)]
+FOLLOWED += [(name, {"split_depth": 1}) for name in ("balls", "sphere")]
+FOLLOWED += [(name, {"split_depth": 4, "rr_depth": 3}) for name in ("slab", "lightpipe", "nested")]
+
+
+@pytest.mark.parametrize(("name", "parameters"), FOLLOWED, ids=str)
 def test_other_numbers_give_the_same_mean(name, parameters, llvm):
     """Welch's test on tiles, one false alarm in 1000 images."""
     scene = load(name)
@@ -252,8 +256,9 @@ def difference(scene, method, step=0.02):
     return (means[1] - means[0]) / (2 * step)
 
 
-@pytest.mark.parametrize("mixed", [False, True], ids=["glass", "mixed"])
-@pytest.mark.parametrize("split", [0, 2])
+@pytest.mark.parametrize(
+    ("mixed", "split"), [(False, 0), (True, 0), (False, 2)], ids=["glass", "mixed", "glass that would split"]
+)
 def test_the_derivative_in_the_index_is_that_of_the_image(mixed, split, llvm):
     """Smooth light and no edges, so that nothing is discontinuous. Standard errors are below 2 % on either side."""
 
