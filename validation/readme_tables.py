@@ -12,6 +12,7 @@ from mi_refract.image_diff import self_test
 from mi_refract.image_diff.methods import METHODS
 from mi_refract.io import image_file
 from mi_refract.io.atomic import update_between, write_atomically
+from mi_refract.io.pixels import srgb_encode
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
@@ -216,10 +217,10 @@ def seen(rows: list[Row]) -> str:
         ]
     )
     trials = next(iter(defects.values()))
-    detectable = _percent([row.values["detectable"] for row in trials], digits=1)
+    detectable = _percent([row.values[self_test.DETECTABLE] for row in trials], digits=1)
     replay, scenes = trials[0].replay, ", ".join(row.case for row in trials)
     text = f"{scenes}; {replay['trials']} trials each of {replay['renders a side']} renders a side. "
-    text += f"Detectable in a tile: {detectable}."
+    text += f"Minimum detectable difference in a tile: {detectable}."
     return _table(text, ["planted", *(f"`{name}`" for name in METHODS)], cells)
 
 
@@ -275,7 +276,7 @@ def gallery(rows: list[Row], context: Context) -> bytes:
         strip = [x for tile in row for x in (tile, gap)][:-1]
         strips += [np.concatenate(strip, axis=1), np.ones((4, sum(x.shape[1] for x in strip), 3), np.float32)]
     linear = np.clip(np.concatenate(strips[:-1]), 0, 1)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055).astype(np.float32)
+    encoded = srgb_encode(linear).astype(np.float32)
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "gallery.png"
         image = oiio.ImageBuf(np.ascontiguousarray(encoded))

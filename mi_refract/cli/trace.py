@@ -33,7 +33,7 @@ def trace(
     ] = None,
     rays: Annotated[int | None, typer.Option(min=1, help="Number of rays of each beam that has several.")] = None,
     max_depth: Annotated[int | None, typer.Option(min=1, help="Boundaries on a path, at most.")] = None,
-    precision: Annotated[str, typer.Option(help="float64 or float32.")] = "float64",
+    precision: Annotated[str, typer.Option(help="float64, or float32 with LLVM or CUDA.")] = "float64",
     formula: Annotated[str | None, typer.Option(help="A formula of refraction; the planar one by default.")] = None,
     arrays: Annotated[str | None, typer.Option("--backend", help="llvm, cuda or scalar; see `doctor`.")] = None,
     keys: Annotated[

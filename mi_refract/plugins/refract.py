@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from mi_refract.formulas import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, fresnel, resolve
+from mi_refract.formulas import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, fresnel, local_cosines, resolve
 from mi_refract.numerics import differentiated, ieee_divide, replace_grad
 
 PLUGIN = "refract"
@@ -162,8 +162,9 @@ def plugin_class(v: Any) -> type:
             k, eta = (dr.select(outside, *x) for x in ((self.k_outer, self.k_inner), (self.k_inner, self.k_outer)))
             side = Side(k, (k - 1) * (k + 1))
             # Unchecked: the ratio is checked where it is set, and NaN stays NaN.
-            wo, transmitted = self.formula.unchecked(a, v.Vector3f(0, 0, 1), *side)
-            return Ray(a, side, wo, v.Float(eta), transmitted, *fresnel.local_odds(a, transmitted, *side))
+            local = local_cosines(a.x, a.y, a.z, side.contrast)
+            wo, transmitted = self.formula.unchecked(a, v.Vector3f(0, 0, 1), *side, local)
+            return Ray(a, side, wo, v.Float(eta), transmitted, *fresnel.local_odds(local, transmitted, *side))
 
         @staticmethod
         def _attached(value: Any) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mi_refract.image_diff import methods
+from mi_refract.image_diff.comparison import Verdict
 from mi_refract.io import image_file
 from mi_refract.scene_export import from_mitsuba, tessellation, write_files
 from mi_refract.scene_export.plain_scene import Camera, Diffuse, Environment, Glass, Light, Mesh, PlainScene
@@ -116,13 +117,13 @@ def test_the_plain_scene_renders_equal(name, level, tmp_path):
     write_files.write(from_mitsuba.load(path, level=level, **size), "mitsuba", tmp_path / "plain")
     other = mi.load_file(str(tmp_path / "plain" / "scene.xml"), optimize=False, parallel=False)
     first = renders(one, 0)
-    assert methods.compare("welch", first, renders(other, 100), tile=16).verdict == methods.Verdict.EQUAL
+    assert methods.compare("welch", first, renders(other, 100), tile=16).verdict == Verdict.EQUAL
     text = (tmp_path / "plain" / "scene.xml").read_text()
     material = '<float name="int_ior" value="1.5046"/>'
     assert material in text
     (tmp_path / "plain" / "scene.xml").write_text(text.replace(material, '<float name="int_ior" value="1.8"/>'))
     wrong = mi.load_file(str(tmp_path / "plain" / "scene.xml"), optimize=False, parallel=False)
-    assert methods.compare("welch", first, renders(wrong, 100), tile=16).verdict == methods.Verdict.DIFFERENT
+    assert methods.compare("welch", first, renders(wrong, 100), tile=16).verdict == Verdict.DIFFERENT
 
 
 # --- Radiance --------------------------------------------------------------------------------------------

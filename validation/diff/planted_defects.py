@@ -1,4 +1,4 @@
-"""The gate: what `mi-refract diff` sees of defects in real renders, and how often it alarms at equal ones.
+"""What `mi-refract diff` sees of defects in real renders, and how often it alarms at equal ones.
 
 Defects of a renderer are planted in the glass, those of an image in the pixels. The ball of the scene `sphere` holds a
 lamp here, off its centre: without one η² on the way in and 1/η² on the way out cancel on every path, and no path is
@@ -17,13 +17,14 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.image_diff import self_test
+from mi_refract.image_diff.defects import DEFECTS
 from mi_refract.plugins import refract
 from mi_refract.rendering.scene_files import REPRODUCIBLE
 from mi_refract.report.row import Row
 from validation.run.context import SCENES, Context, Task
 from validation.run.render_methods import Camera
 
-TITLE = "Gate"
+TITLE = "Image comparison, planted defects"
 TEXT = __doc__.partition("\n")[2].strip() + " " + (self_test.__doc__ or "").partition("\n")[2].strip()
 GLASS = "refract_spoilt"  # the plugin's name is followed by that of the defect
 NAMES = ("sphere", "prism")
@@ -105,7 +106,7 @@ GLASSES: dict[str, tuple[str, Callable[[Any, type], Any]]] = {
 TERMS = (
     self_test.TERMS
     | {name: text for name, (text, _) in GLASSES.items()}
-    | {name: defect.text for name, defect in self_test.DEFECTS.items()}
+    | {name: defect.text for name, defect in DEFECTS.items()}
     | {OTHER_SAMPLER: "multijitter: other random numbers, the same image"}
 )
 
@@ -176,7 +177,7 @@ def defect_rows(context: Context, name: str) -> list[Row]:
     clean = trials(name)
     cameras = {defect: opened(name, f"{GLASS} {defect}") for defect in GLASSES}
     rows = [_row(defect, clean, name, context, camera) for defect, camera in cameras.items()]
-    for defect, planted in self_test.DEFECTS.items():
+    for defect, planted in DEFECTS.items():
         spoilt = [self_test.Trial(t.clean, t.other, functools.partial(planted.spoil, t.clean)) for t in clean]
         rows.append(self_test.detection(defect, planted.always_due, spoilt, name, context.variant))
     rows.append(_row(OTHER_SAMPLER, clean, name, context, opened(name, sampler="multijitter")))

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refract.image_diff import methods as compare
+from mi_refract.image_diff import tile_statistics
 from mi_refract.plugins import scene_features
 from mi_refract.report.row import Row
 from validation.run import kernel_timing
@@ -247,11 +247,11 @@ def _values(subject: Subject, builtins: list[Subject], found: Found, references:
     for metric in METRICS[1:]:
         ratios = [t / s for t, s in zip(test.cost(metric), same.cost(metric), strict=True)]
         values[f"equal-time {metric}"] = statistics.median(ratios)
-    agreed = compare.welch(references, np.stack(test.images), TILE, FAMILY_ERROR, MARGIN)
+    agreed = tile_statistics.compare_stacks(references, np.stack(test.images), TILE, FAMILY_ERROR, MARGIN)
     return values | {
         "Welch alarms": float(agreed.alarms),
         "smallest p, adjusted": agreed.smallest_p,
-        "detectable difference": agreed.detectable,
+        "detectable difference": agreed.minimum_detectable(),
     }
 
 

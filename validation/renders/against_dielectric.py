@@ -18,7 +18,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.formulas import FORMULAS, automatic
-from mi_refract.image_diff import methods as compare
+from mi_refract.image_diff import pixelwise, tile_statistics
 from mi_refract.io import image_file
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.row import Row
@@ -145,11 +145,11 @@ def _metrics(plugins: list[str]) -> list[str]:
 
 def _paired(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """Same seeds, image by image."""
-    found = compare.paired(reference.reshape(-1, *reference.shape[2:]), test.reshape(-1, *test.shape[2:]), CHANGED)
+    found = pixelwise.changes(reference.reshape(-1, *reference.shape[2:]), test.reshape(-1, *test.shape[2:]), CHANGED)
     return {
-        "changed share": found.changed,
+        "changed share": found.share,
         "largest change": found.largest,
-        "RMSE": found.rmse,
+        "RMSE": found.rms,
         "|mean ratio − 1|": abs(found.mean_ratio - 1),
     }
 
@@ -164,11 +164,11 @@ def no_question(test: np.ndarray, reference: np.ndarray) -> str:
 
 
 def _independent(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    found = compare.welch(reference, test, TILE, FAMILY_ERROR, MARGIN)
+    found = tile_statistics.compare_stacks(reference, test, TILE, FAMILY_ERROR, MARGIN)
     return {
         "Welch alarms": float(found.alarms),
         "smallest p, adjusted": found.smallest_p,
-        "detectable difference": found.detectable,
+        "detectable difference": found.minimum_detectable(),
     }
 
 
@@ -178,7 +178,7 @@ def _curves(context: Context, cameras: dict[str, Camera], reference: np.ndarray)
     for spp in context.profile.curve_spp:
         for name, camera in cameras.items():
             points = [camera(spp, seed=context.profile.pairs + i) for i in range(CURVE_SEEDS)]
-            error = statistics.fmean(compare.relative_mse(image, reference) for image, _ in points)
+            error = statistics.fmean(tile_statistics.relative_mse(image, reference) for image, _ in points)
             curves[name].append((statistics.median(seconds for _, seconds in points), error))
     return curves
 
