@@ -10,6 +10,7 @@ from mi_refract import oracle, regimes
 from mi_refract.formulas.documented import FORMULAS
 from mi_refract.numerics import float_expansions
 from mi_refract.regimes import REGIMES, Rays
+from validation import limits
 from validation.directions import search, sweep, worst_rays
 from validation.directions.judge import errors, evaluate, judge
 from validation.directions.worst_rays import Found
@@ -53,7 +54,7 @@ def test_the_screen_is_right_where_it_is_certain(regime, measured):
     assert (wrong == (transmitted != exact.transmitted))[certain].all()
     compared = certain & ~wrong
     certified = errors(b, rays, exact)[0] / measured.roundoff
-    assert np.abs(chord - certified)[compared].max(initial=0) <= sweep.SCREEN_BUDGET
+    assert np.abs(chord - certified)[compared].max(initial=0) <= limits.SCREEN_OFF
     # Neither has terms at k = 1 along the surface; their sum is up to twice the larger one.
     theirs, ours = oracle.margin(rays.a, rays.n, rays.k)[certain], screen.margin[certain]
     assert (np.isnan(theirs) == np.isnan(ours)).all()

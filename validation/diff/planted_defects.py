@@ -20,11 +20,10 @@ from mi_refract.image_diff import self_test
 from mi_refract.plugins import refract
 from mi_refract.rendering.scene_files import REPRODUCIBLE
 from mi_refract.report.row import Row
-from validation.run.context import SCENES, Context, Task
+from validation.run.context import SCENES, Context
 from validation.run.render_methods import Camera
+from validation.study import Study, Task, about
 
-TITLE = "Gate"
-TEXT = __doc__.partition("\n")[2].strip() + " " + (self_test.__doc__ or "").partition("\n")[2].strip()
 GLASS = "refract_spoilt"  # the plugin's name is followed by that of the defect
 NAMES = ("sphere", "prism")
 LAMP = """
@@ -37,7 +36,7 @@ LAMP = """
 </scene>"""
 RESOLUTION, SPP, TRIALS, RENDERS = 64, 16, 8, 6  # of the detection: renders a side
 NULL_RESOLUTION, NULL_SPP, NULL_RENDERS = 32, 4, 4
-NULL_PAIRS = {"quick": 640, "full": 2000}  # with 640 two alarms may be: their bound is 0.98 %
+NULL_PAIRS = {"standard": 640, "full": 2000}  # with 640 two alarms may be: their bound is 0.98 %
 SHEET = 80  # images of a render: it costs less than as many renders
 PARTS = ("sensor", "film", "sampler")
 SCALAR = "needs a compiled variant: thousands of renders"
@@ -102,6 +101,7 @@ GLASSES: dict[str, tuple[str, Callable[[Any, type], Any]]] = {
     "black TIR": ("total internal reflection gives nothing back", _sampling(_black_inside)),
     "swapped lobes": ("reflection as often as transmission should be", _sampling(_swapped_lobes)),
 }
+NAME = self_test.STUDY
 TERMS = (
     self_test.TERMS
     | {name: text for name, (text, _) in GLASSES.items()}
@@ -169,7 +169,7 @@ def tasks(context: Context) -> list[Task]:
 
 def defect_rows(context: Context, name: str) -> list[Row]:
     if context.variant.startswith("scalar"):
-        return [Row(self_test.STUDY, "every defect", name, context.variant, reason=SCALAR)]
+        return [Row(NAME, "every defect", name, context.variant, reason=SCALAR)]
     import mitsuba as mi
 
     register(getattr(mi, context.variant))
@@ -184,7 +184,7 @@ def defect_rows(context: Context, name: str) -> list[Row]:
     about = {"resolution": RESOLUTION, "spp": SPP, "renders": len(every)}
     return [
         *rows,
-        Row(self_test.STUDY, "renders", name, context.variant, {"noise": self_test.noise(every)}, replay=about),
+        Row(NAME, "renders", name, context.variant, {"noise": self_test.noise(every)}, replay=about),
     ]
 
 
@@ -209,7 +209,7 @@ def _row(defect: str, clean: list[self_test.Trial], name: str, context: Context,
 def null_rows(context: Context, name: str) -> list[Row]:
     """Pairs of independent renders, and about as many of the same seed by a scene loaded twice."""
     if context.variant.startswith("scalar"):
-        return [Row(self_test.STUDY, "null pairs", name, context.variant, reason=SCALAR)]
+        return [Row(NAME, "null pairs", name, context.variant, reason=SCALAR)]
     count = NULL_PAIRS[context.profile.name]
     first, second = (opened(name, resolution=NULL_RESOLUTION, count=SHEET) for _ in range(2))
     sides = (_sheet(first, seed) for seed in range(count * 2 * NULL_RENDERS // SHEET))
@@ -223,3 +223,6 @@ def null_rows(context: Context, name: str) -> list[Row]:
 def _sheet(camera: Camera, seed: int) -> np.ndarray:
     """One render, cut into its independent images."""
     return np.stack(np.split(camera(NULL_SPP, seed)[0], SHEET, axis=1))
+
+
+STUDY = Study(NAME, "Gate", about(__doc__), TERMS, tasks)

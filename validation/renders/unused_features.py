@@ -21,11 +21,12 @@ import numpy as np
 from mi_refract.formulas.documented import FORMULAS
 from mi_refract.plugins.refract import LOBES, PLUGIN
 from mi_refract.report.row import Row
+from validation import limits
 from validation.run import kernel_timing
-from validation.run.context import SCENES, Context, Task
+from validation.run.context import SCENES, Context
 from validation.run.render_methods import opened
+from validation.study import Study, Task, about
 
-TITLE = "What a scene does not use"
 TERMS = {
     "operations": "Dr.Jit's count for the whole kernel; of `sample` alone, or of a render",
     "added": "operations more than those of the plain plugin, in radiance mode, with both lobes",
@@ -38,33 +39,29 @@ TERMS = {
     "frozen": "an image by a function under `dr.freeze`, over the same one traced anew; warm",
     "off after an edit": "largest difference between the two after an index was edited: 0, or the frozen one is stale",
 }
-TEXT = __doc__.partition("\n")[2].strip()
-STUDY = "features"
+NAME = "features"
 BUILTIN = "dielectric"
 RAYS = 1024
 RESOLUTION = 32
 SEED = 2026
 GLASSES = (1, 16, 64, 1000)
-FIRST_IMAGE_GOALS = {64: 0.6, 1000: 0.15}
-EDIT_GOAL = 0.2
 PAIRS = 5
 CALLS = 2000
 STEPS = 4  # of an optimisation
-UNCHANGED = 1e-5  # of a pixel: the order in which samples are added up
 SCALAR = "scalar variants have no kernels"
 
 
 def tasks(context: Context) -> list[Task]:
     calls = Task("features: scalar calls", functools.partial(scalar_rows, context))
     if context.variant.startswith("scalar"):
-        return [Task("features", lambda: [Row(STUDY, PLUGIN, "kernels", context.variant, reason=SCALAR)]), calls]
+        return [Task("features", lambda: [Row(NAME, PLUGIN, "kernels", context.variant, reason=SCALAR)]), calls]
     return [
         Task("features: operations", functools.partial(operation_rows, context)),
         Task("features: glasses", functools.partial(glass_rows, context)),
         Task("features: optimisation", functools.partial(optimisation_rows, context)),
         *(
             Task(f"features: first image, {n} glasses", functools.partial(first_image_rows, context, n))
-            for n in FIRST_IMAGE_GOALS
+            for n in limits.FIRST_IMAGE
         ),
         Task("features: edit", functools.partial(edit_rows, context)),
         Task("features: frozen", functools.partial(frozen_rows, context)),
@@ -154,7 +151,7 @@ def scalar_rows(context: Context) -> list[Row]:
 
         seconds = kernel_timing.rounds({name: name for name in bsdfs}, clock, PAIRS)
     values = kernel_timing.ratio(f"call / {BUILTIN}", seconds[PLUGIN], seconds[BUILTIN])
-    return [Row(STUDY, PLUGIN, "a call of sample", "scalar_rgb", values, replay={"calls": CALLS})]
+    return [Row(NAME, PLUGIN, "a call of sample", "scalar_rgb", values, replay={"calls": CALLS})]
 
 
 def bitmap() -> dict[str, Any]:
@@ -177,7 +174,7 @@ def operation_rows(context: Context) -> list[Row]:
         budgets = {"added": values[f"added, {BUILTIN}"]} if less else {}
         goals = {"operations": plain[BUILTIN]} if case == "plain" else {}
         replay = {"rays": RAYS} | {key: str(value) for key, value in asked.items()}
-        return Row(STUDY, PLUGIN, case, variant, values, budgets, goals, replay=replay)
+        return Row(NAME, PLUGIN, case, variant, values, budgets, goals, replay=replay)
 
     rows = [
         row("plain"),
@@ -190,7 +187,7 @@ def operation_rows(context: Context) -> list[Row]:
     rows.append(row("derivative in eta", shared=False, differentiate=True))
     polarised = context.variant.replace("rgb", "mono_polarized")
     if reason := context.variants[polarised]:
-        rows.append(Row(STUDY, PLUGIN, "polarised", polarised, reason=reason))
+        rows.append(Row(NAME, PLUGIN, "polarised", polarised, reason=reason))
     else:
         rows.append(row("polarised", variant=polarised))
     rows += [row(f"formula {name}", shared=False, parameters={"formula": name}) for name in FORMULAS]
@@ -281,7 +278,7 @@ def glass_rows(context: Context) -> list[Row]:
                 }
             budgets = {"operations, over two glasses": 0.0, "compiled": 0.0} if plugin == PLUGIN else {}
             rows.append(
-                Row(STUDY, plugin, f"{count} glasses", context.variant, values, budgets, replay={"glasses": count})
+                Row(NAME, plugin, f"{count} glasses", context.variant, values, budgets, replay={"glasses": count})
             )
     return rows
 
@@ -301,7 +298,7 @@ def optimisation_rows(context: Context) -> list[Row]:
             "eta moved": abs(float(balls.params[balls.eta][0]) - before),
         }
     return [
-        Row(STUDY, PLUGIN, "optimisation of eta", context.variant, values, {"compiled": 0.0}, replay={"steps": STEPS})
+        Row(NAME, PLUGIN, "optimisation of eta", context.variant, values, {"compiled": 0.0}, replay={"steps": STEPS})
     ]
 
 
@@ -323,7 +320,7 @@ def first_image_rows(context: Context, count: int) -> list[Row]:
         with alone(plugin, count) as balls:
             return seconds_of(balls.image)
 
-    return [ratio_row(context, f"first image, {count} glasses", "first image", clock, FIRST_IMAGE_GOALS[count])]
+    return [ratio_row(context, f"first image, {count} glasses", "first image", clock, limits.FIRST_IMAGE[count])]
 
 
 def edit_rows(context: Context) -> list[Row]:
@@ -340,7 +337,7 @@ def edit_rows(context: Context) -> list[Row]:
 
             return seconds_of(edited)
 
-    return [ratio_row(context, "edit of one of 16 glasses", "edit", clock, EDIT_GOAL)]
+    return [ratio_row(context, "edit of one of 16 glasses", "edit", clock, limits.EDIT)]
 
 
 def ratio_row(context: Context, case: str, metric: str, clock: Callable[[str], float], goal: float) -> Row:
@@ -348,7 +345,7 @@ def ratio_row(context: Context, case: str, metric: str, clock: Callable[[str], f
     values = kernel_timing.ratio(f"{metric} / {BUILTIN}", seconds[PLUGIN], seconds[BUILTIN])
     values |= {f"{metric}, {plugin}": float(np.median(x)) for plugin, x in seconds.items()}
     return Row(
-        STUDY, PLUGIN, case, context.variant, values, goals={f"{metric} / {BUILTIN}": goal}, replay={"pairs": PAIRS}
+        NAME, PLUGIN, case, context.variant, values, goals={f"{metric} / {BUILTIN}": goal}, replay={"pairs": PAIRS}
     )
 
 
@@ -372,12 +369,12 @@ def frozen_rows(context: Context) -> list[Row]:
             del replay, subjects
     return [
         Row(
-            STUDY,
+            NAME,
             PLUGIN,
             f"frozen, {count} glasses",
             context.variant,
             values,
-            {"off after an edit": UNCHANGED},
+            {"off after an edit": limits.FROZEN},
             replay={"glasses": count},
         )
     ]
@@ -391,7 +388,7 @@ def boundary_rows(context: Context) -> list[Row]:
             plugin: boundaries(opened(SCENES / f"{name}.xml", plugin, RESOLUTION)) for plugin in (PLUGIN, BUILTIN)
         }
         values[f"boundaries / {BUILTIN}"] = values[PLUGIN] / values[BUILTIN]
-        rows.append(Row(STUDY, PLUGIN, f"{name}: boundaries", context.variant, values, replay={"seed": SEED}))
+        rows.append(Row(NAME, PLUGIN, f"{name}: boundaries", context.variant, values, replay={"seed": SEED}))
     return rows
 
 
@@ -415,3 +412,6 @@ def boundaries(scene: Any, spp: int = 64, most: int = 192) -> float:
     state = (mi.UInt32(0), mi.Bool(True), ray, sampler)
     met, *_ = dr.while_loop(state, lambda met, active, ray, sampler: active, bounce)
     return float(np.array(met).mean())
+
+
+STUDY = Study(NAME, "What a scene does not use", about(__doc__), TERMS, tasks)

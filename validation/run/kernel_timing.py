@@ -17,7 +17,9 @@ import numpy as np
 
 from mi_refract import regimes
 from mi_refract.formulas.documented import FORMULAS
+from validation import limits
 from validation.directions.judge import Subject
+from validation.run.metrics import TIME_OVER_COPY, TIME_OVER_PLAIN
 
 from .array_settings import PLAIN, Setting
 from .context import Context
@@ -26,8 +28,8 @@ COPY = "copy"
 SEED = 2026
 DIFFERENT = 1 << 16  # rays; the rest of a stream repeats them
 TERMS = {
-    "time / copy": "median time of a ray over that of copying its bytes, streaming; low, high: its 95 % interval",
-    "time / plain": f"the same over the time of `{PLAIN}`",
+    TIME_OVER_COPY: "median time of a ray over that of copying its bytes, streaming; low, high: its 95 % interval",
+    TIME_OVER_PLAIN: f"the same over the time of `{PLAIN}`",
     "operations": "Dr.Jit's count for the whole kernel",
     "compile ms": "code generation and compilation of the kernel, by Dr.Jit's record, with a literal no cache can know",
 }
@@ -46,9 +48,9 @@ def measure(context: Context, setting: Setting) -> dict[str, dict[str, float]]:
     inputs = _inputs(setting, rays)
     clock = _scalar_clock(inputs) if setting.is_scalar else _kernel_clock(inputs)
     seconds = rounds(subjects, clock, context.profile.repeats)
-    found = {name: ratio("time / copy", seconds[name], seconds[COPY]) for name in subjects}
+    found = {name: ratio(TIME_OVER_COPY, seconds[name], seconds[COPY]) for name in subjects}
     for name, subject in subjects.items():
-        found[name] |= ratio("time / plain", seconds[name], seconds[PLAIN])
+        found[name] |= ratio(TIME_OVER_PLAIN, seconds[name], seconds[PLAIN])
         if setting.backend == "cuda":
             found[name] |= interval("ns per ray", [s / rays * 1e9 for s in seconds[name]])
         if not setting.is_scalar:
@@ -61,8 +63,8 @@ def goals(subject: str, setting: Setting) -> dict[str, float]:
     if setting.is_scalar or subject not in FORMULAS:
         return {}
     if (goal := FORMULAS[subject].time_goal) is None:
-        return {"time / copy": 1 / 0.9}
-    return {"time / plain": goal} if setting.label == "llvm float32" else {}
+        return {TIME_OVER_COPY: limits.COPY_TIME}
+    return {TIME_OVER_PLAIN: goal} if setting.label == "llvm float32" else {}
 
 
 def rounds(subjects: dict[str, Any], clock: Callable[[Any], float], repeats: int) -> dict[str, list[float]]:

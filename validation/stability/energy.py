@@ -19,14 +19,16 @@ from mi_refract import oracle, regimes
 from mi_refract.formulas import fresnel
 from mi_refract.formulas.documented import resolve
 from mi_refract.report.row import Row
+from validation import limits
 from validation.directions.bsdf_samples import sample_all
 from validation.directions.judge import lengths
 from validation.reference.diffuse_fresnel import GRADE, hemispherical, nodes
 from validation.run.array_settings import Setting, settings
-from validation.run.context import Context, Task
+from validation.run.context import Context
+from validation.run.metrics import MISCLASSIFIED
+from validation.study import Study, Task, about
 
-TITLE = "Energy"
-TEXT = __doc__.partition("\n")[2].strip()
+NAME = "energy"
 AXES = {"x": "|k − 1|", "y": "error of R, in u", "x_scale": "log", "y_scale": "log", "slope": -1}
 BUILTIN = "mi.fresnel"
 TERMS = {
@@ -47,13 +49,9 @@ TERMS = {
 }
 SEED = 2028
 INDICES = (1.0003, 1.1, 1.33, 1.5, 2.42)
-# What the study holds the forms to; they promise 3.12u of R and 2u of T (see `fresnel._powers`).
-POWERS = {"R / u": 4.0, "1 − R / u": 4.0}
-SUMMED = POWERS | {"R + T − 1 / u": 4.0}  # R · 4u + T · 4u
-AMPLITUDES = {"r_s / u": 8.0, "r_p / u": 8.0, "phase / u": 8.0}
-# Of the larger term of a float32 radicand (see `exact`): the promoted form's error. The compensated one's is less, as
-# κ of a float32 k up to 2²³ is a pair exactly.
-RADICAND = 10 * 2.0**-53
+POWERS = {"R / u": limits.POWER, "1 − R / u": limits.POWER}
+SUMMED = POWERS | {"R + T − 1 / u": limits.POWER_SUM}
+AMPLITUDES = dict.fromkeys(("r_s / u", "r_p / u", "phase / u"), limits.AMPLITUDE)
 
 
 def tasks(context: Context) -> list[Task]:
@@ -63,7 +61,7 @@ def tasks(context: Context) -> list[Task]:
 
 def setting_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
-        return [Row("energy", name, "all", setting.label, reason=setting.reason) for name in ("powers", "amplitudes")]
+        return [Row(NAME, name, "all", setting.label, reason=setting.reason) for name in ("powers", "amplitudes")]
     count = context.profile.scalar_rays // 3 if setting.is_scalar else context.profile.rays // 8
     rows = [row for regime in cases() for row in regime_rows(regime, setting, count)]
     rows += [diffuse_row(setting, index) for index in INDICES]
@@ -150,16 +148,16 @@ def power_row(
     right: Any = True,
 ) -> Row:
     r, t, transmitted = found
-    misjudged = transmitted != exact.transmitted
-    right, u = right & ~misjudged, setting.roundoff
+    misclassified = transmitted != exact.transmitted
+    right, u = right & ~misclassified, setting.roundoff
     values = {
         "R / u": worst(relative(r, exact.reflectance, exact.reflectance_low, setting)[right]) / u,
         "1 − R / u": worst(relative(t, exact.transmittance, exact.transmittance_low, setting)[right]) / u,
         "R + T − 1 / u": worst(np.abs(r + t - 1)) / u,
-        "misjudged": float(misjudged.sum()),
+        MISCLASSIFIED: float(misclassified.sum()),
     }
     return Row(
-        "energy", subject, case, setting.label, values, budgets | ({"misjudged": 0.0} if budgets else {}), replay=replay
+        NAME, subject, case, setting.label, values, budgets | ({MISCLASSIFIED: 0.0} if budgets else {}), replay=replay
     )
 
 
@@ -175,7 +173,7 @@ def amplitude_row(
         values["phase / u"] = max(values.get("phase / u", 0.0), worst(np.abs(ours - certified)[~exact.transmitted]))
     values = {name: value / setting.roundoff for name, value in values.items()}
     budgets = {name: budget + slack for name, budget in AMPLITUDES.items()}
-    return Row("energy", "amplitudes", case, setting.label, values, budgets, replay=replay)
+    return Row(NAME, "amplitudes", case, setting.label, values, budgets, replay=replay)
 
 
 def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray, replay: dict[str, Any]) -> Row:
@@ -201,10 +199,10 @@ def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray
 
 
 def resolved(a: np.ndarray, k: np.ndarray, exact: oracle.Certified, u: float) -> np.ndarray:
-    """Whether an error of RADICAND moves T by less than u/2: by ε/2ρ, ρ the radicand over its larger term."""
+    """Whether an error of `limits.RADICAND` moves T by less than u/2: by ε/2ρ, ρ the radicand over its larger term."""
     x, y, z = a.astype(np.longdouble).T
     terms = np.maximum(z * z, np.abs(k.astype(np.longdouble) ** 2 - 1) * (x * x + y * y))
-    return exact.cos_t**2 * lengths(a) ** 2 > RADICAND / u * terms
+    return exact.cos_t**2 * lengths(a) ** 2 > limits.RADICAND / u * terms
 
 
 def relative(x: np.ndarray, exact: np.ndarray, low: np.ndarray, setting: Setting) -> np.ndarray:
@@ -238,7 +236,15 @@ def reciprocity_row(setting: Setting, count: int) -> Row:
         error = worst(np.abs(there[used] / back[used] - 1)) / setting.roundoff
         values["T there and back / u"] = max(error, values["T there and back / u"])
     replay = {"regimes": cases(), "count": count, "seed": SEED}
-    return Row("energy", "powers", "reciprocity", setting.label, values, {"T there and back / u": 3.0}, replay=replay)
+    return Row(
+        NAME,
+        "powers",
+        "reciprocity",
+        setting.label,
+        values,
+        {"T there and back / u": limits.RECIPROCITY},
+        replay=replay,
+    )
 
 
 def diffuse_row(setting: Setting, index: float) -> Row:
@@ -262,9 +268,9 @@ def diffuse_row(setting: Setting, index: float) -> Row:
             f"{side}: R / u": float(abs(reflected / exact - 1)) / setting.roundoff,
             f"{side}: 1 − R / u": float(abs(transmitted / (1 - exact) - 1)) / setting.roundoff,
         }
-    budgets = {name: 12.5 for name in values if name.endswith("/ u")}
+    budgets = {name: limits.DIFFUSE for name in values if name.endswith("/ u")}
     case, replay = f"diffuse light, n = {index}", {"nodes": GRADE}
-    return Row("energy", "powers", case, setting.label, values, budgets, replay=replay)
+    return Row(NAME, "powers", case, setting.label, values, budgets, replay=replay)
 
 
 def matched_row(setting: Setting) -> Row:
@@ -281,7 +287,7 @@ def matched_row(setting: Setting) -> Row:
         curves[name] = list(zip(steps.tolist(), (error / setting.roundoff).tolist(), strict=True))
     values = {"R / u": max(y for _, y in curves["powers"])}
     replay = {"cosines": cosines}
-    return Row("energy", "powers", "k → 1", setting.label, values, {"R / u": 4.0}, replay=replay, curves=curves)
+    return Row(NAME, "powers", "k → 1", setting.label, values, {"R / u": limits.POWER}, replay=replay, curves=curves)
 
 
 # Plugins -------------------------------------------------------------------------------------------------------
@@ -315,9 +321,9 @@ def furnace_row(context: Context, plugin: str) -> Row:
         alone = (lobes[0]["type"] == lobes[1]["type"])[:, None]
         total = np.where(alone, lobes[0]["pdf"] * lobes[0]["weight"][:, :1], total)
         values["white furnace"] = max(values["white furnace"], worst(np.abs(total - 1)))
-    budgets = {"white furnace": 2.0**-23} if plugin == "refract" else {}
+    budgets = {"white furnace": limits.WHITE_FURNACE} if plugin == "refract" else {}
     return Row(
-        "energy",
+        NAME,
         plugin,
         "white furnace",
         context.variant,
@@ -343,5 +349,9 @@ def radiance_row(context: Context, plugin: str) -> Row:
             "weights in and out / u": max(error, values["weights in and out / u"]),
             "weight against 1/n² / u": max(off, values.get("weight against 1/n² / u", 0.0)),
         }
-    budgets = {"weights in and out / u": 6.0, "weight against 1/n² / u": 3.0} if plugin == "refract" else {}
-    return Row("energy", plugin, "basic radiance", context.variant, values, budgets, replay={"indices": INDICES})
+    allowed = {"weights in and out / u": limits.IN_AND_OUT, "weight against 1/n² / u": limits.INDEX_SQUARED}
+    budgets = allowed if plugin == "refract" else {}
+    return Row(NAME, plugin, "basic radiance", context.variant, values, budgets, replay={"indices": INDICES})
+
+
+STUDY = Study(NAME, "Energy", about(__doc__), TERMS, tasks, axes=AXES)
