@@ -1,7 +1,8 @@
 """The reference for refraction in rendering.
 
 `import mi_refract` makes the BSDF `refract` and the integrator `refract_path` known to Mitsuba, in the present variant
-and in every later one.
+and in every later one. It does not import Mitsuba itself: where Mitsuba is not imported yet, the plugins are registered
+as soon as it is. So `mi-refract --help` need not wait for it, and `backend.activate` can still choose the libLLVM.
 
 Conventions, everywhere in this package:
 
@@ -15,25 +16,65 @@ Conventions, everywhere in this package:
 - `contrast` is κ = k² − 1, for those who know it better than float32 `k` does.
 """
 
-import mitsuba as _mi
+from __future__ import annotations
 
-from mi_refract.formulas.documented import FORMULAS, reflect, reflect_sandwich, refract_2d
+import importlib
+import importlib.machinery
+import importlib.util
+import sys
+from typing import TYPE_CHECKING, Any
 
-from .plugins import refract as _bsdf
-from .plugins import refract_path as _integrator
+if TYPE_CHECKING:
+    from .formulas import FORMULAS, reflect, reflect_sandwich, refract_2d
 
 __all__ = ["FORMULAS", "reflect", "reflect_sandwich", "refract_2d"]
 __version__ = "0.1.0"
 
 
-def _register(old: str | None, new: str | None) -> None:
-    """After every `set_variant`. Registration is per variant and does not outlive a switch."""
-    if new:
-        for plugin in (_bsdf, _integrator):
-            plugin.register(getattr(_mi, new))
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module("mi_refract.formulas"), name)
 
 
-# `scalar_rgb` always: Mitsuba's parser asks only that variant what kind of plugin a name is.
-_register(None, "scalar_rgb")
-_register(None, _mi.variant())
-_mi.detail.add_variant_callback(_register)
+def _register_plugins() -> None:
+    """In the present variant, and by a callback of Mitsuba's in every later one."""
+    import mitsuba as mi
+
+    from . import plugins
+
+    def register(old: str | None, new: str | None) -> None:
+        """Registration is per variant and does not outlive a switch."""
+        if new:
+            plugins.register(getattr(mi, new))
+
+    # `scalar_rgb` always: Mitsuba's parser asks only that variant what kind of plugin a name is.
+    register(None, "scalar_rgb")
+    register(None, mi.variant())
+    mi.detail.add_variant_callback(register)
+
+
+class _RegisterWithMitsuba:
+    """A finder of modules that leaves all to the others, but registers the plugins at the end of `import mitsuba`."""
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> importlib.machinery.ModuleSpec | None:
+        if name != "mitsuba":
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(name)
+        if spec is None or spec.loader is None:
+            return None
+        run = spec.loader.exec_module
+
+        def exec_module(module: Any) -> None:
+            run(module)
+            _register_plugins()
+
+        spec.loader.exec_module = exec_module  # type: ignore[method-assign]
+        return spec
+
+
+if "mitsuba" in sys.modules:
+    _register_plugins()
+else:
+    sys.meta_path.insert(0, _RegisterWithMitsuba())

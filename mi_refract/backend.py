@@ -1,12 +1,12 @@
 """Which Mitsuba variants really run here, and with which libLLVM.
 
-Mitsuba's wheel brings no libLLVM, and Dr.Jit is easily given a bad one: LLVM 14 is refused, LLVM 15 and 16 end the
-process (no exception) in the first kernel with a minimum in it. So a library is tried in a process of its own
-before it is trusted, and the answer is remembered in `$XDG_CACHE_HOME/mi_refract/backend.json`.
+Mitsuba's wheel brings no libLLVM, and not every libLLVM works: Dr.Jit refuses LLVM 14, and LLVM 15 and 16 end the
+process (no exception) in the first kernel with a minimum in it. So each library is first tried in a process of its own,
+and the answer is remembered in `$XDG_CACHE_HOME/mi_refract/backend.json`.
 
-Dr.Jit loads libLLVM when it is imported, and never another one. `activate` therefore does its best work before
-that; this module needs nothing but the standard library and can be executed without the package around it. Once
-Dr.Jit is there, a better library needs a new process: `activate(may_restart=True)`, which is for commands.
+Dr.Jit loads a libLLVM when it is imported, and no other one later. So call `activate` before Dr.Jit is imported; this
+module needs only the standard library. After that another library needs a new process:
+`activate(may_restart=True)`, which is for commands.
 """
 
 from __future__ import annotations
@@ -82,16 +82,17 @@ class Library:
 
     @property
     def works(self) -> bool:
+        """Whether nothing is wrong with it."""
         return not self.defect
 
 
 def detect() -> dict[str, Backend]:
-    """What can run in this process: scalar, llvm, cuda. Never raises; each answer is found once per process."""
+    """The backends scalar, llvm, cuda, and whether they run in this process. Never raises; asks once a process."""
     return {"scalar": Backend("scalar", True, "always there"), "llvm": llvm(), "cuda": cuda()}
 
 
 def usable_variants() -> dict[str, str | None]:
-    """Every variant Mitsuba has here: None where it runs, otherwise the reason in one line. Imports Mitsuba."""
+    """Each variant of the installed Mitsuba: None if it runs here, else the reason in one line. Imports Mitsuba."""
     backends = detect()
     _announce(backends["llvm"])
     import mitsuba as mi
@@ -101,10 +102,10 @@ def usable_variants() -> dict[str, str | None]:
 
 
 def activate(preferred: str | None = None, *, may_restart: bool = False) -> str:
-    """Set the variant `preferred`, else llvm_ad_rgb where it runs, else scalar_rgb; register our plugins; its name.
+    """Set a Mitsuba variant that runs here, register our plugins in it, and return its name.
 
-    ValueError, in one line, for a variant that Mitsuba does not have or that cannot run here.
-    `may_restart`: call `restart_if_needed` first.
+    That is `preferred`, or without it llvm_ad_rgb where that runs, else scalar_rgb. ValueError, in one line, for a
+    variant that Mitsuba does not have or that cannot run here. `may_restart`: call `restart_if_needed` first.
     """
     if may_restart:
         restart_if_needed()
@@ -144,13 +145,13 @@ def summary() -> str:
 
 
 def libraries() -> list[Library]:
-    """Every libLLVM that may be used, tried; the best version first. Only the user's, where the user chose one."""
+    """Every libLLVM found here, tried, the highest version first; only the user's, if DRJIT_LIBLLVM_PATH is set."""
     chosen = _users_choice()
     return [_try(path) for path in ([chosen] if chosen else candidates())]
 
 
 def candidates() -> list[str]:
-    """Every libLLVM on this machine, the highest version first; in a process that has one loaded, that one first."""
+    """Every libLLVM on this machine, the highest version first; before all others the one that is loaded, if any."""
     found = {os.path.realpath(path) for path in _search()}
     loaded = _loaded() or set()
     versioned = [(path in loaded, version, path) for path in found if (version := _version(path)) is not None]
@@ -239,9 +240,12 @@ def _announce(backend: Backend) -> None:
 
 
 def restart_if_needed() -> None:
-    """For commands: where Dr.Jit was imported with another libLLVM than the one that works, start this process's
-    command line again with the right one, and do not return."""
+    """For commands: have Dr.Jit use the libLLVM that works.
+
+    Where Dr.Jit was imported with another one already, start this process's command line again, and do not return.
+    """
     here = llvm()
+    _announce(here)
     # Where it was set already and did not help, go on without.
     if here.usable or here.library is None or os.environ.get(CHOICE) == here.library:
         return

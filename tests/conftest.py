@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -60,11 +61,10 @@ def each_variant(request: pytest.FixtureRequest):
     mi.set_variant(before)
 
 
-def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    if "each_variant" in metafunc.fixturenames:
-        marks = {name: pytest.mark.skip(reason=f"{name}: {why}") if why else () for name, why in USABLE.items()}
-        parameters = [pytest.param(name, marks=mark) for name, mark in marks.items()]
-        metafunc.parametrize("each_variant", parameters, indirect=True)
+@pytest.fixture
+def typical_variant(each_variant: str) -> str:
+    """One variant a family and the one that differs most from it: for what no variant does by itself."""
+    return each_variant
 
 
 @dataclass(frozen=True)
@@ -95,23 +95,54 @@ class Setting:
 SETTINGS = [("scalar", "float64")] + [(b, p) for b in ("llvm", "cuda") for p in ("float32", "float64")]
 
 
-def _setting(request: pytest.FixtureRequest) -> Setting:
-    entry = backend.detect()[request.param[0]]
-    if not entry.usable:
-        pytest.skip(f"{entry.name}: {entry.reason}")
+@pytest.fixture(scope="module")
+def setting(request: pytest.FixtureRequest) -> Setting:
+    """Every backend and precision that runs here; see `pytest_generate_tests`."""
     return Setting(*request.param)
 
 
-@pytest.fixture(params=SETTINGS, ids="-".join, scope="module")
-def setting(request: pytest.FixtureRequest) -> Setting:
-    """Every backend and precision."""
-    return _setting(request)
-
-
-@pytest.fixture(params=SETTINGS[1:], ids="-".join, scope="module")
+@pytest.fixture(scope="module")
 def vectorised(request: pytest.FixtureRequest) -> Setting:
     """Those that carry derivatives."""
-    return _setting(request)
+    return Setting(*request.param)
+
+
+def _case(case: str | tuple[str, str]) -> tuple[str, str, str | None]:
+    """Of a variant, or of a backend and a precision: its id, its backend, and why it cannot run here."""
+    if isinstance(case, str):
+        return case, case.partition("_")[0], USABLE[case]
+    entry = backend.detect()[case[0]]
+    return "-".join(case), case[0], None if entry.usable else entry.reason
+
+
+TYPICAL = [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb", "_ad_spectral_polarized"))]
+CASES = {"each_variant": list(USABLE), "setting": SETTINGS, "vectorised": SETTINGS[1:]}
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """A test for each variant or setting that runs here, and one that is skipped for each backend that does not."""
+    for fixture in CASES.keys() & set(metafunc.fixturenames):
+        parameters: dict[str, Any] = {}
+        for case in TYPICAL if "typical_variant" in metafunc.fixturenames else CASES[fixture]:
+            name, family, reason = _case(case)
+            marks = pytest.mark.absent(f"all {family} tests of this file: {reason}") if reason else ()
+            parameters[family if reason else name] = pytest.param(case, id=family if reason else name, marks=marks)
+        scope = None if fixture == "each_variant" else "module"
+        metafunc.parametrize(fixture, list(parameters.values()), indirect=True, scope=scope)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Of the tests whose backend does not run here, one in each file stays, skipped; it says why for all."""
+    said, kept = set(), []
+    for item in items:
+        absent = item.get_closest_marker("absent")
+        if absent:
+            if (item.path, *absent.args) in said:
+                continue
+            said.add((item.path, *absent.args))
+            item.add_marker(pytest.mark.skip(reason=absent.args[0]))
+        kept.append(item)
+    items[:] = kept
 
 
 @pytest.fixture

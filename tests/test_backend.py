@@ -300,9 +300,11 @@ def test_a_command_restarts_with_the_library_that_works(tmp_path, monkeypatch):
     environment = {key: value for key, value in (PYTHON | plain).items() if value}
     code = "from mi_refract import backend; print(backend.activate(may_restart={})); print(backend.llvm().reason)"
 
-    def stdout(may_restart):
-        command = [sys.executable, "-c", code.format(may_restart)]
+    def stdout(may_restart, before="import drjit"):
+        command = [sys.executable, "-c", f"{before}; {code.format(may_restart)}"]
         return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120).stdout
 
     assert stdout(True).startswith("llvm_ad_rgb\nlibLLVM ")
     assert stdout(False).startswith("scalar_rgb\nDr.Jit was imported with no libLLVM; start Python with DRJIT_LIBLLVM")
+    # The package imports Dr.Jit no sooner than it must: then there is nothing to restart.
+    assert stdout(False, before="import mi_refract").startswith("llvm_ad_rgb\nlibLLVM ")

@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 from mi_refract.image_diff import self_test
 from mi_refract.image_diff.methods import METHODS
 from mi_refract.io import image_file
 from mi_refract.io.atomic import update_between, write_atomically
 from mi_refract.io.srgb import encoded
 from mi_refract.plugins.refract import PLUGIN
-from mi_refract.report.plots import compact
+from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
 from validation.directions import per_formula
 from validation.efficiency import error_against_time

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mi_refract import oracle
-from mi_refract.numerics import float_expansions
+from mi_refract import oracle, regimes
 from mi_refract.regimes import Rays
 
 
@@ -21,18 +20,18 @@ def errors(b: np.ndarray, rays: Rays, exact: oracle.Certified) -> tuple[np.ndarr
     return chord, angle, drift
 
 
-def radicand(rays: Rays) -> np.ndarray:
+def absolute_radicand(rays: Rays) -> np.ndarray:
     """|1 − k² sin²θ_i| of every ray, in extended precision: how far the decision is from the critical angle."""
     a, n, k = (x.astype(np.longdouble) for x in (rays.a, rays.n, rays.k))
     return np.abs(1 - (k * lengths(np.cross(n, a)) / (lengths(a) * lengths(n))) ** 2)
 
 
-def margin(rays: Rays) -> np.ndarray:
+def relative_radicand(rays: Rays) -> np.ndarray:
     """|(n·a)² − κ|n×a|²| of every ray, over the mean of the two terms, right to 2⁻¹⁴⁰; NaN where both are 0.
 
-    Near the critical angle, where the terms are alike, it is |`oracle.margin`|.
+    Near the critical angle, where the terms are alike, it is |`oracle.relative_radicand`|.
     """
-    _, d, terms = float_expansions.radicand(*(x.T.astype(np.float64) for x in (rays.a, rays.n, rays.k)))
+    _, d, terms = regimes.radicand(*(x.T.astype(np.float64) for x in (rays.a, rays.n, rays.k)))
     with np.errstate(invalid="ignore"):
         return np.abs(d[0]) / (terms / 2)
 

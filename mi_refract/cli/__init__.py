@@ -1,8 +1,14 @@
-"""The command `mi-refract`: one module a command."""
+"""The command `mi-refract`: a module for each command; `app` puts them together and turns errors into one line.
+
+In: the words of a command line. Out: text on stdout, files that were asked for, and an exit code. The commands only
+read options, call the rooms below, and print; every one of them can be had from Python without this room.
+"""
+
+__all__ = ["app", "main"]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit code."""
+    """Run the command line, or `arguments`; the exit code."""
     from .app import main
 
     return main(arguments)

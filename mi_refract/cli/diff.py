@@ -22,7 +22,8 @@ from mi_refract.image_diff import settings as diff_settings
 from mi_refract.image_diff import text_reports as output
 from mi_refract.image_diff.folders import Results, Status
 from mi_refract.io.atomic import writable
-from mi_refract.rendering.scene_files import provenance
+from mi_refract.io.provenance import provenance
+from mi_refract.report.junit import printable
 
 Folder = Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")]
 Other = Annotated[Path, typer.Argument(metavar="TEST", help="What is compared with it, of the same kind.")]
@@ -128,7 +129,7 @@ def accept(
     _say(found)
     copies = list(engine.changes(found))
     for new, old in copies:
-        print(output.printable(f"{new} → {old}{'' if old.exists() else ' (new)'}"))
+        print(printable(f"{new} → {old}{'' if old.exists() else ' (new)'}"))
     if not copies:
         print("nothing to accept")
     elif yes or _agreed(len(copies)):
@@ -183,9 +184,9 @@ def _settings(
 def _say(found: Results) -> None:
     """The table on stdout, what could not be compared on stderr, a line each."""
     for result in found.of(Status.ERROR):
-        print(f"mi-refract: {output.printable(result.error)}", file=sys.stderr)
+        print(f"mi-refract: {printable(result.error)}", file=sys.stderr)
     for pattern in found.unused:
-        print(f"mi-refract: {output.printable(pattern)}: matches no image", file=sys.stderr)
+        print(f"mi-refract: {printable(pattern)}: matches no image", file=sys.stderr)
     if len(found.results) > len(found.of(Status.ERROR)):
         # As wide as it must be where nobody looks on: no line of a log is a wrapped one.
         console = Console() if sys.stdout.isatty() else Console(width=10_000)

@@ -1,60 +1,70 @@
-"""The commands `mi-refract rays export|check|run`. Words in, words out, as in `cli.py`."""
+"""The commands `mi-refract rays export|check|run`."""
 
 from __future__ import annotations
 
 import importlib.util
 import shlex
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.table import Table
 
 from mi_refract.io.atomic import writable
-from mi_refract.ray_sets import ray_set as sets
-from mi_refract.ray_sets import run_program
+from mi_refract.io.provenance import provenance
+from mi_refract.ray_sets import files, ray_set, run_program
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.regimes import REGIMES
-from mi_refract.rendering.scene_files import provenance
 
-app = typer.Typer(help="Other people's refraction against the certified answers.", rich_markup_mode=None)
+app = typer.Typer(help="Check the refraction of other programs against certified answers.", rich_markup_mode=None)
 
 OUTPUTS = ((".html", ".htm"), (".xml",), (".json",))  # of --report, --junit, --json
+UNWRAPPED = 10_000  # columns: wider than any line
 
 
 def _print_regimes(asked: bool) -> None:
     if asked:
-        width = max(map(len, REGIMES))
+        table = Table("regime", "rays", "", box=None, pad_edge=False)
         for name, regime in REGIMES.items():
-            print(f"{name:{width}}  {regime.text}{'' if name in sets.DEFAULT else '; only where it is asked for'}")
+            table.add_row(name, regime.text, "" if name in ray_set.DEFAULT else "only with --regime")
+        Console(width=None if sys.stdout.isatty() else UNWRAPPED).print(table, highlight=False)
         raise typer.Exit
 
 
 Regime = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME", help="A set of rays, see --regimes; without it, all for unit vectors."),
+    typer.Option(metavar="NAME", help="A regime of rays, see --regimes; by default all with unit vectors."),
 ]
-Count = Annotated[int, typer.Option(min=1, help="Rays of each regime.")]
+Count = Annotated[int, typer.Option(min=1, help="Number of rays per regime.")]
 Precision = Annotated[str, typer.Option(help="f32 or f64.")]
-Seed = Annotated[int, typer.Option(min=0, help="Of the rays.")]
-TwoSided = Annotated[bool, typer.Option("--two-sided", help="Normals on either side; else they face the ray.")]
-Regimes = Annotated[bool, typer.Option("--regimes", is_eager=True, callback=_print_regimes, help="Print the regimes.")]
-File = Annotated[Path | None, typer.Option("--rays", metavar="FILE", help="The rays, as they were exported.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the ray generator.")]
+TwoSided = Annotated[
+    bool, typer.Option("--two-sided", help="Put normals on either side; by default they face the ray.")
+]
+Regimes = Annotated[bool, typer.Option("--regimes", is_eager=True, callback=_print_regimes, help="List the regimes.")]
+File = Annotated[Path | None, typer.Option("--rays", metavar="FILE", help="The file of rays, as exported.")]
 Tir = Annotated[
-    str, typer.Option(help="How total internal reflection is told: auto, zero, nan, reflected, tangent or flag.")
+    str,
+    typer.Option(help="How answers signal total internal reflection: auto, zero, nan, reflected, tangent or flag."),
 ]
 Formula = Annotated[
-    str | None, typer.Option("--as-good-as", metavar="FORMULA", help="The measure; the loosest of a textbook if none.")
+    str | None,
+    typer.Option(
+        "--error-bound", metavar="FORMULA", help="The formula whose error bound applies; by default the loosest."
+    ),
 ]
-Report = Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write a page to look at.")]
-Junit = Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit's XML.")]
+OldFormula = Annotated[str | None, typer.Option("--as-good-as", hidden=True)]  # as --error-bound was called
+Report = Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML page.")]
+Junit = Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")]
 Json = Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")]
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """How answers are judged, and where that is written; whatever is amiss is said before anything runs."""
+class CheckOptions:
+    """How answers are checked, and which files are written."""
 
     tir: str
     formula: str | None
@@ -63,32 +73,34 @@ class Wanted:
     json: Path | None
 
     def __post_init__(self) -> None:
+        """ValueError or OSError, before anything runs, for an option that cannot be met."""
         needed = ("flint", "jinja2") if self.report else ("flint",)
         if not all(map(importlib.util.find_spec, needed)):
             raise ValueError("checking rays needs the extra `validation`: pip install 'mi-refract[validation]'")
-        from mi_refract.formulas.documented import FORMULAS
+        from mi_refract.formulas import FORMULAS
         from mi_refract.ray_sets.tir_signal import AUTO, TIR
 
         if self.tir not in (AUTO, *TIR):
             raise ValueError(f"--tir {self.tir}: unknown; accepted: {', '.join((AUTO, *TIR))}")
         if self.formula not in (None, *FORMULAS):
-            raise ValueError(f"--as-good-as {self.formula}: unknown; accepted: {', '.join(FORMULAS)}")
+            raise ValueError(f"--error-bound {self.formula}: unknown; accepted: {', '.join(FORMULAS)}")
         for path, suffixes in zip((self.report, self.junit, self.json), OUTPUTS, strict=True):
             if path:
                 writable(path, suffixes)
 
     @property
-    def options(self) -> list[str]:
+    def words(self) -> list[str]:
+        """The options of the check that are not the default."""
         chosen = ["--tir", self.tir] if self.tir != "auto" else []
-        return chosen + (["--as-good-as", self.formula] if self.formula else [])
+        return chosen + (["--error-bound", self.formula] if self.formula else [])
 
-    def judge(self, rays: RaySet, answers: Answers, name: str, replay: list[str]) -> int:
-        """Print, write, and give the exit code."""
+    def check(self, rays: RaySet, answers: Answers, name: str, replay: list[str]) -> int:
+        """Check the answers, print and write the reports; the exit code. `replay`: the words of the command."""
         from mi_refract.ray_sets import check_answers, reports
 
-        found = check_answers.check(rays, answers, tir=self.tir, budget=self.formula or check_answers.LOOSEST)
-        # As wide as its numbers are: a wrapped line is read more easily than a squeezed column.
-        Console(width=10_000).print(reports.table(found), highlight=False)
+        found = check_answers.check(rays, answers, tir=self.tir, error_bound=self.formula or check_answers.LOOSEST)
+        # On a terminal, too: a wrapped line is easier to read than a squeezed column.
+        Console(width=UNWRAPPED).print(reports.table(found), highlight=False)
         if self.report:
             about = {"answers": name} | {key: rays.header[key] for key in ("seed", "checksum")} | provenance()
             reports.write_html(self.report, found, about, shlex.join(["mi-refract", "rays", *replay]))
@@ -103,15 +115,15 @@ class Wanted:
 def export(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT.csv|.npz|.exr", help="The file to write.")],
     regime: Regime = None,
-    count: Count = sets.COUNT,
-    precision: Precision = sets.PRECISION,
+    count: Count = ray_set.COUNT,
+    precision: Precision = ray_set.PRECISION,
     seed: Seed = 0,
     two_sided: TwoSided = False,
     regimes: Regimes = False,
 ) -> None:
-    """Write rays for another renderer: incident directions, normals, indices, and what is meant by them."""
-    rays = sets.make(_names(regime), count, precision, seed, two_sided=two_sided)
-    sets.write(output, rays)
+    """Write rays for another program: incident directions, normals and indices of refraction."""
+    rays = ray_set.make(_names(regime), count, precision, seed, two_sided=two_sided)
+    files.write(output, rays)
     print(f"{output}: {_summary(rays)}")
 
 
@@ -121,66 +133,72 @@ def check(
     file: File = None,
     tir: Tir = "auto",
     formula: Formula = None,
+    old_formula: OldFormula = None,
     report: Report = None,
     junit: Junit = None,
     json: Json = None,
 ) -> None:
-    """Compare answers with the certified ones. Exit code 0: right, 1: wrong, 2: not those to the rays.
+    """Check answers against certified ones. Exit code 0: right, 1: wrong, 2: the answers do not match the rays.
 
-    Without --rays they are to the rays that the answers' own # lines name, or those of `export` without options.
+    Without --rays, the rays are those that the # lines of the answers describe, or those of `export` without options.
     """
-    wanted = Wanted(tir, formula, report, junit, json)
-    given = sets.read_answers(answers)
-    known = file or "checksum" in given.header
-    rays = sets.read(file) if file else sets.remake(given.header) if known else sets.make()
-    print(f"{answers}: {_summary(rays)}{'' if known else ', as `export` without options; others with --rays FILE'}")
-    replay = ["check", str(answers), *(["--rays", str(file)] if file else []), *wanted.options]
-    raise typer.Exit(wanted.judge(rays, given, str(answers), replay))
+    options = CheckOptions(tir, formula or old_formula, report, junit, json)
+    given = files.read_answers(answers)
+    described = file or "checksum" in given.header
+    rays = files.read(file) if file else ray_set.remake(given.header) if described else ray_set.make()
+    print(f"{answers}: {_summary(rays)}{'' if described else ', as of `export` without options; others: --rays FILE'}")
+    replay = ["check", str(answers), *(["--rays", str(file)] if file else []), *options.words]
+    raise typer.Exit(options.check(rays, given, str(answers), replay))
 
 
 @app.command()
 def run(
-    command: Annotated[list[str], typer.Argument(metavar="-- COMMAND", help="Reads rays, writes answers, as CSV.")],
+    command: Annotated[
+        list[str], typer.Argument(metavar="-- COMMAND", help="It reads rays and writes answers, as CSV.")
+    ],
     file: File = None,
     regime: Regime = None,
-    count: Count = sets.COUNT,
-    precision: Precision = sets.PRECISION,
+    count: Count = ray_set.COUNT,
+    precision: Precision = ray_set.PRECISION,
     seed: Seed = 0,
     two_sided: TwoSided = False,
-    timeout: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="For the command.")] = run_program.TIMEOUT,
     tir: Tir = "auto",
     formula: Formula = None,
+    old_formula: OldFormula = None,
+    timeout: Annotated[
+        float, typer.Option(min=0, metavar="SECONDS", help="Time limit of the command.")
+    ] = run_program.TIMEOUT,
     report: Report = None,
     junit: Junit = None,
     json: Json = None,
 ) -> None:
-    """Hand rays to a command and check what it answers: rays on its stdin, answers on its stdout.
+    """Run a command on rays and check its answers: rays go to its stdin, answers come from its stdout.
 
-    Exit code 0: right, 1: wrong, 2: not those to the rays, a command that fails, or takes too long.
+    Exit code 0: right, 1: wrong, 2: the answers do not match the rays, or the command fails or takes too long.
     """
-    wanted = Wanted(tir, formula, report, junit, json)
-    made = _made_by(regime, count, precision, seed, two_sided)
+    options = CheckOptions(tir, formula or old_formula, report, junit, json)
+    made = _rays_as_words(regime, count, precision, seed, two_sided)
     if file and made:
-        raise ValueError(f"--rays {file}: says all of the rays; accepted: without {made[0]}")
-    rays = sets.read(file) if file else sets.make(_names(regime), count, precision, seed, two_sided=two_sided)
+        raise ValueError(f"--rays {file} and {made[0]}: both choose the rays; accepted: one of them")
+    rays = files.read(file) if file else ray_set.make(_names(regime), count, precision, seed, two_sided=two_sided)
     given = run_program.answers_of(command, rays, timeout=timeout)
     name = shlex.join(command)
     print(f"{name}: {_summary(rays)}")
     chosen = ["--rays", str(file)] if file else made
-    raise typer.Exit(wanted.judge(rays, given, name, ["run", *chosen, *wanted.options, "--", *command]))
+    raise typer.Exit(options.check(rays, given, name, ["run", *chosen, *options.words, "--", *command]))
 
 
 def _names(regime: list[str] | None) -> tuple[str, ...]:
-    """ ">>" and "<<" stand for the signs that few keyboards have."""
-    return tuple(name.replace(">>", "≫").replace("<<", "≪") for name in regime or sets.DEFAULT)
+    """Names of regimes; ">>" and "<<" may be typed for ≫ and ≪."""
+    return tuple(name.replace(">>", "≫").replace("<<", "≪") for name in regime or ray_set.DEFAULT)
 
 
-def _made_by(regime: list[str] | None, count: int, precision: str, seed: int, two_sided: bool) -> list[str]:
-    """The options that make these rays, as far as they are not the default."""
+def _rays_as_words(regime: list[str] | None, count: int, precision: str, seed: int, two_sided: bool) -> list[str]:
+    """The options that choose these rays, without those that have their default."""
     words = [word for name in regime or [] for word in ("--regime", name)]
     for option, value, default in (
-        ("--count", count, sets.COUNT),
-        ("--precision", precision, sets.PRECISION),
+        ("--count", count, ray_set.COUNT),
+        ("--precision", precision, ray_set.PRECISION),
         ("--seed", seed, 0),
     ):
         words += [option, str(value)] if value != default else []

@@ -1,4 +1,4 @@
-"""The commands `mi-refract scene …`. Words in, words out, as in `cli.py`."""
+"""The command `mi-refract scene export`."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import typer
 from mi_refract import backend
 from mi_refract.rendering import scene_files
 
-app = typer.Typer(help="Scenes for other renderers.", no_args_is_help=True)
+app = typer.Typer(help="Write scenes for other renderers.", no_args_is_help=True, rich_markup_mode=None)
 
 SCENES = Path(__file__).parents[2] / "scenes"  # of a checkout; an installed package has none
 
 
 @app.callback()
 def _scene() -> None:
-    """Keeps `export` a word of its own."""
+    """Without this callback typer would drop the word `export`."""
 
 
 @app.command()
@@ -25,27 +25,30 @@ def export(
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="A Mitsuba scene, or the name of one in scenes/.")],
     to: Annotated[str, typer.Option(metavar="TARGET", help="cycles|luxcore|radiance|povray|mitsuba|obj+json")],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="New or empty; NAME-TARGET by default.")
+        Path | None,
+        typer.Option("-o", "--output", metavar="FOLDER", help="A new or empty folder; NAME-TARGET by default."),
     ] = None,
-    level: Annotated[int | None, typer.Option(help="Of curved shapes: one more halves the triangles' edges.")] = None,
+    level: Annotated[
+        int | None, typer.Option(help="Subdivision of curved shapes, 0 to 8; one more halves the edges. 5 by default.")
+    ] = None,
     define: Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="Replace a <default>.")] = None,
 ) -> None:
-    """Write a scene as triangles, with all that another renderer needs, and a README.txt that says how to run it."""
+    """Write a Mitsuba scene as triangles for another renderer, with a README.txt that says how to render it."""
     defines = scene_files.parse_defines(define or [])
     backend.activate("scalar_rgb", may_restart=True)
     from mi_refract.scene_export import from_mitsuba
     from mi_refract.scene_export.write_files import write
 
-    path = _found(scene)
+    path = _scene_path(scene)
     folder = output or Path(f"{path.stem}-{to}")
-    loaded = from_mitsuba.load(path, level=from_mitsuba.LEVEL if level is None else level, **defines)
-    written = write(loaded, to, folder)
-    triangles = sum(len(mesh.faces) for mesh in loaded.meshes)
+    plain = from_mitsuba.load(path, level=from_mitsuba.LEVEL if level is None else level, **defines)
+    written = write(plain, to, folder)
+    triangles = sum(len(mesh.faces) for mesh in plain.meshes)
     print(f"{folder}: {len(written)} files, {triangles} triangles; {folder / 'README.txt'} says how to render them")
 
 
-def _found(scene: str) -> Path:
-    """A path that exists, or a scene of the checkout by its name."""
+def _scene_path(scene: str) -> Path:
+    """A file, or a scene of the checkout by its name. FileNotFoundError where it is neither."""
     for path in (Path(scene), SCENES / f"{scene}.xml"):
         if path.is_file():
             return path

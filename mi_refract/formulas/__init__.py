@@ -1,5 +1,34 @@
-"""The formulas of refraction and their error bounds."""
+"""The formulas of refraction, Fresnel's equations, and bounds of their errors.
 
-from .documented import FORMULAS, Formula, automatic, reflect, reflect_sandwich, refract_2d, resolve
+In: directions `a`, normals `n` and ratios `k` as Dr.Jit arrays, in the conventions of the package's docstring. Out:
+`(b, transmitted)` from the entries of FORMULAS, powers and amplitudes from `fresnel`, and from `Budget` how far each
+answer may be from the exact one. Nothing here imports Mitsuba.
+"""
 
-__all__ = ["FORMULAS", "Formula", "automatic", "reflect", "reflect_sandwich", "refract_2d", "resolve"]
+from . import fresnel
+from .bounds import NEGLIGIBLE, ROUNDING, UNIT, Budget, cancelling, radicand_for
+from .documented import contract, reflect, reflect_sandwich, refract_2d, wedge
+from .table import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, Formula, automatic, resolve
+from .well_conditioned import Refracted
+
+__all__ = [
+    "FORMULAS",
+    "LARGEST_RATIO",
+    "NEGLIGIBLE",
+    "ROUNDING",
+    "SMALLEST_RATIO",
+    "UNIT",
+    "Budget",
+    "Formula",
+    "Refracted",
+    "automatic",
+    "cancelling",
+    "contract",
+    "fresnel",
+    "radicand_for",
+    "reflect",
+    "reflect_sandwich",
+    "refract_2d",
+    "resolve",
+    "wedge",
+]

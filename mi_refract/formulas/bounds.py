@@ -61,9 +61,9 @@ class Budget:
 
     def of_root(self, u: Any, k: Any, cos_t: Any, transmitted: Any = True) -> Any:
         np = _numpy()
-        return np.where(transmitted, root(self.margin(u, k), cos_t), 0.0)
+        return np.where(transmitted, root(self.radicand_error_bound(u, k), cos_t), 0.0)
 
-    def margin(self, u: Any, k: Any) -> Any:
+    def radicand_error_bound(self, u: Any, k: Any) -> Any:
         """Bound of the error of the radicand, which |1 − k² sin²θ| must exceed for the decision to be right."""
         np = _numpy()
         return self.radicand * u * np.maximum(1.0, k) ** self.growth

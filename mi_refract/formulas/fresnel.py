@@ -22,7 +22,7 @@ from typing import Any
 
 import drjit as dr
 
-from mi_refract.numerics.error_free import DoubleWord, as_component, ieee_divide, two_prod, two_sum
+from mi_refract.numerics import DoubleWord, as_component, ieee_divide, two_prod, two_sum
 
 from .well_conditioned import local_root
 

@@ -31,12 +31,12 @@ from typing import Any
 
 import drjit as dr
 
-from mi_refract.numerics import error_free
-from mi_refract.numerics.error_free import (
+from mi_refract.numerics import (
     DoubleWord,
     TripleWord,
     as_component,
     differentiated,
+    error_free,
     ieee_divide,
     replace_grad,
     two_sum,
@@ -141,7 +141,7 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
     sum b₀ + δ is rounded once. `contrast`: κ where it is known better than k, for the radicand; `k` itself still
     scales the tangent. Source: this project. Weak nowhere for k ≤ 1e6.
     Precondition in float32: lengths of 1e-3 to 1e3, so that no product of four over- or underflows
-    (`numerics.near_unit` sees to it, in the entries of FORMULAS).
+    (`numerics.scale_to_unit` sees to it, in the entries of FORMULAS).
     """
     k, axis = as_component(a, k), _axis(n)
     kappa = DoubleWord.product(k, k) - 1 if contrast is None else _split(a, contrast)

@@ -21,7 +21,8 @@ import numpy as np
 from mi_refract.io.image_file import Image, one_line, read
 from mi_refract.report.embedded_images import EmbeddedImages, encoded, means, shown, strongest
 from mi_refract.report.html_page import write_page
-from mi_refract.report.plots import compact, distinguishable, histogram_svg
+from mi_refract.report.number_text import compact, distinguishable
+from mi_refract.report.plots import histogram_svg
 
 from . import folders, methods
 from .folders import Result, Results, Status

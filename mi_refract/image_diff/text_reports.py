@@ -11,10 +11,12 @@ import os
 import re
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from mi_refract.io.atomic import write_atomically
-from mi_refract.report.plots import compact, distinguishable
+from mi_refract.report import junit
+from mi_refract.report.junit import printable
+from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.row import strict
 
 from .folders import Result, Results, Status
@@ -24,7 +26,6 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 SCHEMA = 1
-UNPRINTABLE = re.compile("[^\x20-\x7e\xa0-\u2027\u202f-\u2065\u206a-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 FEW = 20  # equal images that are listed one by one
 SUMMARY_ROWS = 500  # GitHub cuts a summary at 1 MiB
 WORDS = {
@@ -34,11 +35,6 @@ WORDS = {
     Status.EQUAL: "equal",
 }
 STYLES = {Status.ERROR: "bold red", Status.DIFFERENT: "bold red", Status.INCONCLUSIVE: "yellow", Status.EQUAL: "green"}
-
-
-def printable(text: Any) -> str:
-    """On one line, without control characters (terminal escapes, say) and what has no form in UTF-8 or XML 1.0."""
-    return UNPRINTABLE.sub("\ufffd", str(text))
 
 
 def sentence(results: Results) -> str:
@@ -120,24 +116,18 @@ def _entry(results: Results, result: Result) -> dict[str, Any]:
 
 def write_junit(path: str | Path, results: Results) -> None:
     """One case an image. Different is a failure; inconclusive too, unless it is to pass; no verdict is an error."""
-    from xml.etree import ElementTree as xml
-
-    root = xml.Element("testsuites", name="mi-refract diff")
-    suite = xml.SubElement(root, "testsuite", name=printable(results.test))
-    for result in results.results:
-        case = xml.SubElement(suite, "testcase", classname=printable(_method(result)), name=printable(result.name))
-        if kind := _kind(results, result):
-            tag = xml.SubElement(case, kind, type=_word(result), message=printable(why(result)))
-            tag.text = "\n".join(map(printable, _details(results, result)))
-    counts = Counter(child.tag for case in suite for child in case)
-    tally = {"tests": len(suite), "failures": counts["failure"], "errors": counts["error"], "skipped": 0}
-    for element in (root, suite):
-        element.attrib.update({key: str(count) for key, count in tally.items()})
-    xml.indent(root)
-    write_atomically(path, xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
+    cases = [_case(results, result) for result in results.results]
+    junit.write_junit(path, "mi-refract diff", {str(results.test): cases})
 
 
-def _kind(results: Results, result: Result) -> str:
+def _case(results: Results, result: Result) -> junit.Case:
+    kind = _kind(results, result)
+    if not kind:
+        return junit.Case(_method(result), result.name)
+    return junit.Case(_method(result), result.name, kind, why(result), _details(results, result), _word(result))
+
+
+def _kind(results: Results, result: Result) -> Literal["", "failure", "error"]:
     """ "error", "failure", or "" for what does not fail the run."""
     if result.status is Status.ERROR:
         return "error"

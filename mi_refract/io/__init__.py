@@ -1,1 +1,7 @@
-"""Files, images, processes and TOML tables."""
+"""Files, processes and tables, for all other rooms. Nothing here knows about refraction or Mitsuba.
+
+In: paths, pixels, commands, tables of TOML. Out: files that are complete or not there at all, images as arrays, the
+output of other programs, checked values; errors are one line that says what, where, and what would be accepted.
+"""
+
+__all__ = ["atomic", "image_file", "process_group", "provenance", "toml_schema"]

@@ -1,6 +1,6 @@
-"""Images in files, through OpenImageIO: reading any format it knows, writing OpenEXR.
+"""Images in files, by OpenImageIO: reads every format that it knows, writes OpenEXR.
 
-A pixel array is H × W × C float32, row 0 at the top. A file appears complete or not at all.
+Pixels are arrays of H × W × C float32, row 0 at the top. A file is written completely or not at all.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .atomic import writable
+from . import atomic
 
 Metadata = dict[str, Any]
 SUFFIXES = (".exr",)
@@ -27,32 +27,24 @@ def write_exr(
     channels: Sequence[str] = ("R", "G", "B"),
     metadata: Mapping[str, str | int | float] | None = None,
 ) -> None:
-    """Write H × W × C pixels as float32. One header attribute for each entry of `metadata`.
+    """Write H × W × C pixels as an OpenEXR file of float32, with one header attribute for each entry of `metadata`.
 
-    Attributes keep str, int of 32 bits and float (to 24 bits); any other int becomes text. Replaces an existing file.
-    ValueError for a shape that does not fit `channels`, a name that is not .exr, or an attribute of another type;
-    OSError for a folder that cannot be written or a full disk. Nothing is left behind then.
+    Attributes may be str, int or float; floats are stored in float32, ints beyond 32 bits as text. An existing file is
+    replaced. ValueError for a shape that does not fit `channels`, a name that does not end in .exr, or an attribute of
+    another type; OSError for a folder that cannot be written or a full disk. The old file stays then.
     """
-    path = writable(path, SUFFIXES)
+    path = atomic.writable(path, SUFFIXES)
     pixels = np.ascontiguousarray(pixels, dtype=np.float32)
     if pixels.ndim != 3 or pixels.size == 0 or pixels.shape[2] != len(channels):
         raise ValueError(f"{path}: pixels of shape {pixels.shape}; accepted: H × W × {len(channels)} {tuple(channels)}")
     if len(set(channels)) != len(channels):
         raise ValueError(f"{path}: channels {tuple(channels)}: accepted: distinct names")
-    temporary = temporary_name(path)
+    attributes = _attributes(path, metadata or {})
     try:
-        _write(temporary, pixels, channels, _attributes(path, metadata or {}))
-        temporary.replace(path)
+        with atomic.replacing(path, suffix=".exr") as temporary:  # OpenImageIO tells the format by the name
+            _write(temporary, pixels, channels, attributes)
     except OSError as error:
         raise OSError(f"{path}: cannot be written: {error.strerror or error}") from None
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def temporary_name(path: str | os.PathLike[str]) -> Path:
-    """Where this process writes before the rename: in the same folder, and .exr, by which OpenImageIO goes."""
-    path = Path(path)
-    return path.with_name(f".{path.stem}.{os.getpid()}.exr")
 
 
 def _write(path: Path, pixels: NDArray[np.float32], channels: Sequence[str], attributes: Metadata) -> None:
@@ -87,9 +79,10 @@ def _attributes(path: Path, metadata: Mapping[str, str | int | float]) -> Metada
 
 @dataclass(frozen=True)
 class Image:
-    """One image of a file: H × W × C pixels, the channels' names, where its data window begins (x, y), its header.
+    """An image as a file holds it.
 
-    float32; float64 where the file holds numbers that float32 does not. Integers of a file are mapped to 0 … 1.
+    `pixels`: H × W × C, float32, or float64 where the file holds numbers that float32 cannot; integers of a file are
+    mapped to 0 … 1. `channels`: C names. `origin`: (x, y) where the data window begins. `metadata`: the header.
     """
 
     path: Path
@@ -99,16 +92,16 @@ class Image:
     metadata: Metadata = field(default_factory=dict)
 
     def select(self, channels: Sequence[str]) -> NDArray[np.floating[Any]]:
-        """The pixels of these channels, in this order. ValueError for a name that is not there."""
+        """The pixels of these channels, in this order: H × W × len(channels). ValueError for a name not there."""
         if missing := [name for name in channels if name not in self.channels]:
             raise ValueError(f"{self.path}: no channel {missing[0]!r}; accepted: {', '.join(self.channels)}")
         return self.pixels[..., [self.channels.index(name) for name in channels]]
 
 
 def read(path: str | os.PathLike[str]) -> Image:
-    """The one image in a file of any format that OpenImageIO reads, its format told by the name's ending.
+    """Read a file that holds one image, of any format that OpenImageIO reads; the name's ending tells which.
 
-    OSError for a file that cannot be read; ValueError for one that is empty, truncated, of another type than its
+    OSError for a file that cannot be read; ValueError for one that is empty, truncated, of another format than its
     name says, of several parts, deep, or without pixels. Both are one line that begins with the path.
     """
     import OpenImageIO as oiio
@@ -138,10 +131,10 @@ def read(path: str | os.PathLike[str]) -> Image:
 
 
 def named(name: str, pixels: Any) -> Image:
-    """An array, height × width × channels or height × width, as an image with a name instead of a file.
+    """An image made of an array, H × W × C or H × W, with a name instead of a file.
 
-    Channels are R, G, B (A) where there are three or four, else channel0 and so on. Integers are kept as they are.
-    ValueError for another shape, or what are no numbers.
+    Channels are called R, G, B (, A) where there are three or four, else channel0, channel1 … Integers are kept as
+    they are. ValueError for another shape, or for values that are not numbers.
     """
     pixels = np.asarray(pixels)
     if pixels.ndim not in (2, 3) or not pixels.size or pixels.dtype.kind not in "fiu":
@@ -153,7 +146,7 @@ def named(name: str, pixels: Any) -> Image:
 
 
 def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Image]:
-    """Several images, two at a time: unpacking takes most of the time of a comparison. Errors: those of `read`."""
+    """Read several images, two at a time, as decompression takes most of the time. Raises what `read` raises."""
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(read, paths))
 
@@ -195,10 +188,10 @@ def _endings(name: str) -> list[str]:
 
 
 def read_exr(path: str | os.PathLike[str]) -> tuple[NDArray[np.float32], Metadata]:
-    """(pixels, metadata): H × W × C float32, and the header attributes with the channels' names under "channels".
+    """Read an EXR file: (pixels, metadata). Pixels are H × W × C float32; metadata is the header and "channels".
 
-    The order of channels is the file's as OpenImageIO gives it: R, G, B, A first, then by name.
-    FileNotFoundError or OSError for a file that cannot be read, ValueError for one that is not a complete EXR image.
+    `metadata["channels"]` holds the C names in OpenImageIO's order: R, G, B, A first, then by name.
+    OSError for a file that cannot be read, ValueError for one that is not a complete EXR image.
     """
     path = Path(path)
     with path.open("rb") as file:
@@ -209,4 +202,5 @@ def read_exr(path: str | os.PathLike[str]) -> tuple[NDArray[np.float32], Metadat
 
 
 def one_line(text: str) -> str:
+    """`text` with every run of white space, line breaks among them, as one space."""
     return " ".join(text.split())

@@ -1,4 +1,4 @@
-"""Someone else's program, in a process group of its own: with it ends all that it started."""
+"""Run another program in a process group of its own, so that all processes that it started end with it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Ended:
-    """A program's exit status, negative for a signal, and what it wrote; `said` is stderr where that was kept."""
+    """A program that has ended: its exit status (−n: killed by signal n), its stdout, its stderr where it was kept."""
 
     status: int
     out: bytes
@@ -21,6 +21,7 @@ class Ended:
 
     @property
     def how(self) -> str:
+        """How it ended, in words for an error message."""
         if self.status >= 0:
             return f"ended with status {self.status}"
         names = {member.value: member.name for member in signal.Signals}
@@ -36,9 +37,9 @@ def run(
     cwd: str | Path | None = None,
     env: Mapping[str, str] | None = None,
 ) -> Ended:
-    """Run it to its end with `given` on its stdin. Its stderr goes where ours goes, unless it is kept.
+    """Run `command` to its end, with `given` on its stdin. Its stderr goes where ours goes, unless it is kept.
 
-    OSError where it cannot be started; TimeoutError where it has not ended within `timeout` seconds.
+    OSError if it cannot be started; TimeoutError if it has not ended after `timeout` seconds: it is killed then.
     """
     pipe, errors = subprocess.PIPE, subprocess.PIPE if keep_stderr else None
     process = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""Typed values of TOML tables: what is accepted, in words, for reading, for error messages and for documentation."""
+"""Tables of TOML files: which keys one may hold, what each accepts, and how that reads in errors and documentation."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
+Table = dict[str, Any]  # as tomllib reads it, or parsed: values by key
+Parser = Callable[[Any], Any]  # the value as the code wants it; None where it is not accepted
 
-from mi_refract.planar.curves import unit
-from mi_refract.planar.tracer import Array
-
-Values = dict[str, Any]
-REQUIRED = object()
+REQUIRED = object()  # the default of a key that has none
+SHOWN = 60  # characters of a value in an error
 
 
 # Types of values --------------------------------------------------------------------------------------------------
@@ -22,14 +20,14 @@ REQUIRED = object()
 
 @dataclass(frozen=True)
 class Type:
-    """What a value may be, in words, and `parse`: the value as the code wants it, None where it is something else."""
+    """A type of value: `accepted` says in words what it may be, `parse` returns None for anything else."""
 
     accepted: str
-    parse: Callable[[Any], Any]
+    parse: Parser
 
 
-def _number(value: Any) -> float | None:
-    """A finite float. Neither a bool nor an integer that has none."""
+def number(value: Any) -> float | None:
+    """A finite float. None for anything else: bool, NaN, ±inf, an integer beyond the range of float64."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
@@ -38,28 +36,39 @@ def _number(value: Any) -> float | None:
         return None
 
 
-def _positive(value: Any) -> float | None:
-    number = _number(value)
-    return number if number is not None and number > 0 else None
+def positive(value: Any) -> float | None:
+    """A finite float above 0."""
+    return only_if(lambda x: x > 0, number)(value)
 
 
-def list_of(parse: Callable[[Any], Any], least: int = 1, most: float = math.inf) -> Callable[[Any], Any]:
-    def parse_list(value: Any) -> Any:
+def text(value: Any) -> str | None:
+    """A string that is more than white space."""
+    return value if isinstance(value, str) and value.strip() else None
+
+
+def table(value: Any) -> Table | None:
+    """A table."""
+    return value if isinstance(value, dict) else None
+
+
+def list_of(parse: Parser, least: int = 1, most: float = math.inf) -> Parser:
+    """Parser of a list of `least` to `most` items that `parse` accepts."""
+
+    def parse_list(value: Any) -> list[Any] | None:
         items = [parse(item) for item in value] if isinstance(value, list) and least <= len(value) <= most else [None]
         return None if any(item is None for item in items) else items
 
     return parse_list
 
 
-def _single(parse: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    return lambda value: None if (parsed := parse(value)) is None else [parsed]
-
-
-def _first(*parsers: Callable[[Any], Any]) -> Callable[[Any], Any]:
+def first_of(*parsers: Parser) -> Parser:
+    """Parser of whatever one of `parsers` accepts; the first of them counts."""
     return lambda value: next((parsed for parse in parsers if (parsed := parse(value)) is not None), None)
 
 
-def _if(test: Callable[[Any], bool], parse: Callable[[Any], Any]) -> Callable[[Any], Any]:
+def only_if(test: Callable[[Any], bool], parse: Parser) -> Parser:
+    """Parser of what `parse` accepts and of which `test` holds."""
+
     def parse_if(value: Any) -> Any:
         parsed = parse(value)
         return parsed if parsed is not None and test(parsed) else None
@@ -67,49 +76,20 @@ def _if(test: Callable[[Any], bool], parse: Callable[[Any], Any]) -> Callable[[A
     return parse_if
 
 
-def _text(value: Any) -> str | None:
-    return value if isinstance(value, str) and value.strip() else None
-
-
 def whole(least: int, most: int) -> Type:
-    def parse(value: Any) -> int | None:
-        return value if type(value) is int and least <= value <= most else None
-
-    return Type(f"a whole number, {least} to {most}", parse)
-
-
-def _direction(value: Any) -> Array | None:
-    """From degrees or [x, y], of length 1."""
-    if (degrees := _number(value)) is not None:
-        return np.array(unit(degrees))
-    vector = _pair(value)
-    # First by the larger component: a square may be out of range.
-    size = max(map(abs, vector)) if vector else 0.0
-    if not size:
-        return None
-    scaled = np.array(vector) / size
-    return scaled / math.hypot(*scaled)
+    """The whole numbers from `least` to `most`."""
+    return Type(
+        f"a whole number, {least} to {most}",
+        lambda value: value if type(value) is int and least <= value <= most else None,
+    )
 
 
-_pair = list_of(_number, 2, 2)
-TEXT = Type("a text", _text)
-TEXTS = Type("a list of texts", list_of(_text))
-NUMBER = Type("a number", _number)
-POSITIVE = Type("a number above 0", _positive)
-NUMBERS = Type("a list of numbers", list_of(_number))
-INDEX = Type("a number above 0, or a list of one for each colour", _first(list_of(_positive), _single(_positive)))
-POSITIVES = Type("two numbers above 0", list_of(_positive, 2, 2))
-POINT = Type("[x, y]", _pair)
-POINTS = Type("a list of [x, y]", list_of(_pair))
-PAIR = Type("two numbers", _pair)
-DIRECTION = Type("degrees, or [x, y] that is not [0, 0]", _direction)
-DIRECTIONS = Type("a list of degrees or of [x, y] that are not [0, 0]", list_of(_direction))
-_factor = _if(lambda v: 1e-100 <= abs(v) <= 1e100, _number)
-SCALE = Type("a number of size 1e-100 to 1e100, or two of them", _first(_factor, list_of(_factor, 2, 2)))
-BOX = Type("[x0, x1, y0, y1], x0 < x1, y0 < y1", _if(lambda v: v[0] < v[1] and v[2] < v[3], list_of(_number, 4, 4)))
-APEX = Type("degrees, above 0 and below 180", _if(lambda v: v < 180, _positive))
-TABLES = Type("a table or more, in double brackets", list_of(lambda value: value if isinstance(value, dict) else None))
-RAYS = whole(1, 1_000_000)
+TEXT = Type("a text", text)
+TEXTS = Type("a list of texts", list_of(text))
+NUMBER = Type("a number", number)
+NUMBERS = Type("a list of numbers", list_of(number))
+POSITIVE = Type("a number above 0", positive)
+TABLES = Type("a table or more, in double brackets", list_of(table))
 
 
 # Keys -------------------------------------------------------------------------------------------------------------
@@ -117,35 +97,22 @@ RAYS = whole(1, 1_000_000)
 
 @dataclass(frozen=True)
 class Key:
-    """A key of a table: its type, what it means, and what it is where it is left out (None: nothing)."""
+    """A key of a table: its type, what it means, and its value where it is left out (None: no value)."""
 
     type: Type
     meaning: str
     default: Any = REQUIRED
 
 
-@dataclass(frozen=True)
-class Kind:
-    """A kind of shape or beam: what it is, its own keys, and what is built of their values.
-
-    Of a shape: `build(values)` gives its parts, around its own origin; `values` has `n` and `outside`, per colour.
-    Of a beam: origins and directions, N × 2.
-    """
-
-    meaning: str
-    keys: dict[str, Key]
-    build: Callable[[Values], Any]
-
-
-def read(table: Values, keys: dict[str, Key], where: str = "") -> Values:
-    """The values of `keys`, parsed. ValueError names `where` and the key that is unknown, missing or refused."""
+def read(table: Table, keys: dict[str, Key], where: str = "") -> Table:
+    """The values of `keys`, parsed. ValueError names `where` and the key that is unknown, missing or not accepted."""
     for name in table:
         if name not in keys:
             raise ValueError(f"{where}{_shown_key(name)}: unknown; accepted: {', '.join(keys)}")
     return {name: _value(table, name, key, where) for name, key in keys.items()}
 
 
-def _value(table: Values, name: str, key: Key, where: str) -> Any:
+def _value(table: Table, name: str, key: Key, where: str) -> Any:
     if name not in table and key.default is not REQUIRED:
         return key.default
     value = key.type.parse(table[name]) if name in table else None
@@ -155,60 +122,29 @@ def _value(table: Values, name: str, key: Key, where: str) -> Any:
     return value
 
 
-def read_kind(table: Values, kinds: dict[str, Kind], where: str, colours: int) -> tuple[Kind, Values]:
-    """The kind of a shape or a beam, and its values; indices per colour. ValueError as for `read`."""
-    name = table.get("kind")
-    if not isinstance(name, str) or name not in kinds:
-        found = shown(name) if "kind" in table else "missing"
-        raise ValueError(f"{where}kind: {found}; accepted: {', '.join(kinds)}")
-    keys = kinds[name].keys
-    values = read({key: value for key, value in table.items() if key != "kind"}, keys, where)
-    return kinds[name], per_colour(values, keys, where, colours)
-
-
-def per_colour(values: Values, keys: dict[str, Key], where: str, colours: int) -> Values:
-    """`values` with every index as a tuple of one per colour; ValueError for a list of another length."""
-    found = {name: values[name] for name, key in keys.items() if key.type is INDEX and values[name] is not None}
-    for name, indices in found.items():
-        if len(indices) not in (1, colours):
-            raise ValueError(f"{where}{name}: {len(indices)} numbers; accepted: 1 for all or each of {colours} colours")
-    return values | {name: tuple(n) * (colours // len(n)) for name, n in found.items()}
-
-
 def shown(value: Any) -> str:
-    """A value as in TOML, shortened to a line."""
-    text = str(value).lower() if isinstance(value, bool) else repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    """A value as TOML writes it, cut to one line of SHOWN characters."""
+    written = str(value).lower() if isinstance(value, bool) else repr(value)
+    return written if len(written) <= SHOWN else f"{written[: SHOWN - 3]}..."
 
 
 def _shown_key(name: str) -> str:
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else shown(name)
 
 
-# Tables in Markdown -----------------------------------------------------------------------------------------------
+# Documentation ----------------------------------------------------------------------------------------------------
 
 
 def key_table(title: str, keys: dict[str, Key]) -> str:
-    """Of `title`, accepted value and meaning."""
-    rows = [f"| `{name}` | {key.type.accepted} | {key.meaning}{_default(key)} |" for name, key in keys.items()]
+    """A Markdown table of `keys`: name, accepted values, meaning and default. `title` heads the first column."""
+    rows = [f"| `{name}` | {key.type.accepted} | {key.meaning}{shown_default(key)} |" for name, key in keys.items()]
     return "\n".join([f"| {title} | value | meaning |", "|---|---|---|", *rows])
 
 
-def kind_table(title: str, kinds: dict[str, Kind], shared: dict[str, Key]) -> str:
-    """Of `title`, what it is, and its own keys, not the shared ones."""
-    rows = [f"| `{name}` | {kind.meaning} | {_own_keys(kind, shared)} |" for name, kind in kinds.items()]
-    return "\n".join([f"| {title} | what it is | its keys |", "|---|---|---|", *rows])
-
-
-def _own_keys(kind: Kind, shared: dict[str, Key]) -> str:
-    own = {name: key for name, key in kind.keys.items() if shared.get(name) is not key}
-    texts = (f"`{name}` ({key.type.accepted}) {key.meaning}{_default(key)}" for name, key in own.items())
-    return "; ".join(text.rstrip() for text in texts)
-
-
-def _default(key: Key) -> str:
+def shown_default(key: Key) -> str:
+    """The default as the end of a table cell; empty where the key has none, or None."""
     if key.default is REQUIRED or key.default is None:
         return ""
     default = key.default if isinstance(key.default, list) else [key.default]
-    text = ", ".join(x if isinstance(x, str) else f"{x:g}" for x in default)
-    return f", default {text if len(default) == 1 else f'[{text}]'}"
+    written = ", ".join(x if isinstance(x, str) else f"{x:g}" for x in default)
+    return f", default {written if len(default) == 1 else f'[{written}]'}"

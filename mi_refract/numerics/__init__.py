@@ -1,1 +1,34 @@
-"""Error-free transforms and float expansions. No optics."""
+"""Arithmetic that the formulas of refraction rest on. No optics in here.
+
+In: floats, numpy arrays or Dr.Jit arrays. Out: sums and products with their exact rounding errors, numbers of two or
+three words, and what Dr.Jit's arrays need to behave alike on every backend.
+
+`error_free` and `float_expansions` are modules with a `dot`, `cross` and `two_prod` of their own: the first for the
+formulas, in the precision of the arrays, the second for the code that judges them, in float64.
+"""
+
+from . import error_free, float_expansions
+from .drjit_arrays import as_component, differentiated, ieee_divide, replace_grad, scale_to_unit
+from .error_free import DoubleWord, TripleWord, two_prod, two_sum
+from .float_expansions import FloatExpansion
+from .types import ArrayType, Mask, Number, Variant, Vector3
+
+__all__ = [
+    "ArrayType",
+    "DoubleWord",
+    "FloatExpansion",
+    "Mask",
+    "Number",
+    "TripleWord",
+    "Variant",
+    "Vector3",
+    "as_component",
+    "differentiated",
+    "error_free",
+    "float_expansions",
+    "ieee_divide",
+    "replace_grad",
+    "scale_to_unit",
+    "two_prod",
+    "two_sum",
+]

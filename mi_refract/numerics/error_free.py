@@ -18,49 +18,6 @@ import drjit as dr
 Pair = tuple[Any, Any]
 
 
-def as_component(a: Any, k: Any) -> Any:
-    """The number `k` in the precision and backend of the components of the vector `a`, rounded once."""
-    component = dr.value_t(type(a))
-    if not dr.is_array_v(k):
-        k = float(k)
-    if component is float and dr.type_v(a) == dr.VarType.Float32:
-        return dr.scalar.Array1f(k)[0]
-    return component(k)
-
-
-def ieee_divide(x: Any, y: Any) -> Any:
-    """x / y by the rules of IEEE 754 on every backend; a Python float would raise where y is 0."""
-    if isinstance(y, float) and y == 0:
-        return x * dr.rcp(y)
-    return x / y
-
-
-# Dr.Jit's type stubs say that the first returns an object, and nothing of what the second returns.
-_reinterpret: Any = dr.reinterpret_array
-replace_grad: Any = dr.replace_grad
-
-
-def differentiated(x: Any) -> bool:
-    """Whether `x` carries a derivative. Types that cannot are told apart first: Dr.Jit takes ten times as long."""
-    return dr.is_diff_v(x) and dr.grad_enabled(x)
-
-
-def scale_to_unit(v: Any) -> tuple[Any, Any]:
-    """(v / p, p), p the power of two for which the largest component of v / p is in [1, 2). Exact.
-
-    Where squares could over- or underflow, which is in float32 on Dr.Jit's arrays; every other type has the range
-    for lengths of 1e-18 to 1e18 as it is, and p is the literal 1.
-    """
-    if dr.type_v(v) != dr.VarType.Float32 or not dr.is_jit_v(v):
-        return v, 1
-    number: Any = dr.value_t(type(v))
-    bits, reinterpret = dr.uint32_array_t(number), _reinterpret
-    x, y, z = (reinterpret(bits, dr.detach(v_i)) & 0x7FFFFFFF for v_i in v)  # ordered as |v_i| are
-    exponent = dr.maximum(dr.maximum(x, y), z) & 0x7F800000
-    # 127 is the bias: of 1 / p and of p one each.
-    return v * reinterpret(number, (2 * 127 << 23) - exponent), reinterpret(number, exponent)
-
-
 def two_sum(x: Any, y: Any) -> Pair:
     """s = fl(x + y) and e with s + e = x + y exactly, whatever the magnitudes."""
     s = x + y

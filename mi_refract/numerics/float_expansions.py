@@ -67,7 +67,7 @@ def negated(x: Any) -> FloatExpansion:
     return [-x_i for x_i in x]
 
 
-def ieee_divide(x: Any, y: Any, words: int = 2) -> FloatExpansion:
+def quotient(x: Any, y: Any, words: int = 2) -> FloatExpansion:
     """x / y of two expansions, by long division: relative error ≤ 16 u^words."""
     digits, rest = [], list(x)
     for _ in range(words):
@@ -85,15 +85,3 @@ def dot(x: Any, y: Any, words: int = 3) -> FloatExpansion:
 def cross(x: Any, y: Any, words: int = 3) -> list[FloatExpansion]:
     """x × y of two 3-vectors of floats, each component as `dot` has it."""
     return [dot((x[i], x[j]), (y[j], -y[i]), words) for i, j in ((1, 2), (2, 0), (0, 1))]
-
-
-def radicand(a: Any, n: Any, k: Any) -> tuple[FloatExpansion, FloatExpansion, Any]:
-    """(n·a, D, T): D = (n·a)² − κ |n×a|², κ = k² − 1, which is negative under total internal reflection.
-
-    `a`, `n`: three components each. T = (n·a)² + |κ| |n×a|², to a few u; the error of D is at most 2⁻¹⁴⁰ T.
-    """
-    c = dot(n, a)
-    kappa = distil([*two_prod(k, k), 0 * k - 1])
-    w2 = distil([part for w in cross(n, a) for part in product(w, w)])
-    first, second = product(c, c), product(kappa, w2)
-    return c, distil([*first, *negated(second)]), first[0] + abs(second[0])

@@ -1,5 +1,17 @@
-"""Certified answers by ball arithmetic."""
+"""Exact answers for refraction, each with a bound of what it leaves out. Needs python-flint.
 
-from .ball_arithmetic import Certified, Residual, fresnel, margin, refract, residual
+In: numpy arrays `a`, `n`, `k`, taken as exact numbers. Out: `Certified` directions, cosines, powers and amplitudes to
+106 bits; `residual`, whether Snell's law holds for them; `derivatives`, along a line of inputs. No formula of this
+package is imported: what judges them shares no code with them.
+"""
 
-__all__ = ["Certified", "Residual", "fresnel", "margin", "refract", "residual"]
+try:
+    import flint as _flint  # noqa: F401
+except ImportError as error:
+    raise ImportError("oracle needs python-flint: pip install 'mi-refract[validation]'") from error
+
+from . import derivatives
+from .ball_arithmetic import Certified, fresnel, refract, relative_radicand
+from .snell_residual import Residual, residual
+
+__all__ = ["Certified", "Residual", "derivatives", "fresnel", "refract", "relative_radicand", "residual"]

@@ -17,28 +17,24 @@ Arithmetic: F. Johansson, "Arb: efficient arbitrary-precision midpoint-radius in
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from flint import arb, ctx
 
-try:
-    from flint import arb, ctx
-except ImportError as error:
-    raise ImportError("oracle needs python-flint: pip install 'mi-refract[validation]'") from error
+from .arguments import checked, floats, rays
+from .progress import watched
 
 # The radicand of float64 inputs has its bits between 2^±12600: twice n·a (2 × 4200) and k² (4200).
 EXACT_BITS = 16384
 # 160 bits leave the direction 1e-47 wide; the higher ones are taken only where a ball stays too wide.
 PRECISIONS = (160, 320, 640)
 MAX_RADIUS = 1e-30
-MAX_RESIDUAL = 1e-28
 # |x| ≤ 1 as a pair of doubles: |x − high| ≤ 2⁻⁵⁴, so |x − high − low| ≤ 2⁻¹⁰⁸. Two bits spare for the radius.
 PAIR_ERROR = 2.0**-106
 
-_CHUNK = 256
 _COLUMNS = 18
 _FIRST_FRESNEL = 10
 _NO_FRESNEL = (math.nan,) * 8
@@ -79,14 +75,6 @@ class Certified:
         return len(self.radius)
 
 
-@dataclass(frozen=True)
-class Residual:
-    """What Snell's law says of a certified answer: `holds` (N,) bool, `width` (N,) of its widest ball."""
-
-    holds: np.ndarray
-    width: np.ndarray
-
-
 def refract(a: Any, n: Any, k: Any, *, contrast: Any = None, fresnel: bool = True, progress: bool = True) -> Certified:
     """Solve Snell's law, sin θt = k sin θi in the plane of a and n, for exactly these numbers.
 
@@ -98,11 +86,11 @@ def refract(a: Any, n: Any, k: Any, *, contrast: Any = None, fresnel: bool = Tru
     D = 0 is transmitted along the surface; n·a = 0 is tangential, not transmitted, b = a.
     Raises ValueError on a wrong shape or dtype; never on a value.
     """
-    a, n, k, contrast, valid = _inputs(a, n, k, contrast)
+    a, n, k, contrast, valid = checked(a, n, k, contrast)
     table = np.full((len(a), _COLUMNS), math.nan)
-    for chunk in _watched(len(a), progress):
+    for chunk in watched(len(a), progress):
         index = np.flatnonzero(valid[chunk]) + chunk.start
-        _fill(table, index, (_exact(*ray) for ray in _rays(a, n, k, contrast, index)), fresnel)
+        _fill(table, index, (_exact(*ray) for ray in rays(a, n, k, contrast, index)), fresnel)
     return _certified(table, valid)
 
 
@@ -111,9 +99,9 @@ def fresnel(cos_i: Any, k: Any, *, contrast: Any = None) -> Certified:
 
     cos_i: (N,) float32 or float64. Rays whose cosine is outside 0 … 1 are invalid. Raises as `refract` does.
     """
-    cos_i = _floats("cos_i", cos_i, ("N",))
+    cos_i = floats("cos_i", cos_i, ("N",))
     axis = np.tile([0.0, 0.0, 1.0], (len(cos_i), 1))
-    _, _, k, contrast, valid = _inputs(axis, axis, k, contrast)
+    _, _, k, contrast, valid = checked(axis, axis, k, contrast)
     valid &= (cos_i >= 0) & (cos_i <= 1)
     table, index = np.full((len(cos_i), _COLUMNS), math.nan), np.flatnonzero(valid)
     ratios = k[index].tolist(), [None] * len(index) if contrast is None else contrast[index].tolist()
@@ -242,128 +230,18 @@ def _fresnel(polynomials: tuple, k: Any, root: Any, tangential: bool) -> tuple[f
     return r, float(reflectance - r), t, float(transmittance - t), float(a_s), 0.0, float(a_p), 0.0
 
 
-def margin(a: Any, n: Any, k: Any) -> np.ndarray:
+def relative_radicand(a: Any, n: Any, k: Any) -> np.ndarray:
     """(N,) how far each ray is from the critical angle: D / max(c², |k²−1| |n×a|²), from −1 to 1, to 2⁻⁵³ of itself.
 
     Exactly 0 at the critical angle, negative under total internal reflection; NaN where both terms are 0 or the ray
     is invalid. Arguments as for `refract`.
     """
-    a, n, k, _, valid = _inputs(a, n, k, None)
+    a, n, k, _, valid = checked(a, n, k, None)
     index, ratio = np.flatnonzero(valid), np.full(len(a), math.nan)
-    for i, ray in zip(index, _rays(a, n, k, None, index), strict=True):
+    for i, ray in zip(index, rays(a, n, k, None, index), strict=True):
         with ctx.workprec(EXACT_BITS):
             _, _, _, _, c2, s2, e, _, d, *_ = _exact(*ray)
             larger = max(c2, abs(e) * s2)
         with ctx.workprec(PRECISIONS[0]):
             ratio[i] = float(d / larger) if larger > 0 else math.nan
     return ratio
-
-
-def residual(a: Any, n: Any, k: Any, certified: Certified, *, contrast: Any = None) -> Residual:
-    """Put a certified answer back into the law; arguments as for `refract`.
-
-    With u = n/|n|, i = a/|a| and ratio = k (transmitted) or 1, in balls around the answer:
-        u×b − ratio u×i = 0     Snell's law, its plane and its side
-        u·b − (±√(1 − ratio²|u×i|²)) = 0     |b| = 1; the length itself is blind along n at the critical angle
-    and the flag must be what the exact signs of n·a and 1 − k² sin²θi say. Invalid rays must be NaN.
-    A ball wider than 1e-28 proves nothing: the law does not hold there.
-    """
-    a, n, k, contrast, valid = _inputs(a, n, k, contrast)
-    if len(certified) != len(a):
-        raise ValueError(f"oracle: certified holds {len(certified)} rays; accepted: {len(a)}, as many as a")
-    holds = np.isnan(certified.direction).all(axis=1) & ~certified.transmitted
-    width = np.zeros(len(a))
-    index = np.flatnonzero(valid)
-    for i, ray in zip(index, _rays(a, n, k, contrast, index), strict=True):
-        high, low = certified.direction[i].tolist(), certified.direction_low[i].tolist()
-        balls = _law(ray, high, low, float(certified.radius[i]), bool(certified.transmitted[i]))
-        width[i] = max((2 * float(ball.rad()) for ball in balls), default=math.nan)
-        holds[i] = width[i] <= MAX_RESIDUAL and all(ball.contains(0) for ball in balls)
-    return Residual(holds, width)
-
-
-def _law(ray: tuple, high: list, low: list, radius: float, transmitted: bool) -> list:
-    """The four balls of `residual`; none where the flag is wrong."""
-    with ctx.workprec(EXACT_BITS):
-        ax, ay, az, nx, ny, nz = (arb(x) for x in ray[:6])
-        k2 = arb(ray[6]) ** 2 if ray[7] is None else arb(ray[7]) + 1
-        cross = ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx
-        sines = sum(x * x for x in cross)
-        nn = nx * nx + ny * ny + nz * nz
-        lengths = (ax * ax + ay * ay + az * az) * nn
-        c = ax * nx + ay * ny + az * nz
-        if transmitted != (c != 0 and lengths - k2 * sines >= 0):
-            return []
-        ratio2 = k2 if transmitted else arb(1)
-        cosine = lengths - ratio2 * sines
-    with ctx.workprec(2 * PRECISIONS[0]):
-        bx, by, bz = (arb(h, radius) + rest for h, rest in zip(high, low, strict=True))
-        u, unit, side = nn.rsqrt(), lengths.rsqrt(), 1 if (c > 0) == transmitted else -1
-        scale = ratio2.sqrt() * unit
-        ux, uy, uz = u * nx, u * ny, u * nz
-        return [
-            uy * bz - uz * by + scale * cross[0],
-            uz * bx - ux * bz + scale * cross[1],
-            ux * by - uy * bx + scale * cross[2],
-            bx * ux + by * uy + bz * uz - side * cosine.sqrt() * unit,
-        ]
-
-
-def _inputs(a: Any, n: Any, k: Any, contrast: Any) -> tuple:
-    """Check shapes and dtypes; float64 arrays (it holds float32 exactly) and the mask of valid rays."""
-    a = _floats("a", a, ("N", 3))
-    count = len(a)
-    n, k = _floats("n", n, (count, 3)), np.broadcast_to(_floats("k", k, (), (count,)), (count,))
-    valid = np.isfinite(a).all(axis=1) & np.isfinite(n).all(axis=1) & a.any(axis=1) & n.any(axis=1)
-    valid &= np.isfinite(k) & (k > 0)
-    if contrast is not None:
-        contrast = np.broadcast_to(_floats("contrast", contrast, (), (count,)), (count,))
-        valid &= np.isfinite(contrast) & (contrast > -1)
-    return a, n, k, contrast, valid
-
-
-def _floats(name: str, x: Any, *shapes: tuple) -> np.ndarray:
-    """`x` as float64, exactly. One of `shapes`, where "N" is any length."""
-    x = np.asarray(float(x) if isinstance(x, int) else x)
-    fits = any(len(s) == x.ndim and all(map(lambda w, m: w in ("N", m), s, x.shape)) for s in shapes)
-    if x.dtype not in (np.float32, np.float64) or not fits:
-        accepted = " or ".join(f"({', '.join(map(str, s))})" if s else "a number" for s in shapes)
-        raise ValueError(f"oracle: {name} is {x.dtype} {x.shape}; accepted: float32 or float64, {accepted}")
-    return x.astype(np.float64)
-
-
-def _rays(a: np.ndarray, n: np.ndarray, k: np.ndarray, contrast: Any, index: np.ndarray) -> Iterator[tuple]:
-    """Tuples (ax, ay, az, nx, ny, nz, k, contrast) of Python floats."""
-    columns = [x.tolist() for x in (*a[index].T, *n[index].T, k[index])]
-    return zip(*columns, [None] * len(index) if contrast is None else contrast[index].tolist(), strict=True)
-
-
-def _watched(count: int, progress: bool) -> Iterator[slice]:
-    """Slices of at most _CHUNK rays; past two seconds, a progress bar."""
-    start, bar, task = time.monotonic(), None, None
-    try:
-        for first in range(0, count, _CHUNK):
-            yield slice(first, min(first + _CHUNK, count))
-            if progress and bar is None and time.monotonic() - start > 2:
-                bar, task = _progress_bar(count)
-                progress = bar is not None
-            if bar is not None:
-                bar.update(task, completed=min(first + _CHUNK, count))
-    finally:
-        if bar is not None:
-            bar.stop()
-
-
-def _progress_bar(count: int) -> tuple[Any, Any]:
-    """A started rich bar on stderr and its task; (None, None) where rich is missing or nobody looks."""
-    try:
-        from rich.console import Console
-        from rich.progress import Progress
-    except ImportError:
-        return None, None
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        return None, None
-    bar = Progress(console=console, transient=True)
-    bar.start()
-    return bar, bar.add_task("oracle", total=count)

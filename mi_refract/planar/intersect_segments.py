@@ -19,7 +19,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.numerics.error_free import ieee_divide
+from mi_refract.numerics import ieee_divide
 
 from .array_backend import Lanes
 

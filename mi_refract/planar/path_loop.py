@@ -10,8 +10,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.formulas.documented import FORMULAS, refract_2d
-from mi_refract.formulas.fresnel import powers, refracted_cosine
+from mi_refract.formulas import FORMULAS, fresnel, refract_2d
 
 from .array_backend import Lanes, negated
 from .intersect_segments import NOWHERE, Hit, Ray, Straight, cross
@@ -196,8 +195,8 @@ def _mirrored(d: Any, l: Any) -> Any:  # noqa: E741
 def _share(d: Any, l: Any, k: Any, through: Any) -> Any:  # noqa: E741
     """Of the power, what goes the way that is taken."""
     cos_i = dr.minimum(dr.abs(cross(l, d)), 1)
-    cos_t, transmitted = refracted_cosine(cos_i, k)
-    r, t = powers(cos_i, cos_t, transmitted, k)
+    cos_t, transmitted = fresnel.refracted_cosine(cos_i, k)
+    r, t = fresnel.powers(cos_i, cos_t, transmitted, k)
     return dr.select(through, t, r)
 
 

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_refract.io.toml_schema import per_colour, read, read_kind, shown
+from mi_refract.io.toml_schema import read, shown
 
 from .curves import affine
-from .scene_schema import BEAMS, SCENE, SHAPES, Indices, Part
+from .scene_schema import BEAMS, SCENE, SHAPES, Part
+from .scene_values import Indices, per_colour, read_kind
 from .shared_boundaries import Named, boundaries
 from .tracer import Array, Segments
 

@@ -8,14 +8,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mi_refract.io import toml_schema
-from mi_refract.io.toml_schema import Key, Kind, Values
+from mi_refract.io.toml_schema import NUMBER, NUMBERS, POSITIVE, TABLES, TEXT, TEXTS, Key, Table, key_table, whole
 
 from . import shapes
 from .curves import Curve, unit
+from .scene_values import (
+    APEX,
+    BOX,
+    DIRECTION,
+    DIRECTIONS,
+    INDEX,
+    PAIR,
+    POINT,
+    POINTS,
+    POSITIVES,
+    RAYS,
+    SCALE,
+    Indices,
+    Kind,
+    kind_table,
+)
 from .tracer import Array
-
-Indices = tuple[float, ...]  # one per colour
 
 
 class Part(NamedTuple):
@@ -27,61 +40,57 @@ class Part(NamedTuple):
 
 
 SCENE = {
-    "title": Key(toml_schema.TEXT, "what the image is called; the file's name by default", None),
-    "index": Key(toml_schema.INDEX, "of the medium around everything", [1.0]),
-    "colours": Key(
-        toml_schema.TEXTS, "one for each wavelength, as matplotlib calls them; lists of indices are as long", None
-    ),
-    "max_depth": Key(toml_schema.whole(1, 100_000), "the most boundaries that a ray meets", 16),
-    "branches": Key(
-        toml_schema.whole(0, 8), "the most partial reflections on a path; 0: refracted wherever possible", 0
-    ),
-    "view": Key(toml_schema.BOX, "what the image shows; all shapes by default", None),
-    "shape": Key(toml_schema.TABLES, "[[shape]]: boundaries between media"),
-    "beam": Key(toml_schema.TABLES, "[[beam]]: rays to follow"),
+    "title": Key(TEXT, "what the image is called; the file's name by default", None),
+    "index": Key(INDEX, "of the medium around everything", [1.0]),
+    "colours": Key(TEXTS, "one for each wavelength, as matplotlib calls them; lists of indices are as long", None),
+    "max_depth": Key(whole(1, 100_000), "the most boundaries that a ray meets", 16),
+    "branches": Key(whole(0, 8), "the most partial reflections on a path; 0: refracted wherever possible", 0),
+    "view": Key(BOX, "what the image shows; all shapes by default", None),
+    "shape": Key(TABLES, "[[shape]]: boundaries between media"),
+    "beam": Key(TABLES, "[[beam]]: rays to follow"),
 }
 PLACE = {
-    "scale": Key(toml_schema.SCALE, "stretches the shape, first of all", 1.0),
-    "rotate": Key(toml_schema.NUMBER, "then turns it counter-clockwise, in degrees", 0.0),
-    "at": Key(toml_schema.POINT, "then moves its origin there", [0.0, 0.0]),
+    "scale": Key(SCALE, "stretches the shape, first of all", 1.0),
+    "rotate": Key(NUMBER, "then turns it counter-clockwise, in degrees", 0.0),
+    "at": Key(POINT, "then moves its origin there", [0.0, 0.0]),
 }
-FACETS = {"facets": Key(toml_schema.whole(1, 1_000_000), "so many chords in place of all arcs of a curve", None)}
+FACETS = {"facets": Key(whole(1, 1_000_000), "so many chords in place of all arcs of a curve", None)}
 OUTSIDE = {
-    "outside": Key(toml_schema.INDEX, "index around the shape; that of the whole scene by default", None),
-    "within": Key(toml_schema.TEXT, "or the name of a shape above that it lies in", None),
+    "outside": Key(INDEX, "index around the shape; that of the whole scene by default", None),
+    "within": Key(TEXT, "or the name of a shape above that it lies in", None),
 }
-SOLID = {"n": Key(toml_schema.INDEX, "index inside"), "name": Key(toml_schema.TEXT, "for `within`", None)} | OUTSIDE
-THICKNESS = Key(toml_schema.POSITIVE, "on the axis")
+SOLID = {"n": Key(INDEX, "index inside"), "name": Key(TEXT, "for `within`", None)} | OUTSIDE
+THICKNESS = Key(POSITIVE, "on the axis")
 
 
-def _solid(build: Callable[[Values], Curve]) -> Callable[[Values], list[Part]]:
+def _solid(build: Callable[[Table], Curve]) -> Callable[[Table], list[Part]]:
     return lambda v: [Part(build(v), v["n"], v["outside"])]
 
 
-def _lens(v: Values) -> Curve:
+def _lens(v: Table) -> Curve:
     options = {name: v[name] for name in ("radius", "conic", "vertex")}
     return shapes.lens(v["curvature"], v["thickness"], **options)
 
 
-def _ellipse_lens(v: Values) -> Curve:
+def _ellipse_lens(v: Table) -> Curve:
     return shapes.ellipse_lens(v["n"][0] / v["outside"][0], v["focal_length"], v["thickness"], v["radius"])
 
 
-def _luneburg(v: Values) -> list[Part]:
+def _luneburg(v: Table) -> list[Part]:
     layers = shapes.luneburg(v["radius"], v["layers"])
     media = [v["outside"], *(tuple(n * ratio for n in v["outside"]) for _, ratio in layers)]
     return [Part(c, inner, outer) for (c, _), (outer, inner) in zip(layers, itertools.pairwise(media), strict=True)]
 
 
 def _arcs(pieces: str) -> Key:
-    return Key(toml_schema.NUMBERS, f"degrees by which {pieces} turns left, an arc of a circle; 0: straight", None)
+    return Key(NUMBERS, f"degrees by which {pieces} turns left, an arc of a circle; 0: straight", None)
 
 
 SHAPES = {
     "polygon": Kind(
         "a closed chain of straight pieces and arcs of circles",
         {
-            "points": Key(toml_schema.POINTS, "its corners"),
+            "points": Key(POINTS, "its corners"),
             "arcs": _arcs("each piece, the last one to the first corner,"),
         }
         | SOLID
@@ -91,14 +100,14 @@ SHAPES = {
     ),
     "rectangle": Kind(
         "around its origin",
-        {"width": Key(toml_schema.POSITIVE, "along x"), "height": Key(toml_schema.POSITIVE, "along y")} | SOLID | PLACE,
+        {"width": Key(POSITIVE, "along x"), "height": Key(POSITIVE, "along y")} | SOLID | PLACE,
         _solid(lambda v: shapes.rectangle(v["width"], v["height"])),
     ),
     "prism": Kind(
         "a triangle with two equal sides, its apex up, its centroid at the origin",
         {
-            "side": Key(toml_schema.POSITIVE, "length of either side"),
-            "apex": Key(toml_schema.APEX, "the angle between them", 60.0),
+            "side": Key(POSITIVE, "length of either side"),
+            "apex": Key(APEX, "the angle between them", 60.0),
         }
         | SOLID
         | PLACE,
@@ -106,24 +115,22 @@ SHAPES = {
     ),
     "circle": Kind(
         "around its origin",
-        {"radius": Key(toml_schema.POSITIVE, "from its origin")} | SOLID | PLACE | FACETS,
+        {"radius": Key(POSITIVE, "from its origin")} | SOLID | PLACE | FACETS,
         _solid(lambda v: shapes.circle(v["radius"])),
     ),
     "ellipse": Kind(
         "around its origin",
-        {"radii": Key(toml_schema.POSITIVES, "half axes along x and y")} | SOLID | PLACE | FACETS,
+        {"radii": Key(POSITIVES, "half axes along x and y")} | SOLID | PLACE | FACETS,
         _solid(lambda v: shapes.ellipse(*v["radii"])),
     ),
     "lens": Kind(
         "two conic surfaces z = c r² / (1 + √(1 − (1 + K) c² r²)) on the x axis, with a rim between them",
         {
-            "curvature": Key(
-                toml_schema.PAIR, "c of the front and of the back, positive where the centre lies toward +x"
-            ),
-            "conic": Key(toml_schema.PAIR, "K of each", [0.0, 0.0]),
+            "curvature": Key(PAIR, "c of the front and of the back, positive where the centre lies toward +x"),
+            "conic": Key(PAIR, "K of each", [0.0, 0.0]),
             "thickness": THICKNESS,
-            "radius": Key(toml_schema.POSITIVE, "half the aperture; up to where the surfaces meet by default", None),
-            "vertex": Key(toml_schema.NUMBER, "where the front meets the axis", 0.0),
+            "radius": Key(POSITIVE, "half the aperture; up to where the surfaces meet by default", None),
+            "vertex": Key(NUMBER, "where the front meets the axis", 0.0),
         }
         | SOLID
         | PLACE
@@ -133,9 +140,9 @@ SHAPES = {
     "ellipse_lens": Kind(
         "focuses rays along x into its origin: an ellipse of eccentricity outside/n (first colour), and a circle",
         {
-            "focal_length": Key(toml_schema.POSITIVE, "from the front to the focus"),
+            "focal_length": Key(POSITIVE, "from the front to the focus"),
             "thickness": THICKNESS,
-            "radius": Key(toml_schema.POSITIVE, "half the aperture"),
+            "radius": Key(POSITIVE, "half the aperture"),
         }
         | SOLID
         | PLACE
@@ -145,8 +152,8 @@ SHAPES = {
     "luneburg": Kind(
         "a ball in concentric layers of index outside × √(2 − (r/radius)²)",
         {
-            "radius": Key(toml_schema.POSITIVE, "of the outermost"),
-            "layers": Key(toml_schema.whole(1, 10_000), "how many"),
+            "radius": Key(POSITIVE, "of the outermost"),
+            "layers": Key(whole(1, 10_000), "how many"),
         }
         | OUTSIDE
         | PLACE
@@ -156,10 +163,10 @@ SHAPES = {
     "boundary": Kind(
         "an open chain of straight pieces and arcs of circles between two media",
         {
-            "points": Key(toml_schema.POINTS, "its vertices"),
+            "points": Key(POINTS, "its vertices"),
             "arcs": _arcs("each piece"),
-            "n_left": Key(toml_schema.INDEX, "index on the left, seen along it"),
-            "n_right": Key(toml_schema.INDEX, "index on the right"),
+            "n_left": Key(INDEX, "index on the left, seen along it"),
+            "n_right": Key(INDEX, "index on the right"),
         }
         | PLACE
         | FACETS,
@@ -176,18 +183,18 @@ def _spread(first: Any, last: Any, count: int) -> Array:
     return np.concatenate([(first + (last - first) * steps / (count - 1))[:-1], [last]])
 
 
-def _parallel(v: Values) -> tuple[Array, Array]:
+def _parallel(v: Table) -> tuple[Array, Array]:
     origins = _spread(np.array(v["from"]), np.array(v["to"]), v["count"])
     return origins, np.broadcast_to(v["direction"], origins.shape)
 
 
-def _fan(v: Values) -> tuple[Array, Array]:
+def _fan(v: Table) -> tuple[Array, Array]:
     first, last = v["angles"]
     angles = _spread(first, last, v["count"])
     return np.broadcast_to(v["at"], (v["count"], 2)), np.array([unit(angle) for angle in angles])
 
 
-def _rays(v: Values) -> tuple[Array, Array]:
+def _rays(v: Table) -> tuple[Array, Array]:
     if len(v["origins"]) != len(v["directions"]):
         raise ValueError(f"directions: {len(v['directions'])}, for {len(v['origins'])} origins; accepted: as many")
     return np.array(v["origins"]), np.array(v["directions"])
@@ -197,25 +204,25 @@ BEAMS = {
     "parallel": Kind(
         "parallel rays from a line",
         {
-            "from": Key(toml_schema.POINT, "where the first one starts"),
-            "to": Key(toml_schema.POINT, "where the last one does"),
-            "direction": Key(toml_schema.DIRECTION, "of all"),
-            "count": Key(toml_schema.RAYS, "how many; 1: from the middle"),
+            "from": Key(POINT, "where the first one starts"),
+            "to": Key(POINT, "where the last one does"),
+            "direction": Key(DIRECTION, "of all"),
+            "count": Key(RAYS, "how many; 1: from the middle"),
         },
         _parallel,
     ),
     "fan": Kind(
         "rays from a point",
         {
-            "at": Key(toml_schema.POINT, "the point"),
-            "angles": Key(toml_schema.PAIR, "of the first and of the last one, in degrees"),
-            "count": Key(toml_schema.RAYS, "how many; 1: in the middle"),
+            "at": Key(POINT, "the point"),
+            "angles": Key(PAIR, "of the first and of the last one, in degrees"),
+            "count": Key(RAYS, "how many; 1: in the middle"),
         },
         _fan,
     ),
     "rays": Kind(
         "one by one",
-        {"origins": Key(toml_schema.POINTS, "where they start"), "directions": Key(toml_schema.DIRECTIONS, "as many")},
+        {"origins": Key(POINTS, "where they start"), "directions": Key(DIRECTIONS, "as many")},
         _rays,
     ),
 }
@@ -224,9 +231,9 @@ BEAMS = {
 def reference() -> str:
     """All kinds and keys as tables in Markdown, for the README."""
     shared = SOLID | PLACE | FACETS
-    parts = [toml_schema.key_table("key of the scene", SCENE), toml_schema.key_table("key of a shape", shared)]
+    parts = [key_table("key of the scene", SCENE), key_table("key of a shape", shared)]
     parts += [
-        toml_schema.kind_table("kind of shape", SHAPES, shared),
-        toml_schema.kind_table("kind of beam", BEAMS, {}),
+        kind_table("kind of shape", SHAPES, shared),
+        kind_table("kind of beam", BEAMS, {}),
     ]
     return "\n\n".join(parts)

@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from mi_refract.formulas import fresnel
-from mi_refract.formulas.documented import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, resolve
-from mi_refract.numerics.error_free import differentiated, ieee_divide, replace_grad
+from mi_refract.formulas import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, fresnel, resolve
+from mi_refract.numerics import differentiated, ieee_divide, replace_grad
 
 PLUGIN = "refract"
 LOBES = ("specular_reflectance", "specular_transmittance")  # tint of the reflected and of the transmitted lobe

@@ -1,1 +1,8 @@
-"""Sets of rays for other people's refraction, and the check of the answers."""
+"""Test rays for the refraction of any program, and the check of its answers.
+
+In: regimes of rays by name (`mi_refract.regimes`), or a file of rays; then a program's answers, as a file or on stdout.
+Out: a file of rays (CSV, .npz or EXR); for each regime the errors against certified directions, and the usual mistake
+that explains wrong answers; as text, JSON, JUnit XML or an HTML page. The command is `mi-refract rays`; see README.md.
+"""
+
+__all__ = ["check_answers", "files", "ray_set", "reports", "run_program", "tir_signal"]

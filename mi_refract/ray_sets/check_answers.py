@@ -1,94 +1,93 @@
-"""Answers to a ray set against the certified ones: how far off, where, whether total internal reflection was seen.
+"""Compare answers to a ray set with certified directions: how large the errors are, in which regimes, and why.
 
-Every ray is certified. An answer is held against the budget of a documented formula for that very ray: as good as
-that is right. Errors are angles, in the rays that were decided rightly; lengths are looked at apart.
+The oracle certifies every ray. An answer is right where its error is within the a-priori bound of a documented formula
+for that very ray. Errors are angles, over the rays whose total internal reflection was classified correctly; the error
+of the length is reported separately.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 
 from .diagnosis import Explanation, explain
-from .ray_set import Answers, RaySet
+from .ray_set import Answers, Header, RaySet
 from .tir_signal import AUTO, FLAG, TIR, UNCLEAR, Judged, judge
 
-# The documented formula that is allowed most.
+# The documented formula with the largest error bound.
 LOOSEST = max(FORMULAS, key=lambda name: (FORMULAS[name].budget.growth, FORMULAS[name].budget.radicand))
-FIRST = 5
+LISTED_IDS = 5
 
 
 @dataclass(frozen=True)
-class Figures:
-    """One regime. Errors are angles to the certified direction, of the rays that were decided rightly, in radians."""
+class RegimeErrors:
+    """Errors of the answers to one regime. Angles to the certified direction, in radians; NaN without any compared."""
 
     regime: str
     rays: int  # answered
-    judged: int  # rays whose direction was compared
+    compared: int  # rays whose direction was compared: TIR classified correctly, and the answer is a direction
     worst: float
     p99: float
     mean: float
-    norm: float  # the largest | |b| − 1 |, or of |b|/|a| where that is less
-    misjudged: int  # rays whose total internal reflection was decided wrongly
-    far: int  # those of them that are farther from the critical angle than the budget leaves open
-    share: float  # the largest share that an error takes of its ray's budget
-    wrong: int  # rays beyond their budget: too far off, misjudged far, or without a direction
-    limit: int  # rays whose answer is the exact one but for rounding
-    replay: dict[str, Any]  # the ray with the largest share, in hexadecimal floats
+    length_error: float  # the largest | |b| − 1 |, or | |b|/|a| − 1 | where that is less
+    tir_misclassified: int  # called transmitted where all is reflected, or the reverse
+    tir_beyond_bound: int  # those of them that are farther from the critical angle than the error bound excuses
+    error_over_bound: float  # the largest ratio of an error to the bound of its ray
+    wrong: int  # rays beyond their bound: angle, length or TIR, or without a direction
+    exact: int  # answers that are the certified ones, rounded
+    replay: dict[str, Any]  # the ray with the largest ratio, in hexadecimal floats
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What is wrong with the answers as a set of numbers: `text` names the first of `count`."""
+    """A defect of the set of answers, seen `count` times; `text` lists the first ids."""
 
     kind: str  # a key of PROBLEMS
     count: int
     text: str
 
 
-# What there can be, and whether the answers are then not those to the rays.
+# Each kind of problem, and whether the answers are then not those to the rays.
 PROBLEMS = {"missing": True, "duplicate": True, "unknown": True, "non-finite": False, "zero": False}
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What `check` found. Where `answered` is 0 there are no regimes."""
+    """The result of `check`. Without any answer there are no regimes."""
 
     precision: str
     ulp: float  # 2⁻²³ or 2⁻⁵²
-    budget: str  # the formula whose budget was applied
-    tir: str  # how total internal reflection is told; NONE where no ray has it, UNCLEAR where in no known way
-    told: bool  # by the caller
-    regimes: tuple[Figures, ...]
+    error_bound: str  # the formula whose bound was applied
+    tir: str  # how total internal reflection is signalled; NONE where no ray has it, UNCLEAR where in no known way
+    tir_given: bool  # by the caller
+    regimes: tuple[RegimeErrors, ...]
     problems: tuple[Problem, ...]
     explanations: tuple[Explanation, ...]  # of wrong answers
-    header: dict[str, Any]  # of the rays
+    header: Header  # of the rays
+
+    def total(self, name: str) -> int:
+        """The sum of a count of `RegimeErrors` over the regimes."""
+        return sum(getattr(each, name) for each in self.regimes)
 
     @property
     def answered(self) -> int:
-        return sum(each.rays for each in self.regimes)
-
-    @property
-    def judged(self) -> int:
-        return sum(each.judged for each in self.regimes)
+        """Rays that were answered."""
+        return self.total("rays")
 
     @property
     def wrong(self) -> int:
-        return sum(each.wrong for each in self.regimes)
+        """Rays whose answer is wrong."""
+        return self.total("wrong")
 
     @property
-    def limit(self) -> int:
-        return sum(each.limit for each in self.regimes)
-
-    @property
-    def farthest(self) -> Figures:
+    def farthest(self) -> RegimeErrors:
         """The regime with the largest angle. ValueError where nothing was answered."""
-        return max(self.regimes, key=lambda each: (each.judged > 0, each.worst))
+        return max(self.regimes, key=lambda each: (each.compared > 0, each.worst))
 
     @property
     def diagnosis(self) -> Explanation | None:
@@ -98,52 +97,54 @@ class Findings:
 
     @property
     def exit_code(self) -> int:
-        """0: all within the budget. 1: some refraction is wrong. 2: answers are missing, doubled, or to other rays.
+        """0: all answers are within the bound. 1: some are wrong. 2: missing, duplicate, or answers to other rays.
 
-        1 too where no direction was compared: of rays that anyone may decide either way, all were given up.
+        1 also where no direction was compared: a program that answers nothing but rays in doubt, and those by giving
+        up, has shown nothing.
         """
         if not self.answered or any(PROBLEMS[problem.kind] for problem in self.problems):
             return 2
-        return int(self.wrong > 0 or self.tir == UNCLEAR or bool(self.problems) or not self.judged)
+        return int(self.wrong > 0 or self.tir == UNCLEAR or bool(self.problems) or not self.total("compared"))
 
 
-def check(rays: RaySet, answers: Answers, *, tir: str = AUTO, budget: str = LOOSEST) -> Findings:
-    """Judge every answer. `tir`: how total internal reflection is told, one of TIR, or detected; `budget`: the formula
-    of FORMULAS that the answers must be as good as.
+def check(rays: RaySet, answers: Answers, *, tir: str = AUTO, error_bound: str = LOOSEST) -> Findings:
+    """Compare every answer with the certified direction.
 
-    ValueError for an unknown name, a flag that is not there, or answers whose header is that of other rays.
+    `tir`: how the answers signal total internal reflection, one of TIR; detected where it is AUTO. `error_bound`: the
+    formula of FORMULAS whose a-priori bound the errors must keep. ValueError for an unknown name, for tir = FLAG
+    without the column `transmitted`, or for answers whose header is that of other rays.
     """
-    _accepted("tir", tir, (AUTO, *TIR))
-    _accepted("budget", budget, FORMULAS)
+    _check_name("tir", tir, (AUTO, *TIR))
+    _check_name("error_bound", error_bound, FORMULAS)
     if tir == FLAG and answers.transmitted is None:
         raise ValueError("tir = 'flag': there is no column `transmitted`; accepted: answers with one")
-    if (told := answers.header.get("checksum")) not in (None, rays.header["checksum"]):
-        raise ValueError(f"the answers are to rays with the checksum {told}; accepted: {rays.header['checksum']}")
-    problems, order = _identified(rays, answers)
+    if (given := answers.header.get("checksum")) not in (None, rays.header["checksum"]):
+        raise ValueError(f"the answers are to rays with the checksum {given}; accepted: {rays.header['checksum']}")
+    problems, order = _match_ids(rays, answers)
     kept = np.flatnonzero(order >= 0)
     b = answers.b[order[kept]]
     flag = None if answers.transmitted is None else answers.transmitted[order[kept]]
-    judged = judge(b, flag, rays.rays[kept], rays.precision, FORMULAS[budget].budget, tir)
+    judged = judge(b, flag, rays.rays[kept], rays.precision, FORMULAS[error_bound].budget, tir)
     return Findings(
         precision=rays.precision,
         ulp=2 * rays.roundoff,
-        budget=budget,
+        error_bound=error_bound,
         tir=judged.tir,
-        told=tir != AUTO,
-        regimes=tuple(_figures(rays, judged, kept)),
-        problems=(*problems, *_blank(judged, rays.ids[kept])),
+        tir_given=tir != AUTO,
+        regimes=tuple(_by_regime(rays, judged, kept)),
+        problems=(*problems, *_not_directions(judged, rays.ids[kept])),
         explanations=tuple(explain(judged)) if judged.wrong.any() else (),
         header=rays.header,
     )
 
 
-def _accepted(name: str, value: str, accepted: Any) -> None:
+def _check_name(name: str, value: str, accepted: Collection[str]) -> None:
     if value not in accepted:
         raise ValueError(f"{name} = {value!r}: unknown; accepted: {', '.join(accepted)}")
 
 
-def _identified(rays: RaySet, answers: Answers) -> tuple[list[Problem], np.ndarray]:
-    """What is wrong with the ids, and for every ray the row of its first answer, or −1."""
+def _match_ids(rays: RaySet, answers: Answers) -> tuple[list[Problem], np.ndarray]:
+    """Problems of the ids; and (N,) for each ray the row of its first answer, or −1."""
     ids, first, counts = np.unique(answers.ids, return_index=True, return_counts=True)
     found = {
         "missing": np.setdiff1d(rays.ids, ids),
@@ -156,11 +157,13 @@ def _identified(rays: RaySet, answers: Answers) -> tuple[list[Problem], np.ndarr
 
 
 def _problem(kind: str, ids: np.ndarray) -> Problem:
-    some = ", ".join(map(str, ids[:FIRST]))
-    return Problem(kind, len(ids), f"id{'' if len(ids) == 1 else 's'} {some}{', …' if len(ids) > FIRST else ''}")
+    some = ", ".join(map(str, ids[:LISTED_IDS]))
+    plural, more = "" if len(ids) == 1 else "s", ", …" if len(ids) > LISTED_IDS else ""
+    return Problem(kind, len(ids), f"id{plural} {some}{more}")
 
 
-def _blank(judged: Judged, ids: np.ndarray) -> Iterator[Problem]:
+def _not_directions(judged: Judged, ids: np.ndarray) -> Iterator[Problem]:
+    """Answers that are neither a direction nor the signal of total internal reflection."""
     zero = ~judged.b.any(axis=1)
     for kind, mask in (("non-finite", judged.blank & ~zero), ("zero", judged.blank & zero)):
         if mask.any():
@@ -170,37 +173,41 @@ def _blank(judged: Judged, ids: np.ndarray) -> Iterator[Problem]:
 # By regime ---------------------------------------------------------------------------------------------------------
 
 
-def _figures(rays: RaySet, judged: Judged, kept: np.ndarray) -> Iterator[Figures]:
+def _by_regime(rays: RaySet, judged: Judged, kept: np.ndarray) -> Iterator[RegimeErrors]:
     names = rays.regime[kept]
     for name in rays.header["regimes"]:
         index = np.flatnonzero(names == name)
         if len(index):
-            yield _of_regime(name, rays.ids[kept], judged, index)
+            yield _regime_errors(name, rays.ids[kept], judged, index)
 
 
-def _of_regime(name: str, ids: np.ndarray, judged: Judged, index: np.ndarray) -> Figures:
+def _regime_errors(name: str, ids: np.ndarray, judged: Judged, index: np.ndarray) -> RegimeErrors:
     compared = index[judged.compared[index]]
-    angle, norm = (x[compared] if len(compared) else np.full(1, np.nan) for x in (judged.angle, judged.norm))
+    angle, length = (x[compared] if len(compared) else np.full(1, np.nan) for x in (judged.angle, judged.norm))
     worst = index[np.lexsort((judged.share[index], judged.far[index], judged.blank[index]))[-1]]
-    replay = {
-        "id": int(ids[worst]),
-        **judged.rays.hexed(int(worst)),
-        "answer": [float(x).hex() for x in judged.b[worst]],
-        "exact": [float(x).hex() for x in judged.exact.direction[worst]],
-        "transmitted": bool(judged.exact.transmitted[worst]),
-    }
-    return Figures(
+    return RegimeErrors(
         name,
         len(index),
         len(compared),
         worst=float(angle.max()),
         p99=float(np.quantile(angle, 0.99)),
         mean=float(angle.mean()),
-        norm=float(norm.max()),
-        misjudged=int(judged.misjudged[index].sum()),
-        far=int(judged.far[index].sum()),
-        share=float(judged.share[index].max()),
+        length_error=float(length.max()),
+        tir_misclassified=int(judged.misjudged[index].sum()),
+        tir_beyond_bound=int(judged.far[index].sum()),
+        error_over_bound=float(judged.share[index].max()),
         wrong=int(judged.wrong[index].sum()),
-        limit=int(judged.exact_to_rounding[index].sum()),
-        replay=replay,
+        exact=int(judged.exact_to_rounding[index].sum()),
+        replay=_replay(judged, int(worst), int(ids[worst])),
     )
+
+
+def _replay(judged: Judged, row: int, id_: int) -> dict[str, Any]:
+    """A ray and its answer in hexadecimal floats."""
+    return {
+        "id": id_,
+        **judged.rays.hexed(row),
+        "answer": [float(x).hex() for x in judged.b[row]],
+        "exact": [float(x).hex() for x in judged.exact.direction[row]],
+        "transmitted": bool(judged.exact.transmitted[row]),
+    }

@@ -1,4 +1,4 @@
-"""Tables of numbers as CSV with `# key: value` lines on top, and back. Knows nothing of rays."""
+"""Tables of numbers as CSV text with `# key: value` lines on top."""
 
 from __future__ import annotations
 
@@ -10,22 +10,28 @@ from typing import Any
 
 import numpy as np
 
-# Visual C++ and others say more of a NaN than that it is one: -nan(ind).
+# Visual C++ and others print a NaN as nan(ind) or the like.
 _NAN = re.compile(r"nan\([^),\n]*\)", re.IGNORECASE)
-_SHOWN = 60
+_SHOWN = 60  # characters of a wrong line that an error quotes
 
 
 def with_header(header: Mapping[str, Any], columns: Sequence[str], numbers: np.ndarray) -> str:
-    """`numbers`: (N, columns), whole ones in the first. Each as the shortest decimal that float64 reads as itself."""
+    """CSV text of `numbers` (N, columns); the first column holds whole numbers.
+
+    Each number is the shortest decimal that reads back, in float64, as exactly that number.
+    """
     top = [f"# {key}: {value if value == _value(value) else json.dumps(value)}" for key, value in header.items()]
     row = ",".join(["%d", *["%r"] * (len(columns) - 1)])
     return "\n".join([*top, ",".join(columns), *(row % tuple(each) for each in numbers.tolist()), ""])
 
 
-def table(name: str, content: str | bytes, columns: Sequence[str], *more: str) -> tuple[dict[str, Any], np.ndarray]:
-    """(header, (N, columns) float64); `more` are columns that may follow.
+def parse_table(
+    name: str, content: str | bytes, columns: Sequence[str], *optional: str
+) -> tuple[dict[str, Any], np.ndarray]:
+    """(header, (N, columns) float64) of CSV text. All of the `optional` columns may follow, or none of them.
 
-    ValueError, one line that begins with `name`: no text, another line of names, rows that are no numbers or too short.
+    ValueError, one line that begins with `name`: bytes that are not text, a wrong line of column names, rows that are
+    too short, too long, or not numbers.
     """
     text = _decoded(name, content)
     header: dict[str, Any] = {}
@@ -38,14 +44,15 @@ def table(name: str, content: str | bytes, columns: Sequence[str], *more: str) -
         elif line.strip():
             names = tuple(each.strip() for each in line.split(","))
             break
-    accepted = [tuple(columns), *([(*columns, *more)] if more else [])]
+    accepted = [tuple(columns), *([(*columns, *optional)] if optional else [])]
     if names not in accepted:
-        found = f"header line {','.join(names)[:_SHOWN]!r}" if names else "nothing in it"
+        found = f"the first row is {','.join(names)[:_SHOWN]!r}" if names else "the table is empty"
         raise ValueError(f"{name}: {found}; accepted, in this order: {' or '.join(map(','.join, accepted))}")
     return header, _numbers(name, list(lines), len(names))
 
 
 def _numbers(name: str, lines: list[tuple[int, str]], width: int) -> np.ndarray:
+    """(N, width) of numbered lines."""
     rows = [line for _, line in lines]
     if not any(line.strip() and not line.startswith("#") for line in rows):
         return np.empty((0, width))
@@ -55,12 +62,12 @@ def _numbers(name: str, lines: list[tuple[int, str]], width: int) -> np.ndarray:
             return numbers
     wrong = [(number, line) for number, line in lines if not _is_row(line, width)]
     first, line = wrong[0] if wrong else (0, "")
-    raise ValueError(
-        f"{name}: {len(wrong)} lines are no row, first line {first}, {line[:_SHOWN]!r}; accepted: {width} numbers"
-    )
+    found = f"{len(wrong)} wrong rows, the first is line {first}, {line[:_SHOWN]!r}"
+    raise ValueError(f"{name}: {found}; accepted: {width} numbers a row")
 
 
 def _is_row(line: str, width: int) -> bool:
+    """Whether a line holds `width` numbers, or nothing but a comment."""
     line = line.partition("#")[0].strip()
     if not line:
         return True
@@ -75,12 +82,12 @@ def _decoded(name: str, content: str | bytes) -> str:
     try:
         text = content if isinstance(content, str) else content.decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise ValueError(f"{name}: no text; accepted: CSV in UTF-8") from None
+        raise ValueError(f"{name}: not text; accepted: CSV in UTF-8") from None
     return _NAN.sub("nan", text) if "(" in text else text
 
 
 def _value(text: Any) -> Any:
-    """What JSON understands as such, any other text as it is; None for what is no text."""
+    """The value of JSON text, any other text as it is, None for what is not text."""
     try:
         return json.loads(text)
     except ValueError:

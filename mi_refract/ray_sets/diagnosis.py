@@ -1,7 +1,8 @@
-"""The usual mistakes: what each would have answered, and whether that is what was answered.
+"""The usual mistakes: what each one would answer, and whether the program answered that.
 
-A mistake shows where it moves a direction by more than VISIBLE; there, answers that are within SAME of what it gives
-are explained by it. Slips of precision have no direction of their own: they are known by the bound that holds.
+A mistake is visible on a ray where it changes the direction by more than VISIBLE. It explains an answer there that is
+within SAME of what the mistake gives. A loss of precision predicts no direction: it is recognised by a wider bound that
+the errors keep.
 """
 
 from __future__ import annotations
@@ -14,25 +15,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mi_refract.accuracy.direction_errors import lengths, radicand
+from mi_refract.accuracy.direction_errors import absolute_radicand, lengths
 from mi_refract.regimes import Rays
 
 from .ray_set import indices
 from .tir_signal import Judged
 
 VISIBLE, SAME = 0.1, 5e-3  # radians
-MOST, ALL = 0.9, 0.99  # of the answers that a mistake, or a slip of precision, must explain
-FEWEST = 10  # answers that say anything
-SAMPLE = 150  # wrong answers, and as many others
-# A wider bound than this leaves nothing to explain.
-TELLING = 1e-3
+MOST, ALL = 0.9, 0.99  # the share of the answers that a mistake, or a loss of precision, must explain
+FEWEST = 10  # answers: fewer are no evidence
+SAMPLE = 150  # wrong answers, and as many right ones
+WIDEST_BOUND = 1e-3  # radians: under a wider bound an answer is no evidence
 F32 = 2.0**-24
-DIGITS = {2.0**-24: 7, 2.0**-53: 15}  # fewer than it takes to tell numbers of this roundoff apart
+DIGITS = {2.0**-24: 7, 2.0**-53: 15}  # by roundoff: fewer digits than distinguish its numbers
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """A usual mistake; of a sample of the answers the share that it explains, and the median angle to what it gives."""
+    """A mistake, the share of a sample of the answers that it explains, and the median angle to what it gives."""
 
     mistake: str
     text: str
@@ -42,7 +42,10 @@ class Explanation:
 
 
 def refract(a: np.ndarray, n: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """The textbook's, two-sided, for unit vectors: (N, 3), NaN where nothing is transmitted."""
+    """The refracted direction (N, 3) for unit a and n (N, 3), k (N,), two-sided; NaN where nothing is transmitted.
+
+    b = k a + n (s √(c² − (k² − 1) ‖n × a‖²) − k c),   c = n·a,  s = sign(c)
+    """
     k, c = k[:, None], (a * n).sum(1, keepdims=True)
     across = np.cross(n, a)
     root = np.sqrt(c * c - (k * k - 1) * (across * across).sum(1, keepdims=True))
@@ -51,7 +54,7 @@ def refract(a: np.ndarray, n: np.ndarray, k: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Case:
-    """What mistakes are made from: unit `a` and `n`, the rays as they are, and the right answers to them."""
+    """Rays (N) on which mistakes are evaluated: unit `a` and `n`, the rays as given, and the right answers."""
 
     a: np.ndarray
     n: np.ndarray
@@ -62,32 +65,35 @@ class Case:
 
     @staticmethod
     def of(judged: Judged, index: np.ndarray) -> Case:
+        """The rays with these indices."""
         rays = judged.rays[index]
         a, n = (v.astype(float) / lengths(v).astype(float)[:, None] for v in (rays.a, rays.n))
         exact = judged.exact
         return Case(a, n, rays.k.astype(float), rays, exact.direction[index], exact.transmitted[index])
 
     def with_k(self, k: np.ndarray) -> np.ndarray:
+        """(N, 3): the directions for another ratio of indices."""
         return refract(self.a, self.n, k)
 
     @property
     def refracted(self) -> np.ndarray:
-        """(N, 3), NaN where nothing is transmitted."""
+        """(N, 3): the right directions, NaN where nothing is transmitted."""
         return np.where(self.transmitted[:, None], self.right, np.nan)
 
     @property
     def inverted(self) -> np.ndarray:
+        """(N, 3): the directions for 1/k."""
         return self.with_k(1 / self.k)
 
     @property
     def one_sided(self) -> np.ndarray:
-        """Of code for normals that face the ray."""
+        """(N, 3): the directions that code for normals that face the ray gives."""
         facing = (self.a * self.n).sum(1, keepdims=True) < 0
         return np.where(facing, self.refracted, _across(self.refracted, self.n))
 
     @property
     def mirrored(self) -> np.ndarray:
-        """Where something is transmitted."""
+        """(N, 3): mirror directions, NaN where nothing is transmitted."""
         return np.where(self.transmitted[:, None], _across(self.a, self.n), np.nan)
 
 
@@ -96,13 +102,13 @@ def _across(v: np.ndarray, n: np.ndarray) -> np.ndarray:
     return v - 2 * (v * n).sum(1, keepdims=True) * n
 
 
-# What mistakes give: name → (text, function) -----------------------------------------------------------------------
+# What each mistake answers -----------------------------------------------------------------------------------------
 
 Predict = Callable[[Case], np.ndarray]
 
 
 def _by_angle(change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Predict:
-    """Of code that computes with angles: `change(angle of incidence, k)` is the angle after the surface."""
+    """Code that computes with angles: `change(angle of incidence, k)` is the angle of refraction."""
 
     def predict(case: Case) -> np.ndarray:
         c = (case.a * case.n).sum(1, keepdims=True)
@@ -119,7 +125,7 @@ def _refracted(theta: np.ndarray, k: np.ndarray) -> np.ndarray:
 
 
 def _as_given(vector: str) -> Predict:
-    """The textbook's formula, right for unit vectors, with this vector, or both, as long as it is."""
+    """The textbook formula, right for unit vectors only, with a, n or both ("a", "n", "an") left at its length."""
 
     def predict(case: Case) -> np.ndarray:
         a = case.rays.a.astype(float) if "a" in vector else case.a
@@ -132,7 +138,7 @@ def _as_given(vector: str) -> Predict:
 
 
 def _misread(vector: str, matrix: np.ndarray) -> Predict:
-    """Where the normal is still on the side that the ray comes from: elsewhere codes differ."""
+    """Code that permutes or reverses the axes of a or n. NaN where the normal changes sides: there programs differ."""
 
     def predict(case: Case) -> np.ndarray:
         turned = {"a": case.a, "n": case.n}
@@ -144,7 +150,7 @@ def _misread(vector: str, matrix: np.ndarray) -> Predict:
 
 
 def _axes() -> Iterator[tuple[str, np.ndarray]]:
-    """All ways to name three axes but the right one, and the reversal of all three, which has a name of its own."""
+    """Signed permutations of the axes, without the identity and −1: to reverse all three is another mistake."""
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1, -1), repeat=3):
             if order != (0, 1, 2) or len(set(signs)) > 1:
@@ -153,10 +159,10 @@ def _axes() -> Iterator[tuple[str, np.ndarray]]:
                 yield ", ".join(f"{'-' if s < 0 else ''}{'xyz'[i]}" for i, s in zip(order, signs, strict=True)), matrix
 
 
-def _handed() -> dict[str, Predict]:
+def _handedness() -> dict[str, Predict]:
     table: dict[str, Predict] = {}
     for name, matrix in _axes():
-        table[f"the answer's x, y, z are the right one's {name}"] = functools.partial(_turned, matrix)
+        table[f"the answer's x, y, z are the right answer's {name}"] = functools.partial(_turned, matrix)
         for vector in ("a", "n"):
             table[f"{vector} was read as its {name}"] = _misread(vector, matrix)
     return table
@@ -192,7 +198,7 @@ MISTAKES: dict[str, dict[str, Predict]] = {
         "the angle of incidence was turned into degrees": _by_angle(lambda t, k: _refracted(np.degrees(t), k)),
         "the angle of incidence was taken for degrees": _by_angle(lambda t, k: _refracted(np.radians(t), k)),
     },
-    "handedness": _handed(),
+    "handedness": _handedness(),
     "missing normalisation": {
         "a and n were taken for unit vectors": _as_given("an"),
         "a was taken for a unit vector": _as_given("a"),
@@ -201,25 +207,25 @@ MISTAKES: dict[str, dict[str, Predict]] = {
 }
 
 
-# What was answered -------------------------------------------------------------------------------------------------
+# Comparison with the answers ---------------------------------------------------------------------------------------
 
 
 def explain(judged: Judged) -> list[Explanation]:
-    """Every mistake, and how much of the answers it explains. Precondition: some are wrong."""
+    """Every mistake, and the share of the answers that it explains. Precondition: some answers are wrong."""
     index = _sample(judged)
     case, wrong = Case.of(judged, index), judged.wrong[index]
     with np.errstate(all="ignore"):
-        found = [_gross(name, table, case, judged.b[index], wrong) for name, table in MISTAKES.items()]
-        lengthy, printed, narrow = _lengths(judged), _digits(judged), _single(judged)
-    found[-1] = max(found[-1], lengthy, key=_strength)
-    # Numbers of few digits are within what float32 would be off by, too.
-    return [*found, replace(narrow, explains=narrow.explains and not printed.explains), printed]
+        found = [_best_variant(name, table, case, judged.b[index], wrong) for name, table in MISTAKES.items()]
+        lengths_only, digits, float32 = _wrong_lengths(judged), _few_digits(judged), _float32(judged)
+    found[-1] = max(found[-1], lengths_only, key=_strength)
+    # Numbers of few digits may keep the bound of float32, too.
+    return [*found, replace(float32, explains=float32.explains and not digits.explains), digits]
 
 
 def _sample(judged: Judged) -> np.ndarray:
-    """Wrong answers and others, evenly over the set, but for rays so near to the critical angle that anyone may err."""
-    telling = judged.decided & (judged.bound <= TELLING)
-    return np.concatenate([_evenly(telling & mask, SAMPLE) for mask in (judged.wrong, ~judged.wrong)])
+    """Indices of wrong and of right answers, evenly over the set, without rays whose bound excuses large errors."""
+    evidence = judged.decided & (judged.bound <= WIDEST_BOUND)
+    return np.concatenate([_evenly(evidence & mask, SAMPLE) for mask in (judged.wrong, ~judged.wrong)])
 
 
 def _evenly(mask: np.ndarray, count: int) -> np.ndarray:
@@ -227,8 +233,8 @@ def _evenly(mask: np.ndarray, count: int) -> np.ndarray:
     return index[:: max(1, -(-len(index) // count))]
 
 
-def _gross(name: str, table: dict[str, Predict], case: Case, b: np.ndarray, wrong: np.ndarray) -> Explanation:
-    """The best of the variants of a mistake that moves directions visibly."""
+def _best_variant(name: str, table: dict[str, Predict], case: Case, b: np.ndarray, wrong: np.ndarray) -> Explanation:
+    """Of the variants of a mistake, the one that explains most."""
     variants = []
     for text, predict in table.items():
         given = predict(case)
@@ -246,47 +252,47 @@ def _strength(each: Explanation) -> tuple[bool, float]:
 
 
 def _angle(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Between vectors (N, 3) of any length, radians; NaN where one is no direction."""
+    """(N,): the angle between vectors (N, 3) of any length, in radians; NaN where one is no direction."""
     across, along = lengths(np.cross(u, v)).astype(float), (u * v).sum(1)
     return np.where((across == 0) & (along == 0), np.nan, np.arctan2(across, along))
 
 
-def _share(name: str, text: str, judged: Judged, among: np.ndarray, holds: np.ndarray, enough: bool) -> Explanation:
-    share = float(holds[among].mean()) if among.any() else 0.0
-    compared = judged.compared & among
+def _of_wrong(name: str, text: str, judged: Judged, holds: np.ndarray, enough: bool) -> Explanation:
+    """`holds`: the answers that the mistake accounts for."""
+    share = float(holds[judged.wrong].mean()) if judged.wrong.any() else 0.0
+    compared = judged.compared & judged.wrong
     median = float(np.median(judged.angle[compared])) if compared.any() else math.nan
-    return Explanation(name, text, share, median, bool(enough and share >= ALL and among.sum() >= FEWEST))
+    return Explanation(name, text, share, median, bool(enough and share >= ALL and judged.wrong.sum() >= FEWEST))
 
 
-def _lengths(judged: Judged) -> Explanation:
+def _wrong_lengths(judged: Judged) -> Explanation:
     holds = judged.compared & (judged.angle <= judged.bound)
-    text = "directions are right, but not of length 1"
-    return _share("missing normalisation", text, judged, judged.wrong, holds, True)
+    return _of_wrong("missing normalisation", "directions are right, but not of length 1", judged, holds, True)
 
 
 def _within(judged: Judged, bound: np.ndarray) -> np.ndarray:
     return judged.compared & (np.maximum(judged.angle, judged.norm) <= bound)
 
 
-def _single(judged: Judged) -> Explanation:
-    """float32 where float64 was claimed: errors of its size nearly everywhere, and none that is larger."""
+def _float32(judged: Judged) -> Explanation:
+    """float32 where float64 was claimed: errors of float32's size nearly everywhere, and none that is larger."""
     u, k, exact = 2 * F32, judged.rays.k.astype(float), judged.exact  # u of the inputs, u of the formula
     bound = judged.budget.chord(u, k, exact.cos_t, exact.transmitted, cos_i=exact.cos_i)
-    lost = judged.misjudged & (radicand(judged.rays) <= judged.budget.margin(u, k))
+    lost = judged.misjudged & (absolute_radicand(judged.rays) <= judged.budget.radicand_error_bound(u, k))
     everywhere = judged.compared.any() and np.median(judged.angle[judged.compared]) > F32 / 50
     holds, claimed = _within(judged, bound) | lost, judged.roundoff < F32
-    text = "errors are those of float32"
-    return _share("f32 where f64 was claimed", text, judged, judged.wrong, holds, claimed and bool(everywhere))
+    enough = claimed and bool(everywhere)
+    return _of_wrong("f32 where f64 was claimed", "errors are those of float32", judged, holds, enough)
 
 
-def _digits(judged: Judged) -> Explanation:
-    """Numbers that lost their last digits on the way into a file."""
+def _few_digits(judged: Judged) -> Explanation:
+    """Numbers that were printed with too few digits."""
     values = judged.raw[_evenly(judged.compared, SAMPLE)].ravel()
     values = values[np.rint(values) != values].tolist()
-    told = range(1, DIGITS[judged.roundoff] + 1) if len(values) >= FEWEST else range(0)
-    for digits, (form, word) in itertools.product(told, (("f", "decimals"), ("g", "significant digits"))):
+    candidates = range(1, DIGITS[judged.roundoff] + 1) if len(values) >= FEWEST else range(0)
+    for digits, (form, word) in itertools.product(candidates, (("f", "decimals"), ("g", "significant digits"))):
         if all(float(f"{x:.{digits}{form}}") == x for x in values):
             # Half a unit of the last digit in each of three components.
             bound, text = judged.bound + 10.0**-digits, f"numbers are rounded to {digits} {word}"
-            return _share("too few digits", text, judged, judged.wrong, _within(judged, bound), True)
+            return _of_wrong("too few digits", text, judged, _within(judged, bound), True)
     return Explanation("too few digits", "numbers have all their digits", 0.0, math.nan, False)

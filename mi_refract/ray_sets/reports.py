@@ -1,7 +1,4 @@
-"""What `rays_check` found, laid out for a terminal, scripts (JSON), test runners (JUnit) and people (one HTML page).
-
-Nothing is judged here.
-"""
+"""Reports of a check of answers: text for a terminal, JSON for scripts, JUnit for test runners, and an HTML page."""
 
 from __future__ import annotations
 
@@ -12,15 +9,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mi_refract.image_diff.text_reports import printable
 from mi_refract.io.atomic import write_atomically
 from mi_refract.regimes import REGIMES
+from mi_refract.report import junit
 from mi_refract.report.embedded_images import EmbeddedImages
 from mi_refract.report.html_page import write_page
-from mi_refract.report.plots import compact
+from mi_refract.report.junit import printable
+from mi_refract.report.number_text import compact
 from mi_refract.report.row import strict
 
-from .check_answers import Figures, Findings, Problem
+from .check_answers import Findings, Problem, RegimeErrors
 from .diagnosis import Explanation
 from .tir_signal import NONE, UNCLEAR
 
@@ -28,85 +26,86 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 SCHEMA = 1
-HEAD = (
+COLUMNS = (
     "rays",
     "worst / rad",
     "worst / ulp",
     "p99 / ulp",
     "mean / ulp",
-    "misjudged",
-    "beyond doubt",
-    "length",
-    "of the budget",
+    "TIR misclassified",
+    "TIR beyond bound",
+    "length error",
+    "error / bound",
     "exact",
     "wrong",
 )
 STYLES = {"wrong": "bold red", "fair": "", "exact": "green"}
 TERMS = {
     "ulp": "the spacing of numbers at 1: 2⁻²³ in f32, 2⁻⁵² in f64",
-    "worst, p99, mean": "angles to the certified direction, of the rays whose total internal reflection was decided "
-    "rightly; rounding the exact answer costs up to 0.43 ulp",
-    "misjudged": "rays that were said to be transmitted and are totally reflected, or the reverse",
-    "beyond doubt": "those of them that are farther from the critical angle than rounding can excuse",
-    "length": "how far the length of an answer is from 1, or from that of a",
-    "of the budget": "the largest share that an error takes of what the formula that is the measure may be off by, an "
-    "a-priori bound for that very ray",
-    "exact": "answers that are the certified ones but for rounding: no formula does better",
-    "wrong": "answers beyond their budget, misjudged beyond doubt, or without a direction",
+    "worst, p99, mean": "angles to the certified direction, over the rays whose total internal reflection was "
+    "classified correctly; rounding the exact answer costs up to 0.43 ulp",
+    "TIR misclassified": "rays that were called transmitted and are totally reflected, or the reverse",
+    "TIR beyond bound": "those of them that are farther from the critical angle than rounding can excuse",
+    "length error": "the difference between the length of an answer and 1, or the length of a where that is nearer",
+    "error / bound": "the largest ratio of an error to the a-priori bound of the chosen formula for that ray",
+    "exact": "answers that are the certified direction, rounded: no formula does better",
+    "wrong": "answers whose error is beyond the bound, whose TIR is misclassified beyond it, or that are no direction",
 }
-TELLING = {
-    "zero": "total internal reflection is told by the zero vector",
-    "nan": "total internal reflection is told by NaN",
-    "reflected": "total internal reflection is told by the mirror direction",
-    "tangent": "total internal reflection is told by a vector along the surface",
-    "flag": "total internal reflection is told by transmitted = 0",
+SIGNALS = {
+    "zero": "total internal reflection is signalled by the zero vector",
+    "nan": "total internal reflection is signalled by NaN",
+    "reflected": "total internal reflection is signalled by the mirror direction",
+    "tangent": "total internal reflection is signalled by a vector along the surface",
+    "flag": "total internal reflection is signalled by transmitted = 0",
     NONE: "no ray is totally reflected",
-    UNCLEAR: "total internal reflection is told in no known way; accepted: the zero vector, NaN, the mirror direction, "
-    "a vector along the surface, or a column `transmitted`",
+    UNCLEAR: "total internal reflection is signalled in no known way; accepted: the zero vector, NaN, the mirror "
+    "direction, a vector along the surface, or a column `transmitted`",
 }
-COUNTED = {
+PROBLEM_TEXTS = {
     "missing": "{} without an answer",
     "duplicate": "{} answered more than once",
-    "unknown": "{} answers to rays that were not asked",
-    "non-finite": "{} answers are NaN or infinite where that says nothing",
-    "zero": "{} answers are the zero vector where that says nothing",
+    "unknown": "{} answers to rays that are not in the set",
+    "non-finite": "{} answers are NaN or infinite where that is no signal",
+    "zero": "{} answers are the zero vector where that is no signal",
 }
 
 
 def sentence(found: Findings) -> str:
-    """ "200 of 13000 answers are wrong: eta inverted"."""
+    """The result in one line, such as "200 of 13000 answers are wrong: eta inverted"."""
     if not found.answered:
         return "no ray was answered"
-    whole = f"{found.answered} answers"
+    answers = f"{found.answered} answers"
     if found.diagnosis:
-        return f"{found.wrong} of {whole} are wrong: {found.diagnosis.mistake}"
+        return f"{found.wrong} of {answers} are wrong: {found.diagnosis.mistake}"
     if found.exit_code > 1:
-        return f"{whole}, but not those to the rays" + (f"; {found.wrong} of them are wrong" if found.wrong else "")
+        wrong = f"; {found.wrong} of them are wrong" if found.wrong else ""
+        return f"{answers}, but they do not match the rays{wrong}"
     if found.wrong or found.tir == UNCLEAR:
-        return f"{found.wrong} of {whole} are wrong"
+        return f"{found.wrong} of {answers} are wrong"
     if found.exit_code:
-        return f"{whole}, none of them a direction"
-    if found.limit == found.answered:
-        return f"{whole}, all exact but for rounding"
-    worst = f"{compact(found.farthest.worst)} rad off at most ({found.farthest.regime})"
-    return f"{whole}, all as good as the formula {found.budget} or better, {worst}"
+        return f"{answers}, none of them a direction"
+    if found.total("exact") == found.answered:
+        return f"{answers}, all exact up to rounding"
+    worst = f"the largest error is {compact(found.farthest.worst)} rad ({found.farthest.regime})"
+    return f"{answers}, all within the error bound of the formula {found.error_bound}; {worst}"
 
 
-def counted(problem: Problem) -> str:
-    """ "3 without an answer: ids 1, 5, 8"."""
-    return f"{COUNTED[problem.kind].format(problem.count)}: {problem.text}"
+def problem_text(problem: Problem) -> str:
+    """A problem in one line, such as "3 without an answer: ids 1, 5, 8"."""
+    return f"{PROBLEM_TEXTS[problem.kind].format(problem.count)}: {problem.text}"
 
 
-def telling(found: Findings) -> str:
-    return TELLING[found.tir] + ("" if found.told or found.tir in (NONE, UNCLEAR) else " (detected)")
+def signal(found: Findings) -> str:
+    """How the answers signal total internal reflection, in one line."""
+    return SIGNALS[found.tir] + ("" if found.tir_given or found.tir in (NONE, UNCLEAR) else " (detected)")
 
 
 def explained(found: Findings) -> list[str]:
-    """The diagnosis in words; of several the choice, and of none the nearest."""
+    """The mistakes that explain the answers, a line each; where none does, a line that says so, and the nearest one."""
     if not found.explanations:
         return []
     certain = [each for each in found.explanations if each.explains]
-    if not certain and found.exit_code > 1:  # to other rays, it may be; nothing is known of them
+    if not certain and found.exit_code > 1:  # possibly answers to other rays: no mistake can be named
         return []
     if not certain:
         nearest = max(found.explanations, key=lambda each: each.share)
@@ -115,44 +114,44 @@ def explained(found: Findings) -> list[str]:
 
 
 def _line(each: Explanation) -> str:
-    return f"{each.mistake}: {each.text} ({each.share:.1%} of the answers where it shows)"
+    return f"{each.mistake}: {each.text} ({each.share:.1%} of the answers on which it has an effect)"
 
 
-def grade(each: Figures) -> str:
+def grade(each: RegimeErrors) -> str:
     """ "exact", "fair" or "wrong"."""
-    return "wrong" if each.wrong else "exact" if each.limit == each.rays else "fair"
+    return "wrong" if each.wrong else "exact" if each.exact == each.rays else "fair"
 
 
 # Terminal ----------------------------------------------------------------------------------------------------------
 
 
 def table(found: Findings) -> RenderableType:
-    """Regimes, then what is wrong with the set, then the diagnosis and the sentence; for rich's console."""
+    """The regimes, the problems of the set, the diagnosis and the sentence, for rich's console."""
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
-    rows = Table("", "regime", *HEAD, box=None, pad_edge=False)
+    rows = Table("", "regime", *COLUMNS, box=None, pad_edge=False)
     for column in rows.columns[2:]:
         column.justify = "right"
     for each in found.regimes:
         rows.add_row(Text(grade(each), style=STYLES[grade(each)]), each.regime, *_cells(each, found.ulp).values())
-    notes = [*map(counted, found.problems), telling(found), *explained(found)]
+    notes = [*map(problem_text, found.problems), signal(found), *explained(found)]
     return Group(*([rows] if found.regimes else []), *(Text(printable(note)) for note in notes), Text(sentence(found)))
 
 
-def _cells(each: Figures, ulp: float) -> dict[str, str]:
+def _cells(each: RegimeErrors, ulp: float) -> dict[str, str]:
     """The numbers of a regime as text; "–" where no direction was compared."""
     ulps = {f"{name} / ulp": getattr(each, name) / ulp for name in ("worst", "p99", "mean")}
-    shown = {name: compact(x) if each.judged else "–" for name, x in ({"worst / rad": each.worst} | ulps).items()}
+    shown = {name: compact(x) if each.compared else "–" for name, x in ({"worst / rad": each.worst} | ulps).items()}
     return {
         "rays": str(each.rays),
         **shown,
-        "misjudged": str(each.misjudged),
-        "beyond doubt": str(each.far),
-        "length": compact(each.norm) if each.judged else "–",
-        "of the budget": compact(each.share),
-        "exact": f"{each.limit / each.rays:.1%}",
+        "TIR misclassified": str(each.tir_misclassified),
+        "TIR beyond bound": str(each.tir_beyond_bound),
+        "length error": compact(each.length_error) if each.compared else "–",
+        "error / bound": compact(each.error_over_bound),
+        "exact": f"{each.exact / each.rays:.1%}",
         "wrong": str(each.wrong),
     }
 
@@ -170,8 +169,8 @@ def as_data(found: Findings) -> dict[str, Any]:
         "sentence": sentence(found),
         "precision": found.precision,
         "ulp": found.ulp,
-        "budget": found.budget,
-        "total_internal_reflection": {"told_by": found.tir, "detected": not found.told},
+        "error_bound": found.error_bound,
+        "total_internal_reflection": {"signal": found.tir, "detected": not found.tir_given},
         "answered": found.answered,
         "wrong": found.wrong,
         "problems": [dataclasses.asdict(each) for each in found.problems],
@@ -183,51 +182,41 @@ def as_data(found: Findings) -> dict[str, Any]:
 
 
 def write_json(path: str | Path, found: Findings) -> None:
-    """Write `as_data` as strict JSON: NaN and the infinities become words. OSError."""
+    """Write `as_data` as strict JSON: NaN and the infinities become words. OSError where that fails."""
     write_atomically(path, json.dumps(strict(as_data(found)), indent=1, allow_nan=False) + "\n")
 
 
 def write_junit(path: str | Path, found: Findings, name: str) -> None:
-    """One case a regime and one for the set of answers, which is an error where they are not those to the rays."""
-    from xml.etree import ElementTree as xml
-
-    root = xml.Element("testsuites", name="mi-refract rays")
-    suite = xml.SubElement(root, "testsuite", name=printable(name))
-    case = xml.SubElement(suite, "testcase", classname="answers", name="complete and understood")
-    if found.problems or found.tir == UNCLEAR or not found.answered:
-        _complain(case, "error" if found.exit_code == 2 else "failure", [*map(counted, found.problems), telling(found)])
-    for each in found.regimes:
-        case = xml.SubElement(suite, "testcase", classname="rays", name=printable(each.regime))
-        if each.wrong:
-            numbers = [f"{key} {text}" for key, text in _cells(each, found.ulp).items()]
-            wrong = f"{each.wrong} of {each.rays} answers are wrong"
-            _complain(case, "failure", [wrong, *explained(found), *numbers, json.dumps(strict(each.replay))])
-    tags = [child.tag for case in suite for child in case]
-    tally = {"tests": len(suite), "failures": tags.count("failure"), "errors": tags.count("error"), "skipped": 0}
-    for element in (root, suite):
-        element.attrib.update({key: str(count) for key, count in tally.items()})
-    xml.indent(root)
-    write_atomically(path, xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
+    """One test case per regime, and one for the set of answers: an error where they do not match the rays."""
+    suites = {name: [_answers_case(found), *(_regime_case(found, each) for each in found.regimes)]}
+    junit.write_junit(path, "mi-refract rays", suites)
 
 
-def _complain(case: Any, tag: str, lines: list[str]) -> None:
-    from xml.etree import ElementTree as xml
+def _answers_case(found: Findings) -> junit.Case:
+    group, name = "answers", "complete and understood"
+    if found.answered and not found.problems and found.tir != UNCLEAR:
+        return junit.Case(group, name)
+    lines = [*map(problem_text, found.problems), signal(found)]
+    return junit.Case(group, name, "error" if found.exit_code == 2 else "failure", lines[0], lines)
 
-    xml.SubElement(case, tag, message=printable(lines[0])).text = "\n".join(map(printable, lines))
+
+def _regime_case(found: Findings, each: RegimeErrors) -> junit.Case:
+    if not each.wrong:
+        return junit.Case("rays", each.regime)
+    numbers = [f"{key} {text}" for key, text in _cells(each, found.ulp).items()]
+    wrong = f"{each.wrong} of {each.rays} answers are wrong"
+    lines = [wrong, *explained(found), *numbers, json.dumps(strict(each.replay))]
+    return junit.Case("rays", each.regime, "failure", wrong, lines)
 
 
 def write_html(path: str | Path, found: Findings, context: Mapping[str, Any], replay: str = "") -> None:
-    """Write the page; `context` is shown on top, `replay` is the command that repeats the check. OSError."""
+    """Write the HTML page. `context` is shown on top; `replay` is the command that repeats the check. OSError."""
     texts = {name: regime.text for name, regime in REGIMES.items()}
     rows = [
         {
             "name": each.regime,
             "text": texts.get(each.regime, ""),
-            "wrong": each.wrong,
-            "far": each.far,
-            "grade": grade(each),
-            "over": each.share > 1,
-            "cells": _cells(each, found.ulp),
+            "cells": [(text, _state(name, each)) for name, text in _cells(each, found.ulp).items()],
             "replay": json.dumps(strict(each.replay), indent=1),
         }
         for each in found.regimes
@@ -237,16 +226,28 @@ def write_html(path: str | Path, found: Findings, context: Mapping[str, Any], re
         "sentence": sentence(found),
         "state": "fail" if found.exit_code else "pass",
         "counts": [("pass", "right", found.answered - found.wrong), ("fail", "wrong", found.wrong)],
-        "context": {"precision": found.precision, "measure": found.budget, **context},
-        "problems": [counted(each) for each in found.problems],
-        "telling": telling(found),
+        "context": {"precision": found.precision, "error bound": found.error_bound, **context},
+        "problems": [problem_text(each) for each in found.problems],
+        "signal": signal(found),
         "unclear": found.tir == UNCLEAR,
         "explained": explained(found),
         "explanations": found.explanations,
-        "head": HEAD,
+        "head": COLUMNS,
         "rows": rows,
         "terms": TERMS,
         "pi": math.pi,
         "command": replay,
     }
     write_page(path, "rays.html.j2", content, EmbeddedImages())
+
+
+def _state(column: str, each: RegimeErrors) -> str:
+    """The class of a cell: "fail", "pass" or none."""
+    failing = {
+        "wrong": each.wrong > 0,
+        "TIR beyond bound": each.tir_beyond_bound > 0,
+        "error / bound": each.error_over_bound > 1,
+    }
+    if failing.get(column):
+        return "fail"
+    return "pass" if column == "exact" and grade(each) == "exact" else ""

@@ -1,4 +1,4 @@
-"""A ray set through someone else's program: rays on its stdin, answers on its stdout, both as CSV."""
+"""A program's answers to a ray set: rays go to its stdin, answers come from its stdout, both as CSV."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 
 from mi_refract.io import process_group
 
-from .ray_set import Answers, RaySet, as_csv, parse_answers
+from .files import as_csv, parse_answers
+from .ray_set import Answers, RaySet
 
 TIMEOUT = 300.0  # seconds
 
@@ -21,10 +22,10 @@ def answers_of(
     cwd: str | Path | None = None,
     env: Mapping[str, str] | None = None,
 ) -> Answers:
-    """What `command` answers. Its stderr goes where ours goes; with it ends every process of its group.
+    """The answers of `command`, which has `timeout` seconds. Its stderr is passed through.
 
-    ValueError, one line that begins with the command: a status other than 0, answers that cannot be read, or none
-    within `timeout` seconds. OSError where it cannot be started.
+    Every process of its group is ended with it. ValueError, one line that begins with the command, where it ends with
+    another status than 0, answers too late, or prints no answers. OSError where it cannot be started.
     """
     if not command:
         raise ValueError("no command; accepted: mi-refract rays run [OPTIONS] -- COMMAND")

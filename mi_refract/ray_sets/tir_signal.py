@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_refract import oracle
-from mi_refract.accuracy.direction_errors import errors, lengths, margin, radicand
-from mi_refract.formulas.bounds import NEGLIGIBLE, ROUNDING, Budget
+from mi_refract.accuracy.direction_errors import absolute_radicand, errors, lengths, relative_radicand
+from mi_refract.formulas import NEGLIGIBLE, ROUNDING, Budget
 from mi_refract.regimes import Rays
 
 from .ray_set import PRECISIONS
@@ -122,9 +122,11 @@ def _bound(rays: Rays, exact: oracle.Certified, u: float, budget: Budget) -> np.
 def _decided(rays: Rays, exact: oracle.Certified, u: float, budget: Budget) -> np.ndarray:
     """Where a wrong decision is held against the answers: where the radicand is beyond the budget's own error."""
     if budget.at_the_limit:
-        return ~(margin(rays) <= NEGLIGIBLE * u * u)
+        return ~(relative_radicand(rays) <= NEGLIGIBLE * u * u)
     wide = _off_unit(rays, u)
-    return (radicand(rays) > budget.margin(wide, rays.k.astype(float))) & ~budget.side_open(wide, exact.cos_i)
+    return (absolute_radicand(rays) > budget.radicand_error_bound(wide, rays.k.astype(float))) & ~budget.side_open(
+        wide, exact.cos_i
+    )
 
 
 # How total internal reflection is told -----------------------------------------------------------------------------
@@ -185,7 +187,7 @@ def _detected(seen: _Seen) -> str:
     total = ~seen.exact.transmitted & (seen.exact.cos_i > 0)
     if not total.any():
         return NONE
-    certain = total & (radicand(seen.rays) > CERTAIN)
+    certain = total & (absolute_radicand(seen.rays) > CERTAIN)
     among = certain if certain.any() else total
     shares = {name: float(teller(seen)[among].mean()) for name, teller in TELLERS.items()}
     best = max(shares, key=lambda name: shares[name])

@@ -1,5 +1,26 @@
-"""Named, replayable families of rays."""
+"""Named, replayable sets of rays over the whole domain: where formulas of refraction are at ease, and where not.
 
-from .table import REGIMES, Array, Draw, Index, Rays, Regime, Triple, make, normalised, radicand, rays_at
+In: the name of a regime, a count, a precision and a seed; the same give the same rays. Out: `Rays`, numpy arrays in
+that precision. A regime builds its rays around given normals; `make` rounds them and returns what was rounded. NaN and
+infinity are no refraction and in no regime.
+"""
 
-__all__ = ["REGIMES", "Array", "Draw", "Index", "Rays", "Regime", "Triple", "make", "normalised", "radicand", "rays_at"]
+from .angles import Draw, rays_at
+from .radicand import radicand, radicand_and_gradient
+from .rays import Array, Index, Rays, Triple, normalised
+from .table import REGIMES, Regime, make
+
+__all__ = [
+    "REGIMES",
+    "Array",
+    "Draw",
+    "Index",
+    "Rays",
+    "Regime",
+    "Triple",
+    "make",
+    "normalised",
+    "radicand",
+    "radicand_and_gradient",
+    "rays_at",
+]

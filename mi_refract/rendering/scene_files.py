@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import importlib.metadata
 import json
 import os
 import re
@@ -16,10 +14,11 @@ import numpy as np
 
 from mi_refract.io.atomic import writable
 from mi_refract.io.image_file import SUFFIXES, Metadata, one_line, write_exr
+from mi_refract.io.provenance import provenance
 
 LOADER_OPTIONS = ("path", "parallel", "optimize")  # mi.load_file would take these names for its own
-# Merged meshes come in the order of their addresses, and parallel loading in that of its threads. Then so do emitters,
-# and a seed no longer means an image.
+# Mitsuba orders merged meshes by address, and what it loads in parallel by thread. Emitters are in the same order, so
+# that the same seed would give different images.
 REPRODUCIBLE: Any = {"parallel": False, "optimize": False}
 
 
@@ -37,9 +36,10 @@ def parse_defines(items: Sequence[str]) -> dict[str, str]:
 
 
 def load_scene(path: str | os.PathLike[str], defines: Mapping[str, str] | None = None) -> Any:
-    """The Mitsuba scene in an XML file, under the present variant; `defines` replace its `<default>`s.
+    """Load the Mitsuba scene in an XML file, in the present variant; `defines` replace values of its `<default>`s.
 
-    FileNotFoundError for a missing file; ValueError, in one line, for anything Mitsuba does not accept in it.
+    FileNotFoundError for a missing file; ValueError, in one line, for what Mitsuba does not accept, and for a scene
+    without a sensor.
     """
     import mitsuba as mi
 
@@ -67,10 +67,11 @@ def render_to_exr(
     spp: int | None = None,
     seed: int = 0,
 ) -> Metadata:
-    """Render a scene file by one `mi.render(scene, spp=spp, seed=seed)` in the present variant; the metadata written.
+    """Render a scene file by one `mi.render(scene, spp=spp, seed=seed)`, and return the header of the EXR file.
 
-    `spp`: samples per pixel, the scene's own where None. ValueError or OSError in one line, before the rendering
-    wherever possible, InterruptedError for a rendering that was cut short; then no file is written.
+    `defines`: values for the scene's `<default>`s. `spp`: samples per pixel; None: what the scene says. ValueError or
+    OSError in one line, before the rendering where possible; InterruptedError for a rendering that was cut short. No
+    file is written then.
     """
     import mitsuba as mi
 
@@ -91,7 +92,7 @@ def render_to_exr(
         raise InterruptedError(f"{scene}: the rendering was stopped before its last sample; nothing is written")
     sensor = loaded.sensors()[0]
     channels = [str(field.name) for field in sensor.film().bitmap().struct_()]
-    metadata = provenance() | {
+    metadata: Metadata = provenance() | {
         "mi_refract:variant": mi.variant(),
         "mi_refract:spp": spp or sensor.sampler().sample_count(),
         "mi_refract:seed": seed,
@@ -105,28 +106,13 @@ def render_to_exr(
 
 
 def formulas_in(scene: Any) -> list[str]:
-    """The formulas that the `refract` BSDFs of a scene use, sorted; "promoted (auto)" where it was not asked for."""
+    """The formulas of the `refract` BSDFs in a scene, sorted; "promoted (auto)" where the plugin chose it."""
     texts = (str(shape.bsdf()) for shape in scene.shapes())
     return sorted({name for text in texts for name in re.findall(r"Refract\[.*?formula = (.+?),\n", text, re.DOTALL)})
 
 
-def provenance() -> Metadata:
-    """Header attributes that say which software made an image."""
-    from mi_refract import __version__
-
-    versions = {"mi_refract": __version__, "mitsuba": version("mitsuba"), "drjit": version("drjit")}
-    return {"Software": f"mi_refract {__version__}"} | {f"mi_refract:version:{n}": v for n, v in versions.items()}
-
-
-def version(distribution: str) -> str:
-    """The installed version; "unknown" where it runs without being installed."""
-    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-        return importlib.metadata.version(distribution)
-    return "unknown"
-
-
 def _naming(path: str | os.PathLike[str], error: Exception) -> str:
-    """One line that names the file; without the place in Mitsuba's source."""
+    """The error as one line that names the file, without the line numbers of Mitsuba's source."""
     text = re.sub(r"\[\w+\.(cpp|h):\d+\] ", "", one_line(str(error)))
     text = re.sub(r"Traceback \(most recent call last\):.* (\w+Error: )", "", text)
     return text if str(path) in text else f"{path}: {text}"

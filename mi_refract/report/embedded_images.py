@@ -20,6 +20,7 @@ class EmbeddedImages:
     """The images of one page, each file once. A finite value past ±65504 becomes ±65504. Errors: see `embed`."""
 
     def __init__(self, folder: Path = Path()) -> None:
+        """`folder` is what the paths given to `embed` are relative to."""
         self.folder = folder
         self.embedded: list[dict[str, Any]] = []
         self._files: dict[str, dict[str, Any]] = {}

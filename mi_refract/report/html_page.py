@@ -9,7 +9,7 @@ from typing import Any
 from mi_refract.io.atomic import write_atomically
 
 from .embedded_images import EmbeddedImages
-from .plots import compact
+from .number_text import compact
 
 HERE = Path(__file__).parent / "templates"
 
@@ -28,6 +28,7 @@ def write_page(path: str | Path, template: str, content: Mapping[str, Any], imag
 
 
 def words(value: Any) -> str:
+    """A value of the context as text: mappings and lists separated by commas."""
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {words(item)}" for key, item in value.items())
     return ", ".join(map(words, value)) if isinstance(value, list | tuple) else str(value)

@@ -1,4 +1,4 @@
-"""What a page shows: numbers as compact text, plots as SVG in the page's theme."""
+"""Plots as SVG elements in the colours of the page: curves, histograms, scatter plots."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+
+from .number_text import compact
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Panel
@@ -42,29 +44,6 @@ STYLE: dict[str, Any] = {
 }
 
 
-def compact(value: float, digits: int = 3) -> str:
-    """`value` in at most `digits` significant digits, whole numbers below 10⁵ in full: 1.23e-7, 8056."""
-    if not math.isfinite(value):
-        return str(float(value))
-    if value == int(value) and abs(value) < 1e5:
-        return str(int(value))
-    if 1e3 <= abs(value) < 1e5:
-        return f"{value:.{max(digits - 4, 0)}f}"
-    if 1e-2 <= abs(value) < 1e3:
-        return f"{value:.{digits}g}"
-    mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
-    return f"{mantissa.rstrip('0').rstrip('.') if '.' in mantissa else mantissa}e{int(exponent)}"
-
-
-def distinguishable(value: float, budget: float) -> tuple[str, str]:
-    """Both as text, with as many digits as it takes to tell them apart when they differ."""
-    for digits in range(3, 18):
-        texts = compact(value, digits), compact(budget, digits)
-        if texts[0] != texts[1] or value == budget:
-            return texts
-    return repr(value), repr(budget)
-
-
 @dataclass(frozen=True)
 class Axes:
     """Labels and scales, "log" or "linear", of a plot; `slope` is that of a dashed guide, y ~ x^slope.
@@ -79,6 +58,7 @@ class Axes:
     slope: float | None = None
 
     def __post_init__(self) -> None:
+        """Check the scales. Errors: ValueError."""
         if not {self.x_scale, self.y_scale} <= {"log", "linear"}:
             raise ValueError(f"axes: scales {self.x_scale!r}, {self.y_scale!r}; accepted: 'log', 'linear'")
         if self.slope is not None and self.logarithmic != "xy":
@@ -86,6 +66,7 @@ class Axes:
 
     @property
     def logarithmic(self) -> str:
+        """The axes that are logarithmic: "", "x", "y" or "xy"."""
         return ("x" if self.x_scale == "log" else "") + ("y" if self.y_scale == "log" else "")
 
 

@@ -42,6 +42,7 @@ class Row:
     curves: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        """Check that every bound has its value, and that a row without values says why. Errors: ValueError."""
         unmeasured = (self.budgets.keys() | self.goals.keys()) - self.values.keys() if self.values else set()
         if unmeasured:
             raise ValueError(f"row {self.name}: a bound without a value: {sorted(unmeasured)}")
@@ -50,6 +51,7 @@ class Row:
 
     @property
     def name(self) -> str:
+        """Study, subject, case and setting in one line."""
         return " / ".join((self.study, self.subject, self.case, self.setting))
 
     @property
@@ -80,10 +82,12 @@ class Row:
         return "pass" if self.budgets else "info"
 
     def as_dict(self) -> dict[str, Any]:
+        """The fields by name, and the verdict."""
         return dataclasses.asdict(self) | {"verdict": self.verdict}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Row:
+        """The row whose fields `data` holds; other entries are left out. Errors: KeyError, ValueError."""
         return cls(**{f.name: data[f.name] for f in dataclasses.fields(cls)})
 
     @property
@@ -95,6 +99,7 @@ class Row:
 
 
 def by_study(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """The rows of each study, both in the order in which they first appear."""
     studies: dict[str, list[Row]] = {}
     for row in rows:
         studies.setdefault(row.study, []).append(row)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 from mi_refract.io.atomic import write_atomically
 
-from . import study_page
+from . import junit, study_page
 from .embedded_images import EmbeddedImages
 from .html_page import write_page
-from .plots import distinguishable
+from .number_text import distinguishable
 from .row import SCHEMA, Row, by_study, strict
 
 if TYPE_CHECKING:
@@ -110,41 +109,24 @@ def write_junit(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any
 
     Rows that demand nothing are left out: a case that cannot fail is no test. Errors: OSError.
     """
-    from xml.etree import ElementTree as xml
-
-    root = xml.Element("testsuites", name=_xml(context.get("title", "mi_refract")))
-    for study, members in by_study(rows).items():
-        suite = xml.SubElement(root, "testsuite", name=_xml(study))
-        for row in members:
-            _junit_cases(suite, row)
-        counts = Counter(child.tag for case in suite for child in case)
-        tally = {"tests": len(suite), "failures": counts["failure"], "skipped": counts["skipped"]}
-        suite.attrib.update({key: str(count) for key, count in tally.items()}, errors="0")
-    for key in ("tests", "failures", "skipped", "errors"):
-        root.set(key, str(sum(int(suite.get(key, "0")) for suite in root)))
-    xml.indent(root)
-    write_atomically(path, xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
+    suites = {study: [case for row in members for case in _cases(row)] for study, members in by_study(rows).items()}
+    junit.write_junit(path, context.get("title", "mi_refract"), suites)
 
 
-def _junit_cases(suite: Any, row: Row) -> None:
-    from xml.etree import ElementTree as xml
-
+def _cases(row: Row) -> list[junit.Case]:
     name = " / ".join((row.subject, row.case, row.setting))
     if not row.values:
-        case = xml.SubElement(suite, "testcase", classname=_xml(row.study), name=_xml(name))
-        xml.SubElement(case, "skipped", message=_xml(row.reason))
-    for metric, budget in row.budgets.items() if row.values else ():
-        case = xml.SubElement(suite, "testcase", classname=_xml(row.study), name=_xml(f"{name}: {metric}"))
-        if metric in row.broken:
-            text, limit = distinguishable(row.values[metric], budget)
-            failure = xml.SubElement(case, "failure", message=_xml(f"{metric} {text}, budget {limit}"))
-            parts = (f"value {row.values[metric]!r}, budget {budget!r}", row.reason, row.replay_text)
-            failure.text = _xml("\n".join(filter(None, parts)))
+        return [junit.Case(row.study, name, "skipped", row.reason)]
+    return [_case(row, f"{name}: {metric}", metric) for metric in row.budgets]
 
 
-def _xml(text: Any) -> str:
-    """Text in the characters XML 1.0 has; the others (terminal escapes, say) become U+FFFD."""
-    return re.sub("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", str(text))
+def _case(row: Row, name: str, metric: str) -> junit.Case:
+    if metric not in row.broken:
+        return junit.Case(row.study, name)
+    value, budget = row.values[metric], row.budgets[metric]
+    text, limit = distinguishable(value, budget)
+    details = "\n".join(filter(None, (f"value {value!r}, budget {budget!r}", row.reason, row.replay_text)))
+    return junit.Case(row.study, name, "failure", f"{metric} {text}, budget {limit}", details.splitlines())
 
 
 def summary(rows: Sequence[Row]) -> RenderableType:

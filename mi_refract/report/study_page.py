@@ -19,7 +19,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from .embedded_images import EmbeddedImages
-from .plots import Axes, Scatter, compact, curves_svg, distinguishable, drawable, scatter_svg
+from .number_text import compact, distinguishable
+from .plots import Axes, Scatter, curves_svg, drawable, scatter_svg
 from .row import Row, by_study
 
 STEERING = ("title", "studies", "scatter", "replay")
@@ -27,6 +28,7 @@ ROLES = ("reference", "test", "overlay", "difference")
 
 
 def prepare(rows: Sequence[Row], context: Mapping[str, Any], images: EmbeddedImages) -> dict[str, Any]:
+    """What the template `report.html.j2` is filled with. Errors: those of `EmbeddedImages.embed`."""
     verdicts = Counter(row.verdict for row in rows)
     return {
         "title": context.get("title", "mi_refract"),

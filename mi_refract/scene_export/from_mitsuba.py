@@ -1,10 +1,4 @@
-"""A scene as plain data that any renderer can take, read from a Mitsuba XML file.
-
-    plain = load("scenes/prism.xml", res="64")
-
-Transforms are applied, named indices are numbers, curved shapes are flat triangles, a checkerboard is two meshes of
-one colour each.
-"""
+"""Read a Mitsuba XML file as a plain scene: `load("scenes/prism.xml", res="64")`."""
 
 from __future__ import annotations
 
@@ -17,75 +11,74 @@ import numpy as np
 
 from mi_refract.io.image_file import read_exr
 
-from .meshes_from_shapes import meshes, named
-from .mitsuba_nodes import Node, Reader
-from .plain_scene import Camera, Colour, Diffuse, Environment, Glass, Light, Material, Mesh, Plain
-
-__all__ = ["Camera", "Colour", "Diffuse", "Environment", "Glass", "Light", "Material", "Mesh", "Plain", "load"]
+from .meshes_from_shapes import meshes_of_shape, with_unique_names
+from .mitsuba_nodes import Node, SceneFile
+from .plain_scene import Camera, Colour, Environment, Mesh, PlainScene
 
 LEVEL = 5  # of the tessellation: spheres of 20480 triangles, circles of 256 segments
 LEVELS = range(9)
 INTEGRATORS = ("path", "refract_path", "prb", "volpath", "prbvolpath")
 
 
-def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) -> Plain:
-    """The scene in a file, under the present variant; `defines` replace its `<default>`s.
+def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) -> PlainScene:
+    """The scene in a file, read by the active variant. `defines` replace its `<default>`s.
 
-    FileNotFoundError for a missing file; ValueError, in one line, for what is no scene and for what a plain scene
-    cannot say: other plugins, other parameters of theirs, smooth normals, one-sided surfaces that are open.
+    `level`: of the tessellation of curved shapes; one more halves the edges. FileNotFoundError for a missing file.
+    ValueError, one line, for a file that is no scene, and for what a plain scene cannot hold: other plugins or
+    parameters, smooth normals, one-sided surfaces that are open.
     """
     path = Path(path)
     if level not in LEVELS:
         raise ValueError(f"level = {level}: accepted: a whole number from {LEVELS[0]} to {LEVELS[-1]}")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such scene file")
-    root = Reader(path, defines).node(0)
+    root = SceneFile(path, defines).node(0)
     shapes: list[Mesh] = []
     found: dict[str, Any] = {}
     readers = {"Sensor": _camera, "Integrator": _max_depth, "Emitter": _sky}
     for child in root.children():
         if child.kind == "Shape":
-            shapes += meshes(child, level)
+            shapes += meshes_of_shape(child, level)
         elif child.kind in readers and child.kind not in found:
             found[child.kind] = readers[child.kind](child)
-        elif child.kind != "BSDF":  # those of surfaces are read with them
-            raise child.refused(f"one {child.kind.lower()} too many", "shapes, and one sensor, integrator and sky")
-    root.done()
+        elif child.kind != "BSDF":  # a named BSDF is read with the shapes that use it
+            raise child.error(f"one {child.kind.lower()} too many", "shapes, and one sensor, integrator and sky")
+    root.finish()
     for kind in ("Sensor", "Integrator"):
         if kind not in found:
             raise ValueError(f"{path}: no {kind.lower()}; accepted: a scene with one")
     sky = found.get("Emitter", (0.0, 0.0, 0.0))
-    return Plain(path.stem, named(shapes), sky, found["Sensor"], found["Integrator"])
+    return PlainScene(path.stem, with_unique_names(shapes), sky, found["Sensor"], found["Integrator"])
 
 
 def _max_depth(integrator: Node) -> int:
     if integrator.type not in INTEGRATORS:
-        raise integrator.refused("an integrator of another kind", ", ".join(INTEGRATORS))
-    depth = integrator.of(int, "max_depth", -1)
+        raise integrator.error("an integrator of another kind", ", ".join(INTEGRATORS))
+    depth = integrator.value(int, "max_depth", -1)
     if depth < 1:
-        raise integrator.refused(f"max_depth = {depth}", "a positive whole number")
-    if integrator.of(bool, "hide_emitters", False):
-        raise integrator.refused("hide_emitters", "false")
+        raise integrator.error(f"max_depth = {depth}", "a positive whole number")
+    if integrator.value(bool, "hide_emitters", False):
+        raise integrator.error("hide_emitters", "false")
     integrator.ignore("rr_depth")
-    integrator.done()
+    integrator.finish()
     return depth
 
 
 def _camera(sensor: Node) -> Camera:
-    """Clip planes are left out: they are taken to cut nothing away."""
+    """A perspective sensor. Clip planes are ignored: they are assumed to cut nothing away."""
     if sensor.type != "perspective":
-        raise sensor.refused("a sensor of another kind", "perspective")
+        raise sensor.error("a sensor of another kind", "perspective")
     frame = sensor.transform()
     width = height = 0
     for child in sensor.children():
         if child.kind == "Film":
             width, height = _film(child)
         elif child.kind != "Sampler":
-            raise child.refused(f"a {child.kind.lower()} of a sensor", "a film and a sampler")
+            raise child.error(f"a {child.kind.lower()} of a sensor", "a film and a sampler")
     sensor.ignore("near_clip", "far_clip", "focus_distance")
     origin, axes = frame[:3, 3], frame[:3, :3] / np.linalg.norm(frame[:3, :3], axis=0)
     fov = _fov_x(sensor, width, height)
-    sensor.done()
+    sensor.finish()
     return Camera(_triple(origin), _triple(origin + axes[:, 2]), _triple(axes[:, 1]), fov, width, height)
 
 
@@ -95,26 +88,26 @@ def _triple(vector: Any) -> tuple[float, float, float]:
 
 
 def _fov_x(sensor: Node, width: int, height: int) -> float:
-    """The angle between the left and the right border, in degrees."""
-    fov, axis = sensor.of(float, "fov"), sensor.of(str, "fov_axis", "x")
+    """The angle between the left and the right border of the image, in degrees."""
+    fov, axis = sensor.value(float, "fov"), sensor.value(str, "fov_axis", "x")
     if not 0 < fov < 180:
-        raise sensor.refused(f"fov = {fov}", "an angle of 0 to 180 degrees")
+        raise sensor.error(f"fov = {fov}", "an angle of 0 to 180 degrees")
     lengths = {"x": width, "y": height, "diagonal": math.hypot(width, height)}
     lengths |= {"smaller": min(width, height), "larger": max(width, height)}
     if axis not in lengths:
-        raise sensor.refused(f"fov_axis = {axis!r}", ", ".join(lengths))
+        raise sensor.error(f"fov_axis = {axis!r}", ", ".join(lengths))
     return math.degrees(2 * math.atan(math.tan(math.radians(fov) / 2) * width / lengths[axis]))
 
 
 def _film(film: Node) -> tuple[int, int]:
     for child in film.children():
         if child.type != "box":
-            raise child.refused("a reconstruction filter", "box")
+            raise child.error("a reconstruction filter", "box")
     film.ignore("pixel_format", "component_format", "file_format")
-    width, height = film.of(int, "width", 768), film.of(int, "height", 576)
+    width, height = film.value(int, "width", 768), film.value(int, "height", 576)
     if min(width, height) < 1:
-        raise film.refused(f"{width} × {height} pixels", "at least one")
-    film.done()
+        raise film.error(f"{width} × {height} pixels", "at least one")
+    film.finish()
     return width, height
 
 
@@ -122,15 +115,15 @@ def _sky(emitter: Node) -> Colour | Environment:
     if emitter.type == "constant":
         sky: Colour | Environment = emitter.colour("radiance", 1.0)
     elif emitter.type == "envmap":
-        path, scale = emitter.scene.beside(emitter.of(str, "filename")), emitter.of(float, "scale", 1.0)
+        path, scale = emitter.scene.resolve(emitter.value(str, "filename")), emitter.value(float, "scale", 1.0)
         turn = emitter.transform()[:3, :3]
         if not np.allclose(turn.T @ turn, np.eye(3), atol=1e-9):
-            raise emitter.refused("to_world is no rotation", "a rotation")
+            raise emitter.error("to_world is no rotation", "a rotation")
         sky = Environment(scale * _pixels(emitter, path), turn)
     else:
-        raise emitter.refused("an emitter of another kind", "constant, envmap, and area on a shape")
+        raise emitter.error("an emitter of another kind", "constant, envmap, and area on a shape")
     emitter.ignore("sampling_weight", "mis_compensation")
-    emitter.done()
+    emitter.finish()
     return sky
 
 
@@ -138,7 +131,7 @@ def _pixels(emitter: Node, path: Path) -> Any:
     try:
         pixels = read_exr(path)[0]
     except (OSError, ValueError) as error:
-        raise emitter.refused(str(error), "an OpenEXR file") from None
+        raise emitter.error(str(error), "an OpenEXR file") from None
     if pixels.shape[2] != 3 or min(pixels.shape[:2]) < 2 or not np.isfinite(pixels).all() or (pixels < 0).any():
-        raise emitter.refused(f"{path}: {pixels.shape[1]} × {pixels.shape[0]} × {pixels.shape[2]}", "finite RGB")
+        raise emitter.error(f"{path}: {pixels.shape[1]} × {pixels.shape[0]} × {pixels.shape[2]}", "finite RGB")
     return pixels

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import mitsuba as mi
 import numpy as np
 
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 from mi_refract.plugins.refract import PLUGIN, read_ior
 
 from . import tessellation
@@ -32,21 +32,21 @@ DEFAULT = (0.5, 0.5, 0.5)  # Mitsuba's reflectance
 
 @dataclass(frozen=True)
 class Surface:
-    """A material, or two by a checkerboard of uv with these scales; `one_sided`: black from behind."""
+    """One material, or two in a checkerboard whose uv have these scales. `one_sided`: black from behind."""
 
     materials: tuple[Material, ...]
     scales: tuple[float, float] | None = None
     one_sided: bool = False
 
 
-def meshes(shape: Node, level: int) -> Iterator[Mesh]:
-    """The shape's meshes: two for a checkerboard, else one. ValueError for what they cannot say."""
+def meshes_of_shape(shape: Node, level: int) -> Iterator[Mesh]:
+    """The shape's meshes: two for a checkerboard, otherwise one. ValueError for what a mesh cannot hold."""
     surface, frame = _surface(shape), _frame(shape)
-    flipped = shape.of(bool, "flip_normals", False)
+    flipped = shape.value(bool, "flip_normals", False)
     parts = _parts(shape, surface, level)
-    shape.done()
+    shape.finish()
     if surface.one_sided and (flipped or not all(tessellation.is_closed(faces) for _, faces in parts)):
-        raise shape.refused("diffuse on one side of an open surface", "its BSDF in a `twosided`, or a closed shape")
+        raise shape.error("diffuse on one side of an open surface", "its BSDF in a `twosided`, or a closed shape")
     for i, ((vertices, faces), material) in enumerate(zip(parts, surface.materials, strict=True)):
         if not len(faces):  # a checkerboard of one cell
             continue
@@ -55,8 +55,8 @@ def meshes(shape: Node, level: int) -> Iterator[Mesh]:
         yield Mesh(f"{name}_{i}" if i else name, placed, faces[:, ::-1] if flipped else faces, material)
 
 
-def named(found: Iterable[Mesh]) -> tuple[Mesh, ...]:
-    """The meshes with names of letters, digits and underscores that are unique whatever the case."""
+def with_unique_names(found: Iterable[Mesh]) -> tuple[Mesh, ...]:
+    """The meshes, renamed: letters, digits and underscores only, unique without regard to case."""
     taken: set[str] = set()
     result = []
     for mesh in found:
@@ -71,39 +71,39 @@ def named(found: Iterable[Mesh]) -> tuple[Mesh, ...]:
 
 
 def _parts(shape: Node, surface: Surface, level: int) -> tuple[Triangles, ...]:
-    """In the shape's own coordinates, one for each material."""
+    """Triangles in the shape's own coordinates, one part per material."""
     if surface.scales:
         if shape.type != "rectangle":
-            raise shape.refused("a checkerboard", "one on a rectangle")
+            raise shape.error("a checkerboard", "one on a rectangle")
         return tessellation.checkerboard(*surface.scales)
     if shape.type in FILES:
         return (_from_file(shape),)
     if shape.type not in SHAPES:
-        raise shape.refused("a shape without triangles here", f"{', '.join((*SHAPES, *FILES))}")
+        raise shape.error("a shape of another type", f"{', '.join((*SHAPES, *FILES))}")
     return (SHAPES[shape.type](level),)
 
 
 def _from_file(shape: Node) -> Triangles:
-    path, flat = shape.scene.beside(shape.of(str, "filename")), shape.of(bool, "face_normals", False)
+    path, flat = shape.scene.resolve(shape.value(str, "filename")), shape.value(bool, "face_normals", False)
     try:
         mesh = mi.load_dict({"type": shape.type, "filename": str(path), "face_normals": flat})
     except RuntimeError as error:
-        raise shape.refused(f"{path}: {error}", "a mesh that Mitsuba reads") from None
+        raise shape.error(f"{path}: {error}", "a mesh that Mitsuba reads") from None
     if mesh.has_vertex_normals():
-        raise shape.refused("smooth normals", "face_normals = true")
+        raise shape.error("smooth normals", "face_normals = true")
     vertices = np.array(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)
     return vertices, np.array(mesh.faces_buffer(), np.int64).reshape(-1, 3)
 
 
 def _frame(shape: Node) -> np.ndarray:
-    """From the coordinates of `_parts` to the scene's, 4 × 4."""
+    """(4, 4): from the coordinates of `_parts` to the scene's."""
     frame, local = shape.transform(), np.eye(4)
     if shape.type == "sphere":
         local[:3, 3] = shape.point("center", (0, 0, 0))
-        local[:3, :3] *= _positive(shape, "radius", shape.of(float, "radius", 1.0))
+        local[:3, :3] *= _positive(shape, "radius", shape.value(float, "radius", 1.0))
     elif shape.type == "cylinder":
         start, end = (shape.point(name, (0, 0, z)) for name, z in (("p0", 0), ("p1", 1)))
-        radius = _positive(shape, "radius", shape.of(float, "radius", 1.0))
+        radius = _positive(shape, "radius", shape.value(float, "radius", 1.0))
         length = _positive(shape, "length", float(np.linalg.norm(end - start)))
         local[:3, 3] = start
         local[:3, :3] = _basis((end - start) / length) * [radius, radius, length]
@@ -112,12 +112,12 @@ def _frame(shape: Node) -> np.ndarray:
 
 def _positive(shape: Node, name: str, value: float) -> float:
     if value <= 0:
-        raise shape.refused(f"{name} = {value}", "a positive number")
+        raise shape.error(f"{name} = {value}", "a positive number")
     return value
 
 
 def _basis(z: np.ndarray) -> np.ndarray:
-    """An orthonormal, right-handed one whose last column is `z`; the identity for (0, 0, 1). Duff et al. 2017."""
+    """(3, 3): an orthonormal, right-handed basis with last column z; the identity for (0, 0, 1). Duff et al. 2017."""
     x, y, _ = z
     sign = np.copysign(1.0, z[2])
     a = -1 / (sign + z[2])
@@ -133,48 +133,48 @@ def _surface(shape: Node) -> Surface:
         elif child.kind == "Emitter" and not emitter:
             emitter = child
         else:
-            raise child.refused(f"a {child.kind.lower()} of a shape", "one BSDF, one area emitter")
+            raise child.error(f"a {child.kind.lower()} of a shape", "one BSDF, one area emitter")
     if emitter is None:
         return _scattering(bsdf) if bsdf else Surface((Diffuse(DEFAULT),), one_sided=True)
     if emitter.type != "area":
-        raise emitter.refused("an emitter of a shape", "area")
+        raise emitter.error("an emitter of a shape", "area")
     if bsdf and _scattering(bsdf).materials != (Diffuse(BLACK),):
-        raise bsdf.refused("the BSDF of a lamp", "none, or a black diffuse one")
-    colours, scales = _paint(emitter, "radiance", None)
+        raise bsdf.error("the BSDF of a lamp", "none, or a black diffuse one")
+    colours, scales = _colours(emitter, "radiance", None)
     emitter.ignore("sampling_weight")
-    emitter.done()
+    emitter.finish()
     return Surface(tuple(map(Light, colours)), scales)
 
 
 def _scattering(bsdf: Node) -> Surface:
     if bsdf.type == "twosided":
         inner = list(bsdf.children())
-        bsdf.done()
+        bsdf.finish()
         if len(inner) != 1:
-            raise bsdf.refused("two BSDFs", "the same on both sides")
+            raise bsdf.error("two BSDFs", "the same on both sides")
         return replace(_scattering(inner[0]), one_sided=False)
     if bsdf.type in GLASSES:
         glass = Glass(read_ior(bsdf.props, "int_ior", "bk7"), read_ior(bsdf.props, "ext_ior", "air"))
         bsdf.ignore("int_ior", "ext_ior", "formula")
-        bsdf.done()
+        bsdf.finish()
         return Surface((glass,))
     if bsdf.type == "diffuse":
-        colours, scales = _paint(bsdf, "reflectance", DEFAULT[0])
-        bsdf.done()
+        colours, scales = _colours(bsdf, "reflectance", DEFAULT[0])
+        bsdf.finish()
         return Surface(tuple(map(Diffuse, colours)), scales, one_sided=any(colour != BLACK for colour in colours))
-    raise bsdf.refused("a BSDF of another kind", f"diffuse, twosided, {', '.join(GLASSES)}")
+    raise bsdf.error("a BSDF of another kind", f"diffuse, twosided, {', '.join(GLASSES)}")
 
 
-def _paint(node: Node, name: str, default: float | None) -> tuple[tuple[Colour, ...], tuple[float, float] | None]:
+def _colours(node: Node, name: str, default: float | None) -> tuple[tuple[Colour, ...], tuple[float, float] | None]:
     """One colour, or the two of a checkerboard and the scale of its uv."""
     texture = node.take(name)
     if not isinstance(texture, Node):
         return (node.colour(name, default),), None
     if texture.type != "checkerboard":
-        raise texture.refused(f"a texture for the {name}", "checkerboard")
+        raise texture.error(f"a texture for the {name}", "checkerboard")
     colours = texture.colour("color0", 0.4), texture.colour("color1", 0.2)
     matrix = texture.transform("to_uv")
-    texture.done()
+    texture.finish()
     if not (matrix == np.diag(matrix.diagonal())).all() or not (matrix[[0, 1], [0, 1]] > 0).all():
-        raise texture.refused("to_uv turns or moves", "a scale")
+        raise texture.error("to_uv turns or moves", "a scale")
     return colours, (float(matrix[0, 0]), float(matrix[1, 1]))

@@ -1,4 +1,4 @@
-"""A parsed Mitsuba scene, node by node. Every parameter is either read or refused: nothing is dropped in silence."""
+"""A parsed Mitsuba scene, node by node. A parameter that nobody reads is an error: none is dropped silently."""
 
 from __future__ import annotations
 
@@ -21,88 +21,95 @@ REFERENCE = "ResolvedReference"  # to another node; Mitsuba does not export the 
 
 
 class Node:
-    """A plugin of the parsed scene: its parameters, each to be taken; what is left at the end is refused."""
+    """A plugin of the parsed scene. Its parameters are taken one by one; `finish` raises for those that are left."""
 
-    def __init__(self, scene: Reader, node: Any) -> None:
+    def __init__(self, scene: SceneFile, node: Any) -> None:
+        """`node`: of Mitsuba's parser."""
         self.scene, self._node, self.props, self.type = scene, node, node.props, node.props.plugin_name()
         self.names = list(node.props.keys())
-        self.left = set(self.names)
+        self.unread = set(self.names)
 
     @property
     def kind(self) -> str:
-        """Shape, BSDF, Emitter, …"""
+        """The kind of plugin: Shape, BSDF, Emitter, …"""
         return self._node.type.name
 
     def __str__(self) -> str:
+        """The plugin's name and its id, for errors."""
         return f"{self.type} {self.props.id()}".strip()
 
     def take(self, name: str, default: Any = None) -> Any:
-        self.left.discard(name)
+        """A parameter as Mitsuba holds it; a Node where it is a nested plugin."""
+        self.unread.discard(name)
         value = self.props.get(name, default)
         return self.scene.node(value.index()) if type(value).__name__ == REFERENCE else value
 
     def ignore(self, *names: str) -> None:
-        """Parameters without an effect on what is rendered in the end."""
-        self.left.difference_update(names)
+        """Skip parameters that do not change the expected image."""
+        self.unread.difference_update(names)
 
     def children(self) -> Iterator[Node]:
-        """Its nested plugins that are not yet taken, whatever their names, in the order of the file."""
-        for name in [name for name in self.names if name in self.left]:
+        """The nested plugins that are not taken yet, in the order of the file."""
+        for name in [name for name in self.names if name in self.unread]:
             if type(self.props[name]).__name__ == REFERENCE:
                 yield self.take(name)
 
-    def done(self) -> None:
-        if self.left:
-            raise self.refused(f"its {' and '.join(sorted(self.left))}", "a plain scene without")
+    def finish(self) -> None:
+        """ValueError where a parameter was not taken."""
+        if self.unread:
+            raise self.error(f"its {' and '.join(sorted(self.unread))}", "a plain scene without")
 
-    def refused(self, what: str, accepted: str) -> ValueError:
+    def error(self, what: str, accepted: str) -> ValueError:
+        """The error that names the file and the plugin, what is wrong, and what would be accepted."""
         return ValueError(f"{self.scene.path}: {self}: {what}; accepted: {accepted}")
 
-    def of(self, kind: type[Kind], name: str, default: Kind | None = None) -> Kind:
-        """A number, a text or a truth value; refused where it is of another kind, missing, or not finite."""
+    def value(self, kind: type[Kind], name: str, default: Kind | None = None) -> Kind:
+        """A number, a text or a truth value. ValueError where it is of another type, missing, or not finite."""
         value = self.take(name, default)
         if kind is float and type(value) is int:
             value = float(value)
         if type(value) is not kind or (isinstance(value, float) and not math.isfinite(value)):
-            raise self.refused(f"{name} = {value}", f"one of type {kind.__name__}")
+            raise self.error(f"{name} = {value}", f"one of type {kind.__name__}")
         return value
 
     def point(self, name: str, default: Sequence[float]) -> NDArray[np.float64]:
+        """(3,). ValueError unless it is three finite numbers."""
         value = np.array(self.take(name, default), dtype=object)
         if value.shape != (3,) or not all(isinstance(x, (int, float)) and math.isfinite(x) for x in value):
-            raise self.refused(f"{name} = {value}", "three finite numbers")
+            raise self.error(f"{name} = {value}", "three finite numbers")
         return value.astype(float)
 
     def colour(self, name: str, default: float | None) -> Colour:
-        """Three finite numbers of at least 0."""
+        """Linear RGB. ValueError unless it is three finite numbers, each at least 0."""
         value = self.take(name, default)
         if isinstance(value, Node):
-            raise self.refused(f"{name} is a {value.type}", "a colour")
+            raise self.error(f"{name} is a {value.type}", "a colour")
         uniform = re.fullmatch(r"Properties\.Spectrum\[uniform=([^\]]+)\]", str(value))
         try:
             r, g, b = (float(x) for x in np.broadcast_to(np.array(uniform[1] if uniform else value, float), 3))
         except (TypeError, ValueError):
             r = g = b = math.nan
         if not all(0 <= x < math.inf for x in (r, g, b)):
-            raise self.refused(f"{name} = {value}", "an RGB colour of finite numbers, at least 0")
+            raise self.error(f"{name} = {value}", "an RGB colour of finite numbers, at least 0")
         return r, g, b
 
     def transform(self, name: str = "to_world") -> NDArray[np.float64]:
-        """4 × 4, affine, of positive determinant."""
+        """(4, 4). ValueError unless it is affine, with a positive determinant."""
         value = self.take(name)
         if value is not None and not hasattr(value, "matrix"):
-            raise self.refused(f"{name} = {value}", "a transform")
+            raise self.error(f"{name} = {value}", "a transform")
         matrix = np.eye(4) if value is None else np.array(value.matrix, float)
         affine = np.isfinite(matrix).all() and (matrix[3] == [0, 0, 0, 1]).all()
         if not affine or not np.linalg.det(matrix[:3, :3]) > 0:
-            raise self.refused(f"{name} mirrors or flattens", "a transform that keeps left and right")
+            raise self.error(f"{name} mirrors or flattens", "a transform that keeps left and right")
         return matrix
 
 
-class Reader:
+class SceneFile:
     """A parsed scene file."""
 
     def __init__(self, path: Path, defines: Mapping[str, str]) -> None:
+        """Parse the file; `defines` replace its `<default>`s. ValueError, one line, where Mitsuba cannot parse it."""
         self.path, config = path, mi.parser.ParserConfig("scalar_rgb")
         config.merge_equivalent = config.merge_meshes = config.parallel = False
         try:
@@ -113,8 +120,9 @@ class Reader:
             raise ValueError(message if str(path) in message else f"{path}: {message}") from None
 
     def node(self, index: int) -> Node:
+        """The node with this index; 0 is the scene."""
         return Node(self, self.state.nodes[index])
 
-    def beside(self, name: str) -> Path:
-        """A file named in the scene."""
+    def resolve(self, name: str) -> Path:
+        """The path of a file that the scene names relative to its own folder."""
         return self.path.parent / name

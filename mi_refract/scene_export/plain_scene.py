@@ -1,7 +1,8 @@
-"""A scene as plain data that any renderer can take: triangles, constants, one perspective camera.
+"""A scene as plain data that any renderer can read: triangles, constants, one perspective camera.
 
-Transforms are applied, named indices are numbers, curved shapes are flat triangles, a checkerboard is two meshes of
-one colour each. Right-handed coordinates of the scene file; lengths in its unit; linear RGB of Rec. 709 primaries.
+Transforms are applied, named indices are numbers, curved shapes are flat triangles, and a checkerboard is two meshes of
+one colour each. Coordinates are right-handed, those of the scene file, in its unit of length. Colours are linear RGB
+with Rec. 709 primaries.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Glass:
-    """A smooth boundary of two lossless media; their absolute indices of refraction.
+    """A smooth boundary between two lossless media with these absolute indices of refraction.
 
     The faces' normals point into the medium of `ext_ior`.
     """
@@ -34,7 +35,7 @@ class Diffuse:
 
 @dataclass(frozen=True)
 class Light:
-    """Emits `radiance` into every direction on the side of the faces' normals; black from behind. Reflects nothing."""
+    """A surface that emits `radiance` on the side of its normals, is black from behind, and reflects nothing."""
 
     radiance: Colour
 
@@ -44,25 +45,25 @@ Material = Glass | Diffuse | Light
 
 @dataclass(frozen=True)
 class Mesh:
-    """Flat triangles of one material, counterclockwise seen from where their normals point. Names are unique."""
+    """Flat triangles of one material, counterclockwise as seen from the side of their normals. Names are unique."""
 
     name: str
-    vertices: NDArray[np.float64]  # V × 3
-    faces: NDArray[np.int64]  # F × 3
+    vertices: NDArray[np.float64]  # (V, 3)
+    faces: NDArray[np.int64]  # (F, 3), indices of vertices
     material: Material
 
     def triangles(self) -> NDArray[np.float64]:
-        """F × 3 × 3: the corners of each."""
+        """(F, 3, 3): the corners of each triangle."""
         return self.vertices[self.faces]
 
 
 @dataclass(frozen=True)
 class Environment:
-    """Radiance from infinitely far away by direction, H × W × 3, interpolated linearly in columns and rows.
+    """Radiance from infinitely far away by direction, (H, W, 3), interpolated linearly between columns and rows.
 
     In the map's own coordinates, with +y the zenith, the pixel in row j and column i is the radiance seen in direction
-    (sin φ sin θ, cos θ, −cos φ sin θ): θ = π j / (H − 1), so that first and last row are the poles, and
-    φ = 2π (i + ½) / W. `rotation` (3 × 3, orthonormal, its columns the map's axes) takes these to the scene's.
+    (sin φ sin θ, cos θ, −cos φ sin θ) with θ = π j / (H − 1), so that the first and the last row are the poles, and
+    φ = 2π (i + ½) / W. `rotation` (3, 3) is orthonormal; its columns are the map's axes in the scene's coordinates.
     """
 
     pixels: NDArray[np.float32]
@@ -71,7 +72,7 @@ class Environment:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole: looks from `origin` to `target`, width × height square pixels, each the mean over its own square."""
+    """A pinhole camera that looks from `origin` to `target`. A pixel is the mean over its own square (box filter)."""
 
     origin: Colour
     target: Colour
@@ -82,8 +83,8 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class Plain:
-    """`sky`: radiance from infinitely far away, 0 where there is none. `max_depth`: of a path, as Mitsuba counts."""
+class PlainScene:
+    """A scene. `sky`: radiance from infinitely far away, 0 for none. `max_depth`: of a path, as Mitsuba counts."""
 
     name: str
     meshes: tuple[Mesh, ...]
@@ -93,5 +94,5 @@ class Plain:
 
     @property
     def materials(self) -> tuple[Material, ...]:
-        """Each once, in the order of the meshes."""
+        """Every material once, in the order of the meshes."""
         return tuple(dict.fromkeys(mesh.material for mesh in self.meshes))

@@ -1,6 +1,6 @@
-"""Mitsuba's shapes as flat triangles in their own coordinates, counterclockwise seen from where the normal points.
+"""Mitsuba's shapes as flat triangles in their own coordinates, counterclockwise as seen from the side of the normal.
 
-Curved shapes are inscribed: their vertices lie on the surface. A `level` more halves the length of their edges.
+The vertices of a curved shape lie on its surface. One `level` more halves the length of the edges.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-Vertices = NDArray[np.float64]  # V × 3
-Faces = NDArray[np.int64]  # F × 3
+Vertices = NDArray[np.float64]  # (V, 3)
+Faces = NDArray[np.int64]  # (F, 3)
 Triangles = tuple[Vertices, Faces]
 
 GOLDEN = (1 + 5**0.5) / 2
@@ -20,7 +20,7 @@ GOLDEN = (1 + 5**0.5) / 2
 
 @functools.cache
 def sphere(level: int) -> Triangles:
-    """The unit sphere: an icosahedron, each face of it divided into 4^level."""
+    """The unit sphere: an icosahedron with each face divided into 4^level."""
     corners = np.array([[-1, GOLDEN, 0], [1, GOLDEN, 0], [-1, -GOLDEN, 0], [1, -GOLDEN, 0]])
     corners = np.concatenate([np.roll(corners, shift, axis=1) for shift in (0, 1, 2)])
     near = np.isclose(np.linalg.norm(corners[:, None] - corners, axis=-1), 2)
@@ -32,7 +32,7 @@ def sphere(level: int) -> Triangles:
     for _ in range(level):
         triangles = _halved(triangles)
     vertices, order = welded(triangles)
-    vertices.flags.writeable = order.flags.writeable = False  # they are everybody's
+    vertices.flags.writeable = order.flags.writeable = False  # the cache shares them
     return vertices, order
 
 
@@ -44,13 +44,13 @@ def _halved(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def welded(triangles: NDArray[np.float64]) -> Triangles:
-    """F × 3 × 3 corners as vertices and faces: corners of the same position are one vertex."""
+    """Vertices and faces of corners (F, 3, 3). Corners with the same position become one vertex."""
     vertices, index = np.unique(triangles.reshape(-1, 3) + 0.0, axis=0, return_inverse=True)
     return vertices, index.reshape(-1, 3).astype(np.int64)
 
 
 def is_closed(faces: Faces) -> bool:
-    """Each edge borders two faces, once in either direction; vertices of the same position must be one."""
+    """Whether each edge borders two faces, once in either direction. Precondition: the vertices are welded."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     there = {(int(a), int(b)) for a, b in edges}
     return len(there) == len(edges) and all((b, a) in there for a, b in there)
@@ -71,16 +71,16 @@ def rectangle() -> Triangles:
 
 
 def checkerboard(scale_u: float, scale_v: float) -> tuple[Triangles, Triangles]:
-    """The rectangle's two parts, of `color0` and of `color1`, where the texture's uv are scaled by these numbers."""
+    """The two parts of the rectangle, of `color0` and of `color1`, for a checkerboard with these scales of uv."""
     u, v = _cuts(scale_u), _cuts(scale_v)
-    # The middle of a cell in half units of the scaled coordinate, whose parity is Mitsuba's "beyond one half".
+    # The middle of a cell in half units of the scaled coordinate: odd where Mitsuba's fraction is above one half.
     odd_u, odd_v = (np.floor((x[:-1] + x[1:]) * scale) % 2 == 1 for x, scale in ((u, scale_u), (v, scale_v)))
     same = odd_u[:, None] == odd_v
     return grid(2 * u - 1, 2 * v - 1, same), grid(2 * u - 1, 2 * v - 1, ~same)
 
 
 def _cuts(scale: float) -> NDArray[np.float64]:
-    """0, 1 and where between them a cell ends; cells are half a unit of the scaled coordinate."""
+    """0, the ends of the cells, 1. A cell is half a unit of the scaled coordinate."""
     lines = np.arange(1, np.ceil(2 * scale)) / (2 * scale)
     return np.concatenate([[0.0], lines, [1.0]])
 
@@ -96,7 +96,7 @@ def cube() -> Triangles:
 
 
 def segments(level: int) -> int:
-    """Of a circle."""
+    """The number of segments of a circle."""
     return 8 << level
 
 

@@ -1,19 +1,18 @@
-"""A plain scene in the files of other renderers: `write(plain, "radiance", folder)`."""
+"""Write a plain scene in the format of another renderer: `write(plain, "radiance", folder)`."""
 
 from __future__ import annotations
 
 import os
-import shutil
-import uuid
 from collections.abc import Callable
 from pathlib import Path
 
-from mi_refract.scene_export.targets.shared_files import Files
+from mi_refract.io import atomic
 
-from .plain_scene import Plain
+from .plain_scene import PlainScene
 from .targets import cycles, luxcore, mitsuba, obj, povray, radiance
+from .targets.shared_files import Files
 
-TARGETS: dict[str, Callable[[Plain], Files]] = {
+TARGETS: dict[str, Callable[[PlainScene], Files]] = {
     "cycles": cycles.files,
     "luxcore": luxcore.files,
     "radiance": radiance.files,
@@ -23,36 +22,31 @@ TARGETS: dict[str, Callable[[Plain], Files]] = {
 }
 
 
-def write(plain: Plain, target: str, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write what the renderer needs into a new folder, or an empty one, complete or not at all; the files, sorted.
+def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> list[Path]:
+    """Write the files of a target into a new or an empty folder, all of them or none. Returns their paths, sorted.
 
-    ValueError for an unknown target, a scene that the renderer cannot say, a folder that holds something; OSError
-    for one that cannot be written.
+    ValueError for an unknown target, or a scene that the target's format cannot hold. OSError for a folder that holds
+    files, or cannot be written.
     """
     if target not in TARGETS:
-        raise ValueError(f"target {target!r}: accepted: {', '.join(TARGETS)}")
-    place = _free(folder)
+        raise ValueError(f"target {target!r}: unknown; accepted: {', '.join(TARGETS)}")
+    place = _new_or_empty(folder)
     files = TARGETS[target](plain)
-    temporary = place.with_name(f".{place.name}.{uuid.uuid4().hex}.part")
-    try:
+    with atomic.replacing(place) as temporary:
         temporary.mkdir()
         for name, content in files.items():
             (temporary / name).write_bytes(content)
-        temporary.replace(place)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
     return [Path(folder) / name for name in sorted(files)]
 
 
-def _free(folder: str | os.PathLike[str]) -> Path:
-    """The folder without links in its path; an error unless it can be made or is empty."""
+def _new_or_empty(folder: str | os.PathLike[str]) -> Path:
+    """The path of the folder, its links resolved. OSError unless the folder is empty or can be made."""
     place = Path(folder).resolve()
     if place.is_dir():
         if any(place.iterdir()):
             raise FileExistsError(f"{folder}: holds files already; accepted: a new folder or an empty one")
     elif place.exists():
-        raise NotADirectoryError(f"{folder}: is no folder; accepted: a new folder or an empty one")
+        raise NotADirectoryError(f"{folder}: is not a folder; accepted: a new folder or an empty one")
     if not place.parent.is_dir():
         raise NotADirectoryError(f"{folder}: {place.parent} is not a folder; accepted: a new folder in an existing one")
     if not os.access(place.parent, os.W_OK | os.X_OK):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import sys
@@ -14,7 +15,7 @@ import pytest
 from support.ray_programs import glsl
 
 from mi_refract.cli import app
-from mi_refract.ray_sets import ray_set, run_program
+from mi_refract.ray_sets import files, ray_set, run_program
 
 # A renderer's side of it, with nothing of ours: the comment on stderr must get through.
 PROGRAM = """
@@ -62,7 +63,7 @@ def answer(path, to, program=glsl, lines=()):
 
 
 def header(to):
-    return [line for line in ray_set.as_csv(to).splitlines() if line.startswith("#")]
+    return [line for line in files.as_csv(to).splitlines() if line.startswith("#")]
 
 
 # export and check
@@ -71,19 +72,19 @@ def header(to):
 def test_export_and_check(call):
     code, out, err = call("export", *FEW, "--precision", "f64", "--seed", 3, "-o", "rays.csv")
     assert (code, out, err) == (0, "rays.csv: 120 rays, 2 regimes, f64, seed 3\n", "")
-    to = ray_set.read("rays.csv")
+    to = files.read("rays.csv")
     assert (len(to), to.precision, to.header["seed"]) == (120, "f64", 3)
     answer("answers.csv", to)
     code, out, err = call("check", "answers.csv", "--rays", "rays.csv")
     assert (code, err) == (0, "")
-    assert "120 answers, all as good as the formula decomposed or better" in out
-    assert "told by the zero vector (detected)" in out
+    assert "120 answers, all within the error bound of the formula decomposed; the largest error is" in out
+    assert "signalled by the zero vector (detected)" in out
 
 
 def test_export_in_every_format_is_the_same_set(call):
     for ending in ("csv", "npz", "exr"):
         assert call("export", "--count", 5, "--two-sided", "-o", f"rays.{ending}")[0] == 0
-    found = [ray_set.read(f"rays.{ending}") for ending in ("csv", "npz", "exr")]
+    found = [files.read(f"rays.{ending}") for ending in ("csv", "npz", "exr")]
     assert len({each.header["checksum"] for each in found}) == 1
     assert found[0].header["two_sided"] is True
 
@@ -91,15 +92,15 @@ def test_export_in_every_format_is_the_same_set(call):
 def test_the_regimes(call):
     code, out, err = call("export", "--regimes")
     assert (code, err) == (0, "")
-    assert len(out.splitlines()) == 18
-    assert "only where it is asked for" in out
+    assert len(out.splitlines()) == 19
+    assert "only with --regime" in out
     assert call("export", "--regime", "k >> 1", "--count", 2, "-o", "rays.csv")[0] == 0
-    assert set(ray_set.read("rays.csv").regime) == {"k ≫ 1"}
+    assert set(files.read("rays.csv").regime) == {"k ≫ 1"}
 
 
 def test_wrong_answers(call):
     to = ray_set.make(["generic"], 50)
-    ray_set.write("rays.csv", to)
+    files.write("rays.csv", to)
     answer("answers.csv", to, lambda a, n, k: glsl(a, n, 1 / k))
     code, out, err = call("check", "answers.csv", "--rays", "rays.csv")
     assert (code, err) == (1, "")
@@ -111,18 +112,18 @@ def test_answers_may_say_what_they_answer(call):
     answer("answers.csv", to, lines=header(to))
     code, out, _ = call("check", "answers.csv")
     assert (code, out.splitlines()[0]) == (0, "answers.csv: 40 rays, 1 regimes, f64, seed 8")
-    ray_set.write("rays.csv", to)
+    files.write("rays.csv", to)
     answer("answers.csv", to, lines=[line.replace("sha256:", "sha256:0") for line in header(to)])
     code, _, err = call("check", "answers.csv", "--rays", "rays.csv")
     assert (code, "the answers are to rays with the checksum sha256:0" in err) == (2, True)
     code, _, err = call("check", "answers.csv")
-    assert (code, "cannot make again; accepted: with --rays FILE" in err) == (2, True)
+    assert (code, "cannot make the rays of these answers again; accepted: with --rays FILE" in err) == (2, True)
 
 
 def test_without_a_word_they_are_to_the_default(call):
     answer("answers.csv", ray_set.make())
     code, out, _ = call("check", "answers.csv")
-    told = "as `export` without options; others with --rays FILE"
+    told = "as of `export` without options; others: --rays FILE"
     assert (code, out.splitlines()[0]) == (0, f"answers.csv: 13000 rays, 13 regimes, f32, seed 0, {told}")
     answer("answers.csv", ray_set.make(seed=1))
     assert call("check", "answers.csv")[0] == 1
@@ -131,24 +132,24 @@ def test_without_a_word_they_are_to_the_default(call):
 def test_the_measure_can_be_chosen(call):
     to = ray_set.make(["generic"], 50)
     answer("answers.csv", to, lines=header(to))
-    assert call("check", "answers.csv", "--as-good-as", "wedge")[0] == 0
+    assert call("check", "answers.csv", "--error-bound", "wedge")[0] == 0
     code, out, _ = call("check", "answers.csv", "--as-good-as", "promoted")
     assert (code, "none of the usual mistakes explains the answers" in out) == (1, True)
 
 
 DAMAGE = {
     "no file": (None, 2, "No such file"),
-    "an empty file": ("", 2, "nothing in it"),
-    "other columns": ("id,x,y,z\n0,1,2,3\n", 2, "header line 'id,x,y,z'"),
-    "a short row": ("id,bx,by,bz\n0,0,1,0\n1,0,1", 2, "1 lines are no row, first line 3"),
-    "no text": (b"\xfe\xff\x00", 2, "no text"),
+    "an empty file": ("", 2, "the table is empty"),
+    "other columns": ("id,x,y,z\n0,1,2,3\n", 2, "the first row is 'id,x,y,z'"),
+    "a short row": ("id,bx,by,bz\n0,0,1,0\n1,0,1", 2, "1 wrong rows, the first is line 3"),
+    "no text": (b"\xfe\xff\x00", 2, "not text"),
     "a flag of 2": ("id,bx,by,bz,transmitted\n0,0,1,0,2\n", 2, "transmitted is 2.0"),
 }
 
 
 @pytest.mark.parametrize("content, code, message", DAMAGE.values(), ids=DAMAGE)
 def test_files_that_are_no_answers(call, content, code, message):
-    ray_set.write("rays.csv", ray_set.make(["generic"], 4))
+    files.write("rays.csv", ray_set.make(["generic"], 4))
     if content is not None:
         Path("answers.csv").write_bytes(content if isinstance(content, bytes) else content.encode())
     found, out, err = call("check", "answers.csv", "--rays", "rays.csv")
@@ -160,7 +161,7 @@ def test_files_that_are_no_answers(call, content, code, message):
 
 def test_answers_that_are_not_those_to_the_rays(call):
     to = ray_set.make(["generic"], 50)
-    ray_set.write("rays.csv", to)
+    files.write("rays.csv", to)
     answer("answers.csv", to)
     text = Path("answers.csv").read_text().splitlines()
     Path("answers.csv").write_text("\n".join([*text[:41], text[5], "77,0,0,1"]))
@@ -168,8 +169,8 @@ def test_answers_that_are_not_those_to_the_rays(call):
     assert (code, err) == (2, "")
     assert "10 without an answer: ids 40, 41, 42, 43, 44, …" in out
     assert "1 answered more than once: id 4\n" in out
-    assert "1 answers to rays that were not asked: id 77\n" in out
-    assert out.splitlines()[-1] == "40 answers, but not those to the rays"
+    assert "1 answers to rays that are not in the set: id 77\n" in out
+    assert out.splitlines()[-1] == "40 answers, but they do not match the rays"
     data = json.loads(Path("out.json").read_text())
     assert [(each["kind"], each["count"]) for each in data["problems"]] == [
         ("missing", 10),
@@ -179,12 +180,12 @@ def test_answers_that_are_not_those_to_the_rays(call):
 
 
 def test_rays_that_somebody_edited(call):
-    path = ray_set.write("rays.csv", to := ray_set.make(["generic"], 50))
+    path = files.write("rays.csv", to := ray_set.make(["generic"], 50))
     answer("answers.csv", to)
     path.write_text(path.read_text().replace("0.3", "0.4", 1))
     code, out, err = call("check", "answers.csv", "--rays", "rays.csv")
     assert (code, out) == (2, "")
-    assert "rays.csv: the checksum does not fit" in err
+    assert "rays.csv: the checksum does not match" in err
 
 
 BAD_OPTIONS = {
@@ -195,10 +196,13 @@ BAD_OPTIONS = {
     "a folder": (("export", "-o", "none/r.csv"), "is not a folder"),
     "no file": (("export",), "--output"),
     "a way to tell": (("check", "a.csv", "--tir", "zeros"), "--tir zeros: unknown; accepted: auto, zero, nan"),
-    "a formula": (("check", "a.csv", "--as-good-as", "glsl"), "--as-good-as glsl: unknown; accepted: wedge"),
+    "a formula": (("check", "a.csv", "--error-bound", "glsl"), "--error-bound glsl: unknown; accepted: wedge"),
     "a report": (("check", "a.csv", "--report", "r.pdf"), "r.pdf: accepted"),
     "no command": (("run",), "COMMAND"),
-    "rays twice": (("run", "--rays", "r.csv", "--count", "5", "--", "true"), "accepted: without --count"),
+    "rays twice": (
+        ("run", "--rays", "r.csv", "--count", "5", "--", "true"),
+        "--rays r.csv and --count: both choose the rays",
+    ),
     "nothing": ((), "Missing command"),
 }
 
@@ -214,8 +218,8 @@ def test_options_that_cannot_be(call, words, message):
 
 @pytest.mark.parametrize("package, words", [("flint", ()), ("jinja2", ("--report", "out.html"))])
 def test_what_is_not_installed_is_named(call, monkeypatch, package, words):
-    find = app.cli_rays.importlib.util.find_spec
-    monkeypatch.setattr(app.cli_rays.importlib.util, "find_spec", lambda name: None if name == package else find(name))
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else find(name))
     code, _, err = call("check", "answers.csv", *words)
     assert (code, "pip install 'mi-refract[validation]'" in err) == (2, True)
 
@@ -231,7 +235,7 @@ def test_a_program_that_is_right(call, program):
 
 
 def test_a_program_that_is_wrong(call, program):
-    ray_set.write("rays.npz", ray_set.make(["generic"], 50, "f32", 3))
+    files.write("rays.npz", ray_set.make(["generic"], 50, "f32", 3))
     code, out, _ = call("run", "--rays", "rays.npz", "--", *program, "inverted")
     assert code == 1
     assert out.splitlines()[-1] == "50 of 50 answers are wrong: eta inverted"
@@ -240,9 +244,9 @@ def test_a_program_that_is_wrong(call, program):
 BAD_PROGRAMS = {
     "a status": ("import sys; sys.stdin.read(); print('id,bx,by,bz'); sys.exit(3)", "ended with status 3; accepted"),
     "a signal": ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "was killed by SIGSEGV; accepted"),
-    "nothing": ("pass", "nothing in it"),
-    "a remark": ("print('hello'); print('id,bx,by,bz')", "header line 'hello'"),
-    "bytes": ("import os; os.write(1, bytes(range(256)))", "no text"),
+    "nothing": ("pass", "the table is empty"),
+    "a remark": ("print('hello'); print('id,bx,by,bz')", "the first row is 'hello'"),
+    "bytes": ("import os; os.write(1, bytes(range(256)))", "not text"),
 }
 
 

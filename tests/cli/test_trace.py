@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mi_refract.cli import app
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 from mi_refract.planar import figure, path_tree, scene_file, scene_schema, tracer
 
 BALL = """

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from mi_refract import oracle, regimes
-from mi_refract.formulas.bounds import ROUNDING, Budget, cancelling, radicand_for, root
+from mi_refract.formulas import ROUNDING, Budget, cancelling, radicand_for
+from mi_refract.formulas.bounds import root
 from validation.directions.judge import judge, judged
 
 U = 2.0**-53

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mi_refract import oracle, reflect, reflect_sandwich, refract_2d
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 from mi_refract.regimes import REGIMES, Rays, make
 from validation.directions.judge import BUDGETS, evaluate, judge
 from validation.run.array_settings import Setting

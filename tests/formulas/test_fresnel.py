@@ -8,9 +8,8 @@ import pytest
 from flint import acb, arb, ctx
 
 from mi_refract import oracle
-from mi_refract.formulas import fresnel
-from mi_refract.formulas.documented import FORMULAS
-from mi_refract.numerics.error_free import DoubleWord
+from mi_refract.formulas import FORMULAS, fresnel
+from mi_refract.numerics import DoubleWord
 
 COUNT = {"scalar": 60, "llvm": 4000, "cuda": 4000}
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mi_refract import FORMULAS
 from mi_refract.formulas.bounds import root
 from mi_refract.regimes import REGIMES, Rays, make
-from validation.directions.judge import evaluate, lengths, radicand
+from validation.directions.judge import absolute_radicand, evaluate, lengths
 from validation.directions.planted_defects import EXACT, MUTANTS
 
 
@@ -52,14 +52,14 @@ class Case:
         Moved are the tangent by k, the radicand by 2 sin θ_t k and the square of that.
         """
         across = np.where(self.transmitted, np.maximum(1, self.k), 1) * moved
-        x = across * (2 * self.sin_t + across) + self.budget.margin(self.u, self.k)
+        x = across * (2 * self.sin_t + across) + self.budget.radicand_error_bound(self.u, self.k)
         terms = self.budget.of_terms(self.u, self.k, self.transmitted)
         return 2 * across + terms + np.where(self.transmitted, root(x, self.cos_t), 0)
 
     def undecidable(self, moved=0.0):
         """Rays so near to the critical angle that the budget, or the move, leaves the decision open."""
         across = np.maximum(1, self.k) * moved
-        return radicand(self.rays) <= self.budget.margin(self.u, self.k) + across * (2 + across)
+        return absolute_radicand(self.rays) <= self.budget.radicand_error_bound(self.u, self.k) + across * (2 + across)
 
 
 def agree(b, other, bound, kept):

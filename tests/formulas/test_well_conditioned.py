@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from mi_refract.formulas import well_conditioned
-from mi_refract.numerics import error_free
-from mi_refract.numerics.error_free import DoubleWord, TripleWord
+from mi_refract.numerics import DoubleWord, TripleWord, error_free, scale_to_unit
 
 COUNT = {"scalar": 40, "llvm": 400, "cuda": 400}
 # k of three kinds: the critical angle far from both ends, at grazing, and at almost normal incidence.
@@ -94,7 +93,7 @@ LENGTHS = [1e-18, 3e-7, 1.0, 1.9999999, 2.0, 5e9, 1e18]
 def test_lengths_are_brought_near_one_by_a_power_of_two(length, vectorised):
     v = vectorised.vector(*(length * x for x in (0.6, -0.7, 0.1)))
     dr.make_opaque(v)
-    scaled, power = error_free.scale_to_unit(v)
+    scaled, power = scale_to_unit(v)
     assert (np.array(scaled * power) == np.array(v)).all()
     if vectorised.name == "float32":
         assert 1 <= np.abs(np.array(scaled)).max() < 2
@@ -108,5 +107,5 @@ def test_lengths_are_brought_near_one_by_a_power_of_two(length, vectorised):
 def test_what_has_no_length_is_not_given_one(bad, vectorised):
     v = vectorised.vector(bad, 0.0, 0.0)
     dr.make_opaque(v)
-    scaled = np.array(error_free.scale_to_unit(v)[0]).ravel()
+    scaled = np.array(scale_to_unit(v)[0]).ravel()
     assert scaled[0] == 0 if bad == 0 else not np.isfinite(scaled).all()

@@ -10,7 +10,8 @@ import pytest
 from scipy import stats
 
 from mi_refract.image_diff import methods, tile_statistics
-from mi_refract.image_diff.methods import METHODS, Verdict, preconditions
+from mi_refract.image_diff.comparison import preconditions
+from mi_refract.image_diff.methods import METHODS, Verdict
 from mi_refract.io.image_file import Image
 
 SMOOTH = np.dstack([np.linspace(0.1, 0.9, 48 * 40).reshape(40, 48) ** k for k in (1, 2, 3)]).astype(np.float32)

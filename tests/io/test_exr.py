@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_refract.io import image_file
+from mi_refract.io import atomic, image_file
 from mi_refract.io.image_file import read_exr, write_exr
 
 # Values that a detour over half floats, clamping or a colour transform would change.
@@ -72,12 +72,14 @@ def test_places_that_do_not_fit(tmp_path):
 
 
 @pytest.mark.parametrize("side", [2, 400], ids=["within a buffer", "beyond it"])
-def test_a_full_disk_keeps_the_old_file(tmp_path, side):
+def test_a_full_disk_keeps_the_old_file(tmp_path, side, monkeypatch):
     if not Path("/dev/full").exists():
         pytest.skip("no /dev/full")
     path = tmp_path / "a.exr"
     path.write_text("old")
-    image_file.temporary_name(path).symlink_to("/dev/full")
+    temporary = tmp_path / "temporary.exr"
+    temporary.symlink_to("/dev/full")
+    monkeypatch.setattr(atomic, "temporary_name", lambda path, suffix: temporary)
     with pytest.raises(OSError, match=r"a\.exr: cannot be written: .") as error:
         write_exr(path, np.random.default_rng(1).random((side, side, 3)))
     assert "\n" not in str(error.value)

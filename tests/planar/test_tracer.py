@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.planar_scenes import SQUARE, ball, polygon, star, story, together
 
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 from mi_refract.planar import intersect_segments
 from mi_refract.planar.tracer import Event, Segments
 

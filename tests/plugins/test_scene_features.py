@@ -21,7 +21,7 @@ def facts(**parts):
     return {name for name, value in dataclasses.asdict(inspect(scene)).items() if value is True}
 
 
-def test_a_ball_alone_needs_nothing_but_polarisation(each_variant):
+def test_a_ball_alone_needs_nothing_but_polarisation(typical_variant):
     assert facts() == {"only_glass", "polarising"}
     assert facts(ball={"type": "sphere", "bsdf": BLACK}) == {"only_glass"}
 

@@ -11,7 +11,7 @@ from support.ray_programs import BAD, GOOD
 
 from mi_refract import oracle
 from mi_refract.accuracy.direction_errors import lengths
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 from mi_refract.ray_sets import ray_set, tir_signal
 from mi_refract.ray_sets.check_answers import LOOSEST, check
 from mi_refract.ray_sets.diagnosis import MISTAKES
@@ -61,10 +61,10 @@ def test_the_textbook_passes_however_it_tells(precision, tir):
     for told in ("auto", tir):
         found = check(to, answers, tir=told)
         assert (found.exit_code, found.wrong, found.problems, found.explanations) == (0, 0, (), ())
-        assert (found.tir, found.told) == (tir, told != "auto")
+        assert (found.tir, found.tir_given) == (tir, told != "auto")
         assert found.answered == len(to)
         assert [each.regime for each in found.regimes] == list(ray_set.DEFAULT)
-    assert found.limit < found.answered  # it is not exact, and it is not called so
+    assert found.total("exact") < found.answered  # it is not exact, and it is not called so
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -72,10 +72,10 @@ def test_the_textbook_passes_however_it_tells(precision, tir):
 def test_the_exact_answers_are_exact(precision, names):
     to, (certified, answers) = some(precision, names), exact(precision, names)
     for budget in (LOOSEST, "promoted"):
-        found = check(to, answers, budget=budget)
+        found = check(to, answers, error_bound=budget)
         assert found.exit_code == 0
-        assert found.limit == found.answered == len(to)
-        assert sum(each.misjudged for each in found.regimes) == 0
+        assert found.total("exact") == found.answered == len(to)
+        assert sum(each.tir_misclassified for each in found.regimes) == 0
         assert max(each.worst for each in found.regimes) <= found.ulp
     flagged = check(to, Answers(to.ids, answers.b, certified.transmitted))
     assert (flagged.exit_code, flagged.tir) == (0, "flag")
@@ -86,7 +86,7 @@ def test_the_shortest_decimals_of_float32_will_do():
     to, (_, answers) = some(), exact("f32")
     printed = np.array([[float(str(x)) for x in row] for row in answers.b.astype(np.float32)])
     assert (printed != answers.b).any()
-    assert check(to, Answers(to.ids, printed), budget="promoted").exit_code == 0
+    assert check(to, Answers(to.ids, printed), error_bound="promoted").exit_code == 0
 
 
 def test_figures_are_what_they_say():
@@ -100,12 +100,12 @@ def test_figures_are_what_they_say():
     found = check(to, changed(answers, rows, turned))
     generic = found.regimes[0]
     assert generic.worst == pytest.approx(1e-3, rel=1e-9)
-    compared = np.concatenate([angle.ravel(), np.zeros(generic.judged - len(rows))])
+    compared = np.concatenate([angle.ravel(), np.zeros(generic.compared - len(rows))])
     assert generic.mean == pytest.approx(compared.mean(), rel=1e-6)
     assert generic.p99 == pytest.approx(np.quantile(compared, 0.99), rel=1e-6)
-    assert generic.norm == pytest.approx(0.25, rel=1e-9)
+    assert generic.length_error == pytest.approx(0.25, rel=1e-9)
     assert generic.wrong == found.wrong == len(rows)
-    assert generic.limit == generic.rays - len(rows)
+    assert generic.exact == generic.rays - len(rows)
     assert generic.replay["id"] in to.ids[rows]
     assert found.ulp == 2.0**-52
 
@@ -123,10 +123,10 @@ def test_one_wrong_answer_is_enough():
 
 
 def test_the_textbook_is_not_exact():
-    found = check(some(), answered(some(), programs.glsl), budget="promoted")
+    found = check(some(), answered(some(), programs.glsl), error_bound="promoted")
     assert found.exit_code == 1
-    assert found.budget == "promoted"
-    assert found.wrong == sum(each.rays - each.limit for each in found.regimes)
+    assert found.error_bound == "promoted"
+    assert found.wrong == sum(each.rays - each.exact for each in found.regimes)
 
 
 @pytest.mark.parametrize("lost", [1e-2, 1e-3])
@@ -137,7 +137,7 @@ def test_giving_up_before_the_critical_angle_is_seen(lost):
     found = check(to, changed(answers, rows, 0))
     critical = found.regimes[ray_set.DEFAULT.index("critical")]
     assert len(rows) > 0
-    assert critical.far >= len(rows) == critical.wrong
+    assert critical.tir_beyond_bound >= len(rows) == critical.wrong
     assert found.exit_code == 1
 
 
@@ -253,8 +253,8 @@ def test_a_flag_goes_before_the_direction():
     assert check(to, Answers(to.ids, b, certified.transmitted)).exit_code == 0
     found = check(to, Answers(to.ids, b, ~certified.transmitted))
     assert found.exit_code == 1
-    assert sum(each.misjudged for each in found.regimes) == len(to)
-    assert sum(each.far for each in found.regimes) > 0.6 * len(to)
+    assert sum(each.tir_misclassified for each in found.regimes) == len(to)
+    assert sum(each.tir_beyond_bound for each in found.regimes) > 0.6 * len(to)
 
 
 def test_no_ray_with_total_internal_reflection():
@@ -282,7 +282,7 @@ def test_only_nan_passes_nothing():
 def test_nothing_but_doubt_is_no_pass(regime, value):
     to = some("f32", (regime,))
     found = check(to, Answers(to.ids, np.full((len(to), 3), value)))
-    assert (found.exit_code, found.judged, found.wrong) == (1, 0, 0)
+    assert (found.exit_code, found.total("compared"), found.wrong) == (1, 0, 0)
 
 
 def test_missing_duplicate_and_unknown():
@@ -325,7 +325,7 @@ def test_answers_to_other_rays():
         check(to, Answers(to.ids, answers.b, header=other.header))
 
 
-@pytest.mark.parametrize("given", [{"tir": "zeros"}, {"budget": "decompose"}])
+@pytest.mark.parametrize("given", [{"tir": "zeros"}, {"error_bound": "decompose"}])
 def test_names_that_are_none(given):
     with pytest.raises(ValueError, match="unknown; accepted: "):
         check(some(), exact("f32")[1], **given)

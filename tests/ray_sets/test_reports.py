@@ -39,7 +39,7 @@ def test_json(tmp_path, findings, name):
     assert data["rays"]["checksum"] == found.header["checksum"]
     assert data["wrong"] == sum(each["wrong"] for each in data["regimes"])
     assert data["regimes"][0]["worst_ulps"] == found.regimes[0].worst * 2**23
-    assert data["total_internal_reflection"] == {"told_by": found.tir, "detected": True}
+    assert data["total_internal_reflection"] == {"signal": found.tir, "detected": True}
 
 
 @pytest.mark.parametrize("name, failures, errors", [("right", 0, 0), ("wrong", 3, 1)])

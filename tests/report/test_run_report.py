@@ -15,7 +15,8 @@ import pytest
 from support.browser import CHROMIUM, browse
 
 from mi_refract.report import run_report
-from mi_refract.report.plots import Axes, compact, curves_svg, distinguishable, pareto
+from mi_refract.report.number_text import compact, distinguishable
+from mi_refract.report.plots import Axes, curves_svg, pareto
 from mi_refract.report.row import Row
 
 NAN, INF = math.nan, math.inf

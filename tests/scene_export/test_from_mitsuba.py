@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mi_refract.scene_export import from_mitsuba, write_files
-from mi_refract.scene_export.from_mitsuba import Diffuse, Environment, Glass, Light
+from mi_refract.scene_export.plain_scene import Diffuse, Environment, Glass, Light
 from mi_refract.scene_export.targets.environment_map import radiance
 
 SCENES = Path(__file__).parents[2] / "scenes"

@@ -11,7 +11,7 @@ import pytest
 from mi_refract.image_diff import methods
 from mi_refract.io import image_file
 from mi_refract.scene_export import from_mitsuba, tessellation, write_files
-from mi_refract.scene_export.from_mitsuba import Camera, Diffuse, Environment, Glass, Light, Mesh, Plain
+from mi_refract.scene_export.plain_scene import Camera, Diffuse, Environment, Glass, Light, Mesh, PlainScene
 from mi_refract.scene_export.targets import cycles, environment_map, luxcore, obj, povray
 
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -25,7 +25,7 @@ def meshes(*materials):
 
 @pytest.fixture
 def small():
-    return Plain("small", meshes(GLASS, Light((1.0, 2.0, 3.0))), (0.5, 0.25, 1.0), CAMERA, 12)
+    return PlainScene("small", meshes(GLASS, Light((1.0, 2.0, 3.0))), (0.5, 0.25, 1.0), CAMERA, 12)
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def sky():
 
 @pytest.mark.parametrize("target", write_files.TARGETS)
 def test_every_target_writes_its_folder(target, small, sky, tmp_path):
-    for i, scene in enumerate((small, Plain("turned", small.meshes, sky, CAMERA, 12))):
+    for i, scene in enumerate((small, PlainScene("turned", small.meshes, sky, CAMERA, 12))):
         written = write_files.write(scene, target, tmp_path / f"{i}")
         assert sorted(written) == sorted((tmp_path / f"{i}").iterdir()) and all(map(os.path.getsize, written))
         text = (tmp_path / f"{i}" / "README.txt").read_text()
@@ -59,7 +59,12 @@ def test_what_is_there_stays(small, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
     (tmp_path / "file").write_text("mine")
-    cases = [("full", "holds files"), ("file", "no folder"), ("none/below", "not a folder"), ("file/below", "not a f")]
+    cases = [
+        ("full", "holds files"),
+        ("file", "not a folder"),
+        ("none/below", "not a folder"),
+        ("file/below", "not a f"),
+    ]
     for name, words in cases:
         with pytest.raises(OSError, match=words):
             write_files.write(small, "obj+json", tmp_path / name)
@@ -88,7 +93,9 @@ def test_nothing_stays_of_half_an_export(small, tmp_path, monkeypatch):
 
 
 def test_unknown_target(small, tmp_path):
-    with pytest.raises(ValueError, match=r"'blender': accepted: cycles, luxcore, radiance, povray, mitsuba, obj\+json"):
+    with pytest.raises(
+        ValueError, match=r"'blender': unknown; accepted: cycles, luxcore, radiance, povray, mitsuba, obj\+json"
+    ):
         write_files.write(small, "blender", tmp_path / "new")
 
 
@@ -146,7 +153,7 @@ def test_radiance_surfaces(small, tmp_path):
 
 def test_radiance_sky_is_read_as_it_is_meant(small, sky, tmp_path):
     """The table and the functions of the export, evaluated here as Radiance does, give what `environment` gives."""
-    scene = Plain("turned", small.meshes, sky, CAMERA, 12)
+    scene = PlainScene("turned", small.meshes, sky, CAMERA, 12)
     write_files.write(scene, "radiance", tmp_path / "new")
     lines = (tmp_path / "new" / "sky_g.dat").read_text().splitlines()
     table = np.array([line.split() for line in lines[3:]], float)
@@ -170,13 +177,15 @@ def test_povray_refuses_what_it_does_not_follow(small, tmp_path):
     pane, (ball,) = Mesh("pane", *tessellation.rectangle(), GLASS), meshes(Diffuse((0.5, 0.0, 0.0)))
     for mesh, words in ((pane, "pane: glass with an open"), (ball, "ball_0: a diffuse surface")):
         with pytest.raises(ValueError, match=words):
-            write_files.write(Plain("bad", (mesh,), (1.0, 1.0, 1.0), CAMERA, 8), "povray", tmp_path / "new")
+            write_files.write(PlainScene("bad", (mesh,), (1.0, 1.0, 1.0), CAMERA, 8), "povray", tmp_path / "new")
     assert not list(tmp_path.iterdir())
 
 
 def test_povray_indices_are_relative_to_what_is_outside():
     inner, outer = Mesh("in", *tessellation.sphere(0), Glass(1.2, 1.6)), tessellation.sphere(0)
-    scene = Plain("two", (inner, Mesh("out", 2 * outer[0], outer[1], Glass(1.6, 1.25))), (1.0, 1.0, 1.0), CAMERA, 300)
+    scene = PlainScene(
+        "two", (inner, Mesh("out", 2 * outer[0], outer[1], Glass(1.6, 1.25))), (1.0, 1.0, 1.0), CAMERA, 300
+    )
     text = povray.files(scene)["scene.pov"].decode()
     assert [float(part.split()[0]) for part in text.split("interior { ior ")[1:]] == [1.2 / 1.25, 1.6 / 1.25]
     assert "max_trace_level 256" in text
@@ -186,7 +195,7 @@ def test_povray_indices_are_relative_to_what_is_outside():
 
 
 def test_obj_and_json_hold_everything(small, sky, tmp_path):
-    scene = Plain("turned", small.meshes, sky, CAMERA, 12)
+    scene = PlainScene("turned", small.meshes, sky, CAMERA, 12)
     write_files.write(scene, "obj+json", tmp_path / "new")
     lines = [line.split() for line in (tmp_path / "new" / "scene.obj").read_text().splitlines()]
     vertices = np.array([line[1:] for line in lines if line[0] == "v"], float)
@@ -214,9 +223,9 @@ def test_ply_is_read_by_mitsuba(small, tmp_path):
 def test_maps_are_looked_up_by_unit_directions(module, sky):
     """Every direction is somewhere on the map, and a resampled map shows in each what the sky shows there."""
     u, v = np.random.default_rng(6).random((2, 400))
-    directions = module.looked_up(u, v)
+    directions = module.direction_at(u, v)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1)
-    image = environment_map.longitude_latitude(sky, module.looked_up)
+    image = environment_map.longitude_latitude(sky, module.direction_at)
     height, width = image.shape[:2]
     nearest = image[(v * height).astype(int), (u * width).astype(int)]
     np.testing.assert_allclose(nearest, environment_map.radiance(sky, directions), atol=0.15)

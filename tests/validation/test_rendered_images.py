@@ -140,8 +140,8 @@ def test_an_environment_is_what_mitsuba_makes_of_it():
 
 # Where each renderer looks a direction up: u to the right, v from the top of the image.
 LOOKED_UP = {
-    cycles.looked_up: lambda x, y, z: (0.5 - np.arctan2(y, x) / (2 * np.pi), np.arccos(z) / np.pi),
-    luxcore.looked_up: lambda x, y, z: (np.arctan2(y, x) / (2 * np.pi) % 1, np.arccos(z) / np.pi),
+    cycles.direction_at: lambda x, y, z: (0.5 - np.arctan2(y, x) / (2 * np.pi), np.arccos(z) / np.pi),
+    luxcore.direction_at: lambda x, y, z: (np.arctan2(y, x) / (2 * np.pi) % 1, np.arccos(z) / np.pi),
     image_renderers.equirectangular: lambda x, y, z: (0.5 + np.arctan2(z, x) / (2 * np.pi), np.arccos(y) / np.pi),
 }
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mi_refract import oracle
-from mi_refract.ray_sets import ray_set as ray_files
+from mi_refract.ray_sets import ray_set
 from validation import __main__ as command
 from validation import limits
 from validation.suite import per_ray
@@ -141,7 +141,7 @@ def test_the_sets_are_what_they_say(precision, few):
     through = {name: exact.transmitted[rays.regime == name].mean() for name in per_ray.SETS}
     assert (through["grazing"], through[TOTAL]) == (1, 0)
     assert through["near-critical"] > 0.9, "rounding may put a ray on the other side"
-    assert ray_files.checksum(rays) == rays.header["checksum"]
+    assert ray_set.checksum(rays) == rays.header["checksum"]
 
 
 def test_the_built_in_runs_and_is_right(few):

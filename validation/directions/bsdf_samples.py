@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.formulas.bounds import cancelling
+from mi_refract.formulas import cancelling
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run.context import Context
@@ -90,7 +90,7 @@ def _mode_row(mode: Any, mode_name: str, count: int, variant: str) -> Row:
     budgets |= {"eta worst": limits.SAMPLE_ETA, "lobe flips": limits.SAMPLE_FLIPS * count}
     budgets |= {f"{name} p99": limits.SAMPLE_P99 for name in ("wo", "pdf", "weight")}
     if mi.is_polarized:  # a radicand on either side of the boundary, and its error in three factors of the weight
-        budgets["weight worst"] = limits.SAMPLE_MUELLER * float(cancelling(2).margin(2.0**-24, INT_IOR))
+        budgets["weight worst"] = limits.SAMPLE_MUELLER * float(cancelling(2).radicand_error_bound(2.0**-24, INT_IOR))
     replay = {"count": 3 * count, "seed": SEED, **description}
     return Row(NAME, "refract − dielectric", mode_name, variant, values, budgets, replay=replay)
 

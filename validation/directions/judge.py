@@ -13,8 +13,8 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import oracle
-from mi_refract.accuracy.direction_errors import errors, lengths, margin, radicand
-from mi_refract.formulas.bounds import NEGLIGIBLE, UNIT, Budget, radicand_for
+from mi_refract.accuracy.direction_errors import absolute_radicand, errors, lengths, relative_radicand
+from mi_refract.formulas import NEGLIGIBLE, UNIT, Budget, radicand_for
 from mi_refract.regimes import Rays
 
 Subject = Callable[[Any, Any, Any], tuple[Any, Any]]
@@ -67,7 +67,7 @@ def judged(b: np.ndarray, transmitted: np.ndarray, rays: Rays, exact: oracle.Cer
     """What a subject returned, in extended precision."""
     chord, angle, drift = errors(b, rays, exact)
     misjudged = (transmitted != exact.transmitted) & ~exact.undecided
-    right, distance = ~misjudged & ~exact.undecided, radicand(rays)
+    right, distance = ~misjudged & ~exact.undecided, absolute_radicand(rays)
     u: Any = float(np.finfo(rays.a.dtype).eps) / 2
     k, cos_t, through = rays.k.astype(float), exact.cos_t, exact.transmitted
     off = [np.abs(lengths(v) - 1) for v in (rays.a, rays.n)]
@@ -77,9 +77,9 @@ def judged(b: np.ndarray, transmitted: np.ndarray, rays: Rays, exact: oracle.Cer
     open_side = budget.side_open(u, exact.cos_i)
     far = misjudged & ~open_side
     if budget.at_the_limit:
-        far[far] = ~(margin(rays[far]) <= NEGLIGIBLE * u * u)
+        far[far] = ~(relative_radicand(rays[far]) <= NEGLIGIBLE * u * u)
     else:
-        far &= distance > budget.margin(u, k)
+        far &= distance > budget.radicand_error_bound(u, k)
     far |= exact.undecided  # which no float is
     of_terms, of_root = budget.of_terms(u, k, through, unit), budget.of_root(u, k, cos_t, through)
     needed = np.where(through, radicand_for(np.maximum(chord - of_terms, 0), cos_t), 0.0)

@@ -13,8 +13,7 @@ import functools
 import numpy as np
 
 from mi_refract import oracle, regimes
-from mi_refract.formulas.bounds import ROUNDING
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS, ROUNDING
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing

@@ -17,10 +17,10 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import oracle, regimes
-from mi_refract.formulas.documented import FORMULAS, contract, wedge
+from mi_refract.formulas import FORMULAS, contract, wedge
 from mi_refract.numerics import error_free
 from mi_refract.regimes import Rays
-from mi_refract.report.plots import compact
+from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
 from validation.run.array_settings import Setting, settings
 from validation.run.context import Context

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.random import Generator
 
 from mi_refract import oracle, regimes
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 from mi_refract.regimes import REGIMES, Rays
 from mi_refract.report.row import Row
 from validation.reference.fast_reference import Screen
@@ -160,7 +160,7 @@ def _scores(name: str, subject: Subject, screen: Screen, decision: np.ndarray) -
     from the critical angle where it is wrong, minus that distance where it is right. Rays whose side is open are out.
     """
     chord, wrong = screen.judge(subject)
-    far, budget = np.abs(screen.margin), budget_of(name)
+    far, budget = np.abs(screen.relative_radicand), budget_of(name)
     by_chord = np.where(wrong, -np.inf, chord / screen.bound(budget))
     score = np.where(decision, np.where(wrong, far, -far), by_chord)
     score = np.where(budget.side_open(screen.roundoff, screen.cos_i), -np.inf, score)
@@ -184,12 +184,12 @@ def _to_critical(rng: Generator, rays: Rays) -> Rays:
     """A Newton step to radicand 0 in one number, then the best of TRIALS combinations of ulps, by its linear part."""
     rows, precision = np.arange(len(rays)), rays.k.dtype
     numbers = np.column_stack([rays.a, rays.n, rays.k]).astype(np.float64)
-    d, along = regimes.radicand(numbers[:, :3], numbers[:, 3:6], numbers[:, 6])
+    d, along = regimes.radicand_and_gradient(numbers[:, :3], numbers[:, 3:6], numbers[:, 6])
     j = rng.integers(0, 7, len(rays))
     numbers[rows, j] -= d / along[rows, j]
     ulps = np.spacing(np.abs(numbers).astype(precision)).astype(np.float64)
     numbers = numbers.astype(precision).astype(np.float64)
-    d, along = regimes.radicand(numbers[:, :3], numbers[:, 3:6], numbers[:, 6])
+    d, along = regimes.radicand_and_gradient(numbers[:, :3], numbers[:, 3:6], numbers[:, 6])
     steps = rng.integers(-3, 4, (TRIALS, 7)) * (rng.random((TRIALS, 7)) < 0.5)
     best = np.abs(d[:, None] + (along * ulps) @ steps.T).argmin(1)
     numbers = (numbers + steps[best] * ulps).astype(precision)
@@ -244,7 +244,7 @@ def certify(name: str, subject: Subject, herd: Herd, setting: Setting) -> list[C
     rays, u = herd.rays, setting.roundoff
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
     seen = judge(subject, rays, exact, setting.vector, budget_of(name))
-    margin = np.abs(oracle.margin(rays.a, rays.n, rays.k)) / u**2
+    margin = np.abs(oracle.relative_radicand(rays.a, rays.n, rays.k)) / u**2
     found = []
     for i, wrong in enumerate((seen.misjudged | seen.far).tolist()):
         objective, score = ("decision", margin[i]) if wrong else ("chord", seen.chord[i] / u)
@@ -264,7 +264,7 @@ def rescored(name: str, setting: Setting) -> list[Found]:
     rays, u = worst_rays.rays_of(lines, precision), setting.roundoff
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
     seen = judge(FORMULAS[name], rays, exact, setting.vector, budget_of(name))
-    far = np.where(seen.misjudged, np.abs(oracle.margin(rays.a, rays.n, rays.k)) / u**2, 0.0)
+    far = np.where(seen.misjudged, np.abs(oracle.relative_radicand(rays.a, rays.n, rays.k)) / u**2, 0.0)
     scores = {"chord": seen.chord / u, "decision": far}
     return [line.scored(float(scores[line.objective][i])) for i, line in enumerate(lines)]
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_refract import oracle, regimes
-from mi_refract.formulas.bounds import Budget
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS, Budget
 from mi_refract.regimes import Rays
 from mi_refract.report.row import Row
 from validation import limits
@@ -119,7 +118,7 @@ class Gathered:
     def add(self, screen: Screen, budget: Budget, chord: np.ndarray, wrong: np.ndarray) -> None:
         rays, certain = screen.rays, ~screen.doubtful
         self.worst.add(rays, chord / screen.bound(budget), certain & ~wrong, chord)
-        self.misclassified.add(rays, np.abs(screen.margin), certain & wrong, chord)
+        self.misclassified.add(rays, np.abs(screen.relative_radicand), certain & wrong, chord)
         self.unresolved.add(rays, wrong.astype(float), ~certain, chord)
 
 

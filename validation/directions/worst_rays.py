@@ -2,8 +2,8 @@
 
 `precision | formula | regime | objective | score | a | n | k`, with hexadecimal floats. The objective is "chord",
 scored by the certified chord error in u, or "decision": total internal reflection that the formula decided wrongly,
-scored by |D| in u² of the radicand's terms (`oracle.margin`), or 0 once it is decided rightly. Adding rays scores the
-present ones anew, so that what the formula does today decides which are kept.
+scored by |D| in u² of the radicand's terms (`oracle.relative_radicand`), or 0 once it is decided rightly. Adding rays
+scores the present ones anew, so that what the formula does today decides which are kept.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 from mi_refract.planar.scene_file import PlanarScene, load
 from mi_refract.planar.tracer import Paths, Segments, trace
 from mi_refract.report.row import Row

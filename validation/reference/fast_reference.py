@@ -16,7 +16,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.formulas.bounds import Budget
+from mi_refract import regimes
+from mi_refract.formulas import Budget
 from mi_refract.numerics import float_expansions
 from mi_refract.regimes import Rays
 from validation.directions.judge import Subject
@@ -29,8 +30,8 @@ _UNDERFLOW = 2.0**-900
 class Screen:
     """The answers for `rays` as vectors of type `vector`, a Dr.Jit 3-vector of a vectorised backend.
 
-    `margin`: D/(c² + |κ||n×a|²), within a factor of 2 of `oracle.margin`; `cos_i`: |n·a|/|n||a| and `cos_t` to a few
-    u of float64; `doubtful`: transmission was not resolved.
+    `relative_radicand`: D/(c² + |κ||n×a|²), within a factor of 2 of the oracle's; `cos_i`: |n·a|/|n||a| and `cos_t`
+    to a few u of float64; `doubtful`: transmission was not resolved.
     """
 
     def __init__(self, rays: Rays, vector: Any) -> None:
@@ -42,10 +43,10 @@ class Screen:
         a, n, k = (x.T.astype(np.float64) for x in (rays.a, rays.n, rays.k))
         self._a = wide(a)
         solved = _solve(self._a, wide(n), dr.value_t(wide)(k))
-        self._high, self._low, self._transmitted, c, root, margin, unresolved = solved
+        self._high, self._low, self._transmitted, c, root, ratio, unresolved = solved
         dr.eval(solved)
         tiny = ((np.abs((a, n)) < _UNDERFLOW) & (np.array((a, n)) != 0)).any(axis=(0, 1))
-        self.margin, c = np.array(margin), np.abs(np.array(c))
+        self.relative_radicand, c = np.array(ratio), np.abs(np.array(c))
         lengths = np.array(dr.norm(self._a) * dr.norm(wide(n)))
         self.cos_i, self.cos_t = c / lengths, np.array(root) / lengths
         self.doubtful = np.array(unresolved) | tiny & (c < _UNDERFLOW)
@@ -64,7 +65,7 @@ class Screen:
 
 
 def _solve(a: Any, n: Any, k: Any) -> tuple[Any, ...]:
-    c, d, terms = float_expansions.radicand(a, n, k)
+    c, d, terms = regimes.radicand(a, n, k)
     transmitted = (d[0] >= 0) & (c[0] != 0)
     root = dr.sqrt(dr.select(d[0] > 0, d[0], 1))
     defect = float_expansions.distil([d[0], d[1], *float_expansions.negated(float_expansions.two_prod(root, root))], 2)
@@ -73,7 +74,7 @@ def _solve(a: Any, n: Any, k: Any) -> tuple[Any, ...]:
     scale = dr.select(transmitted, k, 1)
     along = [dr.select(transmitted, dr.mulsign(r, c[0]), -c_i) for r, c_i in zip(roots, c[:2], strict=True)]
     difference = float_expansions.distil([*along, *float_expansions.negated(float_expansions.product(c, [scale]))], 2)
-    factor = float_expansions.ieee_divide(difference, float_expansions.dot(n, n))
+    factor = float_expansions.quotient(difference, float_expansions.dot(n, n))
     parts = [(*float_expansions.two_prod(scale, a[i]), *float_expansions.product(factor, [n[i]])) for i in range(3)]
     b = [float_expansions.distil(part, 2) for part in parts]
     unresolved = (c[0] != 0) & (dr.abs(d[0]) <= RESOLUTION * terms)

@@ -17,7 +17,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.formulas.documented import FORMULAS, automatic
+from mi_refract.formulas import FORMULAS, automatic
 from mi_refract.image_diff import methods as compare
 from mi_refract.io import image_file
 from mi_refract.plugins.refract import PLUGIN

@@ -18,7 +18,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 from mi_refract.plugins.refract import LOBES, PLUGIN
 from mi_refract.report.row import Row
 from validation import limits

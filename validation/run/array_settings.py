@@ -9,8 +9,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.formulas.bounds import Budget
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS, Budget
 from mi_refract.regimes import REGIMES
 from validation.directions.judge import Subject
 

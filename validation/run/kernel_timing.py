@@ -16,7 +16,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import regimes
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 from validation import limits
 from validation.directions.judge import Subject
 from validation.run.metrics import TIME_OVER_COPY, TIME_OVER_PLAIN

@@ -19,8 +19,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import oracle, regimes
-from mi_refract.formulas import fresnel
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS, fresnel
 from mi_refract.oracle import derivatives
 from mi_refract.report.row import Row
 from validation import limits

@@ -16,8 +16,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import oracle, regimes
-from mi_refract.formulas import fresnel
-from mi_refract.formulas.documented import resolve
+from mi_refract.formulas import fresnel, resolve
 from mi_refract.report.row import Row
 from validation import limits
 from validation.directions.bsdf_samples import sample_all

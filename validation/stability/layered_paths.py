@@ -18,7 +18,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.formulas.documented import FORMULAS, automatic
+from mi_refract.formulas import FORMULAS, automatic
 from mi_refract.image_diff import methods
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.rendering import scene_files

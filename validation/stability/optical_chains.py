@@ -17,7 +17,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import regimes
-from mi_refract.formulas.documented import FORMULAS
+from mi_refract.formulas import FORMULAS
 from mi_refract.report.row import Row
 from validation import limits
 from validation.directions.judge import Subject, evaluate

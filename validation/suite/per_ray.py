@@ -17,9 +17,9 @@ import numpy as np
 
 from mi_refract import regimes
 from mi_refract.accuracy import direction_errors
-from mi_refract.ray_sets import check_answers
-from mi_refract.ray_sets import ray_set as ray_files
-from mi_refract.ray_sets.check_answers import PROBLEMS, Figures, Findings
+from mi_refract.ray_sets import check_answers, ray_set
+from mi_refract.ray_sets.check_answers import PROBLEMS, Findings, RegimeErrors
+from mi_refract.ray_sets.files import as_csv, parse_answers
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.report.row import Row
 from validation import limits
@@ -111,8 +111,8 @@ def call_rows(system: System, call: RefractFunction, context: Context) -> list[R
         return [_unmeasured(call, f"{system.megabytes} MB: in the full profile only")]
     rays = given(call.precision)
     try:
-        text = environments.run(environments.script(system, call.script, *call.arguments), ray_files.as_csv(rays))
-        answers = ray_files.parse_answers(text, call.title)
+        text = environments.run(environments.script(system, call.script, *call.arguments), as_csv(rays))
+        answers = parse_answers(text, call.title)
     except environments.Unable as reason_here:
         return [_unmeasured(call, f"cannot run here: {reason_here}")]
     except (environments.Broken, ValueError) as defect:
@@ -128,7 +128,7 @@ def _unmeasured(call: RefractFunction, reason: str) -> Row:
 @functools.cache
 def given(precision: str) -> RaySet:
     """All sets, one after the other."""
-    parts = {name: _made(kind, ray_files.PRECISIONS[precision], i) for i, (name, kind) in enumerate(SETS.items())}
+    parts = {name: _made(kind, ray_set.PRECISIONS[precision], i) for i, (name, kind) in enumerate(SETS.items())}
     return _gathered(parts, precision)
 
 
@@ -144,7 +144,7 @@ def _gathered(parts: dict[str, regimes.Rays], precision: str) -> RaySet:
     ends = {name: np.flatnonzero(regime == name)[[0, -1]].tolist() for name in parts}
     header = {"precision": precision, "seed": SEED, "regimes": ends}
     rays = RaySet(regimes.Rays.joined(list(parts.values())), np.arange(len(regime)), regime, header)
-    return replace(rays, header=header | {"checksum": ray_files.checksum(rays)})
+    return replace(rays, header=header | {"checksum": ray_set.checksum(rays)})
 
 
 # Judged ------------------------------------------------------------------------------------------------------------
@@ -152,7 +152,7 @@ def _gathered(parts: dict[str, regimes.Rays], precision: str) -> RaySet:
 
 def rows(call: RefractFunction, rays: RaySet, answers: Answers) -> list[Row]:
     """One per set."""
-    left_out = direction_errors.radicand(rays.rays) < call.gives_up
+    left_out = direction_errors.absolute_radicand(rays.rays) < call.gives_up
     findings = check_answers.check(_only(rays, ~left_out), _without(answers, rays.ids[left_out]))
     about = _remark(findings, str(answers.header.get("system", "")), call.remark)
     made = []
@@ -189,7 +189,7 @@ def _remark(findings: Findings, system: str, known: str) -> str:
 
 
 def _measured(
-    name: str, call: RefractFunction, findings: Findings, figures: Figures | None
+    name: str, call: RefractFunction, findings: Findings, figures: RegimeErrors | None
 ) -> tuple[Numbers, Numbers, Numbers]:
     """Values, budgets and goals. Where no ray of the set was answered, all that can be said is that it was not."""
     values = {"unfit": float(sum(each.count for each in findings.problems if PROBLEMS[each.kind]))}
@@ -197,9 +197,13 @@ def _measured(
     goals: Numbers = {}
     if figures is None:
         return values | {"wrong": math.nan}, budgets, goals
-    if figures.judged:
+    if figures.compared:
         values |= {WORST_ANGLE: figures.worst, "p99 rad": figures.p99, "mean rad": figures.mean}
-    values |= {ERROR_OVER_BOUND: figures.share, MISCLASSIFIED: float(figures.misjudged), "wrong": float(figures.wrong)}
+    values |= {
+        ERROR_OVER_BOUND: figures.error_over_bound,
+        MISCLASSIFIED: float(figures.tir_misclassified),
+        "wrong": float(figures.wrong),
+    }
     budgets[ERROR_OVER_BOUND] = 1.0
     if name == TOTAL:
         values["told otherwise"], budgets["told otherwise"] = float(findings.tir != call.told), 0.0

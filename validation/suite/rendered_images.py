@@ -26,7 +26,7 @@ from mi_refract.plugins.refract import PLUGIN
 from mi_refract.rendering import scene_files
 from mi_refract.report.row import Row
 from mi_refract.scene_export import from_mitsuba, write_files
-from mi_refract.scene_export.from_mitsuba import Diffuse, Environment, Light, Mesh, Plain
+from mi_refract.scene_export.plain_scene import Diffuse, Environment, Light, Mesh, PlainScene
 from validation import limits
 from validation.run.context import SCENES as FOLDER
 from validation.run.context import Context
@@ -71,19 +71,19 @@ SIZES = {"standard": Size(64, 64, 32, 0.1), "full": Size(128, 512, 1, 0.01)}
 class Scene:
     """`known`: the renderers that are known to disagree on it; the suite must see it."""
 
-    load: Callable[[int], Plain]
+    load: Callable[[int], PlainScene]
     known: tuple[str, ...] = ()
 
 
-def _scene(name: str, resolution: int) -> Plain:
+def _scene(name: str, resolution: int) -> PlainScene:
     return from_mitsuba.load(FOLDER / f"{name}.xml", level=LEVEL, res=str(resolution))
 
 
-def environment(resolution: int) -> Plain:
+def environment(resolution: int) -> PlainScene:
     return dataclasses.replace(_scene("balls", resolution), name="environment", sky=askew())
 
 
-def furnace(resolution: int) -> Plain:
+def furnace(resolution: int) -> PlainScene:
     """The ball on a white floor that absorbs nothing, in a white sky: a correct image is 1 everywhere."""
     given, white = _scene("sphere", resolution), (1.0, 1.0, 1.0)
 

@@ -1,4 +1,4 @@
-"""The plain scene for Cycles: `scene.json`, a PLY file per mesh, and the script that Blender's Python runs on them."""
+"""Cycles: `scene.json`, a PLY file per mesh, and a script for Blender's Python that renders them."""
 
 from __future__ import annotations
 
@@ -6,35 +6,36 @@ from importlib.resources import files as resources
 
 import numpy as np
 
-from mi_refract.scene_export.plain_scene import Plain
+from mi_refract.scene_export.plain_scene import PlainScene
 
 from . import scene_json
 from .environment_map import Array
 from .shared_files import LIGHT_INSIDE, Files, readme
 
-COMMAND = """
+COMMANDS = """
 pip install bpy==5.0.1          (Python 3.11)
 python render.py --spp 256 --seeds 1 2 3 4 --out .
 """
-ASSUMED = (
-    "max_bounces and every other limit of bounces are Mitsuba's max_depth - 2, and min_light_bounces too: no Russian "
-    "roulette.",
+ASSUMPTIONS = (
+    "max_bounces and every other limit of bounces are Mitsuba's max_depth - 2. min_light_bounces is so, too, and "
+    "switches Russian roulette off.",
     "A box filter of one pixel, no clamping, no blurred caustics (blur_glossy = 0), light_sampling_threshold = 0, no "
     "adaptive sampling, no denoising.",
-    "A lamp is an emission that is black from behind.",
-    "A sky that is a map is resampled: Cycles's zenith is +z, and its rows have their centres between the poles.",
+    "A light emits on one side and is black from behind.",
+    "A map of the sky is resampled: in Cycles the zenith is +z, and no row is centred on a pole.",
     LIGHT_INSIDE,
 )
 
 
-def files(plain: Plain) -> Files:
-    return scene_json.files(plain, looked_up) | {
+def files(plain: PlainScene) -> Files:
+    """The files of the export, by name."""
+    return scene_json.files(plain, direction_at) | {
         "render.py": resources(__package__).joinpath("render_cycles.py").read_bytes(),
-        "README.txt": readme(plain, "Cycles", COMMAND, ASSUMED),
+        "README.txt": readme(plain, "Cycles", COMMANDS, ASSUMPTIONS),
     }
 
 
-def looked_up(u: Array, v: Array) -> Array:
-    """The direction whose radiance Cycles finds at (u, v) of an image, v from the top."""
+def direction_at(u: Array, v: Array) -> Array:
+    """(…, 3): the direction in which Cycles shows the pixel at (u, v) of the map, v from the top."""
     phi, theta = np.pi * (1 - 2 * u), np.pi * v
     return np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], axis=-1)

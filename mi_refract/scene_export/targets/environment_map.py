@@ -1,4 +1,4 @@
-"""An environment as the image another renderer looks it up in: by longitude and latitude of its own convention."""
+"""An environment resampled into another renderer's convention of longitude and latitude."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from mi_refract.scene_export.plain_scene import Environment
 
 Array = NDArray[np.float64]
-Lookup = Callable[[Array, Array], Array]
-# The other renderers take texels at their centres, which Mitsuba's rows are not. Between texels a map is linear, and so
-# is the finer one between its own, except where a texel of the first lies within one of its cells.
+Lookup = Callable[[Array, Array], Array]  # (u, v) in [0, 1]², v from the top row down → directions (…, 3)
+# Other renderers place texels at their centres, Mitsuba places its first and last row at the poles. Between its texels
+# a map is linear. A finer map reproduces that, except in those of its cells that a texel of the first map divides.
 FINER = 16
 
 
 def radiance(environment: Environment, directions: Array) -> Array:
-    """N × 3: what is seen in these directions of the scene, N × 3, of any length but 0."""
+    """(…, 3): the radiance in these directions of the scene (…, 3), of any length but 0."""
     x, y, z = np.moveaxis(directions @ environment.rotation, -1, 0)
     pixels = environment.pixels.astype(float)
     height, width = pixels.shape[:2]
@@ -32,7 +32,7 @@ def radiance(environment: Environment, directions: Array) -> Array:
 
 
 def longitude_latitude(environment: Environment, direction: Lookup) -> NDArray[np.float32]:
-    """H × W × 3. `direction(u, v)` is where the renderer's image holds (u, v) in [0, 1]², v from its top row down."""
+    """(H, W, 3): the map for a renderer that shows its pixel at (u, v) in `direction(u, v)`."""
     height = FINER * (environment.pixels.shape[0] - 1)
     width = FINER * environment.pixels.shape[1]
     v, u = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")

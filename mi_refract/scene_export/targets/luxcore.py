@@ -1,4 +1,4 @@
-"""The plain scene for LuxCore: `scene.scn`, `scene.cfg`, a PLY file per mesh, and the script that renders them."""
+"""LuxCore: `scene.scn`, `scene.cfg`, a PLY file per mesh, and a script that renders them."""
 
 from __future__ import annotations
 
@@ -6,25 +6,24 @@ from importlib.resources import files as resources
 
 import numpy as np
 
-from mi_refract.scene_export.plain_scene import Camera, Colour, Environment, Glass, Light, Material, Plain
+from mi_refract.scene_export.plain_scene import Camera, Colour, Environment, Glass, Light, Material, PlainScene
 
 from . import scene_json
 from .environment_map import Array
 from .shared_files import Files, numbers, ply, readme
 
-COMMAND = """
+COMMANDS = """
 pip install pyluxcore==2.11.2
 python render.py --spp 256 --seeds 1 2 3 4 --out .
 """
-ASSUMED = (
-    "path.pathdepth.* is Mitsuba's max_depth; no Russian roulette before it, no clamping, no light tracing.",
-    "A box filter of one pixel. LuxCore's film is one row off, so the screen window is moved down by two over the "
-    "height.",
-    "A sky that is a map is resampled: LuxCore's zenith is +z, its longitudes run the other way, its rows have their "
-    "centres between the poles.",
+ASSUMPTIONS = (
+    "path.pathdepth.* is Mitsuba's max_depth. There is no Russian roulette before it, no clamping, no light tracing.",
+    "A box filter of one pixel. LuxCore's film is one row off, so the screen window is moved down by one row.",
+    "A map of the sky is resampled: in LuxCore the zenith is +z, longitudes run the other way, and no row is centred "
+    "on a pole.",
     "Radiance is scaled by the square of the index at a boundary, as in Mitsuba.",
 )
-# Random numbers of their own in every sample, so that renders of two seeds are independent.
+# RANDOM: the samples of two seeds are independent, and so are their renders.
 CONFIG = """renderengine.type = "PATHCPU"
 sampler.type = "RANDOM"
 scene.file = "scene.scn"
@@ -45,26 +44,27 @@ batch.haltspp = 256
 """
 
 
-def files(plain: Plain) -> Files:
+def files(plain: PlainScene) -> Files:
+    """The files of the export, by name."""
     return (
         {
             "scene.scn": _scene(plain).encode(),
             "scene.cfg": CONFIG.format(camera=plain.camera, depth=plain.max_depth).encode(),
             "render.py": resources(__package__).joinpath("render_luxcore.py").read_bytes(),
-            "README.txt": readme(plain, "LuxCore", COMMAND, ASSUMED),
+            "README.txt": readme(plain, "LuxCore", COMMANDS, ASSUMPTIONS),
         }
-        | scene_json.sky(plain, looked_up)
+        | scene_json.sky(plain, direction_at)
         | {f"{mesh.name}.ply": ply(mesh) for mesh in plain.meshes}
     )
 
 
-def looked_up(u: Array, v: Array) -> Array:
-    """The direction whose radiance LuxCore finds at (u, v) of an image, v from the top."""
+def direction_at(u: Array, v: Array) -> Array:
+    """(…, 3): the direction in which LuxCore shows the pixel at (u, v) of the map, v from the top."""
     phi, theta = 2 * np.pi * u, np.pi * v
     return np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], axis=-1)
 
 
-def _scene(plain: Plain) -> str:
+def _scene(plain: PlainScene) -> str:
     names = scene_json.material_names(plain)
     lines = _camera(plain.camera) + _sky(plain.sky)
     for material, name in names.items():
@@ -92,7 +92,7 @@ def _camera(camera: Camera) -> list[str]:
 
 def _sky(sky: Colour | Environment) -> list[str]:
     if isinstance(sky, Environment):
-        # Without the clamp a pole is mixed with the other one.
+        # Without "clamp" LuxCore interpolates between the two poles.
         own = {"type": '"infinite"', "file": '"sky.exr"', "gamma": "1", "storage": '"float"', "wrap": '"clamp"'}
     elif any(sky):
         own = {"type": '"constantinfinite"', "color": numbers(sky)}

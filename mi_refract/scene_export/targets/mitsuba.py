@@ -1,4 +1,4 @@
-"""The plain scene for Mitsuba: the same triangles and constants as every other target has."""
+"""Mitsuba: the same triangles and constants that every other target gets."""
 
 from __future__ import annotations
 
@@ -6,21 +6,22 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from mi_refract.scene_export.plain_scene import Colour, Diffuse, Environment, Glass, Material, Plain
+from mi_refract.scene_export.plain_scene import Colour, Diffuse, Environment, Glass, Material, PlainScene
 
 from .shared_files import Files, exr, numbers, ply, readme
 
-COMMAND = "mi-refract render scene.xml -o image.exr --spp 1024        (-D bsdf=dielectric for Mitsuba's own)"
+COMMANDS = "mi-refract render scene.xml -o image.exr --spp 1024        (-D bsdf=dielectric for Mitsuba's own)"
 
 
-def files(plain: Plain) -> Files:
+def files(plain: PlainScene) -> Files:
+    """The files of the export, by name."""
     meshes: Files = {f"{mesh.name}.ply": ply(mesh) for mesh in plain.meshes}
     sky: Files = {"sky.exr": exr(plain.sky.pixels)} if isinstance(plain.sky, Environment) else {}
-    text = {"scene.xml": _scene(plain).encode(), "README.txt": readme(plain, "Mitsuba", COMMAND, ())}
+    text = {"scene.xml": _scene(plain).encode(), "README.txt": readme(plain, "Mitsuba", COMMANDS, ())}
     return meshes | sky | text
 
 
-def _scene(plain: Plain) -> str:
+def _scene(plain: PlainScene) -> str:
     camera = plain.camera
     shapes = "\n".join(
         f"""

@@ -1,4 +1,4 @@
-"""The plain scene for POV-Ray: lamps and glass only, for it does not follow light between diffuse surfaces."""
+"""POV-Ray: glass and lights only, because POV-Ray follows no light between diffuse surfaces."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mi_refract.scene_export.plain_scene import (
     Light,
     Material,
     Mesh,
-    Plain,
+    PlainScene,
 )
 from mi_refract.scene_export.tessellation import is_closed
 
@@ -26,52 +26,53 @@ from .shared_files import LIGHT_INSIDE, Files, numbers, readme
 COMMANDS = """
     povray +Iscene.pov +Oimage.exr +FE +W{width} +H{height} -A -D File_Gamma=1.0 Declare=dx=0.5 Declare=dy=0.5
 
-0 <= dx, dy < 1: where in each pixel its only sample is; the mean over images with random dx and dy is the box filter.
+0 <= dx, dy < 1 is the place of the only sample in each pixel. The mean of images with random dx and dy is a box filter.
 """
 ASSUMPTIONS = (
-    "max_trace_level counts as Mitsuba's max_depth does, to 256 at most; both rays are followed at a boundary, until "
-    "the share of one is below 1e-7 (adc_bailout).",
-    "A ray is inside those bodies whose surface it has met once and not twice. Glass must be closed, and bodies inside "
-    "one another must not touch.",
-    "A sky that is a map is resampled: POV-Ray's first column is seen toward +x.",
-    "Mesh vertices are float32, and the image's numbers are half floats.",
+    "max_trace_level counts as Mitsuba's max_depth does, up to 256. At a boundary both rays are followed, until the "
+    "share of one is below 1e-7 (adc_bailout).",
+    "A ray is inside a body after an odd number of intersections with its surface. So glass must be closed, and nested "
+    "bodies must not touch.",
+    "A map of the sky is resampled: POV-Ray shows its first column in direction +x.",
+    "Mesh vertices are float32, and the pixels of the image are half floats.",
     LIGHT_INSIDE,
 )
 BAILOUT = "1e-7"
 
 
-def files(plain: Plain) -> Files:
+def files(plain: PlainScene) -> Files:
+    """The files of the export, by name. ValueError for open glass and for diffuse surfaces."""
     for mesh in plain.meshes:
         place = f"{plain.name}: {mesh.name}"
         if isinstance(mesh.material, Glass) and not is_closed(mesh.faces):
-            raise ValueError(f"{place}: glass with an open surface; accepted for POV-Ray: a closed one")
+            raise ValueError(f"{place}: glass with an open surface; accepted for POV-Ray: a closed surface")
         if isinstance(mesh.material, Diffuse) and any(mesh.material.reflectance):
-            raise ValueError(f"{place}: a diffuse surface; accepted for POV-Ray: glass and lamps only")
+            raise ValueError(f"{place}: a diffuse surface; accepted for POV-Ray: glass and lights")
     camera = plain.camera
     outside = _outside(plain)
     parts = [_settings(plain), _camera(camera), _sky(plain.sky), *(_mesh(mesh, outside) for mesh in plain.meshes)]
     commands = COMMANDS.format(width=camera.width, height=camera.height)
-    return scene_json.sky(plain, looked_up) | {
+    return scene_json.sky(plain, direction_at) | {
         "scene.pov": "\n".join(parts).encode(),
         "README.txt": readme(plain, "POV-Ray 3.7", commands, ASSUMPTIONS),
     }
 
 
-def looked_up(u: Array, v: Array) -> Array:
-    """The direction whose radiance POV-Ray finds at (u, v) of an image, v from the top."""
+def direction_at(u: Array, v: Array) -> Array:
+    """(…, 3): the direction in which POV-Ray shows the pixel at (u, v) of the map, v from the top."""
     phi, theta = 2 * np.pi * u, np.pi * v
     return np.stack([np.cos(phi) * np.sin(theta), np.cos(theta), np.sin(phi) * np.sin(theta)], axis=-1)
 
 
-def _settings(plain: Plain) -> str:
+def _settings(plain: PlainScene) -> str:
     return (
         "#version 3.7;\n"
         f"global_settings {{ assumed_gamma 1.0 max_trace_level {min(plain.max_depth, 256)} adc_bailout {BAILOUT} }}\n"
     )
 
 
-def _outside(plain: Plain) -> float:
-    """The index of the outermost medium: POV-Ray's is 1, so that its indices are relative to this one."""
+def _outside(plain: PlainScene) -> float:
+    """The index of the outermost medium. POV-Ray takes it for 1: its indices are relative to this one."""
     glasses = [mesh for mesh in plain.meshes if isinstance(mesh.material, Glass)]
     outer = max(glasses, key=lambda mesh: mesh.vertices[:, 0].max(), default=None)
     return outer.material.ext_ior if outer and isinstance(outer.material, Glass) else 1.0
@@ -82,7 +83,7 @@ def _vector(values: np.ndarray | tuple[float, ...]) -> str:
 
 
 def _camera(camera: Camera) -> str:
-    """Right-handed: `right` is where the image's right is. Shifted by (dx − ½, dy − ½) pixels."""
+    """Right-handed: `right` points right in the image. Shifted by (dx − ½, dy − ½) pixels."""
     ahead = np.subtract(camera.target, camera.origin)
     ahead = ahead / np.linalg.norm(ahead)
     right = np.cross(ahead, camera.up)

@@ -1,4 +1,4 @@
-"""The plain scene for Radiance, traced as by a path tracer that finds every light by chance."""
+"""Radiance, used as a path tracer that finds lights by chance only."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mi_refract.scene_export.plain_scene import Camera, Diffuse, Environment, Glass, Material, Mesh, Plain
+from mi_refract.scene_export.plain_scene import Camera, Diffuse, Environment, Glass, Material, Mesh, PlainScene
 
 from . import scene_json
 from .shared_files import Files, numbers, readme
@@ -18,19 +18,20 @@ COMMANDS = """
         rtrace -h -w -u+ -fdf -ab {depth} -aa 0 -ad 1 -as 0 -lr -{depth} -lw 1e-2 \\
         scene.oct | total -if3 -of -m -1024 > image.f32
 
-RAYPATH must name both this folder and Radiance's lib.
-image.f32: {height} rows of {width} pixels of 3 float32, the top row first. 1024 is the number of samples per pixel.
+RAYPATH must name both this folder and Radiance's lib. 1024 is the number of samples per pixel.
+image.f32 holds {height} rows of {width} pixels of 3 float32, the top row first.
 """
 ASSUMPTIONS = (
-    "At a boundary both rays are followed while their share is above a hundredth (-lw); below it, Russian roulette (a "
-    "negative -lr) decides, without a bias.",
-    "-lr and -ab count reflections, Mitsuba's max_depth refractions too: Radiance has light that Mitsuba cuts off. "
-    "Where that shows, raise Mitsuba's max_depth: `nested` gains 0.2 % of its mean from 48 to 400.",
-    "Lights and sky are `glow` of radius 0: no shadow ray is sent to one, so that caustics are complete.",
+    "At a boundary both rays are followed while their share is above 0.01 (-lw). Below it, Russian roulette (a "
+    "negative -lr) decides, without bias.",
+    "-lr and -ab count reflections, Mitsuba's max_depth counts refractions, too: Radiance has light that Mitsuba cuts "
+    "off. Where that matters, raise Mitsuba's max_depth: `nested` gains 0.2 % of its mean from 48 to 400.",
+    "Lights and sky are `glow` of radius 0: Radiance sends them no shadow rays, so that caustics are complete.",
 )
 
 
-def files(plain: Plain) -> Files:
+def files(plain: PlainScene) -> Files:
+    """The files of the export, by name."""
     sky, maps = _sky(plain)
     camera = plain.camera
     commands = COMMANDS.format(width=camera.width, height=camera.height, depth=plain.max_depth)
@@ -65,7 +66,7 @@ def _view(camera: Camera) -> str:
     return f"VIEW= -vtv {where} -vh {camera.fov_x_degrees!r} -vv {fov_y!r}\n"
 
 
-def _sky(plain: Plain) -> tuple[str, Files]:
+def _sky(plain: PlainScene) -> tuple[str, Files]:
     """The sky's lines in the scene, and the files that they name."""
     sky = plain.sky
     source = "sky source everywhere 0 0 4 0 0 1 360\n"

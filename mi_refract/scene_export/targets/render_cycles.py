@@ -1,7 +1,8 @@
 """Render `scene.json` by Cycles: `python render.py --spp 256 --seeds 1 2 3 4 --out .`
 
-Run by the Python that has bpy, never imported by mi_refract. One `seedN.exr` per seed. The settings that make Cycles a
-plain path tracer: box filter, no clamping, no blurred caustics, no adaptive sampling, no denoising, one limit of depth.
+It writes one `seedN.exr` per seed. A Python with bpy runs this script; mi_refract never imports it. The settings make
+Cycles a plain path tracer: box filter, no clamping, no blurred caustics, no adaptive sampling, no denoising, one limit
+of depth.
 """
 
 import argparse
@@ -16,10 +17,11 @@ from mathutils import Matrix, Vector
 
 
 def main():
+    """Render once per seed."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--spp", type=int, default=256)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
-    parser.add_argument("--threads", type=int, default=0, help="0: all")
+    parser.add_argument("--threads", type=int, default=0, help="0 for all")
     parser.add_argument("--out", type=Path, default=Path())
     options = parser.parse_args()
     folder = Path(__file__).resolve().parent
@@ -36,6 +38,7 @@ def main():
 
 
 def build(plain, folder):
+    """Make Blender's objects from `scene.json` and the files beside it."""
     materials = {name: material(name, entry) for name, entry in plain["materials"].items()}
     for name, entry in plain["meshes"].items():
         vertices, faces = triangles(folder / entry["file"])
@@ -56,6 +59,7 @@ def triangles(path):
 
 
 def material(name, entry):
+    """A material of Blender's from an entry of "materials"."""
     made = bpy.data.materials.new(name)
     made.use_nodes = True
     nodes, links = made.node_tree.nodes, made.node_tree.links
@@ -66,6 +70,7 @@ def material(name, entry):
 
 
 def glass(nodes, links, entry):
+    """The output of a smooth glass."""
     node = nodes.new("ShaderNodeBsdfGlass")
     node.inputs["Color"].default_value = (1, 1, 1, 1)
     node.inputs["Roughness"].default_value = 0
@@ -74,6 +79,7 @@ def glass(nodes, links, entry):
 
 
 def diffuse(nodes, links, entry):
+    """The output of a Lambertian surface."""
     node = nodes.new("ShaderNodeBsdfDiffuse")
     node.inputs["Color"].default_value = (*entry["reflectance"], 1)
     node.inputs["Roughness"].default_value = 0
@@ -81,7 +87,7 @@ def diffuse(nodes, links, entry):
 
 
 def light(nodes, links, entry):
-    """Emission from the side that the normal points to; the other side is black."""
+    """The output of a surface that emits on the side of its normal and is black from behind."""
     front, back, mix = (nodes.new(f"ShaderNode{kind}") for kind in ("Emission", "BsdfDiffuse", "MixShader"))
     front.inputs["Color"].default_value = (*entry["radiance"], 1)
     front.inputs["Strength"].default_value = 1
@@ -96,6 +102,7 @@ SHADERS = {"glass": glass, "diffuse": diffuse, "light": light}
 
 
 def world(sky, folder):
+    """Set the sky: a map or one colour."""
     made = bpy.data.worlds.new("sky")
     made.use_nodes = True
     bpy.context.scene.world = made
@@ -113,6 +120,7 @@ def world(sky, folder):
 
 
 def camera(entry):
+    """Place the camera."""
     origin, target, up = (Vector(entry[key]) for key in ("origin", "target", "up"))
     back = (origin - target).normalized()
     right = up.cross(back).normalized()
@@ -128,6 +136,7 @@ def camera(entry):
 
 
 def settings(plain, options):
+    """Make Cycles a plain path tracer."""
     scene = bpy.context.scene
     render, cycles, view = scene.render, scene.cycles, plain["camera"]
     render.engine = "CYCLES"

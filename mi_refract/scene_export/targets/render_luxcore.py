@@ -1,6 +1,6 @@
 """Render `scene.cfg` by LuxCore: `python render.py --spp 256 --seeds 1 2 3 4 --out .`
 
-Run by the Python that has pyluxcore, never imported by mi_refract. One `seedN.exr` per seed.
+It writes one `seedN.exr` per seed. A Python with pyluxcore runs this script; mi_refract never imports it.
 """
 
 import argparse
@@ -13,10 +13,11 @@ import pyluxcore
 
 
 def main():
+    """Render once per seed."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--spp", type=int, default=256)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
-    parser.add_argument("--threads", type=int, default=0, help="0: all")
+    parser.add_argument("--threads", type=int, default=0, help="0 for all")
     parser.add_argument("--out", type=Path, default=Path())
     options = parser.parse_args()
     out = options.out.resolve()
@@ -27,6 +28,7 @@ def main():
 
 
 def render(options, seed, path):
+    """Render `scene.cfg` with this seed into a file."""
     config = pyluxcore.Properties("scene.cfg")
     own = {"batch.haltspp": options.spp, "renderengine.seed": seed, "film.outputs.0.filename": str(path)}
     if options.threads:
@@ -48,4 +50,4 @@ def render(options, seed, path):
 if __name__ == "__main__":
     main()
     sys.stdout.flush()
-    os._exit(0)  # with a log handler it would die when Python ends
+    os._exit(0)  # a log handler crashes when Python ends normally

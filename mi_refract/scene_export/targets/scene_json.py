@@ -1,4 +1,4 @@
-"""A plain scene as JSON beside its meshes: `scene.json`, a PLY file per mesh, `sky.exr` where the sky is a map."""
+"""A plain scene as `scene.json`, a PLY file per mesh, and `sky.exr` where the sky is a map."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from mi_refract.scene_export.plain_scene import Environment, Material, Plain
+from mi_refract.scene_export.plain_scene import Environment, Material, PlainScene
 
 from .environment_map import Lookup, longitude_latitude
 from .shared_files import Files, exr, ply
 
 
-def files(plain: Plain, looked_up: Lookup) -> Files:
-    """The sky's map is for a renderer that finds the direction `looked_up(u, v)` at (u, v), v from the top."""
+def files(plain: PlainScene, direction_at: Lookup) -> Files:
+    """The files, by name. The renderer shows the sky's pixel at (u, v) in direction `direction_at(u, v)`."""
     meshes = {f"{mesh.name}.ply": ply(mesh) for mesh in plain.meshes}
     places = {mesh.name: {"file": f"{mesh.name}.ply"} for mesh in plain.meshes}
-    return {"scene.json": document(plain, places)} | meshes | sky(plain, looked_up)
+    return {"scene.json": document(plain, places)} | meshes | sky(plain, direction_at)
 
 
-def document(plain: Plain, places: Mapping[str, Mapping[str, str]]) -> bytes:
-    """The JSON; `places`: of each mesh, where its triangles are."""
+def document(plain: PlainScene, places: Mapping[str, Mapping[str, str]]) -> bytes:
+    """The text of `scene.json`. `places`: by mesh, where its triangles are."""
     names = material_names(plain)
     shown: dict[str, Any] = {
         "name": plain.name,
@@ -37,11 +37,13 @@ def document(plain: Plain, places: Mapping[str, Mapping[str, str]]) -> bytes:
     return json.dumps(shown, indent=1).encode()
 
 
-def material_names(plain: Plain) -> dict[Material, str]:
+def material_names(plain: PlainScene) -> dict[Material, str]:
+    """A name for each material."""
     return {material: f"material{number}" for number, material in enumerate(plain.materials)}
 
 
-def sky(plain: Plain, looked_up: Lookup) -> Files:
+def sky(plain: PlainScene, direction_at: Lookup) -> Files:
+    """`sky.exr` where the sky is a map, resampled for a renderer with this `direction_at`."""
     if not isinstance(plain.sky, Environment):
         return {}
-    return {"sky.exr": exr(longitude_latitude(plain.sky, looked_up))}
+    return {"sky.exr": exr(longitude_latitude(plain.sky, direction_at))}

@@ -1,4 +1,4 @@
-"""What several targets write: meshes, environment maps, the text that goes with them."""
+"""Files that several targets write: meshes, environment maps, README.txt."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from mi_refract import __version__
 from mi_refract.io.image_file import write_exr
-from mi_refract.scene_export.plain_scene import Mesh, Plain
+from mi_refract.scene_export.plain_scene import Mesh, PlainScene
 
-Files = dict[str, bytes]
+Files = dict[str, bytes]  # contents by name
 
 
 def ply(mesh: Mesh) -> bytes:
@@ -30,6 +30,7 @@ def ply(mesh: Mesh) -> bytes:
 
 
 def exr(pixels: NDArray[np.floating]) -> bytes:
+    """An OpenEXR file of pixels (H, W, 3)."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.exr"
         write_exr(path, pixels)
@@ -37,12 +38,12 @@ def exr(pixels: NDArray[np.floating]) -> bytes:
 
 
 def numbers(values: Iterable[float], separator: str = " ") -> str:
-    """The shortest decimals that give the float64 numbers back."""
+    """The numbers as the shortest decimals that read back exactly in float64."""
     return separator.join(repr(float(value)) for value in values)
 
 
-def readme(plain: Plain, target: str, commands: str, assumptions: Sequence[str]) -> bytes:
-    """README.txt: how to render, and in what the renderer's model differs."""
+def readme(plain: PlainScene, target: str, commands: str, assumptions: Sequence[str]) -> bytes:
+    """README.txt: the commands that render the scene, and the differences between the models."""
     camera = plain.camera
     lines = [
         f"{plain.name}: {len(plain.meshes)} flat-shaded meshes of {sum(len(m.faces) for m in plain.meshes)} triangles,",
@@ -52,7 +53,7 @@ def readme(plain: Plain, target: str, commands: str, assumptions: Sequence[str])
         "",
         textwrap.indent(textwrap.dedent(commands).strip(), "    "),
         "",
-        *(["What is assumed, and where the models differ:", ""] if assumptions else []),
+        *(["Assumptions, and differences between the models:", ""] if assumptions else []),
     ]
     for assumption in assumptions:
         lines += textwrap.wrap(assumption, 100, initial_indent="- ", subsequent_indent="  ")
@@ -60,6 +61,6 @@ def readme(plain: Plain, target: str, commands: str, assumptions: Sequence[str])
 
 
 LIGHT_INSIDE = (
-    "Radiance is not scaled by the square of the index inside glass: the same image as long as camera, lights and "
-    "diffuse surfaces are all in the outermost medium."
+    "Radiance is not scaled by the square of the index inside glass. The image is the same as long as camera, lights "
+    "and diffuse surfaces are all in the outermost medium."
 )

@@ -17,7 +17,7 @@ import numpy as np
 from mi_refract.io import image_file
 from mi_refract.io.image_file import Image
 from mi_refract.scene_export import write_files
-from mi_refract.scene_export.plain_scene import Plain
+from mi_refract.scene_export.plain_scene import PlainScene
 from mi_refract.scene_export.targets import cycles, luxcore, povray, radiance, scene_json
 
 from . import environments
@@ -36,15 +36,15 @@ class ImageRenderer:
     """
 
     system: str
-    draw: Callable[[Plain, Path, int, Sequence[int]], list[Image]]
+    draw: Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]
     spp: Mapping[str, int]
     assumed: Sequence[str]
 
 
-def _by_script(target: str) -> Callable[[Plain, Path, int, Sequence[int]], list[Image]]:
+def _by_script(target: str) -> Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]:
     """By the script that is exported with the scene."""
 
-    def draw(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+    def draw(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
         write_files.write(plain, target, folder / "scene")
         program = [environments.python(SYSTEMS[target]), "render.py", "--spp", str(spp), "--out", str(folder)]
         environments.run([*program, "--seeds", *map(str, seeds)], timeout=HOURS, where=folder / "scene")
@@ -53,7 +53,7 @@ def _by_script(target: str) -> Callable[[Plain, Path, int, Sequence[int]], list[
     return draw
 
 
-def _radiance(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+def _radiance(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
     write_files.write(plain, "radiance", folder / "scene")
     camera = plain.camera
     sizes = map(str, (camera.width, spp, plain.max_depth, *seeds))
@@ -63,7 +63,7 @@ def _radiance(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> lis
     return [_raw(folder / f"seed{seed}.f32", plain) for seed in seeds]
 
 
-def _povray(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+def _povray(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
     """The same image for every seed, for it has no noise: the means over grids of samples, √spp on a side of a pixel.
 
     Random grids would not do: they move all pixels together, and a tile knows nothing of its noise then.
@@ -84,10 +84,10 @@ def browser() -> str | None:
     return next(filter(None, map(shutil.which, BROWSERS)), None)
 
 
-def _three(mis: str) -> Callable[[Plain, Path, int, Sequence[int]], list[Image]]:
+def _three(mis: str) -> Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]:
     """With multiple importance sampling of the sky ("1"), as the library comes, or without ("0")."""
 
-    def draw(plain: Plain, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+    def draw(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
         chromium, node = browser(), shutil.which("node")
         if not (chromium and node):
             raise environments.Unable("no node or no Chromium in PATH")
@@ -109,7 +109,7 @@ def equirectangular(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(phi) * np.sin(theta), np.cos(theta), np.sin(phi) * np.sin(theta)], axis=-1)
 
 
-def _raw(path: Path, plain: Plain) -> Image:
+def _raw(path: Path, plain: PlainScene) -> Image:
     shape = (plain.camera.height, plain.camera.width, 3)
     return image_file.named(path.name, np.frombuffer(path.read_bytes(), "<f4").reshape(shape))
 
@@ -136,8 +136,8 @@ def _spp(sphere: int, prism: int, environment: int) -> dict[str, int]:
 POVRAY = ("Each pixel is the mean of a grid of 4 × 4 samples, without noise.", *povray.ASSUMPTIONS)
 IMAGE_RENDERERS: dict[str, ImageRenderer] = {
     "Radiance": ImageRenderer("radiance", _radiance, _spp(160, 112, 4), radiance.ASSUMPTIONS),
-    "Cycles": ImageRenderer("cycles", _by_script("cycles"), _spp(128, 128, 32), cycles.ASSUMED),
-    "LuxCore": ImageRenderer("luxcore", _by_script("luxcore"), _spp(320, 400, 288), luxcore.ASSUMED),
+    "Cycles": ImageRenderer("cycles", _by_script("cycles"), _spp(128, 128, 32), cycles.ASSUMPTIONS),
+    "LuxCore": ImageRenderer("luxcore", _by_script("luxcore"), _spp(320, 400, 288), luxcore.ASSUMPTIONS),
     "POV-Ray": ImageRenderer("povray", _povray, _spp(16, 16, 16), POVRAY),
     "three-gpu-pathtracer": ImageRenderer("three", _three("1"), {"prism": 8, "furnace": 8}, THREE),
     "three-gpu-pathtracer, no MIS": ImageRenderer("three", _three("0"), {"prism": 8, "furnace": 8}, THREE),

@@ -1,26 +1,19 @@
-"""The command line: what it prints, what it leaves behind, and with which exit code."""
+"""`mi-refract render`: the image, its header, what is left behind, and with which exit code."""
 
 from __future__ import annotations
 
-import json
-import os
 import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.processes import python
 
 import mi_refract
 from mi_refract import backend
 from mi_refract.cli import app
 from mi_refract.io.image_file import read_exr
-
-ROOT = Path(app.__file__).parents[2]
-PYTHON = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])}
 
 SCENE = """<scene version="3.0.0">
   <default name="bsdf" value="refract"/>
@@ -46,19 +39,6 @@ def scene(tmp_path):
     return path
 
 
-@pytest.fixture(autouse=True)
-def same_process(monkeypatch):
-    """The variant is as before, and no command replaces the process of the tests."""
-
-    def execv(*arguments):
-        raise AssertionError(f"restarted: {arguments}")
-
-    monkeypatch.setattr(os, "execv", execv)
-    variant = mi.variant()
-    yield
-    mi.set_variant(variant)
-
-
 @pytest.fixture
 def render(scene, capfd):
     """`render("--spp", 2)`: exit code, stdout, stderr of rendering `scene` to out.exr in scalar_rgb."""
@@ -71,19 +51,6 @@ def render(scene, capfd):
         return code, *capfd.readouterr()
 
     return run
-
-
-def shell(code, *arguments, **environment):
-    return subprocess.Popen(
-        [sys.executable, "-c", code, *map(str, arguments)],
-        env=PYTHON | environment,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
-
-
-# render
 
 
 def test_the_image_is_mitsubas(render, scene):
@@ -226,78 +193,10 @@ sys.exit(cli.main(["render", sys.argv[2], "-o", sys.argv[3], "--spp", "20000000"
 def test_ctrl_c(scene, handler, variant, needs_variant):
     needs_variant(variant)
     output = scene.with_name("out.exr")
-    with shell(INTERRUPTED, handler, scene, output, variant) as process:
+    with python(INTERRUPTED, handler, scene, output, variant) as process:
         assert process.stdout.readline() == "loaded\n"
         time.sleep(0.5)  # into the rendering
         assert process.poll() is None
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=30) == 130, process.stderr.read()
     assert list(scene.parent.iterdir()) == [scene]
-
-
-# doctor and the rest
-
-
-def test_doctor(capfd):
-    assert app.main(["doctor"]) == 0
-    out, _ = capfd.readouterr()
-    assert all(variant in out for variant in mi.variants())
-    assert mi.__version__ in out
-    capfd.readouterr()
-    assert app.main(["doctor", "--json"]) == 0
-    facts = json.loads(capfd.readouterr().out)
-    assert facts["variants"] == backend.usable_variants()
-    assert facts["libllvm"] == {library.path: library.defect or "works" for library in backend.libraries()}
-    assert facts["versions"]["mi_refract"] == mi_refract.__version__
-    assert out.rstrip().endswith(facts["advice"])
-
-
-def test_doctor_without_llvm():
-    environment = {backend.CHOICE: "/nonexistent", backend.OWN_CHOICE: ""}
-    with shell("import sys; from mi_refract.cli import main; sys.exit(main(['doctor']))", **environment) as process:
-        out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
-    advice = out.splitlines()[-1]
-    assert advice.startswith("the llvm_* variants are missing: DRJIT_LIBLLVM_PATH=/nonexistent: no such file")
-    assert "apt-get install libllvm19" in advice or "LLVM 17" in advice
-    assert "Traceback" not in err
-
-
-def test_doctor_where_nothing_runs(monkeypatch, capfd):
-    monkeypatch.setattr(backend, "usable_variants", lambda: {"scalar_rgb": "made up"})
-    assert app.main(["doctor"]) == 2
-    assert capfd.readouterr().err == "mi-refract: no variant of Mitsuba runs here; accepted: at least one\n"
-
-
-@pytest.mark.parametrize("arguments", [["nonesuch"], ["render"], ["doctor", "extra"]])
-def test_bad_command(arguments, capfd):
-    assert app.main(arguments) == 2
-    out, err = capfd.readouterr()
-    assert out == ""
-    assert err.startswith("mi-refract: ")
-    assert err.count("\n") == 1
-
-
-def test_without_a_command_the_help_is_printed_and_with_version_the_version(capfd):
-    assert app.main([]) == 2
-    assert "doctor" in capfd.readouterr().out
-    assert app.main(["--version"]) == 0
-    assert capfd.readouterr().out == f"{app.__version__}\n"
-
-
-def test_without_the_extra():
-    code = "import sys; sys.modules['typer'] = None; import mi_refract.cli.app"
-    with shell(code) as process:
-        out, err = process.communicate(timeout=60)
-    assert (process.returncode, out) == (2, "")
-    assert err.splitlines()[-1] == "mi-refract needs the extra `cli`: pip install 'mi-refract[cli]'"
-
-
-def test_diff_in_a_process_of_its_own(pair):
-    """The exit code arrives, and no line of a log is wrapped."""
-    root = Path(app.__file__).parents[2]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(root), *filter(None, sys.path)]), "COLUMNS": "40"}
-    command = [sys.executable, "-m", "mi_refract.cli", "diff", *map(str, pair)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
-    assert (done.returncode, done.stderr) == (1, "")
-    assert len(done.stdout.splitlines()) == 4

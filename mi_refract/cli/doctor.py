@@ -1,0 +1,43 @@
+"""The command `mi-refract doctor`: what runs on this machine."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Annotated, Any
+
+import typer
+
+from mi_refract import __version__, backend
+from mi_refract.io.provenance import installed_version
+
+
+def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
+    """Show which Mitsuba variants run on this machine, why the others do not, and what to install."""
+    backend.restart_if_needed()
+    facts = diagnose()
+    print(json.dumps(facts, indent=2) if as_json else _as_text(facts))
+    if None not in facts["variants"].values():
+        raise ValueError("no variant of Mitsuba runs here; accepted: at least one")
+
+
+def diagnose() -> dict[str, Any]:
+    """What `doctor` prints: `variants` (None, or why not), `libllvm` ("works", or the defect), `versions`, `advice`."""
+    names = ("mitsuba", "drjit", "numpy", "OpenImageIO")
+    versions = {"mi_refract": __version__, "python": sys.version.split()[0]}
+    return {
+        "variants": backend.usable_variants(),
+        "libllvm": {library.path: library.defect or "works" for library in backend.libraries()},
+        "versions": versions | {name: installed_version(name) for name in names},
+        "advice": backend.advice(),
+    }
+
+
+def _as_text(facts: dict[str, Any]) -> str:
+    variants = {name: "usable" if reason is None else f"no: {reason}" for name, reason in facts["variants"].items()}
+    tables = {"variants": variants, "libLLVM": facts["libllvm"] or {"none found": ""}, "versions": facts["versions"]}
+    lines = []
+    for title, table in tables.items():
+        width = max(map(len, table))
+        lines += [title, *(f"  {name:{width}}  {text}".rstrip() for name, text in table.items()), ""]
+    return "\n".join([*lines, facts["advice"]])

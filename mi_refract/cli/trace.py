@@ -1,0 +1,56 @@
+"""The command `mi-refract trace`: rays through the boundaries of a planar scene."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mi_refract import backend
+from mi_refract.io import atomic
+from mi_refract.planar import figure, focal_points, scene_file, scene_schema
+from mi_refract.planar.path_tree import as_data, follow_scene, summary, with_rays
+
+
+def _print_keys(asked: bool) -> None:
+    if asked:
+        print(scene_schema.reference())
+        raise typer.Exit
+
+
+def trace(
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="A planar scene.")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="OUT.svg|.png|.pdf", help="Draw.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the paths as JSON.")] = False,
+    table: Annotated[bool, typer.Option("--table", help="Print focal points and spot sizes.")] = False,
+    branches: Annotated[int | None, typer.Option(min=0, help="Partial reflections on a path, at most.")] = None,
+    rays: Annotated[int | None, typer.Option(min=1, help="Rays of each beam that has several.")] = None,
+    max_depth: Annotated[int | None, typer.Option(min=1, help="Boundaries on a path, at most.")] = None,
+    precision: Annotated[str, typer.Option(help="float64 or float32.")] = "float64",
+    formula: Annotated[str | None, typer.Option(help="A formula of refraction; the planar one by default.")] = None,
+    arrays: Annotated[str | None, typer.Option("--backend", help="llvm, cuda or scalar; see `doctor`.")] = None,
+    keys: Annotated[
+        bool, typer.Option("--keys", is_eager=True, callback=_print_keys, help="Print what a scene file may hold.")
+    ] = False,
+) -> None:
+    """Follow the rays of a planar scene; draw them, print their paths, or where they come together."""
+    backend.restart_if_needed()
+    if output:
+        atomic.writable(output, figure.FORMATS)
+        figure.require_matplotlib()
+    told: dict[str, Any] = {"branches": branches, "max_depth": max_depth}
+    loaded = replace(scene_file.load(scene), **{name: value for name, value in told.items() if value is not None})
+    if rays:
+        loaded = with_rays(loaded, rays)
+    traced = follow_scene(loaded, formula=formula, precision=precision, backend=arrays)
+    if output:
+        figure.save(output, loaded, traced)
+    found = focal_points.groups(loaded, traced) if table else []
+    if as_json:
+        focal = {"foci": [asdict(group) for group in found]} if table else {}
+        print(json.dumps(as_data(loaded, traced) | focal, allow_nan=False))
+    else:
+        print("\n".join([f"{scene.name}: {summary(loaded, traced)}", *([focal_points.table(found)] if found else [])]))

@@ -1,0 +1,113 @@
+"""FORMULAS, the one table of formulas, sources and error bounds; it drives plugin, tests, timing and README."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from mi_refract.numerics import as_component, scale_to_unit
+
+from .bounds import CONTRASTING, ROUNDING, Budget, cancelling
+from .documented import refract_cross, refract_decomposed, refract_rotated, refract_wedge, refract_wedge_contrast
+from .well_conditioned import Refracted, refract_compensated, refract_promoted
+
+# Ratios between them leave k², κ and Fresnel's terms within the range of float32.
+SMALLEST_RATIO, LARGEST_RATIO = 1e-9, 1e9
+
+
+@dataclass(frozen=True)
+class Formula:
+    """A formula of refraction, `entry(a, n, k) -> (b, transmitted)`, with its source and its error budget.
+
+    `takes_contrast`: `contrast` is used, not ignored. `scales`: the function wants lengths near 1. `automatic_for`:
+    the kinds of array it is the default on. `time_goal`: what a ray in float32, streamed through a CPU, may take as
+    a multiple of the plain form's time.
+    """
+
+    function: Callable[..., Refracted]
+    source: str
+    equation: str
+    budget: Budget
+    takes_contrast: bool = False
+    scales: bool = False
+    automatic_for: tuple[str, ...] = ()
+    time_goal: float | None = None
+
+    def __call__(self, a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
+        """The formula as a total function: NaN and False for what is no refraction.
+
+        That is: `a` or `n` zero or not finite, `k` outside 1e-9 … 1e9, `contrast` not finite or not above −1.
+        """
+        n, k = type(a)(n), as_component(a, k)
+        scale: Any = 1
+        if self.scales:
+            (a, scale), (n, _) = scale_to_unit(a), scale_to_unit(n)
+        b, transmitted = self.unchecked(a, n, k, contrast)
+        # `b` has the length of `a`, and a zero or non-finite `n` makes it NaN: one length tells of both.
+        b, length2 = b * scale, dr.dot(b, b)
+        valid = (k >= SMALLEST_RATIO) & (k <= LARGEST_RATIO) & (length2 > 0) & (length2 < dr.inf)
+        if contrast is not None:
+            valid &= (contrast > -1) & (contrast < dr.inf)
+        return dr.select(valid, b, dr.nan), valid & transmitted
+
+    def unchecked(self, a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
+        """The formula alone. Precondition: what `__call__` tests; NaN gives NaN and False."""
+        if self.takes_contrast:
+            return self.function(a, n, k, contrast)
+        return self.function(a, n, k)
+
+
+FORMULAS = {
+    "wedge": Formula(refract_wedge, "000, boxed", "b = k n(n∧a) + s n √(a² + k²(n∧a)²)", budget=cancelling(1)),
+    "wedge_contrast": Formula(
+        refract_wedge_contrast,
+        "000, last form",
+        "b = k n(n∧a) + s n √((n·a)² + (n∧a)²(k² − 1))",
+        budget=CONTRASTING,
+    ),
+    "cross": Formula(refract_cross, "001, eq. 6", "t = n×c + s √(1 − ‖c‖²) n, c = k (i×n)", budget=cancelling(1)),
+    "decomposed": Formula(
+        refract_decomposed, "002, eq. 1", "b = k a − n (k c − s √(1 − k²(1 − c²))), c = n·a", budget=cancelling(2)
+    ),
+    "rotated": Formula(refract_rotated, "004", "b = B (s √(1 − X²), X), X = k R/√(1 + R²)", budget=cancelling(1)),
+    "compensated": Formula(
+        refract_compensated,
+        "this project",
+        "b = (k w×n + s n √((n·a)² − κ w²))/n², w = n×a, κ = k² − 1; error-free transforms",
+        budget=ROUNDING,
+        takes_contrast=True,
+        scales=True,
+        automatic_for=("cuda",),
+        time_goal=2.0,
+    ),
+    "promoted": Formula(
+        refract_promoted,
+        "this project",
+        "the form of `compensated`, one precision up, rounded once",
+        budget=ROUNDING,
+        takes_contrast=True,
+        automatic_for=("scalar", "llvm"),
+        time_goal=1.1,
+    ),
+}
+
+
+def automatic(backend: dr.JitBackend) -> str:
+    """The key of the cheapest formula at the rounding limit in a local frame, where the normal is a literal axis.
+
+    On CPUs float64 has half the throughput of float32, and the promoted form a third of the operations. A consumer's
+    GPU has a 64th.
+    """
+    kind = {dr.JitBackend.CUDA: "cuda", dr.JitBackend.LLVM: "llvm"}.get(backend, "scalar")
+    return next(key for key, formula in FORMULAS.items() if kind in formula.automatic_for)
+
+
+def resolve(name: str, backend: dr.JitBackend) -> tuple[str, Formula]:
+    """The key and entry behind `name`, a key of FORMULAS or "auto". ValueError otherwise."""
+    key = automatic(backend) if name == "auto" else name
+    if key not in FORMULAS:
+        raise ValueError(f"formula = {name!r}: unknown; accepted: auto, {', '.join(FORMULAS)}")
+    return key, FORMULAS[key]

@@ -1,0 +1,19 @@
+"""Names for the types of Dr.Jit and Mitsuba in signatures.
+
+Both packages are untyped to mypy, so each name stands for `Any`: it tells a reader what to pass, and checks nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+# A Python float, or a Dr.Jit float array of N entries (scalar, LLVM, CUDA; float32 or float64; with or without AD).
+Number: TypeAlias = Any
+# Three `Number`s of one type, as `mi.Vector3f` or `drjit.llvm.Array3f` holds them; v.x, v.y, v.z or v[0], v[1], v[2].
+Vector3: TypeAlias = Any
+# A Python bool, or a Dr.Jit array of N of them.
+Mask: TypeAlias = Any
+# A class of Dr.Jit arrays: `type(x)` of a `Number` or a `Vector3`.
+ArrayType: TypeAlias = Any
+# One variant of Mitsuba as a module, as `import mitsuba` gives it after `set_variant`, or `mitsuba.llvm_ad_rgb`.
+Variant: TypeAlias = Any

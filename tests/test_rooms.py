@@ -1,0 +1,76 @@
+"""Each room says what it is for and what it offers; other rooms import nothing else of it."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import mi_refract
+
+PACKAGE = Path(mi_refract.__file__).parent
+ROOMS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
+# Rooms that do not have their `__all__` yet. None may remain.
+PENDING = set(ROOMS) - {"report"}
+DONE = [room for room in ROOMS if room not in PENDING]
+
+
+def offered(room: str) -> list[str]:
+    """`__all__` of a room, read without importing it."""
+    for node in ast.parse((PACKAGE / room / "__init__.py").read_text("utf-8")).body:
+        target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
+        if isinstance(target, ast.Name) and target.id == "__all__" and isinstance(node, ast.Assign | ast.AnnAssign):
+            return list(ast.literal_eval(node.value)) if node.value else []
+    return []
+
+
+def imported(own: str, source: str) -> Iterator[tuple[int, str, str]]:
+    """Line, room and first name below the room of every import of another room in the source of room `own`."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        else:
+            continue
+        for name in names:
+            package, room, member, *_ = [*name.split("."), "", ""]
+            if package == "mi_refract" and room in ROOMS and room != own:
+                yield node.lineno, room, member
+
+
+def test_other_rooms_import_only_what_a_room_offers() -> None:
+    lists = {room: offered(room) for room in DONE}
+    foreign = [
+        f"{path.relative_to(PACKAGE.parent)}:{line}: mi_refract.{room}.{member} is private to its room"
+        for path in sorted(PACKAGE.rglob("*.py"))
+        for line, room, member in imported(path.relative_to(PACKAGE).parts[0], path.read_text("utf-8"))
+        if room in lists and member and member not in lists[room]
+    ]
+    assert not foreign, "\n".join(foreign)
+
+
+@pytest.mark.parametrize("room", DONE)
+def test_a_room_says_what_it_is_for_and_what_it_offers(room: str) -> None:
+    module = importlib.import_module(f"mi_refract.{room}")
+    assert len((module.__doc__ or "").splitlines()) > 1
+    assert offered(room)
+    for name in offered(room):
+        assert hasattr(module, name) or (PACKAGE / room / f"{name}.py").is_file(), f"{room} has no {name}"
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "from mi_refract.report.html_page import words",
+        "from mi_refract.report import html_page",
+        "import mi_refract.report.html_page",
+        "def f():\n    from mi_refract.report.html_page import words",
+    ],
+)
+def test_every_way_to_import_is_seen(source: str) -> None:
+    assert [(room, member) for _, room, member in imported("io", source)] == [("report", "html_page")]
+    assert not list(imported("report", source))
