@@ -36,6 +36,7 @@ QUICK = (
     "directions.per_formula",
     "directions.bsdf_samples",
     "stability.optical_chains",
+    "stability.layered_paths",
     "renders.against_dielectric",
     "planar.against_retrace",
     "diff.planted_defects",

@@ -56,7 +56,7 @@ class Size:
     rounds: int
 
 
-SIZES = {"standard": Size(270, 480, 20, 7), "full": Size(1080, 1920, 1000, 7)}
+SIZES = {"quick": Size(135, 240, 5, 6), "standard": Size(270, 480, 20, 7), "full": Size(1080, 1920, 1000, 7)}
 GOAL_SIZE = SIZES["full"]
 PROCESS = """
 import sys

@@ -1,4 +1,4 @@
-"""Mutants: formulas with one planted defect each, which the judgement of the directions must see.
+"""Planted defects: formulas with one each, which the judgement of the directions must see.
 
 Slips of the documents as printed, and slips one makes. Each is judged by the budget of the formula that it spoils, on
 the same regimes of rays; one that no ray sees has escaped. The control is the formula as it is: no ray may see that.
@@ -241,7 +241,7 @@ def tasks(context: Context) -> list[Task]:
     """On single precision where it is compiled, else on what there is."""
     running = [setting for setting in settings(context) if setting.vector is not None]
     setting = next((s for s in running if s.precision is np.float32), running[0])
-    return [Task(f"mutants: {setting.label}", functools.partial(_rows, setting))]
+    return [Task(f"planted defects: {setting.label}", functools.partial(_rows, setting))]
 
 
 def _rows(setting: Setting) -> list[Row]:
@@ -315,4 +315,4 @@ def _along_axes(precision: type) -> Rays:
     return Rays((n * side).astype(precision), n, k.astype(precision))
 
 
-STUDY = Study(NAME, "Mutants", about(__doc__), TERMS, tasks)
+STUDY = Study(NAME, "Planted defects", about(__doc__), TERMS, tasks)

@@ -74,16 +74,17 @@ class Closed:
 
 def tasks(context: Context) -> list[Task]:
     """One task per backend and precision."""
-    return [Task(f"planar, closed: {s.label}", functools.partial(_setting_rows, s)) for s in settings(context)]
+    return [Task(f"planar, closed: {s.label}", functools.partial(_setting_rows, context, s)) for s in settings(context)]
 
 
-def _setting_rows(setting: Setting) -> list[Row]:
+def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
         return [Row(NAME, "trace", "every answer", setting.label, reason=setting.reason)]
     few = setting.is_scalar
-    rows = [_box_row(setting, count, 4 if few else 16) for count in REFLECTIONS]
+    counts = REFLECTIONS[:2] if context.profile.quick else REFLECTIONS
+    rows = [_box_row(setting, count, 4 if few else 16) for count in counts]
     rows += [_row(setting, name, make(8 if few else 500)) for name, make in CLOSED.items()]
-    return rows if few else [*rows, _curves_row(setting), _facet_row(setting)]
+    return rows if few or context.profile.quick else [*rows, _curves_row(setting), _facet_row(setting)]
 
 
 def _row(setting: Setting, name: str, closed: Closed) -> Row:

@@ -43,7 +43,7 @@ SEED = 2033
 ORIGINAL = 0.05  # its resolution, 1172 segments
 SIZES = (10, 100, 1000, 10_000, 100_000, 1_000_000)
 BRUTE_SIZES = (0, 10, 100, 1000)
-ROUNDS = {"standard": 7, "full": 21}
+ROUNDS = {"quick": 6, "standard": 7, "full": 21}
 MESH, SHUFFLED, BRUTE = "mesh", "mesh, shuffled", "brute"
 # The method, whether rays are shuffled, and how many times fewer of them there are.
 METHODS = {MESH: (MESH, False, 1), SHUFFLED: (MESH, True, 16), BRUTE: (BRUTE, False, 64)}
@@ -58,7 +58,8 @@ def tasks(context: Context) -> list[Task]:
 def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
         return [Row(NAME, "trace", "every size", setting.label, reason=setting.reason)]
-    return measure(context, setting, SIZES[:1] if setting.is_scalar else SIZES)
+    sizes = SIZES[:3] if context.profile.quick else SIZES
+    return measure(context, setting, SIZES[:1] if setting.is_scalar else sizes)
 
 
 @dataclass(frozen=True)

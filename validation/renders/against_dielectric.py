@@ -24,7 +24,7 @@ from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing
-from validation.run.context import NO_REFERENCE, SCENES, Context, Profile
+from validation.run.context import NO_REFERENCE, Context, Profile
 from validation.run.metrics import CHANGED_SHARE, DETECTABLE, MEANS_DIFFER, SMALLEST_P, WELCH_ALARMS
 from validation.run.render_methods import DIELECTRIC as BUILTIN
 from validation.run.render_methods import Camera, opened
@@ -55,7 +55,7 @@ def tasks(context: Context) -> list[Task]:
     plugins = [PLUGIN] + [f"{PLUGIN}_{name}" for name in FORMULAS if context.profile.every_formula]
     return [
         Task(f"renders: {path.stem}, {plugin}", functools.partial(_compare, context, path, plugin))
-        for path in sorted(SCENES.glob("*.xml"))
+        for path in context.scenes
         for plugin in plugins
     ]
 
@@ -68,8 +68,8 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
     values, left_out = _paired(test, reference), no_question(test, reference)
     if not left_out:
         values |= _independent(test[:half], reference[half:])
-    # Both forms at the rounding limit are timed, whichever of them is the default.
-    others = _at_the_limit() if plugin == PLUGIN else []
+    # Both forms at the rounding limit are timed, whichever of them is the default; `quick` saves their kernels.
+    others = _at_the_limit() if plugin == PLUGIN and not profile.quick else []
     values |= _times(profile, cameras | {name: Camera(opened(path, name, profile.resolution)) for name in others})
     # A Python plugin costs a call per operation in scalar variants: its time is demanded of compiled ones only.
     compiled = not context.variant.startswith("scalar")

@@ -14,7 +14,7 @@ from pathlib import Path
 from mi_refract.plugins import scene_features
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.row import Row
-from validation.run.context import SCENES, Context
+from validation.run.context import Context
 from validation.run.render_methods import opened
 from validation.study import Study, Task, about
 
@@ -28,8 +28,7 @@ NAME = "scenes"
 
 def tasks(context: Context) -> list[Task]:
     """One task per scene."""
-    paths = sorted(SCENES.glob("*.xml"))
-    return [Task(f"scenes: {path.stem}", functools.partial(scene_rows, context, path)) for path in paths]
+    return [Task(f"scenes: {path.stem}", functools.partial(scene_rows, context, path)) for path in context.scenes]
 
 
 def scene_rows(context: Context, path: Path) -> list[Row]:

@@ -52,11 +52,15 @@ SCALAR = "scalar variants have no kernels"
 
 
 def tasks(context: Context) -> list[Task]:
+    """One per feature; in the profile `quick` those without scenes of many glasses."""
     calls = Task("features: scalar calls", functools.partial(scalar_rows, context))
     if context.variant.startswith("scalar"):
         return [Task("features", lambda: [Row(NAME, PLUGIN, "kernels", context.variant, reason=SCALAR)]), calls]
+    operations_only = Task("features: operations", functools.partial(operation_rows, context))
+    if context.profile.quick:
+        return [operations_only, calls]
     return [
-        Task("features: operations", functools.partial(operation_rows, context)),
+        operations_only,
         Task("features: glasses", functools.partial(glass_rows, context)),
         Task("features: optimisation", functools.partial(optimisation_rows, context)),
         *(

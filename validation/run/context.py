@@ -8,6 +8,7 @@ from pathlib import Path
 from mi_refract.backend import Backend
 
 SCENES = Path(__file__).parents[2] / "scenes"
+QUICK_SCENES = ("diamond", "furnace", "mirage", "prism", "sphere")  # of the profile `quick`
 # Where the built-in is no reference: images are shown, and nothing is demanded of their agreement.
 NO_REFERENCE = {"mirage": "the built-in turns slanting edges into stairs here, so it is no reference: see Paths"}
 
@@ -40,7 +41,9 @@ class Profile:
 
 
 PROFILES = {
-    "quick": Profile("quick", 1000, 30, 1 << 21, 6, 64, 16, 8, (1, 4, 16), sweep_rays=10_000, certified=8),
+    "quick": Profile(
+        "quick", 1000, 30, 1 << 21, 6, 96, 16, 8, (1, 4, 16), sweep_rays=10_000, certified=8, generations=2
+    ),
     "standard": Profile("standard", 4000, 150, 1 << 21, 11, 128, 16, 8, (1, 4, 16)),
     "full": Profile("full", 100_000, 1000, 1 << 22, 21, 192, 32, 8, (1, 4, 16, 64), True, 10_000_000, 300, 1000),
 }
@@ -71,3 +74,9 @@ class Context:
     def scalar(self) -> bool:
         """Whether only scalar variants run here."""
         return self.variant.startswith("scalar")
+
+    @property
+    def scenes(self) -> list[Path]:
+        """The scene files that are rendered: all, or in the profile `quick` five."""
+        every = sorted(SCENES.glob("*.xml"))
+        return [path for path in every if path.stem in QUICK_SCENES] if self.profile.quick else every

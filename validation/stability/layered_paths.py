@@ -75,9 +75,10 @@ class Bundle:
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per scene for the paths, one per view for the images."""
-    paths = [(layers.scene, functools.partial(_path_rows, context, layers)) for layers in (MIRAGE, FIBRE)]
-    views = [(f"image of the {view[2]}", functools.partial(_view_rows, context, *view)) for view in VIEWS]
+    """One task per scene for the paths, one per view for the images; `quick` has the paths of the mirage."""
+    scenes, seen = ((MIRAGE,), ()) if context.profile.quick else ((MIRAGE, FIBRE), VIEWS)
+    paths = [(layers.scene, functools.partial(_path_rows, context, layers)) for layers in scenes]
+    views = [(f"image of the {view[2]}", functools.partial(_view_rows, context, *view)) for view in seen]
     return [Task(f"paths: {name}", work) for name, work in paths + views]
 
 

@@ -64,7 +64,7 @@ class Size:
     wanted: float
 
 
-SIZES = {"standard": Size(64, 64, 32, 0.1), "full": Size(128, 512, 1, 0.01)}
+SIZES = {"quick": Size(64, 64, 32, 0.1), "standard": Size(64, 64, 32, 0.1), "full": Size(128, 512, 1, 0.01)}
 
 
 @dataclasses.dataclass(frozen=True)
