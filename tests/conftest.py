@@ -62,6 +62,17 @@ def each_variant(request: pytest.FixtureRequest):
 
 
 @pytest.fixture
+def scalar_variant():
+    """`scalar_rgb`, which every wheel has."""
+    import mitsuba as mi
+
+    before = mi.variant()
+    mi.set_variant("scalar_rgb")
+    yield
+    mi.set_variant(before)
+
+
+@pytest.fixture
 def typical_variant(each_variant: str) -> str:
     """One variant a family and the one that differs most from it: for what no variant does by itself."""
     return each_variant
@@ -168,7 +179,7 @@ def follow(setting):
     """`trace` in the setting; paths as lists, without what follows their ends."""
     import numpy as np
 
-    from mi_refract.planar.tracer import trace
+    from mi_refract.planar import trace
 
     def run(segments, origins, directions, max_depth=16, **options):
         options = {"precision": setting.name, "backend": setting.backend, "weights": True} | options

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import mi_refract
 PACKAGE = Path(mi_refract.__file__).parent
 ROOMS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
 # Rooms that do not have their `__all__` yet. None may remain.
-PENDING = set(ROOMS) - {"report"}
+PENDING = {"accuracy", "formulas", "image_diff", "numerics", "oracle", "planar", "plugins", "regimes"}
 DONE = [room for room in ROOMS if room not in PENDING]
 
 
@@ -59,7 +60,7 @@ def test_a_room_says_what_it_is_for_and_what_it_offers(room: str) -> None:
     assert len((module.__doc__ or "").splitlines()) > 1
     assert offered(room)
     for name in offered(room):
-        assert hasattr(module, name) or (PACKAGE / room / f"{name}.py").is_file(), f"{room} has no {name}"
+        assert hasattr(module, name) or importlib.util.find_spec(f"mi_refract.{room}.{name}"), f"{room} has no {name}"
 
 
 @pytest.mark.parametrize(

@@ -68,7 +68,7 @@ def _command(
     write_tables: Annotated[
         bool, typer.Option("--write-tables", help="Write the tables of the READMEs and the gallery, too.")
     ] = False,
-    goals: Annotated[bool, typer.Option("--goals", help="Print the goals that were missed, too.")] = False,
+    goals: Annotated[bool, typer.Option("--goals", help="Print the goals of timing, too.")] = False,
 ) -> int:
     """Measure the formulas and the plugin against certified answers, and write the report."""
     try:
@@ -113,7 +113,7 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
     from mi_refract.report import run_report
     from validation.run.context import Context, profiles
 
-    from . import runner
+    from . import headline, runner
 
     start = time.perf_counter()
     variant = backend.activate(may_restart=True)
@@ -130,13 +130,15 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
     described["studies"] = {study.name: study.described for study in studies}
     described["scatter"] = [scatter for study in studies for scatter in study.scatter]
     described["tasks"] = spent
+    described["first_page"] = headline.first_page(rows)
     run_report.write_json(out / "rows.json", rows, described)
     run_report.write_junit(out / "junit.xml", rows, described)
     run_report.write_html(out / "report.html", rows, described, out)
     if tables:
         tables.write(rows, context, names)
     runner.forget(context)
-    _print_summary(run_report.summary(rows), out / "report.html")
+    parts = [run_report.summary(rows, described), *([run_report.goals_table(rows)] if goals else [])]
+    _print(parts, out / "report.html")
     return 1 if any(row.verdict == "fail" for row in rows) else 0
 
 
@@ -151,11 +153,12 @@ def _tables(names: list[str]) -> ModuleType:
     return readme_tables
 
 
-def _print_summary(summary: Any, page: Path) -> None:
+def _print(parts: list[Any], page: Path) -> None:
     from rich.console import Console
 
     console = Console()
-    console.print(summary)
+    for part in parts:
+        console.print(part)
     console.print(f"report: {page}", highlight=False)
 
 

@@ -1,1 +1,33 @@
-"""How far a direction is from the certified one."""
+"""How far directions are from the exact ones, and whether that is within their error bounds. One judge for all.
+
+In: rays, their certified answers from the oracle, and the directions and decisions of some program or formula as numpy
+arrays (`evaluate` gets them from a formula). Out: a `Judgement`, ray by ray, against the a-priori bounds of
+`formulas.Budget`.
+"""
+
+from .direction_errors import (
+    DirectionErrors,
+    absolute_radicand,
+    errors,
+    errors_of_normalised,
+    lengths,
+    relative_radicand,
+)
+from .evaluate import Subject, evaluate
+from .judge import BUDGETS, Judgement, RayBounds, judge, judge_formula
+
+__all__ = [
+    "BUDGETS",
+    "DirectionErrors",
+    "Judgement",
+    "RayBounds",
+    "Subject",
+    "absolute_radicand",
+    "errors",
+    "errors_of_normalised",
+    "evaluate",
+    "judge",
+    "judge_formula",
+    "lengths",
+    "relative_radicand",
+]

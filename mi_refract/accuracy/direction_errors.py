@@ -2,40 +2,62 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from mi_refract import oracle, regimes
-from mi_refract.regimes import Rays
+from mi_refract.regimes import Array, Rays
 
 
-def errors(b: np.ndarray, rays: Rays, exact: oracle.Certified) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(chord, angle, drift of the length) of every ray, relative to |a|; NaN counts as infinite."""
+class DirectionErrors(NamedTuple):
+    """Errors of directions b, (N,) float64 each; infinite where b is NaN."""
+
+    chord: Array  # |b/|a| − exact|
+    angle: Array  # between b and the exact direction, radians
+    drift: Array  # of the length: | |b|/|a| − 1 |
+
+
+def errors(b: Array, rays: Rays, exact: oracle.Certified) -> DirectionErrors:
+    """Errors of `b` (N, 3), which should have the length of `a`, relative to |a|."""
     unit, low = b / lengths(rays.a)[:, None], exact.direction_low.astype(np.longdouble)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a subject may return anything
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # b may be anything
         difference = (unit - exact.direction) - low
         chord, norm = lengths(difference), lengths(unit)
         across = lengths(np.cross(unit, difference)) / norm
         angle = np.arctan2(across, norm - (unit * difference).sum(1) / norm)
-        chord, angle, drift = (np.nan_to_num(x.astype(float), nan=np.inf) for x in (chord, angle, np.abs(norm - 1)))
-    return chord, angle, drift
+        return DirectionErrors(*(np.nan_to_num(x.astype(float), nan=np.inf) for x in (chord, angle, np.abs(norm - 1))))
 
 
-def absolute_radicand(rays: Rays) -> np.ndarray:
-    """|1 − k² sin²θ_i| of every ray, in extended precision: how far the decision is from the critical angle."""
+def errors_of_normalised(b: Array, rays: Rays, exact: oracle.Certified) -> DirectionErrors:
+    """Errors of `b` (N, 3) that may also have been made unit: `drift` is | |b| − 1 | where that is less.
+
+    Chord and angle are those of b scaled to the length of `a`. NaN stays in `drift`.
+    """
+    with np.errstate(all="ignore"):  # b may be anything
+        length, kept = lengths(b), lengths(rays.a)
+        drift = np.fmin(np.abs(length - 1), np.abs(length / kept - 1)).astype(float)
+        return errors(b * (kept / length)[:, None], rays, exact)._replace(drift=drift)
+
+
+def absolute_radicand(rays: Rays) -> Array:
+    """(N,) |1 − k² sin²θ_i|, in extended precision: how far each ray is from the critical angle."""
     a, n, k = (x.astype(np.longdouble) for x in (rays.a, rays.n, rays.k))
     return np.abs(1 - (k * lengths(np.cross(n, a)) / (lengths(a) * lengths(n))) ** 2)
 
 
-def relative_radicand(rays: Rays) -> np.ndarray:
-    """|(n·a)² − κ|n×a|²| of every ray, over the mean of the two terms, right to 2⁻¹⁴⁰; NaN where both are 0.
+def relative_radicand(rays: Rays) -> Array:
+    """(N,) |(n·a)² − κ|n×a|²| over the mean of its two terms, right to 2⁻¹⁴⁰; NaN where both are 0.
 
-    Near the critical angle, where the terms are alike, it is |`oracle.relative_radicand`|.
+    Near the critical angle, where the terms are alike, it is the modulus of `oracle.relative_radicand`.
     """
     _, d, terms = regimes.radicand(*(x.T.astype(np.float64) for x in (rays.a, rays.n, rays.k)))
     with np.errstate(invalid="ignore"):
-        return np.abs(d[0]) / (terms / 2)
+        ratio: Array = np.abs(d[0]) / (terms / 2)
+    return ratio
 
 
-def lengths(v: np.ndarray) -> np.ndarray:
+def lengths(v: Array) -> Array:
     """(N,) of (N, 3), in extended precision."""
-    return np.sqrt((v.astype(np.longdouble) ** 2).sum(1))
+    length: Array = np.sqrt((v.astype(np.longdouble) ** 2).sum(1))
+    return length

@@ -46,6 +46,8 @@ SELF_TEST_RENDERS, SELF_TEST_SPP = 8, 16
 
 
 class Inconclusive(enum.StrEnum):
+    """What an inconclusive comparison counts as."""
+
     PASS = "pass"
     FAIL = "fail"
 

@@ -26,11 +26,16 @@ def writable(path: str | os.PathLike[str], suffixes: Sequence[str]) -> Path:
         raise ValueError(f"{path}: accepted: a file name that ends in {' or '.join(suffixes)}")
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; accepted: the name of a file")
+    check_parent(path)
+    return path
+
+
+def check_parent(path: Path) -> None:
+    """OSError where the folder that `path` is to be made in is missing, or not writable."""
     if not path.parent.is_dir():
         raise NotADirectoryError(f"{path}: {path.parent} is not a folder; accepted: an existing one")
     if not os.access(path.parent, os.W_OK | os.X_OK):
         raise PermissionError(f"{path}: {path.parent} is not writable; accepted: a writable folder")
-    return path
 
 
 @contextlib.contextmanager

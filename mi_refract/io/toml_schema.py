@@ -38,7 +38,8 @@ def number(value: Any) -> float | None:
 
 def positive(value: Any) -> float | None:
     """A finite float above 0."""
-    return only_if(lambda x: x > 0, number)(value)
+    found: float | None = only_if(lambda x: x > 0, number)(value)
+    return found
 
 
 def text(value: Any) -> str | None:

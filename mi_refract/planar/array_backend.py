@@ -1,7 +1,7 @@
-"""One source for compiled and for scalar arrays: numbers by backend and precision, tables read and written by index.
+"""One source for compiled and scalar arrays: number types by backend and precision, tables, output buffers.
 
-A compiled backend runs all rays at once, a lane each. Scalar numbers are Python's own: one ray after the other, in
-double precision whatever is stored.
+A compiled backend (LLVM, CUDA) follows all rays at once. The scalar backend follows one ray after the other with
+Python's own numbers, in double precision.
 """
 
 from __future__ import annotations
@@ -14,16 +14,23 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.backend import detect
+from mi_refract.numerics import Mask
 
 PRECISIONS = ("float32", "float64")
-Arrays = dict[str, Any]
-Buffer = tuple[Any, tuple[int, ...]]
+
+Index = Any  # a Python int, or a Dr.Jit array of uint32
+Vector2 = Any  # x and y, two Numbers
+Vertices = Any  # the numbers of a start and an end, Indices
+Table = Any  # rows to gather from; see `ArrayBackend.table`
+Buffer = tuple[Any, tuple[int, ...]]  # values and their shape
+Scatter = Callable[[str, Index, Any, Mask], None]  # name of a buffer, row, value, where
 
 
-class Lanes:
-    """The types of a compiled backend, "llvm" or "cuda", in a precision."""
+class ArrayBackend:
+    """Types and memory access of a compiled backend, "llvm" or "cuda", in a precision."""
 
     def __init__(self, backend: str, precision: str) -> None:
+        """Both must be usable here: `choose_backend` checks that."""
         self.backend, self.precision = backend, precision
         arrays = getattr(dr, backend).ad
         wide = "64" if precision == "float64" else ""
@@ -34,14 +41,21 @@ class Lanes:
 
     @property
     def vector(self) -> Any:
+        """The type of vectors in the plane."""
         return self._vectors[2]
 
     @property
     def vector3(self) -> Any:
+        """The type of vectors in space."""
         return self._vectors[3]
 
-    def table(self, values: Any) -> Any:
-        """Rows of numbers, or of indices where `values` are whole; one-dimensional or of 2 or 4 columns."""
+    @property
+    def roundoff(self) -> float:
+        """u, half the distance from 1 to the next number."""
+        return float(np.finfo(self.precision).eps) / 2
+
+    def table(self, values: Any) -> Table:
+        """A numpy array (N, or N × 2, or N × 4; numbers, or indices where whole) as a table of N rows to `gather`."""
         values = np.ascontiguousarray(values)
         whole = values.dtype.kind in "iu"
         columns = 1 if values.ndim == 1 else values.shape[1]
@@ -49,43 +63,47 @@ class Lanes:
         kind = self.index if whole else self.number
         return row, kind(values.ravel().astype(np.uint32 if whole else self.precision, copy=False))
 
-    def gather(self, table: Any, i: Any, active: Any = True) -> Any:
+    def gather(self, table: Table, i: Index, active: Mask = True) -> Any:
+        """Row i of a table; of no meaning where not `active`."""
         row, values = table
         return dr.gather(row, values, i, active)
 
-    @property
-    def roundoff(self) -> float:
-        return float(np.finfo(self.precision).eps) / 2
+    def buffer(self, kind: Any, value: Any, shape: tuple[int, ...]) -> Buffer:
+        """Memory for results, filled with `value`: numbers of type `kind`, or vectors where the shape ends in 2."""
+        return dr.full(kind, value, math.prod(shape)), shape
 
-    def run(self, count: int, buffers: dict[str, Buffer], work: Callable[[Any, Callable[..., None]], None]) -> Arrays:
-        """`work(i, put)` for the lanes i < count: `put(name, j, x, active)` sets buffers[name][j, i] = x. As numpy."""
+    def run(
+        self, count: int, buffers: dict[str, Buffer], work: Callable[[Index, Scatter], None]
+    ) -> dict[str, np.ndarray]:
+        """Run `work(i, scatter)` for all i < count; the buffers as numpy arrays.
+
+        `scatter(name, j, x, active)` sets buffers[name][j, i] = x where `active`.
+        """
         lane = dr.arange(self.index, count)
 
-        def scatter(name: str, j: Any, x: Any, active: Any) -> None:
+        def scatter(name: str, j: Index, x: Any, active: Mask) -> None:
             values, _ = buffers[name]
             x = x if isinstance(x, self.vector) else type(values)(x)
             dr.scatter(values, x, j * count + lane, active, mode=dr.ReduceMode.NoConflicts)
 
-        if count:  # Dr.Jit takes no part in an empty array
+        if count:  # Dr.Jit refuses an empty array
             work(lane, scatter)
         dr.eval(*(values for values, _ in buffers.values()))
         return {name: values.numpy().reshape(shape) for name, (values, shape) in buffers.items()}
 
-    def buffer(self, kind: Any, value: Any, shape: tuple[int, ...]) -> Buffer:
-        """Numbers, or where the shape ends in 2 vectors, all of that value."""
-        return dr.full(kind, value, math.prod(shape)), shape
 
+class ScalarBackend(ArrayBackend):
+    """The same with Python's own numbers, in double precision."""
 
-class Scalars(Lanes):
-    """The same of Python's own numbers."""
-
-    def __init__(self, precision: str) -> None:
-        self.backend, self.precision = "scalar", precision
+    def __init__(self) -> None:
+        """Needs no compiler."""
+        self.backend, self.precision = "scalar", "float64"
         self.number, self.index, self.mask, self.byte, self.signed = float, int, bool, np.uint8, np.int32
         self._vectors = {2: dr.scalar.Array2f64, 3: dr.scalar.Array3f64, 4: dr.scalar.Array4f64}
         self._indices = {1: int, 2: dr.scalar.Array2u}
 
-    def table(self, values: Any) -> Any:
+    def table(self, values: Any) -> Table:
+        """As a list of rows."""
         values = np.asarray(values)
         kind = int if values.dtype.kind in "iu" else float
         if values.ndim == 1:
@@ -93,35 +111,52 @@ class Scalars(Lanes):
         row = (self._indices if kind is int else self._vectors)[values.shape[1]]
         return [row(*map(kind, line)) for line in values]
 
-    def gather(self, table: Any, i: Any, active: Any = True) -> Any:
+    def gather(self, table: Table, i: Index, active: Mask = True) -> Any:
+        """Row i, or the first one where there is no row i: then it is not `active`."""
         return table[i if i < len(table) else 0]
 
-    def run(self, count: int, buffers: dict[str, Buffer], work: Callable[[Any, Callable[..., None]], None]) -> Arrays:
+    def buffer(self, kind: Any, value: Any, shape: tuple[int, ...]) -> Buffer:
+        """A numpy array."""
+        return np.full(shape, value, kind), shape
+
+    def run(
+        self, count: int, buffers: dict[str, Buffer], work: Callable[[Index, Scatter], None]
+    ) -> dict[str, np.ndarray]:
+        """One i after the other."""
         for lane in range(count):
 
-            def scatter(name: str, j: Any, x: Any, active: Any, lane: int = lane) -> None:
+            def scatter(name: str, j: Index, x: Any, active: Mask, lane: int = lane) -> None:
                 if active:
                     buffers[name][0][j, lane] = x
 
             work(lane, scatter)
         return {name: values for name, (values, _) in buffers.items()}
 
-    def buffer(self, kind: Any, value: Any, shape: tuple[int, ...]) -> Buffer:
-        return np.full(shape, value, kind), shape
 
+def choose_backend(name: str | None, precision: str) -> ArrayBackend:
+    """The backend of that name ("llvm", "cuda" or "scalar"); None: LLVM where it runs, else scalar.
 
-def lanes(backend: str | None, precision: str) -> Lanes:
-    """None: the best backend of this machine. ValueError for one that is unknown or cannot run here."""
+    ValueError for an unknown name or precision, a backend that cannot run here, and float32 on the scalar backend,
+    which computes in double.
+    """
     if precision not in PRECISIONS:
         raise ValueError(f"precision = {precision!r}; accepted: {', '.join(PRECISIONS)}")
     found = detect()
-    backend = backend or ("llvm" if found["llvm"].usable else "scalar")
-    if backend not in found:
-        raise ValueError(f"backend = {backend!r}; accepted: {', '.join(found)}")
-    if not found[backend].usable:
-        raise ValueError(f"backend = {backend!r} cannot run here: {found[backend].reason}")
-    return Scalars(precision) if backend == "scalar" else Lanes(backend, precision)
+    llvm = found["llvm"]
+    name = name or ("llvm" if llvm.usable else "scalar")
+    if name not in found:
+        raise ValueError(f"backend = {name!r}; accepted: {', '.join(found)}")
+    if not found[name].usable:
+        raise ValueError(f"backend = {name!r} cannot run here: {found[name].reason}")
+    if name != "scalar":
+        return ArrayBackend(name, precision)
+    if precision == "float32":
+        accepted = "float64, or a compiled backend (llvm, cuda)"
+        missing = "" if llvm.usable else f"; llvm cannot run here: {llvm.reason}"
+        raise ValueError(f"precision = 'float32': scalar arrays compute in double; accepted: {accepted}{missing}")
+    return ScalarBackend()
 
 
-def negated(mask: Any) -> Any:
+def negated(mask: Mask) -> Mask:
+    """Not `mask`: `~True` of a Python bool is −2."""
     return not mask if isinstance(mask, bool) else ~mask

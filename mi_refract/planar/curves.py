@@ -1,8 +1,8 @@
-"""Curves in the plane, of straight pieces and exact arcs of conics. No optics: media come last, with `between`.
+"""Curves in the plane, of straight pieces and exact arcs of conics. No optics: `Curve.between` adds the media.
 
 A closed curve runs counter-clockwise: its inside is on the left. An arc is a rational quadratic Bézier curve, which
 is the conic itself: its control point lies where the end tangents meet, and an affine map of start, control and end
-is an affine map of the arc, the weight unchanged. Arcs turn by at most 90° as they are made; a stretch may change
+is an affine map of the arc with the same weight. Arcs turn by at most 90° when they are made; stretching may change
 that. Each vertex is computed once, so that neighbours share it to the last bit.
 """
 
@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from .tracer import Array, Segments
+from .segments import Array, Segments
 
 
 @dataclass(frozen=True)
@@ -31,19 +32,22 @@ class Curve:
     closed: bool
 
     def __len__(self) -> int:
+        """M, the number of pieces."""
         return len(self.weight)
 
     @property
     def start(self) -> Array:
+        """Where each piece starts, M × 2."""
         return self.vertices[: len(self)]
 
     @property
     def end(self) -> Array:
+        """Where each piece ends, M × 2."""
         return np.roll(self.vertices, -1, 0)[: len(self)]
 
     @property
-    def straight(self) -> Any:
-        """Which pieces are."""
+    def straight(self) -> NDArray[np.bool_]:
+        """Which pieces are straight, M."""
         return (self.weight == 1) & (self.control == (self.start + self.end) / 2).all(1)
 
     def _piece(self, j: int) -> Curve:
@@ -51,12 +55,12 @@ class Curve:
         return Curve(vertices, self.control[j : j + 1], self.weight[j : j + 1], closed=False)
 
     def reversed(self) -> Curve:
-        """The same places, run through the other way; a closed curve keeps its first vertex."""
+        """The same curve in the opposite direction; a closed curve keeps its first vertex."""
         vertices = np.roll(self.vertices[::-1], 1, 0) if self.closed else self.vertices[::-1]
         return replace(self, vertices=vertices, control=self.control[::-1], weight=self.weight[::-1])
 
     def mapped(self, matrix: Any, at: Any = (0.0, 0.0)) -> Curve:
-        """The curve under p → matrix · p + at. Under a reflection it is reversed: what was on its left stays there.
+        """The curve under p → matrix · p + at. A reflection reverses it, so that its left side stays its left side.
 
         ValueError for a matrix that is singular or not finite.
         """
@@ -64,7 +68,7 @@ class Curve:
         determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
         if not (math.isfinite(determinant) and determinant and np.isfinite(at).all()):
             raise ValueError(f"matrix = {matrix.tolist()}, at = {at.tolist()}; accepted: finite, determinant not 0")
-        # By columns: a product with 0 and 1 rounds nothing, in whatever order a library would sum.
+        # Column by column: products with 0 and 1 are exact, whatever order of summation a matrix product has.
         x, y = matrix.T
         vertices, control = (p[:, :1] * x + p[:, 1:] * y + at for p in (self.vertices, self.control))
         mapped = replace(self, vertices=vertices, control=control)
@@ -72,7 +76,7 @@ class Curve:
         return mapped if determinant > 0 else mapped.reversed()
 
     def faceted(self, facets: int) -> Curve:
-        """Chords in place of the arcs, `facets` altogether, shared out evenly; straight pieces stay.
+        """The curve with chords in place of arcs, `facets` of them, as many for each arc; straight pieces stay.
 
         ValueError where there is no arc, or fewer chords than arcs.
         """
@@ -85,7 +89,7 @@ class Curve:
         return polygonal(np.concatenate(chords if self.closed else [*chords, self.vertices[-1:]]), self.closed)
 
     def outline(self, count: int = 64) -> Array:
-        """Points along the curve: its vertices, and `count` − 1 more on each arc."""
+        """Points along the curve, K × 2: its vertices, and `count` − 1 more on each arc."""
         bent = ~self.straight
         if not bent.any():
             return self.vertices
@@ -101,7 +105,7 @@ class Curve:
 
 
 def points(segments: Segments, count: int) -> Array:
-    """M × (count + 1) × 2: each segment from start to end, its ends exact; equal angles on an arc of a circle."""
+    """M × (count + 1) × 2: points along each segment, its ends exact; at equal angles on an arc of a circle."""
     control, weight = segments.control, segments.weight
     if control is None or weight is None:
         control, weight = (segments.start + segments.end) / 2, np.ones(len(segments))
@@ -119,7 +123,7 @@ def _along(start: Array, end: Array, control: Array, weight: Array, count: int) 
 
 
 def affine(rotate: float = 0.0, scale: float | Sequence[float] = 1.0) -> Array:
-    """The matrix that stretches by `scale`, or by its two numbers along x and y, and then turns by degrees."""
+    """The 2 × 2 matrix that stretches by `scale` (one factor, or one for x and one for y), then turns by degrees."""
     cosine, sine = unit(rotate)
     x, y = np.broadcast_to(scale, 2)
     return np.array([[cosine * x, -sine * y], [sine * x, cosine * y]])
@@ -137,14 +141,14 @@ def unit(degrees: float) -> tuple[float, float]:
 
 
 def polygonal(vertices: Array, closed: bool) -> Curve:
-    """Straight pieces from vertex to vertex."""
+    """The curve of straight pieces through `vertices` (K × 2)."""
     following = np.roll(vertices, -1, 0)
     pieces = len(vertices) - (not closed)
     return Curve(vertices, ((vertices + following) / 2)[:pieces], np.ones(pieces), closed)
 
 
 def joined(*curves: Curve) -> Curve:
-    """One closed curve of open ones, each led to the next by a straight piece where it does not end there."""
+    """One closed curve of open ones, with straight pieces between them where they do not meet."""
     parts = []
     for curve, following in zip(curves, [*curves[1:], curves[0]], strict=True):
         gap = polygonal(np.stack([curve.vertices[-1], following.vertices[0]]), closed=False)
@@ -154,6 +158,6 @@ def joined(*curves: Curve) -> Curve:
 
 
 def area(curve: Curve) -> float:
-    """Signed, positive where counter-clockwise; of arcs as of chords by the hundred."""
+    """The area inside a closed curve, positive where it runs counter-clockwise; of arcs that of 64 chords each."""
     x, y = curve.outline().T
     return float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2

@@ -1,7 +1,7 @@
-"""Images of planar scenes: media shaded by index, boundaries, and rays as strong as they are bright.
+"""Figures of planar scenes: media tinted by index, boundaries, and rays with an opacity that grows with their power.
 
-A few rays are drawn as lines. Of many, what is drawn is their density, accumulated in floating point: a line of
-little power among thousands has an opacity of less than the 1/255 that graphics libraries know.
+Few rays are drawn as lines. Of many the density is drawn, accumulated in floating point: a faint line among thousands
+would need an opacity of less than 1/255, which graphics libraries round to 0.
 """
 
 from __future__ import annotations
@@ -20,20 +20,23 @@ from mi_refract.io.atomic import write_atomically
 
 from .figure_geometry import SHARED, Legs, View, around, curves, density, legs
 from .path_tree import Branches, count, summary
+from .paths import Event
 from .scene_file import PlanarScene
-from .tracer import Event, Segments
+from .segments import Segments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 FORMATS = (".svg", ".png", ".pdf")
-# Lines are drawn one by one, as long as there are not more of them and they would not be longer than so many diagonals
-# of the view. Of more the density is drawn.
+# Above this number of lines, or above this total length in diagonals of the view, the density is drawn.
 LINES, DIAGONALS = 6000, 150
-DPI = {".png": 200, ".svg": 150, ".pdf": 150}  # of what is not lines, in the last two
-RAY, WHITE, INK, MUTED = "#c8102e", "#55504c", "#222222", "#6b6b6b"  # WHITE: of all colours, on paper
-DENSE, THIN = (0.73, 0.85, 0.97), (1.00, 0.92, 0.70)  # tints of the media that differ most from what is around all
+DPI = {".png": 200, ".svg": 150, ".pdf": 150}  # in the last two of raster images only
+RAY, WHITE, INK, MUTED = "#c8102e", "#55504c", "#222222", "#6b6b6b"  # WHITE: all colours together, on paper
+DENSE, THIN = (
+    (0.73, 0.85, 0.97),
+    (1.00, 0.92, 0.70),
+)  # tints of the media whose index differs most from the outermost one
 LINE = 0.13  # inches
 NAMED = 5  # media in the legend
 TYPICAL = 0.35  # opacity/(1 − opacity) of a typical density, where that is drawn
@@ -66,31 +69,31 @@ STYLE: Any = {
 
 
 def save(path: Path, scene: PlanarScene, traced: Sequence[Branches]) -> None:
-    """Write the image, in the format of the path's suffix, one of FORMATS.
+    """Draw the scene into a file, in the format of the path's suffix, one of FORMATS.
 
-    ValueError as for `image`; OSError for what cannot be written. Then no file is there, or the old one.
+    ValueError as for `draw`; OSError where the file cannot be written. An error leaves no file, or the old one.
     """
-    content = image(scene, traced, path.suffix.lower())
+    content = draw(scene, traced, path.suffix.lower())
     try:
         write_atomically(path, content)
     except OSError as error:
         raise OSError(f"{path}: cannot be written: {error.strerror or error}") from None
 
 
-def image(scene: PlanarScene, traced: Sequence[Branches], suffix: str) -> bytes:
-    """The content of such a file. The same arguments give the same bytes. ValueError where matplotlib is missing."""
+def draw(scene: PlanarScene, traced: Sequence[Branches], suffix: str) -> bytes:
+    """The figure as the content of a file; equal arguments give equal bytes. ValueError without matplotlib."""
     require_matplotlib()
     import matplotlib.style
 
     buffer = io.BytesIO()
-    with matplotlib.style.context(["default", STYLE]):  # whatever the user's own style is
-        drawn = figure(scene, traced, DPI[suffix])
+    with matplotlib.style.context(["default", STYLE]):  # not the user's style
+        drawn = build_figure(scene, traced, DPI[suffix])
         drawn.savefig(buffer, format=suffix[1:], dpi="figure", metadata=UNDATED[suffix])
     return buffer.getvalue()
 
 
-def figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> Figure:
-    """The image, in matplotlib's present style; its only axes are in the scene's units."""
+def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> Figure:
+    """The figure in matplotlib's current style; its only axes are in the scene's units."""
     from matplotlib.figure import Figure
 
     view = scene.view or around(scene, traced)
@@ -109,23 +112,24 @@ def figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> Figure
 
 
 def require_matplotlib() -> None:
+    """ValueError, which says what to install, where matplotlib is missing."""
     if importlib.util.find_spec("matplotlib") is None:
         raise ValueError("images need the extra `plot`: pip install 'mi-refract[plot]'")
 
 
 def _size(view: View) -> tuple[float, float]:
-    """Of the figure without its caption, in inches: about as large an image whatever its shape."""
+    """Width and height of the figure without its caption, in inches: of about the same area for every view."""
     aspect = min(max((view[1] - view[0]) / (view[3] - view[2]), 0.25), 4)
     height = min(5.2 / aspect**0.5, 7.0)
     return max(height * aspect, 3.6) + 0.6, height + 0.95
 
 
 def _settle(drawn: Figure) -> None:
-    """From here on everything stays in its place, and an image can have as many pixels as there are for it."""
+    """Fix the layout: after this an image of the density can have exactly the pixels of the panel."""
     layout = drawn.get_layout_engine()
     assert layout is not None
     layout.set(w_pad=0.12, h_pad=0.12)  # type: ignore[call-arg]
-    for _ in range(2):  # the first time it is not known yet where the title comes to be
+    for _ in range(2):  # the first pass does not know yet where the title is
         drawn.draw_without_rendering()
     drawn.set_layout_engine("none")
 
@@ -134,7 +138,7 @@ def _settle(drawn: Figure) -> None:
 
 
 def _media(panel: Axes, scene: PlanarScene) -> None:
-    """Regions tinted by index, paler the nearer that is to that around everything; a legend of up to NAMED."""
+    """Tint regions by index, paler the closer it is to the outermost medium's; a legend of up to NAMED media."""
     from matplotlib.patches import Patch, Polygon
 
     around = float(np.mean(scene.index))
@@ -147,7 +151,7 @@ def _media(panel: Axes, scene: PlanarScene) -> None:
         panel.add_patch(Polygon(region.outline, rasterized=len(region.outline) > LINES, **style))
     labels = {around: _label(scene.index)} | {n: _label(r.indices) for r, n in zip(scene.regions, means, strict=True)}
     shown = sorted(labels)
-    if len(shown) > NAMED:  # of many layers the ends and some between
+    if len(shown) > NAMED:  # of many layers the first, the last and some between
         shown = [shown[round(i * (len(shown) - 1) / (NAMED - 1))] for i in range(NAMED)]
     patches = [Patch(facecolor=tints[n], edgecolor="#999999", linewidth=0.5, label=labels[n]) for n in shown]
     place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.1, "borderpad": 0.2}
@@ -155,7 +159,7 @@ def _media(panel: Axes, scene: PlanarScene) -> None:
 
 
 def _tint(contrast: float) -> tuple[float, float, float]:
-    """−1 … 1: how far an index is from that around everything. Denser media are blue, thinner ones yellow."""
+    """A medium's colour by its contrast to the outermost one, −1 … 1. Denser media are blue, thinner ones yellow."""
     red, green, blue = DENSE if contrast > 0 else THIN
     share = abs(contrast) and 0.15 + 0.85 * abs(contrast) ** 1.5
     return 1 - share * (1 - red), 1 - share * (1 - green), 1 - share * (1 - blue)
@@ -181,7 +185,7 @@ def _boundaries(panel: Axes, segments: Segments) -> None:
 
 
 def strength(weight: Any) -> Any:
-    """How strongly a ray is drawn: the square root of its share of the power, or 4 % would not be seen."""
+    """Opacity of a ray: the square root of its share of the power, so that 4 % can be seen."""
     return np.sqrt(weight)
 
 
@@ -206,7 +210,7 @@ def _rgb(scene: PlanarScene, name: str) -> Any:
 
 
 def _stroke(panel: Axes, lines: Legs, colours: dict[int, Any], room: float) -> None:
-    """One line each, thinner and fainter the less room there is; the strongest on top."""
+    """Draw each leg as a line, thinner and fainter the less room there is; the strongest on top."""
     from matplotlib.collections import LineCollection
 
     order = np.argsort(lines.weight, kind="stable")
@@ -218,7 +222,7 @@ def _stroke(panel: Axes, lines: Legs, colours: dict[int, Any], room: float) -> N
 
 
 def _shade(panel: Axes, lines: Legs, colours: dict[int, Any]) -> None:
-    """The density as an image, with as many pixels as the panel has in this figure."""
+    """Draw the density of the legs as an image, with as many pixels as the panel has."""
     box = panel.get_window_extent()
     view = *panel.get_xlim(), *panel.get_ylim()
     width, height = max(round(box.width), 1), max(round(box.height), 1)
@@ -231,7 +235,7 @@ def _shade(panel: Axes, lines: Legs, colours: dict[int, Any]) -> None:
 
 
 def _blend(layers: dict[int, Any], colours: dict[int, Any]) -> Any:
-    """Densities by colour → RGBA in bytes. As much of all colours is the colour of what they have in common."""
+    """Densities by colour → RGBA in bytes. What all colours have in common gets the colour of SHARED."""
     shared = layers.pop(SHARED)
     parts = np.stack(list(layers.values())) / len(layers)
     common = parts.min(axis=0) * (len(layers) > 1)
@@ -241,15 +245,15 @@ def _blend(layers: dict[int, Any], colours: dict[int, Any]) -> Any:
     for part, number in zip(parts - common, layers, strict=True):
         mixed += part[..., None] * colours[number]
     lit = total[total > 0]
-    # The median alone makes a beam black beside faint reflections all over the view; the mean makes them white.
+    # The median alone would make a beam black beside faint reflections all over the view; the mean, those white.
     dense = total * TYPICAL / math.sqrt(lit.mean() * np.median(lit)) if lit.size else total
     colour = np.divide(mixed, total[..., None], out=np.ones_like(mixed), where=total[..., None] > 0)
-    pixels = np.dstack([colour, dense / (1 + dense)])  # without saturating as soon as 1 − exp(−dense) does
+    pixels = np.dstack([colour, dense / (1 + dense)])  # saturates later than 1 − exp(−dense)
     return (pixels * 255).round().astype(np.uint8)
 
 
 def _ends(panel: Axes, traced: Sequence[Branches]) -> None:
-    """A mark where a path ended otherwise than by escaping."""
+    """Mark where a path ended without escaping."""
     for event, (mark, _) in MARKS.items():
         ends = np.concatenate([branches.tips[branches.end == event] for branches in traced])
         if len(ends):
@@ -259,7 +263,7 @@ def _ends(panel: Axes, traced: Sequence[Branches]) -> None:
 
 
 def _caption(scene: PlanarScene, traced: Sequence[Branches], width: int) -> list[str]:
-    """Lines of at most `width` characters."""
+    """The lines below the figure, of at most `width` characters each."""
     numbers = count(traced)
     notes = [text.format(numbers[event.name]) for event, (_, text) in MARKS.items() if numbers[event.name]]
     lines = [f"{scene.path.name}: {summary(scene, traced)}", *notes]

@@ -1,4 +1,4 @@
-"""What an image of a planar scene consists of, as numbers: the legs of paths, their density, curves as polylines."""
+"""The geometry of a figure, without matplotlib: legs of paths in the view, their density, boundaries as polylines."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from .curves import points
 from .path_tree import Branches
+from .paths import Event
 from .scene_file import PlanarScene
-from .tracer import Array, Event, Segments
+from .segments import Array, Segments
 
 View = tuple[float, float, float, float]  # x0, x1, y0, y1
-MARGIN = 0.08  # around what the image holds, of its larger side
+MARGIN = 0.08  # around the scene, as a share of its larger side
 SHARED = -1  # the number of the colour that stands for all of them
 SAMPLES = 2**22  # pixels of lines at a time: 0.3 GB
 
@@ -30,14 +31,16 @@ class Legs:
     colour: NDArray[np.intp]
 
     def __len__(self) -> int:
+        """L."""
         return len(self.start)
 
     def where(self, mask: NDArray[np.bool_]) -> Legs:
+        """Those for which `mask` (L) is True."""
         return Legs(self.start[mask], self.end[mask], self.weight[mask], self.colour[mask])
 
 
 def around(scene: PlanarScene, traced: Sequence[Branches]) -> View:
-    """What holds the boundaries and where rays meet them, with a margin."""
+    """The view that holds all boundaries and all places where rays meet them, with a margin."""
     segments = scene.segments[0]
     places = [segments.start, segments.end, *(region.outline for region in scene.regions)]
     places += [branches.paths.points[:, 1:].reshape(-1, 2) for branches in traced]
@@ -49,7 +52,7 @@ def around(scene: PlanarScene, traced: Sequence[Branches]) -> View:
 
 
 def legs(traced: Sequence[Branches], view: View) -> Legs:
-    """What of the paths is inside the view, every leg once; rays that escape as far as its edge."""
+    """The legs inside the view, each once; rays that escape end at its edge."""
     parts = [_legs(branches, number, len(traced), view) for number, branches in enumerate(traced)]
     columns = ([getattr(part, name) for part in parts] for name in ("start", "end", "weight", "colour"))
     return Legs(*map(np.concatenate, columns))
@@ -58,7 +61,7 @@ def legs(traced: Sequence[Branches], view: View) -> Legs:
 def _legs(branches: Branches, number: int, colours: int, view: View) -> Legs:
     start, end, own = branches.paths.points, _ends(branches, view), branches.own
     colour = np.full(own.shape, number)
-    if colours > 1:  # they part at the first boundary
+    if colours > 1:  # they separate at the first boundary
         colour[:, 0] = SHARED
         own[:, 0] &= number == 0
     start, end, inside = clip(start[own], end[own], view)
@@ -66,7 +69,7 @@ def _legs(branches: Branches, number: int, colours: int, view: View) -> Legs:
 
 
 def _ends(branches: Branches, view: View) -> Array:
-    """Where legs end (P × (D+1) × 2). NaN where there is no leg; an exhausted path has none after its last boundary."""
+    """Where legs end (P × (D+1) × 2); NaN where there is no leg, as after the last boundary of a path that stopped."""
     x0, x1, y0, y1 = view
     ends = np.full_like(branches.paths.points, np.nan)
     ends[:, :-1] = branches.paths.points[:, 1:]
@@ -78,7 +81,7 @@ def _ends(branches: Branches, view: View) -> Array:
 
 
 def clip(start: Array, end: Array, view: View) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Lines cut off at the view's edges, and which of them are inside at all (not those with a NaN)."""
+    """Lines (L × 2) clipped to the view, and which of them are inside at all; False for NaN."""
     first, final = np.zeros(len(start)), np.ones(len(start))
     along = end - start
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -92,7 +95,7 @@ def clip(start: Array, end: Array, view: View) -> tuple[Array, Array, NDArray[np
 def density(lines: Legs, value: Array, view: View, width: int, height: int) -> Array:
     """Σ value × length in each pixel, over the pixel's side (height × width, row 0 at the bottom).
 
-    A line is a chain of points, a pixel apart along its longer axis and each shared by the nearest two pixels across.
+    A line is sampled one pixel apart along its longer axis; each sample is shared by the two nearest pixels across.
     """
     x0, x1, y0, y1 = view
     scale = np.array([width / (x1 - x0), height / (y1 - y0)])
@@ -103,7 +106,7 @@ def density(lines: Legs, value: Array, view: View, width: int, height: int) -> A
 
 
 def _chains(start: Array, end: Array, value: Array, rows: int, columns: int) -> Array:
-    """The density of lines at 45° or less: column, row of their ends, counted from the centre of the first pixel."""
+    """The density of lines at 45° or less; ends as (column, row) from the centre of the first pixel."""
     backward = (start[:, 0] > end[:, 0])[:, None]
     left, right = np.where(backward, end, start), np.where(backward, start, end)
     run, rise = (right - left).T
@@ -111,7 +114,7 @@ def _chains(start: Array, end: Array, value: Array, rows: int, columns: int) -> 
     value = value * np.hypot(1, slope)
     first = np.ceil(left[:, 0]).astype(int)
     lengths = np.maximum(np.floor(right[:, 0]).astype(int) - first + 1, 0)
-    total = np.zeros((rows + 2) * (columns + 2))  # with a frame, for the farther of the nearest two
+    total = np.zeros((rows + 2) * (columns + 2))  # with a frame of one pixel
     step = max(SAMPLES // columns, 1)
     for i in range(0, len(value), step):
         part = slice(i, i + step)
@@ -128,7 +131,7 @@ def _chains(start: Array, end: Array, value: Array, rows: int, columns: int) -> 
 
 
 def curves(segments: Segments, samples: int = 33) -> list[Array]:
-    """The boundaries as polylines, each as long as they follow one another; an arc is sampled at so many points."""
+    """The boundaries as polylines, joined where one starts at the end of the one before; `samples` points per arc."""
     places = points(segments, samples - 1 if segments.curved else 1)
     breaks = np.flatnonzero((segments.start[1:] != segments.end[:-1]).any(axis=1)) + 1
     return [np.concatenate([run[:, :-1].reshape(-1, 2), run[-1:, -1]]) for run in np.split(places, breaks)]

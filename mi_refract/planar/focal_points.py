@@ -1,4 +1,4 @@
-"""Where the rays of a planar scene come together: focal points and spot sizes."""
+"""Focal points and spot sizes of the rays that leave a planar scene."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .path_loop import REFLECT_BITS
 from .path_tree import Branches
+from .paths import REFLECT_BITS, Event
 from .scene_file import PlanarScene
-from .tracer import Array, Event
+from .segments import Array
 
 Point = tuple[float, float]
-PARALLEL = 1e-9  # sine of an angle: two lines below that have no crossing worth naming
-SYMMETRIC = 1e-3  # sine of an angle: by how much two rays may fail to be mirror images of one another
-STEEPEST = math.radians(89)  # off the mean direction: rays that still have a spot in a plane across it
+PARALLEL = 1e-9  # sine of the angle between two lines that count as parallel
+SYMMETRIC = 1e-3  # sine of the angle by which two rays may differ from mirror images of each other
+STEEPEST = math.radians(89)  # largest angle to the mean direction for which there is a spot
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Rays that leave together. Lengths are in the scene's units; None where there is no such thing.
+    """Focal points of rays that leave together. Lengths are in the scene's units; None where there is no such point.
 
     `focus`: the point of least RMS distance from all the rays' lines, `virtual` where it lies behind most of them.
     `spot`: where the rays' mean meets the plane across it in which their RMS distance from their centre, `rms`, is
@@ -42,7 +42,7 @@ class Spread:
 
 
 def spread(origins: Array, directions: Array) -> Spread:
-    """Of the lines through `origins` along unit `directions` (N × 2, N ≥ 1)."""
+    """The focus and spot of lines through `origins` along unit `directions` (N × 2, N ≥ 1)."""
     focus = closest_point(origins, directions)
     behind = focus is not None and bool(np.median(((focus - origins) * directions).sum(axis=1)) < 0)
     found = Spread(len(origins), _point(focus), behind)
@@ -56,7 +56,7 @@ def spread(origins: Array, directions: Array) -> Spread:
 def closest_point(origins: Array, directions: Array) -> Array | None:
     """The point of least squared distance from the lines: Σ nᵢ nᵢᵀ p = Σ nᵢ nᵢᵀ oᵢ, nᵢ across the i-th line.
 
-    None where all are parallel.
+    origins, directions: N × 2, unit directions. None where all are parallel.
     """
     centre = origins.mean(axis=0)
     across = _turned(directions)
@@ -67,7 +67,7 @@ def closest_point(origins: Array, directions: Array) -> Array | None:
 
 
 def crossing(origin: Array, direction: Array, other: Array, along: Array) -> Point | None:
-    """Of two lines; None where they are parallel."""
+    """Where two lines cross; None where they are parallel."""
     sine = _cross(direction, along)
     if abs(sine) <= PARALLEL:
         return None
@@ -75,7 +75,7 @@ def crossing(origin: Array, direction: Array, other: Array, along: Array) -> Poi
 
 
 def _spot(origins: Array, directions: Array) -> tuple[Array, Array] | None:
-    """The mean's place in the plane of least RMS spot, and how far from it each ray meets that plane."""
+    """The centre of the smallest RMS spot, and each ray's signed distance from it in the plane of the spot."""
     mean = directions.mean(axis=0)
     length = math.hypot(*mean)
     if length == 0 or (forward := directions @ mean / length).min() < math.cos(STEEPEST):
@@ -90,7 +90,7 @@ def _spot(origins: Array, directions: Array) -> tuple[Array, Array] | None:
         return arms @ across - slopes * (arms @ axis)
 
     if np.ptp(slopes) > PARALLEL:
-        for _ in range(2):  # the second time from near the spot: differences of small numbers lose nothing
+        for _ in range(2):  # again from near the spot, where differences lose no digits
             y = heights()
             # var(y + s slope) is least at s = −cov(y, slope)/var(slope)
             centre = centre + across * y.mean() - axis * (y @ lean / (lean @ lean))
@@ -103,7 +103,7 @@ def _spot(origins: Array, directions: Array) -> tuple[Array, Array] | None:
 
 @dataclass(frozen=True)
 class Group:
-    """Rays of a colour and beam that met a boundary and escaped, by their partial reflections, as bits."""
+    """Rays of one colour, beam and set of partial reflections (`reflect`, bits) that met a boundary and escaped."""
 
     colour: str
     beam: int
@@ -112,7 +112,7 @@ class Group:
 
 
 def groups(scene: PlanarScene, traced: Sequence[Branches]) -> list[Group]:
-    """By colour, beam and partial reflections. Rays from different sides of a shape are in one group all the same."""
+    """The escaped rays, grouped by colour, beam and partial reflections, on whatever side of a shape they leave."""
     return [
         Group(colour, beam, reflect, _of_group(scene, branches, np.flatnonzero(inside)))
         for colour, branches in zip(scene.colours, traced, strict=True)
@@ -139,7 +139,7 @@ def _of_group(scene: PlanarScene, branches: Branches, members: NDArray[np.intp])
 
 
 def _pairs(scene: PlanarScene, rays: NDArray[np.intp], directions: Array) -> Iterator[tuple[int, int]]:
-    """Mirror images, from the outermost inward: as many rays from either end of the beam, and deflected oppositely."""
+    """Pairs of mirror images, from the outermost inward: equally far from the beam's ends, oppositely deflected."""
     beam = np.flatnonzero(scene.beams == scene.beams[rays[0]])
     known = {ray: i for i, ray in enumerate(rays.tolist())}
     deflection = _cross(scene.directions[rays], directions)
@@ -151,7 +151,7 @@ def _pairs(scene: PlanarScene, rays: NDArray[np.intp], directions: Array) -> Ite
 
 
 def table(found: Sequence[Group]) -> str:
-    """One line per group."""
+    """A table in plain text, one line per group."""
     heads = ("colour", "beam", "reflected at", "rays", "focus", "spot at", "rms", "largest", "marginal", "paraxial")
     lines = [heads, *(_cells(group) for group in found)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(heads))]
@@ -169,7 +169,7 @@ def _cells(group: Group) -> tuple[str, ...]:
 def _text(value: Point | float | None) -> str:
     if value is None:
         return "–"
-    if isinstance(value, tuple):  # a coordinate that is 0 but for roundoff is 0
+    if isinstance(value, tuple):  # 0 up to roundoff is 0
         return ", ".join(_text(x if abs(x) > 1e-12 * max(map(abs, value)) else 0.0) for x in value)
     return f"{value:.6g}"
 

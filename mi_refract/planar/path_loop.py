@@ -1,220 +1,253 @@
-"""The loop behind `planar.trace`: from boundary to boundary, by Snell's law at each."""
+"""The loop of `planar.trace`: find the next boundary, refract or reflect there by Snell's law, repeat."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from mi_refract.formulas import FORMULAS, fresnel, refract_2d
+from mi_refract.numerics import Mask, Number
 
-from .array_backend import Lanes, negated
-from .intersect_segments import NOWHERE, Hit, Ray, Straight, cross
-from .mesh_acceleration import BACK, Extrusion, SearchState
+from .array_backend import ArrayBackend, Index, Scatter, Vector2, negated
+from .intersect_segments import NOWHERE, Hit, LineSegments, Ray, cross
+from .mesh_acceleration import BACK, MeshAcceleration, SearchState
+from .paths import REFLECT_BITS, Event
+from .segments import Array
 
-REFLECT_BITS = 32
-
-
-class Event(IntEnum):
-    """What became of a ray at a boundary, and how its path ended."""
-
-    NONE = 0  # after the end
-    REFRACTED = 1
-    REFLECTED = 2
-    ESCAPED = 3  # no boundary left to meet
-    MAX_DEPTH = 4  # `max_depth` boundaries met, and another one ahead
-    MEDIUM_MISMATCH = 5  # met a boundary whose near side is not the ray's medium
+Refraction = Callable[[Vector2, Vector2, Number], tuple[Vector2, Mask]]  # (d, line, k) → direction, transmitted
 
 
 @dataclass
 class PathState:
-    """Of a lane: its ray, the index of its medium (NaN: unknown), its share of the power, boundaries met.
+    """State of a ray: where it is, the index of its medium (NaN: unknown), its share of the power, boundaries met.
 
-    `look`: how far it has been looked for the next one.
+    search: how far it has been searched for the next boundary.
     """
 
     ray: Ray
-    index: Any
-    power: Any
-    depth: Any
-    look: SearchState
-    active: Any
+    index: Number
+    power: Number
+    depth: Index
+    search: SearchState
+    active: Mask
 
 
-class Walker:
-    """Rays between `boundaries` with media of index (left, right)."""
+@dataclass(frozen=True)
+class Run:
+    """What all rays of a call have in common.
+
+    mirrored: per ray, the bits of `reflect`; None for all 0. scatter: writes to the output buffers.
+    """
+
+    mirrored: Index | None
+    max_depth: int
+    scatter: Scatter
+    weights: bool
+
+
+class PathLoop:
+    """Follows rays through `boundaries`; `media`: M × 2, the index on the left and on the right of each."""
 
     def __init__(
-        self, to: Lanes, boundaries: Straight, mesh: Extrusion | None, media: Any, formula: str | None
+        self,
+        arrays: ArrayBackend,
+        boundaries: LineSegments,
+        mesh: MeshAcceleration | None,
+        media: Array,
+        formula: str | None,
     ) -> None:
-        self.to, self.boundaries, self.mesh, self.media = to, boundaries, mesh, to.table(_ratios(media))
-        self.refract = _refraction(to, formula)
+        """`mesh`: what finds the next boundary; None: try all. `formula`: as for `planar.trace`."""
+        self.arrays, self.boundaries, self.mesh, self.media = arrays, boundaries, mesh, arrays.table(_ratios(media))
+        self.refract = _refraction(arrays, formula)
 
     def __call__(
-        self, origins: Any, directions: Any, index: Any, mirrored: Any, max_depth: int, weights: bool
-    ) -> dict[str, Any]:
-        """The fields of `planar.Paths`, rows of depths; `index` and `mirrored` may be None."""
-        to, count, legs = self.to, len(origins), max_depth + 1
+        self,
+        origins: Array,
+        directions: Array,
+        index: Array | None,
+        mirrored: np.ndarray | None,
+        max_depth: int,
+        weights: bool,
+    ) -> dict[str, np.ndarray]:
+        """The fields of `planar.Paths`, with the depth as their first axis.
+
+        origins, directions: N × 2. index: N, of the medium in which rays start; None: unknown. mirrored: N, `reflect`.
+        """
+        arrays = self.arrays
         if self.mesh:
             self.mesh.expect(origins, directions)
-        rays = [to.table(x) for x in (origins, directions)]
-        others = [None if x is None else to.table(x) for x in (index, mirrored)]
-        buffers = {
-            "points": to.buffer(to.number, np.nan, (legs, count, 2)),
-            "directions": to.buffer(to.number, np.nan, (1, count, 2)),
-            "hits": to.buffer(to.signed, -1, (max_depth, count)),
-            "events": to.buffer(to.byte, int(Event.NONE), (legs, count)),
-        }
-        if weights:
-            buffers |= {name: to.buffer(to.number, np.nan, (legs, count)) for name in ("indices", "weights")}
+        rays = [arrays.table(x) for x in (origins, directions)]
+        others = [None if x is None else arrays.table(x) for x in (index, mirrored)]
 
-        def work(lane: Any, scatter: Callable[..., None]) -> None:
-            p, d = (to.gather(table, lane) for table in rays)
-            index, bits = (None if table is None else to.gather(table, lane) for table in others)
+        def work(lane: Index, scatter: Scatter) -> None:
+            p, d = (arrays.gather(table, lane) for table in rays)
+            index, bits = (None if table is None else arrays.gather(table, lane) for table in others)
             scatter("points", 0, p, True)
-            walk = self._start(p, d, to.number(dr.nan) if index is None else index)
-            scatter("directions", 0, _unit(self._follow(walk, bits, max_depth, scatter, weights).ray.d), True)
+            state = self._start(p, d, arrays.number(dr.nan) if index is None else index)
+            end = self._follow(state, Run(bits, max_depth, scatter, weights))
+            scatter("directions", 0, _unit(end.ray.d), True)
 
-        return to.run(count, buffers, work)
+        return arrays.run(len(origins), self._buffers(len(origins), max_depth, weights), work)
 
-    def _start(self, p: Any, d: Any, index: Any) -> PathState:
-        to, d = self.to, _unit(d)
-        p = self._entered(p, d)
-        slack = 4 * to.roundoff * (dr.abs(p.x) + dr.abs(p.y))
-        ray = Ray(p, d, to.index(NOWHERE), to.number(0.5), to.number(0.5), to.mask(False), slack)
-        return PathState(ray, index, to.number(1), to.index(0), self._look(-BACK), to.mask(True))
+    def _buffers(self, count: int, max_depth: int, weights: bool) -> dict[str, Any]:
+        arrays, legs = self.arrays, max_depth + 1
+        buffers = {
+            "points": arrays.buffer(arrays.number, np.nan, (legs, count, 2)),
+            "directions": arrays.buffer(arrays.number, np.nan, (1, count, 2)),
+            "hits": arrays.buffer(arrays.signed, -1, (max_depth, count)),
+            "events": arrays.buffer(arrays.byte, int(Event.NONE), (legs, count)),
+        }
+        names = ("indices", "weights") if weights else ()
+        return buffers | {name: arrays.buffer(arrays.number, np.nan, (legs, count)) for name in names}
 
-    def _entered(self, p: Any, d: Any) -> Any:
-        """The origin, or from outside the place where the ray enters a box around all boundaries, half as wide again.
+    def _start(self, p: Vector2, d: Vector2, index: Number) -> PathState:
+        arrays, d = self.arrays, _unit(d)
+        p = self._box_entry(p, d)
+        slack = 4 * arrays.roundoff * (dr.abs(p.x) + dr.abs(p.y))
+        half = arrays.number(0.5)
+        ray = Ray(p, d, arrays.index(NOWHERE), half, half, arrays.mask(False), slack)
+        return PathState(ray, index, arrays.number(1), arrays.index(0), self._search(-BACK), arrays.mask(True))
 
-        What is far away is rounded once, here, instead of in every difference from a vertex.
+    def _box_entry(self, p: Vector2, d: Vector2) -> Vector2:
+        """The origin, or where a ray from outside enters the box around all boundaries.
+
+        So a distant origin is rounded once, here, instead of in every difference from a vertex.
         """
-        low, high = (self.to.vector(*corner) for corner in self.boundaries.box)
+        low, high = (self.arrays.vector(*corner) for corner in self.boundaries.box)
         inverse = dr.rcp(dr.select(d == 0, 1e-30, d))
         a, b = (low - p) * inverse, (high - p) * inverse
         enter, leave = dr.max(dr.minimum(a, b)), dr.min(dr.maximum(a, b))
         return dr.select((enter > 0) & (enter < leave), dr.fma(d, enter, p), p)
 
-    def _follow(
-        self, walk: PathState, mirrored: Any, max_depth: int, scatter: Callable[..., None], weights: bool
-    ) -> PathState:
-        def step(walk: PathState) -> tuple[PathState]:
-            return (self._step(walk, mirrored, max_depth, scatter, weights),)
+    def _follow(self, state: PathState, run: Run) -> PathState:
+        def step(state: PathState) -> tuple[PathState]:
+            return (self._step(state, run),)
 
-        return dr.while_loop((walk,), lambda walk: walk.active, step, label="planar")[0]
+        return dr.while_loop((state,), lambda state: state.active, step, label="planar")[0]
 
-    def _step(
-        self, walk: PathState, mirrored: Any, max_depth: int, scatter: Callable[..., None], weights: bool
-    ) -> PathState:
-        """One look for the next boundary, and off it if there it is."""
-        hit, look, settled = self._nearest(walk.ray, walk.look, walk.active)
-        active = walk.active & settled
+    def _step(self, state: PathState, run: Run) -> PathState:
+        """Search once for the next boundary, and cross it if it is found."""
+        hit, search, settled = self._nearest(state.ray, state.search, state.active)
+        active = state.active & settled
         some = active & (hit.segment != NOWHERE)
-        self._leg(scatter, walk, int(Event.ESCAPED), walk.index, active & negated(some), weights)
-        rest = PathState(walk.ray, walk.index, walk.power, walk.depth, look, walk.active & negated(settled))
+        self._write_leg(run, state, int(Event.ESCAPED), state.index, active & negated(some))
+        rest = PathState(state.ray, state.index, state.power, state.depth, search, state.active & negated(settled))
 
-        def across(walk: PathState, hit: Hit, rest: PathState) -> PathState:
-            return self._cross(walk, hit, mirrored, max_depth, scatter, weights)
+        def across(state: PathState, hit: Hit, rest: PathState) -> PathState:
+            return self._cross(state, hit, run)
 
-        def on(walk: PathState, hit: Hit, rest: PathState) -> PathState:
+        def on(state: PathState, hit: Hit, rest: PathState) -> PathState:
             return rest
 
-        # A branch, since all rays of a beam leave together.
-        return dr.if_stmt((walk, hit, rest), some, across, on, label="boundary")
+        # A branch, not a select: neighbouring rays mostly find their boundaries in the same step.
+        return dr.if_stmt((state, hit, rest), some, across, on, label="boundary")
 
-    def _leg(
-        self, scatter: Callable[..., None], walk: PathState, event: Any, index: Any, active: Any, weights: bool
-    ) -> None:
-        """A leg and how it ends."""
-        scatter("events", walk.depth, event, active)
-        if weights:
-            scatter("indices", walk.depth, index, active)
-            scatter("weights", walk.depth, walk.power, active)
+    def _write_leg(self, run: Run, state: PathState, event: Any, index: Number, active: Mask) -> None:
+        """Write a leg and the event at its end."""
+        run.scatter("events", state.depth, event, active)
+        if run.weights:
+            run.scatter("indices", state.depth, index, active)
+            run.scatter("weights", state.depth, state.power, active)
 
-    def _cross(
-        self, walk: PathState, hit: Hit, mirrored: Any, max_depth: int, scatter: Callable[..., None], weights: bool
-    ) -> PathState:
-        """Off the boundary that is met."""
-        to, d, j = self.to, walk.ray.d, walk.depth
-        left, right, to_right, to_left = to.gather(self.media, hit.segment)
+    def _cross(self, state: PathState, hit: Hit, run: Run) -> PathState:
+        """The state after the boundary that is met."""
+        arrays, d, j = self.arrays, state.ray.d, state.depth
+        left, right, to_right, to_left = arrays.gather(self.media, hit.segment)
         near, far = dr.select(hit.to_left, right, left), dr.select(hit.to_left, left, right)
         k = dr.select(hit.to_left, to_left, to_right)
-        index = dr.select(dr.isnan(walk.index), near, walk.index)
-        p, l = self.boundaries.place(hit)  # noqa: E741 (the document's name)
-        b, through = self.refract(d, l, k)
-        if mirrored is not None:
-            forced = through & (j < REFLECT_BITS) & ((mirrored >> dr.minimum(j, REFLECT_BITS - 1)) & 1 == 1)
-            b, through = dr.select(forced, _mirrored(d, l), b), through & negated(forced)
+        index = dr.select(dr.isnan(state.index), near, state.index)
+        p, line = self.boundaries.place(hit)
+        b, through = self._turn(d, line, k, j, run.mirrored)
         event = dr.select(through, int(Event.REFRACTED), int(Event.REFLECTED))
         event = dr.select(near == index, event, int(Event.MEDIUM_MISMATCH))
-        met = j < max_depth
-        self._leg(scatter, walk, dr.select(met, event, int(Event.MAX_DEPTH)), index, True, weights)
-        scatter("points", j + 1, p, met)
-        scatter("hits", j, hit.segment, met)
+        met = j < run.max_depth
+        self._write_leg(run, state, dr.select(met, event, int(Event.MAX_DEPTH)), index, True)
+        run.scatter("points", j + 1, p, met)
+        run.scatter("hits", j, hit.segment, met)
         on = met & (near == index)
-        ray = Ray(p, dr.select(on, b, d), hit.segment, hit.s, hit.r, hit.to_left == through, to.number(0))
-        power = walk.power * _share(d, l, k, through) if weights else walk.power
-        return PathState(ray, dr.select(through, far, index), power, j + 1, self._look(0), on)
+        ray = Ray(p, dr.select(on, b, d), hit.segment, hit.s, hit.r, hit.to_left == through, arrays.number(0))
+        power = state.power * _share(d, line, k, through) if run.weights else state.power
+        return PathState(ray, dr.select(through, far, index), power, j + 1, self._search(0), on)
 
-    def _look(self, gone: float) -> SearchState:
-        return SearchState(self.to.number(gone), self.to.index(NOWHERE))
+    def _turn(
+        self,
+        d: Vector2,
+        line: Vector2,
+        k: Number,
+        j: Index,
+        mirrored: Index | None,
+    ) -> tuple[Vector2, Mask]:
+        """The direction after the j-th boundary, and whether the ray goes through it."""
+        b, through = self.refract(d, line, k)
+        if mirrored is None:
+            return b, through
+        forced = through & (j < REFLECT_BITS) & ((mirrored >> dr.minimum(j, REFLECT_BITS - 1)) & 1 == 1)
+        return dr.select(forced, _mirrored(d, line), b), through & negated(forced)
 
-    def _nearest(self, ray: Ray, look: SearchState, active: Any) -> tuple[Hit, SearchState, Any]:
-        """The first boundary ahead, if it is certain after this look."""
+    def _search(self, gone: float) -> SearchState:
+        return SearchState(self.arrays.number(gone), self.arrays.index(NOWHERE))
+
+    def _nearest(self, ray: Ray, search: SearchState, active: Mask) -> tuple[Hit, SearchState, Mask]:
+        """The first boundary ahead, and whether that is settled or the search must go on."""
         start = self.boundaries.start(ray)
         if self.mesh:
-            return self.mesh.nearest(self.boundaries, ray, start, look, active)
+            return self.mesh.nearest(self.boundaries, ray, start, search, active)
 
-        def test(i: Any, best: Hit) -> tuple[Any, Hit]:
+        def test(i: Index, best: Hit) -> tuple[Index, Hit]:
             return i + 1, self.boundaries.nearer(best, ray, start, i)
 
-        first = self.to.index(0), self.boundaries.none()
+        first = self.arrays.index(0), self.boundaries.none()
         more = lambda i, best: active & (i < self.boundaries.count)  # noqa: E731
-        return dr.while_loop(first, more, test, label="boundaries")[1], look, self.to.mask(True)
+        return dr.while_loop(first, more, test, label="boundaries")[1], search, self.arrays.mask(True)
 
 
-def _ratios(media: Any) -> Any:
-    """The indices on the left and on the right, and k from left to right and back, of the indices before rounding."""
+def _ratios(media: Array) -> Array:
+    """M × 4: the indices on the left and on the right, k from left to right and from right to left.
+
+    The ratios are of the indices in float64, before they are rounded.
+    """
     left, right = media.T
     return np.column_stack([left, right, left / right, right / left])
 
 
-def _unit(v: Any) -> Any:
+def _unit(v: Vector2) -> Vector2:
     return v * dr.rsqrt(dr.squared_norm(v))
 
 
-def _mirrored(d: Any, l: Any) -> Any:  # noqa: E741
-    c = 2 * cross(l, d)
-    return type(d)(d.x + c * l.y, d.y - c * l.x)
+def _mirrored(d: Vector2, line: Vector2) -> Vector2:
+    c = 2 * cross(line, d)
+    return type(d)(d.x + c * line.y, d.y - c * line.x)
 
 
-def _share(d: Any, l: Any, k: Any, through: Any) -> Any:  # noqa: E741
-    """Of the power, what goes the way that is taken."""
-    cos_i = dr.minimum(dr.abs(cross(l, d)), 1)
+def _share(d: Vector2, line: Vector2, k: Number, through: Mask) -> Number:
+    """The share of the power that goes the way that the ray takes: Fresnel's T where it goes through, R otherwise."""
+    cos_i = dr.minimum(dr.abs(cross(line, d)), 1)
     cos_t, transmitted = fresnel.refracted_cosine(cos_i, k)
     r, t = fresnel.powers(cos_i, cos_t, transmitted, k)
     return dr.select(through, t, r)
 
 
-def _refraction(to: Lanes, formula: str | None) -> Callable[..., tuple[Any, Any]]:
-    """(d, l, k) → (direction, transmitted): the core of document 004, or a formula by name, in the plane z = 0."""
+def _refraction(arrays: ArrayBackend, formula: str | None) -> Refraction:
+    """The planar formula of document 004, or one of FORMULAS in the plane z = 0. ValueError for an unknown name."""
     if formula is None:
 
-        def planar(d: Any, l: Any, k: Any) -> tuple[Any, Any]:  # noqa: E741
-            b, transmitted = refract_2d(d, l, k)
-            return to.vector(*b), transmitted  # as long as `d`, to u
+        def planar(d: Vector2, line: Vector2, k: Number) -> tuple[Vector2, Mask]:
+            b, transmitted = refract_2d(d, line, k)
+            return arrays.vector(*b), transmitted  # of the length of `d`, to u
 
         return planar
     if formula not in FORMULAS:
         raise ValueError(f"formula = {formula!r}: unknown; accepted: {', '.join(FORMULAS)}")
 
-    def spatial(d: Any, l: Any, k: Any) -> tuple[Any, Any]:  # noqa: E741
+    def spatial(d: Vector2, line: Vector2, k: Number) -> tuple[Vector2, Mask]:
         zero = 0 * d.x
-        b, transmitted = FORMULAS[formula].unchecked(to.vector3(d.x, d.y, zero), to.vector3(-l.y, l.x, zero), k)
-        return _unit(to.vector(b.x, b.y)), transmitted
+        b, transmitted = FORMULAS[formula].unchecked(
+            arrays.vector3(d.x, d.y, zero), arrays.vector3(-line.y, line.x, zero), k
+        )
+        return _unit(arrays.vector(b.x, b.y)), transmitted
 
     return spatial

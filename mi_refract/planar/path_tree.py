@@ -1,4 +1,4 @@
-"""What becomes of the rays of a planar scene: the tree of paths into which partial reflections split each of them."""
+"""Paths of the rays of a planar scene: partial reflections split each ray into a tree of paths."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .path_loop import REFLECT_BITS
+from .paths import REFLECT_BITS, Event, Paths
 from .scene_file import PlanarScene
-from .tracer import Array, Event, Paths, Segments, Tracer
+from .segments import Array, Segments
+from .tracer import Tracer
 
-LEAST = 1e-3  # of a ray's power: a partial reflection that would carry no more is not followed
-MOST = 2**25  # legs of paths with as many partial reflections: 1.3 GB
+LEAST = 1e-3  # share of a ray's power: partial reflections that carry no more are not followed
+MOST = 2**25  # legs at a time: 1.3 GB
 
 
 @dataclass(frozen=True)
 class Branches:
-    """P paths of N rays, by their number of partial reflections. `paths` has their weights.
+    """P paths of N rays, sorted by the number of their partial reflections.
 
-    `rays` P: the ray's number. `reflect` P: bit j is set where the path takes the partial reflection at the j-th
-    boundary it meets; no two paths of a ray have the same bits.
+    paths: with weights and indices. rays: P, the number of each path's ray. reflect: P, bit j is set where the path
+    takes the partial reflection at the j-th boundary it meets; no two paths of a ray have the same bits.
     """
 
     paths: Paths
@@ -38,12 +39,12 @@ class Branches:
 
     @property
     def first(self) -> NDArray[np.intp]:
-        """P: the first leg that is the path's own. The ones before it belong to another path of the same ray."""
+        """P: the number of the first leg that is the path's own; those before belong to another path of the ray."""
         return np.frexp(self.reflect.astype(float))[1].astype(np.intp)
 
     @property
     def own(self) -> NDArray[np.bool_]:
-        """P × (D+1): whether a leg, and the event at its end, is there and is the path's own."""
+        """P × (D+1): whether there is a leg and it is the path's own, with the event at its end."""
         events = self.paths.events
         return (events != Event.NONE) & (np.arange(events.shape[1]) >= self.first[:, None])
 
@@ -59,7 +60,7 @@ class Branches:
 
     @property
     def tips(self) -> Array:
-        """P × 2: the last place where the path met a boundary, or its origin."""
+        """P × 2: where the path met its last boundary, or its origin."""
         places = np.isfinite(self.paths.points[..., 0]).sum(axis=1)
         return self.paths.points[np.arange(len(self.rays)), places - 1]
 
@@ -74,10 +75,10 @@ def follow(
     least: float = LEAST,
     **how: Any,
 ) -> Branches:
-    """Paths with up to `branches` partial reflections, of a share of more than `least` of the power each.
+    """Follow rays (N × 2) with up to `branches` partial reflections, each of more than `least` of the ray's power.
 
-    `how`: formula, precision, backend, as for `planar.trace`. A path reflects in part at its first 32 boundaries only.
-    ValueError as there, for a negative number of branches, and for more paths than memory should hold.
+    how: formula, precision, backend, as for `planar.trace`. Only the first 32 boundaries of a path reflect in part.
+    ValueError as there, for a negative number of branches, and for more than MOST legs.
     """
     if branches < 0:
         raise ValueError(f"branches = {branches}: accepted: a whole number from 0")
@@ -101,15 +102,15 @@ def _check_size(paths: int, max_depth: int, reflections: int) -> None:
 
 
 def follow_scene(scene: PlanarScene, **how: Any) -> tuple[Branches, ...]:
-    """The paths of a scene, for each of its colours; see `follow`."""
+    """The paths of a scene, one `Branches` per colour; `how` and errors as for `follow`."""
     rays = scene.origins, scene.directions, scene.max_depth, scene.branches
     return tuple(follow(segments, *rays, **how) for segments in scene.segments)
 
 
 def with_rays(scene: PlanarScene, count: int) -> PlanarScene:
-    """Every beam of several rays with `count` of them, at places and angles between those that it has.
+    """The scene with `count` rays in each beam that has several, by interpolating their places and angles.
 
-    ValueError for more than `follow` takes.
+    ValueError for more rays than `follow` accepts.
     """
     sizes = np.bincount(scene.beams)
     _check_size(int(np.where(sizes > 1, count, sizes).sum()), scene.max_depth, 0)
@@ -142,11 +143,11 @@ def _joined(orders: Sequence[Branches]) -> Branches:
     return Branches(Paths(**columns), rays, reflect)
 
 
-# In words and numbers --------------------------------------------------------------------------------------------
+# Summaries -------------------------------------------------------------------------------------------------------
 
 
 def count(traced: Sequence[Branches]) -> Counter[str]:
-    """Events by name, each once though it be on several paths; REFLECTED are those that leave no choice."""
+    """Number of events by name. Legs that several paths share count once; REFLECTED counts total reflections only."""
     total: Counter[str] = Counter()
     for branches in traced:
         events = branches.paths.events[branches.own]
@@ -155,7 +156,7 @@ def count(traced: Sequence[Branches]) -> Counter[str]:
 
 
 def summary(scene: PlanarScene, traced: Sequence[Branches]) -> str:
-    """One line: how many rays, and what became of them; what did not happen is left out."""
+    """One line: the number of rays and of each event; events that did not happen are left out."""
     n = count(traced)
     rays, paths = len(scene.origins), sum(len(branches.rays) for branches in traced)
     colours = f" in {len(traced)} colours" if len(traced) > 1 else ""
@@ -176,7 +177,7 @@ def _plural(number: int, what: str) -> str:
 
 
 def as_data(scene: PlanarScene, traced: Sequence[Branches]) -> dict[str, Any]:
-    """What `mi-refract trace --json` prints: per colour the paths, each as long as it is; null for what is unknown."""
+    """What `mi-refract trace --json` prints: the paths per colour, without padding; null for unknown numbers."""
     colours = zip(scene.colours, traced, strict=True)
     return {
         "scene": str(scene.path),

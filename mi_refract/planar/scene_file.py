@@ -1,4 +1,4 @@
-"""Planar scenes in TOML files: shapes, the media between them, and the rays to follow."""
+"""Reads planar scenes from TOML files: shapes, their media, and the rays to follow."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from mi_refract.io.toml_schema import read, shown
 from .curves import affine
 from .scene_schema import BEAMS, SCENE, SHAPES, Part
 from .scene_values import Indices, per_colour, read_kind
+from .segments import Array, Segments
 from .shared_boundaries import Named, boundaries
-from .tracer import Array, Segments
 
 
 @dataclass(frozen=True)
 class Region:
-    """A closed outline (K × 2, counter-clockwise, arcs sampled finely enough to look smooth) and the index inside."""
+    """A closed outline (K × 2, counter-clockwise, arcs as short chords) and the index inside, for drawing."""
 
     outline: Array
     indices: tuple[float, ...]  # one per colour
@@ -29,13 +29,13 @@ class Region:
 
 @dataclass(frozen=True)
 class PlanarScene:
-    """What a scene file says, ready for `planar.trace` (once per colour) and for an image.
+    """What a scene file says, ready for `planar.trace` (once per colour) and for a figure.
 
-    `colours`: one entry per wavelength, matplotlib's names of colours; ("",) where there is no dispersion.
-    `segments`: one per colour, the same geometry with other indices. `regions`: in drawing order, inner ones later.
+    `colours`: one of matplotlib's names per wavelength; ("",) where there is no dispersion.
+    `segments`: one per colour, the same geometry with other indices. `regions`: in drawing order, inner ones last.
     `index`: of the medium around everything, per colour. `origins`, `directions`: N × 2, directions of length 1;
     `beams`: N, the number of the `[[beam]]` (from 0) that a ray belongs to. `branches`: the most partial reflections
-    on a path; 0: refracted wherever possible. `view`: x0, x1, y0, y1; None: whatever holds the shapes.
+    on a path; 0: rays are refracted wherever possible. `view`: x0, x1, y0, y1; None: all shapes.
     """
 
     path: Path
@@ -53,9 +53,10 @@ class PlanarScene:
 
 
 def load(path: str | Path) -> PlanarScene:
-    """Read a scene file. Shapes and beams count from 0 in its errors.
+    """Read a scene file.
 
-    ValueError, one line with file and key, for what it cannot be; OSError as the system raises it.
+    ValueError, one line that names file and key (shapes and beams count from 0), for anything that is no scene;
+    OSError for a file that cannot be read.
     """
     path = Path(path)
     content = path.read_bytes()
@@ -69,7 +70,7 @@ def _parsed(content: bytes) -> dict[str, Any]:
     try:
         return tomllib.loads(content.decode())
     except UnicodeDecodeError as error:
-        raise ValueError(f"byte {error.start} is no UTF-8; accepted: TOML") from None
+        raise ValueError(f"byte {error.start} is not UTF-8; accepted: TOML") from None
     except RecursionError:
         raise ValueError("brackets nested too deeply; accepted: TOML") from None
     except tomllib.TOMLDecodeError as error:
@@ -99,7 +100,7 @@ def _scene(path: Path, table: dict[str, Any]) -> PlanarScene:
     )
 
 
-FARTHEST = 1e100  # of all coordinates: products of two stay numbers
+FARTHEST = 1e100  # of all coordinates: products of two do not overflow
 
 
 def _parts(tables: list[dict[str, Any]], ambient: Indices, colours: int) -> list[Named]:

@@ -1,4 +1,4 @@
-"""What a planar scene file may hold: one table of kinds and keys, and what is built of them."""
+"""What a planar scene file may hold: one table of kinds and keys, and how their curves and rays are built."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from .scene_values import (
     Kind,
     kind_table,
 )
-from .tracer import Array
+from .segments import Array
 
 
 class Part(NamedTuple):
@@ -176,7 +176,7 @@ SHAPES = {
 
 
 def _spread(first: Any, last: Any, count: int) -> Array:
-    """Evenly from the first to the last; one is in the middle. What falls on whole numbers is exact."""
+    """`count` values evenly from the first to the last; a single one is in the middle. Whole numbers stay exact."""
     if count == 1:
         return np.array([(first + last) / 2])
     steps = np.arange(count).reshape(-1, *[1] * np.ndim(first))
@@ -229,7 +229,7 @@ BEAMS = {
 
 
 def reference() -> str:
-    """All kinds and keys as tables in Markdown, for the README."""
+    """All kinds and keys as tables in Markdown: what `mi-refract trace --keys` prints."""
     shared = SOLID | PLACE | FACETS
     parts = [key_table("key of the scene", SCENE), key_table("key of a shape", shared)]
     parts += [

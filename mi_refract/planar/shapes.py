@@ -1,6 +1,6 @@
-"""Shapes in the plane by their usual parameters: polygons, circles, ellipses, prisms, and lenses of conic surfaces.
+"""Shapes in the plane by their usual parameters: polygons, circles, ellipses, prisms, lenses of conic surfaces.
 
-Each is a `Curve` around its own origin; `mapped` stretches, turns and moves it. Lengths are above 0.
+Each is a `Curve` around its own origin; `Curve.mapped` stretches, turns and moves it. All lengths are above 0.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from .curves import Curve, affine, area, joined, polygonal, unit
-from .tracer import Array
+from .segments import Array
 
-# 1 − (1 + K) c² r² within so much of 0 is 0: the rim of a half sphere, whose curvature is a rounded 1/R.
+# 1 − (1 + K) c² r² counts as 0 up to this: at the rim of a half sphere, whose curvature is 1/R rounded.
 FLAT = 8 * 2.0**-53
 
 
 def polyline(points: Any, arcs: Sequence[float] | None = None) -> Curve:
-    """From point to point (K × 2). `arcs`: degrees by which each piece turns left, a circle's arc; 0: straight.
+    """An open curve from point to point (K × 2). `arcs`: degrees by which each piece turns left, a circle; 0: straight.
 
     ValueError for fewer than 2 points, another number of pieces, or |degrees| ≥ 360.
     """
@@ -27,9 +27,9 @@ def polyline(points: Any, arcs: Sequence[float] | None = None) -> Curve:
 
 
 def polygon(points: Any, arcs: Sequence[float] | None = None) -> Curve:
-    """The same, closed by one more piece from the last point to the first; turned counter-clockwise where it is not.
+    """The same, closed by one more piece from the last point to the first; reversed where it runs clockwise.
 
-    ValueError as for `polyline`, and for a polygon without area. Whether it crosses itself is not looked at.
+    ValueError as for `polyline`, and for a polygon without area. It is not checked whether the polygon crosses itself.
     """
     curve = _chain(points, arcs, closed=True)
     size = area(curve)
@@ -72,25 +72,25 @@ def _arc(p: Array, q: Array, turn: float) -> Iterable[tuple[Array, Array, float]
 
 
 def ellipse(rx: float, ry: float) -> Curve:
-    """Around the origin, with these half axes along x and y: four arcs whose vertices and controls are exact."""
+    """An ellipse around the origin with half axes `rx`, `ry`: four arcs whose vertices and controls are exact."""
     vertices = np.array([(rx, 0.0), (0.0, ry), (-rx, 0.0), (0.0, -ry)])
     control = np.array([(rx, ry), (-rx, ry), (-rx, -ry), (rx, -ry)], float)
     return Curve(vertices, control, np.full(4, math.sqrt(0.5)), closed=True)
 
 
 def circle(radius: float) -> Curve:
-    """Around the origin."""
+    """A circle around the origin."""
     return ellipse(radius, radius)
 
 
 def rectangle(width: float, height: float) -> Curve:
-    """Around the origin."""
+    """A rectangle around the origin, `width` along x and `height` along y."""
     x, y = width / 2, height / 2
     return polygon([(-x, -y), (x, -y), (x, y), (-x, y)])
 
 
 def prism(apex: float, side: float) -> Curve:
-    """A triangle with its apex up, of `apex` degrees between two sides of length `side`; centroid at the origin."""
+    """A triangle with `apex` degrees at its top, between two sides of length `side`; centroid at the origin."""
     cosine, sine = unit(apex / 2)
     x, y = side * sine, side * cosine / 3
     return polygon([(-x, -y), (x, -y), (0.0, 2 * y)])
@@ -100,7 +100,7 @@ def prism(apex: float, side: float) -> Curve:
 
 
 def sag(r: Any, curvature: float, conic: float = 0.0) -> Any:
-    """z = c r² / (1 + √(1 − (1 + K) c² r²)); NaN where the surface does not reach."""
+    """z = c r² / (1 + √(1 − (1 + K) c² r²)), `curvature` c and conic constant K; NaN for r beyond the surface."""
     r = np.asarray(r, float)
     square = 1 - (1 + conic) * (curvature * r) ** 2
     square = np.where(np.abs(square) <= FLAT, 0.0, square)
@@ -127,10 +127,10 @@ def lens(
     conic: Sequence[float] = (0.0, 0.0),
     vertex: float = 0.0,
 ) -> Curve:
-    """Two conic surfaces on the x axis, `curvature` and conic constant of each, with a rim at ±`radius`.
+    """A lens of two conic surfaces around the x axis, with `curvature` and `conic` constant of each; rim at ±`radius`.
 
     Curvatures are positive where the centre lies toward +x. The front surface passes through (`vertex`, 0), the
-    other through (`vertex` + `thickness`, 0). Without a radius the lens ends in the tips in which they meet.
+    other through (`vertex` + `thickness`, 0). Without a radius the lens ends where they meet.
     ValueError where a surface does not reach the rim, or they meet before it, or never.
     """
     if radius is None:
@@ -151,7 +151,7 @@ def lens(
 
 
 def _tip(curvature: Sequence[float], thickness: float, conic: Sequence[float]) -> tuple[float, float]:
-    """(z, r) of the nearest point off the axis in which the surfaces meet; ValueError where they never do.
+    """(z, r) of the nearest point off the axis where the surfaces meet; ValueError where they never meet.
 
     Both obey c r² = 2 z − c (1 + K) z², the other one with z − thickness for z. Without r² that is a quadratic in z.
     """
@@ -165,7 +165,7 @@ def _tip(curvature: Sequence[float], thickness: float, conic: Sequence[float]) -
     for z in places:
         c, k, depth = (c1, k1, z) if abs(c1) >= abs(c2) else (c2, k2, z - t)
         square = 2 * depth / c - k * depth * depth if c else 0.0
-        # On the near half of either conic only: the sag knows no other.
+        # Only on the near half of both conics, which the sag describes.
         if square > 0 and 1 - c1 * k1 * z >= -FLAT and 1 - c2 * k2 * (z - t) >= -FLAT:
             tips.append((math.sqrt(square), z))
     if not tips:
@@ -187,7 +187,7 @@ def ellipse_lens(n: float, focal_length: float, thickness: float, radius: float)
     return lens(curvature, thickness, radius=radius, conic=(-(eccentricity**2), 0.0), vertex=-focal_length)
 
 
-# Document 004's lens, in its own coordinates but for the place: its axis is y, its tips lie on x.
+# Document 004's lens in the document's coordinates, moved to the origin: its axis is y, its tips lie on x.
 LENS_INDEX = 4.4
 LENS_CURVATURE, LENS_HALF_WIDTH, LENS_CONIC, LENS_STRETCH = -0.04, 8.2, 1.9, 4.0
 
@@ -195,8 +195,8 @@ LENS_CURVATURE, LENS_HALF_WIDTH, LENS_CONIC, LENS_STRETCH = -0.04, 8.2, 1.9, 4.0
 def document_lens(resolution: float | None = None) -> Curve:
     """The lens of document 004: y = ±(k + sag(r)) with k = 8.2, c = −0.04, K = 1.9 and x = 4 r, around the origin.
 
-    The original draws chords at r = 0, `resolution`, … (0.05 there: 1172 of them) and leaves it open at the tips.
-    Here its last vertices are the tips, where the width is 0. Without a resolution: four exact arcs.
+    The document draws 1172 chords with ends at r = 0, `resolution`, … (0.05) and leaves the outline open at the tips.
+    Here the last vertices are the tips, where the width is 0. Without a resolution: four exact arcs.
     ValueError for a resolution that is not above 0.
     """
     if resolution is not None and not resolution > 0:
@@ -207,7 +207,7 @@ def document_lens(resolution: float | None = None) -> Curve:
     if resolution is None:
         return whole
     tip = float(np.abs(whole.vertices[:, 0]).max()) / LENS_STRETCH
-    # Summed up as the original sums them.
+    # Summed as the document sums them.
     r = np.cumsum([0.0, *[resolution] * math.ceil(tip / resolution)])
     r = r[r < tip][:-1]
     x, y = np.append(LENS_STRETCH * r, LENS_STRETCH * tip), np.append(k + sag(r, c, conic), 0.0)
@@ -218,7 +218,7 @@ def document_lens(resolution: float | None = None) -> Curve:
 
 
 def luneburg(radius: float, layers: int) -> list[tuple[Curve, float]]:
-    """Concentric circles, the largest first, and the index inside each over that outside of all.
+    """Concentric circles, the largest first, and for each its index inside over that around the lens.
 
     n(r) = √(2 − (r/R)²) in steps of equal n², each layer with the value in the middle of its n².
     """

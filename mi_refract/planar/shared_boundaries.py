@@ -1,4 +1,4 @@
-"""From shapes that touch to boundaries: what two of them share becomes one boundary between their media."""
+"""From shapes to boundaries: where two shapes touch, one boundary between their media."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .scene_schema import Part
-from .tracer import Array, Segments
+from .segments import Array, Segments
 
-# Points are one where neither coordinate differs by more than so much of the largest one.
+# Points are merged where both coordinates differ by at most this share of the largest coordinate.
 NEAR = 2.0**-44
 
-Named = tuple[str, Part]  # by what errors call it
+Named = tuple[str, Part]  # what errors call it, and a part
 Numbers = NDArray[np.intp]
 
 
 def boundaries(parts: list[Named]) -> tuple[Segments, ...]:
-    """All parts as boundaries, one set per colour, with the vertices that only rounding kept apart made one.
+    """All parts as boundaries, one set per colour; vertices that differ by rounding only are merged.
 
-    Where a closed part runs along one before it, there is one boundary: it fills its side of it, which was its
-    outside. So shapes are cemented, and touch from inside what they lie in. ValueError where it was not.
+    Where a closed part runs along an earlier one, they share one boundary, with the inside of the later part on the
+    side where its outside was. So shapes can be cemented, and can touch the shape they lie in from within.
+    ValueError where that side has another index than the part's outside, and for a part too small to keep.
     """
     curves = [part.curve for _, part in parts]
     owner = np.repeat(np.arange(len(parts)), [len(curve) for curve in curves])
@@ -46,14 +47,14 @@ def boundaries(parts: list[Named]) -> tuple[Segments, ...]:
 
 
 def _present(parts: list[Named], pieces: NDArray[Any], largest: float) -> None:
-    """ValueError for a part of which rounding leaves nothing."""
+    """ValueError for a part of which merging leaves no piece."""
     for (name, _), left in zip(parts, pieces, strict=True):
         if not left:
             raise ValueError(f"{name}: a point, beside coordinates of {largest:g}; accepted: above {NEAR:.0e} of that")
 
 
 def _filled(there: Array, earlier: str, later: str, part: Part) -> Any:
-    """What is on that side of the edge of an earlier part along which `part` runs: its inside, for its outside."""
+    """The index on the side of an earlier part's edge along which `part` runs: that of its inside."""
     if not part.curve.closed:
         raise ValueError(f"{later}: it runs along {earlier}; accepted: a boundary of its own")
     if tuple(there) != part.right:
@@ -67,7 +68,7 @@ def _indices(n: Any) -> str:
 
 
 def _merged(points: Array) -> tuple[Array, Numbers]:
-    """The points, near ones replaced by the first of them, and a number for each place."""
+    """The points, near ones replaced by the first of them, and for each point the number of its place."""
     near = NEAR * np.abs(points).max()
     ids = _numbers(*(_groups(x, near) for x in points.T))
     _, first, ids = np.unique(ids, return_index=True, return_inverse=True)
@@ -75,7 +76,7 @@ def _merged(points: Array) -> tuple[Array, Numbers]:
 
 
 def _groups(x: Array, near: float) -> Numbers:
-    """A number for each value, the same for neighbours not farther apart than `near`."""
+    """A number for each value, the same for neighbours at most `near` apart."""
     order = np.argsort(x)
     groups = np.empty(len(x), np.intp)
     groups[order] = np.cumsum(np.diff(x[order], prepend=x[order[0]]) > near)
@@ -83,7 +84,7 @@ def _groups(x: Array, near: float) -> Numbers:
 
 
 def _numbers(*columns: Numbers) -> Numbers:
-    """A number for each row, the same for equal ones."""
+    """A number for each row, the same for equal rows."""
     ids = columns[0]
     for column in columns[1:]:
         ids = np.unique(ids * (column.max() + 1) + column, return_inverse=True)[1]
@@ -91,7 +92,7 @@ def _numbers(*columns: Numbers) -> Numbers:
 
 
 def _again(numbers: Numbers) -> Iterator[tuple[int, int]]:
-    """The first place and a later one of each number that comes more than once."""
+    """Of each number that occurs more than once: its first place and each later one."""
     _, first, inverse = np.unique(numbers, return_index=True, return_inverse=True)
     firsts = first[inverse]
     for j in np.flatnonzero(firsts != np.arange(len(numbers))):

@@ -8,11 +8,11 @@ known to that variant by the names `PLUGIN`, `PLUGIN_<formula>` and `INTEGRATOR`
 from typing import Any
 
 from . import refract, refract_path
-from .refract import PLUGIN
+from .refract import PLUGIN, read_ior
 from .refract_path import INTEGRATOR
 from .scene_features import SceneFeatures, inspect
 
-__all__ = ["INTEGRATOR", "PLUGIN", "SceneFeatures", "inspect", "register"]
+__all__ = ["INTEGRATOR", "PLUGIN", "SceneFeatures", "inspect", "read_ior", "register"]
 
 
 def register(variant: Any) -> None:

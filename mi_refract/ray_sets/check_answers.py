@@ -16,8 +16,9 @@ import numpy as np
 from mi_refract.formulas import FORMULAS
 
 from .diagnosis import Explanation, explain
+from .judged_answers import JudgedAnswers, judge_answers
 from .ray_set import Answers, Header, RaySet
-from .tir_signal import AUTO, FLAG, TIR, UNCLEAR, Judged, judge
+from .tir_signal import AUTO, FLAG, TIR, UNCLEAR
 
 # The documented formula with the largest error bound.
 LOOSEST = max(FORMULAS, key=lambda name: (FORMULAS[name].budget.growth, FORMULAS[name].budget.radicand))
@@ -124,7 +125,7 @@ def check(rays: RaySet, answers: Answers, *, tir: str = AUTO, error_bound: str =
     kept = np.flatnonzero(order >= 0)
     b = answers.b[order[kept]]
     flag = None if answers.transmitted is None else answers.transmitted[order[kept]]
-    judged = judge(b, flag, rays.rays[kept], rays.precision, FORMULAS[error_bound].budget, tir)
+    judged = judge_answers(b, flag, rays.rays[kept], rays.precision, FORMULAS[error_bound].budget, tir)
     return Findings(
         precision=rays.precision,
         ulp=2 * rays.roundoff,
@@ -133,7 +134,7 @@ def check(rays: RaySet, answers: Answers, *, tir: str = AUTO, error_bound: str =
         tir_given=tir != AUTO,
         regimes=tuple(_by_regime(rays, judged, kept)),
         problems=(*problems, *_not_directions(judged, rays.ids[kept])),
-        explanations=tuple(explain(judged)) if judged.wrong.any() else (),
+        explanations=tuple(explain(judged)) if judged.verdict.wrong.any() else (),
         header=rays.header,
     )
 
@@ -162,10 +163,10 @@ def _problem(kind: str, ids: np.ndarray) -> Problem:
     return Problem(kind, len(ids), f"id{plural} {some}{more}")
 
 
-def _not_directions(judged: Judged, ids: np.ndarray) -> Iterator[Problem]:
+def _not_directions(judged: JudgedAnswers, ids: np.ndarray) -> Iterator[Problem]:
     """Answers that are neither a direction nor the signal of total internal reflection."""
     zero = ~judged.b.any(axis=1)
-    for kind, mask in (("non-finite", judged.blank & ~zero), ("zero", judged.blank & zero)):
+    for kind, mask in (("non-finite", judged.verdict.blank & ~zero), ("zero", judged.verdict.blank & zero)):
         if mask.any():
             yield _problem(kind, ids[mask])
 
@@ -173,7 +174,7 @@ def _not_directions(judged: Judged, ids: np.ndarray) -> Iterator[Problem]:
 # By regime ---------------------------------------------------------------------------------------------------------
 
 
-def _by_regime(rays: RaySet, judged: Judged, kept: np.ndarray) -> Iterator[RegimeErrors]:
+def _by_regime(rays: RaySet, judged: JudgedAnswers, kept: np.ndarray) -> Iterator[RegimeErrors]:
     names = rays.regime[kept]
     for name in rays.header["regimes"]:
         index = np.flatnonzero(names == name)
@@ -181,10 +182,11 @@ def _by_regime(rays: RaySet, judged: Judged, kept: np.ndarray) -> Iterator[Regim
             yield _regime_errors(name, rays.ids[kept], judged, index)
 
 
-def _regime_errors(name: str, ids: np.ndarray, judged: Judged, index: np.ndarray) -> RegimeErrors:
-    compared = index[judged.compared[index]]
-    angle, length = (x[compared] if len(compared) else np.full(1, np.nan) for x in (judged.angle, judged.norm))
-    worst = index[np.lexsort((judged.share[index], judged.far[index], judged.blank[index]))[-1]]
+def _regime_errors(name: str, ids: np.ndarray, judged: JudgedAnswers, index: np.ndarray) -> RegimeErrors:
+    verdict = judged.verdict
+    compared = index[verdict.compared[index]]
+    angle, length = (x[compared] if len(compared) else np.full(1, np.nan) for x in (verdict.angle, verdict.drift))
+    worst = index[np.lexsort((verdict.share[index], verdict.far[index], verdict.blank[index]))[-1]]
     return RegimeErrors(
         name,
         len(index),
@@ -193,21 +195,22 @@ def _regime_errors(name: str, ids: np.ndarray, judged: Judged, index: np.ndarray
         p99=float(np.quantile(angle, 0.99)),
         mean=float(angle.mean()),
         length_error=float(length.max()),
-        tir_misclassified=int(judged.misjudged[index].sum()),
-        tir_beyond_bound=int(judged.far[index].sum()),
-        error_over_bound=float(judged.share[index].max()),
-        wrong=int(judged.wrong[index].sum()),
-        exact=int(judged.exact_to_rounding[index].sum()),
+        tir_misclassified=int(verdict.misjudged[index].sum()),
+        tir_beyond_bound=int(verdict.far[index].sum()),
+        error_over_bound=float(verdict.share[index].max()),
+        wrong=int(verdict.wrong[index].sum()),
+        exact=int(judged.rounded_exact[index].sum()),
         replay=_replay(judged, int(worst), int(ids[worst])),
     )
 
 
-def _replay(judged: Judged, row: int, id_: int) -> dict[str, Any]:
+def _replay(judged: JudgedAnswers, row: int, id_: int) -> dict[str, Any]:
     """A ray and its answer in hexadecimal floats."""
+    bounds = judged.verdict.bounds
     return {
         "id": id_,
-        **judged.rays.hexed(row),
+        **bounds.rays.hexed(row),
         "answer": [float(x).hex() for x in judged.b[row]],
-        "exact": [float(x).hex() for x in judged.exact.direction[row]],
-        "transmitted": bool(judged.exact.transmitted[row]),
+        "exact": [float(x).hex() for x in bounds.exact.direction[row]],
+        "transmitted": bool(bounds.exact.transmitted[row]),
     }

@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mi_refract.accuracy.direction_errors import absolute_radicand, lengths
+from mi_refract.accuracy import Judgement, RayBounds, absolute_radicand, lengths
 from mi_refract.regimes import Rays
 
+from .judged_answers import JudgedAnswers
 from .ray_set import indices
-from .tir_signal import Judged
 
 VISIBLE, SAME = 0.1, 5e-3  # radians
 MOST, ALL = 0.9, 0.99  # the share of the answers that a mistake, or a loss of precision, must explain
@@ -64,11 +64,11 @@ class Case:
     transmitted: np.ndarray
 
     @staticmethod
-    def of(judged: Judged, index: np.ndarray) -> Case:
+    def of(bounds: RayBounds, index: np.ndarray) -> Case:
         """The rays with these indices."""
-        rays = judged.rays[index]
+        rays = bounds.rays[index]
         a, n = (v.astype(float) / lengths(v).astype(float)[:, None] for v in (rays.a, rays.n))
-        exact = judged.exact
+        exact = bounds.exact
         return Case(a, n, rays.k.astype(float), rays, exact.direction[index], exact.transmitted[index])
 
     def with_k(self, k: np.ndarray) -> np.ndarray:
@@ -210,22 +210,23 @@ MISTAKES: dict[str, dict[str, Predict]] = {
 # Comparison with the answers ---------------------------------------------------------------------------------------
 
 
-def explain(judged: Judged) -> list[Explanation]:
+def explain(judged: JudgedAnswers) -> list[Explanation]:
     """Every mistake, and the share of the answers that it explains. Precondition: some answers are wrong."""
-    index = _sample(judged)
-    case, wrong = Case.of(judged, index), judged.wrong[index]
+    verdict = judged.verdict
+    index = _sample(verdict)
+    case, wrong = Case.of(verdict.bounds, index), verdict.wrong[index]
     with np.errstate(all="ignore"):
         found = [_best_variant(name, table, case, judged.b[index], wrong) for name, table in MISTAKES.items()]
-        lengths_only, digits, float32 = _wrong_lengths(judged), _few_digits(judged), _float32(judged)
+        lengths_only, digits, float32 = _wrong_lengths(verdict), _few_digits(verdict, judged.raw), _float32(verdict)
     found[-1] = max(found[-1], lengths_only, key=_strength)
     # Numbers of few digits may keep the bound of float32, too.
     return [*found, replace(float32, explains=float32.explains and not digits.explains), digits]
 
 
-def _sample(judged: Judged) -> np.ndarray:
+def _sample(verdict: Judgement) -> np.ndarray:
     """Indices of wrong and of right answers, evenly over the set, without rays whose bound excuses large errors."""
-    evidence = judged.decided & (judged.bound <= WIDEST_BOUND)
-    return np.concatenate([_evenly(evidence & mask, SAMPLE) for mask in (judged.wrong, ~judged.wrong)])
+    evidence = verdict.bounds.decided & (verdict.bounds.chord <= WIDEST_BOUND)
+    return np.concatenate([_evenly(evidence & mask, SAMPLE) for mask in (verdict.wrong, ~verdict.wrong)])
 
 
 def _evenly(mask: np.ndarray, count: int) -> np.ndarray:
@@ -257,42 +258,43 @@ def _angle(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.where((across == 0) & (along == 0), np.nan, np.arctan2(across, along))
 
 
-def _of_wrong(name: str, text: str, judged: Judged, holds: np.ndarray, enough: bool) -> Explanation:
+def _of_wrong(name: str, text: str, verdict: Judgement, holds: np.ndarray, enough: bool) -> Explanation:
     """`holds`: the answers that the mistake accounts for."""
-    share = float(holds[judged.wrong].mean()) if judged.wrong.any() else 0.0
-    compared = judged.compared & judged.wrong
-    median = float(np.median(judged.angle[compared])) if compared.any() else math.nan
-    return Explanation(name, text, share, median, bool(enough and share >= ALL and judged.wrong.sum() >= FEWEST))
+    share = float(holds[verdict.wrong].mean()) if verdict.wrong.any() else 0.0
+    compared = verdict.compared & verdict.wrong
+    median = float(np.median(verdict.angle[compared])) if compared.any() else math.nan
+    return Explanation(name, text, share, median, bool(enough and share >= ALL and verdict.wrong.sum() >= FEWEST))
 
 
-def _wrong_lengths(judged: Judged) -> Explanation:
-    holds = judged.compared & (judged.angle <= judged.bound)
-    return _of_wrong("missing normalisation", "directions are right, but not of length 1", judged, holds, True)
+def _wrong_lengths(verdict: Judgement) -> Explanation:
+    holds = verdict.compared & (verdict.angle <= verdict.bounds.chord)
+    return _of_wrong("missing normalisation", "directions are right, but not of length 1", verdict, holds, True)
 
 
-def _within(judged: Judged, bound: np.ndarray) -> np.ndarray:
-    return judged.compared & (np.maximum(judged.angle, judged.norm) <= bound)
+def _within(verdict: Judgement, bound: np.ndarray) -> np.ndarray:
+    return verdict.compared & (verdict.error <= bound)
 
 
-def _float32(judged: Judged) -> Explanation:
+def _float32(verdict: Judgement) -> Explanation:
     """float32 where float64 was claimed: errors of float32's size nearly everywhere, and none that is larger."""
-    u, k, exact = 2 * F32, judged.rays.k.astype(float), judged.exact  # u of the inputs, u of the formula
-    bound = judged.budget.chord(u, k, exact.cos_t, exact.transmitted, cos_i=exact.cos_i)
-    lost = judged.misjudged & (absolute_radicand(judged.rays) <= judged.budget.radicand_error_bound(u, k))
-    everywhere = judged.compared.any() and np.median(judged.angle[judged.compared]) > F32 / 50
-    holds, claimed = _within(judged, bound) | lost, judged.roundoff < F32
+    bounds, u = verdict.bounds, 2 * F32  # u of the inputs, u of the formula
+    k, exact = bounds.k, bounds.exact
+    bound = bounds.budget.chord(u, k, exact.cos_t, exact.transmitted, cos_i=exact.cos_i)
+    lost = verdict.misjudged & (absolute_radicand(bounds.rays) <= bounds.budget.radicand_error_bound(u, k))
+    everywhere = verdict.compared.any() and np.median(verdict.angle[verdict.compared]) > F32 / 50
+    holds, claimed = _within(verdict, bound) | lost, bounds.roundoff < F32
     enough = claimed and bool(everywhere)
-    return _of_wrong("f32 where f64 was claimed", "errors are those of float32", judged, holds, enough)
+    return _of_wrong("f32 where f64 was claimed", "errors are those of float32", verdict, holds, enough)
 
 
-def _few_digits(judged: Judged) -> Explanation:
+def _few_digits(verdict: Judgement, raw: np.ndarray) -> Explanation:
     """Numbers that were printed with too few digits."""
-    values = judged.raw[_evenly(judged.compared, SAMPLE)].ravel()
+    values = raw[_evenly(verdict.compared, SAMPLE)].ravel()
     values = values[np.rint(values) != values].tolist()
-    candidates = range(1, DIGITS[judged.roundoff] + 1) if len(values) >= FEWEST else range(0)
+    candidates = range(1, DIGITS[verdict.bounds.roundoff] + 1) if len(values) >= FEWEST else range(0)
     for digits, (form, word) in itertools.product(candidates, (("f", "decimals"), ("g", "significant digits"))):
         if all(float(f"{x:.{digits}{form}}") == x for x in values):
             # Half a unit of the last digit in each of three components.
-            bound, text = judged.bound + 10.0**-digits, f"numbers are rounded to {digits} {word}"
-            return _of_wrong("too few digits", text, judged, _within(judged, bound), True)
+            bound, text = verdict.bounds.chord + 10.0**-digits, f"numbers are rounded to {digits} {word}"
+            return _of_wrong("too few digits", text, verdict, _within(verdict, bound), True)
     return Explanation("too few digits", "numbers have all their digits", 0.0, math.nan, False)

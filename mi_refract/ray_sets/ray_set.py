@@ -73,7 +73,7 @@ class RaySet:
 
 @dataclass(frozen=True)
 class Answers:
-    """Answers: ids (N,), b (N, 3) float64, the column `transmitted` (N,) if there is one, and the header."""
+    """A program's answers: ids (N,), b (N, 3) float64, the column `transmitted` (N,) if there is one, the header."""
 
     ids: np.ndarray
     b: np.ndarray

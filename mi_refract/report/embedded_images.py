@@ -75,6 +75,11 @@ def encoded(pixels: Any, limit: float = np.inf, scale: float = 1.0) -> dict[str,
     }
 
 
+def packed(text: str) -> str:
+    """Text as base64 of its deflated UTF-8, which the page's script unpacks."""
+    return base64.b64encode(zlib.compress(text.encode(), 9)).decode()
+
+
 def shown(pixels: Any, channels: tuple[str, ...]) -> tuple[Any, str]:
     """What a page can show of an image: its RGB, or its one channel, and their name; (None, "") for neither."""
     if {"R", "G", "B"} <= set(channels):

@@ -9,6 +9,7 @@ from typing import Any
 from mi_refract.io.atomic import write_atomically
 
 from .embedded_images import EmbeddedImages
+from .first_page import code
 from .number_text import compact
 
 HERE = Path(__file__).parent / "templates"
@@ -21,7 +22,8 @@ def write_page(path: str | Path, template: str, content: Mapping[str, Any], imag
 
     options: Any = {"autoescape": True, "undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(loader=FileSystemLoader(HERE), **options)
-    environment.filters |= {"compact": compact, "words": words}
+    filters: dict[str, Any] = {"compact": compact, "words": words, "code": code}
+    environment.filters |= filters
     inline = {name: Markup((HERE / f"report.{name}").read_text("utf-8")) for name in ("css", "js")}
     text = environment.get_template(template).render(**content, **inline, images=images.embedded)
     write_atomically(path, text.encode("utf-8", "replace"))

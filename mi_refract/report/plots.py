@@ -76,11 +76,12 @@ def drawable(points: Points, axes: Axes) -> list[tuple[float, float]]:
     return [(x, y) for x, y in points if x_low < x < math.inf and y_low < y < math.inf]
 
 
-def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str) -> str:
-    """One line per name, and a dashed guide of the axes' slope from the first line's start.
+def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str, size: tuple[float, float] = (5.3, 3.0)) -> str:
+    """One line per name, and a dashed guide of the axes' slope from the first line's start; the legend is below.
 
     Points without a place on the axes are left out. "" where nothing can be drawn.
-    `salt` makes the ids inside the SVG unique on the page; the same arguments give the same bytes.
+    `salt` makes the ids inside the SVG unique on the page; the same arguments give the same bytes. `size` is width and
+    height in inches without the legend.
     """
     lines = {name: drawable(points, axes) for name, points in curves.items()}
     if not any(lines.values()):
@@ -90,7 +91,7 @@ def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str) -> str:
     with matplotlib.rc_context(_style(salt)):
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(5.3, 3.3), layout="constrained", dpi=72)
+        figure = Figure(layout="constrained", dpi=72)
         panel = figure.add_subplot(xscale=axes.x_scale, yscale=axes.y_scale, xlabel=axes.x, ylabel=axes.y)
         for i, (name, points) in enumerate(lines.items()):
             if points:
@@ -99,8 +100,17 @@ def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str) -> str:
         if axes.slope is not None:
             _guide(panel, [points for points in lines.values() if points], axes.slope)
         _ticks(panel, axes.logarithmic)
-        panel.legend()
+        _legend_below(figure, panel, size)
         return _page_svg(figure)
+
+
+def _legend_below(figure: Figure, panel: Panel, size: tuple[float, float]) -> None:
+    """A legend under the axes, where it covers no point, in as many columns as its longest name leaves room for."""
+    handles, names = panel.get_legend_handles_labels()
+    width, height = size
+    columns = max(1, min(len(names), int(width * 72 // (5 * max(map(len, names)) + 44))))
+    figure.set_size_inches(width, height + 0.21 * math.ceil(len(names) / columns))
+    figure.legend(handles, names, loc="outside lower left", ncols=columns, borderaxespad=0, columnspacing=1.2)
 
 
 def histogram_svg(values: Any, x: str, y: str, *, salt: str, bins: int = 20) -> str:

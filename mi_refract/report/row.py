@@ -106,6 +106,11 @@ def by_study(rows: Iterable[Row]) -> dict[str, list[Row]]:
     return studies
 
 
+def as_json(rows: Iterable[Row]) -> str:
+    """The rows as strict JSON, a list. Errors: TypeError for a value JSON has no form for."""
+    return json.dumps(strict([row.as_dict() for row in rows]), indent=1, allow_nan=False)
+
+
 def strict(value: Any) -> Any:
     """`value` in the types strict JSON has: numpy's as lists and numbers, NaN and the infinities as words."""
     if isinstance(value, float):  # numpy's float64 too, hence the conversion

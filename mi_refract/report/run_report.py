@@ -2,21 +2,20 @@
 
 Everything here lays out what the rows already say; nothing is measured, averaged or judged.
 
-`context` is what all rows share; `page.py` says which of its entries steer the page.
+`context` is what all rows share; `study_page` says which of its entries steer the page.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refract.io.atomic import write_atomically
 
-from . import junit, study_page
+from . import first_page, junit, study_page
 from .embedded_images import EmbeddedImages
 from .html_page import write_page
 from .number_text import distinguishable
@@ -25,12 +24,11 @@ from .row import SCHEMA, Row, by_study, strict
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-VERDICTS = ("fail", "not run", "pass", "info")
 WORDS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
 def write_json(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]) -> None:
-    """Write the document `rows.py` describes, as strict JSON: NaN and the infinities become words.
+    """Write the document `row.py` describes, as strict JSON: NaN and the infinities become words.
 
     Errors: TypeError for a value JSON has no form for; OSError.
     """
@@ -84,24 +82,21 @@ def _row(number: int, data: dict[str, Any]) -> Row:
 
 
 def verdict(rows: Sequence[Row]) -> str:
-    """One sentence: budgets measured and broken, goals missed, rows not run."""
+    """One sentence: how many checks (budgets that were measured) passed or failed, how many rows were not run."""
     measured = sum(len(row.budgets) for row in rows if row.values)
     broken = sum(len(row.broken) for row in rows)
     missing = sum(row.verdict == "not run" for row in rows)
     if not measured:
-        sentence = "No budget was measured"
+        sentence = "Nothing was checked"
     elif broken:
-        sentence = f"{broken} of {_count(measured, 'budget')} broken"
+        sentence = f"{broken:,} of {_count(measured, 'check')} failed"
     else:
-        sentence = f"All {measured} budgets held" if measured > 1 else "The one budget held"
-    missed = sum(len(row.missed) for row in rows)
-    goals = sum(len(row.goals) for row in rows if row.values)
-    sentence += f", {missed} of {_count(goals, 'goal')} missed" if missed else ""
-    return sentence + (f", {_count(missing, 'row')} not run" if missing else "")
+        sentence = f"All {measured:,} checks passed" if measured > 1 else "The one check passed"
+    return sentence + (f", {_count(missing, 'measurement')} not run" if missing else "")
 
 
 def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" + ("" if number == 1 else "s")
+    return f"{number:,} {noun}" + ("" if number == 1 else "s")
 
 
 def write_junit(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]) -> None:
@@ -129,30 +124,41 @@ def _case(row: Row, name: str, metric: str) -> junit.Case:
     return junit.Case(row.study, name, "failure", f"{metric} {text}, budget {limit}", details.splitlines())
 
 
-def summary(rows: Sequence[Row]) -> RenderableType:
-    """Broken budgets and missed goals first, then verdicts by study, then the sentence, for rich's console."""
+def summary(rows: Sequence[Row], context: Mapping[str, Any] | None = None) -> RenderableType:
+    """For rich's console: broken budgets, the answers of the context's `first_page`, then the verdict."""
     from rich.console import Group
+    from rich.text import Text
+
+    page = (context or {}).get("first_page")
+    broken = [(row, metric) for row in rows for metric in row.broken]
+    parts: list[RenderableType] = (
+        [_bounds_table("broken budget", "budget", broken, "bold red"), Text()] if broken else []
+    )
+    parts += first_page.terminal(page) if page else []
+    return Group(*parts, Text(verdict(rows), style="bold red" if broken else "bold"))
+
+
+def goals_table(rows: Sequence[Row]) -> RenderableType:
+    """For rich's console: every goal that was measured, the missed ones first, or a line that says there are none."""
+    from rich.text import Text
+
+    goals = [(row, metric) for row in rows if row.values for metric in row.goals]
+    goals.sort(key=lambda goal: goal[1] not in goal[0].missed)
+    return _bounds_table("goal", "goal", goals, "") if goals else Text("No goal was measured")
+
+
+def _bounds_table(heading: str, bound: str, found: Sequence[tuple[Row, str]], style: str) -> RenderableType:
     from rich.table import Table
     from rich.text import Text
 
-    broken, missed = ([(row, m) for row in rows for m in getattr(row, kind)] for kind in ("broken", "missed"))
-    parts: list[RenderableType] = []
-    for heading, exceeded, style in (("broken budget", broken, "bold red"), ("missed goal", missed, "yellow")):
-        table = Table(heading, "metric", box=None, title_justify="left", pad_edge=False)
-        table.add_column("value", justify="right", style=style)
-        table.add_column("bound", justify="right")
-        for row, metric in exceeded:
-            table.add_row(Text(row.name), Text(metric), *distinguishable(row.values[metric], row.bounds[metric]))
-        parts += [table, Text()] if exceeded else []
-    counts = Table("study", box=None, pad_edge=False)
-    for word in VERDICTS:
-        counts.add_column(word, justify="right")
-    for study, members in by_study(rows).items():
-        tally = Counter(row.verdict for row in members)
-        styles = {"fail": "bold red", "not run": "yellow", "pass": "green", "info": ""}
-        cells = [Text(str(tally[w] or "·"), style=styles[w] if tally[w] else "dim") for w in VERDICTS]
-        counts.add_row(Text(study), *cells)
-    return Group(*parts, counts, Text(), Text(verdict(rows), style="bold red" if broken else "bold"))
+    table = Table(heading, "metric", box=None, pad_edge=False)
+    table.add_column("value", justify="right", style=style)
+    table.add_column(bound, justify="right")
+    for row, metric in found:
+        value, limit = distinguishable(row.values[metric], row.bounds[metric])
+        missed = "yellow" if metric in row.missed else ""
+        table.add_row(Text(row.name), Text(metric), Text(value, style=missed), limit)
+    return table
 
 
 def write_html(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any], folder: str | Path) -> None:

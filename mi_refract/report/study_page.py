@@ -1,10 +1,11 @@
 """What the page shows, laid out from the rows: panels, tables, plots, images. Nothing is measured or judged here.
 
-`context` is what all rows share. Every entry is shown as it is, except four that steer the page:
+`context` is what all rows share. Every entry is shown as it is, except five that steer the page:
 
+- `first_page`: questions and answers on top (`first_page.FirstPage`);
 - `title`: the page's name;
 - `studies`: {study: {"title", "text", "terms", "axes"}}, all optional: heading, introduction and glossary of a study,
-  and the fields of `figures.Axes`, which say how the curves of its rows are drawn;
+  and the fields of `plots.Axes`, which say how the curves of its rows are drawn;
 - `scatter`: [{"study", "x", "y", "title", "interval", "floor", "front"}]: plots of one metric against another, a panel
   per setting; all but the first three optional. `interval` are two metrics between which x lies, `floor` the subject
   whose x is a line (it has no y), `front` steps along the points that no other one of the panel beats in x and y;
@@ -18,19 +19,23 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .embedded_images import EmbeddedImages
+from . import first_page
+from .embedded_images import EmbeddedImages, packed
 from .number_text import compact, distinguishable
 from .plots import Axes, Scatter, curves_svg, drawable, scatter_svg
-from .row import Row, by_study
+from .row import Row, as_json, by_study
 
-STEERING = ("title", "studies", "scatter", "replay")
+STEERING = ("first_page", "title", "studies", "scatter", "replay")
 ROLES = ("reference", "test", "overlay", "difference")
 
 
 def prepare(rows: Sequence[Row], context: Mapping[str, Any], images: EmbeddedImages) -> dict[str, Any]:
     """What the template `report.html.j2` is filled with. Errors: those of `EmbeddedImages.embed`."""
     verdicts = Counter(row.verdict for row in rows)
+    keys = {name: f"study-{number}" for number, name in enumerate(by_study(rows), 1)}
+    first, anchors = context.get("first_page"), keys | {first_page.NOT_RUN: "missing"}
     return {
+        "first": first_page.prepare(rows, first, anchors, images) if first else None,
         "title": context.get("title", "mi_refract"),
         "state": "fail" if verdicts["fail"] else "pass" if verdicts["pass"] else "empty",
         "counts": [(word, verdicts[word]) for word in ("pass", "fail", "not run", "info")],
@@ -46,27 +51,16 @@ def prepare(rows: Sequence[Row], context: Mapping[str, Any], images: EmbeddedIma
             for r in rows
             if r.broken
         ],
-        "missing": _missing(rows),
+        "missing": first_page.not_run(rows),
         "absent": verdicts["not run"],
-        "studies": [
-            _study(name, members, context, images, f"study-{number}")
-            for number, (name, members) in enumerate(by_study(rows).items(), 1)
-        ],
+        "studies": [_study(name, members, context, images, keys[name]) for name, members in by_study(rows).items()],
     }
-
-
-def _missing(rows: Sequence[Row]) -> list[tuple[str, str, list[Row]]]:
-    """The rows that were not run, one entry per study and reason."""
-    groups: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        if row.verdict == "not run":
-            groups.setdefault((row.study, row.reason), []).append(row)
-    return [(*key, members) for key, members in groups.items()]
 
 
 def _study(name: str, rows: list[Row], context: Mapping[str, Any], images: EmbeddedImages, key: str) -> dict[str, Any]:
     about = context.get("studies", {}).get(name, {})
     metrics = list(dict.fromkeys(metric for row in rows for metric in row.values))
+    measured = _measured(rows)
     axes = Axes(**about.get("axes", {}))
     plots = [
         (row, curves_svg(row.curves, axes, salt=f"{key}-{number}"), _left_out(row, axes))
@@ -81,11 +75,20 @@ def _study(name: str, rows: list[Row], context: Mapping[str, Any], images: Embed
         "terms": about.get("terms", {}),
         "failures": sum(row.verdict == "fail" for row in rows),
         "scale": (scale := _scale(rows, metrics)),
-        "panels": _panels(rows, metrics, scale),
+        "panels": _panels(measured, metrics, scale) if measured else [],
+        "missing": first_page.not_run(rows),
+        "data": packed(as_json(rows)),
+        "count": len(rows),
         "scatters": [s for i, each in enumerate(scatters) if (s := _scatter(each, rows, f"{key}-scatter-{i}"))],
         "plots": plots,
         "figures": [_figure(row, images) for row in rows if row.images],
     }
+
+
+def _measured(rows: list[Row]) -> list[Row]:
+    """The rows without the subjects and the cases of which, in their setting, nothing was run."""
+    run = {(row.setting, label) for row in rows if row.values for label in (("s", row.subject), ("c", row.case))}
+    return [row for row in rows if {(row.setting, ("s", row.subject)), (row.setting, ("c", row.case))} <= run]
 
 
 def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> list[dict[str, Any]]:
@@ -99,16 +102,16 @@ def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | No
         {
             "heading": s,
             "matrix": matrices[s],
-            "table": _table(parts[s], metrics, s) if any(row.values for row in parts[s]) else None,
-            "reasons": list(dict.fromkeys(row.reason for row in parts[s])),
+            "table": _table(parts[s], metrics, s),
         }
         for s in settings
     ]
 
 
 def _matrix(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> dict[str, Any] | None:
-    subjects = list(dict.fromkeys(row.subject for row in rows))
-    cases = list(dict.fromkeys(row.case for row in rows))
+    telling = [row for row in rows if metrics[0] in row.values or row.broken]
+    subjects = list(dict.fromkeys(row.subject for row in telling))
+    cases = list(dict.fromkeys(row.case for row in telling))
     cells = {(row.subject, row.case): row for row in rows}
     if len(subjects) < 3 or len(cases) < 3 or len(cells) < len(rows) or scale is None:
         return None
@@ -158,6 +161,7 @@ def _bound(row: Row, metric: str) -> str:
 
 def _table(rows: list[Row], metrics: list[str], heading: str = "") -> dict[str, Any]:
     """Columns: what tells the rows apart, then every metric; a label equal to the one above is marked."""
+    rows = [row for row in rows if row.values]
     keys = [k for k in ("subject", "case", "setting") if len({getattr(row, k) for row in rows}) > 1]
     keys = keys or ["subject"]
     used = [m for m in metrics if any(m in row.values for row in rows)]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mi_refract.io.image_file import read_exr
 
@@ -82,7 +83,7 @@ def _camera(sensor: Node) -> Camera:
     return Camera(_triple(origin), _triple(origin + axes[:, 2]), _triple(axes[:, 1]), fov, width, height)
 
 
-def _triple(vector: Any) -> tuple[float, float, float]:
+def _triple(vector: NDArray[np.float64]) -> tuple[float, float, float]:
     x, y, z = (float(number) for number in vector)
     return x, y, z
 
@@ -127,7 +128,7 @@ def _sky(emitter: Node) -> Colour | Environment:
     return sky
 
 
-def _pixels(emitter: Node, path: Path) -> Any:
+def _pixels(emitter: Node, path: Path) -> NDArray[np.float32]:
     try:
         pixels = read_exr(path)[0]
     except (OSError, ValueError) as error:

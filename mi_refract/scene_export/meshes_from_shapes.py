@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refract.formulas import FORMULAS
-from mi_refract.plugins.refract import PLUGIN, read_ior
+from mi_refract.plugins import PLUGIN, read_ior
 
 from . import tessellation
 from .mitsuba_nodes import Node

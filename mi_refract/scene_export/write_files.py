@@ -47,8 +47,5 @@ def _new_or_empty(folder: str | os.PathLike[str]) -> Path:
             raise FileExistsError(f"{folder}: holds files already; accepted: a new folder or an empty one")
     elif place.exists():
         raise NotADirectoryError(f"{folder}: is not a folder; accepted: a new folder or an empty one")
-    if not place.parent.is_dir():
-        raise NotADirectoryError(f"{folder}: {place.parent} is not a folder; accepted: a new folder in an existing one")
-    if not os.access(place.parent, os.W_OK | os.X_OK):
-        raise PermissionError(f"{folder}: {place.parent} is not writable; accepted: a writable folder")
+    atomic.check_parent(place)
     return place

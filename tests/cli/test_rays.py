@@ -107,7 +107,7 @@ def test_wrong_answers(call):
     assert out.splitlines()[-1] == "50 of 50 answers are wrong: eta inverted"
 
 
-def test_answers_may_say_what_they_answer(call):
+def test_answers_may_repeat_the_header_of_the_rays(call):
     to = ray_set.make(["Brewster"], 40, "f64", 8)
     answer("answers.csv", to, lines=header(to))
     code, out, _ = call("check", "answers.csv")
@@ -120,7 +120,7 @@ def test_answers_may_say_what_they_answer(call):
     assert (code, "cannot make the rays of these answers again; accepted: with --rays FILE" in err) == (2, True)
 
 
-def test_without_a_word_they_are_to_the_default(call):
+def test_answers_without_a_header_are_to_the_default_rays(call):
     answer("answers.csv", ray_set.make())
     code, out, _ = call("check", "answers.csv")
     told = "as of `export` without options; others: --rays FILE"
@@ -129,7 +129,7 @@ def test_without_a_word_they_are_to_the_default(call):
     assert call("check", "answers.csv")[0] == 1
 
 
-def test_the_measure_can_be_chosen(call):
+def test_the_error_bound_can_be_chosen(call):
     to = ray_set.make(["generic"], 50)
     answer("answers.csv", to, lines=header(to))
     assert call("check", "answers.csv", "--error-bound", "wedge")[0] == 0
@@ -148,7 +148,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("content, code, message", DAMAGE.values(), ids=DAMAGE)
-def test_files_that_are_no_answers(call, content, code, message):
+def test_invalid_answers(call, content, code, message):
     files.write("rays.csv", ray_set.make(["generic"], 4))
     if content is not None:
         Path("answers.csv").write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -208,7 +208,7 @@ BAD_OPTIONS = {
 
 
 @pytest.mark.parametrize("words, message", BAD_OPTIONS.values(), ids=BAD_OPTIONS)
-def test_options_that_cannot_be(call, words, message):
+def test_invalid_options(call, words, message):
     code, _, err = call(*words)
     assert code == 2
     assert err.startswith("mi-refract: ")

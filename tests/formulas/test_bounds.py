@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from mi_refract import oracle, regimes
+from mi_refract.accuracy import RayBounds, judge, judge_formula
 from mi_refract.formulas import ROUNDING, Budget, cancelling, radicand_for
 from mi_refract.formulas.bounds import root
-from validation.directions.judge import judge, judged
 
 U = 2.0**-53
 
@@ -75,27 +75,27 @@ def off(exact, linear, radicand):
 def test_what_a_subject_needs_of_either_constant_is_found(sample, linear, radicand):
     rays, exact = sample
     scale = np.where(exact.transmitted, rays.k, 1.0)
-    found = judge(off(exact, linear, radicand), rays, exact, list, cancelling(1))
+    found = judge_formula(off(exact, linear, radicand), rays, exact, list, cancelling(1))
     assert found.share.max() <= 1
     # Rounding of the planted answer is up to two u.
     needed = Budget(1e-9, 14, 1) if radicand else Budget(10, 0, 1)
-    again = judge(off(exact, linear, radicand), rays, exact, list, needed)
-    found = again.radicand if radicand else again.linear * scale
+    again = judge_formula(off(exact, linear, radicand), rays, exact, list, needed)
+    found = again.radicand_needed if radicand else again.linear_needed * scale
     assert found.max() == pytest.approx(linear + radicand, abs=2)
 
 
 def test_a_constant_too_small_is_broken(sample):
     rays, exact = sample
-    assert judge(off(exact, 9.0, 0.0), rays, exact, list, Budget(4, 0, 1)).share.max() > 1
-    assert judge(off(exact, 0.0, 13.0), rays, exact, list, Budget(10, 3, 1)).share.max() > 1
+    assert judge_formula(off(exact, 9.0, 0.0), rays, exact, list, Budget(4, 0, 1)).share.max() > 1
+    assert judge_formula(off(exact, 0.0, 13.0), rays, exact, list, Budget(10, 3, 1)).share.max() > 1
 
 
 def test_a_decision_far_from_the_critical_angle_is_held_against_the_subject(sample):
     rays, exact = sample
-    mirrored = judge(lambda a, n, k: (list(a), False), rays, exact, list, cancelling(1))
+    mirrored = judge_formula(lambda a, n, k: (list(a), False), rays, exact, list, cancelling(1))
     assert mirrored.misjudged.sum() == exact.transmitted.sum()
     assert mirrored.far.sum() == exact.transmitted.sum()  # within 1e-7 rad, the margin is 14 · 2⁻⁵³
-    assert mirrored.radicand.max() > 14
+    assert mirrored.radicand_needed.max() > 14
 
 
 @pytest.mark.parametrize("transmitted", [True, False])
@@ -106,8 +106,8 @@ def test_next_to_the_surface_either_side_is_right_where_the_side_is_open(side, c
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
     x, _, z = exact.direction[0]
     crossed = ([float(x), 0.0, -float(z)] if transmitted else list(rays.a[0])), transmitted
-    found = judge(lambda a, n, k: crossed, rays, exact, list, Budget(10, 14, 1, side=side))
-    assert found.seen.tolist() == [held]
+    found = judge_formula(lambda a, n, k: crossed, rays, exact, list, Budget(10, 14, 1, side=side))
+    assert found.wrong.tolist() == [held]
     assert found.crossed.tolist() == [transmitted and not held]
 
 
@@ -117,7 +117,7 @@ def test_at_the_limit_a_decision_is_held_to_the_terms_of_the_radicand(steps, far
     k = np.array([1.25 + steps * 2.0**-52])
     rays = regimes.Rays(np.array([[4.0, 0.0, -3.0]]), np.array([[0.0, 0.0, 1.0]]), k)
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-    found = judge(lambda a, n, k: (list(a), not exact.transmitted[0]), rays, exact, list, ROUNDING)
+    found = judge_formula(lambda a, n, k: (list(a), not exact.transmitted[0]), rays, exact, list, ROUNDING)
     assert found.misjudged.tolist() == [True]
     assert found.far.tolist() == [far]
 
@@ -126,16 +126,16 @@ def test_at_the_limit_a_decision_is_held_to_the_terms_of_the_radicand(steps, far
 def test_the_length_of_the_ray_itself_says_which_rounding_it_is_held_to(length, bound):
     rays = regimes.Rays(np.array([[0.0, 0.0, -length]]), np.array([[0.0, 0.0, 1.0]]), np.array([1.5]))
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-    found = judge(lambda a, n, k: (list(a), True), rays, exact, list, ROUNDING)
-    assert found.bound == pytest.approx(bound * U)
+    found = judge_formula(lambda a, n, k: (list(a), True), rays, exact, list, ROUNDING)
+    assert found.bounds.chord == pytest.approx(bound * U)
 
 
 def test_a_mirrored_ray_next_to_the_surface_has_not_crossed_it():
     rays = regimes.Rays(np.array([[1.0, 0.0, -2 * U]]), np.array([[0.0, 0.0, 1.0]]), np.array([1.5]))
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-    found = judge(lambda a, n, k: ([1.0, 0.0, 3 * U], False), rays, exact, list, cancelling(1))
+    found = judge_formula(lambda a, n, k: ([1.0, 0.0, 3 * U], False), rays, exact, list, cancelling(1))
     assert found.chord[0] > 0
-    assert not found.seen[0] and not found.crossed[0]
+    assert not found.wrong[0] and not found.crossed[0]
 
 
 def test_a_ray_that_the_oracle_could_not_decide_breaks_the_budget():
@@ -143,5 +143,5 @@ def test_a_ray_that_the_oracle_could_not_decide_breaks_the_budget():
     exact = oracle.refract(rays.a, rays.n, rays.k, progress=False)
     unknown = dataclasses.replace(exact, undecided=np.arange(20) == 7)
     b, transmitted = exact.direction.astype(np.longdouble), exact.transmitted
-    assert not judged(b, transmitted, rays, exact, ROUNDING).seen.any()
-    assert np.flatnonzero(judged(b, transmitted, rays, unknown, ROUNDING).seen).tolist() == [7]
+    assert not judge(b, transmitted, RayBounds(rays, exact, ROUNDING, U)).wrong.any()
+    assert np.flatnonzero(judge(b, transmitted, RayBounds(rays, unknown, ROUNDING, U)).wrong).tolist() == [7]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from mi_refract import oracle, reflect, reflect_sandwich, refract_2d
+from mi_refract.accuracy import BUDGETS, evaluate, judge_formula
 from mi_refract.formulas import FORMULAS
 from mi_refract.regimes import REGIMES, Rays, make
-from validation.directions.judge import BUDGETS, evaluate, judge
 from validation.run.array_settings import Setting
 
 COUNTS = {"scalar": 25, "llvm": 4000, "cuda": 4000}
@@ -36,7 +36,7 @@ def certified():
 
 def broken(subject, rays, exact, setting, budget):
     """The metrics of the judgement that break their budgets."""
-    found = judge(subject, rays, exact, setting.vector, budget).values()
+    found = judge_formula(subject, rays, exact, setting.vector, budget).values()
     return {metric: found[metric] for metric, bound in BUDGETS.items() if not found[metric] <= bound}
 
 

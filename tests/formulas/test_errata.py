@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mi_refract import FORMULAS, refract_2d
-from mi_refract.planar.tracer import Segments, trace
+from mi_refract.planar import Segments, trace
 
 Vector = dr.scalar.Array3f64
 SINE, COSINE = 0.6, 0.8

@@ -9,9 +9,9 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from mi_refract import FORMULAS
+from mi_refract.accuracy import absolute_radicand, evaluate, lengths
 from mi_refract.formulas.bounds import root
 from mi_refract.regimes import REGIMES, Rays, make
-from validation.directions.judge import absolute_radicand, evaluate, lengths
 from validation.directions.planted_defects import EXACT, MUTANTS
 
 

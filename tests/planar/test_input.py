@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from support.planar_scenes import SQUARE, polygon, story, together
 
-from mi_refract.planar.tracer import Event, Segments, trace
+from mi_refract.backend import Backend
+from mi_refract.planar import Event, Segments, array_backend, trace
 
+NO_LLVM = "; llvm cannot run here: why"
 GOOD = {"start": [(0.0, 0.0)], "end": [(1.0, 0.0)], "n_left": [1.5], "n_right": [1.0]}
 
 
@@ -61,7 +63,6 @@ def test_segments_that_coincide_are_refused():
         ({"n_start": "air"}, "n_start: accepted: a number"),
         ({"n_start": 0}, "n_start: accepted: a number"),
         ({"origins": [(0.0, 1e101)]}, "origins: a number beyond ±1e+100; accepted: up to that"),
-        ({"origins": [(0.0, -1e16)], "precision": "float32"}, "origins: a number beyond ±1e+15; accepted: up to that"),
         ({"max_depth": 2**32}, "1 rays, max_depth = 4294967296: accepted: a product below 2³²"),
         ({"n_start": math.nan}, "n_start: accepted: a number"),
     ],
@@ -72,6 +73,31 @@ def test_bad_arguments_are_named_in_one_line(change, message):
         trace(Segments(**GOOD), **arguments)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_float32_has_a_range_of_its_own(needs_variant):
+    needs_variant("llvm_ad_rgb")
+    with pytest.raises(ValueError, match=r"origins: a number beyond ±1e\+15; accepted: up to that"):
+        trace(Segments(**GOOD), [(0.0, -1e16)], [(0.0, 1.0)], 2, precision="float32", backend="llvm")
+
+
+@pytest.mark.parametrize(
+    ("asked", "llvm", "end"),
+    [
+        ("scalar", True, ""),
+        ("scalar", False, "; llvm cannot run here: why"),
+        (None, False, "; llvm cannot run here: why"),
+    ],
+)
+def test_scalar_arrays_refuse_float32_because_they_compute_in_double(monkeypatch, asked, llvm, end):
+    """Asked for by name, or chosen because LLVM cannot run here."""
+    usable = {"scalar": True, "llvm": llvm, "cuda": False}
+    monkeypatch.setattr(array_backend, "detect", lambda: {name: Backend(name, u, "why") for name, u in usable.items()})
+    with pytest.raises(ValueError) as error:
+        array_backend.choose_backend(asked, "float32")
+    message = "precision = 'float32': scalar arrays compute in double; accepted: float64, or a compiled backend (llvm, "
+    assert str(error.value) == f"{message}cuda){end}"
+    assert array_backend.choose_backend("scalar", "float64").number is float
 
 
 @pytest.mark.parametrize("length", [1e-300, 1e-30, 1e30, 1e300])

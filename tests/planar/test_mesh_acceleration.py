@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from support.planar_scenes import polygon, star, together
 
-from mi_refract.planar import mesh_acceleration
+from mi_refract.planar import Event, Segments, mesh_acceleration, trace
 from mi_refract.planar.intersect_segments import NOWHERE
-from mi_refract.planar.tracer import Event, Segments, trace
 
 RAYS = 600
 
@@ -177,7 +176,7 @@ def no_neighbours(vertices, count):
 @pytest.mark.parametrize(
     ("case", "defect"),
     [
-        ("slivers", ("_narrow", lambda a, b, vertices: np.zeros(a.shape))),
+        ("slivers", ("_wedge_shares", lambda a, b, vertices: np.zeros(a.shape))),
         ("fine circle, along its wall", ("MARGIN", 2.0**-26)),
         ("star, at tips", ("OFFSET", 2.0**-9)),
         ("fine circle, along its wall", ("_around", no_neighbours)),

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from support.planar_scenes import SLAB, ball, beam, polygon, scene
 
-from mi_refract.planar import path_tree
+from mi_refract.planar import Event, path_tree
 from mi_refract.planar.path_tree import as_data, count, follow, follow_scene, summary, with_rays
-from mi_refract.planar.tracer import Event
 
 OBLIQUE = math.cos(0.6), math.sin(0.6)
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from mi_refract.io import toml_schema
-from mi_refract.planar import scene_schema, shapes
+from mi_refract.planar import Event, scene_schema, shapes, trace
 from mi_refract.planar.scene_file import load
-from mi_refract.planar.tracer import Event, trace
 
 SCENES = Path(__file__).parents[2] / "scenes" / "planar"
 ULP = 2.0**-52

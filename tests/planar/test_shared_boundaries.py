@@ -2,10 +2,9 @@
 
 import pytest
 
-from mi_refract.planar import shapes, shared_boundaries
+from mi_refract.planar import shapes, shared_boundaries, trace
 from mi_refract.planar.scene_file import load
 from mi_refract.planar.scene_schema import Part
-from mi_refract.planar.tracer import trace
 
 TWO = """
 index = 1.1

@@ -8,8 +8,7 @@ import pytest
 from support.planar_scenes import SQUARE, ball, polygon, star, story, together
 
 from mi_refract.formulas import FORMULAS
-from mi_refract.planar import intersect_segments
-from mi_refract.planar.tracer import Event, Segments
+from mi_refract.planar import Event, Segments, intersect_segments
 
 REFRACTED, REFLECTED, ESCAPED = Event.REFRACTED, Event.REFLECTED, Event.ESCAPED
 
@@ -71,14 +70,14 @@ def test_a_ray_through_a_shared_vertex_crosses_once(follow):
 
 def test_without_one_side_for_each_vertex_rays_leak(follow, monkeypatch):
     """A vertex that counts as the left of one segment and as the right of the next is crossed twice, or never."""
-    plain = intersect_segments.Straight._seen
+    plain = intersect_segments.LineSegments._seen
 
     def slipped(self, ray, start, vertex, place):
         way, side = plain(self, ray, start, vertex, place)
         self.turn = not getattr(self, "turn", False)
         return way, side + (1e-6 if self.turn else -1e-6)
 
-    monkeypatch.setattr(intersect_segments.Straight, "_seen", slipped)
+    monkeypatch.setattr(intersect_segments.LineSegments, "_seen", slipped)
     with pytest.raises(AssertionError):
         test_a_ray_through_a_shared_vertex_crosses_once(follow)
 
@@ -225,7 +224,7 @@ def test_a_ball_turns_a_ray_by_twice_the_difference_of_angles(follow, setting):
     assert np.hypot(*paths.points[:, 1:3].T) == pytest.approx(1, abs=4 * setting.roundoff)
 
 
-@pytest.mark.parametrize("grazing", [0.5, 0.1, 1e-2, 1e-3])
+@pytest.mark.parametrize("grazing", [0.5, 1e-2, 1e-3])
 def test_inside_a_ball_a_ray_turns_by_the_same_angle_each_time(follow, setting, grazing):
     """Chords of angle 2 α, many of them within one arc; none is skipped, none leaks at the joints."""
     count = 500

@@ -1,4 +1,4 @@
-"""Answers against the certified ones: what is right passes, each planted mistake is seen and called by its name."""
+"""Right answers pass, and every planted mistake is found and named."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from support import ray_programs as programs
 from support.ray_programs import BAD, GOOD
 
 from mi_refract import oracle
-from mi_refract.accuracy.direction_errors import lengths
+from mi_refract.accuracy import lengths
 from mi_refract.formulas import FORMULAS
 from mi_refract.ray_sets import ray_set, tir_signal
 from mi_refract.ray_sets.check_answers import LOOSEST, check
@@ -55,7 +55,7 @@ def exact(precision, names=ray_set.DEFAULT):
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("tir", GOOD)
-def test_the_textbook_passes_however_it_tells(precision, tir):
+def test_the_textbook_passes_with_every_signal(precision, tir):
     to = some(precision)
     answers = answered(to, GOOD[tir])
     for told in ("auto", tir):
@@ -187,7 +187,7 @@ def test_float32_where_float64_was_claimed():
 
 @pytest.mark.parametrize("precision, digits", [("f32", 4), ("f64", 6), ("f64", 8), ("f64", 12)])
 @pytest.mark.parametrize("form, word", [("f", "decimals"), ("g", "significant digits")])
-def test_digits_lost_on_the_way(precision, digits, form, word):
+def test_too_few_digits(precision, digits, form, word):
     to = some(precision)
     answers = answered(to, programs.glsl)
     printed = np.array([[float(f"{x:.{digits}{form}}") for x in row] for row in answers.b.tolist()])
@@ -212,7 +212,7 @@ def test_noise_has_no_name():
 # Total internal reflection
 
 
-def test_told_otherwise_than_it_is():
+def test_a_wrong_signal_is_stated():
     answers = answered(some(), programs.glsl)
     for tir in set(GOOD) - {"zero"}:
         found = check(some(), answers, tir=tir)
@@ -222,7 +222,7 @@ def test_told_otherwise_than_it_is():
         check(some(), answers, tir="flag")
 
 
-def test_told_in_several_ways():
+def test_several_signals_at_once():
     to, (certified, _) = some(), exact("f32")
     answers = answered(to, programs.glsl)
     rows = np.flatnonzero(~certified.transmitted)[::2]
@@ -239,7 +239,7 @@ def test_a_mirror_direction_is_judged_too():
     assert (found.exit_code, found.wrong) == (1, 1)
 
 
-def test_who_thinks_a_ray_in_doubt_reflected_may_say_so():
+def test_exactly_critical_rays_may_be_signalled_as_reflected():
     to = some("f64", ("exactly critical",), 100)
     answers = answered(to, programs.with_normals_made_unit)
     assert 0 < (answers.b == 0).all(1).sum() < len(to)
@@ -279,7 +279,7 @@ def test_only_nan_passes_nothing():
 
 @pytest.mark.parametrize("regime", ["exactly critical", "tangential"])
 @pytest.mark.parametrize("value", [np.nan, 0.0])
-def test_nothing_but_doubt_is_no_pass(regime, value):
+def test_answers_to_ambiguous_rays_alone_are_no_pass(regime, value):
     to = some("f32", (regime,))
     found = check(to, Answers(to.ids, np.full((len(to), 3), value)))
     assert (found.exit_code, found.total("compared"), found.wrong) == (1, 0, 0)
@@ -326,7 +326,7 @@ def test_answers_to_other_rays():
 
 
 @pytest.mark.parametrize("given", [{"tir": "zeros"}, {"error_bound": "decompose"}])
-def test_names_that_are_none(given):
+def test_unknown_names(given):
     with pytest.raises(ValueError, match="unknown; accepted: "):
         check(some(), exact("f32")[1], **given)
 
@@ -336,7 +336,7 @@ def test_answers_of_another_shape():
         Answers(np.arange(3), np.zeros((2, 3)))
 
 
-def test_the_measure_is_the_loosest():
+def test_the_default_bound_is_the_loosest():
     u, k = 2.0**-24, np.geomspace(1e-3, 1e6, 50)
     bounds = {name: formula.budget.chord(u, k) for name, formula in FORMULAS.items()}
     assert all((bound <= bounds[LOOSEST]).all() for bound in bounds.values())

@@ -31,7 +31,7 @@ def test_every_bit_returns(tmp_path, precision, ending):
 
 
 @pytest.mark.parametrize("precision, ending", FORMATS)
-def test_the_same_question_gives_the_same_file(tmp_path, precision, ending):
+def test_the_same_options_give_the_same_file(tmp_path, precision, ending):
     written = [files.write(tmp_path / f"{i}.{ending}", ray_set.make(**SMALL, precision=precision)) for i in range(2)]
     assert written[0].read_bytes() == written[1].read_bytes()
     other = files.write(tmp_path / f"3.{ending}", ray_set.make(**SMALL | {"seed": 6}, precision=precision))
@@ -54,7 +54,7 @@ def test_numbers_read_in_either_precision_are_the_rays(precision):
 
 
 @pytest.mark.parametrize("name", ["rays.txt", "rays", "none/rays.csv"])
-def test_places_that_cannot_be(tmp_path, name):
+def test_invalid_paths(tmp_path, name):
     with pytest.raises((ValueError, OSError), match="accepted"):
         files.write(tmp_path / name, ray_set.make(count=2))
     assert not list(tmp_path.iterdir())
@@ -158,7 +158,7 @@ def test_answers_as_people_write_them():
         (b"\xff\xfe\x00id", "not text; accepted: CSV in UTF-8"),
     ],
 )
-def test_answers_that_are_none(text, message):
+def test_invalid_csv(text, message):
     with pytest.raises(ValueError) as caught:
         answers(text)
     assert str(caught.value).startswith("answers.csv: ")
@@ -185,7 +185,7 @@ IDS = np.arange(2)
 
 
 @pytest.mark.parametrize("arrays", [{"id": IDS}, {"b": np.zeros((2, 3))}, {"id": IDS, "b": np.zeros(3)}])
-def test_arrays_that_are_no_answers(tmp_path, arrays):
+def test_invalid_npz(tmp_path, arrays):
     np.savez(tmp_path / "a.npz", **arrays)
     with pytest.raises(ValueError, match=r"a\.npz: .*accepted: an \.npz file with id, b"):
         files.read_answers(tmp_path / "a.npz")

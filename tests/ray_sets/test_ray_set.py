@@ -56,6 +56,6 @@ def test_the_header_makes_the_rays_again():
         ({"seed": -1}, "seed -1"),
     ],
 )
-def test_sets_that_cannot_be(given, message):
+def test_invalid_sets(given, message):
     with pytest.raises(ValueError, match=message):
         ray_set.make(**given)

@@ -1,4 +1,4 @@
-"""What a check of rays leaves behind: JSON, JUnit, and the page that people look at."""
+"""The reports of a check: JSON, JUnit and the HTML page."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_the_page_stands_alone(tmp_path, findings, name):
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium in PATH")
 @pytest.mark.parametrize("name", ["right", "wrong"])
-def test_a_browser_has_nothing_to_say(tmp_path, findings, name):
+def test_a_browser_reports_no_error(tmp_path, findings, name):
     reports.write_html(tmp_path / "out.html", findings[name], {})
     dom, said = browse(tmp_path / "out.html", tmp_path / "profile")
     assert said == []

@@ -17,12 +17,7 @@ SCENE = ROOT / "scenes" / "nested.xml"
 SMALL = {"res": "8"}
 
 
-@pytest.fixture(autouse=True)
-def scalar():
-    before = mi.variant()
-    mi.set_variant("scalar_rgb")
-    yield
-    mi.set_variant(before)
+pytestmark = pytest.mark.usefixtures("scalar_variant")
 
 
 def test_the_header_renders_the_same_image_again(tmp_path):

@@ -121,22 +121,38 @@ def test_junit_counts_budgets_and_leaves_out_rows_that_cannot_fail(tmp_path):
 
 def test_summary_puts_broken_budgets_first_and_takes_names_literally():
     console = pytest.importorskip("rich.console").Console(width=120, record=True, file=io.StringIO())
-    console.print(run_report.summary([*ROWS, dataclasses.replace(GOOD, study="[red]x")]))
+    page = {"answers": [{"question": "Is it [red]right?", "text": "`No`.", "state": "no", "study": "speed"}]}
+    rows = [*ROWS, dataclasses.replace(BAD, subject="[red]x")]
+    console.print(run_report.summary(rows, {"first_page": page}))
     text = console.export_text()
-    words = "cross / generic / llvm float32", "[red]x", "2 of 4 budgets broken"
+    words = "cross / generic / llvm float32", "[red]x / generic", "Is it [red]right?", "No.", "4 of 5 checks failed"
     order = [text.index(word) for word in words]
     assert order == sorted(order)
+
+
+def test_goals_are_a_table_of_their_own_with_the_missed_ones_first():
+    def printed(rows):
+        console = pytest.importorskip("rich.console").Console(width=120, record=True, file=io.StringIO())
+        console.print(run_report.goals_table(rows))
+        return console.export_text()
+
+    met = dataclasses.replace(GOOD, subject="met", goals={"time": 2.0})
+    missed = dataclasses.replace(GOOD, subject="missed", goals={"time": 1.1})
+    text = printed([met, missed])
+    assert text.index("missed / generic") < text.index("met / generic") and "1.1" in text
+    assert printed(ROWS) == "No goal was measured\n"
+    assert run_report.verdict([met, missed]) == "All 2 checks passed"
 
 
 @pytest.mark.parametrize(
     ("rows", "sentence"),
     [
-        ([GOOD, GOOD], "All 2 budgets held"),
-        ([GOOD], "The one budget held"),
-        ([BAD, GOOD], "2 of 3 budgets broken"),
-        ([GOOD, GOOD, ABSENT], "All 2 budgets held, 1 row not run"),
-        ([INFO], "No budget was measured"),
-        ([], "No budget was measured"),
+        ([GOOD, GOOD], "All 2 checks passed"),
+        ([GOOD], "The one check passed"),
+        ([BAD, GOOD], "2 of 3 checks failed"),
+        ([GOOD, GOOD, ABSENT], "All 2 checks passed, 1 measurement not run"),
+        ([INFO], "Nothing was checked"),
+        ([], "Nothing was checked"),
     ],
 )
 def test_the_sentence(rows, sentence, tmp_path):
@@ -151,7 +167,7 @@ def test_html_asks_for_nothing_and_runs_no_name(tmp_path):
     write_exr(tmp_path / "a.exr", np.zeros((2, 2, 3)))
     text = html(tmp_path, [*ROWS, dataclasses.replace(INFO, images={'"><script>': "a.exr"})])
     assert not re.findall(r"https?:|@import|url\((?!#)|\bsrc=|<link|<iframe", text)
-    assert {target[0] for target in re.findall(r'href="([^"]*)"', text)} == {"#"}
+    assert {target.partition("#")[0] for target in re.findall(r'href="([^"]*)"', text)} == {"", "rows.json"}
     assert "&lt;script&gt;alert(1)" in text
     assert "<script>alert" not in text
     assert '"><script>' not in text

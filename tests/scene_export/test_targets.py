@@ -1,7 +1,8 @@
-"""What is written for other renderers: complete or not at all, and the same scene again where that can be told here."""
+"""Exports are written completely or not at all; where this can be checked here, they are the same scene."""
 
 import json
 import os
+import re
 from pathlib import Path
 
 import mitsuba as mi
@@ -243,3 +244,8 @@ def test_scripts_for_other_pythons_are_complete(small, tmp_path):
         text = (tmp_path / target / "render.py").read_text()
         compile(text, "render.py", "exec")
         assert "mi_refract import" not in text and "from ." not in text
+
+
+def test_the_readme_lists_every_target():
+    readme = Path(write_files.__file__).with_name("README.md").read_text()
+    assert set(write_files.TARGETS) <= set(re.findall(r"^\| `(.*?)` \|", readme, re.MULTILINE))

@@ -1,4 +1,4 @@
-"""Are the triangles closed, turned outward and on the surface that they stand for?"""
+"""The triangles are closed, turned outward, and on the surface that they approximate."""
 
 import itertools
 

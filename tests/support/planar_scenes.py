@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mi_refract.planar import Event, Segments
 from mi_refract.planar.scene_file import PlanarScene, Region
-from mi_refract.planar.tracer import Event, Segments
 
 CORNERS = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], float)
 SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]

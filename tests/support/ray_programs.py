@@ -1,4 +1,4 @@
-"""Refraction as others write it, in numpy: the textbook's, and the same with one mistake each. `f(a, n, k) -> b`."""
+"""Refraction by the textbook in numpy, and the same with one mistake each: `f(a, n, k) -> b`."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from mi_refract import FORMULAS, oracle, regimes
+from mi_refract.accuracy import errors
 from mi_refract.image_diff import self_test
 from mi_refract.image_diff.methods import METHODS
 from mi_refract.image_diff.self_test import DEFECTS
@@ -21,7 +22,7 @@ from mi_refract.report.run_report import read_json
 from validation import __main__ as command
 from validation import limits, readme_tables, runner
 from validation.diff import planted_defects
-from validation.directions import bsdf_samples, judge, per_formula
+from validation.directions import bsdf_samples, per_formula
 from validation.renders import against_dielectric
 from validation.renders import scene_needs as scenes
 from validation.run import array_settings as settings
@@ -60,17 +61,17 @@ def test_errors_are_those_that_were_put_in():
     exact = oracle.refract(rays.a, rays.n, rays.k, progress=False)
     length = np.sqrt((rays.a.astype(np.longdouble) ** 2).sum(1))[:, None]
     direction = exact.direction.astype(np.longdouble) + exact.direction_low
-    chord, angle, drift = judge.errors(direction * length, rays, exact)
+    chord, angle, drift = errors(direction * length, rays, exact)
     assert max(chord.max(), angle.max(), drift.max()) < 1e-18
     across = np.cross(direction, np.roll(direction, 1, axis=1))
     across /= np.sqrt((across**2).sum(1))[:, None]
-    chord, angle, _ = judge.errors((direction + 1e-9 * across) * length, rays, exact)
+    chord, angle, _ = errors((direction + 1e-9 * across) * length, rays, exact)
     assert chord == pytest.approx(1e-9, rel=1e-6)
     assert angle == pytest.approx(1e-9, rel=1e-6)
-    chord, angle, drift = judge.errors(direction * 1.001 * length, rays, exact)
+    chord, angle, drift = errors(direction * 1.001 * length, rays, exact)
     assert (chord, drift) == (pytest.approx(1e-3), pytest.approx(1e-3))
     assert angle.max() < 1e-18
-    chord, _, _ = judge.errors(direction * np.nan, rays, exact)
+    chord, _, _ = errors(direction * np.nan, rays, exact)
     assert np.isinf(chord).all()
 
 
@@ -351,6 +352,7 @@ def test_images_of_the_first_page_exist():
     images = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)
     assert images
     assert all((readme_tables.ROOT / path).is_file() for path in images)
+    assert len(text.splitlines()) <= 200
 
 
 def test_a_scene_is_loaded_in_the_same_order_every_time(context):

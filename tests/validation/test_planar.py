@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from mi_refract.backend import detect
-from mi_refract.planar import path_loop, shapes
+from mi_refract.planar import Event, Paths, Segments, path_loop, shapes
 from mi_refract.planar import tracer as tracer
-from mi_refract.planar.tracer import Event, Paths, Segments
 from validation.planar import against_retrace, closed_paths, extruded_scenes, times, wall_scene
 from validation.planar.error_growth import _transfer
 from validation.reference.planar_retrace import retrace

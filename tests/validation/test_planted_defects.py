@@ -22,7 +22,7 @@ def sample(setting):
 def test_a_defect_is_seen_and_none_is_not(name, formula, setting):
     if MUTANTS[name].rare and setting.backend == "scalar":
         pytest.skip(planted_defects.RARE)
-    seen = sample(setting).judge(name, formula, setting.vector).seen.sum()
+    seen = sample(setting).judge(name, formula, setting.vector).wrong.sum()
     assert (seen == 0) == (name == "control")
 
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from mi_refract import oracle, regimes
+from mi_refract.accuracy import errors, evaluate, judge_formula
 from mi_refract.formulas import FORMULAS
 from mi_refract.regimes import REGIMES, Rays
 from validation import limits
 from validation.directions import search, sweep, worst_rays
-from validation.directions.judge import errors, evaluate, judge
 from validation.directions.worst_rays import Found
 from validation.reference.fast_reference import Screen
 from validation.run.array_settings import Setting, budget_of
@@ -212,11 +212,11 @@ def broken(name, subject, lines, setting):
     """The lines on which `subject` breaks the budget of `name`, and by what."""
     rays = worst_rays.rays_of(lines, setting.precision.__name__)
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-    seen = judge(subject, rays, exact, setting.vector, budget_of(name))
+    seen = judge_formula(subject, rays, exact, setting.vector, budget_of(name))
     counted = [not setting.no_budget(budget_of(name), line.regime) for line in lines]
     return [
         (lines[i].line(), "misjudged" if seen.far[i] else f"{seen.share[i]:.3g} of the bound")
-        for i in np.flatnonzero(seen.seen & counted).tolist()
+        for i in np.flatnonzero(seen.wrong & counted).tolist()
     ]
 
 

@@ -13,6 +13,7 @@ import functools
 import numpy as np
 
 from mi_refract import oracle, regimes
+from mi_refract.accuracy import BUDGETS, Judgement, RayBounds, Subject, judge, judge_formula, lengths
 from mi_refract.formulas import FORMULAS, ROUNDING
 from mi_refract.report.row import Row
 from validation import limits
@@ -29,8 +30,6 @@ from validation.run.metrics import (
     WORST_IN_U,
 )
 from validation.study import Study, Task, about
-
-from .judge import BUDGETS, Judgement, Subject, judge, judged, lengths
 
 NAME = "directions"
 FLOOR = "exact, rounded"
@@ -101,20 +100,21 @@ def _floor_row(regime: str, setting: Setting, count: int) -> Row:
     rays, exact = certified(regime, count, setting.precision)
     b = (exact.direction + exact.direction_low.astype(np.longdouble)) * lengths(rays.a)[:, None]
     b = b.astype(setting.precision).astype(np.longdouble)
-    return _row(FLOOR, regime, setting, rays, judged(b, exact.transmitted, rays, exact, ROUNDING))
+    bounds = RayBounds(rays, exact, ROUNDING, setting.roundoff)
+    return _row(FLOOR, regime, setting, rays, judge(b, exact.transmitted, bounds))
 
 
 def _regime_row(name: str, subject: Subject, regime: str, setting: Setting, count: int) -> Row:
     rays, exact = certified(regime, count, setting.precision)
-    found = judge(subject, rays, exact, setting.vector, budget_of(name))
+    found = judge_formula(subject, rays, exact, setting.vector, budget_of(name))
     return _row(name, regime, setting, rays, found, setting.no_budget(budget_of(name), regime))
 
 
 @np.errstate(over="ignore")
 def _row(name: str, regime: str, setting: Setting, rays: regimes.Rays, found: Judgement, reason: str = "") -> Row:
     """`reason`: why there is no budget. Then nothing is said of the share of it either."""
-    u, some = setting.roundoff, found.right.any()
-    chord, angle, drift = (x[found.right] if some else np.zeros(1) for x in (found.chord, found.angle, found.drift))
+    u, some = setting.roundoff, found.compared.any()
+    chord, angle, drift = (x[found.compared] if some else np.zeros(1) for x in (found.chord, found.angle, found.drift))
     values = {
         WORST_IN_U: float(chord.max()) / u,
         **({} if reason else found.values()),
@@ -128,14 +128,14 @@ def _row(name: str, regime: str, setting: Setting, rays: regimes.Rays, found: Ju
         MISCLASSIFIED: float(found.misjudged.sum()),
         "other side": float(found.crossed.sum()),
     }
-    worst = {"largest error": np.where(found.right, found.chord, -1), "nearest to its bound": found.share}
+    worst = {"largest error": np.where(found.compared, found.chord, -1), "nearest to its bound": found.share}
     replay = {
         "regime": regime,
         "text": regimes.REGIMES[regime].text,
         "count": len(rays),
         "seed": SEED,
         **{title: rays.hexed(int(np.argmax(x))) for title, x in worst.items()},
-        "needed": {"linear": float(found.linear.max()), "radicand": float(found.radicand.max())},
+        "needed": {"linear": float(found.linear_needed.max()), "radicand": float(found.radicand_needed.max())},
     }
     budgets = {} if reason else BUDGETS
     return Row(NAME, name, regime, setting.label, values, budgets, reason=reason, replay=replay)

@@ -17,6 +17,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import oracle, regimes
+from mi_refract.accuracy import Judgement, Subject, judge_formula
 from mi_refract.formulas import FORMULAS, contract, wedge
 from mi_refract.numerics import error_free
 from mi_refract.regimes import Rays
@@ -26,8 +27,6 @@ from validation.run.array_settings import Setting, settings
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED_FAR
 from validation.study import Study, Task, about
-
-from .judge import Judgement, Subject, judge
 
 NAME = "planted_defects"
 SEED = 2028
@@ -256,11 +255,11 @@ def _row(name: str, formula: str, setting: Setting, sample: Sample) -> Row:
     if MUTANTS[name].rare and setting.is_scalar:
         return Row(NAME, name, formula, setting.label, reason=RARE)
     found = sample.judge(name, formula, setting.vector)
-    seen = int(found.seen.sum())
+    seen = int(found.wrong.sum())
     values = {"rays that see it": float(seen), "escaped": float(seen == 0), **found.values()}
     budgets = {"rays that see it": 0.0} if name == "control" else {"escaped": 0.0}
     remark = sample.strongest(found) if seen else ""
-    replay = {"seed": SEED, "rays": len(found.seen)}
+    replay = {"seed": SEED, "rays": len(found.wrong)}
     return Row(NAME, name, formula, setting.label, values, budgets, reason=remark, replay=replay)
 
 
@@ -277,7 +276,7 @@ class Sample:
         """A mutant by the budget of the formula that it spoils, on the rays that are for that formula."""
         spoilt, budget = MUTANTS[mutant].make(FORMULAS[formula]), FORMULAS[formula].budget
         part = self if budget.at_the_limit else self.only(self.unit)
-        return judge(spoilt, part.rays, part.exact, vector, budget)
+        return judge_formula(spoilt, part.rays, part.exact, vector, budget)
 
     def only(self, mask: np.ndarray) -> Sample:
         def part(x: Any) -> Any:
@@ -287,7 +286,7 @@ class Sample:
 
     def strongest(self, found: Judgement) -> str:
         """ "regime, metric value": a wrong decision before a wrong direction, where most rays see it."""
-        metric, mask = (MISCLASSIFIED_FAR, found.far) if found.far.any() else (ERROR_OVER_BOUND, found.seen)
+        metric, mask = (MISCLASSIFIED_FAR, found.far) if found.far.any() else (ERROR_OVER_BOUND, found.wrong)
         names = self.regime if len(mask) == len(self.regime) else self.regime[self.unit]
         regime = max(dict.fromkeys(names), key=lambda name: int(mask[names == name].sum()))
         there = names == regime

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.random import Generator
 
 from mi_refract import oracle, regimes
+from mi_refract.accuracy import BUDGETS, Subject, judge_formula
 from mi_refract.formulas import FORMULAS
 from mi_refract.regimes import REGIMES, Rays
 from mi_refract.report.row import Row
@@ -31,7 +32,6 @@ from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED_FAR
 from validation.study import Study, Task, about
 
 from . import worst_rays
-from .judge import BUDGETS, Subject, judge
 from .worst_rays import Found
 
 NAME = "search"
@@ -243,7 +243,7 @@ def certify(name: str, subject: Subject, herd: Herd, setting: Setting) -> list[C
     """Every parent's certified score, held to the budget of `name`."""
     rays, u = herd.rays, setting.roundoff
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-    seen = judge(subject, rays, exact, setting.vector, budget_of(name))
+    seen = judge_formula(subject, rays, exact, setting.vector, budget_of(name))
     margin = np.abs(oracle.relative_radicand(rays.a, rays.n, rays.k)) / u**2
     found = []
     for i, wrong in enumerate((seen.misjudged | seen.far).tolist()):
@@ -263,7 +263,7 @@ def rescored(name: str, setting: Setting) -> list[Found]:
     lines = [line for line in worst_rays.read() if (line.formula, line.precision) == (name, precision)]
     rays, u = worst_rays.rays_of(lines, precision), setting.roundoff
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-    seen = judge(FORMULAS[name], rays, exact, setting.vector, budget_of(name))
+    seen = judge_formula(FORMULAS[name], rays, exact, setting.vector, budget_of(name))
     far = np.where(seen.misjudged, np.abs(oracle.relative_radicand(rays.a, rays.n, rays.k)) / u**2, 0.0)
     scores = {"chord": seen.chord / u, "decision": far}
     return [line.scored(float(scores[line.objective][i])) for i, line in enumerate(lines)]

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_refract import oracle, regimes
+from mi_refract.accuracy import BUDGETS, judge_formula
 from mi_refract.formulas import FORMULAS, Budget
 from mi_refract.regimes import Rays
 from mi_refract.report.row import Row
@@ -22,8 +23,6 @@ from validation.run.array_settings import Setting, budget_of, settings
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED, MISCLASSIFIED_FAR, WORST_IN_U
 from validation.study import Study, Task, about
-
-from .judge import BUDGETS, judge
 
 NAME = "sweep"
 TERMS = {
@@ -145,10 +144,10 @@ def _certified_row(name: str, regime: str, setting: Setting, found: Gathered, co
     certain = np.arange(len(rays)) < len(rays) - len(found.unresolved.rays)
     entry, reason = regimes.REGIMES[regime], setting.no_budget(budget_of(name), regime)
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-    seen = judge(FORMULAS[name], rays, exact, setting.vector, budget_of(name))
+    seen = judge_formula(FORMULAS[name], rays, exact, setting.vector, budget_of(name))
     wrong = seen.misjudged
     values = {
-        WORST_IN_U: float(np.max(seen.chord, where=seen.right, initial=0)) / setting.roundoff,
+        WORST_IN_U: float(np.max(seen.chord, where=seen.compared, initial=0)) / setting.roundoff,
         **({} if reason else seen.values()),
         MISCLASSIFIED: float(found.misclassified.offered + (wrong & ~certain).sum()),
         "screen off": _disagreement(found, seen.chord[certain] / setting.roundoff, wrong[certain]),

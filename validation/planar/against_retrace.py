@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from mi_refract.formulas import FORMULAS
+from mi_refract.planar import Paths, Segments, trace
 from mi_refract.planar.scene_file import PlanarScene, load
-from mi_refract.planar.tracer import Paths, Segments, trace
 from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.planar_retrace import Array, Retraced, retrace

@@ -16,9 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mi_refract.planar import shapes
+from mi_refract.planar import Event, Paths, Segments, shapes
 from mi_refract.planar.curves import Curve
-from mi_refract.planar.tracer import Event, Paths, Segments
 from mi_refract.report.row import Row
 from validation import limits
 from validation.reference import closed_forms as closed

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mi_refract.planar.tracer import Segments
+from mi_refract.planar import Segments
 from validation.reference.planar_retrace import Array, Retraced
 
 ROUNDINGS = 2  # of the operands, and of the result

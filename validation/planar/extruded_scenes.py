@@ -17,7 +17,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.planar.tracer import Event, Paths
+from mi_refract.planar import Event, Paths
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.row import Row
 from validation.reference.layered_scenes import OFFSET

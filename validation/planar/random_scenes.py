@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mi_refract.planar import shapes
+from mi_refract.planar import Segments, shapes
 from mi_refract.planar.curves import Curve, affine
-from mi_refract.planar.tracer import Segments
 from validation.reference.planar_retrace import Array
 
 SIDE = 3  # bodies in a row

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mi_refract.planar.tracer import Paths, Segments
+from mi_refract.planar import Paths, Segments
 from validation.reference.planar_retrace import Array, Curves, Retraced
 
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mi_refract.planar import shapes
-from mi_refract.planar.tracer import Array, Paths, Segments, Tracer
+from mi_refract.planar import Paths, Segments, Tracer, shapes
+from mi_refract.planar.segments import Array
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing

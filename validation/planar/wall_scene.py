@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refract.planar import curves
-from mi_refract.planar.tracer import Segments
+from mi_refract.planar import Segments, curves
 from mi_refract.plugins.refract import PLUGIN
 from validation.reference.planar_retrace import Array
 

@@ -17,10 +17,10 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import regimes
+from mi_refract.accuracy import Subject
 from mi_refract.formulas import Budget
 from mi_refract.numerics import float_expansions
 from mi_refract.regimes import Rays
-from validation.directions.judge import Subject
 
 # The screen's own resolution. Below it, and where a component of float64 is denormal and decides, it has guessed.
 RESOLUTION = 2.0**-140

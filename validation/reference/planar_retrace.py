@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_refract.planar.tracer import Event, Segments
+from mi_refract.planar import Event, Segments
 
 Array = NDArray[Any]
 PAIRS = 1 << 20  # rays times segments at once: 16 bytes each, for a dozen arrays

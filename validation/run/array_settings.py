@@ -9,9 +9,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from mi_refract.accuracy import Subject
 from mi_refract.formulas import FORMULAS, Budget
 from mi_refract.regimes import REGIMES
-from validation.directions.judge import Subject
 
 from .context import Context
 

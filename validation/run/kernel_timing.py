@@ -16,9 +16,9 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import regimes
+from mi_refract.accuracy import Subject
 from mi_refract.formulas import FORMULAS
 from validation import limits
-from validation.directions.judge import Subject
 from validation.run.metrics import TIME_OVER_COPY, TIME_OVER_PLAIN
 
 from .array_settings import PLAIN, Setting

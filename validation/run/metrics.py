@@ -3,7 +3,7 @@
 A table that asks for a name that is not here fails at import, not after the run.
 """
 
-from validation.directions.judge import BUDGETS
+from mi_refract.accuracy import BUDGETS
 
 # Directions, per ray: the judge's own names.
 ERROR_OVER_BOUND, MISCLASSIFIED_FAR = BUDGETS

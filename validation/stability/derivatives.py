@@ -19,11 +19,11 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import oracle, regimes
+from mi_refract.accuracy import lengths
 from mi_refract.formulas import FORMULAS, fresnel
 from mi_refract.oracle import derivatives
 from mi_refract.report.row import Row
 from validation import limits
-from validation.directions.judge import lengths
 from validation.run.array_settings import Setting, settings
 from validation.run.context import Context
 from validation.study import Study, Task, about

@@ -16,11 +16,11 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import oracle, regimes
+from mi_refract.accuracy import lengths
 from mi_refract.formulas import fresnel, resolve
 from mi_refract.report.row import Row
 from validation import limits
 from validation.directions.bsdf_samples import sample_all
-from validation.directions.judge import lengths
 from validation.reference.diffuse_fresnel import GRADE, hemispherical, nodes
 from validation.run.array_settings import Setting, settings
 from validation.run.context import Context

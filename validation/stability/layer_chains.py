@@ -24,7 +24,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from validation.directions.judge import Subject
+from mi_refract.accuracy import Subject
 from validation.run.array_settings import Setting
 
 Array = NDArray[Any]

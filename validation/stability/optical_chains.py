@@ -17,10 +17,10 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import regimes
+from mi_refract.accuracy import Subject, evaluate
 from mi_refract.formulas import FORMULAS
 from mi_refract.report.row import Row
 from validation import limits
-from validation.directions.judge import Subject, evaluate
 from validation.reference import optical_systems
 from validation.run import array_settings as backends
 from validation.run.array_settings import Setting

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mi_refract import regimes
-from mi_refract.accuracy import direction_errors
+from mi_refract.accuracy import absolute_radicand
 from mi_refract.ray_sets import check_answers, ray_set
 from mi_refract.ray_sets.check_answers import PROBLEMS, Findings, RegimeErrors
 from mi_refract.ray_sets.files import as_csv, parse_answers
@@ -152,7 +152,7 @@ def _gathered(parts: dict[str, regimes.Rays], precision: str) -> RaySet:
 
 def rows(call: RefractFunction, rays: RaySet, answers: Answers) -> list[Row]:
     """One per set."""
-    left_out = direction_errors.absolute_radicand(rays.rays) < call.gives_up
+    left_out = absolute_radicand(rays.rays) < call.gives_up
     findings = check_answers.check(_only(rays, ~left_out), _without(answers, rays.ids[left_out]))
     about = _remark(findings, str(answers.header.get("system", "")), call.remark)
     made = []

@@ -196,7 +196,41 @@ function listen() {
   });
 }
 
+// Sideways: says on which sides a table goes on.
+function markScroll(box) {
+  const right = box.scrollWidth - box.clientWidth - box.scrollLeft > 2;
+  box.dataset.more = [box.scrollLeft > 2 && "left", right && "right"].filter(Boolean).join(" ");
+}
+function watchScrolls() {
+  const seen = new ResizeObserver((entries) => entries.forEach((entry) => markScroll(entry.target)));
+  for (const box of all(".scroll")) {
+    seen.observe(box);
+    box.addEventListener("scroll", () => markScroll(box), { passive: true });
+  }
+}
+
+// The rows of a section, from the page itself; where that fails, the link leads to rows.json beside it.
+async function unpacked(id) {
+  const deflated = Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
+  return new Response(new Blob([deflated]).stream().pipeThrough(new DecompressionStream("deflate"))).blob();
+}
+async function save(link) {
+  const made = document.createElement("a");
+  made.href = URL.createObjectURL(new Blob([await unpacked(link.dataset.rows)], { type: "application/json" }));
+  made.download = link.download;
+  made.click();
+  URL.revokeObjectURL(made.href);
+}
+function offerRows() {
+  for (const link of all("a[data-rows]")) link.addEventListener("click", (e) => {
+    e.preventDefault();
+    save(link);
+  });
+}
+
 async function start() {
+  watchScrolls();
+  offerRows();
   await Promise.all([...new Set(all("canvas").map((canvas) => canvas.dataset.pixels))].map(load));
   setExposure(0);
   setSign("signed");

@@ -6,8 +6,7 @@ from importlib.resources import files as resources
 
 import numpy as np
 
-from mi_refract.scene_export.plain_scene import PlainScene
-
+from ..plain_scene import PlainScene
 from . import scene_json
 from .environment_map import Array
 from .shared_files import LIGHT_INSIDE, Files, readme

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_refract.scene_export.plain_scene import Environment
+from ..plain_scene import Environment
 
 Array = NDArray[np.float64]
 Lookup = Callable[[Array, Array], Array]  # (u, v) in [0, 1]², v from the top row down → directions (…, 3)

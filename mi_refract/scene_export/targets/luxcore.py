@@ -6,8 +6,7 @@ from importlib.resources import files as resources
 
 import numpy as np
 
-from mi_refract.scene_export.plain_scene import Camera, Colour, Environment, Glass, Light, Material, PlainScene
-
+from ..plain_scene import Camera, Colour, Environment, Glass, Light, Material, PlainScene
 from . import scene_json
 from .environment_map import Array
 from .shared_files import Files, numbers, ply, readme

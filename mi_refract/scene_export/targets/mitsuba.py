@@ -6,36 +6,14 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from mi_refract.scene_export.plain_scene import Colour, Diffuse, Environment, Glass, Material, PlainScene
-
+from ..plain_scene import Colour, Diffuse, Environment, Glass, Material, Mesh, PlainScene
 from .shared_files import Files, exr, numbers, ply, readme
 
-COMMANDS = "mi-refract render scene.xml -o image.exr --spp 1024        (-D bsdf=dielectric for Mitsuba's own)"
-
-
-def files(plain: PlainScene) -> Files:
-    """The files of the export, by name."""
-    meshes: Files = {f"{mesh.name}.ply": ply(mesh) for mesh in plain.meshes}
-    sky: Files = {"sky.exr": exr(plain.sky.pixels)} if isinstance(plain.sky, Environment) else {}
-    text = {"scene.xml": _scene(plain).encode(), "README.txt": readme(plain, "Mitsuba", COMMANDS, ())}
-    return meshes | sky | text
-
-
-def _scene(plain: PlainScene) -> str:
-    camera = plain.camera
-    shapes = "\n".join(
-        f"""
-    <shape type="ply" id={quoteattr(mesh.name)}>
-        <string name="filename" value={quoteattr(mesh.name + ".ply")}/>
-        <boolean name="face_normals" value="true"/>
-        {_material(mesh.material)}
-    </shape>"""
-        for mesh in plain.meshes
-    )
-    return f"""<scene version="3.0.0">
+COMMANDS = "mi-refract render scene.xml -o image.exr --spp 1024        (-D bsdf=dielectric for Mitsuba's own glass)"
+SCENE = """<scene version="3.0.0">
     <default name="bsdf" value="refract"/>
     <default name="integrator" value="path"/>
-    <default name="max_depth" value="{plain.max_depth}"/>
+    <default name="max_depth" value="{max_depth}"/>
     <default name="spp" value="64"/>
 
     <integrator type="$integrator">
@@ -45,9 +23,9 @@ def _scene(plain: PlainScene) -> str:
 
     <sensor type="perspective">
         <transform name="to_world">
-            <lookat origin="{numbers(camera.origin, ", ")}"
-                    target="{numbers(camera.target, ", ")}"
-                    up="{numbers(camera.up, ", ")}"/>
+            <lookat origin="{origin}"
+                    target="{target}"
+                    up="{up}"/>
         </transform>
         <float name="fov" value="{camera.fov_x_degrees!r}"/>
         <string name="fov_axis" value="x"/>
@@ -63,9 +41,33 @@ def _scene(plain: PlainScene) -> str:
         </film>
     </sensor>
 {shapes}
-{_sky(plain.sky)}
+{sky}
 </scene>
 """
+
+
+def files(plain: PlainScene) -> Files:
+    """The files of the export, by name."""
+    meshes: Files = {f"{mesh.name}.ply": ply(mesh) for mesh in plain.meshes}
+    sky: Files = {"sky.exr": exr(plain.sky.pixels)} if isinstance(plain.sky, Environment) else {}
+    text = {"scene.xml": _scene(plain).encode(), "README.txt": readme(plain, "Mitsuba", COMMANDS, ())}
+    return meshes | sky | text
+
+
+def _scene(plain: PlainScene) -> str:
+    camera = plain.camera
+    vectors = {name: numbers(getattr(camera, name), ", ") for name in ("origin", "target", "up")}
+    shapes = "\n".join(map(_shape, plain.meshes))
+    return SCENE.format(camera=camera, max_depth=plain.max_depth, shapes=shapes, sky=_sky(plain.sky), **vectors)
+
+
+def _shape(mesh: Mesh) -> str:
+    return f"""
+    <shape type="ply" id={quoteattr(mesh.name)}>
+        <string name="filename" value={quoteattr(mesh.name + ".ply")}/>
+        <boolean name="face_normals" value="true"/>
+        {_material(mesh.material)}
+    </shape>"""
 
 
 def _material(material: Material) -> str:

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mi_refract.scene_export.plain_scene import Diffuse, Glass, Material, PlainScene
-
+from ..plain_scene import Diffuse, Glass, Material, PlainScene
 from . import scene_json
 from .environment_map import Array
 from .shared_files import Files, numbers, readme

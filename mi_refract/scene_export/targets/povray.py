@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from mi_refract.scene_export.plain_scene import (
+from ..plain_scene import (
     Camera,
     Colour,
     Diffuse,
@@ -17,14 +17,13 @@ from mi_refract.scene_export.plain_scene import (
     Mesh,
     PlainScene,
 )
-from mi_refract.scene_export.tessellation import is_closed
-
+from ..tessellation import is_closed
 from . import scene_json
 from .environment_map import Array
 from .shared_files import LIGHT_INSIDE, Files, numbers, readme
 
 COMMANDS = """
-    povray +Iscene.pov +Oimage.exr +FE +W{width} +H{height} -A -D File_Gamma=1.0 Declare=dx=0.5 Declare=dy=0.5
+povray +Iscene.pov +Oimage.exr +FE +W{width} +H{height} -A -D File_Gamma=1.0 Declare=dx=0.5 Declare=dy=0.5
 
 0 <= dx, dy < 1 is the place of the only sample in each pixel. The mean of images with random dx and dy is a box filter.
 """

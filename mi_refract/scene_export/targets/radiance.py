@@ -7,16 +7,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mi_refract.scene_export.plain_scene import Camera, Diffuse, Environment, Glass, Material, Mesh, PlainScene
-
+from ..plain_scene import Camera, Diffuse, Environment, Glass, Material, Mesh, PlainScene
 from . import scene_json
 from .shared_files import Files, numbers, readme
 
 COMMANDS = """
-    oconv scene.rad > scene.oct
-    vwrays -fd -x {width} -y {height} -pa 0 -pj 1 -c 1024 -vf camera.vf |
-        rtrace -h -w -u+ -fdf -ab {depth} -aa 0 -ad 1 -as 0 -lr -{depth} -lw 1e-2 \\
-        scene.oct | total -if3 -of -m -1024 > image.f32
+oconv scene.rad > scene.oct
+vwrays -fd -x {width} -y {height} -pa 0 -pj 1 -c 1024 -vf camera.vf |
+    rtrace -h -w -u+ -fdf -ab {depth} -aa 0 -ad 1 -as 0 -lr -{depth} -lw 1e-2 \\
+    scene.oct | total -if3 -of -m -1024 > image.f32
 
 RAYPATH must name both this folder and Radiance's lib. 1024 is the number of samples per pixel.
 image.f32 holds {height} rows of {width} pixels of 3 float32, the top row first.

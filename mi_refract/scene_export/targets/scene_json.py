@@ -7,8 +7,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from mi_refract.scene_export.plain_scene import Environment, Material, PlainScene
-
+from ..plain_scene import Environment, Material, PlainScene
 from .environment_map import Lookup, longitude_latitude
 from .shared_files import Files, exr, ply
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from mi_refract import __version__
 from mi_refract.io.image_file import write_exr
-from mi_refract.scene_export.plain_scene import Mesh, PlainScene
+
+from ..plain_scene import Mesh, PlainScene
 
 Files = dict[str, bytes]  # contents by name
 

@@ -1,0 +1,195 @@
+"""The judge of directions: every ray against its certified answer and the error bound of a formula for that ray."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_refract import oracle
+from mi_refract.formulas import NEGLIGIBLE, UNIT, Budget, radicand_for
+from mi_refract.numerics import ArrayType
+from mi_refract.regimes import Array, Rays
+
+from .direction_errors import absolute_radicand, errors, errors_of_normalised, lengths, relative_radicand
+from .evaluate import Subject, evaluate
+
+Flags = NDArray[np.bool_]
+
+# In u: what making `a` and `n` unit in their own precision leaves of errors, with those of the components.
+NORMALISING = 3.0
+# The most that `Judgement.values` may be.
+BUDGETS = {"error / bound": 1.0, "misjudged far": 0.0}
+
+
+@dataclass(frozen=True)
+class RayBounds:
+    """What an error bound, `budget`, allows for each ray. Arrays are (N,).
+
+    `roundoff`: that of the answers' precision. `normalised`: whoever answers may make `a`, `n` and `b` unit.
+    """
+
+    rays: Rays
+    exact: oracle.Certified
+    budget: Budget
+    roundoff: float
+    normalised: bool = False
+
+    @functools.cached_property
+    def u(self) -> Any:
+        """The roundoff that the bound is taken at, a number or (N,).
+
+        A formula for unit vectors is off by what `a` and `n` are off unit by, too; by no more than NORMALISING
+        roundoffs if they may have been made unit.
+        """
+        if self.budget.at_the_limit:
+            return self.roundoff
+        off = np.maximum(*(np.abs(lengths(v) - 1) for v in (self.rays.a, self.rays.n)))
+        most = NORMALISING * self.roundoff if self.normalised else np.inf
+        return np.clip(off, self.roundoff, most).astype(float)
+
+    @functools.cached_property
+    def k(self) -> Array:
+        """n_from / n_to in float64."""
+        return self.rays.k.astype(float)
+
+    @functools.cached_property
+    def unit(self) -> Any:
+        """Whether |a| is 1, up to the rounding of its components."""
+        return self.normalised or np.abs(lengths(self.rays.a) - 1) <= UNIT * self.roundoff
+
+    @property
+    def side_open(self) -> Any:
+        """Whether the ray is so near to the surface that the formula need not know its side."""
+        return self.budget.side_open(self.u, self.exact.cos_i)
+
+    @property
+    def of_terms(self) -> Any:
+        """The part of the bound that is linear in u."""
+        return self.budget.of_terms(self.u, self.k, self.exact.transmitted, self.unit)
+
+    @property
+    def of_root(self) -> Any:
+        """The part of the bound that is what the root makes of the radicand's error."""
+        return self.budget.of_root(self.u, self.k, self.exact.cos_t, self.exact.transmitted)
+
+    @functools.cached_property
+    def chord(self) -> Array:
+        """Bound of the chord error |b/|a| − exact|."""
+        exact = self.exact
+        return np.asarray(self.budget.chord(self.u, self.k, exact.cos_t, exact.transmitted, self.unit, exact.cos_i))
+
+    @functools.cached_property
+    def decided(self) -> Flags:
+        """Where total internal reflection must be decided rightly: the radicand exceeds the error the bound allows."""
+        return self.decided_of(np.ones(len(self.rays), bool))
+
+    def decided_of(self, some: Flags) -> Flags:
+        """`decided` of the rays in the mask, False elsewhere. (The radicand takes time.)"""
+        rays, found = self.rays[some], some.copy()
+        if self.budget.at_the_limit:
+            # A tangential ray at k = 1 has no terms, and NaN is not within anything.
+            found[some] = ~(relative_radicand(rays) <= NEGLIGIBLE * self.roundoff**2)
+            return found
+        u = self.u[some]
+        found[some] = absolute_radicand(rays) > self.budget.radicand_error_bound(u, self.k[some])
+        return found & ~self.side_open
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The verdict on each ray. Arrays are (N,).
+
+    Errors count where directions are `compared`: total internal reflection was decided rightly, and a direction came.
+    """
+
+    bounds: RayBounds
+    chord: Array  # |b/|a| − exact|; infinite where b is NaN
+    angle: Array  # radians
+    drift: Array  # of the length of b, relative
+    error: Array  # what the bound is of: the chord; of normalised answers the larger of angle and drift
+    compared: Flags
+    misjudged: Flags  # transmitted where all is reflected, or the reverse
+    blank: Flags  # neither a direction nor a sign of total internal reflection
+
+    @functools.cached_property
+    @np.errstate(over="ignore")
+    def share(self) -> Array:
+        """Error over bound of the rays compared, 0 elsewhere."""
+        return np.where(self.compared, self.error / self.bounds.chord, 0.0)
+
+    @functools.cached_property
+    def far(self) -> Flags:
+        """Misjudged although the radicand exceeds what the bound leaves open; or undecided by the oracle."""
+        return self.bounds.decided_of(self.misjudged) | self.bounds.exact.undecided
+
+    @functools.cached_property
+    def wrong(self) -> Flags:
+        """The rays that break the bound."""
+        return ~(self.share <= 1) | self.far | self.blank
+
+    def meets(self, budget: Budget) -> Flags:
+        """The answers that keep the bound of another budget."""
+        return ~replace(self, bounds=replace(self.bounds, budget=budget)).wrong
+
+    @property
+    def crossed(self) -> Flags:
+        """On the other side of the surface, where the bound leaves the side open."""
+        exact = self.bounds.exact
+        return self.bounds.side_open & self.compared & exact.transmitted & (self.error > exact.cos_t)
+
+    @property
+    @np.errstate(over="ignore", invalid="ignore")
+    def linear_needed(self) -> Array:
+        """What `budget.linear` would have to be for this ray, the rest of the budget as it is."""
+        needed = self.bounds.budget.linear * (self.error - self.bounds.of_root) / self.bounds.of_terms
+        return np.where(self.compared & ~self.bounds.side_open, needed, 0.0)
+
+    @property
+    @np.errstate(over="ignore", invalid="ignore")
+    def radicand_needed(self) -> Array:
+        """What `budget.radicand` would have to be for this ray, the rest of the budget as it is."""
+        bounds, exact = self.bounds, self.bounds.exact
+        needed = radicand_for(np.maximum(self.error - bounds.of_terms, 0), exact.cos_t)
+        needed = np.where(exact.transmitted, needed, 0.0)
+        needed = np.where(self.misjudged, absolute_radicand(bounds.rays).astype(float), needed)
+        needed = needed / (bounds.u * np.maximum(1.0, bounds.k) ** bounds.budget.growth)
+        return np.where(bounds.side_open, 0.0, needed)
+
+    def values(self) -> dict[str, float]:
+        """The worst of all rays; within the bounds where each is at most that of BUDGETS."""
+        return {"error / bound": float(self.share.max()), "misjudged far": float(self.far.sum())}
+
+
+def judge_formula(
+    subject: Subject, rays: Rays, exact: oracle.Certified, vector: ArrayType, budget: Budget
+) -> Judgement:
+    """`judge` what `subject` returns for all rays, computed in arrays of the 3-vector type `vector`."""
+    u = float(np.finfo(rays.a.dtype).eps) / 2
+    return judge(*evaluate(subject, rays, vector), RayBounds(rays, exact, budget, u))
+
+
+def judge(
+    b: Array, transmitted: Flags, bounds: RayBounds, directed: Flags | bool = True, blank: Flags | bool = False
+) -> Judgement:
+    """Answers `b` (N, 3), in any precision, and whether each says that the ray is transmitted (N,), ray by ray.
+
+    `directed`: whose b is a direction to compare; `blank`: whose b is neither that nor a sign of total internal
+    reflection. Of `bounds.normalised` answers the length counts less: see `errors_of_normalised`.
+    """
+    exact = bounds.exact
+    known = ~exact.undecided & ~np.broadcast_to(blank, len(exact))
+    misjudged = (transmitted != exact.transmitted) & known
+    measure = errors_of_normalised if bounds.normalised else errors
+    found = measure(b, bounds.rays, exact)
+    return Judgement(
+        bounds,
+        *found,
+        error=np.maximum(found.angle, found.drift) if bounds.normalised else found.chord,
+        compared=~misjudged & known & directed,
+        misjudged=misjudged,
+        blank=np.broadcast_to(blank, len(exact)),
+    )

@@ -1,0 +1,107 @@
+"""Boundaries between media in the plane: directed segments, straight or arcs of conics. Numpy only."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+SHAPES: dict[str, tuple[int, ...]] = {
+    "start": (2,),
+    "end": (2,),
+    "n_left": (),
+    "n_right": (),
+    "control": (2,),
+    "weight": (),
+}
+ARC_FIELDS = "control", "weight"
+
+
+def finite_array(name: str, values: Any, shape: tuple[int, ...]) -> Array:
+    """`values` as float64 of that shape. ValueError, which calls it `name`, for another shape, NaN or Inf."""
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: accepted: numbers of shape {shape}") from None
+    if array.shape != shape:
+        raise ValueError(f"{name}: shape {array.shape}; accepted: {shape}")
+    if array.size and not (np.isfinite(array.min()) and np.isfinite(array.max())):
+        place = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise ValueError(f"{name}{list(place)} = {array[place]}: accepted: finite numbers")
+    return array
+
+
+@dataclass(frozen=True)
+class Segments:
+    """M directed boundaries from `start` to `end` (M × 2), between media of index `n_left` and `n_right` (M).
+
+    Left and right are as seen along the segment. All segments are straight where `control` and `weight` are None.
+    Otherwise they are arcs of conics, written as rational quadratic Bézier curves
+
+        ((1−t)² start + 2w t(1−t) control + t² end) / ((1−t)² + 2w t(1−t) + t²),   0 ≤ t ≤ 1
+
+    with `control` (M × 2), where the tangents at both ends meet, and `weight` (M): w < 1 is an ellipse, w = 1 a
+    parabola, w > 1 a hyperbola. Each arc turns by less than 180°.
+
+    ValueError for shapes that do not fit, NaN or Inf, an index ≤ 0, a weight ≤ 0, and two segments that coincide.
+    """
+
+    start: Array
+    end: Array
+    n_left: Array
+    n_right: Array
+    control: Array | None = None
+    weight: Array | None = None
+
+    def __post_init__(self) -> None:
+        """Convert all fields to float64 and check them."""
+        if len(self.start) == 0:
+            raise ValueError("segments: none; accepted: at least one")
+        for name, shape in SHAPES.items():
+            values = getattr(self, name)
+            if values is None and name in ARC_FIELDS:
+                continue
+            values = finite_array(f"segments.{name}", values, (len(self.start), *shape))
+            object.__setattr__(self, name, values)
+        if (self.control is None) != (self.weight is None):
+            raise ValueError("segments: control and weight: accepted: both or neither")
+        for name in ("n_left", "n_right", "weight"):
+            values = getattr(self, name)
+            if values is not None and not (values > 0).all():
+                i = int(np.argmin(values > 0))
+                raise ValueError(f"segments.{name}[{i}] = {values[i]}: accepted: more than 0")
+        self._check_distinct()
+
+    def __len__(self) -> int:
+        """M."""
+        return len(self.start)
+
+    @property
+    def curved(self) -> bool:
+        """Whether the segments are given as arcs; some of them may be straight all the same."""
+        return self.control is not None
+
+    @functools.cached_property
+    def vertices(self) -> NDArray[np.uint32]:
+        """M × 2: a number for each start and each end, the same for ends at the same place."""
+        places = np.concatenate([self.start, self.end]) + 0.0  # −0 is 0
+        _, numbers = np.unique(places.view(complex).ravel(), return_inverse=True)
+        return numbers.reshape(2, -1).T.astype(np.uint32)
+
+    def _check_distinct(self) -> None:
+        """ValueError for two segments that coincide: neither of them would come first on a ray."""
+        ends = np.sort(self.vertices, axis=1).astype(np.uint64)
+        bulge = np.zeros((len(self), 3))
+        if self.control is not None and self.weight is not None:
+            bulge = np.column_stack([self.control, self.weight]) + 0.0
+        key = np.column_stack([ends[:, 0] << np.uint64(32) | ends[:, 1], bulge.view(np.uint64)])
+        order = np.lexsort(key.T)
+        same = (np.diff(key[order].astype(np.int64), axis=0) == 0).all(1) & (ends[order[1:], 0] != ends[order[1:], 1])
+        if same.any():
+            i, j = sorted(order[int(np.argmax(same)) :][:2].tolist())
+            raise ValueError(f"segments {i} and {j} coincide; accepted: one, with the media on either side of both")
