@@ -173,6 +173,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def defect_rows(context: Context, name: str) -> list[Row]:
+    """A row per defect of the glass and of finished images, and one of the noise of the clean renders."""
     if context.variant.startswith("scalar"):
         return [Row(NAME, "every defect", name, context.variant, reason=SCALAR)]
     import mitsuba as mi

@@ -78,6 +78,7 @@ def tasks(context: Context) -> list[Task]:
 
 @functools.cache
 def certified(regime: str, count: int, precision: type) -> tuple[regimes.Rays, oracle.Certified]:
+    """`count` rays of a regime in a precision, and the oracle's answers."""
     rays = regimes.make(regime, count, precision, SEED)
     return rays, oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
 

@@ -279,6 +279,8 @@ class Sample:
         return judge_formula(spoilt, part.rays, part.exact, vector, budget)
 
     def only(self, mask: np.ndarray) -> Sample:
+        """The rays of a mask (N,)."""
+
         def part(x: Any) -> Any:
             return type(x)(**{f.name: getattr(x, f.name)[mask] for f in dataclasses.fields(x)})
 

@@ -99,6 +99,7 @@ class Herd:
     names: tuple[str, ...]
 
     def __len__(self) -> int:
+        """How many families there are."""
         return len(self.score)
 
 
@@ -254,6 +255,7 @@ def certify(name: str, subject: Subject, herd: Herd, setting: Setting) -> list[C
 
 
 def worth_keeping(found: Iterable[Certified]) -> list[Found]:
+    """The lines whose error over bound is above WORTH_KEEPING."""
     return [f.line for f in found if f.share > WORTH_KEEPING[budget_of(f.line.formula).at_the_limit]]
 
 
@@ -273,6 +275,7 @@ def rescored(name: str, setting: Setting) -> list[Found]:
 
 
 def main(arguments: list[str] | None = None) -> int:
+    """The search by hand: from the command line, or `arguments`; the exit code."""
     parser = argparse.ArgumentParser(prog="validation.search", description="Try to break the budgets of the formulas.")
     parser.add_argument("formulas", nargs="*", help="keys of FORMULAS; all by default")
     parser.add_argument("--generations", type=int, default=PROFILES["full"].generations)

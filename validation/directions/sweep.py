@@ -77,12 +77,14 @@ class Best:
     """The rays with the highest scores so far, at most `size`, with their chords, and how many were offered."""
 
     def __init__(self, size: int) -> None:
+        """None yet; at most `size` are kept."""
         self.size, self.offered = size, 0
         self.score: np.ndarray = np.empty(0)
         self.chord: np.ndarray = np.empty(0)
         self._rays: list[Rays] = []
 
     def add(self, rays: Rays, score: np.ndarray, mask: np.ndarray, chord: np.ndarray) -> None:
+        """Offer the rays of a mask (N,), with their scores and chord errors (N,)."""
         index = np.flatnonzero(mask)
         self.offered += len(index)
         index = index[_largest(score[index], self.size)]
@@ -93,6 +95,7 @@ class Best:
 
     @property
     def rays(self) -> Rays:
+        """The rays that were kept."""
         return self._rays[0]
 
 
@@ -115,6 +118,7 @@ class Gathered:
     unresolved: Best
 
     def add(self, screen: Screen, budget: Budget, chord: np.ndarray, wrong: np.ndarray) -> None:
+        """Offer the rays of a screen, with a formula's chord errors and wrong decisions (N,)."""
         rays, certain = screen.rays, ~screen.doubtful
         self.worst.add(rays, chord / screen.bound(budget), certain & ~wrong, chord)
         self.misclassified.add(rays, np.abs(screen.relative_radicand), certain & wrong, chord)
@@ -135,6 +139,7 @@ def gather(regime: str, setting: Setting, count: int, kept: int) -> dict[str, Ga
 
 
 def regime_rows(regime: str, setting: Setting, count: int, kept: int) -> list[Row]:
+    """A row per formula that has a budget in the regime."""
     found = gather(regime, setting, count, kept)
     return [_certified_row(name, regime, setting, gathered, count) for name, gathered in found.items()]
 

@@ -84,6 +84,7 @@ class Subject:
 
     @property
     def name(self) -> str:
+        """As it stands in the rows."""
         return self.method.name + (f", {INDEPENDENT}" if self.sampler == INDEPENDENT else "")
 
 
@@ -96,6 +97,7 @@ class Measured:
     images: list[np.ndarray]
 
     def cost(self, metric: str) -> list[float]:
+        """Error times seconds, by round: half of it takes half of the time."""
         return [error * seconds for error, seconds in zip(self.figures[metric], self.seconds, strict=True)]
 
 

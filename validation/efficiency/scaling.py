@@ -57,6 +57,7 @@ class Knob:
     every: bool = False
 
     def sizes(self, profile: str) -> tuple[int, ...]:
+        """Those of a profile."""
         return self.full if profile == "full" else self.quick
 
 

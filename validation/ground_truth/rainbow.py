@@ -37,6 +37,7 @@ def angle(index: Any = INDEX) -> float:
 
 
 def scene(glass: dict[str, Any]) -> Any:
+    """The drop of a glass plugin's dictionary, its sun, the screen and the camera."""
     import mitsuba as mi
 
     move = mi.ScalarTransform4f

@@ -21,10 +21,10 @@ from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.optical_systems import Array
-from validation.renders.unused_features import under
 from validation.run import path_overlay
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND
+from validation.run.render_methods import under
 from validation.study import Study, Task, about
 
 from . import rainbow
@@ -68,6 +68,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def variant_rows(context: Context, variant: str) -> list[Row]:
+    """A row per body and plugin in a variant of Mitsuba."""
     reason = context.variants.get(variant, f"this Mitsuba has no variant {variant}")
     if reason is not None:
         return [Row(NAME, PLUGIN, "every body", variant, reason=reason)]
@@ -77,11 +78,13 @@ def variant_rows(context: Context, variant: str) -> list[Row]:
 
 
 def double_row() -> Row:
+    """Why double precision is not measured."""
     reason = "Mitsuba's wheel has no variant in double precision; of formulas in float64 see Stability"
     return Row(NAME, PLUGIN, "every body", "double precision", reason=reason)
 
 
 def bench_row(name: str, bench: Bench, plugin: str, setting: str) -> Row:
+    """A plugin through a body: deviations of each answer, over their bounds."""
     found = bench.deviations(bench.traced(plugin))
     spawned = bench.deviations(bench.traced(plugin, spawned=True))
     values = {answer: float(x.max()) for answer, x in found.items()}
@@ -105,6 +108,7 @@ def _by_surface(found: dict[str, Array], bench: Bench) -> dict[str, list[tuple[f
 
 
 def bow_rows(context: Context) -> list[Row]:
+    """The rainbow of either plugin."""
     if context.variant.startswith("scalar"):
         reason = "takes millions of light paths: needs a compiled variant"
         return [Row(NAME, PLUGIN, "rainbow", context.variant, reason=reason)]

@@ -71,6 +71,7 @@ class Case:
 
     @functools.cached_property
     def exact(self) -> Retraced:
+        """The paths by the independent retrace."""
         return retrace(self.segments, self.origins, self.directions, self.max_depth, reflect=self.reflect)
 
     @functools.cached_property
@@ -80,9 +81,11 @@ class Case:
 
     @property
     def extent(self) -> float:
+        """The diagonal around the segments."""
         return _extent(self.segments)
 
     def trace(self, setting: Setting, formula: str | None = None) -> Paths:
+        """The paths by `planar.trace` in a setting, by the default formula or another one."""
         return trace(
             self.segments,
             self.origins,
@@ -123,6 +126,7 @@ def row_of(case: Case, setting: Setting, formula: str | None = None) -> Row:
 
 
 def budgets(setting: Setting) -> dict[str, float]:
+    """In float32 what rounding may have grown to, in float64 equality, too."""
     exact = {DIFFERENCE: limits.PLANAR_EQUAL, WRONG_PATH: 0.0} if setting.precision is np.float64 else {}
     return GROWN | exact
 
@@ -219,6 +223,7 @@ def _largest(x: Array) -> float:
 
 
 def unit(d: Any) -> Array:
+    """Directions (N × 2) in extended precision, of length 1."""
     d = np.asarray(d, np.longdouble)
     return d / np.hypot(*d.T)[:, None]
 

@@ -119,6 +119,7 @@ class Billiard(Case):
 
     @functools.cached_property
     def exact(self) -> Retraced:
+        """The paths by mirror images."""
         return unfold(self.origins, self.directions, self.max_depth)
 
 

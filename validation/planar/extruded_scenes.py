@@ -56,6 +56,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def scene_rows(context: Context, path: Path) -> list[Row]:
+    """A row per way to go on behind a boundary."""
     if context.variant.startswith("scalar"):
         return [Row(NAME, PLUGIN, path.stem, context.variant, reason=SCALAR)]
     case = faceted(against_retrace.case_of(path, RAYS))
@@ -128,6 +129,7 @@ def faceted(case: Case) -> Case:
 
 
 def along_the_ray(si: Any, d: Any) -> Any:
+    """A ray from the interaction along `d`, moved along itself by Mitsuba's offset."""
     import mitsuba as mi
 
     ray = mi.Ray3f(si.p, d)

@@ -126,6 +126,7 @@ class Run:
     """A tracer called once; `values`: how long it took to set up, and what is measured later."""
 
     def __init__(self, tracers: Callable[[str, int], tuple[Tracer, float]], method: str, size: int, count: int) -> None:
+        """`tracers(method, size)` is a tracer with the seconds that it took; `count` rays, fewer for slow methods."""
         kind, shuffled, fewer = METHODS[method]
         self.method, self.size = method, size
         self.rays = field(size).beam(max(count // fewer, 1), shuffled)
@@ -139,9 +140,11 @@ class Run:
         self.values["ms to compile"] = 1e3 * max(0.0, self.first - float(np.median(seconds)))
 
     def paths(self) -> Paths:
+        """All of its rays, traced."""
         return self.tracer(*self.rays, BOUNDARIES)
 
     def clock(self) -> float:
+        """Seconds to trace them."""
         start = time.perf_counter()
         self.paths()
         return time.perf_counter() - start

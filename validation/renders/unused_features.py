@@ -9,10 +9,8 @@ Dr.Jit compiles what a scene might call for every plugin that is alive, so each 
 from __future__ import annotations
 
 import functools
-import gc
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -24,8 +22,11 @@ from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing
 from validation.run.context import SCENES, Context
-from validation.run.render_methods import opened
+from validation.run.kernel_timing import kernels
+from validation.run.render_methods import opened, under
 from validation.study import Study, Task, about
+
+from .glass_balls import RESOLUTION, Balls, alone, compiled, seconds_of, size_of
 
 TERMS = {
     "operations": "Dr.Jit's count for the whole kernel; of `sample` alone, or of a render",
@@ -42,7 +43,6 @@ TERMS = {
 NAME = "features"
 BUILTIN = "dielectric"
 RAYS = 1024
-RESOLUTION = 32
 SEED = 2026
 GLASSES = (1, 16, 64, 1000)
 PAIRS = 5
@@ -74,27 +74,6 @@ def tasks(context: Context) -> list[Task]:
     ]
 
 
-def kernels(work: Callable[[], Any]) -> list[dict[str, Any]]:
-    """Dr.Jit's record of the kernels that `work` launches."""
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
-        dr.eval(work())
-        dr.sync_thread()
-        return [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
-
-
-def compiled(work: Callable[[], Any]) -> float:
-    """How many kernels no cache in memory had."""
-    return float(sum(not entry["cache_hit"] for entry in kernels(work)))
-
-
-def seconds_of(work: Callable[[], Any]) -> float:
-    start = time.perf_counter()
-    dr.eval(work())
-    dr.sync_thread()
-    return time.perf_counter() - start
-
-
 # `sample` alone ------------------------------------------------------------------------------------------------
 
 
@@ -124,19 +103,6 @@ def operations(
     return float(max(entry["operation_count"] for entry in kernels(lambda: bsdf.sample(asked, si, sample, [0, 0]))))
 
 
-@contextmanager
-def under(variant: str) -> Iterator[None]:
-    """Another variant of Mitsuba for a while."""
-    import mitsuba as mi
-
-    before: Any = mi.variant()
-    mi.set_variant(variant)
-    try:
-        yield
-    finally:
-        mi.set_variant(before)
-
-
 def scalar_rows(context: Context) -> list[Row]:
     """What a call of `sample` takes where nothing is compiled: a Python plugin's calls, against the built-in's C++."""
     import mitsuba as mi
@@ -159,6 +125,7 @@ def scalar_rows(context: Context) -> list[Row]:
 
 
 def bitmap() -> dict[str, Any]:
+    """A constant texture of 2 × 2 pixels."""
     import mitsuba as mi
 
     return {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32))}
@@ -201,67 +168,6 @@ def operation_rows(context: Context) -> list[Row]:
 # Renders -------------------------------------------------------------------------------------------------------
 
 
-class Balls:
-    """A scene of `count` glass balls of different indices with one plugin.
-
-    Without a `max_depth` it is one that no path reaches, and that no cache has seen.
-    """
-
-    def __init__(self, plugin: str, count: int, integrator: str = "path", max_depth: int = 0) -> None:
-        import mitsuba as mi
-
-        side = int(np.ceil(np.sqrt(count)))
-        sky = np.random.default_rng(SEED).random((8, 16, 3)).astype(np.float32)  # a constant one shows no index
-        fresh = int(np.random.default_rng().integers(1 << 20, 1 << 30))
-        film = {"type": "hdrfilm", "width": RESOLUTION, "height": RESOLUTION, "rfilter": {"type": "box"}}
-        view = mi.ScalarTransform4f().look_at([0, 0, 4 * side], [0, 0, 0], [0, 1, 0])
-        scene: dict[str, Any] = {
-            "type": "scene",
-            "integrator": {"type": integrator, "max_depth": max_depth or fresh},
-            "sensor": {"type": "perspective", "fov": 30, "to_world": view, "film": film},
-            "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky)},
-        }
-        for i in range(count):
-            place = [2 * (i % side) - side + 1, 2 * (i // side) - side + 1, 0]
-            glass = {"type": plugin, "int_ior": 1.3 + 0.5 * i / count, "ext_ior": 1.0}
-            scene[f"ball{i:04}"] = {"type": "sphere", "radius": 0.9, "center": place, "bsdf": glass}
-        self.scene = mi.load_dict(scene)
-        self.params = mi.traverse(self.scene)
-        self.eta = next(name for name in self.params.keys() if name.endswith(".eta"))  # noqa: SIM118
-
-    def image(self, seed: int = 0) -> Any:
-        import mitsuba as mi
-
-        return mi.render(self.scene, spp=4, seed=seed)
-
-    def frozen(self) -> Callable[[Any, Any], Any]:
-        """(params, seed) -> the image, traced once and replayed from then on. The scene must be in its closure."""
-        import mitsuba as mi
-
-        scene = self.scene
-
-        @dr.freeze
-        def image(params: Any, seed: Any) -> Any:
-            return mi.render(scene, params, spp=4, seed=seed)
-
-        return image
-
-    def edit(self, eta: float) -> None:
-        self.params[self.eta] = eta
-        self.params.update()
-
-
-@contextmanager
-def alone(plugin: str, count: int, **more: Any) -> Iterator[Balls]:
-    """Balls, and none of them left afterwards."""
-    gc.collect()
-    balls = Balls(plugin, count, **more)
-    yield balls
-    balls.__dict__.clear()
-    del balls
-    gc.collect()
-
-
 def glass_rows(context: Context) -> list[Row]:
     """The kernel of a render for growing numbers of glasses, and what an edit compiles.
 
@@ -285,10 +191,6 @@ def glass_rows(context: Context) -> list[Row]:
                 Row(NAME, plugin, f"{count} glasses", context.variant, values, budgets, replay={"glasses": count})
             )
     return rows
-
-
-def size_of(balls: Balls) -> float:
-    return float(max(entry["operation_count"] for entry in kernels(balls.image)))
 
 
 def optimisation_rows(context: Context) -> list[Row]:
@@ -320,6 +222,8 @@ def step(balls: Balls) -> Any:
 
 
 def first_image_rows(context: Context, count: int) -> list[Row]:
+    """Seconds to an image whose kernels no cache has, over the built-in's."""
+
     def clock(plugin: str) -> float:
         with alone(plugin, count) as balls:
             return seconds_of(balls.image)
@@ -345,6 +249,7 @@ def edit_rows(context: Context) -> list[Row]:
 
 
 def ratio_row(context: Context, case: str, metric: str, clock: Callable[[str], float], goal: float) -> Row:
+    """A goal for the ratio of two times, measured in turn."""
     seconds = kernel_timing.rounds({PLUGIN: PLUGIN, BUILTIN: BUILTIN}, clock, PAIRS)
     values = kernel_timing.ratio(f"{metric} / {BUILTIN}", seconds[PLUGIN], seconds[BUILTIN])
     values |= {f"{metric}, {plugin}": float(np.median(x)) for plugin, x in seconds.items()}

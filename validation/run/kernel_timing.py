@@ -79,6 +79,7 @@ def rounds(subjects: dict[str, Any], clock: Callable[[Any], float], repeats: int
 
 
 def ratio(metric: str, times: list[float], others: list[float]) -> dict[str, float]:
+    """The median of times over others, round by round, and its interval."""
     return interval(metric, [t / o for t, o in zip(times, others, strict=True)])
 
 
@@ -113,24 +114,24 @@ def _scalar_clock(inputs: Any) -> Clock:
 
 
 def _kernel_clock(inputs: Any) -> Clock:
-    return lambda subject: sum(kernel["execution_time"] for kernel in _history(subject, *inputs)) / 1e3
+    return lambda subject: sum(kernel["execution_time"] for kernel in kernels(lambda: subject(*inputs))) / 1e3
 
 
 def _kernel(subject: Subject, inputs: Any) -> dict[str, float]:
     """Operations of the kernel, and ms to compile it anew: k is multiplied by a literal that was never used before."""
     a, n, k = inputs
-    operations = max(kernel["operation_count"] for kernel in _history(subject, a, n, k))
+    operations = max(kernel["operation_count"] for kernel in kernels(lambda: subject(a, n, k)))
     literal = 1 + float(np.random.default_rng().integers(1, 1 << 22)) * 2.0**-23
-    kernels = _history(subject, a, n, k * type(k)(literal))
-    fresh = all(not kernel["cache_hit"] for kernel in kernels)
-    compiled = sum(kernel["codegen_time"] + kernel["backend_time"] for kernel in kernels)
+    found = kernels(lambda: subject(a, n, k * type(k)(literal)))
+    fresh = all(not kernel["cache_hit"] for kernel in found)
+    compiled = sum(kernel["codegen_time"] + kernel["backend_time"] for kernel in found)
     return {"operations": float(operations), "compile ms": compiled if fresh else float("nan")}
 
 
-def _history(subject: Subject, a: Any, n: Any, k: Any) -> list[dict[str, Any]]:
-    """Dr.Jit's record of the kernels that `subject` launches."""
+def kernels(work: Callable[[], Any]) -> list[dict[str, Any]]:
+    """Dr.Jit's record of the kernels that `work` launches."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
-        dr.eval(subject(a, n, k))
+        dr.eval(work())
         dr.sync_thread()
         return [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]

@@ -63,10 +63,12 @@ class Inputs:
 
 
 def tasks(context: Context) -> list[Task]:
+    """One task per backend and precision."""
     return [Task(f"derivatives: {s.label}", functools.partial(setting_rows, context, s)) for s in settings(context)]
 
 
 def setting_rows(context: Context, setting: Setting) -> list[Row]:
+    """Every formula and the reflectance in a setting."""
     reason = "Dr.Jit differentiates compiled arrays only" if setting.is_scalar else setting.reason
     if reason:
         return [Row(NAME, name, "all", setting.label, reason=reason) for name in (*FORMULAS, "powers")]
@@ -122,6 +124,7 @@ def condition_of(certified: oracle.Certified, k: np.ndarray) -> np.ndarray:
 
 
 def pick(certified: oracle.Certified, kept: np.ndarray) -> oracle.Certified:
+    """The certified answers of a mask (N,)."""
     return oracle.Certified(**{name: x[kept] for name, x in vars(certified).items()})
 
 
@@ -155,6 +158,7 @@ def differentiate(formula: Any, given: Inputs, setting: Setting) -> tuple[dict[s
 def formula_rows(
     name: str, formula: Any, given: Inputs, setting: Setting
 ) -> tuple[list[Row], list[tuple[float, float]]]:
+    """A row per derivative of a formula, and the curve of ∂b/∂k against cos²θt."""
     found, transmitted = differentiate(formula, given, setting)
     right, rows = transmitted == given.certified.transmitted, []
     curve: list[tuple[float, float]] = []
@@ -182,6 +186,7 @@ def row(
     right: np.ndarray,
     budgets: dict[str, float],
 ) -> Row:
+    """The worst error of a derivative, relative and over the condition of its ray."""
     finite = np.isfinite(error)
     used = right & finite
     over = np.where(used, error, 0) / (given.condition * setting.roundoff)

@@ -20,9 +20,9 @@ from mi_refract.accuracy import lengths
 from mi_refract.formulas import fresnel, resolve
 from mi_refract.report.row import Row
 from validation import limits
-from validation.directions.bsdf_samples import sample_all
 from validation.reference.diffuse_fresnel import GRADE, hemispherical, nodes
 from validation.run.array_settings import Setting, settings
+from validation.run.bsdf_sampling import sample_all
 from validation.run.context import Context
 from validation.run.metrics import MISCLASSIFIED
 from validation.study import Study, Task, about
@@ -54,11 +54,13 @@ AMPLITUDES = dict.fromkeys(("r_s / u", "r_p / u", "phase / u"), limits.AMPLITUDE
 
 
 def tasks(context: Context) -> list[Task]:
+    """One task per backend and precision, and one for the plugins."""
     found = [Task(f"energy: {s.label}", functools.partial(setting_rows, context, s)) for s in settings(context)]
     return [*found, Task(f"energy: plugins, {context.variant}", functools.partial(plugin_rows, context))]
 
 
 def setting_rows(context: Context, setting: Setting) -> list[Row]:
+    """Powers and amplitudes of every regime, and the laws."""
     if setting.vector is None:
         return [Row(NAME, name, "all", setting.label, reason=setting.reason) for name in ("powers", "amplitudes")]
     count = context.profile.scalar_rays // 3 if setting.is_scalar else context.profile.rays // 8
@@ -105,11 +107,13 @@ def plain(x: Any) -> Any:
 
 
 def ours(cos_i: Any, k: Any) -> tuple:
+    """R, T and the decision of `mi_refract.formulas`, of a cosine and k."""
     cos_t, transmitted = fresnel.refracted_cosine(cos_i, k)
     return *fresnel.powers(cos_i, cos_t, transmitted, k), transmitted
 
 
 def builtin(variant: str | None) -> Callable[[Any, Any], tuple]:
+    """The same of Mitsuba's function in a variant."""
     import mitsuba
 
     mi: Any = getattr(mitsuba, variant) if variant else mitsuba
@@ -123,6 +127,7 @@ def builtin(variant: str | None) -> Callable[[Any, Any], tuple]:
 
 
 def regime_rows(regime: str, setting: Setting, count: int) -> list[Row]:
+    """Powers, amplitudes and, where Mitsuba runs, its own function in a regime."""
     cos_i, k, exact = given(regime, count, setting.precision)
     replay = {"regime": regime, "text": regimes.REGIMES[regime].text, "count": count, "seed": SEED}
     rows = [
@@ -146,6 +151,7 @@ def power_row(
     replay: dict[str, Any],
     right: Any = True,
 ) -> Row:
+    """Errors of R, T and the decision: `found` is (R, T, transmitted), each (N,)."""
     r, t, transmitted = found
     misclassified = transmitted != exact.transmitted
     right, u = right & ~misclassified, setting.roundoff
@@ -163,6 +169,7 @@ def power_row(
 def amplitude_row(
     case: str, setting: Setting, found: list[np.ndarray], exact: oracle.Certified, replay: dict[str, Any]
 ) -> Row:
+    """Errors of r_s, r_p and their phases: `found` is (r_s, r_p), complex (N,)."""
     # The certified amplitudes are doubles, right to 2⁻⁵³ of each part: float64 is held to that much more.
     slack = 1.0 if setting.precision is np.float64 else 0.0
     values = {}
@@ -211,6 +218,7 @@ def relative(x: np.ndarray, exact: np.ndarray, low: np.ndarray, setting: Setting
 
 
 def worst(x: np.ndarray) -> float:
+    """The largest, NaN taken for infinity; 0 of nothing."""
     return float(np.nan_to_num(np.asarray(x, float), nan=np.inf).max(initial=0))
 
 
@@ -293,6 +301,7 @@ def matched_row(setting: Setting) -> Row:
 
 
 def plugin_rows(context: Context) -> list[Row]:
+    """The white furnace and basic radiance, of either plugin."""
     return [row(context, plugin) for plugin in ("refract", "dielectric") for row in (furnace_row, radiance_row)]
 
 

@@ -70,6 +70,7 @@ class Bundle:
     shown: int
 
     def exact(self, layers: Layers, offset: float = layered_scenes.OFFSET) -> list[Path]:
+        """Their exact paths through layers, with Mitsuba's ray offset or another one."""
         rays = zip(self.origins, self.directions, self.media, strict=True)
         return [layered_scenes.exact_path(layers, p, d, int(medium), offset) for p, d, medium in rays]
 
@@ -83,6 +84,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def plugins() -> list[str]:
+    """The built-in, `refract`, and `refract` with each formula."""
     return [BUILTIN, PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS)]
 
 

@@ -76,6 +76,7 @@ class Extent:
 
 
 def extent(context: Context, setting: Setting) -> Extent:
+    """How much is done in a setting."""
     if not setting.is_scalar and context.profile.quick:
         return Extent((1000,), ("askew",), 1000, PASSING + TURNING, True)
     if not setting.is_scalar:
@@ -126,6 +127,7 @@ def absent(context: Context, setting: Setting) -> dict[str, str]:
 
 
 def chain_rows(context: Context, setting: Setting) -> list[Row]:
+    """Mirages, exact ratios and the light pipe of a setting."""
     rows = [Row(NAME, name, "all", setting.label, reason=why) for name, why in absent(context, setting).items()]
     if setting.vector is None:
         return rows
@@ -229,6 +231,7 @@ def mirage_budgets(fed: Fed, u: float, final: slice) -> dict[str, float]:
 
 
 def worst(x: Array) -> float:
+    """The largest, NaN taken for infinity; 0 of nothing."""
     return float(np.nan_to_num(x.astype(float), nan=np.inf).max(initial=0))
 
 
@@ -243,6 +246,7 @@ def problem_row(case: str, fed: Fed, setting: Setting, curves: dict[str, Array])
 
 
 def pipe_row(name: str, subject: Subject, setting: Setting, how: Extent) -> Row:
+    """Total internal reflections in a square pipe."""
     rays = 2 if setting.is_scalar else PIPE_RAYS
     a, chain, exact = pipe(how.reflections, rays, CORE, setting.precision)
     carried = carry(subject, chain, a, np.full(rays, how.reflections), setting)
@@ -270,9 +274,11 @@ class Refractor:
     """A formula as a system asks for it: inputs rounded to the setting's precision. Counts what it did not transmit."""
 
     def __init__(self, subject: Subject, setting: Setting) -> None:
+        """`subject` is evaluated in the arrays of the setting."""
         self.subject, self.setting, self.mirrored = subject, setting, 0
 
     def __call__(self, a: Array, n: Array, k: Any) -> Array:
+        """The directions behind a boundary: `a`, `n` N × 3, k a number or N."""
         given = np.broadcast_arrays(a, n, np.reshape(k, (-1, 1)))
         a, n, k = (x.astype(self.setting.precision) for x in given)
         b, transmitted = evaluate(self.subject, regimes.Rays(a, n, k[:, 0]), self.setting.vector)
@@ -281,11 +287,13 @@ class Refractor:
 
 
 def system_rows(context: Context, setting: Setting) -> list[Row]:
+    """Every optical system with every subject of a setting."""
     found = subjects(context, setting).items()
     return [system_row(name, subject, case, setting) for case in optical_systems.SYSTEMS for name, subject in found]
 
 
 def system_row(name: str, subject: Subject, case: str, setting: Setting) -> Row:
+    """The errors of a subject at the end of a system."""
     trace, refractor = optical_systems.SYSTEMS[case], Refractor(subject, setting)
     error = np.sqrt((trace(refractor) ** 2).sum(1))
     values = {

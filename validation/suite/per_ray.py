@@ -105,6 +105,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def call_rows(system: System, call: RefractFunction, context: Context) -> list[Row]:
+    """A row per set of rays, or one that says why there is none."""
     if reason := environments.absent(system):
         return [_unmeasured(call, reason)]
     if not system.small and context.profile.name != "full":

@@ -80,6 +80,7 @@ def _scene(name: str, resolution: int) -> PlainScene:
 
 
 def environment(resolution: int) -> PlainScene:
+    """The balls under the askew sky."""
     return dataclasses.replace(_scene("balls", resolution), name="environment", sky=askew())
 
 
@@ -132,6 +133,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
+    """A renderer against `refract` in a scene: one row."""
     renderer, size = IMAGE_RENDERERS[title], SIZES[context.profile.name]
     system = SYSTEMS[renderer.system]
     setting = f"{size.resolution}²"
