@@ -2,18 +2,24 @@
 
 In the conftest.py of the tests: `pytest_plugins = ["mi_refract.pytest_plugin"]`. It is no entry point, because that
 would load Mitsuba, and with it a libLLVM, into every pytest run of the environment, before any conftest.py could choose
-one. An image is a file, or an array (height, width, channels) or (height, width). Nothing is ever written, and a
-reference that is not there fails the test.
+one. An image is a file, or an array, H × W × C or H × W. Nothing is ever written, and a reference that does not exist
+fails the test.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import pytest
+
+if TYPE_CHECKING:
+    from mi_refract.image_diff.comparison import Comparison
+    from mi_refract.io.image_file import Image as ReadImage
+
+    Side = ReadImage | Sequence[ReadImage]
 
 Image = Any  # the path of a file, or what numpy makes an array of
 RUNS = 8
@@ -21,10 +27,16 @@ REFERENCE_SEED = 1 << 16  # the first of a rendered reference: both sides must n
 
 
 class AssertEqual(Protocol):
-    def __call__(self, test: Image, reference: Image, method: str = "auto", **options: Any) -> Any: ...
+    """The type of the fixture `assert_image_equal`."""
+
+    def __call__(self, test: Image, reference: Image, method: str = "auto", **options: Any) -> Comparison:
+        """Fail the test unless both images are equal; returns the comparison."""
+        ...
 
 
 class AssertUnbiased(Protocol):
+    """The type of the fixture `assert_image_unbiased`."""
+
     def __call__(
         self,
         render: Callable[[int], Any],
@@ -32,7 +44,9 @@ class AssertUnbiased(Protocol):
         runs: int = RUNS,
         seed: int = 0,
         **options: Any,
-    ) -> Any: ...
+    ) -> Comparison:
+        """Fail the test unless the renders have the reference's mean; returns the comparison."""
+        ...
 
 
 @pytest.fixture
@@ -55,9 +69,9 @@ def assert_image_unbiased() -> AssertUnbiased:
     return _assert_unbiased
 
 
-def _assert_equal(test: Image, reference: Image, method: str = "auto", **options: Any) -> Any:
+def _assert_equal(test: Image, reference: Image, method: str = "auto", **options: Any) -> Comparison:
     __tracebackhide__ = True
-    return _judge(method, lambda: (_image("reference", reference), _image("test", test)), options)
+    return _require_equal(method, lambda: (_image("reference", reference), _image("test", test)), options)
 
 
 def _assert_unbiased(
@@ -66,28 +80,28 @@ def _assert_unbiased(
     runs: int = RUNS,
     seed: int = 0,
     **options: Any,
-) -> Any:
+) -> Comparison:
     __tracebackhide__ = True
     if runs < 2:
         raise ValueError(f"runs = {runs}: accepted: at least 2, or the noise is not known")
 
-    from mi_refract.image_diff.folders import sample_images
+    from mi_refract.image_diff.folders import read_renders
 
     first = seed + REFERENCE_SEED
     known = [reference(i) for i in range(first, first + runs)] if callable(reference) else Path(reference)
     rendered = [render(i) for i in range(seed, seed + runs)]
 
-    def sides() -> tuple[list[Any], list[Any]]:
+    def sides() -> tuple[list[ReadImage], list[ReadImage]]:
         if isinstance(known, Path):
-            references = sample_images(known)
+            references = read_renders(known)
         else:
             references = [_image(f"reference {first + i}", image) for i, image in enumerate(known)]
         return references, [_image(f"test {seed + i}", image) for i, image in enumerate(rendered)]
 
-    return _judge("welch", sides, options)
+    return _require_equal("welch", sides, options)
 
 
-def _judge(method: str, sides: Callable[[], tuple[Any, Any]], options: dict[str, Any]) -> Any:
+def _require_equal(method: str, sides: Callable[[], tuple[Side, Side]], options: dict[str, Any]) -> Comparison:
     __tracebackhide__ = True
     from mi_refract.image_diff.comparison import Verdict
     from mi_refract.image_diff.methods import compare
@@ -97,7 +111,7 @@ def _judge(method: str, sides: Callable[[], tuple[Any, Any]], options: dict[str,
     except (ValueError, OSError) as error:
         pytest.fail(f"could not compare: {error}", pytrace=False)
     if found.verdict is not Verdict.EQUAL:
-        numbers = [f"  {x.name}: {x.value:.6g}" + _bound(x.bound) for x in found.figures]
+        numbers = [f"  {x.name}: {x.value:.6g}" + _bound(x.bound) for x in found.metrics]
         pytest.fail("\n".join([f"{found.method}: {found.verdict}: {found.reason}", *numbers]), pytrace=False)
     return found
 
@@ -106,7 +120,7 @@ def _bound(bound: float | None) -> str:
     return "" if bound is None else f", at most {bound:.6g}"
 
 
-def _image(name: str, image: Image) -> Any:
-    from .io import image_file
+def _image(name: str, image: Image) -> ReadImage:
+    from mi_refract.io import image_file
 
     return image_file.read(image) if isinstance(image, str | os.PathLike) else image_file.named(name, image)

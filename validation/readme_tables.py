@@ -18,7 +18,7 @@ from mi_refract.image_diff import self_test
 from mi_refract.image_diff.methods import METHODS
 from mi_refract.io import image_file
 from mi_refract.io.atomic import update_between, write_atomically
-from mi_refract.io.srgb import encoded
+from mi_refract.io.pixels import srgb_encode
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
@@ -272,7 +272,7 @@ def seen(rows: list[Row]) -> str:
         ]
     )
     trials = next(iter(defects.values()))
-    detectable = _percent([row.values["detectable"] for row in trials], digits=1)
+    detectable = _percent([row.values[self_test.DETECTABLE] for row in trials], digits=1)
     replay, scenes = trials[0].replay, ", ".join(row.case for row in trials)
     text = f"{scenes}; {replay['trials']} trials each of {replay['renders a side']} renders a side. "
     text += f"Minimum detectable difference in a tile: {detectable}."
@@ -331,7 +331,8 @@ def gallery(rows: list[Row], context: Context) -> bytes:
         row += [np.ones_like(tiles[0])] * (GALLERY_COLUMNS - len(row))
         strip = [x for tile in row for x in (tile, gap)][:-1]
         strips += [np.concatenate(strip, axis=1), np.ones((4, sum(x.shape[1] for x in strip), 3), np.float32)]
-    image = oiio.ImageBuf(np.ascontiguousarray(encoded(np.concatenate(strips[:-1])), np.float32))
+    encoded = srgb_encode(np.concatenate(strips[:-1]).clip(0, 1)).astype(np.float32)
+    image = oiio.ImageBuf(np.ascontiguousarray(encoded))
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "gallery.png"
         if not image.write(str(target), "uint8"):

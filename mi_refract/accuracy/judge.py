@@ -62,9 +62,9 @@ class RayBounds:
         return self.normalised or np.abs(lengths(self.rays.a) - 1) <= UNIT * self.roundoff
 
     @property
-    def side_open(self) -> Any:
+    def side_open(self) -> Flags:
         """Whether the ray is so near to the surface that the formula need not know its side."""
-        return self.budget.side_open(self.u, self.exact.cos_i)
+        return np.asarray(self.budget.side_open(self.u, self.exact.cos_i))
 
     @property
     def of_terms(self) -> Any:
@@ -124,12 +124,14 @@ class Judgement:
     @functools.cached_property
     def far(self) -> Flags:
         """Misjudged although the radicand exceeds what the bound leaves open; or undecided by the oracle."""
-        return self.bounds.decided_of(self.misjudged) | self.bounds.exact.undecided
+        far: Flags = self.bounds.decided_of(self.misjudged) | self.bounds.exact.undecided
+        return far
 
     @functools.cached_property
     def wrong(self) -> Flags:
         """The rays that break the bound."""
-        return ~(self.share <= 1) | self.far | self.blank
+        wrong: Flags = ~(self.share <= 1) | self.far | self.blank
+        return wrong
 
     def meets(self, budget: Budget) -> Flags:
         """The answers that keep the bound of another budget."""
@@ -139,7 +141,8 @@ class Judgement:
     def crossed(self) -> Flags:
         """On the other side of the surface, where the bound leaves the side open."""
         exact = self.bounds.exact
-        return self.bounds.side_open & self.compared & exact.transmitted & (self.error > exact.cos_t)
+        crossed: Flags = self.bounds.side_open & self.compared & exact.transmitted & (self.error > exact.cos_t)
+        return crossed
 
     @property
     @np.errstate(over="ignore", invalid="ignore")

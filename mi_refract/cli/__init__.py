@@ -4,11 +4,19 @@ In: the words of a command line. Out: text on stdout, files that were asked for,
 read options, call the rooms below, and print; every one of them can be had from Python without this room.
 """
 
+import sys
+
+from mi_refract import __version__
+
 __all__ = ["app", "main"]
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line, or `arguments`; the exit code."""
+    words = sys.argv[1:] if arguments is None else arguments
+    if words == ["--version"]:  # importing the parser takes ten times as long as all the rest of this
+        print(__version__)
+        return 0
     from .app import main
 
     return main(arguments)

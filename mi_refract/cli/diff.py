@@ -1,4 +1,4 @@
-"""The commands `mi-refract diff` and `mi-refract accept`. Words in, words out, as in `cli.py`."""
+"""The commands `mi-refract diff` and `mi-refract accept`: their options, and what they print and write."""
 
 from __future__ import annotations
 
@@ -12,41 +12,44 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import Progress
 
-from mi_refract.image_diff import folders as engine
-from mi_refract.image_diff import html_report
-from mi_refract.image_diff import self_test as gate
+from mi_refract.image_diff import accept as accepting
+from mi_refract.image_diff import folders, html_report, text_reports
+from mi_refract.image_diff import self_test as self_tests
 from mi_refract.image_diff import settings as diff_settings
-from mi_refract.image_diff import text_reports as output
 from mi_refract.image_diff.folders import Results, Status
+from mi_refract.image_diff.methods import AUTO
 from mi_refract.io.atomic import writable
 from mi_refract.io.provenance import provenance
 from mi_refract.report.junit import printable
 
+from . import self_test_scenes
+
 Folder = Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")]
 Other = Annotated[Path, typer.Argument(metavar="TEST", help="What is compared with it, of the same kind.")]
 NotAlways = Annotated[
-    Path | None, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them; no need for --self-test.")
+    Path | None, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them; --self-test can do without.")
 ]
 NotWithSelfTest = Annotated[Path | None, typer.Argument(metavar="TEST", help="What is compared with it.")]
-Method = Annotated[str, typer.Option(help=f"{'|'.join(diff_settings.ACCEPTED)}; see --methods.")]
+Method = Annotated[str, typer.Option(help=f"How: {'|'.join(diff_settings.ACCEPTED)}; see --methods.")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="An option of the method.")]
 File = Annotated[
     Path | None,
-    typer.Option(metavar="FILE.toml", help=f"Rules for single images; REFERENCE's {diff_settings.FILE} by default."),
+    typer.Option(
+        metavar="FILE.toml", help=f"Settings of single images; by default {diff_settings.FILE} beside the references."
+    ),
 ]
 Nonfinite = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME", help="An image (or pattern) where both sides may have the same NaN or Inf."),
+    typer.Option(metavar="NAME", help="An image (or pattern of names) where both sides may have the same NaN or Inf."),
 ]
 OUTPUTS = ((".html", ".htm"), (".xml",), (".json",))  # of --report, --junit, --json
-SELF_TEST_RENDERS, SELF_TEST_SPP = 8, 16
 
 
 class Inconclusive(enum.StrEnum):
-    """What an inconclusive comparison counts as."""
+    """What an inconclusive image counts as."""
 
     PASS = "pass"
     FAIL = "fail"
@@ -54,36 +57,51 @@ class Inconclusive(enum.StrEnum):
 
 def _print_methods(asked: bool) -> None:
     if asked:
-        print(diff_settings.reference())
+        text = diff_settings.reference()
+        if sys.stdout.isatty():
+            from rich.markdown import Markdown
+
+            Console().print(Markdown(text))
+        else:
+            print(text)
         raise typer.Exit
 
 
 def diff(
     reference: NotAlways = None,
     test: NotWithSelfTest = None,
-    method: Method = diff_settings.AUTO,
+    method: Method = AUTO,
     options: Set = None,
-    samples: Annotated[bool, typer.Option("--samples", help="Both folders hold renders of one image.")] = False,
+    renders: Annotated[bool, typer.Option("--renders", help="Each folder holds renders of one image.")] = False,
+    samples: Annotated[bool, typer.Option("--samples", hidden=True)] = False,
     settings: File = None,
     allow_nonfinite: Nonfinite = None,
-    inconclusive: Annotated[Inconclusive | None, typer.Option(help="What it counts as; else exit code 3.")] = None,
-    report: Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write a page to look at.")] = None,
-    junit: Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit's XML.")] = None,
+    inconclusive: Annotated[
+        Inconclusive | None, typer.Option(help="What an inconclusive image counts as; exit code 3 by default.")
+    ] = None,
+    report: Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML page with the images.")] = None,
+    junit: Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")] = None,
     json: Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")] = None,
-    github: Annotated[bool, typer.Option("--github", help="Print annotations, write the job's summary.")] = False,
+    github: Annotated[
+        bool, typer.Option("--github", help="Print GitHub annotations, write the job's summary.")
+    ] = False,
     methods: Annotated[
-        bool, typer.Option("--methods", is_eager=True, callback=_print_methods, help="Print the methods' options.")
+        bool,
+        typer.Option("--methods", is_eager=True, callback=_print_methods, help="Print the methods and their options."),
     ] = False,
     self_test: Annotated[
         bool,
-        typer.Option("--self-test", help="Which defects planted in REFERENCE are seen? An image, renders, a scene."),
+        typer.Option(
+            "--self-test", help="Plant defects in REFERENCE (an image, a folder of renders, a scene); which are seen?"
+        ),
     ] = False,
 ) -> None:
     """Compare images with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
     _require_extra("scipy", *(("jinja2", "matplotlib") if report else ()))
+    renders = renders or samples
     if self_test:
-        others = (options, samples, settings, allow_nonfinite, inconclusive, report, junit, json, github)
-        if any(others) or method != diff_settings.AUTO:
+        others = (options, renders, settings, allow_nonfinite, inconclusive, report, junit, json, github)
+        if any(others) or method != AUTO:
             raise ValueError("--self-test asks every method and prints; accepted: no other option")
         raise typer.Exit(_self_test(reference, test))
     if reference is None or test is None:
@@ -92,50 +110,53 @@ def diff(
         if path:
             writable(path, suffixes)
     chosen = _settings(reference, method, options, settings, allow_nonfinite)
+    wanted = inconclusive or ""
     with _progress() as tell:
-        found = engine.diff(
-            reference, test, chosen, samples=samples, inconclusive=inconclusive or "", maps=bool(report), tell=tell
+        found = folders.diff(
+            reference, test, chosen, renders=renders, inconclusive=wanted, maps=bool(report), tell=tell
         )
     _say(found)
     if report:
-        flags = chosen.default.flags + _flags("--allow-nonfinite", chosen.allow_nonfinite)
-        flags += _flags("--settings", [settings] if settings else []) + ["--samples"] * samples
-        replay = shlex.join(["mi-refract", "diff", engine.as_word(reference), engine.as_word(test), *flags])
         software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
-        html_report.write(report, found, software, replay)
-    if junit:
-        output.write_junit(junit, found)
-    if json:
-        output.write_json(json, found)
-    if github:
-        for line in output.workflow_commands(found):
-            print(line)
-        output.append_summary(found)
+        html_report.write(report, found, software, _replay(found, chosen, settings))
+    _write(found, junit, json, github)
     raise typer.Exit(found.exit_code)
+
+
+def _write(found: Results, junit: Path | None, json: Path | None, github: bool) -> None:
+    """The forms for programs, as far as they are asked for."""
+    if junit:
+        text_reports.write_junit(junit, found)
+    if json:
+        text_reports.write_json(json, found)
+    if github:
+        for line in text_reports.workflow_commands(found):
+            print(line)
+        text_reports.append_summary(found)
 
 
 def accept(
     reference: Folder,
     test: Other,
-    method: Method = diff_settings.AUTO,
+    method: Method = AUTO,
     options: Set = None,
     settings: File = None,
     allow_nonfinite: Nonfinite = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
-    """Copy the images that are not equal over their references, after showing them. Nothing is deleted."""
+    """Show which images are not equal to their references, ask, and copy them over. Nothing is deleted."""
     _require_extra("scipy")
     chosen = _settings(reference, method, options, settings, allow_nonfinite)
     with _progress() as tell:
-        found = engine.diff(reference, test, chosen, new=True, tell=tell)
+        found = folders.diff(reference, test, chosen, new=True, tell=tell)
     _say(found)
-    copies = list(engine.changes(found))
+    copies = list(accepting.changes(found))
     for new, old in copies:
         print(printable(f"{new} → {old}{'' if old.exists() else ' (new)'}"))
     if not copies:
         print("nothing to accept")
     elif yes or _agreed(len(copies)):
-        engine.accept(copies, found.began)
+        accepting.accept(copies, found.began)
         print(f"{len(copies)} accepted")
     else:
         print("nothing accepted")
@@ -143,14 +164,14 @@ def accept(
 
 
 def _require_extra(*packages: str) -> None:
-    """ValueError where one that methods or report use is not installed: before anything is compared."""
+    """ValueError, before anything is compared, where a package is not installed."""
     if not all(map(importlib.util.find_spec, packages)):
         raise ValueError("comparing needs the extra `diff`: pip install 'mi-refract[diff]'")
 
 
 @contextlib.contextmanager
 def _progress() -> Iterator[Callable[[int, int], None]]:
-    """What to call with the numbers of images done and in all; shown on a terminal, and gone at the end."""
+    """A function to call with the numbers of images done and of all; a progress bar on a terminal."""
     with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
         task = progress.add_task("comparing", total=None)
         yield lambda done, of: progress.update(task, completed=done, total=of)
@@ -162,15 +183,29 @@ def _agreed(count: int) -> bool:
     return typer.confirm(f"Accept {count} as the reference{'' if count == 1 else 's'}?")
 
 
+def _replay(found: Results, chosen: diff_settings.Settings, file: Path | None) -> str:
+    """The command that repeats the whole comparison."""
+    flags = [*chosen.default.flags, *_flags("--allow-nonfinite", chosen.allow_nonfinite)]
+    flags += _flags("--settings", [file] if file else []) + ["--renders"] * found.renders
+    sides = (folders.as_word(path) for path in (found.reference, found.test))
+    return shlex.join(["mi-refract", "diff", *sides, *flags])
+
+
 def _flags(name: str, values: Sequence[Any]) -> list[str]:
     return [word for value in values for word in (name, str(value))]
 
 
 def _self_test(path: Path | None, other: Path | None) -> int:
-    """Prints what is seen of the defects; 1 where one that was due is not."""
+    """Print which defects are seen; 1 where one that was due is not."""
     if other:
         raise ValueError(f"{other}: --self-test takes one path; accepted: an image, a folder of renders, a scene")
-    return gate.self_test(path)
+    if path is None:
+        renders = self_test_scenes.glass_ball()
+    else:
+        renders = self_test_scenes.of_file(path) if path.suffix == ".xml" else self_tests.read_images(path)
+    rows = self_tests.examine(renders, str(path or "a glass ball"))
+    _print(self_tests.table(rows))
+    return int(self_tests.failed(rows))
 
 
 def _settings(
@@ -190,6 +225,10 @@ def _say(found: Results) -> None:
     for pattern in found.unused:
         print(f"mi-refract: {printable(pattern)}: matches no image", file=sys.stderr)
     if len(found.results) > len(found.of(Status.ERROR)):
-        # As wide as it must be where nobody looks on: no line of a log is a wrapped one.
-        console = Console() if sys.stdout.isatty() else Console(width=10_000)
-        console.print(output.table(found), highlight=False)
+        _print(text_reports.table(found))
+
+
+def _print(table: RenderableType) -> None:
+    # As wide as it must be where nobody looks on: no line of a log is a wrapped one.
+    console = Console() if sys.stdout.isatty() else Console(width=10_000)
+    console.print(table, highlight=False)

@@ -19,7 +19,11 @@ from mi_refract.ray_sets import files, ray_set, run_program
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.regimes import REGIMES
 
-app = typer.Typer(help="Check the refraction of other programs against certified answers.", rich_markup_mode=None)
+app = typer.Typer(
+    help="Check the refraction of other programs against certified answers.",
+    add_completion=False,
+    rich_markup_mode=None,
+)
 
 OUTPUTS = ((".html", ".htm"), (".xml",), (".json",))  # of --report, --junit, --json
 UNWRAPPED = 10_000  # columns: wider than any line

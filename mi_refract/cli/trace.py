@@ -22,21 +22,25 @@ def _print_keys(asked: bool) -> None:
 
 
 def trace(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="A planar scene.")],
-    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="OUT.svg|.png|.pdf", help="Draw.")] = None,
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="The scene; --keys says what may be in it.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="OUT.svg|.png|.pdf", help="Draw a figure.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the paths as JSON.")] = False,
     table: Annotated[bool, typer.Option("--table", help="Print focal points and spot sizes.")] = False,
-    branches: Annotated[int | None, typer.Option(min=0, help="Partial reflections on a path, at most.")] = None,
-    rays: Annotated[int | None, typer.Option(min=1, help="Rays of each beam that has several.")] = None,
+    branches: Annotated[
+        int | None, typer.Option(min=0, help="Largest number of partial reflections on a path.")
+    ] = None,
+    rays: Annotated[int | None, typer.Option(min=1, help="Number of rays of each beam that has several.")] = None,
     max_depth: Annotated[int | None, typer.Option(min=1, help="Boundaries on a path, at most.")] = None,
-    precision: Annotated[str, typer.Option(help="float64 or float32.")] = "float64",
+    precision: Annotated[str, typer.Option(help="float64, or float32 with LLVM or CUDA.")] = "float64",
     formula: Annotated[str | None, typer.Option(help="A formula of refraction; the planar one by default.")] = None,
     arrays: Annotated[str | None, typer.Option("--backend", help="llvm, cuda or scalar; see `doctor`.")] = None,
     keys: Annotated[
         bool, typer.Option("--keys", is_eager=True, callback=_print_keys, help="Print what a scene file may hold.")
     ] = False,
 ) -> None:
-    """Follow the rays of a planar scene; draw them, print their paths, or where they come together."""
+    """Trace the rays of a planar scene; draw them, print their paths, or print the points where they meet."""
     backend.restart_if_needed()
     if output:
         atomic.writable(output, figure.FORMATS)

@@ -9,7 +9,7 @@ from . import fresnel
 from .bounds import NEGLIGIBLE, ROUNDING, UNIT, Budget, cancelling, radicand_for
 from .documented import contract, reflect, reflect_sandwich, refract_2d, wedge
 from .table import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, Formula, automatic, resolve
-from .well_conditioned import Refracted
+from .well_conditioned import LocalCosines, Refracted, local_cosines
 
 __all__ = [
     "FORMULAS",
@@ -20,11 +20,13 @@ __all__ = [
     "UNIT",
     "Budget",
     "Formula",
+    "LocalCosines",
     "Refracted",
     "automatic",
     "cancelling",
     "contract",
     "fresnel",
+    "local_cosines",
     "radicand_for",
     "reflect",
     "reflect_sandwich",

@@ -18,7 +18,7 @@ from typing import Any
 
 
 def _numpy() -> Any:
-    """Once a bound is asked for: the package and its plugin do without."""
+    """Imported where a bound is asked for: the plugin does without."""
     import numpy
 
     return numpy
@@ -27,6 +27,9 @@ def _numpy() -> Any:
 @dataclass(frozen=True)
 class Budget:
     """The constants of the bound above; K = 1 where `growth` is 0.
+
+    Arguments of the methods: `u` roundoff, `k` = n_from / n_to, `cos_t`, `cos_i` absolute cosines, `transmitted` and
+    `unit` (whether |a| = 1) masks; each a number or a numpy array (N,). Results have the shape of all of them together.
 
     `any_length`: `linear` where |a| is not 1; None of a formula that takes unit vectors only.
     """
@@ -45,21 +48,23 @@ class Budget:
     def chord(
         self, u: Any, k: Any, cos_t: Any = 0.0, transmitted: Any = True, unit: Any = True, cos_i: Any = 1.0
     ) -> Any:
-        """Bound of |b/|a| − exact|; at the critical angle, where it is largest, by default."""
+        """Bound of the chord error |b/|a| − exact|. The defaults are the critical angle, where it is largest."""
         np = _numpy()
         bound = self.of_terms(u, k, transmitted, unit) + self.of_root(u, k, cos_t, transmitted)
         return bound + np.where(self.side_open(u, cos_i), 2 * cos_t, 0.0)
 
     def side_open(self, u: Any, cos_i: Any) -> Any:
-        """Whether the ray is so near to the surface that its side is not known; never where `side` is 0."""
+        """Whether n·a is within its own error, `side` u, of 0; never where `side` is 0."""
         return (cos_i <= self.side * u) & (self.side > 0)
 
     def of_terms(self, u: Any, k: Any, transmitted: Any = True, unit: Any = True) -> Any:
+        """The part of the bound that is linear in u: `linear` u K."""
         np = _numpy()
         linear = np.where(unit, self.linear, self.any_length or self.linear)
         return linear * u * np.where(transmitted & (self.growth > 0), np.maximum(1.0, k), 1.0)
 
     def of_root(self, u: Any, k: Any, cos_t: Any, transmitted: Any = True) -> Any:
+        """The part of the bound that the root makes of the radicand's error; 0 under total internal reflection."""
         np = _numpy()
         return np.where(transmitted, root(self.radicand_error_bound(u, k), cos_t), 0.0)
 
@@ -70,7 +75,7 @@ class Budget:
 
 
 def root(x: Any, cos_t: Any) -> Any:
-    """ρ(x, cos²θ_t): how far √ moves when its argument is off by x."""
+    """ρ(x, cos²θ_t): how far √ moves when its argument is off by x ≥ 0. Numbers or arrays (N,); ρ(x, 0) = √x."""
     np = _numpy()
     rest = np.sqrt(np.maximum(cos_t * cos_t - x, 0))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -78,7 +83,7 @@ def root(x: Any, cos_t: Any) -> Any:
 
 
 def radicand_for(error: Any, cos_t: Any) -> Any:
-    """The x with ρ(x, cos²θ_t) = `error`."""
+    """The x with ρ(x, cos²θ_t) = `error` ≥ 0, the inverse of `root`. Numbers or arrays (N,)."""
     np = _numpy()
     return np.where(error <= cos_t, error * (2 * cos_t - error), error * error)
 
@@ -97,7 +102,7 @@ SIDE = 4.0
 
 
 def cancelling(growth: int) -> Budget:
-    """Of a form whose radicand is 1 (or a²) less k² sin²θ, sin²θ from a product with `growth` factors off by u.
+    """Budget of a form whose radicand is 1 (or a²) less k² sin²θ, sin²θ from a product with `growth` factors off by u.
 
     With kw ≤ 1 and dot products by fused multiply-adds, for w² = |n×a|²: 2 k²w δw ≤ 2uk (1 + w), w·w ≤ 3u, k² and its
     product 2u, the one 3u if it is a·a, n and a unit only to u 4u, the difference u: at most 14uK. For 1 − (n·a)²:

@@ -17,20 +17,20 @@ from typing import Any
 
 import drjit as dr
 
-from mi_refract.numerics import as_component, ieee_divide
+from mi_refract.numerics import Number, Vector3, as_component, ieee_divide
 
 from .well_conditioned import Refracted
 
 # Shared by all formulas ----------------------------------------------------------------------------------------
 
 
-def _conclude(a: Any, n: Any, c: Any, radicand: Any, b: Any) -> Refracted:
+def _conclude(a: Vector3, n: Vector3, c: Number, radicand: Number, b: Vector3) -> Refracted:
     """Choose between the transmitted direction `b` and the mirror direction."""
     transmitted = (radicand >= 0) & (c != 0)
     return dr.select(transmitted, b, a - n * ieee_divide(2 * c, dr.dot(n, n))), transmitted
 
 
-def _root(radicand: Any) -> Any:
+def _root(radicand: Number) -> Any:
     """√max(radicand, 0), with a finite derivative at 0 (the mirror direction is chosen below 0)."""
     return dr.safe_sqrt(radicand)
 
@@ -38,22 +38,28 @@ def _root(radicand: Any) -> Any:
 # Reflection ----------------------------------------------------------------------------------------------------
 
 
-def wedge(n: Any, a: Any) -> Any:
-    """n ∧ a, as its components on the basis bivectors (yz, zx, xy); in three dimensions these are those of n × a."""
+def wedge(n: Vector3, a: Vector3) -> Vector3:
+    """n ∧ a, as its components on the basis bivectors (yz, zx, xy); in three dimensions these are those of n × a.
+
+    Shapes (3,) and (3,) to (3,). Source: document 000.
+    """
     return dr.cross(n, a)
 
 
-def contract(n: Any, bivector: Any) -> Any:
-    """n ⌋ B, the vector part of the geometric product n B. For B = n ∧ a it is n² a − n (n·a)."""
+def contract(n: Vector3, bivector: Vector3) -> Vector3:
+    """n ⌋ B, the vector part of the geometric product n B. For B = n ∧ a it is n² a − n (n·a).
+
+    Shapes (3,) and (3,) to (3,). Source: document 000.
+    """
     return dr.cross(bivector, n)
 
 
-def reflect(a: Any, n: Any) -> Any:
+def reflect(a: Vector3, n: Vector3) -> Vector3:
     """b = a − 2 n (n·a). Source: document 000, "Reflection". Unit `n`; shapes (3,) and (3,) to (3,)."""
     return a - n * (2 * dr.dot(n, a))
 
 
-def reflect_sandwich(a: Any, n: Any) -> Any:
+def reflect_sandwich(a: Vector3, n: Vector3) -> Vector3:
     """b = −n a n, with the geometric product n a = n·a + n∧a multiplied once more by n from the right.
 
     (n·a) n + (n∧a) n, and (n∧a) n = −n ⌋ (n∧a) because n anticommutes with a bivector that contains it.
@@ -65,11 +71,12 @@ def reflect_sandwich(a: Any, n: Any) -> Any:
 # The documented formulas ---------------------------------------------------------------------------------------
 
 
-def refract_wedge(a: Any, n: Any, k: Any) -> Refracted:
+def refract_wedge(a: Vector3, n: Vector3, k: Number) -> Refracted:
     """b = k n(n∧a) + s n √(a² + k² (n∧a)²),  s = sign(n·a).
 
     Source: document 000, boxed form of "Refraction" (there n·a < 0), made two-sided. Unit `n`.
     Weak near the critical angle, for k near 1 at grazing incidence and for k ≫ 1: the radicand cancels.
+    Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted ().
     """
     k = as_component(a, k)
     c, bivector = dr.dot(n, a), wedge(n, a)
@@ -78,11 +85,12 @@ def refract_wedge(a: Any, n: Any, k: Any) -> Refracted:
     return _conclude(a, n, c, radicand, b)
 
 
-def refract_wedge_contrast(a: Any, n: Any, k: Any) -> Refracted:
+def refract_wedge_contrast(a: Vector3, n: Vector3, k: Number) -> Refracted:
     """b = k n(n∧a) + s n √((n·a)² + (n∧a)² (k² − 1)),  s = sign(n·a).
 
     Source: document 000, last form of "Refraction", made two-sided. Unit `n`.
     Weak where k² − 1 loses digits (k near 1) and where two large terms cancel near the critical angle.
+    Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted ().
     """
     k = as_component(a, k)
     c, bivector = dr.dot(n, a), wedge(n, a)
@@ -91,11 +99,12 @@ def refract_wedge_contrast(a: Any, n: Any, k: Any) -> Refracted:
     return _conclude(a, n, c, radicand, b)
 
 
-def refract_cross(a: Any, n: Any, k: Any) -> Refracted:
+def refract_cross(a: Vector3, n: Vector3, k: Number) -> Refracted:
     """t = n × c + sgn(i·n) √(1 − ‖c‖²) n,  c = k (i × n).
 
     Source: document 001, eq. 6; its ‖c‖ (n × ĉ) is 0/0 at normal incidence, n × c is the same and safe.
     Unit `a`, `n`. Weak near the critical angle, for k near 1 at grazing incidence and for k ≫ 1.
+    Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted ().
     """
     k = as_component(a, k)
     cos, c = dr.dot(a, n), k * dr.cross(a, n)
@@ -104,12 +113,13 @@ def refract_cross(a: Any, n: Any, k: Any) -> Refracted:
     return _conclude(a, n, cos, radicand, t)
 
 
-def refract_decomposed(a: Any, n: Any, k: Any) -> Refracted:
+def refract_decomposed(a: Vector3, n: Vector3, k: Number) -> Refracted:
     """Split `a` along `n`, scale the tangent by k, restore the length.
 
     b = k a − n (k c + s √(1 − k²(1 − c²))),   c = n·a,  s = −sign(c)
     Source: document 002, eq. 1, made two-sided. Unit `a`, `n`.
     Weak near the critical angle, for k near 1 at grazing incidence and for k ≫ 1: the radicand cancels.
+    Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted ().
     """
     k = as_component(a, k)
     c = dr.dot(n, a)
@@ -118,7 +128,7 @@ def refract_decomposed(a: Any, n: Any, k: Any) -> Refracted:
     return _conclude(a, n, c, radicand, b)
 
 
-def refract_2d(i: Any, l: Any, k: Any) -> tuple[list[Any], Any]:  # noqa: E741 (the document's names)
+def refract_2d(i: Any, l: Any, k: Number) -> tuple[list[Any], Any]:  # noqa: E741 (the document's names)
     """Refract a 2D direction `i` at a boundary with direction `l`, by a change of basis.
 
     B = [[−l_y, l_x], [l_x, l_y]] turns `l` into (0, 1); B is its own inverse. With i_B = B i,
@@ -138,12 +148,13 @@ def refract_2d(i: Any, l: Any, k: Any) -> tuple[list[Any], Any]:  # noqa: E741 (
     return [dr.select(valid, b_j, dr.nan) for b_j in b], transmitted
 
 
-def refract_rotated(a: Any, n: Any, k: Any) -> Refracted:
+def refract_rotated(a: Vector3, n: Vector3, k: Number) -> Refracted:
     """`refract_2d` lifted into the plane of incidence, spanned by n and t = (a − n (n·a)) / |a − n (n·a)|.
 
     There the boundary is (0, 1) and i = (−n·a, |a − n (n·a)|), because B turns n into −x. At normal incidence t
     is any unit vector, times 0. Source: document 004. Unit `n`.
     Weak near the critical angle: √(1 − X²) magnifies the rounding of X.
+    Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted ().
     """
     k = as_component(a, k)
     c = dr.dot(n, a)

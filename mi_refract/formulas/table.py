@@ -8,11 +8,11 @@ from typing import Any
 
 import drjit as dr
 
-from mi_refract.numerics import as_component, scale_to_unit
+from mi_refract.numerics import Number, Vector3, as_component, scale_to_unit
 
 from .bounds import CONTRASTING, ROUNDING, Budget, cancelling
 from .documented import refract_cross, refract_decomposed, refract_rotated, refract_wedge, refract_wedge_contrast
-from .well_conditioned import Refracted, refract_compensated, refract_promoted
+from .well_conditioned import LocalCosines, Refracted, refract_compensated, refract_promoted
 
 # Ratios between them leave k², κ and Fresnel's terms within the range of float32.
 SMALLEST_RATIO, LARGEST_RATIO = 1e-9, 1e9
@@ -22,9 +22,9 @@ SMALLEST_RATIO, LARGEST_RATIO = 1e-9, 1e9
 class Formula:
     """A formula of refraction, `entry(a, n, k) -> (b, transmitted)`, with its source and its error budget.
 
-    `takes_contrast`: `contrast` is used, not ignored. `scales`: the function wants lengths near 1. `automatic_for`:
-    the kinds of array it is the default on. `time_goal`: what a ray in float32, streamed through a CPU, may take as
-    a multiple of the plain form's time.
+    `takes_contrast`, `takes_local`: these arguments are used, not ignored. `scales`: the function wants lengths near 1.
+    `automatic_for`: the kinds of array it is the default on. `time_goal`: what a ray in float32, streamed through a
+    CPU, may take as a multiple of the plain form's time.
     """
 
     function: Callable[..., Refracted]
@@ -32,11 +32,12 @@ class Formula:
     equation: str
     budget: Budget
     takes_contrast: bool = False
+    takes_local: bool = False
     scales: bool = False
     automatic_for: tuple[str, ...] = ()
     time_goal: float | None = None
 
-    def __call__(self, a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
+    def __call__(self, a: Vector3, n: Vector3, k: Number, contrast: Number = None) -> Refracted:
         """The formula as a total function: NaN and False for what is no refraction.
 
         That is: `a` or `n` zero or not finite, `k` outside 1e-9 … 1e9, `contrast` not finite or not above −1.
@@ -53,8 +54,15 @@ class Formula:
             valid &= (contrast > -1) & (contrast < dr.inf)
         return dr.select(valid, b, dr.nan), valid & transmitted
 
-    def unchecked(self, a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
-        """The formula alone. Precondition: what `__call__` tests; NaN gives NaN and False."""
+    def unchecked(
+        self, a: Vector3, n: Vector3, k: Number, contrast: Number = None, local: LocalCosines | None = None
+    ) -> Refracted:
+        """The formula alone. Precondition: what `__call__` tests; NaN gives NaN and False.
+
+        `local`: the cosines of a float32 ray, where `n` is the literal z axis and somebody needs them anyhow.
+        """
+        if self.takes_local:
+            return self.function(a, n, k, contrast, local)
         if self.takes_contrast:
             return self.function(a, n, k, contrast)
         return self.function(a, n, k)
@@ -89,6 +97,7 @@ FORMULAS = {
         "the form of `compensated`, one precision up, rounded once",
         budget=ROUNDING,
         takes_contrast=True,
+        takes_local=True,
         automatic_for=("scalar", "llvm"),
         time_goal=1.1,
     ),

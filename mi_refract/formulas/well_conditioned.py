@@ -18,8 +18,8 @@ decided as the exact inputs decide it wherever ρ > ε, and the root is off by �
                   in float64 it is the compensated form
 
 so both are at the rounding limit wherever ρ > 2⁻⁴⁴, and the first everywhere. That is for an exact k; a `contrast` that
-is wider than a pair is rounded to one, and then ε ≤ u². It takes inputs made for it to be nearer: of random ones near
-the critical angle one in 10⁹. There the refracted ray is within 2⁻²² cosθ of the surface and carries
+is wider than a pair is rounded to one, and then ε ≤ u². Only adversarial inputs are nearer: of random ones near the
+critical angle one in 10⁹. There the refracted ray is within 2⁻²² cosθ of the surface and carries
 T ≈ 2 (k + 1/k) √ρ of the power, less than 2e-6 for k ≤ 2.5.
 """
 
@@ -27,13 +27,16 @@ from __future__ import annotations
 
 import functools
 import operator
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 
 from mi_refract.numerics import (
     DoubleWord,
+    Mask,
+    Number,
     TripleWord,
+    Vector3,
     as_component,
     differentiated,
     error_free,
@@ -42,10 +45,11 @@ from mi_refract.numerics import (
     two_sum,
 )
 
-Refracted = tuple[Any, Any]
+# (b, transmitted): directions with the length of `a`, and a mask.
+Refracted = tuple[Vector3, Mask]
 
 
-def _axis(n: Any) -> tuple[int, int] | None:
+def _axis(n: Vector3) -> tuple[int, int] | None:
     """(index, ±1) of a normal along an axis that is known while a kernel is traced and has no derivative; else None.
 
     Known are literals, and Python floats.
@@ -62,24 +66,52 @@ def _axis(n: Any) -> tuple[int, int] | None:
     return (0, int(x)) if x else (1, int(y))
 
 
-def _along_axis(a: Any, axis: tuple[int, int], scale: Any, along: Any) -> Any:
+def _along_axis(a: Vector3, axis: tuple[int, int], scale: Number, along: Number) -> Any:
     """The b with n·b = `along` and the other components of `a` times `scale`, for a literal axis n."""
     index, sign = axis
     return type(a)(*((along if sign > 0 else -along) if i == index else a[i] * scale for i in range(3)))
 
 
-def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
+class LocalCosines(NamedTuple):
+    """A ray at a boundary whose normal is an axis: cosines times |a|, in float64."""
+
+    sin2: Number  # |a|² sin²θ_i
+    cos_i: Number  # |a| cos θ_i, on either side
+    radicand: Number  # |a|² cos²θ_t; negative under total internal reflection
+    cos_t: Number  # √|radicand|
+
+
+def local_cosines(x: Number, y: Number, z: Number, contrast: Number) -> LocalCosines:
+    """The cosines of a float32 ray with these components, z along the normal. `contrast`: κ = k² − 1, in float64.
+
+    Error of the radicand: 5·2⁻⁵³ of its larger term.
+    """
+    wide: Any = dr.float64_array_t(type(x))
+    x, y, z = wide(x), wide(y), wide(z)
+    sin2 = dr.fma(x, x, y * y)
+    # z² is exact; κ (x² + y²): 1·2⁻⁵³ each for a square and the sum, 1 for the product.
+    radicand = dr.fma(z, z, -contrast * sin2)
+    # Below 0 the root is not used: |x| takes fewer operations than max(x, 0). At 0 its derivative is finite.
+    cos_t = dr.safe_sqrt(radicand) if differentiated(radicand) else dr.sqrt(dr.abs(radicand))
+    return LocalCosines(sin2, dr.abs(z), radicand, cos_t)
+
+
+def refract_promoted(
+    a: Vector3, n: Vector3, k: Number, contrast: Number = None, local: LocalCosines | None = None
+) -> Refracted:
     """The well-conditioned form above, one precision up and rounded once: b = k a + n (n·b − k n·a)/n².
 
     float32 is computed in float64. float64 has no wider type: there the form is `refract_compensated`'s, whose
     double-word steps are that wider type. `contrast`: κ where it is known better than k, for the radicand; `k`
-    itself still scales the tangent. Source: this project. `a`, `n` of any length from 1e-18 to 1e18.
+    itself still scales the tangent. `local`: `local_cosines`, where `n` is an axis and they are known already.
+    Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted (). `a`, `n` of any length from 1e-18 to 1e18.
+    Source: this project.
     Weak nowhere for k ≤ 1e6; slow where float64 is (consumer GPUs).
     """
     if dr.type_v(a) != dr.VarType.Float32:
         return refract_compensated(a, n, k, contrast)
     if axis := _axis(n):
-        return _promoted_along(a, axis, k, contrast)
+        return _promoted_along(a, axis, k, contrast, local)
     wide: Any = dr.float64_array_t(type(a))
     number = dr.value_t(wide)
     d, m, k2 = wide(a), wide(n), number(as_component(a, k))
@@ -98,31 +130,20 @@ def refract_promoted(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
     return type(a)(dr.fma(m, ieee_divide(dr.fma(-scale, c, along), dr.dot(m, m)), d * scale)), transmitted
 
 
-def _promoted_along(a: Any, axis: tuple[int, int], k: Any, contrast: Any) -> Refracted:
+def _promoted_along(
+    a: Vector3, axis: tuple[int, int], k: Number, contrast: Number, local: LocalCosines | None
+) -> Refracted:
     """`refract_promoted` for a literal axis: only the radicand and its root need float64."""
     index, sign = axis
     wide: Any = dr.float64_array_t(dr.value_t(type(a)))
     k, along = as_component(a, k), a[index] if sign > 0 else -a[index]
-    kappa = dr.fma(wide(k), wide(k), -1) if contrast is None else wide(contrast)
-    x, y = (a[i] for i in range(3) if i != index)
-    root, radicand = local_root(x, y, along, kappa)
-    transmitted = (radicand >= 0) & (along != 0)
-    onward = dr.select(transmitted, dr.mulsign(as_component(a, root), along), -along)
+    if local is None:
+        kappa = dr.fma(wide(k), wide(k), -1) if contrast is None else wide(contrast)
+        x, y = (a[i] for i in range(3) if i != index)
+        local = local_cosines(x, y, along, kappa)
+    transmitted = (local.radicand >= 0) & (along != 0)
+    onward = dr.select(transmitted, dr.mulsign(as_component(a, local.cos_t), along), -along)
     return _along_axis(a, axis, dr.select(transmitted, k, 1), onward), transmitted
-
-
-def local_root(x: Any, y: Any, z: Any, kappa: Any) -> tuple[Any, Any]:
-    """(√|radicand|, radicand = z² − κ (x² + y²)) in float64, of float32 components in a frame whose axis is the normal.
-
-    Who asks for it twice, as the plugin does for the direction and for Fresnel's equations, pays once: Dr.Jit knows an
-    operation that it has seen.
-    """
-    wide: Any = dr.float64_array_t(type(x))
-    x, y, z = wide(x), wide(y), wide(z)
-    # z² is exact; κ (x² + y²): 1·2⁻⁵³ each for a square and the sum, 1 for the product.
-    radicand = dr.fma(z, z, -kappa * dr.fma(x, x, y * y))
-    # Below 0 the root means nothing, and nobody takes it: |x| is shorter than max(x, 0). At 0 its derivative is finite.
-    return dr.safe_sqrt(radicand) if differentiated(radicand) else dr.sqrt(dr.abs(radicand)), radicand
 
 
 def _radicand(c: TripleWord, w: list[TripleWord], kappa: DoubleWord) -> DoubleWord:
@@ -134,12 +155,13 @@ def _radicand(c: TripleWord, w: list[TripleWord], kappa: DoubleWord) -> DoubleWo
     return (c.squared() - functools.reduce(operator.add, (w_i.squared() for w_i in w)).times(kappa)).double()
 
 
-def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refracted:
+def refract_compensated(a: Vector3, n: Vector3, k: Number, contrast: Number = None) -> Refracted:
     """The well-conditioned form above with error-free transforms, in the arrays' own precision.
 
     A plain evaluation b₀ (a few u off) is corrected by its exact defect in the two equations that define b, so the
     sum b₀ + δ is rounded once. `contrast`: κ where it is known better than k, for the radicand; `k` itself still
-    scales the tangent. Source: this project. Weak nowhere for k ≤ 1e6.
+    scales the tangent. Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted (). Source: this project.
+    Weak nowhere for k ≤ 1e6.
     Precondition in float32: lengths of 1e-3 to 1e3, so that no product of four over- or underflows
     (`numerics.scale_to_unit` sees to it, in the entries of FORMULAS).
     """
@@ -167,7 +189,7 @@ def refract_compensated(a: Any, n: Any, k: Any, contrast: Any = None) -> Refract
     return (replace_grad(exact, b) if differentiated(b) else exact), transmitted
 
 
-def _correct(vector: type, n: Any, around: list[DoubleWord], along: DoubleWord) -> Any:
+def _correct(vector: type, n: Vector3, around: list[DoubleWord], along: DoubleWord) -> Any:
     """The b with n × b = `around` and n·b = `along`: b = (around × n + along n)/n², rounded once.
 
     |b₀ − b| ≤ 8u |b|, and δ from the exact defects is right to 8u of itself: b₀ + δ is b to 64u² before it is
@@ -175,7 +197,7 @@ def _correct(vector: type, n: Any, around: list[DoubleWord], along: DoubleWord) 
     """
     inverse = ieee_divide(1, dr.dot(n, n))
 
-    def solve(around: list[Any], along: Any) -> Any:
+    def solve(around: list[Any], along: Number) -> Any:
         return dr.fma(n, along, dr.cross(vector(*around), n)) * inverse
 
     b = solve([x.hi for x in around], along.hi)
@@ -185,7 +207,7 @@ def _correct(vector: type, n: Any, around: list[DoubleWord], along: DoubleWord) 
     return b + solve(missing, error_free.defect(along, *zip(n, b, strict=True)))
 
 
-def _split(a: Any, x: Any) -> DoubleWord:
+def _split(a: Vector3, x: Number) -> DoubleWord:
     """A number of any precision as a pair in the precision of the components of `a`."""
     hi = as_component(a, x)
     if dr.is_array_v(x) and type(x) is type(hi):

@@ -1,24 +1,26 @@
-"""What a comparison of images says, and the gates before every method.
+"""What a comparison of images says, and the preconditions of every method.
 
-Fails closed: what cannot be compared is an error, and a value that is not finite equals nothing.
+What cannot be compared is an error, and a value that is not finite equals nothing.
 """
 
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.io.image_file import Image
+from mi_refract.io.pixels import Pixels
 
-Maps = dict[str, np.ndarray]
-Pixels = NDArray[np.floating[Any]]
+Maps = dict[str, Pixels]
 
 
 class Verdict(enum.StrEnum):
+    """What a method says of two images."""
+
     EQUAL = "equal"
     DIFFERENT = "different"
     INCONCLUSIVE = "inconclusive"
@@ -26,7 +28,7 @@ class Verdict(enum.StrEnum):
 
 @dataclass(frozen=True)
 class Metric:
-    """A number of a judgement; where it has a threshold, `value <= bound` holds for equal images."""
+    """A number that a method measured; where it has a bound, `value <= bound` holds for equal images."""
 
     name: str
     value: float
@@ -34,29 +36,36 @@ class Metric:
 
     @property
     def holds(self) -> bool:
+        """Whether the value is within the bound; True without a bound, False for NaN."""
         return self.bound is None or self.value <= self.bound
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What a method found. `detectable`: the smallest relative difference that it would have seen, NaN if unknown.
+    """What a method found.
 
-    `maps`: H × W or H × W × C float32 by name, of the images' size.
+    `minimum_detectable`: the smallest relative difference that the method would have seen; NaN where it is not known.
+    `maps`: H × W or H × W × C arrays by name, of the images' size.
     """
 
     method: str
     verdict: Verdict
     reason: str
-    figures: tuple[Metric, ...] = ()
-    detectable: float = np.nan
+    metrics: tuple[Metric, ...] = ()
+    minimum_detectable: float = np.nan
     maps: Maps = field(default_factory=dict)
+
+
+def verdict_of(metrics: Sequence[Metric]) -> Verdict:
+    """EQUAL where every metric is within its bound, else DIFFERENT."""
+    return Verdict.EQUAL if all(metric.holds for metric in metrics) else Verdict.DIFFERENT
 
 
 def preconditions(reference: Image, test: Image, allow_nonfinite: bool = False) -> str | None:
     """Why the two differ before any method is asked: values that are not finite, counted and located; else None.
 
-    ValueError, in one line, where they cannot be compared: other size, channels (by name), or data window.
     With `allow_nonfinite` such a value is allowed where the other image has the same one: NaN, Inf or -Inf.
+    ValueError where the images cannot be compared: other size, other names of channels, other data window.
     """
     a, b = aligned(reference, test)
     if np.isfinite(a).all() and np.isfinite(b).all():
@@ -69,7 +78,7 @@ def preconditions(reference: Image, test: Image, allow_nonfinite: bool = False) 
 
 
 def aligned(reference: Image, test: Image) -> tuple[Pixels, Pixels]:
-    """The pixels of both, in the reference's order of channels. ValueError where they cannot be compared."""
+    """The pixels of both, with the channels in the reference's order. ValueError where they cannot be compared."""
     for name, of in {"size": _size, "channels": _channels, "data window": _window}.items():
         if of(reference) != of(test):
             raise ValueError(f"{test.path}: {name} {of(test)}; accepted: {of(reference)}, as in {reference.path}")
@@ -78,7 +87,10 @@ def aligned(reference: Image, test: Image) -> tuple[Pixels, Pixels]:
 
 
 def checked_pixels(method: str, reference: Image, test: Image, allow: bool) -> tuple[Pixels, Pixels, Comparison | None]:
-    """The pixels of both, finite; or the judgement of the gates. Allowed values that are not finite become 0."""
+    """The pixels of both, finite, and None; or, where the preconditions decide, the comparison that they lead to.
+
+    `allow`: allowed values that are not finite become 0. ValueError as `preconditions`.
+    """
     reason = preconditions(reference, test, allow)
     a, b = aligned(reference, test)
     if reason:
@@ -89,14 +101,15 @@ def checked_pixels(method: str, reference: Image, test: Image, allow: bool) -> t
 
 
 def nonfinite_result(method: str, reason: str, *pixels: Pixels) -> Comparison:
-    """The judgement on images with values that are not finite; they are marked in the map "nonfinite"."""
+    """DIFFERENT, for images with values that are not finite; the map "nonfinite" marks them."""
     bad = sum((~np.isfinite(each) for each in pixels), np.zeros(pixels[0].shape, np.float32))
-    figures = (Metric("values that are not finite", float(bad.sum()), 0.0),)
-    return Comparison(method, Verdict.DIFFERENT, reason, figures, maps={"nonfinite": (bad > 0).astype(np.float32)})
+    metrics = (Metric("values that are not finite", float(bad.sum()), 0.0),)
+    return Comparison(method, Verdict.DIFFERENT, reason, metrics, maps={"nonfinite": (bad > 0).astype(np.float32)})
 
 
-def _same(a: Pixels, b: Pixels) -> Any:
-    return (a == b) | (np.isnan(a) & np.isnan(b))
+def _same(a: Pixels, b: Pixels) -> NDArray[np.bool_]:
+    same: NDArray[np.bool_] = (a == b) | (np.isnan(a) & np.isnan(b))
+    return same
 
 
 def _located(image: Image, values: Pixels, bad: NDArray[np.bool_]) -> str:

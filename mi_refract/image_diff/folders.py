@@ -1,6 +1,6 @@
-"""Pairs of image files, and folders of them: who is compared with whom, what came out, and what may be accepted.
+"""Pairs of image files, and folders of them: which image is compared with which, and what came out.
 
-One pair that cannot be compared does not keep the others from it. Nothing here writes a file but `accept`.
+One pair that cannot be compared does not keep the others from it. Nothing here writes a file.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import functools
 import os
 import shlex
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,11 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from mi_refract.io import image_file
-from mi_refract.io.atomic import write_atomically
 from mi_refract.io.image_file import Image
 
 from . import methods
-from .methods import Comparison, Verdict
+from .comparison import Comparison, Verdict
 from .settings import How, Settings
 
 
@@ -49,6 +48,7 @@ STATUSES = {Verdict.EQUAL: Status.EQUAL, Verdict.DIFFERENT: Status.DIFFERENT, Ve
 CATEGORIES = {Status.EQUAL: Category.UNCHANGED, Status.DIFFERENT: Category.CHANGED}
 AS_ASKED = Settings()
 WORKERS = min(os.cpu_count() or 1, 8)  # each holds a pair of images in memory
+HELD = 250_000_000  # bytes of images that stay in memory for a page; a full page shows fewer
 INCONCLUSIVE = {"": 3, "pass": 0, "fail": 1}  # exit codes by what the user wants of it
 
 
@@ -56,7 +56,8 @@ INCONCLUSIVE = {"": 3, "pass": 0, "fail": 1}  # exit codes by what the user want
 class Result:
     """One image: its name, and what was found. `error` is the line that says why there is no verdict.
 
-    `reference`, `test`: its files, or with samples its folders; None where that side has none. `how`: what was asked.
+    `reference`, `test`: its files, or with renders its folders; None where that side has none. `how`: what was asked.
+    `images`: both sides as they were read, of several renders the mean; empty where they were not kept.
     """
 
     name: str
@@ -66,9 +67,11 @@ class Result:
     how: How = field(default_factory=How)
     comparison: Comparison | None = None
     error: str = ""
+    images: tuple[Image, ...] = ()
 
     @property
     def category(self) -> Category:
+        """What happened to the image between the two folders."""
         if self.status is Status.ERROR:
             return Category.UNKNOWN
         if self.reference is None or self.test is None:
@@ -86,20 +89,23 @@ class Result:
 
 @dataclass(frozen=True)
 class Results:
-    """What `diff` found, failures first. `reference`, `test`: as given. `unused`: patterns that matched no image.
+    """What `diff` found, failures first.
 
-    `began`: when the comparison did, in ns since the epoch.
+    `reference`, `test`: the paths as given; `renders`: each of them holds renders of one image. `inconclusive`: what
+    that counts as ("pass", "fail", or "" for an exit code of its own). `unused`: patterns of the settings that matched
+    no image. `began`: when the comparison began, in ns since the epoch.
     """
 
     reference: Path
     test: Path
     results: tuple[Result, ...]
-    samples: bool = False
+    renders: bool = False
     inconclusive: str = ""
     unused: tuple[str, ...] = ()
     began: int = 0
 
     def of(self, *statuses: Status) -> list[Result]:
+        """The results with one of these statuses."""
         return [result for result in self.results if result.status in statuses]
 
     @property
@@ -117,12 +123,12 @@ class Results:
 
     def reproduce(self, result: Result) -> str:
         """The command that compares this image again; "" where one side has none."""
-        flags = (["--samples"] if self.samples else []) + result.how.flags
+        flags = (["--renders"] if self.renders else []) + result.how.flags
         return _line("diff", result.reference, result.test, flags) if result.reference else ""
 
     def accept(self, result: Result) -> str:
         """The command that makes the new image the reference; "" where there is none, or no need."""
-        flags = [] if self.samples else result.how.flags
+        flags = [] if self.renders else result.how.flags
         return _line("accept", self.target(result), result.test, flags) if result.status is not Status.EQUAL else ""
 
 
@@ -131,7 +137,7 @@ def _line(verb: str, reference: Path, test: Path | None, flags: Sequence[str]) -
 
 
 def as_word(path: Path) -> str:
-    """Of a command line: a name that begins with a dash would be read as an option."""
+    """The path as a word of a command line, with ./ before a name that would be read as an option."""
     return f"./{path}" if str(path).startswith("-") else str(path)
 
 
@@ -143,39 +149,34 @@ def diff(
     test: str | Path,
     settings: Settings = AS_ASKED,
     *,
-    samples: bool = False,
+    renders: bool = False,
     inconclusive: str = "",
     maps: bool = False,
     new: bool = False,
     tell: Callable[[int, int], None] = lambda done, of: None,
 ) -> Results:
-    """Compare two files, two folders by the names of their images, or, with `samples`, two folders as one image.
+    """Compare two files, two folders by the names of their images, or, with `renders`, two folders as one image.
 
-    `maps`: keep those of images that are not equal. `new`: the reference need not exist yet. `tell(done, of)` after
-    each image. ValueError or OSError, in one line, where there is nothing to compare: a path that does not exist, a
-    file against a folder, an empty folder, a path within the other.
+    `maps`: keep the maps of images that are not equal, and the images themselves as far as HELD goes. `new`: the
+    reference need not exist yet. `tell(done, of)` is called after each image. ValueError or OSError where there is
+    nothing to compare: a path that does not exist, a file against a folder, an empty folder, a path within the other.
     """
     began, reference, test = time.time_ns(), Path(reference), Path(test)
     require_apart(reference, test, new)
-    if samples:
-        if not (reference.is_dir() and test.is_dir()):
-            raise NotADirectoryError(f"{test if reference.is_dir() else reference}: accepted with --samples: a folder")
-        paired: list[Result] = [_unjudged(reference.resolve().name, reference, test)]
-    else:
-        paired = pairs(reference, test)
+    if renders and not (reference.is_dir() and test.is_dir()):
+        raise NotADirectoryError(f"{test if reference.is_dir() else reference}: accepted with --renders: a folder")
+    name = reference.resolve().name
+    paired = [Result(name, Status.DIFFERENT, reference, test)] if renders else pairs(reference, test)
     asked = [replace(result, how=settings.of(result.name)) for result in paired]
-
-    def work(result: Result) -> Result:
-        return result if result.error or not (result.reference and result.test) else judge(result, samples, maps)
-
-    found = []
+    found, held = [], 0
     with ThreadPoolExecutor(WORKERS) as pool:
-        for result in pool.map(work, asked):
-            found.append(result)
+        for result in pool.map(lambda result: _compared(result, renders, maps), asked):
+            held += sum(image.pixels.nbytes for image in result.images)
+            found.append(result if held <= HELD else replace(result, images=()))
             tell(len(found), len(asked))
     found.sort(key=lambda result: list(Status).index(result.status))
-    unused = settings.unused([result.name for result in paired]) if reference.is_dir() and not samples else []
-    return Results(reference, test, tuple(found), samples, inconclusive, tuple(unused), began)
+    unused = settings.unused([result.name for result in paired]) if reference.is_dir() and not renders else []
+    return Results(reference, test, tuple(found), renders, inconclusive, tuple(unused), began)
 
 
 def require_apart(reference: Path, test: Path, new: bool = False) -> None:
@@ -191,17 +192,17 @@ def require_apart(reference: Path, test: Path, new: bool = False) -> None:
 
 
 def pairs(reference: Path, test: Path) -> list[Result]:
-    """The images of both sides by name, not yet judged; those of one side only are different."""
+    """The images of both sides by name, not yet compared; those of one side only are different."""
     known = reference.exists()
     if known and reference.is_dir() != test.is_dir():
         raise ValueError(f"{reference}, {test}: a folder and a file; accepted: two of a kind")
     if not test.is_dir():
-        return [_unjudged(reference.name, reference if known else None, test)]
+        return [Result(reference.name, Status.DIFFERENT, reference if known else None, test)]
     (old, lost), (new, missed) = images_in(reference) if known else ({}, []), images_in(test)
     for folder, nothing in ((reference, known and not old and not lost), (test, not new and not missed)):
         if nothing:
             raise ValueError(f"{folder}: holds no image; accepted: at least one")
-    found = [_unjudged(name, old.get(name), new.get(name)) for name in sorted(old | new)]
+    found = [Result(name, Status.DIFFERENT, old.get(name), new.get(name)) for name in sorted(old | new)]
     return [*found, *(Result(name, Status.ERROR, None, None, error=error) for name, error in lost + missed)]
 
 
@@ -237,26 +238,24 @@ def endings() -> frozenset[str]:
     return frozenset(e for name, listed in formats if name not in ("null", "term", "zfile") for e in listed.split(","))
 
 
-def _unjudged(name: str, reference: Path | None, test: Path | None) -> Result:
-    return Result(name, Status.DIFFERENT, reference, test)
-
-
-def judge(result: Result, samples: bool = False, maps: bool = False) -> Result:
-    """The result of comparing its two sides; with ERROR for what is wrong with either."""
-    assert result.reference and result.test
+def _compared(result: Result, renders: bool, maps: bool) -> Result:
+    """The result of comparing its two sides, where it has both; ERROR for what is wrong with either."""
+    if result.error or not (result.reference and result.test):
+        return result
     try:
         if result.reference.samefile(result.test):
             raise ValueError(f"{result.test}: the same file as the reference {result.reference}; accepted: two")
-        read = sample_images if samples else image_file.read
-        found = methods.compare(result.how.method, read(result.reference), read(result.test), **result.how.options)
+        sides = [read_renders(path) if renders else [image_file.read(path)] for path in (result.reference, result.test)]
+        found = methods.compare(result.how.method, *sides, **result.how.options)
     except (ValueError, OSError) as error:
         return replace(result, status=Status.ERROR, error=image_file.one_line(str(error)))
-    if not maps or found.verdict is Verdict.EQUAL:
-        found = replace(found, maps={})  # a thousand images' maps would fill the memory
-    return replace(result, status=STATUSES[found.verdict], comparison=found)
+    kept = maps and found.verdict is not Verdict.EQUAL  # a thousand images' maps would fill the memory
+    images = tuple(map(mean_image, sides)) if kept else ()
+    comparison = found if kept else replace(found, maps={})
+    return replace(result, status=STATUSES[found.verdict], comparison=comparison, images=images)
 
 
-def sample_images(folder: Path) -> list[Image]:
+def read_renders(folder: Path) -> list[Image]:
     """The renders of one image in a folder. ValueError where two are the same, seed and all; otherwise as `read`."""
     found, failed = images_in(folder)
     if failed:
@@ -273,37 +272,10 @@ def sample_images(folder: Path) -> list[Image]:
     return images
 
 
-# Accepting --------------------------------------------------------------------------------------------------------
-
-
-def changes(results: Results) -> Iterator[tuple[Path, Path]]:
-    """(new, reference) for each image that is not equal to its reference, or has none.
-
-    ValueError or OSError for a new image that is no reference: unreadable, with values that are not finite, or of
-    another format than the reference's name says.
-    """
-    for result in results.of(Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE):
-        if result.test is None:
-            if result.error:
-                raise ValueError(result.error)
-            continue
-        image = image_file.read(result.test)
-        if not result.how.options.get("allow_nonfinite") and not np.isfinite(image.pixels).all():
-            raise ValueError(f"{result.test}: values that are not finite; accepted with --allow-nonfinite")
-        target = results.target(result)
-        if target.suffix.lower() != result.test.suffix.lower():
-            raise ValueError(f"{target}: accepted: a name that ends in {result.test.suffix}, as {result.test} does")
-        yield result.test, target
-
-
-def accept(copies: Sequence[tuple[Path, Path]], shown: int) -> None:
-    """Copy each first file over the second; every one is replaced as a whole or stays. OSError ends it.
-
-    `shown`: the time in ns since the epoch when they were compared; OSError, before any copy, for a file changed since.
-    """
-    for new, _ in copies:
-        if max(new.stat().st_mtime_ns, new.stat().st_ctime_ns) > shown:
-            raise OSError(f"{new}: changed since it was compared; accepted: what was shown")
-    for new, reference in copies:
-        reference.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(reference, new.read_bytes())
+def mean_image(images: Sequence[Image]) -> Image:
+    """The first image with the mean of the pixels of all; one image as it is."""
+    first = images[0]
+    if len(images) == 1:
+        return first
+    pixels = sum((each.pixels for each in images[1:]), start=first.pixels) / np.float32(len(images))
+    return replace(first, pixels=pixels)

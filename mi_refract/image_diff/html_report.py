@@ -1,8 +1,8 @@
 """The page that shows a person what `mi-refract diff` found: one offline HTML file, failures first, with images.
 
-Judgements come from the results; only maps that the method did not ask for (the difference, FLIP) are made here.
-Equal images are a line each. Images are embedded until the page is full: those further down keep their numbers,
-and the command that shows them alone.
+Verdicts come from the results; only the maps that the method did not make (the difference, FLIP) are made here. Equal
+images are a line each. Images are embedded until the page is full: those further down keep their numbers, and the
+command that shows them alone.
 """
 
 from __future__ import annotations
@@ -19,19 +19,21 @@ from typing import Any
 import numpy as np
 
 from mi_refract.io.image_file import Image, one_line, read
-from mi_refract.report.embedded_images import EmbeddedImages, encoded, means, shown, strongest
+from mi_refract.io.pixels import Pixels, block_mean
+from mi_refract.report.embedded_images import EmbeddedImages, encoded, shown, strongest
 from mi_refract.report.html_page import write_page
 from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.plots import histogram_svg
 
-from . import folders, methods
+from . import flip, folders
+from .comparison import Maps, Metric
 from .folders import Result, Results, Status
 from .text_reports import sentence
 
 PAGE = 14_000_000  # bytes of images on a page of at most 15 MB
+FULL = "Not embedded: the page is full."
 IMAGE, MAP = 4_600_000, 1_200_000  # bytes of one: two images and three maps are a page
 MAP_WIDTH, FLIP_WIDTH = 960, 640
-PPD = 67.0  # pixels per degree, as everywhere FLIP is used
 SIGNED = ("difference", "t")
 UNSEEN = {"p"}  # a histogram shows it better
 FAILED = (Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE)
@@ -46,7 +48,14 @@ def write(path: str | Path, results: Results, context: Mapping[str, Any] | None 
     An image that cannot be read (any more) is a line on the page. Errors: OSError for the page itself.
     """
     images = EmbeddedImages()
-    failures = [_failure(number, result, results, images) for number, result in enumerate(results.of(*FAILED), 1)]
+    failures: list[dict[str, Any]] = []
+    full = False
+    for number, result in enumerate(results.of(*FAILED), 1):
+        panes, note = ([], FULL) if full else _panes(result)
+        # The first pair is shown, however large; after one that does not fit no other is tried.
+        full = full or bool(images.embedded and images.size + _bytes(panes) > PAGE)
+        panes, note = ([], FULL) if full else ([images.add(pane) for pane in panes], note)
+        failures.append(_failure(number, result, results) | _shown_panes(panes, note))
     counts = Counter(result.status for result in results.results)
     content = {
         "title": "mi-refract diff",
@@ -62,18 +71,23 @@ def write(path: str | Path, results: Results, context: Mapping[str, Any] | None 
     write_page(path, "diff.html.j2", content, images)
 
 
-def _failure(number: int, result: Result, results: Results, images: EmbeddedImages) -> dict[str, Any]:
+def _bytes(panes: list[dict[str, Any]]) -> int:
+    return sum(len(pane["data"]) for pane in panes)
+
+
+def _shown_panes(panes: list[dict[str, Any]], note: str) -> dict[str, Any]:
+    one_size = len({(pane["width"], pane["height"]) for pane in panes[:2]}) == 1
+    return {"panes": panes, "paired": one_size and len(panes) > 1, "note": note}
+
+
+def _failure(number: int, result: Result, results: Results) -> dict[str, Any]:
     found = result.comparison
     p_values = found.maps.get("p") if found else None
-    panes, note = _panes(result, images) if images.size < PAGE else ([], "Not embedded: the page is full.")
     return _line(result) | {
         "key": f"pair-{number}",
         "category": str(result.category),
         "asked": result.how.reason,
-        "detectable": found.detectable if found and math.isfinite(found.detectable) else None,
-        "panes": panes,
-        "paired": len({(pane["width"], pane["height"]) for pane in panes[:2]}) == 1 and len(panes) > 1,
-        "note": note,
+        "minimum_detectable": found.minimum_detectable if found and math.isfinite(found.minimum_detectable) else None,
         "histogram": "" if p_values is None else _histogram(p_values, f"pair-{number}"),
         "commands": [
             (verb, command)
@@ -90,20 +104,20 @@ def _line(result: Result) -> dict[str, Any]:
         "status": str(result.status),
         "method": found.method if found else "",
         "reason": result.reason,
-        "figures": [_figure(figure) for figure in found.figures] if found else [],
+        "metrics": [_metric(metric) for metric in found.metrics] if found else [],
     }
 
 
-def _figure(figure: methods.Metric) -> dict[str, str]:
-    value, bound = figure.value, figure.bound
+def _metric(metric: Metric) -> dict[str, str]:
+    value, bound = metric.value, metric.bound
     if bound is None or value <= bound == math.inf:
-        return {"name": figure.name, "text": compact(value), "limit": "", "state": "info"}
+        return {"name": metric.name, "text": compact(value), "limit": "", "state": "info"}
     text, limit = distinguishable(value, bound)
     state, sign = ("pass", "≤") if value <= bound else ("fail", ">" if value > bound else "≰")
-    return {"name": figure.name, "text": text, "limit": f"{sign} {limit}", "state": state}
+    return {"name": metric.name, "text": text, "limit": f"{sign} {limit}", "state": state}
 
 
-def _histogram(p_values: np.ndarray, salt: str) -> str:
+def _histogram(p_values: Pixels, salt: str) -> str:
     some = p_values[:: -(-len(p_values) // 512)]
     return histogram_svg(some[np.isfinite(some)], "p-value", "share of the tiles", salt=salt)
 
@@ -111,35 +125,42 @@ def _histogram(p_values: np.ndarray, salt: str) -> str:
 # Panes --------------------------------------------------------------------------------------------------------------
 
 
-def _panes(result: Result, images: EmbeddedImages) -> tuple[list[dict[str, Any]], str]:
+def _panes(result: Result) -> tuple[list[dict[str, Any]], str]:
     """What can be shown of a pair, and why the rest cannot."""
-    sides: dict[str, Image] = {}
-    notes = []
-    for role, path in (("reference", result.reference), ("test", result.test)):
+    sides, notes = _sides(result)
+    makers: list[Maker] = [functools.partial(_image, role, image) for role, image in sides.items()]
+    makers += _map_makers(result.comparison.maps if result.comparison else {}, *sides.values())
+    with ThreadPoolExecutor(2) as pool:  # deflating is most of the work, and lets go of the interpreter's lock
+        return list(pool.map(lambda make: make(), makers)), " ".join(notes)
+
+
+def _sides(result: Result) -> tuple[dict[str, Image], list[str]]:
+    """The images by role, in the channels that can be shown; and why one cannot be read."""
+    paths = {"reference": result.reference, "test": result.test}
+    if result.images:
+        return {role: _in_shown_channels(image) for role, image in zip(paths, result.images, strict=True)}, []
+    sides, notes = {}, []
+    for role, path in paths.items():
         try:
             if path:
-                sides[role] = _seen(path)
+                several = folders.read_renders(path) if path.is_dir() else [read(path)]
+                sides[role] = _in_shown_channels(folders.mean_image(several))
         except (ValueError, OSError) as error:
             notes.append(one_line(str(error)))
-    makers: list[Maker] = [functools.partial(_image, role, image) for role, image in sides.items()]
-    makers += _map_makers(dict(result.comparison.maps) if result.comparison else {}, *sides.values())
-    with ThreadPoolExecutor(2) as pool:  # deflating is most of the work, and lets go of the interpreter's lock
-        return [images.add(pane) for pane in pool.map(lambda make: make(), makers)], " ".join(notes)
+    return sides, notes
 
 
-def _seen(path: Path) -> Image:
-    """The image, or the mean of the renders in a folder, in the channels that can be shown."""
-    several = folders.sample_images(path) if path.is_dir() else [read(path)]
-    first = several[0]
-    pixels = sum((each.pixels for each in several[1:]), start=first.pixels) / np.float32(len(several))
-    seen, name = shown(pixels, first.channels)
-    if seen is None:  # neither RGB nor gray: the first channel stands for all
-        seen, name = pixels[..., :1], first.channels[0]
-    return replace(first, pixels=seen, channels=tuple("RGB") if name == "RGB" else (name,))
+def _in_shown_channels(image: Image) -> Image:
+    """RGB or gray; of other channels the first stands for all."""
+    seen, name = shown(image.pixels, image.channels)
+    if seen is None:
+        seen, name = image.pixels[..., :1], image.channels[0]
+    return replace(image, pixels=seen, channels=tuple("RGB") if name == "RGB" else (name,))
 
 
-def _map_makers(maps: dict[str, np.ndarray], *sides: Image) -> list[Maker]:
+def _map_makers(given: Maps, *sides: Image) -> list[Maker]:
     """For the signed difference and FLIP, then the method's own maps."""
+    maps = dict(given)
     made: dict[str, Maker] = {}
     if len(sides) == 2 and sides[0].pixels.shape == sides[1].pixels.shape:
         with np.errstate(invalid="ignore"):
@@ -155,13 +176,13 @@ def _map_makers(maps: dict[str, np.ndarray], *sides: Image) -> list[Maker]:
 
 
 def _image(role: str, image: Image) -> dict[str, Any]:
-    pane = {"role": role, "paint": "code" if methods.encoding(image) == "sRGB" else "light", "gain": None}
+    pane = {"role": role, "paint": "code" if flip.encoding(image) == "sRGB" else "light", "gain": None}
     embedded = encoded(image.pixels, IMAGE)
     channel = "" if len(image.channels) == 3 else f"channel {image.channels[0]}"
     return pane | embedded | {"note": ", ".join(filter(None, (channel, embedded["note"])))}
 
 
-def _map(name: str, values: np.ndarray) -> dict[str, Any]:
+def _map(name: str, values: Pixels) -> dict[str, Any]:
     """A pane whose colours are full at the largest value; its gain starts where the upper hundredth is full."""
     small = strongest(values.reshape(*values.shape[:2], -1), MAP_WIDTH)
     sizes = np.abs(small[np.isfinite(small)])
@@ -178,6 +199,7 @@ def _map(name: str, values: np.ndarray) -> dict[str, Any]:
 def _flip(reference: Image, test: Image) -> dict[str, Any]:
     """The FLIP map of the images made as small as it is shown: whole, they would take it seconds."""
     side = -(-reference.pixels.shape[1] // FLIP_WIDTH)
-    small = [replace(each, pixels=means(each.pixels, side)) for each in (reference, test)]
-    found = _map("flip", methods.flip(*small, ppd=max(PPD / side, 1.0)).maps["flip"])
+    one, two = (replace(each, pixels=block_mean(each.pixels, side)) for each in (reference, test))
+    error = flip.flip_map(one, two, flip.is_hdr(one, two), max(flip.PIXELS_PER_DEGREE / side, 1.0))
+    found = _map("flip", error)
     return found | ({"note": f"of means of {side} × {side} pixels"} if side > 1 else {})

@@ -1,34 +1,39 @@
-"""Proof that a comparison can fail: defects planted in images, which must be seen, and equal pairs, which must not.
+"""Proof that a comparison can fail: defects planted in images must be seen, and equal pairs must not be reported.
 
-A method that takes single images is asked about two of the same random numbers, one of them spoilt; a method that
-takes samples, about clean renders and spoilt ones of other seeds. Seen is what it calls different, or refuses to
-compare; "inconclusive" is counted as not seen. A row per defect: the share of trials in which each method saw it.
+A method that takes single images compares two of the same random numbers, one of them spoilt; a method that takes
+several renders compares clean ones with spoilt ones of other seeds. A defect is seen where the method calls the images
+different, or refuses to compare them; "inconclusive" counts as not seen. One row for each defect: the share of trials
+in which each method saw it.
 
-Due, so that missing it fails the row: what is not finite, not of the same size, or not readable, for every method; a
-change of any bit, for `exact`; and for a method that knows noise, a defect larger than what it prints as detectable.
+A method that misses what is due fails its row. Due are: for every method, values that are not finite, another size,
+and a file that cannot be read; for `exact`, a change of any bit; and for a method that knows the noise, a defect larger
+than the minimum detectable difference that it prints.
 """
 
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mi_refract.io import image_file, srgb
+from mi_refract.io import image_file
+from mi_refract.io.pixels import Pixels, block_mean
 from mi_refract.report.row import Row
 
-from . import methods as compare
+from . import methods
 from .comparison import Verdict
-from .folders import sample_images
+from .defects import DEFECTS, Defect, Renders, through_a_file
+from .folders import read_renders
 from .methods import METHODS
 
-Renders = np.ndarray | list[np.ndarray]  # of one image; a list where one of them is of another size
+if TYPE_CHECKING:
+    from rich.console import RenderableType
 
-STUDY = "gate"
+STUDY = "self-test"
 TILE = METHODS["welch"].options["tile"].default
 TRIALS = 20  # per defect
 NULL_PAIRS = 500
@@ -36,109 +41,33 @@ FALSE_ALARMS = 0.01  # at most this share of equal pairs
 CONFIDENCE = 0.95  # of the bound on that share, one-sided
 SEED = 2026
 RENDERS = 4  # at least: two a side
-OWN_RENDERS, OWN_SPP = 16, 16
+DETECTABLE, RATIO = "minimum detectable difference", "size / minimum detectable"
 TERMS = {
     "size": "of a defect: relative change of a tile's mean, there where it is largest compared with the noise",
-    "detectable": "smallest relative difference that `welch` prints, median over the trials",
-    "size / detectable": "detectable being what is printed, more in tiles noisier than the median one",
+    DETECTABLE: "smallest relative difference that `welch` would have seen in a tile, median over the trials",
+    RATIO: "above 1 the defect is due; in tiles noisier than the median one the minimum is so much larger",
     "missed": "trials in which a method missed what was due: see the introduction",
     "bound": f"{CONFIDENCE:.0%} upper bound of a rate, exact binomial (Clopper and Pearson)",
     "noise": "standard deviation of a pixel over its mean, median over the image",
 }
 
 
-# Defects -------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Defect:
-    """`plant` spoils an image (height, width, channels); it may raise the error of a file that cannot be read.
-
-    `once`: only the first of several renders is spoilt. `always_due`: no noise is an excuse for missing it.
-    """
-
-    text: str
-    plant: Callable[[np.ndarray], np.ndarray]
-    once: bool = False
-    always_due: bool = False
-
-    def spoil(self, renders: np.ndarray) -> Renders:
-        if not self.once:
-            return np.stack([self.plant(image) for image in renders])
-        return [self.plant(renders[0]), *renders[1:]]
-
-
-def _with_centre(value: Callable[[np.ndarray], float]) -> Callable[[np.ndarray], np.ndarray]:
-    """All channels of one pixel replaced."""
-
-    def plant(image: np.ndarray) -> np.ndarray:
-        spoilt = image.copy()
-        spoilt[image.shape[0] // 2, image.shape[1] // 2] = value(image)
-        return spoilt
-
-    return plant
-
-
-def _blurred(image: np.ndarray) -> np.ndarray:
-    height, width = image.shape[:2]
-    padded = np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    return np.mean([padded[y : y + height, x : x + width] for y in range(3) for x in range(3)], 0)
-
-
-def _in_8_bits(image: np.ndarray) -> np.ndarray:
-    """Through an 8-bit sRGB file: white is 1, and what is brighter is cut."""
-    return srgb.decoded(np.round(255 * srgb.encoded(image)) / 255)
-
-
-def _truncated(image: np.ndarray) -> np.ndarray:
-    """Through a file that lost its second half."""
-    return _through_a_file(image, share=0.5)
-
-
-def _through_a_file(image: np.ndarray, share: float = 1.0) -> np.ndarray:
-    """Written, cut to a share of the bytes, and read again. ValueError for what cannot be read."""
-    channels = image_file.named("", image).channels
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "image.exr"
-        image_file.write_exr(path, image, channels)
-        written = path.read_bytes()
-        path.write_bytes(written[: int(share * len(written))])
-        return image_file.read(path).select(channels)
-
-
-DEFECTS = {
-    "gain": Defect("1 % brighter", lambda x: 1.01 * x),
-    "shift": Defect("one pixel to the right", lambda x: np.roll(x, 1, axis=1)),
-    "swapped channels": Defect("the first and the last", lambda x: x[..., ::-1]),
-    "blur": Defect("mean of 3 × 3 pixels", _blurred),
-    "8 bits": Defect("through an 8-bit sRGB file", _in_8_bits),
-    "firefly": Defect("one pixel a thousand times as bright as the mean", _with_centre(lambda x: 1e3 * x.mean())),
-    "NaN": Defect("one pixel of one image", _with_centre(lambda x: math.nan), once=True, always_due=True),
-    "Inf": Defect("one pixel of one image", _with_centre(lambda x: math.inf), once=True, always_due=True),
-    "wrong size": Defect("one image lacks a column", lambda x: x[:, 1:], once=True, always_due=True),
-    "truncated": Defect("half of one image's file is missing", _truncated, once=True, always_due=True),
-}
-
-
-# Asking --------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Trial:
-    """Renders (number, height, width, channels): `clean` and `spoil()` share seeds, `other` are clean of other seeds.
+    """Renders, number × H × W × C: `clean` and `spoil()` have the same seeds, `other` are clean ones of other seeds.
 
-    `spoil` may raise ValueError or OSError: what cannot be read is not compared. An empty `other` leaves out the
-    methods that take samples.
+    `spoil` may raise ValueError or OSError: what cannot be read is not compared. With an empty `other` the methods
+    that take several renders are left out.
     """
 
-    clean: np.ndarray
-    other: np.ndarray
+    clean: Pixels
+    other: Pixels
     spoil: Callable[[], Renders]
 
 
 @dataclass
 class Tally:
-    """What a method said of pairs, and the smallest differences that it says it would have seen."""
+    """What a method said of several pairs, and the minimum detectable differences that it printed."""
 
     seen: int = 0
     inconclusive: int = 0
@@ -147,34 +76,40 @@ class Tally:
 
     @property
     def rate(self) -> float:
+        """The share of the trials in which the method saw a difference."""
         return self.seen / self.trials
 
     @property
     def bound(self) -> float:
-        """The upper bound of the rate of which `seen` of independent `trials` are a sample."""
+        """The upper bound of the rate where the trials are independent: exact, one-sided, at CONFIDENCE."""
         from scipy import stats
 
-        return float(stats.beta.ppf(CONFIDENCE, self.seen + 1, self.trials - self.seen)) if self.rate < 1 else 1.0
+        found = stats.binomtest(self.seen, self.trials, alternative="less")
+        return float(found.proportion_ci(CONFIDENCE, method="exact").high)
+
+    def refuse(self) -> None:
+        """Count a trial whose images could not be compared: that is seen."""
+        self.seen, self.trials = self.seen + 1, self.trials + 1
 
     def ask(self, method: str, reference: Renders, test: Renders) -> None:
-        """Of the first image a side, or of all where the method takes samples. A refusal counts as seen."""
+        """Compare the first image of each side, or all where the method takes several. A refusal counts as seen."""
         sides = [[image_file.named(name, x) for x in side] for name, side in (("reference", reference), ("test", test))]
-        whole = METHODS[method].samples
-        self.trials += 1
+        whole = METHODS[method].takes_renders
         try:
-            found = compare.compare(method, *(side if whole else side[0] for side in sides))
+            found = methods.compare(method, *(side if whole else side[0] for side in sides))
         except (ValueError, OSError):
-            self.seen += 1
+            self.refuse()
             return
+        self.trials += 1
         self.seen += found.verdict is Verdict.DIFFERENT
         self.inconclusive += found.verdict is Verdict.INCONCLUSIVE
-        if math.isfinite(found.detectable):
-            self.detectable.append(found.detectable)
+        if math.isfinite(found.minimum_detectable):
+            self.detectable.append(found.minimum_detectable)
 
 
-def _asked(renders: np.ndarray) -> list[str]:
-    """The methods that so many renders of other seeds can be given to."""
-    return [name for name, method in METHODS.items() if not method.samples or 2 * len(renders) >= RENDERS]
+def _asked(renders: Pixels) -> list[str]:
+    """The methods that can be asked with so many renders of other seeds."""
+    return [name for name, method in METHODS.items() if not method.takes_renders or 2 * len(renders) >= RENDERS]
 
 
 # Rows ----------------------------------------------------------------------------------------------------------
@@ -189,30 +124,42 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
             spoilt = trial.spoil()
         except (ValueError, OSError):
             for tally in tallies.values():
-                tally.seen, tally.trials = tally.seen + 1, tally.trials + 1
+                tally.refuse()
             continue
         if np.array_equal(spoilt[0], trial.clean[0]):
             return Row(STUDY, name, case, setting, reason="left out: it changes nothing in these images")
         for method, tally in tallies.items():
-            tally.ask(method, trial.other if METHODS[method].samples else trial.clean, spoilt)
+            tally.ask(method, trial.other if METHODS[method].takes_renders else trial.clean, spoilt)
         if not always_due:
-            cleans.append([_tiles(image) for image in trial.clean])
-            changes.append(np.mean([_tiles(image) for image in spoilt], 0) - np.mean(cleans[-1], 0))
+            cleans.append([block_mean(image, TILE) for image in trial.clean])
+            changes.append(np.mean([block_mean(image, TILE) for image in spoilt], 0) - np.mean(cleans[-1], 0))
     sizes = _sizes(np.array(changes), np.concatenate(cleans), tallies) if cleans else {}
-    large = sizes.get("size / detectable", 0.0) > 1
-    due = [m for m in tallies if always_due or m == "exact" or (large and METHODS[m].samples)]
+    replay = {"trials": len(trials), "renders a side": len(trials[0].clean)}
+    return _row(name, always_due, tallies, sizes, replay, case, setting)
+
+
+def _row(
+    name: str,
+    always_due: bool,
+    tallies: dict[str, Tally],
+    sizes: dict[str, float],
+    replay: dict[str, int],
+    case: str,
+    setting: str,
+) -> Row:
+    large = sizes.get(RATIO, 0.0) > 1
+    due = [m for m in tallies if always_due or m == "exact" or (large and METHODS[m].takes_renders)]
     values = {method: tally.rate for method, tally in tallies.items()}
     values |= {"missed": float(sum(tallies[m].trials - tallies[m].seen for m in due)), **sizes}
-    replay = {"trials": len(trials), "renders a side": len(trials[0].clean), "due": due}
-    return Row(STUDY, name, case, setting, values, {"missed": 0.0}, replay=replay)
+    return Row(STUDY, name, case, setting, values, {"missed": 0.0}, replay=replay | {"due": due})
 
 
-def _sizes(changes: np.ndarray, clean: np.ndarray, tallies: dict[str, Tally]) -> dict[str, float]:
-    """Of the tile and channel where the change is largest compared with what could be detected there.
+def _sizes(changes: Pixels, clean: Pixels, tallies: dict[str, Tally]) -> dict[str, float]:
+    """Of the tile and channel where the change is largest compared with the noise there.
 
-    What is printed is a median over tiles; in a tile noisier than the median one it is so much more.
+    The minimum detectable difference is printed for the median tile; in a noisier tile it is so much larger.
     """
-    printed = [x for method, tally in tallies.items() if METHODS[method].samples for x in tally.detectable]
+    printed = [x for method, tally in tallies.items() if METHODS[method].takes_renders for x in tally.detectable]
     if not printed or len(clean) < 2:
         return {}
     mean, deviation = clean.mean(0), clean.std(0, ddof=1)
@@ -223,34 +170,27 @@ def _sizes(changes: np.ndarray, clean: np.ndarray, tallies: dict[str, Tally]) ->
     detectable = float(np.median(printed))
     # A tile that is quieter than the median one gets no credit: few renders make some look quiet by chance.
     share = relative / (detectable * np.maximum(noise / np.median(noise), 1))
-    return {"size": float(relative[share.argmax()]), "size / detectable": float(share.max()), "detectable": detectable}
-
-
-def _tiles(image: np.ndarray) -> np.ndarray:
-    """Means of tiles, by channel."""
-    rows, columns = (np.arange(0, n, TILE) for n in image.shape[:2])
-    sums, count = (np.add.reduceat(np.add.reduceat(x, rows, 0), columns, 1) for x in (image, np.ones_like(image)))
-    return sums / count
+    return {"size": float(relative[share.argmax()]), RATIO: float(share.max()), DETECTABLE: detectable}
 
 
 def false_alarms(
-    pairs: Iterable[tuple[np.ndarray, np.ndarray]],
-    repeats: Iterable[tuple[np.ndarray, np.ndarray]],
+    pairs: Iterable[tuple[Pixels, Pixels]],
+    repeats: Iterable[tuple[Pixels, Pixels]],
     case: str,
     setting: str,
     independent: bool = True,
 ) -> list[Row]:
-    """A row per method: how often it called equal pairs different.
+    """A row for each method: how often it called equal pairs different.
 
-    `pairs` are renders of other seeds on either side, for methods that take samples; `repeats` are renders of the same
-    seeds, for the others. `independent`: no render is in two pairs; only then the rate has a bound, and that is what
-    must be below FALSE_ALARMS. Otherwise it is the rate.
+    `pairs` have renders of other seeds on either side, for methods that take several renders; `repeats` have renders of
+    the same seeds, for the others. `independent`: no render is in two pairs; then the upper bound of the rate must be
+    at most FALSE_ALARMS, otherwise the rate itself.
     """
     tallies = {method: Tally() for method in METHODS}
-    for samples, given in ((True, pairs), (False, repeats)):
+    for takes_renders, given in ((True, pairs), (False, repeats)):
         for reference, test in given:
             for method in METHODS:
-                if METHODS[method].samples is samples:
+                if METHODS[method].takes_renders is takes_renders:
                     tallies[method].ask(method, reference, test)
     return [_null_row(method, tally, case, setting, independent) for method, tally in tallies.items() if tally.trials]
 
@@ -259,43 +199,20 @@ def _null_row(method: str, tally: Tally, case: str, setting: str, independent: b
     values = {"false alarms": tally.rate, "null pairs": float(tally.trials)}
     values["inconclusive"] = tally.inconclusive / tally.trials
     budget = "false alarms"
-    if independent and METHODS[method].samples:
+    if independent and METHODS[method].takes_renders:
         budget = "bound"
         values[budget] = tally.bound
-    if tally.detectable and METHODS[method].samples:
-        values["detectable"] = float(np.median(tally.detectable))
+    if tally.detectable and METHODS[method].takes_renders:
+        values[DETECTABLE] = float(np.median(tally.detectable))
     return Row(STUDY, f"null pairs, {method}", case, setting, values, {budget: FALSE_ALARMS})
 
 
 # Given images ------------------------------------------------------------------------------------------------
 
 
-def self_test(path: Path | None = None) -> int:
-    """Prints what is seen in the renders of a folder, in one image, or in our own; 1 where anything due is missed."""
-    if path is None:
-        renders = _own_renders()
-    elif path.suffix == ".xml":
-        renders = _renders_of(path)
-    else:
-        images = sample_images(path) if path.is_dir() else [image_file.read(path)]
-        renders = _stacked(images)
-    rows = examine(renders, str(path or "a glass ball"))
-    print(text(rows))
-    return int(any(row.verdict == "fail" for row in rows))
-
-
-def _renders_of(scene: Path) -> np.ndarray:
-    from mi_refract import backend
-    from mi_refract.rendering.scene_files import load_scene
-
-    backend.activate(may_restart=True)
-    import mitsuba as mi
-
-    loaded = load_scene(scene)
-    return np.stack([np.array(mi.render(loaded, spp=OWN_SPP, seed=seed)) for seed in range(OWN_RENDERS)])
-
-
-def _stacked(images: list[image_file.Image]) -> np.ndarray:
+def read_images(path: Path) -> Pixels:
+    """The renders of one image in a folder, or the image in a file, number × H × W × C. Errors: those of `read`."""
+    images = read_renders(path) if path.is_dir() else [image_file.read(path)]
     first = images[0]
     for image in images[1:]:
         if image.pixels.shape[:2] != first.pixels.shape[:2] or set(image.channels) != set(first.channels):
@@ -303,52 +220,11 @@ def _stacked(images: list[image_file.Image]) -> np.ndarray:
     return np.stack([image.select(first.channels) for image in images])
 
 
-def _own_renders() -> np.ndarray:
-    """A glass ball on a floor under a sky and a lamp."""
-    from mi_refract import backend
+def examine(renders: Pixels, case: str, trials: int = TRIALS, null_pairs: int = NULL_PAIRS) -> list[Row]:
+    """The rows of every defect and of the null pairs on given renders of one image, number × H × W × C.
 
-    backend.activate(may_restart=True)
-    import mitsuba as mi
-
-    look = mi.ScalarTransform4f().look_at
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "path", "max_depth": 16, "rr_depth": 16},
-            "sensor": {
-                "type": "perspective",
-                "fov": 40,
-                "to_world": look([0, -5, 2.5], [0, 0, 0.8], [0, 0, 1]),
-                "film": {
-                    "type": "hdrfilm",
-                    "width": 64,
-                    "height": 64,
-                    "rfilter": {"type": "box"},
-                    "pixel_format": "rgb",
-                },
-            },
-            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.6, 0.8, 1.0]}},
-            "lamp": {
-                "type": "rectangle",
-                "to_world": look([3, -2, 5], [0, 0, 0], [0, 0, 1]),
-                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [3.0, 2.5, 2.0]}},
-            },
-            "floor": {
-                "type": "rectangle",
-                "to_world": mi.ScalarTransform4f().scale(8),
-                "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}},
-            },
-            "ball": {"type": "sphere", "center": [0, 0, 1], "bsdf": {"type": "refract"}},
-        }
-    )
-    return np.stack([np.array(mi.render(scene, spp=OWN_SPP, seed=seed)) for seed in range(OWN_RENDERS)])
-
-
-def examine(renders: np.ndarray, case: str, trials: int = TRIALS, null_pairs: int = NULL_PAIRS) -> list[Row]:
-    """Every defect and the null pairs on given renders of one image (number, height, width, channels).
-
-    Four or more of them, of independent seeds, are split in halves at random; fewer are asked of one by one. ValueError
-    for renders that are not finite: what is planted in them could not be told from what was there.
+    RENDERS or more, of independent seeds, are split in halves at random; of fewer, single images are compared.
+    ValueError for values that are not finite: what is planted could not be told from what was there.
     """
     if not len(renders) or not np.isfinite(renders).all():
         raise ValueError(f"{case}: accepted for a self-test: one or more renders, every value of them finite")
@@ -360,21 +236,21 @@ def examine(renders: np.ndarray, case: str, trials: int = TRIALS, null_pairs: in
         planted = [_split(renders, half, defect, rng) for _ in range(trials)]
         rows.append(detection(name, defect.always_due, planted, case, setting))
     splits = (_halves(renders, half, rng) for _ in range(null_pairs if half else 0))
-    repeats = ((renders[[i]], _through_a_file(renders[i])[None]) for i in range(len(renders)))
+    repeats = ((renders[[i]], through_a_file(renders[i])[None]) for i in range(len(renders)))
     rows += false_alarms(splits, repeats, case, setting, independent=False)
     if half:
         return [*rows, Row(STUDY, "renders", case, setting, {"noise": noise(renders)})]
     return [*rows, Row(STUDY, "renders", case, setting, reason="of fewer than four renders the noise is not known")]
 
 
-def noise(renders: np.ndarray) -> float:
+def noise(renders: Pixels) -> float:
     """Standard deviation of a pixel over its mean, median over the lit part of the image."""
     mean, deviation = renders.mean(0), renders.std(0, ddof=1)
     lit = mean > 0
     return float(np.median(deviation[lit] / mean[lit])) if lit.any() else 0.0
 
 
-def _split(renders: np.ndarray, half: int, defect: Defect, rng: np.random.Generator) -> Trial:
+def _split(renders: Pixels, half: int, defect: Defect, rng: np.random.Generator) -> Trial:
     if half:
         clean, other = _halves(renders, half, rng)
     else:
@@ -382,25 +258,37 @@ def _split(renders: np.ndarray, half: int, defect: Defect, rng: np.random.Genera
     return Trial(clean, other, lambda: defect.spoil(clean))
 
 
-def _halves(renders: np.ndarray, half: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _halves(renders: Pixels, half: int, rng: np.random.Generator) -> tuple[Pixels, Pixels]:
     order = rng.permutation(len(renders))
     return renders[order[:half]], renders[order[half : 2 * half]]
 
 
-def text(rows: Sequence[Row]) -> str:
-    """A table of what `examine` found: a line per defect, a column per method, and what did not hold."""
-    methods = list(METHODS)
-    lines = [f"{'seen':18}" + "".join(f"{name:>11}" for name in methods) + f"{'size':>11}"]
+def failed(rows: Sequence[Row]) -> bool:
+    """Whether anything due was missed, or a method called too many equal pairs different."""
+    return any(row.verdict == "fail" for row in rows)
+
+
+def table(rows: Sequence[Row]) -> RenderableType:
+    """What `examine` found, for rich's console: a line for each defect, a column for each method, and what failed."""
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    shares = Table("seen", box=None, pad_edge=False)
+    for name in (*METHODS, "size"):
+        shares.add_column(name, justify="right")
+    shares.add_column("")
+    lines = []
     for row in rows:
         if row.subject in DEFECTS:
-            cells = [_share(row.values.get(name)) for name in methods]
             size = f"{row.values['size']:.2%}" if "size" in row.values else ""
-            mark = "" if row.values else f"  {row.reason}"
-            lines.append(f"{row.subject:18}" + "".join(f"{cell:>11}" for cell in cells) + f"{size:>11}{mark}")
+            cells = [_share(row.values.get(name)) for name in METHODS]
+            shares.add_row(row.subject, *cells, size, "" if row.values else row.reason)
         elif row.values:
             lines.append(f"{row.subject}: " + ", ".join(f"{name} {x:.3g}" for name, x in row.values.items()))
-    failed = [f"{row.subject}: {', '.join(row.broken)}" for row in rows if row.verdict == "fail"]
-    return "\n".join([*lines, f"not held: {'; '.join(failed)}" if failed else "every defect that was due was seen"])
+    broken = [f"{row.subject}: {', '.join(row.broken)}" for row in rows if row.verdict == "fail"]
+    lines.append(f"failed: {'; '.join(broken)}" if broken else "every defect that was due was seen")
+    return Group(shares, *map(Text, lines))
 
 
 def _share(rate: float | None) -> str:

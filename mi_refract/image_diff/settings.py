@@ -1,6 +1,7 @@
 """How each image is compared: what the command line says for all of them, and `mi-refract.toml` for some.
 
-The file holds `[[image]]` tables. Of those that match an image's name the last one holds, before the command line:
+The file holds `[[image]]` tables. Of the tables that match an image's name the last one counts, and it goes before the
+command line:
 
     [[image]]
     name = "glass/caustic*.exr"
@@ -20,10 +21,9 @@ from typing import Any
 
 from mi_refract.io.toml_schema import TABLES, TEXT, Key, Type, key_table, read
 
-from .methods import METHODS
+from .methods import AUTO, METHODS
 
 FILE = "mi-refract.toml"
-AUTO = "auto"
 ACCEPTED = (AUTO, *METHODS)
 BOOL = Type("true or false", lambda value: value if isinstance(value, bool) else None)
 METHOD = Type(", ".join(ACCEPTED), lambda value: value if isinstance(value, str) and value in ACCEPTED else None)
@@ -53,7 +53,7 @@ TYPES: dict[type, Type] = {
 
 @dataclass(frozen=True)
 class How:
-    """A method, those of its options that are not left to it, and `reason`: why, where a file says so."""
+    """A method, those of its options that are given, and `reason`: why, where a settings file says so."""
 
     method: str = AUTO
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -61,7 +61,7 @@ class How:
 
     @property
     def flags(self) -> list[str]:
-        """The words that say the same on the command line."""
+        """The command line's options that say the same."""
         words = [] if self.method == AUTO else ["--method", self.method]
         for name, value in self.options.items():
             if name != "allow_nonfinite":
@@ -95,9 +95,9 @@ class Settings:
 
 
 def load(path: str | Path) -> tuple[tuple[str, How], ...]:
-    """The rules of a settings file: pattern, and how. Images count from 0 in its errors.
+    """The rules of a settings file: pattern of names, and how such images are compared.
 
-    ValueError, one line with file and key, for what it cannot be; OSError as the system raises it.
+    ValueError names the file and the key, whose images count from 0; OSError as the system raises it.
     """
     path = Path(path)
     try:
@@ -123,7 +123,7 @@ def keys_of(method: str) -> dict[str, Key]:
 
 
 def from_words(method: str, words: Sequence[str]) -> How:
-    """Of the command line: a method, and `NAME=VALUE` for its options. ValueError for what it does not take."""
+    """The method and its options from the command line's words `NAME=VALUE`. ValueError for what it does not take."""
     if method not in ACCEPTED:
         raise ValueError(f"--method {method}: accepted: {METHOD.accepted}")
     if words and method == AUTO:
@@ -150,7 +150,7 @@ def _value(text: str, kind: Type) -> Any:
 
 
 def reference() -> str:
-    """What a settings file may hold and each method takes, in Markdown."""
+    """What a settings file may hold, and the options of each method, in Markdown."""
     parts = [key_table("`[[image]]`", COMMON)]
     for name, method in METHODS.items():
         parts.append(f"`{name}`: {method.summary}")

@@ -1,6 +1,6 @@
-"""What `diff` found, laid out for a terminal, scripts (JSON), test runners (JUnit) and GitHub. Nothing is judged here.
+"""What `diff` found, laid out for a terminal, for scripts (JSON), test runners (JUnit) and GitHub.
 
-Names of files and the texts of errors are strangers' words: each form escapes what would be read as more than text.
+Names of files and messages of errors come from strangers: each form escapes what would be read as more than text.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from mi_refract.report.junit import printable
 from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.row import strict
 
+from .comparison import Metric
 from .folders import Result, Results, Status
-from .methods import Metric
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -46,15 +46,15 @@ def sentence(results: Results) -> str:
 
 
 def table(results: Results) -> RenderableType:
-    """Failures first, then the equal ones as far as they are few, then the sentence; for rich's console."""
+    """Failures first, then the equal images, FEW at most, then the sentence; for rich's console."""
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
-    judged = results.of(Status.DIFFERENT, Status.INCONCLUSIVE)
+    failed = results.of(Status.DIFFERENT, Status.INCONCLUSIVE)
     equal = results.of(Status.EQUAL)
     rows = Table("verdict", "image", "method", "why", box=None, pad_edge=False)
-    for result in [*judged, *equal[:FEW]]:
+    for result in [*failed, *equal[:FEW]]:
         status = Text(_word(result), style=STYLES[result.status])
         rows.add_row(status, *(Text(printable(text)) for text in (result.name, _method(result), why(result))))
     more = [Text(f"… and {len(equal) - FEW} more that are equal", style="dim")] if len(equal) > FEW else []
@@ -62,7 +62,7 @@ def table(results: Results) -> RenderableType:
 
 
 def why(result: Result) -> str:
-    """The reason, and why the image is compared in a way of its own where it is."""
+    """The reason of the verdict, and the settings' reason where the image has settings of its own."""
     return result.reason + (f" [{result.how.reason}]" if result.how.reason else "")
 
 
@@ -88,7 +88,7 @@ def as_data(results: Results) -> dict[str, Any]:
         "sentence": sentence(results),
         "reference": results.reference,
         "test": results.test,
-        "samples": results.samples,
+        "renders": results.renders,
         "counts": {str(status): counts[status] for status in Status},
         "results": [_entry(results, result) for result in results.results],
     }
@@ -107,15 +107,18 @@ def _entry(results: Results, result: Result) -> dict[str, Any]:
         "method": _method(result),
         "options": dict(result.how.options),
         "why_so": result.how.reason,
-        "figures": [{"name": f.name, "value": f.value, "bound": f.bound} for f in (found.figures if found else ())],
-        "detectable": found.detectable if found else math.nan,
+        "metrics": [{"name": m.name, "value": m.value, "bound": m.bound} for m in (found.metrics if found else ())],
+        "minimum_detectable_difference": found.minimum_detectable if found else math.nan,
         "reproduce": results.reproduce(result),
         "accept": results.accept(result),
     }
 
 
 def write_junit(path: str | Path, results: Results) -> None:
-    """One case an image. Different is a failure; inconclusive too, unless it is to pass; no verdict is an error."""
+    """One case for each image: "different" is a failure, "inconclusive" too unless it is to pass, no verdict an error.
+
+    Errors: OSError.
+    """
     cases = [_case(results, result) for result in results.results]
     junit.write_junit(path, "mi-refract diff", {str(results.test): cases})
 
@@ -136,17 +139,17 @@ def _kind(results: Results, result: Result) -> Literal["", "failure", "error"]:
 
 
 def _details(results: Results, result: Result) -> list[str]:
-    figures = [figure_text(figure) for figure in (result.comparison.figures if result.comparison else ())]
+    metrics = [metric_text(metric) for metric in (result.comparison.metrics if result.comparison else ())]
     commands = {"reproduce": results.reproduce(result), "accept": results.accept(result)}
-    return [*figures, *(f"{verb}: {line}" for verb, line in commands.items() if line)]
+    return [*metrics, *(f"{verb}: {line}" for verb, line in commands.items() if line)]
 
 
-def figure_text(figure: Metric) -> str:
+def metric_text(metric: Metric) -> str:
     """ "largest change 0.12 (allowed 0.1)"."""
-    if figure.bound is None:
-        return f"{figure.name} {compact(figure.value)}"
-    value, bound = distinguishable(figure.value, figure.bound)
-    return f"{figure.name} {value} (allowed {bound})"
+    if metric.bound is None:
+        return f"{metric.name} {compact(metric.value)}"
+    value, bound = distinguishable(metric.value, metric.bound)
+    return f"{metric.name} {value} (allowed {bound})"
 
 
 # GitHub -----------------------------------------------------------------------------------------------------------

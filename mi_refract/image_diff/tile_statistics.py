@@ -11,17 +11,24 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
-DARK = 1e-3  # a tile darker than this share of its channel's `usual` counts as that bright where shares are asked for
+from mi_refract.io.pixels import Pixels as Array
+from mi_refract.io.pixels import block_area, block_sum
+
+DARK = 1e-3  # a tile darker than this share of its channel's `median_nonblack` counts as that bright in ratios
 GROWTH = 4  # from one level of tiles to the next
 HEAVY = 4.0  # a tile whose noise comes from fewer pixels than this is heavy-tailed: its t is not a Student's
 POOLED = 30  # blocks of tiles from which the correlation of pixels is estimated again, at least
-MISSED = 0.01  # a difference of the detectable size is missed with this probability
+MISSED = 0.01  # the minimum detectable difference is missed with this probability
 WORKERS = 2
 
-Array = np.ndarray
+CORRECTIONS = ("sidak", "holm")
+
+Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, order=True)
@@ -50,6 +57,7 @@ class Side:
     renders: Array | None = None
 
     def coarser(self) -> Side:
+        """The same side in tiles GROWTH times as wide."""
         area, mean, variance, squares = (
             block_sum(x, GROWTH) for x in (self.area, self.mean, self.variance, self.squares)
         )
@@ -64,7 +72,7 @@ class Side:
         return variance, squares + variance**2 / inflation.freedom
 
     def inflation(self) -> Inflation:
-        """One for all tiles of an image. Of images without `renders` it is not known, and 1."""
+        """The inflation of all tiles of the image; 1 where it is not known, without `renders` or without noise."""
         noisy = self.variance > 0
         if self.renders is None or not noisy.any():
             return Inflation()
@@ -74,14 +82,8 @@ class Side:
         return Inflation(max(1.0, float((between / self.variance[noisy]).mean())), freedom)
 
 
-def block_sum(x: Array, size: int) -> Array:
-    """Sums over size × size blocks of the axes −3 and −2; at the right and lower edge of what is left."""
-    rows, columns = np.arange(0, x.shape[-3], size), np.arange(0, x.shape[-2], size)
-    return np.add.reduceat(np.add.reduceat(x, rows, -3), columns, -2)
-
-
 def from_renders(renders: Sequence[Array], tile: int) -> Side:
-    """One side from independent renders, each H × W × C. Band by band: memory for a row of tiles only."""
+    """One side from independent renders, each H × W × C; needs memory for a row of tiles only."""
     height, width = renders[0].shape[:2]
     columns = np.arange(0, width, tile)
 
@@ -98,41 +100,41 @@ def from_renders(renders: Sequence[Array], tile: int) -> Side:
 
     with ThreadPoolExecutor(WORKERS) as pool:
         each, noise = (np.stack(x, -3) for x in zip(*pool.map(band, range(0, height, tile)), strict=True))
-    return Side(_area(height, width, tile), each.mean(0), noise[0], noise[1], len(renders) - 1.0, each)
+    return Side(block_area(height, width, tile), each.mean(0), noise[0], noise[1], len(renders) - 1.0, each)
 
 
 def from_variances(mean: Array, variance: Array, freedom: float, tile: int) -> Side:
-    """One side from an image and the variance of its pixels, both H × W × C."""
-    area = _area(mean.shape[0], mean.shape[1], tile)
+    """One side from an image and the variance of its pixels, both H × W × C; `freedom`: of that variance."""
+    area = block_area(mean.shape[0], mean.shape[1], tile)
     squares = np.square(variance, dtype=np.float64)
     return Side(area, block_sum(mean, tile), block_sum(variance, tile), block_sum(squares, tile), freedom)
 
 
-def _area(height: int, width: int, tile: int) -> Array:
-    return block_sum(np.ones((height, width, 1)), tile)
-
-
 @dataclass(frozen=True)
 class Level:
-    """One level of tiles. `t` signed, test over reference; `p` of no difference, `beyond` of one within the margin.
+    """One level of tiles; every array is tiles × tiles × C.
 
-    `silent`: no noise on either side, of which a t-test knows nothing: p is 1 there, `off` where the means differ
-    beyond the margin. `heavy`: noise from a few pixels only.
+    `t`: positive where the test is brighter. `p`: of no difference; `beyond`: of none beyond the margin; both 0 where a
+    value is not finite. `silent`: no noise on either side, of which a t-test knows nothing: p is 1 there, and `off`
+    where the means differ beyond the margin. `heavy`: noise from a few pixels only.
     """
 
     t: Array
     p: Array
     beyond: Array
-    silent: Array
-    off: Array
-    heavy: Array
+    silent: Flags
+    off: Flags
+    heavy: Flags
     mean: Array
     allowed: Array
     error: Array
     freedom: Array
 
     def detectable(self, threshold: float) -> Array:
-        """Relative differences seen with probability 1 − MISSED at that p, of the tiles with light and noise."""
+        """Relative differences that are seen with probability 1 − MISSED at that p, of the tiles with light and noise.
+
+        One dimension. A difference δ is seen where δ ≥ margin + (t(1 − p/2) + t(1 − MISSED)) · error.
+        """
         from scipy import special
 
         asked = ~self.silent & (self.mean > DARK * median_nonblack(self.mean))
@@ -141,11 +143,11 @@ class Level:
         return (reach * self.error[asked] + self.allowed[asked]) / self.mean[asked]
 
 
-def levels(reference: Side, test: Side, margin: float) -> Iterator[Level]:
+def levels(reference: Side, test: Side, equivalence_margin: float) -> Iterator[Level]:
     """The test of single tiles, then of blocks GROWTH times as wide, and so on to the whole image."""
     inflations = reference.inflation(), test.inflation()
     while True:
-        yield compare_tiles(reference, test, margin, inflations)
+        yield compare_tiles(reference, test, equivalence_margin, inflations)
         if reference.area.size == 1:
             return
         reference, test = reference.coarser(), test.coarser()
@@ -154,39 +156,45 @@ def levels(reference: Side, test: Side, margin: float) -> Iterator[Level]:
 
 
 def compare_tiles(
-    one: Side, two: Side, margin: float, inflations: tuple[Inflation, Inflation] = (Inflation(), Inflation())
+    one: Side,
+    two: Side,
+    equivalence_margin: float,
+    inflations: tuple[Inflation, Inflation] = (Inflation(), Inflation()),
 ) -> Level:
-    """Welch's test of every tile. Differences up to `margin`, relative to the tile's mean, are as good as none."""
+    """Welch's t-test of every tile; differences up to `equivalence_margin` × the tile's mean count as none."""
     from scipy import special
 
     with np.errstate(divide="ignore", invalid="ignore"):
         m1, m2 = one.mean / one.area, two.mean / two.area
         v1, d1 = one.spread(inflations[0])
         v2, d2 = two.spread(inflations[1])
-        variance, allowed = v1 + v2, margin * np.maximum(np.abs(m1), DARK * median_nonblack(np.abs(m1)))
+        variance = v1 + v2
+        allowed = equivalence_margin * np.maximum(np.abs(m1), DARK * median_nonblack(np.abs(m1)))
         silent, error, difference = variance == 0, np.sqrt(variance), m2 - m1
         freedom = np.where(silent, 1.0, variance**2 / (d1 + d2))
         t = np.where(silent, 0.0, difference / error)
         beyond = np.where(silent, 0.0, np.maximum(np.abs(difference) - allowed, 0) / error)
         few = (one.variance + two.variance) ** 2 < HEAVY * (one.squares + two.squares)
         off = silent & (np.abs(difference) > allowed)
-    p, p_beyond = (2 * special.stdtr(freedom, -np.abs(x)) for x in (t, beyond))
+    # NaN becomes 0: what is not finite equals nothing.
+    p, p_beyond = (np.nan_to_num(2 * special.stdtr(freedom, -np.abs(x)), nan=0.0) for x in (t, beyond))
     return Level(t, p, p_beyond, silent, off, few & ~silent, np.abs(m1), allowed, error, freedom)
 
 
 def median_nonblack(sizes: Array) -> Array:
-    """Of each channel the median of what is not black. Not the mean: next to a lamp everything else would be dark."""
+    """The median of each channel of … × C values without those that are 0 or less; 0 where none is left."""
+    # Not the mean: next to a lamp everything else would be dark.
     channels = sizes.reshape(-1, sizes.shape[-1]).T
     return np.array([np.median(x[x > 0].astype(np.float64)) if (x > 0).any() else 0.0 for x in channels])
 
 
 def sidak(family_error: float, count: int) -> float:
-    """The p below which one of `count` independent tests is an alarm."""
+    """The p below which one of `count` independent tests is an alarm (Šidák 1967): 1 − (1 − family_error)^(1/count)."""
     return float(-np.expm1(np.log1p(-family_error) / max(count, 1)))
 
 
 def adjusted(p: Array) -> float:
-    """The smallest p after Šidák; 1 of no tests."""
+    """The smallest p after Šidák's correction; 1 where there are no tests."""
     return float(-np.expm1(p.size * np.log1p(-min(float(p.min()), 1 - 1e-16)))) if p.size else 1.0
 
 
@@ -199,56 +207,84 @@ def holm(p: Array, family_error: float) -> float:
     return max(first, float(rejected[-1])) if rejected.size else first
 
 
-def benjamini_hochberg(p: Array) -> Array:
-    """Adjusted p: tiles below q are, but for a share q of them, different (Benjamini and Hochberg 1995)."""
-    order = np.argsort(p, axis=None)
-    scaled = p.ravel()[order] * p.size / np.arange(1, p.size + 1)
-    adjusted = np.empty(p.size)
-    adjusted[order] = np.minimum.accumulate(scaled[::-1])[::-1]
-    return np.minimum(adjusted, 1).reshape(p.shape)
+# All tests of an image -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Welch:
-    """`alarms`: tiles and channels that differ, at the given probability of any alarm between equal images.
+class TileTests:
+    """The tests of all tiles and channels with noise, on every level, at one probability of any false alarm."""
 
-    `smallest_p` is Šidák-adjusted; `detectable` the median over tiles of the smallest relative difference of means
-    that would have been seen; `certain` counts tiles without any variance, which a t-test knows nothing of:
-    they are alarms where the means differ beyond the margin.
-    """
+    levels: list[Level]
+    family_error: float
+    correction: str = "sidak"
 
-    alarms: int
-    smallest_p: float
-    detectable: float
-    certain: int
+    @cached_property
+    def p(self) -> Array:
+        """Of all levels the p of tiles with noise, in one dimension."""
+        return np.concatenate([level.beyond[~level.silent] for level in self.levels])
+
+    @cached_property
+    def threshold(self) -> float:
+        """The p at or below which a test is an alarm."""
+        if self.correction == "holm":
+            return holm(self.p, self.family_error)
+        return sidak(self.family_error, self.p.size)
+
+    @property
+    def differing(self) -> int:
+        """The number of tests that are alarms; heavy-tailed tiles are not among them."""
+        return sum(int((self._seen(level) & ~level.heavy).sum()) for level in self.levels)
+
+    @property
+    def heavy_differing(self) -> int:
+        """The number of tests of heavy-tailed tiles that would be alarms."""
+        return sum(int((self._seen(level) & level.heavy).sum()) for level in self.levels)
+
+    @property
+    def silent_differing(self) -> int:
+        """The number of single tiles and channels without noise whose means differ beyond the margin."""
+        return int(self.levels[0].off.sum())
+
+    @property
+    def alarms(self) -> int:
+        """The number of tests that differ, whatever is known of their noise."""
+        return self.differing + self.heavy_differing + self.silent_differing
+
+    @property
+    def smallest_p(self) -> float:
+        """The smallest p after Šidák's correction."""
+        return adjusted(self.p)
+
+    def minimum_detectable(self, level: int = 0) -> float:
+        """The smallest relative difference that is seen in the median tile of a level; NaN where none has noise."""
+        found = self.levels[level].detectable(self.threshold)
+        return float(np.median(found)) if found.size else np.nan
+
+    def _seen(self, level: Level) -> Flags:
+        return (level.beyond <= self.threshold) & ~level.silent
 
 
-def welch(reference: Array, test: Array, tile: int, family_error: float, margin: float = 0.0) -> Welch:
-    """The test of single tiles of two stacks of independent renders, (renders, height, width, channels).
+def compare_stacks(
+    reference: Array, test: Array, tile: int, family_error: float, equivalence_margin: float = 0.0
+) -> TileTests:
+    """Welch's test of single tiles of two stacks of independent renders, each renders × H × W × C.
 
-    Means that differ by no more than `margin`, relative to the tile's or to a thousandth of the channel's, are equal
-    for all practical purposes: the test asks whether they differ by more. It keeps noise-free tiles from turning last
-    bits into certainties. Pixels are taken for independent, as under a box filter.
-
-    ValueError for fewer than 2 renders a side, or of another shape. A tile that is not finite is an alarm.
+    Pixels are taken for independent, as under a box filter. A tile with a value that is not finite is an alarm.
+    `equivalence_margin` is relative to the tile's mean, or to a thousandth of the channel's; above 0 it keeps tiles
+    without noise from differing by their last bits. ValueError for fewer than 2 renders a side, or another shape.
     """
     same_shape(reference[0], test[0])
     if min(len(reference), len(test)) < 2:
         raise ValueError(f"welch: {len(reference)} and {len(test)} renders: at least 2 a side are needed")
-    found = compare_tiles(from_renders(list(reference), tile), from_renders(list(test), tile), margin)
-    p = np.where(found.off | ~np.isfinite(found.beyond), 0.0, found.beyond)
-    threshold = sidak(family_error, p.size)
-    detectable = found.detectable(threshold)
-    return Welch(
-        int((p <= threshold).sum()),
-        adjusted(p),
-        float(np.median(detectable)) if detectable.size else 0.0,
-        int(found.silent.sum()),
-    )
+    one, two = (from_renders(list(side), tile) for side in (reference, test))
+    return TileTests([compare_tiles(one, two, equivalence_margin)], family_error)
 
 
 def relative_mse(image: Array, references: Array, epsilon: float = 0.01) -> float:
-    """mean((x − r)²/(r² + ε)) against the mean r of a stack of independent renders, less what r's own noise adds."""
+    """mean((x − r)²/(r² + ε)) against the mean r of a stack of independent renders, less what r's own noise adds.
+
+    `image` H × W × C, `references` renders × H × W × C. ValueError for other shapes.
+    """
     r = references.mean(0)
     same_shape(r, image)
     own = references.var(0, ddof=1) / len(references)
@@ -256,5 +292,6 @@ def relative_mse(image: Array, references: Array, epsilon: float = 0.01) -> floa
 
 
 def same_shape(reference: Array, test: Array) -> None:
+    """ValueError unless both arrays have one shape."""
     if reference.shape != test.shape:
         raise ValueError(f"images of different shapes: reference {reference.shape}, test {test.shape}")

@@ -19,6 +19,7 @@ from . import atomic
 
 Metadata = dict[str, Any]
 SUFFIXES = (".exr",)
+NO_DATE = {"DateTime": "1970:01:01 00:00:00"}  # for the same bytes every day: without it OpenImageIO writes today's
 
 
 def write_exr(

@@ -15,23 +15,25 @@ from typing import Any
 
 import drjit as dr
 
-Pair = tuple[Any, Any]
+from .types import Mask, Number, Vector3
+
+Pair = tuple[Number, Number]
 
 
-def two_sum(x: Any, y: Any) -> Pair:
+def two_sum(x: Number, y: Number) -> Pair:
     """s = fl(x + y) and e with s + e = x + y exactly, whatever the magnitudes."""
     s = x + y
     y_part = s - x
     return s, (x - (s - y_part)) + (y - y_part)
 
 
-def fast_two_sum(x: Any, y: Any) -> Pair:
+def fast_two_sum(x: Number, y: Number) -> Pair:
     """As `two_sum`, three operations instead of six. Precondition: |x| ≥ |y| or x = 0."""
     s = x + y
     return s, y - (s - x)
 
 
-def two_prod(x: Any, y: Any) -> Pair:
+def two_prod(x: Number, y: Number) -> Pair:
     """p = fl(x y) and e with p + e = x y exactly."""
     p = x * y
     return p, dr.fma(x, y, -p)
@@ -41,30 +43,31 @@ def two_prod(x: Any, y: Any) -> Pair:
 class DoubleWord:
     """A number of twice the working precision, as the unevaluated sum hi + lo, |lo| ≤ 8u |hi|.
 
-    Supports what a formula needs: + − × with another `Double` or a plain number, negation and `sqrt`. Relative error
-    for normalised operands, |lo| ≤ u |hi|: + − ≤ 3u² whatever cancels, × ≤ 5u², √ ≤ 16u²; for others + − ≤ 10u²,
-    × ≤ 90u².
+    Operations: + − × with another `DoubleWord` or a plain number, negation and `sqrt`. Relative error for normalised
+    operands, |lo| ≤ u |hi|: + − ≤ 3u² whatever cancels, × ≤ 5u², √ ≤ 16u²; for others + − ≤ 10u², × ≤ 90u².
     """
 
-    hi: Any
-    lo: Any = 0
+    hi: Number
+    lo: Number = 0
 
     @property
     def is_plain(self) -> bool:
-        """Without a low part, known while a kernel is traced: operations leave out what it would add."""
+        """Whether the low part is known to be 0 while a kernel is traced; operations then leave it out."""
         return isinstance(self.lo, int)
 
     @staticmethod
-    def product(x: Any, y: Any) -> DoubleWord:
+    def product(x: Number, y: Number) -> DoubleWord:
         """x y exactly, for plain numbers x, y."""
         return DoubleWord(*two_prod(x, y))
 
     @staticmethod
     def of(x: Any) -> DoubleWord:
+        """`x` itself, or a plain number without a low part."""
         return x if isinstance(x, DoubleWord) else DoubleWord(x)
 
     def __add__(self, other: Any) -> DoubleWord:
-        # AccurateDWPlusDW, also right where the high parts cancel.
+        """AccurateDWPlusDW of Joldes, Muller, Popescu 2017; `other` may be a plain number."""
+        # Right also where the high parts cancel.
         other = DoubleWord.of(other)
         s, s_lo = two_sum(self.hi, other.hi)
         if other.is_plain:
@@ -74,12 +77,15 @@ class DoubleWord:
         return DoubleWord(*fast_two_sum(s, s_lo + t_lo))
 
     def __neg__(self) -> DoubleWord:
+        """−x, exactly."""
         return DoubleWord(-self.hi, -self.lo)
 
     def __sub__(self, other: Any) -> DoubleWord:
+        """x − y as x + (−y)."""
         return self + -DoubleWord.of(other)
 
     def __mul__(self, other: Any) -> DoubleWord:
+        """x y; `other` may be a plain number."""
         # lo · lo and the last normalisation are left out: |lo| ≤ 3u |hi| for normalised factors.
         other = DoubleWord.of(other)
         p, e = two_prod(self.hi, other.hi)
@@ -87,7 +93,7 @@ class DoubleWord:
             e = dr.fma(self.lo, other.hi, e)
         return DoubleWord(p, e if other.is_plain else dr.fma(self.hi, other.lo, e))
 
-    def rounded(self) -> Any:
+    def rounded(self) -> Number:
         """The nearest plain number."""
         return self.hi + self.lo
 
@@ -102,7 +108,8 @@ class DoubleWord:
         return DoubleWord(root, (dr.fma(-root, root, self.hi) + self.lo) * (0.5 * inverse))
 
 
-def select(mask: Any, x: DoubleWord, y: DoubleWord) -> DoubleWord:
+def select(mask: Mask, x: DoubleWord, y: DoubleWord) -> DoubleWord:
+    """`x` where the mask is True, else `y`."""
     return DoubleWord(dr.select(mask, x.hi, y.hi), dr.select(mask, x.lo, y.lo))
 
 
@@ -115,18 +122,21 @@ class TripleWord:
     of its larger operand. Nothing may underflow at the third order.
     """
 
-    hi: Any
-    first: tuple[Any, ...] = ()
-    second: Any = 0
+    hi: Number
+    first: tuple[Number, ...] = ()
+    second: Number = 0
 
     def __add__(self, other: TripleWord) -> TripleWord:
+        """x + y; the error of the sum of the high parts is one more term of first order."""
         s, e = two_sum(self.hi, other.hi)
         return TripleWord(s, (*self.first, *other.first, e), self.second + other.second)
 
     def __neg__(self) -> TripleWord:
+        """−x, exactly."""
         return TripleWord(-self.hi, tuple(-x for x in self.first), -self.second)
 
     def __sub__(self, other: TripleWord) -> TripleWord:
+        """x − y as x + (−y)."""
         return self + -other
 
     def collected(self) -> TripleWord:
@@ -139,6 +149,7 @@ class TripleWord:
         return TripleWord(self.hi, (first,), second)
 
     def times(self, x: DoubleWord) -> TripleWord:
+        """The product with a double word."""
         y = self.collected()
         (p, e), (q, f) = two_prod(x.hi, y.hi), two_prod(x.hi, y.first[0])
         if x.is_plain:
@@ -147,7 +158,7 @@ class TripleWord:
         return TripleWord(p, (e, q, r), dr.fma(x.hi, y.second, dr.fma(x.lo, y.first[0], f + g)))
 
     def squared(self) -> TripleWord:
-        """Of a number with at most one term of first order."""
+        """x² of a number with at most one term of first order."""
         p, e = two_prod(self.hi, self.hi)
         if not self.first:
             return TripleWord(p, (e,))
@@ -168,7 +179,7 @@ class TripleWord:
         return DoubleWord(self.hi, *self.first)
 
 
-def dot(x: Any, y: Any) -> TripleWord:
+def dot(x: Vector3, y: Vector3) -> TripleWord:
     """x · y of two 3-vectors: error ≤ 3u³ Σ|xᵢ yᵢ|, and hi is 0 only where the sum is less than that."""
     p, e0 = two_prod(x[0], y[0])
     q, e1 = two_prod(x[1], y[1])
@@ -187,12 +198,12 @@ def dot(x: Any, y: Any) -> TripleWord:
     return TripleWord(hi, (mid,), lo)
 
 
-def cross(x: Any, y: Any) -> list[TripleWord]:
+def cross(x: Vector3, y: Vector3) -> list[TripleWord]:
     """x × y of two 3-vectors, each component with relative error ≤ 6u³."""
     return [_exact_difference(x[i], y[j], x[j], y[i]) for i, j in ((1, 2), (2, 0), (0, 1))]
 
 
-def _exact_difference(x: Any, y: Any, z: Any, w: Any) -> TripleWord:
+def _exact_difference(x: Number, y: Number, z: Number, w: Number) -> TripleWord:
     """x y − z w, relative error ≤ 6u³: its four exact terms are d, d_lo, e, e_lo.
 
     Where p and q cancel, d is exact, and a multiple of the last place of e; elsewhere |d| ≥ max(|p|, |q|)/2, so that
@@ -207,7 +218,7 @@ def _exact_difference(x: Any, y: Any, z: Any, w: Any) -> TripleWord:
     return TripleWord(hi, (mid,), lo + e_lo)
 
 
-def defect(target: DoubleWord, *products: Pair) -> Any:
+def defect(target: DoubleWord, *products: Pair) -> Number:
     """target − Σ xᵢ yᵢ as a plain number: error ≤ u |result| + 4u² Σ|xᵢ yᵢ|, so small defects keep their digits."""
     rest, low = target.hi, target.lo
     for x, y in products[:-1]:

@@ -32,7 +32,7 @@ def _split(x: Any) -> tuple[Any, Any]:
 
 
 def distil(terms: Sequence[Any], words: int = 3) -> FloatExpansion:
-    """The sum of m `terms` in `words` floats: error ≤ (m u)^words Σ|terms|, and nothing at all where it is short.
+    """The sum of m `terms` in `words` floats: error ≤ (m u)^words Σ|terms|; exact where `words` floats can hold it.
 
     Every pass takes the float sum out and leaves its exact rounding errors behind.
     """
@@ -64,6 +64,7 @@ def product(x: Any, y: Any, words: int = 3) -> FloatExpansion:
 
 
 def negated(x: Any) -> FloatExpansion:
+    """−x of an expansion."""
     return [-x_i for x_i in x]
 
 

@@ -72,6 +72,7 @@ class Certified:
     amplitude_p: np.ndarray
 
     def __len__(self) -> int:
+        """The number of rays."""
         return len(self.radius)
 
 

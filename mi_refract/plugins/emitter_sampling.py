@@ -1,7 +1,7 @@
-"""Which emitter to sample: all of them as Mitsuba does, or all but a constant environment.
+"""Which emitters are sampled: all of them, as Mitsuba does, or all but a constant environment.
 
-What shines the same from everywhere a BSDF's own samples meet without noise but for what is in the way, so a sample of
-its own would take the others' place.
+Light that is the same from all directions adds little noise where only the BSDF is sampled: what is in the way of it.
+To sample it as an emitter would take samples away from the other emitters.
 """
 
 from __future__ import annotations
@@ -12,23 +12,26 @@ import drjit as dr
 
 
 class SceneEmitters:
-    """Mitsuba's own choice."""
+    """All emitters, chosen by Mitsuba."""
 
     def __init__(self, v: Any, scene: Any) -> None:
+        """`v`: the variant's module."""
         self.scene = scene
 
     def sample(self, si: Any, number: Any, active: Any) -> tuple[Any, Any]:
-        """A direction toward an emitter, and its radiance over the density, whatever is in the way."""
+        """A direction toward an emitter, and its radiance over the density; shadows are not looked at."""
         return self.scene.sample_emitter_direction(si, number, False, active)
 
     def pdf(self, reference: Any, ds: Any, active: Any) -> Any:
+        """The density per solid angle, seen from `reference`, with which `sample` picks `ds`."""
         return self.scene.pdf_emitter_direction(reference, ds, active)
 
 
 class NonConstantEmitters:
-    """All emitters but the environment, by their sampling weights."""
+    """All emitters but the environment, chosen by their sampling weights."""
 
     def __init__(self, v: Any, scene: Any) -> None:
+        """`v`: the variant's module."""
         self.v, emitters = v, scene.emitters()
         kept = [i for i, emitter in enumerate(emitters) if not emitter.is_environment()]
         weights = [float(emitters[i].sampling_weight()) for i in kept]
@@ -42,6 +45,7 @@ class NonConstantEmitters:
         self.choice = v.DiscreteDistribution(weights) if len(kept) > 1 else None
 
     def sample(self, si: Any, number: Any, active: Any) -> tuple[Any, Any]:
+        """As `SceneEmitters.sample`."""
         v, index, probability = self.v, self.v.UInt32(0), 1.0
         if self.choice:
             index, x, probability = self.choice.sample_reuse_pmf(number.x, active)
@@ -52,6 +56,7 @@ class NonConstantEmitters:
         return ds, radiance / probability
 
     def pdf(self, reference: Any, ds: Any, active: Any) -> Any:
+        """As `SceneEmitters.pdf`; 0 for the environment."""
         if not self.vectorised and (ds.emitter is None or ds.emitter.is_environment() or not active):
             return 0.0
         lamp = active & (ds.emitter.is_environment() ^ True)

@@ -1,7 +1,8 @@
-"""Random numbers for a tree of paths: a dimension each for every node, stratified over the samples of a pixel.
+"""Random numbers for a tree of paths: each node has a dimension of its own, stratified over the samples of a pixel.
 
-A Mitsuba sampler counts its dimensions as they are drawn, so what one path draws would move those of the next. Here a
-number belongs to a key, whatever was drawn before. Correlated multi-jitter (Kensler 2013), by Mitsuba's permutation.
+A Mitsuba sampler counts dimensions in the order in which numbers are drawn: a path that draws one number more would
+shift the dimensions of all that follow. Here the number depends on a key only, not on what was drawn before.
+Correlated multi-jitter (Kensler 2013), with Mitsuba's permutation.
 """
 
 from __future__ import annotations
@@ -15,19 +16,22 @@ ONE = 1 - 2.0**-24  # the largest float32 below 1
 
 
 class Sampled:
-    """The scene's own sampler, in the order in which numbers are drawn; keys count for nothing."""
+    """The scene's own sampler: numbers in the order in which they are drawn; keys are ignored."""
 
     def one(self, sampler: Any, key: Any) -> Any:
+        """A number in [0, 1)."""
         return sampler.next_1d()
 
     def two(self, sampler: Any, key: Any) -> Any:
+        """A point in [0, 1)²."""
         return sampler.next_2d()
 
 
 class KeyedMultijitter:
-    """Of the lanes of a wavefront, pixel by pixel `sampler.sample_count()` of them; `v` is the variant's module."""
+    """Stratified numbers for the lanes of a wavefront, in which the samples of a pixel lie side by side."""
 
     def __init__(self, v: Any, sampler: Any, seed: Any) -> None:
+        """`v`: the variant's module. `sampler`: says how many lanes there are, and samples in a pixel."""
         self.v, lanes = v, sampler.wavefront_size()
         self.count = sampler.sample_count() if lanes % sampler.sample_count() == 0 else 1
         self.rows = next(r for r in range(math.isqrt(self.count), 0, -1) if self.count % r == 0)
@@ -39,11 +43,13 @@ class KeyedMultijitter:
         self.pixel = v.sample_tea_32(pixel, seed)[0]
 
     def one(self, sampler: Any, key: Any) -> Any:
+        """A number in [0, 1): n samples of a pixel with the same key lie in n equal intervals, one in each."""
         v, (permutation, noise) = self.v, self.v.sample_tea_32(self.pixel, key)
         stratum = v.permute_kensler(self.index, self.count, permutation)
         return self._placed(v.Float(stratum), self._unit(v.sample_tea_32(self.lane, noise)[0]), self.count)
 
     def two(self, sampler: Any, key: Any) -> Any:
+        """A point in [0, 1)²: stratified in cells of rows × columns, and in x and in y alone."""
         v, (permutation, noise) = self.v, self.v.sample_tea_32(self.pixel, key)
         cell = v.permute_kensler(self.index, self.count, permutation)
         row = cell // self.columns

@@ -1,8 +1,8 @@
-"""The paths of `refract_path`, a lane each: a loop over vertices, and a stack of what is left for later.
+"""The path loop of `refract_path`: each lane follows one path after the other, with a stack of branches for later.
 
-A plugin belongs to one variant, so everything here is given that variant's module, `v`. Paths go depth first: of a pair
-of delta lobes one is followed and the other put aside, and where a path ends the last one put aside is taken up. So a
-lane has no more on its stack than levels are split, however many paths it follows.
+A plugin belongs to one variant, so everything here is given that variant's module, `v`. Paths are followed depth first:
+of a pair of delta lobes one is followed and the other pushed on the stack; where a path ends, the branch pushed last is
+popped. So the stack of a lane holds at most `split_depth` branches, however many paths the lane follows.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import mitsuba as mi
 from .emitter_sampling import NonConstantEmitters, SceneEmitters
 from .keyed_sampler import ONE
 
-# Samples near either end of the unit interval pick the one lobe and the other. What has less power is not followed.
+# Samples near 0 and near 1 pick the one lobe and the other; a lobe with a smaller power than these is not followed.
 FIRST, LAST = 2.0**-25, ONE
 LOBES = mi.BSDFFlags
 
 
 @dataclass(frozen=True)
 class PathFeatures:
-    """What is traced: of what the scene needs, what the parameters leave."""
+    """What is traced: what the scene needs, as far as the integrator's parameters ask for it."""
 
     max_depth: int
     rr_depth: int
@@ -33,15 +33,16 @@ class PathFeatures:
     split_weight: float
     deterministic: bool
     emitter_sampling: bool
-    lamps_only: bool  # of what is sampled: not a constant environment
-    area: bool
+    lamps_only: bool  # emitter sampling leaves out a constant environment
+    area: bool  # some shape emits
     environment: bool
-    first_number: bool  # of a BSDF sample, beside the other two
-    second_number: bool  # those two: delta lobes need none
-    all_of_hit: bool  # or only its shading frame
+    first_number: bool  # a BSDF sample takes `sample1`
+    second_number: bool  # a BSDF sample takes `sample2`, two numbers; delta lobes need none
+    all_of_hit: bool  # a hit needs more than its shading frame
 
     @property
     def roulette(self) -> bool:
+        """Whether Russian roulette may end a path."""
         return self.rr_depth < self.max_depth and not self.deterministic
 
     @property
@@ -52,7 +53,7 @@ class PathFeatures:
 
 @dataclass
 class LoopState:
-    """Of a lane. None is what the plan leaves out."""
+    """What a lane remembers from vertex to vertex; None where the plan has no use for it."""
 
     ray: Any
     throughput: Any
@@ -63,19 +64,19 @@ class LoopState:
     sampler: Any
     eta: Any
     escaped: Any = None
-    previous: Any = None  # of the vertex before: the interaction, and the density and the kind of its sample
-    pdf: Any = None
-    delta: Any = None
-    seen: Any = None  # from the camera by delta lobes only: it splits no farther than that
-    share: Any = None  # of the light of the pixel: the product of the powers of the lobes that were split
-    node: Any = None  # the lobes taken so far
-    waiting: Any = None  # branches on the stack
+    previous: Any = None  # the interaction at the vertex before,
+    pdf: Any = None  # the density of its BSDF sample,
+    delta: Any = None  # and whether that was of a delta lobe
+    seen: Any = None  # the path from the camera has had delta lobes only; after another lobe it is not split
+    share: Any = None  # the share of the pixel's light: the product of the powers of the lobes that were split
+    node: Any = None  # the number of this branch in the tree: 2 n and 2 n + 1 are the branches of n
+    waiting: Any = None  # how many branches are on the stack
     stack: Any = None
     truncated: Any = None
 
 
 def branch_class(v: Any) -> type:
-    """What is left of a path for later; it starts at a delta lobe. A type, as local memory is told what it holds."""
+    """The class of a branch on the stack: a path that goes on from a delta lobe. Local memory needs a type."""
     fields = {
         "o": v.Point3f,
         "d": v.Vector3f,
@@ -92,32 +93,43 @@ class ScalarStack:
     """`dr.alloc_local` for scalar variants, which have no local memory."""
 
     def __init__(self) -> None:
+        """An empty stack."""
         self.branches: list[Any] = []
 
     def write(self, branch: Any, index: int, active: bool) -> None:
+        """Put `branch` at `index`; what lay above is gone."""
         self.branches[index:] = [branch]
 
     def read(self, index: int, active: bool) -> Any:
+        """The branch at `index`."""
         return self.branches[index]
 
 
 def power_heuristic(a: Any, b: Any) -> Any:
-    """Of the technique with density `a` beside that with `b`; 0 where neither has any."""
+    """The weight a²/(a² + b²) of a sample whose technique has density `a`, where another has `b`; 0 if both are 0.
+
+    Source: Veach 1997, section 9.2.4, β = 2.
+    """
     a, b = dr.square(a), dr.square(b)
     some = (a + b > 0) & dr.isfinite(a)
     return dr.select(some, a / dr.select(some, a + b, 1), 0)
 
 
 class Trace:
-    """One call of `sample`. In scalar variants a pointer may be None; elsewhere its lanes are masked."""
+    """The path loop for one call of the integrator's `sample`.
+
+    In scalar variants a pointer may be None and needs an `if`; in the others its lanes are masked.
+    """
 
     def __init__(self, v: Any, scene: Any, plan: PathFeatures, numbers: Any) -> None:
+        """`v`: the variant's module. `numbers`: `Sampled` or `KeyedMultijitter`."""
         self.v, self.scene, self.plan, self.numbers = v, scene, plan, numbers
         self.vectorised, self.branch, self.context = dr.is_jit_v(v.Float), branch_class(v), mi.BSDFContext()
         self.emitters = (NonConstantEmitters if plan.lamps_only else SceneEmitters)(v, scene)
         self.flags = +(mi.RayFlags.All if plan.all_of_hit else mi.RayFlags.ShadingFrame)
 
     def run(self, ray: Any, sampler: Any, active: Any) -> LoopState:
+        """Follow `ray` and all that it splits into; the state at the end, whose `result` is the radiance."""
         if self.plan.hide_emitters and self.plan.area:
             ray = self._past_emitters(ray, active)
         start = self._start(ray, sampler, active)
@@ -169,7 +181,7 @@ class Trace:
         else:
             s.valid = s.valid or hit
         if self.plan.split_depth:
-            onward = self._resume(s, onward)
+            onward = self._pop(s, onward)
         s.active = onward
         return (s,)
 
@@ -265,13 +277,13 @@ class Trace:
     # Both lobes ----------------------------------------------------------------------------------------------------
 
     def _split(self, s: LoopState, si: Any, bsdf: Any, bs: Any, second: Any, throughput: Any, onward: Any) -> Any:
-        """Put the other lobe aside where both are worth following; the throughput of the one that was sampled."""
+        """Push the other lobe where both are worth following; the throughput of the lobe that was sampled."""
         plan, p = self.plan, dr.detach(bs.pdf)
         pair = onward & s.seen & self._is_pair(bsdf.flags())
         s.seen = s.seen & mi.has_flag(bs.sampled_type, LOBES.Delta)
         both = pair & (s.depth <= plan.split_depth) & (s.share * dr.minimum(p, 1 - p) > plan.split_weight)
         if self.vectorised or both:
-            both = self._put_aside(s, si, bsdf, bs, second, both)
+            both = self._push(s, si, bsdf, bs, second, both)
         if plan.deterministic:
             # The sample 1/2 has picked the stronger lobe; the other one is lost.
             self._truncate(s, pair & (both ^ True), 1 - p)
@@ -289,7 +301,7 @@ class Trace:
         pair = mi.has_flag(flags, LOBES.DeltaReflection) & mi.has_flag(flags, LOBES.DeltaTransmission)
         return pair & ((mi.has_flag(flags, LOBES.Smooth) | mi.has_flag(flags, LOBES.Null)) ^ True)
 
-    def _put_aside(self, s: LoopState, si: Any, bsdf: Any, bs: Any, second: Any, both: Any) -> Any:
+    def _push(self, s: LoopState, si: Any, bsdf: Any, bs: Any, second: Any, both: Any) -> Any:
         reflected = mi.has_flag(bs.sampled_type, LOBES.DeltaReflection)
         other, weight = bsdf.sample(self.context, si, dr.select(reflected, LAST, FIRST), second, both)
         both = both & (other.sampled_type != bs.sampled_type)
@@ -305,8 +317,8 @@ class Trace:
         s.share = dr.select(both, s.share * dr.detach(bs.pdf), s.share)
         return both
 
-    def _resume(self, s: LoopState, onward: Any) -> Any:
-        """Where a path ends, take up the last branch put aside."""
+    def _pop(self, s: LoopState, onward: Any) -> Any:
+        """Where a path has ended, pop the branch pushed last and go on with it."""
         found = (onward ^ True) & (s.waiting > 0)
         if not self.vectorised and not found:
             return onward

@@ -1,4 +1,4 @@
-"""The Mitsuba BSDF `refract`, a drop-in for `dielectric`. Glue only: the mathematics is in formulas and fresnel.
+"""The Mitsuba BSDF `refract`, which takes the place of `dielectric`. The mathematics is in `mi_refract.formulas`.
 
 A plugin class belongs to one variant, so `plugin_class` builds it from that variant's module, and `register`
 makes it known there. Parameters: `int_ior`, `ext_ior` (number or a name from Mitsuba's table),
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from mi_refract.formulas import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, fresnel, resolve
+from mi_refract.formulas import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, fresnel, local_cosines, resolve
 from mi_refract.numerics import differentiated, ieee_divide, replace_grad
 
 PLUGIN = "refract"
@@ -22,14 +22,14 @@ LOBES = ("specular_reflectance", "specular_transmittance")  # tint of the reflec
 
 
 class Side(NamedTuple):
-    """What a ray needs to know of the boundary from one side: k = n_from / n_to and κ = k² − 1, in float64."""
+    """The boundary as seen from one side: k = n_from / n_to and κ = k² − 1, in float64."""
 
     k: Any
     contrast: Any
 
 
 class Ray(NamedTuple):
-    """One refraction of `a` = −wi in the local frame: `eta` is n_to / n_from, `r` : `t` are the unpolarised powers."""
+    """A refracted ray in the local frame: a = −wi, `eta` = n_to / n_from, `r` : `t` the unpolarised powers."""
 
     a: Any
     side: Side
@@ -41,9 +41,9 @@ class Ray(NamedTuple):
 
 
 def read_ior(props: Any, name: str, default: str) -> float:
-    """The index of refraction in double precision, from a number or a name of Mitsuba's table.
+    """An index of refraction in double precision, from a number or a name in Mitsuba's table.
 
-    ValueError naming parameter, value and what is accepted, for anything but a positive finite number or a name.
+    ValueError with parameter, value and what is accepted, for all but a positive finite number or such a name.
     """
     value = props.get(name, default)
     if isinstance(value, str):
@@ -162,8 +162,9 @@ def plugin_class(v: Any) -> type:
             k, eta = (dr.select(outside, *x) for x in ((self.k_outer, self.k_inner), (self.k_inner, self.k_outer)))
             side = Side(k, (k - 1) * (k + 1))
             # Unchecked: the ratio is checked where it is set, and NaN stays NaN.
-            wo, transmitted = self.formula.unchecked(a, v.Vector3f(0, 0, 1), *side)
-            return Ray(a, side, wo, v.Float(eta), transmitted, *fresnel.local_odds(a, transmitted, *side))
+            local = local_cosines(a.x, a.y, a.z, side.contrast)
+            wo, transmitted = self.formula.unchecked(a, v.Vector3f(0, 0, 1), *side, local)
+            return Ray(a, side, wo, v.Float(eta), transmitted, *fresnel.local_odds(local, transmitted, *side))
 
         @staticmethod
         def _attached(value: Any) -> Any:

@@ -1,12 +1,13 @@
-"""The integrator `refract_path`: Mitsuba's `path`, less what the scene does not need, and with both lobes of glass.
+"""The integrator `refract_path`: Mitsuba's `path` without what the scene does not need, and with both lobes of glass.
 
-Parameters: `max_depth`, `rr_depth`, `hide_emitters` as in `path`. `split_depth` (0): so many boundaries deep both
-lobes of glass are followed, each with its power, instead of one of them by chance; `split_weight` (0.01): but no lobe
-whose share of the light is less. `deterministic` (False): no lobe is left to chance, and those of a smaller share are
-dropped; the channel `truncated` says how much that is. Times the brightest radiance it bounds the error.
+Parameters: `max_depth`, `rr_depth`, `hide_emitters` as in `path`. `split_depth` (0): at so many boundaries of a path,
+counted from the camera, both lobes of glass are followed, each with its power, instead of one by chance.
+`split_weight` (0.01): but no lobe whose share of the light is smaller. `deterministic` (False): no lobe is chosen by
+chance, and lobes with a smaller share are dropped; the channel `truncated` holds what was dropped, and times the
+largest radiance it is a bound of the error.
 
-Derivatives are attached: rays move with the index, but edges that move are not seen. A render that is differentiated
-does not split.
+Derivatives are attached: rays move with the index. Edges that move across a pixel are not in them. A render that is
+differentiated does not split.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ from .path_loop import PathFeatures, Trace
 from .scene_features import SceneFeatures, inspect
 
 INTEGRATOR = "refract_path"
-MOST_PATHS = 4096  # of one sample, at once
+MOST_PATHS = 4096  # that one sample may split into
 DEEPEST = 64  # split_depth: memory is set aside in every lane
 UNLIMITED = 2**32 - 1
 
 
 def read_count(props: Any, name: str, default: int, least: int) -> int:
-    """An integer parameter. ValueError naming it and what is accepted."""
+    """An integer parameter, at least `least`. ValueError with its name and what is accepted."""
     value = props.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         what = "-1 (no limit) or an integer ≥ 0" if least < 0 else f"an integer ≥ {least}"
@@ -37,6 +38,7 @@ def read_count(props: Any, name: str, default: int, least: int) -> int:
 
 
 def read_flag(props: Any, name: str) -> bool:
+    """A Boolean parameter, False where it is not given. ValueError with its name and what is accepted."""
     value = props.get(name, False)
     if not isinstance(value, bool):
         raise ValueError(f"{INTEGRATOR}: {name} = {value!r}: accepted: true or false")
@@ -44,7 +46,7 @@ def read_flag(props: Any, name: str) -> bool:
 
 
 def read_split(props: Any, deterministic: bool) -> tuple[int, float]:
-    """`split_depth` and `split_weight`. ValueError where one sample could have more than MOST_PATHS paths at once."""
+    """`split_depth` and `split_weight`. ValueError if one sample could split into more than MOST_PATHS paths."""
     depth = read_count(props, "split_depth", DEEPEST if deterministic else 0, 0)
     weight = props.get("split_weight", 1e-3 if deterministic else 1e-2)
     if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not 0 <= weight <= 1:
@@ -53,9 +55,8 @@ def read_split(props: Any, deterministic: bool) -> tuple[int, float]:
     paths = min(2.0**depth, 1 / weight if weight else math.inf)
     if depth > DEEPEST or paths > MOST_PATHS:
         raise ValueError(
-            f"{INTEGRATOR}: split_depth = {depth}, split_weight = {weight}: up to {paths:.3g} paths of a sample at "
-            f"once; accepted: up to {MOST_PATHS}, bounded by 2^split_depth and by 1/split_weight, and a split_depth "
-            f"up to {DEEPEST}"
+            f"{INTEGRATOR}: split_depth = {depth}, split_weight = {weight}: one sample could split into {paths:.3g} "
+            f"paths; accepted: 2^split_depth or 1/split_weight up to {MOST_PATHS}, and split_depth up to {DEEPEST}"
         )
     return depth, float(weight)
 
@@ -95,7 +96,7 @@ def integrator_class(v: Any) -> type:
             return dr.select(end.valid, end.result, 0), end.valid, [end.truncated] if self.deterministic else []
 
         def plan(self, scene: Any) -> PathFeatures:
-            """What is traced of a scene. ValueError where a deterministic render would leave something to chance."""
+            """What is traced of a scene. ValueError where `deterministic` is asked for and cannot be."""
             needs = self._needs(scene)
             # Local memory has no derivatives, and the evaluated loops that derivatives need have no local memory.
             symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
@@ -127,7 +128,7 @@ def integrator_class(v: Any) -> type:
             return self.seen[1]
 
         def left_out(self) -> str:
-            """Of the scene seen last, feature by feature with the reason."""
+            """What was left out of the scene rendered last, each feature with the reason."""
             if self.seen is None:
                 return "no scene seen yet"
             return "; ".join(f"{feature} ({reason})" for feature, reason in self.seen[1].left_out.items()) or "nothing"

@@ -1,8 +1,8 @@
-"""What a loaded Mitsuba scene needs of an integrator, and what it can do without. Any variant, scalar ones too.
+"""What a loaded Mitsuba scene needs of an integrator, and what an integrator can leave out. For every variant.
 
-A surface that is exactly black counts as none: only a `diffuse` whose reflectance is the number 0, which is what an
-area light without a BSDF gets. In spectral variants `<rgb value="0"/>` is a spectrum of some 3e-8, so not black.
-An unknown plugin, and an instance, whose shapes Mitsuba does not show, count as needing everything.
+A black surface needs nothing: that is a `diffuse` whose reflectance is the number 0, as an area light without a BSDF
+has it. In spectral variants `<rgb value="0"/>` is a spectrum of about 3e-8, which is not black. A plugin that is not
+known here, and an instance, whose shapes Mitsuba does not show, count as needing everything.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ POLARISING = {
     "SmoothDielectric",
 }
 KNOWN = WRAPPERS | DEPOLARISING | POLARISING
-# Their samples take the one number or the two, and none of them all three.
+# Plugins that sample with `sample1` or with `sample2`, and never with both.
 EITHER = {
     "Null",
     "Refract",
@@ -53,16 +53,16 @@ EITHER = {
 
 @dataclass(frozen=True)
 class SceneFeatures:
-    """Facts about a scene; `unknown` names the plugins of which everything was presumed."""
+    """Facts about a scene. `unknown`: the plugins that are not known, and so count as needing everything."""
 
-    smooth: bool  # some BSDF has a lobe that is no delta: an emitter sample can matter
+    smooth: bool  # some BSDF has a lobe that is not a delta: then sampling emitters is worth while
     sampleable: bool  # some emitter can be sampled
     lamps: bool  # some emitter other than the environment can be
     area: bool  # some shape emits
     environment: bool
-    plain_environment: bool  # of the same radiance everywhere
-    delta_emitters: bool  # some emitter is met by sampling it only
-    both_numbers: bool  # some BSDF samples with the one random number and with the two as well
+    plain_environment: bool  # it has the same radiance in all directions
+    delta_emitters: bool  # some emitter can be found only by sampling it
+    both_numbers: bool  # some BSDF samples with `sample1` and with `sample2`, too
     only_glass: bool  # every BSDF has delta lobes only
     textured: bool  # something of a BSDF or of a light varies over its surface
     null: bool  # some BSDF has a null lobe
@@ -73,7 +73,7 @@ class SceneFeatures:
 
     @property
     def left_out(self) -> dict[str, str]:
-        """Feature → why the scene can do without it."""
+        """What an integrator can leave out: feature → the reason, in words."""
         reasons = {
             "emitter sampling": "every BSDF has delta lobes only"
             if not self.smooth
@@ -96,7 +96,7 @@ class SceneFeatures:
 
 
 def inspect(scene: Any) -> SceneFeatures:
-    """What `scene` needs as it is now: an edited parameter can change it."""
+    """What a Mitsuba scene needs as it is now; an edit of its parameters can change that."""
     import mitsuba as mi
 
     shapes, emitters, sky = scene.shapes(), scene.emitters(), scene.environment()

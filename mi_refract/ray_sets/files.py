@@ -83,8 +83,7 @@ def _write_exr(path: Path, rays: RaySet) -> None:
     pixels = np.zeros((height * width, len(COLUMNS)), np.float32)
     pixels[len(rays) :, 0] = -1
     pixels[: len(rays)] = rays.numbers
-    # A fixed date: without one OpenImageIO writes today's.
-    metadata = {_ATTRIBUTE: json.dumps(rays.header), "DateTime": "1970:01:01 00:00:00"}
+    metadata = {_ATTRIBUTE: json.dumps(rays.header), **image_file.NO_DATE}
     image_file.write_exr(path, pixels.reshape(height, width, -1), COLUMNS, metadata)
 
 

@@ -14,18 +14,22 @@ Draw = Callable[[Generator, int, float], tuple[Array, Array]]  # (rng, count, ep
 
 
 def generic(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
+    """Cosine uniform, k = 1.5 or 1/1.5."""
     return np.arccos(rng.uniform(0, 1, count)), 1.5 ** either(rng, count)
 
 
 def near_normal(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
+    """1e-12 … 1e-2 rad from the normal."""
     return log_uniform(rng, 1e-12, 1e-2, count), rng.uniform(0.4, 2.5, count)
 
 
 def grazing(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
+    """1e-7 … 1e-2 rad from the surface."""
     return np.pi / 2 - log_uniform(rng, 1e-7, 1e-2, count), rng.uniform(0.4, 2.5, count)
 
 
 def critical(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
+    """1e-7 … 1e-2 rad from the critical angle, on both sides."""
     k = rng.uniform(1.05, 2.5, count)
     return np.arcsin(1 / k) + log_uniform(rng, 1e-7, 1e-2, count) * either(rng, count), k
 
@@ -35,29 +39,34 @@ def _nearly_matched(rng: Generator, count: int, eps: float) -> Array:
 
 
 def matched(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
+    """k within 1e-2 of 1, cosine uniform."""
     return np.arccos(rng.uniform(0, 1, count)), _nearly_matched(rng, count, eps)
 
 
 def matched_grazing(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
+    """k within 1e-2 of 1, 1e-7 … 1e-1 rad from the surface."""
     return np.pi / 2 - log_uniform(rng, 1e-7, 1e-1, count), _nearly_matched(rng, count, eps)
 
 
 def brewster(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
+    """An ulp to 1e-2 rad from Brewster's angle, on both sides."""
     k = rng.uniform(0.4, 2.5, count)
     return np.arctan(1 / k) + log_uniform(rng, eps, 1e-2, count) * either(rng, count), k
 
 
 def steep(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
+    """k from 10 to 1e6, the sine of the refracted angle uniform in 0 … 1.2."""
     k = log_uniform(rng, 10, 1e6, count)
     return np.arcsin(np.minimum(1, rng.uniform(0, 1.2, count) / k)), k
 
 
 def dense(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
+    """k from 1e-6 to 0.1, cosine uniform."""
     return np.arccos(rng.uniform(0, 1, count)), log_uniform(rng, 1e-6, 1e-1, count)
 
 
 def mixed(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
-    """Each ray from one of the sets above."""
+    """Each ray from one of the families above."""
     draws = (generic, near_normal, grazing, critical, matched, matched_grazing, brewster, steep, dense)
     angle, k = np.stack([draw(rng, count, eps) for draw in draws], axis=1)
     chosen = rng.integers(0, len(draws), count), np.arange(count)
@@ -74,4 +83,5 @@ def rays_at(draw: Draw, rng: Generator, n: Array) -> Triple:
 
 
 def at(draw: Draw) -> Build:
+    """The family of rays with the drawn angles and ratios."""
     return functools.partial(rays_at, draw)

@@ -10,6 +10,7 @@ from .rays import Array, Triple, either, log_uniform, normalised
 
 
 def lengths(rng: Generator, n: Array) -> Triple:
+    """|a| and |n| log-uniform in 1e-18 … 1e18, angles and ratios of all families."""
     a, n, k = rays_at(mixed, rng, n)
     of_a, of_n = (log_uniform(rng, 1e-18, 1e18, len(n))[:, None] for _ in range(2))
     return a * of_a, n * of_n, k
@@ -32,6 +33,7 @@ def keep_some(rng: Generator, v: Array, most: int) -> Array:
 
 
 def zeros(rng: Generator, n: Array) -> Triple:
+    """Components of n, and of every other a, replaced by zeros of either sign; no ray is tangential."""
     a, n, k = rays_at(mixed, rng, keep_some(rng, n, 2).astype(n.dtype))
     some = rng.random(len(n)) < 0.5
     a = np.where(some[:, None], keep_some(rng, a, 2), a)

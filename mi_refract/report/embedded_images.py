@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from mi_refract.io.image_file import read
+from mi_refract.io.pixels import block_mean
 
 LARGEST = 65504.0  # of the finite halves
 # Mantissa bits given up, by twos, before an image is made smaller: at 6 a value is within 1/32 of itself.
@@ -58,7 +59,7 @@ def encoded(pixels: Any, limit: float = np.inf, scale: float = 1.0) -> dict[str,
     codes = _halves(pixels)
     while (bits := _fitting(codes, limit)) is None and min(pixels.shape[:2]) > side:
         side *= 2
-        codes = _halves(means(pixels, side))
+        codes = _halves(block_mean(pixels, side))
     if side > 1:
         notes.append(f"means of {side} × {side} pixels")
     if bits:
@@ -99,15 +100,6 @@ def strongest(values: Any, width: int) -> Any:
     blocks = blocks.reshape(height // side, width // side, -1)
     place = np.where(np.isnan(blocks), np.inf, np.abs(blocks)).argmax(-1, keepdims=True)
     return np.take_along_axis(blocks, place, -1)
-
-
-def means(pixels: Any, side: int) -> Any:
-    """Means over blocks of pixels; those at the right and lower edge are as large as what is left."""
-    rows, columns = (np.arange(0, size, side) for size in pixels.shape[:2])
-    area = np.outer(np.diff(rows, append=pixels.shape[0]), np.diff(columns, append=pixels.shape[1]))
-    with np.errstate(invalid="ignore"):
-        sums = np.add.reduceat(np.add.reduceat(pixels, rows, 0), columns, 1)
-    return sums / area[..., None].astype(np.float32)
 
 
 def _halves(pixels: Any) -> Any:

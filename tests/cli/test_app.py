@@ -8,6 +8,7 @@ import sys
 import pytest
 from support.processes import ENVIRONMENT, python
 
+from mi_refract import cli
 from mi_refract.cli import app
 
 
@@ -23,8 +24,9 @@ def test_bad_command(arguments, capfd):
 def test_without_a_command_the_help_is_printed_and_with_version_the_version(capfd):
     assert app.main([]) == 2
     assert "doctor" in capfd.readouterr().out
-    assert app.main(["--version"]) == 0
-    assert capfd.readouterr().out == f"{app.__version__}\n"
+    for main in (app.main, cli.main):
+        assert main(["--version"]) == 0
+        assert capfd.readouterr().out == f"{app.__version__}\n"
 
 
 def test_without_the_extra():

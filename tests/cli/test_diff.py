@@ -7,6 +7,7 @@ import importlib.util
 import json
 import os
 import shlex
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -15,8 +16,7 @@ import pytest
 from support.diff_images import BROKEN, image, samples, tree
 
 from mi_refract import backend
-from mi_refract.cli import app
-from mi_refract.cli import diff as cli_diff
+from mi_refract.cli import app, self_test_scenes
 from mi_refract.image_diff import methods, self_test, text_reports
 from mi_refract.image_diff.folders import Result, Results, Status
 
@@ -49,7 +49,7 @@ def test_inconclusive(run, tmp_path):
     for word, expected in codes.items():
         how = ["--inconclusive", word] if word else []
         junit = tmp_path / "out.xml"
-        code, out, err = run("diff", *folders, "--samples", "--method", "welch", "--junit", junit, *how)
+        code, out, err = run("diff", *folders, "--renders", "--method", "welch", "--junit", junit, *how)
         assert (code, err) == (expected, "")
         assert out.splitlines()[-1] == "1 image: 1 inconclusive"
         failures = ElementTree.parse(junit).findall(".//failure")
@@ -58,19 +58,25 @@ def test_inconclusive(run, tmp_path):
 
 def test_samples(run, tmp_path):
     old, new = samples(tmp_path / "old"), samples(tmp_path / "new", first=100, gain=1.3)
-    code, out, _ = run("diff", old, new, "--samples")
+    code, out, _ = run("diff", old, new, "--renders")
     assert code == 1
     assert out.splitlines()[1].split()[:3] == ["different", "old", "welch"]
-    assert run("diff", old, samples(tmp_path / "same", first=200), "--samples")[0] == 0
+    assert run("diff", old, samples(tmp_path / "same", first=200), "--renders")[0] == 0
+
+
+def test_the_old_word_for_renders_still_works(run, tmp_path):
+    old, new = samples(tmp_path / "old"), samples(tmp_path / "new", first=100, gain=1.3)
+    assert run("diff", old, new, "--samples") == run("diff", old, new, "--renders")
+    assert "--samples" not in run("diff", "--help")[1]
 
 
 @pytest.mark.parametrize("method", methods.METHODS)
 def test_every_method(run, pair, tmp_path, method):
     old, new = pair
     more = []
-    if methods.METHODS[method].samples:
+    if methods.METHODS[method].takes_renders:
         old, new = samples(tmp_path / "s"), samples(tmp_path / "t", first=100, gain=2.0)
-        more = ["--samples"]
+        more = ["--renders"]
     out = tmp_path / "out.json"
     assert run("diff", old, new, "--method", method, "--json", out, *more)[0] == 1
     assert json.loads(out.read_text())["results"][0]["method"] == method
@@ -115,6 +121,13 @@ def test_the_methods_are_printed_without_images(run):
         assert all(f"| `{option}` |" in out for option in method.options)
 
 
+def test_on_a_terminal_the_methods_are_tables(run, monkeypatch):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    code, out, err = run("diff", "--methods")
+    assert (code, err) == (0, "")
+    assert "fail_relative" in out and "|---|" not in out
+
+
 # Bad input --------------------------------------------------------------------------------------------------------
 
 
@@ -157,7 +170,7 @@ BAD = {
     "twice the folder": (["{}/old", "{}/old"], "the same as the reference"),
     "twice the file": (["{}/old/equal.exr", "{}/old/../old/equal.exr"], "the same as the reference"),
     "within": (["{}", "{}/new"], "one within the other"),
-    "samples of files": (["{}/old/equal.exr", "{}/new/equal.exr", "--samples"], "accepted with --samples: a folder"),
+    "samples of files": (["{}/old/equal.exr", "{}/new/equal.exr", "--renders"], "accepted with --renders: a folder"),
     "method": (["{}/old", "{}/new", "--method", "idiff"], "--method idiff: accepted: auto, exact"),
     "option": (["{}/old", "{}/new", "--method", "exact", "--set", "fail=1"], "--set fail: unknown"),
     "option of none": (["{}/old", "{}/new", "--set", "fail=1"], "the options of which method?"),
@@ -177,7 +190,7 @@ BAD = {
 @pytest.mark.parametrize("words, message", BAD.values(), ids=BAD)
 @pytest.mark.parametrize("verb", ["diff", "accept"])
 def test_bad_words(run, pair, tmp_path, verb, words, message):
-    if verb == "accept" and {"--samples", "--inconclusive", "--report", "--junit", "--json"} & {*words}:
+    if verb == "accept" and {"--renders", "--inconclusive", "--report", "--junit", "--json"} & {*words}:
         pytest.skip("not one of its options")
     (tmp_path / "empty").mkdir()
     (tmp_path / "bad.toml").write_text('[[image]]\nname = "a"\nreason = "r"\nfale = 1')
@@ -226,7 +239,7 @@ def test_self_test_of_renders_and_of_one_image(run, tmp_path, quick):
     for path, number in ((folder, "null pairs 4"), (folder / "0.exr", "null pairs 1")):
         code, out, err = run("diff", "--self-test", path)
         assert err == ""
-        assert code == int("not held" in out)
+        assert code == int("failed: " in out)
         assert {"NaN", "blur"} <= {line.split()[0] for line in out.splitlines()}
         assert number in out
 
@@ -235,7 +248,7 @@ def test_self_test_renders_a_scene(run, tmp_path, quick, monkeypatch):
     text = (Path(app.__file__).parents[2] / "scenes" / "sphere.xml").read_text()
     scene = tmp_path / "sphere.xml"
     scene.write_text(text.replace('name="res" value="128"', 'name="res" value="24"'))
-    monkeypatch.setattr(cli_diff, "SELF_TEST_SPP", 2)
+    monkeypatch.setattr(self_test_scenes, "SPP", 2)
     monkeypatch.setattr(backend, "activate", lambda **how: None)
     code, out, err = run("diff", "--self-test", scene)
     assert (code in (0, 1), err) == (True, "")
@@ -308,7 +321,7 @@ def test_json(run, strange, tmp_path):
     changed = by_name["louder.exr"]
     assert (changed["status"], changed["category"]) == ("different", "changed")
     assert changed["test"] == str(new / "louder.exr")
-    assert any(figure["bound"] is not None and figure["value"] > figure["bound"] for figure in changed["figures"])
+    assert any(metric["bound"] is not None and metric["value"] > metric["bound"] for metric in changed["metrics"])
     assert changed["reproduce"] == shlex.join(["mi-refract", "diff", f"{old}/louder.exr", f"{new}/louder.exr"])
     assert run(*shlex.split(changed["reproduce"])[1:])[0] == 1
 

@@ -8,7 +8,8 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from mi_refract.image_diff.methods import Verdict, compare
+from mi_refract.image_diff.comparison import Verdict
+from mi_refract.image_diff.methods import compare
 from mi_refract.io.image_file import Image
 
 RNG = np.random.default_rng(11)
@@ -51,7 +52,7 @@ def test_what_float32_does_not_hold_is_compared_or_refused():
     for a, b in ((1 + 1e-12, 1.0), (1e39, 2e39), (1e39, 0.0), (1e9 + 1, 1e9)):
         found = compare("tolerance", flat(a, float), flat(b, float), fail=0.0, fail_relative=0.0)
         assert found.verdict is DIFFERENT
-        assert found.figures[1].value == abs(a - b)
+        assert found.metrics[1].value == abs(a - b)
     with pytest.raises(ValueError, match=r"beyond those of float32"):
         compare("flip", flat(1e39, float), flat(0, float))
 
@@ -63,9 +64,9 @@ def test_tolerance_counts_what_openimageio_counts(fail, relative):
     b[::5] *= -1
     result = oiio.ImageBufAlgo.compare(oiio.ImageBuf(a), oiio.ImageBuf(b), fail, 0.2, relative, 0.3)
     options = {"fail": fail, "fail_relative": relative, "warn": 0.2, "warn_relative": 0.3}
-    figures = [f.value for f in compare("tolerance", image(a), image(b), **options).figures]
+    metrics = [m.value for m in compare("tolerance", image(a), image(b), **options).metrics]
     expected = [result.nfail / 25, result.maxerror, result.meanerror, result.rms_error, result.nwarn / 25]
-    np.testing.assert_allclose(figures, expected, rtol=1e-6)
+    np.testing.assert_allclose(metrics, expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -131,7 +132,7 @@ def test_without_noise_what_moves_within_a_tile_is_seen():
     assert compare("welch", one, one).verdict is EQUAL
     found = compare("welch", one, other)
     assert found.verdict is INCONCLUSIVE
-    assert {f.name: f.value for f in found.figures}["smallest p, adjusted for the number of tests"] == 1
+    assert {m.name: m.value for m in found.metrics}["smallest p, adjusted for the number of tests"] == 1
 
 
 def test_a_tile_larger_than_the_image_is_the_image():

@@ -12,6 +12,7 @@ import typer
 from support.diff_images import BROKEN, found, image, tree
 
 from mi_refract.cli import diff as cli_diff
+from mi_refract.image_diff import accept
 from mi_refract.image_diff import folders as diff
 from mi_refract.image_diff.folders import Category
 from mi_refract.image_diff.settings import How, Settings
@@ -20,12 +21,12 @@ from mi_refract.image_diff.settings import How, Settings
 def test_what_is_accepted(folders):
     old, new = folders
     results = diff.diff(old, new)
-    copies = list(diff.changes(results))
+    copies = list(accept.changes(results))
     assert copies == [(new / n, old / n) for n in ("added.exr", "inner/changed.exr")]
     before = (old / "inner/changed.exr").read_bytes()
     assert {p.name for p in old.rglob("*.exr")} == {"same.exr", "changed.exr", "removed.exr"}
     assert (old / "inner/changed.exr").read_bytes() == before
-    diff.accept(copies, results.began)
+    accept.accept(copies, results.began)
     assert found(diff.diff(old, new)) == {
         "removed.exr": ("different", "removed"),
         "added.exr": ("equal", "unchanged"),
@@ -38,13 +39,13 @@ def test_what_is_accepted(folders):
 def test_a_reference_that_is_not_there_yet(folders, tmp_path):
     old, new = folders
     results = diff.diff(tmp_path / "first", new, new=True)
-    diff.accept(list(diff.changes(results)), results.began)
+    accept.accept(list(accept.changes(results)), results.began)
     assert diff.diff(tmp_path / "first", new).exit_code == 0
     assert not (tmp_path / "first" / "notes.txt").exists()
     one = tmp_path / "deep" / "one.exr"
     results = diff.diff(one, new / "same.exr", new=True)
     assert results.results[0].category is Category.ADDED
-    diff.accept(list(diff.changes(results)), results.began)
+    accept.accept(list(accept.changes(results)), results.began)
     assert one.read_bytes() == (new / "same.exr").read_bytes()
     assert diff.diff(old, new, new=True).exit_code == 1
 
@@ -56,35 +57,35 @@ def test_a_bad_image_becomes_no_reference(folders, name):
     bad.unlink()
     BROKEN[name](bad)
     with pytest.raises(ValueError, match=r"same\.exr"):
-        list(diff.changes(diff.diff(old, new)))
+        list(accept.changes(diff.diff(old, new)))
 
 
 def test_a_bad_added_image_becomes_no_reference(folders):
     BROKEN["truncated"](folders[1] / "added.exr")
     with pytest.raises(ValueError, match=r"added\.exr"):
-        list(diff.changes(diff.diff(*folders)))
+        list(accept.changes(diff.diff(*folders)))
 
 
 @pytest.mark.parametrize("name", ["ref.png", "folder"])
 def test_a_reference_is_of_the_format_that_its_name_says(folders, tmp_path, name):
     results = diff.diff(tmp_path / name, folders[1] / "same.exr", new=True)
     with pytest.raises(ValueError, match=r"accepted: a name that ends in \.exr"):
-        list(diff.changes(results))
+        list(accept.changes(results))
 
 
 def test_a_bad_reference_can_be_replaced(folders):
     old, new = folders
     BROKEN["truncated"](old / "same.exr")
-    copies = list(diff.changes(diff.diff(old, new)))
+    copies = list(accept.changes(diff.diff(old, new)))
     assert (new / "same.exr", old / "same.exr") in copies
 
 
 def test_values_that_are_not_finite_become_no_reference(folders):
     image(folders[1] / "same.exr", value=np.inf)
     with pytest.raises(ValueError, match="not finite; accepted with --allow-nonfinite"):
-        list(diff.changes(diff.diff(*folders)))
+        list(accept.changes(diff.diff(*folders)))
     named = Settings(allow_nonfinite=("same.exr",))
-    assert len(list(diff.changes(diff.diff(*folders, named)))) == 3
+    assert len(list(accept.changes(diff.diff(*folders, named)))) == 3
 
 
 def test_a_copy_that_fails_leaves_the_old_reference(folders, monkeypatch):
@@ -92,7 +93,7 @@ def test_a_copy_that_fails_leaves_the_old_reference(folders, monkeypatch):
     before = (old / "inner/changed.exr").read_bytes()
     monkeypatch.setattr("pathlib.Path.replace", lambda *a: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):
-        diff.accept([(new / "inner/changed.exr", old / "inner/changed.exr")], time.time_ns())
+        accept.accept([(new / "inner/changed.exr", old / "inner/changed.exr")], time.time_ns())
     assert (old / "inner/changed.exr").read_bytes() == before
     assert not list(old.rglob("*.part"))
 

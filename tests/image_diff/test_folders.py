@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -172,7 +174,7 @@ def test_samples(tmp_path):
         samples(tmp_path / "same", first=100),
         samples(tmp_path / "other", first=200, gain=1.3),
     )
-    equal, different = (diff.diff(old, test, samples=True) for test in (same, other))
+    equal, different = (diff.diff(old, test, renders=True) for test in (same, other))
     assert found(equal) == {"old": ("equal", "unchanged")}
     assert found(different) == {"old": ("different", "changed")}
     assert different.results[0].comparison.method == "welch"
@@ -181,7 +183,7 @@ def test_samples(tmp_path):
 
 def test_samples_too_noisy_for_a_verdict(tmp_path):
     old, new = samples(tmp_path / "old", 2, noise=1.0), samples(tmp_path / "new", 2, 100, noise=1.0)
-    assert diff.diff(old, new, samples=True).exit_code == 3
+    assert diff.diff(old, new, renders=True).exit_code == 3
 
 
 def test_bad_samples(tmp_path):
@@ -195,12 +197,12 @@ def test_bad_samples(tmp_path):
         (samples(tmp_path / "one", 1, 200), "one"),
         (empty, "empty: holds no image"),
     ]:
-        results = diff.diff(good, folder, samples=True)
+        results = diff.diff(good, folder, renders=True)
         assert results.exit_code == 2
         with pytest.raises(ValueError, match=message):
             raise ValueError(results.results[0].error)
-    with pytest.raises(NotADirectoryError, match=r"0\.exr: accepted with --samples: a folder"):
-        diff.diff(good, twice / "0.exr", samples=True)
+    with pytest.raises(NotADirectoryError, match=r"0\.exr: accepted with --renders: a folder"):
+        diff.diff(good, twice / "0.exr", renders=True)
 
 
 # Settings ---------------------------------------------------------------------------------------------------------
@@ -286,6 +288,13 @@ def test_nan_is_allowed_where_it_is_named(tmp_path):
     assert statuses == {"a.exr": ("equal", "unchanged"), "b.exr": ("different", "changed")}
 
 
+def test_the_readme_names_every_method_and_its_settings_are_accepted(rules):
+    text = (Path(diff.__file__).parent / "README.md").read_text("utf-8")
+    assert all(f"| `{name}` |" in text for name in methods.METHODS)
+    (example,) = re.findall("```toml\n(.*?)```", text, re.DOTALL)
+    assert rules(example)[0][1].method == "tolerance"
+
+
 BAD_RULES = {
     "no name": ('[[image]]\nreason = "r"', "image[0].name: missing"),
     "no reason": ('[[image]]\nname = "a"', "image[0].reason: missing; accepted: a text"),
@@ -328,9 +337,9 @@ def test_settings_that_are_no_text(tmp_path):
 
 def test_options_in_words():
     assert diff_settings.from_words("auto", []) == How()
-    how = diff_settings.from_words("welch", ["tile=8", "margin=1", "correction=holm"])
-    assert how == How("welch", {"tile": 8, "margin": 1.0, "correction": "holm"})
-    assert type(how.options["margin"]) is float
+    how = diff_settings.from_words("welch", ["tile=8", "equivalence_margin=1", "correction=holm"])
+    assert how == How("welch", {"tile": 8, "equivalence_margin": 1.0, "correction": "holm"})
+    assert type(how.options["equivalence_margin"]) is float
     assert diff_settings.from_words("tolerance", ["fail=inf"]).options == {"fail": np.inf}
 
 

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from support.browser import CHROMIUM, browse
 
-from mi_refract.image_diff import folders, html_report
+from mi_refract.image_diff import flip, folders, html_report
+from mi_refract.image_diff.comparison import Comparison, Metric, Verdict
 from mi_refract.image_diff.folders import Result, Results, Status
-from mi_refract.image_diff.methods import Comparison, Metric, Verdict
+from mi_refract.image_diff.settings import How, Settings
+from mi_refract.io import image_file
 from mi_refract.io.image_file import write_exr
 from mi_refract.report.embedded_images import ROUNDED, EmbeddedImages, encoded, strongest
 
@@ -31,9 +33,9 @@ def results(folder):
     reference = image(folder / "reference" / "a.exr", 0.25)
     test = image(folder / "test" / "a.exr", 0.5)
     p = np.linspace(0, 1, 24, dtype=np.float32).reshape(4, 6)
-    figures = (Metric("tiles that differ", 12.0, 0.0), Metric("odd", math.nan, 1.0), Metric("smallest p", 1e-9))
+    metrics = (Metric("tiles that differ", 12.0, 0.0), Metric("odd", math.nan, 1.0), Metric("smallest p", 1e-9))
     maps = {"t": 8 * p - 4, "p": p, "q": p, "flags": 0 * p}
-    found = Comparison("welch", Verdict.DIFFERENT, "12 tiles differ.", figures, 0.013, maps)
+    found = Comparison("welch", Verdict.DIFFERENT, "12 tiles differ.", metrics, 0.013, maps)
     return Results(
         folder / "reference",
         folder / "test",
@@ -106,11 +108,37 @@ def test_renders_in_a_folder_are_shown_as_their_mean(tmp_path):
         for i in range(4):
             noise = np.random.default_rng([i, ord(side)]).normal(1 + (side == "t"), 0.01, (8, 8, 3))
             image(tmp_path / side / f"{i}.exr", noise.astype(np.float32))
-    found = folders.diff(tmp_path / "r", tmp_path / "t", samples=True, maps=True)
+    found = folders.diff(tmp_path / "r", tmp_path / "t", renders=True, maps=True)
     assert found.exit_code == 1
     images = re.findall(r'data-channels="3" data-scale="1.0">([^<]*)<', html(tmp_path, found))
     means = [decoded(data).astype(float).mean() for data in images]
     assert means == pytest.approx([1, 2], abs=0.01)
+
+
+@pytest.mark.parametrize("method", ["tolerance", "flip"])
+def test_every_file_is_read_once_and_flip_runs_once_for_verdict_and_page(tmp_path, monkeypatch, method):
+    sides = [image(tmp_path / side / "a.exr", value) for side, value in (("r", 0.25), ("t", 0.5))]
+    reads, runs = [], []
+    read, flip_map = image_file.read, flip.flip_map
+    for module, name in ((image_file, "read"), (html_report, "read")):
+        monkeypatch.setattr(module, name, lambda path: reads.append(path) or read(path))
+    monkeypatch.setattr(flip, "flip_map", lambda *sides: runs.append(sides) or flip_map(*sides))
+    settings = Settings(How(method))
+    whole = html(tmp_path, folders.diff(*sides, settings, maps=True))
+    assert sorted(reads) == sorted(sides) and len(runs) == 1 and "flip" in dict(roles(whole))
+    monkeypatch.setattr(folders, "HELD", 0)
+    again = html(tmp_path, folders.diff(*sides, settings, maps=True))
+    assert len(reads) == 6 and roles(again) == roles(whole)
+
+
+def test_a_pair_that_does_not_fit_any_more_is_left_out(tmp_path, monkeypatch):
+    found = results(tmp_path)
+    alone = html(tmp_path, Results(found.reference, found.test, found.results[1:2]))
+    size = sum(len(data) for data in re.findall(r'data-scale="[^"]*">([^<]*)<', alone))
+    for pairs, factor in ((1, 1.9), (2, 2.1)):
+        monkeypatch.setattr(html_report, "PAGE", factor * size)
+        text = html(tmp_path, Results(found.reference, found.test, found.results[1:2] * 3))
+        assert len(roles(text)) == 6 * pairs and text.count("the page is full") == 3 - pairs
 
 
 def test_a_full_page_keeps_the_numbers_and_says_what_is_left_out(tmp_path, monkeypatch):

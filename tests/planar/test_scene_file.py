@@ -308,7 +308,7 @@ def test_an_empty_scene_is_none(tmp_path, text, expected):
 def test_what_is_no_text_is_no_scene(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_bytes(b"title = '\xff'")
-    with pytest.raises(ValueError, match=r"scene\.toml: byte 9 is no UTF-8; accepted: TOML"):
+    with pytest.raises(ValueError, match=r"scene\.toml: byte 9 is not UTF-8; accepted: TOML"):
         load(path)
     with pytest.raises(FileNotFoundError, match=r"^[^\n]*none\.toml[^\n]*$"):
         load(tmp_path / "none.toml")

@@ -181,7 +181,7 @@ def test_a_vertex_inside_another_segment_is_no_junction(follow):
     assert story(follow(whole, (-3, 1), (0.1, -1))) == ([0], [REFRACTED, ESCAPED])
 
 
-def test_a_segment_turned_round_is_contradicted(follow):
+def test_a_segment_turned_round_is_a_medium_mismatch(follow):
     square = polygon(SQUARE)
     square.n_left[1], square.n_right[1] = 1.0, 1.5
     paths = follow(square, (-1, 0.5), (1, 0))
@@ -192,7 +192,7 @@ def test_a_segment_turned_round_is_contradicted(follow):
 # Ends ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_path_is_exhausted_only_where_another_boundary_is_ahead(follow):
+def test_max_depth_ends_a_path_only_where_another_boundary_is_ahead(follow):
     square = polygon(SQUARE)
     assert story(follow(square, (-1, 0.5), (1, 0), max_depth=1)) == ([3], [REFRACTED, Event.MAX_DEPTH])
     assert story(follow(square, (-1, 0.5), (1, 0), max_depth=2)) == ([3, 1], [REFRACTED, REFRACTED, ESCAPED])

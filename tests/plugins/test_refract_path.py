@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refract.image_diff import methods
+from mi_refract.image_diff import pixelwise, tile_statistics
 from mi_refract.plugins import keyed_sampler, path_loop, refract_path, scene_features
 from mi_refract.rendering import scene_files
 from validation.run.context import SCENES
@@ -78,7 +78,7 @@ def test_where_nothing_is_left_out_the_numbers_and_the_image_are_those_of_path(n
     for parameters in ({}, {"max_depth": 3, "rr_depth": 1}):
         ours, theirs = render(scene, spp, **parameters), by_path(scene, spp, **parameters)
         assert theirs.std() > 0
-        assert methods.paired(theirs, ours, 1e-4).changed <= 1e-3
+        assert pixelwise.changes(theirs, ours, 1e-4).share <= 1e-3
 
 
 @pytest.mark.parametrize("name", [*GLASS_ONLY, *MIXED])
@@ -88,7 +88,7 @@ def test_other_numbers_give_the_same_mean(name, parameters, llvm):
     scene = load(name)
     theirs = np.stack([by_path(scene, seed=i) for i in range(8)])
     ours = np.stack([render(scene, seed=100 + i, **parameters) for i in range(8)])
-    assert methods.welch(theirs, ours, 8, 1e-3, 1e-5).alarms == 0
+    assert tile_statistics.compare_stacks(theirs, ours, 8, 1e-3, 1e-5).alarms == 0
     assert ours.mean() == pytest.approx(theirs.mean(), rel=2e-2)
 
 
@@ -113,13 +113,13 @@ def test_lamps_are_chosen_by_their_weights_and_the_sky_is_met(parameters, typica
     theirs = np.stack([by_path(scene, spp, i) for i in range(count)])
     ours = np.stack([render(scene, spp, 100 + i, **parameters) for i in range(count)])
     tile = theirs.shape[1]
-    assert methods.welch(theirs, ours, tile, 1e-3, 1e-5).alarms == 0
+    assert tile_statistics.compare_stacks(theirs, ours, tile, 1e-3, 1e-5).alarms == 0
     if vectorised:
         choose = mi.DiscreteDistribution.sample_reuse_pmf
         slip = lambda *a: (*choose(*a)[:2], mi.Float(0.4))  # noqa: E731
         monkeypatch.setattr(mi.DiscreteDistribution, "sample_reuse_pmf", slip)
         wrong = np.stack([render(scene, spp, 100 + i, **parameters) for i in range(count)])
-        assert methods.welch(theirs, wrong, tile, 1e-3, 1e-5).alarms > 0
+        assert tile_statistics.compare_stacks(theirs, wrong, tile, 1e-3, 1e-5).alarms > 0
 
 
 @pytest.mark.parametrize("name", ["area", "environment", "all_of_hit"])
@@ -128,7 +128,7 @@ def test_leaving_out_what_a_scene_needs_is_seen(name, llvm, monkeypatch):
     theirs = np.stack([by_path(scene, seed=i) for i in range(8)])
     monkeypatch.setattr(refract_path, "PathFeatures", lambda *a, **k: path_loop.PathFeatures(*a, **k | {name: False}))
     ours = np.stack([render(scene, seed=100 + i) for i in range(8)])
-    assert methods.welch(theirs, ours, 8, 1e-3, 1e-5).alarms > 0
+    assert tile_statistics.compare_stacks(theirs, ours, 8, 1e-3, 1e-5).alarms > 0
 
 
 @pytest.mark.parametrize("name", ["sphere", "slab"])
@@ -333,8 +333,11 @@ def test_a_frozen_render_follows_the_index_and_a_lamp_that_turns_grey(split_dept
         ({"max_depth": "deep"}, "max_depth = 'deep'"),
         ({"rr_depth": 0}, "rr_depth = 0: accepted: an integer ≥ 1"),
         ({"split_depth": -1}, "split_depth = -1: accepted: an integer ≥ 0"),
-        ({"split_depth": 13, "split_weight": 0.0}, "up to 8.19e+03 paths of a sample at once; accepted: up to 4096"),
-        ({"split_depth": 65}, "a split_depth up to 64"),
+        (
+            {"split_depth": 13, "split_weight": 0.0},
+            "split into 8.19e+03 paths; accepted: 2^split_depth or 1/split_weight up to 4096",
+        ),
+        ({"split_depth": 65}, "and split_depth up to 64"),
         ({"split_weight": 1.5}, "split_weight = 1.5: accepted: a number from 0 to 1"),
         ({"split_weight": float("nan")}, "split_weight = nan"),
         ({"deterministic": 1}, "deterministic = 1: accepted: true or false"),

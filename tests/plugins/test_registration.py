@@ -59,3 +59,14 @@ def test_the_import_brings_no_heavy_package():
     heavy = ("numpy", "OpenImageIO", "flint", "matplotlib", "scipy", "rich", "typer", "jinja2")
     outcome = run(f"import mitsuba, mi_refract, sys; print([m for m in {heavy!r} if m in sys.modules])")
     assert outcome.stdout.strip() == "[]", outcome.stderr
+
+
+def test_the_import_waits_for_mitsuba_and_its_formulas_for_dr_jit():
+    loaded = "[name in sys.modules for name in ('drjit', 'mitsuba')]"
+    outcome = run(f"import mi_refract, sys; print({loaded}, mi_refract.reflect.__name__, {loaded})")
+    assert outcome.stdout.strip() == "[False, False] reflect [True, False]", outcome.stderr
+
+
+def test_an_attribute_that_is_not_there():
+    outcome = run("import mi_refract; mi_refract.refelct")
+    assert "module 'mi_refract' has no attribute 'refelct'" in outcome.stderr

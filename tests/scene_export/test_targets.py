@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mi_refract.image_diff import methods
+from mi_refract.image_diff.comparison import Verdict
 from mi_refract.io import image_file
 from mi_refract.scene_export import from_mitsuba, tessellation, write_files
 from mi_refract.scene_export.plain_scene import Camera, Diffuse, Environment, Glass, Light, Mesh, PlainScene
@@ -116,13 +117,13 @@ def test_the_plain_scene_renders_equal(name, level, tmp_path):
     write_files.write(from_mitsuba.load(path, level=level, **size), "mitsuba", tmp_path / "plain")
     other = mi.load_file(str(tmp_path / "plain" / "scene.xml"), optimize=False, parallel=False)
     first = renders(one, 0)
-    assert methods.compare("welch", first, renders(other, 100), tile=16).verdict == methods.Verdict.EQUAL
+    assert methods.compare("welch", first, renders(other, 100), tile=16).verdict == Verdict.EQUAL
     text = (tmp_path / "plain" / "scene.xml").read_text()
     material = '<float name="int_ior" value="1.5046"/>'
     assert material in text
     (tmp_path / "plain" / "scene.xml").write_text(text.replace(material, '<float name="int_ior" value="1.8"/>'))
     wrong = mi.load_file(str(tmp_path / "plain" / "scene.xml"), optimize=False, parallel=False)
-    assert methods.compare("welch", first, renders(wrong, 100), tile=16).verdict == methods.Verdict.DIFFERENT
+    assert methods.compare("welch", first, renders(wrong, 100), tile=16).verdict == Verdict.DIFFERENT
 
 
 # --- Radiance --------------------------------------------------------------------------------------------
@@ -218,6 +219,12 @@ def test_ply_is_read_by_mitsuba(small, tmp_path):
     vertices = np.array(mesh.vertex_positions_buffer()).reshape(-1, 3)
     faces = np.array(mesh.faces_buffer()).reshape(-1, 3)
     np.testing.assert_array_equal(vertices[faces], small.meshes[0].triangles().astype(np.float32))
+
+
+def test_the_map_has_no_date(small, sky, tmp_path):
+    """So that the same scene gives the same bytes."""
+    write_files.write(PlainScene("turned", small.meshes, sky, CAMERA, 12), "mitsuba", tmp_path / "new")
+    assert image_file.read(tmp_path / "new" / "sky.exr").metadata["DateTime"] == "1970:01:01 00:00:00"
 
 
 @pytest.mark.parametrize("module", [cycles, luxcore, povray, obj], ids=lambda module: module.__name__.split(".")[-1])

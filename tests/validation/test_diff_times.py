@@ -23,7 +23,7 @@ def test_what_is_timed_is_told_apart(root):
     """An image that differs is what the page shows; the folder's images are equal for all that `auto` asks."""
     one, other = root / "a" / "0.exr", root / "b" / "0.exr"
     assert folders.diff(one, other, Settings(How("tolerance"))).exit_code == 1
-    assert folders.diff(root / "a", root / "b", samples=True).exit_code == 1
+    assert folders.diff(root / "a", root / "b", renders=True).exit_code == 1
     folder = folders.diff(root / "many_a", root / "many_b")
     assert (folder.exit_code, len(folder.results)) == (0, SMALL.pairs)
     assert folders.diff(root / "many_a", root / "many_b", Settings(How("exact"))).exit_code == 1

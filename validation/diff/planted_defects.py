@@ -1,4 +1,4 @@
-"""The gate: what `mi-refract diff` sees of defects in real renders, and how often it alarms at equal ones.
+"""What `mi-refract diff` sees of defects in real renders, and how often it alarms at equal ones.
 
 Defects of a renderer are planted in the glass, those of an image in the pixels. The ball of the scene `sphere` holds a
 lamp here, off its centre: without one η² on the way in and 1/η² on the way out cancel on every path, and no path is
@@ -17,6 +17,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.image_diff import self_test
+from mi_refract.image_diff.defects import DEFECTS
 from mi_refract.plugins import refract
 from mi_refract.rendering.scene_files import REPRODUCIBLE
 from mi_refract.report.row import Row
@@ -106,7 +107,7 @@ NAME = self_test.STUDY
 TERMS = (
     self_test.TERMS
     | {name: text for name, (text, _) in GLASSES.items()}
-    | {name: defect.text for name, defect in self_test.DEFECTS.items()}
+    | {name: defect.text for name, defect in DEFECTS.items()}
     | {OTHER_SAMPLER: "multijitter: other random numbers, the same image"}
 )
 
@@ -200,7 +201,7 @@ def image_defect_rows(context: Context, name: str) -> list[Row]:
 
 def _image_defects(clean: list[self_test.Trial], name: str, context: Context) -> list[Row]:
     rows = []
-    for defect, planted in self_test.DEFECTS.items():
+    for defect, planted in DEFECTS.items():
         spoilt = [self_test.Trial(t.clean, t.other, functools.partial(planted.spoil, t.clean)) for t in clean]
         rows.append(self_test.detection(defect, planted.always_due, spoilt, name, context.variant))
     return rows

@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from mi_refract.image_diff import folders, html_report
-from mi_refract.image_diff.methods import METHODS
-from mi_refract.image_diff.settings import AUTO, How, Settings
+from mi_refract.image_diff.methods import AUTO, METHODS
+from mi_refract.image_diff.settings import How, Settings
 from mi_refract.io import image_file
 from mi_refract.report.row import Row
 from validation import limits
@@ -108,7 +108,7 @@ def _reading(name: str) -> str:
     """The subject that reads the same files as this one; "" for the page, and for those themselves."""
     if name == AUTO:
         return "read the folder"
-    return ("read the renders" if METHODS[name].samples else "read the pair") if name in METHODS else ""
+    return ("read the renders" if METHODS[name].takes_renders else "read the pair") if name in METHODS else ""
 
 
 def _readings(root: Path) -> dict[str, Callable[[], object]]:
@@ -129,9 +129,9 @@ def _subjects(root: Path, page: Path) -> dict[str, Callable[[], object]]:
     found = {
         name: functools.partial(
             folders.diff,
-            *((a, b) if method.samples else (a / "0.exr", b / "0.exr")),
+            *((a, b) if method.takes_renders else (a / "0.exr", b / "0.exr")),
             Settings(How(name)),
-            samples=method.samples,
+            renders=method.takes_renders,
         )
         for name, method in METHODS.items()
     }
@@ -172,7 +172,7 @@ def _memory_row(root: Path, size: Size, setting: str) -> Row:
     subject, case = "memory", _case("welch", size)
     if not Path("/proc/self/status").exists():
         return Row(NAME, subject, case, setting, reason="this system does not say a process's peak")
-    words = ["diff", str(root / "a"), str(root / "b"), "--samples", "--report", str(root / "welch.html")]
+    words = ["diff", str(root / "a"), str(root / "b"), "--renders", "--report", str(root / "welch.html")]
     done = subprocess.run([sys.executable, "-c", PROCESS, *words], capture_output=True, text=True)
     if done.returncode:
         raise OSError(f"diff, times: {done.stderr.strip()}")

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refract.image_diff import methods as compare
+from mi_refract.image_diff import tile_statistics
 from mi_refract.plugins import scene_features
 from mi_refract.report.row import Row
 from validation import limits
@@ -255,11 +255,12 @@ def _values(subject: Subject, builtins: list[Subject], found: Found, references:
     for metric in METRICS[1:]:
         ratios = [t / s for t, s in zip(test.cost(metric), same.cost(metric), strict=True)]
         values[f"equal-time {metric}"] = statistics.median(ratios)
-    agreed = compare.welch(references, np.stack(test.images), TILE, limits.WELCH_ERROR, limits.WELCH_MARGIN)
+    asked = TILE, limits.WELCH_ERROR, limits.WELCH_MARGIN
+    agreed = tile_statistics.compare_stacks(references, np.stack(test.images), *asked)
     return values | {
         WELCH_ALARMS: float(agreed.alarms),
         SMALLEST_P: agreed.smallest_p,
-        DETECTABLE: agreed.detectable,
+        DETECTABLE: agreed.minimum_detectable(),
     }
 
 

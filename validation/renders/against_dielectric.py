@@ -18,7 +18,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.formulas import FORMULAS, automatic
-from mi_refract.image_diff import methods as compare
+from mi_refract.image_diff import pixelwise, tile_statistics
 from mi_refract.io import image_file
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.row import Row
@@ -148,11 +148,11 @@ def _metrics(plugins: list[str]) -> list[str]:
 
 def _paired(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """Same seeds, image by image."""
-    found = compare.paired(reference.reshape(-1, *reference.shape[2:]), test.reshape(-1, *test.shape[2:]), CHANGED)
+    found = pixelwise.changes(reference.reshape(-1, *reference.shape[2:]), test.reshape(-1, *test.shape[2:]), CHANGED)
     return {
-        CHANGED_SHARE: found.changed,
+        CHANGED_SHARE: found.share,
         "largest change": found.largest,
-        "RMSE": found.rmse,
+        "RMSE": found.rms,
         MEANS_DIFFER: abs(found.mean_ratio - 1),
     }
 
@@ -167,11 +167,11 @@ def no_question(test: np.ndarray, reference: np.ndarray) -> str:
 
 
 def _independent(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    found = compare.welch(reference, test, TILE, limits.WELCH_ERROR, limits.WELCH_MARGIN)
+    found = tile_statistics.compare_stacks(reference, test, TILE, limits.WELCH_ERROR, limits.WELCH_MARGIN)
     return {
         WELCH_ALARMS: float(found.alarms),
         SMALLEST_P: found.smallest_p,
-        DETECTABLE: found.detectable,
+        DETECTABLE: found.minimum_detectable(),
     }
 
 
@@ -181,7 +181,7 @@ def _curves(context: Context, cameras: dict[str, Camera], reference: np.ndarray)
     for spp in context.profile.curve_spp:
         for name, camera in cameras.items():
             points = [camera(spp, seed=context.profile.pairs + i) for i in range(CURVE_SEEDS)]
-            error = statistics.fmean(compare.relative_mse(image, reference) for image, _ in points)
+            error = statistics.fmean(tile_statistics.relative_mse(image, reference) for image, _ in points)
             curves[name].append((statistics.median(seconds for _, seconds in points), error))
     return curves
 

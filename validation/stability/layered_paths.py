@@ -19,7 +19,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.formulas import FORMULAS, automatic
-from mi_refract.image_diff import methods
+from mi_refract.image_diff import pixelwise
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.rendering import scene_files
 from mi_refract.report.row import Row
@@ -287,8 +287,8 @@ def _view_rows(context: Context, scene: str, parameters: dict[str, str], name: s
     views = {p: View(scene, p, parameters, profile.resolution, spp) for p in (BUILTIN, PLUGIN, right)}
     reference, test, control = (view.image for view in views.values())
     values = {
-        "pixels off": methods.paired(reference, test, VISIBLE).changed,
-        "pixels off, control": methods.paired(control, test, VISIBLE).changed,
+        "pixels off": pixelwise.changes(reference, test, VISIBLE).share,
+        "pixels off, control": pixelwise.changes(control, test, VISIBLE).share,
     }
     about = {"scene": f"{scene}.xml", "resolution": profile.resolution, "spp": spp, "seed": 0, **parameters}
     images = {

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refract.image_diff import methods as compare
-from mi_refract.image_diff.methods import Comparison, Verdict
+from mi_refract.image_diff.comparison import Comparison, Verdict
+from mi_refract.image_diff.methods import compare
 from mi_refract.io import image_file
 from mi_refract.io.image_file import Image
 from mi_refract.plugins.refract import PLUGIN
@@ -169,7 +169,7 @@ def reference(scene: str, size: Size) -> list[Image]:
 
 def _row(context: Context, title: str, scene: str, ours: Sequence[Image], theirs: Sequence[Image], about: dict) -> Row:
     size = SIZES[context.profile.name]
-    found = compare.welch_images(ours, theirs, family_error=limits.SUITE_ERROR, resolution=size.wanted)
+    found = compare("welch", ours, theirs, family_error=limits.SUITE_ERROR, resolution=size.wanted)
     values = _values(found, *(np.stack([image.pixels for image in side]) for side in (ours, theirs)))
     known = title in SCENES[scene].known
     if known:
@@ -189,14 +189,14 @@ def _row(context: Context, title: str, scene: str, ours: Sequence[Image], theirs
 
 def _values(found: Comparison, ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
     """The numbers of a pair; `ours` and `theirs` are renders × height × width × 3."""
-    figures = {figure.name: figure.value for figure in found.figures}
+    metrics = {metric.name: metric.value for metric in found.metrics}
     noise = sum(side.var(0, ddof=1).mean() / len(side) for side in (ours.astype(float), theirs.astype(float)))
     rmse = np.sqrt(np.square(theirs.mean(0) - ours.mean(0)).mean())
     values = {
-        "tests that differ": figures.get("tests of tiles and channels that differ", np.nan),
-        "tiles that differ without noise": figures.get("tiles without noise that differ", np.nan),
-        DETECTABLE: found.detectable,
-        "detectable difference, image": figures.get("detectable relative difference of the whole image", np.nan),
+        "tests that differ": metrics.get("tests of tiles and channels that differ", np.nan),
+        "tiles that differ without noise": metrics.get("tiles without noise that differ", np.nan),
+        DETECTABLE: found.minimum_detectable,
+        "detectable difference, image": metrics.get("minimum detectable difference of the whole image", np.nan),
         MEAN_DIFFERENCE: float(theirs.mean() / ours.mean() - 1),
     }
     return values | ({"RMSE / noise": float(rmse / np.sqrt(noise))} if noise > 0 else {})

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract import __version__
-from mi_refract.io.image_file import write_exr
+from mi_refract.io.image_file import NO_DATE, write_exr
 
 from ..plain_scene import Mesh, PlainScene
 
@@ -34,7 +34,7 @@ def exr(pixels: NDArray[np.floating]) -> bytes:
     """An OpenEXR file of pixels (H, W, 3)."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.exr"
-        write_exr(path, pixels)
+        write_exr(path, pixels, metadata=NO_DATE)
         return path.read_bytes()
 
 

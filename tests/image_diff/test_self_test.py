@@ -1,0 +1,113 @@
+"""The self-test sees planted defects, and fails where a method is blind or alarms at everything."""
+
+import numpy as np
+import pytest
+
+from mi_refract.image_diff import methods, self_test
+from mi_refract.image_diff.comparison import Comparison, Verdict
+from mi_refract.image_diff.defects import DEFECTS
+from mi_refract.io import image_file
+
+IMAGE = 0.2 + 0.8 * np.random.default_rng(5).random((32, 32, 3))
+
+
+def renders(count, seed=1, spread=0.02):
+    """Independent noisy renders of one image, of a skewed distribution."""
+    shape = spread**-2
+    return IMAGE * np.random.default_rng(seed).gamma(shape, 1 / shape, (count, *IMAGE.shape))
+
+
+def by_subject(rows):
+    return {row.subject: row for row in rows}
+
+
+@pytest.fixture(scope="module")
+def found():
+    return by_subject(self_test.examine(renders(12), "noise", trials=4, null_pairs=40))
+
+
+@pytest.mark.parametrize("name", DEFECTS)
+def test_what_is_due_is_seen(found, name):
+    row = found[name]
+    assert row.verdict == "pass"
+    assert row.values["exact"] == 1
+    if DEFECTS[name].always_due:
+        assert row.replay["due"] == list(methods.METHODS)
+        assert {row.values[method] for method in methods.METHODS} == {1}
+
+
+def test_the_size_of_a_defect_is_measured(found):
+    assert found["gain"].values["size"] == pytest.approx(0.01, rel=1e-3)
+    assert found["gain"].values[self_test.RATIO] > 1  # 0.02/√(256 × 6) a tile: due
+    assert found["gain"].values["welch"] == 1
+    assert found["renders"].values["noise"] == pytest.approx(0.02, rel=0.1)
+
+
+def test_equal_pairs_alarm_nowhere(found):
+    rows = [found[f"null pairs, {method}"] for method in methods.METHODS]
+    assert all(row.verdict == "pass" and row.values["false alarms"] == 0 for row in rows)
+    assert found["null pairs, welch"].values["null pairs"] == 40
+
+
+@pytest.mark.parametrize("method", methods.METHODS)
+def test_a_blind_method_fails(method, monkeypatch):
+    """It says of everything, NaN and other sizes included, that it is equal, and that it would have seen 1e-4."""
+    real = methods.compare
+    blind = Comparison(method, Verdict.EQUAL, "", minimum_detectable=1e-4)
+    monkeypatch.setattr(methods, "compare", lambda m, *sides: blind if m == method else real(m, *sides))
+    rows = by_subject(self_test.examine(renders(8), "noise", trials=2, null_pairs=2))
+    failed = {name for name, row in rows.items() if row.verdict == "fail"}
+    always = {name for name, defect in DEFECTS.items() if defect.always_due and name != "truncated"}
+    expected = {"exact": set(DEFECTS) - {"truncated"}, "welch": always | {"gain", "shift", "8 bits", "firefly"}}
+    assert failed >= expected.get(method, always)
+    assert rows["NaN"].values["missed"] == 2
+
+
+def test_a_method_that_cries_wolf_fails(monkeypatch):
+    monkeypatch.setattr(methods, "compare", lambda m, *sides: Comparison(m, Verdict.DIFFERENT, ""))
+    rows = self_test.examine(renders(8), "noise", trials=1, null_pairs=5)
+    assert {row.subject for row in rows if row.verdict == "fail"} == {f"null pairs, {m}" for m in methods.METHODS}
+    monkeypatch.setattr(methods, "compare", lambda m, *sides: Comparison(m, Verdict.INCONCLUSIVE, ""))
+    rows = by_subject(self_test.examine(renders(8), "noise", trials=1, null_pairs=5))
+    assert rows["null pairs, welch"].values["inconclusive"] == 1
+    assert rows["gain"].values["exact"] == 0
+    assert rows["gain"].verdict == "fail"
+
+
+@pytest.mark.parametrize(("alarms", "pairs"), [(0, 640), (2, 640), (3, 640), (10, 10)])
+def test_the_bound_is_where_so_few_alarms_have_the_probability_left(alarms, pairs):
+    from scipy import stats
+
+    bound = self_test.Tally(seen=alarms, trials=pairs).bound
+    left = stats.binom.cdf(alarms, pairs, bound)
+    assert left == pytest.approx(1 if alarms == pairs else 1 - self_test.CONFIDENCE)
+    assert (bound <= self_test.FALSE_ALARMS) == (alarms <= 2)
+
+
+def test_a_defect_that_changes_nothing_is_left_out():
+    grey = np.repeat(renders(4)[..., :1], 3, axis=3)
+    rows = by_subject(self_test.examine(grey, "grey", trials=1, null_pairs=1))
+    assert rows["swapped channels"].verdict == "not run"
+    assert "changes nothing" in rows["swapped channels"].reason
+
+
+def test_the_command_takes_a_folder_or_an_image_and_refuses_what_is_not_finite(tmp_path, run, monkeypatch):
+    monkeypatch.setattr(self_test.examine, "__defaults__", (2, 20))
+    for i, image in enumerate(renders(4)):
+        image_file.write_exr(tmp_path / f"{i}.exr", image)
+    code, out, _ = run("diff", "--self-test", tmp_path)
+    assert code == 0
+    assert "every defect that was due was seen" in out
+    code, out, _ = run("diff", "--self-test", tmp_path / "0.exr")
+    assert code == 0
+    assert "–" in out  # no noise is known of one image: nothing for welch
+    monkeypatch.setattr(methods, "compare", lambda m, *sides: Comparison(m, Verdict.EQUAL, ""))
+    code, out, _ = run("diff", "--self-test", tmp_path / "0.exr")
+    assert code == 1
+    assert "failed: " in out
+    image_file.write_exr(tmp_path / "bad.exr", np.full_like(IMAGE, np.nan))
+    code, _, err = run("diff", "--self-test", tmp_path / "bad.exr")
+    assert code == 2 and "finite" in err
+    image_file.write_exr(tmp_path / "bad.exr", IMAGE[1:])
+    code, _, err = run("diff", "--self-test", tmp_path)
+    assert code == 2 and "differ from" in err
