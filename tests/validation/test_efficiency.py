@@ -105,7 +105,7 @@ def test_images_grow_until_their_time_can_be_told(context, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("scene", "words"), [("furnace", "no noise"), ("mirage", "stairs"), ("slab", "the profile quick measures balls")]
+    ("scene", "words"), [("furnace", "no noise"), ("mirage", "stairs"), ("slab", "the profile standard measures balls")]
 )
 def test_what_is_left_out_has_its_reason(context, monkeypatch, scene, words):
     measured = ("balls",) if scene == "slab" else ()
