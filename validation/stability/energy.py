@@ -50,7 +50,7 @@ INDICES = (1.0003, 1.1, 1.33, 1.5, 2.42)
 POWERS = {"R / u": 4.0, "1 − R / u": 4.0}
 SUMMED = POWERS | {"R + T − 1 / u": 4.0}  # R · 4u + T · 4u
 AMPLITUDES = {"r_s / u": 8.0, "r_p / u": 8.0, "phase / u": 8.0}
-# Of the larger term of a float32 radicand (see `exact`): the promoted form's error. The compensated one's is less, as
+# Of the larger term of a float32 radicand: the promoted form's error. The compensated one's is less, as
 # κ of a float32 k up to 2²³ is a pair exactly.
 RADICAND = 10 * 2.0**-53
 
