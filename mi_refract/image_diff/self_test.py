@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refract.io import image_file
+from mi_refract.io import image_file, srgb
 from mi_refract.report.row import Row
 
 from . import methods as compare
@@ -87,9 +87,7 @@ def _blurred(image: np.ndarray) -> np.ndarray:
 
 def _in_8_bits(image: np.ndarray) -> np.ndarray:
     """Through an 8-bit sRGB file: white is 1, and what is brighter is cut."""
-    x = np.clip(image, 0, 1)
-    code = np.round(255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)) / 255
-    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+    return srgb.decoded(np.round(255 * srgb.encoded(image)) / 255)
 
 
 def _truncated(image: np.ndarray) -> np.ndarray:

@@ -35,6 +35,7 @@ class Screen:
     """
 
     def __init__(self, rays: Rays, vector: Any) -> None:
+        """Solve the rays; subjects are evaluated in arrays of the 3-vector type `vector`."""
         self.rays, self.roundoff = rays, float(np.finfo(rays.k.dtype).eps) / 2
         self._inputs = vector(rays.a.T), vector(rays.n.T), dr.value_t(vector)(rays.k)
         dr.eval(self._inputs)
