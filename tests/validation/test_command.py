@@ -81,7 +81,7 @@ def test_directions_name_what_does_not_run_and_hold_what_does(context):
     absent = [s for s in settings.settings(context) if s.vector is None]
     assert all(row.verdict == "not run" and row.reason for s in absent for row in per_formula._setting_rows(context, s))
     worst = next(row for row in rows if row.subject == "promoted" and row.case == "critical")
-    assert {"error / bound", "misjudged far"} == set(worst.budgets)
+    assert {"error / bound", "TIR misclassified, beyond its bound"} == set(worst.budgets)
     assert len(worst.replay["largest error"]["a"]) == 3
 
 

@@ -103,7 +103,7 @@ def stubborn(a, n, k, contrast=None):
 
 @pytest.mark.parametrize(
     ("defect", "regime", "broken"),
-    [(rare, "generic", {"error / bound"}), (stubborn, "critical", {"misjudged far"})],
+    [(rare, "generic", {"error / bound"}), (stubborn, "critical", {"TIR misclassified, beyond its bound"})],
 )
 def test_a_sweep_sees_defects_of_a_few_rays(defect, regime, broken, measured, replace, monkeypatch):
     monkeypatch.setattr(sweep, "CHUNK", 20_000)
