@@ -19,12 +19,12 @@ Conventions, everywhere in this package:
 from __future__ import annotations
 
 import importlib
-import importlib.machinery
-import importlib.util
 import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from importlib.machinery import ModuleSpec
+
     from .formulas import FORMULAS, reflect, reflect_sandwich, refract_2d
 
 __all__ = ["FORMULAS", "reflect", "reflect_sandwich", "refract_2d"]
@@ -57,11 +57,19 @@ def _register_plugins() -> None:
 class _RegisterWithMitsuba:
     """A finder of modules that leaves all to the others, but registers the plugins at the end of `import mitsuba`."""
 
-    def find_spec(self, name: str, path: Any = None, target: Any = None) -> importlib.machinery.ModuleSpec | None:
-        if name != "mitsuba":
+    def __init__(self) -> None:
+        self.asks_others = False
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        if name != "mitsuba" or self.asks_others:
             return None
-        sys.meta_path.remove(self)
-        spec = importlib.util.find_spec(name)
+        import importlib.util
+
+        self.asks_others = True
+        try:
+            spec = importlib.util.find_spec(name)
+        finally:
+            self.asks_others = False
         if spec is None or spec.loader is None:
             return None
         run = spec.loader.exec_module

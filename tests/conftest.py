@@ -174,7 +174,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture
 def scalar_context(tmp_path):
-    """`scalar_context(rays=800, ...)`: a run of the validation on scalar_rgb, quick but for what is given."""
+    """`scalar_context(rays=800, ...)`: a run of the validation on scalar_rgb, standard but for what is given."""
     import dataclasses
 
     import mitsuba as mi
@@ -183,8 +183,10 @@ def scalar_context(tmp_path):
 
     before = mi.variant()
     mi.set_variant("scalar_rgb")
-    quick = SCALAR_PROFILES["quick"]
-    yield lambda **given: Context(dataclasses.replace(quick, **given), tmp_path, "scalar_rgb", backend.detect(), USABLE)
+    standard = SCALAR_PROFILES["standard"]
+    yield lambda **given: Context(
+        dataclasses.replace(standard, **given), tmp_path, "scalar_rgb", backend.detect(), USABLE
+    )
     mi.set_variant(before)
 
 

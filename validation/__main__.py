@@ -1,140 +1,164 @@
-"""`python -m validation [STUDY …] [--profile quick|full] [--out DIR]`, or `python -m validation renderers …`.
+"""`python -m validation [STUDY …] [--profile quick|standard|full] [--out DIR]`, or `python -m validation renderers …`.
 
 Exit code 0 where every budget held, 1 where one was broken, 2 for misuse, 130 where it was interrupted.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import time
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-# Each study by name, and the modules that make it up.
-STUDIES = {
-    "directions": {
-        "directions": "directions.per_formula",
-        "mutants": "directions.planted_defects",
-        "samples": "directions.bsdf_samples",
-        "sweep": "directions.sweep",
-        "search": "directions.search",
-    },
-    "stability": {
-        "stability": "stability.optical_chains",
-        "energy": "stability.energy",
-        "derivatives": "stability.derivatives",
-        "paths": "stability.layered_paths",
-    },
-    "renders": {
-        "scenes": "renders.scene_needs",
-        "renders": "renders.against_dielectric",
-        "features": "renders.unused_features",
-    },
-    "efficiency": {"efficiency": "efficiency.error_against_time", "scaling": "efficiency.scaling"},
-    "planar": {
-        "planar": "planar.against_retrace",
-        "planar_closed": "planar.closed_paths",
-        "extrusion": "planar.extruded_scenes",
-        "planar_times": "planar.times",
-    },
-    "gate": {"gate": "diff.planted_defects", "diff_times": "diff.times"},
-    "truth": {"truth": "ground_truth.traced_bodies"},
-    "suite": {"matrix": "suite.matrix", "per_ray": "suite.per_ray", "images": "suite.rendered_images"},
+import typer
+
+from validation.run import command_line
+
+if TYPE_CHECKING:
+    from validation.study import Study
+
+# By name on the command line: the room, and the modules in it whose STUDY is run, in the order of the report.
+ROOMS = {
+    "directions": ("directions", ("per_formula", "planted_defects", "bsdf_samples", "sweep", "search")),
+    "stability": ("stability", ("optical_chains", "energy", "derivatives", "layered_paths")),
+    "renders": ("renders", ("scene_needs", "against_dielectric", "unused_features")),
+    "efficiency": ("efficiency", ("error_against_time", "scaling")),
+    "planar": ("planar", ("against_retrace", "closed_paths", "extruded_scenes", "times")),
+    "diff": ("diff", ("planted_defects", "times")),
+    "ground-truth": ("ground_truth", ("traced_bodies",)),
+    "suite": ("suite", ("matrix", "per_ray", "rendered_images")),
 }
+# What the profile `quick` runs where no study is named.
+QUICK = (
+    "directions.per_formula",
+    "directions.bsdf_samples",
+    "stability.optical_chains",
+    "stability.layered_paths",
+    "renders.against_dielectric",
+    "planar.against_retrace",
+    "diff.planted_defects",
+)
+PROFILES = {"quick": "seconds", "standard": "minutes", "full": "hours"}
+
+app = command_line.application()
 
 
 def main(arguments: list[str] | None = None) -> int:
+    """Run the command line, or `arguments`; the exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments[:1] == ["renderers"]:
         from validation.suite.renderers import command
 
         return command.main(arguments[1:])
-    options = _parser().parse_args(arguments)
+    return command_line.exit_code(app, "validation", arguments)
+
+
+@app.command(epilog="`python -m validation renderers` lists and installs other renderers.")
+def _command(
+    studies: Annotated[
+        list[str] | None, typer.Argument(metavar="STUDY", help=f"Of {', '.join(ROOMS)}; all by default.")
+    ] = None,
+    profile: Annotated[
+        str, typer.Option(help=f"How much is measured: {', '.join(f'{k} ({v})' for k, v in PROFILES.items())}.")
+    ] = "quick",
+    out: Annotated[Path, typer.Option(help="Folder of the report.")] = Path("out"),
+    write_tables: Annotated[
+        bool, typer.Option("--write-tables", help="Write the tables of the READMEs and the gallery, too.")
+    ] = False,
+    goals: Annotated[bool, typer.Option("--goals", help="Print the goals of timing, too.")] = False,
+) -> int:
+    """Measure the formulas and the plugin against certified answers, and write the report."""
     try:
-        _check(options)
-    except (ValueError, OSError) as error:
-        print(f"validation: {error}", file=sys.stderr)
-        return 2
-    try:
-        return _run(options)
+        _check(studies or [], profile, out, write_tables)
+        return _run(studies or [], profile, out, write_tables, goals)
     except KeyboardInterrupt:
         print("validation: interrupted; the same command goes on from here", file=sys.stderr)
         return 130
-    except (OSError, ImportError) as error:  # anything else is a defect of ours, and keeps its traceback
-        print(f"validation: {error}", file=sys.stderr)
-        return 2
+    except (Misuse, OSError, ImportError) as error:  # anything else is a defect of ours, and keeps its traceback
+        return command_line.misuse("validation", str(error))
 
 
-class _OneLine(argparse.ArgumentParser):
-    def error(self, message: str) -> None:  # type: ignore[override]
-        self.exit(2, f"{self.prog}: {message}\n")
+class Misuse(ValueError):
+    """What was asked for cannot be done; one line."""
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = _OneLine(prog="validation", description="Measure the formulas and the plugin; write the report.")
-    parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"of {', '.join(STUDIES)}; all by default")
-    parser.add_argument("--profile", default="quick", choices=("quick", "full"), help="minutes, or hours")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder of the report (default: out)")
-    parser.add_argument("--readme", type=Path, help="write the tables and the gallery of this Markdown file, too")
-    return parser
-
-
-def _check(options: argparse.Namespace) -> None:
-    unknown = [name for name in options.studies if name not in STUDIES]
-    if unknown:
-        raise ValueError(f"unknown study {unknown[0]!r}; accepted: {', '.join(STUDIES)}")
+def _check(studies: list[str], profile: str, out: Path, write_tables: bool) -> None:
+    if unknown := [name for name in studies if name not in ROOMS]:
+        raise Misuse(f"unknown study {unknown[0]!r}; accepted: {', '.join(ROOMS)}")
+    if profile not in PROFILES:
+        raise Misuse(f"unknown profile {profile!r}; accepted: {', '.join(PROFILES)}")
+    if write_tables and profile == "quick":
+        raise Misuse("--write-tables with the profile 'quick'; accepted: --profile standard, --profile full")
     try:
-        options.out.mkdir(parents=True, exist_ok=True)
+        out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OSError(f"--out {options.out}: {error.strerror}; accepted: a writable folder") from None
-    if not os.access(options.out, os.W_OK):
-        raise PermissionError(f"{options.out}: not writable")
+        raise Misuse(f"--out {out}: {error.strerror}; accepted: a writable folder") from None
+    if not os.access(out, os.W_OK):
+        raise Misuse(f"--out {out}: not writable; accepted: a writable folder")
 
 
-def _run(options: argparse.Namespace) -> int:
+def modules(studies: list[str], profile: str) -> list[str]:
+    """Names of the modules below `validation` whose studies are run."""
+    if profile == "quick" and not studies:
+        return list(QUICK)
+    chosen = [ROOMS[name] for name in studies or ROOMS]
+    return list(dict.fromkeys(f"{room}.{module}" for room, members in chosen for module in members))
+
+
+def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: bool) -> int:
     from mi_refract import backend
     from mi_refract.report import run_report
-    from validation.run.context import PROFILES, SCALAR_PROFILES, Context
+    from validation.run.context import Context, profiles
 
-    from . import headline, readme_tables, runner
+    from . import headline, runner
 
     start = time.perf_counter()
     variant = backend.activate(may_restart=True)
     print(f"validation: {backend.summary()}", file=sys.stderr)
-    profiles = SCALAR_PROFILES if variant.startswith("scalar") else PROFILES
-    context = Context(profiles[options.profile], options.out, variant, backend.detect(), backend.usable_variants())
-    modules = {name: module for study in options.studies or STUDIES for name, module in STUDIES[study].items()}
-    studies: dict[str, ModuleType] = {name: import_module(f"validation.{module}") for name, module in modules.items()}
-    rows = runner.run([task for study in studies.values() for task in study.tasks(context)], context)
-    for study in studies.values():
-        rows = study.with_summary(rows) if hasattr(study, "with_summary") else rows
+    tables = _tables(names) if write_tables else None
+    chosen = profiles(variant)[profile]
+    context = Context(chosen, out, variant, backend.detect(), backend.usable_variants())
+    studies: list[Study] = [import_module(f"validation.{name}").STUDY for name in modules(names, profile)]
+    rows, spent = runner.run([task for study in studies for task in study.tasks(context)], context)
+    for study in studies:
+        rows = study.summarise(rows)
     described = runner.describe(context, time.perf_counter() - start)
-    described["studies"] = {
-        name: {"title": study.TITLE, "text": " ".join(study.TEXT.split()), "terms": study.TERMS}
-        | ({"axes": study.AXES} if hasattr(study, "AXES") else {})
-        for name, study in studies.items()
-    }
-    described["scatter"] = [scatter for study in studies.values() for scatter in getattr(study, "SCATTER", [])]
-    described["first_page"] = headline.first_page(rows, context.profile.name)
-    run_report.write_json(options.out / "rows.json", rows, described)
-    run_report.write_junit(options.out / "junit.xml", rows, described)
-    run_report.write_html(options.out / "report.html", rows, described, options.out)
-    if options.readme:
-        readme_tables.update(options.readme, rows, context)
+    described["replay"] = " ".join(["python -m validation", *names, f"--profile {profile}"])
+    described["studies"] = {study.name: study.described for study in studies}
+    described["scatter"] = [scatter for study in studies for scatter in study.scatter]
+    described["tasks"] = spent
+    described["first_page"] = headline.first_page(rows, profile)
+    run_report.write_json(out / "rows.json", rows, described)
+    run_report.write_junit(out / "junit.xml", rows, described)
+    run_report.write_html(out / "report.html", rows, described, out)
+    if tables:
+        tables.write(rows, context, names)
     runner.forget(context)
-    _print_summary(run_report.summary(rows, described), options.out / "report.html")
+    parts = [run_report.summary(rows, described), *([run_report.goals_table(rows)] if goals else [])]
+    _print(parts, out / "report.html")
     return 1 if any(row.verdict == "fail" for row in rows) else 0
 
 
-def _print_summary(summary: Any, page: Path) -> None:
+def _tables(names: list[str]) -> ModuleType:
+    """The module that writes them, imported and checked before the run."""
+    from . import readme_tables
+
+    try:
+        readme_tables.check(names)
+    except ValueError as error:
+        raise Misuse(str(error)) from None
+    return readme_tables
+
+
+def _print(parts: list[Any], page: Path) -> None:
     from rich.console import Console
 
     console = Console()
-    console.print(summary)
+    for part in parts:
+        console.print(part)
     console.print(f"report: {page}", highlight=False)
 
 

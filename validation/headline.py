@@ -13,16 +13,26 @@ from collections.abc import Iterable, Sequence
 from mi_refract.report.first_page import NOT_RUN, Answer, FirstPage, ShownImage, ShownPlot, not_run
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
+from validation.run.metrics import (
+    CHANGED_SHARE,
+    EQUAL_TIME,
+    ERROR_OVER_BOUND,
+    MEANS_DIFFER,
+    MISCLASSIFIED,
+    MISCLASSIFIED_FAR,
+    WELCH_ALARMS,
+    WORST_ANGLE,
+    WORST_IN_U,
+    WRONG_PATH,
+)
 
-# Names of studies, cases and metrics that the sentences are made of.
+# Names of studies, cases and metrics that the sentences are made of; studies are named without importing them.
 DIRECTIONS, EVERYTHING, COMMON, SINGLE, DOUBLE = "directions", "all regimes", "generic", "float32", "float64"
-ANGLE, ROUNDOFFS, MISJUDGED, FAR = "worst rad", "worst / u", "misjudged", "misjudged far"
 OURS, BUILTIN_FORMULA = ("compensated", "promoted"), "mi.fresnel + mi.refract"
-TRUTH, BOUNDED = "truth", "error / bound"
-RENDERS, PLUGIN, BUILTIN = "renders", "refract", "dielectric"
-TIME, CHANGED, MEANS, ALARMS = "time / dielectric", "changed share", "|mean ratio − 1|", "Welch alarms"
-EFFICIENCY, INTEGRATOR, EQUAL_TIME, METHODS = "efficiency", "refract_path", "equal-time MSE", "every method"
-PATHS, MIRAGE, ASTRAY, ROUNDED = "paths", "mirage", "astray", "exact, indices in float32"
+GROUND_TRUTH, RENDERS, EFFICIENCY, PATHS = "ground_truth", "renders", "efficiency", "paths"
+PLUGIN, BUILTIN, INTEGRATOR, METHODS = "refract", "dielectric", "refract_path", "every method"
+TIME = "time / dielectric"
+MIRAGE, ROUNDED = "mirage", "exact, indices in float32"
 LAYERS, SHALLOW = 1000, "89.55°"
 INDICES, CONTRASTS = (f"mirage askew, {LAYERS} layers, {given}" for given in ("indices", "contrasts"))
 RENDERERS, QUICK = "other renderers", "quick"
@@ -76,22 +86,28 @@ def _overall(rows: Sequence[Row], precision: str, case: str = EVERYTHING) -> dic
     found: dict[str, Row] = {}
     for kind in ("llvm", "cuda", "scalar"):
         for row in rows:
-            if (row.study, row.case, row.setting) == (DIRECTIONS, case, f"{kind} {precision}") and ANGLE in row.values:
+            if (row.study, row.case, row.setting) == (
+                DIRECTIONS,
+                case,
+                f"{kind} {precision}",
+            ) and WORST_ANGLE in row.values:
                 found.setdefault(row.subject, row)
     return found
 
 
 def _right(rows: Sequence[Row]) -> Answer:
     question = "Is `refract` right?"
-    measured = [row for row in rows if row.study in (DIRECTIONS, TRUTH) and row.subject in (*OURS, PLUGIN)]
+    measured = [row for row in rows if row.study in (DIRECTIONS, GROUND_TRUTH) and row.subject in (*OURS, PLUGIN)]
     sentences = []
     overall = _overall(rows, SINGLE) or _overall(rows, DOUBLE)
     if best := [overall[name] for name in OURS if name in overall]:
         sentences.append(_direction_sentence(best))
-    truth = [row for row in rows if row.study == TRUTH and row.subject == PLUGIN and BOUNDED in row.values]
+    truth = [
+        row for row in rows if row.study == GROUND_TRUTH and row.subject == PLUGIN and ERROR_OVER_BOUND in row.values
+    ]
     if truth:
         bodies = len({row.case for row in truth})
-        kept = all(row.values[BOUNDED] <= 1 for row in truth)
+        kept = all(row.values[ERROR_OVER_BOUND] <= 1 for row in truth)
         stay = "all its rays stay within" if kept else "some of its rays leave"
         sentences.append(
             f"Through {bodies} bodies with a known answer, from a prism to a camera lens, {stay} their error bounds."
@@ -103,14 +119,14 @@ def _right(rows: Sequence[Row]) -> Answer:
 
 def _direction_sentence(best: Sequence[Row]) -> str:
     rays = max(row.replay.get("rays", 0) for row in best)
-    angle, roundoffs = (max(row.values[metric] for row in best) for metric in (ANGLE, ROUNDOFFS))
-    misjudged, far = (max(row.values[metric] for row in best) for metric in (MISJUDGED, FAR))
+    angle, roundoffs = (max(row.values[metric] for row in best) for metric in (WORST_ANGLE, WORST_IN_U))
+    misclassified, far = (max(row.values[metric] for row in best) for metric in (MISCLASSIFIED, MISCLASSIFIED_FAR))
     rounding = ", no more than rounding the exact answer costs" if roundoffs <= 1 else ""
     among = f"Over {rays:,} rays, the hardest known among them"
     sentence = f"{among}, its direction is off by at most {_degrees(angle)}{rounding}."
     if far:
         return f"{sentence} It mistakes total internal reflection on {far:.0f} of them."
-    close = f", but for {misjudged:.0f} too close to the critical angle to tell" if misjudged else ""
+    close = f", but for {misclassified:.0f} too close to the critical angle to tell" if misclassified else ""
     return f"{sentence} Total internal reflection is decided rightly on all{close}."
 
 
@@ -121,7 +137,7 @@ def _trusted(rows: Sequence[Row]) -> Answer:
     ours = [name for name in OURS if name in single and name in double]
     if ours:
         names = " and ".join(f"`{name}`" for name in ours)
-        angles = [_degrees(max(found[name].values[ANGLE] for name in ours)) for found in (single, double)]
+        angles = [_degrees(max(found[name].values[WORST_ANGLE] for name in ours)) for found in (single, double)]
         ends = f"to {angles[0]} in single precision and {angles[1]} in double"
         sentences.append(f"{names}, which are this project's own, everywhere: {ends}.")
     textbook = [row for name, row in single.items() if name not in (*OURS, BUILTIN_FORMULA)]
@@ -132,11 +148,11 @@ def _trusted(rows: Sequence[Row]) -> Answer:
 
 def _textbook_sentence(textbook: Sequence[Row], common: dict[str, Row]) -> str:
     """How far the documented formulas are off for glass at common angles, and on the hard rays."""
-    usual = [common[row.subject].values[ANGLE] for row in textbook if row.subject in common]
-    worst = max(textbook, key=lambda row: row.values[ANGLE])
-    wrong = [100 * row.values[MISJUDGED] / row.replay["rays"] for row in textbook if row.replay.get("rays")]
+    usual = [common[row.subject].values[WORST_ANGLE] for row in textbook if row.subject in common]
+    worst = max(textbook, key=lambda row: row.values[WORST_ANGLE])
+    wrong = [100 * row.values[MISCLASSIFIED] / row.replay["rays"] for row in textbook if row.replay.get("rays")]
     good = f"are good to {_degrees(max(usual))} for glass at common angles, but " if usual else ""
-    sentence = f"The {len(textbook)} textbook formulas {good}err by up to {_degrees(worst.values[ANGLE])}"
+    sentence = f"The {len(textbook)} textbook formulas {good}err by up to {_degrees(worst.values[WORST_ANGLE])}"
     sentence += f" (`{worst.subject}`) on rays made to be hard"
     mistaken = f", and mistake total internal reflection on {_ends(wrong, 0)} % of these" if wrong else ""
     return f"{sentence}{mistaken}."
@@ -162,16 +178,16 @@ def _fast(rows: Sequence[Row]) -> Answer:
 
 
 def _differ(rows: Sequence[Row]) -> Answer:
-    compared = [row for row in rows if row.study == RENDERS and row.subject == PLUGIN and CHANGED in row.values]
-    differing = [row for row in compared if row.values.get(ALARMS)]
+    compared = [row for row in rows if row.study == RENDERS and row.subject == PLUGIN and CHANGED_SHARE in row.values]
+    differing = [row for row in compared if row.values.get(WELCH_ALARMS)]
     sentences = []
     if same := [row for row in compared if row not in differing]:
-        most = _percent(max(row.values[MEANS] for row in same))
+        most = _percent(max(row.values[MEANS_DIFFER] for row in same))
         nowhere = f"In {len(same)} of {len(compared)} scenes nowhere"
         sentences.append(
             f"{nowhere}: the means of the images differ by at most {most}, and no part differs beyond noise."
         )
-    sentences += [f"In `{row.case}`, {_percent(row.values[CHANGED])} of the pixels change." for row in differing]
+    sentences += [f"In `{row.case}`, {_percent(row.values[CHANGED_SHARE])} of the pixels change." for row in differing]
     paths = {row.subject: row for row in rows if row.study == PATHS and row.case == f"{MIRAGE}: path" and row.values}
     if PLUGIN in paths and BUILTIN in paths:
         sentences.append(_paths_sentence(paths))
@@ -184,7 +200,7 @@ def _differ(rows: Sequence[Row]) -> Answer:
 
 def _paths_sentence(paths: dict[str, Row]) -> str:
     """How many light paths through the mirage each plugin loses."""
-    lost = {name: row.values[ASTRAY] for name, row in paths.items()}
+    lost = {name: row.values[WRONG_PATH] for name, row in paths.items()}
     count = paths[PLUGIN].replay.get("rays", 0)
     right = (
         f"loses {lost[PLUGIN]:.0f} of {count} light paths" if lost[PLUGIN] else f"follows all {count} exact light paths"
@@ -239,9 +255,9 @@ def _image(rows: Sequence[Row]) -> ShownImage | None:
     pairs = [r for r in rows if r.study == RENDERS and r.subject == PLUGIN and {"reference", "test"} <= r.images.keys()]
     if not pairs:
         return None
-    row = max(pairs, key=lambda each: each.values.get(ALARMS, 0))
-    said = "the two differ" if row.values.get(ALARMS) else "the same up to noise"
-    if row.case == MIRAGE and row.values.get(ALARMS):
+    row = max(pairs, key=lambda each: each.values.get(WELCH_ALARMS, 0))
+    said = "the two differ" if row.values.get(WELCH_ALARMS) else "the same up to noise"
+    if row.case == MIRAGE and row.values.get(WELCH_ALARMS):
         said = f"`{PLUGIN}` keeps the edges that `{BUILTIN}` breaks into stairs"
     labels = {"reference": BUILTIN, "test": PLUGIN}
     return {"row": row.name, "labels": labels, "caption": f"Scene `{row.case}`: {said}."}

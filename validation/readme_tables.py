@@ -1,8 +1,14 @@
-"""What the README quotes: tables and the gallery, all from the rows of one run."""
+"""The tables of the READMEs and the gallery, all from the rows of one run.
+
+Rows are found by the names of studies and metrics that the studies themselves use: a label that is renamed fails here
+at import, not after the run.
+"""
 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,33 +22,80 @@ from mi_refract.io.pixels import srgb_encode
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
+from validation.directions import per_formula
+from validation.efficiency import error_against_time
+from validation.planar import against_retrace
+from validation.planar import times as planar_times
 from validation.reference.layered_scenes import MIRAGE
+from validation.renders import against_dielectric
 from validation.run.array_settings import PLAIN
 from validation.run.context import SCENES, Context
+from validation.run.metrics import (
+    CHANGED_SHARE,
+    DETECTABLE,
+    EQUAL_TIME,
+    EQUAL_TIME_DEFAULTS,
+    ERROR_OVER_BOUND,
+    MEANS_DIFFER,
+    MISCLASSIFIED,
+    SMALLEST_P,
+    TIME_OVER_BUILTIN,
+    TIME_OVER_COPY,
+    TIME_OVER_PLAIN,
+    WORST_CHORD,
+    WORST_IN_U,
+    WRONG_PATH,
+    high,
+    low,
+)
+from validation.stability import layered_paths
+from validation.suite import matrix
 
-from .suite import matrix
-
+ROOT = SCENES.parent
 GALLERY = SCENES / "gallery.png"
-COLUMNS = 6
+GALLERY_COLUMNS = 6
 
 
-def update(path: Path, rows: list[Row], context: Context) -> None:
-    """Write the tables between their markers in `path`, and the gallery beside the scenes.
+@dataclass(frozen=True)
+class Table:
+    """Where a table is written, between its markers; `study` is what must be run for it, by its command-line name."""
 
-    A run of nothing but the suite writes the table of other renderers, any other run all the rest. ValueError where a
-    marker is missing or the run has not measured what the README quotes.
+    path: str
+    study: str
+    make: Callable[[list[Row]], str]
+
+
+def check(studies: list[str]) -> None:
+    """ValueError, one line, where a file or a marker of the tables of these studies is missing."""
+    for marker, table in chosen(studies).items():
+        path = ROOT / table.path
+        text = path.read_text() if path.is_file() else ""
+        if f"<!-- begin: {marker} -->" not in text or f"<!-- end: {marker} -->" not in text:
+            raise ValueError(
+                f"{path}: no markers '<!-- begin: {marker} -->' and '<!-- end: {marker} -->' for its table"
+            )
+
+
+def chosen(studies: list[str]) -> dict[str, Table]:
+    """The tables of these studies. Without any: all but that of other renderers, which needs them installed."""
+    return {m: t for m, t in TABLES.items() if (t.study in studies if studies else t.study != "suite")}
+
+
+def write(rows: list[Row], context: Context, studies: list[str]) -> None:
+    """Write the tables of the studies that were run, and the gallery where scenes were rendered.
+
+    ValueError where a marker is missing, or the run has not measured what a table holds.
     """
-    if {row.study for row in rows} <= {matrix.STUDY, *matrix.CHECKS}:
-        update_between(path, "suite", suite(rows))
-        return
-    for marker, table in TABLES.items():
-        update_between(path, marker, table(rows))
-    write_atomically(GALLERY, gallery(rows, context))
+    for marker, table in chosen(studies).items():
+        update_between(ROOT / table.path, marker, table.make(rows))
+    if any(row.study == against_dielectric.NAME and row.images for row in rows):
+        write_atomically(GALLERY, gallery(rows, context))
 
 
 def accuracy(rows: list[Row]) -> str:
-    """Markdown: worst error over all regimes and misjudged rays by formula, in float32 and float64, and the times."""
-    found = {(r.subject, r.setting): r for r in rows if r.case == "all regimes" and "worst chord" in r.values}
+    """Markdown: by formula the worst error over all regimes, misclassified rays and times, in float32 and float64."""
+    summaries = [r for r in rows if r.study == per_formula.NAME and r.case == per_formula.ALL]
+    found = {(r.subject, r.setting): r for r in summaries if WORST_CHORD in r.values}
     subjects = list(dict.fromkeys(subject for subject, setting in found if setting in ACCURACY))
     if not subjects:
         raise ValueError("README: no directions were measured on LLVM; its accuracy table needs them")
@@ -71,32 +124,32 @@ def _table(text: str, heading: list[str], rows: list[list[str]]) -> str:
 
 
 def _with_interval(row: Row, metric: str) -> str:
-    ends = [compact(row.values[end]) for end in (f"{metric}, low", f"{metric}, high") if end in row.values]
+    ends = [compact(row.values[end]) for end in (low(metric), high(metric)) if end in row.values]
     return compact(row.values[metric]) + (f" ({'–'.join(ends)})" if ends else "")
 
 
 ACCURACY = {
     "llvm float32": {
-        "worst chord": "worst chord",
-        "in u": "worst / u",
-        "misjudged": "misjudged",
-        "time / copy": "time / copy",
-        "time / plain": "time / plain",
+        "worst chord": WORST_CHORD,
+        "in u": WORST_IN_U,
+        "TIR misclassified": MISCLASSIFIED,
+        "time / copy": TIME_OVER_COPY,
+        "time / plain": TIME_OVER_PLAIN,
     },
-    "llvm float64": {"worst chord": "worst chord", "in u": "worst / u", "time / copy": "time / copy"},
+    "llvm float64": {"worst chord": WORST_CHORD, "in u": WORST_IN_U, "time / copy": TIME_OVER_COPY},
 }
 RENDERS = {
-    "changed share": "pixels changed",
-    "|mean ratio − 1|": "means differ by",
-    "smallest p, adjusted": "Welch, smallest p",
-    "detectable difference": "detectable",
-    "time / dielectric": "time",
+    CHANGED_SHARE: "pixels changed",
+    MEANS_DIFFER: "means differ by",
+    SMALLEST_P: "Welch, smallest p",
+    DETECTABLE: "minimum detectable difference",
+    against_dielectric.TIME: "time",
 }
 
 
 def renders(rows: list[Row]) -> str:
     """Markdown: `refract` against `dielectric`, scene by scene."""
-    found = [row for row in rows if row.study == "renders" and row.subject == PLUGIN and row.values]
+    found = [row for row in rows if row.study == against_dielectric.NAME and row.subject == PLUGIN and row.values]
     if not found:
         raise ValueError("README: no scene was rendered; its table needs them")
     replay = found[0].replay
@@ -109,16 +162,16 @@ def renders(rows: list[Row]) -> str:
 
 
 PATHS = {
-    "astray": "astray",
-    "median direction": "direction, median",
-    "direction": "direction, worst",
-    "place": "place, worst",
+    WRONG_PATH: "wrong path",
+    layered_paths.MEDIAN_DIRECTION: "direction, median",
+    layered_paths.DIRECTION: "direction, worst",
+    layered_paths.PLACE: "place, worst",
 }
 
 
 def paths(rows: list[Row]) -> str:
     """Markdown: the paths through the mirage, of every plugin and of exact arithmetic with rounded indices."""
-    found = [row for row in rows if row.study == "paths" and row.values.keys() >= PATHS.keys()]
+    found = [row for row in rows if row.study == layered_paths.NAME and row.values.keys() >= PATHS.keys()]
     found = [row for row in found if row.replay["scene"] == f"{MIRAGE.scene}.xml"]
     if not found:
         raise ValueError("README: no paths were traced; its table needs a compiled variant")
@@ -133,15 +186,15 @@ def paths(rows: list[Row]) -> str:
 
 
 EFFICIENCY = {
-    "time / built-in": "time",
-    "equal-time MSE": "MSE at equal time",
-    "equal-time MSE / independent": "… over its defaults",
+    TIME_OVER_BUILTIN: "time",
+    EQUAL_TIME: "MSE at equal time",
+    EQUAL_TIME_DEFAULTS: "… over its defaults",
 }
 
 
 def efficiency(rows: list[Row]) -> str:
     """Markdown: every method on the scenes that were measured, over the built-in with the same sampler."""
-    found = [row for row in rows if row.study == "efficiency" and row.values.keys() >= EFFICIENCY.keys()]
+    found = [row for row in rows if row.study == error_against_time.NAME and row.values.keys() >= EFFICIENCY.keys()]
     if not found:
         raise ValueError("README: no efficiency was measured; its table needs a compiled variant")
     replay = found[0].replay
@@ -156,40 +209,42 @@ def efficiency(rows: list[Row]) -> str:
 
 def planar(rows: list[Row]) -> str:
     """Markdown: scene by scene how far paths are from the retrace, and what a path costs by the number of segments."""
-    found = {(r.study, r.subject, r.case, r.setting): r for r in rows if r.values}
-    cells, times = [], []
-    for _, _, case, setting in (key for key in found if key[:2] == ("planar", "trace")):
-        exact, narrow = (found.get(("planar", "trace", case, f"llvm {p}")) for p in ("float64", "float32"))
-        if setting == "llvm float64" and exact and narrow:
-            most = f"{exact.values['boundaries']:.0f}"
-            cells.append(
-                [
-                    f"`{case}`",
-                    str(exact.replay["rays"]),
-                    most,
-                    compact(exact.values["difference"]),
-                    compact(narrow.values["difference"]),
-                    compact(narrow.values["error / bound"]),
-                ]
-            )
-    for _, subject, case, setting in (key for key in found if key[0] == "planar_times"):
-        if subject == "mesh" and setting == "llvm float32":
-            columns = [("mesh", "float32"), ("mesh", "float64"), ("mesh, shuffled", "float32"), ("brute", "float32")]
-            timed = [found.get(("planar_times", name, case, f"llvm {p}")) for name, p in columns]
-            times.append([case, *(_with_interval(row, "µs per path") if row else "–" for row in timed)])
-    if not cells or not times:
+    retraced, timed = _planar_errors(rows), _planar_times(rows)
+    if not retraced or not timed:
         raise ValueError("README: no planar paths were traced on LLVM; its tables need them")
-    heading = ["scene", "rays", "boundaries", "float64: off by", "float32: off by", "over its bound"]
+    columns = ["float32", "float64", "float32, rays shuffled", "float32, every segment tried"]
+    errors = ["scene", "rays", "boundaries", "float64: error", "float32: error", "error / bound"]
     return "\n\n".join(
         [
-            _table("Largest distance from an independent retrace, over the scene's extent, on LLVM.", heading, cells),
-            _table(
-                "µs per path of two boundaries, with 95 % intervals.",
-                ["segments", "float32", "float64", "float32, rays shuffled", "float32, every segment tried"],
-                times,
-            ),
+            _table("Largest distance from an independent retrace, over the scene's extent, on LLVM.", errors, retraced),
+            _table("µs per path of two boundaries, with 95 % intervals.", ["segments", *columns], timed),
         ]
     )
+
+
+def _planar_errors(rows: list[Row]) -> list[list[str]]:
+    study = against_retrace
+    found = {(r.case, r.setting): r for r in rows if r.study == study.NAME and r.subject == study.TRACE and r.values}
+    lines = []
+    for case in dict.fromkeys(case for case, _ in found):
+        exact, narrow = (found.get((case, f"llvm {precision}")) for precision in ("float64", "float32"))
+        if exact and narrow:
+            most, rays = f"{exact.values[study.BOUNDARIES]:.0f}", str(exact.replay["rays"])
+            errors = [compact(row.values[study.DIFFERENCE]) for row in (exact, narrow)]
+            lines.append([f"`{case}`", rays, most, *errors, compact(narrow.values[ERROR_OVER_BOUND])])
+    return lines
+
+
+def _planar_times(rows: list[Row]) -> list[list[str]]:
+    study = planar_times
+    found = {(r.subject, r.case, r.setting): r for r in rows if r.study == study.NAME and r.values}
+    columns = [(study.MESH, "float32"), (study.MESH, "float64"), (study.SHUFFLED, "float32"), (study.BRUTE, "float32")]
+    lines = []
+    for subject, case, setting in found:
+        if (subject, setting) == (study.MESH, "llvm float32"):
+            timed = [found.get((name, case, f"llvm {precision}")) for name, precision in columns]
+            lines.append([case, *(_with_interval(row, study.PER_PATH) if row else "–" for row in timed)])
+    return lines
 
 
 def seen(rows: list[Row]) -> str:
@@ -228,7 +283,7 @@ def suite(rows: list[Row]) -> str:
     """Markdown: how far every system is off at most, check by check."""
     cells: dict[str, dict[str, Row]] = {}
     for row in rows:
-        if row.study == matrix.STUDY:
+        if row.study == matrix.NAME:
             cells.setdefault(row.subject, {})[row.case] = row
     if not any(row.values for each in cells.values() for row in each.values()):
         raise ValueError("README: no other renderer was run; its table needs some")
@@ -253,12 +308,13 @@ def _percent(shares: list[float], digits: int = 0) -> str:
 
 
 TABLES = {
-    "accuracy": accuracy,
-    "renders": renders,
-    "paths": paths,
-    "efficiency": efficiency,
-    "planar": planar,
-    "gate": seen,
+    "accuracy": Table("README.md", "directions", accuracy),
+    "renders": Table("validation/README.md", "renders", renders),
+    "paths": Table("validation/README.md", "stability", paths),
+    "efficiency": Table("mi_refract/plugins/README.md", "efficiency", efficiency),
+    "planar": Table("mi_refract/planar/README.md", "planar", planar),
+    "defects": Table("mi_refract/image_diff/README.md", "diff", seen),
+    "suite": Table("validation/README.md", "suite", suite),
 }
 
 
@@ -266,20 +322,19 @@ def gallery(rows: list[Row], context: Context) -> bytes:
     """A PNG of every scene as `refract` rendered it, side by side; without the furnace, which is white when right."""
     import OpenImageIO as oiio
 
-    paths = [row.images["test"] for row in rows if row.study == "renders" and row.subject == PLUGIN]
+    paths = [row.images["test"] for row in rows if row.study == against_dielectric.NAME and row.subject == PLUGIN]
     tiles = [tile for path in paths if (tile := image_file.read_exr(context.out / path)[0]).std() > 1e-3]
     gap = np.ones((tiles[0].shape[0], 4, 3), np.float32)
     strips = []
-    for start in range(0, len(tiles), COLUMNS):
-        row = tiles[start : start + COLUMNS]
-        row += [np.ones_like(tiles[0])] * (COLUMNS - len(row))
+    for start in range(0, len(tiles), GALLERY_COLUMNS):
+        row = tiles[start : start + GALLERY_COLUMNS]
+        row += [np.ones_like(tiles[0])] * (GALLERY_COLUMNS - len(row))
         strip = [x for tile in row for x in (tile, gap)][:-1]
         strips += [np.concatenate(strip, axis=1), np.ones((4, sum(x.shape[1] for x in strip), 3), np.float32)]
-    linear = np.clip(np.concatenate(strips[:-1]), 0, 1)
-    encoded = srgb_encode(linear).astype(np.float32)
+    encoded = srgb_encode(np.concatenate(strips[:-1]).clip(0, 1)).astype(np.float32)
+    image = oiio.ImageBuf(np.ascontiguousarray(encoded))
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "gallery.png"
-        image = oiio.ImageBuf(np.ascontiguousarray(encoded))
         if not image.write(str(target), "uint8"):
             raise OSError(f"{target}: {image.geterror()}")
         return target.read_bytes()

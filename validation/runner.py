@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import platform
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -15,26 +17,40 @@ from typing import Any
 import mi_refract
 from mi_refract.io.atomic import write_atomically
 from mi_refract.report.row import Row
-from validation.run.context import SCENES, Context, Task
+from validation.run.context import SCENES, Context
+from validation.study import Task
 from validation.suite.renderers import SYSTEMS, environments
 
 
-def run(tasks: list[Task], context: Context) -> list[Row]:
-    """All rows, in the order of the tasks. KeyboardInterrupt passes, with the finished tasks kept."""
+def run(tasks: list[Task], context: Context) -> tuple[list[Row], list[dict[str, Any]]]:
+    """All rows, in the order of the tasks, and what each task took: its name, seconds, and seconds of all processors.
+
+    KeyboardInterrupt passes, with the finished tasks kept.
+    """
     store = context.out / "unfinished"
     store.mkdir(parents=True, exist_ok=True)
     fingerprint = _fingerprint(context)
     rows: list[Row] = []
+    spent: list[dict[str, Any]] = []
     with _progress(len(tasks)) as advance:
         for task in tasks:
             advance(task.name)
             kept = store / f"{hashlib.sha256((fingerprint + task.name).encode()).hexdigest()[:24]}.json"
-            found = _recall(kept)
-            if found is None:
-                found = task.run()
-                write_atomically(kept, json.dumps([row.as_dict() for row in found]))
-            rows += found
-    return rows
+            finished = _recall(kept)
+            if finished is None:
+                finished = _timed(task)
+                record = {"spent": finished[1], "rows": [row.as_dict() for row in finished[0]]}
+                write_atomically(kept, json.dumps(record))
+            rows += finished[0]
+            spent.append(finished[1])
+    return rows, spent
+
+
+def _timed(task: Task) -> tuple[list[Row], dict[str, Any]]:
+    start, processors = time.perf_counter(), sum(os.times()[:4])
+    rows = task.run()
+    seconds, cpu = time.perf_counter() - start, sum(os.times()[:4]) - processors
+    return rows, {"task": task.name, "seconds": round(seconds, 2), "CPU seconds": round(cpu, 2)}
 
 
 def forget(context: Context) -> None:
@@ -61,10 +77,11 @@ def _processor() -> str:
     return f"{len(names)} × {names[0]}" if names else platform.machine()
 
 
-def _recall(kept: Path) -> list[Row] | None:
-    """The rows of a finished task; None where there are none, or where they cannot be read."""
+def _recall(kept: Path) -> tuple[list[Row], dict[str, Any]] | None:
+    """The rows of a finished task and what it took; None where there are none, or where they cannot be read."""
     try:
-        return [Row.from_dict(data) for data in json.loads(kept.read_text())]
+        record = json.loads(kept.read_text())
+        return [Row.from_dict(data) for data in record["rows"]], dict(record["spent"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -74,7 +91,7 @@ def _fingerprint(context: Context) -> str:
     installed = [name for name, system in SYSTEMS.items() if not environments.absent(system)]
     digest = hashlib.sha256(repr((context.profile, context.variant, installed, describe(context, 0))).encode())
     ours, here = Path(mi_refract.__file__).parent, Path(__file__).parent
-    sources = [ours.rglob("*.py"), here.rglob("*.py"), here.glob("*.json"), SCENES.rglob("*")]
+    sources = [ours.rglob("*.py"), here.rglob("*.py"), here.rglob("*.json"), SCENES.rglob("*")]
     for path in sorted(path for group in sources for path in group if path.is_file()):
         digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -22,7 +22,7 @@ Flags = NDArray[np.bool_]
 # In u: what making `a` and `n` unit in their own precision leaves of errors, with those of the components.
 NORMALISING = 3.0
 # The most that `Judgement.values` may be.
-BUDGETS = {"error / bound": 1.0, "misjudged far": 0.0}
+BUDGETS = {"error / bound": 1.0, "TIR misclassified, beyond its bound": 0.0}
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ class Judgement:
 
     def values(self) -> dict[str, float]:
         """The worst of all rays; within the bounds where each is at most that of BUDGETS."""
-        return {"error / bound": float(self.share.max()), "misjudged far": float(self.far.sum())}
+        return {"error / bound": float(self.share.max()), "TIR misclassified, beyond its bound": float(self.far.sum())}
 
 
 def judge_formula(

@@ -7,18 +7,23 @@ known to that variant by the names `PLUGIN`, `PLUGIN_<formula>` and `INTEGRATOR`
 
 from typing import Any
 
-from . import refract, refract_path
-from .refract import PLUGIN, read_ior
-from .refract_path import INTEGRATOR
-from .scene_features import SceneFeatures, inspect
-
-__all__ = ["INTEGRATOR", "PLUGIN", "SceneFeatures", "inspect", "read_ior", "register"]
-
 
 def register(variant: Any) -> None:
     """Make `refract`, `refract_<formula>` and `refract_path` known to one variant, given its module.
 
     Registering again is harmless. Registration is lost when the variant is switched: `mi_refract` repeats it then.
     """
+    from . import refract, refract_path
+
     refract.register(variant)
     refract_path.register(variant)
+
+
+# Importing Mitsuba calls `register`, which must be there; the modules below need Mitsuba.
+import mitsuba  # noqa: E402, F401
+
+from .refract import PLUGIN, read_ior  # noqa: E402
+from .refract_path import INTEGRATOR  # noqa: E402
+from .scene_features import SceneFeatures, inspect  # noqa: E402
+
+__all__ = ["INTEGRATOR", "PLUGIN", "SceneFeatures", "inspect", "read_ior", "register"]

@@ -1,4 +1,4 @@
-"""What the forms at the rounding limit rest on: the error of the radicand, and lengths brought near 1."""
+"""What the forms at the rounding limit rest on: the error of the radicand."""
 
 from fractions import Fraction
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mi_refract.formulas import well_conditioned
-from mi_refract.numerics import DoubleWord, TripleWord, error_free, scale_to_unit
+from mi_refract.numerics import DoubleWord, TripleWord, error_free
 
 COUNT = {"scalar": 40, "llvm": 400, "cuda": 400}
 # k of three kinds: the critical angle far from both ends, at grazing, and at almost normal incidence.
@@ -28,7 +28,7 @@ def near_critical(kind, count, precision):
 
 
 def each_ray(setting, function, a, n, k):
-    """`function(a, n, k)`, a Double, as exact fractions, ray by ray."""
+    """`function(a, n, k)`, a double word, as exact fractions, ray by ray."""
     if setting.backend == "scalar":
         found = [function(setting.vector(x), setting.vector(y), float(z)) for x, y, z in zip(a, n, k, strict=True)]
         return [Fraction(float(x.hi)) + Fraction(float(x.lo)) for x in found]
@@ -84,28 +84,3 @@ def test_the_radicand_keeps_what_its_inequalities_say(kind, setting):
 @pytest.mark.parametrize("mutant", [radicand_of_plain_contrast, radicand_of_plain_cosine, radicand_of_the_second_order])
 def test_a_term_of_the_radicand_that_loses_its_low_parts_is_seen(mutant, setting):
     assert largest_error(mutant, "critical", setting) > 1e3
-
-
-LENGTHS = [1e-18, 3e-7, 1.0, 1.9999999, 2.0, 5e9, 1e18]
-
-
-@pytest.mark.parametrize("length", LENGTHS)
-def test_lengths_are_brought_near_one_by_a_power_of_two(length, vectorised):
-    v = vectorised.vector(*(length * x for x in (0.6, -0.7, 0.1)))
-    dr.make_opaque(v)
-    scaled, power = scale_to_unit(v)
-    assert (np.array(scaled * power) == np.array(v)).all()
-    if vectorised.name == "float32":
-        assert 1 <= np.abs(np.array(scaled)).max() < 2
-        mantissa, _ = np.frexp(float(np.array(power).ravel()[0]))
-        assert mantissa == 0.5
-    else:
-        assert power == 1
-
-
-@pytest.mark.parametrize("bad", [0.0, np.nan, np.inf, -np.inf])
-def test_what_has_no_length_is_not_given_one(bad, vectorised):
-    v = vectorised.vector(bad, 0.0, 0.0)
-    dr.make_opaque(v)
-    scaled = np.array(scale_to_unit(v)[0]).ravel()
-    assert scaled[0] == 0 if bad == 0 else not np.isfinite(scaled).all()

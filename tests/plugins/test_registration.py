@@ -13,6 +13,11 @@ XML = '<scene version="3.0.0"><shape type="sphere"><bsdf type="refract"/></shape
 CASES = {
     "before any variant": f"import mitsuba as mi; import mi_refract; mi.set_variant('scalar_rgb'); {LOAD}",
     "before mitsuba": f"import mi_refract; import mitsuba as mi; mi.set_variant('scalar_rgb'); {LOAD}",
+    "after a search for mitsuba": (
+        "import mi_refract, importlib.util as u; assert u.find_spec('mitsuba') and u.find_spec('mitsuba.detail');"
+        f"import mitsuba as mi; mi.set_variant('scalar_rgb'); {LOAD}"
+    ),
+    "from a part of mitsuba": f"import mi_refract, mitsuba.detail; mi = mitsuba; mi.set_variant('scalar_rgb'); {LOAD}",
     "after a variant": f"import mitsuba as mi; mi.set_variant('scalar_rgb'); import mi_refract; {LOAD}",
     "between variants": (
         f"import mitsuba as mi; mi.set_variant('scalar_rgb'); import mi_refract; {LOAD};"

@@ -5,7 +5,6 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from mi_refract.numerics import float_expansions
 from mi_refract.regimes import REGIMES, make, normalised, radicand, radicand_and_gradient
 
 oracle = pytest.importorskip("mi_refract.oracle", reason="needs python-flint", exc_type=ImportError)
@@ -186,23 +185,6 @@ def test_the_radicand_in_sums_of_floats_is_right_to_its_bound(regime, precision)
         assert abs(sum(Fraction(float(x[i])) for x in c) - exact_c) <= bound * abs(exact_c)
         assert larger * Fraction(1, 2) <= Fraction(float(terms[i])) <= larger * Fraction(5, 2)
         assert [abs(x[i]) for x in d] == sorted((abs(x[i]) for x in d), reverse=True)
-
-
-def test_products_are_exact_and_quotients_are_long_divisions():
-    rng = np.random.default_rng(3)
-    x, y = rng.normal(size=(2, 200)) * np.exp2(rng.integers(-30, 30, (2, 200)))
-    p, e = float_expansions.two_prod(x, y)
-    q = float_expansions.quotient([x], [y], 3)
-    for i in range(200):
-        fx, fy = Fraction(float(x[i])), Fraction(float(y[i]))
-        assert Fraction(float(p[i])) + Fraction(float(e[i])) == fx * fy
-        assert abs(sum(Fraction(float(digit[i])) for digit in q) - fx / fy) <= 2**-150 * abs(fx / fy)
-
-
-def test_what_cancels_is_regained_and_the_largest_part_leads():
-    terms = [1.0, 2.0**-60, -1.0, 2.0**-80, -(2.0**-60), 2.0**-140]
-    assert float_expansions.distil(terms) == [2.0**-80, 2.0**-140, 0]
-    assert float_expansions.distil([0.5, -0.5, 0.0]) == [0, 0, 0]
 
 
 @pytest.mark.parametrize("j", range(7))

@@ -1,6 +1,8 @@
 """The validation sees planted defects, resumes what was interrupted, and refuses misuse in one line."""
 
 import dataclasses
+import importlib
+import math
 import re
 import types
 from pathlib import Path
@@ -10,17 +12,26 @@ import numpy as np
 import pytest
 
 from mi_refract import FORMULAS, oracle, regimes
+from mi_refract.accuracy import errors
+from mi_refract.image_diff import self_test
+from mi_refract.image_diff.methods import METHODS
+from mi_refract.image_diff.self_test import DEFECTS
 from mi_refract.plugins import refract as bsdf
 from mi_refract.report.row import Row
 from mi_refract.report.run_report import read_json
 from validation import __main__ as command
-from validation import readme_tables, runner
-from validation.directions import bsdf_samples, judge, per_formula
+from validation import limits, readme_tables, runner
+from validation.diff import planted_defects
+from validation.directions import bsdf_samples, per_formula
 from validation.renders import against_dielectric
 from validation.renders import scene_needs as scenes
 from validation.run import array_settings as settings
 from validation.run import render_methods
-from validation.run.context import SCENES, Task
+from validation.run.context import SCENES
+from validation.stability import layered_paths
+from validation.study import Study, Task
+from validation.suite.renderers import SYSTEMS
+from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
 
 @pytest.fixture
@@ -50,17 +61,17 @@ def test_errors_are_those_that_were_put_in():
     exact = oracle.refract(rays.a, rays.n, rays.k, progress=False)
     length = np.sqrt((rays.a.astype(np.longdouble) ** 2).sum(1))[:, None]
     direction = exact.direction.astype(np.longdouble) + exact.direction_low
-    chord, angle, drift = judge.errors(direction * length, rays, exact)
+    chord, angle, drift = errors(direction * length, rays, exact)
     assert max(chord.max(), angle.max(), drift.max()) < 1e-18
     across = np.cross(direction, np.roll(direction, 1, axis=1))
     across /= np.sqrt((across**2).sum(1))[:, None]
-    chord, angle, _ = judge.errors((direction + 1e-9 * across) * length, rays, exact)
+    chord, angle, _ = errors((direction + 1e-9 * across) * length, rays, exact)
     assert chord == pytest.approx(1e-9, rel=1e-6)
     assert angle == pytest.approx(1e-9, rel=1e-6)
-    chord, angle, drift = judge.errors(direction * 1.001 * length, rays, exact)
+    chord, angle, drift = errors(direction * 1.001 * length, rays, exact)
     assert (chord, drift) == (pytest.approx(1e-3), pytest.approx(1e-3))
     assert angle.max() < 1e-18
-    chord, _, _ = judge.errors(direction * np.nan, rays, exact)
+    chord, _, _ = errors(direction * np.nan, rays, exact)
     assert np.isinf(chord).all()
 
 
@@ -70,13 +81,13 @@ def test_directions_name_what_does_not_run_and_hold_what_does(context):
     absent = [s for s in settings.settings(context) if s.vector is None]
     assert all(row.verdict == "not run" and row.reason for s in absent for row in per_formula._setting_rows(context, s))
     worst = next(row for row in rows if row.subject == "promoted" and row.case == "critical")
-    assert {"error / bound", "misjudged far"} == set(worst.budgets)
+    assert {"error / bound", "TIR misclassified, beyond its bound"} == set(worst.budgets)
     assert len(worst.replay["largest error"]["a"]) == 3
 
 
 @pytest.mark.parametrize(("constant", "factor"), [("linear", 6), ("radicand", 6), ("linear", 1), ("linear", 0.2)])
 def test_a_budget_that_is_loose_or_too_tight_fails_the_full_sweep(constant, factor, context, monkeypatch):
-    monkeypatch.setattr(per_formula, "TWO_SIDED", 60)
+    monkeypatch.setattr(limits, "SLACK_FROM_RAYS", 60)
     formula = FORMULAS["decomposed"]
     off = dataclasses.replace(formula.budget, **{constant: factor * getattr(formula.budget, constant)})
     monkeypatch.setitem(FORMULAS, "decomposed", dataclasses.replace(formula, budget=off))
@@ -162,7 +173,9 @@ def test_an_interrupted_run_goes_on_where_it_stopped(context):
     first, last = Task("first", lambda: work("first")), Task("last", lambda: work("last"))
     with pytest.raises(KeyboardInterrupt):
         runner.run([first, Task("last", interrupt)], context)
-    assert runner.run([first, last], context) == [row(), row()]
+    rows, spent = runner.run([first, last], context)
+    assert rows == [row(), row()]
+    assert [(each["task"], each["CPU seconds"] >= 0) for each in spent] == [("first", True), ("last", True)]
     assert calls == ["first", "last"]
     other = dataclasses.replace(context, profile=dataclasses.replace(context.profile, rays=17))
     runner.run([first], other)
@@ -173,10 +186,9 @@ def test_an_interrupted_run_goes_on_where_it_stopped(context):
 
 
 def study(*rows):
-    def tasks(context):
-        return [Task("a task", lambda: list(rows))]
-
-    return types.SimpleNamespace(TITLE="A study", TEXT="", TERMS={}, tasks=tasks)
+    return types.SimpleNamespace(
+        STUDY=Study("directions", "A study", "What it asks.", {}, lambda context: [Task("a task", lambda: list(rows))])
+    )
 
 
 @pytest.mark.parametrize(("budget", "code"), [(1.0, 0), (0.4, 1), (float("nan"), 1)])
@@ -194,27 +206,55 @@ def test_the_exit_code_follows_the_budgets(tmp_path, monkeypatch, capsys, budget
     ("arguments", "words"),
     [
         (["refractions"], "unknown study 'refractions'; accepted: directions, stability, renders, efficiency, planar"),
-        (["--profile", "slow"], "invalid choice: 'slow'"),
-        (["--out", __file__], "File exists"),
-        (["--speed", "9"], "unrecognized arguments"),
+        (["--profile", "slow"], "unknown profile 'slow'; accepted: quick, standard, full"),
+        (["--out", __file__], "File exists; accepted: a writable folder"),
+        (["--speed", "9"], "No such option: --speed"),
+        (["--write-tables"], "--write-tables with the profile 'quick'; accepted: --profile standard, --profile full"),
+        (["renderers", "--install", "blender"], "unknown system 'blender'; accepted: mitsuba, pyglm"),
+        (["renderers", "--list", "--install", "pyglm"], "accepted: one of them"),
+        (["renderers", "pyglm"], "unexpected extra argument"),
     ],
 )
 def test_misuse_is_one_line_and_exit_code_2(arguments, words, capsys):
-    try:
-        code = command.main(arguments)
-    except SystemExit as stop:
-        code = stop.code
+    code = command.main(arguments)
     printed = capsys.readouterr().err
     assert code == 2
     assert words in printed
     assert len(printed.splitlines()) == 1
 
 
+def test_an_interruption_is_exit_code_130_and_says_how_to_go_on(tmp_path, monkeypatch, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "_run", interrupted)
+    assert command.main(["--out", str(tmp_path)]) == 130
+    assert "the same command goes on from here" in capsys.readouterr().err
+
+
+def test_every_study_is_in_a_room_and_has_rows_of_its_own():
+    names = [name for profile in command.PROFILES for name in command.modules([], profile)]
+    assert set(command.QUICK) < set(command.modules([], "standard")) == set(command.modules([], "full"))
+    root = Path(command.__file__).parent
+    modules = {str(p.relative_to(root).with_suffix("")).replace("/", ".") for p in root.glob("*/*.py")}
+    holding = {name for name in modules if "\nSTUDY = Study(" in (root / f"{name.replace('.', '/')}.py").read_text()}
+    assert holding == set(names)
+    studies = [importlib.import_module(f"validation.{name}").STUDY for name in sorted(holding)]
+    assert len({each.name for each in studies}) == len(studies)
+    assert all(each.title and each.text and each.terms for each in studies)
+
+
+def test_a_limit_is_a_number_with_a_reason():
+    table = limits.table()
+    assert len(table) > 50
+    assert [name for name, limit in table.items() if not (limit.reason and math.isfinite(limit) and limit > 0)] == []
+
+
 # The README ----------------------------------------------------------------------------------------------------
 
 
 def test_the_accuracy_table_holds_the_rows_and_nothing_else():
-    settings = {"llvm float32": {"misjudged": 3.0}, "llvm float64": {}}
+    settings = {"llvm float32": {"TIR misclassified": 3.0}, "llvm float64": {}}
     rows = [
         Row(
             "directions",
@@ -268,14 +308,48 @@ def test_a_readme_is_not_written_from_a_run_that_measured_too_little():
         readme_tables.suite([])
 
 
-def test_the_readme_holds_its_table_and_shows_images_and_files_that_exist():
-    root = Path(command.__file__).parents[1]
-    text = (root / "README.md").read_text()
-    table = text.partition("<!-- begin: accuracy -->")[2].partition("<!-- end: accuracy -->")[0]
-    assert [name for name in FORMULAS if name not in table] == []
+def test_the_readmes_hold_their_tables():
+    scenes = [path.stem for path in SCENES.glob("*.xml")]
+    ways = [method.name for method in render_methods.METHODS]
+    others = [call.title for system in SYSTEMS.values() for call in system.calls]
+    words_of = {
+        "accuracy": FORMULAS,
+        "renders": scenes,
+        "paths": layered_paths.plugins(),
+        "efficiency": ways,
+        "planar": [path.stem for path in SCENES.glob("planar/*.toml")],
+        "defects": [*planted_defects.GLASSES, *DEFECTS, *METHODS],
+        "suite": [*others, *IMAGE_RENDERERS],
+    }
+    assert words_of.keys() == readme_tables.TABLES.keys()
+    readme_tables.check(list(command.ROOMS))
+    for marker, words in words_of.items():
+        text = (readme_tables.ROOT / readme_tables.TABLES[marker].path).read_text()
+        table = text.partition(f"<!-- begin: {marker} -->")[2].partition(f"<!-- end: {marker} -->")[0]
+        assert [word for word in words if word not in table] == []
+
+
+def test_the_table_of_other_renderers_is_written_where_the_suite_is_named():
+    assert readme_tables.chosen([]).keys() == readme_tables.TABLES.keys() - {"suite"}
+    assert readme_tables.chosen(["suite"]).keys() == {"suite"}
+    assert readme_tables.chosen(["planar", "diff"]).keys() == {"planar", "defects"}
+    assert {table.study for table in readme_tables.TABLES.values()} <= command.ROOMS.keys()
+
+
+def test_the_table_of_defects_is_made_of_the_rows_of_the_self_test():
+    rng = np.random.default_rng(1)
+    rows = self_test.examine(rng.gamma(16, 1 / 16, (4, 16, 16, 3)), "noise", trials=1, null_pairs=2)
+    lines = readme_tables.seen(rows).splitlines()
+    assert lines[0].startswith("noise; 1 trials each of 2 renders a side. Minimum detectable difference in a tile: ")
+    assert [line.split("|")[1].strip() for line in lines[4:-1]] == list(DEFECTS)
+    assert lines[-1].split("|")[2].strip() == "0 of 4"
+
+
+def test_images_of_the_first_page_exist():
+    text = (readme_tables.ROOT / "README.md").read_text()
     images = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)
     assert images
-    assert all((root / path).is_file() for path in images)
+    assert all((readme_tables.ROOT / path).is_file() for path in images)
     assert len(text.splitlines()) <= 200
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from mi_refract.image_diff import folders
 from mi_refract.image_diff.settings import How, Settings
+from validation import limits
 from validation.diff import times
 
 SMALL = times.Size(48, 64, 2, 1)
@@ -34,7 +35,7 @@ def test_rows():
     assert {name for name, row in rows.items() if "time / reading" in row.values} == {*times.METHODS, "auto"}
     assert not [row for row in rows.values() if row.goals]  # they are those of another size
     assert rows["memory"].values["MB of memory"] > 10
-    assert 0.02 < rows["size of the page"].values["MB of page"] < times.LIMIT
+    assert 0.02 < rows["size of the page"].values["MB of page"] < limits.PAGE_MEGABYTES
 
 
 def test_a_process_that_fails_is_no_measurement(root, monkeypatch):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mi_refract import backend
+from validation import limits
 from validation.efficiency import error_against_time, scaling
 from validation.efficiency.error_against_time import Extent
 from validation.run import render_methods
@@ -24,8 +25,8 @@ GIVEN = (BUILTIN, METHODS[1], SHORT, ABSENT)
 def context(tmp_path, needs_variant, monkeypatch):
     needs_variant("llvm_ad_rgb")
     mi.set_variant("llvm_ad_rgb")
-    monkeypatch.setitem(error_against_time.EXTENTS, "quick", SMALL)
-    return Context(PROFILES["quick"], tmp_path, "llvm_ad_rgb", backend.detect(), backend.usable_variants())
+    monkeypatch.setitem(error_against_time.EXTENTS, "standard", SMALL)
+    return Context(PROFILES["standard"], tmp_path, "llvm_ad_rgb", backend.detect(), backend.usable_variants())
 
 
 # Figures -------------------------------------------------------------------------------------------------------
@@ -104,11 +105,11 @@ def test_images_grow_until_their_time_can_be_told(context, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("scene", "words"), [("furnace", "no noise"), ("mirage", "stairs"), ("slab", "the profile quick measures balls")]
+    ("scene", "words"), [("furnace", "no noise"), ("mirage", "stairs"), ("slab", "the profile standard measures balls")]
 )
 def test_what_is_left_out_has_its_reason(context, monkeypatch, scene, words):
     measured = ("balls",) if scene == "slab" else ()
-    monkeypatch.setitem(error_against_time.EXTENTS, "quick", dataclasses.replace(SMALL, scenes=measured))
+    monkeypatch.setitem(error_against_time.EXTENTS, "standard", dataclasses.replace(SMALL, scenes=measured))
     (row,) = error_against_time.scene_rows(context, SCENES / f"{scene}.xml", GIVEN)
     assert row.verdict == "not run"
     assert row.reason.startswith("left out: ") and words in row.reason
@@ -122,11 +123,11 @@ def test_goals_go_to_the_best_that_splits_on_glass_and_to_the_best_elsewhere():
     costs = dict(zip((s.name for s in subjects), (1.0, 1.0, 0.1, 0.5, 0.3, 0.4), strict=True))
     found = {name: measured(cost) for name, cost in costs.items()}
     glass = error_against_time.goals_of(subjects, found, only_glass=True)
-    assert glass[subjects[4].name] == error_against_time.GLASS_GOALS
+    assert glass[subjects[4].name] == limits.ONLY_GLASS
     assert glass[subjects[2].name] == {"time / built-in": 0.8}
     assert subjects[1].name not in glass and glass[subjects[3].name] == {}
     mixed = error_against_time.goals_of(subjects, found, only_glass=False)
-    assert mixed[subjects[2].name] == error_against_time.MIXED_GOALS
+    assert mixed[subjects[2].name] == limits.MIXED
     assert not any(mixed[s.name] for s in subjects[3:])
 
 

@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from validation import limits
 from validation.ground_truth import rainbow, traced_bodies, traced_system, traced_systems
 from validation.reference import closed_forms, optical_systems
 
@@ -86,7 +87,7 @@ def test_normals_of_the_wrong_sign_break_every_row(name, made, scalar, monkeypat
 def test_a_bound_that_would_hold_whatever_comes_fails(scalar, monkeypatch):
     monkeypatch.setattr(traced_system, "PLACE", 100 * traced_system.PLACE)
     assert traced_bodies.bench_row("slab", traced_systems.slab(), "refract", "scalar_rgb").broken == {
-        "index seen": traced_bodies.SEEN
+        "index seen": limits.INDEX_SEEN
     }
 
 
@@ -131,7 +132,7 @@ def image(index):
 def test_the_edge_of_a_bow_without_noise_is_the_rainbow_angle():
     assert rainbow.angle(4 / 3) == pytest.approx(180 - 42.03, abs=0.01)
     for index in (1.333, 1.338):
-        assert abs(rainbow.edge(image(index)) - rainbow.angle(index)) < rainbow.BLUR
+        assert abs(rainbow.edge(image(index)) - rainbow.angle(index)) < limits.RAINBOW_BLUR
 
 
 def test_an_image_without_an_edge_has_none():
@@ -149,7 +150,7 @@ def test_the_rainbow_of_a_noisy_bow_sees_an_index_off_by_1e_4(defect):
     ends, inside, at = rainbow._bins()
     light = np.bincount(at, exact[inside], len(ends))
     first = light[(ends > rainbow.angle()) & (ends < rainbow.angle() + 0.1)].sum()
-    noisy = [rng.poisson(exact * 9e3 / first) for _ in range(traced_bodies.RENDERS["quick"])]
+    noisy = [rng.poisson(exact * 9e3 / first) for _ in range(traced_bodies.RENDERS["standard"])]
     row = traced_bodies.bow_row("refract", "llvm_ad_rgb", noisy, {})
     assert row.broken == ({"error / bound": 1.0} if defect else {})
 
@@ -160,7 +161,7 @@ def test_a_rendered_rainbow_stands_where_it_should(defect, verdict, needs_varian
     needs_variant("llvm_ad_rgb")
     before = mi.variant()
     mi.set_variant("llvm_ad_rgb")
-    monkeypatch.setattr(traced_bodies, "RESOLVED", 0.005)
+    monkeypatch.setattr(limits, "RAINBOW_RESOLVED", 0.005)
     try:
         found = rainbow.images(traced_systems.glass("refract", rainbow.INDEX + defect), 4)
     finally:

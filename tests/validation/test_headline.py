@@ -14,11 +14,19 @@ from validation.ground_truth import traced_bodies
 from validation.renders import against_dielectric
 from validation.stability import layered_paths, optical_chains
 
-WORST = {"worst rad": 5e-8, "worst / u": 0.9, "misjudged": 0.0, "misjudged far": 0.0}
+WORST = {"worst rad": 5e-8, "worst / u": 0.9, "TIR misclassified": 0.0, "TIR misclassified, beyond its bound": 0.0}
 OURS = Row(
-    "directions", "promoted", "all regimes", "llvm float32", WORST, {"misjudged far": 0.0}, replay={"rays": 1000}
+    "directions",
+    "promoted",
+    "all regimes",
+    "llvm float32",
+    WORST,
+    {"TIR misclassified, beyond its bound": 0.0},
+    replay={"rays": 1000},
 )
-TEXTBOOK = dataclasses.replace(OURS, subject="cross", values={**WORST, "worst rad": math.pi / 2, "misjudged": 70.0})
+TEXTBOOK = dataclasses.replace(
+    OURS, subject="cross", values={**WORST, "worst rad": math.pi / 2, "TIR misclassified": 70.0}
+)
 DOUBLE = dataclasses.replace(OURS, setting="llvm float64", values={**WORST, "worst rad": 1e-16})
 RENDER = {"changed share": 0.01, "|mean ratio − 1|": 1e-6, "Welch alarms": 0.0, "time / dielectric": 1.1}
 SPHERE = Row("renders", "refract", "sphere", "llvm_ad_rgb", RENDER, {"Welch alarms": 0.0})
@@ -54,7 +62,9 @@ def test_what_is_right_is_said_with_numbers():
         assert words in trusted["text"], words
 
 
-@pytest.mark.parametrize(("metric", "value", "words"), [("misjudged far", 3.0, "on 3 of them"), ("worst / u", 2.0, "")])
+@pytest.mark.parametrize(
+    ("metric", "value", "words"), [("TIR misclassified, beyond its bound", 3.0, "on 3 of them"), ("worst / u", 2.0, "")]
+)
 def test_what_is_wrong_is_not_praised(metric, value, words):
     spoilt = dataclasses.replace(OURS, values={**WORST, metric: value}, budgets={metric: 1.0})
     right = answers(spoilt)[0]
@@ -64,7 +74,7 @@ def test_what_is_wrong_is_not_praised(metric, value, words):
 
 def test_scenes_that_differ_are_named_with_what_is_right_there():
     traced = [
-        Row("paths", name, "mirage: path", "llvm_ad_rgb", {"astray": lost}, replay={"rays": 64})
+        Row("paths", name, "mirage: path", "llvm_ad_rgb", {"wrong path": lost}, replay={"rays": 64})
         for name, lost in (("refract", 0.0), ("dielectric", 11.0), ("exact, indices in float32", 7.0))
     ]
     text = answers(SPHERE, MIRAGE, *traced)[3]["text"]

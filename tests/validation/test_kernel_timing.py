@@ -14,7 +14,7 @@ from validation.run import kernel_timing
 from validation.run.array_settings import BUILTIN, settings
 from validation.run.context import SCALAR_PROFILES, Context
 
-PROFILE = dataclasses.replace(SCALAR_PROFILES["quick"], scalar_rays=20, streamed_rays=2000, repeats=9)
+PROFILE = dataclasses.replace(SCALAR_PROFILES["standard"], scalar_rays=20, streamed_rays=2000, repeats=9)
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ def llvm(needs_variant):
 
 @pytest.fixture
 def context(tmp_path):
-    profile = dataclasses.replace(PROFILES["quick"], resolution=48, spp=4)
+    profile = dataclasses.replace(PROFILES["standard"], resolution=48, spp=4)
     return Context(profile, tmp_path, "llvm_ad_rgb", backend.detect(), {})
 
 
@@ -115,7 +115,7 @@ def test_every_plugin_is_traced_and_only_forms_at_the_rounding_limit_keep_to_the
 
 def test_a_fibre_guides_every_ray_with_every_plugin(llvm, context):
     rows = [row for row in layered_paths._path_rows(context, FIBRE) if row.case == "fibre: path"]
-    assert {row.values["astray"] for row in rows} == {0.0}
+    assert {row.values["wrong path"] for row in rows} == {0.0}
     assert all(row.values["direction"] < 0.01 for row in rows)
 
 

@@ -9,15 +9,15 @@ from validation.suite import matrix, per_ray, rendered_images
 
 
 def ray(subject="A", case="random", budget=None, **values):
-    values = {"worst rad": 1e-6, "wrong": 0.0, "misjudged": 0.0} | values
-    return Row(per_ray.STUDY, subject, case, "f32", values, {"wrong": 0.0}, reason="A 1.2; zero")
+    values = {"worst rad": 1e-6, "wrong": 0.0, "TIR misclassified": 0.0} | values
+    return Row(per_ray.NAME, subject, case, "f32", values, {"wrong": 0.0}, reason="A 1.2; zero")
 
 
 def image(subject="B", verdict="equal", differing=0.0, **more):
     values = {"mean difference": -0.02, "tests that differ": differing}
     budgets = {"tests that differ": 0.0} | more
     replay = {"verdict": verdict, "renderer": "B 3"}
-    return Row(rendered_images.STUDY, subject, "prism", "64²", values, budgets, reason="why", replay=replay)
+    return Row(rendered_images.NAME, subject, "prism", "64²", values, budgets, reason="why", replay=replay)
 
 
 def test_numbers_and_verdicts_are_those_of_the_rows():
@@ -39,7 +39,7 @@ def test_a_system_that_is_known_to_differ_passes_and_is_said_to_differ():
 
 
 @pytest.mark.parametrize(
-    ("study", "cases"), [(per_ray.STUDY, per_ray.SETS), (rendered_images.STUDY, rendered_images.SCENES)]
+    ("study", "cases"), [(per_ray.NAME, per_ray.SETS), (rendered_images.NAME, rendered_images.SCENES)]
 )
 def test_what_was_not_run_is_not_run_for_every_check(study, cases):
     found = matrix.summary([Row(study, "A", "every set", "f32", reason="pip install it")])
@@ -50,5 +50,5 @@ def test_what_was_not_run_is_not_run_for_every_check(study, cases):
 def test_the_summary_stands_before_what_it_is_taken_from():
     other = Row("directions", "x", "y", "z", {"v": 1.0})
     rows = matrix.with_summary([other, ray(), other])
-    assert [row.study for row in rows] == ["directions", matrix.STUDY, per_ray.STUDY, "directions"]
+    assert [row.study for row in rows] == ["directions", matrix.NAME, per_ray.NAME, "directions"]
     assert matrix.with_summary([other]) == [other]

@@ -16,6 +16,7 @@ from validation.planar.error_growth import _transfer
 from validation.reference.planar_retrace import retrace
 from validation.run.array_settings import settings
 from validation.run.context import PROFILES, Context
+from validation.run.metrics import WRONG_PATH, WRONG_PATH_FAR
 
 LD = np.longdouble
 THROUGH, MIRRORED = Event.REFRACTED, Event.REFLECTED
@@ -125,7 +126,7 @@ def test_what_is_right_passes(scalar):
         for name in ("lens", "prism")
     ]
     assert {row.verdict for row in rows} == {"pass"}
-    assert all(row.values["astray"] == 0 for row in rows)
+    assert all(row.values[WRONG_PATH] == 0 for row in rows)
 
 
 def document_slip(d, l, k):  # noqa: E741
@@ -160,7 +161,7 @@ def test_a_wrong_formula_breaks_a_scene(defect, scalar, monkeypatch):
     monkeypatch.setattr(path_loop, "refract_2d", defect)
     assert (
         "error / bound" in against_retrace.row_of(case, scalar).broken
-        or "astray" in against_retrace.row_of(case, scalar).broken
+        or WRONG_PATH in against_retrace.row_of(case, scalar).broken
     )
 
 
@@ -174,13 +175,13 @@ def traced_otherwise(case, **changes):
 def test_swapped_media_a_moved_vertex_and_a_gap_are_seen():
     case = against_retrace.case_of(against_retrace.FOLDER / "prism.toml", 3)
     s = case.segments
-    assert against_retrace.judge(case.trace(settings_of("scalar")), case, 2.0**-53)["astray"] == 0
-    assert traced_otherwise(case, n_left=s.n_right, n_right=s.n_left)["astray"] > 0
+    assert against_retrace.judge(case.trace(settings_of("scalar")), case, 2.0**-53)[WRONG_PATH] == 0
+    assert traced_otherwise(case, n_left=s.n_right, n_right=s.n_left)[WRONG_PATH] > 0
     assert traced_otherwise(case, start=s.start + 1e-9 * case.extent)["error / bound"] > 1e3
     hit = case.exact.hits[0, 0]
     gone = s.end.copy()
     gone[hit] = s.start[hit]
-    assert traced_otherwise(case, end=gone)["astray, far"] > 0
+    assert traced_otherwise(case, end=gone)[WRONG_PATH_FAR] > 0
 
 
 def test_a_leak_at_a_vertex_is_seen():
@@ -190,9 +191,9 @@ def test_a_leak_at_a_vertex_is_seen():
     d = np.repeat([[1.0, 0], [-1, 0], [0, 1], [0, -1]], 2, axis=0)
     origins = -10 * d + np.tile([[-1.0], [1.0]], (4, 1)) * d[:, ::-1]
     case = against_retrace.Case("octagon", octagon, origins, d, 8, np.zeros(8, int))
-    assert (case.exact.met >= 2).all() and traced_otherwise(case)["astray"] == 0
+    assert (case.exact.met >= 2).all() and traced_otherwise(case)[WRONG_PATH] == 0
     short = 1e-12 * (octagon.end - octagon.start)
-    assert traced_otherwise(case, start=corners + short, end=octagon.end - short)["astray"] > 0
+    assert traced_otherwise(case, start=corners + short, end=octagon.end - short)[WRONG_PATH] > 0
 
 
 def settings_of(backend):
@@ -211,15 +212,15 @@ def test_what_is_missing_is_not_equal(field):
     values = getattr(whole, field).copy()
     values[0] = -1 if field == "hits" else 0 if field == "events" else np.nan
     found = against_retrace.judge(dataclasses.replace(whole, **{field: values}), case, 2.0**-53)
-    assert found["astray"] == 1 if field in ("hits", "events") else not found["difference"] < 1
+    assert found[WRONG_PATH] == 1 if field in ("hits", "events") else not found["difference"] < 1
 
 
-def test_a_ray_that_is_far_from_every_vertex_must_not_go_astray():
+def test_a_ray_that_is_far_from_every_vertex_must_not_take_a_wrong_path():
     case = against_retrace.case_of(against_retrace.FOLDER / "lens.toml", 3)
     hits = case.exact.hits.copy()
     hits[0, 0] = (hits[0, 0] + 1) % len(case.segments)
     found = against_retrace.judge(dataclasses.replace(as_paths(case.exact), hits=hits), case, 2.0**-24)
-    assert found["astray, far"] == 1
+    assert found[WRONG_PATH_FAR] == 1
 
 
 @pytest.mark.parametrize("height", [1 - 1e-9, 1 + 1e-9, 1 + 1e-3])
@@ -229,7 +230,7 @@ def test_rounding_may_decide_what_touches_a_circle(height):
     case = against_retrace.Case("ball", ball, np.array([[-3, height]]), np.array([[1.0, 0]]), 4, np.zeros(1, int))
     other = retrace(ball, [[-3, 1 - 1e-9 if height > 1 else 1 + 1e-9]], case.directions, 4)
     found = against_retrace.judge(as_paths(other), case, 2.0**-24)
-    assert (found["astray"], found["astray, far"]) == (1, height == 1 + 1e-3)
+    assert (found[WRONG_PATH], found[WRONG_PATH_FAR]) == (1, height == 1 + 1e-3)
 
 
 @pytest.mark.parametrize("beyond", [1e-9, 1e-3])
@@ -240,7 +241,7 @@ def test_rounding_may_decide_at_the_critical_angle(beyond):
     case = against_retrace.Case("plane", plane, np.array([[0.1, -1]]), d, 1, np.zeros(1, int))
     through = retrace(plane, case.origins, [[0.0, 1.0]], 1)
     found = against_retrace.judge(as_paths(dataclasses.replace(through, hits=case.exact.hits)), case, 2.0**-24)
-    assert (found["astray"], found["astray, far"]) == (1, beyond == 1e-3)
+    assert (found[WRONG_PATH], found[WRONG_PATH_FAR]) == (1, beyond == 1e-3)
 
 
 def test_either_segment_is_right_at_their_vertex():
@@ -253,7 +254,7 @@ def test_either_segment_is_right_at_their_vertex():
     )
     there = [
         against_retrace.judge(dataclasses.replace(as_paths(case.exact), hits=put(hits, ray, n)), case, 2.0**-53)[
-            "astray"
+            WRONG_PATH
         ]
         for n in neighbours
     ]
@@ -288,7 +289,7 @@ def extruded(case, spawn="along the ray", segments=None):
 def test_walls_do_what_segments_do(spawn, compiled):
     case = extruded_scenes.faceted(against_retrace.case_of(against_retrace.FOLDER / "prism.toml", 30))
     found = extruded(case, spawn)
-    assert found["astray"] == 0 and found["error / bound"] <= 1
+    assert found[WRONG_PATH] == 0 and found["error / bound"] <= 1
 
 
 def test_wrong_walls_are_seen(compiled):
@@ -297,16 +298,16 @@ def test_wrong_walls_are_seen(compiled):
     paths = extruded_scenes.trace(wall_scene.extrude(case.segments), case, extruded_scenes.SPAWNS["spawn_ray"][0])
     assert against_retrace.judge(paths, case, extruded_scenes.U)["error / bound"] > 1
     s = case.segments
-    assert extruded(case, segments=Segments(s.start, s.end, s.n_right, s.n_left))["astray, far"] > 0
+    assert extruded(case, segments=Segments(s.start, s.end, s.n_right, s.n_left))[WRONG_PATH_FAR] > 0
     assert extruded(case, segments=Segments(s.start, s.end, s.n_left * (1 + 1e-5), s.n_right))["error / bound"] > 1
     hit = case.exact.hits[0, 0]
     kept = np.arange(len(s)) != hit
     fewer = Segments(*(getattr(s, name)[kept] for name in ("start", "end", "n_left", "n_right")))
-    assert extruded(case, segments=fewer)["astray, far"] > 0
+    assert extruded(case, segments=fewer)[WRONG_PATH_FAR] > 0
 
 
 def test_extruded_rows_have_an_image(compiled, tmp_path):
-    context = Context(PROFILES["quick"], tmp_path, "llvm_ad_rgb", detect(), {})
+    context = Context(PROFILES["standard"], tmp_path, "llvm_ad_rgb", detect(), {})
     rows = extruded_scenes.scene_rows(context, against_retrace.FOLDER / "ellipse.toml")
     assert {row.verdict for row in rows} == {"pass"}
     (image,) = (row.images["overlay"] for row in rows if row.images)

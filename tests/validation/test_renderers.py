@@ -12,11 +12,12 @@ import pytest
 from mi_refract import oracle
 from mi_refract.ray_sets import ray_set
 from validation import __main__ as command
+from validation import limits
 from validation.suite import per_ray
 from validation.suite.renderers import SYSTEMS, environments
 from validation.suite.renderers.system import RECORDED_F64, SCRIPTS, TOTAL, Apt, Npm, Pip, RefractFunction, System
 
-QUICK, FULL = (SimpleNamespace(profile=SimpleNamespace(name=name)) for name in ("quick", "full"))
+STANDARD, FULL = (SimpleNamespace(profile=SimpleNamespace(name=name)) for name in ("standard", "full"))
 # What every program below does right unless `{defect}` says otherwise.
 PROGRAM = f"""
 import os, sys, time
@@ -71,7 +72,7 @@ def rows_of(few, tmp_path):
         path = tmp_path / "program.py"
         path.write_text(PROGRAM.format(before=before, after=after))
         call = RefractFunction("a program", "f64", str(path), recorded_error, "zero", gives_up=gives_up)
-        return per_ray.call_rows(System("a", "A", "none", None, 0, small=True), call, QUICK)
+        return per_ray.call_rows(System("a", "A", "none", None, 0, small=True), call, STANDARD)
 
     return run
 
@@ -115,11 +116,11 @@ def test_what_cannot_run_here_is_not_run(rows_of):
     assert (row.verdict, row.reason) == ("not run", "cannot run here: no driver")
 
 
-def test_a_noted_error_is_a_goal_on_both_sides(rows_of):
+def test_a_recorded_error_is_a_goal_on_both_sides(rows_of):
     much, little = (dict.fromkeys(RECORDED_F64, (x, x)) for x in (1e-2, 1e-30))
     for recorded_error in (much, little):
         rows = [row for row in rows_of(recorded_error=recorded_error) if row.case != TOTAL]
-        assert all(row.missed == {"off the noted": per_ray.NEAR} and row.verdict == "pass" for row in rows)
+        assert all(row.missed == {per_ray.OFF_RECORDED: limits.RECORDED} and row.verdict == "pass" for row in rows)
     assert [per_ray.off(x, 2, 4) for x in (1, 2, 3, 4, 8)] == [2, 1, 1, 1, 2]
     assert per_ray.off(0, 2, 4) == np.inf and np.isnan(per_ray.off(np.nan, 2, 4))
 
@@ -145,7 +146,7 @@ def test_the_sets_are_what_they_say(precision, few):
 
 def test_the_built_in_runs_and_is_right(few):
     for call in SYSTEMS["mitsuba"].calls:
-        rows = per_ray.call_rows(SYSTEMS["mitsuba"], call, QUICK)
+        rows = per_ray.call_rows(SYSTEMS["mitsuba"], call, STANDARD)
         assert [row.verdict for row in rows] == ["pass"] * len(per_ray.SETS), call.title
 
 
@@ -153,7 +154,7 @@ def test_the_built_in_runs_and_is_right(few):
 def test_small_systems_that_are_installed_are_right(name, few):
     if reason := environments.absent(SYSTEMS[name]):
         pytest.skip(reason)
-    rows = [row for call in SYSTEMS[name].calls for row in per_ray.call_rows(SYSTEMS[name], call, QUICK)]
+    rows = [row for call in SYSTEMS[name].calls for row in per_ray.call_rows(SYSTEMS[name], call, STANDARD)]
     assert {row.verdict for row in rows} <= ({"pass", "not run"} if name == "glsl" else {"pass"})
 
 
@@ -198,7 +199,7 @@ def test_large_systems_wait_for_the_full_profile(monkeypatch):
     monkeypatch.setattr(environments, "absent", lambda system: "")
     large = [system for system in SYSTEMS.values() if not system.small and system.calls]
     for system in large:
-        (row,) = per_ray.call_rows(system, system.calls[0], QUICK)
+        (row,) = per_ray.call_rows(system, system.calls[0], STANDARD)
         assert row.verdict == "not run" and "full profile" in row.reason
 
 

@@ -15,7 +15,7 @@ from validation.run.context import SCALAR_PROFILES, Context
 from validation.stability import layer_chains, optical_chains
 from validation.stability.layer_chains import air, carry, enter, exact_ratios, pipe
 
-HERE = Context(SCALAR_PROFILES["quick"], Path(), "scalar_rgb", backend.detect(), backend.usable_variants())
+HERE = Context(SCALAR_PROFILES["standard"], Path(), "scalar_rgb", backend.detect(), backend.usable_variants())
 SETTINGS = {setting.label: setting for setting in optical_chains.settings(HERE)}
 SCALAR = SETTINGS["scalar float64"]
 SMALL = optical_chains.Extent((40,), ("askew",), 60, (89.4, 89.8), False)
@@ -255,7 +255,7 @@ def test_a_pipe_passes_and_sees_planted_defects():
     rows = [optical_chains.pipe_row("promoted", defect, SCALAR, SMALL) for defect in defects]
     assert [row.verdict for row in rows] == ["fail"] * len(defects)
     assert rows[0].values["length drift"] == pytest.approx(60e-13, rel=1e-2)
-    assert rows[1].values["misjudged"] == 60 * 2
+    assert rows[1].values["TIR misclassified"] == 60 * 2
 
 
 @pytest.mark.parametrize("name", optical_systems.SYSTEMS)
@@ -300,7 +300,7 @@ def test_a_budget_that_no_answer_could_break_is_none():
     assert (lost.verdict, lost.reason) == ("info", optical_chains.NOTHING)
     assert row(np.float64, (89.4,)).broken.keys() == {"error / condition"}
     held = row(np.float64, (89.4, 89.8))
-    assert held.budgets.keys() == {"error / condition", "misjudged", "turning height"}
+    assert held.budgets.keys() == {"error / condition", "TIR misclassified", "turning height"}
     assert held.broken.keys() == held.budgets.keys()
 
 

@@ -10,6 +10,7 @@ from mi_refract import oracle, regimes
 from mi_refract.accuracy import errors, evaluate, judge_formula
 from mi_refract.formulas import FORMULAS
 from mi_refract.regimes import REGIMES, Rays
+from validation import limits
 from validation.directions import search, sweep, worst_rays
 from validation.directions.worst_rays import Found
 from validation.reference.fast_reference import Screen
@@ -52,7 +53,7 @@ def test_the_screen_is_right_where_it_is_certain(regime, measured):
     assert (wrong == (transmitted != exact.transmitted))[certain].all()
     compared = certain & ~wrong
     certified = errors(b, rays, exact)[0] / measured.roundoff
-    assert np.abs(chord - certified)[compared].max(initial=0) <= sweep.SCREEN_BUDGET
+    assert np.abs(chord - certified)[compared].max(initial=0) <= limits.SCREEN_OFF
     # Neither has terms at k = 1 along the surface; their sum is up to twice the larger one.
     theirs, ours = oracle.relative_radicand(rays.a, rays.n, rays.k)[certain], screen.relative_radicand[certain]
     assert (np.isnan(theirs) == np.isnan(ours)).all()
@@ -102,7 +103,7 @@ def stubborn(a, n, k, contrast=None):
 
 @pytest.mark.parametrize(
     ("defect", "regime", "broken"),
-    [(rare, "generic", {"error / bound"}), (stubborn, "critical", {"misjudged far"})],
+    [(rare, "generic", {"error / bound"}), (stubborn, "critical", {"TIR misclassified, beyond its bound"})],
 )
 def test_a_sweep_sees_defects_of_a_few_rays(defect, regime, broken, measured, replace, monkeypatch):
     monkeypatch.setattr(sweep, "CHUNK", 20_000)

@@ -21,7 +21,7 @@ def context(tmp_path):
         pytest.skip("no LLVM or CUDA variant runs here")
     before = mi.variant()
     mi.set_variant(usable[0])
-    quick = dataclasses.replace(PROFILES["quick"], repeats=3)
+    quick = dataclasses.replace(PROFILES["standard"], repeats=3)
     yield Context(quick, tmp_path, usable[0], backend.detect(), variants)
     mi.set_variant(before)
 

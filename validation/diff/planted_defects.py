@@ -21,11 +21,10 @@ from mi_refract.image_diff.defects import DEFECTS
 from mi_refract.plugins import refract
 from mi_refract.rendering.scene_files import REPRODUCIBLE
 from mi_refract.report.row import Row
-from validation.run.context import SCENES, Context, Task
+from validation.run.context import SCENES, Context
 from validation.run.render_methods import Camera
+from validation.study import Study, Task, about
 
-TITLE = "Image comparison, planted defects"
-TEXT = __doc__.partition("\n")[2].strip() + " " + (self_test.__doc__ or "").partition("\n")[2].strip()
 GLASS = "refract_spoilt"  # the plugin's name is followed by that of the defect
 NAMES = ("sphere", "prism")
 LAMP = """
@@ -37,8 +36,9 @@ LAMP = """
     </shape>
 </scene>"""
 RESOLUTION, SPP, TRIALS, RENDERS = 64, 16, 8, 6  # of the detection: renders a side
+QUICK_TRIALS = 2
 NULL_RESOLUTION, NULL_SPP, NULL_RENDERS = 32, 4, 4
-NULL_PAIRS = {"quick": 640, "full": 2000}  # with 640 two alarms may be: their bound is 0.98 %
+NULL_PAIRS = {"standard": 640, "full": 2000}  # with 640 two alarms may be: their bound is 0.98 %
 SHEET = 80  # images of a render: it costs less than as many renders
 PARTS = ("sensor", "film", "sampler")
 SCALAR = "needs a compiled variant: thousands of renders"
@@ -103,6 +103,7 @@ GLASSES: dict[str, tuple[str, Callable[[Any, type], Any]]] = {
     "black TIR": ("total internal reflection gives nothing back", _sampling(_black_inside)),
     "swapped lobes": ("reflection as often as transmission should be", _sampling(_swapped_lobes)),
 }
+NAME = self_test.STUDY
 TERMS = (
     self_test.TERMS
     | {name: text for name, (text, _) in GLASSES.items()}
@@ -146,12 +147,14 @@ def _later(camera: Camera, first: int) -> Callable[[], np.ndarray]:
     return lambda: _renders(camera, first)
 
 
-def trials(name: str) -> list[self_test.Trial]:
+def trials(name: str, count: int = TRIALS, resolution: int = RESOLUTION, spp: int = SPP) -> list[self_test.Trial]:
     """Clean renders, nothing planted: no seed is used twice."""
-    camera = opened(name)
-    seeds = [2 * RENDERS * trial for trial in range(TRIALS)]
+    camera = opened(name, resolution=resolution)
+    seeds = [2 * RENDERS * trial for trial in range(count)]
     return [
-        self_test.Trial(_renders(camera, seed), _renders(camera, seed + RENDERS), _later(camera, seed))
+        self_test.Trial(
+            _renders(camera, seed, spp=spp), _renders(camera, seed + RENDERS, spp=spp), _later(camera, seed)
+        )
         for seed in seeds
     ]
 
@@ -160,33 +163,48 @@ def trials(name: str) -> list[self_test.Trial]:
 
 
 def tasks(context: Context) -> list[Task]:
-    """Two tasks per scene."""
+    """Two tasks per scene; in the profile `quick` the defects of images in one."""
+    if context.profile.quick:
+        return [Task(f"diff: {NAMES[0]}, image defects", functools.partial(image_defect_rows, context, NAMES[0]))]
     return [
-        Task(f"gate: {name}, {what}", functools.partial(run, context, name))
+        Task(f"diff: {name}, {what}", functools.partial(run, context, name))
         for name in NAMES
         for what, run in (("defects", defect_rows), ("null pairs", null_rows))
     ]
 
 
 def defect_rows(context: Context, name: str) -> list[Row]:
+    """A row per defect of the glass and of finished images, and one of the noise of the clean renders."""
     if context.variant.startswith("scalar"):
-        return [Row(self_test.STUDY, "every defect", name, context.variant, reason=SCALAR)]
+        return [Row(NAME, "every defect", name, context.variant, reason=SCALAR)]
     import mitsuba as mi
 
     register(getattr(mi, context.variant))
     clean = trials(name)
     cameras = {defect: opened(name, f"{GLASS} {defect}") for defect in GLASSES}
     rows = [_row(defect, clean, name, context, camera) for defect, camera in cameras.items()]
-    for defect, planted in DEFECTS.items():
-        spoilt = [self_test.Trial(t.clean, t.other, functools.partial(planted.spoil, t.clean)) for t in clean]
-        rows.append(self_test.detection(defect, planted.always_due, spoilt, name, context.variant))
+    rows += _image_defects(clean, name, context)
     rows.append(_row(OTHER_SAMPLER, clean, name, context, opened(name, sampler="multijitter")))
     every = np.concatenate([t.clean for t in clean])
     about = {"resolution": RESOLUTION, "spp": SPP, "renders": len(every)}
     return [
         *rows,
-        Row(self_test.STUDY, "renders", name, context.variant, {"noise": self_test.noise(every)}, replay=about),
+        Row(NAME, "renders", name, context.variant, {"noise": self_test.noise(every)}, replay=about),
     ]
+
+
+def image_defect_rows(context: Context, name: str) -> list[Row]:
+    """The defects that are planted in finished images, in a few trials: no other glass is compiled."""
+    size = (32, 4) if context.scalar else (RESOLUTION, SPP)
+    return _image_defects(trials(name, QUICK_TRIALS, *size), name, context)
+
+
+def _image_defects(clean: list[self_test.Trial], name: str, context: Context) -> list[Row]:
+    rows = []
+    for defect, planted in DEFECTS.items():
+        spoilt = [self_test.Trial(t.clean, t.other, functools.partial(planted.spoil, t.clean)) for t in clean]
+        rows.append(self_test.detection(defect, planted.always_due, spoilt, name, context.variant))
+    return rows
 
 
 def _row(defect: str, clean: list[self_test.Trial], name: str, context: Context, camera: Camera) -> Row:
@@ -210,7 +228,7 @@ def _row(defect: str, clean: list[self_test.Trial], name: str, context: Context,
 def null_rows(context: Context, name: str) -> list[Row]:
     """Pairs of independent renders, and about as many of the same seed by a scene loaded twice."""
     if context.variant.startswith("scalar"):
-        return [Row(self_test.STUDY, "null pairs", name, context.variant, reason=SCALAR)]
+        return [Row(NAME, "null pairs", name, context.variant, reason=SCALAR)]
     count = NULL_PAIRS[context.profile.name]
     first, second = (opened(name, resolution=NULL_RESOLUTION, count=SHEET) for _ in range(2))
     sides = (_sheet(first, seed) for seed in range(count * 2 * NULL_RENDERS // SHEET))
@@ -224,3 +242,6 @@ def null_rows(context: Context, name: str) -> list[Row]:
 def _sheet(camera: Camera, seed: int) -> np.ndarray:
     """One render, cut into its independent images."""
     return np.stack(np.split(camera(NULL_SPP, seed)[0], SHEET, axis=1))
+
+
+STUDY = Study(NAME, "Image comparison, planted defects", f"{about(__doc__)} {about(self_test.__doc__)}", TERMS, tasks)

@@ -25,11 +25,11 @@ from mi_refract.image_diff.methods import AUTO, METHODS
 from mi_refract.image_diff.settings import How, Settings
 from mi_refract.io import image_file
 from mi_refract.report.row import Row
+from validation import limits
 from validation.run import kernel_timing
-from validation.run.context import Context, Task
+from validation.run.context import Context
+from validation.study import Study, Task, about
 
-TITLE = "Diff, times"
-TEXT = __doc__.partition("\n")[2].strip()
 TERMS = {
     "seconds": "median, of reading and judging, or of writing the page; low, high: its 95 % interval",
     "time / reading": "median of the rounds' ratios to reading the same files; low, high: its 95 % interval",
@@ -38,15 +38,12 @@ TERMS = {
     "8 + 8": "renders of one image, as many a side",
     AUTO: "tolerance here: the images say nothing of their noise",
 }
-STUDY = "diff_times"
+NAME = "diff_times"
 SEED = 2034
 SPP, GAIN = 16, 1.05  # the noise of the renders; how much brighter a quarter of the other image is
 SMALL = 256
 RENDERS = 8  # a side
 MEGABYTE = 1e6
-LIMIT = 15.0  # MB of a page
-GOALS = {"tolerance": 0.5, "welch": 3.0, "page": 5.0, AUTO: 60.0}  # seconds with two cores
-MEMORY = 1024.0 * 2**20 / MEGABYTE
 
 
 @dataclass(frozen=True)
@@ -59,7 +56,7 @@ class Size:
     rounds: int
 
 
-SIZES = {"quick": Size(270, 480, 20, 7), "full": Size(1080, 1920, 1000, 7)}
+SIZES = {"quick": Size(135, 240, 5, 6), "standard": Size(270, 480, 20, 7), "full": Size(1080, 1920, 1000, 7)}
 GOAL_SIZE = SIZES["full"]
 PROCESS = """
 import sys
@@ -160,24 +157,27 @@ def _row(name: str, seconds: dict[str, list[float]], size: Size, setting: str) -
     values = kernel_timing.interval("seconds", seconds[name])
     if reading := _reading(name):
         values |= kernel_timing.ratio("time / reading", seconds[name], seconds[reading])
-    goals = {"seconds": GOALS[name]} if size == GOAL_SIZE and name in GOALS else {}
+    goals = {"seconds": limits.DIFF_SECONDS[name]} if size == GOAL_SIZE and name in limits.DIFF_SECONDS else {}
     replay = {"seed": SEED, "rounds": size.rounds}
-    return Row(STUDY, name, _case(name, size), setting, values, goals=goals, replay=replay)
+    return Row(NAME, name, _case(name, size), setting, values, goals=goals, replay=replay)
 
 
 def _page_row(page: Path, size: Size, setting: str) -> Row:
     values = {"MB of page": page.stat().st_size / MEGABYTE}
-    return Row(STUDY, "size of the page", _case("", size), setting, values, {"MB of page": LIMIT})
+    return Row(NAME, "size of the page", _case("", size), setting, values, {"MB of page": limits.PAGE_MEGABYTES})
 
 
 def _memory_row(root: Path, size: Size, setting: str) -> Row:
     """Of the process with the most: Welch's test of all renders, with its page."""
     subject, case = "memory", _case("welch", size)
     if not Path("/proc/self/status").exists():
-        return Row(STUDY, subject, case, setting, reason="this system does not say a process's peak")
+        return Row(NAME, subject, case, setting, reason="this system does not say a process's peak")
     words = ["diff", str(root / "a"), str(root / "b"), "--renders", "--report", str(root / "welch.html")]
     done = subprocess.run([sys.executable, "-c", PROCESS, *words], capture_output=True, text=True)
     if done.returncode:
         raise OSError(f"diff, times: {done.stderr.strip()}")
     values = {"MB of memory": 1024 * json.loads(done.stdout.split()[-1]) / MEGABYTE}
-    return Row(STUDY, subject, case, setting, values, {"MB of memory": MEMORY})
+    return Row(NAME, subject, case, setting, values, {"MB of memory": limits.MEMORY_MEGABYTES})
+
+
+STUDY = Study(NAME, "Diff, times", about(__doc__), TERMS, tasks)

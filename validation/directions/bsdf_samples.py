@@ -14,10 +14,12 @@ import numpy as np
 
 from mi_refract.formulas import cancelling
 from mi_refract.report.row import Row
-from validation.run.context import Context, Task
+from validation import limits
+from validation.run.bsdf_sampling import sample_all
+from validation.run.context import Context
+from validation.study import Study, Task, about
 
-TITLE = "Samples"
-TEXT = __doc__.partition("\n")[2].strip()
+NAME = "samples"
 TERMS = {
     "lobe flips": "rays for which the two plugins chose different lobes",
     "wo, pdf, eta, weight": "entries of the sample: worst, and what 99 rays of 100 stay below. Of Mueller matrices the "
@@ -31,9 +33,11 @@ QUANTITIES = ("wo", "pdf", "eta", "weight")
 
 
 def tasks(context: Context) -> list[Task]:
+    """One per variant of Mitsuba's wheel; in the profile `quick` that of the run."""
+    variants = {context.variant: None} if context.profile.quick else context.variants
     return [
         Task(f"samples: {variant}", functools.partial(_variant_rows, context, variant, reason))
-        for variant, reason in context.variants.items()
+        for variant, reason in variants.items()
     ]
 
 
@@ -41,7 +45,7 @@ def _variant_rows(context: Context, variant: str, reason: str | None) -> list[Ro
     import mitsuba as mi
 
     if reason is not None:
-        return [Row("samples", "refract − dielectric", "all", variant, reason=reason)]
+        return [Row(NAME, "refract − dielectric", "all", variant, reason=reason)]
     mi.set_variant(variant)
     try:
         count = context.profile.rays if dr.is_jit_v(mi.Float) else context.profile.scalar_rays
@@ -86,34 +90,12 @@ def _mode_row(mode: Any, mode_name: str, count: int, variant: str) -> Row:
     # The built-in's radicand cancels: the a-priori bound of such a form, and a few roundings for 99 rays of 100.
     bound = float(cancelling(2).chord(2.0**-24, INT_IOR))
     budgets = {f"{name} worst": bound for name in ("wo", "pdf", "weight")}
-    budgets |= {"eta worst": 2e-7, "lobe flips": 1e-3 * count}
-    budgets |= {f"{name} p99": 4e-6 for name in ("wo", "pdf", "weight")}
+    budgets |= {"eta worst": limits.SAMPLE_ETA, "lobe flips": limits.SAMPLE_FLIPS * count}
+    budgets |= {f"{name} p99": limits.SAMPLE_P99 for name in ("wo", "pdf", "weight")}
     if mi.is_polarized:  # a radicand on either side of the boundary, and its error in three factors of the weight
-        budgets["weight worst"] = 6 * float(cancelling(2).radicand_error_bound(2.0**-24, INT_IOR))
+        budgets["weight worst"] = limits.SAMPLE_MUELLER * float(cancelling(2).radicand_error_bound(2.0**-24, INT_IOR))
     replay = {"count": 3 * count, "seed": SEED, **description}
-    return Row("samples", "refract − dielectric", mode_name, variant, values, budgets, replay=replay)
+    return Row(NAME, "refract − dielectric", mode_name, variant, values, budgets, replay=replay)
 
 
-def sample_all(bsdf: Any, context: Any, wi: np.ndarray, sample1: np.ndarray) -> dict[str, np.ndarray]:
-    """`bsdf.sample` for every ray: arrays (N, entries) of wo, pdf, eta, weight, and (N,) of the sampled type."""
-    import mitsuba as mi
-
-    def ask(w: Any, s: Any, count: int) -> dict[str, np.ndarray]:
-        si = dr.zeros(mi.SurfaceInteraction3f)
-        si.wi = mi.Vector3f(w)
-        bs, weight = bsdf.sample(context, si, s, [0, 0])
-        found = {"wo": bs.wo, "pdf": bs.pdf, "eta": bs.eta, "weight": weight, "type": bs.sampled_type}
-        return {name: _lanes(np.array(x, dtype=float), count) for name, x in found.items()}
-
-    if dr.is_jit_v(mi.Float):
-        found = ask(wi.T, mi.Float(sample1), len(wi))
-    else:
-        each = [ask(w, float(s), 1) for w, s in zip(wi, sample1, strict=True)]
-        found = {name: np.concatenate([x[name] for x in each]) for name in each[0]}
-    return found | {"type": found["type"][:, 0]}
-
-
-def _lanes(x: np.ndarray, count: int) -> np.ndarray:
-    """(count, entries) from an array that has the lanes last (or none, in scalar variants)."""
-    lanes = x if x.ndim and x.shape[-1] in (1, count) and count > 1 else x[..., None]
-    return np.broadcast_to(lanes, (*lanes.shape[:-1], count)).reshape(-1, count).T
+STUDY = Study(NAME, "Samples", about(__doc__), TERMS, tasks)

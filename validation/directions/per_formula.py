@@ -16,22 +16,33 @@ from mi_refract import oracle, regimes
 from mi_refract.accuracy import BUDGETS, Judgement, RayBounds, Subject, judge, judge_formula, lengths
 from mi_refract.formulas import FORMULAS, ROUNDING
 from mi_refract.report.row import Row
+from validation import limits
 from validation.run import kernel_timing
 from validation.run.array_settings import Setting, budget_of, settings
-from validation.run.context import Context, Task
+from validation.run.context import Context
+from validation.run.metrics import (
+    ERROR_OVER_BOUND,
+    MISCLASSIFIED,
+    MISCLASSIFIED_FAR,
+    TIME_OVER_COPY,
+    WORST_ANGLE,
+    WORST_CHORD,
+    WORST_IN_U,
+)
+from validation.study import Study, Task, about
 
+NAME = "directions"
 FLOOR = "exact, rounded"
-TITLE = "Directions"
-TEXT = __doc__.partition("\n")[2].strip()
+ALL = "all regimes"  # the case of a formula's summary
 TERMS = (
     {name: f"{formula.equation} (source: {formula.source})" for name, formula in FORMULAS.items()}
     | {name: regime.text for name, regime in regimes.REGIMES.items()}
     | {
-        "worst / u": "the largest chord error in units of roundoff; rounding the exact answer costs 0.87",
-        "error / bound": "the largest share that an error takes of its ray's a-priori bound",
-        "misjudged": "rays whose total internal reflection was decided wrongly",
-        "misjudged far": "those of them that are farther from the critical angle than the formula's own error; at the "
-        "rounding limit, those whose radicand exceeds u² of its terms: below, the decision moves b by u at most",
+        WORST_IN_U: "the largest chord error in units of roundoff; rounding the exact answer costs 0.87",
+        ERROR_OVER_BOUND: "the largest error of a ray over its a-priori bound",
+        MISCLASSIFIED: "rays whose total internal reflection was decided wrongly",
+        MISCLASSIFIED_FAR: "those of them that are farther from the critical angle than the formula's own error; at "
+        "the rounding limit, those whose radicand exceeds u² of its terms: below, the decision moves b by u at most",
         FLOOR: "the certified direction times |a|, rounded: no form does better. At most √3/2 u where |a| = 1, and 1 u "
         "elsewhere, where all components may have just passed a power of two",
         "other side": "rays within 4u of the surface that a documented formula sends to the other side of it, because "
@@ -42,22 +53,19 @@ TERMS = (
     }
     | kernel_timing.TERMS
 )
-SCATTER = [
+SCATTER = tuple(
     {
-        "study": "directions",
+        "study": NAME,
         "x": x,
-        "y": "worst / u",
+        "y": WORST_IN_U,
         "title": f"Worst error against {x}",
         "front": True,
         "interval": [f"{x}, low", f"{x}, high"],
         "floor": kernel_timing.COPY,
     }
-    for x in ("time / copy", "ns per ray")
-]
+    for x in (TIME_OVER_COPY, "ns per ray")
+)
 SEED = 2026
-# Fewer rays than this need not come near a bound: only from here on a bound that is too wide is a defect.
-TWO_SIDED = 50_000
-LARGEST_SLACK = 4.0
 
 
 def tasks(context: Context) -> list[Task]:
@@ -70,23 +78,21 @@ def tasks(context: Context) -> list[Task]:
 
 @functools.cache
 def certified(regime: str, count: int, precision: type) -> tuple[regimes.Rays, oracle.Certified]:
+    """`count` rays of a regime in a precision, and the oracle's answers."""
     rays = regimes.make(regime, count, precision, SEED)
     return rays, oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
 
 
 def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
-        return [
-            Row("directions", name, "all regimes", setting.label, reason=setting.reason)
-            for name in (*FORMULAS, kernel_timing.COPY)
-        ]
+        return [Row(NAME, name, ALL, setting.label, reason=setting.reason) for name in (*FORMULAS, kernel_timing.COPY)]
     count = context.profile.scalar_rays if setting.is_scalar else context.profile.rays
     times = kernel_timing.measure(context, setting)
     rows = [_floor_row(regime, setting, count) for regime in regimes.REGIMES]
     for name, subject in setting.subjects.items():
         parts = [_regime_row(name, subject, regime, setting, count) for regime in regimes.REGIMES]
         rows += [*parts, _summary(name, parts, setting, times[name])]
-    copying = Row("directions", kernel_timing.COPY, "all regimes", setting.label, times[kernel_timing.COPY])
+    copying = Row(NAME, kernel_timing.COPY, ALL, setting.label, times[kernel_timing.COPY])
     return [*rows, copying]
 
 
@@ -111,16 +117,16 @@ def _row(name: str, regime: str, setting: Setting, rays: regimes.Rays, found: Ju
     u, some = setting.roundoff, found.compared.any()
     chord, angle, drift = (x[found.compared] if some else np.zeros(1) for x in (found.chord, found.angle, found.drift))
     values = {
-        "worst / u": float(chord.max()) / u,
+        WORST_IN_U: float(chord.max()) / u,
         **({} if reason else found.values()),
-        "worst chord": float(chord.max()),
+        WORST_CHORD: float(chord.max()),
         "p99 / u": _p99(chord) / u,
         "mean / u": float(chord.mean()) / u,
-        "worst rad": float(angle.max()),
+        WORST_ANGLE: float(angle.max()),
         "p99 rad": _p99(angle),
         "mean rad": float(angle.mean()),
         "length drift": float(drift.max()),
-        "misjudged": float(found.misjudged.sum()),
+        MISCLASSIFIED: float(found.misjudged.sum()),
         "other side": float(found.crossed.sum()),
     }
     worst = {"largest error": np.where(found.compared, found.chord, -1), "nearest to its bound": found.share}
@@ -133,7 +139,7 @@ def _row(name: str, regime: str, setting: Setting, rays: regimes.Rays, found: Ju
         "needed": {"linear": float(found.linear_needed.max()), "radicand": float(found.radicand_needed.max())},
     }
     budgets = {} if reason else BUDGETS
-    return Row("directions", name, regime, setting.label, values, budgets, reason=reason, replay=replay)
+    return Row(NAME, name, regime, setting.label, values, budgets, reason=reason, replay=replay)
 
 
 def _p99(x: np.ndarray) -> float:
@@ -144,16 +150,16 @@ def _p99(x: np.ndarray) -> float:
 def _summary(name: str, parts: list[Row], setting: Setting, times: dict[str, float]) -> Row:
     """The worst over all regimes with a budget and what it cost: a point in the plane of error and time."""
     parts = [row for row in parts if row.budgets]
-    metrics = "worst / u", "error / bound", "worst chord", "worst rad", "length drift"
+    metrics = WORST_IN_U, ERROR_OVER_BOUND, WORST_CHORD, WORST_ANGLE, "length drift"
     values = {m: max(row.values[m] for row in parts) for m in metrics}
-    values |= {m: sum(row.values[m] for row in parts) for m in ("misjudged", "misjudged far", "other side")}
+    values |= {m: sum(row.values[m] for row in parts) for m in (MISCLASSIFIED, MISCLASSIFIED_FAR, "other side")}
     budgets = {}
-    if min(row.replay["count"] for row in parts) >= TWO_SIDED:
+    if min(row.replay["count"] for row in parts) >= limits.SLACK_FROM_RAYS:
         slack = _slack(name, parts)
-        values, budgets = values | slack, dict.fromkeys(slack, LARGEST_SLACK)
+        values, budgets = values | slack, dict.fromkeys(slack, limits.SLACK)
     replay = {"rays": sum(row.replay["count"] for row in parts), "seed": SEED}
     goals = kernel_timing.goals(name, setting)
-    return Row("directions", name, "all regimes", setting.label, values | times, budgets, goals, replay=replay)
+    return Row(NAME, name, ALL, setting.label, values | times, budgets, goals, replay=replay)
 
 
 def _slack(name: str, parts: list[Row]) -> dict[str, float]:
@@ -161,3 +167,6 @@ def _slack(name: str, parts: list[Row]) -> dict[str, float]:
     constants = {"linear": budget_of(name).linear, "radicand": budget_of(name).radicand}
     needed = {c: max(row.replay["needed"][c] for row in parts) for c in constants}
     return {f"slack, {c}": x / max(needed[c], 1e-3 * x) for c, x in constants.items() if x}
+
+
+STUDY = Study(NAME, "Directions", about(__doc__), TERMS, tasks, scatter=SCATTER)

@@ -1,4 +1,4 @@
-"""Mutants: formulas with one planted defect each, which the judgement of the directions must see.
+"""Planted defects: formulas with one each, which the judgement of the directions must see.
 
 Slips of the documents as printed, and slips one makes. Each is judged by the budget of the formula that it spoils, on
 the same regimes of rays; one that no ray sees has escaped. The control is the formula as it is: no ray may see that.
@@ -24,10 +24,11 @@ from mi_refract.regimes import Rays
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
 from validation.run.array_settings import Setting, settings
-from validation.run.context import Context, Task
+from validation.run.context import Context
+from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED_FAR
+from validation.study import Study, Task, about
 
-TITLE = "Mutants"
-TEXT = __doc__.partition("\n")[2].strip()
+NAME = "planted_defects"
 SEED = 2028
 COUNT, SCALAR_COUNT = 400, 20  # rays per regime
 EXACT = tuple(name for name, formula in FORMULAS.items() if formula.budget.at_the_limit)
@@ -239,7 +240,7 @@ def tasks(context: Context) -> list[Task]:
     """On single precision where it is compiled, else on what there is."""
     running = [setting for setting in settings(context) if setting.vector is not None]
     setting = next((s for s in running if s.precision is np.float32), running[0])
-    return [Task(f"mutants: {setting.label}", functools.partial(_rows, setting))]
+    return [Task(f"planted defects: {setting.label}", functools.partial(_rows, setting))]
 
 
 def _rows(setting: Setting) -> list[Row]:
@@ -252,14 +253,14 @@ RARE = "shows on one ray in a hundred; scalar arrays are asked for too few"
 
 def _row(name: str, formula: str, setting: Setting, sample: Sample) -> Row:
     if MUTANTS[name].rare and setting.is_scalar:
-        return Row("mutants", name, formula, setting.label, reason=RARE)
+        return Row(NAME, name, formula, setting.label, reason=RARE)
     found = sample.judge(name, formula, setting.vector)
     seen = int(found.wrong.sum())
     values = {"rays that see it": float(seen), "escaped": float(seen == 0), **found.values()}
     budgets = {"rays that see it": 0.0} if name == "control" else {"escaped": 0.0}
     remark = sample.strongest(found) if seen else ""
     replay = {"seed": SEED, "rays": len(found.wrong)}
-    return Row("mutants", name, formula, setting.label, values, budgets, reason=remark, replay=replay)
+    return Row(NAME, name, formula, setting.label, values, budgets, reason=remark, replay=replay)
 
 
 @dataclass(frozen=True)
@@ -278,6 +279,8 @@ class Sample:
         return judge_formula(spoilt, part.rays, part.exact, vector, budget)
 
     def only(self, mask: np.ndarray) -> Sample:
+        """The rays of a mask (N,)."""
+
         def part(x: Any) -> Any:
             return type(x)(**{f.name: getattr(x, f.name)[mask] for f in dataclasses.fields(x)})
 
@@ -285,11 +288,11 @@ class Sample:
 
     def strongest(self, found: Judgement) -> str:
         """ "regime, metric value": a wrong decision before a wrong direction, where most rays see it."""
-        metric, mask = ("misjudged far", found.far) if found.far.any() else ("error / bound", found.wrong)
+        metric, mask = (MISCLASSIFIED_FAR, found.far) if found.far.any() else (ERROR_OVER_BOUND, found.wrong)
         names = self.regime if len(mask) == len(self.regime) else self.regime[self.unit]
         regime = max(dict.fromkeys(names), key=lambda name: int(mask[names == name].sum()))
         there = names == regime
-        value = mask[there].sum() if metric == "misjudged far" else found.share[there].max()
+        value = mask[there].sum() if metric == MISCLASSIFIED_FAR else found.share[there].max()
         return f"caught by {regime}: {metric} {compact(float(value))}"
 
 
@@ -311,3 +314,6 @@ def _along_axes(precision: type) -> Rays:
     n: np.ndarray = np.tile(np.eye(3, dtype=precision), (4, 1))
     side, k = np.repeat([[1.0], [-1.0]], 6, axis=0), np.tile(np.repeat([0.75, 1.5], 3), 2)
     return Rays((n * side).astype(precision), n, k.astype(precision))
+
+
+STUDY = Study(NAME, "Planted defects", about(__doc__), TERMS, tasks)

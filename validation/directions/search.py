@@ -27,16 +27,17 @@ from mi_refract.regimes import REGIMES, Rays
 from mi_refract.report.row import Row
 from validation.reference.fast_reference import Screen
 from validation.run.array_settings import Setting, budget_of, settings
-from validation.run.context import PROFILES, Context, Profile, Task
+from validation.run.context import PROFILES, Context, Profile
+from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED_FAR
+from validation.study import Study, Task, about
 
 from . import worst_rays
 from .worst_rays import Found
 
-TITLE = "Search"
-TEXT = __doc__.partition("\n")[2].partition("\n\n`python")[0].strip()
+NAME = "search"
 TERMS = {
-    "error / bound": "the largest share of its ray's a-priori bound that a certified error was found to take",
-    "misjudged far": "rays found whose total internal reflection the formula must decide rightly and does not",
+    ERROR_OVER_BOUND: "the largest certified error found, over its ray's a-priori bound",
+    MISCLASSIFIED_FAR: "rays found whose total internal reflection the formula must decide rightly and does not",
     "rays tried": "children of all generations",
 }
 SEED = 2037
@@ -61,17 +62,23 @@ def tasks(context: Context) -> list[Task]:
 
 def _rows(context: Context, name: str, setting: Setting) -> list[Row]:
     if setting.vector is None:
-        return [Row("search", name, "all regimes", setting.label, reason=setting.reason)]
+        return [Row(NAME, name, "all regimes", setting.label, reason=setting.reason)]
     generations, sample = context.profile.generations, _sample_size(context.profile)
     herd = climb(name, FORMULAS[name], domain(name, setting), setting, generations, sample=sample)
     found = certify(name, FORMULAS[name], herd, setting)
     chords = [f for f in found if f.line.objective == "chord"]
     far = [f.line.line() for f in found if f.line.objective == "decision" and f.share > 0]
-    values = {"error / bound": max((f.share for f in chords), default=0.0), "misjudged far": float(len(far))}
+    values = {ERROR_OVER_BOUND: max((f.share for f in chords), default=0.0), MISCLASSIFIED_FAR: float(len(far))}
     values["rays tried"] = float(generations * CHILDREN * len(herd))
     worst_lines = [f.line.line() for f in sorted(chords, key=lambda f: -f.share)[:3]]
-    replay = {"seed": SEED, "sample": sample, "generations": generations, "worst": worst_lines, "misjudged": far[:3]}
-    return [Row("search", name, "all regimes", setting.label, values, BUDGETS, replay=replay)]
+    replay = {
+        "seed": SEED,
+        "sample": sample,
+        "generations": generations,
+        "worst": worst_lines,
+        "misclassified": far[:3],
+    }
+    return [Row(NAME, name, "all regimes", setting.label, values, BUDGETS, replay=replay)]
 
 
 def _sample_size(profile: Profile) -> int:
@@ -92,6 +99,7 @@ class Herd:
     names: tuple[str, ...]
 
     def __len__(self) -> int:
+        """How many families there are."""
         return len(self.score)
 
 
@@ -247,6 +255,7 @@ def certify(name: str, subject: Subject, herd: Herd, setting: Setting) -> list[C
 
 
 def worth_keeping(found: Iterable[Certified]) -> list[Found]:
+    """The lines whose error over bound is above WORTH_KEEPING."""
     return [f.line for f in found if f.share > WORTH_KEEPING[budget_of(f.line.formula).at_the_limit]]
 
 
@@ -266,6 +275,7 @@ def rescored(name: str, setting: Setting) -> list[Found]:
 
 
 def main(arguments: list[str] | None = None) -> int:
+    """The search by hand: from the command line, or `arguments`; the exit code."""
     parser = argparse.ArgumentParser(prog="validation.search", description="Try to break the budgets of the formulas.")
     parser.add_argument("formulas", nargs="*", help="keys of FORMULAS; all by default")
     parser.add_argument("--generations", type=int, default=PROFILES["full"].generations)
@@ -296,6 +306,9 @@ def _context() -> Context:
 
     variant = backend.activate(may_restart=True)
     return Context(PROFILES["full"], Path(), variant, backend.detect(), backend.usable_variants())
+
+
+STUDY = Study(NAME, "Search", about(__doc__), TERMS, tasks)
 
 
 if __name__ == "__main__":

@@ -17,26 +17,26 @@ from mi_refract.accuracy import BUDGETS, judge_formula
 from mi_refract.formulas import FORMULAS, Budget
 from mi_refract.regimes import Rays
 from mi_refract.report.row import Row
+from validation import limits
 from validation.reference.fast_reference import Screen
 from validation.run.array_settings import Setting, budget_of, settings
-from validation.run.context import Context, Task
+from validation.run.context import Context
+from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED, MISCLASSIFIED_FAR, WORST_IN_U
+from validation.study import Study, Task, about
 
-TITLE = "Sweep"
-TEXT = __doc__.partition("\n")[2].strip()
+NAME = "sweep"
 TERMS = {
-    "worst / u": "the largest certified chord error in units of roundoff, of the rays that were decided rightly",
-    "error / bound": "the largest share that a certified error takes of its ray's a-priori bound",
-    "misjudged": "rays whose total internal reflection was decided wrongly: all that the screen is certain of, and of "
-    "the others those that were certified",
-    "misjudged far": "certified ones that the formula must decide rightly, as in the study of directions",
+    WORST_IN_U: "the largest certified chord error in units of roundoff, of the rays that were decided rightly",
+    ERROR_OVER_BOUND: "the largest certified error of a ray over its a-priori bound",
+    MISCLASSIFIED: "rays whose total internal reflection was decided wrongly: all that the screen is certain of, and "
+    "of the others those that were certified",
+    MISCLASSIFIED_FAR: "certified ones that the formula must decide rightly, as in the study of directions",
     "screen off": "the largest difference between the screen's chord error and the certified one, in u; infinite where "
     "a decision that the screen is certain of was wrong",
     "unresolved": "rays nearer to the critical angle than the screen resolves that were not certified either",
 }
 SEED = 2031
 CHUNK = 1 << 16
-# What the screen may be off by: extended precision, which compares with the certified answer, costs as much.
-SCREEN_BUDGET = 0.01
 # Rays nearer to the critical angle than the screen resolves, per kept one.
 UNRESOLVED_SHARE = 50
 
@@ -52,7 +52,7 @@ def tasks(context: Context) -> list[Task]:
 
 def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
-        return [Row("sweep", name, "all regimes", setting.label, reason=setting.reason) for name in FORMULAS]
+        return [Row(NAME, name, "all regimes", setting.label, reason=setting.reason) for name in FORMULAS]
     profile = context.profile
     sizes = profile.sweep_rays, profile.certified
     rows = [row for regime in regimes.REGIMES for row in regime_rows(regime, setting, *sizes)]
@@ -63,11 +63,11 @@ def _setting_rows(context: Context, setting: Setting) -> list[Row]:
 
 def _worst_of(rows: list[Row]) -> Row:
     """One row for a documented formula, over all regimes it was swept in."""
-    worst = max(rows, key=lambda row: row.values["error / bound"])
-    values = {m: max(row.values[m] for row in rows) for m in ("worst / u", "error / bound", "screen off")}
-    values |= {m: sum(row.values[m] for row in rows) for m in ("misjudged", "misjudged far", "rays", "certified")}
+    worst = max(rows, key=lambda row: row.values[ERROR_OVER_BOUND])
+    values = {m: max(row.values[m] for row in rows) for m in (WORST_IN_U, ERROR_OVER_BOUND, "screen off")}
+    values |= {m: sum(row.values[m] for row in rows) for m in (MISCLASSIFIED, MISCLASSIFIED_FAR, "rays", "certified")}
     case = "all regimes of unit vectors"
-    return Row("sweep", worst.subject, case, worst.setting, values, worst.budgets, replay=worst.replay)
+    return Row(NAME, worst.subject, case, worst.setting, values, worst.budgets, replay=worst.replay)
 
 
 # One regime ----------------------------------------------------------------------------------------------------
@@ -77,12 +77,14 @@ class Best:
     """The rays with the highest scores so far, at most `size`, with their chords, and how many were offered."""
 
     def __init__(self, size: int) -> None:
+        """None yet; at most `size` are kept."""
         self.size, self.offered = size, 0
         self.score: np.ndarray = np.empty(0)
         self.chord: np.ndarray = np.empty(0)
         self._rays: list[Rays] = []
 
     def add(self, rays: Rays, score: np.ndarray, mask: np.ndarray, chord: np.ndarray) -> None:
+        """Offer the rays of a mask (N,), with their scores and chord errors (N,)."""
         index = np.flatnonzero(mask)
         self.offered += len(index)
         index = index[_largest(score[index], self.size)]
@@ -93,6 +95,7 @@ class Best:
 
     @property
     def rays(self) -> Rays:
+        """The rays that were kept."""
         return self._rays[0]
 
 
@@ -103,19 +106,22 @@ def _largest(x: np.ndarray, count: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Gathered:
-    """What one formula leaves of a regime: of the rays that the screen is certain of and that were decided rightly
-    those nearest to their bounds; the misjudged ones, farthest from the critical angle first; and rays that the screen
+    """What is kept of a regime for one formula.
+
+    `worst`: of the rays that the screen is certain of and that were decided rightly, those nearest to their bounds.
+    `misclassified`: those decided wrongly, farthest from the critical angle first. `unresolved`: rays that the screen
     cannot resolve, those that it would decide differently first.
     """
 
     worst: Best
-    misjudged: Best
+    misclassified: Best
     unresolved: Best
 
     def add(self, screen: Screen, budget: Budget, chord: np.ndarray, wrong: np.ndarray) -> None:
+        """Offer the rays of a screen, with a formula's chord errors and wrong decisions (N,)."""
         rays, certain = screen.rays, ~screen.doubtful
         self.worst.add(rays, chord / screen.bound(budget), certain & ~wrong, chord)
-        self.misjudged.add(rays, np.abs(screen.relative_radicand), certain & wrong, chord)
+        self.misclassified.add(rays, np.abs(screen.relative_radicand), certain & wrong, chord)
         self.unresolved.add(rays, wrong.astype(float), ~certain, chord)
 
 
@@ -133,27 +139,28 @@ def gather(regime: str, setting: Setting, count: int, kept: int) -> dict[str, Ga
 
 
 def regime_rows(regime: str, setting: Setting, count: int, kept: int) -> list[Row]:
+    """A row per formula that has a budget in the regime."""
     found = gather(regime, setting, count, kept)
     return [_certified_row(name, regime, setting, gathered, count) for name, gathered in found.items()]
 
 
 def _certified_row(name: str, regime: str, setting: Setting, found: Gathered, count: int) -> Row:
-    rays = Rays.joined([found.worst.rays, found.misjudged.rays, found.unresolved.rays])
+    rays = Rays.joined([found.worst.rays, found.misclassified.rays, found.unresolved.rays])
     certain = np.arange(len(rays)) < len(rays) - len(found.unresolved.rays)
     entry, reason = regimes.REGIMES[regime], setting.no_budget(budget_of(name), regime)
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
     seen = judge_formula(FORMULAS[name], rays, exact, setting.vector, budget_of(name))
     wrong = seen.misjudged
     values = {
-        "worst / u": float(np.max(seen.chord, where=seen.compared, initial=0)) / setting.roundoff,
+        WORST_IN_U: float(np.max(seen.chord, where=seen.compared, initial=0)) / setting.roundoff,
         **({} if reason else seen.values()),
-        "misjudged": float(found.misjudged.offered + (wrong & ~certain).sum()),
+        MISCLASSIFIED: float(found.misclassified.offered + (wrong & ~certain).sum()),
         "screen off": _disagreement(found, seen.chord[certain] / setting.roundoff, wrong[certain]),
         "rays": float(count),
         "certified": float(len(rays)),
         "unresolved": float(found.unresolved.offered - (~certain).sum()),
     }
-    budgets = {} if reason else {**BUDGETS, "screen off": SCREEN_BUDGET}
+    budgets = {} if reason else {**BUDGETS, "screen off": limits.SCREEN_OFF}
     replay = {
         "regime": regime,
         "text": entry.text,
@@ -161,13 +168,13 @@ def _certified_row(name: str, regime: str, setting: Setting, found: Gathered, co
         "chunk": CHUNK,
         "first seed": SEED,
         "worst ray": rays.hexed(int(np.argmax(seen.share))),
-        "misjudged": [rays.hexed(int(i)) for i in np.flatnonzero(wrong)[:3]],
+        "misclassified": [rays.hexed(int(i)) for i in np.flatnonzero(wrong)[:3]],
     }
-    return Row("sweep", name, regime, setting.label, values, budgets, reason=reason, replay=replay)
+    return Row(NAME, name, regime, setting.label, values, budgets, reason=reason, replay=replay)
 
 
 def _disagreement(found: Gathered, chord: np.ndarray, wrong: np.ndarray) -> float:
-    """How far the screen is off on the worst and the misjudged rays, in u; of errors above 1e6 u, in millionths."""
+    """How far the screen is off on the worst and the misclassified rays, in u; of errors above 1e6 u, in millionths."""
     screened = found.worst.chord
     if wrong[: len(screened)].any() or not wrong[len(screened) :].all():
         return np.inf
@@ -176,3 +183,6 @@ def _disagreement(found: Gathered, chord: np.ndarray, wrong: np.ndarray) -> floa
         return np.inf
     screened, chord = screened[finite], chord[: len(screened)][finite]
     return float(np.max(np.abs(screened - chord) / np.maximum(1, chord / 1e6), initial=0))
+
+
+STUDY = Study(NAME, "Sweep", about(__doc__), TERMS, tasks)

@@ -37,18 +37,22 @@ class Found:
 
     @classmethod
     def at(cls, rays: Rays, i: int, formula: str, regime: str, objective: str, score: float) -> Found:
+        """The line of ray `i`, with a score rounded to four digits."""
         ray = rays.hexed(i)
         numbers = *ray["a"], *ray["n"], ray["k"]
         return cls(rays.k.dtype.name, formula, regime, objective, float(f"{score:.4g}"), numbers)
 
     def scored(self, score: float) -> Found:
+        """The same ray with another score."""
         return replace(self, score=float(f"{score:.4g}"))
 
     @property
     def group(self) -> tuple[str, ...]:
+        """Lines of one group compete for MOST places."""
         return self.precision, self.formula, self.regime, self.objective
 
     def line(self) -> str:
+        """The line as it stands in the file."""
         vectors = " ".join(self.numbers[:3]), " ".join(self.numbers[3:6]), self.numbers[6]
         return _SEPARATOR.join((*self.group, f"{self.score:.4g}", *vectors))
 

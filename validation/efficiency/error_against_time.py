@@ -19,31 +19,36 @@ import numpy as np
 from mi_refract.image_diff import tile_statistics
 from mi_refract.plugins import scene_features
 from mi_refract.report.row import Row
+from validation import limits
 from validation.run import kernel_timing
-from validation.run.context import NO_REFERENCE, SCENES, Context, Task
+from validation.run.context import NO_REFERENCE, SCENES, Context
+from validation.run.metrics import (
+    DETECTABLE,
+    EQUAL_TIME,
+    EQUAL_TIME_DEFAULTS,
+    SMALLEST_P,
+    TIME_OVER_BUILTIN,
+    WELCH_ALARMS,
+)
 from validation.run.render_methods import BUILTIN, METHODS, OURS, Camera, Method, camera
+from validation.study import Study, Task, about
 
-TITLE = "Efficiency"
-TEXT = __doc__.partition("\n")[2].strip()
 TERMS = {
-    "time / built-in": "at equal samples per pixel and the same sampler; low, high: its 95 % interval over the rounds",
+    TIME_OVER_BUILTIN: "at equal samples per pixel and the same sampler; low, high: its 95 % interval over the rounds",
     "MSE": "mean over pixels and channels of the squared error; relMSE: over reference² + 0.01",
     "MSE, trimmed": "without the 0.1 % of pixels where the squared error, or the relative one, is largest",
-    "equal-time MSE": "MSE × time over that of path + dielectric with the same sampler: 1 / relative efficiency",
-    "equal-time MSE / independent": "the same over that of path + dielectric with `independent`, Mitsuba's default",
-    "Welch alarms": "tiles and channels whose mean differs from the reference's; at most one method in 1000 by chance",
+    EQUAL_TIME: "MSE × time over that of path + dielectric with the same sampler: 1 / relative efficiency",
+    EQUAL_TIME_DEFAULTS: "the same over that of path + dielectric with `independent`, Mitsuba's default",
+    WELCH_ALARMS: "tiles and channels whose mean differs from the reference's; at most one method in 1000 by chance",
 }
 AXES = {"x": "seconds", "y": "RMSE", "slope": -0.5}
-STUDY = "efficiency"
+NAME = "efficiency"
 SCALAR = "needs a compiled variant: a scalar one's time is that of Python"
 INDEPENDENT, STRATIFIED = "independent", ("multijitter", "orthogonal")
 EPSILON, WORST = 0.01, 1e-3
-NOISE = 1e-5  # of float32 images: below it independent seeds give the same one
-TILE, FAMILY_ERROR, MARGIN = 16, 1e-3, 1e-5
+TILE = 16
 FIRST_REFERENCE = 1000  # seed: no method has seen any from here on
 METRICS = ("MSE", "MSE, trimmed", "relMSE", "relMSE, trimmed")
-GLASS_GOALS = {"equal-time MSE": 0.4, "equal-time MSE / independent": 0.12}
-MIXED_GOALS = {"equal-time MSE": 0.8}
 
 
 @dataclass(frozen=True)
@@ -63,7 +68,8 @@ class Extent:
 
 
 EXTENTS = {
-    "quick": Extent((4, 25), 6, 12, scenes=("balls", "furnace", "mirage", "sphere")),
+    "quick": Extent((4, 9), 6, 12, resolution=64, scenes=("sphere",)),
+    "standard": Extent((4, 25), 6, 12, scenes=("balls", "furnace", "mirage", "sphere")),
     "full": Extent((4, 9, 25), 8, 16, seconds=0.25),
 }
 LARGEST = 512
@@ -78,6 +84,7 @@ class Subject:
 
     @property
     def name(self) -> str:
+        """As it stands in the rows."""
         return self.method.name + (f", {INDEPENDENT}" if self.sampler == INDEPENDENT else "")
 
 
@@ -90,6 +97,7 @@ class Measured:
     images: list[np.ndarray]
 
     def cost(self, metric: str) -> list[float]:
+        """Error times seconds, by round: half of it takes half of the time."""
         return [error * seconds for error, seconds in zip(self.figures[metric], self.seconds, strict=True)]
 
 
@@ -112,17 +120,17 @@ def scene_rows(context: Context, path: Path, methods: tuple[Method, ...] = METHO
         reason = f"left out: the profile {context.profile.name} measures {', '.join(extent.scenes)}"
     elif path.stem in NO_REFERENCE:
         reason = f"left out: {NO_REFERENCE[path.stem]}"
-    elif (noise := _noise(path, extent)) < NOISE:
+    elif (noise := _noise(path, extent)) < limits.NOISE:
         reason = f"left out: no noise, so no error against time: two seeds differ by {noise:.1e} at most"
     if reason:
-        return [Row(STUDY, "every method", path.stem, context.variant, reason=reason)]
+        return [Row(NAME, "every method", path.stem, context.variant, reason=reason)]
     return _measured_rows(context, path, extent, methods)
 
 
 def _measured_rows(context: Context, path: Path, extent: Extent, methods: tuple[Method, ...]) -> list[Row]:
     resolution = _resolution(path, extent)
     absent = {method.name: reason for method in methods if (reason := method.missing)}
-    rows = [Row(STUDY, name, path.stem, context.variant, reason=reason) for name, reason in absent.items()]
+    rows = [Row(NAME, name, path.stem, context.variant, reason=reason) for name, reason in absent.items()]
     sampler = best_sampler(path, resolution, extent)
     subjects = [Subject(BUILTIN, INDEPENDENT), Subject(BUILTIN, sampler)]
     subjects += [Subject(m, sampler) for m in methods if m != BUILTIN and m.name not in absent]
@@ -144,10 +152,10 @@ def _measured_rows(context: Context, path: Path, extent: Extent, methods: tuple[
     for subject in subjects:
         values = _values(subject, subjects[:2], found, references)
         # The reference is the built-in's own.
-        budgets = {} if subject.method == BUILTIN else {"Welch alarms": 0.0}
+        budgets = {} if subject.method == BUILTIN else {WELCH_ALARMS: 0.0}
         rows.append(
             Row(
-                STUDY,
+                NAME,
                 subject.name,
                 path.stem,
                 context.variant,
@@ -159,7 +167,7 @@ def _measured_rows(context: Context, path: Path, extent: Extent, methods: tuple[
             )
         )
     own = {"reference variance": float(references.var(0, ddof=1).mean() / len(references))}
-    rows.append(Row(STUDY, "every method", path.stem, context.variant, own, {}, {}, remark, replay, {}, _curves(found)))
+    rows.append(Row(NAME, "every method", path.stem, context.variant, own, {}, {}, remark, replay, {}, _curves(found)))
     return rows
 
 
@@ -239,19 +247,20 @@ def _values(subject: Subject, builtins: list[Subject], found: Found, references:
     spp = max(found[subject.name])
     test, default, best = (found[s.name][spp] for s in (subject, *builtins))
     same = default if subject == builtins[0] else best
-    values = kernel_timing.ratio("equal-time MSE", test.cost("MSE"), same.cost("MSE"))
-    values |= kernel_timing.ratio("equal-time MSE / independent", test.cost("MSE"), default.cost("MSE"))
-    values |= kernel_timing.ratio("time / built-in", test.seconds, same.seconds)
+    values = kernel_timing.ratio(EQUAL_TIME, test.cost("MSE"), same.cost("MSE"))
+    values |= kernel_timing.ratio(EQUAL_TIME_DEFAULTS, test.cost("MSE"), default.cost("MSE"))
+    values |= kernel_timing.ratio(TIME_OVER_BUILTIN, test.seconds, same.seconds)
     values |= {"seconds": statistics.median(test.seconds)}
     values |= {metric: statistics.fmean(test.figures[metric]) for metric in METRICS}
     for metric in METRICS[1:]:
         ratios = [t / s for t, s in zip(test.cost(metric), same.cost(metric), strict=True)]
         values[f"equal-time {metric}"] = statistics.median(ratios)
-    agreed = tile_statistics.compare_stacks(references, np.stack(test.images), TILE, FAMILY_ERROR, MARGIN)
+    asked = TILE, limits.WELCH_ERROR, limits.WELCH_MARGIN
+    agreed = tile_statistics.compare_stacks(references, np.stack(test.images), *asked)
     return values | {
-        "Welch alarms": float(agreed.alarms),
-        "smallest p, adjusted": agreed.smallest_p,
-        "detectable difference": agreed.minimum_detectable(),
+        WELCH_ALARMS: float(agreed.alarms),
+        SMALLEST_P: agreed.smallest_p,
+        DETECTABLE: agreed.minimum_detectable(),
     }
 
 
@@ -263,10 +272,10 @@ def goals_of(subjects: list[Subject], found: Found, only_glass: bool) -> dict[st
     if rivals:
         spp = max(found[rivals[0].name])
         best = min(rivals, key=lambda s: statistics.median(found[s.name][spp].cost("MSE")))
-        goals[best.name] |= GLASS_GOALS if only_glass else MIXED_GOALS
+        goals[best.name] |= limits.ONLY_GLASS if only_glass else limits.MIXED
     for subject in ours:
         if only_glass and not subject.method.parameters:
-            goals[subject.name]["time / built-in"] = 0.8
+            goals[subject.name][TIME_OVER_BUILTIN] = limits.ONLY_GLASS_TIME
     return goals
 
 
@@ -279,3 +288,6 @@ def _curves(found: Found) -> dict[str, list[tuple[float, float]]]:
         ]
         for name, by_spp in found.items()
     }
+
+
+STUDY = Study(NAME, "Efficiency", about(__doc__), TERMS, tasks, axes=AXES)

@@ -26,11 +26,11 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.report.row import Row
-from validation.run.context import SCENES, Context, Task
+from validation import limits
+from validation.run.context import SCENES, Context
 from validation.run.render_methods import BUILTIN, METHODS, Camera, Method, camera
+from validation.study import Study, Task, about
 
-TITLE = "Scaling"
-TEXT = __doc__.partition("\n")[2].strip()
 TERMS = {
     "first image": "seconds, nothing compiled before; / built-in: over that of path + dielectric",
     "render": "seconds of a later image, the kernels in memory",
@@ -38,7 +38,7 @@ TERMS = {
     "arrays MB": "most that Dr.Jit held for arrays at once, by its own account; process MB: most of the whole process",
 }
 AXES = {"x": "size", "y": "seconds", "slope": None}
-STUDY = "scaling"
+NAME = "scaling"
 SCALAR = "needs a compiled variant: a scalar one compiles nothing"
 LIMIT = 600.0  # seconds of a process
 TIMES = ("first image", "render", "after an edit")
@@ -57,6 +57,7 @@ class Knob:
     every: bool = False
 
     def sizes(self, profile: str) -> tuple[int, ...]:
+        """Those of a profile."""
         return self.full if profile == "full" else self.quick
 
 
@@ -153,11 +154,6 @@ KNOBS = {
     "pixels": Knob(_pixels, (128**2,), (32**2, 128**2, 512**2, 1024**2)),
     "spp": Knob(_spp, (16,), (4, 32, 256), every=True),
 }
-# Ratios to the built-in of the leanest method there is, by knob and size.
-GOALS = {
-    ("glasses", 64): {"first image / built-in": 0.6, "after an edit / built-in": 0.2},
-    ("glasses", 1000): {"first image / built-in": 0.15},
-}
 
 
 # One process ---------------------------------------------------------------------------------------------------
@@ -205,7 +201,7 @@ def run(job: Job, home: str) -> dict[str, float]:
     environment = dict.fromkeys(("HOME", "CUDA_CACHE_PATH", "OPTIX_CACHE_PATH"), home)
     environment["PYTHONUSERBASE"] = site.getuserbase()  # packages may be below the home folder, too
     done = subprocess.run(
-        [sys.executable, "-m", "validation.scaling", json.dumps(vars(job))],
+        [sys.executable, "-m", "validation.efficiency.scaling", json.dumps(vars(job))],
         cwd=SCENES.parent,
         check=False,
         env=os.environ | environment,
@@ -228,18 +224,19 @@ def _files(folder: str) -> int:
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per knob."""
-    return [Task(f"scaling: {name}", functools.partial(knob_rows, context, name)) for name in KNOBS]
+    """One task per knob; in the profile `quick` the number of glasses only."""
+    knobs = ("glasses",) if context.profile.quick else tuple(KNOBS)
+    return [Task(f"scaling: {name}", functools.partial(knob_rows, context, name)) for name in knobs]
 
 
 def knob_rows(context: Context, knob: str, methods: tuple[Method, ...] = METHODS) -> list[Row]:
     """A row per size and method, and the curves of all of them."""
     if context.variant.startswith("scalar"):
-        return [Row(STUDY, "every method", knob, context.variant, reason=SCALAR)]
+        return [Row(NAME, "every method", knob, context.variant, reason=SCALAR)]
     if not KNOBS[knob].every:
         methods = tuple(method for method in methods if not method.parameters)
     absent = {method.name: reason for method in methods if (reason := method.missing)}
-    rows = [Row(STUDY, name, knob, context.variant, reason=reason) for name, reason in absent.items()]
+    rows = [Row(NAME, name, knob, context.variant, reason=reason) for name, reason in absent.items()]
     present = [method for method in methods if method.name not in absent]
     sizes = KNOBS[knob].sizes(context.profile.name)
     by_size = {size: _size_rows(context, knob, size, present) for size in sizes}
@@ -250,7 +247,7 @@ def knob_rows(context: Context, knob: str, methods: tuple[Method, ...] = METHODS
             for i, method in enumerate(present)
         }
         processes = {"processes": float(_processes(context))}
-        rows.append(Row(STUDY, "every method", f"{knob}: {metric}", context.variant, processes, curves=curves))
+        rows.append(Row(NAME, "every method", f"{knob}: {metric}", context.variant, processes, curves=curves))
     return rows
 
 
@@ -262,9 +259,9 @@ def _size_rows(context: Context, knob: str, size: int, methods: list[Method]) ->
         goals: dict[str, float] = {}
         if name != BUILTIN.name:
             values |= {f"{metric} / built-in": values[metric] / found[BUILTIN.name][metric] for metric in TIMES}
-            goals = GOALS.get((knob, size), {})
+            goals = limits.SCALING.get((knob, size), {})
         case = f"{knob} = {size}"
-        rows.append(Row(STUDY, name, case, context.variant, values, goals=goals, replay=vars(jobs[name])))
+        rows.append(Row(NAME, name, case, context.variant, values, goals=goals, replay=vars(jobs[name])))
     return rows
 
 
@@ -290,6 +287,9 @@ def _rounds(jobs: dict[str, Job], rounds: int) -> dict[str, dict[str, float]]:
         name: {metric: statistics.median(values[metric] for values in found) for metric in found[0]}
         for name, found in measured.items()
     }
+
+
+STUDY = Study(NAME, "Scaling", about(__doc__), TERMS, tasks, axes=AXES)
 
 
 if __name__ == "__main__":

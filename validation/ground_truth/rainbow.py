@@ -29,9 +29,6 @@ STEP = 0.01  # degrees
 # Degrees behind the edge. Nearer, pixels blur it: theirs is σ² = 0.041²/12, and C² is less by s σ²/4(D − D₀).
 # Farther, the cubic term counts.
 WINDOW = 0.1, 1.0
-# Degrees that pixels may move the edge: σ²/4(D − D₀) at 0.1 degrees is 3.5e-4; the parabola carries 1.7 of it to D₀,
-# 6e-4, which bows without noise show, too.
-BLUR = 1e-3
 
 
 def angle(index: Any = INDEX) -> float:
@@ -40,6 +37,7 @@ def angle(index: Any = INDEX) -> float:
 
 
 def scene(glass: dict[str, Any]) -> Any:
+    """The drop of a glass plugin's dictionary, its sun, the screen and the camera."""
     import mitsuba as mi
 
     move = mi.ScalarTransform4f

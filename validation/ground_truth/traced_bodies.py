@@ -1,11 +1,11 @@
-"""Truth: rays and a render through actual Mitsuba, against closed forms and CODE V's print.
+"""Ground truth: rays and a render through actual Mitsuba, against closed forms and CODE V's print.
 
 Rays are intersected with Mitsuba's shapes and refracted by the plugin's own samples, boundary by boundary, through
-bodies whose answer is known: their errors stand over a bound of what float32 may do on the way (`validation/bench.py`
-counts it), which is of the worst case. The double Gauss is that of a file, `validation/double_gauss_codev.json`, as
-ray-optics (BSD-3-Clause) carries CODE V's listing. The rainbow is measured on an image (`validation/bow.py`): its
-error stands over what chance leaves once in ten thousand runs. The built-in `dielectric` is shown beside, without
-budgets.
+bodies whose answer is known: their errors stand over a bound of what float32 may do on the way
+(`validation/ground_truth/traced_system.py` counts it), which is of the worst case. The double Gauss is that of a file,
+`validation/reference/double_gauss_codev.json`, as ray-optics (BSD-3-Clause) carries CODE V's listing. The rainbow is
+measured on an image (`validation/ground_truth/rainbow.py`): its error stands over what chance leaves once in ten
+thousand runs. The built-in `dielectric` is shown beside, without budgets.
 """
 
 from __future__ import annotations
@@ -19,24 +19,25 @@ import numpy as np
 
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.row import Row
+from validation import limits
 from validation.reference.optical_systems import Array
-from validation.renders.unused_features import under
 from validation.run import path_overlay
-from validation.run.context import Context, Task
+from validation.run.context import Context
+from validation.run.metrics import ERROR_OVER_BOUND
+from validation.run.render_methods import under
+from validation.study import Study, Task, about
 
 from . import rainbow
 from .traced_system import Bench
 from .traced_systems import BENCHES, glass
 
-TITLE = "Truth"
-TEXT = __doc__.partition("\n")[2].strip()
 BUILTIN = "dielectric"
 PLUGINS = PLUGIN, BUILTIN
 TERMS = {name: " ".join((make.__doc__ or "").split()) for name, make in BENCHES.items()} | {
     "shift, place, miss / mm": "largest distance from where the ray should be; of a miss, of its line from the focus",
     "direction / °": "largest |d − exact|, as an angle",
     "tangent": "largest deviation of (dx/dz, dy/dz)",
-    "error / bound": "largest of all of these over its own bound: the sum of what every rounding on the way may do, "
+    ERROR_OVER_BOUND: "largest of all of these over its own bound: the sum of what every rounding on the way may do, "
     "and, of the double Gauss, what its print is off; of the rainbow, as many standard errors as Student's t exceeds "
     "once in ten thousand times, and the blur of pixels",
     "index seen": "the least relative error of every index that takes a ray to its bound: a bound that holds whatever "
@@ -46,49 +47,54 @@ TERMS = {name: " ".join((make.__doc__ or "").split()) for name, make in BENCHES.
     "standard error / °": "of the mean over renders with seeds of their own",
 }
 AXES = {"x": "surface", "y": "mm, or tangent", "x_scale": "linear", "y_scale": "log", "slope": None}
-STUDY = "truth"
+NAME = "ground_truth"
 VARIANTS = "scalar_rgb", "llvm_ad_rgb", "cuda_ad_rgb"
-RENDERS = {"quick": 10, "full": 40}
-FALSE_ALARM = 1e-4
-SEEN = 1e-4  # of an index
-RESOLVED = 0.0145 / 10  # degrees: such an index moves the rainbow by 0.0145
+RENDERS = {"standard": 10, "full": 40}
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per variant, and one for the rainbow."""
-    found = [Task(f"truth: {variant}", functools.partial(variant_rows, context, variant)) for variant in VARIANTS]
-    double = Task("truth: double precision", lambda: [double_row()])
-    return [*found, double, Task("truth: rainbow", functools.partial(bow_rows, context))]
+    """One task per variant, and one for the rainbow; in the profile `quick` the variant of the run."""
+    if context.profile.quick:
+        variant = context.variant
+        return [Task(f"ground truth: {variant}", functools.partial(variant_rows, context, variant))]
+    found = [
+        Task(f"ground truth: {variant}", functools.partial(variant_rows, context, variant)) for variant in VARIANTS
+    ]
+    double = Task("ground truth: double precision", lambda: [double_row()])
+    return [*found, double, Task("ground truth: rainbow", functools.partial(bow_rows, context))]
 
 
 # Rays ----------------------------------------------------------------------------------------------------------
 
 
 def variant_rows(context: Context, variant: str) -> list[Row]:
+    """A row per body and plugin in a variant of Mitsuba."""
     reason = context.variants.get(variant, f"this Mitsuba has no variant {variant}")
     if reason is not None:
-        return [Row(STUDY, PLUGIN, "every body", variant, reason=reason)]
+        return [Row(NAME, PLUGIN, "every body", variant, reason=reason)]
     with under(variant):
         made = {name: make() for name, make in BENCHES.items()}
         return [bench_row(name, bench, plugin, variant) for name, bench in made.items() for plugin in PLUGINS]
 
 
 def double_row() -> Row:
+    """Why double precision is not measured."""
     reason = "Mitsuba's wheel has no variant in double precision; of formulas in float64 see Stability"
-    return Row(STUDY, PLUGIN, "every body", "double precision", reason=reason)
+    return Row(NAME, PLUGIN, "every body", "double precision", reason=reason)
 
 
 def bench_row(name: str, bench: Bench, plugin: str, setting: str) -> Row:
+    """A plugin through a body: deviations of each answer, over their bounds."""
     found = bench.deviations(bench.traced(plugin))
     spawned = bench.deviations(bench.traced(plugin, spawned=True))
     values = {answer: float(x.max()) for answer, x in found.items()}
-    values["error / bound"] = max(float((x / bench.bounds[answer]).max()) for answer, x in found.items())
+    values[ERROR_OVER_BOUND] = max(float((x / bench.bounds[answer]).max()) for answer, x in found.items())
     values["index seen"] = bench.index_seen
     values |= {f"{answer}, spawned": float(x.max()) for answer, x in spawned.items()}
-    budgets = {"error / bound": 1.0, "index seen": SEEN} if plugin == PLUGIN else {}
+    budgets = {ERROR_OVER_BOUND: limits.BODY, "index seen": limits.INDEX_SEEN} if plugin == PLUGIN else {}
     replay = {"definition": name, "rays": len(bench.origins), "boundaries": len(bench.boundaries)}
     curves = _by_surface(found, bench) if bench.printed else {}
-    return Row(STUDY, plugin, name, setting, values, budgets, replay=replay, curves=curves)
+    return Row(NAME, plugin, name, setting, values, budgets, replay=replay, curves=curves)
 
 
 def _by_surface(found: dict[str, Array], bench: Bench) -> dict[str, list[tuple[float, float]]]:
@@ -102,9 +108,10 @@ def _by_surface(found: dict[str, Array], bench: Bench) -> dict[str, list[tuple[f
 
 
 def bow_rows(context: Context) -> list[Row]:
+    """The rainbow of either plugin."""
     if context.variant.startswith("scalar"):
         reason = "takes millions of light paths: needs a compiled variant"
-        return [Row(STUDY, PLUGIN, "rainbow", context.variant, reason=reason)]
+        return [Row(NAME, PLUGIN, "rainbow", context.variant, reason=reason)]
     seeds = RENDERS[context.profile.name]
     found = {plugin: rainbow.images(glass(plugin, rainbow.INDEX), seeds) for plugin in PLUGINS}
     about = {"index": float(rainbow.INDEX), "seeds": seeds, "resolution": rainbow.SIZE}
@@ -121,19 +128,22 @@ def bow_row(
 
     edges = np.array([rainbow.edge(image) for image in images])
     error, chance = edges.mean() - rainbow.angle(), edges.std(ddof=1) / math.sqrt(len(edges))
-    bound = stats.t.isf(FALSE_ALARM / 2, len(edges) - 1) * chance + rainbow.BLUR
+    bound = stats.t.isf(limits.FALSE_ALARM / 2, len(edges) - 1) * chance + limits.RAINBOW_BLUR
     values = {
         "rainbow / °": float(edges.mean()),
         "exact / °": rainbow.angle(),
         "error / °": float(abs(error)),
         "standard error / °": float(chance),
-        "error / bound": float(abs(error) / bound),
+        ERROR_OVER_BOUND: float(abs(error) / bound),
     }
-    budgets = {"error / bound": 1.0, "standard error / °": RESOLVED} if plugin == PLUGIN else {}
-    return Row(STUDY, plugin, "rainbow", setting, values, budgets, replay=replay, images=shown or {})
+    budgets = {ERROR_OVER_BOUND: limits.BODY, "standard error / °": limits.RAINBOW_RESOLVED} if plugin == PLUGIN else {}
+    return Row(NAME, plugin, "rainbow", setting, values, budgets, replay=replay, images=shown or {})
 
 
 def _save(folder: Path, plugin: str, images: list[Array], about: dict[str, Any]) -> str:
     """Their mean in squares of 4 pixels, 1 at its brightest."""
     mean = np.mean(images, axis=0).reshape(rainbow.SIZE // 4, 4, rainbow.SIZE // 4, 4).mean((1, 3))
     return path_overlay.save(folder, f"rainbow {plugin}", np.repeat(mean[..., None] / mean.max(), 3, axis=2), about)
+
+
+STUDY = Study(NAME, "Ground truth", about(__doc__), TERMS, tasks, axes=AXES)

@@ -53,6 +53,7 @@ class Plane:
     bend = 0.0
 
     def meet(self, p: Array, d: Array) -> tuple[Array, Array]:
+        """Where rays from `p` along `d` (N × 3) meet it, and the unit normals there."""
         return p + d * (dot(self.normal, self.point - p) / dot(self.normal, d)), np.broadcast_to(self.normal, p.shape)
 
 
@@ -70,6 +71,7 @@ class Ball:
         return float(self.axes.max() / self.axes.min() ** 2)
 
     def meet(self, p: Array, d: Array) -> tuple[Array, Array]:
+        """Where rays from `p` along `d` (N × 3) meet it, and the unit normals there."""
         q, e = (p - self.centre) / self.axes, d / self.axes
         b, square = dot(q, e), dot(e, e)
         root = np.sqrt(b * b - square * (dot(q, q) - 1))
@@ -88,6 +90,7 @@ class Boundary:
     thickness: float = 0.0
 
     def turn(self, a: Array, n: Array) -> Array:
+        """The directions behind it, by Snell's law or by reflection."""
         return a - 2 * dot(n, a) * n if self.k is None else snell(a, n, self.k)
 
     def denser(self, share: float) -> Boundary:
@@ -192,6 +195,7 @@ class Bench:
 
 
 def length(x: Array) -> Array:
+    """Of vectors (… × 3), as … × 1."""
     return np.sqrt(dot(x, x))
 
 

@@ -24,6 +24,7 @@ WATER = np.longdouble(1.333)
 
 
 def glass(plugin: str, inside: Any, outside: Any = 1.0) -> dict[str, Any]:
+    """Mitsuba's dictionary of a glass by its two indices."""
     return {"type": plugin, "int_ior": float(inside), "ext_ior": float(outside)}
 
 
@@ -143,6 +144,7 @@ def ellipsoid() -> Bench:
 
 
 def drop(order: int) -> Bench:
+    """A drop with `order` reflections inside."""
     i = degrees(2, 80)
     a, p, d = vectors(0 * i, 0, 1), RADIUS * vectors(np.sin(i), 0, -np.cos(i)), closed_forms.deflection(i, WATER, order)
     near, far = (Ball(vectors([0], 0, 0), RADIUS * vectors([1], 1, 1), far=x) for x in (False, True))

@@ -1,12 +1,12 @@
 """Planar: `planar.trace` against an independent retrace, on every scene file.
 
-Paths are followed once more in extended precision, by implicit curves and momenta. A ray is astray where it meets
-other boundaries than it should, or ends another way. Of the others, every point and the last direction count, and
+Paths are followed once more in extended precision, by implicit curves and momenta. A ray takes a wrong path where it
+meets other boundaries than it should, or ends another way. Of the others, every point and the last direction count, and
 stand over what rounding may have grown to: each boundary adds a few roundings of the largest coordinate so far and of
-the angle, a facet's own turn by its rounded ends and 1/cos behind the boundary among them, and the first-order
-transfer of a displaced and tilted ray carries them on (`validation/growth.py`). Rays are the file's, and seeded ones
-scattered around them; `clutter` are scenes by chance, of bodies of every kind, nested and turned. Then the formulas by
-name.
+the angle, a facet's own turn by its rounded ends and 1/cos behind the boundary among them, and the first-order transfer
+of a displaced and tilted ray carries them on (`validation/planar/error_growth.py`). Rays are the file's, and seeded
+ones scattered around them; `clutter` are scenes by chance, of bodies of every kind, nested and turned. Then the
+formulas by name.
 """
 
 from __future__ import annotations
@@ -22,33 +22,39 @@ from mi_refract.formulas import FORMULAS
 from mi_refract.planar import Paths, Segments, trace
 from mi_refract.planar.scene_file import PlanarScene, load
 from mi_refract.report.row import Row
+from validation import limits
 from validation.reference.planar_retrace import Array, Retraced, retrace
 from validation.run.array_settings import Setting, settings
-from validation.run.context import SCENES, Context, Task
+from validation.run.context import SCENES, Context
+from validation.run.metrics import ERROR_OVER_BOUND, WRONG_PATH, WRONG_PATH_FAR
+from validation.study import Study, Task, about
 
 from . import random_scenes
 from .error_growth import growth
 from .rounding_ambiguity import undecided
 
-TITLE = "Planar"
-TEXT = __doc__.partition("\n")[2].strip()
+DIFFERENCE, BOUNDARIES = "difference", "boundaries"
 TERMS = {
-    "difference": "largest distance of a point from the retrace, over the extent of the scene, and |d − exact|",
-    "error / bound": "largest of any point and last direction, over what rounding may have grown to",
-    "astray": "rays that meet other boundaries than they should, or end another way",
-    "astray, far": "of these, how many no rounding excuses: they pass every vertex of their boundaries at more than "
+    DIFFERENCE: "largest distance of a point from the retrace, over the extent of the scene, and |d − exact|",
+    ERROR_OVER_BOUND: "largest of any point and last direction, over what rounding may have grown to",
+    WRONG_PATH: "rays that meet other boundaries than they should, or end another way",
+    WRONG_PATH_FAR: "of these, how many no rounding excuses: they pass every vertex of their boundaries at more than "
     "their bound, touch no curve, and are off the critical angle",
-    "boundaries": "the most that a ray meets",
+    BOUNDARIES: "the most that a ray meets",
 }
-STUDY = "planar"
+NAME = "planar"
 FOLDER = SCENES / "planar"
 SEED = 2031
-RAYS = {"quick": 250, "full": 2000}  # at most so many of the file's own, and as many scattered around them
+RAYS = {
+    "quick": 100,
+    "standard": 250,
+    "full": 2000,
+}  # at most so many of the file's own, and as many scattered around them
 SCALAR_RAYS = 2
-CLUTTER = {"quick": (12, 100), "full": (100, 500)}  # scenes, and rays in each
+CLUTTER = {"standard": (12, 100), "full": (100, 500)}  # scenes, and rays in each
 SPREAD = 1e-2  # of the extent, and in radians
-EQUAL = 1e-9  # in float64, of the extent and in radians
-GROWN = {"error / bound": 1.0, "astray, far": 0.0}
+GROWN = {ERROR_OVER_BOUND: limits.GROWN, WRONG_PATH_FAR: 0.0}
+TRACE = "trace"  # the subject of its rows: `planar.trace` with the default formula
 SHOWN = "lens"  # the scene of the formulas
 
 
@@ -65,6 +71,7 @@ class Case:
 
     @functools.cached_property
     def exact(self) -> Retraced:
+        """The paths by the independent retrace."""
         return retrace(self.segments, self.origins, self.directions, self.max_depth, reflect=self.reflect)
 
     @functools.cached_property
@@ -74,9 +81,11 @@ class Case:
 
     @property
     def extent(self) -> float:
+        """The diagonal around the segments."""
         return _extent(self.segments)
 
     def trace(self, setting: Setting, formula: str | None = None) -> Paths:
+        """The paths by `planar.trace` in a setting, by the default formula or another one."""
         return trace(
             self.segments,
             self.origins,
@@ -96,8 +105,10 @@ def tasks(context: Context) -> list[Task]:
 
 def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
-        return [Row(STUDY, "trace", "every scene", setting.label, reason=setting.reason)]
+        return [Row(NAME, TRACE, "every scene", setting.label, reason=setting.reason)]
     rays = SCALAR_RAYS if setting.is_scalar else RAYS[context.profile.name]
+    if context.profile.quick:
+        return [row_of(case_of(FOLDER / f"{SHOWN}.toml", rays), setting)]
     cases = [case_of(path, rays) for path in sorted(FOLDER.glob("*.toml"))]
     rows = [row_of(case, setting) for case in cases]
     rows.append(clutter_row(setting, *((2, 5) if setting.is_scalar else CLUTTER[context.profile.name])))
@@ -111,22 +122,23 @@ def row_of(case: Case, setting: Setting, formula: str | None = None) -> Row:
     """A scene in a setting, by the default formula or another one."""
     values = judge(case.trace(setting, formula), case, setting.roundoff)
     replay = {"scene": f"{case.name}.toml", "rays": len(case.origins), "seed": SEED}
-    return Row(STUDY, formula or "trace", case.name, setting.label, values, budgets(setting), replay=replay)
+    return Row(NAME, formula or TRACE, case.name, setting.label, values, budgets(setting), replay=replay)
 
 
 def budgets(setting: Setting) -> dict[str, float]:
-    exact = {"difference": EQUAL, "astray": 0.0} if setting.precision is np.float64 else {}
+    """In float32 what rounding may have grown to, in float64 equality, too."""
+    exact = {DIFFERENCE: limits.PLANAR_EQUAL, WRONG_PATH: 0.0} if setting.precision is np.float64 else {}
     return GROWN | exact
 
 
 def clutter_row(setting: Setting, scenes: int, rays: int) -> Row:
     """Scenes by chance: counts of all of them, and the worst of the rest."""
     parts = [judge(case.trace(setting), case, setting.roundoff) for case in _clutter(scenes, rays)]
-    counts = ("astray", "astray, far")
+    counts = (WRONG_PATH, WRONG_PATH_FAR)
     values = {name: (sum if name in counts else max)(part[name] for part in parts) for name in parts[0]}
     replay = {"scenes": scenes, "rays": scenes * rays, "seed": SEED}
     # Among so many bodies errors may grow beyond any fixed bound: their own one counts.
-    return Row(STUDY, "trace", "clutter", setting.label, values, GROWN, replay=replay)
+    return Row(NAME, TRACE, "clutter", setting.label, values, GROWN, replay=replay)
 
 
 @functools.cache
@@ -182,15 +194,15 @@ def judge(paths: Paths, case: Case, u: float, offset: float = 0.0) -> dict[str, 
     same = paths.hits == exact.hits
     # Of two segments that share a vertex either is right there, if it does the same to the ray.
     same |= _at_their_vertex(paths.hits, case) & (ratio <= 1)[:, None]
-    astray = ~same.all(1) | (paths.events != exact.events).any(1)
+    wrong = ~same.all(1) | (paths.events != exact.events).any(1)
     near = undecided(exact, paths, case.segments, points, directions)
     worst = np.maximum(off.max(1) / case.extent, turned)
     return {
-        "error / bound": _largest(ratio[~astray]),
-        "difference": _largest(worst[~astray]),
-        "astray": float(astray.sum()),
-        "astray, far": float((astray & ~near).sum()),
-        "boundaries": float(exact.met.max()),
+        ERROR_OVER_BOUND: _largest(ratio[~wrong]),
+        DIFFERENCE: _largest(worst[~wrong]),
+        WRONG_PATH: float(wrong.sum()),
+        WRONG_PATH_FAR: float((wrong & ~near).sum()),
+        BOUNDARIES: float(exact.met.max()),
     }
 
 
@@ -211,5 +223,9 @@ def _largest(x: Array) -> float:
 
 
 def unit(d: Any) -> Array:
+    """Directions (N × 2) in extended precision, of length 1."""
     d = np.asarray(d, np.longdouble)
     return d / np.hypot(*d.T)[:, None]
+
+
+STUDY = Study(NAME, "Planar", about(__doc__), TERMS, tasks)

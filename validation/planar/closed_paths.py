@@ -19,16 +19,17 @@ import numpy as np
 from mi_refract.planar import Event, Paths, Segments, shapes
 from mi_refract.planar.curves import Curve
 from mi_refract.report.row import Row
+from validation import limits
 from validation.reference import closed_forms as closed
 from validation.reference.planar_retrace import Array, Retraced
 from validation.run.array_settings import Setting, settings
-from validation.run.context import Context, Task
+from validation.run.context import Context
+from validation.run.metrics import ERROR_OVER_BOUND
+from validation.study import Study, Task, about
 
 from . import against_retrace
 from .against_retrace import Case, budgets, judge, unit
 
-TITLE = "Planar, closed answers"
-TEXT = __doc__.partition("\n")[2].strip()
 TERMS = against_retrace.TERMS | {
     "error": "largest deviation from the closed answer: of a line from the point that it should meet, over its "
     "distance; of a direction, |d − exact|",
@@ -36,13 +37,11 @@ TERMS = against_retrace.TERMS | {
     "box": "total internal reflections in a box of index 1.5, by their number; answers from mirror images",
 }
 AXES = {"x": "reflections, or facets", "y": "deviation", "x_scale": "log", "y_scale": "log", "slope": None}
-STUDY = "planar_closed"
+NAME = "planar_closed"
 SEED = 2032
 REFLECTIONS = (20, 200, 2000)
 INDEX, FOCAL_LENGTH = 1.5, 9.0
 FACETS = (100, 1000, 10_000, 100_000)
-# Of the ellipse lens, in u: a place, a normal and a direction at either boundary, each rounded once in x and in y.
-SPOT = 6 * math.sqrt(2)
 
 
 @dataclass(frozen=True)
@@ -74,16 +73,17 @@ class Closed:
 
 def tasks(context: Context) -> list[Task]:
     """One task per backend and precision."""
-    return [Task(f"planar, closed: {s.label}", functools.partial(_setting_rows, s)) for s in settings(context)]
+    return [Task(f"planar, closed: {s.label}", functools.partial(_setting_rows, context, s)) for s in settings(context)]
 
 
-def _setting_rows(setting: Setting) -> list[Row]:
+def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
-        return [Row(STUDY, "trace", "every answer", setting.label, reason=setting.reason)]
+        return [Row(NAME, "trace", "every answer", setting.label, reason=setting.reason)]
     few = setting.is_scalar
-    rows = [_box_row(setting, count, 4 if few else 16) for count in REFLECTIONS]
+    counts = REFLECTIONS[:2] if context.profile.quick else REFLECTIONS
+    rows = [_box_row(setting, count, 4 if few else 16) for count in counts]
     rows += [_row(setting, name, make(8 if few else 500)) for name, make in CLOSED.items()]
-    return rows if few else [*rows, _curves_row(setting), _facet_row(setting)]
+    return rows if few or context.profile.quick else [*rows, _curves_row(setting), _facet_row(setting)]
 
 
 def _row(setting: Setting, name: str, closed: Closed) -> Row:
@@ -91,9 +91,9 @@ def _row(setting: Setting, name: str, closed: Closed) -> Row:
     errors = np.nan_to_num(closed.error(paths).astype(float), nan=np.inf) / setting.roundoff
     values = judge(paths, closed.case, setting.roundoff)
     values |= {"error": float(errors.max() * setting.roundoff), "error / u": float(errors.max())}
-    values["error / bound"] = max(values["error / bound"], float((errors / closed.bound).max()))
-    bounds = budgets(setting) | ({"error / u": SPOT} if name == "ellipse lens" else {})
-    return Row(STUDY, "trace", name, setting.label, values, bounds, replay={"rays": len(paths.hits)})
+    values[ERROR_OVER_BOUND] = max(values[ERROR_OVER_BOUND], float((errors / closed.bound).max()))
+    bounds = budgets(setting) | ({"error / u": limits.SPOT} if name == "ellipse lens" else {})
+    return Row(NAME, "trace", name, setting.label, values, bounds, replay={"rays": len(paths.hits)})
 
 
 # The box -------------------------------------------------------------------------------------------------------
@@ -119,6 +119,7 @@ class Billiard(Case):
 
     @functools.cached_property
     def exact(self) -> Retraced:
+        """The paths by mirror images."""
         return unfold(self.origins, self.directions, self.max_depth)
 
 
@@ -155,7 +156,7 @@ def _box_row(setting: Setting, count: int, rays: int) -> Row:
     case = box(count, rays)
     values = judge(case.trace(setting), case, setting.roundoff)
     replay = {"rays": rays, "seed": SEED, "reflections": count}
-    return Row(STUDY, "trace", f"box, {count}", setting.label, values, budgets(setting), replay=replay)
+    return Row(NAME, "trace", f"box, {count}", setting.label, values, budgets(setting), replay=replay)
 
 
 def _curves_row(setting: Setting) -> Row:
@@ -170,7 +171,7 @@ def _curves_row(setting: Setting) -> Row:
     bound = setting.roundoff / case.extent * case.bounds[0].max(0)
     curves["bound"] = [(float(j), float(bound[j])) for j in shown]
     values = {"place after all": curves["place, worst"][-1][1]}
-    return Row(STUDY, "trace", "box, by reflections", setting.label, values, curves=curves)
+    return Row(NAME, "trace", "box, by reflections", setting.label, values, curves=curves)
 
 
 # Lenses and prisms ---------------------------------------------------------------------------------------------
@@ -239,9 +240,12 @@ def _facet_row(setting: Setting) -> Row:
     arcs = _spot(setting, 0)
     curves = {"facets": spots, "arcs": [(m, arcs) for m, _ in spots]}
     values, case = {"error": spots[-1][1], "arcs": arcs}, "ellipse lens, by facets"
-    return Row(STUDY, "trace", case, setting.label, values, replay={"facets": FACETS}, curves=curves)
+    return Row(NAME, "trace", case, setting.label, values, replay={"facets": FACETS}, curves=curves)
 
 
 def _spot(setting: Setting, facets: int) -> float:
     closed = ellipse_lens(40, facets)
     return float(np.max(np.nan_to_num(closed.error(closed.case.trace(setting)), nan=np.inf)))
+
+
+STUDY = Study(NAME, "Planar, closed answers", about(__doc__), TERMS, tasks, axes=AXES)

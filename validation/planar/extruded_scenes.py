@@ -24,20 +24,19 @@ from validation.reference.layered_scenes import OFFSET
 from validation.reference.planar_retrace import Array
 from validation.run import path_overlay
 from validation.run.array_settings import Setting
-from validation.run.context import Context, Task
+from validation.run.context import Context
+from validation.study import Study, Task, about
 
 from . import against_retrace, wall_scene
 from .against_retrace import FOLDER, Case, judge
 
-TITLE = "Planar, extruded"
-TEXT = __doc__.partition("\n")[2].strip()
 TERMS = against_retrace.TERMS | {
     "along the ray": "rays moved along themselves behind a boundary, so that they do not meet it again",
     "spawn_ray": "moved along the normal, as Mitsuba does by itself; the bound counts that in",
     "from planar float32, float64": "largest distance from the points of `planar.trace`, over the extent, where both "
     "meet the same walls",
 }
-STUDY = "extrusion"
+NAME = "extrusion"
 SCALAR = "needs a compiled variant: a loop over rays in Python would take hours"
 U = 2.0**-24
 FACETS = 64  # of an arc, at most
@@ -48,16 +47,18 @@ RAYS = 100  # of the file's, and as many scattered
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per scene file."""
+    """One task per scene file; in the profile `quick` that of the lens."""
+    shown = f"{against_retrace.SHOWN}.toml" if context.profile.quick else "*.toml"
     return [
         Task(f"extruded: {path.stem}", functools.partial(scene_rows, context, path))
-        for path in sorted(FOLDER.glob("*.toml"))
+        for path in sorted(FOLDER.glob(shown))
     ]
 
 
 def scene_rows(context: Context, path: Path) -> list[Row]:
+    """A row per way to go on behind a boundary."""
     if context.variant.startswith("scalar"):
-        return [Row(STUDY, PLUGIN, path.stem, context.variant, reason=SCALAR)]
+        return [Row(NAME, PLUGIN, path.stem, context.variant, reason=SCALAR)]
     case = faceted(against_retrace.case_of(path, RAYS))
     scene, rows = wall_scene.extrude(case.segments), []
     planar_paths = {
@@ -76,7 +77,7 @@ def scene_rows(context: Context, path: Path) -> list[Row]:
         images = {"overlay": _image(context, scene, case, paths)} if name == DRAWN else {}
         rows.append(
             Row(
-                STUDY,
+                NAME,
                 f"{PLUGIN}, {name}",
                 path.stem,
                 context.variant,
@@ -128,6 +129,7 @@ def faceted(case: Case) -> Case:
 
 
 def along_the_ray(si: Any, d: Any) -> Any:
+    """A ray from the interaction along `d`, moved along itself by Mitsuba's offset."""
     import mitsuba as mi
 
     ray = mi.Ray3f(si.p, d)
@@ -178,3 +180,6 @@ def trace(scene: Any, case: Case, spawn: Spawn) -> Paths:
         np.array(events).astype(np.uint8).reshape(depth + 1, count).T,
         np.full((count, depth + 1), np.nan),
     )
+
+
+STUDY = Study(NAME, "Planar, extruded", about(__doc__), TERMS, tasks)

@@ -9,7 +9,7 @@ from validation.reference.planar_retrace import Array, Curves, Retraced
 
 
 def undecided(exact: Retraced, paths: Paths, segments: Segments, points: Array, directions: Array) -> Array:
-    """Which rays (N) may go astray, by the bounds of the errors of their points and directions.
+    """Which rays (N) may take a wrong path, by the bounds of the errors of their points and directions.
 
     A ray meets a curve between h and −h from its top where its cosine is less than √(2 |κ| h); by φ off, it is
     refracted or not where |1 − k² sin²θ| is less than 2 k φ.

@@ -20,14 +20,15 @@ import numpy as np
 from mi_refract.planar import Paths, Segments, Tracer, shapes
 from mi_refract.planar.segments import Array
 from mi_refract.report.row import Row
+from validation import limits
 from validation.run import kernel_timing
 from validation.run.array_settings import Setting, settings
-from validation.run.context import Context, Task
+from validation.run.context import Context
+from validation.study import Study, Task, about
 
-TITLE = "Planar, times"
-TEXT = __doc__.partition("\n")[2].strip()
+PER_PATH = "µs per path"
 TERMS = {
-    "µs per path": "median time of a path of two boundaries; low, high: its 95 % interval",
+    PER_PATH: "median time of a path of two boundaries; low, high: its 95 % interval",
     "ms to compile": "of the first call, what the later ones do not take; 0 where a kernel was kept",
     "ms to set up": "of the segments, once: tables, and the mesh",
     "differing": "paths of which a bit differs between the two methods",
@@ -36,20 +37,16 @@ TERMS = {
     "shuffled": "rays in no order; else they come lens by lens, from one side of each to the other",
     "M": "segments; 1172 are those of the original program",
 }
-AXES = {"x": "segments", "y": "µs per path", "x_scale": "log", "y_scale": "log", "slope": None}
-STUDY = "planar_times"
+AXES = {"x": "segments", "y": PER_PATH, "x_scale": "log", "y_scale": "log", "slope": None}
+NAME = "planar_times"
 SEED = 2033
 ORIGINAL = 0.05  # its resolution, 1172 segments
 SIZES = (10, 100, 1000, 10_000, 100_000, 1_000_000)
 BRUTE_SIZES = (0, 10, 100, 1000)
-ROUNDS = {"quick": 7, "full": 21}
-GOALS = {  # with two cores
-    ("llvm float32", "document 004"): {"µs per path": 0.1},
-    ("llvm float32", "M = 1000000"): {"µs per path": 1.0},
-}
-MESH, BRUTE = "mesh", "brute"
+ROUNDS = {"quick": 6, "standard": 7, "full": 21}
+MESH, SHUFFLED, BRUTE = "mesh", "mesh, shuffled", "brute"
 # The method, whether rays are shuffled, and how many times fewer of them there are.
-METHODS = {MESH: (MESH, False, 1), "mesh, shuffled": (MESH, True, 16), BRUTE: (BRUTE, False, 64)}
+METHODS = {MESH: (MESH, False, 1), SHUFFLED: (MESH, True, 16), BRUTE: (BRUTE, False, 64)}
 BOUNDARIES = 2
 
 
@@ -60,8 +57,9 @@ def tasks(context: Context) -> list[Task]:
 
 def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
-        return [Row(STUDY, "trace", "every size", setting.label, reason=setting.reason)]
-    return measure(context, setting, SIZES[:1] if setting.is_scalar else SIZES)
+        return [Row(NAME, "trace", "every size", setting.label, reason=setting.reason)]
+    sizes = SIZES[:3] if context.profile.quick else SIZES
+    return measure(context, setting, SIZES[:1] if setting.is_scalar else sizes)
 
 
 @dataclass(frozen=True)
@@ -109,12 +107,12 @@ def measure(context: Context, setting: Setting, sizes: tuple[int, ...]) -> list[
 def _row(setting: Setting, run: Run, brute: Run | None) -> Row:
     case, budgets, goals = f"M = {run.size}" if run.size else "document 004", {}, {}
     if run.method == MESH:
-        goals = GOALS.get((setting.label, case), {})
+        goals = limits.PLANAR_TIMES.get((setting.label, case), {})
         if brute:
             run.values["differing"] = float(differing(run.tracer(*brute.rays, BOUNDARIES), brute.paths()))
             budgets = {"differing": 0.0}
     replay = {"rays": len(run.rays[0]), "seed": SEED, "segments": len(field(run.size).segments)}
-    return Row(STUDY, run.method, case, setting.label, run.values, budgets, goals, replay=replay)
+    return Row(NAME, run.method, case, setting.label, run.values, budgets, goals, replay=replay)
 
 
 def _tracer(setting: Setting, method: str, size: int) -> tuple[Tracer, float]:
@@ -128,6 +126,7 @@ class Run:
     """A tracer called once; `values`: how long it took to set up, and what is measured later."""
 
     def __init__(self, tracers: Callable[[str, int], tuple[Tracer, float]], method: str, size: int, count: int) -> None:
+        """`tracers(method, size)` is a tracer with the seconds that it took; `count` rays, fewer for slow methods."""
         kind, shuffled, fewer = METHODS[method]
         self.method, self.size = method, size
         self.rays = field(size).beam(max(count // fewer, 1), shuffled)
@@ -137,15 +136,15 @@ class Run:
 
     def take(self, seconds: list[float]) -> None:
         """The times of later calls."""
-        self.values = (
-            kernel_timing.interval("µs per path", [t / len(self.rays[0]) * 1e6 for t in seconds]) | self.values
-        )
+        self.values = kernel_timing.interval(PER_PATH, [t / len(self.rays[0]) * 1e6 for t in seconds]) | self.values
         self.values["ms to compile"] = 1e3 * max(0.0, self.first - float(np.median(seconds)))
 
     def paths(self) -> Paths:
+        """All of its rays, traced."""
         return self.tracer(*self.rays, BOUNDARIES)
 
     def clock(self) -> float:
+        """Seconds to trace them."""
         start = time.perf_counter()
         self.paths()
         return time.perf_counter() - start
@@ -164,10 +163,13 @@ def differing(some: Paths, others: Paths) -> int:
 def _growth_row(setting: Setting, runs: list[Run]) -> Row:
     """µs per path against the number of segments, method by method."""
     curves = {
-        method: [(float(run.size), run.values["µs per path"]) for run in runs if run.method == method and run.size]
+        method: [(float(run.size), run.values[PER_PATH]) for run in runs if run.method == method and run.size]
         for method in METHODS
     }
     size, cost = np.array([point for point in curves[MESH] if point[0] >= 1000]).T
     slope = np.polyfit(np.log2(size), cost, 1)[0]
     found = {"per doubling": float(slope / cost[0]), "most over a thousand": float(cost[-1] / cost[0])}
-    return Row(STUDY, "every method", "µs per path", setting.label, found, curves=curves)
+    return Row(NAME, "every method", PER_PATH, setting.label, found, curves=curves)
+
+
+STUDY = Study(NAME, "Planar, times", about(__doc__), TERMS, tasks, axes=AXES)

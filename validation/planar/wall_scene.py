@@ -62,6 +62,7 @@ class Plan:
     """The plane z = 0 of an extruded scene from above, `middle` ± `half`: media by index, as rays along x find them."""
 
     def __init__(self, scene: Any, segments: Segments, size: int) -> None:
+        """`size`: pixels on a side."""
         import mitsuba as mi
 
         corners = np.concatenate([segments.start, segments.end])
@@ -78,5 +79,6 @@ class Plan:
         self.image = (0.02 + 0.25 * share.reshape(size, size, 1)) * np.array([0.4, 0.7, 1.0])
 
     def project(self, points: np.ndarray) -> np.ndarray:
+        """Where points (N × 3) are on the image, from 0 to 1, y downward."""
         seen = (points[:, :2] - self.middle) / self.half
         return 0.5 + 0.5 * seen * [1, -1]

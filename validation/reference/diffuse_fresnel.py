@@ -66,5 +66,6 @@ def nodes(index: float, precision: Any) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def extended(x: Any) -> np.longdouble:
+    """A number of more digits than a double, as the sum of two."""
     high = float(x)
     return np.longdouble(high) + np.longdouble(float(x - high))

@@ -1,7 +1,7 @@
 """A second exact answer, a thousand times faster than the certified one: it says which rays are worth certifying.
 
-Snell's law for the exact inputs in unevaluated sums of floats (`expansions`), for float32 and float64 alike, with none
-of the arithmetic of the formulas it judges:
+Snell's law for the exact inputs in unevaluated sums of floats (`numerics.float_expansions`), for float32 and float64
+alike, with none of the arithmetic of the formulas it judges:
 
     b = k a + n (s √D − k c)/n²,   b = a − 2 c n/n² under total internal reflection
     c = n·a,   D = c² − (k² − 1)|n×a|²,   s = sign(c)
@@ -35,6 +35,7 @@ class Screen:
     """
 
     def __init__(self, rays: Rays, vector: Any) -> None:
+        """Solve the rays; subjects are evaluated in arrays of the 3-vector type `vector`."""
         self.rays, self.roundoff = rays, float(np.finfo(rays.k.dtype).eps) / 2
         self._inputs = vector(rays.a.T), vector(rays.n.T), dr.value_t(vector)(rays.k)
         dr.eval(self._inputs)

@@ -39,10 +39,12 @@ FIELDS = {0.0: 0.0, 0.176327: 10.0, 0.249328: 14.0}  # printed tangent: degrees
 
 
 def dot(x: Array, y: Array) -> Array:
+    """Of vectors (… × 3), as … × 1."""
     return (x * y).sum(-1, keepdims=True)
 
 
 def unit(x: Array) -> Array:
+    """Vectors (… × 3) of length 1."""
     return x / np.sqrt(dot(x, x))
 
 
@@ -52,6 +54,7 @@ def vectors(*components: Any) -> Array:
 
 
 def degrees(first: float, last: float, count: int = RAYS) -> Array:
+    """`count` angles from `first` to `last`, in radians, in extended precision."""
     return np.deg2rad(np.linspace(first, last, count).astype(np.longdouble))
 
 

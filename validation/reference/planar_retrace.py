@@ -46,6 +46,7 @@ class Retraced:
 
     @property
     def directions(self) -> Array:
+        """Behind the last boundary (N × 2)."""
         return self.last(self.legs)
 
 
@@ -128,6 +129,7 @@ class Curves:
     """The boundaries as implicit curves. `arcs`: the ids of those that are not straight."""
 
     def __init__(self, segments: Segments) -> None:
+        """Ends and curvatures of the segments, in extended precision."""
         self.start, self.end = (np.asarray(x, np.longdouble) for x in (segments.start, segments.end))
         self.n_left, self.n_right = (np.asarray(x, np.longdouble) for x in (segments.n_left, segments.n_right))
         chord = self.end - self.start

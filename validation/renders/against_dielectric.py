@@ -22,31 +22,32 @@ from mi_refract.image_diff import pixelwise, tile_statistics
 from mi_refract.io import image_file
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.row import Row
+from validation import limits
 from validation.run import kernel_timing
-from validation.run.context import NO_REFERENCE, SCENES, Context, Profile, Task
+from validation.run.context import NO_REFERENCE, Context, Profile
+from validation.run.metrics import CHANGED_SHARE, DETECTABLE, MEANS_DIFFER, SMALLEST_P, WELCH_ALARMS
 from validation.run.render_methods import DIELECTRIC as BUILTIN
 from validation.run.render_methods import Camera, opened
+from validation.study import Study, Task, about
 
-TITLE = "Renders"
+NAME = "renders"
+TIME = f"time / {BUILTIN}"
 TERMS = {
     "reference, test, difference": "dielectric, refract, refract − dielectric: means over the same seeds",
-    "changed share": "pixels of which any channel differs by more than 1e-5, same seeds",
-    "Welch alarms": "tiles and channels whose means differ, independent seeds; at most one image in 1000 by chance",
-    "detectable difference": "relative difference of a tile's mean that would have been an alarm, median over tiles",
-    "time / dielectric": "median over alternating warm renders, a goal, not a budget, because a busy machine spoils "
+    CHANGED_SHARE: "pixels of which any channel differs by more than 1e-5, same seeds",
+    WELCH_ALARMS: "tiles and channels whose means differ, independent seeds; at most one image in 1000 by chance",
+    DETECTABLE: "relative difference of a tile's mean that would have been an alarm, median over tiles",
+    TIME: "median over alternating warm renders, a goal, not a budget, because a busy machine spoils "
     "it; with a name: of the plugin with that formula; low, high: the 95 % interval",
 }
 AXES = {"x": "seconds", "y": "relMSE", "slope": -1}  # relMSE is a variance
-TEXT = __doc__.partition("\n")[2].strip()
 # Paths in these scenes are short: a difference in the last bit stays one, unless it flips the choice of a lobe.
 SHORT_PATHS = {"sphere", "slab", "prism", "furnace"}
 Curves = dict[str, list[tuple[float, float]]]
 CHANGED = 1e-5
 TILE = 16
 CURVE_SEEDS = 2
-MARGIN = 1e-5  # relative: float32 images that differ by less are equal
 TIMED = 0.1  # seconds of a render whose time counts
-FAMILY_ERROR = 1e-3  # of Welch's test, per scene, after Šidák: 1 false alarm in 1000 images that are equal
 
 
 def tasks(context: Context) -> list[Task]:
@@ -54,7 +55,7 @@ def tasks(context: Context) -> list[Task]:
     plugins = [PLUGIN] + [f"{PLUGIN}_{name}" for name in FORMULAS if context.profile.every_formula]
     return [
         Task(f"renders: {path.stem}, {plugin}", functools.partial(_compare, context, path, plugin))
-        for path in sorted(SCENES.glob("*.xml"))
+        for path in context.scenes
         for plugin in plugins
     ]
 
@@ -67,12 +68,14 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
     values, left_out = _paired(test, reference), no_question(test, reference)
     if not left_out:
         values |= _independent(test[:half], reference[half:])
-    # Both forms at the rounding limit are timed, whichever of them is the default.
-    others = _at_the_limit() if plugin == PLUGIN else []
+    # Both forms at the rounding limit are timed, whichever of them is the default; `quick` saves their kernels.
+    others = _at_the_limit() if plugin == PLUGIN and not profile.quick else []
     values |= _times(profile, cameras | {name: Camera(opened(path, name, profile.resolution)) for name in others})
     # A Python plugin costs a call per operation in scalar variants: its time is demanded of compiled ones only.
     compiled = not context.variant.startswith("scalar")
-    goals = {metric: 1.0 for metric in values if metric in _metrics([plugin, *others])} if compiled else {}
+    goals = (
+        {metric: limits.RENDER_TIME for metric in values if metric in _metrics([plugin, *others])} if compiled else {}
+    )
     replay = {
         "scene": path.name,
         "plugin": plugin,
@@ -87,7 +90,7 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
     curves = _curves(context, cameras, reference) if plugin == PLUGIN and noisy and scene not in NO_REFERENCE else {}
     return [
         Row(
-            "renders",
+            NAME,
             plugin,
             scene,
             context.variant,
@@ -105,8 +108,8 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
 def _budgets(scene: str, left_out: str) -> dict[str, float]:
     if scene in NO_REFERENCE:
         return {}
-    budgets = {"|mean ratio − 1|": 1e-4} | ({} if left_out else {"Welch alarms": 0.0})
-    return budgets | ({"changed share": 1e-3} if left_out or scene in SHORT_PATHS else {})
+    budgets = {MEANS_DIFFER: limits.MEANS} | ({} if left_out else {WELCH_ALARMS: 0.0})
+    return budgets | ({CHANGED_SHARE: limits.CHANGED} if left_out or scene in SHORT_PATHS else {})
 
 
 def _images(profile: Profile, *cameras: Camera) -> list[np.ndarray]:
@@ -139,18 +142,18 @@ def _times(profile: Profile, cameras: dict[str, Camera]) -> dict[str, float]:
 
 
 def _metrics(plugins: list[str]) -> list[str]:
-    others = [f"time / {BUILTIN}, {name.removeprefix(PLUGIN + '_')}" for name in plugins[1:]]
-    return [f"time / {BUILTIN}", *others]
+    others = [f"{TIME}, {name.removeprefix(PLUGIN + '_')}" for name in plugins[1:]]
+    return [TIME, *others]
 
 
 def _paired(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """Same seeds, image by image."""
     found = pixelwise.changes(reference.reshape(-1, *reference.shape[2:]), test.reshape(-1, *test.shape[2:]), CHANGED)
     return {
-        "changed share": found.share,
+        CHANGED_SHARE: found.share,
         "largest change": found.largest,
         "RMSE": found.rms,
-        "|mean ratio − 1|": abs(found.mean_ratio - 1),
+        MEANS_DIFFER: abs(found.mean_ratio - 1),
     }
 
 
@@ -164,11 +167,11 @@ def no_question(test: np.ndarray, reference: np.ndarray) -> str:
 
 
 def _independent(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    found = tile_statistics.compare_stacks(reference, test, TILE, FAMILY_ERROR, MARGIN)
+    found = tile_statistics.compare_stacks(reference, test, TILE, limits.WELCH_ERROR, limits.WELCH_MARGIN)
     return {
-        "Welch alarms": float(found.alarms),
-        "smallest p, adjusted": found.smallest_p,
-        "detectable difference": found.minimum_detectable(),
+        WELCH_ALARMS: float(found.alarms),
+        SMALLEST_P: found.smallest_p,
+        DETECTABLE: found.minimum_detectable(),
     }
 
 
@@ -192,3 +195,6 @@ def _save(context: Context, settings: dict[str, Any], test: np.ndarray, referenc
         image_file.write_exr(context.out / folder / name, image.astype(np.float32), metadata=settings | {"role": role})
         saved[role] = str(folder / name)
     return saved
+
+
+STUDY = Study(NAME, "Renders", about(__doc__), TERMS, tasks, axes=AXES)

@@ -14,30 +14,32 @@ from pathlib import Path
 from mi_refract.plugins import scene_features
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.row import Row
-from validation.run.context import SCENES, Context, Task
+from validation.run.context import Context
 from validation.run.render_methods import opened
+from validation.study import Study, Task, about
 
-TITLE = "Scenes"
-TEXT = __doc__.partition("\n")[2].strip()
 TERMS = {
     "smooth": "some surface scatters, so that it can pay to sample the emitters there",
     "only glass": "every lobe of every surface is a delta",
     "delta emitters": "some emitter can be found by sampling it only",
 }
-STUDY = "scenes"
+NAME = "scenes"
 
 
 def tasks(context: Context) -> list[Task]:
     """One task per scene."""
-    paths = sorted(SCENES.glob("*.xml"))
-    return [Task(f"scenes: {path.stem}", functools.partial(scene_rows, context, path)) for path in paths]
+    return [Task(f"scenes: {path.stem}", functools.partial(scene_rows, context, path)) for path in context.scenes]
 
 
 def scene_rows(context: Context, path: Path) -> list[Row]:
+    """One row: what the loaded scene has that needs care."""
     found = scene_features.inspect(opened(path, PLUGIN, context.profile.resolution))
     values = {name.replace("_", " "): float(x) for name, x in dataclasses.asdict(found).items() if name != "unknown"}
     remark = f"left out: {', '.join(found.left_out)}"
     if found.unknown:
         remark = f"everything is presumed of {', '.join(found.unknown)}"
     replay = {"scene": path.name, "left out": found.left_out}
-    return [Row(STUDY, "needs", path.stem, context.variant, values, reason=remark, replay=replay)]
+    return [Row(NAME, "needs", path.stem, context.variant, values, reason=remark, replay=replay)]
+
+
+STUDY = Study(NAME, "Scenes", about(__doc__), TERMS, tasks)

@@ -9,10 +9,8 @@ Dr.Jit compiles what a scene might call for every plugin that is alive, so each 
 from __future__ import annotations
 
 import functools
-import gc
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -21,11 +19,15 @@ import numpy as np
 from mi_refract.formulas import FORMULAS
 from mi_refract.plugins.refract import LOBES, PLUGIN
 from mi_refract.report.row import Row
+from validation import limits
 from validation.run import kernel_timing
-from validation.run.context import SCENES, Context, Task
-from validation.run.render_methods import opened
+from validation.run.context import SCENES, Context
+from validation.run.kernel_timing import kernels
+from validation.run.render_methods import opened, under
+from validation.study import Study, Task, about
 
-TITLE = "What a scene does not use"
+from .glass_balls import RESOLUTION, Balls, alone, compiled, seconds_of, size_of
+
 TERMS = {
     "operations": "Dr.Jit's count for the whole kernel; of `sample` alone, or of a render",
     "added": "operations more than those of the plain plugin, in radiance mode, with both lobes",
@@ -38,60 +40,38 @@ TERMS = {
     "frozen": "an image by a function under `dr.freeze`, over the same one traced anew; warm",
     "off after an edit": "largest difference between the two after an index was edited: 0, or the frozen one is stale",
 }
-TEXT = __doc__.partition("\n")[2].strip()
-STUDY = "features"
+NAME = "features"
 BUILTIN = "dielectric"
 RAYS = 1024
-RESOLUTION = 32
 SEED = 2026
 GLASSES = (1, 16, 64, 1000)
-FIRST_IMAGE_GOALS = {64: 0.6, 1000: 0.15}
-EDIT_GOAL = 0.2
 PAIRS = 5
 CALLS = 2000
 STEPS = 4  # of an optimisation
-UNCHANGED = 1e-5  # of a pixel: the order in which samples are added up
 SCALAR = "scalar variants have no kernels"
 
 
 def tasks(context: Context) -> list[Task]:
+    """One per feature; in the profile `quick` those without scenes of many glasses."""
     calls = Task("features: scalar calls", functools.partial(scalar_rows, context))
     if context.variant.startswith("scalar"):
-        return [Task("features", lambda: [Row(STUDY, PLUGIN, "kernels", context.variant, reason=SCALAR)]), calls]
+        return [Task("features", lambda: [Row(NAME, PLUGIN, "kernels", context.variant, reason=SCALAR)]), calls]
+    operations_only = Task("features: operations", functools.partial(operation_rows, context))
+    if context.profile.quick:
+        return [operations_only, calls]
     return [
-        Task("features: operations", functools.partial(operation_rows, context)),
+        operations_only,
         Task("features: glasses", functools.partial(glass_rows, context)),
         Task("features: optimisation", functools.partial(optimisation_rows, context)),
         *(
             Task(f"features: first image, {n} glasses", functools.partial(first_image_rows, context, n))
-            for n in FIRST_IMAGE_GOALS
+            for n in limits.FIRST_IMAGE
         ),
         Task("features: edit", functools.partial(edit_rows, context)),
         Task("features: frozen", functools.partial(frozen_rows, context)),
         Task("features: boundaries", functools.partial(boundary_rows, context)),
         calls,
     ]
-
-
-def kernels(work: Callable[[], Any]) -> list[dict[str, Any]]:
-    """Dr.Jit's record of the kernels that `work` launches."""
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-        dr.kernel_history_clear()
-        dr.eval(work())
-        dr.sync_thread()
-        return [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
-
-
-def compiled(work: Callable[[], Any]) -> float:
-    """How many kernels no cache in memory had."""
-    return float(sum(not entry["cache_hit"] for entry in kernels(work)))
-
-
-def seconds_of(work: Callable[[], Any]) -> float:
-    start = time.perf_counter()
-    dr.eval(work())
-    dr.sync_thread()
-    return time.perf_counter() - start
 
 
 # `sample` alone ------------------------------------------------------------------------------------------------
@@ -123,19 +103,6 @@ def operations(
     return float(max(entry["operation_count"] for entry in kernels(lambda: bsdf.sample(asked, si, sample, [0, 0]))))
 
 
-@contextmanager
-def under(variant: str) -> Iterator[None]:
-    """Another variant of Mitsuba for a while."""
-    import mitsuba as mi
-
-    before: Any = mi.variant()
-    mi.set_variant(variant)
-    try:
-        yield
-    finally:
-        mi.set_variant(before)
-
-
 def scalar_rows(context: Context) -> list[Row]:
     """What a call of `sample` takes where nothing is compiled: a Python plugin's calls, against the built-in's C++."""
     import mitsuba as mi
@@ -154,10 +121,11 @@ def scalar_rows(context: Context) -> list[Row]:
 
         seconds = kernel_timing.rounds({name: name for name in bsdfs}, clock, PAIRS)
     values = kernel_timing.ratio(f"call / {BUILTIN}", seconds[PLUGIN], seconds[BUILTIN])
-    return [Row(STUDY, PLUGIN, "a call of sample", "scalar_rgb", values, replay={"calls": CALLS})]
+    return [Row(NAME, PLUGIN, "a call of sample", "scalar_rgb", values, replay={"calls": CALLS})]
 
 
 def bitmap() -> dict[str, Any]:
+    """A constant texture of 2 × 2 pixels."""
     import mitsuba as mi
 
     return {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32))}
@@ -177,7 +145,7 @@ def operation_rows(context: Context) -> list[Row]:
         budgets = {"added": values[f"added, {BUILTIN}"]} if less else {}
         goals = {"operations": plain[BUILTIN]} if case == "plain" else {}
         replay = {"rays": RAYS} | {key: str(value) for key, value in asked.items()}
-        return Row(STUDY, PLUGIN, case, variant, values, budgets, goals, replay=replay)
+        return Row(NAME, PLUGIN, case, variant, values, budgets, goals, replay=replay)
 
     rows = [
         row("plain"),
@@ -190,7 +158,7 @@ def operation_rows(context: Context) -> list[Row]:
     rows.append(row("derivative in eta", shared=False, differentiate=True))
     polarised = context.variant.replace("rgb", "mono_polarized")
     if reason := context.variants[polarised]:
-        rows.append(Row(STUDY, PLUGIN, "polarised", polarised, reason=reason))
+        rows.append(Row(NAME, PLUGIN, "polarised", polarised, reason=reason))
     else:
         rows.append(row("polarised", variant=polarised))
     rows += [row(f"formula {name}", shared=False, parameters={"formula": name}) for name in FORMULAS]
@@ -198,67 +166,6 @@ def operation_rows(context: Context) -> list[Row]:
 
 
 # Renders -------------------------------------------------------------------------------------------------------
-
-
-class Balls:
-    """A scene of `count` glass balls of different indices with one plugin.
-
-    Without a `max_depth` it is one that no path reaches, and that no cache has seen.
-    """
-
-    def __init__(self, plugin: str, count: int, integrator: str = "path", max_depth: int = 0) -> None:
-        import mitsuba as mi
-
-        side = int(np.ceil(np.sqrt(count)))
-        sky = np.random.default_rng(SEED).random((8, 16, 3)).astype(np.float32)  # a constant one shows no index
-        fresh = int(np.random.default_rng().integers(1 << 20, 1 << 30))
-        film = {"type": "hdrfilm", "width": RESOLUTION, "height": RESOLUTION, "rfilter": {"type": "box"}}
-        view = mi.ScalarTransform4f().look_at([0, 0, 4 * side], [0, 0, 0], [0, 1, 0])
-        scene: dict[str, Any] = {
-            "type": "scene",
-            "integrator": {"type": integrator, "max_depth": max_depth or fresh},
-            "sensor": {"type": "perspective", "fov": 30, "to_world": view, "film": film},
-            "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky)},
-        }
-        for i in range(count):
-            place = [2 * (i % side) - side + 1, 2 * (i // side) - side + 1, 0]
-            glass = {"type": plugin, "int_ior": 1.3 + 0.5 * i / count, "ext_ior": 1.0}
-            scene[f"ball{i:04}"] = {"type": "sphere", "radius": 0.9, "center": place, "bsdf": glass}
-        self.scene = mi.load_dict(scene)
-        self.params = mi.traverse(self.scene)
-        self.eta = next(name for name in self.params.keys() if name.endswith(".eta"))  # noqa: SIM118
-
-    def image(self, seed: int = 0) -> Any:
-        import mitsuba as mi
-
-        return mi.render(self.scene, spp=4, seed=seed)
-
-    def frozen(self) -> Callable[[Any, Any], Any]:
-        """(params, seed) -> the image, traced once and replayed from then on. The scene must be in its closure."""
-        import mitsuba as mi
-
-        scene = self.scene
-
-        @dr.freeze
-        def image(params: Any, seed: Any) -> Any:
-            return mi.render(scene, params, spp=4, seed=seed)
-
-        return image
-
-    def edit(self, eta: float) -> None:
-        self.params[self.eta] = eta
-        self.params.update()
-
-
-@contextmanager
-def alone(plugin: str, count: int, **more: Any) -> Iterator[Balls]:
-    """Balls, and none of them left afterwards."""
-    gc.collect()
-    balls = Balls(plugin, count, **more)
-    yield balls
-    balls.__dict__.clear()
-    del balls
-    gc.collect()
 
 
 def glass_rows(context: Context) -> list[Row]:
@@ -281,13 +188,9 @@ def glass_rows(context: Context) -> list[Row]:
                 }
             budgets = {"operations, over two glasses": 0.0, "compiled": 0.0} if plugin == PLUGIN else {}
             rows.append(
-                Row(STUDY, plugin, f"{count} glasses", context.variant, values, budgets, replay={"glasses": count})
+                Row(NAME, plugin, f"{count} glasses", context.variant, values, budgets, replay={"glasses": count})
             )
     return rows
-
-
-def size_of(balls: Balls) -> float:
-    return float(max(entry["operation_count"] for entry in kernels(balls.image)))
 
 
 def optimisation_rows(context: Context) -> list[Row]:
@@ -301,7 +204,7 @@ def optimisation_rows(context: Context) -> list[Row]:
             "eta moved": abs(float(balls.params[balls.eta][0]) - before),
         }
     return [
-        Row(STUDY, PLUGIN, "optimisation of eta", context.variant, values, {"compiled": 0.0}, replay={"steps": STEPS})
+        Row(NAME, PLUGIN, "optimisation of eta", context.variant, values, {"compiled": 0.0}, replay={"steps": STEPS})
     ]
 
 
@@ -319,11 +222,13 @@ def step(balls: Balls) -> Any:
 
 
 def first_image_rows(context: Context, count: int) -> list[Row]:
+    """Seconds to an image whose kernels no cache has, over the built-in's."""
+
     def clock(plugin: str) -> float:
         with alone(plugin, count) as balls:
             return seconds_of(balls.image)
 
-    return [ratio_row(context, f"first image, {count} glasses", "first image", clock, FIRST_IMAGE_GOALS[count])]
+    return [ratio_row(context, f"first image, {count} glasses", "first image", clock, limits.FIRST_IMAGE[count])]
 
 
 def edit_rows(context: Context) -> list[Row]:
@@ -340,15 +245,16 @@ def edit_rows(context: Context) -> list[Row]:
 
             return seconds_of(edited)
 
-    return [ratio_row(context, "edit of one of 16 glasses", "edit", clock, EDIT_GOAL)]
+    return [ratio_row(context, "edit of one of 16 glasses", "edit", clock, limits.EDIT)]
 
 
 def ratio_row(context: Context, case: str, metric: str, clock: Callable[[str], float], goal: float) -> Row:
+    """A goal for the ratio of two times, measured in turn."""
     seconds = kernel_timing.rounds({PLUGIN: PLUGIN, BUILTIN: BUILTIN}, clock, PAIRS)
     values = kernel_timing.ratio(f"{metric} / {BUILTIN}", seconds[PLUGIN], seconds[BUILTIN])
     values |= {f"{metric}, {plugin}": float(np.median(x)) for plugin, x in seconds.items()}
     return Row(
-        STUDY, PLUGIN, case, context.variant, values, goals={f"{metric} / {BUILTIN}": goal}, replay={"pairs": PAIRS}
+        NAME, PLUGIN, case, context.variant, values, goals={f"{metric} / {BUILTIN}": goal}, replay={"pairs": PAIRS}
     )
 
 
@@ -372,12 +278,12 @@ def frozen_rows(context: Context) -> list[Row]:
             del replay, subjects
     return [
         Row(
-            STUDY,
+            NAME,
             PLUGIN,
             f"frozen, {count} glasses",
             context.variant,
             values,
-            {"off after an edit": UNCHANGED},
+            {"off after an edit": limits.FROZEN},
             replay={"glasses": count},
         )
     ]
@@ -391,7 +297,7 @@ def boundary_rows(context: Context) -> list[Row]:
             plugin: boundaries(opened(SCENES / f"{name}.xml", plugin, RESOLUTION)) for plugin in (PLUGIN, BUILTIN)
         }
         values[f"boundaries / {BUILTIN}"] = values[PLUGIN] / values[BUILTIN]
-        rows.append(Row(STUDY, PLUGIN, f"{name}: boundaries", context.variant, values, replay={"seed": SEED}))
+        rows.append(Row(NAME, PLUGIN, f"{name}: boundaries", context.variant, values, replay={"seed": SEED}))
     return rows
 
 
@@ -415,3 +321,6 @@ def boundaries(scene: Any, spp: int = 64, most: int = 192) -> float:
     state = (mi.UInt32(0), mi.Bool(True), ray, sampler)
     met, *_ = dr.while_loop(state, lambda met, active, ray, sampler: active, bounce)
     return float(np.array(met).mean())
+
+
+STUDY = Study(NAME, "What a scene does not use", about(__doc__), TERMS, tasks)

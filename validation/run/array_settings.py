@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -32,16 +32,30 @@ class Setting:
     reason: str = ""
     mitsuba: str | None = None
 
+    @classmethod
+    def of(cls, backend: str, precision: str) -> Setting:
+        """That of a backend that runs, in "float32" or "float64"."""
+        name = {"float32": "Array3f", "float64": "Array3f64"}[precision]
+        return cls(backend, np.dtype(precision).type, getattr(getattr(dr, backend), name))
+
+    @property
+    def name(self) -> str:
+        """The precision: "float32" or "float64"."""
+        return np.dtype(self.precision).name
+
     @property
     def label(self) -> str:
-        return f"{self.backend} {np.dtype(self.precision).name}"
+        """As in the rows: "llvm float32"."""
+        return f"{self.backend} {self.name}"
 
     @property
     def roundoff(self) -> float:
+        """u: 2⁻²⁴ or 2⁻⁵³."""
         return float(np.finfo(self.precision).eps) / 2
 
     @property
     def is_scalar(self) -> bool:
+        """Whether every operation is a Python call."""
         return self.backend == "scalar"
 
     @functools.cached_property
@@ -67,21 +81,29 @@ class Setting:
 
 
 def settings(context: Context) -> list[Setting]:
-    found = [Setting("scalar", np.float64, dr.scalar.Array3f64)]
+    """Every backend and precision; the profile `quick` leaves scalar arrays out where compiled ones run."""
+    every = _settings(context)
+    if not context.profile.quick or context.scalar:
+        return every
+    return [setting for setting in every if not setting.is_scalar]
+
+
+def _settings(context: Context) -> list[Setting]:
+    found = [Setting.of("scalar", "float64")]
     for backend in ("llvm", "cuda"):
         entry = context.backends[backend]
-        for precision, name in ((np.float32, "Array3f"), (np.float64, "Array3f64")):
+        for precision in (np.float32, np.float64):
             if not entry.usable:
                 found.append(Setting(backend, precision, reason=entry.reason))
                 continue
-            variant = f"{backend}_ad_rgb"
+            variant, running = f"{backend}_ad_rgb", Setting.of(backend, np.dtype(precision).name)
             has_functions = precision is np.float32 and context.variants[variant] is None
-            vector = getattr(getattr(dr, backend), name)
-            found.append(Setting(backend, precision, vector, mitsuba=variant if has_functions else None))
+            found.append(replace(running, mitsuba=variant) if has_functions else running)
     return found
 
 
 def budget_of(subject: str) -> Budget:
+    """The budget that a subject is held to: its own, or that of the common form."""
     return FORMULAS[subject if subject in FORMULAS else PLAIN].budget
 
 

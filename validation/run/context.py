@@ -1,22 +1,24 @@
-"""What a study is given and what it returns: profiles, the context of a run, and tasks."""
+"""What a study is given: the profile, which says how much is measured, and the context of a run."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from mi_refract.backend import Backend
-from mi_refract.report.row import Row
 
 SCENES = Path(__file__).parents[2] / "scenes"
+QUICK_SCENES = ("diamond", "furnace", "mirage", "prism", "sphere")  # of the profile `quick`
 # Where the built-in is no reference: images are shown, and nothing is demanded of their agreement.
 NO_REFERENCE = {"mirage": "the built-in turns slanting edges into stairs here, so it is no reference: see Paths"}
 
 
 @dataclass(frozen=True)
 class Profile:
-    """How much is measured. Sizes in rays, samples per pixel and renders; one image is `resolution` squared."""
+    """How much is measured. Sizes in rays, samples per pixel and renders; one image is `resolution` squared.
+
+    `name` is "quick", "standard" or "full": studies with sizes of their own have a table of them by that name.
+    """
 
     name: str
     rays: int  # per regime, against the oracle
@@ -27,21 +29,35 @@ class Profile:
     spp: int  # of each of the `pairs` renders of a scene with either plugin
     pairs: int
     curve_spp: tuple[int, ...]  # error against run time
-    every_formula: bool  # renders with every formula, not only the default one
+    every_formula: bool = False  # renders with every formula, not only the default one
     sweep_rays: int = 30_000  # per regime, screened
-    certified: int = 32  # of these, per formula: the worst, and as many misjudged ones
+    certified: int = 32  # of these, per formula: the worst, and as many whose TIR was misclassified
     generations: int = 4  # of the search
+
+    @property
+    def quick(self) -> bool:
+        """Whether a study answers in seconds: with fewer scenes and settings, not only with fewer rays."""
+        return self.name == "quick"
 
 
 PROFILES = {
-    "quick": Profile("quick", 4000, 150, 1 << 21, 11, 128, 16, 8, (1, 4, 16), False),
+    "quick": Profile(
+        "quick", 1000, 30, 1 << 21, 6, 96, 16, 8, (1, 4, 16), sweep_rays=10_000, certified=8, generations=2
+    ),
+    "standard": Profile("standard", 4000, 150, 1 << 21, 11, 128, 16, 8, (1, 4, 16)),
     "full": Profile("full", 100_000, 1000, 1 << 22, 21, 192, 32, 8, (1, 4, 16, 64), True, 10_000_000, 300, 1000),
 }
 # Where only scalar variants run, a render costs a hundred times as much.
 SCALAR_PROFILES = {
-    "quick": Profile("quick", 4000, 150, 200, 9, 12, 4, 8, (1, 4), False),
+    "quick": Profile("quick", 1000, 100, 100, 6, 12, 4, 8, (1, 4)),
+    "standard": Profile("standard", 4000, 150, 200, 9, 12, 4, 8, (1, 4)),
     "full": Profile("full", 100_000, 2000, 1000, 9, 32, 8, 12, (1, 4, 16), True),
 }
+
+
+def profiles(variant: str) -> dict[str, Profile]:
+    """Those for a variant of Mitsuba, by name."""
+    return SCALAR_PROFILES if variant.startswith("scalar") else PROFILES
 
 
 @dataclass(frozen=True)
@@ -54,10 +70,13 @@ class Context:
     backends: dict[str, Backend]
     variants: dict[str, str | None]  # of the wheel: None, or why it cannot run here
 
+    @property
+    def scalar(self) -> bool:
+        """Whether only scalar variants run here."""
+        return self.variant.startswith("scalar")
 
-@dataclass(frozen=True)
-class Task:
-    """A unit of work that is finished or not: interrupting a run keeps the rows of finished tasks."""
-
-    name: str
-    run: Callable[[], list[Row]]
+    @property
+    def scenes(self) -> list[Path]:
+        """The scene files that are rendered: all, or in the profile `quick` five."""
+        every = sorted(SCENES.glob("*.xml"))
+        return [path for path in every if path.stem in QUICK_SCENES] if self.profile.quick else every

@@ -18,6 +18,8 @@ import numpy as np
 from mi_refract import regimes
 from mi_refract.accuracy import Subject
 from mi_refract.formulas import FORMULAS
+from validation import limits
+from validation.run.metrics import TIME_OVER_COPY, TIME_OVER_PLAIN
 
 from .array_settings import PLAIN, Setting
 from .context import Context
@@ -26,8 +28,8 @@ COPY = "copy"
 SEED = 2026
 DIFFERENT = 1 << 16  # rays; the rest of a stream repeats them
 TERMS = {
-    "time / copy": "median time of a ray over that of copying its bytes, streaming; low, high: its 95 % interval",
-    "time / plain": f"the same over the time of `{PLAIN}`",
+    TIME_OVER_COPY: "median time of a ray over that of copying its bytes, streaming; low, high: its 95 % interval",
+    TIME_OVER_PLAIN: f"the same over the time of `{PLAIN}`",
     "operations": "Dr.Jit's count for the whole kernel",
     "compile ms": "code generation and compilation of the kernel, by Dr.Jit's record, with a literal no cache can know",
 }
@@ -46,9 +48,9 @@ def measure(context: Context, setting: Setting) -> dict[str, dict[str, float]]:
     inputs = _inputs(setting, rays)
     clock = _scalar_clock(inputs) if setting.is_scalar else _kernel_clock(inputs)
     seconds = rounds(subjects, clock, context.profile.repeats)
-    found = {name: ratio("time / copy", seconds[name], seconds[COPY]) for name in subjects}
+    found = {name: ratio(TIME_OVER_COPY, seconds[name], seconds[COPY]) for name in subjects}
     for name, subject in subjects.items():
-        found[name] |= ratio("time / plain", seconds[name], seconds[PLAIN])
+        found[name] |= ratio(TIME_OVER_PLAIN, seconds[name], seconds[PLAIN])
         if setting.backend == "cuda":
             found[name] |= interval("ns per ray", [s / rays * 1e9 for s in seconds[name]])
         if not setting.is_scalar:
@@ -61,8 +63,8 @@ def goals(subject: str, setting: Setting) -> dict[str, float]:
     if setting.is_scalar or subject not in FORMULAS:
         return {}
     if (goal := FORMULAS[subject].time_goal) is None:
-        return {"time / copy": 1 / 0.9}
-    return {"time / plain": goal} if setting.label == "llvm float32" else {}
+        return {TIME_OVER_COPY: limits.COPY_TIME}
+    return {TIME_OVER_PLAIN: goal} if setting.label == "llvm float32" else {}
 
 
 def rounds(subjects: dict[str, Any], clock: Callable[[Any], float], repeats: int) -> dict[str, list[float]]:
@@ -77,6 +79,7 @@ def rounds(subjects: dict[str, Any], clock: Callable[[Any], float], repeats: int
 
 
 def ratio(metric: str, times: list[float], others: list[float]) -> dict[str, float]:
+    """The median of times over others, round by round, and its interval."""
     return interval(metric, [t / o for t, o in zip(times, others, strict=True)])
 
 
@@ -111,24 +114,24 @@ def _scalar_clock(inputs: Any) -> Clock:
 
 
 def _kernel_clock(inputs: Any) -> Clock:
-    return lambda subject: sum(kernel["execution_time"] for kernel in _history(subject, *inputs)) / 1e3
+    return lambda subject: sum(kernel["execution_time"] for kernel in kernels(lambda: subject(*inputs))) / 1e3
 
 
 def _kernel(subject: Subject, inputs: Any) -> dict[str, float]:
     """Operations of the kernel, and ms to compile it anew: k is multiplied by a literal that was never used before."""
     a, n, k = inputs
-    operations = max(kernel["operation_count"] for kernel in _history(subject, a, n, k))
+    operations = max(kernel["operation_count"] for kernel in kernels(lambda: subject(a, n, k)))
     literal = 1 + float(np.random.default_rng().integers(1, 1 << 22)) * 2.0**-23
-    kernels = _history(subject, a, n, k * type(k)(literal))
-    fresh = all(not kernel["cache_hit"] for kernel in kernels)
-    compiled = sum(kernel["codegen_time"] + kernel["backend_time"] for kernel in kernels)
+    found = kernels(lambda: subject(a, n, k * type(k)(literal)))
+    fresh = all(not kernel["cache_hit"] for kernel in found)
+    compiled = sum(kernel["codegen_time"] + kernel["backend_time"] for kernel in found)
     return {"operations": float(operations), "compile ms": compiled if fresh else float("nan")}
 
 
-def _history(subject: Subject, a: Any, n: Any, k: Any) -> list[dict[str, Any]]:
-    """Dr.Jit's record of the kernels that `subject` launches."""
+def kernels(work: Callable[[], Any]) -> list[dict[str, Any]]:
+    """Dr.Jit's record of the kernels that `work` launches."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
-        dr.eval(subject(a, n, k))
+        dr.eval(work())
         dr.sync_thread()
         return [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]

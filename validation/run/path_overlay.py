@@ -25,13 +25,15 @@ class Seen(Protocol):
 
     image: np.ndarray
 
-    def project(self, points: np.ndarray) -> np.ndarray: ...
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Where points (N × 3) are on the image, from 0 to 1, y downward; N × 2."""
 
 
 class View:
     """A scene with one plugin, rendered once with seed 0. Perspective camera, square film."""
 
     def __init__(self, scene: str, plugin: str, parameters: Mapping[str, Any], size: int, spp: int) -> None:
+        """Load the scene with the plugin and render it; `size`: pixels on a side."""
         import mitsuba as mi
 
         path = str(SCENES / f"{scene}.xml")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -58,9 +60,11 @@ class Camera:
     """A loaded scene: renders images as numpy arrays and says how long each took."""
 
     def __init__(self, scene: Any, integrator: Any = None) -> None:
+        """`scene` as Mitsuba loaded it; `integrator`: another one than its own."""
         self.scene, self.integrator = scene, integrator
 
     def __call__(self, spp: int, seed: int) -> tuple[np.ndarray, float]:
+        """The image (height × width × 3) and the seconds that it took."""
         import mitsuba as mi
 
         start = time.perf_counter()
@@ -69,6 +73,19 @@ class Camera:
         dr.sync_thread()
         seconds = time.perf_counter() - start
         return np.array(image, dtype=np.float64), seconds
+
+
+@contextmanager
+def under(variant: str) -> Iterator[None]:
+    """Another variant of Mitsuba for a while."""
+    import mitsuba as mi
+
+    before: Any = mi.variant()
+    mi.set_variant(variant)
+    try:
+        yield
+    finally:
+        mi.set_variant(before)
 
 
 def opened(path: Path, bsdf: str, resolution: int, **parameters: Any) -> Any:

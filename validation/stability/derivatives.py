@@ -23,11 +23,12 @@ from mi_refract.accuracy import lengths
 from mi_refract.formulas import FORMULAS, fresnel
 from mi_refract.oracle import derivatives
 from mi_refract.report.row import Row
+from validation import limits
 from validation.run.array_settings import Setting, settings
-from validation.run.context import Context, Task
+from validation.run.context import Context
+from validation.study import Study, Task, about
 
-TITLE = "Derivatives"
-TEXT = __doc__.partition("\n")[2].strip()
+NAME = "derivatives"
 AXES = {
     "x": "cos²θt, transmitted",
     "y": "largest error of k ∂b/∂k",
@@ -47,10 +48,6 @@ TERMS = {
 }
 SEED = 2029
 BINS = np.geomspace(1e-9, 1, 19)
-# Of a form at the rounding limit, D is right to u, and a derivative is k a′ along the surface and D′/2√D along n. D′ is
-# the difference of two products of four rounded factors, and what they cancel to is what the condition counts: 4u;
-# 1/√D 2u, the last product u, the result u.
-LIMIT = 8.0
 
 
 @dataclass(frozen=True)
@@ -66,13 +63,15 @@ class Inputs:
 
 
 def tasks(context: Context) -> list[Task]:
+    """One task per backend and precision."""
     return [Task(f"derivatives: {s.label}", functools.partial(setting_rows, context, s)) for s in settings(context)]
 
 
 def setting_rows(context: Context, setting: Setting) -> list[Row]:
+    """Every formula and the reflectance in a setting."""
     reason = "Dr.Jit differentiates compiled arrays only" if setting.is_scalar else setting.reason
     if reason:
-        return [Row("derivatives", name, "all", setting.label, reason=reason) for name in (*FORMULAS, "powers")]
+        return [Row(NAME, name, "all", setting.label, reason=reason) for name in (*FORMULAS, "powers")]
     given = inputs(context.profile.rays // 40, setting.precision)
     rows, curves = [], {}
     for name, formula in FORMULAS.items():
@@ -80,7 +79,7 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
         rows += found
     curves["condition · u"] = binned(given, given.condition * setting.roundoff)
     problem = Row(
-        "derivatives",
+        NAME,
         "the problem",
         "∂b/∂k",
         setting.label,
@@ -125,6 +124,7 @@ def condition_of(certified: oracle.Certified, k: np.ndarray) -> np.ndarray:
 
 
 def pick(certified: oracle.Certified, kept: np.ndarray) -> oracle.Certified:
+    """The certified answers of a mask (N,)."""
     return oracle.Certified(**{name: x[kept] for name, x in vars(certified).items()})
 
 
@@ -158,10 +158,11 @@ def differentiate(formula: Any, given: Inputs, setting: Setting) -> tuple[dict[s
 def formula_rows(
     name: str, formula: Any, given: Inputs, setting: Setting
 ) -> tuple[list[Row], list[tuple[float, float]]]:
+    """A row per derivative of a formula, and the curve of ∂b/∂k against cos²θt."""
     found, transmitted = differentiate(formula, given, setting)
     right, rows = transmitted == given.certified.transmitted, []
     curve: list[tuple[float, float]] = []
-    budgets = {"error / condition": LIMIT, "not finite": 0.0} if FORMULAS[name].budget.at_the_limit else {}
+    budgets = {"error / condition": limits.DERIVATIVE, "not finite": 0.0} if FORMULAS[name].budget.at_the_limit else {}
     for case, exact in given.exact.items():
         error = lengths(found[case] - exact) / np.maximum(1, lengths(exact))
         rows.append(row(name, case, error, given, setting, right, budgets))
@@ -185,6 +186,7 @@ def row(
     right: np.ndarray,
     budgets: dict[str, float],
 ) -> Row:
+    """The worst error of a derivative, relative and over the condition of its ray."""
     finite = np.isfinite(error)
     used = right & finite
     over = np.where(used, error, 0) / (given.condition * setting.roundoff)
@@ -200,7 +202,7 @@ def row(
         "rays": len(error),
         "worst": {"regime": str(given.regime[worst]), "a": a, "n": n, "k": float(given.rays.k[worst]).hex()},
     }
-    return Row("derivatives", subject, case, setting.label, values, budgets, replay=replay)
+    return Row(NAME, subject, case, setting.label, values, budgets, replay=replay)
 
 
 def binned(given: Inputs, y: np.ndarray) -> list[tuple[float, float]]:
@@ -230,6 +232,9 @@ def reflectance_row(given: Inputs, setting: Setting) -> Row:
     with np.errstate(invalid="ignore"):
         error = np.abs(found - exact) / np.maximum(np.maximum(np.abs(exact), r), np.finfo(setting.precision).tiny)
     exists = np.isfinite(exact)
-    budgets = {"error / condition": LIMIT, "not finite": 0.0}
+    budgets = {"error / condition": limits.DERIVATIVE, "not finite": 0.0}
     given = dataclasses.replace(given, condition=condition)  # that of the rounded cosines
     return row("powers", "∂R/∂η", error, given, setting, exists, budgets)
+
+
+STUDY = Study(NAME, "Derivatives", about(__doc__), TERMS, tasks, axes=AXES)

@@ -19,13 +19,15 @@ from mi_refract import oracle, regimes
 from mi_refract.accuracy import lengths
 from mi_refract.formulas import fresnel, resolve
 from mi_refract.report.row import Row
-from validation.directions.bsdf_samples import sample_all
+from validation import limits
 from validation.reference.diffuse_fresnel import GRADE, hemispherical, nodes
 from validation.run.array_settings import Setting, settings
-from validation.run.context import Context, Task
+from validation.run.bsdf_sampling import sample_all
+from validation.run.context import Context
+from validation.run.metrics import MISCLASSIFIED
+from validation.study import Study, Task, about
 
-TITLE = "Energy"
-TEXT = __doc__.partition("\n")[2].strip()
+NAME = "energy"
 AXES = {"x": "|k − 1|", "y": "error of R, in u", "x_scale": "log", "y_scale": "log", "slope": -1}
 BUILTIN = "mi.fresnel"
 TERMS = {
@@ -46,23 +48,21 @@ TERMS = {
 }
 SEED = 2028
 INDICES = (1.0003, 1.1, 1.33, 1.5, 2.42)
-# What the study holds the forms to; they promise 3.12u of R and 2u of T (see `fresnel._powers`).
-POWERS = {"R / u": 4.0, "1 − R / u": 4.0}
-SUMMED = POWERS | {"R + T − 1 / u": 4.0}  # R · 4u + T · 4u
-AMPLITUDES = {"r_s / u": 8.0, "r_p / u": 8.0, "phase / u": 8.0}
-# Of the larger term of a float32 radicand (see `exact`): the promoted form's error. The compensated one's is less, as
-# κ of a float32 k up to 2²³ is a pair exactly.
-RADICAND = 10 * 2.0**-53
+POWERS = {"R / u": limits.POWER, "1 − R / u": limits.POWER}
+SUMMED = POWERS | {"R + T − 1 / u": limits.POWER_SUM}
+AMPLITUDES = dict.fromkeys(("r_s / u", "r_p / u", "phase / u"), limits.AMPLITUDE)
 
 
 def tasks(context: Context) -> list[Task]:
+    """One task per backend and precision, and one for the plugins."""
     found = [Task(f"energy: {s.label}", functools.partial(setting_rows, context, s)) for s in settings(context)]
     return [*found, Task(f"energy: plugins, {context.variant}", functools.partial(plugin_rows, context))]
 
 
 def setting_rows(context: Context, setting: Setting) -> list[Row]:
+    """Powers and amplitudes of every regime, and the laws."""
     if setting.vector is None:
-        return [Row("energy", name, "all", setting.label, reason=setting.reason) for name in ("powers", "amplitudes")]
+        return [Row(NAME, name, "all", setting.label, reason=setting.reason) for name in ("powers", "amplitudes")]
     count = context.profile.scalar_rays // 3 if setting.is_scalar else context.profile.rays // 8
     rows = [row for regime in cases() for row in regime_rows(regime, setting, count)]
     rows += [diffuse_row(setting, index) for index in INDICES]
@@ -107,11 +107,13 @@ def plain(x: Any) -> Any:
 
 
 def ours(cos_i: Any, k: Any) -> tuple:
+    """R, T and the decision of `mi_refract.formulas`, of a cosine and k."""
     cos_t, transmitted = fresnel.refracted_cosine(cos_i, k)
     return *fresnel.powers(cos_i, cos_t, transmitted, k), transmitted
 
 
 def builtin(variant: str | None) -> Callable[[Any, Any], tuple]:
+    """The same of Mitsuba's function in a variant."""
     import mitsuba
 
     mi: Any = getattr(mitsuba, variant) if variant else mitsuba
@@ -125,6 +127,7 @@ def builtin(variant: str | None) -> Callable[[Any, Any], tuple]:
 
 
 def regime_rows(regime: str, setting: Setting, count: int) -> list[Row]:
+    """Powers, amplitudes and, where Mitsuba runs, its own function in a regime."""
     cos_i, k, exact = given(regime, count, setting.precision)
     replay = {"regime": regime, "text": regimes.REGIMES[regime].text, "count": count, "seed": SEED}
     rows = [
@@ -148,23 +151,25 @@ def power_row(
     replay: dict[str, Any],
     right: Any = True,
 ) -> Row:
+    """Errors of R, T and the decision: `found` is (R, T, transmitted), each (N,)."""
     r, t, transmitted = found
-    misjudged = transmitted != exact.transmitted
-    right, u = right & ~misjudged, setting.roundoff
+    misclassified = transmitted != exact.transmitted
+    right, u = right & ~misclassified, setting.roundoff
     values = {
         "R / u": worst(relative(r, exact.reflectance, exact.reflectance_low, setting)[right]) / u,
         "1 − R / u": worst(relative(t, exact.transmittance, exact.transmittance_low, setting)[right]) / u,
         "R + T − 1 / u": worst(np.abs(r + t - 1)) / u,
-        "misjudged": float(misjudged.sum()),
+        MISCLASSIFIED: float(misclassified.sum()),
     }
     return Row(
-        "energy", subject, case, setting.label, values, budgets | ({"misjudged": 0.0} if budgets else {}), replay=replay
+        NAME, subject, case, setting.label, values, budgets | ({MISCLASSIFIED: 0.0} if budgets else {}), replay=replay
     )
 
 
 def amplitude_row(
     case: str, setting: Setting, found: list[np.ndarray], exact: oracle.Certified, replay: dict[str, Any]
 ) -> Row:
+    """Errors of r_s, r_p and their phases: `found` is (r_s, r_p), complex (N,)."""
     # The certified amplitudes are doubles, right to 2⁻⁵³ of each part: float64 is held to that much more.
     slack = 1.0 if setting.precision is np.float64 else 0.0
     values = {}
@@ -174,7 +179,7 @@ def amplitude_row(
         values["phase / u"] = max(values.get("phase / u", 0.0), worst(np.abs(ours - certified)[~exact.transmitted]))
     values = {name: value / setting.roundoff for name, value in values.items()}
     budgets = {name: budget + slack for name, budget in AMPLITUDES.items()}
-    return Row("energy", "amplitudes", case, setting.label, values, budgets, replay=replay)
+    return Row(NAME, "amplitudes", case, setting.label, values, budgets, replay=replay)
 
 
 def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray, replay: dict[str, Any]) -> Row:
@@ -200,10 +205,10 @@ def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray
 
 
 def resolved(a: np.ndarray, k: np.ndarray, exact: oracle.Certified, u: float) -> np.ndarray:
-    """Whether an error of RADICAND moves T by less than u/2: by ε/2ρ, ρ the radicand over its larger term."""
+    """Whether an error of `limits.RADICAND` moves T by less than u/2: by ε/2ρ, ρ the radicand over its larger term."""
     x, y, z = a.astype(np.longdouble).T
     terms = np.maximum(z * z, np.abs(k.astype(np.longdouble) ** 2 - 1) * (x * x + y * y))
-    return exact.cos_t**2 * lengths(a) ** 2 > RADICAND / u * terms
+    return exact.cos_t**2 * lengths(a) ** 2 > limits.RADICAND / u * terms
 
 
 def relative(x: np.ndarray, exact: np.ndarray, low: np.ndarray, setting: Setting) -> np.ndarray:
@@ -213,6 +218,7 @@ def relative(x: np.ndarray, exact: np.ndarray, low: np.ndarray, setting: Setting
 
 
 def worst(x: np.ndarray) -> float:
+    """The largest, NaN taken for infinity; 0 of nothing."""
     return float(np.nan_to_num(np.asarray(x, float), nan=np.inf).max(initial=0))
 
 
@@ -237,7 +243,15 @@ def reciprocity_row(setting: Setting, count: int) -> Row:
         error = worst(np.abs(there[used] / back[used] - 1)) / setting.roundoff
         values["T there and back / u"] = max(error, values["T there and back / u"])
     replay = {"regimes": cases(), "count": count, "seed": SEED}
-    return Row("energy", "powers", "reciprocity", setting.label, values, {"T there and back / u": 3.0}, replay=replay)
+    return Row(
+        NAME,
+        "powers",
+        "reciprocity",
+        setting.label,
+        values,
+        {"T there and back / u": limits.RECIPROCITY},
+        replay=replay,
+    )
 
 
 def diffuse_row(setting: Setting, index: float) -> Row:
@@ -261,9 +275,9 @@ def diffuse_row(setting: Setting, index: float) -> Row:
             f"{side}: R / u": float(abs(reflected / exact - 1)) / setting.roundoff,
             f"{side}: 1 − R / u": float(abs(transmitted / (1 - exact) - 1)) / setting.roundoff,
         }
-    budgets = {name: 12.5 for name in values if name.endswith("/ u")}
+    budgets = {name: limits.DIFFUSE for name in values if name.endswith("/ u")}
     case, replay = f"diffuse light, n = {index}", {"nodes": GRADE}
-    return Row("energy", "powers", case, setting.label, values, budgets, replay=replay)
+    return Row(NAME, "powers", case, setting.label, values, budgets, replay=replay)
 
 
 def matched_row(setting: Setting) -> Row:
@@ -280,13 +294,14 @@ def matched_row(setting: Setting) -> Row:
         curves[name] = list(zip(steps.tolist(), (error / setting.roundoff).tolist(), strict=True))
     values = {"R / u": max(y for _, y in curves["powers"])}
     replay = {"cosines": cosines}
-    return Row("energy", "powers", "k → 1", setting.label, values, {"R / u": 4.0}, replay=replay, curves=curves)
+    return Row(NAME, "powers", "k → 1", setting.label, values, {"R / u": limits.POWER}, replay=replay, curves=curves)
 
 
 # Plugins -------------------------------------------------------------------------------------------------------
 
 
 def plugin_rows(context: Context) -> list[Row]:
+    """The white furnace and basic radiance, of either plugin."""
     return [row(context, plugin) for plugin in ("refract", "dielectric") for row in (furnace_row, radiance_row)]
 
 
@@ -314,9 +329,9 @@ def furnace_row(context: Context, plugin: str) -> Row:
         alone = (lobes[0]["type"] == lobes[1]["type"])[:, None]
         total = np.where(alone, lobes[0]["pdf"] * lobes[0]["weight"][:, :1], total)
         values["white furnace"] = max(values["white furnace"], worst(np.abs(total - 1)))
-    budgets = {"white furnace": 2.0**-23} if plugin == "refract" else {}
+    budgets = {"white furnace": limits.WHITE_FURNACE} if plugin == "refract" else {}
     return Row(
-        "energy",
+        NAME,
         plugin,
         "white furnace",
         context.variant,
@@ -342,5 +357,9 @@ def radiance_row(context: Context, plugin: str) -> Row:
             "weights in and out / u": max(error, values["weights in and out / u"]),
             "weight against 1/n² / u": max(off, values.get("weight against 1/n² / u", 0.0)),
         }
-    budgets = {"weights in and out / u": 6.0, "weight against 1/n² / u": 3.0} if plugin == "refract" else {}
-    return Row("energy", plugin, "basic radiance", context.variant, values, budgets, replay={"indices": INDICES})
+    allowed = {"weights in and out / u": limits.IN_AND_OUT, "weight against 1/n² / u": limits.INDEX_SQUARED}
+    budgets = allowed if plugin == "refract" else {}
+    return Row(NAME, plugin, "basic radiance", context.variant, values, budgets, replay={"indices": INDICES})
+
+
+STUDY = Study(NAME, "Energy", about(__doc__), TERMS, tasks, axes=AXES)

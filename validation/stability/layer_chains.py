@@ -55,6 +55,7 @@ class Chain:
 
     @property
     def count(self) -> int:
+        """How many layers there are."""
         return len(self.k) // 2
 
 
@@ -155,6 +156,7 @@ class Layers:
 
     @property
     def count(self) -> int:
+        """How many boundaries there are."""
         return len(self.steps)
 
     def chain(self, normal: Array, feed: str, precision: type) -> Chain:

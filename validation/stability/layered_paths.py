@@ -23,34 +23,35 @@ from mi_refract.image_diff import pixelwise
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.rendering import scene_files
 from mi_refract.report.row import Row
+from validation import limits
 from validation.reference import layered_scenes
 from validation.reference.layered_scenes import FIBRE, MIRAGE, Layers, Path
 from validation.run import path_overlay
-from validation.run.context import SCENES, Context, Task
+from validation.run.context import SCENES, Context
+from validation.run.metrics import WRONG_PATH
 from validation.run.path_overlay import View
+from validation.study import Study, Task, about
 
-TITLE = "Paths"
-TEXT = __doc__.partition("\n")[2].strip()
 INDICES, RATIOS = "exact, indices in float32", "exact, ratios in float32"
+DIRECTION, MEDIAN_DIRECTION, PLACE = "direction", "median direction", "place"
 TERMS = {
     "direction": "largest |d − exact| anywhere on a path, over the sine of the angle at which it enters",
     "direction / condition": "the same, less what the fall of a cosine to a smaller one magnifies of any error",
-    "place": "largest distance from the exact path, over that path's own extent across the layers",
+    PLACE: "largest distance from the exact path, over that path's own extent across the layers",
     INDICES: "Snell's law in double precision for the indices rounded to float32, which the built-in starts from",
     RATIOS: "the same for the ratio of every two neighbours rounded to float32, which the other formulas start from",
-    "astray": "rays that meet another number of boundaries than they should",
+    WRONG_PATH: "rays that meet another number of boundaries than they should",
     "ray offset": "the place, if the exact path were without Mitsuba's ray offset: the same for every plugin",
     "pixels off": "pixels of which a channel differs by more than 0.1 from the built-in's, same seed",
     "pixels off, control": "the same between two formulas at the rounding limit: what flipped lobes alone do",
 }
 AXES = {"x": "distance, or mrad of entry", "y": "deviation", "x_scale": "linear", "y_scale": "log", "slope": None}
-STUDY = "paths"
+NAME = "paths"
 BUILTIN = "dielectric"
 SCALAR = "needs a compiled variant: on scalar arrays formulas compute in double precision"
 SEED = 2028
 RAYS = 64
 VISIBLE = 0.1
-FLIPPED = 1e-3  # of the pixels: those of which a last bit changes the choice between reflection and refraction
 # The images: a scene, what its parameters are, and the name of the view.
 VIEWS: tuple[tuple[str, dict[str, str], str], ...] = (
     ("mirage", {}, "mirage, telescope"),
@@ -69,18 +70,21 @@ class Bundle:
     shown: int
 
     def exact(self, layers: Layers, offset: float = layered_scenes.OFFSET) -> list[Path]:
+        """Their exact paths through layers, with Mitsuba's ray offset or another one."""
         rays = zip(self.origins, self.directions, self.media, strict=True)
         return [layered_scenes.exact_path(layers, p, d, int(medium), offset) for p, d, medium in rays]
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per scene for the paths, one per view for the images."""
-    paths = [(layers.scene, functools.partial(_path_rows, context, layers)) for layers in (MIRAGE, FIBRE)]
-    views = [(f"image of the {view[2]}", functools.partial(_view_rows, context, *view)) for view in VIEWS]
+    """One task per scene for the paths, one per view for the images; `quick` has the paths of the mirage."""
+    scenes, seen = ((MIRAGE,), ()) if context.profile.quick else ((MIRAGE, FIBRE), VIEWS)
+    paths = [(layers.scene, functools.partial(_path_rows, context, layers)) for layers in scenes]
+    views = [(f"image of the {view[2]}", functools.partial(_view_rows, context, *view)) for view in seen]
     return [Task(f"paths: {name}", work) for name, work in paths + views]
 
 
 def plugins() -> list[str]:
+    """The built-in, `refract`, and `refract` with each formula."""
     return [BUILTIN, PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS)]
 
 
@@ -175,7 +179,7 @@ def deviation(layers: Layers, exact: Path, segments: np.ndarray) -> Deviation:
 
 def _path_rows(context: Context, layers: Layers) -> list[Row]:
     if context.variant.startswith("scalar"):
-        return [Row(STUDY, plugin, layers.scene, context.variant, reason=SCALAR) for plugin in plugins()]
+        return [Row(NAME, plugin, layers.scene, context.variant, reason=SCALAR) for plugin in plugins()]
     rays = bundle(layers)
     exact = rays.exact(layers)
     steps = 4 * max(len(path.media) for path in exact)
@@ -184,7 +188,7 @@ def _path_rows(context: Context, layers: Layers) -> list[Row]:
     replay = {"scene": f"{layers.scene}.xml", "rays": RAYS, "seed": SEED, "shown": rays.shown}
     rows = [
         Row(
-            STUDY,
+            NAME,
             plugin,
             f"{layers.scene}: path",
             context.variant,
@@ -197,7 +201,7 @@ def _path_rows(context: Context, layers: Layers) -> list[Row]:
     offset = {"ray offset": _moved(layers, rays, exact)}
     for case, curves in _curves(rays, found).items():
         case = f"{layers.scene}: {case}"
-        rows.append(Row(STUDY, "every plugin", case, context.variant, offset, replay=replay, curves=curves))
+        rows.append(Row(NAME, "every plugin", case, context.variant, offset, replay=replay, curves=curves))
     return rows
 
 
@@ -238,19 +242,19 @@ def _exact_deviations(other: Layers, layers: Layers, rays: Bundle, exact: list[P
 
 
 def _values(exact: list[Path], parts: list[Deviation]) -> dict[str, float]:
-    astray = [part.boundaries != len(path.media) - 1 for path, part in zip(exact, parts, strict=True)]
+    wrong = [part.boundaries != len(path.media) - 1 for path, part in zip(exact, parts, strict=True)]
     return {
-        "direction": float(max(part.direction.max() for part in parts)),
+        DIRECTION: float(max(part.direction.max() for part in parts)),
         "direction / condition": float(max(part.conditioned.max() for part in parts)),
-        "median direction": float(np.median([part.direction.max() for part in parts])),
-        "place": float(max(part.place.max() for part in parts)),
+        MEDIAN_DIRECTION: float(np.median([part.direction.max() for part in parts])),
+        PLACE: float(max(part.place.max() for part in parts)),
         "median place": float(np.median([part.place.max() for part in parts])),
-        "astray": float(sum(astray)),
+        WRONG_PATH: float(sum(wrong)),
     }
 
 
 def _budgets(layers: Layers, plugin: str, exact: list[Path]) -> dict[str, float]:
-    """Of the forms at the rounding limit: no ray goes astray; in the mirage the direction is bounded a priori.
+    """Of the forms at the rounding limit: no ray takes a wrong path; in the mirage the direction is bounded a priori.
 
     A boundary rounds the cosine twice (b, and to world coordinates), u each; κ is off by u, and all of them together
     are no more than sin² α: (2 m + 1) u after m boundaries. A curved boundary adds the rounding of the intersection.
@@ -259,7 +263,9 @@ def _budgets(layers: Layers, plugin: str, exact: list[Path]) -> dict[str, float]
     if plugin != PLUGIN and (name not in FORMULAS or not FORMULAS[name].budget.at_the_limit):
         return {}
     most = max(len(path.media) - 1 for path in exact)
-    return {"astray": 0.0} | ({} if layers.round else {"direction / condition": (2 * most + 1) * 2.0**-24})
+    return {WRONG_PATH: 0.0} | (
+        {} if layers.round else {"direction / condition": (2 * most + 1) * limits.PATH_BOUNDARY}
+    )
 
 
 def _moved(layers: Layers, rays: Bundle, exact: list[Path]) -> float:
@@ -275,7 +281,7 @@ def _moved(layers: Layers, rays: Bundle, exact: list[Path]) -> float:
 def _view_rows(context: Context, scene: str, parameters: dict[str, str], name: str) -> list[Row]:
     """`refract` and the built-in, image against image; and what flipped lobes alone do, as a control."""
     if context.variant.startswith("scalar"):
-        return [Row(STUDY, PLUGIN, f"{name}: image", context.variant, reason=SCALAR)]
+        return [Row(NAME, PLUGIN, f"{name}: image", context.variant, reason=SCALAR)]
     profile, right = context.profile, _other_right_formula()
     spp = max(1, profile.spp // 4)
     views = {p: View(scene, p, parameters, profile.resolution, spp) for p in (BUILTIN, PLUGIN, right)}
@@ -290,8 +296,8 @@ def _view_rows(context: Context, scene: str, parameters: dict[str, str], name: s
         for role, plugin in (("reference", BUILTIN), ("test", PLUGIN))
     }
     replay = about | {"control": right}
-    budgets = {"pixels off, control": FLIPPED}
-    return [Row(STUDY, PLUGIN, f"{name}: image", context.variant, values, budgets, replay=replay, images=images)]
+    budgets = {"pixels off, control": limits.FLIPPED}
+    return [Row(NAME, PLUGIN, f"{name}: image", context.variant, values, budgets, replay=replay, images=images)]
 
 
 def _other_right_formula() -> str:
@@ -323,3 +329,6 @@ def _until(layers: Layers, path: Path, end: np.ndarray) -> np.ndarray:
     p, d = path.starts[-1], path.directions[-1]
     last = p + d * (end[layers.axis] - p[layers.axis]) / d[layers.axis]
     return np.concatenate([np.stack([path.starts, path.ends], 1).reshape(-1, 3)[:-1], [last]])
+
+
+STUDY = Study(NAME, "Paths", about(__doc__), TERMS, tasks, axes=AXES)

@@ -20,15 +20,17 @@ from mi_refract import regimes
 from mi_refract.accuracy import Subject, evaluate
 from mi_refract.formulas import FORMULAS
 from mi_refract.report.row import Row
+from validation import limits
 from validation.reference import optical_systems
 from validation.run import array_settings as backends
 from validation.run.array_settings import Setting
-from validation.run.context import Context, Task
+from validation.run.context import Context
+from validation.run.metrics import MISCLASSIFIED
+from validation.study import Study, Task, about
 
 from .layer_chains import FEEDS, Array, Fed, Layers, air, carry, cosine, enter, exact_ratios, frame, pipe
 
-TITLE = "Stability"
-TEXT = __doc__.partition("\n")[2].strip()
+NAME = "stability"
 AXES = {
     "x": "layers passed",
     "y": "relative error of the cosine",
@@ -48,7 +50,7 @@ TERMS = {
     "error / condition": "the worst error over condition · u of its ray",
     "error": "the worst error; of a mirage, relative, of the cosine where the ray ends; of directions, in radians",
     **{f"{angle}°": f"the same of the ray that enters at {angle}°" for angle in PASSING},
-    "misjudged": "rays that turned where they should have passed or the reverse; reflections that were none",
+    MISCLASSIFIED: "rays that turned where they should have passed or the reverse; reflections that were none",
     "turning height": "how far the layer in which a ray turned is from the right one, over all layers",
     "length drift": "how far the length of the direction is from what it was, relative",
     "over print": "the largest deviation from CODE V's print, over what printing rounds to",
@@ -74,6 +76,9 @@ class Extent:
 
 
 def extent(context: Context, setting: Setting) -> Extent:
+    """How much is done in a setting."""
+    if not setting.is_scalar and context.profile.quick:
+        return Extent((1000,), ("askew",), 1000, PASSING + TURNING, True)
     if not setting.is_scalar:
         return Extent((1000, 100_000), tuple(PLANES), 10_000, PASSING + TURNING, True)
     if context.profile.name == "full":
@@ -88,9 +93,15 @@ def settings(context: Context) -> list[Setting]:
 
 
 def tasks(context: Context) -> list[Task]:
+    """Chains and systems in every setting; in the profile `quick` chains in the first one that runs, float32 if any."""
+    every = settings(context)
+    if context.profile.quick:
+        running = [s for s in every if s.vector is not None and not (s.is_scalar and s.precision is np.float32)]
+        first = running[0]
+        return [Task(f"stability: {first.label}, chains", functools.partial(chain_rows, context, first))]
     return [
         Task(f"stability: {setting.label}, {name}", functools.partial(rows, context, setting))
-        for setting in settings(context)
+        for setting in every
         for name, rows in (("chains", chain_rows), ("systems", system_rows))
         if setting.vector is not None or name == "chains"
     ]
@@ -116,7 +127,8 @@ def absent(context: Context, setting: Setting) -> dict[str, str]:
 
 
 def chain_rows(context: Context, setting: Setting) -> list[Row]:
-    rows = [Row("stability", name, "all", setting.label, reason=why) for name, why in absent(context, setting).items()]
+    """Mirages, exact ratios and the light pipe of a setting."""
+    rows = [Row(NAME, name, "all", setting.label, reason=why) for name, why in absent(context, setting).items()]
     if setting.vector is None:
         return rows
     how, found = extent(context, setting), subjects(context, setting)
@@ -179,7 +191,7 @@ def mirage_row(name: str, subject: Subject, case: str, fed: Fed, setting: Settin
     values = {
         "error / condition": worst((error / (fed.condition * setting.roundoff))[final][right[final]]),
         "error": worst(error[final]),
-        "misjudged": float((~right)[final].sum()),
+        MISCLASSIFIED: float((~right)[final].sum()),
         "turning height": worst((np.abs(turned - rays.last) / count)[final][~rays.passes[final]]),
         "length drift": worst(np.abs(length - 1)[final]),
     } | {f"{angle}°": float(e) for angle, e in zip(how.angles, error, strict=False) if angle in PASSING}
@@ -193,38 +205,33 @@ def mirage_row(name: str, subject: Subject, case: str, fed: Fed, setting: Settin
         "normal": [float(x).hex() for x in rays.normal],
     }
     case = f"{case}, {fed.feed}"
-    return Row("stability", name, case, setting.label, values, budgets, reason=remark, replay=replay), error
+    return Row(NAME, name, case, setting.label, values, budgets, reason=remark, replay=replay), error
 
 
-# Where ln cos θ changes by x to first order, cos²θ changes by 2x of itself, and |1 − √(1 ± 2x)| ≤ 2x/(1 + √(1 − 2x)).
-# A form at the rounding limit is off by 1.005u a step, where a length has left 1, and by cos θ u/2 ≤ 0.02u for the
-# rounded k that scales the tangent: x ≤ 1.025 condition · u. That is a cosine off by 2 condition · u at most while
-# √(1 − 2x) ≥ 0.025, so while condition · u ≤ 0.487.
-LIMIT = 2.0
-FIRST_ORDER = 0.487
 NOTHING = "no budget: with every input and output off by u, these rays may go anywhere"
 
 
 def mirage_budgets(fed: Fed, u: float, final: slice) -> dict[str, float]:
     """Of a form at the rounding limit, as far as the problem leaves anything to demand: each of them can be broken.
 
-    Where its bound reaches as far as the decision, a ray may be misjudged.
+    Where its bound reaches as far as the decision, a ray may be misclassified.
     """
-    rays, height = fed.rays, LIMIT * u * fed.height + 1
+    rays, height = fed.rays, limits.MIRAGE * u * fed.height + 1
     count = rays.layers.count
-    doubtful = np.where(rays.passes, fed.condition * u > FIRST_ORDER, rays.last + height >= count)[final]
+    doubtful = np.where(rays.passes, fed.condition * u > limits.FIRST_ORDER, rays.last + height >= count)[final]
     heights = (height / count)[final][~rays.passes[final]]
     budgets = {}
-    if (fed.condition[final] * u <= FIRST_ORDER).any():
-        budgets["error / condition"] = LIMIT
+    if (fed.condition[final] * u <= limits.FIRST_ORDER).any():
+        budgets["error / condition"] = limits.MIRAGE
     if not doubtful.all():
-        budgets["misjudged"] = float(doubtful.sum())
+        budgets[MISCLASSIFIED] = float(doubtful.sum())
     if len(heights) and worst(heights) < 1:
         budgets["turning height"] = worst(heights)
     return budgets
 
 
 def worst(x: Array) -> float:
+    """The largest, NaN taken for infinity; 0 of nothing."""
     return float(np.nan_to_num(x.astype(float), nan=np.inf).max(initial=0))
 
 
@@ -235,10 +242,11 @@ def problem_row(case: str, fed: Fed, setting: Setting, curves: dict[str, Array])
     curves = curves | {"condition · u": (fed.condition * setting.roundoff).astype(float)[seen:]}
     lines = {name: list(zip(stop[seen:].tolist(), y.tolist(), strict=True)) for name, y in curves.items()}
     values = {"condition · u": lines["condition · u"][-1][1]}
-    return Row("stability", PROBLEM, f"{case}, {fed.feed}", setting.label, values, curves=lines)
+    return Row(NAME, PROBLEM, f"{case}, {fed.feed}", setting.label, values, curves=lines)
 
 
 def pipe_row(name: str, subject: Subject, setting: Setting, how: Extent) -> Row:
+    """Total internal reflections in a square pipe."""
     rays = 2 if setting.is_scalar else PIPE_RAYS
     a, chain, exact = pipe(how.reflections, rays, CORE, setting.precision)
     carried = carry(subject, chain, a, np.full(rays, how.reflections), setting)
@@ -249,15 +257,14 @@ def pipe_row(name: str, subject: Subject, setting: Setting, how: Extent) -> Row:
     values = {
         "error / condition": worst(chord / (condition * setting.roundoff)),
         "error": worst(chord),
-        "misjudged": float(carried.passed.sum()),
+        MISCLASSIFIED: float(carried.passed.sum()),
         "length drift": worst(np.abs(lengths[0] / lengths[1] - 1)),
     }
-    limits = {"error / condition": 1.0, "misjudged": 0.0}
-    budgets = limits if at_limit(name) else {}
+    budgets = {"error / condition": limits.LIGHT_PIPE, MISCLASSIFIED: 0.0} if at_limit(name) else {}
     axis = [float(x).hex() for x in frame(setting.precision)[2]]
     replay = {"reflections": how.reflections, "rays": rays, "axis": axis}
     case = f"light pipe, {how.reflections} reflections"
-    return Row("stability", name, case, setting.label, values, budgets, reason=how.remark, replay=replay)
+    return Row(NAME, name, case, setting.label, values, budgets, reason=how.remark, replay=replay)
 
 
 # Systems -------------------------------------------------------------------------------------------------------
@@ -267,9 +274,11 @@ class Refractor:
     """A formula as a system asks for it: inputs rounded to the setting's precision. Counts what it did not transmit."""
 
     def __init__(self, subject: Subject, setting: Setting) -> None:
+        """`subject` is evaluated in the arrays of the setting."""
         self.subject, self.setting, self.mirrored = subject, setting, 0
 
     def __call__(self, a: Array, n: Array, k: Any) -> Array:
+        """The directions behind a boundary: `a`, `n` N × 3, k a number or N."""
         given = np.broadcast_arrays(a, n, np.reshape(k, (-1, 1)))
         a, n, k = (x.astype(self.setting.precision) for x in given)
         b, transmitted = evaluate(self.subject, regimes.Rays(a, n, k[:, 0]), self.setting.vector)
@@ -278,24 +287,29 @@ class Refractor:
 
 
 def system_rows(context: Context, setting: Setting) -> list[Row]:
+    """Every optical system with every subject of a setting."""
     found = subjects(context, setting).items()
     return [system_row(name, subject, case, setting) for case in optical_systems.SYSTEMS for name, subject in found]
 
 
 def system_row(name: str, subject: Subject, case: str, setting: Setting) -> Row:
+    """The errors of a subject at the end of a system."""
     trace, refractor = optical_systems.SYSTEMS[case], Refractor(subject, setting)
     error = np.sqrt((trace(refractor) ** 2).sum(1))
     values = {
         "error / condition": worst(error / (optical_systems.condition(trace) * setting.roundoff)),
         "error": worst(error),
-        "misjudged": float(refractor.mirrored),
+        MISCLASSIFIED: float(refractor.mirrored),
     }
     # The condition counts u for every rounding. Inputs take √3/2 of it, a form at the rounding limit 0.8724, or 1.005
     # where a length has left 1: that half a hundredth is not granted.
-    budgets = {"error / condition": 1.0, "misjudged": 0.0} if at_limit(name) else {}
+    budgets = {"error / condition": limits.SYSTEM, MISCLASSIFIED: 0.0} if at_limit(name) else {}
     if case == "double Gauss":
         values["over print"] = optical_systems.off_print(Refractor(subject, setting))
         # Angles stay below 45°, where a surface costs any formula 20u, and 11 · 20 · 2⁻⁵³ is far below the print.
-        budgets |= {"over print": 1.0} if setting.precision is np.float64 else {}
+        budgets |= {"over print": limits.PRINT} if setting.precision is np.float64 else {}
     replay = {"definition": " ".join((trace.__doc__ or "").split()), "rays": len(error)}
-    return Row("stability", name, case, setting.label, values, budgets, replay=replay)
+    return Row(NAME, name, case, setting.label, values, budgets, replay=replay)
+
+
+STUDY = Study(NAME, "Stability", about(__doc__), TERMS, tasks, axes=AXES)

@@ -2,8 +2,8 @@
 
 A program reads rays as CSV and answers with directions; `mi-refract rays run` hands rays to one in the same way, and
 judges alike. Its answers must keep the bound of the textbook formula in its precision for that very ray. How far each
-is off was noted before, for rays of these kinds whose numbers were not kept: to meet the noted worst error within a
-factor of 3 either way is a goal and no budget. A program that is installed and crashes, hangs, or answers other rays
+is off was recorded before, for rays of these kinds whose numbers were not kept: to meet the recorded worst error within
+a factor of 3 either way is a goal and no budget. A program that is installed and crashes, hangs, or answers other rays
 than it was given fails; one that says that it cannot run on this machine, or is not installed, is not run.
 """
 
@@ -22,18 +22,19 @@ from mi_refract.ray_sets.check_answers import PROBLEMS, Findings, RegimeErrors
 from mi_refract.ray_sets.files import as_csv, parse_answers
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.report.row import Row
-from validation.run.context import Context, Task
+from validation import limits
+from validation.run.context import Context
+from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED, WORST_ANGLE
+from validation.study import Study, Task, about
 from validation.suite.renderers.system import CRITICAL, GRAZING, MATCHED, RANDOM, TOTAL, RefractFunction, System
 
 from .renderers import SYSTEMS, environments
 
 Numbers = dict[str, float]
-TITLE = "Per ray"
-TEXT = __doc__.partition("\n")[2].strip()
-STUDY = "per_ray"
+NAME = "per_ray"
 SEED = 2040
+RECORDED, OFF_RECORDED = "recorded", "off the recorded"
 APART = 4e-4  # of cos²θ_t from 0, in random rays
-NEAR = 3.0  # the factor that the worst error may be off the noted one
 
 
 @dataclass(frozen=True)
@@ -81,15 +82,15 @@ SETS = {
     TOTAL: Set(1000, _total, "0.01 rad or more beyond the critical angle and from the surface, k = 1.5"),
 }
 TERMS = {name: f"{rays.count} rays: {rays.text}" for name, rays in SETS.items()} | {
-    "worst rad": "the largest angle to the certified direction, of the rays that were decided rightly",
-    "noted": "the largest such angle that was noted of this system before",
-    "off the noted": "the factor between the two, whichever is larger; 1 inside a range that was noted",
-    "error / bound": "the largest share that an error takes of its ray's a-priori bound, that of the textbook formula",
-    "misjudged": "rays whose total internal reflection was decided wrongly",
-    "wrong": "rays beyond the bound, misjudged although the bound decides them, or without a direction",
+    WORST_ANGLE: "the largest angle to the certified direction, of the rays that were decided rightly",
+    RECORDED: "the largest such angle that was recorded of this system before",
+    OFF_RECORDED: "the factor between the two, whichever is larger; 1 inside a range that was recorded",
+    ERROR_OVER_BOUND: "the largest error of a ray over its a-priori bound, that of the textbook formula",
+    MISCLASSIFIED: "rays whose total internal reflection was decided wrongly",
+    "wrong": "rays beyond the bound, misclassified although the bound decides them, or without a direction",
     "given up": "rays left out because the system takes what is that near to the critical angle for totally reflected",
     "unfit": "answers that are missing, doubled, or to rays that were not asked",
-    "told otherwise": "1 where total internal reflection is not told as it was noted to be",
+    "told otherwise": "1 where total internal reflection is not told as it was recorded to be",
     "unanswered": "rays that a program which crashed, hung or printed no answers leaves open",
 }
 
@@ -104,9 +105,10 @@ def tasks(context: Context) -> list[Task]:
 
 
 def call_rows(system: System, call: RefractFunction, context: Context) -> list[Row]:
+    """A row per set of rays, or one that says why there is none."""
     if reason := environments.absent(system):
         return [_unmeasured(call, reason)]
-    if not system.small and context.profile.name == "quick":
+    if not system.small and context.profile.name != "full":
         return [_unmeasured(call, f"{system.megabytes} MB: in the full profile only")]
     rays = given(call.precision)
     try:
@@ -116,12 +118,12 @@ def call_rows(system: System, call: RefractFunction, context: Context) -> list[R
         return [_unmeasured(call, f"cannot run here: {reason_here}")]
     except (environments.Broken, ValueError) as defect:
         values = {"unanswered": float(len(rays))}
-        return [Row(STUDY, call.title, "every set", call.precision, values, {"unanswered": 0}, reason=str(defect))]
+        return [Row(NAME, call.title, "every set", call.precision, values, {"unanswered": 0}, reason=str(defect))]
     return rows(call, rays, answers)
 
 
 def _unmeasured(call: RefractFunction, reason: str) -> Row:
-    return Row(STUDY, call.title, "every set", call.precision, reason=reason)
+    return Row(NAME, call.title, "every set", call.precision, reason=reason)
 
 
 @functools.cache
@@ -166,7 +168,7 @@ def rows(call: RefractFunction, rays: RaySet, answers: Answers) -> list[Row]:
             "script": " ".join((call.script, *call.arguments)),
             "worst": figures.replay if figures else None,
         }
-        made.append(Row(STUDY, call.title, name, call.precision, values, budgets, goals, about, replay))
+        made.append(Row(NAME, call.title, name, call.precision, values, budgets, goals, about, replay))
     return made
 
 
@@ -197,21 +199,21 @@ def _measured(
     if figures is None:
         return values | {"wrong": math.nan}, budgets, goals
     if figures.compared:
-        values |= {"worst rad": figures.worst, "p99 rad": figures.p99, "mean rad": figures.mean}
+        values |= {WORST_ANGLE: figures.worst, "p99 rad": figures.p99, "mean rad": figures.mean}
     values |= {
-        "error / bound": figures.error_over_bound,
-        "misjudged": float(figures.tir_misclassified),
+        ERROR_OVER_BOUND: figures.error_over_bound,
+        MISCLASSIFIED: float(figures.tir_misclassified),
         "wrong": float(figures.wrong),
     }
-    budgets["error / bound"] = 1.0
+    budgets[ERROR_OVER_BOUND] = 1.0
     if name == TOTAL:
         values["told otherwise"], budgets["told otherwise"] = float(findings.tir != call.told), 0.0
     if name in call.recorded_error:
         values |= {
-            "noted": call.recorded_error[name][1],
-            "off the noted": off(figures.worst, *call.recorded_error[name]),
+            RECORDED: call.recorded_error[name][1],
+            OFF_RECORDED: off(figures.worst, *call.recorded_error[name]),
         }
-        goals["off the noted"] = NEAR
+        goals[OFF_RECORDED] = limits.RECORDED
     return values, budgets, goals
 
 
@@ -220,3 +222,6 @@ def off(worst: float, low: float, high: float) -> float:
     if not worst > 0:
         return math.inf if worst == 0 else math.nan
     return max(worst / high, low / worst, 1.0)
+
+
+STUDY = Study(NAME, "Per ray", about(__doc__), TERMS, tasks)

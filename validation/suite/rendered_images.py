@@ -27,27 +27,27 @@ from mi_refract.rendering import scene_files
 from mi_refract.report.row import Row
 from mi_refract.scene_export import from_mitsuba, write_files
 from mi_refract.scene_export.plain_scene import Diffuse, Environment, Light, Mesh, PlainScene
+from validation import limits
 from validation.run.context import SCENES as FOLDER
-from validation.run.context import Context, Task
+from validation.run.context import Context
+from validation.run.metrics import DETECTABLE, MEAN_DIFFERENCE
 from validation.run.render_methods import Camera
+from validation.study import Study, Task, about
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
 from .renderers import SYSTEMS, environments
 
-TITLE = "Images"
-TEXT = __doc__.partition("\n")[2].strip()
-STUDY = "images"
+NAME = "images"
 TERMS = {
     "tests that differ": "of tiles of 16² pixels by channel, blocks of tiles, and the whole image; of pairs that are "
     "equal, one in 10,000 has any",
     "tiles that differ without noise": "of those where neither side has noise",
-    "detectable difference": "relative to the tile's mean, median over the tiles; of the image: of its mean",
-    "mean difference": "of the image's mean, relative: what the other renderer has more",
+    DETECTABLE: "relative to the tile's mean, median over the tiles; of the image: of its mean",
+    MEAN_DIFFERENCE: "of the image's mean, relative: what the other renderer has more",
     "RMSE / noise": "of the two means by pixel, over what the spread between renders predicts: 1 for equal images "
     "whose noise is all in that spread, which it is not for a fixed grid of samples",
     "reference, test, difference": f"`{PLUGIN}`, the other renderer, test − reference: means over the renders",
-} | {f"{title}, assumed": " ".join(painter.assumed) for title, painter in IMAGE_RENDERERS.items()}
-FAMILY_ERROR = 1e-4
+} | {f"{title}, assumed": " ".join(renderer.assumed) for title, renderer in IMAGE_RENDERERS.items()}
 RENDERS = 4  # a side
 OURS = 1000  # the first seed of the reference's
 LEVEL = 4  # of the spheres: facets that can be seen, so that both sides must shade them flat
@@ -56,7 +56,7 @@ COMPILED = "needs a compiled variant: millions of samples"
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """`spp` of each reference render; a painter's own spp is divided by `less`; `wanted`: difference to be seen."""
+    """`spp` of each reference render; a renderer's own spp is divided by `less`; `wanted`: difference to be seen."""
 
     resolution: int
     spp: int
@@ -64,7 +64,7 @@ class Size:
     wanted: float
 
 
-SIZES = {"quick": Size(64, 64, 32, 0.1), "full": Size(128, 512, 1, 0.01)}
+SIZES = {"quick": Size(64, 64, 32, 0.1), "standard": Size(64, 64, 32, 0.1), "full": Size(128, 512, 1, 0.01)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,6 +80,7 @@ def _scene(name: str, resolution: int) -> PlainScene:
 
 
 def environment(resolution: int) -> PlainScene:
+    """The balls under the askew sky."""
     return dataclasses.replace(_scene("balls", resolution), name="environment", sky=askew())
 
 
@@ -126,32 +127,33 @@ def tasks(context: Context) -> list[Task]:
     """One per renderer and scene."""
     return [
         Task(f"images: {title}, {scene}", functools.partial(pair_rows, context, title, scene))
-        for title, painter in IMAGE_RENDERERS.items()
-        for scene in painter.spp
+        for title, renderer in IMAGE_RENDERERS.items()
+        for scene in renderer.spp
     ]
 
 
 def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
-    painter, size = IMAGE_RENDERERS[title], SIZES[context.profile.name]
-    system = SYSTEMS[painter.system]
+    """A renderer against `refract` in a scene: one row."""
+    renderer, size = IMAGE_RENDERERS[title], SIZES[context.profile.name]
+    system = SYSTEMS[renderer.system]
     setting = f"{size.resolution}²"
     reason = environments.absent(system)
-    if not reason and not system.small and context.profile.name == "quick":
+    if not reason and not system.small and context.profile.name != "full":
         reason = f"{system.megabytes} MB: in the full profile only"
     if not reason and context.variant.startswith("scalar"):
         reason = COMPILED
     if reason:
-        return [Row(STUDY, title, scene, setting, reason=reason)]
+        return [Row(NAME, title, scene, setting, reason=reason)]
     given, seeds = SCENES[scene].load(size.resolution), range(1, RENDERS + 1)
-    spp = max(painter.spp[scene] // size.less, 1)
+    spp = max(renderer.spp[scene] // size.less, 1)
     try:
         with tempfile.TemporaryDirectory() as folder:
-            test = painter.draw(given, Path(folder), spp, seeds)
+            test = renderer.draw(given, Path(folder), spp, seeds)
     except (environments.Unable, ValueError) as why:  # ValueError: a scene that the renderer cannot say
-        return [Row(STUDY, title, scene, setting, reason=" ".join(str(why).split()))]
+        return [Row(NAME, title, scene, setting, reason=" ".join(str(why).split()))]
     except (environments.Broken, OSError) as defect:
         values = {"not rendered": float(RENDERS)}
-        return [Row(STUDY, title, scene, setting, values, {"not rendered": 0.0}, reason=str(defect))]
+        return [Row(NAME, title, scene, setting, values, {"not rendered": 0.0}, reason=str(defect))]
     return [_row(context, title, scene, reference(scene, size), test, {"spp": spp, "seeds": list(seeds)})]
 
 
@@ -167,7 +169,7 @@ def reference(scene: str, size: Size) -> list[Image]:
 
 def _row(context: Context, title: str, scene: str, ours: Sequence[Image], theirs: Sequence[Image], about: dict) -> Row:
     size = SIZES[context.profile.name]
-    found = compare("welch", ours, theirs, family_error=FAMILY_ERROR, resolution=size.wanted)
+    found = compare("welch", ours, theirs, family_error=limits.SUITE_ERROR, resolution=size.wanted)
     values = _values(found, *(np.stack([image.pixels for image in side]) for side in (ours, theirs)))
     known = title in SCENES[scene].known
     if known:
@@ -175,14 +177,14 @@ def _row(context: Context, title: str, scene: str, ours: Sequence[Image], theirs
     budgets = {"not seen to differ": 0.0} if known else {}
     if title not in WHY:
         budgets = {"tests that differ": 0.0, "tiles that differ without noise": 0.0}
-    goals = {"detectable difference": size.wanted} if title not in WHY else {}
+    goals = {DETECTABLE: size.wanted} if title not in WHY else {}
     reason = f"{found.verdict}: {found.reason}"
     if title in WHY and found.verdict is Verdict.DIFFERENT:
         reason += f"; {WHY[title]}"
     replay = {"verdict": str(found.verdict), "scene": scene, "resolution": size.resolution, "reference spp": size.spp}
     replay |= about | {"renderer": SYSTEMS[IMAGE_RENDERERS[title].system].source}
     images = _saved(context, title, scene, ours, theirs)
-    return Row(STUDY, title, scene, f"{size.resolution}²", values, budgets, goals, reason, replay, images)
+    return Row(NAME, title, scene, f"{size.resolution}²", values, budgets, goals, reason, replay, images)
 
 
 def _values(found: Comparison, ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
@@ -193,19 +195,22 @@ def _values(found: Comparison, ours: np.ndarray, theirs: np.ndarray) -> dict[str
     values = {
         "tests that differ": metrics.get("tests of tiles and channels that differ", np.nan),
         "tiles that differ without noise": metrics.get("tiles without noise that differ", np.nan),
-        "detectable difference": found.minimum_detectable,
+        DETECTABLE: found.minimum_detectable,
         "detectable difference, image": metrics.get("minimum detectable difference of the whole image", np.nan),
-        "mean difference": float(theirs.mean() / ours.mean() - 1),
+        MEAN_DIFFERENCE: float(theirs.mean() / ours.mean() - 1),
     }
     return values | ({"RMSE / noise": float(rmse / np.sqrt(noise))} if noise > 0 else {})
 
 
 def _saved(context: Context, title: str, scene: str, ours: Sequence[Image], theirs: Sequence[Image]) -> dict[str, str]:
     """Both means and their difference, as EXR files below the output folder."""
-    folder = Path("images") / STUDY / scene
+    folder = Path("images") / NAME / scene
     (context.out / folder).mkdir(parents=True, exist_ok=True)
     one, two = (np.stack([image.pixels for image in side]).mean(0, dtype=np.float64) for side in (ours, theirs))
     shown = {"reference": (PLUGIN, one), "test": (title, two), "difference": (f"{title} difference", two - one)}
     for name, image in shown.values():
         image_file.write_exr(context.out / folder / f"{name}.exr", image.astype(np.float32))
     return {role: str(folder / f"{name}.exr") for role, (name, _) in shown.items()}
+
+
+STUDY = Study(NAME, "Images", about(__doc__), TERMS, tasks)

@@ -1,13 +1,10 @@
-"""Other renderers and libraries that really run, each in a process and an environment of its own; see `SYSTEMS`.
+"""Other renderers and libraries that really run, each in a process and an environment of its own.
 
-What runs there is a script of scripts/ that imports nothing of this project. A script that cannot run on this machine
-says why in a line on stderr and exits with 77.
+In: rays as CSV, or a plain scene. Out: directions, or images. What runs there is a script of scripts/ that imports
+nothing of this project; a script that cannot run on this machine says why in a line on stderr and exits with 77.
 """
 
-from . import cycles, glsl, luxcore, mitsuba_builtin, optiland, povray, pyglm, radiance, rayoptics, three
 from .system import System
+from .table import SYSTEMS
 
-SYSTEMS: dict[str, System] = {
-    module.SYSTEM.name: module.SYSTEM
-    for module in (mitsuba_builtin, pyglm, glsl, rayoptics, optiland, radiance, cycles, luxcore, povray, three)
-}
+__all__ = ["SYSTEMS", "System", "command", "environments", "image_renderers"]

@@ -5,36 +5,42 @@ Exit code 0; 1 where an installation failed, with a line on stderr for each; 2 f
 
 from __future__ import annotations
 
-import argparse
 import sys
-from typing import NoReturn
+from typing import Annotated
 
-from . import SYSTEMS, environments
+import typer
+
+from validation.run import command_line
+
+from . import environments
 from .system import System
+from .table import SYSTEMS
 
-
-class _OneLine(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}\n")
+NAME = "validation renderers"
+app = command_line.application()
 
 
 def main(arguments: list[str]) -> int:
-    options = _parser().parse_args(arguments)
-    wanted = [name.strip() for name in (options.install or "").split(",") if name.strip()]
+    """Run the command line; the exit code."""
+    return command_line.exit_code(app, NAME, arguments)
+
+
+@app.command()
+def _command(
+    listed: Annotated[
+        bool, typer.Option("--list", help="Print what there is, and whether it is installed (default).")
+    ] = False,
+    install: Annotated[str, typer.Option(metavar="NAME,…", help=f"Install some of {', '.join(SYSTEMS)}.")] = "",
+) -> int:
+    """List or install the other renderers and libraries that can be run here."""
+    wanted = [name.strip() for name in install.split(",") if name.strip()]
     if unknown := [name for name in wanted if name not in SYSTEMS]:
-        print(f"validation renderers: unknown system {unknown[0]!r}; accepted: {', '.join(SYSTEMS)}", file=sys.stderr)
-        return 2
+        return command_line.misuse(NAME, f"unknown system {unknown[0]!r}; accepted: {', '.join(SYSTEMS)}")
+    if listed and wanted:
+        return command_line.misuse(NAME, "--list with --install; accepted: one of them")
     if not wanted:
         print("\n".join(_line(system) for system in SYSTEMS.values()))
     return max([_install(SYSTEMS[name]) for name in wanted], default=0)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _OneLine(prog="validation renderers", description="Other renderers and libraries that can be run here.")
-    choice = parser.add_mutually_exclusive_group()
-    choice.add_argument("--list", action="store_true", help="what there is, and whether it is installed (default)")
-    choice.add_argument("--install", metavar="NAME,…", help=f"of {', '.join(SYSTEMS)}")
-    return parser
 
 
 def _install(system: System) -> int:
@@ -42,7 +48,7 @@ def _install(system: System) -> int:
     try:
         environments.install(system)
     except OSError as error:
-        print(f"validation renderers: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"{NAME}: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
     return 0
 

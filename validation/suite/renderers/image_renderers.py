@@ -20,9 +20,11 @@ from mi_refract.scene_export import write_files
 from mi_refract.scene_export.plain_scene import PlainScene
 from mi_refract.scene_export.targets import cycles, luxcore, povray, radiance, scene_json
 
-from . import SYSTEMS, environments, three
+from . import environments
+from .table import SYSTEMS
 
 HOURS = 4 * 3600.0  # after which a renderer hangs
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 @dataclass(frozen=True)
@@ -77,11 +79,16 @@ def _povray(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> 
     return [image_file.named(f"seed {seed}", coarse.astype(np.float32)) for seed in seeds]
 
 
+def browser() -> str | None:
+    """The path of a Chromium; None where there is none."""
+    return next(filter(None, map(shutil.which, BROWSERS)), None)
+
+
 def _three(mis: str) -> Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]:
     """With multiple importance sampling of the sky ("1"), as the library comes, or without ("0")."""
 
     def draw(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
-        chromium, node = three.browser(), shutil.which("node")
+        chromium, node = browser(), shutil.which("node")
         if not (chromium and node):
             raise environments.Unable("no node or no Chromium in PATH")
         (folder / "scene").mkdir()

@@ -14,6 +14,7 @@ Noted = Mapping[str, tuple[float, float]]  # worst angle in radians by set, from
 
 
 def recorded_error(random: float, critical: float, grazing: float | tuple, matched: float | tuple) -> Noted:
+    """Worst angles in radians by set of rays, a number or a range (from, to)."""
     figures = zip((RANDOM, CRITICAL, GRAZING, MATCHED), (random, critical, grazing, matched), strict=True)
     return {name: x if isinstance(x, tuple) else (x, x) for name, x in figures}
 

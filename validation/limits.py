@@ -1,0 +1,156 @@
+"""Every budget and every goal of the studies, each with its reason.
+
+A budget that is broken fails the run. A goal is for what a busy machine can spoil (times): a missed goal is shown, and
+decides no verdict. Units of roundoff are u = 2⁻²⁴ or 2⁻⁵³. Where a limit depends on the ray, on the number of layers or
+on the scene, the study computes it, and the number here is the factor or the probability that it starts from. The
+a-priori bounds of the formulas themselves stand in `mi_refract.formulas.bounds`, those of the planted defects of the
+image comparison in `mi_refract.image_diff.self_test`.
+"""
+
+from __future__ import annotations
+
+import math
+
+from validation.run.metrics import EQUAL_TIME, EQUAL_TIME_DEFAULTS
+
+
+class Limit(float):
+    """An upper bound that knows the reason for it."""
+
+    reason: str
+
+
+def limit(value: float, reason: str) -> float:
+    """The bound `value` as a `Limit`; `reason` says where it comes from."""
+    found = Limit(value)
+    found.reason = reason
+    return found
+
+
+# Directions ----------------------------------------------------------------------------------------------------
+
+SLACK = limit(4.0, "a constant of an a-priori bound that could be four times smaller has become loose")
+SLACK_FROM_RAYS = limit(50_000, "rays per regime: fewer need not come near a bound, so a loose one is no defect there")
+SCREEN_OFF = limit(0.01, "u: extended precision, which compares with the certified answer, costs as much")
+COPY_TIME = limit(1 / 0.9, "over the time of a copy: nine tenths of the throughput that memory allows")
+
+# BSDF samples, float32 against the built-in's own
+SAMPLE_FLIPS = limit(1e-3, "of the rays: a random number within rounding of the reflectance")
+SAMPLE_ETA = limit(2e-7, "absolute: one rounding of a ratio up to 1.5, and one of its reciprocal")
+SAMPLE_P99 = limit(4e-6, "absolute: a few roundings, for 99 rays of 100")
+SAMPLE_MUELLER = limit(6, "radicand errors: one on either side of the boundary, in three factors of the weight")
+
+# Stability -----------------------------------------------------------------------------------------------------
+
+# Where ln cos θ changes by x to first order, cos²θ changes by 2x of itself, and |1 − √(1 ± 2x)| ≤ 2x/(1 + √(1 − 2x)).
+# A form at the rounding limit is off by 1.005u a step, where a length has left 1, and by cos θ u/2 ≤ 0.02u for the
+# rounded k that scales the tangent: x ≤ 1.025 condition · u. That is a cosine off by 2 condition · u at most while
+# √(1 − 2x) ≥ 0.025, so while condition · u ≤ 0.487.
+MIRAGE = limit(2.0, "error of the cosine over condition · u, as long as condition · u ≤ FIRST_ORDER")
+FIRST_ORDER = limit(0.487, "condition · u up to which the bound of first order holds")
+LIGHT_PIPE = limit(1.0, "each total internal reflection passes on what is wrong and adds at most u: only signs change")
+SYSTEM = limit(1.0, "the condition counts u for every rounding; inputs take √3/2 of it, a form at the limit 0.8724")
+PRINT = limit(1.0, "what printing rounds to: 11 surfaces of 20u each, u = 2⁻⁵³, are far below CODE V's digits")
+
+POWER = limit(4.0, "u, relative, of R and of 1 − R: the forms promise 3.12u of R and 2u of T")
+POWER_SUM = limit(4.0, "u, of R + T − 1: R · 4u + T · 4u")
+AMPLITUDE = limit(8.0, "u, relative, of r_s, r_p and the phase's point of the unit circle")
+# Of the larger term of a float32 radicand: the promoted form's error. The compensated one's is less, as κ of a float32
+# k up to 2²³ is a pair exactly.
+RADICAND = limit(10 * 2.0**-53, "of the larger term of a float32 radicand: the error of the promoted form")
+RECIPROCITY = limit(3.0, "u, of T there over T back: two roundings of T and that of 1/k, which T feels once at most")
+DIFFUSE = limit(12.5, "u: two cosines of a node, k and κ move R by 2.12u each, next to the 4u of R itself")
+WHITE_FURNACE = limit(2.0**-23, "an ulp of 1: the weights of both lobes add up to R + T")
+IN_AND_OUT = limit(6.0, "u: k² and 1/k², each with k rounded and squared, 3u")
+INDEX_SQUARED = limit(3.0, "u: k rounded and squared")
+
+# D is right to u, and a derivative is k a′ along the surface and D′/2√D along n. D′ is the difference of two products
+# of four rounded factors, and what they cancel to is what the condition counts: 4u; 1/√D 2u, the last product u, the
+# result u.
+DERIVATIVE = limit(8.0, "error over condition · u of a form at the rounding limit")
+
+PATH_BOUNDARY = limit(2.0**-24, "of the direction, (2 m + 1) times after m boundaries: the cosine is rounded twice")
+FLIPPED = limit(1e-3, "of the pixels: those of which a last bit changes the choice between reflection and refraction")
+
+# Renders -------------------------------------------------------------------------------------------------------
+
+MEANS = limit(1e-4, "relative, of the means of two images of the same random numbers")
+CHANGED = limit(1e-3, "of the pixels, same seeds: lobe decisions that a last bit flips")
+WELCH_ERROR = limit(1e-3, "probability of any alarm in an image of equal renders, after Šidák")
+WELCH_MARGIN = limit(1e-5, "relative: means of float32 images that differ by less are equal")
+RENDER_TIME = limit(1.0, "over the built-in's time: `refract` is not slower")
+
+FIRST_IMAGE = {
+    64: limit(0.6, "of the built-in's first image of so many glasses: one callable for all of them"),
+    1000: limit(0.15, "of the built-in's first image of so many glasses: one callable for all of them"),
+}
+EDIT = limit(0.2, "of the built-in's image after an edit: the index is no literal, so nothing is compiled")
+FROZEN = limit(1e-5, "of a pixel: the order in which samples are added up")
+
+# Efficiency ----------------------------------------------------------------------------------------------------
+
+ONLY_GLASS_TIME = limit(0.8, "of the built-in's time: `refract_path` leaves emitter sampling out where all is glass")
+ONLY_GLASS = {
+    EQUAL_TIME: limit(0.4, "of the built-in's with the same sampler: both lobes of the first boundaries"),
+    EQUAL_TIME_DEFAULTS: limit(0.12, "of the built-in's defaults: stratification comes on top"),
+}
+MIXED = {EQUAL_TIME: limit(0.8, "of the built-in's with the same sampler, where surfaces scatter, too")}
+NOISE = limit(1e-5, "of float32 images: below it independent seeds give the same one, and there is no error to buy")
+SCALING = {
+    ("glasses", 64): {"first image / built-in": FIRST_IMAGE[64], "after an edit / built-in": EDIT},
+    ("glasses", 1000): {"first image / built-in": FIRST_IMAGE[1000]},
+}
+
+# Planar --------------------------------------------------------------------------------------------------------
+
+GROWN = limit(1.0, "error over what rounding may have grown to, see `validation/planar/error_growth.py`")
+PLANAR_EQUAL = limit(1e-9, "float64: of the extent, and in radians")
+# Of the ellipse lens: a place, a normal and a direction at either boundary, each rounded once in x and in y.
+SPOT = limit(6 * math.sqrt(2), "u, of the focus of the ellipse lens: six roundings, each in x and in y")
+PLANAR_TIMES = {
+    ("llvm float32", "document 004"): {"µs per path": limit(0.1, "two cores, the lens of the original program")},
+    ("llvm float32", "M = 1000000"): {"µs per path": limit(1.0, "two cores: ten times the segments cost no tenfold")},
+}
+
+# Image comparison ----------------------------------------------------------------------------------------------
+
+DIFF_SECONDS = {
+    "tolerance": limit(0.5, "seconds of a 1080p pair, two cores"),
+    "welch": limit(3.0, "seconds of 8 + 8 renders of 1080p, two cores"),
+    "page": limit(5.0, "seconds of the page of a 1080p image, two cores"),
+    "auto": limit(60.0, "seconds of a folder of 1000 pairs of 256², two cores"),
+}
+PAGE_MEGABYTES = limit(15.0, "MB: a page that can be sent by mail")
+MEMORY_MEGABYTES = limit(1024.0 * 2**20 / 1e6, "MB, 1 GiB: what the smallest machines of a CI have to spare")
+
+# Ground truth --------------------------------------------------------------------------------------------------
+
+BODY = limit(1.0, "error over the sum of what every rounding on the way may do")
+INDEX_SEEN = limit(1e-4, "relative: an error of an index that size takes a ray to its bound, or the bound is no test")
+FALSE_ALARM = limit(1e-4, "probability that Student's t of the rainbow exceeds its bound by chance")
+RAINBOW_RESOLVED = limit(0.0145 / 10, "degrees, standard error: INDEX_SEEN moves the rainbow by 0.0145")
+# Pixels may move the edge: σ²/4(D − D₀) at 0.1 degrees is 3.5e-4; the parabola carries 1.7 of it to D₀, 6e-4, which
+# images without noise show, too.
+RAINBOW_BLUR = limit(1e-3, "degrees that pixels may move the edge of the rainbow")
+
+# Other renderers -----------------------------------------------------------------------------------------------
+
+RECORDED = limit(3.0, "factor between the worst error and the recorded one: the numbers of those rays were not kept")
+SUITE_ERROR = limit(1e-4, "probability of any alarm in a pair of equal images")
+
+
+def table() -> dict[str, Limit]:
+    """All of them by name, those of a group as "NAME, key"."""
+    found: dict[str, Limit] = {}
+
+    def collect(name: str, value: object) -> None:
+        if isinstance(value, Limit):
+            found[name] = value
+        elif isinstance(value, dict):
+            for key, each in value.items():
+                collect(f"{name}, {key}", each)
+
+    for name, value in globals().items():
+        if name.isupper():
+            collect(name, value)
+    return found

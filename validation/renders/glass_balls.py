@@ -1,0 +1,99 @@
+"""Scenes of glass balls side by side under a spotted sky, each ball with an index of its own."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from validation.run.kernel_timing import kernels
+
+RESOLUTION = 32
+SEED = 2026
+
+
+class Balls:
+    """A scene of `count` glass balls of different indices with one plugin.
+
+    Without a `max_depth` it is one that no path reaches, and that no cache has seen.
+    """
+
+    def __init__(self, plugin: str, count: int, integrator: str = "path", max_depth: int = 0) -> None:
+        """Load it, for an integrator to a depth."""
+        import mitsuba as mi
+
+        side = int(np.ceil(np.sqrt(count)))
+        sky = np.random.default_rng(SEED).random((8, 16, 3)).astype(np.float32)  # a constant one shows no index
+        fresh = int(np.random.default_rng().integers(1 << 20, 1 << 30))
+        film = {"type": "hdrfilm", "width": RESOLUTION, "height": RESOLUTION, "rfilter": {"type": "box"}}
+        view = mi.ScalarTransform4f().look_at([0, 0, 4 * side], [0, 0, 0], [0, 1, 0])
+        scene: dict[str, Any] = {
+            "type": "scene",
+            "integrator": {"type": integrator, "max_depth": max_depth or fresh},
+            "sensor": {"type": "perspective", "fov": 30, "to_world": view, "film": film},
+            "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky)},
+        }
+        for i in range(count):
+            place = [2 * (i % side) - side + 1, 2 * (i // side) - side + 1, 0]
+            glass = {"type": plugin, "int_ior": 1.3 + 0.5 * i / count, "ext_ior": 1.0}
+            scene[f"ball{i:04}"] = {"type": "sphere", "radius": 0.9, "center": place, "bsdf": glass}
+        self.scene = mi.load_dict(scene)
+        self.params = mi.traverse(self.scene)
+        self.eta = next(name for name in self.params.keys() if name.endswith(".eta"))  # noqa: SIM118
+
+    def image(self, seed: int = 0) -> Any:
+        """A render of 4 samples per pixel."""
+        import mitsuba as mi
+
+        return mi.render(self.scene, spp=4, seed=seed)
+
+    def frozen(self) -> Callable[[Any, Any], Any]:
+        """(params, seed) -> the image, traced once and replayed from then on. The scene must be in its closure."""
+        import mitsuba as mi
+
+        scene = self.scene
+
+        @dr.freeze
+        def image(params: Any, seed: Any) -> Any:
+            return mi.render(scene, params, spp=4, seed=seed)
+
+        return image
+
+    def edit(self, eta: float) -> None:
+        """Give the first ball another index."""
+        self.params[self.eta] = eta
+        self.params.update()
+
+
+@contextmanager
+def alone(plugin: str, count: int, **more: Any) -> Iterator[Balls]:
+    """Balls, and none of them left afterwards."""
+    gc.collect()
+    balls = Balls(plugin, count, **more)
+    yield balls
+    balls.__dict__.clear()
+    del balls
+    gc.collect()
+
+
+def compiled(work: Callable[[], Any]) -> float:
+    """How many kernels no cache in memory had."""
+    return float(sum(not entry["cache_hit"] for entry in kernels(work)))
+
+
+def seconds_of(work: Callable[[], Any]) -> float:
+    """Seconds until what `work` returns is evaluated."""
+    start = time.perf_counter()
+    dr.eval(work())
+    dr.sync_thread()
+    return time.perf_counter() - start
+
+
+def size_of(balls: Balls) -> float:
+    """Operations of the largest kernel of a render."""
+    return float(max(entry["operation_count"] for entry in kernels(balls.image)))

@@ -1,0 +1,33 @@
+"""`bsdf.sample` of many rays at once, in any variant of Mitsuba, as numpy arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+
+def sample_all(bsdf: Any, context: Any, wi: np.ndarray, sample1: np.ndarray) -> dict[str, np.ndarray]:
+    """`bsdf.sample` for every ray: arrays (N, entries) of wo, pdf, eta, weight, and (N,) of the sampled type."""
+    import mitsuba as mi
+
+    def ask(w: Any, s: Any, count: int) -> dict[str, np.ndarray]:
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wi = mi.Vector3f(w)
+        bs, weight = bsdf.sample(context, si, s, [0, 0])
+        found = {"wo": bs.wo, "pdf": bs.pdf, "eta": bs.eta, "weight": weight, "type": bs.sampled_type}
+        return {name: _lanes(np.array(x, dtype=float), count) for name, x in found.items()}
+
+    if dr.is_jit_v(mi.Float):
+        found = ask(wi.T, mi.Float(sample1), len(wi))
+    else:
+        each = [ask(w, float(s), 1) for w, s in zip(wi, sample1, strict=True)]
+        found = {name: np.concatenate([x[name] for x in each]) for name in each[0]}
+    return found | {"type": found["type"][:, 0]}
+
+
+def _lanes(x: np.ndarray, count: int) -> np.ndarray:
+    """(count, entries) from an array that has the lanes last (or none, in scalar variants)."""
+    lanes = x if x.ndim and x.shape[-1] in (1, count) and count > 1 else x[..., None]
+    return np.broadcast_to(lanes, (*lanes.shape[:-1], count)).reshape(-1, count).T

@@ -1,0 +1,39 @@
+"""Names of metrics that several studies share, and of those that the written tables look up.
+
+A table that asks for a name that is not here fails at import, not after the run.
+"""
+
+from mi_refract.accuracy import BUDGETS
+
+# Directions, per ray: the judge's own names.
+ERROR_OVER_BOUND, MISCLASSIFIED_FAR = BUDGETS
+MISCLASSIFIED = "TIR misclassified"
+WORST_CHORD = "worst chord"
+WORST_IN_U = "worst / u"
+WORST_ANGLE = "worst rad"
+# Times
+TIME_OVER_COPY = "time / copy"
+TIME_OVER_PLAIN = "time / plain"
+TIME_OVER_BUILTIN = "time / built-in"
+# Paths
+WRONG_PATH = "wrong path"
+WRONG_PATH_FAR = "wrong path, beyond rounding"
+# Images
+MEANS_DIFFER = "|mean ratio − 1|"
+CHANGED_SHARE = "changed share"
+WELCH_ALARMS = "Welch alarms"
+SMALLEST_P = "smallest p, adjusted"
+MEAN_DIFFERENCE = "mean difference"
+DETECTABLE = "minimum detectable difference"
+EQUAL_TIME = "equal-time MSE"
+EQUAL_TIME_DEFAULTS = "equal-time MSE / independent"
+
+
+def low(metric: str) -> str:
+    """The lower end of the 95 % interval of a metric."""
+    return f"{metric}, low"
+
+
+def high(metric: str) -> str:
+    """The upper end of the 95 % interval of a metric."""
+    return f"{metric}, high"

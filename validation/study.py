@@ -1,0 +1,52 @@
+"""A study: what it asks, what the report says of it, and the tasks that answer it.
+
+A module that holds a study ends with `STUDY = Study(...)`; `rooms.py` lists these modules.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from mi_refract.report.row import Row
+from validation.run.context import Context
+
+
+@dataclass(frozen=True)
+class Task:
+    """A unit of work that is finished or not: an interrupted run keeps the rows of finished tasks."""
+
+    name: str
+    run: Callable[[], list[Row]]
+
+
+@dataclass(frozen=True)
+class Study:
+    """One question and its measurements.
+
+    `name` is the `study` of its rows; `title`, `text` and `terms` (metric or case → meaning) are shown by the report.
+    `tasks(context)` lists what is to be run. `axes` says what the curves of its rows are drawn over, `scatter` which
+    metric is plotted against which (both as `mi_refract.report.study_page` describes them). `summarise(rows)` returns
+    all rows of a run with the summary of this study among them.
+    """
+
+    name: str
+    title: str
+    text: str
+    terms: Mapping[str, str]
+    tasks: Callable[[Context], list[Task]]
+    axes: Mapping[str, Any] = field(default_factory=dict)
+    scatter: tuple[Mapping[str, Any], ...] = ()
+    summarise: Callable[[list[Row]], list[Row]] = list
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """What the report is told: title, introduction, glossary and axes."""
+        about: dict[str, Any] = {"title": self.title, "text": " ".join(self.text.split()), "terms": dict(self.terms)}
+        return about | ({"axes": dict(self.axes)} if self.axes else {})
+
+
+def about(docstring: str | None) -> str:
+    """What a module's docstring says below its first line, up to a paragraph that begins with a command."""
+    return (docstring or "").partition("\n")[2].partition("\n\n`python")[0].strip()
