@@ -43,7 +43,7 @@ def test_the_names_are_those_of_the_studies():
         error_against_time: headline.EFFICIENCY,
         layered_paths: headline.PATHS,
     }
-    assert all(study.NAME == name for study, name in named.items())
+    assert all(name == study.NAME for study, name in named.items())
     assert per_formula.ALL == headline.EVERYTHING and against_dielectric.TIME == headline.TIME
     known = {headline.COMMON, headline.WORST_IN_U, headline.MISCLASSIFIED, headline.MISCLASSIFIED_FAR}
     assert known <= per_formula.TERMS.keys()
