@@ -35,11 +35,21 @@ ABSENT = Row("directions", "promoted", "all", "cuda float32", reason="no NVIDIA 
 RENDERER = Row("per_ray", "PyGLM", "every set", "f32", reason="python -m validation renderers --install pyglm")
 
 
-def test_the_metrics_are_those_of_the_studies():
-    assert {headline.ROUNDOFFS, headline.MISJUDGED, headline.FAR, headline.COMMON} <= per_formula.TERMS.keys()
-    assert headline.EQUAL_TIME in error_against_time.TERMS and headline.ASTRAY in layered_paths.TERMS
-    assert {headline.CHANGED, headline.ALARMS, headline.TIME} <= against_dielectric.TERMS.keys()
-    assert headline.BOUNDED in traced_bodies.TERMS and headline.SHALLOW in optical_chains.TERMS
+def test_the_names_are_those_of_the_studies():
+    named = {
+        per_formula: headline.DIRECTIONS,
+        traced_bodies: headline.GROUND_TRUTH,
+        against_dielectric: headline.RENDERS,
+        error_against_time: headline.EFFICIENCY,
+        layered_paths: headline.PATHS,
+    }
+    assert all(name == study.NAME for study, name in named.items())
+    assert per_formula.ALL == headline.EVERYTHING and against_dielectric.TIME == headline.TIME
+    known = {headline.COMMON, headline.WORST_IN_U, headline.MISCLASSIFIED, headline.MISCLASSIFIED_FAR}
+    assert known <= per_formula.TERMS.keys()
+    assert headline.EQUAL_TIME in error_against_time.TERMS and headline.WRONG_PATH in layered_paths.TERMS
+    assert {headline.CHANGED_SHARE, headline.WELCH_ALARMS, headline.TIME} <= against_dielectric.TERMS.keys()
+    assert headline.ERROR_OVER_BOUND in traced_bodies.TERMS and headline.SHALLOW in optical_chains.TERMS
 
 
 def answers(*rows):
