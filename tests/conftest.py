@@ -54,12 +54,12 @@ def needs_variant() -> Callable[[str], None]:
 def variant(request: pytest.FixtureRequest) -> str:
     """The variant of the test: its parameter, else the best that runs here. Switched only where it is another one."""
     parameters = request.node.callspec.params if hasattr(request.node, "callspec") else {}
-    wanted: str = parameters.get("each_variant", VARIANT)
+    scalar = {"scalar_variant", "scalar_context"} & set(request.fixturenames)
+    wanted: str = parameters.get("each_variant", "scalar_rgb" if scalar else VARIANT)
     if wanted != VARIANT or "mitsuba" in sys.modules:
-        import mitsuba as mi
+        from support.variants import switch
 
-        if mi.variant() != wanted:
-            mi.set_variant(wanted)
+        switch(wanted)
     return wanted
 
 
@@ -71,11 +71,7 @@ def each_variant(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def scalar_variant() -> None:
-    """`scalar_rgb` for the test."""
-    import mitsuba as mi
-
-    if mi.variant() != "scalar_rgb":
-        mi.set_variant("scalar_rgb")
+    """`scalar_rgb` for the test, which `variant` sets."""
 
 
 @pytest.fixture(scope="module")
@@ -177,17 +173,12 @@ def scalar_context(tmp_path):
     """`scalar_context(rays=800, ...)`: a run of the validation on scalar_rgb, standard but for what is given."""
     import dataclasses
 
-    import mitsuba as mi
-
     from validation.run.context import SCALAR_PROFILES, Context
 
-    before = mi.variant()
-    mi.set_variant("scalar_rgb")
     standard = SCALAR_PROFILES["standard"]
-    yield lambda **given: Context(
+    return lambda **given: Context(
         dataclasses.replace(standard, **given), tmp_path, "scalar_rgb", backend.detect(), USABLE
     )
-    mi.set_variant(before)
 
 
 @pytest.fixture

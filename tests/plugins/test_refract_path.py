@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.variants import switch
 
 from mi_refract.image_diff import pixelwise, tile_statistics
 from mi_refract.plugins import keyed_sampler, path_loop, refract_path, scene_features
@@ -26,8 +27,7 @@ BLACK = {"type": "diffuse", "reflectance": 0.0}
 @pytest.fixture
 def llvm(needs_variant):
     needs_variant(LLVM)
-    if mi.variant() != LLVM:
-        mi.set_variant(LLVM)
+    switch(LLVM)
 
 
 def load(name, resolution=32, **parameters):
