@@ -121,6 +121,12 @@ def setting(request: pytest.FixtureRequest) -> Setting:
 
 
 @pytest.fixture(scope="module")
+def float32(request: pytest.FixtureRequest) -> Setting:
+    """Those in float32: for what takes long and depends on the precision in nothing but numbers."""
+    return Setting(*request.param)
+
+
+@pytest.fixture(scope="module")
 def vectorised(request: pytest.FixtureRequest) -> Setting:
     """Those that carry derivatives."""
     return Setting(*request.param)
@@ -139,7 +145,8 @@ SUBSETS = {
     "typical_variant": [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb", "_ad_spectral_polarized"))],
     "polarized_variant": [name for name in USABLE if name.endswith("_polarized")],
 }
-CASES = {"each_variant": list(USABLE), "setting": SETTINGS, "vectorised": SETTINGS[1:]}
+CASES: dict[str, Any] = {"each_variant": list(USABLE), "setting": SETTINGS, "vectorised": SETTINGS[1:]}
+CASES["float32"] = [case for case in SETTINGS if case[1] == "float32"]
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
