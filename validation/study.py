@@ -1,6 +1,6 @@
 """A study: what it asks, what the report says of it, and the tasks that answer it.
 
-A module that holds a study ends with `STUDY = Study(...)`; `rooms.py` lists these modules.
+A module that holds a study ends with `STUDY = Study(...)`; `__main__.py` lists these modules.
 """
 
 from __future__ import annotations
