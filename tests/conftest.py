@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -69,13 +70,32 @@ def each_variant(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-@pytest.fixture
-def scalar_variant() -> None:
-    """`scalar_rgb` for the test."""
+@contextlib.contextmanager
+def switched(name: str) -> Iterator[None]:
+    """Another variant, and then the one before."""
     import mitsuba as mi
 
-    if mi.variant() != "scalar_rgb":
-        mi.set_variant("scalar_rgb")
+    before = mi.variant()
+    if before != name:
+        mi.set_variant(name)
+    yield
+    if before and mi.variant() != before:
+        mi.set_variant(before)
+
+
+@pytest.fixture
+def scalar_variant() -> Iterator[None]:
+    """`scalar_rgb` for the test."""
+    with switched("scalar_rgb"):
+        yield
+
+
+@pytest.fixture
+def llvm_variant(needs_variant: Callable[[str], None]) -> Iterator[None]:
+    """`llvm_ad_rgb` for the test, which is skipped where it cannot run."""
+    needs_variant("llvm_ad_rgb")
+    with switched("llvm_ad_rgb"):
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -173,21 +193,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture
-def scalar_context(tmp_path):
+def scalar_context(tmp_path, scalar_variant):
     """`scalar_context(rays=800, ...)`: a run of the validation on scalar_rgb, standard but for what is given."""
     import dataclasses
 
-    import mitsuba as mi
-
     from validation.run.context import SCALAR_PROFILES, Context
 
-    before = mi.variant()
-    mi.set_variant("scalar_rgb")
     standard = SCALAR_PROFILES["standard"]
-    yield lambda **given: Context(
+    return lambda **given: Context(
         dataclasses.replace(standard, **given), tmp_path, "scalar_rgb", backend.detect(), USABLE
     )
-    mi.set_variant(before)
 
 
 @pytest.fixture

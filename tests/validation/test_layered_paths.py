@@ -18,15 +18,6 @@ each = pytest.mark.parametrize("layers", LAYERS.values(), ids=LAYERS)
 
 
 @pytest.fixture
-def llvm(needs_variant):
-    needs_variant("llvm_ad_rgb")
-    before = mi.variant()
-    mi.set_variant("llvm_ad_rgb")
-    yield
-    mi.set_variant(before)
-
-
-@pytest.fixture
 def context(tmp_path):
     profile = dataclasses.replace(PROFILES["standard"], resolution=48, spp=4)
     return Context(profile, tmp_path, "llvm_ad_rgb", backend.detect(), {})
@@ -99,7 +90,7 @@ def test_a_deviation_is_the_one_that_was_put_in():
 # The study -----------------------------------------------------------------------------------------------------
 
 
-def test_every_plugin_is_traced_and_only_forms_at_the_rounding_limit_keep_to_the_path(llvm, context):
+def test_every_plugin_is_traced_and_only_forms_at_the_rounding_limit_keep_to_the_path(llvm_variant, context):
     rows = {row.subject: row for row in layered_paths._path_rows(context, MIRAGE) if row.case == "mirage: path"}
     assert list(rows) == [*layered_paths.plugins(), layered_paths.INDICES, layered_paths.RATIOS]
     held = rows["refract"]
@@ -113,7 +104,7 @@ def test_every_plugin_is_traced_and_only_forms_at_the_rounding_limit_keep_to_the
             assert dataclasses.replace(row, budgets=held.budgets).broken.keys() == held.budgets.keys(), name
 
 
-def test_a_fibre_guides_every_ray_with_every_plugin(llvm, context):
+def test_a_fibre_guides_every_ray_with_every_plugin(llvm_variant, context):
     rows = [row for row in layered_paths._path_rows(context, FIBRE) if row.case == "fibre: path"]
     assert {row.values["wrong path"] for row in rows} == {0.0}
     assert all(row.values["direction"] < 0.01 for row in rows)
@@ -126,7 +117,7 @@ def test_a_path_is_not_run_on_scalar_arrays(context):
     assert {row.case for row in rows} >= {"mirage", "fibre", "mirage, telescope: image"}
 
 
-def test_the_built_in_differs_from_both_right_formulas_in_the_telescope(llvm, context):
+def test_the_built_in_differs_from_both_right_formulas_in_the_telescope(llvm_variant, context):
     """Why `renders` demands nothing of this scene's agreement."""
     (row,) = layered_paths._view_rows(context, *layered_paths.VIEWS[0])
     assert row.values["pixels off"] > 5e-3
@@ -134,21 +125,16 @@ def test_the_built_in_differs_from_both_right_formulas_in_the_telescope(llvm, co
     assert all((context.out / path).is_file() for path in row.images.values())
 
 
-def test_two_right_formulas_of_which_one_is_none_are_seen(llvm, context, monkeypatch):
+def test_two_right_formulas_of_which_one_is_none_are_seen(llvm_variant, context, monkeypatch):
     monkeypatch.setattr(layered_paths, "_other_right_formula", lambda: "refract_decomposed")
     (row,) = layered_paths._view_rows(context, *layered_paths.VIEWS[0])
     assert row.broken.keys() == {"pixels off, control"}
 
 
 @each
-def test_points_are_projected_as_the_camera_sees_them(layers):
-    before = mi.variant()
-    mi.set_variant("scalar_rgb")
-    try:
-        view = path_overlay.View(layers.scene, "dielectric", {}, 4, 1)
-        for u, v in ((0.1, 0.2), (0.7, 0.4)):
-            ray, _ = view.scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(u, v), mi.Point2f(0.5))
-            for p, d in ((np.array(ray.o), np.array(ray.d)), view.ray(u, v)):
-                assert view.project((p + 500 * d)[None])[0] == pytest.approx([u, v], abs=1e-4)
-    finally:
-        mi.set_variant(before)
+def test_points_are_projected_as_the_camera_sees_them(layers, scalar_variant):
+    view = path_overlay.View(layers.scene, "dielectric", {}, 4, 1)
+    for u, v in ((0.1, 0.2), (0.7, 0.4)):
+        ray, _ = view.scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(u, v), mi.Point2f(0.5))
+        for p, d in ((np.array(ray.o), np.array(ray.d)), view.ray(u, v)):
+            assert view.project((p + 500 * d)[None])[0] == pytest.approx([u, v], abs=1e-4)

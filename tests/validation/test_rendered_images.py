@@ -21,12 +21,7 @@ from validation.suite.renderers import environments, image_renderers
 from validation.suite.renderers.image_renderers import ImageRenderer
 
 SMALL = rendered_images.Size(48, 32, 1, 0.2)
-
-
-@pytest.fixture(autouse=True)
-def llvm(needs_variant):
-    needs_variant("llvm_ad_rgb")
-    mi.set_variant("llvm_ad_rgb")
+pytestmark = pytest.mark.usefixtures("llvm_variant")
 
 
 @pytest.fixture
