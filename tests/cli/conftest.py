@@ -11,11 +11,7 @@ import pytest
 @pytest.fixture(autouse=True)
 def same_process(monkeypatch):
     """The variant is as before, and no command replaces the process of the tests."""
-
-    def execv(*arguments):
-        raise AssertionError(f"restarted: {arguments}")
-
-    monkeypatch.setattr(os, "execv", execv)
+    monkeypatch.setattr(os, "execv", lambda *arguments: pytest.fail(f"restarted: {arguments}"))
     variant = mi.variant()
     yield
     mi.set_variant(variant)

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-import mitsuba as mi
 import pytest
 from support.readme import python_blocks
 
 from mi_refract import plugins
 
+pytestmark = pytest.mark.usefixtures("llvm_variant")
 ROOT = Path(__file__).parents[2]
 IN_A_SCENE, INVERSE = python_blocks(Path(plugins.__file__).with_name("README.md"))
 
@@ -19,14 +19,6 @@ def run(code, **changes):
     names = {}
     exec(code, names)
     return names
-
-
-@pytest.fixture(autouse=True)
-def same_variant(needs_variant):
-    needs_variant("llvm_ad_rgb")
-    before = mi.variant()
-    yield
-    mi.set_variant(before)
 
 
 def test_in_a_scene(tmp_path, monkeypatch):
