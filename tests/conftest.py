@@ -2,30 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
 
+from mi_refract import backend
 
-def _alone(name: str) -> ModuleType:
-    """A module of mi_refract without the package around it, which would import Dr.Jit."""
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[1] / f"{name.replace('.', '/')}.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-backend = _alone("mi_refract.backend")
 VARIANT = backend.activate()
-sys.modules["mi_refract"].backend = backend
 USABLE: dict[str, str | None] = backend.usable_variants()
 
 
@@ -50,12 +36,18 @@ def needs_variant() -> Callable[[str], None]:
     return check
 
 
+# The variant of a test, by the fixture that asks for it.
+FIXED = {"llvm_variant": "llvm_ad_rgb", "scalar_variant": "scalar_rgb", "scalar_context": "scalar_rgb"}
+
+
 @pytest.fixture(autouse=True)
 def variant(request: pytest.FixtureRequest) -> str:
     """The variant of the test: its parameter, else the best that runs here. Switched only where it is another one."""
     parameters = request.node.callspec.params if hasattr(request.node, "callspec") else {}
-    scalar = {"scalar_variant", "scalar_context"} & set(request.fixturenames)
-    wanted: str = parameters.get("each_variant", "scalar_rgb" if scalar else VARIANT)
+    fixed = [name for fixture, name in FIXED.items() if fixture in request.fixturenames]
+    wanted: str = parameters.get("each_variant", [*fixed, VARIANT][0])
+    if USABLE[wanted]:  # the fixture that asks for it skips the test
+        return VARIANT
     if wanted != VARIANT or "mitsuba" in sys.modules:
         from support.variants import switch
 
@@ -72,6 +64,12 @@ def each_variant(request: pytest.FixtureRequest) -> str:
 @pytest.fixture
 def scalar_variant() -> None:
     """`scalar_rgb` for the test, which `variant` sets."""
+
+
+@pytest.fixture
+def llvm_variant(needs_variant: Callable[[str], None]) -> None:
+    """`llvm_ad_rgb` for the test, which `variant` sets; skipped where it cannot run."""
+    needs_variant("llvm_ad_rgb")
 
 
 @pytest.fixture(scope="module")
@@ -176,7 +174,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture
-def scalar_context(tmp_path):
+def scalar_context(tmp_path, scalar_variant):
     """`scalar_context(rays=800, ...)`: a run of the validation on scalar_rgb, standard but for what is given."""
     import dataclasses
 

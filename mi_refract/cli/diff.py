@@ -67,34 +67,43 @@ def _print_methods(asked: bool) -> None:
         raise typer.Exit
 
 
+# Of `diff` alone.
+Renders = Annotated[bool, typer.Option("--renders", help="Each folder holds renders of one image.")]
+OldRenders = Annotated[bool, typer.Option("--samples", hidden=True)]
+CountsAs = Annotated[
+    Inconclusive | None, typer.Option(help="What an inconclusive image counts as; exit code 3 by default.")
+]
+Report = Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML page with the images.")]
+JUnit = Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")]
+Json = Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")]
+GitHub = Annotated[bool, typer.Option("--github", help="Print GitHub annotations, write the job's summary.")]
+Methods = Annotated[
+    bool, typer.Option("--methods", is_eager=True, callback=_print_methods, help="Print the methods and their options.")
+]
+SelfTest = Annotated[
+    bool,
+    typer.Option(
+        "--self-test", help="Plant defects in REFERENCE (an image, a folder of renders, a scene); which are seen?"
+    ),
+]
+
+
 def diff(
     reference: NotAlways = None,
     test: NotWithSelfTest = None,
     method: Method = AUTO,
     options: Set = None,
-    renders: Annotated[bool, typer.Option("--renders", help="Each folder holds renders of one image.")] = False,
-    samples: Annotated[bool, typer.Option("--samples", hidden=True)] = False,
+    renders: Renders = False,
+    samples: OldRenders = False,
     settings: File = None,
     allow_nonfinite: Nonfinite = None,
-    inconclusive: Annotated[
-        Inconclusive | None, typer.Option(help="What an inconclusive image counts as; exit code 3 by default.")
-    ] = None,
-    report: Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML page with the images.")] = None,
-    junit: Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")] = None,
-    json: Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")] = None,
-    github: Annotated[
-        bool, typer.Option("--github", help="Print GitHub annotations, write the job's summary.")
-    ] = False,
-    methods: Annotated[
-        bool,
-        typer.Option("--methods", is_eager=True, callback=_print_methods, help="Print the methods and their options."),
-    ] = False,
-    self_test: Annotated[
-        bool,
-        typer.Option(
-            "--self-test", help="Plant defects in REFERENCE (an image, a folder of renders, a scene); which are seen?"
-        ),
-    ] = False,
+    inconclusive: CountsAs = None,
+    report: Report = None,
+    junit: JUnit = None,
+    json: Json = None,
+    github: GitHub = False,
+    methods: Methods = False,
+    self_test: SelfTest = False,
 ) -> None:
     """Compare images with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
     _require_extra("scipy", *(("jinja2", "matplotlib") if report else ()))
@@ -117,10 +126,14 @@ def diff(
         )
     _say(found)
     if report:
-        software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
-        html_report.write(report, found, software, _replay(found, chosen, settings))
+        _write_page(report, found, _replay(found, chosen, settings))
     _write(found, junit, json, github)
     raise typer.Exit(found.exit_code)
+
+
+def _write_page(path: Path, found: Results, replay: str) -> None:
+    software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
+    html_report.write(path, found, software, replay)
 
 
 def _write(found: Results, junit: Path | None, json: Path | None, github: bool) -> None:

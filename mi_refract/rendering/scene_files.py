@@ -81,15 +81,7 @@ def render_to_exr(
         raise ValueError(f"seed = {seed}: accepted: a whole number from 0 to 2³² − 1")
     output = writable(output, SUFFIXES)
     loaded = load_scene(scene, defines)
-    start = time.perf_counter()
-    try:
-        pixels = np.array(mi.render(loaded, spp=spp or 0, seed=seed))
-    except Exception as error:
-        raise ValueError(_naming(scene, error)) from None
-    seconds = time.perf_counter() - start
-    # On Ctrl-C the C++ integrators return what they have, and so they do after their `timeout`.
-    if loaded.integrator().should_stop():
-        raise InterruptedError(f"{scene}: the rendering was stopped before its last sample; nothing is written")
+    pixels, seconds = _rendered(scene, loaded, spp or 0, seed)
     sensor = loaded.sensors()[0]
     channels = [str(field.name) for field in sensor.film().bitmap().struct_()]
     metadata: Metadata = provenance() | {
@@ -103,6 +95,22 @@ def render_to_exr(
     }
     write_exr(output, pixels, channels, metadata)
     return metadata
+
+
+def _rendered(path: str | os.PathLike[str], scene: Any, spp: int, seed: int) -> tuple[np.ndarray, float]:
+    """The image of a scene read from `path`, and the seconds it took."""
+    import mitsuba as mi
+
+    start = time.perf_counter()
+    try:
+        pixels = np.array(mi.render(scene, spp=spp, seed=seed))
+    except Exception as error:
+        raise ValueError(_naming(path, error)) from None
+    seconds = time.perf_counter() - start
+    # On Ctrl-C the C++ integrators return what they have, and so they do after their `timeout`.
+    if scene.integrator().should_stop():
+        raise InterruptedError(f"{path}: the rendering was stopped before its last sample; nothing is written")
+    return pixels, seconds
 
 
 def formulas_in(scene: Any) -> list[str]:

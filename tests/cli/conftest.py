@@ -10,8 +10,4 @@ import pytest
 @pytest.fixture(autouse=True)
 def same_process(monkeypatch):
     """No command replaces the process of the tests."""
-
-    def execv(*arguments):
-        raise AssertionError(f"restarted: {arguments}")
-
-    monkeypatch.setattr(os, "execv", execv)
+    monkeypatch.setattr(os, "execv", lambda *arguments: pytest.fail(f"restarted: {arguments}"))

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from support.ray_programs import glsl
 
-from mi_refract.cli import app
 from mi_refract.ray_sets import files, ray_set, run_program
 
 # A renderer's side of it, with nothing of ours: the comment on stderr must get through.
@@ -44,16 +43,10 @@ def program(tmp_path):
 
 
 @pytest.fixture
-def call(tmp_path, monkeypatch, capfd):
+def call(tmp_path, monkeypatch, run):
     """`call("check", …)`: exit code, stdout, stderr of `mi-refract rays …` in an empty folder."""
     monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        capfd.readouterr()
-        code = app.main(["rays", *map(str, arguments)])
-        return code, *capfd.readouterr()
-
-    return run
+    return lambda *arguments: run("rays", *arguments)
 
 
 def answer(path, to, program=glsl, lines=()):

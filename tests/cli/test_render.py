@@ -12,7 +12,6 @@ from support.processes import python
 
 import mi_refract
 from mi_refract import backend
-from mi_refract.cli import app
 from mi_refract.io.image_file import read_exr
 
 SCENE = """<scene version="3.0.0">
@@ -40,17 +39,14 @@ def scene(tmp_path):
 
 
 @pytest.fixture
-def render(scene, capfd):
+def render(scene, run):
     """`render("--spp", 2)`: exit code, stdout, stderr of rendering `scene` to out.exr in scalar_rgb."""
 
-    def run(*options, scene=scene, output=None, variant="scalar_rgb"):
-        output = output or scene.with_name("out.exr")
-        capfd.readouterr()
+    def call(*options, scene=scene, output=None, variant="scalar_rgb"):
         chosen = ["--variant", variant] if variant else []
-        code = app.main(["render", str(scene), "-o", str(output), *chosen, *map(str, options)])
-        return code, *capfd.readouterr()
+        return run("render", scene, "-o", output or scene.with_name("out.exr"), *chosen, *options)
 
-    return run
+    return call
 
 
 def test_the_image_is_mitsubas(render, scene):

@@ -1,6 +1,5 @@
 """`mi-refract scene export`: what it prints, writes and refuses, and with which exit code."""
 
-import os
 from pathlib import Path
 
 import pytest
@@ -10,37 +9,31 @@ from mi_refract.cli import app
 SCENES = Path(app.__file__).parents[2] / "scenes"
 
 
-@pytest.fixture(autouse=True)
-def here(monkeypatch, tmp_path):
-    """An empty working folder; and no command replaces the process of the tests."""
-    monkeypatch.setattr(os, "execv", None)
+@pytest.fixture
+def export(tmp_path, monkeypatch, run):
+    """`export("prism", …)`: exit code, stdout, stderr of `mi-refract scene export …` in an empty folder."""
     monkeypatch.chdir(tmp_path)
+    return lambda *words: run("scene", "export", *words)
 
 
-def run(capfd, *words):
-    capfd.readouterr()
-    code = app.main(["scene", "export", *map(str, words)])
-    return code, *capfd.readouterr()
-
-
-def test_by_name_and_by_path(capfd, tmp_path):
-    code, out, err = run(capfd, "prism", "--to", "radiance")
+def test_by_name_and_by_path(export, tmp_path):
+    code, out, err = export("prism", "--to", "radiance")
     assert (code, err) == (0, "")
     assert out == "prism-radiance: 3 files, 1162 triangles; prism-radiance/README.txt says how to render them\n"
-    assert run(capfd, SCENES / "prism.xml", "--to", "radiance", "-o", "other")[0] == 0
+    assert export(SCENES / "prism.xml", "--to", "radiance", "-o", "other")[0] == 0
     assert (tmp_path / "other" / "scene.rad").read_bytes() == (tmp_path / "prism-radiance" / "scene.rad").read_bytes()
 
 
-def test_level_and_defines(capfd, tmp_path):
-    code, out, _ = run(capfd, "sphere", "--to", "mitsuba", "--level", 1, "-D", "res=17", "-D", "max_depth=9")
+def test_level_and_defines(export, tmp_path):
+    code, out, _ = export("sphere", "--to", "mitsuba", "--level", 1, "-D", "res=17", "-D", "max_depth=9")
     assert code == 0 and "1650 triangles" in out
     text = (tmp_path / "sphere-mitsuba" / "scene.xml").read_text()
     assert '<integer name="width" value="17"/>' in text and 'name="max_depth" value="9"' in text
 
 
-def test_level_0_is_not_the_default(capfd):
+def test_level_0_is_not_the_default(export):
     """60 triangles less than in the test above: those of one sphere."""
-    assert "1590 triangles" in run(capfd, "sphere", "--to", "mitsuba", "--level", 0)[1]
+    assert "1590 triangles" in export("sphere", "--to", "mitsuba", "--level", 0)[1]
 
 
 @pytest.mark.parametrize(
@@ -57,11 +50,11 @@ def test_level_0_is_not_the_default(capfd):
         (["full/scene.xml", "--to", "cycles"], "full/scene.xml"),
     ],
 )
-def test_refused_in_one_line(words, says, capfd, tmp_path):
+def test_refused_in_one_line(words, says, export, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "scene.xml").write_text("<scene version='3.0.0'><bsdf type='hair'/></scene")
     before = sorted(tmp_path.rglob("*"))
-    code, out, err = run(capfd, *words)
+    code, out, err = export(*words)
     assert (code, out) == (2, "") and says in err
     assert err.startswith("mi-refract: ") and err.count("\n") == 1
     assert sorted(tmp_path.rglob("*")) == before

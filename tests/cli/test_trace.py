@@ -44,16 +44,9 @@ def ball(tmp_path):
 
 
 @pytest.fixture
-def trace(ball, capfd, monkeypatch):
+def trace(ball, run):
     """`trace("--table")`: exit code, stdout, stderr of tracing `ball`, or another scene."""
-    monkeypatch.setattr(os, "execv", lambda *arguments: pytest.fail(f"restarted: {arguments}"))
-
-    def run(*options, scene=ball):
-        capfd.readouterr()
-        code = app.main(["trace", str(scene), *map(str, options)])
-        return code, *capfd.readouterr()
-
-    return run
+    return lambda *options, scene=ball: run("trace", scene, *options)
 
 
 def paths_of(result):

@@ -1,14 +1,13 @@
 """The page of `mi-refract diff`: failures first, true to the pixels, nothing executable, nothing fetched."""
 
 import base64
-import json
 import math
 import re
 import zlib
 
 import numpy as np
 import pytest
-from support.browser import CHROMIUM, browse
+from support.browser import browse, needs_chromium, seen
 
 from mi_refract.image_diff import flip, folders, html_report
 from mi_refract.image_diff.comparison import Comparison, Metric, Verdict
@@ -246,18 +245,13 @@ const wait = setInterval(async () => {
 </script></body>"""
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PATH: the page's script was not run")
+@needs_chromium
 def test_the_page_works_from_a_file(tmp_path):
     found = results(tmp_path)
     text = html(tmp_path, Results(found.reference, found.test, found.results[1:]))
     page = tmp_path / "report.html"
     page.write_text(text.replace("</body>", SCRIPT), "utf-8")
-    dom, console = browse(page, tmp_path / "profile")
-    assert console == []
-    tag = re.search("<html[^>]*>", dom)[0]
-    assert 'data-ready="1"' in tag and "data-error" not in tag
-    seen = json.loads(re.search('data-seen="([^"]*)"', tag)[1].replace("&quot;", '"'))
-    assert seen == {
+    assert seen(page, tmp_path / "profile") == {
         "test": [188, 188, 188],  # sRGB of 0.5
         "difference": [178, 24, 43],  # the test is brighter: red
         "brighter": [255, 255, 255],
@@ -271,7 +265,7 @@ def test_the_page_works_from_a_file(tmp_path):
     }
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PATH: the page's script was not run")
+@needs_chromium
 def test_the_browser_sees_a_request_and_an_error(tmp_path):
     """What the test above would miss if it could not fail."""
     page = tmp_path / "report.html"

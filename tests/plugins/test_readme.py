@@ -7,6 +7,7 @@ from support.readme import python_blocks
 
 from mi_refract import plugins
 
+pytestmark = pytest.mark.usefixtures("llvm_variant")
 ROOT = Path(__file__).parents[2]
 IN_A_SCENE, INVERSE = python_blocks(Path(plugins.__file__).with_name("README.md"))
 
@@ -18,11 +19,6 @@ def run(code, **changes):
     names = {}
     exec(code, names)
     return names
-
-
-@pytest.fixture(autouse=True)
-def llvm(needs_variant):
-    needs_variant("llvm_ad_rgb")
 
 
 def test_in_a_scene(tmp_path, monkeypatch):

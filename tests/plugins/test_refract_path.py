@@ -7,14 +7,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.variants import switch
 
 from mi_refract.image_diff import pixelwise, tile_statistics
 from mi_refract.plugins import keyed_sampler, path_loop, refract_path, scene_features
 from mi_refract.rendering import scene_files
 from validation.run.context import SCENES
 
-LLVM = "llvm_ad_rgb"
 MIXED = ("sphere", "nested")
 GLASS_ONLY = ("balls", "slab", "lightpipe")
 AROUND, DOWN = 0.6 + 0.4 * np.sin(np.arange(64) * 2 * np.pi / 64 + 0.3), np.linspace(0, 0.7, 32)
@@ -22,12 +20,6 @@ SKY = (AROUND[None, :, None] + DOWN[:, None, None]).astype(np.float32) * np.ones
 
 BOX = {"type": "box"}
 BLACK = {"type": "diffuse", "reflectance": 0.0}
-
-
-@pytest.fixture
-def llvm(needs_variant):
-    needs_variant(LLVM)
-    switch(LLVM)
 
 
 def load(name, resolution=32, **parameters):
@@ -92,7 +84,7 @@ FOLLOWED += [(name, {"split_depth": 4, "rr_depth": 3}) for name in ("slab", "lig
 
 
 @pytest.mark.parametrize(("name", "parameters"), FOLLOWED, ids=str)
-def test_other_numbers_give_the_same_mean(name, parameters, llvm):
+def test_other_numbers_give_the_same_mean(name, parameters, llvm_variant):
     """Welch's test on tiles, one false alarm in 1000 images."""
     scene = load(name)
     theirs = np.stack([by_path(scene, seed=i) for i in range(8)])
@@ -132,7 +124,7 @@ def test_lamps_are_chosen_by_their_weights_and_the_sky_is_met(parameters, typica
 
 
 @pytest.mark.parametrize("name", ["area", "environment", "all_of_hit"])
-def test_leaving_out_what_a_scene_needs_is_seen(name, llvm, monkeypatch):
+def test_leaving_out_what_a_scene_needs_is_seen(name, llvm_variant, monkeypatch):
     scene = load("slab" if name == "all_of_hit" else "sphere")
     theirs = np.stack([by_path(scene, seed=i) for i in range(8)])
     monkeypatch.setattr(refract_path, "PathFeatures", lambda *a, **k: path_loop.PathFeatures(*a, **k | {name: False}))
@@ -142,7 +134,7 @@ def test_leaving_out_what_a_scene_needs_is_seen(name, llvm, monkeypatch):
 
 @pytest.mark.parametrize("name", ["sphere", "slab"])
 @pytest.mark.parametrize("parameters", [{"hide_emitters": True}, {"max_depth": 1}, {"max_depth": 2}], ids=str)
-def test_parameters_mean_what_they_mean_to_path(name, parameters, llvm):
+def test_parameters_mean_what_they_mean_to_path(name, parameters, llvm_variant):
     scene = load(name)
     theirs, ours = by_path(scene, 64, **parameters), render(scene, 64, **parameters)
     assert ((theirs == 0).all(2) == (ours == 0).all(2)).mean() > 0.95
@@ -173,7 +165,7 @@ def test_splitting_takes_noise_away_and_scalars_do_it_too(typical_variant):
     assert noise[3] < 0.8 * noise[0]
 
 
-def test_strata_are_those_of_correlated_multi_jitter(llvm):
+def test_strata_are_those_of_correlated_multi_jitter(llvm_variant):
     """Of 12 samples of each of 5 pixels every stratum holds one, of rows, columns and cells; keys are independent."""
     sampler = mi.load_dict({"type": "independent", "sample_count": 12})
     sampler.seed(3, 60)
@@ -189,7 +181,7 @@ def test_strata_are_those_of_correlated_multi_jitter(llvm):
     assert (np.array(numbers.one(sampler, mi.UInt32(7))).reshape(5, 12) == one).all()  # whatever was drawn before
 
 
-def test_a_deterministic_image_errs_by_what_it_says_was_truncated(llvm):
+def test_a_deterministic_image_errs_by_what_it_says_was_truncated(llvm_variant):
     """The ball from one point: no noise but the position in the pixel, which is its centre in every sample."""
     scene = glass_ball(sky=sky(), sampler={"type": "multijitter", "jitter": False})
     exact, coarse = (
@@ -204,7 +196,7 @@ def test_a_deterministic_image_errs_by_what_it_says_was_truncated(llvm):
     assert exact[..., 3].max() < 0.01
 
 
-def test_a_white_sky_shows_what_was_truncated(llvm):
+def test_a_white_sky_shows_what_was_truncated(llvm_variant):
     scene = load("slab", sampler="multijitter")
     flat = glass_ball(sky={"type": "constant"})
     image, truncated = np.split(render(flat, 1, 1, deterministic=True), [3], axis=2)
@@ -223,7 +215,7 @@ def test_a_white_sky_shows_what_was_truncated(llvm):
     ],
     ids=lambda bsdf: bsdf["type"],
 )
-def test_what_would_be_left_to_chance_is_refused(bsdf, llvm):
+def test_what_would_be_left_to_chance_is_refused(bsdf, llvm_variant):
     with pytest.raises(RuntimeError) as caught:
         render(glass_ball(sky=sky(), other={"type": "sphere", "bsdf": bsdf}), 1, deterministic=True)
     assert "accepted: scenes of smooth dielectrics and conductors" in str(caught.value.__cause__)
@@ -266,7 +258,7 @@ def difference(scene, method, step=0.02):
 @pytest.mark.parametrize(
     ("mixed", "split"), [(False, 0), (True, 0), (False, 2)], ids=["glass", "mixed", "glass that would split"]
 )
-def test_the_derivative_in_the_index_is_that_of_the_image(mixed, split, llvm):
+def test_the_derivative_in_the_index_is_that_of_the_image(mixed, split, llvm_variant):
     """Smooth light and no edges, so that nothing is discontinuous. Standard errors are below 2 % on either side."""
 
     def scene():
@@ -293,7 +285,7 @@ def operations(scene, method):
         return max(entry.get("operation_count", 0) for entry in dr.kernel_history())
 
 
-def test_what_is_left_out_is_not_in_the_kernel_and_is_said(llvm, monkeypatch):
+def test_what_is_left_out_is_not_in_the_kernel_and_is_said(llvm_variant, monkeypatch):
     gc.collect()  # Dr.Jit compiles whatever BSDF is alive: differences are compared, not counts
     scene = load("balls")
     method, theirs = (mi.load_dict({"type": t, "max_depth": 16, "rr_depth": 16}) for t in ("refract_path", "path"))
@@ -309,7 +301,7 @@ def test_what_is_left_out_is_not_in_the_kernel_and_is_said(llvm, monkeypatch):
 
 
 @pytest.mark.parametrize("split_depth", [0, 2])
-def test_a_frozen_render_follows_the_index_and_a_lamp_that_turns_grey(split_depth, llvm):
+def test_a_frozen_render_follows_the_index_and_a_lamp_that_turns_grey(split_depth, llvm_variant):
     """What is recorded must hold for any value: a lamp's black surface counts as one that may reflect."""
     lamp = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(9)}
     scene = glass_ball(sky=sky(), lamp=lamp | {"emitter": {"type": "area"}, "bsdf": BLACK})

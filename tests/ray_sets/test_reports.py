@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from support.browser import CHROMIUM, browse
+from support.browser import browse, needs_chromium
 from support.ray_programs import glsl
 
 from mi_refract.ray_sets import check_answers, ray_set, reports
@@ -92,7 +92,7 @@ def test_the_page_stands_alone(tmp_path, findings, name):
     assert ("eta inverted" in text) == (name == "wrong")
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium in PATH")
+@needs_chromium
 @pytest.mark.parametrize("name", ["right", "wrong"])
 def test_a_browser_reports_no_error(tmp_path, findings, name):
     reports.write_html(tmp_path / "out.html", findings[name], {})

@@ -12,7 +12,7 @@ import zlib
 
 import numpy as np
 import pytest
-from support.browser import CHROMIUM, browse
+from support.browser import needs_chromium, seen
 
 from mi_refract.report import run_report
 from mi_refract.report.number_text import compact, distinguishable
@@ -372,7 +372,7 @@ const wait = setInterval(() => {
 </script></body>"""
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PATH: the page's script was not run")
+@needs_chromium
 def test_the_page_works_from_a_file(tmp_path):
     for role, value in (("reference", 0.25), ("test", 0.5), ("difference", -1.0)):
         pixels = np.full((2, 2, 3), value)
@@ -382,12 +382,7 @@ def test_the_page_works_from_a_file(tmp_path):
     page = tmp_path / "report.html"
     text = html(tmp_path, [*ROWS, dataclasses.replace(GOOD, images=images)])
     page.write_text(text.replace("</body>", PROBE), "utf-8")
-    dom, console = browse(page, tmp_path / "profile")
-    assert console == []
-    tag = re.search("<html[^>]*>", dom)[0]
-    assert 'data-ready="1"' in tag and "data-error" not in tag
-    seen = json.loads(re.search('data-seen="([^"]*)"', tag)[1].replace("&quot;", '"'))
-    assert seen == {
+    assert seen(page, tmp_path / "profile") == {
         "test": [188, 188, 188],  # sRGB of 0.5
         "nan": [255, 0, 255],
         "difference": [33, 102, 172],  # negative: blue

@@ -1,9 +1,14 @@
 """A real browser, where there is one: what a page's own script did to it."""
 
+import json
+import re
 import shutil
 import subprocess
 
+import pytest
+
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on PATH: the page's script was not run")
 
 
 def browse(page, profile):
@@ -28,3 +33,12 @@ def browse(page, profile):
         check=True,
     )
     return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+
+
+def seen(page, profile):
+    """What the page's scripts left as JSON in `data-seen`; none of them failed, and the console says nothing."""
+    dom, console = browse(page, profile)
+    assert console == []
+    tag = re.search("<html[^>]*>", dom)[0]
+    assert 'data-ready="1"' in tag and "data-error" not in tag
+    return json.loads(re.search('data-seen="([^"]*)"', tag)[1].replace("&quot;", '"'))

@@ -59,9 +59,15 @@ def deep(path):
     output.close()
 
 
+def cut(path, keep):
+    """Keep so many bytes of a file (negative: all but so many), or that share of them."""
+    data = path.read_bytes()
+    path.write_bytes(data[: keep if isinstance(keep, int) else int(keep * len(data))])
+
+
 def truncated(path):
     image(path)
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    cut(path, 0.5)
 
 
 def zero_size(path):

@@ -321,21 +321,21 @@ def test_a_share_of_several_scenes_is_that_of_all():
     assert readme_tables._percent([0.101, 0.1]) == "10 %"
 
 
-def test_a_readme_is_not_written_from_a_run_that_measured_too_little():
-    with pytest.raises(ValueError, match="no directions were measured"):
-        readme_tables.accuracy([])
-    with pytest.raises(ValueError, match="no scene was rendered"):
-        readme_tables.renders([])
-    with pytest.raises(ValueError, match="no paths were traced"):
-        readme_tables.paths([])
-    with pytest.raises(ValueError, match="no efficiency was measured"):
-        readme_tables.efficiency([])
-    with pytest.raises(ValueError, match="no planar paths were traced"):
-        readme_tables.planar([])
-    with pytest.raises(ValueError, match="no defects were planted"):
-        readme_tables.seen([])
-    with pytest.raises(ValueError, match="no other renderer was run"):
-        readme_tables.suite([])
+NOTHING_MEASURED = {
+    "accuracy": "no directions were measured",
+    "renders": "no scene was rendered",
+    "paths": "no paths were traced",
+    "efficiency": "no efficiency was measured",
+    "planar": "no planar paths were traced",
+    "seen": "no defects were planted",
+    "suite": "no other renderer was run",
+}
+
+
+@pytest.mark.parametrize("table", NOTHING_MEASURED)
+def test_a_readme_is_not_written_from_a_run_that_measured_too_little(table):
+    with pytest.raises(ValueError, match=NOTHING_MEASURED[table]):
+        getattr(readme_tables, table)([])
 
 
 def test_the_readmes_hold_their_tables():

@@ -6,7 +6,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.variants import switch
 
 from validation.diff import planted_defects as study
 
@@ -66,11 +65,9 @@ def test_a_scalar_variant_is_not_run_with_the_reason(scalar_context):
     assert {row.verdict for row in rows} == {"not run"}
 
 
-def test_the_study_sees_its_defects_and_no_other_sampler(needs_variant, monkeypatch):
-    needs_variant("llvm_ad_rgb")
+def test_the_study_sees_its_defects_and_no_other_sampler(llvm_variant, monkeypatch):
     monkeypatch.setattr(study, "TRIALS", 2)
     monkeypatch.setattr(study, "GLASSES", {k: v for k, v in study.GLASSES.items() if k == "flipped normal"})
-    switch("llvm_ad_rgb")
     rows = by_subject(study.defect_rows(types.SimpleNamespace(variant="llvm_ad_rgb"), "prism"))
     assert rows["flipped normal"].values["welch"] == 1
     assert rows["flipped normal"].verdict == "pass"

@@ -5,7 +5,6 @@ import math
 
 import numpy as np
 import pytest
-from support.variants import switch
 
 from mi_refract import backend
 from validation import limits
@@ -22,9 +21,7 @@ GIVEN = (BUILTIN, METHODS[1], SHORT, ABSENT)
 
 
 @pytest.fixture
-def context(tmp_path, needs_variant, monkeypatch):
-    needs_variant("llvm_ad_rgb")
-    switch("llvm_ad_rgb")
+def context(tmp_path, llvm_variant, monkeypatch):
     monkeypatch.setitem(error_against_time.EXTENTS, "standard", SMALL)
     return Context(PROFILES["standard"], tmp_path, "llvm_ad_rgb", backend.detect(), backend.usable_variants())
 

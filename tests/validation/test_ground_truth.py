@@ -157,10 +157,8 @@ def test_the_rainbow_of_a_noisy_bow_sees_an_index_off_by_1e_4(defect):
 
 
 @pytest.mark.parametrize(("defect", "verdict"), [(0.0, "pass"), (1e-3, "fail")])
-def test_a_rendered_rainbow_stands_where_it_should(defect, verdict, needs_variant, monkeypatch):
+def test_a_rendered_rainbow_stands_where_it_should(defect, verdict, llvm_variant, monkeypatch):
     """Four renders: with 3 degrees of freedom chance may take 22 standard errors."""
-    needs_variant("llvm_ad_rgb")
-    switch("llvm_ad_rgb")
     monkeypatch.setattr(limits, "RAINBOW_RESOLVED", 0.005)
     found = rainbow.images(traced_systems.glass("refract", rainbow.INDEX + defect), 4)
     assert traced_bodies.bow_row("refract", "llvm_ad_rgb", found, {}).verdict == verdict

@@ -6,7 +6,6 @@ import math
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.variants import switch
 
 from mi_refract import backend
 from validation.reference import layered_scenes
@@ -16,12 +15,6 @@ from validation.run.context import PROFILES, SCENES, Context
 from validation.stability import layered_paths
 
 each = pytest.mark.parametrize("layers", LAYERS.values(), ids=LAYERS)
-
-
-@pytest.fixture
-def llvm(needs_variant):
-    needs_variant("llvm_ad_rgb")
-    switch("llvm_ad_rgb")
 
 
 @pytest.fixture
@@ -97,7 +90,7 @@ def test_a_deviation_is_the_one_that_was_put_in():
 # The study -----------------------------------------------------------------------------------------------------
 
 
-def test_every_plugin_is_traced_and_only_forms_at_the_rounding_limit_keep_to_the_path(llvm, context):
+def test_every_plugin_is_traced_and_only_forms_at_the_rounding_limit_keep_to_the_path(llvm_variant, context):
     rows = {row.subject: row for row in layered_paths._path_rows(context, MIRAGE) if row.case == "mirage: path"}
     assert list(rows) == [*layered_paths.plugins(), layered_paths.INDICES, layered_paths.RATIOS]
     held = rows["refract"]
@@ -111,7 +104,7 @@ def test_every_plugin_is_traced_and_only_forms_at_the_rounding_limit_keep_to_the
             assert dataclasses.replace(row, budgets=held.budgets).broken.keys() == held.budgets.keys(), name
 
 
-def test_a_fibre_guides_every_ray_with_every_plugin(llvm, context):
+def test_a_fibre_guides_every_ray_with_every_plugin(llvm_variant, context):
     rows = [row for row in layered_paths._path_rows(context, FIBRE) if row.case == "fibre: path"]
     assert {row.values["wrong path"] for row in rows} == {0.0}
     assert all(row.values["direction"] < 0.01 for row in rows)
@@ -124,7 +117,7 @@ def test_a_path_is_not_run_on_scalar_arrays(context):
     assert {row.case for row in rows} >= {"mirage", "fibre", "mirage, telescope: image"}
 
 
-def test_the_built_in_differs_from_both_right_formulas_in_the_telescope(llvm, context):
+def test_the_built_in_differs_from_both_right_formulas_in_the_telescope(llvm_variant, context):
     """Why `renders` demands nothing of this scene's agreement."""
     (row,) = layered_paths._view_rows(context, *layered_paths.VIEWS[0])
     assert row.values["pixels off"] > 5e-3
@@ -132,7 +125,7 @@ def test_the_built_in_differs_from_both_right_formulas_in_the_telescope(llvm, co
     assert all((context.out / path).is_file() for path in row.images.values())
 
 
-def test_two_right_formulas_of_which_one_is_none_are_seen(llvm, context, monkeypatch):
+def test_two_right_formulas_of_which_one_is_none_are_seen(llvm_variant, context, monkeypatch):
     monkeypatch.setattr(layered_paths, "_other_right_formula", lambda: "refract_decomposed")
     (row,) = layered_paths._view_rows(context, *layered_paths.VIEWS[0])
     assert row.broken.keys() == {"pixels off, control"}

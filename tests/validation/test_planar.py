@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.variants import switch
 
 from mi_refract.backend import detect
 from mi_refract.planar import Event, Paths, Segments, path_loop, shapes
@@ -270,12 +269,6 @@ def put(hits, ray, segment):
 # Extruded ------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def compiled(needs_variant):
-    needs_variant("llvm_ad_rgb")
-    switch("llvm_ad_rgb")
-
-
 def extruded(case, spawn="along the ray", segments=None):
     spawn, offset = extruded_scenes.SPAWNS[spawn]
     paths = extruded_scenes.trace(wall_scene.extrude(segments or case.segments), case, spawn)
@@ -283,13 +276,13 @@ def extruded(case, spawn="along the ray", segments=None):
 
 
 @pytest.mark.parametrize("spawn", extruded_scenes.SPAWNS)
-def test_walls_do_what_segments_do(spawn, compiled):
+def test_walls_do_what_segments_do(spawn, llvm_variant):
     case = extruded_scenes.faceted(against_retrace.case_of(against_retrace.FOLDER / "prism.toml", 30))
     found = extruded(case, spawn)
     assert found[WRONG_PATH] == 0 and found["error / bound"] <= 1
 
 
-def test_wrong_walls_are_seen(compiled):
+def test_wrong_walls_are_seen(llvm_variant):
     """Rays moved along the normal without leave, swapped media, an index off by 1e-5, and a wall that is not there."""
     case = extruded_scenes.faceted(against_retrace.case_of(against_retrace.FOLDER / "prism.toml", 30))
     paths = extruded_scenes.trace(wall_scene.extrude(case.segments), case, extruded_scenes.SPAWNS["spawn_ray"][0])
@@ -303,7 +296,7 @@ def test_wrong_walls_are_seen(compiled):
     assert extruded(case, segments=fewer)[WRONG_PATH_FAR] > 0
 
 
-def test_extruded_rows_have_an_image(compiled, tmp_path):
+def test_extruded_rows_have_an_image(llvm_variant, tmp_path):
     context = Context(PROFILES["standard"], tmp_path, "llvm_ad_rgb", detect(), {})
     rows = extruded_scenes.scene_rows(context, against_retrace.FOLDER / "ellipse.toml")
     assert {row.verdict for row in rows} == {"pass"}

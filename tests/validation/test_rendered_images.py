@@ -7,7 +7,6 @@ import importlib.util
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.variants import switch
 
 from mi_refract.io import image_file
 from mi_refract.rendering import scene_files
@@ -22,12 +21,7 @@ from validation.suite.renderers import environments, image_renderers
 from validation.suite.renderers.image_renderers import ImageRenderer
 
 SMALL = rendered_images.Size(48, 32, 1, 0.2)
-
-
-@pytest.fixture(autouse=True)
-def llvm(needs_variant):
-    needs_variant("llvm_ad_rgb")
-    switch("llvm_ad_rgb")
+pytestmark = pytest.mark.usefixtures("llvm_variant")
 
 
 @pytest.fixture

@@ -20,8 +20,6 @@ NAMES += ["mirage", "nested", "prism", "slab", "sphere"]
 DEFAULTS = {"bsdf": "refract", "integrator": "path", "sampler": "independent"}
 DEFAULTS |= {"max_depth": None, "spp": "64", "res": "128"}
 each_scene = pytest.mark.parametrize("name", NAMES)
-
-
 pytestmark = pytest.mark.usefixtures("scalar_variant")
 
 

@@ -14,6 +14,7 @@ import math
 import statistics
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -140,15 +141,7 @@ def _measured_rows(context: Context, path: Path, extent: Extent, methods: tuple[
     found = measure(cameras, references, extent)
     facts = scene_features.inspect(cameras[subjects[1].name].scene)
     goals = goals_of(subjects, found, facts.only_glass)
-    replay = {
-        "scene": path.name,
-        "resolution": resolution,
-        "spp": extent.spp[-1],
-        "rounds": extent.rounds,
-        "reference renders": extent.references,
-        "reference seeds from": FIRST_REFERENCE,
-        "sampler": sampler,
-    }
+    replay = _replay(path, resolution, sampler, extent)
     remark = f"the best stratified sampler here: {sampler}"
     for subject in subjects:
         values = _values(subject, subjects[:2], found, references)
@@ -170,6 +163,18 @@ def _measured_rows(context: Context, path: Path, extent: Extent, methods: tuple[
     own = {"reference variance": float(references.var(0, ddof=1).mean() / len(references))}
     rows.append(Row(NAME, "every method", path.stem, context.variant, own, {}, {}, remark, replay, {}, _curves(found)))
     return rows
+
+
+def _replay(path: Path, resolution: int, sampler: str, extent: Extent) -> dict[str, Any]:
+    return {
+        "scene": path.name,
+        "resolution": resolution,
+        "spp": extent.spp[-1],
+        "rounds": extent.rounds,
+        "reference renders": extent.references,
+        "reference seeds from": FIRST_REFERENCE,
+        "sampler": sampler,
+    }
 
 
 def _camera(path: Path, method: Method, resolution: int, sampler: str, extent: Extent) -> Camera:

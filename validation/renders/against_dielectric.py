@@ -69,14 +69,7 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
     values, left_out = _paired(test, reference), no_question(test, reference)
     if not left_out:
         values |= _independent(test[:half], reference[half:])
-    # Both forms at the rounding limit are timed, whichever of them is the default; `quick` saves their kernels.
-    others = _at_the_limit() if plugin == PLUGIN and not profile.quick else []
-    values |= _times(profile, cameras | {name: Camera(opened(path, name, profile.resolution)) for name in others})
-    # A Python plugin costs a call per operation in scalar variants: its time is demanded of compiled ones only.
-    compiled = not context.variant.startswith("scalar")
-    goals = (
-        {metric: limits.RENDER_TIME for metric in values if metric in _metrics([plugin, *others])} if compiled else {}
-    )
+    times, goals = _timed(context, path, plugin, cameras)
     replay = {
         "scene": path.name,
         "plugin": plugin,
@@ -95,7 +88,7 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
             plugin,
             scene,
             context.variant,
-            values,
+            values | times,
             _budgets(scene, left_out),
             goals,
             remark,
@@ -124,6 +117,19 @@ def _at_the_limit() -> list[str]:
 
     default = automatic(dr.backend_v(mi.Float))
     return [f"{PLUGIN}_{name}" for name, formula in FORMULAS.items() if formula.budget.at_the_limit and name != default]
+
+
+def _timed(
+    context: Context, path: Path, plugin: str, cameras: dict[str, Camera]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """The times of `_times`, and the goals for those that have one."""
+    profile = context.profile
+    # Both forms at the rounding limit are timed, whichever of them is the default; `quick` saves their kernels.
+    others = _at_the_limit() if plugin == PLUGIN and not profile.quick else []
+    times = _times(profile, cameras | {name: Camera(opened(path, name, profile.resolution)) for name in others})
+    # A Python plugin costs a call per operation in scalar variants: its time is demanded of compiled ones only.
+    demanded = [] if context.variant.startswith("scalar") else _metrics([plugin, *others])
+    return times, dict.fromkeys(demanded, limits.RENDER_TIME)
 
 
 def _times(profile: Profile, cameras: dict[str, Camera]) -> dict[str, float]:
