@@ -54,12 +54,12 @@ def needs_variant() -> Callable[[str], None]:
 def variant(request: pytest.FixtureRequest) -> str:
     """The variant of the test: its parameter, else the best that runs here. Switched only where it is another one."""
     parameters = request.node.callspec.params if hasattr(request.node, "callspec") else {}
-    wanted: str = parameters.get("each_variant", VARIANT)
+    scalar = {"scalar_variant", "scalar_context"} & set(request.fixturenames)
+    wanted: str = parameters.get("each_variant", "scalar_rgb" if scalar else VARIANT)
     if wanted != VARIANT or "mitsuba" in sys.modules:
-        import mitsuba as mi
+        from support.variants import switch
 
-        if mi.variant() != wanted:
-            mi.set_variant(wanted)
+        switch(wanted)
     return wanted
 
 
@@ -71,11 +71,7 @@ def each_variant(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def scalar_variant() -> None:
-    """`scalar_rgb` for the test."""
-    import mitsuba as mi
-
-    if mi.variant() != "scalar_rgb":
-        mi.set_variant("scalar_rgb")
+    """`scalar_rgb` for the test, which `variant` sets."""
 
 
 @pytest.fixture(scope="module")
@@ -125,6 +121,12 @@ def setting(request: pytest.FixtureRequest) -> Setting:
 
 
 @pytest.fixture(scope="module")
+def float32(request: pytest.FixtureRequest) -> Setting:
+    """Those in float32: for what takes long and depends on the precision in nothing but numbers."""
+    return Setting(*request.param)
+
+
+@pytest.fixture(scope="module")
 def vectorised(request: pytest.FixtureRequest) -> Setting:
     """Those that carry derivatives."""
     return Setting(*request.param)
@@ -143,7 +145,8 @@ SUBSETS = {
     "typical_variant": [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb", "_ad_spectral_polarized"))],
     "polarized_variant": [name for name in USABLE if name.endswith("_polarized")],
 }
-CASES = {"each_variant": list(USABLE), "setting": SETTINGS, "vectorised": SETTINGS[1:]}
+CASES: dict[str, Any] = {"each_variant": list(USABLE), "setting": SETTINGS, "vectorised": SETTINGS[1:]}
+CASES["float32"] = [case for case in SETTINGS if case[1] == "float32"]
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -177,17 +180,12 @@ def scalar_context(tmp_path):
     """`scalar_context(rays=800, ...)`: a run of the validation on scalar_rgb, standard but for what is given."""
     import dataclasses
 
-    import mitsuba as mi
-
     from validation.run.context import SCALAR_PROFILES, Context
 
-    before = mi.variant()
-    mi.set_variant("scalar_rgb")
     standard = SCALAR_PROFILES["standard"]
-    yield lambda **given: Context(
+    return lambda **given: Context(
         dataclasses.replace(standard, **given), tmp_path, "scalar_rgb", backend.detect(), USABLE
     )
-    mi.set_variant(before)
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 import os
 from pathlib import Path
 
-import mitsuba as mi
 import pytest
 
 from mi_refract.cli import app
@@ -13,12 +12,9 @@ SCENES = Path(app.__file__).parents[2] / "scenes"
 
 @pytest.fixture(autouse=True)
 def here(monkeypatch, tmp_path):
-    """An empty working folder; the variant is as before, and no command replaces the process of the tests."""
+    """An empty working folder; and no command replaces the process of the tests."""
     monkeypatch.setattr(os, "execv", None)
     monkeypatch.chdir(tmp_path)
-    before = mi.variant()
-    yield
-    mi.set_variant(before)
 
 
 def run(capfd, *words):

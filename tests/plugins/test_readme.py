@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import mitsuba as mi
 import pytest
 from support.readme import python_blocks
 
@@ -22,11 +21,8 @@ def run(code, **changes):
 
 
 @pytest.fixture(autouse=True)
-def same_variant(needs_variant):
+def llvm(needs_variant):
     needs_variant("llvm_ad_rgb")
-    before = mi.variant()
-    yield
-    mi.set_variant(before)
 
 
 def test_in_a_scene(tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.variants import switch
 
 from validation.diff import planted_defects as study
 
@@ -69,12 +70,8 @@ def test_the_study_sees_its_defects_and_no_other_sampler(needs_variant, monkeypa
     needs_variant("llvm_ad_rgb")
     monkeypatch.setattr(study, "TRIALS", 2)
     monkeypatch.setattr(study, "GLASSES", {k: v for k, v in study.GLASSES.items() if k == "flipped normal"})
-    before = mi.variant()
-    mi.set_variant("llvm_ad_rgb")
-    try:
-        rows = by_subject(study.defect_rows(types.SimpleNamespace(variant="llvm_ad_rgb"), "prism"))
-    finally:
-        mi.set_variant(before)
+    switch("llvm_ad_rgb")
+    rows = by_subject(study.defect_rows(types.SimpleNamespace(variant="llvm_ad_rgb"), "prism"))
     assert rows["flipped normal"].values["welch"] == 1
     assert rows["flipped normal"].verdict == "pass"
     assert rows["other sampler"].values["welch"] == 0

@@ -3,9 +3,9 @@
 import dataclasses
 import math
 
-import mitsuba as mi
 import numpy as np
 import pytest
+from support.variants import switch
 
 from mi_refract import backend
 from validation import limits
@@ -24,7 +24,7 @@ GIVEN = (BUILTIN, METHODS[1], SHORT, ABSENT)
 @pytest.fixture
 def context(tmp_path, needs_variant, monkeypatch):
     needs_variant("llvm_ad_rgb")
-    mi.set_variant("llvm_ad_rgb")
+    switch("llvm_ad_rgb")
     monkeypatch.setitem(error_against_time.EXTENTS, "standard", SMALL)
     return Context(PROFILES["standard"], tmp_path, "llvm_ad_rgb", backend.detect(), backend.usable_variants())
 
@@ -137,14 +137,12 @@ def test_scalar_variants_are_not_run(scalar_context):
     assert {row.verdict for row in found} == {"not run"}
 
 
-def test_a_wrong_parameter_is_no_missing_integrator():
-    mi.set_variant("scalar_rgb")
+def test_a_wrong_parameter_is_no_missing_integrator(scalar_variant):
     with pytest.raises(RuntimeError, match="split_depth"):
         _ = Method("wrong", "path", "refract", {"split_depth": 1}).missing
 
 
-def test_a_method_renders_to_the_depth_of_the_scene_or_to_another():
-    mi.set_variant("scalar_rgb")
+def test_a_method_renders_to_the_depth_of_the_scene_or_to_another(scalar_variant):
     path = SCENES / "nested.xml"
     assert "max_depth = 48" in str(render_methods.camera(path, BUILTIN, 4).integrator)
     assert "max_depth = 7" in str(render_methods.camera(path, BUILTIN, 4, max_depth=7).integrator)
@@ -165,8 +163,7 @@ def test_a_ball_is_closed_convex_and_of_its_size(size):
 
 
 @pytest.mark.parametrize("knob", scaling.KNOBS)
-def test_every_knob_makes_an_image(knob):
-    mi.set_variant("scalar_rgb")
+def test_every_knob_makes_an_image(knob, scalar_variant):
     size = {"pixels": 16, "glasses": 5}.get(knob, 8)
     image, _ = scaling.KNOBS[knob].make(BUILTIN, size, 4)(1, seed=0)
     assert image.shape == (4, 4, 3)

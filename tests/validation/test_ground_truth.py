@@ -6,6 +6,7 @@ import math
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.variants import switch
 
 from validation import limits
 from validation.ground_truth import rainbow, traced_bodies, traced_system, traced_systems
@@ -111,7 +112,7 @@ def test_compiled_rays_are_those_of_the_scalar_variant(made, needs_variant, scal
     """To roundings: a mistake in the order of rays or components would be of the size of the bodies."""
     needs_variant("llvm_ad_rgb")
     one = made["slab"].traced("refract")
-    mi.set_variant("llvm_ad_rgb")
+    switch("llvm_ad_rgb")
     other = made["slab"].traced("refract")
     assert np.abs(one.places - other.places).max() < 1e-4
     assert np.abs(one.directions - other.directions).max() < 1e-5
@@ -159,11 +160,7 @@ def test_the_rainbow_of_a_noisy_bow_sees_an_index_off_by_1e_4(defect):
 def test_a_rendered_rainbow_stands_where_it_should(defect, verdict, needs_variant, monkeypatch):
     """Four renders: with 3 degrees of freedom chance may take 22 standard errors."""
     needs_variant("llvm_ad_rgb")
-    before = mi.variant()
-    mi.set_variant("llvm_ad_rgb")
+    switch("llvm_ad_rgb")
     monkeypatch.setattr(limits, "RAINBOW_RESOLVED", 0.005)
-    try:
-        found = rainbow.images(traced_systems.glass("refract", rainbow.INDEX + defect), 4)
-    finally:
-        mi.set_variant(before)
+    found = rainbow.images(traced_systems.glass("refract", rainbow.INDEX + defect), 4)
     assert traced_bodies.bow_row("refract", "llvm_ad_rgb", found, {}).verdict == verdict

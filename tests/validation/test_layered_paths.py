@@ -6,6 +6,7 @@ import math
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.variants import switch
 
 from mi_refract import backend
 from validation.reference import layered_scenes
@@ -20,10 +21,7 @@ each = pytest.mark.parametrize("layers", LAYERS.values(), ids=LAYERS)
 @pytest.fixture
 def llvm(needs_variant):
     needs_variant("llvm_ad_rgb")
-    before = mi.variant()
-    mi.set_variant("llvm_ad_rgb")
-    yield
-    mi.set_variant(before)
+    switch("llvm_ad_rgb")
 
 
 @pytest.fixture
@@ -141,14 +139,9 @@ def test_two_right_formulas_of_which_one_is_none_are_seen(llvm, context, monkeyp
 
 
 @each
-def test_points_are_projected_as_the_camera_sees_them(layers):
-    before = mi.variant()
-    mi.set_variant("scalar_rgb")
-    try:
-        view = path_overlay.View(layers.scene, "dielectric", {}, 4, 1)
-        for u, v in ((0.1, 0.2), (0.7, 0.4)):
-            ray, _ = view.scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(u, v), mi.Point2f(0.5))
-            for p, d in ((np.array(ray.o), np.array(ray.d)), view.ray(u, v)):
-                assert view.project((p + 500 * d)[None])[0] == pytest.approx([u, v], abs=1e-4)
-    finally:
-        mi.set_variant(before)
+def test_points_are_projected_as_the_camera_sees_them(layers, scalar_variant):
+    view = path_overlay.View(layers.scene, "dielectric", {}, 4, 1)
+    for u, v in ((0.1, 0.2), (0.7, 0.4)):
+        ray, _ = view.scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(u, v), mi.Point2f(0.5))
+        for p, d in ((np.array(ray.o), np.array(ray.d)), view.ray(u, v)):
+            assert view.project((p + 500 * d)[None])[0] == pytest.approx([u, v], abs=1e-4)

@@ -4,9 +4,9 @@ import dataclasses
 import math
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 import pytest
+from support.variants import switch
 
 from mi_refract.backend import detect
 from mi_refract.planar import Event, Paths, Segments, path_loop, shapes
@@ -273,10 +273,7 @@ def put(hits, ray, segment):
 @pytest.fixture
 def compiled(needs_variant):
     needs_variant("llvm_ad_rgb")
-    before = mi.variant()
-    mi.set_variant("llvm_ad_rgb")
-    yield
-    mi.set_variant(before)
+    switch("llvm_ad_rgb")
 
 
 def extruded(case, spawn="along the ray", segments=None):

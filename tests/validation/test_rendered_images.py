@@ -7,6 +7,7 @@ import importlib.util
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.variants import switch
 
 from mi_refract.io import image_file
 from mi_refract.rendering import scene_files
@@ -26,7 +27,7 @@ SMALL = rendered_images.Size(48, 32, 1, 0.2)
 @pytest.fixture(autouse=True)
 def llvm(needs_variant):
     needs_variant("llvm_ad_rgb")
-    mi.set_variant("llvm_ad_rgb")
+    switch("llvm_ad_rgb")
 
 
 @pytest.fixture

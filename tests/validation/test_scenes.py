@@ -22,13 +22,7 @@ DEFAULTS |= {"max_depth": None, "spp": "64", "res": "128"}
 each_scene = pytest.mark.parametrize("name", NAMES)
 
 
-@pytest.fixture(autouse=True)
-def scalar():
-    before = mi.variant()
-    mi.set_variant("scalar_rgb")
-    yield
-    if before:
-        mi.set_variant(before)
+pytestmark = pytest.mark.usefixtures("scalar_variant")
 
 
 def load(path, **parameters):
