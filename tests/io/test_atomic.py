@@ -65,9 +65,12 @@ def test_update_between_refuses_a_text_with_a_marker_of_its_own(tmp_path, text):
     assert path.read_text() == f"{BEGIN}\nold\n{END}\n"
 
 
-def test_the_page_travels_with_the_package():
+def test_what_is_no_code_travels_with_the_package():
+    """All of it but the READMEs: `py.typed`, and the templates of the pages."""
     root = Path(__file__).parents[2]
-    project = tomllib.loads((root / "pyproject.toml").read_text())
-    globs = project["tool"]["setuptools"]["package-data"]["mi_refract"]
-    files = [p for p in (root / "mi_refract").iterdir() if p.is_file() and p.suffix != ".py"]
-    assert not [p.name for p in files if not any(p.match(glob) for glob in globs)]
+    data = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    folders = {name: root / name.replace(".", "/") for name in data}
+    taken = {path for name, globs in data.items() for glob in globs for path in folders[name].glob(glob)}
+    files = {path for path in (root / "mi_refract").rglob("*.*") if path.suffix not in (".py", ".pyc", ".md")}
+    assert {path.suffix for path in files} >= {".j2", ".css", ".js", ".typed"}
+    assert files <= taken
