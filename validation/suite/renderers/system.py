@@ -8,12 +8,12 @@ from pathlib import Path
 
 SCRIPTS = Path(__file__).parent / "scripts"
 
-# Where the rays of `validation.per_ray` come from; the names of its sets.
+# Where the rays of `validation.suite.per_ray` come from; the names of its sets.
 RANDOM, CRITICAL, GRAZING, MATCHED, TOTAL = "random", "near-critical", "grazing", "η ≈ 1", "total reflection"
-Noted = Mapping[str, tuple[float, float]]  # worst angle in radians by set, from … to
+RecordedError = Mapping[str, tuple[float, float]]  # worst angle in radians by set, from … to
 
 
-def recorded_error(random: float, critical: float, grazing: float | tuple, matched: float | tuple) -> Noted:
+def recorded_error(random: float, critical: float, grazing: float | tuple, matched: float | tuple) -> RecordedError:
     """Worst angles in radians by set of rays, a number or a range (from, to)."""
     figures = zip((RANDOM, CRITICAL, GRAZING, MATCHED), (random, critical, grazing, matched), strict=True)
     return {name: x if isinstance(x, tuple) else (x, x) for name, x in figures}
@@ -52,14 +52,14 @@ class Apt:
 class RefractFunction:
     """A function of refraction in one precision: `script` of scripts/ reads rays and writes answers, both as CSV.
 
-    `told`: how total internal reflection is, one of `mi_refract.rays_judge.TIR`. `gives_up`: the cos²θ_t below which it
-    takes a ray for totally reflected, by its own word. `remark`: where it is known to differ, and how.
+    `told`: how total internal reflection is, one of `mi_refract.ray_sets.tir_signal.TIR`. `gives_up`: the cos²θ_t below
+    which it takes a ray for totally reflected, by its own word. `remark`: where it is known to differ, and how.
     """
 
     title: str
     precision: str  # "f32" or "f64"
     script: str
-    recorded_error: Noted
+    recorded_error: RecordedError
     told: str
     arguments: tuple[str, ...] = ()
     gives_up: float = 0.0
