@@ -6,7 +6,7 @@ error, and the distance from the critical angle at which total internal reflecti
 children are as near to that angle as a few ulps of their numbers bring them. All stay in the domain: unit vectors stay
 unit up to rounding, lengths within 1e-18 … 1e18, ratios within the regime's.
 
-`python -m validation.search --keep` adds the worst to tests/data/worst_rays.txt, which the tests replay.
+`python -m validation.directions.search --keep` adds the worst to tests/data/worst_rays.txt, which the tests replay.
 """
 
 from __future__ import annotations
@@ -276,7 +276,9 @@ def rescored(name: str, setting: Setting) -> list[Found]:
 
 def main(arguments: list[str] | None = None) -> int:
     """The search by hand: from the command line, or `arguments`; the exit code."""
-    parser = argparse.ArgumentParser(prog="validation.search", description="Try to break the budgets of the formulas.")
+    parser = argparse.ArgumentParser(
+        prog="validation.directions.search", description="Try to break the budgets of the formulas."
+    )
     parser.add_argument("formulas", nargs="*", help="keys of FORMULAS; all by default")
     parser.add_argument("--generations", type=int, default=PROFILES["full"].generations)
     parser.add_argument("--seed", type=int, default=SEED)

@@ -1,6 +1,6 @@
 """The surroundings of `scenes/balls.xml`: a dim sky with lamps, a hundred times as bright. Writes them as a script.
 
-python -m validation.lamps
+python -m validation.renders.lamp_environment
 """
 
 from __future__ import annotations
