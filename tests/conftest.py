@@ -2,31 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
-import importlib.util
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
 
+from mi_refract import backend
 
-def _alone(name: str) -> ModuleType:
-    """A module of mi_refract without the package around it, which would import Dr.Jit."""
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[1] / f"{name.replace('.', '/')}.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-backend = _alone("mi_refract.backend")
 VARIANT = backend.activate()
-sys.modules["mi_refract"].backend = backend
 USABLE: dict[str, str | None] = backend.usable_variants()
 
 
@@ -51,16 +36,22 @@ def needs_variant() -> Callable[[str], None]:
     return check
 
 
+# The variant of a test, by the fixture that asks for it.
+FIXED = {"llvm_variant": "llvm_ad_rgb", "scalar_variant": "scalar_rgb", "scalar_context": "scalar_rgb"}
+
+
 @pytest.fixture(autouse=True)
 def variant(request: pytest.FixtureRequest) -> str:
     """The variant of the test: its parameter, else the best that runs here. Switched only where it is another one."""
     parameters = request.node.callspec.params if hasattr(request.node, "callspec") else {}
-    wanted: str = parameters.get("each_variant", VARIANT)
+    fixed = [name for fixture, name in FIXED.items() if fixture in request.fixturenames]
+    wanted: str = parameters.get("each_variant", [*fixed, VARIANT][0])
+    if USABLE[wanted]:  # the fixture that asks for it skips the test
+        return VARIANT
     if wanted != VARIANT or "mitsuba" in sys.modules:
-        import mitsuba as mi
+        from support.variants import switch
 
-        if mi.variant() != wanted:
-            mi.set_variant(wanted)
+        switch(wanted)
     return wanted
 
 
@@ -70,32 +61,15 @@ def each_variant(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-@contextlib.contextmanager
-def switched(name: str) -> Iterator[None]:
-    """Another variant, and then the one before."""
-    import mitsuba as mi
-
-    before = mi.variant()
-    if before != name:
-        mi.set_variant(name)
-    yield
-    if before and mi.variant() != before:
-        mi.set_variant(before)
+@pytest.fixture
+def scalar_variant() -> None:
+    """`scalar_rgb` for the test, which `variant` sets."""
 
 
 @pytest.fixture
-def scalar_variant() -> Iterator[None]:
-    """`scalar_rgb` for the test."""
-    with switched("scalar_rgb"):
-        yield
-
-
-@pytest.fixture
-def llvm_variant(needs_variant: Callable[[str], None]) -> Iterator[None]:
-    """`llvm_ad_rgb` for the test, which is skipped where it cannot run."""
+def llvm_variant(needs_variant: Callable[[str], None]) -> None:
+    """`llvm_ad_rgb` for the test, which `variant` sets; skipped where it cannot run."""
     needs_variant("llvm_ad_rgb")
-    with switched("llvm_ad_rgb"):
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -145,6 +119,12 @@ def setting(request: pytest.FixtureRequest) -> Setting:
 
 
 @pytest.fixture(scope="module")
+def float32(request: pytest.FixtureRequest) -> Setting:
+    """Those in float32: for what takes long and depends on the precision in nothing but numbers."""
+    return Setting(*request.param)
+
+
+@pytest.fixture(scope="module")
 def vectorised(request: pytest.FixtureRequest) -> Setting:
     """Those that carry derivatives."""
     return Setting(*request.param)
@@ -163,7 +143,8 @@ SUBSETS = {
     "typical_variant": [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb", "_ad_spectral_polarized"))],
     "polarized_variant": [name for name in USABLE if name.endswith("_polarized")],
 }
-CASES = {"each_variant": list(USABLE), "setting": SETTINGS, "vectorised": SETTINGS[1:]}
+CASES: dict[str, Any] = {"each_variant": list(USABLE), "setting": SETTINGS, "vectorised": SETTINGS[1:]}
+CASES["float32"] = [case for case in SETTINGS if case[1] == "float32"]
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

@@ -113,7 +113,8 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
     from mi_refract.report import run_report
     from validation.run.context import Context, profiles
 
-    from . import headline, runner
+    from . import runner
+    from .run import headline
 
     start = time.perf_counter()
     variant = backend.activate(may_restart=True)

@@ -1,10 +1,9 @@
 """Every budget and every goal of the studies, each with its reason.
 
-A budget that is broken fails the run. A goal is for what a busy machine can spoil (times): a missed goal is shown, and
-decides no verdict. Units of roundoff are u = 2⁻²⁴ or 2⁻⁵³. Where a limit depends on the ray, on the number of layers or
-on the scene, the study computes it, and the number here is the factor or the probability that it starts from. The
-a-priori bounds of the formulas themselves stand in `mi_refract.formulas.bounds`, those of the planted defects of the
-image comparison in `mi_refract.image_diff.self_test`.
+A broken budget fails the run. A goal is for times, which a busy machine makes longer: a missed goal is shown and fails
+nothing. u is the unit roundoff, 2⁻²⁴ or 2⁻⁵³. Where a limit depends on the ray, on the number of layers or on the
+scene, the study computes it from the factor or the probability given here. The a-priori bounds of the formulas are in
+`mi_refract.formulas.bounds`, the limits of the planted image defects in `mi_refract.image_diff.self_test`.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ SAMPLE_MUELLER = limit(6, "radicand errors: one on either side of the boundary, 
 # √(1 − 2x) ≥ 0.025, so while condition · u ≤ 0.487.
 MIRAGE = limit(2.0, "error of the cosine over condition · u, as long as condition · u ≤ FIRST_ORDER")
 FIRST_ORDER = limit(0.487, "condition · u up to which the bound of first order holds")
-LIGHT_PIPE = limit(1.0, "each total internal reflection passes on what is wrong and adds at most u: only signs change")
+LIGHT_PIPE = limit(1.0, "each total internal reflection keeps the error so far and adds at most u: only signs change")
 SYSTEM = limit(1.0, "the condition counts u for every rounding; inputs take √3/2 of it, a form at the limit 0.8724")
 PRINT = limit(1.0, "what printing rounds to: 11 surfaces of 20u each, u = 2⁻⁵³, are far below CODE V's digits")
 
@@ -84,7 +83,9 @@ FIRST_IMAGE = {
     64: limit(0.6, "of the built-in's first image of so many glasses: one callable for all of them"),
     1000: limit(0.15, "of the built-in's first image of so many glasses: one callable for all of them"),
 }
-EDIT = limit(0.2, "of the built-in's image after an edit: the index is no literal, so nothing is compiled")
+EDIT = limit(
+    0.2, "of the built-in's image after an edit: the index is not a literal in the kernel, so nothing is compiled"
+)
 FROZEN = limit(1e-5, "of a pixel: the order in which samples are added up")
 
 # Efficiency ----------------------------------------------------------------------------------------------------
@@ -95,7 +96,9 @@ ONLY_GLASS = {
     EQUAL_TIME_DEFAULTS: limit(0.12, "of the built-in's defaults: stratification comes on top"),
 }
 MIXED = {EQUAL_TIME: limit(0.8, "of the built-in's with the same sampler, where surfaces scatter, too")}
-NOISE = limit(1e-5, "of float32 images: below it independent seeds give the same one, and there is no error to buy")
+NOISE = limit(
+    1e-5, "of float32 images: below it independent seeds give the same image, and there is no error to compare"
+)
 SCALING = {
     ("glasses", 64): {"first image / built-in": FIRST_IMAGE[64], "after an edit / built-in": EDIT},
     ("glasses", 1000): {"first image / built-in": FIRST_IMAGE[1000]},
@@ -103,13 +106,15 @@ SCALING = {
 
 # Planar --------------------------------------------------------------------------------------------------------
 
-GROWN = limit(1.0, "error over what rounding may have grown to, see `validation/planar/error_growth.py`")
+GROWN = limit(1.0, "error over the bound on rounding errors, see `validation/planar/error_growth.py`")
 PLANAR_EQUAL = limit(1e-9, "float64: of the extent, and in radians")
 # Of the ellipse lens: a place, a normal and a direction at either boundary, each rounded once in x and in y.
 SPOT = limit(6 * math.sqrt(2), "u, of the focus of the ellipse lens: six roundings, each in x and in y")
 PLANAR_TIMES = {
     ("llvm float32", "document 004"): {"µs per path": limit(0.1, "two cores, the lens of the original program")},
-    ("llvm float32", "M = 1000000"): {"µs per path": limit(1.0, "two cores: ten times the segments cost no tenfold")},
+    ("llvm float32", "M = 1000000"): {
+        "µs per path": limit(1.0, "two cores: ten times the segments take much less than ten times as long")
+    },
 }
 
 # Image comparison ----------------------------------------------------------------------------------------------
@@ -125,8 +130,8 @@ MEMORY_MEGABYTES = limit(1024.0 * 2**20 / 1e6, "MB, 1 GiB: what the smallest mac
 
 # Ground truth --------------------------------------------------------------------------------------------------
 
-BODY = limit(1.0, "error over the sum of what every rounding on the way may do")
-INDEX_SEEN = limit(1e-4, "relative: an error of an index that size takes a ray to its bound, or the bound is no test")
+BODY = limit(1.0, "error over the sum of the largest effects of every rounding on the way")
+INDEX_SEEN = limit(1e-4, "relative: an index off by this must move a ray to its bound, or the bound is no test")
 FALSE_ALARM = limit(1e-4, "probability that Student's t of the rainbow exceeds its bound by chance")
 RAINBOW_RESOLVED = limit(0.0145 / 10, "degrees, standard error: INDEX_SEEN moves the rainbow by 0.0145")
 # Pixels may move the edge: σ²/4(D − D₀) at 0.1 degrees is 3.5e-4; the parabola carries 1.7 of it to D₀, 6e-4, which

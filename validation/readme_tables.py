@@ -1,7 +1,7 @@
-"""The tables of the READMEs and the gallery, all from the rows of one run.
+"""The tables of the READMEs and the image gallery, all made from the rows of one run.
 
-Rows are found by the names of studies and metrics that the studies themselves use: a label that is renamed fails here
-at import, not after the run.
+Rows are found by the studies' own constants for names of studies and metrics. So a renamed label is an error when this
+module is imported, not after the run.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Runs tasks, keeps the rows of each as soon as it is finished, and takes them up again after an interruption."""
+"""Runs tasks, saves the rows of each as soon as it is finished, and resumes after an interruption."""
 
 from __future__ import annotations
 

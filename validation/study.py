@@ -1,6 +1,6 @@
-"""A study: what it asks, what the report says of it, and the tasks that answer it.
+"""A study: the question it asks, its text in the report, and the tasks that measure it.
 
-A module that holds a study ends with `STUDY = Study(...)`; `rooms.py` lists these modules.
+A module that holds a study ends with `STUDY = Study(...)`; `__main__.py` lists these modules.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Study:
 
     @property
     def described(self) -> dict[str, Any]:
-        """What the report is told: title, introduction, glossary and axes."""
+        """What the report shows of the study: title, introduction, glossary and axes."""
         about: dict[str, Any] = {"title": self.title, "text": " ".join(self.text.split()), "terms": dict(self.terms)}
         return about | ({"axes": dict(self.axes)} if self.axes else {})
 

@@ -1,7 +1,7 @@
-"""The command `mi-refract`: a module for each command; `app` puts them together and turns errors into one line.
+"""The command `mi-refract`: one module per command; `app` puts them together and turns errors into one line.
 
-In: the words of a command line. Out: text on stdout, files that were asked for, and an exit code. The commands only
-read options, call the rooms below, and print; every one of them can be had from Python without this room.
+In: the arguments of a command line. Out: text on stdout, the files asked for, and an exit code. The commands only read
+options, call the rooms below, and print; everything they do can be done from Python without this room.
 """
 
 import sys

@@ -1,7 +1,7 @@
-"""The command `mi-refract`: its list of commands, and what becomes of errors.
+"""The command `mi-refract`: its list of commands, and how errors are printed.
 
-A command's module is imported when that command is called, so that `--help` and `--version` wait for none of them.
-Errors are one line on stderr, `mi-refract: ...`, and exit code 2. Ctrl-C exits with 130.
+A command's module is imported only when that command is called, which keeps `--help` and `--version` fast. Errors are
+one line on stderr, `mi-refract: ...`, with exit code 2. Ctrl-C exits with 130.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The commands `mi-refract diff` and `mi-refract accept`: their options, and what they print and write."""
+"""The commands `mi-refract diff` and `mi-refract accept`: their options, and their output."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `mi-refract diff --self-test` renders: a scene file, or a glass ball of our own."""
+"""The images for `mi-refract diff --self-test`: renders of a scene file, or of a built-in scene with a glass ball."""
 
 from __future__ import annotations
 

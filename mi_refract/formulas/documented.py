@@ -1,4 +1,4 @@
-"""One pure Dr.Jit function per documented formula of refraction, and the FORMULAS table.
+"""One pure Dr.Jit function per documented formula of refraction.
 
 Every formula is `f(a, n, k) -> (b, transmitted)` in the conventions of the package docstring: `a` travels toward
 the surface, `n` is a normal on either side, k = n_from / n_to, and `b` leaves the boundary with the length of `a`.

@@ -1,6 +1,6 @@
-"""Pairs of image files, and folders of them: which image is compared with which, and what came out.
+"""Pairs of image files, and folders of them: which image is compared with which, and the results.
 
-One pair that cannot be compared does not keep the others from it. Nothing here writes a file.
+A pair that cannot be compared does not stop the others. Nothing here writes a file.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The table of methods, and `compare`, which asks one of them whether two images are the same."""
+"""The table of methods, and `compare`, which applies one of them to two images."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Methods that look at every pixel alone: `exact`, `tolerance` and `paired`.
 
-Where there are two of a kind, the second says whether an all-black test image would pass with the same options: then
-the method could not have seen a difference.
+`tolerance_passes_black` and `paired_passes_black` say whether an all-black test image would pass with the same
+options: then the method could not have seen a difference.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""Proof that a comparison can fail: defects planted in images must be seen, and equal pairs must not be reported.
+"""The self-test of the comparison: defects planted in images must be seen, and equal pairs must not be reported.
 
-A method that takes single images compares two of the same random numbers, one of them spoilt; a method that takes
-several renders compares clean ones with spoilt ones of other seeds. A defect is seen where the method calls the images
-different, or refuses to compare them; "inconclusive" counts as not seen. One row for each defect: the share of trials
-in which each method saw it.
+A method for single images compares two renders with the same random numbers, one of them with a defect. A method for
+several renders compares clean renders with defective ones of other seeds. A defect is seen where the method calls the
+images different, or refuses to compare them; "inconclusive" counts as not seen. There is one row for each defect: the
+share of trials in which each method saw it.
 
-A method that misses what is due fails its row. Due are: for every method, values that are not finite, another size,
-and a file that cannot be read; for `exact`, a change of any bit; and for a method that knows the noise, a defect larger
-than the minimum detectable difference that it prints.
+The row fails where a method misses a defect that it must see. Every method must see values that are not finite, another
+size, and a file that cannot be read; `exact` any changed bit; and a method that models the noise a defect larger than
+the minimum detectable difference that it prints.
 """
 
 from __future__ import annotations
@@ -224,7 +224,7 @@ def examine(renders: Pixels, case: str, trials: int = TRIALS, null_pairs: int = 
     """The rows of every defect and of the null pairs on given renders of one image, number × H × W × C.
 
     RENDERS or more, of independent seeds, are split in halves at random; of fewer, single images are compared.
-    ValueError for values that are not finite: what is planted could not be told from what was there.
+    ValueError for values that are not finite: a planted NaN could not be distinguished from one that was there.
     """
     if not len(renders) or not np.isfinite(renders).all():
         raise ValueError(f"{case}: accepted for a self-test: one or more renders, every value of them finite")

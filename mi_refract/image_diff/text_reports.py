@@ -1,6 +1,6 @@
-"""What `diff` found, laid out for a terminal, for scripts (JSON), test runners (JUnit) and GitHub.
+"""The results of `diff` as text: for a terminal, for scripts (JSON), test runners (JUnit) and GitHub.
 
-Names of files and messages of errors come from strangers: each form escapes what would be read as more than text.
+Names of files and messages of errors may hold any character: each format escapes what would be read as more than text.
 """
 
 from __future__ import annotations

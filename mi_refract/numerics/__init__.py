@@ -1,10 +1,10 @@
-"""Arithmetic that the formulas of refraction rest on. No optics in here.
+"""The arithmetic of the formulas of refraction. No optics in here.
 
 In: floats, numpy arrays or Dr.Jit arrays. Out: sums and products with their exact rounding errors, numbers of two or
-three words, and what Dr.Jit's arrays need to behave alike on every backend.
+three words, and operations that make Dr.Jit's arrays behave alike on every backend.
 
-`error_free` and `float_expansions` are modules with a `dot`, `cross` and `two_prod` of their own: the first for the
-formulas, in the precision of the arrays, the second for the code that judges them, in float64.
+`error_free` and `float_expansions` are modules that each have a `dot`, `cross` and `two_prod`: the first for the
+formulas, in the precision of the arrays, the second for the code that checks them, in float64.
 """
 
 from . import error_free, float_expansions

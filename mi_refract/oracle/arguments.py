@@ -1,4 +1,4 @@
-"""The arguments of the oracle: shapes and dtypes checked, invalid rays told apart, numbers handed on exactly."""
+"""The arguments of the oracle: checks of shapes and dtypes, the mask of invalid rays, exact conversion of numbers."""
 
 from __future__ import annotations
 

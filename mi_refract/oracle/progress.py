@@ -1,4 +1,4 @@
-"""A progress bar for the many seconds that ball arithmetic takes."""
+"""A progress bar, as ball arithmetic takes many seconds."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .segments import Array
 
-REFLECT_BITS = 32  # boundaries on a path at which a ray can be told to reflect
+REFLECT_BITS = 32  # boundaries on a path at which `reflect` can ask for reflection
 
 
 class Event(IntEnum):

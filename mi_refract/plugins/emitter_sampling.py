@@ -1,7 +1,7 @@
 """Which emitters are sampled: all of them, as Mitsuba does, or all but a constant environment.
 
-Light that is the same from all directions adds little noise where only the BSDF is sampled: what is in the way of it.
-To sample it as an emitter would take samples away from the other emitters.
+Light that is the same from all directions adds little noise where only the BSDF is sampled; the noise comes from what
+occludes it. Sampling it as an emitter would leave fewer samples for the other emitters.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The usual mistakes: what each one would answer, and whether the program answered that.
+"""The usual mistakes: the answers that each one would give, and whether the program gave those.
 
 A mistake is visible on a ray where it changes the direction by more than VISIBLE. It explains an answer there that is
-within SAME of what the mistake gives. A loss of precision predicts no direction: it is recognised by a wider bound that
-the errors keep.
+within SAME of the direction that the mistake gives. A loss of precision predicts no direction: it is recognised by a
+wider bound that contains the errors.
 """
 
 from __future__ import annotations

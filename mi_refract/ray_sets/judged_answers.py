@@ -1,4 +1,4 @@
-"""The judgement of answers to a ray set: which signal total internal reflection, and how large the errors are."""
+"""Errors of the answers to a ray set, and the signal of total internal reflection that they use."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Named, replayable sets of rays over the whole domain: where formulas of refraction are at ease, and where not.
+"""Named, replayable sets of rays over the whole domain: easy ones, and those on which formulas lose accuracy.
 
 In: the name of a regime, a count, a precision and a seed; the same give the same rays. Out: `Rays`, numpy arrays in
-that precision. A regime builds its rays around given normals; `make` rounds them and returns what was rounded. NaN and
-infinity are no refraction and in no regime.
+that precision. A regime builds its rays around given normals; `make` rounds them and returns the rounded rays. No
+regime holds NaN or infinity, which are no refraction.
 """
 
 from .angles import Draw, rays_at

@@ -1,7 +1,6 @@
 """JUnit's XML, and text that is safe in XML and on a terminal.
 
-The names of files and the messages of errors come from strangers. Whatever prints them or writes them passes them
-through `printable`.
+Names of files and messages of errors may hold any character; `printable` makes them safe to print and to write.
 """
 
 from __future__ import annotations

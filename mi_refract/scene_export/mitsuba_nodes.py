@@ -1,4 +1,4 @@
-"""A parsed Mitsuba scene, node by node. A parameter that nobody reads is an error: none is dropped silently."""
+"""A parsed Mitsuba scene, node by node. A parameter that was not read is an error, so that none is dropped silently."""
 
 from __future__ import annotations
 

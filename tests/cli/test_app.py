@@ -21,6 +21,15 @@ def test_bad_command(arguments, capfd):
     assert err.count("\n") == 1
 
 
+def test_an_error_of_several_lines_is_printed_in_one(capfd, monkeypatch):
+    def fails(*arguments, **options):
+        raise ValueError("first\n  second\n")
+
+    monkeypatch.setattr(app, "app", fails)
+    assert app.main(["doctor"]) == 2
+    assert capfd.readouterr() == ("", "mi-refract: first second\n")
+
+
 def test_without_a_command_the_help_is_printed_and_with_version_the_version(capfd):
     assert app.main([]) == 2
     assert "doctor" in capfd.readouterr().out

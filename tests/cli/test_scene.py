@@ -31,6 +31,11 @@ def test_level_and_defines(export, tmp_path):
     assert '<integer name="width" value="17"/>' in text and 'name="max_depth" value="9"' in text
 
 
+def test_level_0_is_not_the_default(export):
+    """60 triangles less than in the test above: those of one sphere."""
+    assert "1590 triangles" in export("sphere", "--to", "mitsuba", "--level", 0)[1]
+
+
 @pytest.mark.parametrize(
     "words, says",
     [

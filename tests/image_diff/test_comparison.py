@@ -130,6 +130,15 @@ def test_tolerance_means_what_idiff_means(by, options, verdict):
     assert judge("tolerance", image(SMOOTH), altered(SMOOTH[3, 5, 1] + by), **options).verdict is verdict
 
 
+@pytest.mark.parametrize("by, pixels, verdict", [(0.0039, 9, EQUAL), (0.0041, 1, EQUAL), (0.0041, 2, DIFFERENT)])
+def test_tolerance_allows_a_change_of_0_004_and_more_in_0_02_percent_of_the_pixels(by, pixels, verdict):
+    """Of 6000 pixels 1 is 0.017 %, 2 are 0.033 %."""
+    reference = np.full((60, 100, 3), 0.5)
+    test = reference.copy()
+    test[0, :pixels, 1] += by
+    assert judge("tolerance", image(reference), image(test)).verdict is verdict
+
+
 def test_a_warning_is_said_and_is_no_failure():
     found = judge("tolerance", image(SMOOTH), altered(SMOOTH[3, 5, 1] + 0.01), fail=0.02, warn=0.005)
     assert found.verdict is EQUAL
@@ -307,6 +316,29 @@ def test_variance_channels_take_the_place_of_several_renders(kind):
         methods.compare("welch", one, two)
     told = [replace(each, metadata={"mi_refract:spp": 16}) for each in (one, two)]
     assert methods.compare("welch", *told).minimum_detectable == pytest.approx(found.minimum_detectable)
+
+
+def test_a_variance_from_n_samples_has_n_less_one_degrees_of_freedom():
+    """In one pixel, where both sides have the same variance, Welch's test has 2 (n − 1) of them."""
+    from scipy import stats
+
+    one, two = (image([[[mean, 0.08]]], ("Y", "Y.variance")) for mean in (1.0, 1.5))
+    for count in (2, 5):
+        t = 0.5 / np.sqrt(2 * 0.08 / count)
+        found = methods.compare("welch", one, two, spp=count).maps["p"]
+        assert found.item() == pytest.approx(2 * stats.t.sf(t, 2 * (count - 1)), rel=1e-5)
+
+
+def test_the_minimum_detectable_difference_is_missed_with_the_probability_stated():
+    """Where the noise is known, the test statistic is normal."""
+    from scipy import stats
+
+    one = np.ones((1, 1, 1))
+    none = one < 0
+    level = tile_statistics.Level(0 * one, one, one, none, none, none, 2 * one, 0 * one, 0.1 * one, 1e9 * one)
+    (found,) = level.detectable(threshold := 1e-4)
+    seen = stats.norm.sf(stats.norm.isf(threshold / 2) - 2 * found / 0.1)
+    assert seen == pytest.approx(1 - tile_statistics.MISSED)
 
 
 # The table -----------------------------------------------------------------------------------------------------

@@ -91,6 +91,9 @@ def test_panes_of_a_pair_are_in_order_and_an_equal_one_has_none(tmp_path):
     names = [("reference", "light"), ("test", "light"), ("difference", "signed"), ("flip", "heat"), ("t", "signed")]
     assert roles(text) == [*names, ("−log₁₀ q", "heat")]  # no flags: none is up
     assert "compare pair paired" in text
+    scale, data = re.findall(r'data-scale="([^"]*)">([^<]*)<', text)[2]
+    difference = float(scale) * decoded(data).astype(float)
+    assert difference == pytest.approx(0.5 - 0.25)  # positive where the test is brighter
     text = html(tmp_path, Results(found.reference, found.test, found.results[3:]))
     assert roles(text) == [] and "Image viewer" not in text
 

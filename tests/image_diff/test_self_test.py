@@ -91,6 +91,14 @@ def test_a_defect_that_changes_nothing_is_left_out():
     assert "changes nothing" in rows["swapped channels"].reason
 
 
+def test_four_renders_are_split_and_three_are_not(monkeypatch):
+    monkeypatch.setattr(self_test, "DEFECTS", {})
+    small = renders(4)[:, :16, :16]
+    four, three = (by_subject(self_test.examine(some, "noise", null_pairs=2)) for some in (small, small[:3]))
+    assert four["null pairs, welch"].values["null pairs"] == 2 and "noise" in four["renders"].values
+    assert "null pairs, welch" not in three and three["renders"].verdict == "not run"
+
+
 def test_the_command_takes_a_folder_or_an_image_and_refuses_what_is_not_finite(tmp_path, run, monkeypatch):
     monkeypatch.setattr(self_test.examine, "__defaults__", (2, 20))
     for i, image in enumerate(renders(4)):

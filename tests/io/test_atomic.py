@@ -25,6 +25,14 @@ def test_a_failed_write_leaves_the_old_file_alone(tmp_path, monkeypatch):
         assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_replaced_file_keeps_its_permissions(tmp_path):
+    path = tmp_path / "file"
+    write_atomically(path, "old")
+    path.chmod(0o640)
+    write_atomically(path, "new")
+    assert path.read_text() == "new" and path.stat().st_mode & 0o777 == 0o640
+
+
 BEGIN, END = "<!-- begin: t -->", "<!-- end: t -->"
 
 
@@ -46,6 +54,15 @@ def test_update_between_refuses_an_unclear_place(tmp_path, text):
     with pytest.raises(ValueError, match=r"README\.md: expected one .*begin: t"):
         update_between(path, "t", "new")
     assert path.read_text() == text
+
+
+@pytest.mark.parametrize("text", [f"new\n{BEGIN}", f"{END}\nnew"])
+def test_update_between_refuses_a_text_with_a_marker_of_its_own(tmp_path, text):
+    path = tmp_path / "README.md"
+    path.write_text(f"{BEGIN}\nold\n{END}\n")
+    with pytest.raises(ValueError, match=r"README\.md: the text for 't' contains its own marker"):
+        update_between(path, "t", text)
+    assert path.read_text() == f"{BEGIN}\nold\n{END}\n"
 
 
 def test_the_page_travels_with_the_package():

@@ -212,6 +212,12 @@ def test_a_scene_is_read_as_it_is_written(tmp_path):
     assert vertex == pytest.approx([2 * math.cos(math.pi / 6), 2 * math.sin(math.pi / 6)], abs=1e-15)
 
 
+def test_what_is_not_said_of_a_scene(tmp_path):
+    text = '[[shape]]\nkind = "circle"\nradius = 1\nn = 1.5\n[[beam]]\nkind = "rays"\norigins = [[0, 3]]\n'
+    scene = load(written(tmp_path, text + "directions = [0]\n"))
+    assert (scene.max_depth, scene.branches, scene.index, scene.view) == (16, 0, (1.0,), None)
+
+
 def test_rays_start_at_round_numbers_where_they_can():
     for count in range(2, 200):
         beam = {"from": [0, 1], "to": [count - 1, 1], "direction": np.array([0, 1]), "count": count}

@@ -5,6 +5,7 @@ import math
 import drjit as dr
 import numpy as np
 import pytest
+from support.variants import switch
 
 import mi_refract  # noqa: F401  (registers the plugin)
 from mi_refract import backend
@@ -297,8 +298,7 @@ def jit():
     usable = [name for name, why in backend.usable_variants().items() if why is None and name.endswith("ad_rgb")]
     if not usable:
         pytest.skip("no LLVM or CUDA variant runs here")
-    if mi.variant() != usable[0]:
-        mi.set_variant(usable[0])
+    switch(usable[0])
     return usable[0]
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.variants import switch
 
 from mi_refract.plugins.scene_features import inspect
 from validation.run.context import SCENES
@@ -56,8 +57,7 @@ MEDIUM = {"type": "homogeneous"}
         (LAMP | {"emitter": {"type": "directionalarea"}}, {"sampleable", "lamps", "area", "delta_emitters"}),
     ],
 )
-def test_each_part_adds_what_it_needs_and_no_more(part, seen):
-    mi.set_variant("scalar_rgb")
+def test_each_part_adds_what_it_needs_and_no_more(part, seen, scalar_variant):
     expected = {"polarising"} | seen | (set() if "smooth" in seen else {"only_glass"})
     assert facts(part=part) == expected
 
@@ -65,8 +65,7 @@ def test_each_part_adds_what_it_needs_and_no_more(part, seen):
 EVERYTHING = {"both_numbers", "smooth", "null", "textured", "polarising", "dispersive"}
 
 
-def test_what_is_not_known_needs_everything():
-    mi.set_variant("scalar_rgb")
+def test_what_is_not_known_needs_everything(scalar_variant):
 
     class Refract(mi.BSDF):  # ours by its name, but not by its module
         def __init__(self, props):
@@ -87,8 +86,7 @@ def test_what_is_not_known_needs_everything():
     assert facts(group=group, instance=instance) == EVERYTHING | {"area", "media"}
 
 
-def test_an_emitter_that_declares_nothing_may_be_a_delta():
-    mi.set_variant("scalar_rgb")
+def test_an_emitter_that_declares_nothing_may_be_a_delta(scalar_variant):
 
     class Silent(mi.Emitter):
         def traverse(self, callback):
@@ -101,7 +99,7 @@ def test_an_emitter_that_declares_nothing_may_be_a_delta():
 @pytest.mark.parametrize(("reflectance", "black"), [(0.0, True), ({"type": "rgb", "value": 1e-9}, False)])
 def test_a_spectrum_from_rgb_is_never_exactly_black(reflectance, black):
     """Mitsuba calls its largest value 0."""
-    mi.set_variant("scalar_spectral")
+    switch("scalar_spectral")
     part = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
     assert ("smooth" in facts(part=part)) != black
 
@@ -109,7 +107,7 @@ def test_a_spectrum_from_rgb_is_never_exactly_black(reflectance, black):
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
 def test_the_scenes(variant, needs_variant):
     needs_variant(variant)
-    mi.set_variant(variant)
+    switch(variant)
     found = {path.stem: inspect(mi.load_file(str(path), res=4)) for path in SCENES.glob("*.xml")}
     assert {name for name, needs in found.items() if needs.only_glass} == GLASS_ONLY
     assert {name for name, needs in found.items() if not needs.environment} == {"fibre", "mirage"}
@@ -141,8 +139,7 @@ def unseen(needs, seen):
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in SCENES.glob("*.xml")))
-def test_no_path_meets_what_the_scene_does_not_need(name):
-    mi.set_variant("scalar_rgb")
+def test_no_path_meets_what_the_scene_does_not_need(name, scalar_variant):
     scene = mi.load_file(str(SCENES / f"{name}.xml"), res=4)
     needs, seen = inspect(scene), met(scene)
     assert unseen(needs, seen) == set()
@@ -150,8 +147,7 @@ def test_no_path_meets_what_the_scene_does_not_need(name):
     assert seen and unseen(wrong, seen) == seen
 
 
-def test_what_is_left_out_has_its_reason():
-    mi.set_variant("scalar_rgb")
+def test_what_is_left_out_has_its_reason(scalar_variant):
     found = inspect(mi.load_file(str(SCENES / "slab.xml"), res=4)).left_out
     assert found["emitter sampling"] == "every BSDF has delta lobes only"
     assert set(found) == {"emitter sampling", "a random number", "media", "null lobes", "dispersion"}
@@ -162,9 +158,8 @@ def test_what_is_left_out_has_its_reason():
     assert {"area lights", "environment", "polarisation"} <= set(dark)
 
 
-def test_an_edit_changes_what_is_needed():
+def test_an_edit_changes_what_is_needed(scalar_variant):
     """A lamp's own black surface, made grey."""
-    mi.set_variant("scalar_rgb")
     scene = mi.load_dict({"type": "scene", "lamp": LAMP})
     assert not inspect(scene).smooth
     params = mi.traverse(scene)

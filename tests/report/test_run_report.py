@@ -119,6 +119,14 @@ def test_junit_counts_budgets_and_leaves_out_rows_that_cannot_fail(tmp_path):
     assert cases["cross / generic / cuda float32"][0].get("message") == "no CUDA device \ufffd[0m"
 
 
+def test_a_missed_goal_is_no_case(tmp_path):
+    row = dataclasses.replace(GOOD, goals={"time": 1.1})
+    assert row.missed
+    run_report.write_junit(tmp_path / "junit.xml", [row], CONTEXT)
+    names = [case.get("name") for case in xml.parse(tmp_path / "junit.xml").iter("testcase")]
+    assert names == ["promoted / generic / llvm float32: worst"]
+
+
 def test_summary_puts_broken_budgets_first_and_takes_names_literally():
     console = pytest.importorskip("rich.console").Console(width=120, record=True, file=io.StringIO())
     page = {"answers": [{"question": "Is it [red]right?", "text": "`No`.", "state": "no", "study": "speed"}]}

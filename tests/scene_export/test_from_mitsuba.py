@@ -154,6 +154,14 @@ def _united(scene, shapes):
         yield [list(box.min), list(box.max)]
 
 
+@pytest.mark.parametrize("flip, side", [("", 1), ('<boolean name="flip_normals" value="true"/>', -1)])
+def test_flipped_normals_stay_flipped(flip, side, scene, tmp_path):
+    path = scene('<shape type="sphere" id="ball">', f'<shape type="cube" id="ball">{flip}')
+    ray = mi.Ray3f([0.1, 0.2, -40], [0, 0, 1])
+    for each in (original(path), again(from_mitsuba.load(path), tmp_path / "plain")):
+        assert met(each, ray)[2:4] == [-1, side]
+
+
 @pytest.mark.parametrize(
     "old, new",
     [

@@ -172,6 +172,14 @@ def test_radiance_sky_is_read_as_it_is_meant(small, sky, tmp_path):
         assert value == pytest.approx(environment_map.radiance(sky, direction[None])[0, 1], abs=1e-6)
 
 
+# --- LuxCore ---------------------------------------------------------------------------------------------
+
+
+def test_luxcore_sees_the_whole_image_and_no_more(small):
+    """The window is 2 wide and as much lower as the image is, 4 : 8, and lies one row, 2 / 8, deeper."""
+    assert "scene.camera.screenwindow = -1.0 1.0 -0.75 0.25\n" in luxcore.files(small)["scene.scn"].decode()
+
+
 # --- POV-Ray ---------------------------------------------------------------------------------------------
 
 

@@ -5,6 +5,7 @@ import itertools
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.variants import switch
 
 from mi_refract.scene_export import tessellation
 
@@ -64,7 +65,7 @@ def test_closed_sees_a_defect():
 
 def colour_faults(scales, triangles, seed=3):
     """How many of 400 points of the two parts have another of the checkerboard's colours."""
-    mi.set_variant("scalar_rgb")
+    switch("scalar_rgb")
     texture = mi.load_dict(
         {
             "type": "checkerboard",

@@ -185,6 +185,31 @@ def test_an_interrupted_run_goes_on_where_it_stopped(context):
     assert calls[-2:] == ["first", "first"]
 
 
+def test_rows_are_in_the_order_of_the_tasks_and_of_each(context):
+    made = [dataclasses.replace(row(), subject=name) for name in "abcd"]
+    tasks = [Task("first", lambda: made[:2]), Task("last", lambda: made[2:])]
+    for _ in range(2):  # measured, then taken up again
+        assert runner.run(tasks, context)[0] == made
+
+
+def test_rows_are_taken_up_again_for_the_same_sources_only(context, tmp_path, monkeypatch):
+    names = ("package/room/a.py", "validation/room/b.py", "validation/room/c.json", "scenes/planar/d.toml")
+    for name in names:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("old")
+    monkeypatch.setattr(runner.mi_refract, "__file__", str(tmp_path / "package/__init__.py"))
+    monkeypatch.setattr(runner, "__file__", str(tmp_path / "validation/runner.py"))
+    monkeypatch.setattr(runner, "SCENES", tmp_path / "scenes")
+    calls = []
+    task = Task("a task", lambda: calls.append(1) or [row()])
+    for count, name in enumerate((*names, None), 1):
+        for _ in range(2):
+            runner.run([task], context)
+        assert len(calls) == count, names[count - 2]
+        if name:
+            (tmp_path / name).write_text("new")
+
+
 def study(*rows):
     return types.SimpleNamespace(
         STUDY=Study("directions", "A study", "What it asks.", {}, lambda context: [Task("a task", lambda: list(rows))])
@@ -289,6 +314,11 @@ def test_the_accuracy_table_holds_the_rows_and_nothing_else():
         "0.834",
         "1.01 (0.98–1.2)",
     ]
+
+
+def test_a_share_of_several_scenes_is_that_of_all():
+    assert readme_tables._percent([0.31, 0.1, 0.25]) == "10–31 %"
+    assert readme_tables._percent([0.101, 0.1]) == "10 %"
 
 
 NOTHING_MEASURED = {

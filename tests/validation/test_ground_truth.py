@@ -6,6 +6,7 @@ import math
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.variants import switch
 
 from validation import limits
 from validation.ground_truth import rainbow, traced_bodies, traced_system, traced_systems
@@ -111,7 +112,7 @@ def test_compiled_rays_are_those_of_the_scalar_variant(made, needs_variant, scal
     """To roundings: a mistake in the order of rays or components would be of the size of the bodies."""
     needs_variant("llvm_ad_rgb")
     one = made["slab"].traced("refract")
-    mi.set_variant("llvm_ad_rgb")
+    switch("llvm_ad_rgb")
     other = made["slab"].traced("refract")
     assert np.abs(one.places - other.places).max() < 1e-4
     assert np.abs(one.directions - other.directions).max() < 1e-5

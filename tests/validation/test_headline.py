@@ -7,11 +7,11 @@ import pytest
 
 from mi_refract.report.first_page import STATES
 from mi_refract.report.row import Row
-from validation import headline
 from validation.directions import per_formula
 from validation.efficiency import error_against_time
 from validation.ground_truth import traced_bodies
 from validation.renders import against_dielectric
+from validation.run import headline
 from validation.stability import layered_paths, optical_chains
 
 WORST = {"worst rad": 5e-8, "worst / u": 0.9, "TIR misclassified": 0.0, "TIR misclassified, beyond its bound": 0.0}

@@ -42,3 +42,4 @@ def test_a_mutant_that_escapes_fails_its_row_and_so_does_a_control_that_is_seen(
     assert rows["swapped k"].broken == {"escaped": 0.0}
     assert rows["control"].broken == {"rays that see it": 0.0}
     assert rows["control"].reason.startswith("caught by ")
+    assert f": {planted_defects.MISCLASSIFIED_FAR} " in rows["control"].reason

@@ -23,6 +23,12 @@ def measured(vectorised):
     return Setting(vectorised.backend, vectorised.precision, vectorised.vector)
 
 
+@pytest.fixture(scope="module")
+def in_float32(float32):
+    """As `measured`, in float32 only."""
+    return Setting(float32.backend, float32.precision, float32.vector)
+
+
 @pytest.fixture
 def replace(monkeypatch):
     """Put `function` in the place of a formula."""
@@ -105,13 +111,13 @@ def stubborn(a, n, k, contrast=None):
     ("defect", "regime", "broken"),
     [(rare, "generic", {"error / bound"}), (stubborn, "critical", {"TIR misclassified, beyond its bound"})],
 )
-def test_a_sweep_sees_defects_of_a_few_rays(defect, regime, broken, measured, replace, monkeypatch):
+def test_a_sweep_sees_defects_of_a_few_rays(defect, regime, broken, in_float32, replace, monkeypatch):
     monkeypatch.setattr(sweep, "CHUNK", 20_000)
-    sound = {row.subject: row for row in sweep.regime_rows(regime, measured, 50_000, 16)}
+    sound = {row.subject: row for row in sweep.regime_rows(regime, in_float32, 50_000, 16)}
     assert sound["promoted"].verdict == "pass"
     assert sound["promoted"].values["rays"] == 50_000
     replace("compensated", defect)
-    row = {row.subject: row for row in sweep.regime_rows(regime, measured, 50_000, 16)}["compensated"]
+    row = {row.subject: row for row in sweep.regime_rows(regime, in_float32, 50_000, 16)}["compensated"]
     assert set(row.broken) == broken
     assert {"a", "n", "k"} == set(row.replay["worst ray"])
 
@@ -163,9 +169,9 @@ def test_the_herd_stays_in_its_domain_and_gets_no_better(measured):
     assert again.rays.a.tobytes() == last.rays.a.tobytes()
 
 
-def test_every_formula_has_its_rows(measured, scalar_context, monkeypatch):
-    monkeypatch.setattr(search, "settings", lambda context: [measured])
-    monkeypatch.setattr(sweep, "settings", lambda context: [measured])
+def test_every_formula_has_its_rows(in_float32, scalar_context, monkeypatch):
+    monkeypatch.setattr(search, "settings", lambda context: [in_float32])
+    monkeypatch.setattr(sweep, "settings", lambda context: [in_float32])
     context = scalar_context(sweep_rays=2000, certified=4, generations=1)
     rows = [row for study in (sweep, search) for task in study.tasks(context) for row in task.run()]
     assert {(row.study, row.subject) for row in rows} == {(s, name) for s in ("sweep", "search") for name in FORMULAS}

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.variants import switch
 
 from mi_refract import backend
 from mi_refract.plugins import refract
@@ -19,11 +20,9 @@ def context(tmp_path):
     usable = [name for name, why in variants.items() if why is None and name.endswith("ad_rgb")]
     if not usable:
         pytest.skip("no LLVM or CUDA variant runs here")
-    before = mi.variant()
-    mi.set_variant(usable[0])
+    switch(usable[0])
     quick = dataclasses.replace(PROFILES["standard"], repeats=3)
-    yield Context(quick, tmp_path, usable[0], backend.detect(), variants)
-    mi.set_variant(before)
+    return Context(quick, tmp_path, usable[0], backend.detect(), variants)
 
 
 def planted(monkeypatch, **methods):

@@ -1,6 +1,6 @@
-"""Which defects does each method of image comparison see, how often is it wrong, and what does it cost?
+"""Which defects does each method of image comparison see, what are its false alarms, and how long does it take?
 
-In: renders of two scenes, clean and with planted defects. Out: rows with the share of trials in which each defect was
+In: renders of two scenes, with and without planted defects. Out: rows with the share of trials in which each defect was
 seen, false alarms, times and sizes.
 """
 

@@ -1,9 +1,9 @@
-"""What `mi-refract diff` sees of defects in real renders, and how often it alarms at equal ones.
+"""Which defects `mi-refract diff` sees in real renders, and how often it reports a difference between equal ones.
 
-Defects of a renderer are planted in the glass, those of an image in the pixels. The ball of the scene `sphere` holds a
-lamp here, off its centre: without one η² on the way in and 1/η² on the way out cancel on every path, and no path is
-totally reflected. A pair of renders by another sampler is equal for a method that knows noise, and for no other. Null
-pairs have seeds that no other pair has, so that their number of alarms is binomial.
+Defects of a renderer are planted in the glass, defects of an image in its pixels. In the scene `sphere` the ball holds
+a lamp, off its centre. Without it the factors η² and 1/η² on the way in and out would cancel on every path, and no path
+would be totally reflected. Renders with another sampler are equal for a method that models noise, and different for the
+others. Each null pair (two equal renders) has seeds of its own, so the number of false alarms is binomial.
 """
 
 from __future__ import annotations

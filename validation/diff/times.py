@@ -1,9 +1,9 @@
-"""Diff, times: what a verdict costs beside reading the files, how long a page takes, and the memory of it all.
+"""Run time of a comparison, beside that of reading the files, and of its HTML page; and the memory of both.
 
-The images are smooth ones with the noise of 16 samples per pixel, zip-compressed EXR. Subjects take turns, and
-medians of the rounds count, with 95 % intervals. Seconds are this machine's, so they have goals and no budgets, and
-those only at the sizes they were set for; Python's start and its imports are not in them. What has a budget is the size
-of the page. Memory is the largest of a whole process, which compares, and writes the page.
+The images are smooth, with the noise of 16 samples per pixel, in zip-compressed EXR files. All subjects run once per
+round; medians over the rounds are reported, with 95 % intervals. Times depend on the machine, so they have goals and no
+budgets; the start of Python and its imports are not counted. The size of the page has a budget. Memory is the peak of a
+process that compares and writes the page.
 """
 
 from __future__ import annotations

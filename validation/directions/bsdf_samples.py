@@ -1,7 +1,7 @@
-"""Samples: `refract` against `dielectric`, one `bsdf.sample` at a time, in every variant of the wheel.
+"""Samples: `refract` against `dielectric`, one `bsdf.sample` at a time, in every variant that Mitsuba's wheel offers.
 
-Rays from outside and inside, both lobes together and each alone, radiance and importance. Where both plugins chose
-the same lobe, directions, densities, weights and relative indices are compared entry by entry.
+Rays come from outside and from inside, with both lobes and with each alone, for radiance and for importance. Where both
+plugins chose the same lobe, their directions, densities, weights and relative indices are compared entry by entry.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from validation.study import Study, Task, about
 NAME = "samples"
 TERMS = {
     "lobe flips": "rays for which the two plugins chose different lobes",
-    "wo, pdf, eta, weight": "entries of the sample: worst, and what 99 rays of 100 stay below. Of Mueller matrices the "
-    "differences are times the smaller cos²θ: the built-in goes back from wo to the cosine of wi by Snell's law, and "
-    "what that cancels it divides by that cosine's square",
+    "wo, pdf, eta, weight": "differences of the sample's entries: the largest, and that of the 99th percentile. "
+    "Those of Mueller matrices are multiplied by the smaller cos²θ, because the built-in recomputes the cosine of wi "
+    "from wo by Snell's law, and divides by its square the digits that are lost in this",
 }
 SEED = 2027
 INT_IOR, EXT_IOR = 1.5, 1.0

@@ -1,9 +1,10 @@
-"""Directions: every formula against the certified answer, ray by ray, with the time it takes.
+"""Directions: every formula against the certified answer, ray by ray, and its run time.
 
-The error of a ray is the chord |b/|a| − exact| in units of roundoff u (2⁻²⁴, 2⁻⁵³), and the angle in radians.
-Its bound is an a-priori one for that very ray. Rays whose total internal reflection was decided wrongly are counted,
-and left out of the errors. Times are those of kernels that stream rays from memory, as a multiple of the time of
-copying the same bytes (a + k n). The stepped line joins the formulas that none is both faster and more accurate than.
+The error of a ray is the chord |b/|a| − exact| in units of roundoff u (2⁻²⁴ or 2⁻⁵³), and the angle in radians. It is
+compared with the formula's a-priori bound for that ray. Rays whose total internal reflection was misclassified are
+counted, and left out of the errors. A time is that of a kernel that streams rays from memory, divided by the time of
+copying the same bytes (a + k n). In the plots of error against time the stepped line joins the formulas that no other
+one beats in both.
 """
 
 from __future__ import annotations
@@ -40,16 +41,17 @@ TERMS = (
     | {
         WORST_IN_U: "the largest chord error in units of roundoff; rounding the exact answer costs 0.87",
         ERROR_OVER_BOUND: "the largest error of a ray over its a-priori bound",
-        MISCLASSIFIED: "rays whose total internal reflection was decided wrongly",
-        MISCLASSIFIED_FAR: "those of them that are farther from the critical angle than the formula's own error; at "
-        "the rounding limit, those whose radicand exceeds u² of its terms: below, the decision moves b by u at most",
-        FLOOR: "the certified direction times |a|, rounded: no form does better. At most √3/2 u where |a| = 1, and 1 u "
-        "elsewhere, where all components may have just passed a power of two",
+        MISCLASSIFIED: "rays whose total internal reflection was misclassified",
+        MISCLASSIFIED_FAR: "those of them that are farther from the critical angle than the formula's bound "
+        "explains; for formulas at the rounding limit, those whose radicand exceeds u² of its terms: below that "
+        "either decision moves b by at most u",
+        FLOOR: "the certified direction times |a|, rounded: no formula can do better. At most √3/2 u where |a| = 1, "
+        "else 1 u, as all components may be just above a power of two",
         "other side": "rays within 4u of the surface that a documented formula sends to the other side of it, because "
-        "it knows n·a to no more; their bound is wider by 2 cosθ_t, and their decision is either",
-        "no budget": "the documented formulas demand unit vectors: where those are not, their rows are shown only",
-        "length drift": "how far the length of b is from that of a, relative",
-        "slack": "by how much a constant of the bound could be smaller: of what is linear, of what is under the root",
+        "its n·a is not more accurate than that; their bound is wider by 2 cosθ_t, and either decision is accepted",
+        "no budget": "the documented formulas demand unit vectors: for other vectors their rows have no budget",
+        "length drift": "relative difference between the lengths of b and a",
+        "slack": "factor by which constants of the bound could be smaller, in the linear term and under the root",
     }
     | kernel_timing.TERMS
 )

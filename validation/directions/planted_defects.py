@@ -1,7 +1,8 @@
-"""Planted defects: formulas with one each, which the judgement of the directions must see.
+"""Planted defects: each formula with one mistake in it, which the check of the directions must detect.
 
-Slips of the documents as printed, and slips one makes. Each is judged by the budget of the formula that it spoils, on
-the same regimes of rays; one that no ray sees has escaped. The control is the formula as it is: no ray may see that.
+The mistakes are those printed in the documents, and common ones. Each spoilt formula is checked against the bound of
+the formula it was made from, on the same regimes of rays. A defect that no ray detects has escaped. The control is the
+formula without a defect: no ray may fail it.
 """
 
 from __future__ import annotations
@@ -206,8 +207,8 @@ MUTANTS = {
     "one-sided": Mutant("the root without the sign of n·a", _one_sided),
     "slipped cross product": Mutant("n × a with a wrong sign in one component", _slipped_cross),
     "no mirror": Mutant("total internal reflection lets the ray pass", _never_reflected),
-    "always transmitted": Mutant("total internal reflection is not told", _always(True)),
-    "never transmitted": Mutant("transmission is not told", _always(False)),
+    "always transmitted": Mutant("`transmitted` is True for every ray", _always(True)),
+    "never transmitted": Mutant("`transmitted` is False for every ray", _always(False)),
     "000 as printed": Mutant("n·a < 0 assumed", _printed_000, ("wedge",)),
     "001 as printed": Mutant("‖c‖ (n × ĉ), with ĉ = 0/0 at normal incidence", _printed_001, ("cross",)),
     "002 as printed": Mutant("N·L < 0 assumed", _printed_002, ("decomposed",)),

@@ -1,10 +1,10 @@
-"""Search: hill-climbing on the bits of rays, against every formula in every regime.
+"""Search for the worst rays: hill climbing on the bits of a ray, for every formula in every regime.
 
-The worst of a sample of each regime are the parents. In every generation each has children with a few numbers changed
-by a power of two of ulps, and the worst child that is no better than its parent takes its place. Climbed are the chord
-error, and the distance from the critical angle at which total internal reflection is still decided wrongly. Some
-children are as near to that angle as a few ulps of their numbers bring them. All stay in the domain: unit vectors stay
-unit up to rounding, lengths within 1e-18 … 1e18, ratios within the regime's.
+The first parents are the worst rays of a random sample of each regime. In each generation a parent gets children, in
+which a few numbers are changed by 2ⁱ ulps; the worst child replaces the parent if it is at least as bad. Two
+quantities are maximised: the chord error, and the distance from the critical angle at which total internal reflection
+is still misclassified. Some children are put within a few ulps of the critical angle. All rays stay in the domain: unit
+vectors stay unit up to rounding, lengths within 1e-18 … 1e18, ratios within those of the regime.
 
 `python -m validation.directions.search --keep` adds the worst to tests/data/worst_rays.txt, which the tests replay.
 """
@@ -37,8 +37,8 @@ from .worst_rays import Found
 NAME = "search"
 TERMS = {
     ERROR_OVER_BOUND: "the largest certified error found, over its ray's a-priori bound",
-    MISCLASSIFIED_FAR: "rays found whose total internal reflection the formula must decide rightly and does not",
-    "rays tried": "children of all generations",
+    MISCLASSIFIED_FAR: "rays found whose total internal reflection the formula must classify correctly and does not",
+    "rays tried": "number of children in all generations",
 }
 SEED = 2037
 SAMPLE, LARGEST_SAMPLE = 4000, 1 << 16
@@ -90,7 +90,7 @@ def _sample_size(profile: Profile) -> int:
 
 @dataclass(frozen=True)
 class Herd:
-    """Families: a parent each, its regime (an index into `names`), whether it climbs the decision, and its score."""
+    """The parents: rays, the regime of each (an index into `names`), whether its objective is "decision", its score."""
 
     rays: Rays
     regime: np.ndarray
@@ -117,7 +117,7 @@ def climb(
     seed: int = SEED,
     sample: int = SAMPLE,
 ) -> Herd:
-    """The herd after so many generations. `subject` is evaluated, and held to what `name` is held to."""
+    """The worst rays after `generations`. `subject` is evaluated, and compared with the bound of `name`."""
     rng, names = np.random.default_rng(seed), tuple(names)
     herd = _parents(name, subject, names, setting, seed, sample)
     rows = np.arange(len(herd))
@@ -277,12 +277,13 @@ def rescored(name: str, setting: Setting) -> list[Found]:
 def main(arguments: list[str] | None = None) -> int:
     """The search by hand: from the command line, or `arguments`; the exit code."""
     parser = argparse.ArgumentParser(
-        prog="validation.directions.search", description="Try to break the budgets of the formulas."
+        prog="python -m validation.directions.search",
+        description="Search for the rays with the largest errors of each formula.",
     )
-    parser.add_argument("formulas", nargs="*", help="keys of FORMULAS; all by default")
-    parser.add_argument("--generations", type=int, default=PROFILES["full"].generations)
-    parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--keep", action="store_true", help=f"add the worst to {worst_rays.PATH.name}")
+    parser.add_argument("formulas", nargs="*", help="names of formulas; all by default")
+    parser.add_argument("--generations", type=int, default=PROFILES["full"].generations, help="default: %(default)s")
+    parser.add_argument("--seed", type=int, default=SEED, help="of the ray generator; default: %(default)s")
+    parser.add_argument("--keep", action="store_true", help=f"add the worst rays to tests/data/{worst_rays.PATH.name}")
     options = parser.parse_args(arguments)
     if unknown := [name for name in options.formulas if name not in FORMULAS]:
         parser.error(f"unknown formula {unknown[0]!r}; accepted: {', '.join(FORMULAS)}")

@@ -1,8 +1,8 @@
-"""Sweep: every regime at full size; the screen finds the worst rays, and the oracle certifies these.
+"""Sweep: every regime at full size; a fast second solution finds the worst rays, and the oracle certifies these.
 
-The screen solves every ray a second way, right to 2⁻¹⁴⁰ of the radicand's terms. Certified by ball arithmetic are the
-rays that it finds worst, those whose total internal reflection a formula decides as the screen does not, and those too
-near to the critical angle for the screen. Only certified errors are shown.
+The fast solution (the "screen") is exact to 2⁻¹⁴⁰ of the radicand's terms. Ball arithmetic then certifies the rays with
+the largest errors, those on which a formula and the screen disagree about total internal reflection, and those too near
+to the critical angle for the screen. Only certified errors are shown.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from validation.study import Study, Task, about
 
 NAME = "sweep"
 TERMS = {
-    WORST_IN_U: "the largest certified chord error in units of roundoff, of the rays that were decided rightly",
+    WORST_IN_U: "the largest certified chord error in units of roundoff, without misclassified rays",
     ERROR_OVER_BOUND: "the largest certified error of a ray over its a-priori bound",
-    MISCLASSIFIED: "rays whose total internal reflection was decided wrongly: all that the screen is certain of, and "
+    MISCLASSIFIED: "rays whose total internal reflection was misclassified: all on which the screen is certain, and "
     "of the others those that were certified",
-    MISCLASSIFIED_FAR: "certified ones that the formula must decide rightly, as in the study of directions",
+    MISCLASSIFIED_FAR: "certified ones that the formula must classify correctly, as in the study of directions",
     "screen off": "the largest difference between the screen's chord error and the certified one, in u; infinite where "
-    "a decision that the screen is certain of was wrong",
-    "unresolved": "rays nearer to the critical angle than the screen resolves that were not certified either",
+    "the screen was certain of a decision and wrong",
+    "unresolved": "rays too near to the critical angle for the screen, and not certified",
 }
 SEED = 2031
 CHUNK = 1 << 16

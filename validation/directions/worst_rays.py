@@ -1,9 +1,10 @@
-"""The worst rays that were ever found: a text file, one ray a line, replayed by the tests.
+"""The worst rays found so far: a text file with one ray per line, which the tests replay.
 
-`precision | formula | regime | objective | score | a | n | k`, with hexadecimal floats. The objective is "chord",
-scored by the certified chord error in u, or "decision": total internal reflection that the formula decided wrongly,
-scored by |D| in u² of the radicand's terms (`oracle.relative_radicand`), or 0 once it is decided rightly. Adding rays
-scores the present ones anew, so that what the formula does today decides which are kept.
+A line is `precision | formula | regime | objective | score | a | n | k`, with hexadecimal floats. The objective is
+"chord", scored by the certified chord error in u, or "decision", a ray whose total internal reflection the formula
+misclassified, scored by |D| in u² of the radicand's terms (`oracle.relative_radicand`); the score is 0 once the formula
+classifies it correctly. When rays are added, the old ones are scored again, so that the present formula decides which
+are kept.
 """
 
 from __future__ import annotations

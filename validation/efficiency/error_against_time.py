@@ -1,9 +1,10 @@
-"""Efficiency: the error of an image against the time it took, by integrator, BSDF and sampler, in turn in one run.
+"""Efficiency: the error of an image against render time, by integrator, BSDF and sampler.
 
-The error is that against the mean of independent renders by the built-in, path + dielectric with its better stratified
-sampler, at the most samples per pixel measured here; the variance of that mean is subtracted. A ratio is formed within
-a round, in which every method renders the same seed; the median of the rounds counts. Efficiency must not be bought
-with bias: the mean of a method's images must agree with the built-in's, or the run fails.
+The reference is the mean of independent renders by the built-in (path + dielectric with the better of its stratified
+samplers) at the largest number of samples per pixel measured here; the variance of that mean is subtracted from the
+error. All methods render the same seed once per round; a ratio is formed within a round, and the median over the rounds
+is reported. A method must not be faster by being biased: the run fails if the mean of its images differs from the
+built-in's.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Scaling: time to the first image, time of later ones, and memory, as a scene grows in one respect.
+"""Scaling: time to the first image, time of later images, and memory, as one property of a scene grows.
 
-Each measurement is a process of its own, whose folder of compiled kernels is empty: the first image is the time from
-the loaded scene to the image, with all that is traced and compiled for it; the render is the median of those that
-follow; after an edit of one index of refraction comes one image more. Imports and loading do not count. Methods take
-turns, and medians of the processes count.
+Each measurement is a new process with an empty kernel cache. "First image" is the time from the loaded scene to the
+image, including tracing and compilation; "render" is the median of the following images; "after an edit" is one more
+image after one index of refraction was changed. Imports and loading are not counted. Methods run in turn, and medians
+over the processes are reported.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from validation.run.render_methods import BUILTIN, METHODS, Camera, Method, came
 from validation.study import Study, Task, about
 
 TERMS = {
-    "first image": "seconds, nothing compiled before; / built-in: over that of path + dielectric",
+    "first image": "seconds, with nothing compiled before; / built-in: over those of path + dielectric",
     "render": "seconds of a later image, the kernels in memory",
     "after an edit": "seconds of the image after an edit of one index of refraction",
-    "arrays MB": "most that Dr.Jit held for arrays at once, by its own account; process MB: most of the whole process",
+    "arrays MB": "peak of the memory that Dr.Jit reports for arrays; process MB: peak of the whole process",
 }
 AXES = {"x": "size", "y": "seconds", "slope": None}
 NAME = "scaling"

@@ -1,14 +1,15 @@
-"""The rainbow of one drop, rendered: sunlight traced onto a screen, and the angle at which its bright edge stands.
+"""The rainbow of one drop, rendered: sunlight traced onto a screen, and the angle of its bright edge.
 
-A disk of parallel light falls on a drop; a camera beside the drop looks back at a screen ten million radii away, on
-which particle tracing gathers what left the drop. So places on the image are angles to 3e-7. Near the least
-deflection D₀ a ray's own is D = D₀ + a δ² + …, δ the distance of its entry from that of the stationary ray: the light
-C(D) deflected by less than D is that of two intervals of δ, and odd powers of δ cancel between them. Hence
+A disk of parallel light illuminates a drop; a camera beside the drop looks back at a screen ten million radii away, on
+which particle tracing gathers the light that left the drop. At this distance a place on the image is an angle, to 3e-7.
+Near the least deflection D₀ a ray is deflected by D = D₀ + a δ² + …, where δ is the distance between its entry and that
+of the stationary ray. The light C(D) that is deflected by less than D comes from two intervals of δ, in which the odd
+powers of δ cancel. Hence
 
     C² = s (D − D₀) + q (D − D₀)² + …
 
-and a parabola through D as a function of C² meets C = 0 in the rainbow angle. Light of other paths is smooth there;
-its density in the dark band before the edge is taken off.
+and a parabola fitted to D as a function of C² gives the rainbow angle at C = 0. Light of other paths is smooth there;
+its density is measured in the dark band before the edge and subtracted.
 """
 
 from __future__ import annotations

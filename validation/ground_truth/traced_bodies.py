@@ -1,11 +1,11 @@
-"""Ground truth: rays and a render through actual Mitsuba, against closed forms and CODE V's print.
+"""Ground truth: rays and a render in Mitsuba, against closed forms and CODE V's printed results.
 
 Rays are intersected with Mitsuba's shapes and refracted by the plugin's own samples, boundary by boundary, through
-bodies whose answer is known: their errors stand over a bound of what float32 may do on the way
-(`validation/ground_truth/traced_system.py` counts it), which is of the worst case. The double Gauss is that of a file,
-`validation/reference/double_gauss_codev.json`, as ray-optics (BSD-3-Clause) carries CODE V's listing. The rainbow is
-measured on an image (`validation/ground_truth/rainbow.py`): its error stands over what chance leaves once in ten
-thousand runs. The built-in `dielectric` is shown beside, without budgets.
+bodies whose answer is known. Their errors are divided by a worst-case bound on what float32 may do on the way
+(`validation/ground_truth/traced_system.py`). The double Gauss is read from
+`validation/reference/double_gauss_codev.json`: CODE V's listing, as ray-optics (BSD-3-Clause) has it. The rainbow is
+measured on an image (`validation/ground_truth/rainbow.py`); its error is divided by a bound that chance exceeds once in
+ten thousand runs. The built-in `dielectric` is shown for comparison, without budgets.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ TERMS = {name: " ".join((make.__doc__ or "").split()) for name, make in BENCHES.
     "shift, place, miss / mm": "largest distance from where the ray should be; of a miss, of its line from the focus",
     "direction / °": "largest |d − exact|, as an angle",
     "tangent": "largest deviation of (dx/dz, dy/dz)",
-    ERROR_OVER_BOUND: "largest of all of these over its own bound: the sum of what every rounding on the way may do, "
-    "and, of the double Gauss, what its print is off; of the rainbow, as many standard errors as Student's t exceeds "
-    "once in ten thousand times, and the blur of pixels",
-    "index seen": "the least relative error of every index that takes a ray to its bound: a bound that holds whatever "
-    "comes would be no test",
-    "…, spawned": "the same if rays go on as in a render, set off by Mitsuba along the normal: the same for any plugin",
+    ERROR_OVER_BOUND: "largest of all of these over its own bound: the sum of the effects of every rounding on the "
+    "way, and, for the double Gauss, the rounding of its printed numbers; for the rainbow, the number of standard "
+    "errors that Student's t exceeds once in ten thousand runs, and the blur of pixels",
+    "index seen": "the smallest relative error of all indices that moves a ray to its bound; large values would mean "
+    "that the bound tests nothing",
+    "…, spawned": "the same with Mitsuba's ray offset along the normal, as in a render: the same for any plugin",
     "rainbow": "D₀ = π + 2i − 4r, cos i = √((n² − 1)/3), sin r = sin i / n: 137.92° for n = 1.333",
     "standard error / °": "of the mean over renders with seeds of their own",
 }

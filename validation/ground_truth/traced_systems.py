@@ -1,6 +1,6 @@
-"""The benches with a closed or a printed answer: slab, prism, aplanatic ball, ellipsoid lens, drop and double Gauss.
+"""The systems with a known answer: slab, prism, aplanatic ball, ellipsoid lens, drop and double Gauss.
 
-Lengths are in mm, of the order of 100, and bodies of BK7 in air where nothing else is said.
+Lengths are in mm, of the order of 100; bodies are of BK7 in air unless stated otherwise.
 """
 
 from __future__ import annotations

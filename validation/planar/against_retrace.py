@@ -1,12 +1,11 @@
 """Planar: `planar.trace` against an independent retrace, on every scene file.
 
-Paths are followed once more in extended precision, by implicit curves and momenta. A ray takes a wrong path where it
-meets other boundaries than it should, or ends another way. Of the others, every point and the last direction count, and
-stand over what rounding may have grown to: each boundary adds a few roundings of the largest coordinate so far and of
-the angle, a facet's own turn by its rounded ends and 1/cos behind the boundary among them, and the first-order transfer
-of a displaced and tilted ray carries them on (`validation/planar/error_growth.py`). Rays are the file's, and seeded
-ones scattered around them; `clutter` are scenes by chance, of bodies of every kind, nested and turned. Then the
-formulas by name.
+The retrace follows each path again in extended precision, by other formulas (implicit curves and momenta). A ray whose
+path meets other boundaries, or ends in another way, takes a "wrong path". For the others every point and the last
+direction are compared, and their errors divided by a bound on rounding: at each boundary a few roundings of the largest
+coordinate so far and of the angle, the turn of a facet by its rounded ends, and 1/cos behind the boundary, all carried
+on to first order (`validation/planar/error_growth.py`). Rays are those of the file, and random ones near them.
+`clutter` are random scenes of bodies of every kind, nested and turned. At the end the formulas are compared by name.
 """
 
 from __future__ import annotations
@@ -36,11 +35,11 @@ from .rounding_ambiguity import undecided
 DIFFERENCE, BOUNDARIES = "difference", "boundaries"
 TERMS = {
     DIFFERENCE: "largest distance of a point from the retrace, over the extent of the scene, and |d − exact|",
-    ERROR_OVER_BOUND: "largest of any point and last direction, over what rounding may have grown to",
+    ERROR_OVER_BOUND: "largest error of any point or last direction over its bound on rounding errors",
     WRONG_PATH: "rays that meet other boundaries than they should, or end another way",
-    WRONG_PATH_FAR: "of these, how many no rounding excuses: they pass every vertex of their boundaries at more than "
-    "their bound, touch no curve, and are off the critical angle",
-    BOUNDARIES: "the most that a ray meets",
+    WRONG_PATH_FAR: "those of them that rounding cannot explain: they pass every vertex of their boundaries at more "
+    "than their bound, touch no curve, and are not at the critical angle",
+    BOUNDARIES: "largest number that a ray meets",
 }
 NAME = "planar"
 FOLDER = SCENES / "planar"

@@ -1,11 +1,11 @@
-"""Planar, closed: paths whose end is known in closed form.
+"""Planar, closed answers: paths whose end is known in closed form.
 
-A billiard in a box unfolds into a straight line by mirror images; the corners are whole numbers though no side is
-along an axis. An ellipse of eccentricity 1/n gathers rays along its axis in its far focus, and a circle around that
-lets them out of the glass unbent. A ball sends rays from a point R/n from its centre as though from n R. A prism of
-apex A deviates by i + asin(n sin(A − asin(sin i/n))) − A, a drop by π + 2 asin b − 4 asin(b/n) for its first rainbow.
-Beside the lens of arcs stands the same one in facets, of which each is off in its direction by up to half the angle
-to the next.
+In a box mirror images unfold a path of total reflections into a straight line; the corners are whole numbers, though no
+side is along an axis. An ellipse of eccentricity 1/n focuses rays along its axis into its far focus; a circle around
+that focus lets them leave the glass unrefracted. A ball refracts rays from a point R/n from its centre as though they
+came from n R. A prism of apex A deviates rays by i + asin(n sin(A − asin(sin i/n))) − A, a drop by
+π + 2 asin b − 4 asin(b/n) for its first rainbow. A lens of arcs is also compared with the same lens in facets, each of
+which is turned by up to half the angle to the next one.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from . import against_retrace
 from .against_retrace import Case, budgets, judge, unit
 
 TERMS = against_retrace.TERMS | {
-    "error": "largest deviation from the closed answer: of a line from the point that it should meet, over its "
-    "distance; of a direction, |d − exact|",
+    "error": "largest deviation from the closed answer: of a line from the point that it should meet, over the "
+    "distance to it; of a direction, |d − exact|",
     "error / u": "the same in units of roundoff",
     "box": "total internal reflections in a box of index 1.5, by their number; answers from mirror images",
 }

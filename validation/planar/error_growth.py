@@ -1,17 +1,18 @@
-"""How far rounding takes a path: what each boundary adds, carried on to first order.
+"""How far rounding errors move a path: the error added at each boundary, carried on to first order.
 
-A ray that is off by h across itself (to its left) and by φ in its angle is off, behind a boundary and L farther on, by
+Let a ray be displaced by h across itself (to its left) and turned by φ. Behind a boundary, and L farther on, it is
+displaced and turned by
 
     h' = h d'_n/d_n + L φ',    φ' = g φ − (1 − g) κ h/d_n,    g = n d_n/(n' d'_n)
 
-where d and d' are its directions before and behind, the index n stands for normal components (of a reflection g = −1),
-and κ is the curvature. Each boundary adds, in units of ROUNDINGS · u,
+where d and d' are its directions before and behind, the index n marks normal components, κ is the curvature, and g = −1
+for a reflection. Each boundary adds, in units of ROUNDINGS · u,
 
     to h: S (1 + |d'_n/d_n| + |d × d'|/|d_n|)          to φ: 1 + |g| + 1/|d'_n| + |1 − g| S/ℓ
 
-S: the largest coordinate so far, of the path and of the segments it met, for coordinates are rounded to u S, and with
-them the ends of a segment of length ℓ, which turns by S/ℓ; 1/|d'_n|: a cosine as √(1 − X²). The sum of the magnitudes
-bounds what they all do. It holds as long as the path meets the boundaries that it should.
+S is the largest coordinate so far, of the path and of the segments it met: coordinates are rounded to u S. So are the
+ends of a segment of length ℓ, which turns it by S/ℓ. 1/|d'_n| comes from a cosine computed as √(1 − X²). The sum of the
+magnitudes is a bound as long as the path meets the right boundaries.
 """
 
 from __future__ import annotations

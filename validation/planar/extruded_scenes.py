@@ -1,10 +1,10 @@
-"""Extruded: a planar scene as upright walls in Mitsuba, with the `refract` BSDF, along the same rays.
+"""Planar, extruded: a planar scene as upright walls in Mitsuba, with the BSDF `refract`, along the same rays.
 
-Each segment becomes a wall of two triangles along z, arcs in facets; the walls between two media are a mesh with the
-left medium outside. Rays in the plane z = 0 are traced by Mitsuba's own intersection and the plugin's own samples,
-reflected only where all is reflected, and compared with the retrace of the same facets. Behind a boundary Mitsuba
-moves a ray along the normal, by up to 1500 u (1 + max |p|), which `spawn_ray` does: that is a share of the bound then.
-Moved along itself by as much instead, a ray stays on its line, and all that is left is rounding.
+Each segment becomes a wall of two triangles along z; arcs become facets. The walls between the same two media are one
+mesh, whose outside is the left medium. Rays in the plane z = 0 are traced with Mitsuba's own intersection and the
+plugin's own samples, reflected only where reflection is total, and compared with the retrace of the same facets. Behind
+a boundary `spawn_ray` of Mitsuba moves a ray along the normal, by up to 1500 u (1 + max |p|), and the bound includes
+this. In the rows "along the ray" a ray is moved along itself by as much instead, so that only rounding is left.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from .against_retrace import FOLDER, Case, judge
 
 TERMS = against_retrace.TERMS | {
     "along the ray": "rays moved along themselves behind a boundary, so that they do not meet it again",
-    "spawn_ray": "moved along the normal, as Mitsuba does by itself; the bound counts that in",
+    "spawn_ray": "rays moved along the normal, as Mitsuba does; the bound includes that",
     "from planar float32, float64": "largest distance from the points of `planar.trace`, over the extent, where both "
     "meet the same walls",
 }

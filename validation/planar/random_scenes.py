@@ -1,4 +1,4 @@
-"""Planar scenes by chance: bodies of every kind, nested and turned, and rays through them, some reflected at will."""
+"""Random planar scenes: bodies of every kind, nested and turned, and rays through them, some of them reflected."""
 
 from __future__ import annotations
 

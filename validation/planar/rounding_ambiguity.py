@@ -1,4 +1,4 @@
-"""Where rounding decides what a ray meets: at a vertex, where it touches a curve, and at the critical angle."""
+"""Rays for which rounding decides what they meet: at a vertex, where they touch a curve, and at the critical angle."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
 """Planar, times: paths through the lens of document 004, against the number of segments.
 
-Parallel rays pass two boundaries each; beyond a thousand segments there are more lenses, and rays through any of them.
-A path is all of `Tracer.__call__`, from arrays of rays to arrays of points.
-Methods and sizes take turns, and medians of the rounds count, with 95 % intervals. Seconds are this machine's, so they
-have goals and no budgets; what has a budget is that both methods return the same bits. Grown like log M, the cost of
-a doubling of the segments is constant: it is what a straight line through the cost against log₂ M says.
+Parallel rays cross two boundaries each; beyond a thousand segments there are more lenses, and each ray goes through one
+of them. The time of a path is that of `Tracer.__call__`, from arrays of rays to arrays of points, per ray. Methods and
+sizes run in turn; medians over the rounds are reported, with 95 % intervals. Times depend on the machine, so they have
+goals and no budgets; that both methods return the same bits is a budget. If the cost grows like log M, each doubling of
+the number of segments M adds the same: this is fitted by a line through the cost against log₂ M.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from validation.study import Study, Task, about
 PER_PATH = "µs per path"
 TERMS = {
     PER_PATH: "median time of a path of two boundaries; low, high: its 95 % interval",
-    "ms to compile": "of the first call, what the later ones do not take; 0 where a kernel was kept",
-    "ms to set up": "of the segments, once: tables, and the mesh",
-    "differing": "paths of which a bit differs between the two methods",
-    "per doubling": "what twice as many segments add to a path, over the path at a thousand; beyond a thousand",
-    "most over a thousand": "the cost of a path among the most segments over that among a thousand",
-    "shuffled": "rays in no order; else they come lens by lens, from one side of each to the other",
-    "M": "segments; 1172 are those of the original program",
+    "ms to compile": "time of the first call less that of a later one; 0 where the kernel was in the cache",
+    "ms to set up": "once for the segments: tables, and the mesh",
+    "differing": "paths that differ between the two methods in any bit",
+    "per doubling": "time that twice as many segments add, over the time at a thousand; from a thousand on",
+    "most over a thousand": "time per path with the most segments over that with a thousand",
+    "shuffled": "rays in random order; otherwise lens by lens, from one side of each to the other",
+    "M": "number of segments; the original program has 1172",
 }
 AXES = {"x": "segments", "y": PER_PATH, "x_scale": "log", "y_scale": "log", "slope": None}
 NAME = "planar_times"

@@ -1,4 +1,4 @@
-"""Planar scenes extruded: segments as upright walls in Mitsuba, and their plan."""
+"""Planar scenes extruded: segments as upright walls in Mitsuba, and their view from above."""
 
 from __future__ import annotations
 

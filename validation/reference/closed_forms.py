@@ -1,7 +1,7 @@
-"""Closed forms of refraction by simple bodies. Angles in radians; `index`: of the body over that of the outside.
+"""Closed forms of refraction by simple bodies. Angles are in radians; `index` is that of the body over that outside.
 
-Sources: Born and Wolf, Principles of Optics, 4.7.2 (prism); Descartes, Les Météores, 1637 (rainbow). The slab's is
-plane trigonometry.
+Sources: Born and Wolf, Principles of Optics, 4.7.2 (prism); Descartes, Les Météores, 1637 (rainbow). The slab follows
+from plane trigonometry.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""A second exact answer, a thousand times faster than the certified one: it says which rays are worth certifying.
+"""A second exact answer, a thousand times faster than the certified one; it finds the rays worth certifying.
 
 Snell's law for the exact inputs in unevaluated sums of floats (`numerics.float_expansions`), for float32 and float64
-alike, with none of the arithmetic of the formulas it judges:
+alike, by none of the arithmetic of the formulas it checks:
 
     b = k a + n (s √D − k c)/n²,   b = a − 2 c n/n² under total internal reflection
     c = n·a,   D = c² − (k² − 1)|n×a|²,   s = sign(c)

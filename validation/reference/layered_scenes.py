@@ -1,9 +1,8 @@
 """Nested media: the layers of `scenes/mirage.xml` and `scenes/fibre.xml`, and the exact path of a ray through them.
 
-`python -m validation.reference.layered_scenes` writes the layers into both scenes, between their markers. Every solid
-lies inside the one before it, so that each boundary is that of two absolute indices. Thinner layers than these are not
-to be had: after each boundary Mitsuba moves a ray along the normal by OFFSET (1 + max |p|), and steps over what is
-thinner.
+`python -m validation.reference.layered_scenes` writes the layers into both scene files, between two marker comments.
+Every solid lies inside the one before it, so each boundary separates two absolute indices. The layers cannot be much
+thinner: after each boundary Mitsuba moves a ray along the normal by OFFSET (1 + max |p|), and would skip thinner ones.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""Paths in the plane in extended precision: the judge of `mi_refract.planar`, with which it shares nothing.
+"""Paths in the plane in extended precision: the reference for `mi_refract.planar`, with which it shares no code.
 
 Boundaries are implicit curves. With the barycentric coordinates τ of a point in the triangle start, control, end, an
-arc of weight w is τ₁² = 4w² τ₀τ₂ with τ₁ > 0 and τ₀ + τ₂ > 0: along a ray a quadratic in the distance. At a boundary
-the tangential part of P = n d is conserved, and P_n² becomes n'² − P_t²; where that is negative, P_n is reversed.
+arc of weight w is τ₁² = 4w² τ₀τ₂ with τ₁ > 0 and τ₀ + τ₂ > 0; along a ray this is a quadratic in the distance. At a
+boundary the tangential part of P = n d is conserved, and P_n² becomes n'² − P_t²; where that is negative, P_n is
+reversed.
 """
 
 from __future__ import annotations

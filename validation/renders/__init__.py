@@ -1,4 +1,4 @@
-"""Does `refract` render the images of `dielectric`, in the same time, and at no cost for what a scene does not use?
+"""Does `refract` render the images of `dielectric`, as fast, and at no cost for features that a scene does not use?
 
 In: the scenes of `scenes/`, with either plugin. Out: rows with differences, significance, times and kernel sizes, and
 the images as EXR files.

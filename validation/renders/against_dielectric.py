@@ -1,9 +1,10 @@
-"""Renders: every scene with `refract` and with `dielectric`, same seeds and independent seeds, and what it costs.
+"""Renders: every scene with `refract` and with `dielectric`, with the same and with independent seeds, and times.
 
-Same seed: both plugins consume the same random numbers, so images agree but for last bits and the lobe decisions
-those flip. Independent seeds: Welch's t-test on tiles. The error of an image is relMSE against the mean of the
-built-in's other renders, less that mean's own variance. Times are of warm renders of at least a tenth of a second, the
-plugins in turn; below that the time to trace a plugin written in Python, half a millisecond a render, begins to count.
+With the same seed both plugins use the same random numbers, so the images agree except where a last bit changes the
+choice between reflection and refraction. Independent seeds are compared by Welch's t-test on tiles. The error of an
+image is relMSE against the mean of the built-in's other renders, minus the variance of that mean. Times are of warm
+renders of at least 0.1 s, the plugins in turn; in shorter ones the half millisecond that Mitsuba needs per render to
+trace a plugin written in Python would matter.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Scenes of glass balls side by side under a spotted sky, each ball with an index of its own."""
+"""Scenes of glass balls side by side under a sky with spots, each ball with its own index."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The surroundings of `scenes/balls.xml`: a dim sky with lamps, a hundred times as bright. Writes them as a script.
+"""The environment map of `scenes/balls.xml`: a dim sky with lamps a hundred times as bright.
 
-python -m validation.renders.lamp_environment
+`python -m validation.renders.lamp_environment` writes it to `scenes/lamps.exr`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Scenes: what each of them needs of an integrator and of a study, as the loaded scene shows it, in this variant.
+"""Scenes: which features each scene needs of an integrator and of a study, in this variant.
 
-1 where it has something that needs care. What a scene lacks is left out, of kernels and of studies: nothing is said of
-dispersion where no index depends on the wavelength, and nothing of polarisation where nothing polarises. The remark
-names what is left out, the replay the reason of each.
+A feature is 1 where the scene has it. What a scene lacks is left out of kernels and of studies: for example dispersion
+where no index depends on the wavelength, and polarisation where nothing polarises. The remark names what is left out,
+the replay the reason for each.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from validation.study import Study, Task, about
 TERMS = {
     "smooth": "some surface scatters, so that it can pay to sample the emitters there",
     "only glass": "every lobe of every surface is a delta",
-    "delta emitters": "some emitter can be found by sampling it only",
+    "delta emitters": "some emitter can be found only by sampling it",
 }
 NAME = "scenes"
 

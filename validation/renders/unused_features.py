@@ -1,9 +1,9 @@
-"""Features: what each costs in a kernel, what a scene of many glasses costs, and what an edit of the index costs.
+"""What a scene does not use: the cost of each feature in a kernel, of many glasses, and of an edit of the index.
 
 A feature that is not used must not be in the kernel: the plugin's `sample` is traced alone, with and without it, and
-Dr.Jit's operations are counted. Renders are of glass balls side by side under a spotted sky, each with an index of its
-own. A first image is one that no cache knows: the scene's `max_depth`, a literal of the kernel, was never used before.
-Dr.Jit compiles what a scene might call for every plugin that is alive, so each scene is measured alone.
+Dr.Jit's operations are counted. Renders show glass balls side by side under a sky with spots, each with its own index.
+For a first image the scene gets a `max_depth` that was never used before; it is a literal in the kernel, so no cache
+holds that kernel. Dr.Jit compiles the code of every plugin that is alive, so each scene is measured alone.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from .glass_balls import RESOLUTION, Balls, alone, compiled, seconds_of, size_of
 
 TERMS = {
     "operations": "Dr.Jit's count for the whole kernel; of `sample` alone, or of a render",
-    "added": "operations more than those of the plain plugin, in radiance mode, with both lobes",
-    "compiled": "kernels that no cache had, in all images after the first",
+    "added": "operations in addition to those of the plain plugin, in radiance mode, with both lobes",
+    "compiled": "kernels compiled (in no cache) in all images after the first",
     "first image": "seconds from a loaded scene to its image, kernels compiled; over the built-in's, median of "
     "alternating pairs; low, high: its 95 % interval, or the extremes of a few pairs",
     "edit": "the same for one index edited, to the next image",
     "boundaries": "surfaces that a path from the camera meets on average, without roulette",
     "call": "seconds of one call of `sample`, over the built-in's",
-    "frozen": "an image by a function under `dr.freeze`, over the same one traced anew; warm",
-    "off after an edit": "largest difference between the two after an index was edited: 0, or the frozen one is stale",
+    "frozen": "time of an image under `dr.freeze`, over that of the same one traced anew; warm",
+    "off after an edit": "largest difference of the two after an edit of an index: 0 unless the frozen one is stale",
 }
 NAME = "features"
 BUILTIN = "dielectric"

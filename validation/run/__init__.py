@@ -1,6 +1,7 @@
-"""What every study uses: the context of a run, timing, arrays and precisions, cameras, names of metrics.
+"""What all studies share: the context of a run, timing, arrays and precisions, cameras, names of metrics, the headline.
 
-In: what runs on this machine. Out: profiles, settings, times and images, of which the studies make rows.
+In: what runs on this machine. Out: profiles, settings, times and images, of which the studies make rows; and the
+sentences of the report's first page, made from the rows.
 """
 
 __all__ = [
@@ -8,6 +9,7 @@ __all__ = [
     "bsdf_sampling",
     "command_line",
     "context",
+    "headline",
     "kernel_timing",
     "metrics",
     "path_overlay",

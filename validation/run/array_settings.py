@@ -1,4 +1,4 @@
-"""Where formulas are measured: backends and precisions, and with them Mitsuba's own functions."""
+"""The backends and precisions in which formulas are measured, and Mitsuba's own functions beside them."""
 
 from __future__ import annotations
 

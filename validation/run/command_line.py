@@ -1,4 +1,4 @@
-"""The two command lines of the validation, on typer: errors are one line on stderr, and exit code 2."""
+"""What the two command lines of the validation share: errors are one line on stderr, with exit code 2."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a study is given: the profile, which says how much is measured, and the context of a run."""
+"""What a study is given: the profile (how much is measured) and the context of a run."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""What a formula costs: kernel times of streaming rays from memory, in turn in one run, and the time to compile.
+"""Kernel times of the formulas, which stream rays from memory, and the time to compile each kernel.
 
-A ratio is formed within a round, in which every subject runs once; the median of the rounds counts, with a
-confidence interval of 95 % or more from its order statistics. On a CPU only ratios are kept: to a copy of the same
-bytes, which is the floor that memory sets, and to the plain form. A GPU has ns per ray as well.
+All subjects run once per round. A ratio is formed within a round; the median over the rounds is reported, with a
+confidence interval of at least 95 % from order statistics. On a CPU only ratios are reported: to a copy of the same
+bytes, which is the lower limit set by memory, and to the plain formula. On a GPU there are ns per ray, too.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Names of metrics that several studies share, and of those that the written tables look up.
+"""Names of metrics that several studies or the written tables use.
 
-A table that asks for a name that is not here fails at import, not after the run.
+A table that asks for a name that is not here fails when it is imported, not after the run.
 """
 
 from mi_refract.accuracy import BUDGETS

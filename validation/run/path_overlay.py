@@ -1,4 +1,4 @@
-"""Images with paths drawn over them: a scene from its own camera, and points of it projected as that camera does."""
+"""Light paths drawn over a rendered image: points are projected as the scene's camera projects them."""
 
 from __future__ import annotations
 

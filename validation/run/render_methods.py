@@ -1,4 +1,4 @@
-"""The ways to render a scene that are compared, an integrator and a BSDF each, and the camera that times them."""
+"""The methods of rendering that are compared (an integrator and a BSDF each), and the camera used for timing."""
 
 from __future__ import annotations
 

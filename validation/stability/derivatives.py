@@ -1,9 +1,9 @@
 """Derivatives by automatic differentiation, of directions and of the reflectance, against certified ones.
 
-∂b/∂a along two unit vectors at right angles to `a`, in the plane of incidence and across it; k ∂b/∂k; and η ∂R/∂η,
-which is −k ∂R/∂k. The error is relative, or absolute where the derivative is below 1 (below R). At the critical angle
-they diverge as 1/cosθt: the condition, 1 + k² sinθi (sinθi + 2 cosθi)/cos²θt, is what inputs off by u may change the
-derivative by, in u, to first order.
+Measured are ∂b/∂a along two unit vectors perpendicular to `a`, in the plane of incidence and across it; k ∂b/∂k; and
+η ∂R/∂η, which is −k ∂R/∂k. The error is relative, or absolute where the derivative is below 1 (below R). At the
+critical angle the derivatives diverge as 1/cosθt. The condition, 1 + k² sinθi (sinθi + 2 cosθi)/cos²θt, is the change
+of the derivative, in u and to first order, that inputs off by u may cause.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ TERMS = {
     "∂R/∂η": "times η, of `fresnel.powers` with the cosine of `fresnel.refracted_cosine`",
     "error": "the largest",
     "error / condition": "the largest, in units of condition · u",
-    "not finite": "rays whose derivative came out NaN or infinite, though it exists",
+    "not finite": "rays whose derivative is computed as NaN or infinite, though it exists",
 }
 SEED = 2029
 BINS = np.geomspace(1e-9, 1, 19)

@@ -1,8 +1,8 @@
-"""Energy: reflected and transmitted power against certified values, and the laws they obey.
+"""Energy: reflected and transmitted power against certified values, and the laws that they obey.
 
-Errors are relative, in units of roundoff u (2⁻²⁴, 2⁻⁵³), of R, of 1 − R and of both amplitudes; phases are points of
-the unit circle, and their error is the distance. The exact values are those of the very cosine and ratio that were
-given. Mitsuba's `mi.fresnel` stands beside.
+Errors of R, of 1 − R and of both amplitudes are relative, in units of roundoff u (2⁻²⁴ or 2⁻⁵³). A phase is a point on
+the unit circle; its error is a distance. The exact values are for the very cosine and ratio that were given. Mitsuba's
+`mi.fresnel` is shown for comparison.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ AXES = {"x": "|k − 1|", "y": "error of R, in u", "x_scale": "log", "y_scale": 
 BUILTIN = "mi.fresnel"
 TERMS = {
     "powers": "R and T of `fresnel.powers`, with the cosine that `fresnel.refracted_cosine` gives",
-    "pipeline": "R and T as the plugin computes them: from `a`, transmitted where the default formula says so",
+    "pipeline": "R and T as the plugin computes them from `a`, with the decision of the default formula",
     "amplitudes": "`fresnel.amplitudes`",
-    BUILTIN: "Mitsuba's function of the same cosine and k, from the inside; what it transmits is 1 − R by subtraction",
+    BUILTIN: "Mitsuba's function of the same cosine and k, from the inside; its T is 1 − R, by subtraction",
     "R / u, 1 − R / u, r_s / u, r_p / u": "the largest relative errors, in units of roundoff",
     "phase / u": "under total internal reflection, the largest distance from the exact point of the unit circle",
     "R + T − 1 / u": "the largest deviation from 1",
-    "nearer than rounding": "rays whose radicand is below 0.32u of its larger term, where its own error may move T by "
-    "more than u/2; the errors leave them out",
-    "T there and back / u": "T(θi, k) over T(θt, 1/k), less 1: light takes the same way back",
-    "weights in and out / u": "the plugin's weight of radiance that enters over n², times that of leaving, less 1",
-    "outside, inside": "the share of diffuse light that is reflected or not, relative, against its closed form; from "
-    "the inside with what is reflected totally",
+    "nearer than rounding": "rays whose radicand is below 0.32u of its larger term, where its rounding error may "
+    "change T by more than u/2; they are left out of the errors",
+    "T there and back / u": "T(θi, k) over T(θt, 1/k), less 1: T is the same in both directions",
+    "weights in and out / u": "the plugin's weight of radiance that enters, over n², times that of leaving, less 1",
+    "outside, inside": "relative error of the reflected and of the transmitted share of diffuse light, against the "
+    "closed form; from the inside total internal reflection is included",
     "white furnace": "the weights of both lobes times their densities, which must add up to 1",
 }
 SEED = 2028

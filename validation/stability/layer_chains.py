@@ -29,12 +29,12 @@ from validation.run.array_settings import Setting
 
 Array = NDArray[Any]
 
-TOP = 1.0003  # the index of the coldest air
-MIRAGE = 3e-5  # what it loses down to the road
+TOP = 1.0003  # the index of the coldest air, at the top
+MIRAGE = 3e-5  # decrease of the index down to the road
 EXACT_RATIO = 2.0**-23  # 1 + this is the first float32 after 1
 FEEDS = {
-    "ratios": "each k rounded once; neighbours 3e-8 apart have 1 in float32, and the ray goes straight",
-    "reciprocals": "each k as 1/η of a rounded η = n_to/n_from; the same neighbours have 1 + 2⁻²³, four times too much",
+    "ratios": "each k rounded once; in float32, neighbours 3e-8 apart have k = 1, and the ray is not refracted",
+    "reciprocals": "each k as 1/η of a rounded η = n_to/n_from; the same have k = 1 + 2⁻²³, four times too much",
     "indices": "each k as a quotient of rounded indices, as scenes give them",
     "contrasts": "each k rounded once, and with it k² − 1 from double precision",
 }
@@ -42,7 +42,7 @@ FEEDS = {
 
 @dataclass(frozen=True)
 class Chain:
-    """Boundaries 0 … count − 1, each met after the one before, as a formula is told of them.
+    """Boundaries 0 … count − 1, each met after the one before, as given to a formula.
 
     `normals` (rays or 1, count or 1, 3). `k` (2 count): n_from/n_to on the way down, then on the way up. `contrasts`:
     k² − 1 likewise, or None. `turns`: a mirrored ray goes back up; else it goes on, as between the walls of a pipe.
@@ -160,7 +160,7 @@ class Layers:
         return len(self.steps)
 
     def chain(self, normal: Array, feed: str, precision: type) -> Chain:
-        """What a formula is told of a boundary: one of FEEDS."""
+        """The numbers that a formula is given for each boundary; `feed`: one of FEEDS."""
         index = self.index.astype(precision) if feed == "indices" else self.index
         k = np.concatenate([index[:-1] / index[1:], index[1:] / index[:-1]])
         if feed == "reciprocals":
@@ -169,7 +169,7 @@ class Layers:
         return Chain(normal.reshape(1, 1, 3), k, contrasts)
 
     def cosine(self, c2: Array, s2: Array, layer: Array) -> Array:
-        """cos θ of rays with cos²θ₀ = c2 in `layer`; 0 where they do not get."""
+        """cos θ of rays with cos²θ₀ = c2 in `layer`; 0 where they do not arrive."""
         return np.sqrt(np.maximum(c2 - self.kappa[layer] * s2, 0))
 
     def turning(self, c2: Array, s2: Array) -> Array:
@@ -196,7 +196,7 @@ class Rays:
     cosines: Array
 
     def fed(self, feed: str, precision: type) -> Fed:
-        """The same rays, as a formula in `precision` is told of the layers."""
+        """The same rays, with the layers as given to a formula in `precision`; `feed`: one of FEEDS."""
         each = {"ratios": 1, "reciprocals": 2}.get(feed, 0)  # a reciprocal is rounded twice
         all_down = 3 if feed == "indices" else each * self.last * (not self.layers.exact)
         turned = 1 if feed == "indices" else each * self.last * (2 - self.layers.exact)

@@ -1,10 +1,10 @@
 """Paths: rays through the layers of `scenes/mirage.xml` and `scenes/fibre.xml`, against the exact path.
 
-A ray is traced through Mitsuba's scene with the plugin's own samples, transmitted wherever it can be, and compared
-with straight segments and Snell's law in double precision. Mitsuba's ray offset is part of both: in the mirage it
-moves rays more than anything here, but it turns none. Then the images: the mirage in a telescope and to the naked
-eye, and the fibre, with exact paths drawn over them (white, between squares) and the ends of the traced ones (green
-crosses).
+A ray is traced through Mitsuba's scene with the plugin's own samples, transmitted wherever possible, and compared with
+a path of straight segments and Snell's law in double precision. Both include Mitsuba's ray offset: in the mirage it
+moves rays by more than any other error, but it turns none. The images show the mirage through a telescope and to the
+naked eye, and the fibre, with exact paths drawn over them (white, between squares) and the ends of the traced ones
+(green crosses).
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ INDICES, RATIOS = "exact, indices in float32", "exact, ratios in float32"
 DIRECTION, MEDIAN_DIRECTION, PLACE = "direction", "median direction", "place"
 TERMS = {
     "direction": "largest |d − exact| anywhere on a path, over the sine of the angle at which it enters",
-    "direction / condition": "the same, less what the fall of a cosine to a smaller one magnifies of any error",
+    "direction / condition": "the same, divided by the factor by which a decreasing cosine magnifies any error",
     PLACE: "largest distance from the exact path, over that path's own extent across the layers",
     INDICES: "Snell's law in double precision for the indices rounded to float32, which the built-in starts from",
     RATIOS: "the same for the ratio of every two neighbours rounded to float32, which the other formulas start from",
-    WRONG_PATH: "rays that meet another number of boundaries than they should",
-    "ray offset": "the place, if the exact path were without Mitsuba's ray offset: the same for every plugin",
+    WRONG_PATH: "rays that meet a wrong number of boundaries",
+    "ray offset": "the place error if the exact path had no ray offset: the same for every plugin",
     "pixels off": "pixels of which a channel differs by more than 0.1 from the built-in's, same seed",
-    "pixels off, control": "the same between two formulas at the rounding limit: what flipped lobes alone do",
+    "pixels off, control": "the same between two formulas at the rounding limit: caused by flipped lobes alone",
 }
 AXES = {"x": "distance, or mrad of entry", "y": "deviation", "x_scale": "linear", "y_scale": "log", "slope": None}
 NAME = "paths"

@@ -1,10 +1,9 @@
-"""Stability: formulas at work, boundary after boundary, against closed answers.
+"""Stability: formulas applied at one boundary after another, against closed-form answers.
 
-A formula is fed with inputs rounded to its precision, and its output is carried on; all geometry in between is in
-extended precision. Each error stands next to itself over condition · u: that is what the answer may be off by if
-every rounded input and every direction a formula returns were off by u, the roundoff, to first order. Up to 1 the
-problem is to blame, for rounding the exact answers may do as badly; above 1 the formula. Mitsuba's functions exist in
-float32 only.
+A formula gets inputs rounded to its precision, and its output goes to the next boundary; the geometry between them is
+in extended precision. Each error is also shown divided by condition · u: the error, to first order, that the answer may
+have if every input and every direction were off by u, the roundoff. Up to 1 the error is that of the problem: rounding
+the exact answers could cause it. Above 1 it is that of the formula. Mitsuba's functions exist in float32 only.
 """
 
 from __future__ import annotations
@@ -50,16 +49,16 @@ TERMS = {
     "error / condition": "the worst error over condition · u of its ray",
     "error": "the worst error; of a mirage, relative, of the cosine where the ray ends; of directions, in radians",
     **{f"{angle}°": f"the same of the ray that enters at {angle}°" for angle in PASSING},
-    MISCLASSIFIED: "rays that turned where they should have passed or the reverse; reflections that were none",
-    "turning height": "how far the layer in which a ray turned is from the right one, over all layers",
-    "length drift": "how far the length of the direction is from what it was, relative",
-    "over print": "the largest deviation from CODE V's print, over what printing rounds to",
+    MISCLASSIFIED: "rays that turned instead of passing or the reverse, and missed total internal reflections",
+    "turning height": "distance of the layer in which a ray turned from the right one, over all layers",
+    "length drift": "relative change of the length of the direction",
+    "over print": "the largest deviation from CODE V's printed numbers, over their rounding",
     "mirage": "air of index 1.0003 at the top and 3e-5 less at the bottom, in layers; entered at 88 … 89.95°, the last "
     "three turn. Upright: the normal is an axis; askew: it is none",
-    "exact ratios": "250 layers of ratio 1 + 2⁻²³, which float32 holds: nothing is lost before a formula begins",
+    "exact ratios": "250 layers of ratio 1 + 2⁻²³, which float32 holds exactly: the inputs have no error",
     **FEEDS,
     PROBLEM: f"condition · u of the ray that enters at {SEEN_AT}°, with the error of every formula layer by layer",
-    "light pipe": f"total internal reflections in a square pipe of index {CORE}, askew; only signs may change",
+    "light pipe": f"total internal reflections in a square pipe of index {CORE}, askew; only signs should change",
 } | {name: " ".join((trace.__doc__ or "").split()) for name, trace in optical_systems.SYSTEMS.items()}
 
 
@@ -144,7 +143,7 @@ def mirages(how: Extent) -> list[tuple[str, Layers, Array]]:
 
 
 def feeds(layers: Layers, setting: Setting) -> list[str]:
-    """What float32 holds exactly is told in one way; where nothing is lost, in float64, the way makes no difference."""
+    """The ways to give a formula its ratios: one where float32 holds them exactly; two in float64, where all agree."""
     if layers.exact:
         return ["ratios"]
     return [*FEEDS] if setting.precision is np.float32 else ["ratios", "contrasts"]

@@ -1,8 +1,8 @@
-"""Suite: every system against every check, out of the rows of Per ray and Images.
+"""Suite: every system against every check, from the rows of the studies "Per ray" and "Images".
 
-A number is how far off a system is at most: of rays the largest angle to the certified direction in radians, of
-images the difference of the means, as a share. A cell fails where the study that it comes from does. Beside each row
-stand the version, and what the system does otherwise than it should, or than `refract` does.
+For rays, a number is the largest angle to the certified direction in radians; for images, the relative difference of
+the means. A cell fails where the study that it comes from fails. Each row also gives the version, and where the system
+does not do what it should, or what `refract` does.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from . import per_ray, rendered_images
 NAME = "matrix"
 OFF = "off by"
 TERMS = {
-    OFF: "rays: the largest angle, in radians, of those decided rightly; images: |test / reference − 1| of the means",
-    "disagrees": "1 where a budget of the row that this is taken from is broken",
-    "differs": "1 where the images are different, as it is known of this system; see its sentence",
+    OFF: "rays: the largest angle, in radians, without misclassified rays; images: |test / reference − 1| of the means",
+    "disagrees": "1 where a budget is broken in the row that this comes from",
+    "differs": "1 where the images are different and this is known of the system; see its remark",
 }
 CHECKS = {per_ray.NAME: tuple(per_ray.SETS), rendered_images.NAME: tuple(rendered_images.SCENES)}
 

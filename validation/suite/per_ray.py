@@ -1,10 +1,10 @@
-"""Per ray: other people's refraction, each in its own program, against the certified answer.
+"""Per ray: the refraction of other programs, each in a process of its own, against the certified answer.
 
-A program reads rays as CSV and answers with directions; `mi-refract rays run` hands rays to one in the same way, and
-judges alike. Its answers must keep the bound of the textbook formula in its precision for that very ray. How far each
-is off was recorded before, for rays of these kinds whose numbers were not kept: to meet the recorded worst error within
-a factor of 3 either way is a goal and no budget. A program that is installed and crashes, hangs, or answers other rays
-than it was given fails; one that says that it cannot run on this machine, or is not installed, is not run.
+A program reads rays as CSV and answers with directions; `mi-refract rays run` does and checks the same. Each answer
+must be within the bound of the textbook formula, in the program's precision, for that ray. The worst errors of each
+program were recorded earlier on rays of the same kinds (the rays themselves were not kept); a goal, not a budget, is to
+be within a factor of 3 of these. A program fails that is installed and crashes, hangs, or answers rays that it was not
+given. One that is not installed, or says that it cannot run on this machine, is not run.
 """
 
 from __future__ import annotations
@@ -82,16 +82,16 @@ SETS = {
     TOTAL: Set(1000, _total, "0.01 rad or more beyond the critical angle and from the surface, k = 1.5"),
 }
 TERMS = {name: f"{rays.count} rays: {rays.text}" for name, rays in SETS.items()} | {
-    WORST_ANGLE: "the largest angle to the certified direction, of the rays that were decided rightly",
-    RECORDED: "the largest such angle that was recorded of this system before",
-    OFF_RECORDED: "the factor between the two, whichever is larger; 1 inside a range that was recorded",
+    WORST_ANGLE: "the largest angle to the certified direction, without misclassified rays",
+    RECORDED: "the largest such angle recorded earlier for this system",
+    OFF_RECORDED: "the ratio of the two, taken above 1; 1 inside a recorded range",
     ERROR_OVER_BOUND: "the largest error of a ray over its a-priori bound, that of the textbook formula",
-    MISCLASSIFIED: "rays whose total internal reflection was decided wrongly",
+    MISCLASSIFIED: "rays whose total internal reflection was misclassified",
     "wrong": "rays beyond the bound, misclassified although the bound decides them, or without a direction",
-    "given up": "rays left out because the system takes what is that near to the critical angle for totally reflected",
-    "unfit": "answers that are missing, doubled, or to rays that were not asked",
-    "told otherwise": "1 where total internal reflection is not told as it was recorded to be",
-    "unanswered": "rays that a program which crashed, hung or printed no answers leaves open",
+    "given up": "rays left out: so near to the critical angle that the system treats them as totally reflected",
+    "unfit": "answers that are missing, duplicate, or to rays that were not given",
+    "told otherwise": "1 where the program signals total internal reflection in another way than was recorded",
+    "unanswered": "rays without an answer, because the program crashed, hung or printed none",
 }
 
 
@@ -183,7 +183,7 @@ def _without(answers: Answers, ids: np.ndarray) -> Answers:
 
 
 def _remark(findings: Findings, system: str, known: str) -> str:
-    """Who answered, how total internal reflection was told, what is wrong with the answers, and what explains them."""
+    """Who answered, the signal of total internal reflection, what is wrong with the answers, and what explains them."""
     problems = [f"{each.kind} {each.text}" for each in findings.problems]
     mistake = [findings.diagnosis.text] if findings.diagnosis else []
     return "; ".join(filter(None, (system, f"total internal reflection: {findings.tir}", known, *problems, *mistake)))

@@ -1,11 +1,11 @@
-"""Images: the same plain scene by this plugin and by other renderers, judged by Welch's test.
+"""Images: the same plain scene rendered by this plugin and by other renderers, compared by Welch's t-test.
 
 Both sides have the same flat triangles, the same camera, a box filter, and several independent renders; the glossary
-says how each renderer's model is brought to Mitsuba's. `refract` renders by Mitsuba's `path`. The balls of the scene
-`environment` are those of `balls` under a smooth sky without symmetry, whose map lies askew; in the scene `furnace`,
+says how each renderer's model differs from Mitsuba's. `refract` is rendered with Mitsuba's `path`. The scene
+`environment` has the balls of `balls` under a smooth sky without symmetry, whose map is turned. In the scene `furnace`,
 a ball on a floor that absorbs nothing under a sky of radiance 1, nothing should be visible. A verdict is "equal",
-"different", or "inconclusive", where the noise hides what would matter or a difference lies only where a t-test knows
-little. Renderers other than the small ones run where they are installed, in the full profile.
+"different", or "inconclusive": noise would hide a relevant difference, or only tiles differ about which a t-test knows
+little. The profile `full` also runs the large renderers that are installed.
 """
 
 from __future__ import annotations

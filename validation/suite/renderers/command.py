@@ -1,4 +1,4 @@
-"""`python -m validation renderers [--list | --install NAME,…]`: the other systems, and what brings them.
+"""`python -m validation renderers [--list | --install NAME,…]`: lists and installs the other renderers.
 
 Exit code 0; 1 where an installation failed, with a line on stderr for each; 2 for misuse.
 """

@@ -1,4 +1,4 @@
-"""The private environments of other systems: where they are, what makes them, and how a program in one is run."""
+"""The environments of the other renderers: where they are, how they are made, and how a program in one is run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is known of a system: what it can be asked, what brings it, and what it was seen to do."""
+"""What is known of another renderer: what it can do, how to install it, and how it behaved."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 SCRIPTS = Path(__file__).parent / "scripts"
 
-# Where the rays of `validation.suite.per_ray` come from; the names of its sets.
+# The sets of rays of `validation.suite.per_ray`, by name.
 RANDOM, CRITICAL, GRAZING, MATCHED, TOTAL = "random", "near-critical", "grazing", "η ≈ 1", "total reflection"
 RecordedError = Mapping[str, tuple[float, float]]  # worst angle in radians by set, from … to
 
@@ -52,8 +52,9 @@ class Apt:
 class RefractFunction:
     """A function of refraction in one precision: `script` of scripts/ reads rays and writes answers, both as CSV.
 
-    `told`: how total internal reflection is, one of `mi_refract.ray_sets.tir_signal.TIR`. `gives_up`: the cos²θ_t below
-    which it takes a ray for totally reflected, by its own word. `remark`: where it is known to differ, and how.
+    `told`: the signal of total internal reflection, one of `mi_refract.ray_sets.tir_signal.TIR`. `gives_up`: the
+    cos²θ_t below which it treats a ray as totally reflected, by its documentation. `remark`: known
+    differences.
     """
 
     title: str

@@ -1,7 +1,7 @@
-"""The table of other renderers and libraries: what brings each, what it can be asked, what it was seen to do.
+"""The table of other renderers and libraries: how to install each, what it can do, and how it behaved.
 
-A new one is an entry here; a function of refraction needs a script in scripts/, an image renderer an entry in
-`image_renderers`. Programs under the GPL are run, never imported nor passed on.
+A new renderer is one entry here. A function of refraction also needs a script in scripts/, an image renderer an entry
+in `image_renderers`. Programs under the GPL are run, never imported nor redistributed.
 """
 
 from .system import RECORDED_F32, RECORDED_F64, Apt, Npm, Pip, RefractFunction, System, recorded_error

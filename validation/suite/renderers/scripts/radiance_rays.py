@@ -1,7 +1,7 @@
-"""Radiance's `rtrace`: every ray meets a ring of its own between the two media, and `-otdW` tells what it becomes.
+"""Radiance's `rtrace`: every ray meets a ring of its own between the two media, and `-otdW` prints what follows.
 
-A ring takes its normal as it is given, where a polygon would compute one from its corners. The rings stand apart, so
-small that none is in another ray's way.
+A ring takes its normal as given, where a polygon would compute one from its corners. The rings are far apart, and so
+small that no ray meets another one's.
 """
 
 import os

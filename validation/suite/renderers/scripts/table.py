@@ -1,8 +1,8 @@
-"""Rays in and answers out, as CSV: what every script of this folder shares. Needs numpy, and nothing of mi_refract.
+"""Rays in and answers out, as CSV: what all scripts of this folder share. Needs numpy, and nothing of mi_refract.
 
 In: `#` lines, then `id,ax,ay,az,nx,ny,nz,n_from,n_to` and a ray per line: the direction toward the surface, a normal on
 either side of it, the indices of the medium that the ray leaves and of the one it enters. Out: `id,bx,by,bz`, and
-`transmitted` where it is told.
+`transmitted` where the program gives it.
 """
 
 import sys

@@ -1,7 +1,7 @@
-"""What a run says to someone who sees this project for the first time: five questions, answered from its rows.
+"""The first screen of the report: five questions about `refract`, answered from the rows of a run.
 
-Rows come in, sentences with numbers go out (`first_page`); the report and the terminal show them. What the run did not
-measure is said to be not measured.
+In: rows. Out: sentences with numbers, one image and one plot (`first_page`), for the report and the terminal. What the
+run did not measure gets the sentence "Not measured in this run."
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from collections.abc import Iterable, Sequence
 from mi_refract.report.first_page import NOT_RUN, Answer, FirstPage, ShownImage, ShownPlot, not_run
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
-from validation.run.metrics import (
+
+from .metrics import (
     CHANGED_SHARE,
     EQUAL_TIME,
     ERROR_OVER_BOUND,
