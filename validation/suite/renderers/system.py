@@ -10,10 +10,10 @@ SCRIPTS = Path(__file__).parent / "scripts"
 
 # The sets of rays of `validation.suite.per_ray`, by name.
 RANDOM, CRITICAL, GRAZING, MATCHED, TOTAL = "random", "near-critical", "grazing", "η ≈ 1", "total reflection"
-Noted = Mapping[str, tuple[float, float]]  # worst angle in radians by set, from … to
+RecordedError = Mapping[str, tuple[float, float]]  # worst angle in radians by set, from … to
 
 
-def recorded_error(random: float, critical: float, grazing: float | tuple, matched: float | tuple) -> Noted:
+def recorded_error(random: float, critical: float, grazing: float | tuple, matched: float | tuple) -> RecordedError:
     """Worst angles in radians by set of rays, a number or a range (from, to)."""
     figures = zip((RANDOM, CRITICAL, GRAZING, MATCHED), (random, critical, grazing, matched), strict=True)
     return {name: x if isinstance(x, tuple) else (x, x) for name, x in figures}
@@ -60,7 +60,7 @@ class RefractFunction:
     title: str
     precision: str  # "f32" or "f64"
     script: str
-    recorded_error: Noted
+    recorded_error: RecordedError
     told: str
     arguments: tuple[str, ...] = ()
     gives_up: float = 0.0

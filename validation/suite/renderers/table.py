@@ -6,6 +6,15 @@ in `image_renderers`. Programs under the GPL are run, never imported nor redistr
 
 from .system import RECORDED_F32, RECORDED_F64, Apt, Npm, Pip, RefractFunction, System, recorded_error
 
+
+def _as_in_glsl(title: str, script: str) -> tuple[RefractFunction, ...]:
+    """`refract` of vec3 and of dvec3, which answer total internal reflection with the null vector."""
+    return (
+        RefractFunction(f"{title}, vec3", "f32", script, RECORDED_F32, "zero", ("float32",)),
+        RefractFunction(f"{title}, dvec3", "f64", script, RECORDED_F64, "zero", ("float64",)),
+    )
+
+
 _SYSTEMS = (
     System(
         "mitsuba",
@@ -35,10 +44,7 @@ _SYSTEMS = (
         Pip(("PyGLM==2.8.3", "numpy")),
         megabytes=140,
         small=True,
-        calls=(
-            RefractFunction("PyGLM, vec3", "f32", "pyglm_rays.py", RECORDED_F32, "zero", ("float32",)),
-            RefractFunction("PyGLM, dvec3", "f64", "pyglm_rays.py", RECORDED_F64, "zero", ("float64",)),
-        ),
+        calls=_as_in_glsl("PyGLM", "pyglm_rays.py"),
     ),
     System(  # by the OpenGL driver that EGL finds: Mesa's llvmpipe where there is no other
         "glsl",
@@ -47,10 +53,7 @@ _SYSTEMS = (
         Pip(("moderngl==5.13.0", "numpy")),
         megabytes=100,
         small=True,
-        calls=(
-            RefractFunction("GLSL, vec3", "f32", "glsl_rays.py", RECORDED_F32, "zero", ("float32",)),
-            RefractFunction("GLSL, dvec3", "f64", "glsl_rays.py", RECORDED_F64, "zero", ("float64",)),
-        ),
+        calls=_as_in_glsl("GLSL", "glsl_rays.py"),
     ),
     System(  # a ray tracer for lens design; the function that bends a ray needs none of its windows and plots
         "rayoptics",
