@@ -28,11 +28,11 @@ from mi_refract.report.junit import printable
 from . import self_test_scenes
 
 Folder = Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")]
-Other = Annotated[Path, typer.Argument(metavar="TEST", help="What is compared with it, of the same kind.")]
+Other = Annotated[Path, typer.Argument(metavar="TEST", help="The image or folder to compare with it.")]
 NotAlways = Annotated[
-    Path | None, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them; --self-test can do without.")
+    Path | None, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them; optional with --self-test.")
 ]
-NotWithSelfTest = Annotated[Path | None, typer.Argument(metavar="TEST", help="What is compared with it.")]
+NotWithSelfTest = Annotated[Path | None, typer.Argument(metavar="TEST", help="The image or folder to compare with it.")]
 Method = Annotated[str, typer.Option(help=f"How: {'|'.join(diff_settings.ACCEPTED)}; see --methods.")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="An option of the method.")]
 File = Annotated[
@@ -72,7 +72,7 @@ def diff(
     test: NotWithSelfTest = None,
     method: Method = AUTO,
     options: Set = None,
-    renders: Annotated[bool, typer.Option("--renders", help="Each folder holds renders of one image.")] = False,
+    renders: Annotated[bool, typer.Option("--renders", help="Each folder holds several renders of one image.")] = False,
     samples: Annotated[bool, typer.Option("--samples", hidden=True)] = False,
     settings: File = None,
     allow_nonfinite: Nonfinite = None,

@@ -39,7 +39,7 @@ COLUMNS = (
     "exact",
     "wrong",
 )
-STYLES = {"wrong": "bold red", "fair": "", "exact": "green"}
+STYLES = {"wrong": "bold red", "right": "", "exact": "green"}
 TERMS = {
     "ulp": "the spacing of numbers at 1: 2⁻²³ in f32, 2⁻⁵² in f64",
     "worst, p99, mean": "angles to the certified direction, over the rays whose total internal reflection was "
@@ -118,8 +118,8 @@ def _line(each: Explanation) -> str:
 
 
 def grade(each: RegimeErrors) -> str:
-    """ "exact", "fair" or "wrong"."""
-    return "wrong" if each.wrong else "exact" if each.exact == each.rays else "fair"
+    """ "exact", "right" or "wrong"."""
+    return "wrong" if each.wrong else "exact" if each.exact == each.rays else "right"
 
 
 # Terminal ----------------------------------------------------------------------------------------------------------

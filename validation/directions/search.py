@@ -157,8 +157,9 @@ def _sample(name: str, setting: Setting, seed: int, count: int) -> Screen:
 
 
 def _scores(name: str, subject: Subject, screen: Screen, decision: np.ndarray) -> np.ndarray:
-    """The higher the worse. Chord: its share of the bound, of rays that are decided rightly. Decision: the distance
-    from the critical angle where it is wrong, minus that distance where it is right. Rays whose side is open are out.
+    """The higher the worse. Chord: the error over its bound, for rays that are classified correctly. Decision: the
+    distance from the critical angle where it is wrong, minus that distance where it is right. Rays whose side of the
+    surface the formula need not know are left out.
     """
     chord, wrong = screen.judge(subject)
     far, budget = np.abs(screen.relative_radicand), budget_of(name)

@@ -104,7 +104,7 @@ def operations(
 
 
 def scalar_rows(context: Context) -> list[Row]:
-    """What a call of `sample` takes where nothing is compiled: a Python plugin's calls, against the built-in's C++."""
+    """Time of a call of `sample` in a scalar variant: a plugin in Python, against the built-in's C++."""
     import mitsuba as mi
 
     with under("scalar_rgb"):
