@@ -124,7 +124,7 @@ def diff(
 
 
 def _write(found: Results, junit: Path | None, json: Path | None, github: bool) -> None:
-    """The forms for programs, as far as they are asked for."""
+    """Write the JSON and JUnit files, and the GitHub annotations, that were asked for."""
     if junit:
         text_reports.write_junit(junit, found)
     if json:

@@ -108,7 +108,7 @@ class Tally:
 
 
 def _asked(renders: Pixels) -> list[str]:
-    """The methods that can be asked with so many renders of other seeds."""
+    """The methods that can be applied with this number of renders of other seeds."""
     return [name for name, method in METHODS.items() if not method.takes_renders or 2 * len(renders) >= RENDERS]
 
 

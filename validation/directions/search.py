@@ -235,7 +235,7 @@ def _inside(rays: Rays, herd: Herd, parents: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Certified:
-    """A line, and its share of what is allowed: of the chord error; for a decision 1 where it had to be right, or 0."""
+    """A line, and its chord error over the bound; for a decision 1 where it had to be right, else 0."""
 
     line: Found
     share: float
@@ -261,7 +261,7 @@ def worth_keeping(found: Iterable[Certified]) -> list[Found]:
 
 
 def rescored(name: str, setting: Setting) -> list[Found]:
-    """The lines of the file for `name` in that precision, with the scores of the formula as it is now."""
+    """The lines of the file for `name` in that precision, with the scores of the present formula."""
     precision = np.dtype(setting.precision).name
     lines = [line for line in worst_rays.read() if (line.formula, line.precision) == (name, precision)]
     rays, u = worst_rays.rays_of(lines, precision), setting.roundoff

@@ -71,7 +71,7 @@ def first_page(rows: Sequence[Row], profile: str = "") -> FirstPage:
 
 
 def _answer(question: str, text: str, rows: Iterable[Row], study: str) -> Answer:
-    """`rows` are what the answer rests on: their verdicts make its state."""
+    """`rows` are the evidence for the answer: their verdicts determine its state."""
     verdicts = {row.verdict for row in rows if row.values}
     state = "no" if "fail" in verdicts else "yes" if "pass" in verdicts else "plain"
     return {
