@@ -136,7 +136,7 @@ def advice() -> str:
 
 
 def summary() -> str:
-    """What the CPU's variants run on; one line."""
+    """The library that the CPU's variants run on; one line."""
     here = llvm()
     return f"llvm_* variants run on {here.reason}" if here.usable else f"only scalar_* variants run: {here.reason}"
 
@@ -351,7 +351,7 @@ def _circumstances() -> str:
 
 
 def _cache_file() -> Path:
-    """RuntimeError where nobody has a home."""
+    """RuntimeError where the user has no home directory."""
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "mi_refract" / "backend.json"
 
 

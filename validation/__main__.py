@@ -82,7 +82,7 @@ def _command(
 
 
 class Misuse(ValueError):
-    """What was asked for cannot be done; one line."""
+    """Wrong arguments; one line."""
 
 
 def _check(studies: list[str], profile: str, out: Path, write_tables: bool) -> None:

@@ -208,7 +208,7 @@ def efficiency(rows: list[Row]) -> str:
 
 
 def planar(rows: list[Row]) -> str:
-    """Markdown: scene by scene how far paths are from the retrace, and what a path costs by the number of segments."""
+    """Markdown: by scene the distance of paths from the retrace, and the time per path by the number of segments."""
     retraced, timed = _planar_errors(rows), _planar_times(rows)
     if not retraced or not timed:
         raise ValueError("README: no planar paths were traced on LLVM; its tables need them")

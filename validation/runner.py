@@ -78,7 +78,7 @@ def _processor() -> str:
 
 
 def _recall(kept: Path) -> tuple[list[Row], dict[str, Any]] | None:
-    """The rows of a finished task and what it took; None where there are none, or where they cannot be read."""
+    """The rows of a finished task and its time; None if there are none or they cannot be read."""
     try:
         record = json.loads(kept.read_text())
         return [Row.from_dict(data) for data in record["rows"]], dict(record["spent"])

@@ -48,5 +48,5 @@ class Study:
 
 
 def about(docstring: str | None) -> str:
-    """What a module's docstring says below its first line, up to a paragraph that begins with a command."""
+    """A module's docstring without its first line, up to a paragraph that begins with a command."""
     return (docstring or "").partition("\n")[2].partition("\n\n`python")[0].strip()

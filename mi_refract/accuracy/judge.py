@@ -73,7 +73,7 @@ class RayBounds:
 
     @property
     def of_root(self) -> Any:
-        """The part of the bound that is what the root makes of the radicand's error."""
+        """The part of the bound that comes from the radicand's error under the root."""
         return self.budget.of_root(self.u, self.k, self.exact.cos_t, self.exact.transmitted)
 
     @functools.cached_property
@@ -124,7 +124,7 @@ class Judgement:
 
     @functools.cached_property
     def far(self) -> Flags:
-        """Misjudged although the radicand exceeds what the bound leaves open; or undecided by the oracle."""
+        """Misclassified although the radicand exceeds the bound on its error; or undecided by the oracle."""
         far: Flags = self.bounds.decided_of(self.misjudged) | self.bounds.exact.undecided
         return far
 
@@ -148,14 +148,14 @@ class Judgement:
     @property
     @np.errstate(over="ignore", invalid="ignore")
     def linear_needed(self) -> Array:
-        """What `budget.linear` would have to be for this ray, the rest of the budget as it is."""
+        """The value of `budget.linear` that this ray needs, with the rest of the budget unchanged."""
         needed = self.bounds.budget.linear * (self.error - self.bounds.of_root) / self.bounds.of_terms
         return np.where(self.compared & ~self.bounds.side_open, needed, 0.0)
 
     @property
     @np.errstate(over="ignore", invalid="ignore")
     def radicand_needed(self) -> Array:
-        """What `budget.radicand` would have to be for this ray, the rest of the budget as it is."""
+        """The value of `budget.radicand` that this ray needs, with the rest of the budget unchanged."""
         bounds, exact = self.bounds, self.bounds.exact
         needed = radicand_for(np.maximum(self.error - bounds.of_terms, 0), exact.cos_t)
         needed = np.where(exact.transmitted, needed, 0.0)

@@ -90,7 +90,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         return app(arguments, prog_name="mi-refract", standalone_mode=False) or 0
     except (ValueError, OSError) as error:
-        return _fail(str(error))
+        return _fail(_message(error))
     except KeyboardInterrupt:
         return 130
     except Exception as error:
@@ -100,6 +100,13 @@ def main(arguments: list[str] | None = None) -> int:
         if not hasattr(error, "format_message"):
             raise
         return _fail(error.format_message())
+
+
+def _message(error: Exception) -> str:
+    """The error's own words; those of the operating system without their number, the file first."""
+    if isinstance(error, OSError) and error.errno and error.strerror and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
 
 
 def _fail(message: str) -> int:

@@ -28,11 +28,11 @@ from mi_refract.report.junit import printable
 from . import self_test_scenes
 
 Folder = Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")]
-Other = Annotated[Path, typer.Argument(metavar="TEST", help="What is compared with it, of the same kind.")]
+Other = Annotated[Path, typer.Argument(metavar="TEST", help="The image or folder to compare with it.")]
 NotAlways = Annotated[
-    Path | None, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them; --self-test can do without.")
+    Path | None, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them; optional with --self-test.")
 ]
-NotWithSelfTest = Annotated[Path | None, typer.Argument(metavar="TEST", help="What is compared with it.")]
+NotWithSelfTest = Annotated[Path | None, typer.Argument(metavar="TEST", help="The image or folder to compare with it.")]
 Method = Annotated[str, typer.Option(help=f"How: {'|'.join(diff_settings.ACCEPTED)}; see --methods.")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="An option of the method.")]
 File = Annotated[
@@ -137,7 +137,7 @@ def _write_page(path: Path, found: Results, replay: str) -> None:
 
 
 def _write(found: Results, junit: Path | None, json: Path | None, github: bool) -> None:
-    """The forms for programs, as far as they are asked for."""
+    """Write the JSON and JUnit files, and the GitHub annotations, that were asked for."""
     if junit:
         text_reports.write_junit(junit, found)
     if json:

@@ -210,4 +210,6 @@ def _rays_as_words(regime: list[str] | None, count: int, precision: str, seed: i
 
 
 def _summary(rays: RaySet) -> str:
-    return f"{len(rays)} rays, {len(rays.header['regimes'])} regimes, {rays.precision}, seed {rays.header['seed']}"
+    number = len(rays.header["regimes"])
+    regimes = f"{number} regime{'' if number == 1 else 's'}"
+    return f"{len(rays)} rays, {regimes}, {rays.precision}, seed {rays.header['seed']}"

@@ -22,7 +22,9 @@ def _print_keys(asked: bool) -> None:
 
 
 def trace(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.toml", help="The scene; --keys says what may be in it.")],
+    scene: Annotated[
+        Path, typer.Argument(metavar="SCENE.toml", help="The scene; --keys prints all keys of such a file.")
+    ],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="OUT.svg|.png|.pdf", help="Draw a figure.")
     ] = None,
@@ -32,21 +34,21 @@ def trace(
         int | None, typer.Option(min=0, help="Largest number of partial reflections on a path.")
     ] = None,
     rays: Annotated[int | None, typer.Option(min=1, help="Number of rays of each beam that has several.")] = None,
-    max_depth: Annotated[int | None, typer.Option(min=1, help="Boundaries on a path, at most.")] = None,
+    max_depth: Annotated[int | None, typer.Option(min=1, help="Largest number of boundaries on a path.")] = None,
     precision: Annotated[str, typer.Option(help="float64, or float32 with LLVM or CUDA.")] = "float64",
     formula: Annotated[str | None, typer.Option(help="A formula of refraction; the planar one by default.")] = None,
     arrays: Annotated[str | None, typer.Option("--backend", help="llvm, cuda or scalar; see `doctor`.")] = None,
     keys: Annotated[
-        bool, typer.Option("--keys", is_eager=True, callback=_print_keys, help="Print what a scene file may hold.")
+        bool, typer.Option("--keys", is_eager=True, callback=_print_keys, help="Print all keys of a scene file.")
     ] = False,
 ) -> None:
-    """Trace the rays of a planar scene; draw them, print their paths, or print the points where they meet."""
+    """Trace the rays of a planar scene; draw them, print their paths, or print focal points."""
     backend.restart_if_needed()
     if output:
         atomic.writable(output, figure.FORMATS)
         figure.require_matplotlib()
-    told: dict[str, Any] = {"branches": branches, "max_depth": max_depth}
-    loaded = replace(scene_file.load(scene), **{name: value for name, value in told.items() if value is not None})
+    given: dict[str, Any] = {"branches": branches, "max_depth": max_depth}
+    loaded = replace(scene_file.load(scene), **{name: value for name, value in given.items() if value is not None})
     if rays:
         loaded = with_rays(loaded, rays)
     traced = follow_scene(loaded, formula=formula, precision=precision, backend=arrays)

@@ -18,7 +18,7 @@ from typing import Any
 
 
 def _numpy() -> Any:
-    """Imported where a bound is asked for: the plugin does without."""
+    """Imported only when a bound is computed; the plugin needs no numpy."""
     import numpy
 
     return numpy
@@ -64,7 +64,7 @@ class Budget:
         return linear * u * np.where(transmitted & (self.growth > 0), np.maximum(1.0, k), 1.0)
 
     def of_root(self, u: Any, k: Any, cos_t: Any, transmitted: Any = True) -> Any:
-        """The part of the bound that the root makes of the radicand's error; 0 under total internal reflection."""
+        """The part of the bound due to the radicand's error under the root; 0 under total internal reflection."""
         np = _numpy()
         return np.where(transmitted, root(self.radicand_error_bound(u, k), cos_t), 0.0)
 

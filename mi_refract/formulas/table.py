@@ -38,7 +38,7 @@ class Formula:
     time_goal: float | None = None
 
     def __call__(self, a: Vector3, n: Vector3, k: Number, contrast: Number = None) -> Refracted:
-        """The formula as a total function: NaN and False for what is no refraction.
+        """The formula as a total function: NaN and False for invalid input.
 
         That is: `a` or `n` zero or not finite, `k` outside 1e-9 … 1e9, `contrast` not finite or not above −1.
         """

@@ -19,7 +19,7 @@ Maps = dict[str, Pixels]
 
 
 class Verdict(enum.StrEnum):
-    """What a method says of two images."""
+    """The verdict of a method on two images."""
 
     EQUAL = "equal"
     DIFFERENT = "different"
@@ -42,7 +42,7 @@ class Metric:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What a method found.
+    """The result of a method.
 
     `minimum_detectable`: the smallest relative difference that the method would have seen; NaN where it is not known.
     `maps`: H × W or H × W × C arrays by name, of the images' size.
@@ -62,7 +62,7 @@ def verdict_of(metrics: Sequence[Metric]) -> Verdict:
 
 
 def preconditions(reference: Image, test: Image, allow_nonfinite: bool = False) -> str | None:
-    """Why the two differ before any method is asked: values that are not finite, counted and located; else None.
+    """Why the two differ before any method is applied: values that are not finite, counted and located; else None.
 
     With `allow_nonfinite` such a value is allowed where the other image has the same one: NaN, Inf or -Inf.
     ValueError where the images cannot be compared: other size, other names of channels, other data window.

@@ -18,7 +18,7 @@ Renders = Pixels | list[Pixels]  # of one image, renders × H × W × C; a list 
 
 @dataclass(frozen=True)
 class Defect:
-    """`plant` spoils an image, H × W × C; it may raise the error of a file that cannot be read.
+    """`plant` puts the defect into an image, H × W × C; it may raise the error of a file that cannot be read.
 
     `once`: only the first of several renders is spoilt. `always_due`: every method must see it, however noisy the
     images are.
@@ -55,7 +55,7 @@ def _blurred(image: Pixels) -> Pixels:
 
 
 def _in_8_bits(image: Pixels) -> Pixels:
-    """Through an 8-bit sRGB file: white is 1, and what is brighter is cut."""
+    """Through an 8-bit sRGB file: values above 1 (white) become 1."""
     return srgb_decode(np.round(255 * srgb_encode(np.clip(image, 0, 1))) / 255)
 
 

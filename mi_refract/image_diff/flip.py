@@ -33,7 +33,7 @@ def flip(
     hdr: Annotated[str, "auto (by the file's format), yes or no"] = "auto",
     ppd: Annotated[float, "pixels per degree of the viewer's field"] = PIXELS_PER_DEGREE,
 ) -> Comparison:
-    """What a person who flips between the two would see: FLIP, for LDR and HDR images."""
+    """The differences that a person flipping between the images would see: FLIP, for LDR and HDR images."""
     require_nonnegative(locals())
     if hdr not in ("auto", "yes", "no"):
         raise ValueError(f"hdr = {hdr!r}: accepted: auto, yes, no")
@@ -95,7 +95,7 @@ def encoding(image: Image) -> str:
 
 
 def _linear(image: Image) -> Pixels:
-    """Linear H × W × 3 float32; what is not finite is 0."""
+    """Linear H × W × 3 float32; values that are not finite become 0."""
     names = _colours(image)
     if names != RGB and len(names) != 1:
         raise ValueError(f"{image.path}: channels {', '.join(names)}; accepted by FLIP: R, G, B, or one")

@@ -26,7 +26,7 @@ from .settings import How, Settings
 
 
 class Status(enum.StrEnum):
-    """A verdict, or ERROR where there is none. In the order of what a person must see first."""
+    """A verdict, or ERROR where there is none. The most important first."""
 
     ERROR = "error"
     DIFFERENT = "different"
@@ -35,7 +35,7 @@ class Status(enum.StrEnum):
 
 
 class Category(enum.StrEnum):
-    """What happened to an image between the two folders; UNKNOWN where no verdict says so."""
+    """What happened to an image between the two folders; UNKNOWN without a verdict."""
 
     ADDED = "added"
     REMOVED = "removed"
@@ -80,7 +80,7 @@ class Result:
 
     @property
     def reason(self) -> str:
-        """One sentence why the status is what it is."""
+        """The reason for the status in one sentence."""
         if self.comparison:
             return self.comparison.reason
         sides = {Category.ADDED: "only among the new images", Category.REMOVED: "only among the references"}

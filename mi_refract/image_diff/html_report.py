@@ -197,7 +197,7 @@ def _map(name: str, values: Pixels) -> dict[str, Any]:
 
 
 def _flip(reference: Image, test: Image) -> dict[str, Any]:
-    """The FLIP map of the images made as small as it is shown: whole, they would take it seconds."""
+    """The FLIP map of the images at the size in which it is shown; at full size it would take seconds."""
     side = -(-reference.pixels.shape[1] // FLIP_WIDTH)
     one, two = (replace(each, pixels=block_mean(each.pixels, side)) for each in (reference, test))
     error = flip.flip_map(one, two, flip.is_hdr(one, two), max(flip.PIXELS_PER_DEGREE / side, 1.0))

@@ -40,14 +40,14 @@ def tolerance(
     test: Image,
     *,
     allow_nonfinite: bool = False,
-    fail: Annotated[float, "a value may differ by this much"] = 0.004,
-    fail_relative: Annotated[float, "or by this share of the mean of both"] = 0.001,
-    fail_percent: Annotated[float, "of the pixels, this many percent may differ by more"] = 0.02,
+    fail: Annotated[float, "difference up to which values count as equal"] = 0.004,
+    fail_relative: Annotated[float, "the same, as a share of the mean of both"] = 0.001,
+    fail_percent: Annotated[float, "percentage of the pixels that may differ by more"] = 0.02,
     hard_fail: Annotated[float, "no value may differ by more than this"] = np.inf,
-    warn: Annotated[float, "a difference worth a warning"] = np.inf,
-    warn_relative: Annotated[float, "or this share of the mean of both"] = 0.0,
-    warn_percent: Annotated[float, "of the pixels, this many percent may differ so without a warning"] = 0.0,
-    hard_warn: Annotated[float, "any value that differs by more is worth a warning"] = np.inf,
+    warn: Annotated[float, "difference above which a pixel gives a warning"] = np.inf,
+    warn_relative: Annotated[float, "the same, as a share of the mean of both"] = 0.0,
+    warn_percent: Annotated[float, "percentage of the pixels that may do so without a warning"] = 0.0,
+    hard_warn: Annotated[float, "any larger difference gives a warning"] = np.inf,
 ) -> Comparison:
     """Differences within absolute and relative thresholds, except for a share of the pixels, as `idiff` counts them."""
     require_nonnegative(locals())

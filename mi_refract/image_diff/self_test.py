@@ -43,10 +43,10 @@ SEED = 2026
 RENDERS = 4  # at least: two a side
 DETECTABLE, RATIO = "minimum detectable difference", "size / minimum detectable"
 TERMS = {
-    "size": "of a defect: relative change of a tile's mean, there where it is largest compared with the noise",
+    "size": "of a defect: relative change of a tile's mean, in the tile where it is largest compared with the noise",
     DETECTABLE: "smallest relative difference that `welch` would have seen in a tile, median over the trials",
-    RATIO: "above 1 the defect is due; in tiles noisier than the median one the minimum is so much larger",
-    "missed": "trials in which a method missed what was due: see the introduction",
+    RATIO: "above 1 the defect must be seen; tiles noisier than the median one have a larger minimum",
+    "missed": "trials in which a method missed a defect that it must see, see the introduction",
     "bound": f"{CONFIDENCE:.0%} upper bound of a rate, exact binomial (Clopper and Pearson)",
     "noise": "standard deviation of a pixel over its mean, median over the image",
 }
@@ -67,7 +67,7 @@ class Trial:
 
 @dataclass
 class Tally:
-    """What a method said of several pairs, and the minimum detectable differences that it printed."""
+    """The verdicts of a method over several pairs, and the minimum detectable differences that it printed."""
 
     seen: int = 0
     inconclusive: int = 0
@@ -108,7 +108,7 @@ class Tally:
 
 
 def _asked(renders: Pixels) -> list[str]:
-    """The methods that can be asked with so many renders of other seeds."""
+    """The methods that can be applied with this number of renders of other seeds."""
     return [name for name, method in METHODS.items() if not method.takes_renders or 2 * len(renders) >= RENDERS]
 
 
@@ -264,7 +264,7 @@ def _halves(renders: Pixels, half: int, rng: np.random.Generator) -> tuple[Pixel
 
 
 def failed(rows: Sequence[Row]) -> bool:
-    """Whether anything due was missed, or a method called too many equal pairs different."""
+    """Whether a defect that must be seen was missed, or a method called too many equal pairs different."""
     return any(row.verdict == "fail" for row in rows)
 
 
@@ -287,7 +287,7 @@ def table(rows: Sequence[Row]) -> RenderableType:
         elif row.values:
             lines.append(f"{row.subject}: " + ", ".join(f"{name} {x:.3g}" for name, x in row.values.items()))
     broken = [f"{row.subject}: {', '.join(row.broken)}" for row in rows if row.verdict == "fail"]
-    lines.append(f"failed: {'; '.join(broken)}" if broken else "every defect that was due was seen")
+    lines.append(f"failed: {'; '.join(broken)}" if broken else "every defect that had to be seen was seen")
     return Group(shares, *map(Text, lines))
 
 

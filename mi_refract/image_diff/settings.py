@@ -30,7 +30,7 @@ METHOD = Type(", ".join(ACCEPTED), lambda value: value if isinstance(value, str)
 COMMON = {
     "name": Key(TEXT, "the image's path inside its folder; `*` stands for anything, `/` included"),
     "reason": Key(TEXT, "why this image is not compared like the others"),
-    "method": Key(METHOD, "how; by default as the command line says", None),
+    "method": Key(METHOD, "the method; that of the command line by default", None),
     "allow_nonfinite": Key(BOOL, "whether NaN or Inf is allowed where the other image has the same", None),
 }
 
@@ -53,7 +53,7 @@ TYPES: dict[type, Type] = {
 
 @dataclass(frozen=True)
 class How:
-    """A method, those of its options that are given, and `reason`: why, where a settings file says so."""
+    """A method, those of its options that are given, and the `reason` from a settings file."""
 
     method: str = AUTO
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -123,7 +123,7 @@ def keys_of(method: str) -> dict[str, Key]:
 
 
 def from_words(method: str, words: Sequence[str]) -> How:
-    """The method and its options from the command line's words `NAME=VALUE`. ValueError for what it does not take."""
+    """The method and its options from the command line's `NAME=VALUE`. ValueError for anything else."""
     if method not in ACCEPTED:
         raise ValueError(f"--method {method}: accepted: {METHOD.accepted}")
     if words and method == AUTO:

@@ -40,9 +40,9 @@ STYLES = {Status.ERROR: "bold red", Status.DIFFERENT: "bold red", Status.INCONCL
 def sentence(results: Results) -> str:
     """All statuses in one line: "12 images: 1 different, 11 equal"."""
     counts = Counter(result.status for result in results.results)
-    told = ", ".join(f"{counts[status]} {WORDS[status]}" for status in Status if counts[status])
+    counted = ", ".join(f"{counts[status]} {WORDS[status]}" for status in Status if counts[status])
     number = len(results.results)
-    return f"{number} image{'' if number == 1 else 's'}: {told}"
+    return f"{number} image{'' if number == 1 else 's'}: {counted}"
 
 
 def table(results: Results) -> RenderableType:

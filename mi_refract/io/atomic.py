@@ -66,7 +66,7 @@ def temporary_name(path: Path, suffix: str) -> Path:
 
 
 def remove_unfinished() -> None:
-    """Remove the temporary files of this process, for those who end it without another word (`os._exit`)."""
+    """Remove the temporary files of this process, for code that ends it by `os._exit`."""
     for temporary in tuple(_unfinished):
         _remove(temporary)
 

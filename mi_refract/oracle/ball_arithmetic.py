@@ -43,7 +43,7 @@ _UNDECIDED = (math.nan,) * _COLUMNS
 
 @dataclass(frozen=True)
 class Certified:
-    """The exact answer for each ray, as doubles with a bound on what they leave out.
+    """The exact answer for each ray, as doubles, with a bound on their rounding error.
 
     Directions are unit, b/|a|. `x + x_low` is the value to about 106 bits, `x` alone the nearest double.
     `radius` bounds the error of every component of `direction + direction_low` and is at most 1e-30.

@@ -26,7 +26,7 @@ def watched(count: int, progress: bool) -> Iterator[slice]:
 
 
 def _progress_bar(count: int) -> tuple[Any, Any]:
-    """A started rich bar on stderr and its task; (None, None) where rich is missing or nobody looks."""
+    """A started rich bar on stderr and its task; (None, None) without rich, or where stderr is no terminal."""
     try:
         from rich.console import Console
         from rich.progress import Progress

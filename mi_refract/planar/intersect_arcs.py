@@ -51,7 +51,7 @@ class ConicArcs(LineSegments):
         return self.arrays.vector(shape[0], shape[1]), shape[2], shape[3]
 
     def start(self, ray: Ray) -> Start:
-        """What is known of the ray's start: once per ray, not per arc."""
+        """Quantities of the ray's start, computed once per ray, not per arc."""
         there = ray.own != NOWHERE
         (a, b, vertices), (c, w, turn) = self._of(ray.own, there), self._shape(ray.own, there)
         s, r = start_shares(ray)

@@ -119,7 +119,7 @@ class LineSegments:
         return vector(ends[0], ends[1]), vector(ends[2], ends[3]), self.arrays.gather(self.vertices, i, active)
 
     def start(self, ray: Ray) -> Start:
-        """What is known of the ray's start: once per ray, not per segment."""
+        """Quantities of the ray's start, computed once per ray, not per segment."""
         a, b, vertices = self._of(ray.own, ray.own != NOWHERE)
         s, r, e = *start_shares(ray), b - a
         return Start(self._own(ray, vertices), (-e * r, e * s), self._sides(ray, e, s, r))

@@ -29,7 +29,7 @@ class Region:
 
 @dataclass(frozen=True)
 class PlanarScene:
-    """What a scene file says, ready for `planar.trace` (once per colour) and for a figure.
+    """The content of a scene file, ready for `planar.trace` (once per colour) and for a figure.
 
     `colours`: one of matplotlib's names per wavelength; ("",) where there is no dispersion.
     `segments`: one per colour, the same geometry with other indices. `regions`: in drawing order, inner ones last.

@@ -40,27 +40,30 @@ class Part(NamedTuple):
 
 
 SCENE = {
-    "title": Key(TEXT, "what the image is called; the file's name by default", None),
-    "index": Key(INDEX, "of the medium around everything", [1.0]),
-    "colours": Key(TEXTS, "one for each wavelength, as matplotlib calls them; lists of indices are as long", None),
-    "max_depth": Key(whole(1, 100_000), "the most boundaries that a ray meets", 16),
-    "branches": Key(whole(0, 8), "the most partial reflections on a path; 0: refracted wherever possible", 0),
-    "view": Key(BOX, "what the image shows; all shapes by default", None),
+    "title": Key(TEXT, "title of the figure; the file's name by default", None),
+    "index": Key(INDEX, "index of the medium around all shapes", [1.0]),
+    "colours": Key(TEXTS, "one for each wavelength, by matplotlib's names; a list of indices must be as long", None),
+    "max_depth": Key(whole(1, 100_000), "largest number of boundaries that a ray meets", 16),
+    "branches": Key(whole(0, 8), "largest number of partial reflections on a path; 0: refracted wherever possible", 0),
+    "view": Key(BOX, "the part that the figure shows; all shapes by default", None),
     "shape": Key(TABLES, "[[shape]]: boundaries between media"),
     "beam": Key(TABLES, "[[beam]]: rays to follow"),
 }
 PLACE = {
-    "scale": Key(SCALE, "stretches the shape, first of all", 1.0),
+    "scale": Key(SCALE, "stretches the shape; done first", 1.0),
     "rotate": Key(NUMBER, "then turns it counter-clockwise, in degrees", 0.0),
     "at": Key(POINT, "then moves its origin there", [0.0, 0.0]),
 }
-FACETS = {"facets": Key(whole(1, 1_000_000), "so many chords in place of all arcs of a curve", None)}
+FACETS = {"facets": Key(whole(1, 1_000_000), "number of chords that replace the arcs of a curve", None)}
 OUTSIDE = {
     "outside": Key(INDEX, "index around the shape; that of the whole scene by default", None),
-    "within": Key(TEXT, "or the name of a shape above that it lies in", None),
+    "within": Key(TEXT, "instead of `outside`: the name of an earlier shape that this one lies in", None),
 }
-SOLID = {"n": Key(INDEX, "index inside"), "name": Key(TEXT, "for `within`", None)} | OUTSIDE
-THICKNESS = Key(POSITIVE, "on the axis")
+SOLID = {
+    "n": Key(INDEX, "index inside"),
+    "name": Key(TEXT, "a name that `within` of later shapes can use", None),
+} | OUTSIDE
+THICKNESS = Key(POSITIVE, "thickness on the axis")
 
 
 def _solid(build: Callable[[Table], Curve]) -> Callable[[Table], list[Part]]:
@@ -83,7 +86,7 @@ def _luneburg(v: Table) -> list[Part]:
 
 
 def _arcs(pieces: str) -> Key:
-    return Key(NUMBERS, f"degrees by which {pieces} turns left, an arc of a circle; 0: straight", None)
+    return Key(NUMBERS, f"degrees by which {pieces} turns left as an arc of a circle; 0: straight", None)
 
 
 SHAPES = {
@@ -99,7 +102,7 @@ SHAPES = {
         _solid(lambda v: shapes.polygon(v["points"], v["arcs"])),
     ),
     "rectangle": Kind(
-        "around its origin",
+        "a rectangle around its origin",
         {"width": Key(POSITIVE, "along x"), "height": Key(POSITIVE, "along y")} | SOLID | PLACE,
         _solid(lambda v: shapes.rectangle(v["width"], v["height"])),
     ),
@@ -114,12 +117,12 @@ SHAPES = {
         _solid(lambda v: shapes.prism(v["apex"], v["side"])),
     ),
     "circle": Kind(
-        "around its origin",
-        {"radius": Key(POSITIVE, "from its origin")} | SOLID | PLACE | FACETS,
+        "a circle around its origin",
+        {"radius": Key(POSITIVE, "of the circle")} | SOLID | PLACE | FACETS,
         _solid(lambda v: shapes.circle(v["radius"])),
     ),
     "ellipse": Kind(
-        "around its origin",
+        "an ellipse around its origin",
         {"radii": Key(POSITIVES, "half axes along x and y")} | SOLID | PLACE | FACETS,
         _solid(lambda v: shapes.ellipse(*v["radii"])),
     ),
@@ -152,8 +155,8 @@ SHAPES = {
     "luneburg": Kind(
         "a ball in concentric layers of index outside × √(2 − (r/radius)²)",
         {
-            "radius": Key(POSITIVE, "of the outermost"),
-            "layers": Key(whole(1, 10_000), "how many"),
+            "radius": Key(POSITIVE, "radius of the outermost layer"),
+            "layers": Key(whole(1, 10_000), "number of layers"),
         }
         | OUTSIDE
         | PLACE
@@ -204,25 +207,25 @@ BEAMS = {
     "parallel": Kind(
         "parallel rays from a line",
         {
-            "from": Key(POINT, "where the first one starts"),
-            "to": Key(POINT, "where the last one does"),
-            "direction": Key(DIRECTION, "of all"),
-            "count": Key(RAYS, "how many; 1: from the middle"),
+            "from": Key(POINT, "start of the first ray"),
+            "to": Key(POINT, "start of the last ray"),
+            "direction": Key(DIRECTION, "of all rays"),
+            "count": Key(RAYS, "number of rays; 1: from the middle"),
         },
         _parallel,
     ),
     "fan": Kind(
         "rays from a point",
         {
-            "at": Key(POINT, "the point"),
-            "angles": Key(PAIR, "of the first and of the last one, in degrees"),
-            "count": Key(RAYS, "how many; 1: in the middle"),
+            "at": Key(POINT, "start of all rays"),
+            "angles": Key(PAIR, "directions of the first and of the last ray, in degrees"),
+            "count": Key(RAYS, "number of rays; 1: in the middle"),
         },
         _fan,
     ),
     "rays": Kind(
-        "one by one",
-        {"origins": Key(POINTS, "where they start"), "directions": Key(DIRECTIONS, "as many")},
+        "rays one by one",
+        {"origins": Key(POINTS, "their starts"), "directions": Key(DIRECTIONS, "one for each start")},
         _rays,
     ),
 }

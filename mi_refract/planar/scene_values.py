@@ -65,7 +65,7 @@ RAYS = whole(1, 1_000_000)
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of shape or beam: what it is, its own keys, and what is built of their values.
+    """A kind of shape or beam: a description, its own keys, and the function that builds it from their values.
 
     Of a shape: `build(values)` gives its parts, around its own origin; `values` has `n` and `outside`, per colour.
     Of a beam: origins and directions, N × 2.

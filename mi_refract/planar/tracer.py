@@ -178,7 +178,7 @@ def _each(name: str, values: Any, count: int, kinds: str, kind: Any) -> Any:
 
 
 def _mesh(arrays: ArrayBackend, segments: Segments, method: str) -> MeshAcceleration | None:
-    """What finds the next boundary; None where trying all segments is faster, asked for, or the only way."""
+    """The mesh that finds the next boundary; None where all segments are tried: faster, asked for, or the only way."""
     if method not in METHODS:
         raise ValueError(f"method = {method!r}; accepted: {', '.join(METHODS)}")
     if method == "brute" or (method == "auto" and len(segments) <= FEW):

@@ -24,7 +24,7 @@ LOBES = mi.BSDFFlags
 
 @dataclass(frozen=True)
 class PathFeatures:
-    """What is traced: what the scene needs, as far as the integrator's parameters ask for it."""
+    """The features that are traced: those that the scene needs and the integrator's parameters allow."""
 
     max_depth: int
     rr_depth: int
@@ -53,7 +53,7 @@ class PathFeatures:
 
 @dataclass
 class LoopState:
-    """What a lane remembers from vertex to vertex; None where the plan has no use for it."""
+    """The state of a lane between vertices; None for parts that the features do not need."""
 
     ray: Any
     throughput: Any
@@ -97,7 +97,7 @@ class ScalarStack:
         self.branches: list[Any] = []
 
     def write(self, branch: Any, index: int, active: bool) -> None:
-        """Put `branch` at `index`; what lay above is gone."""
+        """Put `branch` at `index`; entries above it are lost."""
         self.branches[index:] = [branch]
 
     def read(self, index: int, active: bool) -> Any:

@@ -96,7 +96,7 @@ def integrator_class(v: Any) -> type:
             return dr.select(end.valid, end.result, 0), end.valid, [end.truncated] if self.deterministic else []
 
         def plan(self, scene: Any) -> PathFeatures:
-            """What is traced of a scene. ValueError where `deterministic` is asked for and cannot be."""
+            """The features that are traced for a scene. ValueError where `deterministic` is set and impossible."""
             needs = self._needs(scene)
             # Local memory has no derivatives, and the evaluated loops that derivatives need have no local memory.
             symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)

@@ -87,7 +87,7 @@ def _decoded(name: str, content: str | bytes) -> str:
 
 
 def _value(text: Any) -> Any:
-    """The value of JSON text, any other text as it is, None for what is not text."""
+    """The value of JSON text, any other text unchanged, None for anything but text."""
     try:
         return json.loads(text)
     except ValueError:

@@ -32,7 +32,7 @@ DIGITS = {2.0**-24: 7, 2.0**-53: 15}  # by roundoff: fewer digits than distingui
 
 @dataclass(frozen=True)
 class Explanation:
-    """A mistake, the share of a sample of the answers that it explains, and the median angle to what it gives."""
+    """A mistake, the share of a sample of the answers that it explains, and the median angle to its directions."""
 
     mistake: str
     text: str

@@ -39,16 +39,16 @@ COLUMNS = (
     "exact",
     "wrong",
 )
-STYLES = {"wrong": "bold red", "fair": "", "exact": "green"}
+STYLES = {"wrong": "bold red", "right": "", "exact": "green"}
 TERMS = {
     "ulp": "the spacing of numbers at 1: 2⁻²³ in f32, 2⁻⁵² in f64",
     "worst, p99, mean": "angles to the certified direction, over the rays whose total internal reflection was "
     "classified correctly; rounding the exact answer costs up to 0.43 ulp",
     "TIR misclassified": "rays that were called transmitted and are totally reflected, or the reverse",
-    "TIR beyond bound": "those of them that are farther from the critical angle than rounding can excuse",
+    "TIR beyond bound": "those of them that are farther from the critical angle than rounding can explain",
     "length error": "the difference between the length of an answer and 1, or the length of a where that is nearer",
     "error / bound": "the largest ratio of an error to the a-priori bound of the chosen formula for that ray",
-    "exact": "answers that are the certified direction, rounded: no formula does better",
+    "exact": "answers that are the certified direction, rounded: no formula can do better",
     "wrong": "answers whose error is beyond the bound, whose TIR is misclassified beyond it, or that are no direction",
 }
 SIGNALS = {
@@ -118,8 +118,8 @@ def _line(each: Explanation) -> str:
 
 
 def grade(each: RegimeErrors) -> str:
-    """ "exact", "fair" or "wrong"."""
-    return "wrong" if each.wrong else "exact" if each.exact == each.rays else "fair"
+    """ "exact", "right" or "wrong"."""
+    return "wrong" if each.wrong else "exact" if each.exact == each.rays else "right"
 
 
 # Terminal ----------------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ def lengths(rng: Generator, n: Array) -> Triple:
 
 
 def off_unit(rng: Generator, n: Array) -> Triple:
-    """What a change of frame leaves: every vector times a matrix, both rounded, in the precision's own arithmetic."""
+    """Vectors after a change of frame: each times a matrix, both rounded, in the precision's own arithmetic."""
     a, n, k = rays_at(mixed, rng, n)
     turn = np.linalg.qr(rng.normal(size=(len(n), 3, 3)))[0].astype(n.dtype)
     return np.einsum("nij,nj->ni", turn, a.astype(n.dtype)), np.einsum("nij,nj->ni", turn, n), k

@@ -82,7 +82,7 @@ def packed(text: str) -> str:
 
 
 def shown(pixels: Any, channels: tuple[str, ...]) -> tuple[Any, str]:
-    """What a page can show of an image: its RGB, or its one channel, and their name; (None, "") for neither."""
+    """The part of an image that a page can show: RGB or its one channel, and its name; (None, "") for neither."""
     if {"R", "G", "B"} <= set(channels):
         return pixels[..., [channels.index(name) for name in "RGB"]], "RGB"
     return (pixels, channels[0]) if len(channels) == 1 else (None, "")

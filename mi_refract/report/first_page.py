@@ -23,7 +23,7 @@ STATES = ("yes", "no", "plain", "not measured")
 
 
 class Answer(TypedDict):
-    """A question and what the rows say to it.
+    """A question, and the answer that the rows give.
 
     `state`: "yes" where every budget behind the answer held, "no" where one did not, "plain" where there is none, "not
     measured" where no row answers. `study` is the one that says more, NOT_RUN the list of what was not run, "" none.
@@ -36,7 +36,7 @@ class Answer(TypedDict):
 
 
 class ShownImage(TypedDict):
-    """Images of one row, by the row's name: which roles, the label of each, and what they show."""
+    """Images of one row, by the row's name: which roles, the label of each, and the caption."""
 
     row: str
     labels: Mapping[str, str]
@@ -44,7 +44,7 @@ class ShownImage(TypedDict):
 
 
 class ShownPlot(TypedDict):
-    """Curves of one row, by the row's name: which ones, the label of each, and what they show."""
+    """Curves of one row, by the row's name: which ones, the label of each, and the caption."""
 
     row: str
     labels: Mapping[str, str]

@@ -30,7 +30,7 @@ ROLES = ("reference", "test", "overlay", "difference")
 
 
 def prepare(rows: Sequence[Row], context: Mapping[str, Any], images: EmbeddedImages) -> dict[str, Any]:
-    """What the template `report.html.j2` is filled with. Errors: those of `EmbeddedImages.embed`."""
+    """The values for the template `report.html.j2`. Errors: those of `EmbeddedImages.embed`."""
     verdicts = Counter(row.verdict for row in rows)
     keys = {name: f"study-{number}" for number, name in enumerate(by_study(rows), 1)}
     first, anchors = context.get("first_page"), keys | {first_page.NOT_RUN: "missing"}

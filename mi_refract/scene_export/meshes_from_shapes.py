@@ -40,7 +40,7 @@ class Surface:
 
 
 def meshes_of_shape(shape: Node, level: int) -> Iterator[Mesh]:
-    """The shape's meshes: two for a checkerboard, otherwise one. ValueError for what a mesh cannot hold."""
+    """The shape's meshes: two for a checkerboard, otherwise one. ValueError for parameters that a mesh cannot have."""
     surface, frame = _surface(shape), _frame(shape)
     flipped = shape.value(bool, "flip_normals", False)
     parts = _parts(shape, surface, level)

@@ -104,7 +104,7 @@ def test_answers_may_repeat_the_header_of_the_rays(call):
     to = ray_set.make(["Brewster"], 40, "f64", 8)
     answer("answers.csv", to, lines=header(to))
     code, out, _ = call("check", "answers.csv")
-    assert (code, out.splitlines()[0]) == (0, "answers.csv: 40 rays, 1 regimes, f64, seed 8")
+    assert (code, out.splitlines()[0]) == (0, "answers.csv: 40 rays, 1 regime, f64, seed 8")
     files.write("rays.csv", to)
     answer("answers.csv", to, lines=[line.replace("sha256:", "sha256:0") for line in header(to)])
     code, _, err = call("check", "answers.csv", "--rays", "rays.csv")

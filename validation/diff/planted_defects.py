@@ -113,7 +113,7 @@ TERMS = (
 
 
 def register(variant: Any) -> None:
-    """The spoilt glasses, for the variant of this module (`mitsuba.llvm_ad_rgb`, say)."""
+    """Register the glasses with a defect, for the variant of this module (`mitsuba.llvm_ad_rgb`, say)."""
     plugin = refract.plugin_class(variant)
     for name, (_, make) in GLASSES.items():
         variant.register_bsdf(f"{GLASS} {name}", lambda props, make=make: make(props, plugin))

@@ -150,7 +150,7 @@ def _p99(x: np.ndarray) -> float:
 
 
 def _summary(name: str, parts: list[Row], setting: Setting, times: dict[str, float]) -> Row:
-    """The worst over all regimes with a budget and what it cost: a point in the plane of error and time."""
+    """The worst error over all regimes with a budget, and the time: a point in the plot of error against time."""
     parts = [row for row in parts if row.budgets]
     metrics = WORST_IN_U, ERROR_OVER_BOUND, WORST_CHORD, WORST_ANGLE, "length drift"
     values = {m: max(row.values[m] for row in parts) for m in metrics}
@@ -165,7 +165,7 @@ def _summary(name: str, parts: list[Row], setting: Setting, times: dict[str, flo
 
 
 def _slack(name: str, parts: list[Row]) -> dict[str, float]:
-    """Constant over what the sweep needs of it, each with the other one as it is."""
+    """Each constant of the bound over the smallest one that these rays allow, with the other one unchanged."""
     constants = {"linear": budget_of(name).linear, "radicand": budget_of(name).radicand}
     needed = {c: max(row.replay["needed"][c] for row in parts) for c in constants}
     return {f"slack, {c}": x / max(needed[c], 1e-3 * x) for c, x in constants.items() if x}

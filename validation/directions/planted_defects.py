@@ -37,7 +37,7 @@ EXACT = tuple(name for name, formula in FORMULAS.items() if formula.budget.at_th
 
 @dataclass(frozen=True)
 class Mutant:
-    """`make(formula)` is the spoilt subject; `of` are the formulas that it spoils.
+    """`make(formula)` is the formula with the defect; `of` are the formulas to which it applies.
 
     `rare`: it shows on too few rays to be looked for on scalar arrays, which cost a call per operation.
     """
@@ -274,7 +274,7 @@ class Sample:
     unit: np.ndarray
 
     def judge(self, mutant: str, formula: str, vector: Any) -> Judgement:
-        """A mutant by the budget of the formula that it spoils, on the rays that are for that formula."""
+        """Check a mutant against the bound of the formula it was made from, on the rays that this formula accepts."""
         spoilt, budget = MUTANTS[mutant].make(FORMULAS[formula]), FORMULAS[formula].budget
         part = self if budget.at_the_limit else self.only(self.unit)
         return judge_formula(spoilt, part.rays, part.exact, vector, budget)

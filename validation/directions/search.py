@@ -157,8 +157,9 @@ def _sample(name: str, setting: Setting, seed: int, count: int) -> Screen:
 
 
 def _scores(name: str, subject: Subject, screen: Screen, decision: np.ndarray) -> np.ndarray:
-    """The higher the worse. Chord: its share of the bound, of rays that are decided rightly. Decision: the distance
-    from the critical angle where it is wrong, minus that distance where it is right. Rays whose side is open are out.
+    """The higher the worse. Chord: the error over its bound, for rays that are classified correctly. Decision: the
+    distance from the critical angle where it is wrong, minus that distance where it is right. Rays whose side of the
+    surface the formula need not know are left out.
     """
     chord, wrong = screen.judge(subject)
     far, budget = np.abs(screen.relative_radicand), budget_of(name)
@@ -234,7 +235,7 @@ def _inside(rays: Rays, herd: Herd, parents: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Certified:
-    """A line, and its share of what is allowed: of the chord error; for a decision 1 where it had to be right, or 0."""
+    """A line, and its chord error over the bound; for a decision 1 where it had to be right, else 0."""
 
     line: Found
     share: float
@@ -260,7 +261,7 @@ def worth_keeping(found: Iterable[Certified]) -> list[Found]:
 
 
 def rescored(name: str, setting: Setting) -> list[Found]:
-    """The lines of the file for `name` in that precision, with the scores of the formula as it is now."""
+    """The lines of the file for `name` in that precision, with the scores of the present formula."""
     precision = np.dtype(setting.precision).name
     lines = [line for line in worst_rays.read() if (line.formula, line.precision) == (name, precision)]
     rays, u = worst_rays.rays_of(lines, precision), setting.roundoff

@@ -106,7 +106,7 @@ def _largest(x: np.ndarray, count: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Gathered:
-    """What is kept of a regime for one formula.
+    """The results of one formula in one regime.
 
     `worst`: of the rays that the screen is certain of and that were decided rightly, those nearest to their bounds.
     `misclassified`: those decided wrongly, farthest from the critical angle first. `unresolved`: rays that the screen

@@ -187,7 +187,7 @@ def _noise(path: Path, extent: Extent) -> float:
 
 
 def _resolution(path: Path, extent: Extent) -> int:
-    """Of images that take long enough for what a render costs beside its samples not to count."""
+    """The image size at which the fixed cost of a render is negligible beside that of its samples."""
     resolution = extent.resolution
     while resolution < LARGEST and extent.seconds:
         look = _camera(path, BUILTIN, resolution, INDEPENDENT, extent)

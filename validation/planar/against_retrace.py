@@ -131,7 +131,7 @@ def budgets(setting: Setting) -> dict[str, float]:
 
 
 def clutter_row(setting: Setting, scenes: int, rays: int) -> Row:
-    """Scenes by chance: counts of all of them, and the worst of the rest."""
+    """Random scenes: sums of the counts, and the worst of the other metrics."""
     parts = [judge(case.trace(setting), case, setting.roundoff) for case in _clutter(scenes, rays)]
     counts = (WRONG_PATH, WRONG_PATH_FAR)
     values = {name: (sum if name in counts else max)(part[name] for part in parts) for name in parts[0]}

@@ -123,7 +123,7 @@ def _tracer(setting: Setting, method: str, size: int) -> tuple[Tracer, float]:
 
 
 class Run:
-    """A tracer called once; `values`: how long it took to set up, and what is measured later."""
+    """A tracer called once; `values`: its setup time, and later measurements."""
 
     def __init__(self, tracers: Callable[[str, int], tuple[Tracer, float]], method: str, size: int, count: int) -> None:
         """`tracers(method, size)` is a tracer with the seconds that it took; `count` rays, fewer for slow methods."""

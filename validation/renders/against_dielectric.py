@@ -165,7 +165,7 @@ def _paired(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:
 
 
 def no_question(test: np.ndarray, reference: np.ndarray) -> str:
-    """Why Welch's test has nothing to ask: what is the same needs no statistics; "" where it has."""
+    """Why Welch's test is not applied, because the images are the same without statistics; "" where it is."""
     if np.array_equal(test, reference):
         return "left out: Welch's test, because images of the same seed are identical bit for bit"
     if reference.std(0).max() < CHANGED and test.std(0).max() < CHANGED:  # two conditions: NaN is below nothing

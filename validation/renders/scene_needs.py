@@ -32,7 +32,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def scene_rows(context: Context, path: Path) -> list[Row]:
-    """One row: what the loaded scene has that needs care."""
+    """One row: the features of the loaded scene."""
     found = scene_features.inspect(opened(path, PLUGIN, context.profile.resolution))
     values = {name.replace("_", " "): float(x) for name, x in dataclasses.asdict(found).items() if name != "unknown"}
     remark = f"left out: {', '.join(found.left_out)}"

@@ -104,7 +104,7 @@ def operations(
 
 
 def scalar_rows(context: Context) -> list[Row]:
-    """What a call of `sample` takes where nothing is compiled: a Python plugin's calls, against the built-in's C++."""
+    """Time of a call of `sample` in a scalar variant: a plugin in Python, against the built-in's C++."""
     import mitsuba as mi
 
     with under("scalar_rgb"):
@@ -136,7 +136,7 @@ def operation_rows(context: Context) -> list[Row]:
     plain = {plugin: operations(plugin) for plugin in (PLUGIN, BUILTIN)}
 
     def row(case: str, shared: bool = True, less: bool = False, variant: str = context.variant, **asked: Any) -> Row:
-        """`less`: asked for less, the plugin must leave out at least as many operations as the built-in."""
+        """`less`: with fewer features, the plugin must drop at least as many operations as the built-in."""
         values: dict[str, float] = {}
         for plugin, name in ((PLUGIN, ""), (BUILTIN, f", {BUILTIN}"))[: 2 if shared else 1]:
             with under(variant):

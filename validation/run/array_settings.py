@@ -60,14 +60,14 @@ class Setting:
 
     @functools.cached_property
     def flushes(self) -> bool:
-        """Whether denormal numbers are taken for 0, which Dr.Jit's threads do. Asked of the array, not presumed."""
+        """Whether denormal numbers are taken for 0, which Dr.Jit's threads do. This is tested, not assumed."""
         if self.is_scalar:
             return False
         least = np.full(1 << 16, np.finfo(self.precision).smallest_subnormal)
         return not np.array(dr.value_t(self.vector)(least) > 0).all()
 
     def no_budget(self, budget: Budget, regime: str) -> str:
-        """Why a formula is not held to its budget in a regime; "" where it is."""
+        """Why a formula has no budget in a regime; "" where it is."""
         entry = REGIMES[regime]
         if entry.rests_on_denormals and self.flushes:
             return "no budget: this backend takes denormal numbers for 0"
@@ -103,7 +103,7 @@ def _settings(context: Context) -> list[Setting]:
 
 
 def budget_of(subject: str) -> Budget:
-    """The budget that a subject is held to: its own, or that of the common form."""
+    """The budget of a subject: its own, or that of the common form."""
     return FORMULAS[subject if subject in FORMULAS else PLAIN].budget
 
 

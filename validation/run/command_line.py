@@ -15,7 +15,7 @@ def application() -> typer.Typer:
 def exit_code(app: typer.Typer, name: str, arguments: list[str]) -> int:
     """Run the command; its exit code, 2 after a usage error, 130 after an interruption."""
     try:
-        return app(arguments, prog_name=name, standalone_mode=False) or 0
+        return app(arguments, prog_name=f"python -m {name}", standalone_mode=False) or 0
     except Exception as error:
         # Typer's parser raises errors of its own, in a module whose name depends on its version.
         if type(error).__name__ == "Abort":
@@ -26,6 +26,6 @@ def exit_code(app: typer.Typer, name: str, arguments: list[str]) -> int:
 
 
 def misuse(name: str, message: str) -> int:
-    """Say what is wrong in one line; 2."""
+    """Print the error in one line on stderr; 2, the exit code."""
     print(f"{name}: {' '.join(message.split())}", file=sys.stderr)
     return 2

@@ -71,7 +71,7 @@ def first_page(rows: Sequence[Row], profile: str = "") -> FirstPage:
 
 
 def _answer(question: str, text: str, rows: Iterable[Row], study: str) -> Answer:
-    """`rows` are what the answer rests on: their verdicts make its state."""
+    """`rows` are the evidence for the answer: their verdicts determine its state."""
     verdicts = {row.verdict for row in rows if row.values}
     state = "no" if "fail" in verdicts else "yes" if "pass" in verdicts else "plain"
     return {
@@ -216,7 +216,7 @@ def _paths_sentence(paths: dict[str, Row]) -> str:
 
 
 def _layers_sentence(rows: Sequence[Row]) -> str:
-    """What a thousand thin layers of air do to a direction, of what each plugin starts from; "" where not measured."""
+    """The error after a thousand thin layers of air, with the inputs that each plugin gets; "" where not measured."""
     ours, theirs = (
         [row.values[SHALLOW] for row in rows if row.case == case and row.subject in subjects and SHALLOW in row.values]
         for case, subjects in ((CONTRASTS, OURS), (INDICES, (BUILTIN_FORMULA,)))

@@ -37,7 +37,7 @@ Clock = Callable[[Subject], float]
 
 
 def copy(a: Any, n: Any, k: Any) -> tuple[Any, Any]:
-    """Reads and writes what a formula does, and computes as little as can be."""
+    """Reads and writes the bytes that a formula reads and writes, with almost no computation."""
     return a + n * k, k > 0
 
 

@@ -44,7 +44,7 @@ class View:
         self.to_world = np.array(self.scene.sensors()[0].world_transform().matrix, float).reshape(4, 4)
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Where the camera sees points (N × 3), on an image from 0 to 1, y downward; NaN for what is behind it."""
+        """Image coordinates of points (N × 3), from 0 to 1, y downward; NaN for points behind the camera."""
         x, y, z = np.linalg.inv(self.to_world[:3, :3]) @ (points - self.to_world[:3, 3]).T
         z = np.where(z > 0, z, np.nan)
         return 0.5 - 0.5 * np.stack([x, y], 1) / (self.half * z)[:, None]

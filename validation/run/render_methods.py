@@ -22,7 +22,7 @@ OURS = "refract_path"
 
 @dataclass(frozen=True)
 class Method:
-    """An integrator with what it takes beyond the depth, and the BSDF of the glass."""
+    """An integrator with its parameters other than the depth, and the BSDF of the glass."""
 
     name: str
     integrator: str

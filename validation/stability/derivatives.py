@@ -115,7 +115,7 @@ def inputs(count: int, precision: type) -> Inputs:
 
 
 def condition_of(certified: oracle.Certified, k: np.ndarray) -> np.ndarray:
-    """1 + k² sinθi (sinθi + 2 cosθi)/cos²θt: k and both directions, each off by u, move log cosθt by as much u."""
+    """1 + k² sinθi (sinθi + 2 cosθi)/cos²θt: k and both directions, each off by u, change log cosθt by that many u."""
     cos_i = certified.cos_i
     sin_i = np.sqrt((1 - cos_i) * (1 + cos_i))
     with np.errstate(divide="ignore", invalid="ignore"):

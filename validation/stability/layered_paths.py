@@ -230,7 +230,7 @@ def _deviations(layers: Layers, rays: Bundle, exact: list[Path], plugin: str, st
 
 
 def rounded(layers: Layers) -> dict[str, Layers]:
-    """What is lost before any formula: the indices in float32, and their ratios, as a plugin may be given them."""
+    """The errors of the inputs alone: indices, or their ratios, rounded to float32 as a plugin may get them."""
     n = np.array(layers.indices)
     ratios = (n[1:] / n[:-1]).astype(np.float32).astype(float)
     indices = {INDICES: n.astype(np.float32).astype(float), RATIOS: n[0] * np.cumprod([1.0, *ratios])}

@@ -235,7 +235,7 @@ def worst(x: Array) -> float:
 
 
 def problem_row(case: str, fed: Fed, setting: Setting, curves: dict[str, Array]) -> Row:
-    """What the problem itself makes of u, and the error of every formula against the number of layers."""
+    """The condition of the problem in u, and the error of every formula, against the number of layers."""
     stop = fed.rays.stop
     seen = len(stop) - len(next(iter(curves.values())))
     curves = curves | {"condition · u": (fed.condition * setting.roundoff).astype(float)[seen:]}
@@ -270,7 +270,7 @@ def pipe_row(name: str, subject: Subject, setting: Setting, how: Extent) -> Row:
 
 
 class Refractor:
-    """A formula as a system asks for it: inputs rounded to the setting's precision. Counts what it did not transmit."""
+    """A formula as a system calls it: inputs rounded to the setting's precision. Counts what it did not transmit."""
 
     def __init__(self, subject: Subject, setting: Setting) -> None:
         """`subject` is evaluated in the arrays of the setting."""

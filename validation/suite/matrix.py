@@ -57,7 +57,7 @@ def _system(row: Row) -> str:
 
 
 def with_summary(rows: list[Row]) -> list[Row]:
-    """The rows of a run with the summary before what it is taken from."""
+    """The rows of a run, with the summary before the rows it is made from."""
     place = next((i for i, row in enumerate(rows) if row.study in CHECKS), len(rows))
     return [*rows[:place], *summary(rows), *rows[place:]]
 

@@ -47,7 +47,7 @@ class Set:
 
 
 def _random(rng: np.random.Generator, count: int, eps: float) -> tuple[np.ndarray, np.ndarray]:
-    """What is nearer to the critical angle than one in 10⁴ is the next set's: here it would be a matter of luck."""
+    """Rays at all angles but the nearest to the critical one; there chance would decide the worst error of this set."""
     cosine, k = rng.uniform(0, 1, 2 * count), 1.5 ** rng.choice([-1.0, 1.0], 2 * count)
     apart = np.flatnonzero(np.abs(1 - k * k * (1 - cosine * cosine)) > APART)[:count]
     return np.arccos(cosine[apart]), k[apart]

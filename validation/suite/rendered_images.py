@@ -80,7 +80,7 @@ def _scene(name: str, resolution: int) -> PlainScene:
 
 
 def environment(resolution: int) -> PlainScene:
-    """The balls under the askew sky."""
+    """The balls under the turned sky."""
     return dataclasses.replace(_scene("balls", resolution), name="environment", sky=askew())
 
 
@@ -96,7 +96,7 @@ def furnace(resolution: int) -> PlainScene:
 
 
 def askew() -> Environment:
-    """A smooth sky that no rotation or mirror takes to itself, turned about two axes."""
+    """A smooth sky without symmetry, turned about two axes."""
     height, width = 64, 128
     theta, phi = np.pi * np.arange(height) / (height - 1), 2 * np.pi * (np.arange(width) + 0.5) / width
     t, p = np.meshgrid(theta, phi, indexing="ij")

@@ -117,7 +117,7 @@ def script(system: System, name: str, *arguments: str) -> list[str]:
 
 
 def run(command: Sequence[str], given: str = "", timeout: float | None = None, where: Path | None = None) -> str:
-    """What a program prints, `given` on its stdin; it and all it started are gone when this returns.
+    """The output of a program with `given` on its stdin; all its processes have ended when this returns.
 
     Unable: it exits with CANNOT, for the reason that is its last line on stderr. Broken: it is not there, exits with
     another code than 0, is killed, prints no text, or runs for longer than `timeout` seconds (TIMEOUT by default).
@@ -142,6 +142,6 @@ def run(command: Sequence[str], given: str = "", timeout: float | None = None, w
 
 
 def _last_word(said: bytes) -> str:
-    """The last line on stderr: the one that says what is wrong."""
+    """The last line on stderr, which names the error."""
     lines = [line.strip() for line in said.decode(errors="replace").splitlines() if line.strip()]
     return lines[-1] if lines else "no word on stderr"

@@ -29,7 +29,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 @dataclass(frozen=True)
 class ImageRenderer:
-    """`draw(plain, folder, spp, seeds)` leaves one image a seed, from what it puts into an empty folder.
+    """`draw(plain, folder, spp, seeds)` writes the scene into an empty folder and renders one image per seed.
 
     `spp`: by scene of the study, the samples a pixel and image that make a difference of 1 % visible where four
     images are judged; `assumed`: in what the models differ.

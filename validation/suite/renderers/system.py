@@ -26,7 +26,7 @@ RECORDED_F64 = recorded_error(9e-15, 1.9e-12, 2e-16, 1e-15)
 
 @dataclass(frozen=True)
 class Pip:
-    """A virtual environment of its own. `bare`: without what these packages say they depend on."""
+    """A virtual environment of its own. `bare`: without the dependencies of these packages."""
 
     requirements: tuple[str, ...]
     python: str = ""  # the one version that there are wheels for, as "3.11"

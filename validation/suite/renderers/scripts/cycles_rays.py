@@ -1,4 +1,4 @@
-"""Cycles' refraction closure: a camera written in OSL shoots every ray at a triangle of its own, and the world answers.
+"""Cycles' refraction closure: a camera in OSL shoots every ray at a triangle of its own, and the world returns it.
 
 The triangle faces the ray, and gives the closure the ray's normal and index; the world's colour is the direction that
 leaves, and black where the closure has none. So nothing of Cycles' geometry is in the answer. Runs in Blender's module.
