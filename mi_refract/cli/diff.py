@@ -68,7 +68,7 @@ def _print_methods(asked: bool) -> None:
 
 
 # Of `diff` alone.
-Renders = Annotated[bool, typer.Option("--renders", help="Each folder holds renders of one image.")]
+Renders = Annotated[bool, typer.Option("--renders", help="Each folder holds several renders of one image.")]
 OldRenders = Annotated[bool, typer.Option("--samples", hidden=True)]
 CountsAs = Annotated[
     Inconclusive | None, typer.Option(help="What an inconclusive image counts as; exit code 3 by default.")
