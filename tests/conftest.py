@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,10 +12,6 @@ import pytest
 from mi_refract import backend
 
 VARIANT = backend.activate()
-if "PYTEST_XDIST_WORKER_COUNT" in os.environ:  # the workers share the cores: Dr.Jit's threads wait actively
-    import drjit as dr
-
-    dr.set_thread_count(max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])))
 USABLE: dict[str, str | None] = backend.usable_variants()
 
 

@@ -135,15 +135,17 @@ def _trusted(rows: Sequence[Row]) -> Answer:
     single, double = _overall(rows, SINGLE), _overall(rows, DOUBLE)
     measured = [row for row in rows if row.study == DIRECTIONS and row.subject != BUILTIN_FORMULA]
     sentences = []
-    ours = [name for name in OURS if name in single and name in double]
+    found = {name: each for name, each in (("single precision", single), ("double precision", double)) if each}
+    ours = [name for name in OURS if found and all(name in each for each in found.values())]
     if ours:
         names = " and ".join(f"`{name}`" for name in ours)
-        angles = [_degrees(max(found[name].values[WORST_ANGLE] for name in ours)) for found in (single, double)]
-        ends = f"to {angles[0]} in single precision and {angles[1]} in double"
+        worst = {name: max(each[formula].values[WORST_ANGLE] for formula in ours) for name, each in found.items()}
+        ends = " and ".join(f"to {_degrees(angle)} in {name}" for name, angle in worst.items())
         sentences.append(f"{names}, which are this project's own, everywhere: {ends}.")
-    textbook = [row for name, row in single.items() if name not in (*OURS, BUILTIN_FORMULA)]
+    precision, measured_in = (SINGLE, single) if single else (DOUBLE, double)
+    textbook = [row for name, row in measured_in.items() if name not in (*OURS, BUILTIN_FORMULA)]
     if textbook:
-        sentences.append(_textbook_sentence(textbook, _overall(rows, SINGLE, COMMON)))
+        sentences.append(_textbook_sentence(textbook, _overall(rows, precision, COMMON)))
     return _answer("How far can each formula be trusted?", " ".join(sentences), measured, DIRECTIONS)
 
 
@@ -163,11 +165,7 @@ def _fast(rows: Sequence[Row]) -> Answer:
     times = [row.values[TIME] for row in rows if row.study == RENDERS and row.subject == PLUGIN and TIME in row.values]
     sentences = []
     if times:
-        middle = statistics.median(times)
-        faster = f"{_percent(abs(middle - 1))} {'slower' if middle > 1 else 'faster'}"
-        sentences.append(
-            f"In the median of {len(times)} scenes it is {faster}: a render takes {_ends(times, 2)} times as long."
-        )
+        sentences.append(_time_sentence(times))
     best: dict[str, float] = {}
     for row in rows:
         if row.study == EFFICIENCY and row.subject.startswith(INTEGRATOR) and EQUAL_TIME in row.values:
@@ -176,6 +174,15 @@ def _fast(rows: Sequence[Row]) -> Answer:
         each = " and ".join(f"{_percent(share)} (`{scene}`)" for scene, share in list(best.items())[:3])
         sentences.append(f"With the integrator `{INTEGRATOR}`, the same error takes {each} of the built-in's time.")
     return _answer("Is it as fast as `dielectric`?", " ".join(sentences), (), EFFICIENCY if best else RENDERS)
+
+
+def _time_sentence(times: Sequence[float]) -> str:
+    middle = statistics.median(times)
+    if middle > 2:  # only where nothing compiles it
+        advice = "as a plugin written in Python does in scalar variants: use a compiled one"
+        return f"A render takes {_ends(times, 0)} times as long, {advice}."
+    faster = f"{_percent(abs(middle - 1))} {'slower' if middle > 1 else 'faster'}"
+    return f"In the median of {len(times)} scenes it is {faster}: a render takes {_ends(times, 2)} times as long."
 
 
 def _differ(rows: Sequence[Row]) -> Answer:
