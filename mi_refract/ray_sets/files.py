@@ -163,7 +163,7 @@ def _read(path: Path, arrays: dict[str, int], columns: Sequence[str], *optional:
 
 def _read_npz(path: Path, arrays: dict[str, int], optional: Sequence[str]) -> tuple[Header, np.ndarray]:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:  # a bad file is closed, too
             found = {name: file[name] for name in file.files}
         parts = {name: found[name] for name in ("id", *arrays) if name in found or name not in optional}
         count = len(parts["id"])
