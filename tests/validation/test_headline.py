@@ -99,6 +99,14 @@ def test_the_times_of_renders_and_of_equal_error():
     assert "10 % slower" in text and "5.5 % (`balls`)" in text
 
 
+def test_without_a_compiled_variant_only_double_precision_is_trusted_and_the_time_is_explained():
+    scalar = dataclasses.replace(DOUBLE, setting="scalar float64")
+    slow = dataclasses.replace(SPHERE, setting="scalar_rgb", values={**RENDER, "time / dielectric": 67.0})
+    _, trusted, fast, *_ = answers(scalar, slow)
+    assert "in double precision" in trusted["text"] and "single" not in trusted["text"]
+    assert "67 times as long" in fast["text"] and "use a compiled one" in fast["text"] and "%" not in fast["text"]
+
+
 def test_what_was_not_run_is_counted_by_what_would_bring_it():
     other = dataclasses.replace(ABSENT, reason="Dr.Jit cannot")
     text = answers(OURS, ABSENT, ABSENT, RENDERER, other)[4]["text"]
