@@ -17,6 +17,7 @@ from mi_refract.backend import detect
 from mi_refract.numerics import Mask
 
 PRECISIONS = ("float32", "float64")
+ALIGNMENT = 64  # bytes, as of Dr.Jit's own memory
 
 Index = Any  # a Python int, or a Dr.Jit array of uint32
 Vector2 = Any  # x and y, two Numbers
@@ -61,7 +62,7 @@ class ArrayBackend:
         columns = 1 if values.ndim == 1 else values.shape[1]
         row = self._indices[columns] if whole else self._vectors[columns] if columns > 1 else self.number
         kind = self.index if whole else self.number
-        return row, kind(values.ravel().astype(np.uint32 if whole else self.precision, copy=False))
+        return row, kind(_aligned(values.ravel(), np.dtype(np.uint32 if whole else self.precision)))
 
     def gather(self, table: Table, i: Index, active: Mask = True) -> Any:
         """Row i of a table; of no meaning where not `active`."""
@@ -72,6 +73,10 @@ class ArrayBackend:
         """Memory for results, filled with `value`: numbers of type `kind`, or vectors where the shape ends in 2."""
         return dr.full(kind, value, math.prod(shape)), shape
 
+    def uniform(self, kind: Any, *values: Any) -> Any:
+        """A number or vector of type `kind` that is the same for all rays, but no part of the code of a kernel."""
+        return dr.opaque(kind, values[0]) if len(values) == 1 else kind(*(dr.opaque(self.number, x) for x in values))
+
     def run(
         self, count: int, buffers: dict[str, Buffer], work: Callable[[Index, Scatter], None]
     ) -> dict[str, np.ndarray]:
@@ -79,12 +84,12 @@ class ArrayBackend:
 
         `scatter(name, j, x, active)` sets buffers[name][j, i] = x where `active`.
         """
-        lane = dr.arange(self.index, count)
+        lane, stride = dr.arange(self.index, count), self.uniform(self.index, count)
 
         def scatter(name: str, j: Index, x: Any, active: Mask) -> None:
             values, _ = buffers[name]
             x = x if isinstance(x, self.vector) else type(values)(x)
-            dr.scatter(values, x, j * count + lane, active, mode=dr.ReduceMode.NoConflicts)
+            dr.scatter(values, x, j * stride + lane, active, mode=dr.ReduceMode.NoConflicts)
 
         if count:  # Dr.Jit refuses an empty array
             work(lane, scatter)
@@ -118,6 +123,10 @@ class ScalarBackend(ArrayBackend):
     def buffer(self, kind: Any, value: Any, shape: tuple[int, ...]) -> Buffer:
         """A numpy array."""
         return np.full(shape, value, kind), shape
+
+    def uniform(self, kind: Any, *values: Any) -> Any:
+        """The number or vector itself."""
+        return kind(*values)
 
     def run(
         self, count: int, buffers: dict[str, Buffer], work: Callable[[Index, Scatter], None]
@@ -160,3 +169,16 @@ def choose_backend(name: str | None, precision: str) -> ArrayBackend:
 def negated(mask: Mask) -> Mask:
     """Not `mask`: `~True` of a Python bool is −2."""
     return not mask if isinstance(mask, bool) else ~mask
+
+
+def _aligned(values: np.ndarray, kind: np.dtype) -> np.ndarray:
+    """A copy at an address that is a multiple of ALIGNMENT.
+
+    Dr.Jit uses numpy's memory as it lies, and reads the rows of a table number by number where that is not aligned:
+    another kernel, and a slower one, by chance.
+    """
+    room = np.empty(values.size * kind.itemsize + ALIGNMENT, np.uint8)
+    skipped = -room.ctypes.data % ALIGNMENT
+    copy = room[skipped : skipped + values.size * kind.itemsize].view(kind)
+    copy[:] = values
+    return copy

@@ -107,7 +107,8 @@ class LineSegments:
 
     def __init__(self, arrays: ArrayBackend, start: Array, end: Array, vertices: Vertices) -> None:
         """Copy them to the backend."""
-        self.arrays, self.count, self.box = arrays, len(start), bounding_box(start, end)
+        self.arrays, self.count = arrays, arrays.uniform(arrays.index, len(start))
+        self.box = bounding_box(start, end)
         self.ends = arrays.table(np.concatenate([start, end], 1))
         self.vertices = arrays.table(vertices.astype(np.uint32))
         e = end - start

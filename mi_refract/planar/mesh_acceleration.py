@@ -65,8 +65,9 @@ class MeshAcceleration:
         variant = "scalar_rgb" if arrays.backend == "scalar" else f"{arrays.backend}_ad_rgb"
         self.mi: Any = getattr(mitsuba, variant)
         low, high = (f(np.concatenate([start, end]), axis=0) for f in (np.min, np.max))
-        self.centre, self.half = (low + high) / 2, float((high - low).max() / 2)
-        a, b = ((x - self.centre) / self.half for x in (start, end))
+        centre, self.half = (low + high) / 2, float((high - low).max() / 2)
+        self.centre, self.scale = arrays.uniform(arrays.vector, *centre), arrays.uniform(arrays.number, 1 / self.half)
+        a, b = ((x - centre) / self.half for x in (start, end))
         starts, ends = _strokes(a, b, vertices)
         self.scene = _upright(variant, starts, ends)
         self.crowded = self._crowded(a, b, vertices)
@@ -102,7 +103,7 @@ class MeshAcceleration:
         given = boundaries.none(), stroke, found, corner, held
         best = dr.if_stmt(given, found | corner | (held != NOWHERE), tried, lambda best, *_: best, label="stroke")
         gone = search.gone + t
-        settled = negated(found) | (best.distance * (1 / self.half) <= gone + MARGIN)
+        settled = negated(found) | (best.distance * self.scale <= gone + MARGIN)
         return best, SearchState(gone + STEP, best.segment), settled
 
     def _near_end(self, segment: Index, at: Hit | Ray, active: Mask) -> Mask:
@@ -140,7 +141,7 @@ class MeshAcceleration:
 
     def _beside(self, ray: Ray, start: Start) -> Vector2:
         """Where to trace from: the ray's start, moved off its own segment, to the side to which the ray goes."""
-        q = (ray.p - self.arrays.vector(*self.centre.tolist())) * (1 / self.half)
+        q = (ray.p - self.centre) * self.scale
         a, b = start.ways
         x, y = (self.mi.Float(e) for e in b - a)
         size = dr.select(ray.left, OFFSET, -OFFSET) * dr.rsqrt(dr.fma(x, x, y * y))

@@ -44,7 +44,7 @@ class Run:
     """
 
     mirrored: Index | None
-    max_depth: int
+    max_depth: Index
     scatter: Scatter
     weights: bool
 
@@ -88,7 +88,8 @@ class PathLoop:
             index, bits = (None if table is None else arrays.gather(table, lane) for table in others)
             scatter("points", 0, p, True)
             state = self._start(p, d, arrays.number(dr.nan) if index is None else index)
-            end = self._follow(state, Run(bits, max_depth, scatter, weights))
+            deepest = arrays.uniform(arrays.index, max_depth)
+            end = self._follow(state, Run(bits, deepest, scatter, weights))
             scatter("directions", 0, _unit(end.ray.d), True)
 
         return arrays.run(len(origins), self._buffers(len(origins), max_depth, weights), work)
@@ -117,7 +118,7 @@ class PathLoop:
 
         So a distant origin is rounded once, here, instead of in every difference from a vertex.
         """
-        low, high = (self.arrays.vector(*corner) for corner in self.boundaries.box)
+        low, high = (self.arrays.uniform(self.arrays.vector, *corner) for corner in self.boundaries.box)
         inverse = dr.rcp(dr.select(d == 0, 1e-30, d))
         a, b = (low - p) * inverse, (high - p) * inverse
         enter, leave = dr.max(dr.minimum(a, b)), dr.min(dr.maximum(a, b))
