@@ -6,14 +6,12 @@ quantities are maximised: the chord error, and the distance from the critical an
 is still misclassified. Some children are put within a few ulps of the critical angle. All rays stay in the domain: unit
 vectors stay unit up to rounding, lengths within 1e-18 … 1e18, ratios within those of the regime.
 
-`python -m validation.directions.search --keep` adds the worst to tests/data/worst_rays.txt, which the tests replay.
+`python -m validation.directions.keep_worst` adds the worst to tests/data/worst_rays.txt, which the tests replay.
 """
 
 from __future__ import annotations
 
-import argparse
 import functools
-import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -27,7 +25,7 @@ from mi_refract.regimes import REGIMES, Rays
 from mi_refract.report.row import Row
 from validation.reference.fast_reference import Screen
 from validation.run.array_settings import Setting, budget_of, settings
-from validation.run.context import PROFILES, Context, Profile
+from validation.run.context import Context, Profile
 from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED_FAR
 from validation.study import Study, Task, about
 
@@ -272,48 +270,4 @@ def rescored(name: str, setting: Setting) -> list[Found]:
     return [line.scored(float(scores[line.objective][i])) for i, line in enumerate(lines)]
 
 
-# By hand -------------------------------------------------------------------------------------------------------
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """The search by hand: from the command line, or `arguments`; the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m validation.directions.search",
-        description="Search for the rays with the largest errors of each formula.",
-    )
-    parser.add_argument("formulas", nargs="*", help="names of formulas; all by default")
-    parser.add_argument("--generations", type=int, default=PROFILES["full"].generations, help="default: %(default)s")
-    parser.add_argument("--seed", type=int, default=SEED, help="of the ray generator; default: %(default)s")
-    parser.add_argument("--keep", action="store_true", help=f"add the worst rays to tests/data/{worst_rays.PATH.name}")
-    options = parser.parse_args(arguments)
-    if unknown := [name for name in options.formulas if name not in FORMULAS]:
-        parser.error(f"unknown formula {unknown[0]!r}; accepted: {', '.join(FORMULAS)}")
-    for setting in settings(_context()):
-        if setting.is_scalar or setting.vector is None:
-            continue
-        for name in options.formulas or FORMULAS:
-            start = options.generations, options.seed, LARGEST_SAMPLE
-            herd = climb(name, FORMULAS[name], domain(name, setting), setting, *start)
-            found = certify(name, FORMULAS[name], herd, setting)
-            kept = worth_keeping(found)
-            broken = sum(f.share > 1 if f.line.objective == "chord" else f.share > 0 for f in found)
-            print(f"{setting.label}, {name}: {max(f.share for f in found):.3g} of its bound, {broken} rays over it")
-            if options.keep:
-                print(f"  {worst_rays.keep([*rescored(name, setting), *kept])} new lines")
-    return 0
-
-
-def _context() -> Context:
-    from pathlib import Path
-
-    from mi_refract import backend
-
-    variant = backend.activate(may_restart=True)
-    return Context(PROFILES["full"], Path(), variant, backend.detect(), backend.usable_variants())
-
-
 STUDY = Study(NAME, "Search", about(__doc__), TERMS, tasks)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
