@@ -156,9 +156,11 @@ def test_the_rainbow_of_a_noisy_bow_sees_an_index_off_by_1e_4(defect):
     assert row.broken == ({"error / bound": 1.0} if defect else {})
 
 
-@pytest.mark.parametrize(("defect", "verdict"), [(0.0, "pass"), (1e-3, "fail")])
-def test_a_rendered_rainbow_stands_where_it_should(defect, verdict, llvm_variant, monkeypatch):
+def test_a_rendered_rainbow_stands_where_it_should_and_not_at_the_angle_of_another_index(llvm_variant, monkeypatch):
     """Four renders: with 3 degrees of freedom chance may take 22 standard errors."""
     monkeypatch.setattr(limits, "RAINBOW_RESOLVED", 0.005)
-    found = rainbow.images(traced_systems.glass("refract", rainbow.INDEX + defect), 4)
-    assert traced_bodies.bow_row("refract", "llvm_ad_rgb", found, {}).verdict == verdict
+    found = rainbow.images(traced_systems.glass("refract", rainbow.INDEX), 4)
+    assert traced_bodies.bow_row("refract", "llvm_ad_rgb", found, {}).verdict == "pass"
+    off = rainbow.angle(rainbow.INDEX - 1e-3)
+    monkeypatch.setattr(rainbow, "angle", lambda: off)
+    assert traced_bodies.bow_row("refract", "llvm_ad_rgb", found, {}).broken.keys() == {"error / bound"}
