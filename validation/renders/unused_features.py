@@ -169,7 +169,7 @@ def operation_rows(context: Context) -> list[Row]:
 
 
 def glass_rows(context: Context) -> list[Row]:
-    """The kernel of a render for growing numbers of glasses, and what an edit compiles; of the plugin and of the built-in.
+    """The kernel of a render for growing numbers of glasses, and what an edit compiles; also of the built-in.
 
     Compared to two: a plugin that is the only one is called directly, which saves the six operations of a choice.
     """
