@@ -190,9 +190,12 @@ def test_ctrl_c(scene, handler, variant, needs_variant):
     needs_variant(variant)
     output = scene.with_name("out.exr")
     with python(INTERRUPTED, handler, scene, output, variant) as process:
-        assert process.stdout.readline() == "loaded\n"
-        time.sleep(0.5)  # into the rendering
-        assert process.poll() is None
-        process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=30) == 130, process.stderr.read()
+        try:
+            assert process.stdout.readline() == "loaded\n"
+            time.sleep(0.5)  # into the rendering
+            assert process.poll() is None
+            process.send_signal(signal.SIGINT)
+            assert process.wait(timeout=30) == 130, process.stderr.read()
+        finally:
+            process.kill()  # or a failure would wait for it without end
     assert list(scene.parent.iterdir()) == [scene]

@@ -175,7 +175,7 @@ def test_kernels_that_were_there_give_no_first_image_and_the_peak_of_a_process_i
     assert math.isnan(cold["process MB"]) or cold["process MB"] < 300
 
 
-def test_a_process_that_fails_says_why(context, tmp_path):
-    job = scaling.Job("llvm_ad_rgb", "glasses", 2, METHODS[1].name, -8, 1, 2)
+def test_a_process_that_fails_says_why(tmp_path):
+    job = scaling.Job("scalar_rgb", "glasses", 2, METHODS[1].name, -8, 1, 2)
     with pytest.raises(RuntimeError, match=r"glasses = 2: exit code 1: .*"):
         scaling.run(job, str(tmp_path))

@@ -1,6 +1,7 @@
 """Benches and the rainbow: their answers without Mitsuba, their bounds, and planted defects that break every row."""
 
 import dataclasses
+import functools
 import math
 
 import mitsuba as mi
@@ -121,6 +122,7 @@ def test_compiled_rays_are_those_of_the_scalar_variant(made, needs_variant, scal
 # The rainbow ---------------------------------------------------------------------------------------------------
 
 
+@functools.cache
 def image(index):
     """Of the light once reflected within, without noise."""
     entry = np.linspace(0.79, 0.93, 1_000_000)
