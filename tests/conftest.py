@@ -79,6 +79,12 @@ def typical_variant(each_variant: str) -> str:
 
 
 @pytest.fixture(scope="module")
+def rgb_variant(each_variant: str) -> str:
+    """One variant a family: for what does not ask whether light is polarised."""
+    return each_variant
+
+
+@pytest.fixture(scope="module")
 def polarized_variant(each_variant: str) -> str:
     """Every variant with Mueller matrices."""
     return each_variant
@@ -141,6 +147,7 @@ def _case(case: str | tuple[str, str]) -> tuple[str, str, str | None]:
 # Subsets of the variants, by the fixture that asks for them.
 SUBSETS = {
     "typical_variant": [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb", "_ad_spectral_polarized"))],
+    "rgb_variant": [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb"))],
     "polarized_variant": [name for name in USABLE if name.endswith("_polarized")],
 }
 CASES: dict[str, Any] = {"each_variant": list(USABLE), "setting": SETTINGS, "vectorised": SETTINGS[1:]}

@@ -18,13 +18,9 @@ CASES = {
         f"import mitsuba as mi; mi.set_variant('scalar_rgb'); {LOAD}"
     ),
     "from a part of mitsuba": f"import mi_refract, mitsuba.detail; mi = mitsuba; mi.set_variant('scalar_rgb'); {LOAD}",
-    "after a variant": f"import mitsuba as mi; mi.set_variant('scalar_rgb'); import mi_refract; {LOAD}",
-    "between variants": (
-        f"import mitsuba as mi; mi.set_variant('scalar_rgb'); import mi_refract; {LOAD};"
-        f"mi.set_variant('scalar_spectral'); {LOAD}; mi.set_variant('scalar_rgb'); {LOAD}"
-    ),
-    "twice": (
-        "import mitsuba as mi; mi.set_variant('scalar_rgb'); import mi_refract, importlib;"
+    "after a variant, between variants and twice": (
+        f"import mitsuba as mi; mi.set_variant('scalar_rgb'); import mi_refract, importlib; {LOAD};"
+        f"mi.set_variant('scalar_spectral'); {LOAD}; mi.set_variant('scalar_rgb'); {LOAD};"
         f"importlib.reload(mi_refract); {LOAD}"
     ),
     "parsed from XML, where Mitsuba asks scalar_rgb": (

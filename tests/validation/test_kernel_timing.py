@@ -62,7 +62,7 @@ def test_a_slow_subject_is_seen_on_every_backend_that_runs(context):
         if not dr.is_jit_v(a):
             time.sleep(2e-3)
         b, transmitted = FORMULAS["decomposed"](a, n, k)
-        for _ in range(60):
+        for _ in range(20):
             b = dr.sin(b)
         return b, transmitted
 

@@ -12,7 +12,7 @@ from mi_refract.io import image_file
 from mi_refract.rendering import scene_files
 from mi_refract.scene_export import write_files
 from mi_refract.scene_export.plain_scene import Glass
-from mi_refract.scene_export.targets import cycles, luxcore
+from mi_refract.scene_export.targets import cycles, environment_map, luxcore
 from mi_refract.scene_export.targets.environment_map import longitude_latitude, radiance
 from validation.run.context import PROFILES, Context
 from validation.run.render_methods import Camera
@@ -142,7 +142,8 @@ LOOKED_UP = {
 
 
 @pytest.mark.parametrize("renderer", LOOKED_UP)
-def test_a_renderer_finds_the_sky_where_it_looks(renderer):
+def test_a_renderer_finds_the_sky_where_it_looks(renderer, monkeypatch):
+    monkeypatch.setattr(environment_map, "FINER", 8)
     sky, seen = rendered_images.askew(), directions()
     image = longitude_latitude(sky, renderer)
     u, v = LOOKED_UP[renderer](*seen.T)

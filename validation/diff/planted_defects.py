@@ -147,7 +147,7 @@ def _later(camera: Camera, first: int) -> Callable[[], np.ndarray]:
     return lambda: _renders(camera, first)
 
 
-def trials(name: str, count: int = TRIALS, resolution: int = RESOLUTION, spp: int = SPP) -> list[self_test.Trial]:
+def trials(name: str, count: int, resolution: int = RESOLUTION, spp: int = SPP) -> list[self_test.Trial]:
     """Clean renders, nothing planted: no seed is used twice."""
     camera = opened(name, resolution=resolution)
     seeds = [2 * RENDERS * trial for trial in range(count)]
@@ -180,7 +180,7 @@ def defect_rows(context: Context, name: str) -> list[Row]:
     import mitsuba as mi
 
     register(getattr(mi, context.variant))
-    clean = trials(name)
+    clean = trials(name, TRIALS)
     cameras = {defect: opened(name, f"{GLASS} {defect}") for defect in GLASSES}
     rows = [_row(defect, clean, name, context, camera) for defect, camera in cameras.items()]
     rows += _image_defects(clean, name, context)
