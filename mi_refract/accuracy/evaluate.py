@@ -23,6 +23,7 @@ def evaluate(subject: Subject, rays: Rays, vector: ArrayType) -> tuple[Array, ND
     """
     if dr.is_jit_v(vector):
         b, transmitted = subject(vector(rays.a.T), vector(rays.n.T), dr.value_t(vector)(rays.k))
+        dr.eval(b, transmitted)  # in one kernel
         return np.array(b).T.astype(np.longdouble), np.array(transmitted)
     pairs = [subject(vector(a), vector(n), float(k)) for a, n, k in zip(rays.a, rays.n, rays.k, strict=True)]
     return np.array([list(b) for b, _ in pairs], np.longdouble), np.array([t for _, t in pairs], bool)
