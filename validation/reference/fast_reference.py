@@ -45,10 +45,11 @@ class Screen:
         self._a = wide(a)
         solved = _solve(self._a, wide(n), dr.value_t(wide)(k))
         self._high, self._low, self._transmitted, c, root, ratio, unresolved = solved
-        dr.eval(solved)
+        length = dr.norm(self._a) * dr.norm(wide(n))
+        dr.eval(solved, length)  # in one kernel
         tiny = ((np.abs((a, n)) < _UNDERFLOW) & (np.array((a, n)) != 0)).any(axis=(0, 1))
         self.relative_radicand, c = np.array(ratio), np.abs(np.array(c))
-        lengths = np.array(dr.norm(self._a) * dr.norm(wide(n)))
+        lengths = np.array(length)
         self.cos_i, self.cos_t = c / lengths, np.array(root) / lengths
         self.doubtful = np.array(unresolved) | tiny & (c < _UNDERFLOW)
 
@@ -56,8 +57,9 @@ class Screen:
         """(chord error in u, infinite where it is NaN; whether the decision differs) of every ray."""
         b, transmitted = subject(*self._inputs)
         error = dr.norm((type(self._a)(b) - self._high) - self._low) / dr.norm(self._a)
-        chord = np.array(dr.select(dr.isfinite(error), error, dr.inf)) / self.roundoff
-        return chord, np.array(transmitted != self._transmitted)
+        error, wrong = dr.select(dr.isfinite(error), error, dr.inf), transmitted != self._transmitted
+        dr.eval(error, wrong)  # in one kernel
+        return np.array(error) / self.roundoff, np.array(wrong)
 
     def bound(self, budget: Budget) -> np.ndarray:
         """In u, the bound of every ray's chord, as if it were unit to the last bit."""
