@@ -10,7 +10,7 @@ from support.fresnel_rays import DRAWS, WORST, drawn
 
 from mi_refract import oracle
 from mi_refract.formulas import FORMULAS, fresnel
-from mi_refract.numerics import DoubleWord
+from mi_refract.numerics import DoubleWord, from_numpy
 
 # Evaluation ------------------------------------------------------------------------------------------------------
 
@@ -34,7 +34,7 @@ def evaluate(setting, cos_i, k):
         each = [[plain(x) for x in ask(float(c), float(x))] for c, x in zip(cos_i, k, strict=True)]
         return [np.array(column) for column in zip(*each, strict=True)]
     number = dr.value_t(setting.vector)
-    return [np.broadcast_to(plain(x), len(k)) for x in ask(number(cos_i), number(k))]
+    return [np.broadcast_to(plain(x), len(k)) for x in ask(from_numpy(number, cos_i), from_numpy(number, k))]
 
 
 def relative(x, exact, low, setting):
@@ -316,7 +316,7 @@ def test_powers_of_rays_that_are_unit_only_up_to_rounding(name, formula, vectori
     if vectorised.name != "float32":
         pytest.skip("the plugin's precision is float32")
     cos_i, sine, a, k, exact = turned(name, vectorised)
-    ray, wide = vectorised.vector(a.T), dr.float64_array_t(dr.value_t(vectorised.vector))(k)
+    ray, wide = from_numpy(vectorised.vector, a), from_numpy(dr.float64_array_t(dr.value_t(vectorised.vector)), k)
     contrast = dr.fma(wide, wide, -1)
     _, transmitted = FORMULAS[formula].unchecked(ray, vectorised.vector(0, 0, 1), wide, contrast)
     powers = fresnel.local_powers(ray, transmitted, wide, contrast)
