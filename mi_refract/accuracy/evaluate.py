@@ -24,7 +24,8 @@ def evaluate(subject: Subject, rays: Rays, vector: ArrayType) -> tuple[Array, ND
     if dr.is_jit_v(vector):
         b, transmitted = subject(*arrays(rays, vector))
         dr.eval(b, transmitted)  # in one kernel
-        return np.array(b).T.astype(np.longdouble), np.array(transmitted)
+        parts = np.broadcast_arrays(*(np.array(x) for x in b))
+        return np.stack(parts, 1).astype(np.longdouble), np.array(transmitted)
     pairs = [subject(vector(a), vector(n), float(k)) for a, n, k in zip(rays.a, rays.n, rays.k, strict=True)]
     return np.array([list(b) for b, _ in pairs], np.longdouble), np.array([t for _, t in pairs], bool)
 
