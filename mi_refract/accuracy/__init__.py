@@ -13,7 +13,7 @@ from .direction_errors import (
     lengths,
     relative_radicand,
 )
-from .evaluate import Subject, evaluate
+from .evaluate import Subject, arrays, evaluate
 from .judge import BUDGETS, Judgement, RayBounds, judge, judge_formula
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "RayBounds",
     "Subject",
     "absolute_radicand",
+    "arrays",
     "errors",
     "errors_of_normalised",
     "evaluate",

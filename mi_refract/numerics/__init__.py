@@ -8,7 +8,7 @@ formulas, in the precision of the arrays, the second for the code that checks th
 """
 
 from . import error_free, float_expansions
-from .drjit_arrays import as_component, differentiated, ieee_divide, replace_grad, scale_to_unit
+from .drjit_arrays import aligned, as_component, differentiated, from_numpy, ieee_divide, replace_grad, scale_to_unit
 from .error_free import DoubleWord, TripleWord, two_prod, two_sum
 from .float_expansions import FloatExpansion
 from .types import ArrayType, Mask, Number, Variant, Vector3
@@ -22,10 +22,12 @@ __all__ = [
     "TripleWord",
     "Variant",
     "Vector3",
+    "aligned",
     "as_component",
     "differentiated",
     "error_free",
     "float_expansions",
+    "from_numpy",
     "ieee_divide",
     "replace_grad",
     "scale_to_unit",

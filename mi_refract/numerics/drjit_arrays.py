@@ -5,15 +5,21 @@ Each works on scalar, LLVM and CUDA arrays of either precision.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from .types import Number, Vector3
+from .types import ArrayType, Number, Vector3
+
+if TYPE_CHECKING:  # the plugin needs no numpy
+    import numpy as np
+    from numpy.typing import NDArray
 
 # Dr.Jit's type stubs say that the first returns an object, and nothing of what the second returns.
 _reinterpret: Any = dr.reinterpret_array
 replace_grad: Any = dr.replace_grad
+
+ALIGNMENT = 64  # bytes, of what Dr.Jit reads in one go
 
 
 def as_component(a: Vector3, k: Number) -> Number:
@@ -24,6 +30,34 @@ def as_component(a: Vector3, k: Number) -> Number:
     if component is float and dr.type_v(a) == dr.VarType.Float32:
         return dr.scalar.Array1f(k)[0]
     return component(k)
+
+
+def from_numpy(kind: ArrayType, values: NDArray[Any]) -> Any:
+    """The Dr.Jit array of a numpy array: numbers of (N,), a vector of (N, 3), in the precision of `kind`.
+
+    Dr.Jit's own conversion lets a kernel know the size and the place of the memory, so that others need another kernel.
+    """
+    import numpy as np
+
+    number = dr.value_t(kind) if values.ndim > 1 else kind
+    dtype = np.dtype(np.float64 if dr.type_v(kind) == dr.VarType.Float64 else np.float32)
+    parts = [number(aligned(part, dtype)) for part in np.atleast_2d(values.T)]
+    return kind(*parts) if values.ndim > 1 else parts[0]
+
+
+def aligned(values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """A copy (N,) at an address that is a multiple of ALIGNMENT.
+
+    Dr.Jit uses numpy's memory as it lies, and reads it number by number where that is not aligned: another kernel, and
+    a slower one, by chance.
+    """
+    import numpy as np
+
+    room = np.empty(values.size * dtype.itemsize + ALIGNMENT, np.uint8)
+    skipped = -room.ctypes.data % ALIGNMENT
+    copy: NDArray[Any] = room[skipped : skipped + values.size * dtype.itemsize].view(dtype)
+    copy[:] = values
+    return copy
 
 
 def ieee_divide(x: Number, y: Number) -> Number:

@@ -14,10 +14,9 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.backend import detect
-from mi_refract.numerics import Mask
+from mi_refract.numerics import Mask, aligned
 
 PRECISIONS = ("float32", "float64")
-ALIGNMENT = 64  # bytes, as of Dr.Jit's own memory
 
 Index = Any  # a Python int, or a Dr.Jit array of uint32
 Vector2 = Any  # x and y, two Numbers
@@ -62,7 +61,7 @@ class ArrayBackend:
         columns = 1 if values.ndim == 1 else values.shape[1]
         row = self._indices[columns] if whole else self._vectors[columns] if columns > 1 else self.number
         kind = self.index if whole else self.number
-        return row, kind(_aligned(values.ravel(), np.dtype(np.uint32 if whole else self.precision)))
+        return row, kind(aligned(values.ravel(), np.dtype(np.uint32 if whole else self.precision)))
 
     def gather(self, table: Table, i: Index, active: Mask = True) -> Any:
         """Row i of a table; of no meaning where not `active`."""
@@ -169,16 +168,3 @@ def choose_backend(name: str | None, precision: str) -> ArrayBackend:
 def negated(mask: Mask) -> Mask:
     """Not `mask`: `~True` of a Python bool is −2."""
     return not mask if isinstance(mask, bool) else ~mask
-
-
-def _aligned(values: np.ndarray, kind: np.dtype) -> np.ndarray:
-    """A copy at an address that is a multiple of ALIGNMENT.
-
-    Dr.Jit uses numpy's memory as it lies, and reads the rows of a table number by number where that is not aligned:
-    another kernel, and a slower one, by chance.
-    """
-    room = np.empty(values.size * kind.itemsize + ALIGNMENT, np.uint8)
-    skipped = -room.ctypes.data % ALIGNMENT
-    copy = room[skipped : skipped + values.size * kind.itemsize].view(kind)
-    copy[:] = values
-    return copy

@@ -130,7 +130,9 @@ def _settle(drawn: Figure) -> None:
     assert layout is not None
     layout.set(w_pad=0.12, h_pad=0.12)  # type: ignore[call-arg]
     for _ in range(2):  # the first pass does not know yet where the title is
-        drawn.draw_without_rendering()
+        layout.execute(drawn)
+    for panel in drawn.axes:
+        panel.apply_aspect()
     drawn.set_layout_engine("none")
 
 

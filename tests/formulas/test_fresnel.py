@@ -1,5 +1,7 @@
 """Fresnel's equations against certified answers and against their textbook form: 4u for powers, 8u for amplitudes."""
 
+import functools
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from support.fresnel_rays import DRAWS, WORST, drawn
 
 from mi_refract import oracle
 from mi_refract.formulas import FORMULAS, fresnel
-from mi_refract.numerics import DoubleWord
+from mi_refract.numerics import DoubleWord, from_numpy
 
 # Evaluation ------------------------------------------------------------------------------------------------------
 
@@ -16,7 +18,9 @@ from mi_refract.numerics import DoubleWord
 def ask(c, k):
     """R, T, r_s, r_p and which are transmitted, of Dr.Jit numbers."""
     cos_t, transmitted = fresnel.refracted_cosine(c, k)
-    return *fresnel.powers(c, cos_t, transmitted, k), *fresnel.amplitudes(c, k), transmitted
+    found = *fresnel.powers(c, cos_t, transmitted, k), *fresnel.amplitudes(c, k), transmitted
+    dr.eval(found)  # in one kernel
+    return found
 
 
 def plain(x):
@@ -30,7 +34,7 @@ def evaluate(setting, cos_i, k):
         each = [[plain(x) for x in ask(float(c), float(x))] for c, x in zip(cos_i, k, strict=True)]
         return [np.array(column) for column in zip(*each, strict=True)]
     number = dr.value_t(setting.vector)
-    return [np.broadcast_to(plain(x), len(k)) for x in ask(number(cos_i), number(k))]
+    return [np.broadcast_to(plain(x), len(k)) for x in ask(from_numpy(number, cos_i), from_numpy(number, k))]
 
 
 def relative(x, exact, low, setting):
@@ -38,10 +42,16 @@ def relative(x, exact, low, setting):
     return np.nan_to_num(error.astype(float), nan=np.inf).max(initial=0) / setting.roundoff
 
 
-def errors(setting, cos_i, k):
+@functools.cache
+def certified(name, setting):
+    """Rays of a kind and their exact answers."""
+    rays = drawn(name, setting)
+    return *rays, oracle.fresnel(*rays)
+
+
+def errors(setting, cos_i, k, exact):
     """The worst errors in u of R, of T and of the amplitudes."""
     r, t, s, p, transmitted = evaluate(setting, cos_i, k)
-    exact = oracle.fresnel(cos_i, k)
     assert (transmitted == exact.transmitted).all()
     worst = [
         relative(r, exact.reflectance, exact.reflectance_low, setting),
@@ -52,7 +62,7 @@ def errors(setting, cos_i, k):
 
 @pytest.mark.parametrize("name", DRAWS)
 def test_powers_are_within_4u_and_amplitudes_within_8u(name, setting):
-    r, t, amplitude = errors(setting, *drawn(name, setting))
+    r, t, amplitude = errors(setting, *certified(name, setting))
     assert r <= 4
     assert t <= 4
     assert amplitude <= 8
@@ -63,7 +73,7 @@ def test_the_worst_that_was_found(setting):
         np.array([float.fromhex(x) for x in column], setting.precision)
         for column in zip(*WORST[setting.name], strict=True)
     )
-    r, t, amplitude = errors(setting, cos_i, k)
+    r, t, amplitude = errors(setting, cos_i, k, oracle.fresnel(cos_i, k))
     assert 2.9 < r <= 4
     assert 1.9 < t <= 4
     assert amplitude <= 8
@@ -165,7 +175,7 @@ def test_defects_are_seen(name, vectorised, monkeypatch):
         pytest.skip("float32 is computed in float64: there this is no defect")
     mutate, draw = MUTANTS[name]
     monkeypatch.setattr(fresnel, "_powers", mutate(fresnel._powers))
-    r, t, _ = errors(vectorised, *drawn(draw, vectorised))
+    r, t, _ = errors(vectorised, *certified(draw, vectorised))
     assert max(r, t) > 4
 
 
@@ -179,8 +189,7 @@ def test_double_words_do_not_suffice_to_the_ulp(name, vectorised, monkeypatch):
         radicand, defect = k2 * c2 - (k2 - 1), k2 * (-c2 + 1) - c2
         return (radicand, defect.rounded()) if vectorised.name == "float64" else (DoubleWord(radicand), defect)
 
-    cos_i, k = drawn(name, vectorised)
-    exact = oracle.fresnel(cos_i, k)
+    cos_i, k, exact = certified(name, vectorised)
     monkeypatch.setattr(fresnel, "_differences", differences)
     _, t, _, p, _ = evaluate(vectorised, cos_i, k)
     lost = (
@@ -272,9 +281,9 @@ def matrices(c, ratio):
 @pytest.mark.parametrize("name", ["generic", "critical", "matched"])
 def test_mueller_matrices_are_those_of_the_certified_amplitudes(name, setting):
     number = float if setting.backend == "scalar" else dr.value_t(setting.vector)
-    cos_i, k = (x[:8] for x in drawn(name, setting))
-    exact, u = oracle.fresnel(cos_i, k), setting.roundoff
-    for i in range(len(k)):
+    cos_i, k, exact = certified(name, setting)
+    u = setting.roundoff
+    for i in range(8):
         r, t = matrices(number(float(cos_i[i])), number(float(k[i])))
         s, p = exact.amplitude_s[i], exact.amplitude_p[i]
         powers, cross = (abs(s) ** 2, abs(p) ** 2), p * np.conj(s)
@@ -291,20 +300,28 @@ def test_mueller_matrices_are_those_of_the_certified_amplitudes(name, setting):
 # In the plugin ---------------------------------------------------------------------------------------------------
 
 
+@functools.cache
+def turned(name, setting):
+    """Rays of a kind at all azimuths, unit up to rounding: their cosines, directions, ratios and exact answers."""
+    cos_i, k = drawn(name, setting)
+    azimuth = np.random.default_rng(5).uniform(0, 2 * np.pi, len(k))
+    sine = np.sqrt((1 - cos_i.astype(float)) * (1 + cos_i.astype(float)))
+    a = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cos_i], axis=1).astype(setting.precision)
+    return cos_i, sine, a, k, oracle.refract(a, np.tile(np.array([0, 0, 1], a.dtype), (len(k), 1)), k)
+
+
 @pytest.mark.parametrize("formula", ["promoted", "compensated"])
 @pytest.mark.parametrize("name", DRAWS)
 def test_powers_of_rays_that_are_unit_only_up_to_rounding(name, formula, vectorised):
     if vectorised.name != "float32":
         pytest.skip("the plugin's precision is float32")
-    cos_i, k = drawn(name, vectorised)
-    azimuth = np.random.default_rng(5).uniform(0, 2 * np.pi, len(k))
-    sine = np.sqrt((1 - cos_i.astype(float)) * (1 + cos_i.astype(float)))
-    a = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cos_i], axis=1).astype(vectorised.precision)
-    exact = oracle.refract(a, np.tile(np.array([0, 0, 1], a.dtype), (len(k), 1)), k)
-    ray, wide = vectorised.vector(a.T), dr.float64_array_t(dr.value_t(vectorised.vector))(k)
+    cos_i, sine, a, k, exact = turned(name, vectorised)
+    ray, wide = from_numpy(vectorised.vector, a), from_numpy(dr.float64_array_t(dr.value_t(vectorised.vector)), k)
     contrast = dr.fma(wide, wide, -1)
     _, transmitted = FORMULAS[formula].unchecked(ray, vectorised.vector(0, 0, 1), wide, contrast)
-    r, t = (plain(x) for x in fresnel.local_powers(ray, transmitted, wide, contrast))
+    powers = fresnel.local_powers(ray, transmitted, wide, contrast)
+    dr.eval(powers, transmitted)
+    r, t = map(plain, powers)
     # Off by ε ≤ 10·2⁻⁵³ of its larger term, a radicand moves T by ε/2ρ: nearer to the critical angle by more than u/2.
     scale = np.maximum(cos_i.astype(float) ** 2, np.abs(k.astype(float) ** 2 - 1) * sine**2)
     far = (exact.cos_t**2 > 10 * 2.0**-53 / vectorised.roundoff * scale) | ~exact.transmitted

@@ -6,8 +6,10 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from mi_refract.accuracy import arrays
 from mi_refract.formulas import well_conditioned
 from mi_refract.numerics import DoubleWord, TripleWord, error_free
+from mi_refract.regimes import Rays
 
 COUNT = {"scalar": 40, "llvm": 400, "cuda": 400}
 # k of three kinds: the critical angle far from both ends, at grazing, and at almost normal incidence.
@@ -32,7 +34,7 @@ def each_ray(setting, function, a, n, k):
     if setting.backend == "scalar":
         found = [function(setting.vector(x), setting.vector(y), float(z)) for x, y, z in zip(a, n, k, strict=True)]
         return [Fraction(float(x.hi)) + Fraction(float(x.lo)) for x in found]
-    found = function(setting.vector(a.T), setting.vector(n.T), dr.value_t(setting.vector)(k))
+    found = function(*arrays(Rays(a, n, k), setting.vector))
     parts = (np.broadcast_to(np.array(x), len(k)) for x in (found.hi, found.lo))
     return [Fraction(float(x)) + Fraction(float(y)) for x, y in zip(*parts, strict=True)]
 

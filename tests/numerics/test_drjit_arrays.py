@@ -1,10 +1,33 @@
-"""Division by 0 and scaling by powers of two, on every backend and in both precisions."""
+"""Conversion from numpy, division by 0 and scaling by powers of two, on every backend and in both precisions."""
 
 import drjit as dr
 import numpy as np
 import pytest
 
-from mi_refract.numerics import ieee_divide, scale_to_unit
+from mi_refract.numerics import aligned, from_numpy, ieee_divide, scale_to_unit
+from mi_refract.numerics.drjit_arrays import ALIGNMENT
+
+
+@pytest.mark.parametrize("offset", range(0, 64, 8))
+def test_numbers_start_where_they_can_be_read_at_once(offset):
+    values = np.arange(100.0)[offset // 8 :]
+    copy = aligned(values, np.dtype(np.float32))
+    assert copy.ctypes.data % ALIGNMENT == 0
+    assert copy.dtype == np.float32
+    assert (copy == values).all()
+
+
+def test_a_kernel_serves_vectors_of_any_number_and_place(vectorised):
+    number, seen = dr.value_t(vectorised.vector), set()
+    for count in (30, 31, 100):
+        v = np.random.default_rng(count).normal(size=(count + 1, 3)).astype(vectorised.precision)[1:]
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            found = 2 * from_numpy(vectorised.vector, v) + from_numpy(number, v[:, 0])
+            dr.eval(found)
+            seen.add(dr.kernel_history([dr.KernelType.JIT])[0]["hash"])
+        assert (2 * v + v[:, :1] == np.array(found).T).all()
+    assert len(seen) == 1
 
 
 def test_quotient_by_zero_raises_on_no_backend(setting):

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from mi_refract.planar import Segments, trace
-from mi_refract.planar.array_backend import ALIGNMENT, _aligned
 
 
 def polygon(corners, radius):
@@ -30,12 +29,3 @@ def test_another_scene_of_that_kind_needs_no_other_kernel(vectorised, method):
     assert first
     for scene in ((9, 2.5, 40, 4), (30, 0.3, 70, 9), (5, 40, 50, 2)):
         assert kernels(vectorised, method, *scene) == first
-
-
-@pytest.mark.parametrize("offset", range(0, 64, 8))
-def test_a_table_starts_where_rows_can_be_read_at_once(offset):
-    values = np.arange(100.0)[offset // 8 :]
-    copy = _aligned(values, np.dtype(np.float32))
-    assert copy.ctypes.data % ALIGNMENT == 0
-    assert copy.dtype == np.float32
-    assert (copy == values).all()

@@ -18,7 +18,7 @@ from mi_refract.ray_sets.diagnosis import MISTAKES
 from mi_refract.ray_sets.ray_set import Answers
 
 PRECISIONS = list(ray_set.PRECISIONS)
-COUNT = 80
+COUNT = 40
 
 
 @functools.cache

@@ -6,7 +6,7 @@ import zlib
 
 import numpy as np
 
-COUNT = {"scalar": 60, "llvm": 4000, "cuda": 4000}
+COUNT = {"scalar": 60, "llvm": 2000, "cuda": 2000}
 
 
 def log_uniform(rng, low, high, count):

@@ -17,7 +17,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import regimes
-from mi_refract.accuracy import Subject
+from mi_refract.accuracy import Subject, arrays
 from mi_refract.formulas import Budget
 from mi_refract.numerics import float_expansions
 from mi_refract.regimes import Rays
@@ -37,18 +37,19 @@ class Screen:
     def __init__(self, rays: Rays, vector: Any) -> None:
         """Solve the rays; subjects are evaluated in arrays of the 3-vector type `vector`."""
         self.rays, self.roundoff = rays, float(np.finfo(rays.k.dtype).eps) / 2
-        self._inputs = vector(rays.a.T), vector(rays.n.T), dr.value_t(vector)(rays.k)
+        self._inputs = arrays(rays, vector)
         dr.eval(self._inputs)
         wide: Any = dr.float64_array_t(vector)
         # Widened here: Dr.Jit's threads take denormal numbers for 0.
-        a, n, k = (x.T.astype(np.float64) for x in (rays.a, rays.n, rays.k))
-        self._a = wide(a)
-        solved = _solve(self._a, wide(n), dr.value_t(wide)(k))
+        a, n, k = (x.astype(np.float64) for x in (rays.a, rays.n, rays.k))
+        self._a, wide_n, wide_k = arrays(Rays(a, n, k), wide)
+        solved = _solve(self._a, wide_n, wide_k)
         self._high, self._low, self._transmitted, c, root, ratio, unresolved = solved
-        dr.eval(solved)
-        tiny = ((np.abs((a, n)) < _UNDERFLOW) & (np.array((a, n)) != 0)).any(axis=(0, 1))
+        length = dr.norm(self._a) * dr.norm(wide_n)
+        dr.eval(solved, length)  # in one kernel
+        tiny = ((np.abs((a, n)) < _UNDERFLOW) & (np.array((a, n)) != 0)).any(axis=(0, 2))
         self.relative_radicand, c = np.array(ratio), np.abs(np.array(c))
-        lengths = np.array(dr.norm(self._a) * dr.norm(wide(n)))
+        lengths = np.array(length)
         self.cos_i, self.cos_t = c / lengths, np.array(root) / lengths
         self.doubtful = np.array(unresolved) | tiny & (c < _UNDERFLOW)
 
@@ -56,8 +57,9 @@ class Screen:
         """(chord error in u, infinite where it is NaN; whether the decision differs) of every ray."""
         b, transmitted = subject(*self._inputs)
         error = dr.norm((type(self._a)(b) - self._high) - self._low) / dr.norm(self._a)
-        chord = np.array(dr.select(dr.isfinite(error), error, dr.inf)) / self.roundoff
-        return chord, np.array(transmitted != self._transmitted)
+        error, wrong = dr.select(dr.isfinite(error), error, dr.inf), transmitted != self._transmitted
+        dr.eval(error, wrong)  # in one kernel
+        return np.array(error) / self.roundoff, np.array(wrong)
 
     def bound(self, budget: Budget) -> np.ndarray:
         """In u, the bound of every ray's chord, as if it were unit to the last bit."""

@@ -19,8 +19,9 @@ import drjit as dr
 import numpy as np
 
 from mi_refract import oracle, regimes
-from mi_refract.accuracy import lengths
+from mi_refract.accuracy import arrays, lengths
 from mi_refract.formulas import FORMULAS, fresnel
+from mi_refract.numerics import from_numpy
 from mi_refract.oracle import derivatives
 from mi_refract.report.row import Row
 from validation import limits
@@ -147,9 +148,9 @@ def differentiate(formula: Any, given: Inputs, setting: Setting) -> tuple[dict[s
     """The derivatives of b, (N, 3) in extended precision, and which rays were transmitted."""
     vector, rays = differentiable(setting), given.rays
     number = dr.value_t(vector)
-    a, n, k, found = vector(rays.a.T), vector(rays.n.T), number(rays.k), {}
+    (a, n, k), found = arrays(rays, vector), {}
     for name, e in given.along.items():
-        found[name] = forward(lambda a: formula(a, n, k)[0], vector(a), vector(e.T))[1]
+        found[name] = forward(lambda a: formula(a, n, k)[0], vector(a), from_numpy(vector, e))[1]
     found["∂b/∂k"] = forward(lambda k: formula(a, n, k)[0], number(k), k)[1]
     transmitted = np.array(formula(a, n, k)[1])
     return {name: np.array(x).T.astype(np.longdouble) for name, x in found.items()}, transmitted
