@@ -266,7 +266,8 @@ def test_matplotlib_is_only_loaded_for_images(ball):
 def test_ctrl_c_leaves_nothing_half_written(ball):
     """Interrupted while the temporary file is there and the renaming is still to come."""
     more = """
-import time
+import signal, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job of a script ignores it
 def slow(self, target):
     print("written", flush=True)
     time.sleep(60)
