@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mi_refract import backend
 from mi_refract.cli import app
 from mi_refract.planar import figure, path_tree, scene_file, scene_schema, tracer
 
@@ -284,7 +285,9 @@ atomic.Path.replace = slow
 
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
 def test_every_scene_of_ours_is_consistent(trace, path):
-    code, out, err = trace(scene=path)
+    # Scalar arrays follow one ray after the other: a few do there.
+    few = () if backend.detect()["llvm"].usable else ("--rays", "5")
+    code, out, err = trace(*few, scene=path)
     assert (code, err) == (0, "")
     assert " escaped" in out
     assert "mismatch" not in out
