@@ -57,12 +57,8 @@ def _failed(name: str, error: BaseException) -> int:
         if os.environ.get(TRACEBACK) == "1":
             traceback.print_exception(error)
         print(f"{name}: {describe(error)}", file=sys.stderr, flush=True)
-    try:
+    with contextlib.suppress(OSError, ValueError):  # what is left would be tried when Python ends, and be exit code 120
         sys.stdout.flush()
-    except (OSError, ValueError):
-        # What is left in the buffer would be tried again when Python ends, and change the exit code.
-        with contextlib.suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return MISUSE
 
 

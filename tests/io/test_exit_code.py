@@ -113,6 +113,14 @@ def test_streams_that_are_closed_full_or_not_read(case, images):
     assert (done.returncode, done.stderr.strip()) == (code, said)
 
 
+def test_output_that_cannot_be_written_is_not_the_exit_code_of_an_error():
+    code = "from mi_refract.io.exit_code import exit_code\nexit(exit_code('it', lambda: print('x') or int('y')))"
+    script = f'"$0" -c "{code}" >/dev/full'
+    done = subprocess.run(["bash", "-c", script, sys.executable], env=ENVIRONMENT, capture_output=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.startswith(b"it: invalid literal")
+
+
 def test_no_file_takes_the_number_of_a_closed_stream():
     code = "import os, sys\nfrom mi_refract.io.exit_code import exit_code\n"
     code += "exit_code('it', lambda: os.write(int(sys.argv[1]), bytes([48 + os.open('/dev/null', os.O_RDONLY)])))"
