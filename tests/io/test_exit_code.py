@@ -7,10 +7,12 @@ import subprocess
 import sys
 
 import pytest
+from support import processes
 from support.diff_images import image
-from support.processes import ENVIRONMENT
 
 from mi_refract.io import exit_code as exits
+
+ENVIRONMENT = processes.ENVIRONMENT | {"PYTHONUNBUFFERED": ""}  # what a test prints waits, as it does for most users
 
 
 def ended(body, capsys):
