@@ -57,8 +57,13 @@ def _failed(name: str, error: BaseException) -> int:
         if os.environ.get(TRACEBACK) == "1":
             traceback.print_exception(error)
         print(f"{name}: {describe(error)}", file=sys.stderr, flush=True)
-    with contextlib.suppress(OSError, ValueError):  # what is left would be tried when Python ends, and be exit code 120
-        sys.stdout.flush()
+    for output in (sys.stdout, sys.stderr):
+        try:
+            output.flush()
+        except (OSError, ValueError):
+            # What is left would be tried again when Python ends, and change the exit code to 120.
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())
     return MISUSE
 
 
