@@ -1,6 +1,6 @@
 """`python -m validation [STUDY …] [--profile quick|standard|full] [--out DIR]`, or `python -m validation renderers …`.
 
-Exit code 0 where every budget held, 1 where one was broken, 2 for misuse, 130 where it was interrupted.
+Exit code 0 where every budget held, 1 where one was broken, 2 for misuse and errors, 130 where it was interrupted.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ app = command_line.application()
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line, or `arguments`; the exit code."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    if arguments[:1] == ["renderers"]:
+    words = sys.argv[1:] if arguments is None else arguments
+    if words[:1] == ["renderers"]:
         from validation.suite.renderers import command
 
-        return command.main(arguments[1:])
-    return command_line.exit_code(app, "validation", arguments)
+        return command.main(words[1:])
+    return command_line.exit_code(app, "validation", words)
 
 
 @app.command(epilog="`python -m validation renderers` lists and installs other renderers.")
@@ -71,14 +71,12 @@ def _command(
     goals: Annotated[bool, typer.Option("--goals", help="Print the goals of timing, too.")] = False,
 ) -> int:
     """Measure the formulas and the plugin against certified answers, and write the report."""
+    _check(studies or [], profile, out, write_tables)
     try:
-        _check(studies or [], profile, out, write_tables)
         return _run(studies or [], profile, out, write_tables, goals)
     except KeyboardInterrupt:
         print("validation: interrupted; the same command goes on from here", file=sys.stderr)
-        return 130
-    except (Misuse, OSError, ImportError) as error:  # anything else is a defect of ours, and keeps its traceback
-        return command_line.misuse("validation", str(error))
+        raise
 
 
 class Misuse(ValueError):

@@ -7,14 +7,18 @@ options, call the rooms below, and print; everything they do can be done from Py
 import sys
 
 from mi_refract import __version__
+from mi_refract.io.exit_code import exit_code
 
 __all__ = ["app", "main"]
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line, or `arguments`; the exit code."""
-    words = sys.argv[1:] if arguments is None else arguments
-    if words == ["--version"]:  # importing the parser takes ten times as long as all the rest of this
+    return exit_code("mi-refract", lambda: _run(sys.argv[1:] if arguments is None else arguments))
+
+
+def _run(arguments: list[str]) -> int:
+    if arguments == ["--version"]:  # importing the parser takes ten times as long as all the rest of this
         print(__version__)
         return 0
     from .app import main

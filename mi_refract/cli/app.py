@@ -20,6 +20,7 @@ except ModuleNotFoundError as missing:
     sys.exit(2)
 
 from mi_refract import __version__
+from mi_refract.io.exit_code import exit_code
 
 
 class Command(NamedTuple):
@@ -87,28 +88,4 @@ def _root(
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line, or `arguments`; the exit code."""
-    try:
-        return app(arguments, prog_name="mi-refract", standalone_mode=False) or 0
-    except (ValueError, OSError) as error:
-        return _fail(_message(error))
-    except KeyboardInterrupt:
-        return 130
-    except Exception as error:
-        # Typer's parser raises errors of its own, in a module whose name depends on its version.
-        if type(error).__name__ == "Abort":
-            return 130
-        if not hasattr(error, "format_message"):
-            raise
-        return _fail(error.format_message())
-
-
-def _message(error: Exception) -> str:
-    """The error's own words; those of the operating system without their number, the file first."""
-    if isinstance(error, OSError) and error.errno and error.strerror and error.filename:
-        return f"{error.filename}: {error.strerror}"
-    return str(error)
-
-
-def _fail(message: str) -> int:
-    print(f"mi-refract: {' '.join(message.split())}", file=sys.stderr)
-    return 2
+    return exit_code("mi-refract", lambda: app(arguments, prog_name="mi-refract", standalone_mode=False))

@@ -6,6 +6,8 @@ import sys
 
 import typer
 
+from mi_refract.io import exit_code as exits
+
 
 def application() -> typer.Typer:
     """An empty one, without completion and without typer's own tracebacks."""
@@ -13,16 +15,8 @@ def application() -> typer.Typer:
 
 
 def exit_code(app: typer.Typer, name: str, arguments: list[str]) -> int:
-    """Run the command; its exit code, 2 after a usage error, 130 after an interruption."""
-    try:
-        return app(arguments, prog_name=f"python -m {name}", standalone_mode=False) or 0
-    except Exception as error:
-        # Typer's parser raises errors of its own, in a module whose name depends on its version.
-        if type(error).__name__ == "Abort":
-            return 130
-        if not hasattr(error, "format_message"):
-            raise
-        return misuse(name, error.format_message())
+    """Run the command; its exit code, 2 after an error, 130 after an interruption."""
+    return exits.exit_code(name, lambda: app(arguments, prog_name=f"python -m {name}", standalone_mode=False))
 
 
 def misuse(name: str, message: str) -> int:
