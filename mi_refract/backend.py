@@ -26,6 +26,7 @@ import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 CHOICE = "DRJIT_LIBLLVM_PATH"  # where Dr.Jit looks first
 OWN_CHOICE = "MI_REFRACT_LIBLLVM"  # set to the same value where the choice was ours, not the user's
@@ -121,8 +122,16 @@ def activate(preferred: str | None = None, *, may_restart: bool = False) -> str:
         raise ValueError(f"variant {preferred!r}: unknown; accepted: {', '.join(_running())}")
     elif not preferred.startswith("scalar_") and (reason := usable_variants()[preferred]):
         raise ValueError(f"variant {preferred!r} cannot run here: {reason}; accepted: {', '.join(_running())}")
+    _own_plugins_first(mi)
     mi.set_variant(preferred)
     return preferred
+
+
+def _own_plugins_first(mi: Any) -> None:
+    """Have Mitsuba look for plugins in its own folder first: it would run `plugins/sphere.so` of the working folder."""
+    own = str(Path(mi.__file__).parent)
+    if str(next(iter(mi.file_resolver()))) != own:
+        mi.file_resolver().prepend(own)
 
 
 def _running() -> list[str]:

@@ -29,8 +29,14 @@ def render(
     variant: Annotated[
         str | None, typer.Option(help="A Mitsuba variant; without it llvm_ad_rgb where that runs, else scalar_rgb.")
     ] = None,
-    spp: Annotated[int | None, typer.Option(min=1, help="Samples per pixel; without it what the scene says.")] = None,
+    spp: Annotated[
+        int | None, typer.Option(min=1, max=2**32 - 1, help="Samples per pixel; without it what the scene says.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the sampler.")] = 0,
+    allow_plugins: Annotated[
+        list[str] | None,
+        typer.Option("--allow-plugins", metavar="NAME", help="Run this plugin, which the scene brings, too."),
+    ] = None,
 ) -> None:
     """Render a Mitsuba scene into an EXR file that says how it was made.
 
@@ -40,7 +46,9 @@ def render(
     chosen = backend.activate(variant, may_restart=True)
     console = Console(stderr=True)
     with _interruptible(console), _spinner(console, f"{scene.name}, {chosen}"):
-        header = scene_files.render_to_exr(scene, output, defines=defines, spp=spp, seed=seed)
+        header = scene_files.render_to_exr(
+            scene, output, defines=defines, spp=spp, seed=seed, allow_plugins=allow_plugins or []
+        )
     print(f"{output}: {chosen}, {header['mi_refract:spp']} spp, {header['mi_refract:render_seconds']:.2f} s")
     if variant is None and not backend.llvm().usable:
         print(f"mi-refract: {chosen} is slow; {backend.summary()}", file=sys.stderr)

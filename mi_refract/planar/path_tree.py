@@ -16,7 +16,7 @@ from .segments import Array, Segments
 from .tracer import Tracer
 
 LEAST = 1e-3  # share of a ray's power: partial reflections that carry no more are not followed
-MOST = 2**25  # legs at a time: 1.3 GB
+MOST = 2**25  # legs of all paths of all colours: 1.3 GB
 
 
 @dataclass(frozen=True)
@@ -73,12 +73,14 @@ def follow(
     branches: int = 0,
     *,
     least: float = LEAST,
+    most: int | None = None,
     **how: Any,
 ) -> Branches:
     """Follow rays (N × 2) with up to `branches` partial reflections, each of more than `least` of the ray's power.
 
     how: formula, precision, backend, as for `planar.trace`. Only the first 32 boundaries of a path reflect in part.
-    ValueError as there, for a negative number of branches, and for more than MOST legs.
+    ValueError as there, for a negative number of branches, and, before they are followed, for more than `most` legs
+    (None: MOST).
     """
     if branches < 0:
         raise ValueError(f"branches = {branches}: accepted: a whole number from 0")
@@ -86,7 +88,9 @@ def follow(
     rays, reflect = np.arange(len(origins)), np.zeros(len(origins), np.uint32)
     orders: list[Branches] = []
     while True:
-        _check_size(rays.size, max_depth, len(orders))
+        _check_size(
+            rays.size + sum(len(order.rays) for order in orders), max_depth, len(orders), MOST if most is None else most
+        )
         paths = trace(origins[rays], directions[rays], max_depth, reflect=reflect, weights=True)
         orders.append(Branches(paths, rays, reflect))
         parent, boundary = np.nonzero(_worth(orders[-1], least))
@@ -95,16 +99,22 @@ def follow(
         rays, reflect = rays[parent], reflect[parent] | (np.uint32(1) << boundary.astype(np.uint32))
 
 
-def _check_size(paths: int, max_depth: int, reflections: int) -> None:
-    if paths * (max_depth + 1) > MOST:
-        size = f"{paths} paths of up to {max_depth} boundaries with {reflections} partial reflections"
-        raise ValueError(f"{size}; accepted: fewer rays, branches or boundaries, {MOST} legs altogether")
+def _check_size(paths: int, max_depth: int, reflections: int, most: int) -> None:
+    if paths * (max_depth + 1) > most:
+        size = f"{paths} paths of up to {max_depth} boundaries with up to {reflections} partial reflections"
+        rest = "" if most == MOST else f", of which other colours take {MOST - most}"
+        raise ValueError(f"{size}; accepted: fewer rays, branches or boundaries, {MOST} legs altogether{rest}")
 
 
 def follow_scene(scene: PlanarScene, **how: Any) -> tuple[Branches, ...]:
-    """The paths of a scene, one `Branches` per colour; `how` and errors as for `follow`."""
+    """The paths of a scene, one `Branches` per colour; `how` and errors as for `follow`, for all colours together."""
+    _check_size(len(scene.origins) * len(scene.segments), scene.max_depth, 0, MOST)
     rays = scene.origins, scene.directions, scene.max_depth, scene.branches
-    return tuple(follow(segments, *rays, **how) for segments in scene.segments)
+    traced: list[Branches] = []
+    for segments in scene.segments:
+        used = sum(branches.paths.events.size for branches in traced)
+        traced.append(follow(segments, *rays, most=MOST - used, **how))
+    return tuple(traced)
 
 
 def with_rays(scene: PlanarScene, count: int) -> PlanarScene:
@@ -112,8 +122,8 @@ def with_rays(scene: PlanarScene, count: int) -> PlanarScene:
 
     ValueError for more rays than `follow` accepts.
     """
-    sizes = np.bincount(scene.beams)
-    _check_size(int(np.where(sizes > 1, count, sizes).sum()), scene.max_depth, 0)
+    sizes = np.bincount(scene.beams).tolist()
+    _check_size(sum(count if size > 1 else size for size in sizes), scene.max_depth, 0, MOST)
     parts = []
     for beam in np.unique(scene.beams):
         origins, directions = scene.origins[scene.beams == beam], scene.directions[scene.beams == beam]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mi_refract.io import regular_file
 from mi_refract.io.toml_schema import read, shown
 
 from .curves import affine
@@ -17,6 +18,11 @@ from .scene_schema import BEAMS, SCENE, SHAPES, Part
 from .scene_values import Indices, per_colour, read_kind
 from .segments import Array, Segments
 from .shared_boundaries import Named, boundaries
+
+# Of what a file may ask for, checked before memory is allocated.
+SIZE = 2**24  # bytes of the file
+PIECES = 2**22  # of all curves, once for each colour
+RAYS = 2**24  # of all beams
 
 
 @dataclass(frozen=True)
@@ -59,7 +65,9 @@ def load(path: str | Path) -> PlanarScene:
     OSError for a file that cannot be read.
     """
     path = Path(path)
-    content = path.read_bytes()
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: is a folder; accepted: a scene file")
+    content = regular_file.read_bytes(path, SIZE)
     try:
         return _scene(path, _parsed(content))
     except ValueError as error:
@@ -107,6 +115,7 @@ def _parts(tables: list[dict[str, Any]], ambient: Indices, colours: int) -> list
     """The shapes' parts in their places."""
     parts: list[Named] = []
     media: dict[str, Indices] = {}
+    pieces = 0
     for j, table in enumerate(tables):
         where = f"shape[{j}]"
         kind, values = read_kind(table, SHAPES, f"{where}.", colours)
@@ -115,6 +124,12 @@ def _parts(tables: list[dict[str, Any]], ambient: Indices, colours: int) -> list
             raise ValueError(f"{where}.name: {shown(values['name'])} is another shape's; accepted: a new one")
         if values.get("name"):
             media[values["name"]] = values["n"]
+        each = max(values.get("facets") or 4, len(values.get("points", ())))
+        pieces += values.get("layers", 1) * each * colours
+        if pieces > PIECES:
+            raise ValueError(
+                f"{where}: {pieces} pieces and more; accepted: {PIECES}, colours times those of all shapes"
+            )
         try:
             with np.errstate(all="ignore"):
                 placed = _placed(kind.build(values), values)
@@ -154,9 +169,13 @@ def _check_range(where: str, *points: Array) -> None:
 
 
 def _rays(tables: list[dict[str, Any]]) -> tuple[Array, Array, NDArray[np.intp]]:
-    rays = []
+    rays: list[tuple[Array, Array]] = []
+    count = 0
     for j, table in enumerate(tables):
         kind, values = read_kind(table, BEAMS, f"beam[{j}].", 1)
+        count += values.get("count", 1)
+        if count > RAYS:
+            raise ValueError(f"beam[{j}].count: {count} rays with the beams before; accepted: up to {RAYS}")
         try:
             rays.append(kind.build(values))
         except ValueError as error:

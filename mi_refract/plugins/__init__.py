@@ -26,4 +26,4 @@ from .refract import PLUGIN, read_ior  # noqa: E402
 from .refract_path import INTEGRATOR  # noqa: E402
 from .scene_features import SceneFeatures, inspect  # noqa: E402
 
-__all__ = ["INTEGRATOR", "PLUGIN", "SceneFeatures", "inspect", "read_ior", "register"]
+__all__ = ["INTEGRATOR", "PLUGIN", "SceneFeatures", "inspect", "read_ior", "register", "scene_limits", "scene_parser"]

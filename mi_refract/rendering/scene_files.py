@@ -6,9 +6,9 @@ import json
 import os
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -16,10 +16,9 @@ from mi_refract.io.atomic import writable
 from mi_refract.io.image_file import SUFFIXES, Metadata, one_line, write_exr
 from mi_refract.io.provenance import provenance
 
-LOADER_OPTIONS = ("path", "parallel", "optimize")  # mi.load_file would take these names for its own
-# Mitsuba orders merged meshes by address, and what it loads in parallel by thread. Emitters are in the same order, so
-# that the same seed would give different images.
-REPRODUCIBLE: Any = {"parallel": False, "optimize": False}
+TAKEN = ("config", "filename")  # names that mi.parser.parse_file would take for its own
+REPRODUCIBLE: Any = {"parallel": False, "optimize": False}  # for mi.load_file, as scene_parser.load does
+PIXELS = 2**26  # of an image; four channels of them are 1 GiB
 
 
 def parse_defines(items: Sequence[str]) -> dict[str, str]:
@@ -35,27 +34,37 @@ def parse_defines(items: Sequence[str]) -> dict[str, str]:
     return defines
 
 
-def load_scene(path: str | os.PathLike[str], defines: Mapping[str, str] | None = None) -> Any:
+def load_scene(
+    path: str | os.PathLike[str], defines: Mapping[str, str] | None = None, allow_plugins: Collection[str] = ()
+) -> Any:
     """Load the Mitsuba scene in an XML file, in the present variant; `defines` replace values of its `<default>`s.
 
-    FileNotFoundError for a missing file; ValueError, in one line, for what Mitsuba does not accept, and for a scene
-    without a sensor.
+    A scene may bring plugins, which are code: none is loaded but those in `allow_plugins`, Mitsuba's own and ours.
+    FileNotFoundError for a missing file; ValueError, in one line, for other plugins, a file beyond the limits of
+    `mi_refract.plugins.scene_limits`, what Mitsuba does not accept, and a scene without a sensor.
     """
     import mitsuba as mi
 
-    defines = dict(defines or {})
-    if not Path(path).is_file():
+    from mi_refract.plugins import scene_parser
+
+    path, defines = Path(path), dict(defines or {})
+    if not path.exists():
         raise FileNotFoundError(f"{path}: no such scene file")
-    if taken := [name for name in LOADER_OPTIONS if name in defines]:
-        raise ValueError(f"define {taken[0]!r}: taken by Mitsuba's loader; accepted: any name but {LOADER_OPTIONS}")
+    if taken := [name for name in TAKEN if name in defines]:
+        raise ValueError(f"define {taken[0]!r}: taken by Mitsuba's parser; accepted: any name but {TAKEN}")
     try:
-        scene = mi.load_file(str(path), **REPRODUCIBLE, **cast(Any, defines))
+        scene = scene_parser.load(path, defines, allow_plugins)
+    except OSError:
+        raise
     except Exception as error:  # RuntimeError from the parser; whatever a Python plugin raises
         raise ValueError(_naming(path, error)) from None
     if not isinstance(scene, mi.Scene):
         raise ValueError(f"{path}: holds a {type(scene).__name__}; accepted: a <scene>")
     if not scene.sensors():
         raise ValueError(f"{path}: a scene without a sensor; accepted: at least one")
+    width, height = scene.sensors()[0].film().crop_size()
+    if width * height > PIXELS:
+        raise ValueError(f"{path}: a film of {width} × {height} pixels; accepted: up to {PIXELS}")
     return scene
 
 
@@ -66,21 +75,22 @@ def render_to_exr(
     defines: Mapping[str, str] | None = None,
     spp: int | None = None,
     seed: int = 0,
+    allow_plugins: Collection[str] = (),
 ) -> Metadata:
     """Render a scene file by one `mi.render(scene, spp=spp, seed=seed)`, and return the header of the EXR file.
 
-    `defines`: values for the scene's `<default>`s. `spp`: samples per pixel; None: what the scene says. ValueError or
-    OSError in one line, before the rendering where possible; InterruptedError for a rendering that was cut short. No
-    file is written then.
+    `defines`: values for the scene's `<default>`s. `spp`: samples per pixel; None: what the scene says.
+    `allow_plugins`: names of plugins that the scene may bring, which are code. ValueError or OSError in one line,
+    before the rendering where possible; InterruptedError for a rendering that was cut short. No file is written then.
     """
     import mitsuba as mi
 
-    if spp is not None and spp < 1:
-        raise ValueError(f"spp = {spp}: accepted: a positive whole number")
+    if spp is not None and not 1 <= spp < 2**32:
+        raise ValueError(f"spp = {spp}: accepted: a whole number from 1 to 2³² − 1")
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed = {seed}: accepted: a whole number from 0 to 2³² − 1")
     output = writable(output, SUFFIXES)
-    loaded = load_scene(scene, defines)
+    loaded = load_scene(scene, defines, allow_plugins)
     pixels, seconds = _rendered(scene, loaded, spp or 0, seed)
     sensor = loaded.sensors()[0]
     channels = [str(field.name) for field in sensor.film().bitmap().struct_()]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mi_refract.io.image_file import read_exr
 
-from .meshes_from_shapes import meshes_of_shape, with_unique_names
+from .meshes_from_shapes import MOST, meshes_of_shape, with_unique_names
 from .mitsuba_nodes import Node, SceneFile
 from .plain_scene import Camera, Colour, Environment, Mesh, PlainScene
 
@@ -31,7 +31,7 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) ->
     path = Path(path)
     if level not in LEVELS:
         raise ValueError(f"level = {level}: accepted: a whole number from {LEVELS[0]} to {LEVELS[-1]}")
-    if not path.is_file():
+    if not path.exists():
         raise FileNotFoundError(f"{path}: no such scene file")
     root = SceneFile(path, defines).node(0)
     shapes: list[Mesh] = []
@@ -39,7 +39,7 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) ->
     readers = {"Sensor": _camera, "Integrator": _max_depth, "Emitter": _sky}
     for child in root.children():
         if child.kind == "Shape":
-            shapes += meshes_of_shape(child, level)
+            shapes += meshes_of_shape(child, level, MOST - sum(len(mesh.faces) for mesh in shapes))
         elif child.kind in readers and child.kind not in found:
             found[child.kind] = readers[child.kind](child)
         elif child.kind != "BSDF":  # a named BSDF is read with the shapes that use it

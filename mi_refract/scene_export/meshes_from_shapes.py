@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refract.formulas import FORMULAS
-from mi_refract.plugins import PLUGIN, read_ior
+from mi_refract.plugins import PLUGIN, read_ior, scene_parser
 
 from . import tessellation
 from .mitsuba_nodes import Node
@@ -26,6 +27,8 @@ SHAPES: dict[str, Callable[[int], Triangles]] = {
     "rectangle": lambda level: tessellation.rectangle(),
     "sphere": tessellation.sphere,
 }
+FARTHEST = 1e30  # of all coordinates: float32 holds products with directions
+MOST = 2**24  # triangles of all shapes, counted before they are made
 BLACK = (0.0, 0.0, 0.0)
 DEFAULT = (0.5, 0.5, 0.5)  # Mitsuba's reflectance
 
@@ -39,11 +42,16 @@ class Surface:
     one_sided: bool = False
 
 
-def meshes_of_shape(shape: Node, level: int) -> Iterator[Mesh]:
-    """The shape's meshes: two for a checkerboard, otherwise one. ValueError for parameters that a mesh cannot have."""
+def meshes_of_shape(shape: Node, level: int, most: int = MOST) -> Iterator[Mesh]:
+    """The shape's meshes: two for a checkerboard, otherwise one.
+
+    ValueError for parameters that a mesh cannot have, and, before they are made, for more than `most` triangles.
+    """
     surface, frame = _surface(shape), _frame(shape)
     flipped = shape.value(bool, "flip_normals", False)
+    _check_count(shape, _count(shape, surface, level), most)
     parts = _parts(shape, surface, level)
+    _check_count(shape, sum(len(faces) for _, faces in parts), most)
     shape.finish()
     if surface.one_sided and (flipped or not all(tessellation.is_closed(faces) for _, faces in parts)):
         raise shape.error("diffuse on one side of an open surface", "its BSDF in a `twosided`, or a closed shape")
@@ -52,6 +60,8 @@ def meshes_of_shape(shape: Node, level: int) -> Iterator[Mesh]:
             continue
         name = shape.props.id() or shape.type
         placed = vertices @ frame[:3, :3].T + frame[:3, 3]
+        if not (np.abs(placed) <= FARTHEST).all():
+            raise shape.error(f"coordinates beyond {FARTHEST:g}", "finite ones, up to that")
         yield Mesh(f"{name}_{i}" if i else name, placed, faces[:, ::-1] if flipped else faces, material)
 
 
@@ -70,6 +80,19 @@ def with_unique_names(found: Iterable[Mesh]) -> tuple[Mesh, ...]:
     return tuple(result)
 
 
+def _check_count(shape: Node, count: int, most: int) -> None:
+    if count > most:
+        raise shape.error(f"{count} triangles where {most} are left", f"{MOST} in all; a lower level, fewer cells")
+
+
+def _count(shape: Node, surface: Surface, level: int) -> int:
+    """The number of triangles; of a file, which is read first, 0."""
+    if surface.scales:
+        return 2 * math.prod(max(math.ceil(2 * scale), 1) for scale in surface.scales)
+    counts = {"sphere": 20 << 2 * level, "cylinder": 16 << level, "disk": 8 << level, "cube": 12, "rectangle": 2}
+    return counts.get(shape.type, 0)
+
+
 def _parts(shape: Node, surface: Surface, level: int) -> tuple[Triangles, ...]:
     """Triangles in the shape's own coordinates, one part per material."""
     if surface.scales:
@@ -86,13 +109,17 @@ def _parts(shape: Node, surface: Surface, level: int) -> tuple[Triangles, ...]:
 def _from_file(shape: Node) -> Triangles:
     path, flat = shape.scene.resolve(shape.value(str, "filename")), shape.value(bool, "face_normals", False)
     try:
-        mesh = mi.load_dict({"type": shape.type, "filename": str(path), "face_normals": flat})
+        with scene_parser.folders(scene_parser.own_folder()):
+            mesh = mi.load_dict({"type": shape.type, "filename": str(path.absolute()), "face_normals": flat})
     except RuntimeError as error:
         raise shape.error(f"{path}: {error}", "a mesh that Mitsuba reads") from None
     if mesh.has_vertex_normals():
         raise shape.error("smooth normals", "face_normals = true")
     vertices = np.array(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)
-    return vertices, np.array(mesh.faces_buffer(), np.int64).reshape(-1, 3)
+    faces = np.array(mesh.faces_buffer(), np.int64).reshape(-1, 3)
+    if faces.size and faces.max() >= len(vertices):
+        raise shape.error(f"{path}: vertex {faces.max()} of a face", f"0 to {len(vertices) - 1}, the vertices it has")
+    return vertices, faces
 
 
 def _frame(shape: Node) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.io.image_file import one_line
+from mi_refract.plugins import scene_limits, scene_parser
 
 from .plain_scene import Colour
 
@@ -109,12 +110,17 @@ class SceneFile:
     """A parsed scene file."""
 
     def __init__(self, path: Path, defines: Mapping[str, str]) -> None:
-        """Parse the file; `defines` replace its `<default>`s. ValueError, one line, where Mitsuba cannot parse it."""
+        """Parse the file; `defines` replace its `<default>`s. Nothing in it runs.
+
+        ValueError, one line, where Mitsuba cannot parse it, and beyond the limits of `plugins.scene_limits`.
+        """
         self.path, config = path, mi.parser.ParserConfig("scalar_rgb")
         config.merge_equivalent = config.merge_meshes = config.parallel = False
         try:
-            self.state = mi.parser.parse_file(config, str(path), **defines)
-            mi.parser.transform_all(config, self.state)
+            with scene_parser.folders(path.parent):
+                self.state = scene_parser.parse(path, config, defines)
+        except OSError:
+            raise
         except Exception as error:
             message = re.sub(r"\[\w+\.(cpp|h):\d+\] ", "", one_line(str(error)))
             raise ValueError(message if str(path) in message else f"{path}: {message}") from None
@@ -124,5 +130,7 @@ class SceneFile:
         return Node(self, self.state.nodes[index])
 
     def resolve(self, name: str) -> Path:
-        """The path of a file that the scene names relative to its own folder."""
-        return self.path.parent / name
+        """The path of a file that the scene names relative to its own folder. ValueError for a pipe or a device."""
+        path = self.path.parent / name
+        scene_limits.refuse_special(path)
+        return path

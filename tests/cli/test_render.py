@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 
@@ -112,7 +113,8 @@ BAD = {
     "define without a name": ({}, ("-D", "=dielectric"), "-D =dielectric: accepted: NAME=VALUE"),
     "define twice": ({}, ("-D", "bsdf=a", "-D", "bsdf=b"), "bsdf is given twice"),
     "define of nothing": ({}, ("-D", "bdsf=dielectric"), "bdsf"),
-    "define of the loader": ({}, ("-D", "parallel=x"), "taken by Mitsuba's loader"),
+    "define of the parser": ({}, ("-D", "config=x"), "taken by Mitsuba's parser"),
+    "plugin of another kind": ({}, ("-D", "bsdf=../evil"), "plugin '../evil': neither Mitsuba's nor mi_refract's"),
     "no plugin": ({}, ("-D", "bsdf=nonesuch"), "nonesuch"),
     "no samples": ({}, ("--spp", "0"), "--spp"),
     "no number": ({}, ("--spp", "many"), "--spp"),
@@ -150,6 +152,23 @@ def test_bad_scene(render, scene, text, message):
     assert err.startswith("mi-refract: ")
     assert message in err
     assert list(scene.parent.iterdir()) == [scene]
+
+
+def test_a_plugin_of_the_scenes_own_runs_only_where_it_is_allowed(render, scene):
+    """Then Mitsuba tries to load it, and says that it is no native code."""
+    scene.with_name("plugins").mkdir()
+    (scene.parent / "plugins" / "evil.so").write_text("native code")
+    code, _, err = render("-D", "bsdf=evil")
+    assert code == 2 and "accepted: those; to `render` also code that the scene brings, by --allow-plugins evil" in err
+    code, _, err = render("-D", "bsdf=evil", "--allow-plugins", "other", "--allow-plugins", "evil")
+    assert (code, err.count("\n")) == (2, 1) and "Error while loading plugin" in err and "plugins/evil.so" in err
+
+
+def test_a_pipe_is_no_scene(render, scene):
+    scene.unlink()
+    os.mkfifo(scene)
+    code, _, err = render()
+    assert (code, err) == (2, f"mi-refract: {scene}: is a pipe or a device; accepted: a file\n")
 
 
 def test_a_failed_rendering_keeps_the_old_image(render, scene):

@@ -183,6 +183,8 @@ BAD = {
     "option": (("--nonesuch",), "--nonesuch"),
     "too much": (("--rays", "4000000"), "accepted: fewer rays"),
     "far too much": (("--rays", "1000000000000"), "accepted: fewer rays"),
+    "beyond numbers": (("--rays", f"1{'0' * 30}"), "accepted: fewer rays"),
+    "too deep": (("--max-depth", f"1{'0' * 30}"), "accepted: fewer rays"),
 }
 
 

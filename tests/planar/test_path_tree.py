@@ -103,8 +103,32 @@ def test_too_many_branches_are_refused(monkeypatch):
     with pytest.raises(ValueError, match="branches = -1: accepted"):
         through_slab(-1)
     monkeypatch.setattr(path_tree, "MOST", 30)
-    with pytest.raises(ValueError, match="2 paths of up to 20 boundaries with 1 partial reflections; accepted: fewer"):
+    with pytest.raises(ValueError, match="3 paths of up to 20 boundaries with up to 1 partial reflections; accepted: "):
         through_slab(1)
+
+
+def test_legs_of_all_colours_are_counted_before_the_first_is_traced(monkeypatch):
+    """16 rays of up to 10 legs."""
+    colours = ("red", "blue")
+    given = scene((polygon(SLAB, 1.5), polygon(SLAB, 1.6)), beam(16, 1.0), (1, 0), colours=colours, max_depth=9)
+    monkeypatch.setattr(path_tree, "MOST", 320)
+    assert len(follow_scene(given)) == 2
+    with pytest.raises(ValueError, match=r"320 legs altogether"):
+        follow_scene(replace(given, branches=1))
+    monkeypatch.setattr(path_tree, "MOST", 319)
+    monkeypatch.setattr(path_tree, "Tracer", lambda *arguments, **how: pytest.fail("traced"))
+    with pytest.raises(ValueError, match="32 paths of up to 9 boundaries"):
+        follow_scene(given)
+
+
+def test_what_one_colour_takes_is_not_left_for_the_next(monkeypatch):
+    """48 paths of one colour: those of 16 rays, and 2 partial reflections of each."""
+    given = scene((polygon(SLAB, 1.5),) * 2, beam(16, 1.0), (1, 0), colours=("red", "blue"), max_depth=9, branches=1)
+    monkeypatch.setattr(path_tree, "MOST", 960)
+    assert [len(branches.rays) for branches in follow_scene(given)] == [48, 48]
+    monkeypatch.setattr(path_tree, "MOST", 950)
+    with pytest.raises(ValueError, match="950 legs altogether, of which other colours take 480"):
+        follow_scene(given)
 
 
 def test_the_data_is_strict_json():

@@ -31,13 +31,22 @@ def test_the_header_renders_the_same_image_again(tmp_path):
     assert {name: header[name] for name in first if name != seconds} == {n: v for n, v in first.items() if n != seconds}
 
 
-@pytest.mark.parametrize("wrong", [{"spp": 0}, {"spp": -1}, {"seed": -1}, {"seed": 2**32}, {"defines": {"path": "x"}}])
+WRONG = [{"spp": 0}, {"spp": -1}, {"seed": -1}, {"seed": 2**32}, {"defines": {"config": "x"}}]
+
+
+@pytest.mark.parametrize("wrong", WRONG)
 def test_wrong_numbers_are_refused_before_the_rendering(tmp_path, monkeypatch, wrong):
     monkeypatch.setattr(mi, "render", lambda *arguments, **named: pytest.fail("rendered"))
     with pytest.raises(ValueError, match="accepted: ") as error:
         scene_files.render_to_exr(SCENE, tmp_path / "a.exr", **wrong)
     assert "\n" not in str(error.value)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_film_is_measured_before_the_rendering(tmp_path, monkeypatch):
+    monkeypatch.setattr(mi, "render", lambda *arguments, **named: pytest.fail("rendered"))
+    with pytest.raises(ValueError, match=r"nested\.xml: a film of 8193 × 8193 pixels; accepted: up to 67108864"):
+        scene_files.render_to_exr(SCENE, tmp_path / "a.exr", defines={"res": "8193"})
 
 
 @pytest.mark.parametrize(

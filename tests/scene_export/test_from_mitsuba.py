@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refract.scene_export import from_mitsuba, write_files
+from mi_refract.scene_export import from_mitsuba, meshes_from_shapes, write_files
 from mi_refract.scene_export.plain_scene import Diffuse, Environment, Glass, Light
 from mi_refract.scene_export.targets.environment_map import radiance
 
@@ -241,6 +241,15 @@ REFUSED = {
     "infinite": (BALL, f'{BALL}<float name="radius" value="inf"/>', "radius = inf"),
     "no point": (BALL, f'{BALL}<float name="center" value="1"/>', "center = 1"),
     "no transform": (MOVED, '<float name="to_world" value="1"/>', "to_world"),
+    "cells": (
+        LIGHT,
+        f'{AREA}<texture type="checkerboard" name="radiance"><transform name="to_uv"><scale value="1e9"/></transform>'
+        "</texture>",
+        "8000000000000000000 triangles where",
+    ),
+    "pipe": (BALL, 'type="ply"><string name="filename" value="/dev/zero"/>', "/dev/zero: is a pipe or a device"),
+    "deep": ("</scene>", '<bsdf type="twosided">' * 20000 + "</bsdf>" * 20000 + "</scene>", "nested more than 32 deep"),
+    "far away": ('<translate x="3"/>', '<scale value="1e31"/>', "coordinates beyond 1e+30"),
     "missing mesh": (BALL, 'type="ply"><string name="filename" value="no.ply"/>', "no.ply"),
 }
 
@@ -261,6 +270,49 @@ def test_smooth_normals_are_refused(scene, tmp_path):
         from_mitsuba.load(scene('type="sphere" id="ball">', ply))
     flat = f'{ply}<boolean name="face_normals" value="true"/>'
     assert len(from_mitsuba.load(scene('type="sphere" id="ball">', flat)).meshes[0].faces) == 8
+
+
+def write_ply(path, last):
+    corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
+    head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    path.write_text(head + "".join("{} {} {}\n".format(*corner) for corner in corners) + f"3 0 1 {last}\n")
+
+
+@pytest.mark.parametrize("last", [3, 10**9, 2**32 - 1])
+def test_a_face_without_its_vertices_is_refused(last, scene, tmp_path):
+    shape = 'type="ply" id="ball"><string name="filename" value="m.ply"/><boolean name="face_normals" value="true"/>'
+    path = scene('type="sphere" id="ball">', shape)
+    write_ply(tmp_path / "m.ply", 2)
+    assert len(from_mitsuba.load(path).meshes[0].faces) == 1
+    write_ply(tmp_path / "m.ply", last)
+    with pytest.raises(ValueError, match=r"^[^\n]*m\.ply[^\n]*accepted: [^\n]*$"):
+        from_mitsuba.load(path)
+
+
+def test_triangles_are_counted_before_they_are_made(scene, monkeypatch):
+    """80 of the ball, 12 of the box, 2 of the lamp."""
+    monkeypatch.setattr(from_mitsuba, "MOST", 94)
+    assert len(from_mitsuba.load(scene(), level=1).meshes) == 3
+    monkeypatch.setattr(meshes_from_shapes.tessellation, "sphere", lambda level: pytest.fail("made"))
+    monkeypatch.setattr(from_mitsuba, "MOST", 79)
+    with pytest.raises(ValueError, match="sphere ball: 80 triangles where 79 are left; accepted: "):
+        from_mitsuba.load(scene(), level=1)
+
+
+@pytest.mark.parametrize("name", meshes_from_shapes.SHAPES)
+def test_the_count_of_triangles_is_the_number_that_is_made(name, scene, monkeypatch):
+    twosided = '<bsdf type="twosided"><bsdf type="diffuse"/></bsdf>'
+    path = scene("</scene>", f'<shape type="{name}" id="last">{twosided}</shape></scene>')
+    (made,) = (len(mesh.faces) for mesh in from_mitsuba.load(path, level=2).meshes if mesh.name == "last")
+    monkeypatch.setattr(from_mitsuba, "MOST", 320 + 12 + 2 + made - 1)
+    monkeypatch.setattr(
+        meshes_from_shapes,
+        "_parts",
+        lambda *a, parts=meshes_from_shapes._parts: pytest.fail("made") if a[0].props.id() == "last" else parts(*a),
+    )
+    with pytest.raises(ValueError, match=f"{name} last: {made} triangles where {made - 1} are left"):
+        from_mitsuba.load(path, level=2)
 
 
 def test_other_errors(scene):

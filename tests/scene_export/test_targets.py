@@ -50,6 +50,12 @@ def test_every_target_writes_its_folder(target, small, sky, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0", "1"]
 
 
+@pytest.mark.parametrize("target", write_files.TARGETS)
+def test_a_scene_of_sky_only(target, sky, tmp_path):
+    for i, shown in enumerate(((0.5, 0.25, 1.0), sky)):
+        assert write_files.write(PlainScene("empty", (), shown, CAMERA, 12), target, tmp_path / f"{i}")
+
+
 def test_an_empty_folder_is_taken(small, tmp_path):
     (tmp_path / "there").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "there")

@@ -34,7 +34,7 @@ def files(plain: PlainScene) -> Files:
     """The files of the export, by name."""
     return scene_json.sky(plain, direction_at) | {
         "scene.obj": "".join(_objects(plain)).encode(),
-        "scene.mtl": "".join(map(_material, *zip(*scene_json.material_names(plain).items(), strict=True))).encode(),
+        "scene.mtl": "".join(_material(*item) for item in scene_json.material_names(plain).items()).encode(),
         "scene.json": scene_json.document(plain, {mesh.name: {"object": mesh.name} for mesh in plain.meshes}),
         "README.txt": readme(plain, "a program of your own", COMMANDS, ASSUMPTIONS),
     }

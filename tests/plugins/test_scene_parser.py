@@ -1,0 +1,244 @@
+"""A scene file runs no code but Mitsuba's and ours, and ends no process, whatever it holds."""
+
+import os
+import re
+import time
+from pathlib import Path
+
+import mitsuba as mi
+import pytest
+from support.processes import python
+
+from mi_refract.io import regular_file
+from mi_refract.plugins import scene_limits, scene_parser
+
+SCENES = Path(__file__).parents[2] / "scenes"
+SENSOR = '<sensor type="perspective"/>'
+
+pytestmark = pytest.mark.usefixtures("scalar_variant")
+
+
+@pytest.fixture
+def load(tmp_path):
+    """`load("<bsdf/>", other="<scene/>")`: the scene of these elements, with other files beside it."""
+
+    def call(elements, *allowed, defines=None, **files):
+        for name, text in ({"s": elements} | files).items():
+            content = text if isinstance(text, bytes) else f'<scene version="3.0.0">{text}</scene>'.encode()
+            (tmp_path / f"{name}.xml").write_bytes(content)
+        return scene_parser.load(tmp_path / "s.xml", defines or {}, allowed)
+
+    return call
+
+
+@pytest.fixture
+def bait(tmp_path):
+    """Files in the places where Mitsuba looks for plugins. It would fail to load them, and say so."""
+    for path in ("plugins/evil.so", "evil.so", "more/plugins/evil.so", "more/evil.so"):
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text("native code")
+    return tmp_path
+
+
+# Plugins ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "elements",
+    [
+        '<bsdf type="evil"/>',
+        '<bsdf type="../evil"/>',
+        '<path value="more"/><bsdf type="evil"/>',
+        '<shape type="sphere"><bsdf type="twosided"><bsdf type="evil"/></bsdf></shape>',
+        '<bsdf type="diffuse"><spectrum name="reflectance" type="evil"/></bsdf>',
+        '<default name="name" value="evil"/><integrator type="$name"/>',
+        '<include filename="other.xml"/>',
+        '<bsdf type="%s/evil"/>',
+    ],
+)
+def test_a_plugin_of_the_scenes_own_is_refused_by_name(elements, load, bait):
+    with pytest.raises(ValueError, match=r"s\.xml: plugin '.*evil': neither Mitsuba's nor .*--allow-plugins .*evil$"):
+        load(elements.replace("%s", str(bait)), other='<bsdf type="evil"/>')
+
+
+def test_an_allowed_plugin_is_loaded(load, bait):
+    """Mitsuba says that the file is no native code: it tried."""
+    with pytest.raises(RuntimeError, match=r"Error while loading plugin .*plugins/evil\.so"):
+        load('<bsdf type="evil"/>', "evil")
+    with pytest.raises(ValueError, match="plugin 'worse'"):
+        load('<bsdf type="evil"/><bsdf type="worse"/>', "evil")
+
+
+BAIT = """
+import os, sys
+from pathlib import Path
+import mitsuba as mi
+import mi_refract
+from mi_refract.cli import main
+folder = Path("plugins")
+folder.mkdir()
+for path in (Path(mi.__file__).parent / "plugins").iterdir():
+    (folder / path.name).write_text("native code")
+Path("more").mkdir()
+os.symlink(folder.resolve(), "more/plugins")
+code = main(["trace", "t.toml", "--backend", "scalar"])  # a mesh has a diffuse BSDF
+sys.exit(code or main(["render", "s.xml", "-o", "out.exr", "--variant", "scalar_rgb", "--spp", "1"]))
+"""
+
+
+def test_mitsubas_own_plugins_are_not_looked_for_in_the_folder_of_the_scene(tmp_path, monkeypatch):
+    """Nor in a <path>, nor in the working folder. In a process of its own: plugins are loaded once."""
+    film = '<film type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/></film>'
+    sensor = f'<sensor type="perspective">{film}</sensor>'
+    elements = f'<path value="more"/><integrator type="path"/>{sensor}<shape type="sphere"/><emitter type="constant"/>'
+    (tmp_path / "s.xml").write_text(f'<scene version="3.0.0">{elements}</scene>')
+    beam = '[[beam]]\nkind = "fan"\nat = [0, 0]\nangles = [0, 90]\ncount = 3'
+    (tmp_path / "t.toml").write_text(f'[[shape]]\nkind = "circle"\nradius = 1\nn = 1.5\nfacets = 60\n{beam}')
+    monkeypatch.chdir(tmp_path)
+    with python(BAIT) as process:
+        out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert "t.toml: 3 rays" in out
+
+
+def test_the_names_are_mitsubas():
+    """Of plugins in C++ those of the folder; of plugins in Python those that its own modules register."""
+    own = scene_parser.own_folder()
+    text = "".join(path.read_text() for path in (own / "python").rglob("*.py"))
+    assert sorted(re.findall(r"\.register_\w+\(\s*[\"'](\w+)[\"']", text)) == sorted(scene_parser.PYTHON)
+    assert {"diffuse", "dielectric", "path", "prb", "refract", "refract_cross", "refract_path"} < (
+        scene_parser.known_plugins()
+    )
+    assert not any("/" in name or not name for name in scene_parser.known_plugins())
+
+
+@pytest.mark.parametrize("path", sorted(SCENES.glob("*.xml")), ids=lambda path: path.stem)
+def test_our_scenes_pass(path):
+    """And with as much room below the limits as they are said to leave."""
+    config = mi.parser.ParserConfig("scalar_rgb")
+    with scene_parser.folders(path.parent):
+        state = scene_parser.parse(path, config, {})
+    scene_parser.check_plugins(path, [node.props.plugin_name() for node in state.nodes], ())
+
+
+def test_the_search_path_is_as_before(load):
+    before = [str(folder) for folder in mi.file_resolver()]
+    load(f"{SENSOR}<path value='.'/>")
+    with pytest.raises(ValueError, match="evil"):
+        load('<bsdf type="evil"/>')
+    assert [str(folder) for folder in mi.file_resolver()] == before
+
+
+# Limits -----------------------------------------------------------------------------------------------------------
+
+
+def nested(depth):
+    return '<bsdf type="twosided">' * depth + "</bsdf>" * depth
+
+
+def chain(count, back=1):
+    """BSDFs that each hold a reference to the one before, or to the one after."""
+    links = range(1, count) if back > 0 else range(count - 1)
+    last = 0 if back > 0 else count - 1
+    bsdfs = "".join(f'<bsdf type="twosided" id="b{i}"><ref id="b{i - back}"/></bsdf>' for i in links)
+    return f'<bsdf type="diffuse" id="b{last}"/>{bsdfs}'
+
+
+TWICE = '<include filename="other.xml"/>' * 2
+LAUGHS = "".join(f'<default name="a{i + 1}" value="{f"$a{i}" * 10}"/>' for i in range(8))
+REFUSED = {
+    "deep": (nested(20000), "elements nested more than 32 deep"),
+    "deep, unfinished": (b"<scene>" * 20000, "elements nested more than 32 deep"),
+    "deep in an include": (
+        '<default name="o" value="oth"/><default name="oer" value="other"/><include filename="$oer.xml"/>',
+        "other.xml: elements nested",
+    ),
+    "deep by references": (chain(2000), "plugins nested"),
+    "deep by references, forward": (chain(2000, -1), "plugins nested"),
+    "many lobes": (chain(20), "65536 lobes of a BSDF"),
+    "circle": (
+        '<bsdf type="twosided" id="a"><ref id="b"/></bsdf><bsdf type="twosided" id="b"><ref id="a"/></bsdf>',
+        "in a circle",
+    ),
+    "files": ('<include filename="s.xml"/>' * 2, "more than 1000 files included"),
+    "long value": (f'<default name="a0" value="xxxxxxxxxx"/>{LAUGHS}', "<default>: a value of 10000 characters"),
+    "document type": (b'<!DOCTYPE a [<!ENTITY b "c">]><scene version="3.0.0"/>', "a document type"),
+    "another encoding": ('<scene version="3.0.0"/>'.encode("utf-16"), "zero bytes; accepted: XML in UTF-8"),
+    "included pipe": ('<include filename="pipe"/>', "pipe: is a pipe or a device"),
+    "pipe as a spectrum": (
+        '<bsdf type="diffuse"><spectrum name="reflectance" filename="pipe"/></bsdf>',
+        "pipe: is a pipe or a device",
+    ),
+    "pipe by a parameter": ('<default name="p" value="pipe"/><include filename="$p"/>', "pipe: is a pipe"),
+    "pipe as an image": ('<texture type="bitmap"><string name="filename" value="pipe"/></texture>', "pipe: is a pipe"),
+    "device as a mesh": ('<shape type="ply"><string name="filename" value="/dev/zero"/></shape>', "/dev/zero: is"),
+    "device": (b"", "s.xml: is a pipe or a device"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_would_end_the_process_is_refused(case, load, tmp_path, monkeypatch):
+    elements, message = REFUSED[case]
+    os.mkfifo(tmp_path / "pipe")
+    if case == "device":
+        os.mkfifo(tmp_path / "s.xml")
+        monkeypatch.setattr(Path, "write_bytes", lambda path, content: None)
+    parse = mi.parser.parse_file
+    seen = []
+    monkeypatch.setattr(mi.parser, "parse_file", lambda *a, **k: seen.append(case) or parse(*a, **k))
+    monkeypatch.setattr(mi.parser, "instantiate", lambda *arguments: pytest.fail("ran"))
+    begin = time.process_time()
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        load(elements, other=nested(20000))
+    assert "accepted: " in str(caught.value) and "\n" not in str(caught.value)
+    assert time.process_time() - begin < 10
+    # Only what cannot be told from the text alone comes to Mitsuba's parser.
+    assert bool(seen) == case.startswith(("deep by", "many", "circle", "pipe as an image", "device as"))
+
+
+def test_limits_of_size(load, monkeypatch):
+    monkeypatch.setattr(scene_limits, "SIZE", 200)
+    with pytest.raises(ValueError, match=r"s\.xml: 2\d\d bytes; accepted: up to 200"):
+        load(" " * 170)
+    with pytest.raises(ValueError, match=r"other\.xml: \d+ bytes; accepted: up to \d+"):
+        load('<include filename="other.xml"/>' * 2, other=" " * 40)
+    with pytest.raises(ValueError, match="expand to over 200 bytes"):
+        load(f'<default name="a" value="{"x" * 60}"/>' + "$a" * 4)
+    monkeypatch.setattr(scene_limits, "SIZE", 10_000)
+    load(f"{SENSOR}{' ' * 200}")
+
+
+def test_what_is_no_harm_is_no_error(load):
+    """Mitsuba's XML parser takes more than XML; elements in comments are none; a parameter may be unknown."""
+    comment = f"<!-- -- {nested(50)[:800]} --><![CDATA[{'<a>' * 50}]]><?p {'<a>' * 50}?>"
+    depth = '<bsdf type="bumpmap"><texture type="checkerboard"/>' * 10 + '<bsdf type="diffuse"/>' + "</bsdf>" * 10
+    balls = '<shape type="sphere"/>' * 40
+    scene = load(f"{SENSOR}{comment}{depth}<bsdf type='diffuse' id='>>'/>{balls}")
+    assert len(scene.shapes()) == 40
+
+
+@pytest.mark.parametrize("text", [b"", b"<", b"<scene", b"<!--", b"<scene version='", b"\xff\xfe<", b"</a></b><scene>"])
+def test_what_is_no_xml_is_mitsubas_to_say(text, load):
+    with pytest.raises(RuntimeError, match=r"XML|version"):
+        load(text)
+
+
+HARD = [b"<a" + b" x" * 300_000, b"<a " + b"x='" * 200_001, b"<" * 300_000, b"<!--" * 200_000]
+
+
+@pytest.mark.parametrize("text", HARD)
+def test_hard_texts_take_no_longer_than_long_ones(text, tmp_path):
+    """A pattern that tries every way to read them would need hours."""
+    begin = time.process_time()
+    (tmp_path / "s.xml").write_bytes(text)
+    scene_limits.check_files(tmp_path / "s.xml", [], {})
+    assert time.process_time() - begin < 5
+
+
+def test_a_large_scene_is_read_in_its_own_time(tmp_path):
+    text = '<float name="a" value="3"/>' * 50_000
+    (tmp_path / "s.xml").write_text(f'<scene version="3.0.0">{text}</scene>')
+    assert len(regular_file.read_bytes(tmp_path / "s.xml", 2**21)) > 10**6
+    begin = time.process_time()
+    scene_limits.check_files(tmp_path / "s.xml", [], {})
+    assert time.process_time() - begin < 5

@@ -1,0 +1,106 @@
+"""Enough of Blender's Python to run the script of a Cycles export, and to see what it would have rendered."""
+
+import sys
+import types
+from unittest import mock
+
+import numpy as np
+
+
+class Vector(np.ndarray):
+    """mathutils.Vector."""
+
+    def __new__(cls, values):
+        return np.array(values, float).view(cls)
+
+    def normalized(self):
+        return self / np.linalg.norm(self)
+
+    def cross(self, other):
+        return Vector(np.cross(self, other))
+
+
+class Matrix(Vector):
+    """mathutils.Matrix, of rows."""
+
+    def transposed(self):
+        return self.T
+
+    def to_4x4(self):
+        matrix = np.eye(4)
+        matrix[:3, :3] = self
+        return matrix
+
+    @staticmethod
+    def Translation(offset):
+        matrix = np.eye(4)
+        matrix[:3, 3] = offset
+        return matrix
+
+
+class Sockets(dict):
+    """Inputs or outputs of a node, by name or number; each is made when it is asked for."""
+
+    def __init__(self, node):
+        super().__init__()
+        self.node = node
+
+    def __missing__(self, key):
+        self[key] = types.SimpleNamespace(node=self.node, key=key, default_value=None)
+        return self[key]
+
+
+class Tree:
+    """A tree of shader nodes."""
+
+    def __init__(self):
+        self.made, self.sources = [], {}
+        self.nodes = types.SimpleNamespace(new=self._new, clear=self.made.clear)
+        self.links = types.SimpleNamespace(new=self._link)
+
+    def _new(self, kind):
+        node = types.SimpleNamespace(kind=kind)
+        node.inputs, node.outputs = Sockets(node), Sockets(node)
+        self.made.append(node)
+        return node
+
+    def _link(self, source, target):
+        self.sources[id(target.node), target.key] = source
+
+    def source(self, node, key):
+        """The node, and its output, that feeds an input."""
+        found = self.sources[id(node), key]
+        return found.node, found.key
+
+    def only(self, kind):
+        """The only node of a kind."""
+        (node,) = (node for node in self.made if node.kind == kind)
+        return node
+
+
+def named(**attributes):
+    """A collection of Blender's: `new(name, …)` makes and keeps an item."""
+    made = {}
+
+    def new(name, *arguments):
+        made[name] = types.SimpleNamespace(**{key: make(*arguments) for key, make in attributes.items()})
+        return made[name]
+
+    return types.SimpleNamespace(new=new, made=made)
+
+
+def run(folder, monkeypatch):
+    """Run the script up to its rendering; Blender's `bpy` as the script leaves it."""
+    bpy = mock.MagicMock()
+    bpy.data.materials, bpy.data.worlds = named(node_tree=Tree), named(node_tree=Tree)
+    bpy.data.meshes, bpy.data.cameras = named(materials=list, from_pydata=mock.Mock), named()
+    bpy.data.objects = named(data=lambda data: data)
+    bpy.context.scene.render.resolution_x = None
+    monkeypatch.setitem(sys.modules, "bpy", bpy)
+    monkeypatch.setitem(sys.modules, "mathutils", types.SimpleNamespace(Vector=Vector, Matrix=Matrix))
+    monkeypatch.setattr(sys, "argv", ["render.py", "--spp", "3", "--out", str(folder)])
+    script = folder / "render.py"
+    space = {"__file__": str(script), "__name__": "script"}
+    exec(compile(script.read_text(), str(script), "exec"), space)
+    space["main"]()
+    return bpy

@@ -1,0 +1,337 @@
+"""Reads exported scenes as their renderers would: cameras, triangles, materials, skies.
+
+Each reader follows the renderer's documentation, not the code that writes the export. `Scene.ray(x, y)` is the ray of a
+place in the image, from (0, 0) at its upper left corner to (1, 1). `Scene.sky(directions)` is the radiance from there.
+"""
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from support import fake_bpy
+
+from mi_refract.io.image_file import read_exr
+
+
+@dataclass
+class Scene:
+    """A scene that was read. By mesh: its triangles, index inside over outside, and radiance."""
+
+    size: tuple[int, int]
+    depth: int
+    ray: Callable
+    sky: Callable
+    triangles: dict = field(default_factory=dict)
+    indices: dict = field(default_factory=dict)
+    lights: dict = field(default_factory=dict)
+    colours: dict = field(default_factory=dict)
+
+
+def unit(vector):
+    return np.asarray(vector) / np.linalg.norm(vector)
+
+
+def pinhole(origin, ahead, up, wide, high):
+    """Rays of a camera; `wide`, `high`: tangents of half the angles of view."""
+    ahead = unit(ahead)
+    right = unit(np.cross(ahead, up))
+    upward = np.cross(right, ahead)
+    return lambda x, y: (np.asarray(origin), ahead + (2 * x - 1) * wide * right + (1 - 2 * y) * high * upward)
+
+
+def on_map(path, place):
+    """The sky of a map whose pixel in direction d is at `place(d)`: from the left and from the top, 0 to 1."""
+    pixels = read_exr(path)[0].astype(float)
+    height, width = pixels.shape[:2]
+
+    def sky(directions):
+        u, v = place(*directions.T)
+        column, row = u % 1 * width - 0.5, np.clip(v * height - 0.5, 0, height - 1)
+        i, j = np.floor(row).astype(int), np.floor(column).astype(int)
+        a, b = (row - i)[:, None], (column - j)[:, None]
+        below, right = np.minimum(i + 1, height - 1), (j + 1) % width
+        upper = (1 - b) * pixels[i, j % width] + b * pixels[i, right]
+        return (1 - a) * upper + a * ((1 - b) * pixels[below, j % width] + b * pixels[below, right])
+
+    return sky
+
+
+def plain_sky(colour):
+    return lambda directions: np.broadcast_to(np.array(colour, float), directions.shape)
+
+
+def ply(path):
+    header, _, data = path.read_bytes().partition(b"end_header\n")
+    vertices, faces = (int(number) for number in re.findall(rb"element \w+ (\d+)", header))
+    places = np.frombuffer(data, "<f4", 3 * vertices).reshape(-1, 3)
+    return places[np.frombuffer(data, [("n", "u1"), ("i", "<i4", 3)], faces, 12 * vertices)["i"]]
+
+
+def readme(folder, pattern):
+    return [int(number) for number in re.search(pattern, (folder / "README.txt").read_text()).groups()]
+
+
+# Radiance ---------------------------------------------------------------------------------------------------------
+
+
+def radiance(folder, monkeypatch):
+    """An interface's first medium is the one behind its normal; a view's angles are those of both directions."""
+    words = (folder / "camera.vf").read_text().split()
+    assert words[:2] == ["VIEW=", "-vtv"]
+
+    def value(name, count=3):
+        place = words.index(name) + 1
+        return np.array(words[place : place + count], float)
+
+    wide, high = (np.tan(np.radians(value(name, 1)[0]) / 2) for name in ("-vh", "-vv"))
+    ray = pinhole(value("-vp"), value("-vd"), value("-vu"), wide, high)
+    width, height, *depths = readme(folder, r"-x (\d+) -y (\d+) -pa 0 [^$]*?-ab (\d+) [^$]*?-lr -(\d+) ")
+    assert depths[0] == depths[1]
+    found = Scene((width, height), depths[0], ray, plain_sky((0, 0, 0)))
+    surfaces = {}
+    for line in (folder / "scene.rad").read_text().splitlines():
+        if not line:
+            continue
+        modifier, kind, name, *rest = line.split()
+        numbers = [float(x) for x in rest[3 + int(rest[0]) :]]
+        if kind == "polygon":
+            mesh = name.rpartition(".")[0]
+            found.triangles.setdefault(mesh, []).append(np.reshape(numbers, (3, 3)))
+            kind, numbers = surfaces[modifier]
+            if kind == "interface":
+                found.indices[mesh] = numbers[3] / numbers[7]
+            else:
+                {"glow": found.lights, "plastic": found.colours}[kind][mesh] = numbers[:3]
+        elif kind == "source":
+            assert modifier == name == "sky" or modifier == "sky"
+            assert numbers[3] == 360
+            found.sky = (
+                _radiance_sky(folder, surfaces["sky"][1]) if "map" in surfaces else plain_sky(surfaces["sky"][1][:3])
+            )
+        else:
+            surfaces[name] = kind, numbers
+    return found
+
+
+def _radiance_sky(folder, glow):
+    """`sky.cal` gives the place in the tables, which are linear between their entries."""
+    assert glow == [1, 1, 1, 0]
+    code = (folder / "sky.cal").read_text().replace(";", "")
+    tables = []
+    for colour in "rgb":
+        lines = (folder / f"sky_{colour}.dat").read_text().splitlines()
+        assert lines[0] == "2"
+        table = np.array([line.split() for line in lines[3:]], float)
+        assert [line.split()[2] for line in lines[1:3]] == [str(count) for count in table.shape]
+        tables.append(table)
+
+    def sky(directions):
+        found = []
+        for x, y, z in directions:
+            names = {"Dx": x, "Dy": y, "Dz": z, "PI": np.pi, "Acos": np.arccos, "atan2": np.arctan2, "floor": np.floor}
+            exec(code, names)
+            i, j = int(names["row"]), int(names["column"])
+            a, b = names["row"] - i, names["column"] - j
+            i = min(i, tables[0].shape[0] - 2)
+            values = [t[i : i + 2, j : j + 2] for t in tables]
+            found.append([np.array([1 - a, a]) @ value @ np.array([1 - b, b]) for value in values])
+        return np.array(found)
+
+    return sky
+
+
+# LuxCore ----------------------------------------------------------------------------------------------------------
+
+
+def luxcore(folder, monkeypatch):
+    """The image shows the screen window, whose ±1 is half the field of view; LuxCore's film is one row off."""
+    properties = {}
+    for name in ("scene.scn", "scene.cfg"):
+        for line in (folder / name).read_text().splitlines():
+            key, _, text = line.partition(" = ")
+            properties[key] = text.strip('"') if '"' in text else [float(x) for x in text.split()]
+
+    camera = {key.removeprefix("scene.camera."): value for key, value in properties.items()}
+    tangent = np.tan(np.radians(camera["fieldofview"][0]) / 2)
+    left, right, bottom, top = camera["screenwindow"]
+    width, height = (int(properties[f"film.{name}"][0]) for name in ("width", "height"))
+    origin = np.array(camera["lookat.orig"])
+    ahead = unit(np.array(camera["lookat.target"]) - origin)
+    sideways = unit(np.cross(ahead, camera["up"]))
+    upward = np.cross(sideways, ahead)
+
+    def ray(x, y):
+        across = left + x * (right - left)
+        above = top - (y - 1 / height) * (top - bottom)
+        return origin, ahead + tangent * (across * sideways + above * upward)
+
+    depths = {properties[f"path.pathdepth.{name}"][0] for name in ("total", "diffuse", "glossy", "specular")}
+    (depth,) = depths
+    found = Scene((width, height), int(depth), ray, plain_sky((0, 0, 0)))
+    if properties.get("scene.lights.sky.type") == "infinite":
+        assert properties["scene.lights.sky.wrap"] == "clamp"
+        place = lambda x, y, z: (np.arctan2(y, x) / (2 * np.pi), np.arccos(z) / np.pi)  # noqa: E731
+        found.sky = on_map(folder / properties["scene.lights.sky.file"], place)
+    elif "scene.lights.sky.type" in properties:
+        found.sky = plain_sky(properties["scene.lights.sky.color"])
+    for key, file in properties.items():
+        if match := re.fullmatch(r"scene\.objects\.(\w+)\.ply", key):
+            name = match[1]
+            material = f"scene.materials.{properties[f'scene.objects.{name}.material']}"
+            found.triangles[name] = ply(folder / file)
+            if properties[f"{material}.type"] == "glass":
+                inner, outer = (properties[f"{material}.{side}ior"][0] for side in ("interior", "exterior"))
+                found.indices[name] = inner / outer
+            elif f"{material}.emission" in properties:
+                found.lights[name] = properties[f"{material}.emission"]
+            else:
+                found.colours[name] = properties[f"{material}.kd"]
+    return found
+
+
+# POV-Ray ----------------------------------------------------------------------------------------------------------
+
+
+def povray(folder, monkeypatch):
+    """A ray goes along direction + (x − ½) right + (½ − y) up; `dx`, `dy` choose the place in the pixel."""
+    text = (folder / "scene.pov").read_text()
+    number = r"[-+.\de]+"
+    vectors = lambda part: [np.array(v.split(","), float) for v in re.findall(r"<([^<>]*)>", part)]  # noqa: E731
+    (right,), (up,) = (vectors(re.search(rf"#declare {name} = (.*);", text)[1]) for name in ("Right", "Up"))
+    origin, ahead = vectors(re.search(r"location[^#]*?direction <[^>]*>", text)[0])
+    pattern = r"direction <[^>]*> \+ Right\*\(dx - 0\.5\)/(\d+) - Up\*\(dy - 0\.5\)/(\d+) }"
+    shift = [int(count) for count in re.search(pattern, text).groups()]
+    assert "right Right up Up" in text
+    size = readme(folder, r"\+W(\d+) \+H(\d+) ")
+
+    def ray(x, y):
+        (i, dx), (j, dy) = ((int(a * n), a * n - int(a * n)) for a, n in zip((x, y), size, strict=True))
+        direction = ahead + right * (dx - 0.5) / shift[0] - up * (dy - 0.5) / shift[1]
+        return origin, direction + ((i + 0.5) / size[0] - 0.5) * right + (0.5 - (j + 0.5) / size[1]) * up
+
+    found = Scene(tuple(size), int(re.search(r"max_trace_level (\d+)", text)[1]), ray, None)
+    if "sky_sphere" in text:
+        assert "map_type 1 " in text
+        place = lambda x, y, z: (np.arctan2(z, x) / (2 * np.pi), 0.5 - np.arcsin(y) / np.pi)  # noqa: E731
+        found.sky = on_map(folder / re.search(r'exr "(.*?)"', text)[1], place)
+    else:
+        found.sky = plain_sky(vectors(re.search(r"background \{ rgb (.*) }", text)[1])[0])
+    for part in text.split("mesh2 { // ")[1:]:
+        name = part.split()[0]
+        places, faces, surface = re.split(r"face_indices|(?=texture \{ pigment)", part, maxsplit=2)
+        corners = np.array(vectors(places))
+        # Clockwise in POV-Ray's left-handed coordinates is counterclockwise in ours.
+        found.triangles[name] = corners[np.array(vectors(faces), int)[:, ::-1]]
+        if match := re.search(rf"interior \{{ ior ({number}) }}", surface):
+            found.indices[name] = float(match[1])
+        else:
+            front, back = surface.split("interior_texture")
+            assert "emission 1" in front and "emission" not in back
+            found.lights[name] = vectors(front)[0]
+    return found
+
+
+# Cycles -----------------------------------------------------------------------------------------------------------
+
+
+def cycles(folder, monkeypatch):
+    """What the script makes of Blender. A camera looks along −z, and +y is up in its image."""
+    bpy = fake_bpy.run(folder, monkeypatch)
+    scene, data = bpy.context.scene, bpy.data
+    matrix, lens = scene.camera.matrix_world, scene.camera.data
+    assert lens is data.cameras.made["camera"] and lens.sensor_fit == "HORIZONTAL"
+    size = scene.render.resolution_x, scene.render.resolution_y
+    wide = np.tan(lens.angle / 2)
+
+    def ray(x, y):
+        local = np.array([(2 * x - 1) * wide, (1 - 2 * y) * wide * size[1] / size[0], -1])
+        return matrix[:3, 3], np.asarray(matrix[:3, :3] @ local)
+
+    bounces = {getattr(scene.cycles, f"{name}_bounces") for name in ("max", "diffuse", "glossy", "transmission")}
+    (depth,) = bounces
+    found = Scene(size, depth + 2, ray, None)
+    world = scene.world.node_tree
+    background, _ = world.source(world.only("ShaderNodeOutputWorld"), "Surface")
+    if colour := background.inputs["Color"].default_value:
+        found.sky = plain_sky(colour[:3])
+    else:
+        assert world.source(background, "Color")[0].kind == "ShaderNodeTexEnvironment"
+        (path,) = bpy.data.images.load.call_args.args
+        place = lambda x, y, z: (0.5 - np.arctan2(y, x) / (2 * np.pi), np.arccos(z) / np.pi)  # noqa: E731
+        found.sky = on_map(path, place)
+    for name, mesh in data.meshes.made.items():
+        ((vertices, _, faces), _) = mesh.from_pydata.call_args
+        found.triangles[name] = np.array(vertices)[np.array(faces)]
+        (material,) = mesh.materials
+        tree = material.node_tree
+        surface, _ = tree.source(tree.only("ShaderNodeOutputMaterial"), "Surface")
+        if surface.kind == "ShaderNodeBsdfGlass":
+            found.indices[name] = surface.inputs["IOR"].default_value
+        elif surface.kind == "ShaderNodeBsdfDiffuse":
+            found.colours[name] = surface.inputs["Color"].default_value[:3]
+        else:
+            found.lights[name] = _cycles_light(tree, surface)
+    return found
+
+
+def _cycles_light(tree, mix):
+    """A mix by whether the ray meets the back: of nothing but light in front, and black behind."""
+    assert tree.source(mix, 0)[1] == "Backfacing"
+    (front, _), (back, _) = (tree.source(mix, i) for i in (1, 2))
+    assert (front.kind, back.inputs["Color"].default_value[:3]) == ("ShaderNodeEmission", (0, 0, 0))
+    return np.array(front.inputs["Color"].default_value[:3]) * front.inputs["Strength"].default_value
+
+
+# A program of one's own -------------------------------------------------------------------------------------------
+
+
+def obj(folder, monkeypatch):
+    """As README.txt says it."""
+    document = json.loads((folder / "scene.json").read_text())
+    camera = document["camera"]
+    size = camera["width"], camera["height"]
+    wide = np.tan(np.radians(camera["fov_x_degrees"]) / 2)
+    ahead = np.subtract(camera["target"], camera["origin"])
+    ray = pinhole(camera["origin"], ahead, camera["up"], wide, wide * size[1] / size[0])
+    found = Scene(size, document["max_depth"], ray, None)
+    if "environment" in document["sky"]:
+        place = lambda x, y, z: (np.arctan2(x, -z) / (2 * np.pi), np.arccos(y) / np.pi)  # noqa: E731
+        found.sky = on_map(folder / document["sky"]["environment"], place)
+    else:
+        found.sky = plain_sky(document["sky"]["radiance"])
+    library, vertices = _mtl(folder / "scene.mtl"), []
+    for line in (folder / "scene.obj").read_text().splitlines():
+        word, *rest = line.split()
+        if word == "o":
+            name = rest[0]
+            material = document["materials"][document["meshes"][name]["material"]]
+        elif word == "usemtl":
+            entry = library[rest[0]]
+            if material["type"] == "glass":
+                found.indices[name] = entry["Ni"][0]
+                assert np.isclose(material["int_ior"] / material["ext_ior"], entry["Ni"][0], rtol=1e-15)
+            else:
+                key, place = {"light": ("Ke", found.lights), "diffuse": ("Kd", found.colours)}[material["type"]]
+                place[name] = entry[key]
+                assert entry[key] in (material.get("radiance"), material.get("reflectance"))
+        elif word == "v":
+            vertices.append([float(x) for x in rest])
+        elif word == "f":
+            found.triangles.setdefault(name, []).append([vertices[int(i) - 1] for i in rest])
+    return found
+
+
+def _mtl(path):
+    found = {}
+    for line in path.read_text().splitlines():
+        word, *rest = line.split()
+        if word == "newmtl":
+            entry = found[rest[0]] = {}
+        else:
+            entry[word] = [float(x) for x in rest]
+    return found
+
+
+READERS = {"radiance": radiance, "luxcore": luxcore, "povray": povray, "cycles": cycles, "obj+json": obj}
