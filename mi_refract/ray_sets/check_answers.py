@@ -17,7 +17,8 @@ from mi_refract.formulas import FORMULAS
 
 from .diagnosis import Explanation, explain
 from .judged_answers import JudgedAnswers, judge_answers
-from .ray_set import Answers, Header, RaySet
+from .header import Header, shown
+from .ray_set import Answers, RaySet
 from .tir_signal import AUTO, FLAG, TIR, UNCLEAR
 
 # The documented formula with the largest error bound.
@@ -120,7 +121,8 @@ def check(rays: RaySet, answers: Answers, *, tir: str = AUTO, error_bound: str =
     if tir == FLAG and answers.transmitted is None:
         raise ValueError("tir = 'flag': there is no column `transmitted`; accepted: answers with one")
     if (given := answers.header.get("checksum")) not in (None, rays.header["checksum"]):
-        raise ValueError(f"the answers are to rays with the checksum {given}; accepted: {rays.header['checksum']}")
+        accepted = f"{rays.header['checksum']}, or other rays with --rays FILE"
+        raise ValueError(f"the answers are to rays with the checksum {shown(given)}; accepted: {accepted}")
     problems, order = _match_ids(rays, answers)
     kept = np.flatnonzero(order >= 0)
     b = answers.b[order[kept]]

@@ -13,7 +13,7 @@ from mi_refract.formulas import ROUNDING, Budget
 from mi_refract.regimes import Rays
 
 from . import tir_signal
-from .ray_set import PRECISIONS
+from .header import PRECISIONS
 
 
 @dataclass(frozen=True)
