@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -22,6 +23,7 @@ _ABOVE = 2**14  # bytes: NumPy describes an array in 10,000 at most
 _BROKEN = (
     *(zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, EOFError),
     *(RuntimeError, TypeError, ValueError, OverflowError, MemoryError),
+    *(SyntaxError, tokenize.TokenError),  # of NumPy's parser
 )
 
 

@@ -135,9 +135,9 @@ def table(found: Findings) -> RenderableType:
     for column in rows.columns[2:]:
         column.justify = "right"
     for each in found.regimes:
-        rows.add_row(Text(grade(each), style=STYLES[grade(each)]), each.regime, *_cells(each, found.ulp).values())
+        rows.add_row(Text(grade(each), style=STYLES[grade(each)]), Text(printable(each.regime)), *_cells(each, found.ulp).values())
     notes = [*map(problem_text, found.problems), signal(found), *explained(found)]
-    return Group(*([rows] if found.regimes else []), *(Text(printable(note)) for note in notes), Text(sentence(found)))
+    return Group(*([rows] if found.regimes else []), *(Text(printable(line)) for line in (*notes, sentence(found))))
 
 
 def _cells(each: RegimeErrors, ulp: float) -> dict[str, str]:
