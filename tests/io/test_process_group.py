@@ -69,8 +69,11 @@ def test_a_timeout_ends_it(text):
 
 
 PARENT = f"""
-import sys
+import signal, sys
 from mi_refract.io import process_group
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+for number in (signal.SIGTERM, signal.SIGHUP):
+    signal.signal(number, signal.SIG_DFL)
 process_group.run(["sh", "-c", {SLEEPER!r}, sys.argv[1]], b"", 600)
 """
 
