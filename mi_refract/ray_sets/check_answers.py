@@ -16,10 +16,10 @@ import numpy as np
 from mi_refract.formulas import FORMULAS
 
 from .diagnosis import Explanation, explain
-from .judged_answers import LOOSEST, JudgedAnswers, judge_answers
+from .judged_answers import JudgedAnswers, judge_answers
 from .header import Header, shown
 from .ray_set import Answers, RaySet
-from .tir_signal import AUTO, FLAG, TIR, UNCLEAR
+from .tir_signal import AUTO, FLAG, LOOSEST, TIR, UNCLEAR
 
 LISTED_IDS = 5
 

@@ -14,9 +14,7 @@ from mi_refract.regimes import Rays
 
 from . import certain_parts, tir_signal
 from .header import PRECISIONS
-
-# The documented formula with the largest error bound.
-LOOSEST = max(FORMULAS, key=lambda name: (FORMULAS[name].budget.growth, FORMULAS[name].budget.radicand))
+from .tir_signal import LOOSEST
 
 
 @dataclass(frozen=True)
