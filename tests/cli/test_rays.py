@@ -100,17 +100,27 @@ def test_wrong_answers(call):
     assert out.splitlines()[-1] == "50 of 50 answers are wrong: eta inverted"
 
 
-def test_answers_may_repeat_the_header_of_the_rays(call):
+def test_the_rays_may_be_named_by_the_options_of_export(call):
     to = ray_set.make(["Brewster"], 40, "f64", 8)
     answer("answers.csv", to, lines=header(to))
-    code, out, _ = call("check", "answers.csv")
+    options = ("--regime", "Brewster", "--count", 40, "--precision", "f64", "--seed", 8)
+    code, out, _ = call("check", "answers.csv", *options)
     assert (code, out.splitlines()[0]) == (0, "answers.csv: 40 rays, 1 regime, f64, seed 8")
-    files.write("rays.csv", to)
     answer("answers.csv", to, lines=[line.replace("sha256:", "sha256:0") for line in header(to)])
-    code, _, err = call("check", "answers.csv", "--rays", "rays.csv")
-    assert (code, "the answers are to rays with the checksum sha256:0" in err) == (2, True)
+    code, _, err = call("check", "answers.csv", *options)
+    assert (code, "the answers are to rays with the checksum 'sha256:0" in err) == (2, True)
+
+
+def test_answers_do_not_choose_the_rays(call):
+    """Right answers to one easy ray, with the header of that ray."""
+    to = ray_set.make(["near-normal"], 1)
+    answer("answers.csv", to, lines=header(to))
     code, _, err = call("check", "answers.csv")
-    assert (code, "cannot make the rays of these answers again; accepted: with --rays FILE" in err) == (2, True)
+    assert (code, "or other rays with --rays FILE" in err) == (2, True)
+    answer("answers.csv", to, lines=[line for line in header(to) if "checksum" not in line])
+    code, out, _ = call("check", "answers.csv")
+    assert (code, "12999 without an answer" in out) == (2, True)
+    assert call("check", "answers.csv", "--regime", "near-normal", "--count", 1)[0] == 0
 
 
 def test_answers_without_a_header_are_to_the_default_rays(call):
@@ -124,9 +134,10 @@ def test_answers_without_a_header_are_to_the_default_rays(call):
 
 def test_the_error_bound_can_be_chosen(call):
     to = ray_set.make(["generic"], 50)
-    answer("answers.csv", to, lines=header(to))
-    assert call("check", "answers.csv", "--error-bound", "wedge")[0] == 0
-    code, out, _ = call("check", "answers.csv", "--as-good-as", "promoted")
+    answer("answers.csv", to)
+    chosen = ("--regime", "generic", "--count", 50)
+    assert call("check", "answers.csv", *chosen, "--error-bound", "wedge")[0] == 0
+    code, out, _ = call("check", "answers.csv", *chosen, "--as-good-as", "promoted")
     assert (code, "none of the usual mistakes explains the answers" in out) == (1, True)
 
 
