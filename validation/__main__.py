@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mi_refract.io.outside_text import printable
 from validation.run import command_line
 
 if TYPE_CHECKING:
@@ -116,7 +117,7 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
 
     start = time.perf_counter()
     variant = backend.activate(may_restart=True)
-    print(f"validation: {backend.summary()}", file=sys.stderr)
+    print(printable(f"validation: {backend.summary()}"), file=sys.stderr)
     tables = _tables(names) if write_tables else None
     chosen = profiles(variant)[profile]
     context = Context(chosen, out, variant, backend.detect(), backend.usable_variants())
@@ -158,7 +159,7 @@ def _print(parts: list[Any], page: Path) -> None:
     console = Console()
     for part in parts:
         console.print(part)
-    console.print(f"report: {page}", highlight=False)
+    console.print(printable(f"report: {page}"), highlight=False, markup=False)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mi_refract.io.atomic import writable
+from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import provenance
 from mi_refract.ray_sets import files, ray_set, run_program
 from mi_refract.ray_sets.ray_set import Answers, RaySet
@@ -128,7 +129,7 @@ def export(
     """Write rays for another program: incident directions, normals and indices of refraction."""
     rays = ray_set.make(_names(regime), count, precision, seed, two_sided=two_sided)
     files.write(output, rays)
-    print(f"{output}: {_summary(rays)}")
+    print(printable(f"{output}: {_summary(rays)}"))
 
 
 @app.command()
@@ -150,7 +151,8 @@ def check(
     given = files.read_answers(answers)
     described = file or "checksum" in given.header
     rays = files.read(file) if file else ray_set.remake(given.header) if described else ray_set.make()
-    print(f"{answers}: {_summary(rays)}{'' if described else ', as of `export` without options; others: --rays FILE'}")
+    origin = "" if described else ", as of `export` without options; others: --rays FILE"
+    print(printable(f"{answers}: {_summary(rays)}{origin}"))
     replay = ["check", str(answers), *(["--rays", str(file)] if file else []), *options.words]
     raise typer.Exit(options.check(rays, given, str(answers), replay))
 
@@ -187,7 +189,7 @@ def run(
     rays = files.read(file) if file else ray_set.make(_names(regime), count, precision, seed, two_sided=two_sided)
     given = run_program.answers_of(command, rays, timeout=timeout)
     name = shlex.join(command)
-    print(f"{name}: {_summary(rays)}")
+    print(printable(f"{name}: {_summary(rays)}"))
     chosen = ["--rays", str(file)] if file else made
     raise typer.Exit(options.check(rays, given, name, ["run", *chosen, *options.words, "--", *command]))
 
