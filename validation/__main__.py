@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mi_refract.io import lock
 from mi_refract.io.outside_text import printable
 from validation.run import command_line
 
@@ -42,6 +43,7 @@ QUICK = (
     "planar.against_retrace",
     "diff.planted_defects",
 )
+LOCK = "validation.lock"  # in the folder of the report, while it is being made
 PROFILES = {"quick": "seconds", "standard": "minutes", "full": "hours"}
 
 app = command_line.application()
@@ -74,7 +76,8 @@ def _command(
     """Measure the formulas and the plugin against certified answers, and write the report."""
     _check(studies or [], profile, out, write_tables)
     try:
-        return _run(studies or [], profile, out, write_tables, goals)
+        with lock.held(out / LOCK, "a validation"):
+            return _run(studies or [], profile, out, write_tables, goals)
     except KeyboardInterrupt:
         print("validation: interrupted; the same command goes on from here", file=sys.stderr)
         raise

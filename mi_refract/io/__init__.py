@@ -4,4 +4,14 @@ In: paths, pixels, commands, tables of TOML. Out: files that are complete or not
 output of other programs, checked values; errors are one line that says what, where, and what would be accepted.
 """
 
-__all__ = ["atomic", "exit_code", "image_file", "outside_text", "pixels", "process_group", "provenance", "toml_schema"]
+__all__ = [
+    "atomic",
+    "exit_code",
+    "image_file",
+    "lock",
+    "outside_text",
+    "pixels",
+    "process_group",
+    "provenance",
+    "toml_schema",
+]
