@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mi_refract.io import lock
+from mi_refract.io.outside_text import printable
 from validation.run import command_line
 
 if TYPE_CHECKING:
@@ -41,6 +43,7 @@ QUICK = (
     "planar.against_retrace",
     "diff.planted_defects",
 )
+LOCK = "validation.lock"  # in the folder of the report, while it is being made
 PROFILES = {"quick": "seconds", "standard": "minutes", "full": "hours"}
 
 app = command_line.application()
@@ -73,7 +76,8 @@ def _command(
     """Measure the formulas and the plugin against certified answers, and write the report."""
     _check(studies or [], profile, out, write_tables)
     try:
-        return _run(studies or [], profile, out, write_tables, goals)
+        with lock.held(out / LOCK, "a validation"):
+            return _run(studies or [], profile, out, write_tables, goals)
     except KeyboardInterrupt:
         print("validation: interrupted; the same command goes on from here", file=sys.stderr)
         raise
@@ -116,7 +120,7 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
 
     start = time.perf_counter()
     variant = backend.activate(may_restart=True)
-    print(f"validation: {backend.summary()}", file=sys.stderr)
+    print(printable(f"validation: {backend.summary()}"), file=sys.stderr)
     tables = _tables(names) if write_tables else None
     chosen = profiles(variant)[profile]
     context = Context(chosen, out, variant, backend.detect(), backend.usable_variants())
@@ -158,7 +162,7 @@ def _print(parts: list[Any], page: Path) -> None:
     console = Console()
     for part in parts:
         console.print(part)
-    console.print(f"report: {page}", highlight=False)
+    console.print(printable(f"report: {page}"), highlight=False, markup=False)
 
 
 if __name__ == "__main__":

@@ -22,8 +22,8 @@ from mi_refract.image_diff import settings as diff_settings
 from mi_refract.image_diff.folders import Results, Status
 from mi_refract.image_diff.methods import AUTO
 from mi_refract.io.atomic import writable
+from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import provenance
-from mi_refract.report.junit import printable
 
 from . import self_test_scenes
 

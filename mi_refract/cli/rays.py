@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mi_refract.io.atomic import writable
+from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import provenance
 from mi_refract.ray_sets import files, ray_set, run_program
 from mi_refract.ray_sets.ray_set import Answers, RaySet
@@ -128,7 +129,7 @@ def export(
     """Write rays for another program: incident directions, normals and indices of refraction."""
     rays = ray_set.make(_names(regime), count, precision, seed, two_sided=two_sided)
     files.write(output, rays)
-    print(f"{output}: {_summary(rays)}")
+    print(printable(f"{output}: {_summary(rays)}"))
 
 
 @app.command()
@@ -155,7 +156,8 @@ def check(
     options = CheckOptions(tir, formula or old_formula, report, junit, json)
     rays, chosen = _rays(file, regime, count, precision, seed, two_sided)
     given = files.read_answers(answers, most=files.most_answers(rays))
-    print(f"{answers}: {_summary(rays)}{'' if chosen else ', as of `export` without options; others: --rays FILE'}")
+    origin = "" if chosen else ", as of `export` without options; others: --rays FILE"
+    print(printable(f"{answers}: {_summary(rays)}{origin}"))
     raise typer.Exit(options.check(rays, given, str(answers), ["check", str(answers), *chosen, *options.words]))
 
 
@@ -188,7 +190,7 @@ def run(
     rays, chosen = _rays(file, regime, count, precision, seed, two_sided)
     given = run_program.answers_of(command, rays, timeout=timeout, adopt=True)
     name = shlex.join(command)
-    print(f"{name}: {_summary(rays)}")
+    print(printable(f"{name}: {_summary(rays)}"))
     raise typer.Exit(options.check(rays, given, name, ["run", *chosen, *options.words, "--", *command]))
 
 

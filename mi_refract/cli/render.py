@@ -13,9 +13,11 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.text import Text
 
 from mi_refract import backend
 from mi_refract.io import atomic
+from mi_refract.io.outside_text import printable
 from mi_refract.rendering import scene_files
 
 
@@ -49,13 +51,14 @@ def render(
         header = scene_files.render_to_exr(
             scene, output, defines=defines, spp=spp, seed=seed, allow_plugins=allow_plugins or []
         )
-    print(f"{output}: {chosen}, {header['mi_refract:spp']} spp, {header['mi_refract:render_seconds']:.2f} s")
+    done = f"{header['mi_refract:spp']} spp, {header['mi_refract:render_seconds']:.2f} s"
+    print(printable(f"{output}: {chosen}, {done}"))
     if variant is None and not backend.llvm().usable:
-        print(f"mi-refract: {chosen} is slow; {backend.summary()}", file=sys.stderr)
+        print(printable(f"mi-refract: {chosen} is slow; {backend.summary()}"), file=sys.stderr)
 
 
 def _spinner(console: Console, text: str) -> contextlib.AbstractContextManager[Any]:
-    return console.status(text) if console.is_terminal else contextlib.nullcontext()
+    return console.status(Text(printable(text))) if console.is_terminal else contextlib.nullcontext()
 
 
 @contextlib.contextmanager

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mi_refract import backend
+from mi_refract.io.outside_text import printable
 from mi_refract.rendering import scene_files
 
 app = typer.Typer(
@@ -46,7 +47,8 @@ def export(
     plain = from_mitsuba.load(path, level=from_mitsuba.LEVEL if level is None else level, **defines)
     written = write(plain, to, folder)
     triangles = sum(len(mesh.faces) for mesh in plain.meshes)
-    print(f"{folder}: {len(written)} files, {triangles} triangles; {folder / 'README.txt'} says how to render them")
+    done = f"{len(written)} files, {triangles} triangles; {folder / 'README.txt'} says how to render them"
+    print(printable(f"{folder}: {done}"))
 
 
 def _scene_path(scene: str) -> Path:

@@ -11,6 +11,7 @@ import typer
 
 from mi_refract import backend
 from mi_refract.io import atomic
+from mi_refract.io.outside_text import printable
 from mi_refract.planar import figure, focal_points, scene_file, scene_schema
 from mi_refract.planar.path_tree import as_data, follow_scene, summary, with_rays
 
@@ -59,4 +60,6 @@ def trace(
         focal = {"foci": [asdict(group) for group in found]} if table else {}
         print(json.dumps(as_data(loaded, traced) | focal, allow_nan=False))
     else:
-        print("\n".join([f"{scene.name}: {summary(loaded, traced)}", *([focal_points.table(found)] if found else [])]))
+        print(printable(f"{scene.name}: {summary(loaded, traced)}"))
+        if found:
+            print(focal_points.table(found))

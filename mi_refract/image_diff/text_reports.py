@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from mi_refract.io.atomic import write_atomically
+from mi_refract.io.outside_text import printable
 from mi_refract.report import junit
-from mi_refract.report.junit import printable
 from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.row import strict
 

@@ -4,4 +4,15 @@ In: paths, pixels, commands, tables of TOML. Out: files that are complete or not
 output of other programs, checked values; errors are one line that says what, where, and what would be accepted.
 """
 
-__all__ = ["atomic", "exit_code", "image_file", "pixels", "process_group", "provenance", "regular_file", "toml_schema"]
+__all__ = [
+    "atomic",
+    "exit_code",
+    "image_file",
+    "lock",
+    "outside_text",
+    "pixels",
+    "process_group",
+    "provenance",
+    "regular_file",
+    "toml_schema",
+]

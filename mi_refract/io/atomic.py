@@ -6,13 +6,21 @@ Whoever writes does so under a temporary name in the same folder, which is renam
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
+import re
+import secrets
 import shutil
-import uuid
+import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from .lock import is_at
+
+_OURS = re.compile(r"\..*\.[0-9a-f]{32}\.part(\.\w+)?", re.DOTALL)  # as `temporary_name` makes them
+_KEPT = 40  # characters of the file's own name: a name of 255 bytes has no room for more
 _unfinished: set[Path] = set()
+_swept: set[Path] = set()
 
 
 def writable(path: str | os.PathLike[str], suffixes: Sequence[str]) -> Path:
@@ -39,30 +47,92 @@ def check_parent(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike[str], suffix: str = "") -> Iterator[Path]:
+def replacing(path: str | os.PathLike[str], suffix: str = "", *, folder: bool = False) -> Iterator[Path]:
     """Yield a temporary path in the same folder, ending in `suffix`; rename what is written there to `path` at the end.
 
-    A reader sees the old file, or folder, or the new one. The old file's permissions are kept. On any exception,
-    the caller's or OSError from the system, the old file stays and the temporary one is removed.
+    An empty file is there already, or with `folder` an empty folder: made exclusively, under a name that nobody can
+    guess, with the permissions of the old one. A reader sees the old file, or folder, or the new one. On any exception,
+    the caller's or OSError from the system, the old one stays and the temporary one is removed; what a killed process
+    left behind goes with the next file that is written beside it.
     """
     path = Path(path)
-    temporary = temporary_name(path, suffix)
+    sweep(path.parent)
+    temporary, lock = _new(path, suffix, folder)
     _unfinished.add(temporary)
     try:
         yield temporary
-        if path.is_file():
-            shutil.copymode(path, temporary)
+        _copy_mode(path, lock)
         temporary.replace(path)
     except BaseException:
         _remove(temporary)
         raise
     finally:
         _unfinished.discard(temporary)
+        os.close(lock)
+
+
+def _new(path: Path, suffix: str, folder: bool) -> tuple[Path, int]:
+    """A temporary beside `path`, new and open, and its descriptor, locked for as long as this process uses it."""
+    while True:
+        temporary = temporary_name(path, suffix)
+        if folder:
+            temporary.mkdir()
+        else:
+            temporary.touch(exist_ok=False)  # O_EXCL: a link of that name is an error, too
+        with contextlib.suppress(FileNotFoundError):  # another process took it, as yet unlocked, for a stale one
+            file = os.open(temporary, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            if _try_lock(file) is not False and is_at(file, temporary):
+                _copy_mode(path, file, stat.S_IRWXU if folder else stat.S_IRUSR | stat.S_IWUSR)
+                return temporary, file
+            os.close(file)
 
 
 def temporary_name(path: Path, suffix: str) -> Path:
-    """A hidden name beside `path` that nothing else has."""
-    return path.with_name(f".{path.name}.{uuid.uuid4().hex}.part{suffix}")
+    """A hidden name beside `path` that nobody can guess."""
+    return path.with_name(f".{path.name[:_KEPT]}.{secrets.token_hex(16)}.part{suffix}")
+
+
+def _copy_mode(path: Path, file: int, least: int = 0) -> None:
+    """Give the open file the permissions of `path`, where there is one, and `least`."""
+    with contextlib.suppress(FileNotFoundError):
+        os.fchmod(file, stat.S_IMODE(path.stat().st_mode) | least)
+
+
+def _try_lock(file: int) -> bool | None:
+    """True where the file is locked now, False where another process has it, None where the system has no locks."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
+
+
+def sweep(folder: Path) -> None:
+    """Remove the temporary files and folders of ours in `folder` whose process has ended. Once for each folder.
+
+    A living process holds a lock on each of its own. What cannot be locked or removed stays; nothing is raised.
+    """
+    folder = folder.resolve()
+    if folder in _swept:
+        return
+    _swept.add(folder)
+    with contextlib.suppress(OSError):
+        for entry in os.scandir(folder):
+            if _OURS.fullmatch(entry.name):
+                _remove_stale(Path(entry.path))
+
+
+def _remove_stale(temporary: Path) -> None:
+    with contextlib.suppress(OSError):
+        file = os.open(temporary, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        try:
+            ours = stat.S_IFMT(os.fstat(file).st_mode) in (stat.S_IFREG, stat.S_IFDIR)
+            if ours and _try_lock(file) and is_at(file, temporary):
+                _remove(temporary)
+        finally:
+            os.close(file)
 
 
 def remove_unfinished() -> None:

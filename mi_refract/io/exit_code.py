@@ -8,6 +8,8 @@ import sys
 import traceback
 from collections.abc import Callable
 
+from .outside_text import printable
+
 MISUSE, INTERRUPTED = 2, 130
 TRACEBACK = "MI_REFRACT_TRACEBACK"  # environment variable: with "1" the traceback is printed as well
 
@@ -49,7 +51,7 @@ def describe(error: BaseException) -> str:
         text = str(error)
     else:
         text = f"internal error: {type(error).__name__}: {error} ({TRACEBACK}=1 shows where)"
-    return " ".join(text.split())
+    return printable(" ".join(text.split()))
 
 
 def _failed(name: str, error: BaseException) -> int:

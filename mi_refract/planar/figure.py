@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mi_refract.io.atomic import write_atomically
+from mi_refract.io.outside_text import printable
 
 from .figure_geometry import SHARED, Legs, View, around, curves, density, legs
 from .path_tree import Branches, count, summary
@@ -101,7 +102,7 @@ def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> 
     caption = _caption(scene, traced, int(14 * width))
     drawn = Figure((width, height + LINE * len(caption)), dpi, layout="constrained")
     panel = drawn.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal")
-    panel.set_title("\n".join(textwrap.wrap(scene.title, int(10.5 * width))))
+    panel.set_title("\n".join(textwrap.wrap(printable(" ".join(scene.title.split())), int(10.5 * width))))
     panel.set_xlabel("\n".join(caption), loc="left", fontsize=7.5)
     _media(panel, scene)
     _settle(drawn)
@@ -268,5 +269,5 @@ def _caption(scene: PlanarScene, traced: Sequence[Branches], width: int) -> list
     """The lines below the figure, of at most `width` characters each."""
     numbers = count(traced)
     notes = [text.format(numbers[event.name]) for event, (_, text) in MARKS.items() if numbers[event.name]]
-    lines = [f"{scene.path.name}: {summary(scene, traced)}", *notes]
+    lines = [f"{printable(scene.path.name)}: {summary(scene, traced)}", *notes]
     return [part for line in lines for part in textwrap.wrap(line, width)]

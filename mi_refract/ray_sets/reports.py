@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refract.io.atomic import write_atomically
+from mi_refract.io.outside_text import printable
 from mi_refract.regimes import REGIMES
 from mi_refract.report import junit
 from mi_refract.report.embedded_images import EmbeddedImages
 from mi_refract.report.html_page import write_page
-from mi_refract.report.junit import printable
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import strict
 
@@ -142,9 +142,14 @@ def table(found: Findings) -> RenderableType:
     for column in rows.columns[2:]:
         column.justify = "right"
     for each in found.regimes:
-        rows.add_row(Text(grade(each), style=STYLES[grade(each)]), Text(printable(each.regime)), *_cells(each, found.ulp).values())
+        rows.add_row(
+            Text(grade(each), style=STYLES[grade(each)]),
+            Text(printable(each.regime)),
+            *_cells(each, found.ulp).values(),
+        )
     notes = [*map(problem_text, found.problems), signal(found), *explained(found)]
-    return Group(*([rows] if found.regimes else []), *(Text(printable(line)) for line in (*notes, sentence(found))))
+    texts = (Text(printable(note)) for note in [*notes, sentence(found)])
+    return Group(*([rows] if found.regimes else []), *texts)
 
 
 def _cells(each: RegimeErrors, ulp: float) -> dict[str, str]:

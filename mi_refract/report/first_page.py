@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
 
+from mi_refract.io.outside_text import printable_lines
+
 from .embedded_images import EmbeddedImages
 from .plots import Axes, curves_svg
 from .row import Row
@@ -129,4 +131,4 @@ def code(text: str) -> Any:
     """Escaped HTML in which words between backticks are `<code>`."""
     from markupsafe import Markup, escape
 
-    return Markup(re.sub("`([^`]*)`", r"<code>\1</code>", str(escape(text))))
+    return Markup(re.sub("`([^`]*)`", r"<code>\1</code>", str(escape(printable_lines(text)))))

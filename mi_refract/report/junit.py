@@ -1,21 +1,16 @@
-"""JUnit's XML, and text that is safe in XML and on a terminal.
-
-Names of files and messages of errors may hold any character; `printable` makes them safe to print and to write.
-"""
+"""JUnit's XML. Names of files and messages of errors may hold any character: `printable` makes them fit for XML."""
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 from xml.etree import ElementTree as xml
 
 from mi_refract.io.atomic import write_atomically
-
-UNPRINTABLE = re.compile("[^\x20-\x7e\xa0-\u2027\u202f-\u2065\u206a-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+from mi_refract.io.outside_text import printable
 
 
 @dataclass(frozen=True)
@@ -32,15 +27,6 @@ class Case:
     message: str = ""
     details: Sequence[str] = ()
     kind: str = ""
-
-
-def printable(text: Any) -> str:
-    """The text on one line; each character that XML 1.0, UTF-8 or a terminal would not show becomes U+FFFD.
-
-    Those are control characters (line ends and terminal escapes among them), surrogates, and marks that change the
-    direction of writing.
-    """
-    return UNPRINTABLE.sub("\ufffd", str(text))
 
 
 def write_junit(path: str | Path, name: str, suites: Mapping[str, Sequence[Case]]) -> None:

@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from mi_refract.io.outside_text import printable_lines
+
 from .number_text import compact
 
 if TYPE_CHECKING:
@@ -172,6 +174,7 @@ def scatter_svg(panels: Mapping[str, Scatter], axes: Axes, *, floor: str, front:
             _floor(panel, panels[setting].floor, floor)
             _front(panel, subjects if front else {})
             _ticks(panel, axes.logarithmic)
+        _printable(figure)
         figure.canvas.draw()  # settles the layout that the labels' places depend on
         for panel, subjects in zip(grid, drawn.values(), strict=False):
             _labels(panel, subjects, colours)
@@ -255,8 +258,18 @@ def _labels(panel: Panel, subjects: Mapping[str, Points], colours: Mapping[str, 
         panel.annotate(subject, head, offset, **text)  # type: ignore[arg-type]
 
 
+def _printable(figure: Figure) -> None:
+    """Make every text of the figure, names of subjects and cases among them, printable."""
+    from matplotlib.text import Text
+
+    for found in figure.findobj(Text):
+        assert isinstance(found, Text)
+        found.set_text(printable_lines(found.get_text()))
+
+
 def _page_svg(figure: Figure) -> str:
     """The figure as an `<svg>` element for a page: no declarations, links, dates, or ids but those in use."""
+    _printable(figure)
     buffer = io.StringIO()
     nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     figure.savefig(buffer, format="svg", transparent=True, metadata=nothing)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refract.io.atomic import write_atomically
+from mi_refract.io.outside_text import printable
 
 from . import first_page, junit, study_page
 from .embedded_images import EmbeddedImages
@@ -157,7 +158,7 @@ def _bounds_table(heading: str, bound: str, found: Sequence[tuple[Row, str]], st
     for row, metric in found:
         value, limit = distinguishable(row.values[metric], row.bounds[metric])
         missed = "yellow" if metric in row.missed else ""
-        table.add_row(Text(row.name), Text(metric), Text(value, style=missed), limit)
+        table.add_row(Text(printable(row.name)), Text(printable(metric)), Text(value, style=missed), limit)
     return table
 
 

@@ -32,8 +32,7 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
         raise ValueError(f"target {target!r}: unknown; accepted: {', '.join(TARGETS)}")
     place = _new_or_empty(folder)
     files = TARGETS[target](plain)
-    with atomic.replacing(place) as temporary:
-        temporary.mkdir()
+    with atomic.replacing(place, folder=True) as temporary:
         for name, content in files.items():
             (temporary / name).write_bytes(content)
     return [Path(folder) / name for name in sorted(files)]

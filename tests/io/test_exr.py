@@ -80,12 +80,14 @@ def test_a_full_disk_keeps_the_old_file(tmp_path, side, monkeypatch):
     path.write_text("old")
     temporary = tmp_path / "temporary.exr"
     temporary.symlink_to("/dev/full")
-    monkeypatch.setattr(atomic, "temporary_name", lambda path, suffix: temporary)
+    lock = (tmp_path / "lock").open("w")
+    monkeypatch.setattr(atomic, "_new", lambda *_: (temporary, os.dup(lock.fileno())))
     with pytest.raises(OSError, match=r"a\.exr: cannot be written: .") as error:
         write_exr(path, np.random.default_rng(1).random((side, side, 3)))
     assert "\n" not in str(error.value)
     assert path.read_text() == "old"
-    assert [entry.name for entry in tmp_path.iterdir()] == ["a.exr"]
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["a.exr", "lock"]
+    lock.close()
 
 
 def test_an_interrupted_write_keeps_the_old_file(tmp_path, monkeypatch):

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import math
+import os
 import re
 import types
 from pathlib import Path
@@ -255,6 +256,22 @@ def test_an_interruption_is_exit_code_130_and_says_how_to_go_on(tmp_path, monkey
     monkeypatch.setattr(command, "_run", interrupted)
     assert command.main(["--out", str(tmp_path)]) == 130
     assert "the same command goes on from here" in capsys.readouterr().err
+
+
+def test_two_validations_do_not_share_a_folder(tmp_path, monkeypatch, capsys):
+    inside = []
+
+    def second():
+        inside.append(command.main(["directions", "--out", str(tmp_path)]))
+        return [row()]
+
+    holding = Study("directions", "A study", "", {}, lambda context: [Task("a task", second)])
+    monkeypatch.setattr(command, "import_module", lambda name: types.SimpleNamespace(STUDY=holding))
+    assert command.main(["directions", "--out", str(tmp_path)]) == 0
+    assert inside == [2]
+    said = [line for line in capsys.readouterr().err.splitlines() if "runs there already" in line]
+    assert len(said) == 1 and f"{tmp_path}: a validation runs there already, process {os.getpid()} on " in said[0]
+    assert {path.name for path in tmp_path.iterdir()} == {"rows.json", "junit.xml", "report.html"}
 
 
 def test_every_study_is_in_a_room_and_has_rows_of_its_own():

@@ -7,6 +7,7 @@ import sys
 import typer
 
 from mi_refract.io import exit_code as exits
+from mi_refract.io.outside_text import printable
 
 
 def application() -> typer.Typer:
@@ -21,5 +22,5 @@ def exit_code(app: typer.Typer, name: str, arguments: list[str]) -> int:
 
 def misuse(name: str, message: str) -> int:
     """Print the error in one line on stderr; 2, the exit code."""
-    print(f"{name}: {' '.join(message.split())}", file=sys.stderr)
+    print(printable(f"{name}: {' '.join(message.split())}"), file=sys.stderr)
     return 2

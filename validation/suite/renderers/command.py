@@ -48,7 +48,7 @@ def _install(system: System) -> int:
     try:
         environments.install(system)
     except OSError as error:
-        print(f"{NAME}: {' '.join(str(error).split())}", file=sys.stderr)
+        command_line.misuse(NAME, str(error))
         return 1
     return 0
 

@@ -1,0 +1,44 @@
+"""Text that somebody else wrote: names of files, channels and regimes, titles, reasons, messages of other programs.
+
+All of it passes through `printable` on its way to a terminal, a log, HTML, XML, SVG or Markdown, each of which then
+escapes what is markup there. U+FFFD stands where something was taken out.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+MARK = "\ufffd"
+
+# What XML 1.0 or UTF-8 cannot hold, what steers a terminal, what changes the direction of writing (all of Unicode's
+# Bidi_Control), and what cannot be seen at all. U+200C and U+200D stay: languages and emoji are spelled with them.
+_HIDDEN = re.compile(
+    "["
+    "\x00-\x1f\x7f-\x9f"  # controls: line ends, tabs and escapes among them
+    "\xad\u034f\u061c\u115f\u1160\u17b4\u17b5\u180b-\u180f"
+    "\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f"
+    "\u3164\ufe00-\ufe0e\ufeff\uffa0\ufff0-\ufffb\ufffe\uffff"
+    "\ud800-\udfff"  # surrogates: bytes of a file name that are no UTF-8
+    "\U0001d173-\U0001d17a\U000e0000-\U000e0fff"
+    "]"
+)
+# What a runner of GitHub (also in its old form, anywhere in a line), Azure or TeamCity would carry out: `##[error]`,
+# `##vso[…]`, and `::error::` where a line begins with it.
+_ANYWHERE = re.compile(r"##(?=\w*\[)")
+_AT_THE_START = re.compile(r"^(\s*):(?=:)")
+
+
+def printable(text: Any) -> str:
+    """The text on one line, without a character that is not shown, or that more than shows; U+FFFD stands for each.
+
+    Commands to the runner of a CI service are broken up: of `##[error]` and of a leading `::` one character is
+    replaced. Everything else, markup too, stays as it is. What is printable is left unchanged: it may pass twice.
+    """
+    shown = _HIDDEN.sub(MARK, str(text))
+    return _AT_THE_START.sub(rf"\1{MARK}", _ANYWHERE.sub(f"#{MARK}", shown))
+
+
+def printable_lines(text: Any) -> str:
+    """The same for a text of several lines, of which \\n is kept."""
+    return "\n".join(map(printable, str(text).split("\n")))

@@ -1,0 +1,117 @@
+"""What others wrote, in every form of a report: no character that is not seen, and markup is text."""
+
+import dataclasses
+from xml.etree import ElementTree
+
+import pytest
+from rich.console import Console
+from support import processes
+from support.hostile import NAME, shows_more_than_text
+
+from mi_refract.image_diff import html_report, text_reports
+from mi_refract.image_diff.comparison import Comparison, Metric, Verdict
+from mi_refract.image_diff.folders import Result, Results, Status
+from mi_refract.image_diff.settings import How
+from mi_refract.planar import figure, path_tree, scene_file
+from mi_refract.ray_sets import check_answers, reports
+from mi_refract.ray_sets.diagnosis import Explanation
+from mi_refract.report import plots, run_report
+from mi_refract.report.row import Row
+
+pytest.importorskip("jinja2")
+
+
+def printed(table):
+    console = Console(width=10_000, color_system=None, force_terminal=False)
+    with console.capture() as capture:
+        console.print(table, highlight=False)
+    return capture.get()
+
+
+@pytest.fixture
+def results(tmp_path):
+    how = How("exact", {}, NAME)
+    said = Comparison("exact", Verdict.DIFFERENT, NAME, (Metric(NAME, 2.0, 1.0),))
+    found = [Result(NAME, Status.ERROR, tmp_path, tmp_path, how, error=NAME)]
+    found += [Result(NAME, Status.DIFFERENT, None, tmp_path, how)]
+    found += [Result(NAME, status, tmp_path, tmp_path, how, said) for status in (Status.INCONCLUSIVE, Status.EQUAL)]
+    return Results(tmp_path / "old", tmp_path / NAME.replace("/", ""), tuple(found), unused=(NAME,))
+
+
+def findings():
+    """Of one wrong answer, in a set whose regime and ids were named by somebody else."""
+    fields = {field.name: 1 for field in dataclasses.fields(check_answers.RegimeErrors)}
+    regime = check_answers.RegimeErrors(**fields | {"regime": NAME, "replay": {NAME: NAME}})
+    problems = (check_answers.Problem("unknown", 1, NAME),)
+    why = (Explanation(NAME, NAME, 1.0, 0.1, True),)
+    return check_answers.Findings("f32", 2.0**-23, NAME, "zero", True, (regime,), problems, why, {"seed": NAME})
+
+
+FORMS = {
+    "terminal": lambda results, path: printed(text_reports.table(results)),
+    "GitHub": lambda results, path: "\n".join(
+        line.replace("::", "", 1) for line in text_reports.workflow_commands(results)
+    ),
+    "Markdown": lambda results, path: text_reports.markdown(results),
+    "JUnit": lambda results, path: text_reports.write_junit(path, results) or path.read_text(),
+    "HTML": lambda results, path: html_report.write(path, results, {NAME: [NAME]}, NAME) or path.read_text(),
+}
+
+
+ANSWER_FORMS = {
+    "terminal": lambda found, path: printed(reports.table(found)),
+    "JUnit": lambda found, path: reports.write_junit(path, found, NAME) or path.read_text(),
+    "HTML": lambda found, path: reports.write_html(path, found, {NAME: NAME}, NAME) or path.read_text(),
+}
+
+
+@pytest.mark.parametrize("form", ANSWER_FORMS)
+def test_names_of_regimes_and_ids_of_answers(form, tmp_path):
+    text = ANSWER_FORMS[form](findings(), tmp_path / "out")
+    assert "task.x" in text
+    assert shows_more_than_text(text) == []
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_names_reasons_and_errors_of_images(form, results, tmp_path):
+    text = FORMS[form](results, tmp_path / "out")
+    assert "error" in text
+    assert shows_more_than_text(text) == []
+    assert "<script>&" not in text or form in ("terminal", "GitHub")
+
+
+def test_names_of_rows_and_what_other_programs_said(tmp_path):
+    row = Row(NAME, NAME, NAME, NAME, {NAME: 2.0}, budgets={NAME: 1.0}, reason=NAME, replay={NAME: NAME})
+    curve = dataclasses.replace(row, curves={NAME: [(1.0, 1.0), (2.0, 3.0)]}, subject="other")
+    absent = Row(NAME, "absent", NAME, NAME, reason=NAME)
+    context = {NAME: NAME, "title": NAME, "replay": NAME, "studies": {NAME: {"title": NAME, "text": NAME}}}
+    rows = [row, curve, absent]
+    run_report.write_html(tmp_path / "out.html", rows, context, tmp_path)
+    run_report.write_junit(tmp_path / "out.xml", rows, context)
+    ElementTree.parse(tmp_path / "out.xml")
+    for text in ((tmp_path / "out.html").read_text(), (tmp_path / "out.xml").read_text()):
+        assert shows_more_than_text(text) == [] and "<script>&" not in text
+    assert shows_more_than_text(printed(run_report.summary(rows))) == []
+
+
+def test_plots():
+    name = "::x\x1b[31m\u202e##[error]<b>&"
+    drawn = plots.curves_svg({name: [(1, 1), (2, 2)]}, plots.Axes(name, name), salt="x")
+    panels = {name: plots.Scatter({name: [(1, 1), (2, 2)]}, [], 1.0)}
+    scattered = plots.scatter_svg(panels, plots.Axes(name, name), floor=name, front=True, salt="y")
+    for svg in (drawn, scattered):
+        assert svg.count("error]") > 2
+        assert shows_more_than_text(svg) == []
+        ElementTree.fromstring(svg)
+
+
+def test_a_planar_scene_with_a_hostile_title(tmp_path):
+    path = tmp_path / "##[error]\u202e.toml"
+    title = "title = '::x::<b>&'".replace("'", '"').replace("<b>", r"\u001b[31m\u202e##[error]<b>") + "\n"
+    text = title + (processes.ROOT / "scenes/planar/lens.toml").read_text().replace("title", "# title")
+    path.write_text(text)
+    scene = scene_file.load(path)
+    svg = figure.draw(scene, path_tree.follow_scene(scene), ".svg").decode()
+    assert "error]" in svg
+    assert shows_more_than_text(svg) == []
+    ElementTree.fromstring(svg)
