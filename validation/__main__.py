@@ -112,7 +112,7 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
     from validation.run.context import Context, profiles
 
     from . import runner
-    from .run import headline
+    from .run import headline, seeds
 
     start = time.perf_counter()
     variant = backend.activate(may_restart=True)
@@ -121,7 +121,8 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
     chosen = profiles(variant)[profile]
     context = Context(chosen, out, variant, backend.detect(), backend.usable_variants())
     studies: list[Study] = [import_module(f"validation.{name}").STUDY for name in modules(names, profile)]
-    rows, spent = runner.run([task for study in studies for task in study.tasks(context)], context)
+    work = [task for study in studies for task in (*study.tasks(context), *seeds.tasks(study, context))]
+    rows, spent = runner.run(work, context)
     for study in studies:
         rows = study.summarise(rows)
     described = runner.describe(context, time.perf_counter() - start)
