@@ -15,6 +15,7 @@ import numpy as np
 from mi_refract.formulas import cancelling
 from mi_refract.report.row import Row
 from validation import limits
+from validation.run import seeds
 from validation.run.bsdf_sampling import sample_all
 from validation.run.context import Context
 from validation.study import Study, Task, about
@@ -65,7 +66,7 @@ def _mode_row(mode: Any, mode_name: str, count: int, variant: str) -> Row:
 
     description = {"int_ior": INT_IOR, "ext_ior": EXT_IOR, "specular_reflectance": 0.9, "specular_transmittance": 0.8}
     ours, theirs = (mi.load_dict({"type": name, **description}) for name in ("refract", "dielectric"))
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(seeds.current(SEED))
     wi = rng.normal(size=(count, 3))
     wi, sample1 = wi / np.linalg.norm(wi, axis=1, keepdims=True), rng.random(count)
     differences: dict[str, list[np.ndarray]] = {name: [] for name in QUANTITIES}
@@ -94,8 +95,8 @@ def _mode_row(mode: Any, mode_name: str, count: int, variant: str) -> Row:
     budgets |= {f"{name} p99": limits.SAMPLE_P99 for name in ("wo", "pdf", "weight")}
     if mi.is_polarized:  # a radicand on either side of the boundary, and its error in three factors of the weight
         budgets["weight worst"] = limits.SAMPLE_MUELLER * float(cancelling(2).radicand_error_bound(2.0**-24, INT_IOR))
-    replay = {"count": 3 * count, "seed": SEED, **description}
+    replay = {"count": 3 * count, "seed": seeds.current(SEED), **description}
     return Row(NAME, "refract − dielectric", mode_name, variant, values, budgets, replay=replay)
 
 
-STUDY = Study(NAME, "Samples", about(__doc__), TERMS, tasks)
+STUDY = Study(NAME, "Samples", about(__doc__), TERMS, tasks, again=seeds.by_tasks(tasks))

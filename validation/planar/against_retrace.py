@@ -23,6 +23,7 @@ from mi_refract.planar.scene_file import PlanarScene, load
 from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.planar_retrace import Array, Retraced, retrace
+from validation.run import seeds
 from validation.run.array_settings import Setting, settings
 from validation.run.context import SCENES, Context
 from validation.run.metrics import ERROR_OVER_BOUND, WRONG_PATH, WRONG_PATH_FAR
@@ -117,10 +118,20 @@ def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     return rows
 
 
+def drawn_rows(context: Context) -> list[Row]:
+    """Every scene and a third of the random ones, in every compiled setting."""
+    rows, (scenes, rays) = [], CLUTTER["standard"]
+    for setting in settings(context):
+        if setting.vector is not None and not setting.is_scalar:
+            rows += [row_of(case_of(path, RAYS["quick"]), setting) for path in sorted(FOLDER.glob("*.toml"))]
+            rows.append(clutter_row(setting, scenes // 3, rays))
+    return rows
+
+
 def row_of(case: Case, setting: Setting, formula: str | None = None) -> Row:
     """A scene in a setting, by the default formula or another one."""
     values = judge(case.trace(setting, formula), case, setting.roundoff)
-    replay = {"scene": f"{case.name}.toml", "rays": len(case.origins), "seed": SEED}
+    replay = {"scene": f"{case.name}.toml", "rays": len(case.origins), "seed": seeds.current(SEED)}
     return Row(NAME, formula or TRACE, case.name, setting.label, values, budgets(setting), replay=replay)
 
 
@@ -135,19 +146,19 @@ def clutter_row(setting: Setting, scenes: int, rays: int) -> Row:
     parts = [judge(case.trace(setting), case, setting.roundoff) for case in _clutter(scenes, rays)]
     counts = (WRONG_PATH, WRONG_PATH_FAR)
     values = {name: (sum if name in counts else max)(part[name] for part in parts) for name in parts[0]}
-    replay = {"scenes": scenes, "rays": scenes * rays, "seed": SEED}
+    replay = {"scenes": scenes, "rays": scenes * rays, "seed": seeds.current(SEED)}
     # Among so many bodies errors may grow beyond any fixed bound: their own one counts.
     return Row(NAME, TRACE, "clutter", setting.label, values, GROWN, replay=replay)
 
 
-@functools.cache
+@seeds.cached
 def _clutter(scenes: int, rays: int) -> list[Case]:
-    rngs = [np.random.default_rng((SEED, number)) for number in range(scenes)]
+    rngs = [np.random.default_rng((seeds.current(SEED), number)) for number in range(scenes)]
     described = [(random_scenes.bodies(rng), *random_scenes.rays(rng, rays)) for rng in rngs]
     return [Case("clutter", s, o, d, random_scenes.DEPTH, reflect) for s, o, d, reflect in described]
 
 
-@functools.cache
+@seeds.cached
 def case_of(path: Path, rays: int) -> Case:
     """The first colour of a scene file: refracted wherever possible, and reflected once where the file has branches."""
     scene = load(path)
@@ -160,7 +171,7 @@ def case_of(path: Path, rays: int) -> Case:
 
 def rays_of(scene: PlanarScene, count: int) -> tuple[Array, Array]:
     """At most `count` of the file's rays, and `count` scattered around any of them."""
-    rng, extent = np.random.default_rng(SEED), _extent(scene.segments[0])
+    rng, extent = np.random.default_rng(seeds.current(SEED)), _extent(scene.segments[0])
     own = np.linspace(0, len(scene.origins) - 1, min(count, len(scene.origins))).astype(int)
     chosen = rng.integers(0, len(scene.origins), count)
     shift, turn = SPREAD * extent * rng.uniform(-1, 1, (count, 2)), SPREAD * rng.uniform(-1, 1, count)
@@ -227,4 +238,4 @@ def unit(d: Any) -> Array:
     return d / np.hypot(*d.T)[:, None]
 
 
-STUDY = Study(NAME, "Planar", about(__doc__), TERMS, tasks)
+STUDY = Study(NAME, "Planar", about(__doc__), TERMS, tasks, again=drawn_rows)

@@ -6,10 +6,12 @@ A bound is derived for every ray, so it holds for every seed; a study that only 
 from __future__ import annotations
 
 import functools
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
+from pathlib import Path
 from typing import ParamSpec, TypeVar
 
 from mi_refract.report.row import Row
@@ -51,6 +53,11 @@ def cached(function: Callable[P, T]) -> Callable[P, T]:
     return found
 
 
+def by_tasks(tasks: Callable[[Context], list[Task]]) -> Callable[[Context], list[Row]]:
+    """`Study.again` of a study all of whose rows are to be repeated: those of its tasks."""
+    return lambda context: [row for task in tasks(context) for row in task.run()]
+
+
 def tasks(study: Study, context: Context) -> list[Task]:
     """One task per other seed of a randomised study; none in the profile `quick`."""
     if study.again is None:
@@ -66,8 +73,8 @@ def tasks(study: Study, context: Context) -> list[Task]:
 def rows_of(study: Study, context: Context, shift: int) -> list[Row]:
     """One row with the worst share of a budget, and, in full, every row that breaks one."""
     assert study.again is not None
-    with shifted(shift):
-        found = [row for row in study.again(context) if row.values]
+    with shifted(shift), tempfile.TemporaryDirectory() as folder:  # images are those of the study's own seed
+        found = [replace(row, images={}) for row in study.again(replace(context, out=Path(folder))) if row.values]
     shares = [share(row.values[m], bound) for row in found for m, bound in row.budgets.items()]
     broken = [replace(row, case=f"{row.case}, other seed {shift}") for row in found if row.broken]
     values = {"checks": float(len(shares)), "broken": float(len(broken)), "largest share": max(shares, default=0.0)}

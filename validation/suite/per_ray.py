@@ -23,6 +23,7 @@ from mi_refract.ray_sets.files import as_csv, parse_answers
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.report.row import Row
 from validation import limits
+from validation.run import seeds
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED, WORST_ANGLE
 from validation.study import Study, Task, about
@@ -126,7 +127,7 @@ def _unmeasured(call: RefractFunction, reason: str) -> Row:
     return Row(NAME, call.title, "every set", call.precision, reason=reason)
 
 
-@functools.cache
+@seeds.cached
 def given(precision: str) -> RaySet:
     """All sets, one after the other."""
     parts = {name: _made(kind, ray_set.PRECISIONS[precision], i) for i, (name, kind) in enumerate(SETS.items())}
@@ -134,7 +135,7 @@ def given(precision: str) -> RaySet:
 
 
 def _made(kind: Set, precision: type, number: int) -> regimes.Rays:
-    rng = np.random.default_rng([SEED, number])
+    rng = np.random.default_rng([seeds.current(SEED), number])
     normal: np.ndarray = regimes.normalised(rng.normal(size=(kind.count, 3))).astype(precision)
     a, n, k = regimes.rays_at(kind.draw, rng, normal)
     return regimes.Rays(a.astype(precision), n.astype(precision), k.astype(precision))
@@ -143,7 +144,7 @@ def _made(kind: Set, precision: type, number: int) -> regimes.Rays:
 def _gathered(parts: dict[str, regimes.Rays], precision: str) -> RaySet:
     regime = np.concatenate([np.full(len(part), name, dtype=object) for name, part in parts.items()])
     ends = {name: np.flatnonzero(regime == name)[[0, -1]].tolist() for name in parts}
-    header = {"precision": precision, "seed": SEED, "regimes": ends}
+    header = {"precision": precision, "seed": seeds.current(SEED), "regimes": ends}
     rays = RaySet(regimes.Rays.joined(list(parts.values())), np.arange(len(regime)), regime, header)
     return replace(rays, header=header | {"checksum": ray_set.checksum(rays)})
 
@@ -164,7 +165,7 @@ def rows(call: RefractFunction, rays: RaySet, answers: Answers) -> list[Row]:
             values["given up"] = float(left_out[rays.regime == name].sum())
         replay = {
             "set": SETS[name].text,
-            "seed": SEED,
+            "seed": seeds.current(SEED),
             "script": " ".join((call.script, *call.arguments)),
             "worst": figures.replay if figures else None,
         }
@@ -224,4 +225,4 @@ def off(worst: float, low: float, high: float) -> float:
     return max(worst / high, low / worst, 1.0)
 
 
-STUDY = Study(NAME, "Per ray", about(__doc__), TERMS, tasks)
+STUDY = Study(NAME, "Per ray", about(__doc__), TERMS, tasks, again=seeds.by_tasks(tasks))
