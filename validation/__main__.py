@@ -112,7 +112,7 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
     from validation.run.context import Context, profiles
 
     from . import runner
-    from .run import headline, seeds
+    from .run import headline, seeds, tightness
 
     start = time.perf_counter()
     variant = backend.activate(may_restart=True)
@@ -125,9 +125,11 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
     rows, spent = runner.run(work, context)
     for study in studies:
         rows = study.summarise(rows)
+    if not chosen.quick:  # whose few cases need not come near any bound
+        rows = [*rows, *tightness.rows(rows)]
     described = runner.describe(context, time.perf_counter() - start)
     described["replay"] = " ".join(["python -m validation", *names, f"--profile {profile}"])
-    described["studies"] = {study.name: study.described for study in studies}
+    described["studies"] = {study.name: study.described for study in studies} | {tightness.NAME: tightness.ABOUT}
     described["scatter"] = [scatter for study in studies for scatter in study.scatter]
     described["tasks"] = spent
     described["first_page"] = headline.first_page(rows, profile)

@@ -34,7 +34,7 @@ SCREEN_OFF = limit(0.01, "u: extended precision, which compares with the certifi
 COPY_TIME = limit(1 / 0.9, "over the time of a copy: nine tenths of the throughput that memory allows")
 
 # BSDF samples, float32 against the built-in's own
-SAMPLE_FLIPS = limit(1e-3, "of the rays: a random number within rounding of the reflectance")
+SAMPLE_FLIPS = limit(1e-6, "probability of more flips than allowed: a random number within rounding of the reflectance")
 SAMPLE_ETA = limit(2e-7, "absolute: one rounding of a ratio up to 1.5, and one of its reciprocal")
 SAMPLE_P99 = limit(4e-6, "absolute: a few roundings, for 99 rays of 100")
 SAMPLE_MUELLER = limit(6, "radicand errors: one on either side of the boundary, in three factors of the weight")
