@@ -50,6 +50,7 @@ def cached(function: Callable[P, T]) -> Callable[P, T]:
         result: T = by_shift(_SHIFT.get(), *args, **kwargs)
         return result
 
+    vars(found)["cache_clear"] = by_shift.cache_clear
     return found
 
 

@@ -3,7 +3,9 @@
 A program reads rays as CSV and answers with directions; `mi-refract rays run` does and checks the same. Each answer
 must be within the bound of the textbook formula, in the program's precision, for that ray. The worst errors of each
 program were recorded earlier on rays of the same kinds (the rays themselves were not kept); a goal, not a budget, is to
-be within a factor of 3 of these. A program fails that is installed and crashes, hangs, or answers rays that it was not
+be within a factor of 3 of these. The goal is shown where it is missed and fails no run: the worst of some thousand rays
+depends on which they are (of six seeds of random rays `dielectric` is 1.8 to 3.7 times the recorded figure). After the
+first results random rays near the critical angle were left out of their set; those are in the next one. A program fails that is installed and crashes, hangs, or answers rays that it was not
 given. One that is not installed, or says that it cannot run on this machine, is not run.
 """
 
