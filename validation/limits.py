@@ -64,12 +64,18 @@ IN_AND_OUT = limit(6.0, "u: k² and 1/k², each with k rounded and squared, 3u")
 INDEX_SQUARED = limit(3.0, "u: k rounded and squared")
 
 # Over condition · u of a form at the rounding limit; derived in `validation/stability/derivative_conditions.py`.
-DERIVATIVE = limit(29.0, "error over condition · u: every product of the differentiated form rounded, each at its worst")
-ETENDUE = limit(41.0, "relative, over condition · u, the condition with 1/12 cosθi: both derivatives, and both directions")
+DERIVATIVE = limit(
+    29.0, "error over condition · u: every product of the differentiated form rounded, each at its worst"
+)
+ETENDUE = limit(
+    41.0, "relative, over condition · u, the condition with 1/12 cosθi: both derivatives, and both directions"
+)
 ROUNDED_DERIVATIVE = limit(1.01, "error over condition · u of what is computed in float64 and rounded once to float32")
 ROUNDED_ETENDUE = limit(3.8, "relative, over condition · u: two vectors rounded, 2, and two directions off unit, √3")
 REFLECTANCE = {
-    "float32": limit(10.5, "of the sum of magnitudes S: the rounded cosine 8.2, its derivative, the result; float64 0.3"),
+    "float32": limit(
+        10.5, "of the sum of magnitudes S: the rounded cosine 8.2, its derivative, the result; float64 0.3"
+    ),
     "float64": limit(50.0, "of the sum of magnitudes S: 48.2 roundings of cosine, powers, products and quotient"),
 }
 

@@ -214,13 +214,19 @@ def planar(rows: list[Row]) -> str:
     if not retraced or not timed:
         raise ValueError("README: no planar paths were traced on LLVM; its tables need them")
     columns = ["float32", "float64", "float32, rays shuffled", "float32, every segment tried"]
-    errors = ["scene", "rays", "boundaries", "float64: error", "float32: error", "error / bound"]
+    errors = ["scene", "rays", "boundaries", "float64: error", "float32: error", "nearest its bound", "bound", "ratio"]
     return "\n\n".join(
         [
-            _table("Largest distance from an independent retrace, over the scene's extent, on LLVM.", errors, retraced),
+            _table(PLANAR_TEXT, errors, retraced),
             _table("µs per path of two boundaries, with 95 % intervals.", ["segments", *columns], timed),
         ]
     )
+
+
+PLANAR_TEXT = (
+    "Largest distance from an independent retrace, over the scene's extent, on LLVM; and in float32 the error that comes\n"
+    "nearest to its bound, at one point of one path, with the bound there."
+)
 
 
 def _planar_errors(rows: list[Row]) -> list[list[str]]:
@@ -232,7 +238,8 @@ def _planar_errors(rows: list[Row]) -> list[list[str]]:
         if exact and narrow:
             most, rays = f"{exact.values[study.BOUNDARIES]:.0f}", str(exact.replay["rays"])
             errors = [compact(row.values[study.DIFFERENCE]) for row in (exact, narrow)]
-            lines.append([f"`{case}`", rays, most, *errors, compact(narrow.values[ERROR_OVER_BOUND])])
+            nearest = [compact(narrow.values[m]) for m in (study.NEAREST, study.ITS_BOUND, ERROR_OVER_BOUND)]
+            lines.append([f"`{case}`", rays, most, *errors, *nearest])
     return lines
 
 

@@ -29,7 +29,10 @@ ABOUT = {
 }
 # By study and metric, for bounds that no case comes near: what they still exclude.
 EXCLUDES = {
-    ("energy", "inside: 1 − R / u"): "roundings of thousands of nodes average out, and a worst case cannot count on it; "
+    (
+        "energy",
+        "inside: 1 − R / u",
+    ): "roundings of thousands of nodes average out, and a worst case cannot count on it; "
     "12.5 u = 7.5e-7 excludes an index off by 1e-6",
     ("energy", "inside: R / u"): "as for 1 − R: an index off by 1e-6",
     ("energy", "outside: 1 − R / u"): "as for the inside: an index off by 1e-6",
