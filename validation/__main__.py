@@ -116,7 +116,7 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
     from validation.run.context import Context, profiles
 
     from . import runner
-    from .run import headline
+    from .run import headline, seeds, tightness
 
     start = time.perf_counter()
     variant = backend.activate(may_restart=True)
@@ -125,12 +125,15 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
     chosen = profiles(variant)[profile]
     context = Context(chosen, out, variant, backend.detect(), backend.usable_variants())
     studies: list[Study] = [import_module(f"validation.{name}").STUDY for name in modules(names, profile)]
-    rows, spent = runner.run([task for study in studies for task in study.tasks(context)], context)
+    work = [task for study in studies for task in (*study.tasks(context), *seeds.tasks(study, context))]
+    rows, spent = runner.run(work, context)
     for study in studies:
         rows = study.summarise(rows)
+    if not chosen.quick:  # whose few cases need not come near any bound
+        rows = [*rows, *tightness.rows(rows)]
     described = runner.describe(context, time.perf_counter() - start)
     described["replay"] = " ".join(["python -m validation", *names, f"--profile {profile}"])
-    described["studies"] = {study.name: study.described for study in studies}
+    described["studies"] = {study.name: study.described for study in studies} | {tightness.NAME: tightness.ABOUT}
     described["scatter"] = [scatter for study in studies for scatter in study.scatter]
     described["tasks"] = spent
     described["first_page"] = headline.first_page(rows, profile)

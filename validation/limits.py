@@ -34,7 +34,7 @@ SCREEN_OFF = limit(0.01, "u: extended precision, which compares with the certifi
 COPY_TIME = limit(1 / 0.9, "over the time of a copy: nine tenths of the throughput that memory allows")
 
 # BSDF samples, float32 against the built-in's own
-SAMPLE_FLIPS = limit(1e-3, "of the rays: a random number within rounding of the reflectance")
+SAMPLE_FLIPS = limit(1e-6, "probability of more flips than allowed: a random number within rounding of the reflectance")
 SAMPLE_ETA = limit(2e-7, "absolute: one rounding of a ratio up to 1.5, and one of its reciprocal")
 SAMPLE_P99 = limit(4e-6, "absolute: a few roundings, for 99 rays of 100")
 SAMPLE_MUELLER = limit(6, "radicand errors: one on either side of the boundary, in three factors of the weight")
@@ -63,10 +63,21 @@ WHITE_FURNACE = limit(2.0**-23, "an ulp of 1: the weights of both lobes add up t
 IN_AND_OUT = limit(6.0, "u: k² and 1/k², each with k rounded and squared, 3u")
 INDEX_SQUARED = limit(3.0, "u: k rounded and squared")
 
-# D is right to u, and a derivative is k a′ along the surface and D′/2√D along n. D′ is the difference of two products
-# of four rounded factors, and what they cancel to is what the condition counts: 4u; 1/√D 2u, the last product u, the
-# result u.
-DERIVATIVE = limit(8.0, "error over condition · u of a form at the rounding limit")
+# Over condition · u of a form at the rounding limit; derived in `validation/stability/derivative_conditions.py`.
+DERIVATIVE = limit(
+    29.0, "error over condition · u: every product of the differentiated form rounded, each at its worst"
+)
+ETENDUE = limit(
+    41.0, "relative, over condition · u, the condition with 1/12 cosθi: both derivatives, and both directions"
+)
+ROUNDED_DERIVATIVE = limit(1.01, "error over condition · u of what is computed in float64 and rounded once to float32")
+ROUNDED_ETENDUE = limit(3.8, "relative, over condition · u: two vectors rounded, 2, and two directions off unit, √3")
+REFLECTANCE = {
+    "float32": limit(
+        10.5, "of the sum of magnitudes S: the rounded cosine 8.2, its derivative, the result; float64 0.3"
+    ),
+    "float64": limit(50.0, "of the sum of magnitudes S: 48.2 roundings of cosine, powers, products and quotient"),
+}
 
 PATH_BOUNDARY = limit(2.0**-24, "of the direction, (2 m + 1) times after m boundaries: the cosine is rounded twice")
 FLIPPED = limit(1e-3, "of the pixels: those of which a last bit changes the choice between reflection and refraction")

@@ -28,7 +28,8 @@ class Study:
     `name` is the `study` of its rows; `title`, `text` and `terms` (metric or case → meaning) are shown by the report.
     `tasks(context)` lists what is to be run. `axes` says what the curves of its rows are drawn over, `scatter` which
     metric is plotted against which (both as `mi_refract.report.study_page` describes them). `summarise(rows)` returns
-    all rows of a run with the summary of this study among them.
+    all rows of a run with the summary of this study among them. `again(context)`, of a study whose answer rests on
+    random draws, gives the rows that they decide (no times, no images), for `validation.run.seeds` to repeat.
     """
 
     name: str
@@ -39,6 +40,7 @@ class Study:
     axes: Mapping[str, Any] = field(default_factory=dict)
     scatter: tuple[Mapping[str, Any], ...] = ()
     summarise: Callable[[list[Row]], list[Row]] = list
+    again: Callable[[Context], list[Row]] | None = None
 
     @property
     def described(self) -> dict[str, Any]:

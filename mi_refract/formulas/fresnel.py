@@ -22,7 +22,18 @@ from typing import Any
 
 import drjit as dr
 
-from mi_refract.numerics import DoubleWord, Mask, Number, Vector3, as_component, ieee_divide, two_prod, two_sum
+from mi_refract.numerics import (
+    DoubleWord,
+    Mask,
+    Number,
+    Vector3,
+    as_component,
+    differentiated,
+    ieee_divide,
+    replace_grad,
+    two_prod,
+    two_sum,
+)
 
 from .well_conditioned import LocalCosines, local_cosines
 
@@ -130,10 +141,21 @@ def _powers(c: Number, y: Number, mirror: Number, sin2: Number, k: Number, kappa
     root = _fma(d_s, d_p, mirror)
     whole, square = r + t, root * root
     if isinstance(r, DoubleWord):
-        return _divide(r, whole), _divide(t, square)
+        return _with_slope(_divide(r, whole), _divide(t, square), r.hi, t.hi, whole.hi)
     # One division for both: it takes as long as eight other operations. Cosines of 1e-38 leave the product 1e-302.
     inverse = ieee_divide(1, whole * square)
-    return (r * square) * inverse, (t * whole) * inverse
+    return _with_slope((r * square) * inverse, (t * whole) * inverse, r, t, whole)
+
+
+def _with_slope(reflected: Number, through: Number, r: Number, t: Number, whole: Number) -> tuple[Any, Any]:
+    """R and T with the derivative dR = −dT = (T dr − R dt)/(r + t), which keeps its digits as R → 1 and as T → 1.
+
+    The quotient's own, dr/w − R dw/w, cancels to dr/w · T near the critical angle.
+    """
+    if not differentiated(reflected):
+        return reflected, through
+    slope = (dr.detach(through) * r - dr.detach(reflected) * t) / dr.detach(whole)
+    return replace_grad(reflected, slope), replace_grad(through, -slope)
 
 
 # Cosines and amplitudes ----------------------------------------------------------------------------------------
@@ -212,6 +234,10 @@ def _differences(cos_i: Number, k: Number, contrast: Number) -> tuple[DoubleWord
     k2 = two_prod(k, k) if contrast is None else (contrast, 1)
     products = [part for x in c2 for y in k2 for part in two_prod(x, y)]
     radicand = _sum([1, -k2[0], -k2[1], *products] if contrast is None else [-contrast, *products])
+    if differentiated(radicand.hi):
+        # The derivative of 1 − k² sin²θ: 2 k cos²θ − 2 k, as above, would be off by u/sin²θ of itself.
+        slope = -(k * k if contrast is None else contrast + 1) * ((1 - cos_i) * (1 + cos_i))
+        radicand = DoubleWord(replace_grad(radicand.hi, slope), dr.detach(radicand.lo))
     return radicand, _sum([*k2, -c2[0], -c2[1], *(-x for x in products)]).rounded()
 
 

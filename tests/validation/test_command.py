@@ -104,9 +104,16 @@ def test_samples_pass_and_see_an_index_that_is_off(context, monkeypatch):
     modes = bsdf_samples._modes()
     assert all(bsdf_samples._mode_row(*mode, 200, "scalar_rgb").verdict == "pass" for mode in modes)
     load = mi.load_dict
-    monkeypatch.setattr(mi, "load_dict", lambda d: load(d | {"int_ior": 1.501} if d["type"] == "refract" else d))
+    # By 1e-5: one bound for all rays, that of the critical angle, would allow 1.4e-3.
+    monkeypatch.setattr(mi, "load_dict", lambda d: load(d | {"int_ior": 1.50001} if d["type"] == "refract" else d))
     broken = bsdf_samples._mode_row(*modes[0], 200, "scalar_rgb").broken
-    assert {"eta worst", "weight p99", "wo p99"} <= set(broken)
+    assert {"eta worst", "wo / bound", "pdf / bound", "weight / bound"} <= set(broken)
+
+
+@pytest.mark.parametrize(("expected", "most"), [(0.0, 0), (1e-7, 0), (1e-3, 1), (0.05, 3), (1.0, 9)])
+def test_flips_are_allowed_as_chance_has_them(expected, most):
+    """The smallest m with P(Poisson > m) ≤ 1e-6: for a small mean x, x^(m+1)/(m+1)!."""
+    assert bsdf_samples.most_flips(expected) == most
 
 
 @pytest.mark.parametrize(("plugin", "verdict"), [("refract", "pass"), ("refract_defect", "fail")])

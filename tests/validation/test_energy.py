@@ -10,9 +10,11 @@ from mi_refract import FORMULAS, oracle, regimes
 from mi_refract.formulas import fresnel
 from mi_refract.oracle import derivatives as oracle_derivative
 from mi_refract.plugins import refract as bsdf
+from validation import limits
 from validation.reference import diffuse_fresnel
+from validation.run import seeds
 from validation.run.array_settings import settings
-from validation.stability import derivatives, energy
+from validation.stability import derivative_conditions, derivatives, energy
 
 
 @pytest.fixture
@@ -256,6 +258,61 @@ def test_a_contrast_that_is_detached_is_seen(context, monkeypatch):
     assert derivatives.reflectance_row(given, setting).verdict == "pass"
     monkeypatch.setattr(fresnel, "_powers", lambda *x: POWERS(*x[:-1], dr.detach(x[-1])))
     assert "error / condition" in derivatives.reflectance_row(given, setting).broken
+
+
+@pytest.mark.parametrize("k", [882668.0, 30000.0])
+def test_the_derivative_of_the_reflectance_keeps_its_digits_near_the_critical_angle(k, context):
+    """1 − k² sin²θ between 1e-6 and 0.5 at sin θ = √(…)/k: 2k cos²θ − 2k would lose 1/sin²θ = k² times u."""
+    setting = next((s for s in compiled(context) if s.precision is np.float64), None)
+    if setting is None:
+        pytest.skip("no compiled float64 here")
+    sine = np.sqrt(1 - np.geomspace(1e-6, 0.5, 40)) / k
+    cos_i, ratio = np.sqrt((1 - sine) * (1 + sine)), np.full(40, k)
+    exact = oracle_derivative.derivative_of_powers(cos_i, ratio, 0.0, ratio)
+    certified = oracle.fresnel(cos_i, ratio)
+    number = dr.value_t(derivatives.differentiable(setting))
+
+    def reflectance(k):
+        cos_t, transmitted = fresnel.refracted_cosine(number(cos_i), k)
+        return fresnel.powers(number(cos_i), cos_t, transmitted, k)[0]
+
+    found = np.array(derivatives.forward(reflectance, number(ratio), number(ratio))[1])
+    size = derivative_conditions.size_of_powers(certified, cos_i, ratio)
+    assert (np.abs(found - exact) <= limits.REFLECTANCE["float64"] * setting.roundoff * size).all()
+    assert (np.abs(found - exact) <= 1e-9 * np.abs(exact)).sum() > 20
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_derivatives_hold_for_other_seeds(seed, context):
+    """What a study promises, it promises for every seed; the profile `standard` runs more of them, of every study."""
+    for setting in compiled(context):
+        with seeds.shifted(seed):
+            given = derivatives.inputs(40, setting.precision)
+        rows = [derivatives.reflectance_row(given, setting)]
+        rows += derivatives.formula_rows("compensated", FORMULAS["compensated"], given, setting)[0]
+        rows += derivatives.formula_rows("promoted", FORMULAS["promoted"], given, setting)[0]
+        assert [row.name for row in rows if row.verdict != "pass"] == []
+
+
+@pytest.mark.parametrize(("case", "scale"), [("∂b/∂k", 0.0), ("étendue", 1e-5)])
+def test_a_derivative_that_is_off_by_little_is_seen_at_every_length(case, scale, context):
+    """Of the étendue also where k ≪ 1 and an absolute error would hide it."""
+    setting = compiled(context)[0]
+    given = derivatives.inputs(20, setting.precision)
+    kept = derivatives.Inputs(
+        given.rays[given.rays.k < 1e-3],
+        *({name: x[given.rays.k < 1e-3] for name, x in part.items()} for part in (given.along, given.exact)),
+        derivatives.pick(given.certified, given.rays.k < 1e-3),
+        given.condition[given.rays.k < 1e-3],
+        given.regime[given.rays.k < 1e-3],
+    )
+
+    def spoilt(a, n, k):
+        b, transmitted = FORMULAS["compensated"](a, n, k)
+        return dr.replace_grad(b, b * (1 + scale)), transmitted
+
+    rows, _ = derivatives.formula_rows("compensated", spoilt, kept, setting)
+    assert next(r for r in rows if r.case == case).verdict == ("fail" if scale else "pass")
 
 
 def test_misjudged_rays_are_no_rays_of_the_derivative(context):

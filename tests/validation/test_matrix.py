@@ -5,7 +5,12 @@ from __future__ import annotations
 import pytest
 
 from mi_refract.report.row import Row
+from validation import limits, readme_tables
 from validation.suite import matrix, per_ray, rendered_images
+from validation.suite.renderers import SYSTEMS
+from validation.suite.renderers.system import TOTAL
+
+GOAL = {per_ray.OFF_RECORDED: limits.RECORDED}
 
 
 def ray(subject="A", case="random", budget=None, **values):
@@ -29,6 +34,24 @@ def test_numbers_and_verdicts_are_those_of_the_rows():
     assert (equal.subject, equal.values[matrix.OFF], equal.verdict) == ("B", 0.02, "pass")
     assert (equal.values["differs"], equal.reason) == (0.0, "B 3; why")
     assert (different.verdict, different.values["differs"], different.reason) == ("fail", 1.0, "B 3; why")
+
+
+def test_a_missed_goal_is_shown_beside_the_number_and_fails_nothing():
+    missed = Row(per_ray.NAME, "A", "random", "f32", {"worst rad": 5e-6, "off the recorded": 3.67}, goals=GOAL)
+    reached = Row(per_ray.NAME, "B", "random", "f32", {"worst rad": 5e-6, "off the recorded": 2.9}, goals=GOAL)
+    rows = matrix.summary([missed, reached])
+    assert [row.verdict for row in rows] == ["pass", "pass"]
+    assert [bool(row.missed) for row in rows] == [True, False]
+    table = readme_tables.suite(rows)
+    assert "| A, f32 | 5e-6 (3.67 × recorded) |" in table
+    assert "| B, f32 | 5e-6 |" in table
+    assert "a goal" in table and "fails nothing" in table
+
+
+def test_every_recorded_error_of_mitsuba_is_a_goal():
+    """`dielectric` on random rays missed it, and the goal was taken away."""
+    for call in SYSTEMS["mitsuba"].calls:
+        assert set(call.recorded_error) == set(per_ray.SETS) - {TOTAL}, call.title
 
 
 def test_a_system_that_is_known_to_differ_passes_and_is_said_to_differ():

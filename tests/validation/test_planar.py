@@ -15,7 +15,7 @@ from validation.planar.error_growth import _transfer
 from validation.reference.planar_retrace import retrace
 from validation.run.array_settings import settings
 from validation.run.context import PROFILES, Context
-from validation.run.metrics import WRONG_PATH, WRONG_PATH_FAR
+from validation.run.metrics import ERROR_OVER_BOUND, WRONG_PATH, WRONG_PATH_FAR
 
 LD = np.longdouble
 THROUGH, MIRRORED = Event.REFRACTED, Event.REFLECTED
@@ -350,6 +350,40 @@ def test_what_cannot_run_has_a_reason(study, scalar_context):
     )
     rows = [row for task in study.tasks(context) if "scalar" not in task.name for row in task.run()]
     assert rows and {row.verdict for row in rows} == {"not run"}
+
+
+def test_an_error_stands_beside_the_bound_of_the_same_point(scalar):
+    """The largest error may be far from its bound, which grows along a path."""
+    case = against_retrace.case_of(against_retrace.FOLDER / "nested.toml", 4)
+    found = against_retrace.judge(case.trace(scalar), case, scalar.roundoff)
+    error, bound = found[against_retrace.NEAREST], found[against_retrace.ITS_BOUND]
+    assert error / bound == pytest.approx(found[ERROR_OVER_BOUND], rel=1e-12)
+    assert error < found[against_retrace.DIFFERENCE] or bound == pytest.approx(error / found[ERROR_OVER_BOUND])
+    worse = found | {ERROR_OVER_BOUND: 2.0, against_retrace.NEAREST: 4.0, against_retrace.ITS_BOUND: 2.0}
+    both = against_retrace.together([found, worse | {against_retrace.DIFFERENCE: 0.0}])
+    assert (both[against_retrace.NEAREST], both[against_retrace.ITS_BOUND], both[ERROR_OVER_BOUND]) == (4.0, 2.0, 2.0)
+    assert both[against_retrace.DIFFERENCE] == found[against_retrace.DIFFERENCE]
+    assert np.isnan(against_retrace.together([found, found | {ERROR_OVER_BOUND: np.nan}])[ERROR_OVER_BOUND])
+
+
+def test_every_ray_of_every_colour_is_followed(monkeypatch):
+    """Of the rainbow 250 of 1201 rays of one colour were "every path"."""
+    path = against_retrace.FOLDER / "rainbow.toml"
+    scene = against_retrace.load(path)
+    masks = 1 + min(2, scene.max_depth)
+    assert (len(scene.origins), len(scene.colours)) == (1201, 3)
+    asked = []
+    monkeypatch.setattr(against_retrace, "judge", lambda paths, case, u: asked.append(case) or GOOD)
+    monkeypatch.setattr(against_retrace.Case, "trace", lambda case, setting: None)
+    row = against_retrace.colours_row(path, against_retrace.Setting("scalar", np.float64), 3)
+    assert row.replay["rays"] == 3 * masks * (1201 + 3) == sum(len(case.origins) for case in asked)
+    for case, segments in zip(asked, scene.segments, strict=True):
+        assert all(np.array_equal(x, getattr(segments, name)) for name, x in vars(case.segments).items())
+        assert np.array_equal(case.origins[:1201], scene.origins)
+
+
+GOOD = dict.fromkeys((*against_retrace.GROWN, against_retrace.DIFFERENCE, against_retrace.WRONG_PATH), 0.0)
+GOOD |= {against_retrace.NEAREST: 0.0, against_retrace.ITS_BOUND: 1.0}
 
 
 def test_every_scene_file_is_in_the_study(scalar_context, monkeypatch):

@@ -24,6 +24,7 @@ from mi_refract.numerics import error_free
 from mi_refract.regimes import Rays
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
+from validation.run import seeds
 from validation.run.array_settings import Setting, settings
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED_FAR
@@ -260,7 +261,7 @@ def _row(name: str, formula: str, setting: Setting, sample: Sample) -> Row:
     values = {"rays that see it": float(seen), "escaped": float(seen == 0), **found.values()}
     budgets = {"rays that see it": 0.0} if name == "control" else {"escaped": 0.0}
     remark = sample.strongest(found) if seen else ""
-    replay = {"seed": SEED, "rays": len(found.wrong)}
+    replay = {"seed": seeds.current(SEED), "rays": len(found.wrong)}
     return Row(NAME, name, formula, setting.label, values, budgets, reason=remark, replay=replay)
 
 
@@ -297,11 +298,11 @@ class Sample:
         return f"caught by {regime}: {metric} {compact(float(value))}"
 
 
-@functools.cache
+@seeds.cached
 def draw(count: int, precision: type) -> Sample:
     """`count` rays of every regime that is one on every backend, and normal incidence along the axes."""
     entries = {name: entry for name, entry in regimes.REGIMES.items() if not entry.rests_on_denormals}
-    parts = {name: regimes.make(name, count, precision, SEED) for name in entries}
+    parts = {name: regimes.make(name, count, precision, seeds.current(SEED)) for name in entries}
     parts["along an axis"] = _along_axes(precision)
     units = [*(entry.unit for entry in entries.values()), True]
     a, n, k = (np.concatenate([getattr(rays, x) for rays in parts.values()]) for x in ("a", "n", "k"))
@@ -317,4 +318,4 @@ def _along_axes(precision: type) -> Rays:
     return Rays((n * side).astype(precision), n, k.astype(precision))
 
 
-STUDY = Study(NAME, "Planted defects", about(__doc__), TERMS, tasks)
+STUDY = Study(NAME, "Planted defects", about(__doc__), TERMS, tasks, again=seeds.by_tasks(tasks))

@@ -19,6 +19,7 @@ from mi_refract.regimes import Rays
 from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.fast_reference import Screen
+from validation.run import seeds
 from validation.run.array_settings import Setting, budget_of, settings
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED, MISCLASSIFIED_FAR, WORST_IN_U
@@ -131,7 +132,7 @@ def gather(regime: str, setting: Setting, count: int, kept: int) -> dict[str, Ga
     names = [name for name, b in budgets.items() if b.at_the_limit or not setting.no_budget(b, regime)]
     found = {name: Gathered(Best(kept), Best(kept), Best(UNRESOLVED_SHARE * kept)) for name in names}
     for i, start in enumerate(range(0, count, CHUNK)):
-        rays = regimes.make(regime, min(CHUNK, count - start), setting.precision, SEED + i)
+        rays = regimes.make(regime, min(CHUNK, count - start), setting.precision, seeds.current(SEED) + i)
         screen = Screen(rays, setting.vector)
         for name in names:
             found[name].add(screen, budgets[name], *screen.judge(FORMULAS[name]))
@@ -166,7 +167,7 @@ def _certified_row(name: str, regime: str, setting: Setting, found: Gathered, co
         "text": entry.text,
         "count": count,
         "chunk": CHUNK,
-        "first seed": SEED,
+        "first seed": seeds.current(SEED),
         "worst ray": rays.hexed(int(np.argmax(seen.share))),
         "misclassified": [rays.hexed(int(i)) for i in np.flatnonzero(wrong)[:3]],
     }
@@ -185,4 +186,4 @@ def _disagreement(found: Gathered, chord: np.ndarray, wrong: np.ndarray) -> floa
     return float(np.max(np.abs(screened - chord) / np.maximum(1, chord / 1e6), initial=0))
 
 
-STUDY = Study(NAME, "Sweep", about(__doc__), TERMS, tasks)
+STUDY = Study(NAME, "Sweep", about(__doc__), TERMS, tasks, again=seeds.by_tasks(tasks))

@@ -4,7 +4,8 @@ The retrace follows each path again in extended precision, by other formulas (im
 path meets other boundaries, or ends in another way, takes a "wrong path". For the others every point and the last
 direction are compared, and their errors divided by a bound on rounding: at each boundary a few roundings of the largest
 coordinate so far and of the angle, the turn of a facet by its rounded ends, and 1/cos behind the boundary, all carried
-on to first order (`validation/planar/error_growth.py`). Rays are those of the file, and random ones near them.
+on to first order (`validation/planar/error_growth.py`). Rays are those of the file, in each of its colours, and random
+ones near them; the profile `quick` takes at most 100 of the file's, in the first colour.
 `clutter` are random scenes of bodies of every kind, nested and turned. At the end the formulas are compared by name.
 """
 
@@ -23,6 +24,7 @@ from mi_refract.planar.scene_file import PlanarScene, load
 from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.planar_retrace import Array, Retraced, retrace
+from validation.run import seeds
 from validation.run.array_settings import Setting, settings
 from validation.run.context import SCENES, Context
 from validation.run.metrics import ERROR_OVER_BOUND, WRONG_PATH, WRONG_PATH_FAR
@@ -33,9 +35,12 @@ from .error_growth import growth
 from .rounding_ambiguity import undecided
 
 DIFFERENCE, BOUNDARIES = "difference", "boundaries"
+NEAREST, ITS_BOUND = "error nearest its bound", "that bound"
 TERMS = {
     DIFFERENCE: "largest distance of a point from the retrace, over the extent of the scene, and |d − exact|",
     ERROR_OVER_BOUND: "largest error of any point or last direction over its bound on rounding errors",
+    NEAREST: "the error, of a point over the extent or of a direction, that comes nearest to its bound; its bound is next",
+    ITS_BOUND: "the bound of that very point or direction: the ratio of the two is the largest of any",
     WRONG_PATH: "rays that meet other boundaries than they should, or end another way",
     WRONG_PATH_FAR: "those of them that rounding cannot explain: they pass every vertex of their boundaries at more "
     "than their bound, touch no curve, and are not at the critical angle",
@@ -44,11 +49,7 @@ TERMS = {
 NAME = "planar"
 FOLDER = SCENES / "planar"
 SEED = 2031
-RAYS = {
-    "quick": 100,
-    "standard": 250,
-    "full": 2000,
-}  # at most so many of the file's own, and as many scattered around them
+RAYS = {"quick": 100, "standard": 250, "full": 2000}  # scattered around the file's own
 SCALAR_RAYS = 2
 CLUTTER = {"standard": (12, 100), "full": (100, 500)}  # scenes, and rays in each
 SPREAD = 1e-2  # of the extent, and in radians
@@ -107,20 +108,56 @@ def _setting_rows(context: Context, setting: Setting) -> list[Row]:
         return [Row(NAME, TRACE, "every scene", setting.label, reason=setting.reason)]
     rays = SCALAR_RAYS if setting.is_scalar else RAYS[context.profile.name]
     if context.profile.quick:
-        return [row_of(case_of(FOLDER / f"{SHOWN}.toml", rays), setting)]
-    cases = [case_of(path, rays) for path in sorted(FOLDER.glob("*.toml"))]
-    rows = [row_of(case, setting) for case in cases]
+        return [file_row(FOLDER / f"{SHOWN}.toml", setting, rays)]
+    follow = file_row if setting.is_scalar else colours_row
+    rows = [follow(path, setting, rays) for path in sorted(FOLDER.glob("*.toml"))]
     rows.append(clutter_row(setting, *((2, 5) if setting.is_scalar else CLUTTER[context.profile.name])))
     if setting.precision is np.float32:
-        shown = next(case for case in cases if case.name == SHOWN)
+        shown = case_of(FOLDER / f"{SHOWN}.toml", rays)
         rows += [row_of(shown, setting, formula) for formula in FORMULAS]
     return rows
+
+
+def drawn_rows(context: Context) -> list[Row]:
+    """Every scene and a third of the random ones, in every compiled setting."""
+    rows, (scenes, rays) = [], CLUTTER["standard"]
+    for setting in settings(context):
+        if setting.vector is not None and not setting.is_scalar:
+            rows += [file_row(path, setting, RAYS["quick"]) for path in sorted(FOLDER.glob("*.toml"))]
+            rows.append(clutter_row(setting, scenes // 3, rays))
+    return rows
+
+
+def file_row(path: Path, setting: Setting, rays: int) -> Row:
+    """At most `rays` rays of a file in its first colour, and as many scattered around them."""
+    return row_of(case_of(path, rays), setting)
+
+
+def colours_row(path: Path, setting: Setting, rays: int) -> Row:
+    """Every ray of a file in every colour, and `rays` scattered around them."""
+    cases = [case_of(path, rays, colour) for colour in range(len(load(path).colours))]
+    values = together([judge(case.trace(setting), case, setting.roundoff) for case in cases])
+    replay = {
+        "scene": path.name,
+        "rays": sum(len(case.origins) for case in cases),
+        "colours": len(cases),
+        "seed": seeds.current(SEED),
+    }
+    return Row(NAME, TRACE, path.stem, setting.label, values, budgets(setting), replay=replay)
+
+
+def together(parts: list[dict[str, float]]) -> dict[str, float]:
+    """Sums of the counts, and the worst of the other metrics; NaN stays: no ray of a part kept to its path."""
+    counts = (WRONG_PATH, WRONG_PATH_FAR)
+    values = {name: float((sum if name in counts else np.max)([part[name] for part in parts])) for name in parts[0]}
+    nearest = max(parts, key=lambda part: part[ERROR_OVER_BOUND])
+    return values | {name: nearest[name] for name in (NEAREST, ITS_BOUND)}
 
 
 def row_of(case: Case, setting: Setting, formula: str | None = None) -> Row:
     """A scene in a setting, by the default formula or another one."""
     values = judge(case.trace(setting, formula), case, setting.roundoff)
-    replay = {"scene": f"{case.name}.toml", "rays": len(case.origins), "seed": SEED}
+    replay = {"scene": f"{case.name}.toml", "rays": len(case.origins), "seed": seeds.current(SEED)}
     return Row(NAME, formula or TRACE, case.name, setting.label, values, budgets(setting), replay=replay)
 
 
@@ -132,36 +169,38 @@ def budgets(setting: Setting) -> dict[str, float]:
 
 def clutter_row(setting: Setting, scenes: int, rays: int) -> Row:
     """Random scenes: sums of the counts, and the worst of the other metrics."""
-    parts = [judge(case.trace(setting), case, setting.roundoff) for case in _clutter(scenes, rays)]
-    counts = (WRONG_PATH, WRONG_PATH_FAR)
-    values = {name: (sum if name in counts else max)(part[name] for part in parts) for name in parts[0]}
-    replay = {"scenes": scenes, "rays": scenes * rays, "seed": SEED}
+    values = together([judge(case.trace(setting), case, setting.roundoff) for case in _clutter(scenes, rays)])
+    replay = {"scenes": scenes, "rays": scenes * rays, "seed": seeds.current(SEED)}
     # Among so many bodies errors may grow beyond any fixed bound: their own one counts.
     return Row(NAME, TRACE, "clutter", setting.label, values, GROWN, replay=replay)
 
 
-@functools.cache
+@seeds.cached
 def _clutter(scenes: int, rays: int) -> list[Case]:
-    rngs = [np.random.default_rng((SEED, number)) for number in range(scenes)]
+    rngs = [np.random.default_rng((seeds.current(SEED), number)) for number in range(scenes)]
     described = [(random_scenes.bodies(rng), *random_scenes.rays(rng, rays)) for rng in rngs]
     return [Case("clutter", s, o, d, random_scenes.DEPTH, reflect) for s, o, d, reflect in described]
 
 
-@functools.cache
-def case_of(path: Path, rays: int) -> Case:
-    """The first colour of a scene file: refracted wherever possible, and reflected once where the file has branches."""
+@seeds.cached
+def case_of(path: Path, rays: int, colour: int | None = None) -> Case:
+    """A colour of a scene file: refracted wherever possible, and reflected once where the file has branches.
+
+    None: the first colour with at most `rays` of the file's rays; else all of them. `rays` are scattered around them.
+    """
     scene = load(path)
-    origins, directions = rays_of(scene, rays)
+    origins, directions = rays_of(scene, rays, colour is not None)
     masks = [0] + [1 << j for j in range(min(2, scene.max_depth))] * bool(scene.branches)
     reflect = np.repeat(masks, len(origins))
     origins, directions = (np.tile(x, (len(masks), 1)) for x in (origins, directions))
-    return Case(path.stem, scene.segments[0], origins, directions, scene.max_depth, reflect)
+    return Case(path.stem, scene.segments[colour or 0], origins, directions, scene.max_depth, reflect)
 
 
-def rays_of(scene: PlanarScene, count: int) -> tuple[Array, Array]:
-    """At most `count` of the file's rays, and `count` scattered around any of them."""
-    rng, extent = np.random.default_rng(SEED), _extent(scene.segments[0])
-    own = np.linspace(0, len(scene.origins) - 1, min(count, len(scene.origins))).astype(int)
+def rays_of(scene: PlanarScene, count: int, every: bool) -> tuple[Array, Array]:
+    """All of the file's rays, or at most `count` of them, and `count` scattered around any of them."""
+    rng, extent = np.random.default_rng(seeds.current(SEED)), _extent(scene.segments[0])
+    most = len(scene.origins) if every else min(count, len(scene.origins))
+    own = np.linspace(0, len(scene.origins) - 1, most).round().astype(int)
     chosen = rng.integers(0, len(scene.origins), count)
     shift, turn = SPREAD * extent * rng.uniform(-1, 1, (count, 2)), SPREAD * rng.uniform(-1, 1, count)
     x, y = scene.directions[chosen].T
@@ -189,7 +228,8 @@ def judge(paths: Paths, case: Case, u: float, offset: float = 0.0) -> dict[str, 
     # A point that is missing differs by infinity: only what the retrace does not have may be NaN.
     off = np.where(np.isnan(exact.points[..., 0]), 0, np.nan_to_num(off, nan=np.inf))
     turned = np.nan_to_num(np.hypot(*(unit(paths.directions) - exact.directions).T).astype(float), nan=np.inf)
-    ratio = np.maximum(np.nanmax(off / points, axis=1), turned / exact.last(directions))
+    ends = exact.last(directions)
+    ratio = np.maximum(np.nanmax(off / points, axis=1), turned / ends)
     same = paths.hits == exact.hits
     # Of two segments that share a vertex either is right there, if it does the same to the ray.
     same |= _at_their_vertex(paths.hits, case) & (ratio <= 1)[:, None]
@@ -198,6 +238,7 @@ def judge(paths: Paths, case: Case, u: float, offset: float = 0.0) -> dict[str, 
     worst = np.maximum(off.max(1) / case.extent, turned)
     return {
         ERROR_OVER_BOUND: _largest(ratio[~wrong]),
+        **_nearest(*(x[~wrong] for x in (off / case.extent, points / case.extent, turned, ends))),
         DIFFERENCE: _largest(worst[~wrong]),
         WRONG_PATH: float(wrong.sum()),
         WRONG_PATH_FAR: float((wrong & ~near).sum()),
@@ -217,6 +258,15 @@ def _at_their_vertex(hits: Array, case: Case) -> Array:
     return there & (hits >= 0) & (case.exact.hits >= 0)
 
 
+def _nearest(off: Array, points: Array, turned: Array, ends: Array) -> dict[str, float]:
+    """The error nearest to its bound, and that bound: of points (N × D) or of last directions (N)."""
+    errors, bounds = np.column_stack([off, turned]), np.column_stack([points, ends])
+    if not len(errors):
+        return {NEAREST: float("nan"), ITS_BOUND: float("nan")}
+    at = np.unravel_index(np.nanargmax(errors / bounds), errors.shape)
+    return {NEAREST: float(errors[at]), ITS_BOUND: float(bounds[at])}
+
+
 def _largest(x: Array) -> float:
     return float(x.max()) if len(x) else float("nan")
 
@@ -227,4 +277,4 @@ def unit(d: Any) -> Array:
     return d / np.hypot(*d.T)[:, None]
 
 
-STUDY = Study(NAME, "Planar", about(__doc__), TERMS, tasks)
+STUDY = Study(NAME, "Planar", about(__doc__), TERMS, tasks, again=drawn_rows)

@@ -22,6 +22,7 @@ from mi_refract.report.row import Row
 from validation import limits
 from validation.reference import closed_forms as closed
 from validation.reference.planar_retrace import Array, Retraced
+from validation.run import seeds
 from validation.run.array_settings import Setting, settings
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND
@@ -101,12 +102,12 @@ def _row(setting: Setting, name: str, closed: Closed) -> Row:
 SIDES = np.array([[6.0, 8.0], [-4.0, 3.0]])  # at right angles, 10 and 5 long
 
 
-@functools.cache
+@seeds.cached
 def box(count: int, rays: int) -> Case:
     """`count` total internal reflections of each ray; origins and directions exact in float32."""
     corners = np.array([[0, 0], SIDES[0], SIDES.sum(0), SIDES[1]])
     segments = Segments(corners, np.roll(corners, -1, 0), np.full(4, INDEX), np.ones(4))
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(seeds.current(SEED))
     # Angles of incidence of 43 to 47°, beyond the critical 41.8° at all four walls.
     angle = math.atan2(8, 6) + np.deg2rad(45 + rng.uniform(-2, 2, rays) + 90 * rng.integers(0, 4, rays))
     origins = (rng.uniform(0.1, 0.9, (rays, 2)) @ SIDES).astype(np.float32).astype(float)
@@ -155,7 +156,7 @@ def unfold(origins: Array, directions: Array, count: int) -> Retraced:
 def _box_row(setting: Setting, count: int, rays: int) -> Row:
     case = box(count, rays)
     values = judge(case.trace(setting), case, setting.roundoff)
-    replay = {"rays": rays, "seed": SEED, "reflections": count}
+    replay = {"rays": rays, "seed": seeds.current(SEED), "reflections": count}
     return Row(NAME, "trace", f"box, {count}", setting.label, values, budgets(setting), replay=replay)
 
 
@@ -248,4 +249,4 @@ def _spot(setting: Setting, facets: int) -> float:
     return float(np.max(np.nan_to_num(closed.error(closed.case.trace(setting)), nan=np.inf)))
 
 
-STUDY = Study(NAME, "Planar, closed answers", about(__doc__), TERMS, tasks, axes=AXES)
+STUDY = Study(NAME, "Planar, closed answers", about(__doc__), TERMS, tasks, axes=AXES, again=seeds.by_tasks(tasks))

@@ -22,7 +22,7 @@ from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.row import Row
 from validation.reference.layered_scenes import OFFSET
 from validation.reference.planar_retrace import Array
-from validation.run import path_overlay
+from validation.run import path_overlay, seeds
 from validation.run.array_settings import Setting
 from validation.run.context import Context
 from validation.study import Study, Task, about
@@ -72,7 +72,7 @@ def scene_rows(context: Context, path: Path) -> list[Row]:
             "scene": path.name,
             "walls": len(case.segments),
             "rays": len(case.origins),
-            "seed": against_retrace.SEED,
+            "seed": seeds.current(against_retrace.SEED),
         }
         images = {"overlay": _image(context, scene, case, paths)} if name == DRAWN else {}
         rows.append(
@@ -182,4 +182,4 @@ def trace(scene: Any, case: Case, spawn: Spawn) -> Paths:
     )
 
 
-STUDY = Study(NAME, "Planar, extruded", about(__doc__), TERMS, tasks)
+STUDY = Study(NAME, "Planar, extruded", about(__doc__), TERMS, tasks, again=seeds.by_tasks(tasks))

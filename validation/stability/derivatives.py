@@ -2,8 +2,10 @@
 
 Measured are ∂b/∂a along two unit vectors perpendicular to `a`, in the plane of incidence and across it; k ∂b/∂k; and
 η ∂R/∂η, which is −k ∂R/∂k. The error is relative, or absolute where the derivative is below 1 (below R). At the
-critical angle the derivatives diverge as 1/cosθt. The condition, 1 + k² sinθi (sinθi + 2 cosθi)/cos²θt, is the change
-of the derivative, in u and to first order, that inputs off by u may cause.
+critical angle the derivatives diverge as 1/cosθt. The condition of ∂b, 1 + k² sinθi (sinθi + 2 cosθi)/cos²θt, is the
+change of the derivative, in u and to first order, that inputs off by u may cause; the étendue's has 1/12 cosθi more. That
+of ∂R/∂η is the sum of the magnitudes of its terms, over the larger of their sum and R, which rounds to u of it.
+`validation/stability/derivative_conditions.py` derives the limits.
 """
 
 from __future__ import annotations
@@ -25,9 +27,12 @@ from mi_refract.numerics import from_numpy
 from mi_refract.oracle import derivatives
 from mi_refract.report.row import Row
 from validation import limits
+from validation.run import seeds
 from validation.run.array_settings import Setting, settings
 from validation.run.context import Context
 from validation.study import Study, Task, about
+
+from .derivative_conditions import condition_of, condition_of_etendue, size_of_powers
 
 NAME = "derivatives"
 AXES = {
@@ -90,11 +95,24 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
     return [*rows, problem, reflectance_row(given, setting)]
 
 
-@functools.cache
+def drawn_rows(context: Context) -> list[Row]:
+    """Of the forms at the rounding limit, which have budgets, and of the reflectance, in every compiled setting."""
+    rows = []
+    for setting in settings(context):
+        if setting.is_scalar or setting.vector is None:
+            continue
+        given = inputs(context.profile.rays // 40, setting.precision)
+        limited = {name: formula for name, formula in FORMULAS.items() if formula.budget.at_the_limit}
+        rows += [row for name, formula in limited.items() for row in formula_rows(name, formula, given, setting)[0]]
+        rows.append(reflectance_row(given, setting))
+    return rows
+
+
+@seeds.cached
 def inputs(count: int, precision: type) -> Inputs:
     """Unit rays of all regimes that have derivatives: neither tangential nor exactly critical."""
     names = [name for name, regime in regimes.REGIMES.items() if regime.unit and not regime.rests_on_denormals]
-    parts = [regimes.make(name, count, precision, SEED) for name in names]
+    parts = [regimes.make(name, count, precision, seeds.current(SEED)) for name in names]
     a, n, k = (np.concatenate([getattr(part, x) for part in parts]) for x in ("a", "n", "k"))
     regime = np.repeat(names, count)
     certified = oracle.refract(a, n, k, progress=False, fresnel=False)
@@ -113,15 +131,6 @@ def inputs(count: int, precision: type) -> Inputs:
     along, exact = ({name: x[kept] for name, x in found.items()} for found in (along, exact))
     condition = condition_of(certified, k)[kept]
     return Inputs(regimes.Rays(a[kept], n[kept], k[kept]), along, exact, pick(certified, kept), condition, regime[kept])
-
-
-def condition_of(certified: oracle.Certified, k: np.ndarray) -> np.ndarray:
-    """1 + k² sinθi (sinθi + 2 cosθi)/cos²θt: k and both directions, each off by u, change log cosθt by that many u."""
-    cos_i = certified.cos_i
-    sin_i = np.sqrt((1 - cos_i) * (1 + cos_i))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        moved = k.astype(float) ** 2 * sin_i * (sin_i + 2 * cos_i) / certified.cos_t**2
-    return 1 + np.where(certified.transmitted, moved, 0)
 
 
 def pick(certified: oracle.Certified, kept: np.ndarray) -> oracle.Certified:
@@ -163,7 +172,7 @@ def formula_rows(
     found, transmitted = differentiate(formula, given, setting)
     right, rows = transmitted == given.certified.transmitted, []
     curve: list[tuple[float, float]] = []
-    budgets = {"error / condition": limits.DERIVATIVE, "not finite": 0.0} if FORMULAS[name].budget.at_the_limit else {}
+    budgets, budgets_of_area = budgets_of(name, setting)
     for case, exact in given.exact.items():
         error = lengths(found[case] - exact) / np.maximum(1, lengths(exact))
         rows.append(row(name, case, error, given, setting, right, budgets))
@@ -174,8 +183,19 @@ def formula_rows(
     through, along_b = right & given.certified.transmitted, (area * given.certified.direction).sum(1)
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.abs(np.abs(along_b) * cos_t / (k * k * given.certified.cos_i) - 1)
-    rows.append(row(name, "étendue", error, given, setting, through, budgets))
+    steep = dataclasses.replace(given, condition=condition_of_etendue(given.condition, given.certified.cos_i))
+    rows.append(row(name, "étendue", error, steep, setting, through, budgets_of_area))
     return rows, curve
+
+
+def budgets_of(name: str, setting: Setting) -> tuple[dict[str, float], dict[str, float]]:
+    """The budgets of a formula's derivatives and of its étendue; empty of a form that is not at the rounding limit."""
+    if not FORMULAS[name].budget.at_the_limit:
+        return {}, {}
+    rounded_once = name == "promoted" and setting.precision is np.float32
+    found = limits.ROUNDED_DERIVATIVE if rounded_once else limits.DERIVATIVE
+    area = limits.ROUNDED_ETENDUE if rounded_once else limits.ETENDUE
+    return {"error / condition": found, "not finite": 0.0}, {"error / condition": area, "not finite": 0.0}
 
 
 def row(
@@ -199,7 +219,7 @@ def row(
     }
     a, n = ([float(x).hex() for x in v[worst]] for v in (given.rays.a, given.rays.n))
     replay = {
-        "seed": SEED,
+        "seed": seeds.current(SEED),
         "rays": len(error),
         "worst": {"regime": str(given.regime[worst]), "a": a, "n": n, "k": float(given.rays.k[worst]).hex()},
     }
@@ -223,19 +243,22 @@ def reflectance_row(given: Inputs, setting: Setting) -> Row:
     k: Any = given.rays.k
     cos_i: Any = given.certified.cos_i.astype(setting.precision)
     exact = derivatives.derivative_of_powers(cos_i, k, 0.0, k)
-    cosine, condition = number(cos_i), condition_of(oracle.fresnel(cos_i, k), k)
+    cosine, certified = number(cos_i), oracle.fresnel(cos_i, k)
 
     def reflectance(k: Any) -> Any:
         cos_t, transmitted = fresnel.refracted_cosine(cosine, k)
         return fresnel.powers(cosine, cos_t, transmitted, k)[0]
 
     r, found = (np.array(x).astype(np.longdouble) for x in forward(reflectance, number(k), number(k)))
+    size = np.maximum(np.maximum(np.abs(exact), r), np.finfo(setting.precision).tiny)
+    # Where every term is 0, so must be their sum: any error is infinitely many conditions, and "not finite" stays 0.
+    condition = np.maximum(size_of_powers(certified, cos_i, k) / size, np.finfo(float).tiny)
     with np.errstate(invalid="ignore"):
-        error = np.abs(found - exact) / np.maximum(np.maximum(np.abs(exact), r), np.finfo(setting.precision).tiny)
+        error = np.abs(found - exact) / size
     exists = np.isfinite(exact)
-    budgets = {"error / condition": limits.DERIVATIVE, "not finite": 0.0}
+    budgets = {"error / condition": limits.REFLECTANCE[setting.name], "not finite": 0.0}
     given = dataclasses.replace(given, condition=condition)  # that of the rounded cosines
     return row("powers", "∂R/∂η", error, given, setting, exists, budgets)
 
 
-STUDY = Study(NAME, "Derivatives", about(__doc__), TERMS, tasks, axes=AXES)
+STUDY = Study(NAME, "Derivatives", about(__doc__), TERMS, tasks, axes=AXES, again=drawn_rows)

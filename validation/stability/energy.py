@@ -21,6 +21,7 @@ from mi_refract.formulas import fresnel, resolve
 from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.diffuse_fresnel import GRADE, hemispherical, nodes
+from validation.run import seeds
 from validation.run.array_settings import Setting, settings
 from validation.run.bsdf_sampling import sample_all
 from validation.run.context import Context
@@ -77,10 +78,10 @@ def cases() -> list[str]:
 # Against certified values --------------------------------------------------------------------------------------
 
 
-@functools.cache
+@seeds.cached
 def given(regime: str, count: int, precision: type) -> tuple[np.ndarray, np.ndarray, oracle.Certified]:
     """(cos_i, k) of a regime's rays, rounded, and the certified answers for them."""
-    rays = regimes.make(regime, count, precision, SEED)
+    rays = regimes.make(regime, count, precision, seeds.current(SEED))
     a, n = (v.astype(np.longdouble) for v in (rays.a, rays.n))
     cos_i = np.abs((a * n).sum(1)) / (lengths(a) * lengths(n))
     cos_i = np.minimum(cos_i, 1).astype(precision)
@@ -129,7 +130,7 @@ def builtin(variant: str | None) -> Callable[[Any, Any], tuple]:
 def regime_rows(regime: str, setting: Setting, count: int) -> list[Row]:
     """Powers, amplitudes and, where Mitsuba runs, its own function in a regime."""
     cos_i, k, exact = given(regime, count, setting.precision)
-    replay = {"regime": regime, "text": regimes.REGIMES[regime].text, "count": count, "seed": SEED}
+    replay = {"regime": regime, "text": regimes.REGIMES[regime].text, "count": count, "seed": seeds.current(SEED)}
     rows = [
         power_row("powers", regime, setting, each(ours, setting, cos_i, k), exact, SUMMED, replay),
         amplitude_row(regime, setting, each(fresnel.amplitudes, setting, cos_i, k), exact, replay),
@@ -184,7 +185,7 @@ def amplitude_row(
 
 def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray, replay: dict[str, Any]) -> Row:
     """In the local frame, where `a` is unit only up to rounding. The ratio is a double, as in the plugin."""
-    azimuth = np.random.default_rng(SEED).uniform(0, 2 * np.pi, len(k))
+    azimuth = np.random.default_rng(seeds.current(SEED)).uniform(0, 2 * np.pi, len(k))
     sine = np.sqrt((1 - cos_i.astype(float)) * (1 + cos_i.astype(float)))
     a: Any = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cos_i], axis=1).astype(setting.precision)
     n: Any = np.tile(np.array([[0, 0, 1]], setting.precision), (len(k), 1))
@@ -242,7 +243,7 @@ def reciprocity_row(setting: Setting, count: int) -> Row:
         used = transmitted & (exact.transmittance > np.finfo(setting.precision).tiny)
         error = worst(np.abs(there[used] / back[used] - 1)) / setting.roundoff
         values["T there and back / u"] = max(error, values["T there and back / u"])
-    replay = {"regimes": cases(), "count": count, "seed": SEED}
+    replay = {"regimes": cases(), "count": count, "seed": seeds.current(SEED)}
     return Row(
         NAME,
         "powers",
@@ -309,7 +310,7 @@ def directions(context: Context) -> np.ndarray:
     """Uniform, and as many more that graze the surface."""
     import mitsuba as mi
 
-    rng, count = np.random.default_rng(SEED), context.profile.rays // 4 if dr.is_jit_v(mi.Float) else 30
+    rng, count = np.random.default_rng(seeds.current(SEED)), context.profile.rays // 4 if dr.is_jit_v(mi.Float) else 30
     wi = rng.normal(size=(2 * count, 3))
     wi[count:, 2] *= 10.0 ** rng.uniform(-6, 0, count)
     return wi / np.linalg.norm(wi, axis=1, keepdims=True)
@@ -337,7 +338,7 @@ def furnace_row(context: Context, plugin: str) -> Row:
         context.variant,
         values,
         budgets,
-        replay={"indices": INDICES, "directions": len(wi), "seed": SEED},
+        replay={"indices": INDICES, "directions": len(wi), "seed": seeds.current(SEED)},
     )
 
 
@@ -362,4 +363,4 @@ def radiance_row(context: Context, plugin: str) -> Row:
     return Row(NAME, plugin, "basic radiance", context.variant, values, budgets, replay={"indices": INDICES})
 
 
-STUDY = Study(NAME, "Energy", about(__doc__), TERMS, tasks, axes=AXES)
+STUDY = Study(NAME, "Energy", about(__doc__), TERMS, tasks, axes=AXES, again=seeds.by_tasks(tasks))

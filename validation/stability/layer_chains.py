@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.accuracy import Subject
+from validation.run import seeds
 from validation.run.array_settings import Setting
 
 Array = NDArray[Any]
@@ -272,14 +273,14 @@ def frame(precision: type) -> Array:
     return np.longdouble(precision(1) / precision(3)) * np.array([[1, 2, 2], [2, 1, -2], [2, -2, 1]], np.longdouble)
 
 
-@functools.cache
+@seeds.cached
 def pipe(reflections: int, rays: int, index: float, precision: type) -> tuple[Array, Chain, Array]:
     """(a, chain, exact direction in the end) in a square pipe with the axes `frame`: walls ±0, ±1, length 2.
 
     Unfolded, the ray is straight and meets the walls of either pair at equal distances: each meeting changes the
     sign of one component, and nothing else.
     """
-    rng, axes = np.random.default_rng(7), frame(precision)
+    rng, axes = np.random.default_rng(seeds.current(7)), frame(precision)
     across = rng.uniform(0.05, 0.6, (rays, 2)) * rng.choice([-1, 1], (rays, 2))
     local = np.column_stack([across, np.sqrt(1 - (across**2).sum(1))])
     a: Array = (local @ axes).astype(precision)

@@ -26,7 +26,7 @@ from mi_refract.report.row import Row
 from validation import limits
 from validation.reference import layered_scenes
 from validation.reference.layered_scenes import FIBRE, MIRAGE, Layers, Path
-from validation.run import path_overlay
+from validation.run import path_overlay, seeds
 from validation.run.context import SCENES, Context
 from validation.run.metrics import WRONG_PATH
 from validation.run.path_overlay import View
@@ -83,6 +83,11 @@ def tasks(context: Context) -> list[Task]:
     return [Task(f"paths: {name}", work) for name, work in paths + views]
 
 
+def drawn_rows(context: Context) -> list[Row]:
+    """The paths through the fibre, whose rays are random; those of the mirage are not."""
+    return _path_rows(context, FIBRE)
+
+
 def plugins() -> list[str]:
     """The built-in, `refract`, and `refract` with each formula."""
     return [BUILTIN, PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS)]
@@ -102,7 +107,7 @@ def bundle(layers: Layers) -> Bundle:
             RAYS * 2 // 5,
         )
     else:
-        rng = np.random.default_rng(SEED)
+        rng = np.random.default_rng(seeds.current(SEED))
         media = rng.integers(2, len(layers.indices) - 1, RAYS)
         edges = np.array([*layers.boundaries, 0.0])
         radius, n = (edges[media - 1] + edges[media]) / 2, np.array(layers.indices)[media]
@@ -185,7 +190,7 @@ def _path_rows(context: Context, layers: Layers) -> list[Row]:
     steps = 4 * max(len(path.media) for path in exact)
     found = {plugin: _deviations(layers, rays, exact, plugin, steps) for plugin in plugins()}
     found |= {name: _exact_deviations(other, layers, rays, exact) for name, other in rounded(layers).items()}
-    replay = {"scene": f"{layers.scene}.xml", "rays": RAYS, "seed": SEED, "shown": rays.shown}
+    replay = {"scene": f"{layers.scene}.xml", "rays": RAYS, "seed": seeds.current(SEED), "shown": rays.shown}
     rows = [
         Row(
             NAME,
@@ -331,4 +336,4 @@ def _until(layers: Layers, path: Path, end: np.ndarray) -> np.ndarray:
     return np.concatenate([np.stack([path.starts, path.ends], 1).reshape(-1, 3)[:-1], [last]])
 
 
-STUDY = Study(NAME, "Paths", about(__doc__), TERMS, tasks, axes=AXES)
+STUDY = Study(NAME, "Paths", about(__doc__), TERMS, tasks, axes=AXES, again=drawn_rows)

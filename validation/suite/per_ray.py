@@ -3,7 +3,9 @@
 A program reads rays as CSV and answers with directions; `mi-refract rays run` does and checks the same. Each answer
 must be within the bound of the textbook formula, in the program's precision, for that ray. The worst errors of each
 program were recorded earlier on rays of the same kinds (the rays themselves were not kept); a goal, not a budget, is to
-be within a factor of 3 of these. A program fails that is installed and crashes, hangs, or answers rays that it was not
+be within a factor of 3 of these. The goal is shown where it is missed and fails no run: the worst of some thousand rays
+depends on which they are (of six seeds of random rays `dielectric` is 1.8 to 3.7 times the recorded figure). After the
+first results random rays near the critical angle were left out of their set; those are in the next one. A program fails that is installed and crashes, hangs, or answers rays that it was not
 given. One that is not installed, or says that it cannot run on this machine, is not run.
 """
 
@@ -23,6 +25,7 @@ from mi_refract.ray_sets.files import as_csv, parse_answers
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.report.row import Row
 from validation import limits
+from validation.run import seeds
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED, WORST_ANGLE
 from validation.study import Study, Task, about
@@ -126,7 +129,7 @@ def _unmeasured(call: RefractFunction, reason: str) -> Row:
     return Row(NAME, call.title, "every set", call.precision, reason=reason)
 
 
-@functools.cache
+@seeds.cached
 def given(precision: str) -> RaySet:
     """All sets, one after the other."""
     parts = {name: _made(kind, ray_set.PRECISIONS[precision], i) for i, (name, kind) in enumerate(SETS.items())}
@@ -134,7 +137,7 @@ def given(precision: str) -> RaySet:
 
 
 def _made(kind: Set, precision: type, number: int) -> regimes.Rays:
-    rng = np.random.default_rng([SEED, number])
+    rng = np.random.default_rng([seeds.current(SEED), number])
     normal: np.ndarray = regimes.normalised(rng.normal(size=(kind.count, 3))).astype(precision)
     a, n, k = regimes.rays_at(kind.draw, rng, normal)
     return regimes.Rays(a.astype(precision), n.astype(precision), k.astype(precision))
@@ -143,7 +146,7 @@ def _made(kind: Set, precision: type, number: int) -> regimes.Rays:
 def _gathered(parts: dict[str, regimes.Rays], precision: str) -> RaySet:
     regime = np.concatenate([np.full(len(part), name, dtype=object) for name, part in parts.items()])
     ends = {name: np.flatnonzero(regime == name)[[0, -1]].tolist() for name in parts}
-    header = {"precision": precision, "seed": SEED, "regimes": ends}
+    header = {"precision": precision, "seed": seeds.current(SEED), "regimes": ends}
     rays = RaySet(regimes.Rays.joined(list(parts.values())), np.arange(len(regime)), regime, header)
     return replace(rays, header=header | {"checksum": ray_set.checksum(rays)})
 
@@ -164,7 +167,7 @@ def rows(call: RefractFunction, rays: RaySet, answers: Answers) -> list[Row]:
             values["given up"] = float(left_out[rays.regime == name].sum())
         replay = {
             "set": SETS[name].text,
-            "seed": SEED,
+            "seed": seeds.current(SEED),
             "script": " ".join((call.script, *call.arguments)),
             "worst": figures.replay if figures else None,
         }
@@ -224,4 +227,4 @@ def off(worst: float, low: float, high: float) -> float:
     return max(worst / high, low / worst, 1.0)
 
 
-STUDY = Study(NAME, "Per ray", about(__doc__), TERMS, tasks)
+STUDY = Study(NAME, "Per ray", about(__doc__), TERMS, tasks, again=seeds.by_tasks(tasks))

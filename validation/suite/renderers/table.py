@@ -33,8 +33,15 @@ _SYSTEMS = (
                 "flag",
                 ("functions",),
             ),
-            # Nothing recorded: `dielectric` has the rounding of its frame, too.
-            RefractFunction("Mitsuba, dielectric", "f32", "mitsuba_rays.py", {}, "flag", ("dielectric",)),
+            # Of the functions: `dielectric` has the rounding of its frame, too. It misses the goal on random rays.
+            RefractFunction(
+                "Mitsuba, dielectric",
+                "f32",
+                "mitsuba_rays.py",
+                recorded_error(1.4e-6, 4.3e-4, 2e-7, 1.2e-6),
+                "flag",
+                ("dielectric",),
+            ),
         ),
     ),
     System(  # the mathematics library GLM, which follows GLSL
