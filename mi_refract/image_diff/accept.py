@@ -13,7 +13,7 @@ import numpy as np
 from mi_refract.io import image_file
 from mi_refract.io.atomic import replacing
 
-from .folders import Results, Status, digest
+from .folders import Results, Status, digest, opened
 
 BLOCK = 2**20  # bytes that are copied at once
 
@@ -83,7 +83,7 @@ def _changed(path: Path) -> OSError:
 def _copied(source: Path, to: Path) -> str:
     """The digest of what was copied."""
     found = hashlib.sha256()
-    with source.open("rb") as file, to.open("wb") as written:
+    with opened(source) as file, to.open("wb") as written:
         while block := file.read(BLOCK):
             found.update(block)
             written.write(block)

@@ -10,10 +10,12 @@ import functools
 import hashlib
 import os
 import shlex
+import stat
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -256,13 +258,21 @@ def _compared(result: Result, renders: bool, maps: bool, to_accept: bool) -> Res
 
 
 def digest(path: Path | None) -> str:
-    """The SHA-256 of a file's bytes; "" where there is none. ValueError for what is no regular file, or OSError."""
+    """The SHA-256 of a file's bytes; "" where there is none. OSError, and ValueError, as `opened`."""
     if path is None or not path.exists():
         return ""
-    if not path.is_file():
-        raise ValueError(f"{path}: accepted: a regular file")
-    with path.open("rb") as file:
+    with opened(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def opened(path: Path) -> BinaryIO:
+    """A file to read from. OSError, or ValueError for a pipe or a device, which might never end."""
+    nonblocking = getattr(os, "O_NONBLOCK", 0)  # or the pipe is waited for
+    file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | nonblocking))  # noqa: SIM115
+    if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        return file
+    file.close()
+    raise ValueError(f"{path}: accepted: a regular file")
 
 
 def _judged(result: Result, reference: Path | None, test: Path | None, renders: bool, maps: bool) -> Result:

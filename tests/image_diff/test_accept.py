@@ -168,7 +168,8 @@ def test_what_changed_since_it_was_compared_is_not_accepted(folders, tmp_path, n
     assert len(copies) == 4
     change(old, new)
     before = tree(old)
-    with pytest.raises((OSError, ValueError), match=rf"{name}: (changed since it was compared|accepted: a regular)"):
+    said = "'?$|: changed since it was compared|: accepted: a regular file"
+    with pytest.raises((OSError, ValueError), match=f"{name}({said})"):
         accept.accept(copies)
     assert tree(old) == before
 
