@@ -149,7 +149,6 @@ CHANGED = {
     "new image": ("inner/changed.exr", lambda old, new: rewritten(new / "inner/changed.exr")),
     "new folder": ("inner/changed.exr", lambda old, new: renamed(new / "inner")),
     "link": ("linked.exr", lambda old, new: ((new / "linked.exr").unlink(), image(new / "linked.exr", gain=3.0))),
-    "pipe": ("added.exr", lambda old, new: ((new / "added.exr").unlink(), os.mkfifo(new / "added.exr"))),
     "gone": ("added.exr", lambda old, new: (new / "added.exr").unlink()),
     "reference": ("inner/changed.exr", lambda old, new: rewritten(old / "inner/changed.exr")),
     "reference gone": ("inner/changed.exr", lambda old, new: (old / "inner/changed.exr").unlink()),
@@ -164,14 +163,24 @@ def test_what_changed_since_it_was_compared_is_not_accepted(folders, tmp_path, n
     image(new / "other" / "changed.exr", gain=3.0)
     image(tmp_path / "linked.exr", gain=2.0)
     (new / "linked.exr").symlink_to(tmp_path / "linked.exr")
+    image(new / "fresh" / "folder" / "added.exr")
     copies = to_accept(old, new)
-    assert len(copies) == 4
+    assert len(copies) == 5
     change(old, new)
-    before = tree(old)
-    said = "'?$|: changed since it was compared|: accepted: a regular file"
+    before, all_before = tree(old), sorted(old.rglob("*"))
+    said = "'?$|: changed since it was compared"
     with pytest.raises((OSError, ValueError), match=f"{name}({said})"):
         accept.accept(copies)
     assert tree(old) == before
+    assert sorted(old.rglob("*")) == all_before
+
+
+def test_no_pipe_or_device_is_read(tmp_path):
+    os.mkfifo(tmp_path / "a.exr")
+    (tmp_path / "b.exr").symlink_to("/dev/null")
+    for path in (tmp_path / "a.exr", tmp_path / "b.exr"):
+        with pytest.raises(ValueError, match=r"\.exr: accepted: a regular file"):
+            diff.digest(path)
 
 
 @pytest.mark.parametrize("side", [0, 1])
