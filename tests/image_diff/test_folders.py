@@ -136,6 +136,8 @@ def test_images_larger_than_allowed_are_not_compared(folders):
     assert results.reproduce(results.results[0]).endswith(f"changed.exr --max-values {most - 1}")
     with pytest.raises(ValueError, match="max-values"):
         diff.read_renders(folders[0], most - 1)
+    ruled = Settings(How(max_values=most - 1), rules=(("same.exr", How("exact")),))
+    assert found(diff.diff(*folders, ruled))["same.exr"] == ("error", "unknown")
 
 
 def test_a_folder_inside_without_permission(folders, monkeypatch):

@@ -70,6 +70,15 @@ def test_an_image_that_cannot_be_shown_keeps_no_other_from_being_shown(tmp_path,
     assert dict(roles(text)).keys() == {"test", "reference"}  # of the one that cannot be compared, and of the removed
 
 
+def test_an_image_that_is_larger_than_allowed_is_not_read_for_the_page(tmp_path):
+    image(tmp_path / "old" / "same.exr", 0.5)
+    for side in ("old", "new"):
+        image(tmp_path / side / "added.exr", 0.5)
+    (tmp_path / "old" / "added.exr").unlink()
+    found = folders.diff(tmp_path / "old", tmp_path / "new", Settings(How(max_values=71)))
+    assert "accepted: up to 71 values (max-values)" in html(tmp_path, found)
+
+
 # The text
 
 
