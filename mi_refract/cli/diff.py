@@ -8,6 +8,7 @@ import importlib.util
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,6 +23,7 @@ from mi_refract.image_diff import settings as diff_settings
 from mi_refract.image_diff.folders import Results, Status
 from mi_refract.image_diff.methods import AUTO
 from mi_refract.io.atomic import writable
+from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import provenance
 
@@ -44,6 +46,9 @@ File = Annotated[
 Nonfinite = Annotated[
     list[str] | None,
     typer.Option(metavar="NAME", help="An image (or pattern of names) where both sides may have the same NaN or Inf."),
+]
+MaxValues = Annotated[
+    int, typer.Option("--max-values", metavar="N", min=1, help="Width × height × channels of an image, at most.")
 ]
 OUTPUTS = ((".html", ".htm"), (".xml",), (".json",))  # of --report, --junit, --json
 
@@ -97,6 +102,7 @@ def diff(
     samples: OldRenders = False,
     settings: File = None,
     allow_nonfinite: Nonfinite = None,
+    max_values: MaxValues = MAX_VALUES,
     inconclusive: CountsAs = None,
     report: Report = None,
     junit: JUnit = None,
@@ -111,14 +117,14 @@ def diff(
     if self_test:
         others = (options, renders, settings, allow_nonfinite, inconclusive, report, junit, json, github)
         if any(others) or method != AUTO:
-            raise ValueError("--self-test asks every method and prints; accepted: no other option")
-        raise typer.Exit(_self_test(reference, test))
+            raise ValueError("--self-test asks every method and prints; accepted: no other option but --max-values")
+        raise typer.Exit(_self_test(reference, test, max_values))
     if reference is None or test is None:
         raise ValueError("two paths are needed; accepted: mi-refract diff REFERENCE TEST")
     for path, suffixes in zip((report, junit, json), OUTPUTS, strict=True):
         if path:
             writable(path, suffixes)
-    chosen = _settings(reference, method, options, settings, allow_nonfinite)
+    chosen = _settings(reference, method, options, settings, allow_nonfinite, max_values)
     wanted = inconclusive or ""
     with _progress() as tell:
         found = folders.diff(
@@ -155,21 +161,22 @@ def accept(
     options: Set = None,
     settings: File = None,
     allow_nonfinite: Nonfinite = None,
+    max_values: MaxValues = MAX_VALUES,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
     """Show which images are not equal to their references, ask, and copy them over. Nothing is deleted."""
     _require_extra("scipy")
-    chosen = _settings(reference, method, options, settings, allow_nonfinite)
+    chosen = _settings(reference, method, options, settings, allow_nonfinite, max_values)
     with _progress() as tell:
-        found = folders.diff(reference, test, chosen, new=True, tell=tell)
+        found = folders.diff(reference, test, chosen, to_accept=True, tell=tell)
     _say(found)
     copies = list(accepting.changes(found))
-    for new, old in copies:
-        print(printable(f"{new} → {old}{'' if old.exists() else ' (new)'}"))
+    for copy in copies:
+        print(printable(f"{copy.new} → {copy.reference}{'' if copy.replaced else ' (new)'}"))
     if not copies:
         print("nothing to accept")
     elif yes or _agreed(len(copies)):
-        accepting.accept(copies, found.began)
+        accepting.accept(copies)
         print(f"{len(copies)} accepted")
     else:
         print("nothing accepted")
@@ -208,23 +215,29 @@ def _flags(name: str, values: Sequence[Any]) -> list[str]:
     return [word for value in values for word in (name, str(value))]
 
 
-def _self_test(path: Path | None, other: Path | None) -> int:
+def _self_test(path: Path | None, other: Path | None, max_values: int) -> int:
     """Print which defects are seen; 1 where one that was due is not."""
     if other:
         raise ValueError(f"{other}: --self-test takes one path; accepted: an image, a folder of renders, a scene")
     if path is None:
         renders = self_test_scenes.glass_ball()
     else:
-        renders = self_test_scenes.of_file(path) if path.suffix == ".xml" else self_tests.read_images(path)
+        scene = path.suffix == ".xml"
+        renders = self_test_scenes.of_file(path) if scene else self_tests.read_images(path, max_values)
     rows = self_tests.examine(renders, str(path or "a glass ball"))
     _print(self_tests.table(rows))
     return int(self_tests.failed(rows))
 
 
 def _settings(
-    reference: Path, method: str, words: list[str] | None, file: Path | None, nonfinite: list[str] | None
+    reference: Path,
+    method: str,
+    words: list[str] | None,
+    file: Path | None,
+    nonfinite: list[str] | None,
+    max_values: int,
 ) -> diff_settings.Settings:
-    default = diff_settings.from_words(method, words or [])
+    default = replace(diff_settings.from_words(method, words or []), max_values=max_values)
     beside = (reference if reference.is_dir() else reference.parent) / diff_settings.FILE
     path = file or (beside if beside.exists() else None)
     rules = diff_settings.load(path) if path else ()

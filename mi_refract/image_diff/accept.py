@@ -2,45 +2,89 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mi_refract.io import image_file
-from mi_refract.io.atomic import write_atomically
+from mi_refract.io.atomic import replacing
 
-from .folders import Results, Status
+from .folders import Results, Status, digest, opened
+
+BLOCK = 2**20  # bytes that are copied at once
 
 
-def changes(results: Results) -> Iterator[tuple[Path, Path]]:
-    """(new, reference) for each image that is not equal to its reference, or has none.
+@dataclass(frozen=True)
+class Copy:
+    """A new image that is to become the reference.
+
+    `shown`, `replaced`: what `digest` said of the new image and of the reference when they were compared.
+    """
+
+    new: Path
+    reference: Path
+    shown: str
+    replaced: str
+
+
+def changes(results: Results) -> Iterator[Copy]:
+    """A copy for each image that is not equal to its reference, or has none. `results`: of a `diff(to_accept=True)`.
 
     ValueError or OSError for a new image that can be no reference: unreadable, with values that are not finite, or of
     another format than the reference's name says.
     """
     for result in results.of(Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE):
-        if result.test is None:
+        if result.test is None or result.digests is None:
             if result.error:
                 raise ValueError(result.error)
+            if result.test:
+                raise ValueError(f"{result.test}: compared without digests; accepted: results of diff(to_accept=True)")
             continue
-        image = image_file.read(result.test)
+        image = image_file.read(result.test, result.how.max_values)
         if not result.how.options.get("allow_nonfinite") and not np.isfinite(image.pixels).all():
             raise ValueError(f"{result.test}: values that are not finite; accepted with --allow-nonfinite")
         target = results.target(result)
         if target.suffix.lower() != result.test.suffix.lower():
             raise ValueError(f"{target}: accepted: a name that ends in {result.test.suffix}, as {result.test} does")
-        yield result.test, target
+        replaced, shown = result.digests
+        yield Copy(result.test, target, shown, replaced)
 
 
-def accept(copies: Sequence[tuple[Path, Path]], shown: int) -> None:
-    """Copy each first file over the second; every one is replaced as a whole or stays. OSError ends it.
+def accept(copies: Sequence[Copy]) -> None:
+    """Copy each new image over its reference: exactly the bytes that were compared, over those they were compared with.
 
-    `shown`: the time in ns since the epoch when they were compared; OSError, before any copy, for a file changed since.
+    OSError or ValueError where either has changed, or a copy cannot be written: then no reference is replaced. Every
+    copy is complete before the first of them takes its name.
     """
-    for new, _ in copies:
-        if max(new.stat().st_mtime_ns, new.stat().st_ctime_ns) > shown:
-            raise OSError(f"{new}: changed since it was compared; accepted: what was shown")
-    for new, reference in copies:
-        reference.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(reference, new.read_bytes())
+    _require_unchanged(copies)
+    with contextlib.ExitStack() as unfinished:
+        for copy in copies:
+            copy.reference.parent.mkdir(parents=True, exist_ok=True)
+            if _copied(copy.new, unfinished.enter_context(replacing(copy.reference))) != copy.shown:
+                raise _changed(copy.new)
+        _require_unchanged(copies)
+
+
+def _require_unchanged(copies: Sequence[Copy]) -> None:
+    for copy in copies:
+        for path, before in ((copy.new, copy.shown), (copy.reference, copy.replaced)):
+            if digest(path) != before:
+                raise _changed(path)
+
+
+def _changed(path: Path) -> OSError:
+    return OSError(f"{path}: changed since it was compared; accepted: what was shown")
+
+
+def _copied(source: Path, to: Path) -> str:
+    """The digest of what was copied."""
+    found = hashlib.sha256()
+    with opened(source) as file, to.open("wb") as written:
+        while block := file.read(BLOCK):
+            found.update(block)
+            written.write(block)
+    return found.hexdigest()

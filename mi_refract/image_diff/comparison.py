@@ -6,7 +6,7 @@ What cannot be compared is an error, and a value that is not finite equals nothi
 from __future__ import annotations
 
 import enum
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -65,7 +65,7 @@ def preconditions(reference: Image, test: Image, allow_nonfinite: bool = False) 
     """Why the two differ before any method is applied: values that are not finite, counted and located; else None.
 
     With `allow_nonfinite` such a value is allowed where the other image has the same one: NaN, Inf or -Inf.
-    ValueError where the images cannot be compared: other size, other names of channels, other data window.
+    ValueError where the images cannot be compared, as `aligned`.
     """
     a, b = aligned(reference, test)
     if np.isfinite(a).all() and np.isfinite(b).all():
@@ -78,8 +78,12 @@ def preconditions(reference: Image, test: Image, allow_nonfinite: bool = False) 
 
 
 def aligned(reference: Image, test: Image) -> tuple[Pixels, Pixels]:
-    """The pixels of both, with the channels in the reference's order. ValueError where they cannot be compared."""
-    for name, of in {"size": _size, "channels": _channels, "data window": _window}.items():
+    """The pixels of both, with the channels in the reference's order.
+
+    ValueError where they cannot be compared: another size, other names of channels, or a header that puts the same
+    pixels elsewhere, in another shape, or turned.
+    """
+    for name, of in HEADER.items():
         if of(reference) != of(test):
             raise ValueError(f"{test.path}: {name} {of(test)}; accepted: {of(reference)}, as in {reference.path}")
     same_order = reference.channels == test.channels
@@ -98,6 +102,13 @@ def checked_pixels(method: str, reference: Image, test: Image, allow: bool) -> t
     if allow:
         a, b = np.where(np.isfinite(a), a, 0), np.where(np.isfinite(b), b, 0)
     return a, b, None
+
+
+def not_compared(reference: Image) -> tuple[int, list[str]]:
+    """How many values are not finite, and the channels that hold no other ones: there nothing was compared."""
+    finite = np.isfinite(reference.pixels).reshape(-1, len(reference.channels))
+    seen = zip(reference.channels, finite.any(0), strict=True)
+    return int(finite.size - finite.sum()), [name for name, any_value in seen if not any_value]
 
 
 def nonfinite_result(method: str, reason: str, *pixels: Pixels) -> Comparison:
@@ -132,3 +143,18 @@ def _channels(image: Image) -> str:
 
 def _window(image: Image) -> str:
     return "from x = {}, y = {}".format(*image.origin)
+
+
+def _display(image: Image) -> str:
+    x, y, width, height = image.display or (*image.origin, *image.pixels.shape[1::-1])
+    return f"{width} × {height} from x = {x}, y = {y}"
+
+
+HEADER: dict[str, Callable[[Image], str]] = {
+    "size": _size,
+    "channels": _channels,
+    "data window": _window,
+    "display window": _display,
+    "pixel aspect ratio": lambda image: str(image.metadata.get("PixelAspectRatio", 1.0)),
+    "orientation": lambda image: str(image.metadata.get("Orientation", 1)),
+}

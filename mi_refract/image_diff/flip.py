@@ -15,8 +15,8 @@ import numpy as np
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels, srgb_decode
 
-from .comparison import Comparison, Metric, checked_pixels, verdict_of
-from .pixelwise import require_nonnegative
+from .comparison import Comparison, Metric, Verdict, checked_pixels, verdict_of
+from .pixelwise import require_nonnegative, tolerance, tolerance_passes_black
 
 PIXELS_PER_DEGREE = 67.0  # of the viewer's field: FLIP's default, a screen of 0.7 m and 3840 pixels at 0.7 m
 RGB = ("R", "G", "B")
@@ -33,7 +33,10 @@ def flip(
     hdr: Annotated[str, "auto (by the file's format), yes or no"] = "auto",
     ppd: Annotated[float, "pixels per degree of the viewer's field"] = PIXELS_PER_DEGREE,
 ) -> Comparison:
-    """The differences that a person flipping between the images would see: FLIP, for LDR and HDR images."""
+    """The differences that a person flipping between the images would see: FLIP, for LDR and HDR images.
+
+    Channels other than R, G, B are compared by `tolerance` with its defaults.
+    """
     require_nonnegative(locals())
     if hdr not in ("auto", "yes", "no"):
         raise ValueError(f"hdr = {hdr!r}: accepted: auto, yes, no")
@@ -50,9 +53,26 @@ def flip(
         Metric("99th percentile of the FLIP error", float(np.percentile(error, 99))),
     )
     reason = f"mean FLIP error {error.mean():.3g}, largest {error.max():.3g} ({'HDR' if wide else 'LDR'})"
-    if ignored := [name for name in reference.channels if name not in _colours(reference)]:
-        reason += f"; not looked at: {', '.join(ignored)}"
-    return Comparison("flip", verdict_of(metrics), reason, metrics, maps={"flip": error})
+    found = Comparison("flip", verdict_of(metrics), reason, metrics, maps={"flip": error})
+    others = tuple(name for name in reference.channels if name not in _colours(reference))
+    return _with_others(found, _only(reference, others), _only(test, others), allow_nonfinite) if others else found
+
+
+def _only(image: Image, channels: tuple[str, ...]) -> Image:
+    return replace(image, pixels=image.select(channels), channels=channels)
+
+
+def _with_others(found: Comparison, reference: Image, test: Image, allow_nonfinite: bool) -> Comparison:
+    """FLIP's comparison with that of the channels that it does not look at."""
+    names = ", ".join(reference.channels)
+    if np.array_equal(reference.pixels, test.pixels, equal_nan=True):
+        return replace(found, reason=f"{found.reason}; not looked at, but the same: {names}")
+    others = tolerance(reference, test, allow_nonfinite=allow_nonfinite)
+    metrics = (*found.metrics, replace(others.metrics[0], name=f"{others.metrics[0].name}, in {names}"))
+    verdict, reason = verdict_of(metrics), f"{found.reason}; by tolerance {names}: {others.reason}"
+    if verdict is Verdict.EQUAL and tolerance_passes_black(reference, tolerance.__kwdefaults__ or {}):
+        verdict, reason = Verdict.INCONCLUSIVE, f"{reason}, as would be if they were black"
+    return replace(found, verdict=verdict, reason=reason, metrics=metrics)
 
 
 def flip_passes_black(reference: Image, options: Mapping[str, Any]) -> bool:

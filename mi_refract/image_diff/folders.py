@@ -7,18 +7,20 @@ from __future__ import annotations
 
 import enum
 import functools
+import hashlib
 import os
 import shlex
-import time
+import stat
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
-from mi_refract.io import image_file
-from mi_refract.io.image_file import Image
+from mi_refract.io import exit_code, image_file
+from mi_refract.io.image_file import MAX_VALUES, Image
 
 from . import methods
 from .comparison import Comparison, Verdict
@@ -57,7 +59,8 @@ class Result:
     """One image: its name, and what was found. `error` is the line that says why there is no verdict.
 
     `reference`, `test`: its files, or with renders its folders; None where that side has none. `how`: what was asked.
-    `images`: both sides as they were read, of several renders the mean; empty where they were not kept.
+    `images`: both sides as they were read, of several renders the mean; empty where they were not kept. `digests`: of
+    both files when they were compared, as `digest` gives them; None where that was not asked, or a file is unreadable.
     """
 
     name: str
@@ -68,6 +71,7 @@ class Result:
     comparison: Comparison | None = None
     error: str = ""
     images: tuple[Image, ...] = ()
+    digests: tuple[str, str] | None = None
 
     @property
     def category(self) -> Category:
@@ -93,7 +97,7 @@ class Results:
 
     `reference`, `test`: the paths as given; `renders`: each of them holds renders of one image. `inconclusive`: what
     that counts as ("pass", "fail", or "" for an exit code of its own). `unused`: patterns of the settings that matched
-    no image. `began`: when the comparison began, in ns since the epoch.
+    no image.
     """
 
     reference: Path
@@ -102,7 +106,6 @@ class Results:
     renders: bool = False
     inconclusive: str = ""
     unused: tuple[str, ...] = ()
-    began: int = 0
 
     def of(self, *statuses: Status) -> list[Result]:
         """The results with one of these statuses."""
@@ -152,17 +155,18 @@ def diff(
     renders: bool = False,
     inconclusive: str = "",
     maps: bool = False,
-    new: bool = False,
+    to_accept: bool = False,
     tell: Callable[[int, int], None] = lambda done, of: None,
 ) -> Results:
     """Compare two files, two folders by the names of their images, or, with `renders`, two folders as one image.
 
-    `maps`: keep the maps of images that are not equal, and the images themselves as far as HELD goes. `new`: the
-    reference need not exist yet. `tell(done, of)` is called after each image. ValueError or OSError where there is
-    nothing to compare: a path that does not exist, a file against a folder, an empty folder, a path within the other.
+    `maps`: keep the maps of images that are not equal, and the images themselves as far as HELD goes. `to_accept`: the
+    reference need not exist yet, and the results have `digests`. `tell(done, of)` is called after each image.
+    Whatever goes wrong with one image is the error of its result. ValueError or OSError where there is nothing to
+    compare: a path that does not exist, a file against a folder, an empty folder, a path within the other.
     """
-    began, reference, test = time.time_ns(), Path(reference), Path(test)
-    require_apart(reference, test, new)
+    reference, test = Path(reference), Path(test)
+    require_apart(reference, test, to_accept)
     if renders and not (reference.is_dir() and test.is_dir()):
         raise NotADirectoryError(f"{test if reference.is_dir() else reference}: accepted with --renders: a folder")
     name = reference.resolve().name
@@ -170,13 +174,13 @@ def diff(
     asked = [replace(result, how=settings.of(result.name)) for result in paired]
     found, held = [], 0
     with ThreadPoolExecutor(WORKERS) as pool:
-        for result in pool.map(lambda result: _compared(result, renders, maps), asked):
+        for result in pool.map(lambda result: _compared(result, renders, maps, to_accept), asked):
             held += sum(image.pixels.nbytes for image in result.images)
             found.append(result if held <= HELD else replace(result, images=()))
             tell(len(found), len(asked))
     found.sort(key=lambda result: list(Status).index(result.status))
     unused = settings.unused([result.name for result in paired]) if reference.is_dir() and not renders else []
-    return Results(reference, test, tuple(found), renders, inconclusive, tuple(unused), began)
+    return Results(reference, test, tuple(found), renders, inconclusive, tuple(unused))
 
 
 def require_apart(reference: Path, test: Path, new: bool = False) -> None:
@@ -238,24 +242,54 @@ def endings() -> frozenset[str]:
     return frozenset(e for name, listed in formats if name not in ("null", "term", "zfile") for e in listed.split(","))
 
 
-def _compared(result: Result, renders: bool, maps: bool) -> Result:
-    """The result of comparing its two sides, where it has both; ERROR for what is wrong with either."""
-    if result.error or not (result.reference and result.test):
+def _compared(result: Result, renders: bool, maps: bool, to_accept: bool) -> Result:
+    """The result of comparing its two sides, where it has both; ERROR for whatever goes wrong."""
+    if result.error:
         return result
     try:
-        if result.reference.samefile(result.test):
-            raise ValueError(f"{result.test}: the same file as the reference {result.reference}; accepted: two")
-        sides = [read_renders(path) if renders else [image_file.read(path)] for path in (result.reference, result.test)]
-        found = methods.compare(result.how.method, *sides, **result.how.options)
-    except (ValueError, OSError) as error:
-        return replace(result, status=Status.ERROR, error=image_file.one_line(str(error)))
+        if to_accept:  # before the images are read: what is read later and has the same digest is what was compared
+            result = replace(result, digests=(digest(result.reference), digest(result.test)))
+        return _judged(result, result.reference, result.test, renders, maps)
+    except Exception as error:  # of whatever kind: the other images are still to be compared
+        exit_code.print_traceback(error)
+        text = exit_code.describe(error)
+        known = isinstance(error, ValueError | OSError)
+        return replace(result, status=Status.ERROR, error=text if known else f"{result.test}: {text}")
+
+
+def digest(path: Path | None) -> str:
+    """The SHA-256 of a file's bytes; "" where there is none. OSError, and ValueError, as `opened`."""
+    if path is None or not path.exists():
+        return ""
+    with opened(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def opened(path: Path) -> BinaryIO:
+    """A file to read from. OSError, or ValueError for a pipe or a device, which might never end."""
+    nonblocking = getattr(os, "O_NONBLOCK", 0)  # or the pipe is waited for
+    file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | nonblocking))  # noqa: SIM115
+    if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        return file
+    file.close()
+    raise ValueError(f"{path}: accepted: a regular file")
+
+
+def _judged(result: Result, reference: Path | None, test: Path | None, renders: bool, maps: bool) -> Result:
+    if not (reference and test):
+        return result
+    if reference.samefile(test):
+        raise ValueError(f"{test}: the same file as the reference {reference}; accepted: two")
+    most = result.how.max_values
+    sides = [read_renders(path, most) if renders else [image_file.read(path, most)] for path in (reference, test)]
+    found = methods.compare(result.how.method, *sides, **result.how.options)
     kept = maps and found.verdict is not Verdict.EQUAL  # a thousand images' maps would fill the memory
     images = tuple(map(mean_image, sides)) if kept else ()
     comparison = found if kept else replace(found, maps={})
     return replace(result, status=STATUSES[found.verdict], comparison=comparison, images=images)
 
 
-def read_renders(folder: Path) -> list[Image]:
+def read_renders(folder: Path, max_values: int = MAX_VALUES) -> list[Image]:
     """The renders of one image in a folder. ValueError where two are the same, seed and all; otherwise as `read`."""
     found, failed = images_in(folder)
     if failed:
@@ -263,7 +297,7 @@ def read_renders(folder: Path) -> list[Image]:
     if not found:
         raise ValueError(f"{folder}: holds no image; accepted: several renders of one")
     with ThreadPoolExecutor(WORKERS) as pool:
-        images = list(pool.map(image_file.read, found.values()))
+        images = list(pool.map(lambda path: image_file.read(path, max_values), found.values()))
     sums: dict[float, Image] = {}
     for image in images:
         other = sums.setdefault(float(image.pixels.sum(dtype=np.float64)), image)

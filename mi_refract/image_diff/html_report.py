@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from mi_refract.io import exit_code
 from mi_refract.io.image_file import Image, one_line, read
 from mi_refract.io.pixels import Pixels, block_mean
 from mi_refract.report.embedded_images import EmbeddedImages, encoded, shown, strongest
@@ -51,7 +52,7 @@ def write(path: str | Path, results: Results, context: Mapping[str, Any] | None 
     failures: list[dict[str, Any]] = []
     full = False
     for number, result in enumerate(results.of(*FAILED), 1):
-        panes, note = ([], FULL) if full else _panes(result)
+        panes, note = ([], FULL) if full else _panes_or_why(result)
         # The first pair is shown, however large; after one that does not fit no other is tried.
         full = full or bool(images.embedded and images.size + _bytes(panes) > PAGE)
         panes, note = ([], FULL) if full else ([images.add(pane) for pane in panes], note)
@@ -125,6 +126,14 @@ def _histogram(p_values: Pixels, salt: str) -> str:
 # Panes --------------------------------------------------------------------------------------------------------------
 
 
+def _panes_or_why(result: Result) -> tuple[list[dict[str, Any]], str]:
+    try:
+        return _panes(result)
+    except Exception as error:  # of whatever kind: the page is for all images
+        exit_code.print_traceback(error)
+        return [], f"Cannot be shown: {exit_code.describe(error)}"
+
+
 def _panes(result: Result) -> tuple[list[dict[str, Any]], str]:
     """What can be shown of a pair, and why the rest cannot."""
     sides, notes = _sides(result)
@@ -143,7 +152,8 @@ def _sides(result: Result) -> tuple[dict[str, Image], list[str]]:
     for role, path in paths.items():
         try:
             if path:
-                several = folders.read_renders(path) if path.is_dir() else [read(path)]
+                most = result.how.max_values
+                several = folders.read_renders(path, most) if path.is_dir() else [read(path, most)]
                 sides[role] = _in_shown_channels(folders.mean_image(several))
         except (ValueError, OSError) as error:
             notes.append(one_line(str(error)))

@@ -13,7 +13,7 @@ import numpy as np
 from mi_refract.io.image_file import Image
 
 from . import flip, pixelwise, welch
-from .comparison import Comparison, Verdict, aligned
+from .comparison import Comparison, Verdict, aligned, not_compared
 
 AUTO = "auto"
 ROW_STEP = 16  # every so many rows show whether a method would see that an image is black
@@ -83,7 +83,7 @@ def compare(method: str, reference: Side, test: Side, *, allow_nonfinite: bool =
     """Compare two images, or two sequences of renders of one image, by a method of the table.
 
     "auto" is `welch` where it can be, else `tolerance`. Where a method calls the images equal but would call a black
-    one equal, too, the verdict is INCONCLUSIVE.
+    one equal, too, or where no value of a channel is finite, the verdict is INCONCLUSIVE.
 
     ValueError for an unknown method or option, an option of another type or out of its range, several renders for a
     method that takes one, and images that cannot be compared.
@@ -97,7 +97,7 @@ def compare(method: str, reference: Side, test: Side, *, allow_nonfinite: bool =
     if not all(sides):
         raise ValueError(f"{method}: no image on one side; accepted: at least one")
     if chosen.takes_renders:
-        return chosen.function(*sides, allow_nonfinite=allow_nonfinite, **checked)
+        return _of_the_finite(chosen.function(*sides, allow_nonfinite=allow_nonfinite, **checked), sides[0][0])
     if [len(side) for side in sides] != [1, 1]:
         raise ValueError(f"{method}: {len(sides[0])} and {len(sides[1])} images; accepted: one a side")
     one, two = sides[0][0], sides[1][0]
@@ -105,7 +105,18 @@ def compare(method: str, reference: Side, test: Side, *, allow_nonfinite: bool =
     if found.verdict is Verdict.EQUAL and _sees_nothing(chosen, one, two, checked):
         reason = f"an all-black image would pass, too, with these options; {found.reason}"
         return replace(found, verdict=Verdict.INCONCLUSIVE, reason=reason)
-    return found
+    return _of_the_finite(found, one)
+
+
+def _of_the_finite(found: Comparison, reference: Image) -> Comparison:
+    """The comparison with what it left out; INCONCLUSIVE where that is all of a channel."""
+    count, empty = not_compared(reference) if found.verdict is Verdict.EQUAL else (0, [])
+    if not count:
+        return found
+    if empty:
+        reason = f"no value is finite, and nothing was compared, in {', '.join(empty)}; {found.reason}"
+        return replace(found, verdict=Verdict.INCONCLUSIVE, reason=reason)
+    return replace(found, reason=f"{found.reason}; not compared: {count} of {reference.pixels.size} values, not finite")
 
 
 def _sees_nothing(method: Method, reference: Image, test: Image, options: dict[str, Any]) -> bool:

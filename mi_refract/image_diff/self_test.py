@@ -210,9 +210,9 @@ def _null_row(method: str, tally: Tally, case: str, setting: str, independent: b
 # Given images ------------------------------------------------------------------------------------------------
 
 
-def read_images(path: Path) -> Pixels:
+def read_images(path: Path, max_values: int = image_file.MAX_VALUES) -> Pixels:
     """The renders of one image in a folder, or the image in a file, number × H × W × C. Errors: those of `read`."""
-    images = read_renders(path) if path.is_dir() else [image_file.read(path)]
+    images = read_renders(path, max_values) if path.is_dir() else [image_file.read(path, max_values)]
     first = images[0]
     for image in images[1:]:
         if image.pixels.shape[:2] != first.pixels.shape[:2] or set(image.channels) != set(first.channels):

@@ -19,6 +19,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
+from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.toml_schema import TABLES, TEXT, Key, Type, key_table, read
 
 from .methods import AUTO, METHODS
@@ -53,11 +54,15 @@ TYPES: dict[type, Type] = {
 
 @dataclass(frozen=True)
 class How:
-    """A method, those of its options that are given, and the `reason` from a settings file."""
+    """A method, those of its options that are given, and the `reason` from a settings file.
+
+    `max_values`: width × height × channels of an image, at most.
+    """
 
     method: str = AUTO
     options: Mapping[str, Any] = field(default_factory=dict)
     reason: str = ""
+    max_values: int = MAX_VALUES
 
     @property
     def flags(self) -> list[str]:
@@ -68,7 +73,7 @@ class How:
                 words += ["--set", f"{name}={value}"]
             elif value:
                 words += ["--allow-nonfinite", "*"]
-        return words
+        return words + ([] if self.max_values == MAX_VALUES else ["--max-values", str(self.max_values)])
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,7 @@ class Settings:
             how = replace(how, method=self.default.method, options={**self.default.options, **how.options})
         if any(fnmatchcase(name, pattern) for pattern in self.allow_nonfinite):
             how = replace(how, options={"allow_nonfinite": True, **how.options})
-        return how
+        return replace(how, max_values=self.default.max_values)
 
     def unused(self, names: Sequence[str]) -> list[str]:
         """The patterns that match none of these names."""

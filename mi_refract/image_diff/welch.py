@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated
@@ -11,6 +12,7 @@ import numpy as np
 
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels, block_sum
+from mi_refract.io.toml_schema import shown
 
 from .comparison import Comparison, Maps, Metric, Verdict, aligned, nonfinite_result, preconditions
 from .tile_statistics import (
@@ -139,14 +141,20 @@ def spreads(channels: Sequence[str]) -> dict[str, tuple[str, bool]]:
 
 
 def _moments(image: Image, pairs: dict[str, tuple[str, bool]], tile: int, spp: int) -> Side:
-    spp = spp or int(image.metadata.get("mi_refract:spp", 0))
-    if spp < 2:
-        raise ValueError(f"{image.path}: its header names no samples per pixel; accepted: `spp` of at least 2")
+    spp = _spp(image, spp)
     mean = _finite(image.select(list(pairs))).astype(np.float64)
     spread = _finite(image.select([name for name, _ in pairs.values()])).astype(np.float64)
     is_moment = np.array([moment for _, moment in pairs.values()])
     variance = np.where(is_moment, (spread - mean**2) * spp / (spp - 1), spread) / spp
     return from_variances(mean, np.maximum(variance, 0), spp - 1.0, tile)
+
+
+def _spp(image: Image, given: int) -> int:
+    """The samples per pixel that are given, or else those of the header, which may hold anything."""
+    found = given or image.metadata.get("mi_refract:spp", "no samples per pixel")
+    if not re.fullmatch(r"[0-9]{1,15}(\.0)?", text := str(found)) or float(text) < 2:
+        raise ValueError(f"{image.path}: its header names {shown(found)}; accepted: `spp`, 2 to 10¹⁵")
+    return int(float(text))
 
 
 def _verdict(tests: TileTests, resolution: float) -> tuple[Verdict, str]:

@@ -54,10 +54,16 @@ def describe(error: BaseException) -> str:
     return printable(" ".join(text.split()))
 
 
+def print_traceback(error: BaseException) -> None:
+    """The traceback on stderr, where the environment variable asks for it."""
+    if os.environ.get(TRACEBACK) == "1":
+        with contextlib.suppress(OSError, ValueError):
+            traceback.print_exception(error)
+
+
 def _failed(name: str, error: BaseException) -> int:
     with contextlib.suppress(OSError, ValueError):  # a stderr that cannot be written says nothing
-        if os.environ.get(TRACEBACK) == "1":
-            traceback.print_exception(error)
+        print_traceback(error)
         print(f"{name}: {describe(error)}", file=sys.stderr, flush=True)
     for output in (sys.stdout, sys.stderr):
         try:

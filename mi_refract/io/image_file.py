@@ -6,6 +6,7 @@ Pixels are arrays of H × W × C float32, row 0 at the top. A file is written co
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -19,6 +20,9 @@ from . import atomic
 
 Metadata = dict[str, Any]
 SUFFIXES = (".exr",)
+MAX_VALUES = 2**28  # width × height × channels of an image: 1 GiB as float32
+# How files begin that OpenImageIO decodes when it opens them: GIF, JPEG 2000, JPEG XL.
+WHEN_OPENED = (b"GIF", b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51", b"\0\0\0\x0cJXL ", b"\xff\x0a")
 NO_DATE = {"DateTime": "1970:01:01 00:00:00"}  # for the same bytes every day: without it OpenImageIO writes today's
 
 
@@ -64,7 +68,7 @@ def _write(path: Path, pixels: NDArray[np.float32], channels: Sequence[str], att
         raise OSError(one_line(message or output.geterror()) or "OpenImageIO gives no reason")
     # On a full disk `close` is True all the same when the image was small enough for a buffer.
     try:
-        complete = read_exr(path)[0].shape == pixels.shape
+        complete = read_exr(path, pixels.size)[0].shape == pixels.shape
     except ValueError:
         complete = False
     if not complete:
@@ -84,6 +88,7 @@ class Image:
 
     `pixels`: H × W × C, float32, or float64 where the file holds numbers that float32 cannot; integers of a file are
     mapped to 0 … 1. `channels`: C names. `origin`: (x, y) where the data window begins. `metadata`: the header.
+    `display`: x, y, width and height of the display window; None where it is the data window.
     """
 
     path: Path
@@ -91,6 +96,7 @@ class Image:
     channels: tuple[str, ...]
     origin: tuple[int, int] = (0, 0)
     metadata: Metadata = field(default_factory=dict)
+    display: tuple[int, int, int, int] | None = None
 
     def select(self, channels: Sequence[str]) -> NDArray[np.floating[Any]]:
         """The pixels of these channels, in this order: H × W × len(channels). ValueError for a name not there."""
@@ -99,14 +105,13 @@ class Image:
         return self.pixels[..., [self.channels.index(name) for name in channels]]
 
 
-def read(path: str | os.PathLike[str]) -> Image:
+def read(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> Image:
     """Read a file that holds one image, of any format that OpenImageIO reads; the name's ending tells which.
 
-    OSError for a file that cannot be read; ValueError for one that is empty, truncated, of another format than its
-    name says, of several parts, deep, or without pixels. Both are one line that begins with the path.
+    `max_values`: width × height × channels, at most; asked of the header, before memory is allocated. OSError for a
+    file that cannot be read; ValueError for one that is empty, truncated, too large, of another format than its name
+    says, of several parts, deep, or without pixels. Both are one line that begins with the path.
     """
-    import OpenImageIO as oiio
-
     path = Path(path)
     kind = path.suffix[1:].upper() or "image"
     try:
@@ -116,19 +121,41 @@ def read(path: str | os.PathLike[str]) -> Image:
     if path.exists() and not (path.is_file() or path.is_dir()):  # reading a pipe might never end
         raise ValueError(f"{path}: accepted: a regular file")
     with path.open("rb") as file:  # the operating system's own words for what is missing or forbidden
-        if not file.read(1):
-            raise ValueError(f"{path}: corrupt {kind} file: it is empty")
-    config = oiio.ImageSpec()
-    config.attribute("oiio:UnassociatedAlpha", 1)  # else colours under a transparent alpha are read as black
-    source = oiio.ImageInput.open(str(path), config)
-    if source is None:
-        raise ValueError(f"{path}: corrupt {kind} file: {_without(path, oiio.geterror())}")
+        begin = file.read(8)
+    if not begin:
+        raise ValueError(f"{path}: corrupt {kind} file: it is empty")
+    # Others hold 8 bytes a value or fewer, and are asked below.
+    source = _opened(path, kind, max_values, max_values * (1 if begin.startswith(WHEN_OPENED) else 8))
     try:
-        return _image(path, source, kind)
+        return _image(path, source, kind, max_values)
     except MemoryError:
-        raise ValueError(f"{path}: corrupt {kind} file: more pixels than there is memory for") from None
+        raise ValueError(f"{path}: more pixels than there is memory for; accepted: a smaller image") from None
     finally:
         source.close()
+
+
+_opening = threading.Lock()  # OpenImageIO has one limit for all that it opens
+
+
+def _opened(path: Path, kind: str, max_values: int, max_bytes: int) -> Any:
+    """OpenImageIO's reader of the file, if its pixels take up to `max_bytes`. Some formats are decoded here."""
+    import OpenImageIO as oiio
+
+    config = oiio.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)  # else colours under a transparent alpha are read as black
+    with _opening:
+        before = oiio.get_int_attribute("limits:imagesize_MB")
+        oiio.attribute("limits:imagesize_MB", min(-(-max_bytes >> 20), 2**31 - 1))
+        try:
+            source = oiio.ImageInput.open(str(path), config)
+        finally:
+            oiio.attribute("limits:imagesize_MB", before)
+    if source is None:
+        message = _without(path, oiio.geterror())
+        if "MB limit" in message:
+            raise ValueError(f"{path}: {message}; accepted: up to {max_values} values (max-values)")
+        raise ValueError(f"{path}: corrupt {kind} file: {message}")
+    return source
 
 
 def named(name: str, pixels: Any) -> Image:
@@ -152,7 +179,7 @@ def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Image]:
         return list(pool.map(read, paths))
 
 
-def _image(path: Path, source: Any, kind: str) -> Image:
+def _image(path: Path, source: Any, kind: str, max_values: int) -> Image:
     spec = source.spec()
     found = source.format_name()
     if path.suffix[1:].lower() not in _endings(found) or found == "null":  # which is black, whatever the file holds
@@ -161,6 +188,9 @@ def _image(path: Path, source: Any, kind: str) -> Image:
         raise ValueError(f"{path}: accepted: an image without deep samples")
     if min(spec.width, spec.height, spec.nchannels) < 1 or spec.depth > 1:
         raise ValueError(f"{path}: {spec.width} × {spec.height} × {spec.depth} pixels; accepted: a plane with pixels")
+    if spec.width * spec.height * spec.nchannels > max_values:
+        size = f"{spec.width} × {spec.height} × {spec.nchannels} values"
+        raise ValueError(f"{path}: {size}; accepted: up to {max_values} values (max-values)")
     formats = {str(each) for each in (spec.channelformats or [spec.format])}
     if formats & {"uint64", "int64"}:
         raise ValueError(f"{path}: integers of 64 bits; accepted: up to 32")
@@ -172,7 +202,8 @@ def _image(path: Path, source: Any, kind: str) -> Image:
     if source.seek_subimage(1, 0):
         raise ValueError(f"{path}: several parts in one file; accepted: one image")
     metadata = {attribute.name: attribute.value for attribute in spec.extra_attribs}
-    return Image(path, pixels, tuple(spec.channelnames), (spec.x, spec.y), metadata)
+    display = (spec.full_x, spec.full_y, spec.full_width, spec.full_height)
+    return Image(path, pixels, tuple(spec.channelnames), (spec.x, spec.y), metadata, display)
 
 
 def _without(path: Path, message: str) -> str:
@@ -188,17 +219,17 @@ def _endings(name: str) -> list[str]:
     return formats.get(name, name).split(",")
 
 
-def read_exr(path: str | os.PathLike[str]) -> tuple[NDArray[np.float32], Metadata]:
+def read_exr(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> tuple[NDArray[np.float32], Metadata]:
     """Read an EXR file: (pixels, metadata). Pixels are H × W × C float32; metadata is the header and "channels".
 
     `metadata["channels"]` holds the C names in OpenImageIO's order: R, G, B, A first, then by name.
-    OSError for a file that cannot be read, ValueError for one that is not a complete EXR image.
+    OSError for a file that cannot be read, ValueError for one that is not a complete EXR image of up to `max_values`.
     """
     path = Path(path)
     with path.open("rb") as file:
         if file.read(4) != b"\x76\x2f\x31\x01":
             raise ValueError(f"{path}: not an EXR file")
-    image = read(path)
+    image = read(path, max_values)
     return image.pixels.astype(np.float32, copy=False), image.metadata | {"channels": image.channels}
 
 

@@ -17,6 +17,7 @@ from support.diff_images import BROKEN, image, samples, tree
 from mi_refract import backend
 from mi_refract.cli import app, self_test_scenes
 from mi_refract.image_diff import methods, self_test
+from mi_refract.io import exit_code
 
 # Verdicts ---------------------------------------------------------------------------------------------------------
 
@@ -155,6 +156,37 @@ def test_an_image_without_permission(run, pair):
     assert (code, err.count("\n")) == (2, 1)
     assert "Permission denied" in err
     assert "louder.exr" in out
+
+
+def test_whatever_one_image_does_the_report_is_written(run, pair, tmp_path, monkeypatch):
+    compare = methods.compare
+
+    def fail(method, one, two, **options):
+        if one[0].path.name == "equal.exr":
+            raise MemoryError("Unable to allocate 9 GiB")
+        return compare(method, one, two, **options)
+
+    monkeypatch.setattr(methods, "compare", fail)
+    outputs = {"--report": "out.html", "--junit": "out.xml", "--json": "out.json"}
+    words = [word for option, name in outputs.items() for word in (option, tmp_path / name)]
+    code, out, err = run("diff", *pair, *words, "--github")
+    assert (code, err) == (2, f"mi-refract: {pair[1]}/equal.exr: out of memory: Unable to allocate 9 GiB\n")
+    assert "2 images: 1 could not be compared, 1 different" in out.splitlines()
+    for name in outputs.values():
+        text = (tmp_path / name).read_text()
+        assert "out of memory" in text and "louder.exr" in text
+    monkeypatch.setenv(exit_code.TRACEBACK, "1")
+    assert "Traceback" in run("diff", *pair)[2]
+
+
+def test_images_larger_than_allowed(run, pair):
+    names = [pair[0] / "louder.exr", pair[1] / "louder.exr"]
+    for words in (["diff", *names], ["accept", *names, "--yes"], ["diff", "--self-test", names[0]]):
+        code, out, err = run(*words, "--max-values", 100)
+        assert (code, out) == (2, "")
+        assert err.endswith("louder.exr: 48 × 32 × 3 values; accepted: up to 100 values (max-values)\n")
+    assert run("diff", *names, "--max-values", 2**62)[0] == 1
+    assert run("diff", *names, "--max-values", 0)[0] == 2
 
 
 BAD = {

@@ -7,11 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 from mi_refract.image_diff import methods, tile_statistics
 from mi_refract.image_diff.comparison import Verdict, preconditions
 from mi_refract.image_diff.methods import METHODS
+from mi_refract.io import image_file
 from mi_refract.io.image_file import Image
 
 SMOOTH = np.dstack([np.linspace(0.1, 0.9, 48 * 40).reshape(40, 48) ** k for k in (1, 2, 3)]).astype(np.float32)
@@ -79,8 +81,12 @@ def test_allowed_values_must_be_the_same_ones(method):
         (image(SMOOTH[..., :1], ("R",)), "channels"),
         (image(SMOOTH, ("R", "G", "Z")), "channels"),
         (image(SMOOTH, origin=(0, 1)), "data window"),
+        (image(SMOOTH, display=(0, 0, 48, 41)), "display window"),
+        (image(SMOOTH, display=(-1, 0, 48, 40)), "display window"),
+        (image(SMOOTH, metadata={"PixelAspectRatio": 2.0}), "pixel aspect ratio"),
+        (image(SMOOTH, metadata={"Orientation": 3}), "orientation"),
     ],
-    ids=["size", "count", "name", "window"],
+    ids=["size", "count", "name", "window", "display", "place", "aspect", "orientation"],
 )
 def test_what_cannot_be_compared_is_an_error(method, other, what):
     for pair in ((image(SMOOTH), other), (other, image(SMOOTH))):
@@ -94,6 +100,52 @@ def test_channels_are_matched_by_name(method):
     assert judge(method, image(SMOOTH), image(SMOOTH[..., ::-1], ("B", "G", "R"))).verdict is EQUAL
     if method != "welch":
         assert judge(method, image(SMOOTH), image(SMOOTH[..., ::-1])).verdict is DIFFERENT
+
+
+def test_headers_that_say_the_same_in_other_words_are_equal():
+    said = {"PixelAspectRatio": 1.0, "Orientation": 1}
+    assert preconditions(image(SMOOTH), image(SMOOTH, display=(0, 0, 48, 40), metadata=said)) is None
+    moved = [image(SMOOTH, origin=(3, 4), display=display) for display in (None, (3, 4, 48, 40))]
+    assert preconditions(*moved) is None
+
+
+@pytest.mark.parametrize("name", ["a.exr", "a.png", "a.tif"])
+def test_the_header_of_a_file_is_asked(tmp_path, name):
+    """Exit code 2 of `diff`, not 0, where the same pixels are shown in another place, or in another shape."""
+    for number, attributes in enumerate(({}, {}, {"PixelAspectRatio": 2.0}, {"full_width": 99})):
+        spec = oiio.ImageSpec(48, 40, 3, "uint8" if name == "a.png" else "float")
+        for key, value in attributes.items():
+            setattr(spec, key, value) if key == "full_width" else spec.attribute(key, value)
+        path = tmp_path / str(number) / name
+        path.parent.mkdir()
+        output = oiio.ImageOutput.create(str(path))
+        assert output.open(str(path), spec) and output.write_image(SMOOTH) and output.close()
+    one, same, aspect, display = (image_file.read(tmp_path / str(i) / name) for i in range(4))
+    assert preconditions(one, same) is None
+    with pytest.raises(ValueError, match=r"pixel aspect ratio 2\.0; accepted: 1\.0"):
+        preconditions(one, aspect)
+    if name != "a.png":  # which holds none
+        with pytest.raises(ValueError, match="display window 99 × 40 from x = 0, y = 0; accepted: 48 × 40"):
+            preconditions(one, display)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_channel_without_a_value_is_not_compared(method, bad):
+    """Allowed or not: a channel of NaN on both sides says nothing."""
+    every, green = np.full_like(SMOOTH, bad), SMOOTH.copy()
+    green[..., 1] = bad
+    for pixels, names in ((every, "R, G, B"), (green, "G")):
+        found = judge(method, image(pixels), image(pixels), allow_nonfinite=True)
+        assert found.verdict is INCONCLUSIVE
+        assert found.reason.startswith(f"no value is finite, and nothing was compared, in {names}; ")
+    few = judge(method, altered(bad), altered(bad), allow_nonfinite=True)
+    assert (few.verdict, few.reason.endswith("; not compared: 1 of 5760 values, not finite")) == (EQUAL, True)
+    green[0, 0, 1] = 0.5
+    assert judge(method, image(green), image(green), allow_nonfinite=True).verdict is EQUAL
+    other = image(green + np.float32(0.1) * (np.arange(3) == 2))
+    if method != "welch":
+        assert judge(method, image(green), other, allow_nonfinite=True).verdict is DIFFERENT
 
 
 def test_preconditions_pass_what_is_whole():
@@ -189,9 +241,37 @@ def test_flip_of_hdr_sees_what_is_too_bright_for_a_display():
 
 def test_flip_says_what_it_does_not_look_at():
     four = image(np.dstack([SMOOTH, SMOOTH[..., :1]]), ("R", "G", "B", "A"))
-    assert judge("flip", four, four).reason.endswith("not looked at: A")
+    assert judge("flip", four, four).reason.endswith("not looked at, but the same: A")
     with pytest.raises(ValueError, match="accepted by FLIP"):
         judge("flip", image(SMOOTH, ("X", "Y", "Z")), image(SMOOTH, ("X", "Y", "Z")))
+
+
+@pytest.mark.parametrize(
+    "change, verdict",
+    [
+        (lambda alpha: 1 - alpha, DIFFERENT),
+        (lambda alpha: 0 * alpha, DIFFERENT),
+        (lambda alpha: alpha + 0.01, DIFFERENT),
+        (lambda alpha: alpha + 0.003, EQUAL),
+        (lambda alpha: alpha + np.where(alpha > 0.899, 9.0, 0.0), DIFFERENT),
+    ],
+)
+@pytest.mark.parametrize("names", [("R", "G", "B", "A"), ("Z", "B", "G", "R")])
+def test_flip_with_another_channel_that_changes(change, verdict, names):
+    alpha = SMOOTH[..., :1]
+    where = names.index("A") if "A" in names else 0
+    one, two = (image(np.insert(SMOOTH, [where], each, axis=2), names) for each in (alpha, change(alpha)))
+    found = judge("flip", one, two)
+    assert (found.verdict, found.metrics[0].value) == (verdict, 0)
+    assert f"; by tolerance {names[where]}: " in found.reason
+    assert judge("flip", two, one).verdict is verdict
+
+
+def test_flip_with_another_channel_that_is_dark():
+    depth = 0.004 * SMOOTH[..., :1]
+    one, two = (image(np.dstack([SMOOTH, each]), ("R", "G", "B", "Z")) for each in (depth, 0.5 * depth))
+    assert judge("flip", one, two).verdict is INCONCLUSIVE
+    assert judge("flip", one, one).verdict is EQUAL
 
 
 # Samples -------------------------------------------------------------------------------------------------------

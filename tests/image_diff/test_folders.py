@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 from support.diff_images import BROKEN, found, image, samples
 
@@ -68,17 +69,75 @@ def test_no_permission(folders, monkeypatch):
     """By a planted error: who runs as root may read everything."""
     read = image_file.read
 
-    def refuse(path):
+    def refuse(path, *most):
         if path.name == "same.exr":
             raise PermissionError(13, "Permission denied", str(path))
-        return read(path)
+        return read(path, *most)
 
     monkeypatch.setattr(image_file, "read", refuse)
     results = diff.diff(*folders)
     assert [(r.name, r.error) for r in results.of(Status.ERROR)] == [
-        ("same.exr", f"[Errno 13] Permission denied: '{folders[0] / 'same.exr'}'")
+        ("same.exr", f"{folders[0] / 'same.exr'}: Permission denied")
     ]
     assert len(results.of(Status.DIFFERENT)) == 3
+
+
+@pytest.mark.parametrize(
+    "planted, words",
+    [
+        (MemoryError("Unable to allocate 9 GiB"), "out of memory: Unable to allocate 9 GiB"),
+        (RecursionError("too deep"), "internal error: RecursionError: too deep"),
+        (OverflowError("a method's\nmistake"), "internal error: OverflowError: a method's mistake"),
+        (AssertionError(), "internal error: AssertionError"),
+        (FloatingPointError(), "internal error: FloatingPointError"),
+    ],
+    ids=lambda x: type(x).__name__,
+)
+def test_no_error_with_one_image_ends_the_run(folders, monkeypatch, planted, words):
+    compare = methods.compare
+
+    def fail(method, one, two, **options):
+        if one[0].path.name == "same.exr":
+            raise planted
+        return compare(method, one, two, **options)
+
+    monkeypatch.setattr(methods, "compare", fail)
+    results = diff.diff(*folders)
+    assert (found(results)["same.exr"], found(results)["inner/changed.exr"][0]) == (("error", "unknown"), "different")
+    assert (results.exit_code, len(results.results)) == (2, 4)
+    (error,) = [result.error for result in results.of(Status.ERROR)]
+    assert error.startswith(f"{folders[1] / 'same.exr'}: {words}")
+    assert "\n" not in error
+
+
+@pytest.mark.parametrize("spp", [float("inf"), float("nan"), (4, 5, 6), (1.0, 2.0, 3.0), "many", -4, 1, 1e30, 2.5])
+def test_a_header_may_say_anything_of_its_samples(tmp_path, spp):
+    for side in ("old", "new"):
+        image(tmp_path / side / "same.exr")
+        path = tmp_path / side / "noisy.exr"
+        spec = oiio.ImageSpec(8, 8, 2, "float")
+        spec.channelnames = ("Y", "Y.variance")
+        kind = f"{'int' if type(spp[0]) is int else 'float'}[3]" if isinstance(spp, tuple) else ""
+        spec.attribute("mi_refract:spp", *([kind] if kind else []), spp)
+        output = oiio.ImageOutput.create(str(path))
+        assert output.open(str(path), spec) and output.write_image(np.ones((8, 8, 2), np.float32)) and output.close()
+    results = diff.diff(tmp_path / "old", tmp_path / "new")
+    assert {r.name: str(r.status) for r in results.results} == {"noisy.exr": "error", "same.exr": "equal"}
+    assert "old/noisy.exr: its header names " in results.results[0].error
+
+
+def test_images_larger_than_allowed_are_not_compared(folders):
+    most = 32 * 48 * 3
+    assert not diff.diff(*folders, Settings(How(max_values=most))).of(Status.ERROR)
+    results = diff.diff(*folders, Settings(How(max_values=most - 1)))
+    assert [r.name for r in results.of(Status.ERROR)] == ["inner/changed.exr", "same.exr"]
+    ending = f"changed.exr: 48 × 32 × 3 values; accepted: up to {most - 1} values (max-values)"
+    assert results.of(Status.ERROR)[0].error.endswith(ending)
+    assert results.reproduce(results.results[0]).endswith(f"changed.exr --max-values {most - 1}")
+    with pytest.raises(ValueError, match="max-values"):
+        diff.read_renders(folders[0], most - 1)
+    ruled = Settings(How(max_values=most - 1), rules=(("same.exr", How("exact")),))
+    assert found(diff.diff(*folders, ruled))["same.exr"] == ("error", "unknown")
 
 
 def test_a_folder_inside_without_permission(folders, monkeypatch):

@@ -56,6 +56,29 @@ def roles(text):
     return re.findall('data-role="([^"]*)" data-paint="([^"]*)"', text)
 
 
+def test_an_image_that_cannot_be_shown_keeps_no_other_from_being_shown(tmp_path, monkeypatch):
+    panes = html_report._panes
+
+    def fail(result):
+        if result.name == EVIL:
+            raise MemoryError("Unable to allocate 9 GiB")
+        return panes(result)
+
+    monkeypatch.setattr(html_report, "_panes", fail)
+    text = html(tmp_path)
+    assert "Cannot be shown: out of memory: Unable to allocate 9 GiB" in text
+    assert dict(roles(text)).keys() == {"test", "reference"}  # of the one that cannot be compared, and of the removed
+
+
+def test_an_image_that_is_larger_than_allowed_is_not_read_for_the_page(tmp_path):
+    image(tmp_path / "old" / "same.exr", 0.5)
+    for side in ("old", "new"):
+        image(tmp_path / side / "added.exr", 0.5)
+    (tmp_path / "old" / "added.exr").unlink()
+    found = folders.diff(tmp_path / "old", tmp_path / "new", Settings(How(max_values=71)))
+    assert "accepted: up to 71 values (max-values)" in html(tmp_path, found)
+
+
 # The text
 
 
@@ -123,7 +146,7 @@ def test_every_file_is_read_once_and_flip_runs_once_for_verdict_and_page(tmp_pat
     reads, runs = [], []
     read, flip_map = image_file.read, flip.flip_map
     for module, name in ((image_file, "read"), (html_report, "read")):
-        monkeypatch.setattr(module, name, lambda path: reads.append(path) or read(path))
+        monkeypatch.setattr(module, name, lambda path, *most: reads.append(path) or read(path, *most))
     monkeypatch.setattr(flip, "flip_map", lambda *sides: runs.append(sides) or flip_map(*sides))
     settings = Settings(How(method))
     whole = html(tmp_path, folders.diff(*sides, settings, maps=True))

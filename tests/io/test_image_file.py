@@ -136,6 +136,40 @@ def test_bad_files_are_one_line_that_names_them(tmp_path, name):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("name", ["a.exr", "a.png", "a.tif", "a.gif", "a.jp2", "a.jxl", "jp2 as.png", "gif as.exr"])
+def test_the_size_is_asked_of_the_header(tmp_path, name):
+    """Of a file that ends after its header: what is read of the rest would be an error of its own."""
+    side = 592  # more than 1 MiB, in which OpenImageIO counts
+    path = tmp_path / f"a.{name[:3]}" if " " in name else tmp_path / name
+    save(path, np.zeros((side, side, 3), np.uint8), "uint8")
+    path = path.rename(tmp_path / name)
+    cut(path, -1 if name == "a.tif" else 0.9)
+    with pytest.raises(ValueError, match=r"\(max-values\)$|not a|Not a") as error:
+        read(path, side * side)
+    assert ("max-values" in str(error.value)) is (" " not in name)
+    assert error.value.args[0].count(str(tmp_path)) == 1
+    with pytest.raises(ValueError, match=r"corrupt|holds an image of format"):
+        read(path)
+
+
+def test_as_many_values_as_are_allowed_are_read(tmp_path):
+    """Of the widest numbers, 2 MiB: OpenImageIO counts bytes."""
+    pixels = np.zeros((300, 300, 3))
+    path = save(tmp_path / "a.tif", pixels, "double")
+    assert read(path, pixels.size).pixels.shape == pixels.shape
+    with pytest.raises(ValueError, match=r"a\.tif: 300 × 300 × 3 values; accepted: up to 269999 values"):
+        read(path, pixels.size - 1)
+
+
+def test_a_limit_of_openimageio_is_left_as_it_was(tmp_path):
+    before = oiio.get_int_attribute("limits:imagesize_MB")
+    read(save(tmp_path / "a.exr", PIXELS))
+    with pytest.raises(ValueError, match="corrupt"):
+        BAD["text.exr"](tmp_path / "a.exr")
+        read(tmp_path / "a.exr")
+    assert oiio.get_int_attribute("limits:imagesize_MB") == before
+
+
 @pytest.mark.parametrize("name, kind", [("a.exr", "float"), ("a.png", "uint8"), ("a.hdr", "float"), ("a.tif", "float")])
 @pytest.mark.parametrize("keep", [0, 6, 0.3, 0.7, 0.97])
 def test_truncated_files(tmp_path, name, kind, keep):
