@@ -19,7 +19,7 @@ def opened(path: str | os.PathLike[str], most: int) -> Iterator[BinaryIO]:
     """
     path = Path(path)
     # A pipe without a writer would block when it is opened.
-    with open(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb") as file:
+    with os.fdopen(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb") as file:
         found = os.fstat(file.fileno())
         if stat.S_ISDIR(found.st_mode):
             raise IsADirectoryError(f"{path}: is a folder; accepted: a file")
