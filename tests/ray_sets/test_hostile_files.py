@@ -276,6 +276,14 @@ def test_more_answers_than_rays_need(tmp_path):
     refused(path, "1099511627776 bytes; accepted", files.read_answers)
 
 
+def test_a_folder_and_a_missing_file(tmp_path):
+    (tmp_path / "a.csv").mkdir()
+    for name in ("a.csv", "b.npz"):
+        with pytest.raises(OSError) as caught:
+            files.read_answers(tmp_path / name)
+        assert caught.value.filename == str(tmp_path / name) or caught.value.filename == tmp_path / name
+
+
 def test_a_pipe_is_refused(tmp_path):
     os.mkfifo(tmp_path / "a.csv")
     (tmp_path / "b.npz").symlink_to("/dev/zero")
