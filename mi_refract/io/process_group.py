@@ -152,9 +152,13 @@ def _written(number: int, rest: memoryview) -> int:
 def _signals_noted() -> Iterator[list[int]]:
     """Signals that would end us are noted meanwhile, and have their effect afterwards. In the main thread only."""
     noted: list[int] = []
-    before = {}
+    before: dict[signal.Signals, Any] = {}
     if threading.current_thread() is threading.main_thread():
-        usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+        usual = {
+            signal.SIGINT: signal.default_int_handler,
+            signal.SIGTERM: signal.SIG_DFL,
+            signal.SIGHUP: signal.SIG_DFL,
+        }
         for number, handler in usual.items():
             if signal.getsignal(number) is handler:
                 before[number] = signal.signal(number, lambda number, frame: noted.append(number))
@@ -163,8 +167,8 @@ def _signals_noted() -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        for number in noted:
-            signal.raise_signal(number)
+        for caught in noted:
+            signal.raise_signal(caught)
 
 
 # Orphans -----------------------------------------------------------------------------------------------------------

@@ -6,7 +6,6 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import BinaryIO
 
 
@@ -17,17 +16,18 @@ def opened(path: str | os.PathLike[str], most: int) -> Iterator[BinaryIO]:
     ValueError for a larger one, or for what is no file: a pipe or a device may never end. OSError where it cannot be
     read.
     """
-    path = Path(path)
-    # A pipe without a writer would block when it is opened.
-    with open(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb") as file:
+    with open(path, "rb", opener=_without_waiting) as file:
         found = os.fstat(file.fileno())
-        if stat.S_ISDIR(found.st_mode):
-            raise IsADirectoryError(f"{path}: is a folder; accepted: a file")
         if not stat.S_ISREG(found.st_mode):
             raise ValueError(f"{path}: is a pipe or a device; accepted: a file")
         if found.st_size > most:
             raise ValueError(f"{path}: {found.st_size} bytes; accepted: up to {most}")
         yield file
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    """A pipe without a writer would block when it is opened."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def read_bytes(path: str | os.PathLike[str], most: int) -> bytes:

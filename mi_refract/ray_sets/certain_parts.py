@@ -64,7 +64,7 @@ def possible_mirror(b: np.ndarray, bounds: RayBounds, some: np.ndarray) -> np.nd
 
 
 def _within(off: np.ndarray, forward: np.ndarray, size: np.ndarray, slack: np.ndarray) -> np.ndarray:
-    """Whether a vector of this size is no farther than `slack` from the line of b, and b does not point away from it."""
+    """Whether a vector of this size is within `slack` of the line of b, and b does not point away from it."""
     return (size <= slack) | (off <= slack) & (forward > 0)
 
 

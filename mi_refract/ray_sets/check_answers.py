@@ -16,8 +16,8 @@ import numpy as np
 from mi_refract.formulas import FORMULAS
 
 from .diagnosis import Explanation, explain
-from .judged_answers import JudgedAnswers, judge_answers
 from .header import Header, shown
+from .judged_answers import JudgedAnswers, judge_answers
 from .ray_set import Answers, RaySet
 from .tir_signal import AUTO, FLAG, LOOSEST, TIR, UNCLEAR
 
@@ -55,7 +55,14 @@ class Problem:
 
 
 # Each kind of problem, and whether the answers are then not those to the rays.
-PROBLEMS = {"missing": True, "duplicate": True, "unknown": True, "non-finite": False, "zero": False, "impossible": False}
+PROBLEMS = {
+    "missing": True,
+    "duplicate": True,
+    "unknown": True,
+    "non-finite": False,
+    "zero": False,
+    "impossible": False,
+}
 
 
 @dataclass(frozen=True)
@@ -190,9 +197,9 @@ def _regime_errors(name: str, ids: np.ndarray, judged: JudgedAnswers, index: np.
     verdict = judged.verdict
     compared = index[verdict.compared[index]]
     angle, length = (x[compared] if len(compared) else np.full(1, np.nan) for x in (verdict.angle, verdict.drift))
-    worst = index[np.lexsort(
-        (verdict.share[index], judged.impossible[index], verdict.far[index], verdict.blank[index])
-    )[-1]]
+    worst = index[
+        np.lexsort((verdict.share[index], judged.impossible[index], verdict.far[index], verdict.blank[index]))[-1]
+    ]
     return RegimeErrors(
         name,
         len(index),

@@ -67,9 +67,7 @@ def judge_answers(
     return JudgedAnswers(b, rounded, tir, verdict, _impossible(seen, reflected, tir, verdict))
 
 
-def _impossible(
-    seen: tir_signal.SeenAnswers, reflected: np.ndarray, tir: str, verdict: Judgement
-) -> np.ndarray:
+def _impossible(seen: tir_signal.SeenAnswers, reflected: np.ndarray, tir: str, verdict: Judgement) -> np.ndarray:
     """(N,) of the directions that `verdict` does not compare, or under a wide bound only, those that cannot be."""
     excused = ~verdict.compared | (verdict.bounds.chord > certain_parts.UNDECIDABLE)
     asked = seen.is_direction & excused & ~seen.exact.undecided

@@ -86,6 +86,10 @@ def _described(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np
     if version not in _HEADERS:
         raise ValueError(f"{name} is in version {version} of NumPy's format")
     shape, _, dtype = _HEADERS[version](head)
-    if dtype.hasobject or head.tell() + math.prod(shape) * dtype.itemsize != info.file_size or min(shape, default=0) < 0:
+    if (
+        dtype.hasobject
+        or head.tell() + math.prod(shape) * dtype.itemsize != info.file_size
+        or min(shape, default=0) < 0
+    ):
         raise ValueError(f"{name} is said to hold {shape} of {dtype}, which is not what the file has")
     return shape, dtype

@@ -45,8 +45,8 @@ TERMS = {
     "ulp": "the spacing of numbers at 1: 2⁻²³ in f32, 2⁻⁵² in f64",
     "worst, p99, mean": "angles to the certified direction, over the rays whose total internal reflection was "
     "classified correctly; rounding the exact answer costs up to 0.43 ulp",
-    "undecidable": "rays whose error bound is above 0.1 rad, where a direction within it shows nothing: of these, all that "
-    "is judged is the plane of incidence, the side of the surface, and what is forward",
+    "undecidable": "rays whose error bound is above 0.1 rad, where a direction within it shows little: all that "
+    "is judged there is the plane of incidence, the side of the surface, and what is forward",
     "TIR misclassified": "rays that were called transmitted and are totally reflected, or the reverse",
     "TIR beyond bound": "those of them that are farther from the critical angle than rounding can explain",
     "length error": "the difference between the length of an answer and 1, or the length of a where that is nearer",
@@ -70,8 +70,8 @@ PROBLEM_TEXTS = {
     "unknown": "{} answers to rays that are not in the set",
     "non-finite": "{} answers are NaN or infinite where that is no signal",
     "zero": "{} answers are the zero vector where that is no signal",
-    "impossible": "{} answers are outside the plane of incidence, or on the wrong side of the surface, by more than the "
-    "rounding of any documented formula explains",
+    "impossible": "{} answers are outside the plane of incidence, or on the wrong side of the surface, by more than "
+    "the rounding of any documented formula explains",
 }
 
 

@@ -17,7 +17,8 @@ AUTO, FLAG = "auto", "flag"
 NONE, UNCLEAR = "none", "unclear"
 # The documented formula with the largest error bound.
 LOOSEST = max(FORMULAS, key=lambda name: (FORMULAS[name].budget.growth, FORMULAS[name].budget.radicand))
-# Beyond this radicand, and its error bound, a ray is totally reflected in any arithmetic. This share of those rays must agree on a signal.
+# Beyond this radicand, and its error bound, a ray is totally reflected in any arithmetic.
+# This share of those rays must agree on a signal.
 CERTAIN, AGREEING = 1e-3, 0.9
 # In u: a cosine below this is that of a ray along the surface.
 ALONG = 8.0

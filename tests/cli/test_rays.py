@@ -207,6 +207,8 @@ BAD_OPTIONS = {
         ("run", "--rays", "r.csv", "--count", "5", "--", "true"),
         "--rays r.csv and --count: both choose the rays",
     ),
+    "a time that is none": (("run", "--timeout", "nan", "--", "true"), "--timeout"),
+    "a time without end": (("run", "--timeout", "inf", "--", "true"), "--timeout inf: accepted"),
     "nothing": ((), "Missing command"),
 }
 
@@ -249,6 +251,7 @@ BAD_PROGRAMS = {
     "a status": ("import sys; sys.stdin.read(); print('id,bx,by,bz'); sys.exit(3)", "ended with status 3; accepted"),
     "a signal": ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "was killed by SIGSEGV; accepted"),
     "nothing": ("pass", "the table is empty"),
+    "without end": ("while True: print('id,bx,by,bz' * 1000)", "bytes of output; accepted: one answer a ray"),
     "a remark": ("print('hello'); print('id,bx,by,bz')", "the first row is 'hello'"),
     "bytes": ("import os; os.write(1, bytes(range(256)))", "not text"),
 }
@@ -323,6 +326,15 @@ def test_what_a_program_leaves_behind_is_ended(tmp_path):
     command = parent(tmp_path / "child", rest, stdin="DEVNULL", stdout="DEVNULL")
     assert len(run_program.answers_of(command, ray_set.make(["generic"], 3)).ids) == 0
     assert_ended(tmp_path / "child")
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux lets us adopt orphans")
+def test_what_left_its_group_is_ended_too(call, tmp_path):
+    rest = f"while not os.path.exists({str(tmp_path / 'child')!r}):\n    time.sleep(0.01)\nprint('id,bx,by,bz')"
+    command = parent(tmp_path / "child", rest, stdin="DEVNULL", stdout="DEVNULL")
+    command[-1] = command[-1].replace("stdin=", "start_new_session=True, stdin=")
+    assert call("run", *FEW, "--", *command)[0] == 2
+    assert not alive(int((tmp_path / "child").read_text()))
 
 
 def test_rays_and_answers_larger_than_a_pipe(tmp_path):

@@ -43,7 +43,9 @@ def tangent(a, n):
 
 
 GARBAGE = {
-    "a random direction along the surface": lambda rng, a, n, b: turned(tangent(a, n), n, rng.uniform(0.5, 5, (len(a), 1))),
+    "a random direction along the surface": lambda rng, a, n, b: turned(
+        tangent(a, n), n, rng.uniform(0.5, 5, (len(a), 1))
+    ),
     "a random direction": lambda rng, a, n, b: unit(rng.normal(size=a.shape)),
     "backward along the surface": lambda rng, a, n, b: -tangent(a, n),
     "turned about the normal": lambda rng, a, n, b: turned(b, n, 0.5),
@@ -69,7 +71,7 @@ def test_garbage_does_not_pass_where_the_bound_is_beyond_a_half_turn(tir, garbag
 @pytest.mark.parametrize("tir", GOOD)
 @pytest.mark.parametrize("made_unit", [False, True])
 def test_the_textbook_passes_there_at_any_length(tir, made_unit):
-    to, exact, lost = steep()
+    to = steep()[0]
     b = answers(GOOD[tir])
     if made_unit:
         b = np.where(b.any(1, keepdims=True), unit(np.where(b.any(1, keepdims=True), b, 1)), 0)
@@ -78,7 +80,7 @@ def test_the_textbook_passes_there_at_any_length(tir, made_unit):
 
 
 def test_undecidable_rays_are_counted():
-    to, exact, lost = steep()
+    to, _, lost = steep()
     found = check(to, Answers(to.ids, answers(glsl)))
     steep_, generic = found.regimes
     assert (generic.undecidable, generic.judged) == (0, generic.compared)
@@ -99,7 +101,7 @@ def test_undecidable_rays_alone_are_no_pass():
 
 @pytest.mark.parametrize("tir", ["reflected", "tangent"])
 def test_a_direction_that_signals_total_reflection_is_in_the_plane_of_incidence(tir):
-    """A tangent turned about the normal; and a mirror direction in place of a transmitted one near the critical angle."""
+    """Tangents and mirror directions turned about the normal, next to the critical angle."""
     to = ray_set.make(("critical, to the ulp",), 200, "f64", 4)
     exact = oracle.refract(to.rays.a, to.rays.n, to.rays.k, fresnel=False, progress=False)
     a, n = to.rays.a, to.rays.n

@@ -348,7 +348,7 @@ def test_the_default_bound_is_the_loosest():
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_vectors_off_unit_excuse_no_more_than_making_them_unit_costs(precision):
-    """1000 u across the plane of incidence, where three roundoffs of the vectors allow 10 · 3 u and less than 14 · 3 u."""
+    """1000 u across the plane of incidence, where 3 u of the vectors allow 10 · 3 u and less than 14 · 3 u k²."""
     to, (found, answers) = some(precision, ("lengths",)), exact(precision, ("lengths",))
     rows = np.flatnonzero(found.transmitted & (to.rays.k < 2) & (found.cos_t > 0.5))
     across = np.cross(answers.b[rows], to.rays.n[rows])
@@ -368,12 +368,17 @@ def test_next_to_the_surface_total_reflection_is_decided_all_the_same(precision,
     near = 1e-4 if precision == "f64" else 4e-3  # cos θ_t: its square is the radicand
     cases = [  # θ_i, k
         *[(sin, -c, 0.5), (sin, -c, 1.5)],  # grazing: transmitted, reflected
-        *[(np.sqrt(1 - near**2) / 1.5, None, 1.5), (np.sqrt(1 + near**2) / 1.5, None, 1.5)],  # next to the critical angle
+        *[
+            (np.sqrt(1 - near**2) / 1.5, None, 1.5),
+            (np.sqrt(1 + near**2) / 1.5, None, 1.5),
+        ],  # next to the critical angle
     ]
     a = np.array([[s, 0, z if z is not None else -np.sqrt(1 - s * s)] for s, z, _ in cases]).astype(dtype)
     n, k = np.tile(np.array([[0, 0, 1]], dtype), (4, 1)), np.array([x[2] for x in cases], dtype)
     rays = Rays(a, n, k)
-    to = RaySet(rays, np.arange(4), np.full(4, "x", object), {"precision": precision, "regimes": {"x": [0, 3]}, "checksum": ""})
+    to = RaySet(
+        rays, np.arange(4), np.full(4, "x", object), {"precision": precision, "regimes": {"x": [0, 3]}, "checksum": ""}
+    )
     certified = oracle.refract(a, n, k, fresnel=False, progress=False)
     assert certified.transmitted.tolist() == [True, False, True, False]
     assert near**2 > 2 * 14 * u * 1.5**2

@@ -43,7 +43,10 @@ def refused(path, message, read=files.read):
 # Headers
 
 HEADERS = {
-    "three rays unjudged": ({"regimes": {"generic": [0, 0]}, "count": 1}, "the header is of 1 × 1 rays, the file has 4"),
+    "three rays unjudged": (
+        {"regimes": {"generic": [0, 0]}, "count": 1},
+        "the header is of 1 × 1 rays, the file has 4",
+    ),
     "a gap": ({"regimes": {"generic": [0, 0], "critical": [2, 3]}}, "regime 'generic' has the ids [0, 0]"),
     "two at once": ({"regimes": {"generic": [0, 1], "critical": [1, 2]}}, "regime 'critical' has the ids [1, 2]"),
     "backward": ({"regimes": {"generic": [2, 3], "critical": [0, 1]}}, "regime 'generic' has the ids [2, 3]"),
@@ -95,7 +98,13 @@ def test_json_of_any_depth(tmp_path, four, ending, text):
     if ending == "csv":
         path.write_text(files.as_csv(four).replace('{"generic"', text + '{"generic"'))
     elif ending == "npz":
-        split = {"id": four.ids, "a": columns[:, 1:4], "n": columns[:, 4:7], "n_from": columns[:, 7], "n_to": columns[:, 8]}
+        split = {
+            "id": four.ids,
+            "a": columns[:, 1:4],
+            "n": columns[:, 4:7],
+            "n_from": columns[:, 7],
+            "n_to": columns[:, 8],
+        }
         np.savez(path, **split, header=np.array(text))
     else:
         image_file.write_exr(path, columns[None], files.COLUMNS, {"mi_refract:rays": text})
@@ -267,8 +276,16 @@ def test_more_answers_than_rays_need(tmp_path):
     refused(path, "1099511627776 bytes; accepted", files.read_answers)
 
 
+def test_a_folder_and_a_missing_file(tmp_path):
+    (tmp_path / "a.csv").mkdir()
+    for name in ("a.csv", "b.npz"):
+        with pytest.raises(OSError) as caught:
+            files.read_answers(tmp_path / name)
+        assert caught.value.filename == str(tmp_path / name) or caught.value.filename == tmp_path / name
+
+
 def test_a_pipe_is_refused(tmp_path):
     os.mkfifo(tmp_path / "a.csv")
-    os.symlink("/dev/zero", tmp_path / "b.npz")
+    (tmp_path / "b.npz").symlink_to("/dev/zero")
     for name in ("a.csv", "b.npz"):
         refused(tmp_path / name, "is a pipe or a device; accepted: a file", files.read_answers)

@@ -127,7 +127,7 @@ def run(command: Sequence[str], given: str = "", timeout: float | None = None, w
     limit = TIMEOUT if timeout is None else timeout
     try:
         ended = process_group.run(command, given.encode(), limit, keep_stderr=True, cwd=where, env=own)
-    except TimeoutError as error:
+    except (TimeoutError, process_group.TooMuchOutputError) as error:
         raise Broken(str(error)) from None
     except OSError as error:
         raise Broken(f"{command[0]}: {error.strerror}") from None
