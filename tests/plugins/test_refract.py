@@ -203,6 +203,33 @@ def test_textures_are_traversed_and_tint_their_lobe_only(typical_variant):
     assert transmitted == pytest.approx(1)
 
 
+def test_attributes_of_a_texture_are_its_colour(scalar_variant):
+    colour = [0.2, 0.5, 0.8]
+    bsdf, si = load(specular_reflectance={"type": "rgb", "value": colour}), interaction((0, 0, 1))
+    assert vector(bsdf.eval_attribute_3("specular_reflectance", si)) == pytest.approx(colour)
+    assert vector(bsdf.eval_attribute("specular_reflectance", si)) == pytest.approx(colour)
+    assert number(load(specular_reflectance=0.4).eval_attribute_1("specular_reflectance", si)) == pytest.approx(0.4)
+    for evaluate in (bsdf.eval_attribute, bsdf.eval_attribute_1, bsdf.eval_attribute_3):
+        with pytest.raises(RuntimeError, match=r"no attribute 'roughness'; it has eta, specular_reflectance"):
+            evaluate("roughness", si)
+
+
+@pytest.mark.parametrize(("keys", "eta"), [([], 1.25), (["eta"], 1.25), (["specular_reflectance"], 1.5)])
+def test_a_change_without_keys_may_be_of_anything(scalar_variant, keys, eta):
+    bsdf = load(int_ior=1.5, ext_ior=1)
+    bsdf.eta = dr.scalar.Array1f(1.25)  # as Mitsuba sets it
+    bsdf.parameters_changed(keys)
+    assert number(sample(bsdf, (0.6, 0, 0.8), 0.9)[0].eta) == eta
+
+
+@pytest.mark.parametrize("sample1", [0.0, 0.9])
+def test_a_sample_that_is_not_asked_for_has_no_weight(scalar_variant, sample1):
+    si, context = interaction((0, 0, 1)), mi.BSDFContext()
+    for bsdf in (load(), tinted()):
+        weights = [bsdf.sample(context, si, sample1, [0, 0], active)[1] for active in (False, True)]
+        assert [np.array(weight).any() for weight in weights] == [False, True]
+
+
 def test_nothing_reflects_where_nothing_differs(typical_variant):
     """Index-matched, and the sample that is exactly 0: the built-in reflects with density 0 there."""
     bsdf = load(int_ior=1.3, ext_ior=1.3)

@@ -2,12 +2,13 @@
 
 import dataclasses
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from support.variants import switch
 
-from mi_refract.plugins.scene_features import inspect
+from mi_refract.plugins.scene_features import EITHER, inspect
 from validation.run.context import SCENES
 
 GLASS_ONLY = {"balls", "fibre", "furnace", "glasses64", "lightpipe", "mirage", "slab"}
@@ -60,6 +61,58 @@ MEDIUM = {"type": "homogeneous"}
 def test_each_part_adds_what_it_needs_and_no_more(part, seen, scalar_variant):
     expected = {"polarising"} | seen | (set() if "smooth" in seen else {"only_glass"})
     assert facts(part=part) == expected
+
+
+def test_a_lamp_with_the_weight_0_is_never_sampled(scalar_variant):
+    """Beside a constant sky, which is not sampled either, it is met by the BSDFs' own samples only."""
+    lamp = LAMP | {"emitter": {"type": "area", "sampling_weight": 0.0}}
+    expected = {"only_glass", "polarising", "sampleable", "area", "environment", "plain_environment"}
+    assert facts(sky={"type": "constant"}, lamp=lamp) == expected
+    assert facts(sky={"type": "constant"}, lamp=LAMP) == expected | {"lamps"}
+
+
+ONE_NUMBER = {
+    "Null": {"type": "null"},
+    "Refract": {"type": "refract"},
+    "RoughConductor": {"type": "roughconductor"},
+    "SmoothConductor": {"type": "conductor"},
+    "SmoothDielectric": {"type": "dielectric"},
+    "SmoothDiffuse": {"type": "diffuse"},
+    "ThinDielectric": {"type": "thindielectric"},
+    "TwoSidedBRDF": {"type": "twosided", "nested": {"type": "diffuse"}},
+}
+BOTH_NUMBERS = {
+    "Hair": {"type": "hair"},
+    "PolarizedPlastic": {"type": "pplastic"},
+    "Principled": {"type": "principled", "metallic": 0.5, "spec_trans": 0.5},
+    "PrincipledThin": {"type": "principledthin", "spec_trans": 0.5, "diff_trans": 1.0},
+    "RoughDielectric": {"type": "roughdielectric"},
+    "RoughPlastic": {"type": "roughplastic"},
+    "SmoothPlastic": {"type": "plastic"},
+}
+
+
+def numbers_asked(bsdf):
+    """Which of `sample1` and `sample2` a BSDF's sample depends on, tried on a grid."""
+    si, grid = dr.zeros(mi.SurfaceInteraction3f), (np.arange(16) + 0.5) / 16
+    si.wi = mi.Vector3f(0.36, 0.48, 0.8)
+
+    def several(numbers):
+        found = [bsdf.sample(mi.BSDFContext(), si, *pair)[0] for pair in numbers]
+        return len({(bs.wo.x, bs.wo.y, bs.wo.z, bs.pdf) for bs in found}) > 1
+
+    asked = {1} if several((x, [0.3, 0.6]) for x in grid) else set()
+    return asked | ({2} if several((0.3, [x, 1 - x]) for x in grid) else set())
+
+
+def test_plugins_that_take_either_number_have_been_tried(scalar_variant):
+    """`measured`, which needs a file, has not been."""
+    assert set(ONE_NUMBER) == EITHER
+    for name, bsdf in (ONE_NUMBER | BOTH_NUMBERS).items():
+        loaded, both = mi.load_dict(bsdf), name in BOTH_NUMBERS
+        assert name in (loaded.class_name(), type(loaded).__name__)
+        assert (numbers_asked(loaded) == {1, 2}) == both, name
+        assert ("both_numbers" in facts(part={"type": "sphere", "bsdf": bsdf})) == both, name
 
 
 EVERYTHING = {"both_numbers", "smooth", "null", "textured", "polarising", "dispersive"}
