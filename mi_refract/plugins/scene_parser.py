@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 from mi_refract.formulas import FORMULAS
 
@@ -87,7 +88,29 @@ def load(path: Path, defines: Mapping[str, str], allowed: Collection[str] = ()) 
         state = parse(path, config, defines)
         check_plugins(path, (node.props.plugin_name() for node in state.nodes), allowed)
         inside.prepend(str(own_folder()))  # before every <path>
+        for file in {node.props["filename"] for node in state.nodes if _is_mesh(node.props)}:
+            check_faces(resolved(file, [path.parent, *(Path(str(folder)) for folder in inside)]))
         return mi.parser.instantiate(config, state)
+
+
+def _is_mesh(props: Any) -> bool:
+    return props.plugin_name() == "ply" and isinstance(props.get("filename", None), str)
+
+
+def check_faces(path: Path) -> None:
+    """ValueError for a PLY file with a face that names a vertex which the file does not have.
+
+    Mitsuba writes the normals of such vertices somewhere into memory. Other errors are left to the loading itself.
+    """
+    try:
+        mesh = mi.load_dict({"type": "ply", "filename": str(path.absolute()), "face_normals": True})
+    except RuntimeError:
+        return
+    faces, count = np.array(mesh.faces_buffer()), mesh.vertex_count()
+    if faces.size and faces.max() >= count:
+        raise ValueError(
+            f"{path}: vertex {faces.max()} of a face; accepted: 0 to {count - 1}, the vertices of the file"
+        )
 
 
 def check_plugins(path: Path, names: Any, allowed: Collection[str]) -> None:

@@ -110,6 +110,8 @@ def _from_file(shape: Node) -> Triangles:
     path, flat = shape.scene.resolve(shape.value(str, "filename")), shape.value(bool, "face_normals", False)
     try:
         with scene_parser.folders(scene_parser.own_folder()):
+            if shape.type == "ply":
+                scene_parser.check_faces(path)
             mesh = mi.load_dict({"type": shape.type, "filename": str(path.absolute()), "face_normals": flat})
     except RuntimeError as error:
         raise shape.error(f"{path}: {error}", "a mesh that Mitsuba reads") from None
@@ -117,8 +119,6 @@ def _from_file(shape: Node) -> Triangles:
         raise shape.error("smooth normals", "face_normals = true")
     vertices = np.array(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)
     faces = np.array(mesh.faces_buffer(), np.int64).reshape(-1, 3)
-    if faces.size and faces.max() >= len(vertices):
-        raise shape.error(f"{path}: vertex {faces.max()} of a face", f"0 to {len(vertices) - 1}, the vertices it has")
     return vertices, faces
 
 

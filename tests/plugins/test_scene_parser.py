@@ -129,6 +129,21 @@ def test_the_search_path_is_as_before(load):
     assert [str(folder) for folder in mi.file_resolver()] == before
 
 
+@pytest.mark.parametrize("last", [3, 10**9])
+def test_a_face_without_its_vertices_is_refused(last, load, tmp_path):
+    """Mitsuba writes a normal for each vertex of a face, wherever that is, unless all faces are flat."""
+    head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n"
+    mesh = tmp_path / "more" / "m.ply"
+    mesh.parent.mkdir()
+    mesh.write_text(f"{head}3 0 1 2\n")
+    scene = f'{SENSOR}<path value="more"/><shape type="ply"><string name="filename" value="m.ply"/></shape>'
+    assert len(load(scene).shapes()) == 1
+    mesh.write_text(f"{head}3 0 1 {last}\n")
+    with pytest.raises(ValueError, match=rf"m\.ply: vertex {last} of a face; accepted: 0 to 2, the vertices"):
+        load(scene)
+
+
 # Limits -----------------------------------------------------------------------------------------------------------
 
 
