@@ -115,8 +115,8 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
     from mi_refract.report import run_report
     from validation.run.context import Context, profiles
 
-    from . import runner
-    from .run import headline, seeds, tightness
+    from . import repeated, runner
+    from .run import headline, tightness
 
     start = time.perf_counter()
     variant = backend.activate(may_restart=True)
@@ -125,7 +125,7 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
     chosen = profiles(variant)[profile]
     context = Context(chosen, out, variant, backend.detect(), backend.usable_variants())
     studies: list[Study] = [import_module(f"validation.{name}").STUDY for name in modules(names, profile)]
-    work = [task for study in studies for task in (*study.tasks(context), *seeds.tasks(study, context))]
+    work = [task for study in studies for task in (*study.tasks(context), *repeated.tasks(study, context))]
     rows, spent = runner.run(work, context)
     for study in studies:
         rows = study.summarise(rows)

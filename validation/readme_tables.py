@@ -224,8 +224,8 @@ def planar(rows: list[Row]) -> str:
 
 
 PLANAR_TEXT = (
-    "Largest distance from an independent retrace, over the scene's extent, on LLVM; and in float32 the error that comes\n"
-    "nearest to its bound, at one point of one path, with the bound there."
+    "Largest distance from an independent retrace, over the scene's extent, on LLVM; and in float32 the error that\n"
+    "comes nearest to its bound, at one point of one path, with the bound there."
 )
 
 
@@ -298,9 +298,9 @@ def suite(rows: list[Row]) -> str:
     checks = [check for each in matrix.CHECKS.values() for check in each]
     lines = [[system, *(_off(found.get(check)) for check in checks)] for system, found in cells.items()]
     text = (
-        "Rays: radians; images: share of the mean. ✓: every ray within its bound; ✗: a bound is broken, and the run fails."
-        f"\nTo be within a factor of {limits.RECORDED:g} of the error recorded earlier is a goal: what misses it says "
-        '"× recorded",\nand fails nothing.'
+        "Rays: radians; images: share of the mean. ✓: every ray within its bound; ✗: a bound is broken, and the run "
+        f"fails.\nTo be within a factor of {limits.RECORDED:g} of the error recorded earlier is a goal: what misses it "
+        'says\n"× recorded", and fails nothing.'
     )
     return _table(text, ["", *checks], lines)
 

@@ -29,7 +29,7 @@ class Study:
     `tasks(context)` lists what is to be run. `axes` says what the curves of its rows are drawn over, `scatter` which
     metric is plotted against which (both as `mi_refract.report.study_page` describes them). `summarise(rows)` returns
     all rows of a run with the summary of this study among them. `again(context)`, of a study whose answer rests on
-    random draws, gives the rows that they decide (no times, no images), for `validation.run.seeds` to repeat.
+    random draws, gives the rows that they decide (no times, no images), for `validation.repeated` to repeat.
     """
 
     name: str

@@ -79,6 +79,16 @@ def test_the_worst_that_was_found(setting):
     assert amplitude <= 8
 
 
+@pytest.mark.parametrize("cos_i", [0.02, 0.5])
+def test_a_refracted_cosine_that_underflowed_to_0_reflects_all(cos_i, setting):
+    """A transmitted ray with cosθt = 0 and k = 1: without the least share of `_through` both powers are 0/0."""
+    number = float if setting.backend == "scalar" else dr.value_t(setting.vector)
+    transmitted = True if number is float else dr.mask_t(number)(True)
+    r, t = fresnel.powers(number(cos_i), number(0.0), transmitted, number(1.0))
+    assert np.array(r).ravel().tolist() == [1.0]
+    assert np.array(t).ravel().tolist() == [0.0]
+
+
 def textbook(cos_i, k):
     """(r_s, r_p) as printed in books, with the square root on the branch of a decaying wave, at 400 bits."""
     with ctx.workprec(400):

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from support.planar_scenes import SLAB, ball, beam, polygon, scene
 
-from mi_refract.planar import Event, path_tree
+from mi_refract.backend import detect
+from mi_refract.planar import Event, Segments, path_tree, trace
 from mi_refract.planar.path_tree import as_data, count, follow, follow_scene, summary, with_rays
+from mi_refract.planar.paths import REFLECT_BITS
 
 OBLIQUE = math.cos(0.6), math.sin(0.6)
 
@@ -163,3 +165,34 @@ def test_more_rays_lie_between_those_of_the_beam():
     np.testing.assert_allclose(more.directions[5], [0, -1], atol=1e-15)
     angles = np.degrees(np.arctan2(*more.directions[6:].T[::-1])) % 360
     np.testing.assert_allclose(angles, [170, 180, 190, 200, 210])
+
+
+# More boundaries than bits ---------------------------------------------------------------------------------------
+
+
+def slabs(boundaries):
+    """Parallel walls at x = 0, 1, 2, …, between air and a thin glass in turn."""
+    x, far = np.arange(boundaries, dtype=float), np.full(boundaries, 1e4)
+    even = np.arange(boundaries) % 2 == 0
+    # Walls run upwards: their left is the side of smaller x.
+    walls = np.column_stack([x, -far]), np.column_stack([x, far])
+    return Segments(*walls, np.where(even, 1.0, 1.1), np.where(even, 1.1, 1.0))
+
+
+def test_only_the_boundaries_that_have_a_bit_reflect_in_part():
+    """Of 40 boundaries the first 32: each reflection has a bit of its own, and no path is there twice."""
+    found = follow(slabs(40), np.array([[-1.0, 0]]), np.array([OBLIQUE]), 80, 1, least=0.0, backend="scalar")
+    assert found.paths.events[0].tolist().count(Event.REFRACTED) == 40
+    assert sorted(found.reflect.tolist()) == [0, *(1 << j for j in range(REFLECT_BITS))]
+
+
+@pytest.mark.parametrize("backend", ["scalar", "llvm"])
+def test_the_last_bit_is_that_of_one_boundary(backend):
+    """Reflected at the 32nd boundary, a ray refracts at all that it meets on its way back."""
+    if backend != "scalar" and not detect()[backend].usable:
+        pytest.skip(detect()[backend].reason)
+    asked = np.array([0, 1 << (REFLECT_BITS - 1)])
+    paths = trace(slabs(40), [(-1.0, 0)] * 2, [OBLIQUE] * 2, 80, reflect=asked, backend=backend)
+    assert np.flatnonzero(paths.events[1] == Event.REFLECTED).tolist() == [REFLECT_BITS - 1]
+    assert (paths.events[1] == Event.REFRACTED).sum() == 2 * (REFLECT_BITS - 1)
+    assert (paths.events == Event.ESCAPED).sum(1).tolist() == [1, 1]

@@ -10,6 +10,7 @@ import pytest
 import validation.__main__ as command
 from mi_refract import backend
 from mi_refract.report.row import Row
+from validation import repeated
 from validation.run import seeds, tightness
 from validation.run.context import SCALAR_PROFILES, Context
 from validation.study import Study
@@ -55,7 +56,7 @@ def study(again):
 def test_a_bound_that_only_its_own_seed_holds_fails(profile, count, tmp_path):
     context = replace(HERE, profile=SCALAR_PROFILES[profile], out=tmp_path)
     assert drawn(context)[0].verdict == "pass"
-    tasks = seeds.tasks(study(drawn), context)
+    tasks = repeated.tasks(study(drawn), context)
     assert len({task.name for task in tasks}) == len(tasks) == count
     for task in tasks:
         summary, broken = task.run()
@@ -67,7 +68,7 @@ def test_a_bound_that_only_its_own_seed_holds_fails(profile, count, tmp_path):
 
 def test_a_repetition_that_checks_nothing_fails():
     nothing = study(lambda context: [Row("s", "x", "y", "", {"error": 1.0})])
-    assert seeds.rows_of(nothing, HERE, 1)[0].broken == {"nothing checked": 0.0}
+    assert repeated.rows_of(nothing, HERE, 1)[0].broken == {"nothing checked": 0.0}
 
 
 def test_what_is_drawn_is_kept_by_seed():
@@ -81,7 +82,7 @@ def test_what_is_drawn_is_kept_by_seed():
 
 @pytest.mark.parametrize(("value", "bound", "share"), [(0, 0, 0), (1, 0, np.inf), (np.nan, 0, np.nan), (1, 4, 0.25)])
 def test_shares_of_bounds(value, bound, share):
-    assert seeds.share(float(value), float(bound)) == pytest.approx(share, nan_ok=True)
+    assert repeated.share(float(value), float(bound)) == pytest.approx(share, nan_ok=True)
 
 
 def bounded(subject, case, value, bound=1.0, study="energy", metric="error"):

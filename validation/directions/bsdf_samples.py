@@ -15,7 +15,7 @@ import numpy as np
 
 from mi_refract.formulas import ROUNDING, cancelling
 from mi_refract.report.row import Row
-from validation import limits
+from validation import limits, repeated
 from validation.run import seeds
 from validation.run.bsdf_sampling import sample_all
 from validation.run.context import Context
@@ -116,8 +116,8 @@ def bounds(wi: np.ndarray) -> dict[str, np.ndarray]:
         |δR| ≤ 2kcρ [1/(kc + y')² + 1/(c + ky')²] + 16u,
 
     as |∂T_s/∂y| ≤ 4kc/(kc + y)², likewise T_p. Each built-in amplitude is a quotient of two sums, 5u, its square 11u,
-    their mean 12u; `refract`'s R is right to u; |wi| is 1 to u, and |∂R/∂ log c| ≤ 1; 1 − R is rounded: 16u. A weight is
-    that, or a constant, times at most 1 or k², of which either plugin rounds 2.5 factors: 5u.
+    their mean 12u; `refract`'s R is right to u; |wi| is 1 to u, and |∂R/∂ log c| ≤ 1; 1 − R is rounded: 16u. A weight
+    is that, or a constant, times at most 1 or k², of which either plugin rounds 2.5 factors: 5u.
     """
     z = wi[:, 2].astype(np.float32).astype(float)
     c, k = np.abs(z), np.where(z > 0, EXT_IOR / INT_IOR, INT_IOR / EXT_IOR)
@@ -150,4 +150,4 @@ def most_flips(expected: float) -> float:
     return float(most)
 
 
-STUDY = Study(NAME, "Samples", about(__doc__), TERMS, tasks, again=seeds.by_tasks(tasks))
+STUDY = Study(NAME, "Samples", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))

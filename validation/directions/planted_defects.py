@@ -24,6 +24,7 @@ from mi_refract.numerics import error_free
 from mi_refract.regimes import Rays
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
+from validation import repeated
 from validation.run import seeds
 from validation.run.array_settings import Setting, settings
 from validation.run.context import Context
@@ -318,4 +319,4 @@ def _along_axes(precision: type) -> Rays:
     return Rays((n * side).astype(precision), n, k.astype(precision))
 
 
-STUDY = Study(NAME, "Planted defects", about(__doc__), TERMS, tasks, again=seeds.by_tasks(tasks))
+STUDY = Study(NAME, "Planted defects", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))

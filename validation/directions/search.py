@@ -23,6 +23,7 @@ from mi_refract.accuracy import BUDGETS, Subject, judge_formula
 from mi_refract.formulas import FORMULAS
 from mi_refract.regimes import REGIMES, Rays
 from mi_refract.report.row import Row
+from validation import repeated
 from validation.reference.fast_reference import Screen
 from validation.run import seeds
 from validation.run.array_settings import Setting, budget_of, settings
@@ -271,4 +272,4 @@ def rescored(name: str, setting: Setting) -> list[Found]:
     return [line.scored(float(scores[line.objective][i])) for i, line in enumerate(lines)]
 
 
-STUDY = Study(NAME, "Search", about(__doc__), TERMS, tasks, again=seeds.by_tasks(tasks))
+STUDY = Study(NAME, "Search", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))

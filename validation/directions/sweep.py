@@ -17,7 +17,7 @@ from mi_refract.accuracy import BUDGETS, judge_formula
 from mi_refract.formulas import FORMULAS, Budget
 from mi_refract.regimes import Rays
 from mi_refract.report.row import Row
-from validation import limits
+from validation import limits, repeated
 from validation.reference.fast_reference import Screen
 from validation.run import seeds
 from validation.run.array_settings import Setting, budget_of, settings
@@ -186,4 +186,4 @@ def _disagreement(found: Gathered, chord: np.ndarray, wrong: np.ndarray) -> floa
     return float(np.max(np.abs(screened - chord) / np.maximum(1, chord / 1e6), initial=0))
 
 
-STUDY = Study(NAME, "Sweep", about(__doc__), TERMS, tasks, again=seeds.by_tasks(tasks))
+STUDY = Study(NAME, "Sweep", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))

@@ -39,7 +39,7 @@ NEAREST, ITS_BOUND = "error nearest its bound", "that bound"
 TERMS = {
     DIFFERENCE: "largest distance of a point from the retrace, over the extent of the scene, and |d − exact|",
     ERROR_OVER_BOUND: "largest error of any point or last direction over its bound on rounding errors",
-    NEAREST: "the error, of a point over the extent or of a direction, that comes nearest to its bound; its bound is next",
+    NEAREST: "the error, of a point over the extent or of a direction, that comes nearest to its bound",
     ITS_BOUND: "the bound of that very point or direction: the ratio of the two is the largest of any",
     WRONG_PATH: "rays that meet other boundaries than they should, or end another way",
     WRONG_PATH_FAR: "those of them that rounding cannot explain: they pass every vertex of their boundaries at more "

@@ -19,7 +19,7 @@ import numpy as np
 from mi_refract.planar import Event, Paths, Segments, shapes
 from mi_refract.planar.curves import Curve
 from mi_refract.report.row import Row
-from validation import limits
+from validation import limits, repeated
 from validation.reference import closed_forms as closed
 from validation.reference.planar_retrace import Array, Retraced
 from validation.run import seeds
@@ -249,4 +249,4 @@ def _spot(setting: Setting, facets: int) -> float:
     return float(np.max(np.nan_to_num(closed.error(closed.case.trace(setting)), nan=np.inf)))
 
 
-STUDY = Study(NAME, "Planar, closed answers", about(__doc__), TERMS, tasks, axes=AXES, again=seeds.by_tasks(tasks))
+STUDY = Study(NAME, "Planar, closed answers", about(__doc__), TERMS, tasks, axes=AXES, again=repeated.by_tasks(tasks))

@@ -20,6 +20,7 @@ import numpy as np
 from mi_refract.planar import Event, Paths
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.row import Row
+from validation import repeated
 from validation.reference.layered_scenes import OFFSET
 from validation.reference.planar_retrace import Array
 from validation.run import path_overlay, seeds
@@ -182,4 +183,4 @@ def trace(scene: Any, case: Case, spawn: Spawn) -> Paths:
     )
 
 
-STUDY = Study(NAME, "Planar, extruded", about(__doc__), TERMS, tasks, again=seeds.by_tasks(tasks))
+STUDY = Study(NAME, "Planar, extruded", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))

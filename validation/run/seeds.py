@@ -1,27 +1,14 @@
-"""Seeds of the randomised studies: their own, and others, with which the profiles `standard` and `full` repeat them.
-
-A bound is derived for every ray, so it holds for every seed; a study that only its own seed passes has no bound.
-"""
+"""Seeds of the randomised studies: their own, and others that `validation.repeated` asks for."""
 
 from __future__ import annotations
 
 import functools
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import replace
-from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import Any, TypeVar
 
-from mi_refract.report.row import Row
-from validation.study import Study, Task
-
-from .context import Context, profiles
-
-P = ParamSpec("P")
 T = TypeVar("T")
-OTHERS = {"standard": 3, "full": 10}  # other seeds of a profile; each at the size of the profile `quick`
 STEP = 10_007  # between two seeds: no study has numbers of its own that come near
 _SHIFT: ContextVar[int] = ContextVar("shift", default=0)
 
@@ -41,52 +28,14 @@ def shifted(by: int) -> Iterator[None]:
         _SHIFT.reset(token)
 
 
-def cached(function: Callable[P, T]) -> Callable[P, T]:
+def cached(function: Callable[..., T]) -> Callable[..., T]:
     """As `functools.cache`, of what is drawn: what one seed gave is not the answer for another."""
     by_shift = functools.cache(lambda _, *args, **kwargs: function(*args, **kwargs))
 
     @functools.wraps(function)
-    def found(*args: P.args, **kwargs: P.kwargs) -> T:
+    def found(*args: Any, **kwargs: Any) -> T:
         result: T = by_shift(_SHIFT.get(), *args, **kwargs)
         return result
 
     vars(found)["cache_clear"] = by_shift.cache_clear
     return found
-
-
-def by_tasks(tasks: Callable[[Context], list[Task]]) -> Callable[[Context], list[Row]]:
-    """`Study.again` of a study all of whose rows are to be repeated: those of its tasks."""
-    return lambda context: [row for task in tasks(context) for row in task.run()]
-
-
-def tasks(study: Study, context: Context) -> list[Task]:
-    """One task per other seed of a randomised study; none in the profile `quick`."""
-    if study.again is None:
-        return []
-    count = OTHERS.get(context.profile.name, 0)
-    small = replace(context, profile=profiles(context.variant)["quick"])
-    return [
-        Task(f"{study.name}: other seed {i} of {count}", functools.partial(rows_of, study, small, i))
-        for i in range(1, count + 1)
-    ]
-
-
-def rows_of(study: Study, context: Context, shift: int) -> list[Row]:
-    """One row with the worst share of a budget, and, in full, every row that breaks one."""
-    assert study.again is not None
-    with shifted(shift), tempfile.TemporaryDirectory() as folder:  # images are those of the study's own seed
-        found = [replace(row, images={}) for row in study.again(replace(context, out=Path(folder))) if row.values]
-    shares = [share(row.values[m], bound) for row in found for m, bound in row.budgets.items()]
-    broken = [replace(row, case=f"{row.case}, other seed {shift}") for row in found if row.broken]
-    values = {"checks": float(len(shares)), "broken": float(len(broken)), "largest share": max(shares, default=0.0)}
-    values |= {"nothing checked": float(not shares)}
-    replay = {"seeds": f"each {STEP * shift} above the study's own", "profile": context.profile.name}
-    budgets = {"broken": 0.0, "nothing checked": 0.0}
-    return [Row(study.name, "every subject", f"other seed {shift}", "", values, budgets, replay=replay), *broken]
-
-
-def share(value: float, bound: float) -> float:
-    """`value` over its bound; of a bound of 0 as the value says: 0 for 0, infinity for anything else, NaN stays."""
-    if bound > 0 or value != value:
-        return value / bound if bound > 0 else value
-    return 0.0 if value <= bound else float("inf")

@@ -31,8 +31,8 @@ The certified derivative is a double, 1 more: DERIVATIVE = 29 ≥ error/(C M u).
 y² + k²s² = 1 and |κ|s² ≤ 1, so at most 2.84/c + 8 + 4√2 + 9.42 + 7 + 6 = 2.84/c + 36.1. Both e are off unit by √3/2
 each; cosines and b are doubles, 3 more: 40.8 + 2.84/c ≤ 41 (C + 1/12c). Here a small k does not hide in M.
 
-**The promoted form in float32** computes all of this with 2⁻⁵³ and rounds v and w once: |δb′| ≤ u|b′|, 1.01 with what is
-left of float64; the étendue 2 + √3 of it.
+**The promoted form in float32** computes all of this with 2⁻⁵³ and rounds v and w once: |δb′| ≤ u|b′|, 1.01 with what
+is left of float64; the étendue 2 + √3 of it.
 
 **∂R/∂η** of R = A/(A + B), A = κ²(p² + q²), B = 2kp(d_s² + d_p²), p = cy, q = ks², where log y changes with log k by
 Y = −k²s²/y². k ∂R/∂k = RT(α − β), and the sum of its terms' magnitudes is
@@ -54,7 +54,7 @@ from mi_refract import oracle
 
 
 def condition_of(certified: oracle.Certified, k: np.ndarray) -> np.ndarray:
-    """C = 1 + k² sinθi (sinθi + 2 cosθi)/cos²θt: k and both directions, each off by u, change log cosθt by so many u."""
+    """C = 1 + k² sinθi (sinθi + 2 cosθi)/cos²θt: what k and both directions, off by u, change log cosθt by."""
     cos_i = certified.cos_i
     sin_i = np.sqrt((1 - cos_i) * (1 + cos_i))
     with np.errstate(divide="ignore", invalid="ignore"):

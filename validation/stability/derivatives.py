@@ -3,8 +3,8 @@
 Measured are ∂b/∂a along two unit vectors perpendicular to `a`, in the plane of incidence and across it; k ∂b/∂k; and
 η ∂R/∂η, which is −k ∂R/∂k. The error is relative, or absolute where the derivative is below 1 (below R). At the
 critical angle the derivatives diverge as 1/cosθt. The condition of ∂b, 1 + k² sinθi (sinθi + 2 cosθi)/cos²θt, is the
-change of the derivative, in u and to first order, that inputs off by u may cause; the étendue's has 1/12 cosθi more. That
-of ∂R/∂η is the sum of the magnitudes of its terms, over the larger of their sum and R, which rounds to u of it.
+change of the derivative, in u and to first order, that inputs off by u may cause; the étendue's has 1/12 cosθi more.
+That of ∂R/∂η is the sum of the magnitudes of its terms, over the larger of their sum and R, which rounds to u of it.
 `validation/stability/derivative_conditions.py` derives the limits.
 """
 

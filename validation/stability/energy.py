@@ -19,7 +19,7 @@ from mi_refract import oracle, regimes
 from mi_refract.accuracy import lengths
 from mi_refract.formulas import fresnel, resolve
 from mi_refract.report.row import Row
-from validation import limits
+from validation import limits, repeated
 from validation.reference.diffuse_fresnel import GRADE, hemispherical, nodes
 from validation.run import seeds
 from validation.run.array_settings import Setting, settings
@@ -363,4 +363,4 @@ def radiance_row(context: Context, plugin: str) -> Row:
     return Row(NAME, plugin, "basic radiance", context.variant, values, budgets, replay={"indices": INDICES})
 
 
-STUDY = Study(NAME, "Energy", about(__doc__), TERMS, tasks, axes=AXES, again=seeds.by_tasks(tasks))
+STUDY = Study(NAME, "Energy", about(__doc__), TERMS, tasks, axes=AXES, again=repeated.by_tasks(tasks))

@@ -19,9 +19,9 @@ from mi_refract import regimes
 from mi_refract.accuracy import Subject, evaluate
 from mi_refract.formulas import FORMULAS
 from mi_refract.report.row import Row
-from validation import limits
+from validation import limits, repeated
 from validation.reference import optical_systems
-from validation.run import array_settings as backends, seeds
+from validation.run import array_settings as backends
 from validation.run.array_settings import Setting
 from validation.run.context import Context
 from validation.run.metrics import MISCLASSIFIED
@@ -311,4 +311,4 @@ def system_row(name: str, subject: Subject, case: str, setting: Setting) -> Row:
     return Row(NAME, name, case, setting.label, values, budgets, replay=replay)
 
 
-STUDY = Study(NAME, "Stability", about(__doc__), TERMS, tasks, axes=AXES, again=seeds.by_tasks(tasks))
+STUDY = Study(NAME, "Stability", about(__doc__), TERMS, tasks, axes=AXES, again=repeated.by_tasks(tasks))

@@ -5,8 +5,9 @@ must be within the bound of the textbook formula, in the program's precision, fo
 program were recorded earlier on rays of the same kinds (the rays themselves were not kept); a goal, not a budget, is to
 be within a factor of 3 of these. The goal is shown where it is missed and fails no run: the worst of some thousand rays
 depends on which they are (of six seeds of random rays `dielectric` is 1.8 to 3.7 times the recorded figure). After the
-first results random rays near the critical angle were left out of their set; those are in the next one. A program fails that is installed and crashes, hangs, or answers rays that it was not
-given. One that is not installed, or says that it cannot run on this machine, is not run.
+first results random rays near the critical angle were left out of their set; those are in the next one. A program fails
+that is installed and crashes, hangs, or answers rays that it was not given. One that is not installed, or says that it
+cannot run on this machine, is not run.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from mi_refract.ray_sets.check_answers import PROBLEMS, Findings, RegimeErrors
 from mi_refract.ray_sets.files import as_csv, parse_answers
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.report.row import Row
-from validation import limits
+from validation import limits, repeated
 from validation.run import seeds
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED, WORST_ANGLE
@@ -227,4 +228,4 @@ def off(worst: float, low: float, high: float) -> float:
     return max(worst / high, low / worst, 1.0)
 
 
-STUDY = Study(NAME, "Per ray", about(__doc__), TERMS, tasks, again=seeds.by_tasks(tasks))
+STUDY = Study(NAME, "Per ray", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))

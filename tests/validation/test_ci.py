@@ -1,0 +1,64 @@
+"""CI fails where little ran: too few passed cases, no libLLVM, an install that failed."""
+
+import os
+import runpy
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+MINIMUM = runpy.run_path(str(ROOT / ".ci" / "minimum"))["main"]
+REPORT = """<testsuites><testsuite><testcase name="a"/><testcase name="b"><properties/></testcase>
+<testcase name="c"><skipped/></testcase><testcase name="d"><failure/></testcase><testcase name="e"><error/></testcase>
+</testsuite></testsuites>"""
+
+
+@pytest.mark.parametrize(("least", "code"), [(1, 0), (2, 0), (3, 1)])
+def test_only_cases_that_passed_count(least, code, tmp_path):
+    report = tmp_path / "report.xml"
+    report.write_text(REPORT)
+    assert MINIMUM([str(report), str(least)]) == code
+
+
+@pytest.mark.parametrize("text", [None, "", "<testsuites>", "\x00"])
+def test_what_cannot_be_counted_is_not_enough(text, tmp_path, capsys):
+    report = tmp_path / "report.xml"
+    if text is not None:
+        report.write_text(text)
+    assert MINIMUM([str(report), "0"]) == 2
+    assert MINIMUM([]) == MINIMUM([str(report), "many"]) == 2
+    assert "accepted: FILE.xml CASES" in capsys.readouterr().err
+
+
+def test_no_step_of_ci_goes_on_after_a_failure():
+    """And each run of tests or budgets is counted."""
+    text = (ROOT / ".ci" / "run").read_text()
+    assert "set -eu" in text
+    steps = [line for line in text.splitlines() if not line.startswith(("#", "[", "  #"))]
+    assert not [line for line in steps if "||" in line or "|| true" in line]
+    assert text.count(".ci/minimum") == text.count("--junitxml") + text.count("-m validation --out") + 1
+    assert "MI_REFRACT_NEEDS_LLVM=1" in text
+    assert "bash .ci/run" in (ROOT / ".github" / "workflows" / "ci.yml").read_text()
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
+@pytest.mark.parametrize("apt", ["fails", "absent"])
+def test_setup_fails_where_llvm_is_needed_and_there_is_none(apt, tmp_path):
+    """In a copy, so that no .venv is touched; before it looks for Python."""
+    (tmp_path / ".ci").mkdir()
+    shutil.copy(ROOT / ".ci" / "setup", tmp_path / ".ci" / "setup")
+    stubs = {"ldconfig": "exit 0", "sudo": "exit 1", "timeout": 'shift; "$@"', "env": 'shift; "$@"'}
+    stubs |= {"apt-get": "exit 100"} if apt == "fails" else {"id": "echo 1"}
+    for name, body in stubs.items():
+        (tmp_path / name).write_text(f"#!/bin/bash\n{body}\n")
+        (tmp_path / name).chmod(0o755)
+    given = {name: value for name, value in os.environ.items() if name != "DRJIT_LIBLLVM_PATH"}
+    given |= {"PATH": f"{tmp_path}:{os.environ['PATH']}", "MI_REFRACT_NEEDS_LLVM": "1"}
+    done = subprocess.run(
+        ["bash", str(tmp_path / ".ci" / "setup"), "test"], env=given, capture_output=True, text=True, timeout=30
+    )
+    assert done.returncode == 1
+    assert "apt-get install libllvm19" in done.stderr.splitlines()[-1]
+    assert not (tmp_path / ".venv").exists()
