@@ -139,22 +139,26 @@ def check(
     tir: Tir = "auto",
     formula: Formula = None,
     old_formula: OldFormula = None,
+    regime: Regime = None,
+    count: Count = ray_set.COUNT,
+    precision: Precision = ray_set.PRECISION,
+    seed: Seed = 0,
+    two_sided: TwoSided = False,
     report: Report = None,
     junit: Junit = None,
     json: Json = None,
 ) -> None:
     """Check answers against certified ones. Exit code 0: right, 1: wrong, 2: the answers do not match the rays.
 
-    Without --rays, the rays are those that the # lines of the answers describe, or those of `export` without options.
+    The rays are those of --rays, or those that `export` makes with the same options as here, or without any. The
+    answers do not choose them.
     """
     options = CheckOptions(tir, formula or old_formula, report, junit, json)
-    given = files.read_answers(answers)
-    described = file or "checksum" in given.header
-    rays = files.read(file) if file else ray_set.remake(given.header) if described else ray_set.make()
-    origin = "" if described else ", as of `export` without options; others: --rays FILE"
+    rays, chosen = _rays(file, regime, count, precision, seed, two_sided)
+    given = files.read_answers(answers, most=files.most_answers(rays))
+    origin = "" if chosen else ", as of `export` without options; others: --rays FILE"
     print(printable(f"{answers}: {_summary(rays)}{origin}"))
-    replay = ["check", str(answers), *(["--rays", str(file)] if file else []), *options.words]
-    raise typer.Exit(options.check(rays, given, str(answers), replay))
+    raise typer.Exit(options.check(rays, given, str(answers), ["check", str(answers), *chosen, *options.words]))
 
 
 @app.command()
@@ -172,7 +176,7 @@ def run(
     formula: Formula = None,
     old_formula: OldFormula = None,
     timeout: Annotated[
-        float, typer.Option(min=0, metavar="SECONDS", help="Time limit of the command.")
+        float, typer.Option(min=0, metavar="SECONDS", help="Time limit of the command, up to a week.")
     ] = run_program.TIMEOUT,
     report: Report = None,
     junit: Junit = None,
@@ -183,15 +187,23 @@ def run(
     Exit code 0: right, 1: wrong, 2: the answers do not match the rays, or the command fails or takes too long.
     """
     options = CheckOptions(tir, formula or old_formula, report, junit, json)
+    rays, chosen = _rays(file, regime, count, precision, seed, two_sided)
+    given = run_program.answers_of(command, rays, timeout=timeout, adopt=True)
+    name = shlex.join(command)
+    print(printable(f"{name}: {_summary(rays)}"))
+    raise typer.Exit(options.check(rays, given, name, ["run", *chosen, *options.words, "--", *command]))
+
+
+def _rays(
+    file: Path | None, regime: list[str] | None, count: int, precision: str, seed: int, two_sided: bool
+) -> tuple[RaySet, list[str]]:
+    """The rays, and the options that choose them; none for those of `export` without options."""
     made = _rays_as_words(regime, count, precision, seed, two_sided)
     if file and made:
         raise ValueError(f"--rays {file} and {made[0]}: both choose the rays; accepted: one of them")
-    rays = files.read(file) if file else ray_set.make(_names(regime), count, precision, seed, two_sided=two_sided)
-    given = run_program.answers_of(command, rays, timeout=timeout)
-    name = shlex.join(command)
-    print(printable(f"{name}: {_summary(rays)}"))
-    chosen = ["--rays", str(file)] if file else made
-    raise typer.Exit(options.check(rays, given, name, ["run", *chosen, *options.words, "--", *command]))
+    if file:
+        return files.read(file), ["--rays", str(file)]
+    return ray_set.make(_names(regime), count, precision, seed, two_sided=two_sided), made
 
 
 def _names(regime: list[str] | None) -> tuple[str, ...]:

@@ -13,5 +13,6 @@ __all__ = [
     "pixels",
     "process_group",
     "provenance",
+    "regular_file",
     "toml_schema",
 ]

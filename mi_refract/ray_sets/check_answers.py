@@ -16,12 +16,11 @@ import numpy as np
 from mi_refract.formulas import FORMULAS
 
 from .diagnosis import Explanation, explain
+from .header import Header, shown
 from .judged_answers import JudgedAnswers, judge_answers
-from .ray_set import Answers, Header, RaySet
-from .tir_signal import AUTO, FLAG, TIR, UNCLEAR
+from .ray_set import Answers, RaySet
+from .tir_signal import AUTO, FLAG, LOOSEST, TIR, UNCLEAR
 
-# The documented formula with the largest error bound.
-LOOSEST = max(FORMULAS, key=lambda name: (FORMULAS[name].budget.growth, FORMULAS[name].budget.radicand))
 LISTED_IDS = 5
 
 
@@ -39,7 +38,9 @@ class RegimeErrors:
     tir_misclassified: int  # called transmitted where all is reflected, or the reverse
     tir_beyond_bound: int  # those of them that are farther from the critical angle than the error bound excuses
     error_over_bound: float  # the largest ratio of an error to the bound of its ray
-    wrong: int  # rays beyond their bound: angle, length or TIR, or without a direction
+    undecidable: int  # rays whose bound is above 0.1 rad: a direction within it shows nothing
+    judged: int  # rays compared that are not so
+    wrong: int  # rays beyond their bound: angle, length or TIR; without a direction, or with an impossible one
     exact: int  # answers that are the certified ones, rounded
     replay: dict[str, Any]  # the ray with the largest ratio, in hexadecimal floats
 
@@ -54,7 +55,14 @@ class Problem:
 
 
 # Each kind of problem, and whether the answers are then not those to the rays.
-PROBLEMS = {"missing": True, "duplicate": True, "unknown": True, "non-finite": False, "zero": False}
+PROBLEMS = {
+    "missing": True,
+    "duplicate": True,
+    "unknown": True,
+    "non-finite": False,
+    "zero": False,
+    "impossible": False,
+}
 
 
 @dataclass(frozen=True)
@@ -100,12 +108,12 @@ class Findings:
     def exit_code(self) -> int:
         """0: all answers are within the bound. 1: some are wrong. 2: missing, duplicate, or answers to other rays.
 
-        1 also where no direction was compared: a program that answers nothing but rays in doubt, and those by giving
+        1 also where no direction was judged: a program that answers nothing but rays in doubt, and those by giving
         up, has shown nothing.
         """
         if not self.answered or any(PROBLEMS[problem.kind] for problem in self.problems):
             return 2
-        return int(self.wrong > 0 or self.tir == UNCLEAR or bool(self.problems) or not self.total("compared"))
+        return int(self.wrong > 0 or self.tir == UNCLEAR or bool(self.problems) or not self.total("judged"))
 
 
 def check(rays: RaySet, answers: Answers, *, tir: str = AUTO, error_bound: str = LOOSEST) -> Findings:
@@ -120,7 +128,8 @@ def check(rays: RaySet, answers: Answers, *, tir: str = AUTO, error_bound: str =
     if tir == FLAG and answers.transmitted is None:
         raise ValueError("tir = 'flag': there is no column `transmitted`; accepted: answers with one")
     if (given := answers.header.get("checksum")) not in (None, rays.header["checksum"]):
-        raise ValueError(f"the answers are to rays with the checksum {given}; accepted: {rays.header['checksum']}")
+        accepted = f"{rays.header['checksum']}, or other rays with --rays FILE"
+        raise ValueError(f"the answers are to rays with the checksum {shown(given)}; accepted: {accepted}")
     problems, order = _match_ids(rays, answers)
     kept = np.flatnonzero(order >= 0)
     b = answers.b[order[kept]]
@@ -164,11 +173,13 @@ def _problem(kind: str, ids: np.ndarray) -> Problem:
 
 
 def _not_directions(judged: JudgedAnswers, ids: np.ndarray) -> Iterator[Problem]:
-    """Answers that are neither a direction nor the signal of total internal reflection."""
+    """Answers that are neither a direction nor the signal of total internal reflection, or an impossible one."""
     zero = ~judged.b.any(axis=1)
     for kind, mask in (("non-finite", judged.verdict.blank & ~zero), ("zero", judged.verdict.blank & zero)):
         if mask.any():
             yield _problem(kind, ids[mask])
+    if judged.impossible.any():
+        yield _problem("impossible", ids[judged.impossible])
 
 
 # By regime ---------------------------------------------------------------------------------------------------------
@@ -186,7 +197,9 @@ def _regime_errors(name: str, ids: np.ndarray, judged: JudgedAnswers, index: np.
     verdict = judged.verdict
     compared = index[verdict.compared[index]]
     angle, length = (x[compared] if len(compared) else np.full(1, np.nan) for x in (verdict.angle, verdict.drift))
-    worst = index[np.lexsort((verdict.share[index], verdict.far[index], verdict.blank[index]))[-1]]
+    worst = index[
+        np.lexsort((verdict.share[index], judged.impossible[index], verdict.far[index], verdict.blank[index]))[-1]
+    ]
     return RegimeErrors(
         name,
         len(index),
@@ -198,7 +211,9 @@ def _regime_errors(name: str, ids: np.ndarray, judged: JudgedAnswers, index: np.
         tir_misclassified=int(verdict.misjudged[index].sum()),
         tir_beyond_bound=int(verdict.far[index].sum()),
         error_over_bound=float(verdict.share[index].max()),
-        wrong=int(verdict.wrong[index].sum()),
+        undecidable=int(judged.undecidable[index].sum()),
+        judged=int((~judged.undecidable)[compared].sum()),
+        wrong=int(judged.wrong[index].sum()),
         exact=int(judged.rounded_exact[index].sum()),
         replay=_replay(judged, int(worst), int(ids[worst])),
     )

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
-# Visual C++ and others print a NaN as nan(ind) or the like.
-_NAN = re.compile(r"nan\([^),\n]*\)", re.IGNORECASE)
+from .header import as_json
+
+# Visual C++ and others print a NaN as nan(ind) or the like; C has letters, digits and _ between the brackets.
+_NAN = re.compile(r"nan\([A-Za-z0-9_]{0,32}\)", re.IGNORECASE)
 _SHOWN = 60  # characters of a wrong line that an error quotes
 
 
@@ -61,8 +63,9 @@ def _numbers(name: str, lines: list[tuple[int, str]], width: int) -> np.ndarray:
         if numbers.shape[1] == width:
             return numbers
     wrong = [(number, line) for number, line in lines if not _is_row(line, width)]
-    first, line = wrong[0] if wrong else (0, "")
-    found = f"{len(wrong)} wrong rows, the first is line {first}, {line[:_SHOWN]!r}"
+    found = f"{len(wrong)} wrong rows"
+    if wrong:
+        found += f", the first is line {wrong[0][0]}, {wrong[0][1][:_SHOWN]!r}"
     raise ValueError(f"{name}: {found}; accepted: {width} numbers a row")
 
 
@@ -72,6 +75,8 @@ def _is_row(line: str, width: int) -> bool:
     if not line:
         return True
     cells = line.split(",")
+    if not line.isascii() or "_" in line:  # numbers in Python only
+        return False
     try:
         return len([float(cell) for cell in cells]) == width
     except ValueError:
@@ -89,7 +94,7 @@ def _decoded(name: str, content: str | bytes) -> str:
 def _value(text: Any) -> Any:
     """The value of JSON text, any other text unchanged, None for anything but text."""
     try:
-        return json.loads(text)
+        return as_json(text)
     except ValueError:
         return text
     except TypeError:

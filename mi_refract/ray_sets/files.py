@@ -14,20 +14,26 @@ import json
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from mi_refract.io import image_file
+from mi_refract.io import image_file, regular_file
 from mi_refract.io.atomic import writable, write_atomically
 from mi_refract.regimes import Rays
 
+from . import header as headers
+from . import npz_arrays
 from .csv_table import parse_table, with_header
-from .ray_set import FORMAT, PRECISIONS, Answers, Header, RaySet, checksum, indices, regime_names
+from .header import FORMAT, PRECISIONS, Header
+from .ray_set import Answers, RaySet, checksum, indices, regime_names
 
 SUFFIXES = (".csv", ".npz", ".exr")
 COLUMNS = ("id", "ax", "ay", "az", "nx", "ny", "nz", "n_from", "n_to")
 ANSWER_COLUMNS = ("id", "bx", "by", "bz")
 TRANSMITTED = "transmitted"  # the optional column of answers
+MOST_RAYS = 2**28 // len(COLUMNS)  # in a file
+_CSV_BYTES = 2**32
 _EXR_WIDTH = 1024
 _EXR_IDS = 2**24  # float32 holds all whole numbers up to this one
 _ATTRIBUTE = "mi_refract:rays"
@@ -97,17 +103,19 @@ def read(path: str | Path) -> RaySet:
     match (a file that was edited or cut short). OSError where the file cannot be read.
     """
     path = _with_known_suffix(path)
-    header, numbers = _read(path, {"a": 3, "n": 3, "n_from": 1, "n_to": 1}, COLUMNS)
+    header, numbers = _read(path, {"a": 3, "n": 3, "n_from": 1, "n_to": 1}, COLUMNS, most=MOST_RAYS)
     if header.get("format") != FORMAT:
         raise ValueError(f"{path}: not a file of rays; accepted: what `mi-refract rays export` writes ({FORMAT})")
     try:
-        rays = _ray_set(header, numbers)
-        intact = checksum(rays) == header["checksum"] and np.array_equal(rays.numbers, numbers)
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: broken header ({error!r}); accepted: the file as it was exported") from None
-    if not intact:
+        headers.check(header, len(numbers))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    rays = _ray_set(header, numbers)
+    if checksum(rays) != header["checksum"] or not np.array_equal(rays.numbers, numbers):
         found = "the checksum does not match, so it was edited or cut short"
         raise ValueError(f"{path}: {found}; accepted: the file as it was exported")
+    if wrong := _first_without_meaning(rays):
+        raise ValueError(f"{path}: {wrong}; accepted: finite vectors that are not zero, finite indices above 0")
     return rays
 
 
@@ -116,19 +124,39 @@ def _ray_set(header: Header, numbers: np.ndarray) -> RaySet:
     with np.errstate(all="ignore"):
         a, n, k = numbers[:, 1:4], numbers[:, 4:7], numbers[:, 7] / numbers[:, 8]
         rays = Rays(*(x.astype(precision) for x in (a, n, k)))
-        ids = numbers[:, 0].astype(np.int64)
+    ids = np.arange(len(numbers))
     return RaySet(rays, ids, regime_names(header, len(ids)), header)
 
 
-def read_answers(path: str | Path) -> Answers:
-    """The answers in a file. ValueError, one line, where it holds none. OSError where it cannot be read."""
+def _first_without_meaning(rays: RaySet) -> str:
+    """Of the rays that have no refraction, the first; "" where there is none."""
+    a, n, k = rays.rays.a, rays.rays.n, rays.rays.k
+    good = np.isfinite(a).all(1) & np.isfinite(n).all(1) & a.any(1) & n.any(1) & np.isfinite(k) & (k > 0)
+    return "" if good.all() else f"ray {np.argmin(good)} is none"
+
+
+def read_answers(path: str | Path, *, most: int = MOST_RAYS) -> Answers:
+    """The answers in a file: `most` at most.
+
+    ValueError, one line, where it holds none, or more. OSError where it cannot be read.
+    """
     path = _with_known_suffix(path)
-    return _answers(str(path), *_read(path, {"b": 3, TRANSMITTED: 1}, ANSWER_COLUMNS, TRANSMITTED))
+    return _answers(str(path), *_read(path, {"b": 3, TRANSMITTED: 1}, ANSWER_COLUMNS, TRANSMITTED, most=most))
 
 
 def parse_answers(text: str | bytes, name: str = "answers") -> Answers:
     """The answers in the text of a CSV file. ValueError, one line that begins with `name`, where it holds none."""
     return _answers(name, *parse_table(name, text, ANSWER_COLUMNS, TRANSMITTED))
+
+
+def most_answers(rays: RaySet) -> int:
+    """The most rows that answers to these rays may have: twice as many, and some for small sets."""
+    return 2 * len(rays) + 100
+
+
+def csv_bytes(rows: int) -> int:
+    """The largest size of a CSV file with so many rows: five times what their digits need, and 1 MiB for the header."""
+    return min(rows * 1024 + 2**20, _CSV_BYTES)
 
 
 def _with_known_suffix(path: str | Path) -> Path:
@@ -149,35 +177,37 @@ def _answers(name: str, header: Header, numbers: np.ndarray) -> Answers:
     return Answers(ids.astype(np.int64), numbers[:, 1:4], None if flags is None else flags == 1, header)
 
 
-def _read(path: Path, arrays: dict[str, int], columns: Sequence[str], *optional: str) -> tuple[Header, np.ndarray]:
-    """(header, (N, columns) float64) of any format. `arrays`: the arrays of an .npz file and their widths."""
+def _read(
+    path: Path, arrays: dict[str, int], columns: Sequence[str], *optional: str, most: int
+) -> tuple[Header, np.ndarray]:
+    """(header, (N, columns) float64) of any format, N up to `most`.
+
+    `arrays`: the arrays of an .npz file and their widths.
+    """
+    header, numbers = _read_any(path, arrays, columns, optional, most)
+    if len(numbers) > most:
+        raise ValueError(f"{path}: {len(numbers)} rows; accepted: up to {most}")
+    return header, numbers
+
+
+def _read_any(
+    path: Path, arrays: dict[str, int], columns: Sequence[str], optional: Sequence[str], most: int
+) -> tuple[Header, np.ndarray]:
     if path.suffix.lower() == ".csv":
-        return parse_table(str(path), path.read_bytes(), columns, *optional)
+        return parse_table(str(path), regular_file.read_bytes(path, csv_bytes(most)), columns, *optional)
     if path.suffix.lower() == ".npz":
-        return _read_npz(path, arrays, optional)
+        text, numbers = npz_arrays.read(path, {"id": 1, **arrays}, optional, most)
+        return _header(text), numbers
     image = image_file.read(path)
     chosen = [*columns, *(name for name in optional if name in image.channels)]
     pixels = image.select(chosen).reshape(-1, len(chosen)).astype(np.float64)
-    return _header(image.metadata.get(_ATTRIBUTE, "{}")), pixels[pixels[:, 0] != -1]
+    return _header(image.metadata.get(_ATTRIBUTE, "")), pixels[pixels[:, 0] != -1]
 
 
-def _read_npz(path: Path, arrays: dict[str, int], optional: Sequence[str]) -> tuple[Header, np.ndarray]:
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:  # a bad file is closed, too
-            found = {name: file[name] for name in file.files}
-        parts = {name: found[name] for name in ("id", *arrays) if name in found or name not in optional}
-        count = len(parts["id"])
-        numbers = [x.reshape(count, {"id": 1, **arrays}[name]).astype(np.float64) for name, x in parts.items()]
-    except (KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        accepted = ", ".join(name for name in ("id", *arrays) if name not in optional)
-        raise ValueError(f"{path}: {image_file.one_line(str(error))}; accepted: an .npz file with {accepted}") from None
-    return _header(str(found.get("header", "{}"))), np.hstack(numbers)
-
-
-def _header(text: str) -> Header:
+def _header(text: Any) -> Header:
     """The header in JSON text, empty where there is none."""
     try:
-        header = json.loads(text)
+        header = headers.as_json(text) if isinstance(text, str) else {}
     except ValueError:
         return {}
     return header if isinstance(header, dict) else {}

@@ -3,27 +3,42 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mi_refract import oracle
 from mi_refract.accuracy import Judgement, RayBounds, judge
-from mi_refract.formulas import ROUNDING, Budget
+from mi_refract.formulas import FORMULAS, ROUNDING, Budget
 from mi_refract.regimes import Rays
 
-from . import tir_signal
-from .ray_set import PRECISIONS
+from . import certain_parts, tir_signal
+from .header import PRECISIONS
+from .tir_signal import LOOSEST
 
 
 @dataclass(frozen=True)
 class JudgedAnswers:
-    """Answers (N, 3) as given and in the set's precision, how they signal TIR, and the verdict on each."""
+    """Answers (N, 3) as given and in the set's precision, how they signal TIR, and the verdict on each.
+
+    `impossible`: (N,) where the error bound excuses the direction, and no documented formula gives it all the same.
+    """
 
     raw: np.ndarray
     b: np.ndarray
     tir: str
     verdict: Judgement
+    impossible: np.ndarray
+
+    @property
+    def undecidable(self) -> np.ndarray:
+        """(N,) where the error bound is so wide that the direction shows nothing."""
+        return self.verdict.bounds.chord > certain_parts.UNDECIDABLE
+
+    @property
+    def wrong(self) -> np.ndarray:
+        """(N,) the wrong answers."""
+        return self.verdict.wrong | self.impossible
 
     @functools.cached_property
     def rounded_exact(self) -> np.ndarray:
@@ -48,4 +63,21 @@ def judge_answers(
     reflected = tir_signal.reflected(seen, flag, tir, bounds.decided)
     blank = ~seen.is_direction & (~reflected | tir_signal.has_direction(tir))
     directed = exact.transmitted | (tir == "reflected")
-    return JudgedAnswers(b, rounded, tir, judge(rounded, ~reflected, bounds, directed, blank))
+    verdict = judge(rounded, ~reflected, bounds, directed, blank)
+    return JudgedAnswers(b, rounded, tir, verdict, _impossible(seen, reflected, tir, verdict))
+
+
+def _impossible(seen: tir_signal.SeenAnswers, reflected: np.ndarray, tir: str, verdict: Judgement) -> np.ndarray:
+    """(N,) of the directions that `verdict` does not compare, or under a wide bound only, those that cannot be."""
+    excused = ~verdict.compared | (verdict.bounds.chord > certain_parts.UNDECIDABLE)
+    asked = seen.is_direction & excused & ~seen.exact.undecided
+    bounds = replace(verdict.bounds, budget=FORMULAS[LOOSEST].budget)
+    found = np.zeros(len(asked), bool)
+    for mask, test in (
+        (asked & ~reflected, certain_parts.possible),
+        (asked & reflected & (tir == "tangent"), certain_parts.possible_tangent),
+        (asked & reflected & (tir == "reflected"), certain_parts.possible_mirror),
+    ):
+        some = np.flatnonzero(mask)
+        found[some] = ~test(seen.b, bounds, some)
+    return found

@@ -11,7 +11,6 @@ import hashlib
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -19,10 +18,8 @@ from mi_refract import regimes
 from mi_refract.numerics import float_expansions
 from mi_refract.regimes import Rays
 
-Header = dict[str, Any]  # the `# key: value` lines of a file
+from .header import FORMAT, PRECISIONS, Header
 
-FORMAT = "mi_refract rays 1"
-PRECISIONS: dict[str, type[np.floating]] = {"f32": np.float32, "f64": np.float64}
 # Their vectors are unit up to the rounding of each component, as the documented formulas require.
 DEFAULT = tuple(name for name, regime in regimes.REGIMES.items() if regime.unit and not regime.rests_on_denormals)
 COUNT, PRECISION = 1000, "f32"
@@ -155,18 +152,3 @@ def checksum(rays: RaySet) -> str:
     digest = hashlib.sha256(json.dumps(hashed, sort_keys=True).encode())
     digest.update(rays.numbers.astype("<f8").tobytes())
     return f"sha256:{digest.hexdigest()}"
-
-
-def remake(header: Header) -> RaySet:
-    """The set that a header describes.
-
-    ValueError where the header describes no set, or where this version makes other rays from it.
-    """
-    try:
-        names, count, precision, seed = (header[key] for key in ("regimes", "count", "precision", "seed"))
-        rays = make(names, count, precision, seed, two_sided=header["two_sided"])
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"the answers' header describes no rays ({error!r}); accepted: that of the rays") from None
-    if rays.header["checksum"] != header.get("checksum"):
-        raise ValueError("this version cannot make the rays of these answers again; accepted: with --rays FILE")
-    return rays

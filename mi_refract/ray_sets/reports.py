@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 SCHEMA = 1
 COLUMNS = (
     "rays",
+    "undecidable",
     "worst / rad",
     "worst / ulp",
     "p99 / ulp",
@@ -44,6 +45,8 @@ TERMS = {
     "ulp": "the spacing of numbers at 1: 2⁻²³ in f32, 2⁻⁵² in f64",
     "worst, p99, mean": "angles to the certified direction, over the rays whose total internal reflection was "
     "classified correctly; rounding the exact answer costs up to 0.43 ulp",
+    "undecidable": "rays whose error bound is above 0.1 rad, where a direction within it shows little: all that "
+    "is judged there is the plane of incidence, the side of the surface, and what is forward",
     "TIR misclassified": "rays that were called transmitted and are totally reflected, or the reverse",
     "TIR beyond bound": "those of them that are farther from the critical angle than rounding can explain",
     "length error": "the difference between the length of an answer and 1, or the length of a where that is nearer",
@@ -67,6 +70,8 @@ PROBLEM_TEXTS = {
     "unknown": "{} answers to rays that are not in the set",
     "non-finite": "{} answers are NaN or infinite where that is no signal",
     "zero": "{} answers are the zero vector where that is no signal",
+    "impossible": "{} answers are outside the plane of incidence, or on the wrong side of the surface, by more than "
+    "the rounding of any documented formula explains",
 }
 
 
@@ -83,11 +88,13 @@ def sentence(found: Findings) -> str:
     if found.wrong or found.tir == UNCLEAR:
         return f"{found.wrong} of {answers} are wrong"
     if found.exit_code:
-        return f"{answers}, none of them a direction"
+        return f"{answers}, none of them a direction{' that shows anything' if found.total('compared') else ''}"
     if found.total("exact") == found.answered:
         return f"{answers}, all exact up to rounding"
     worst = f"the largest error is {compact(found.farthest.worst)} rad ({found.farthest.regime})"
-    return f"{answers}, all within the error bound of the formula {found.error_bound}; {worst}"
+    wide = found.total("undecidable")
+    open_ = f"; {wide} of them are to rays whose bound is above 0.1 rad, which shows little" if wide else ""
+    return f"{answers}, all within the error bound of the formula {found.error_bound}; {worst}{open_}"
 
 
 def problem_text(problem: Problem) -> str:
@@ -141,8 +148,7 @@ def table(found: Findings) -> RenderableType:
             *_cells(each, found.ulp).values(),
         )
     notes = [*map(problem_text, found.problems), signal(found), *explained(found)]
-    texts = (Text(printable(note)) for note in [*notes, sentence(found)])
-    return Group(*([rows] if found.regimes else []), *texts)
+    return Group(*([rows] if found.regimes else []), *(Text(printable(line)) for line in (*notes, sentence(found))))
 
 
 def _cells(each: RegimeErrors, ulp: float) -> dict[str, str]:
@@ -151,6 +157,7 @@ def _cells(each: RegimeErrors, ulp: float) -> dict[str, str]:
     shown = {name: compact(x) if each.compared else "–" for name, x in ({"worst / rad": each.worst} | ulps).items()}
     return {
         "rays": str(each.rays),
+        "undecidable": str(each.undecidable),
         **shown,
         "TIR misclassified": str(each.tir_misclassified),
         "TIR beyond bound": str(each.tir_beyond_bound),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mi_refract.io import process_group
 
-from .files import as_csv, parse_answers
+from .files import as_csv, csv_bytes, most_answers, parse_answers
 from .ray_set import Answers, RaySet
 
 TIMEOUT = 300.0  # seconds
@@ -21,17 +21,25 @@ def answers_of(
     timeout: float = TIMEOUT,
     cwd: str | Path | None = None,
     env: Mapping[str, str] | None = None,
+    adopt: bool = False,
 ) -> Answers:
     """The answers of `command`, which has `timeout` seconds. Its stderr is passed through.
 
-    Every process of its group is ended with it. ValueError, one line that begins with the command, where it ends with
-    another status than 0, answers too late, or prints no answers. OSError where it cannot be started.
+    Every process of its group is ended with it; with `adopt`, on Linux, what has left the group as well: only for a
+    caller that starts no other process meanwhile. ValueError, one line that begins with the command, where it ends with
+    another status than 0, answers too late, prints no answers, or more than two for each ray need. OSError where it
+    cannot be started.
     """
     if not command:
         raise ValueError("no command; accepted: mi-refract rays run [OPTIONS] -- COMMAND")
     name = shlex.join(command)
+    if not 0 <= timeout <= process_group.LONGEST:
+        raise ValueError(f"--timeout {timeout:g}: accepted: 0 … {process_group.LONGEST:g} seconds")
+    most = csv_bytes(most_answers(rays))
     try:
-        ended = process_group.run(command, as_csv(rays).encode(), timeout, cwd=cwd, env=env)
+        ended = process_group.run(command, as_csv(rays).encode(), timeout, cwd=cwd, env=env, most=most, adopt=adopt)
+    except process_group.TooMuchOutputError as error:
+        raise ValueError(f"{name}: {error}; accepted: one answer a ray") from None
     except TimeoutError:
         raise ValueError(f"{name}: no answer within {timeout:g} s; accepted: a longer --timeout") from None
     except OSError as error:

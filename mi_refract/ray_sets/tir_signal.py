@@ -9,12 +9,16 @@ import numpy as np
 
 from mi_refract import oracle
 from mi_refract.accuracy import absolute_radicand, lengths
+from mi_refract.formulas import FORMULAS
 from mi_refract.regimes import Rays
 
 AUTO, FLAG = "auto", "flag"
 # Results of `detect` beside those of TIR: no ray is totally reflected; the rays signal it in no known way.
 NONE, UNCLEAR = "none", "unclear"
-# Beyond this radicand a ray is totally reflected in any arithmetic. This share of those rays must agree on a signal.
+# The documented formula with the largest error bound.
+LOOSEST = max(FORMULAS, key=lambda name: (FORMULAS[name].budget.growth, FORMULAS[name].budget.radicand))
+# Beyond this radicand, and its error bound, a ray is totally reflected in any arithmetic.
+# This share of those rays must agree on a signal.
 CERTAIN, AGREEING = 1e-3, 0.9
 # In u: a cosine below this is that of a ray along the surface.
 ALONG = 8.0
@@ -94,7 +98,8 @@ def detect(seen: SeenAnswers, flag: np.ndarray | None) -> str:
     total = ~seen.exact.transmitted & (seen.exact.cos_i > 0)
     if not total.any():
         return NONE
-    certain = total & (absolute_radicand(seen.rays) > CERTAIN)
+    bound = FORMULAS[LOOSEST].budget.radicand_error_bound(seen.u, seen.rays.k.astype(float))
+    certain = total & (absolute_radicand(seen.rays) > np.maximum(CERTAIN, bound))
     among = certain if certain.any() else total
     shares = {name: float(detector(seen)[among].mean()) for name, detector in DETECTORS.items()}
     best = max(shares, key=lambda name: shares[name])

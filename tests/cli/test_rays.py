@@ -100,17 +100,27 @@ def test_wrong_answers(call):
     assert out.splitlines()[-1] == "50 of 50 answers are wrong: eta inverted"
 
 
-def test_answers_may_repeat_the_header_of_the_rays(call):
+def test_the_rays_may_be_named_by_the_options_of_export(call):
     to = ray_set.make(["Brewster"], 40, "f64", 8)
     answer("answers.csv", to, lines=header(to))
-    code, out, _ = call("check", "answers.csv")
+    options = ("--regime", "Brewster", "--count", 40, "--precision", "f64", "--seed", 8)
+    code, out, _ = call("check", "answers.csv", *options)
     assert (code, out.splitlines()[0]) == (0, "answers.csv: 40 rays, 1 regime, f64, seed 8")
-    files.write("rays.csv", to)
     answer("answers.csv", to, lines=[line.replace("sha256:", "sha256:0") for line in header(to)])
-    code, _, err = call("check", "answers.csv", "--rays", "rays.csv")
-    assert (code, "the answers are to rays with the checksum sha256:0" in err) == (2, True)
+    code, _, err = call("check", "answers.csv", *options)
+    assert (code, "the answers are to rays with the checksum 'sha256:0" in err) == (2, True)
+
+
+def test_answers_do_not_choose_the_rays(call):
+    """Right answers to one easy ray, with the header of that ray."""
+    to = ray_set.make(["near-normal"], 1)
+    answer("answers.csv", to, lines=header(to))
     code, _, err = call("check", "answers.csv")
-    assert (code, "cannot make the rays of these answers again; accepted: with --rays FILE" in err) == (2, True)
+    assert (code, "or other rays with --rays FILE" in err) == (2, True)
+    answer("answers.csv", to, lines=[line for line in header(to) if "checksum" not in line])
+    code, out, _ = call("check", "answers.csv")
+    assert (code, "12999 without an answer" in out) == (2, True)
+    assert call("check", "answers.csv", "--regime", "near-normal", "--count", 1)[0] == 0
 
 
 def test_answers_without_a_header_are_to_the_default_rays(call):
@@ -124,9 +134,10 @@ def test_answers_without_a_header_are_to_the_default_rays(call):
 
 def test_the_error_bound_can_be_chosen(call):
     to = ray_set.make(["generic"], 50)
-    answer("answers.csv", to, lines=header(to))
-    assert call("check", "answers.csv", "--error-bound", "wedge")[0] == 0
-    code, out, _ = call("check", "answers.csv", "--as-good-as", "promoted")
+    answer("answers.csv", to)
+    chosen = ("--regime", "generic", "--count", 50)
+    assert call("check", "answers.csv", *chosen, "--error-bound", "wedge")[0] == 0
+    code, out, _ = call("check", "answers.csv", *chosen, "--as-good-as", "promoted")
     assert (code, "none of the usual mistakes explains the answers" in out) == (1, True)
 
 
@@ -196,6 +207,8 @@ BAD_OPTIONS = {
         ("run", "--rays", "r.csv", "--count", "5", "--", "true"),
         "--rays r.csv and --count: both choose the rays",
     ),
+    "a time that is none": (("run", "--timeout", "nan", "--", "true"), "--timeout"),
+    "a time without end": (("run", "--timeout", "inf", "--", "true"), "--timeout inf: accepted"),
     "nothing": ((), "Missing command"),
 }
 
@@ -238,6 +251,7 @@ BAD_PROGRAMS = {
     "a status": ("import sys; sys.stdin.read(); print('id,bx,by,bz'); sys.exit(3)", "ended with status 3; accepted"),
     "a signal": ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "was killed by SIGSEGV; accepted"),
     "nothing": ("pass", "the table is empty"),
+    "without end": ("while True: print('id,bx,by,bz' * 1000)", "bytes of output; accepted: one answer a ray"),
     "a remark": ("print('hello'); print('id,bx,by,bz')", "the first row is 'hello'"),
     "bytes": ("import os; os.write(1, bytes(range(256)))", "not text"),
 }
@@ -312,6 +326,15 @@ def test_what_a_program_leaves_behind_is_ended(tmp_path):
     command = parent(tmp_path / "child", rest, stdin="DEVNULL", stdout="DEVNULL")
     assert len(run_program.answers_of(command, ray_set.make(["generic"], 3)).ids) == 0
     assert_ended(tmp_path / "child")
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux lets us adopt orphans")
+def test_what_left_its_group_is_ended_too(call, tmp_path):
+    rest = f"while not os.path.exists({str(tmp_path / 'child')!r}):\n    time.sleep(0.01)\nprint('id,bx,by,bz')"
+    command = parent(tmp_path / "child", rest, stdin="DEVNULL", stdout="DEVNULL")
+    command[-1] = command[-1].replace("stdin=", "start_new_session=True, stdin=")
+    assert call("run", *FEW, "--", *command)[0] == 2
+    assert not alive(int((tmp_path / "child").read_text()))
 
 
 def test_rays_and_answers_larger_than_a_pipe(tmp_path):

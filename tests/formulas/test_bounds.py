@@ -8,7 +8,7 @@ import pytest
 
 from mi_refract import oracle, regimes
 from mi_refract.accuracy import RayBounds, judge, judge_formula
-from mi_refract.formulas import ROUNDING, Budget, cancelling, radicand_for
+from mi_refract.formulas import FORMULAS, ROUNDING, Budget, cancelling, radicand_for
 from mi_refract.formulas.bounds import root
 
 U = 2.0**-53
@@ -145,3 +145,29 @@ def test_a_ray_that_the_oracle_could_not_decide_breaks_the_budget():
     b, transmitted = exact.direction.astype(np.longdouble), exact.transmitted
     assert not judge(b, transmitted, RayBounds(rays, exact, ROUNDING, U)).wrong.any()
     assert np.flatnonzero(judge(b, transmitted, RayBounds(rays, unknown, ROUNDING, U)).wrong).tolist() == [7]
+
+
+@pytest.mark.parametrize("name", [name for name, formula in FORMULAS.items() if formula.budget.side])
+@pytest.mark.parametrize(("cos_i", "held"), [(3 * U, False), (12 * U, True)])
+def test_the_side_is_known_three_times_as_far_from_the_surface_as_it_need_not_be(name, cos_i, held):
+    """n·a by three products and two sums is off by 3 u of its terms, and by what rounding a and n costs: 4 u."""
+    rays = regimes.Rays(np.array([[1.0, 0.0, -cos_i]]), np.array([[0.0, 0.0, 1.0]]), np.array([0.5]))
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    x, _, z = exact.direction[0]
+    budget = FORMULAS[name].budget
+    found = judge_formula(lambda a, n, k: ([float(x), 0.0, -float(z)], True), rays, exact, list, budget)
+    assert found.wrong.tolist() == [held]
+
+
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+@pytest.mark.parametrize(("apart", "far"), [(0.5, False), (10.0, True)])
+def test_at_the_limit_a_radicand_of_a_hundred_u_squared_decides(precision, apart, far):
+    """(n·a)² = κ w² but for a part y of the ray across: w² = 16 (1 + y²), y = `apart` u, and κ = 9/16."""
+    u = float(np.finfo(precision).eps) / 2
+    a = np.array([[4.0, 4 * apart * u, -3.0]], precision)
+    rays = regimes.Rays(a, np.array([[0.0, 0.0, 1.0]], precision), np.array([1.25], precision))
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    assert not exact.transmitted[0]
+    called = judge(rays.a.astype(float), np.array([True]), RayBounds(rays, exact, ROUNDING, u))
+    assert called.misjudged.tolist() == [True]
+    assert called.far.tolist() == [far]

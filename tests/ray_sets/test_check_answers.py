@@ -15,7 +15,8 @@ from mi_refract.formulas import FORMULAS
 from mi_refract.ray_sets import ray_set, tir_signal
 from mi_refract.ray_sets.check_answers import LOOSEST, check
 from mi_refract.ray_sets.diagnosis import MISTAKES
-from mi_refract.ray_sets.ray_set import Answers
+from mi_refract.ray_sets.ray_set import Answers, RaySet
+from mi_refract.regimes import Rays
 
 PRECISIONS = list(ray_set.PRECISIONS)
 COUNT = 80
@@ -340,3 +341,49 @@ def test_the_default_bound_is_the_loosest():
     u, k = 2.0**-24, np.geomspace(1e-3, 1e6, 50)
     bounds = {name: formula.budget.chord(u, k) for name, formula in FORMULAS.items()}
     assert all((bound <= bounds[LOOSEST]).all() for bound in bounds.values())
+
+
+# How wide the bounds are
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+def test_vectors_off_unit_excuse_no_more_than_making_them_unit_costs(precision):
+    """1000 u across the plane of incidence, where 3 u of the vectors allow 10 · 3 u and less than 14 · 3 u k²."""
+    to, (found, answers) = some(precision, ("lengths",)), exact(precision, ("lengths",))
+    rows = np.flatnonzero(found.transmitted & (to.rays.k < 2) & (found.cos_t > 0.5))
+    across = np.cross(answers.b[rows], to.rays.n[rows])
+    across *= lengths(answers.b[rows]).astype(float)[:, None] / lengths(across).astype(float)[:, None]
+    off = changed(answers, rows, answers.b[rows] + 1000 * to.roundoff * across)
+    assert len(rows) > 5
+    assert check(to, off).wrong == len(rows)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("flip", [True, False], ids=["transmitted", "reflected"])
+def test_next_to_the_surface_total_reflection_is_decided_all_the_same(precision, flip):
+    """Cosines of 1e-4, of either angle: far from all that rounding excuses, |n·a| ≤ 4 u and |radicand| ≤ 14 u k²."""
+    c = np.float64(1e-4)
+    sin = np.sqrt(1 - c * c)
+    dtype, u = ray_set.PRECISIONS[precision], float(np.finfo(ray_set.PRECISIONS[precision]).eps) / 2
+    near = 1e-4 if precision == "f64" else 4e-3  # cos θ_t: its square is the radicand
+    cases = [  # θ_i, k
+        *[(sin, -c, 0.5), (sin, -c, 1.5)],  # grazing: transmitted, reflected
+        *[
+            (np.sqrt(1 - near**2) / 1.5, None, 1.5),
+            (np.sqrt(1 + near**2) / 1.5, None, 1.5),
+        ],  # next to the critical angle
+    ]
+    a = np.array([[s, 0, z if z is not None else -np.sqrt(1 - s * s)] for s, z, _ in cases]).astype(dtype)
+    n, k = np.tile(np.array([[0, 0, 1]], dtype), (4, 1)), np.array([x[2] for x in cases], dtype)
+    rays = Rays(a, n, k)
+    to = RaySet(
+        rays, np.arange(4), np.full(4, "x", object), {"precision": precision, "regimes": {"x": [0, 3]}, "checksum": ""}
+    )
+    certified = oracle.refract(a, n, k, fresnel=False, progress=False)
+    assert certified.transmitted.tolist() == [True, False, True, False]
+    assert near**2 > 2 * 14 * u * 1.5**2
+    right = Answers(to.ids, certified.direction, certified.transmitted)
+    assert check(to, right).wrong == 0
+    rows = certified.transmitted == flip
+    found = check(to, Answers(to.ids, certified.direction, certified.transmitted ^ rows))
+    assert found.total("tir_beyond_bound") == 2

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
@@ -34,15 +32,6 @@ def test_normals_face_the_ray(precision):
     assert (side[1] <= 0).all()
     np.testing.assert_array_equal(np.abs(facing.n), np.abs(either.n))
     np.testing.assert_array_equal(facing.a, either.a)
-
-
-def test_the_header_makes_the_rays_again():
-    made = ray_set.make(["matched"], 20, "f64", 9, two_sided=True)
-    assert bits(ray_set.remake(json.loads(json.dumps(made.header)))) == bits(made)
-    with pytest.raises(ValueError, match="this version cannot make the rays"):
-        ray_set.remake(made.header | {"seed": 8})
-    with pytest.raises(ValueError, match="describes no rays"):
-        ray_set.remake({"checksum": "?"})
 
 
 @pytest.mark.parametrize(

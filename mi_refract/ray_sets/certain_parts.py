@@ -1,0 +1,97 @@
+"""What is certain of an answer whose error bound excuses its direction: no rounding of a formula gives any other.
+
+A documented formula is off by L = linear u K in any direction, and by its root along the normal (see
+`mi_refract.formulas.bounds`). With t the direction of `a` along the surface, m the normal on the side that the
+transmitted ray goes to, D = cos²θ_t, it answers, at any length s > 0,
+
+    b = s (k sinθ t + r m + δ),   |δ| ≤ L,   r ≥ 0,   |r² − D| ≤ x
+
+So b is in the plane of incidence, forward, and not on the side that the ray came from, whatever x is. Of a vector that
+signals total internal reflection the same is certain, along the surface, and of a mirror direction all is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_refract.accuracy import RayBounds, lengths
+
+UNDECIDABLE = 0.1  # radians: a direction is not judged where its bound is larger
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Directions (M, 3) as parts along t, along m, and across both: (M,) each, of a unit vector."""
+
+    along: np.ndarray
+    onward: np.ndarray
+    across: np.ndarray
+
+
+def possible(b: np.ndarray, bounds: RayBounds, some: np.ndarray) -> np.ndarray:
+    """(M,) the answers of `b` (N, 3) to the rays `some` (M indices) that a transmitted direction may be."""
+    u, k, exact = bounds.u[some], bounds.k[some], bounds.exact
+    given, incident = _parts(b, bounds, some)
+    e = k * incident.along
+    root2 = np.where(exact.transmitted[some], exact.cos_t[some] ** 2, 1 - e * e)
+    x = bounds.budget.radicand_error_bound(u, k)
+    low, high = (np.sqrt(np.maximum(root2 + sign * x, 0)) for sign in (-1, 1))
+    either = bounds.budget.side_open(u, exact.cos_i[some])
+    onward = np.where(either, np.abs(given.onward), given.onward)
+    plane = given.along**2 + given.across**2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        nearest = np.where(plane > 0, e * onward * given.along / plane, low).clip(low, high)
+    off = np.sqrt((nearest**2 + e * e) * given.across**2 + (e * onward - nearest * given.along) ** 2)
+    return _within(off, e * given.along + nearest * onward, np.hypot(e, nearest), _slack(bounds, some))
+
+
+def possible_tangent(b: np.ndarray, bounds: RayBounds, some: np.ndarray) -> np.ndarray:
+    """(M,) as `possible`, of vectors along the surface."""
+    given, incident = _parts(b, bounds, some)
+    e, length = bounds.k[some] * incident.along, np.hypot(given.along, given.across)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return _within(e * given.across / length, given.along, e, _slack(bounds, some))
+
+
+def possible_mirror(b: np.ndarray, bounds: RayBounds, some: np.ndarray) -> np.ndarray:
+    """(M,) as `possible`, of mirror directions."""
+    given, incident = _parts(b, bounds, some)
+    e, back = incident.along, -incident.onward
+    off = np.sqrt(given.across**2 + (e * given.onward - back * given.along) ** 2)
+    return _within(off, e * given.along + back * given.onward, np.ones(len(some)), _slack(bounds, some, 1.0))
+
+
+def _within(off: np.ndarray, forward: np.ndarray, size: np.ndarray, slack: np.ndarray) -> np.ndarray:
+    """Whether a vector of this size is within `slack` of the line of b, and b does not point away from it."""
+    return (size <= slack) | (off <= slack) & (forward > 0)
+
+
+def _slack(bounds: RayBounds, some: np.ndarray, largest: float = np.inf) -> np.ndarray:
+    """(M,): L, with K = k where k > 1, up to `largest`."""
+    k = np.minimum(bounds.k[some], largest)
+    return np.asarray(bounds.budget.of_terms(bounds.u[some], k))
+
+
+def _parts(b: np.ndarray, bounds: RayBounds, some: np.ndarray) -> tuple[Parts, Parts]:
+    """The parts of b and of `a`, in extended precision."""
+    a, n = (_unit(v[some]) for v in (bounds.rays.a, bounds.rays.n))
+    c = (a * n).sum(1, keepdims=True)
+    m = np.where(c < 0, -n, n)
+    tangent = a - c * n
+    length = lengths(tangent)
+    t = tangent / np.where(length > 0, length, 1)[:, None]
+    b = _unit(b[some])
+    onward = (b * m).sum(1)
+    rest = b - onward[:, None] * m  # first: next to the normal, t is not orthogonal to m to the last digit
+    along = (rest * t).sum(1)
+    across = lengths(rest - along[:, None] * t)
+    return Parts(along, onward, across), Parts(length, np.abs(c[:, 0]), np.zeros(len(some)))
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    """Any vectors (M, 3), made unit in extended precision. Precondition: finite, not zero."""
+    wide = v.astype(np.longdouble)
+    wide = wide / np.abs(wide).max(1, keepdims=True, initial=0)  # squares of the least numbers would be 0
+    return wide / lengths(wide)[:, None]

@@ -1,0 +1,135 @@
+"""Another program ends when it should, with all that it started, and says no more than it may."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from mi_refract.io import process_group
+
+LINUX = sys.platform.startswith("linux")
+# Leaves its number in a file, and sleeps.
+SLEEPER = 'echo $$ > "$0.part"; mv "$0.part" "$0"; exec sleep 600'
+
+
+def alive(pid):
+    """Whether it runs; a killed one may wait for whoever collects it."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_for(condition, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return condition()
+
+
+def shell(text, *arguments):
+    return ["sh", "-c", text, *map(str, arguments)]
+
+
+def test_what_goes_in_and_what_comes_out():
+    given = os.urandom(300_000)  # more than a pipe holds, both ways at once
+    ended = process_group.run(shell("cat; echo said >&2; exit 3"), given, 60, keep_stderr=True)
+    assert (ended.status, ended.out, ended.said) == (3, given, b"said\n")
+    assert process_group.run(["true"], given, 60).out == b""
+    assert process_group.run(shell("exec <&-; sleep 0.1; echo x"), given, 60).out == b"x\n"
+
+
+@pytest.mark.parametrize("stream", ["1", "2"])
+def test_more_than_it_may_say(tmp_path, stream):
+    endless = f'echo $$ > "$0"; while :; do echo yyyyyyyyyyyyyyyyyyyyyyyyyyyyyyyy >&{stream}; done'
+    with pytest.raises(process_group.TooMuchOutputError, match="more than 20000 bytes"):
+        process_group.run(shell(endless, tmp_path / "pid"), b"", 60, keep_stderr=True, most=20_000)
+    assert not alive(int((tmp_path / "pid").read_text()))
+    assert len(process_group.run(shell("head -c 20000 /dev/zero"), b"", 60, most=20_000).out) == 20_000
+
+
+@pytest.mark.parametrize("timeout", [float("nan"), float("inf"), -1, 1e9])
+def test_a_timeout_that_is_no_time(timeout):
+    with pytest.raises(ValueError, match=r"accepted: 0 … 604800 s"):
+        process_group.run(["true"], b"", timeout)
+
+
+@pytest.mark.parametrize("text", ["sleep 600", "exec >&-; sleep 600"], ids=["that holds stdout", "that closed it"])
+def test_a_timeout_ends_it(text):
+    start = time.monotonic()
+    with pytest.raises(TimeoutError, match=r"no end within 0\.2 s"):
+        process_group.run(shell(text), b"", 0.2)
+    assert time.monotonic() - start < 30
+
+
+PARENT = f"""
+import signal, sys
+from mi_refract.io import process_group
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+for number in (signal.SIGTERM, signal.SIGHUP):
+    signal.signal(number, signal.SIG_DFL)
+process_group.run(["sh", "-c", {SLEEPER!r}, sys.argv[1]], b"", 600)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="asks /proc who runs")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_a_signal_to_us_ends_it_too(tmp_path, number):
+    """And has its usual effect on us."""
+    us = subprocess.Popen([sys.executable, "-c", PARENT, tmp_path / "pid"], stderr=subprocess.DEVNULL)
+    try:
+        assert wait_for((tmp_path / "pid").exists)
+        us.send_signal(number)
+        assert us.wait(60) == -number
+    finally:
+        us.kill()
+        us.wait()
+    assert not alive(int((tmp_path / "pid").read_text()))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_that_the_caller_handles_is_left_to_him(number):
+    before = signal.signal(number, signal.SIG_IGN)
+    try:
+        assert process_group.run(shell("kill -$1 $PPID; echo x", "", int(number)), b"", 60).out == b"x\n"
+    finally:
+        signal.signal(number, before)
+    assert signal.getsignal(number) is before
+
+
+# A child that leaves the group, in a session of its own, and starts another; each leaves its number.
+AWAY = f"""
+import os, subprocess, sys
+if os.fork() == 0:
+    os.setsid()
+    if os.fork() == 0:
+        null = os.open(os.devnull, os.O_RDWR)
+        for number in range(3):
+            os.dup2(null, number)
+        subprocess.Popen(["sh", "-c", {SLEEPER!r}, sys.argv[1]], start_new_session=True)
+        os.execvp("sh", ["sh", "-c", {SLEEPER!r}, sys.argv[2]])
+    os._exit(0)
+os.wait()
+import time
+while not all(map(os.path.exists, sys.argv[1:3])): time.sleep(0.01)
+print("x")
+"""
+
+
+@pytest.mark.skipif(not LINUX, reason="only Linux lets us adopt orphans")
+def test_a_double_fork_is_ended_where_we_adopt(tmp_path):
+    other = subprocess.Popen(["sleep", "600"])  # a child of ours that the program did not start
+    try:
+        command = [sys.executable, "-S", "-c", AWAY, str(tmp_path / "a"), str(tmp_path / "b")]
+        assert process_group.run(command, b"", 60, adopt=True).out == b"x\n"
+        assert not any(alive(int((tmp_path / name).read_text())) for name in "ab")
+        assert other.poll() is None
+    finally:
+        other.kill()
+        other.wait()

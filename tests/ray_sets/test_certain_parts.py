@@ -1,0 +1,112 @@
+"""Where rounding may have changed a direction beyond recognition: what is right passes, what cannot be is wrong."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+from support.ray_programs import GOOD, dot, glsl, mirrored
+
+from mi_refract import oracle
+from mi_refract.ray_sets import ray_set, reports
+from mi_refract.ray_sets.check_answers import check
+from mi_refract.ray_sets.ray_set import Answers
+
+STEEP = ("k ≫ 1", "generic")
+
+
+@functools.cache
+def steep():
+    """Rays, the certified answers, and those whose bound is beyond a half turn, which are half of the transmitted."""
+    to = ray_set.make(STEEP, 300, seed=4)
+    exact = oracle.refract(to.rays.a, to.rays.n, to.rays.k, fresnel=False, progress=False)
+    return to, exact, (to.rays.k > 3000) & exact.transmitted
+
+
+def answers(program):
+    to = steep()[0]
+    return program(to.rays.a, to.rays.n, to.rays.k).astype(float)
+
+
+def unit(v):
+    return v / np.sqrt(dot(v, v))
+
+
+def turned(v, n, angle):
+    """`v` turned about n, which is unit."""
+    return np.cos(angle) * v + np.sin(angle) * np.cross(n, v) + (1 - np.cos(angle)) * dot(n, v) * n
+
+
+def tangent(a, n):
+    return unit(a - dot(a, n) * n)
+
+
+GARBAGE = {
+    "a random direction along the surface": lambda rng, a, n, b: turned(
+        tangent(a, n), n, rng.uniform(0.5, 5, (len(a), 1))
+    ),
+    "a random direction": lambda rng, a, n, b: unit(rng.normal(size=a.shape)),
+    "backward along the surface": lambda rng, a, n, b: -tangent(a, n),
+    "turned about the normal": lambda rng, a, n, b: turned(b, n, 0.5),
+    "the way that it came": lambda rng, a, n, b: -a,
+    "back from the surface": lambda rng, a, n, b: b - 2 * dot(b, n) * n,
+}
+
+
+@pytest.mark.parametrize("tir", GOOD)
+@pytest.mark.parametrize("garbage", GARBAGE.values(), ids=GARBAGE)
+def test_garbage_does_not_pass_where_the_bound_is_beyond_a_half_turn(tir, garbage):
+    to, exact, lost = steep()
+    b = answers(GOOD[tir])
+    a, n = (unit(v[lost].astype(float)) for v in (to.rays.a, to.rays.n))
+    b[lost] = garbage(np.random.default_rng(1), a, n, exact.direction[lost])
+    found = check(to, Answers(to.ids, b), tir=tir)
+    assert found.exit_code == 1
+    told = {each.kind: each.count for each in found.problems}
+    # Of a random direction a few are possible; next to k sinθ = 0 all angles about the normal are.
+    assert told["impossible"] == found.wrong >= 0.5 * lost.sum()
+
+
+@pytest.mark.parametrize("tir", GOOD)
+@pytest.mark.parametrize("made_unit", [False, True])
+def test_the_textbook_passes_there_at_any_length(tir, made_unit):
+    to = steep()[0]
+    b = answers(GOOD[tir])
+    if made_unit:
+        b = np.where(b.any(1, keepdims=True), unit(np.where(b.any(1, keepdims=True), b, 1)), 0)
+    found = check(to, Answers(to.ids, b), tir=tir)
+    assert (found.exit_code, found.problems) == (0, ())
+
+
+def test_undecidable_rays_are_counted():
+    to, _, lost = steep()
+    found = check(to, Answers(to.ids, answers(glsl)))
+    steep_, generic = found.regimes
+    assert (generic.undecidable, generic.judged) == (0, generic.compared)
+    assert lost.sum() <= steep_.undecidable < steep_.rays
+    assert steep_.judged + steep_.undecidable <= steep_.rays
+    assert f"; {steep_.undecidable} of them are to rays whose bound is above 0.1 rad" in reports.sentence(found)
+    assert reports.as_data(found)["regimes"][0]["undecidable"] == steep_.undecidable
+
+
+def test_undecidable_rays_alone_are_no_pass():
+    to, exact, lost = steep()
+    some = ray_set.RaySet(to.rays[lost], np.flatnonzero(lost), to.regime[lost], to.header)
+    found = check(some, Answers(some.ids, exact.direction[lost]))
+    assert (found.exit_code, found.wrong, found.total("judged")) == (1, 0, 0)
+    assert found.total("compared") > 0
+    assert "none of them a direction that shows anything" in reports.sentence(found)
+
+
+@pytest.mark.parametrize("tir", ["reflected", "tangent"])
+def test_a_direction_that_signals_total_reflection_is_in_the_plane_of_incidence(tir):
+    """Tangents and mirror directions turned about the normal, next to the critical angle."""
+    to = ray_set.make(("critical, to the ulp",), 200, "f64", 4)
+    exact = oracle.refract(to.rays.a, to.rays.n, to.rays.k, fresnel=False, progress=False)
+    a, n = to.rays.a, to.rays.n
+    b = mirrored(a, n, to.rays.k) if tir == "reflected" else tangent(a, n)
+    assert check(to, Answers(to.ids, b), tir=tir).wrong == 0  # so near to the critical angle any ray may be reflected
+    assert exact.transmitted.any() and not exact.transmitted.all()
+    found = check(to, Answers(to.ids, turned(b, n, 0.1)), tir=tir)
+    assert (found.exit_code, found.wrong) == (1, len(to))
