@@ -96,6 +96,8 @@ def parsers(folder: Path) -> dict[str, Parser]:
 
     def equal(path: Path) -> str:
         (result,) = folders.diff(image, path).results
+        if result.error:
+            raise ValueError(result.error)
         if result.status is not Status.EQUAL:
             return ""
         pixels = image_file.read(path).pixels
