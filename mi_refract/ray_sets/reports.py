@@ -148,8 +148,7 @@ def table(found: Findings) -> RenderableType:
             *_cells(each, found.ulp).values(),
         )
     notes = [*map(problem_text, found.problems), signal(found), *explained(found)]
-    texts = (Text(printable(note)) for note in [*notes, sentence(found)])
-    return Group(*([rows] if found.regimes else []), *texts)
+    return Group(*([rows] if found.regimes else []), *(Text(printable(line)) for line in (*notes, sentence(found))))
 
 
 def _cells(each: RegimeErrors, ulp: float) -> dict[str, str]:

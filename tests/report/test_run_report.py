@@ -390,3 +390,9 @@ def test_the_page_works_from_a_file(tmp_path):
         "mode": "flicker",
         "read": "0.25  0.25  0.25",
     }
+
+
+def test_json_that_is_nested_too_deeply_is_one_line(tmp_path):
+    (tmp_path / "rows.json").write_text("[" * 100_000)
+    with pytest.raises(ValueError, match="nested too deeply"):
+        run_report.read_json(tmp_path / "rows.json")

@@ -1,8 +1,12 @@
 """Other systems: what is wrong with one of them never passes, and what is absent says what would bring it."""
 
 import ast
+import hashlib
+import json
+import re
 import sys
 import time
+import zipfile
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -171,6 +175,13 @@ def test_things_apart_are_in_no_row(monkeypatch):
 
 @pytest.fixture
 def elsewhere(tmp_path, monkeypatch):
+    locks = tmp_path / "locks"
+    (locks / "thing").mkdir(parents=True)
+    for name in ("thing.txt", "pinned.txt", "thing/package.json", "thing/package-lock.json"):
+        (locks / name).write_text("{}" if "json" in name else f"mi-refract-no-such-thing==1 --hash=sha256:{'0' * 64}")
+    for lock in environments.LOCKS.glob("*.txt"):
+        (locks / lock.name).write_bytes(lock.read_bytes())
+    monkeypatch.setattr(environments, "LOCKS", locks)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "mi_refract" / "renderers"
 
@@ -207,6 +218,25 @@ def test_every_system_has_a_place_a_licence_and_scripts():
     assert all((SCRIPTS / call.script).is_file() for system in SYSTEMS.values() for call in system.calls)
     needs = [system.needs for system in SYSTEMS.values() if isinstance(system.needs, Pip)]
     assert all("==" in each.requirements[0] for each in needs)
+
+
+def test_every_package_is_pinned_by_hashes_and_no_script_of_one_runs():
+    for system in SYSTEMS.values():
+        if isinstance(system.needs, Pip):
+            text = environments.locked(system).read_text().replace("\\\n", "")
+            lines = [line for line in text.splitlines() if line and not line.startswith("#")]
+            assert all(re.match(r"[\w.-]+==[\w.]+( ; [^#]+?)?( +--hash=sha256:[0-9a-f]{64})+$", line) for line in lines)
+            pinned = {line.split()[0].lower() for line in lines}
+            assert {each.lower() for each in system.needs.requirements if "==" in each} <= pinned, system.name
+            bare = {re.split("[=<]", each)[0].lower() for each in system.needs.requirements}
+            assert bare <= {each.partition("==")[0] for each in pinned}
+        if isinstance(system.needs, Npm):
+            folder = environments.locked(system)
+            asked = json.loads((folder / "package.json").read_text())["dependencies"]
+            assert {f"{name}@{version}" for name, version in asked.items()} == {*system.needs.packages}
+            packages = json.loads((folder / "package-lock.json").read_text())["packages"]
+            assert packages.pop("")["dependencies"] == asked
+            assert all(each["integrity"].startswith("sha512-") for each in packages.values())
 
 
 def test_scripts_import_nothing_of_ours_and_we_nothing_of_theirs():
@@ -287,7 +317,34 @@ def test_an_installation_is_made_once_and_anew_for_another_version(elsewhere, mo
     for system, commands in ((first, 2), (first, 2), (second, 4)):
         environments.install(system)
         assert len(done) == commands and not environments.absent(system)
-    assert done[1][-1] == "a==1" and done[3][-1] == "a==2"
+    assert all({"--require-hashes", "--only-binary", "--no-deps"} < {*given} for given in done[1::2])
+    assert all(given[-2:] == ["--requirement", str(environments.locked(first))] for given in done[1::2])
+    environments.locked(first).write_text("another lock")
+    assert environments.absent(second)
+    environments.install(System("thing", "Thing", "none", Npm(("a@1",)), 0))
+    assert done[-1][:2] == ["npm", "ci"] and "--ignore-scripts" in done[-1]
+
+
+def test_pip_refuses_a_package_without_or_with_another_hash(elsewhere, tmp_path, monkeypatch):
+    """A wheel of the right name that is not the locked one is not installed."""
+    wheel = tmp_path / "thing-1-py3-none-any.whl"
+    with zipfile.ZipFile(wheel, "w") as file:
+        file.writestr("thing.py", "")
+        file.writestr("thing-1.dist-info/METADATA", "Metadata-Version: 2.1\nName: thing\nVersion: 1\n")
+        file.writestr("thing-1.dist-info/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        file.writestr("thing-1.dist-info/RECORD", "")
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
+    system = System("thing", "Thing", "none", Pip(("thing==1",)), 0)
+    right = hashlib.sha256(wheel.read_bytes()).hexdigest()
+    for line in (f"thing==1 --hash=sha256:{'0' * 64}", "thing==1"):
+        environments.locked(system).write_text(line)
+        with pytest.raises(OSError, match="thing: "):
+            environments.install(system)
+        assert environments.absent(system)
+    environments.locked(system).write_text(f"thing==1 --hash=sha256:{right}")
+    environments.install(system)
+    assert not environments.absent(system)
 
 
 # Programs ------------------------------------------------------------------------------------------------------

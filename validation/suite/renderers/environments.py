@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -10,8 +11,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mi_refract.io import process_group
+from mi_refract.io.atomic import write_atomically
 
-from .system import SCRIPTS, Apt, Npm, Pip, System
+from .system import LOCKS, SCRIPTS, Apt, Npm, Pip, System
 
 COMMAND = "python -m validation renderers --install"
 CANNOT = 77  # the exit code of a script that cannot run on this machine
@@ -60,7 +62,14 @@ def _marker(system: System) -> Path:
 
 
 def _mark(system: System) -> list[str]:
-    return [repr(system.needs)]
+    """What is installed: another version of the table or of the lock is another mark."""
+    lock = locked(system) / "package-lock.json" if isinstance(system.needs, Npm) else locked(system)
+    return [repr(system.needs), hashlib.sha256(lock.read_bytes()).hexdigest()]
+
+
+def locked(system: System) -> Path:
+    """The packages with their hashes, of all that may be installed: a file for pip, a folder for npm."""
+    return LOCKS / (system.name if isinstance(system.needs, Npm) else f"{system.name}.txt")
 
 
 def python(system: System) -> str:
@@ -80,17 +89,24 @@ def install(system: System) -> None:
         root = [] if os.geteuid() == 0 else ["sudo", "-n"]
         _do(system, [*root, "apt-get", "install", "-y", "-qq", "--no-install-recommends", *needs.packages])
         return
+    if not locked(system).exists():
+        raise OSError(f"{system.name}: no lock of its packages; accepted: {locked(system)}")
     shutil.rmtree(folder(system), ignore_errors=True)
     folder(system).mkdir(parents=True)
     if isinstance(needs, Npm):
-        _do(system, ["npm", "install", "--silent", "--no-audit", "--prefix", str(folder(system)), *needs.packages])
+        for name in ("package.json", "package-lock.json"):
+            shutil.copy(locked(system) / name, folder(system))
+        options = ["--ignore-scripts", "--silent", "--no-audit", "--no-fund"]
+        _do(system, ["npm", "ci", *options, "--prefix", str(folder(system))])
     elif isinstance(needs, Pip):
         # This environment's pip for the other one: to make one there costs more than most of what it would install.
         _do(system, [_interpreter(system, needs.python), "-m", "venv", "--without-pip", str(folder(system))])
         pip = [sys.executable, "-m", "pip", "--python", python(system), "install"]
-        options = ["--quiet", "--disable-pip-version-check", "--no-input", "--no-compile"]
-        _do(system, [*pip, *options, *(["--no-deps"] if needs.bare else []), *needs.requirements])
-    _marker(system).write_text(json.dumps(_mark(system)))
+        options = ["--quiet", "--disable-pip-version-check", "--no-input", "--no-compile", "--no-deps"]
+        # To build a package would run, and fetch, code without a hash.
+        safe = ["--require-hashes", "--only-binary", ":all:"]
+        _do(system, [*pip, *options, *safe, "--requirement", str(locked(system))])
+    write_atomically(_marker(system), json.dumps(_mark(system)))
 
 
 def _interpreter(system: System, version: str) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 SCRIPTS = Path(__file__).parent / "scripts"
+LOCKS = Path(__file__).parent / "locks"
 
 # The sets of rays of `validation.suite.per_ray`, by name.
 RANDOM, CRITICAL, GRAZING, MATCHED, TOTAL = "random", "near-critical", "grazing", "η ≈ 1", "total reflection"
@@ -26,11 +27,10 @@ RECORDED_F64 = recorded_error(9e-15, 1.9e-12, 2e-16, 1e-15)
 
 @dataclass(frozen=True)
 class Pip:
-    """A virtual environment of its own. `bare`: without the dependencies of these packages."""
+    """A virtual environment of its own. What these packages need, as far as it is needed, is in the lock."""
 
     requirements: tuple[str, ...]
     python: str = ""  # the one version that there are wheels for, as "3.11"
-    bare: bool = False
 
 
 @dataclass(frozen=True)

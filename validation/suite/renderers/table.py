@@ -66,7 +66,7 @@ _SYSTEMS = (
         "rayoptics",
         "rayoptics",
         "BSD-3-Clause",
-        Pip(("rayoptics==0.9.8", "numpy"), bare=True),
+        Pip(("rayoptics==0.9.8", "numpy")),
         megabytes=140,
         small=True,
         calls=(

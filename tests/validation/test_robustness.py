@@ -1,0 +1,87 @@
+"""Garbage in, kills and full disks: the studies' own small runs, and that they see planted defects."""
+
+import json
+import random
+import subprocess
+import sys
+
+import pytest
+from support import processes
+
+from validation.robustness import mutate, mutated_inputs, parsers
+
+INPUTS = 450
+
+
+def test_garbage_is_answered_in_one_line_by_every_parser(monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", processes.ENVIRONMENT["PYTHONPATH"])
+    counts, findings = mutated_inputs.fuzz(INPUTS)
+    assert findings == []
+    assert len(counts) == 9
+    assert all(found.total() == INPUTS / 9 and found["refused"] > 0 for found in counts.values())
+
+
+def test_the_same_seed_gives_the_same_input_and_another_one_another():
+    made = [mutate.mutated(parsers.SETTINGS, random.Random(f"{seed}/7")) for seed in (0, 0, 1)]
+    assert made[0] == made[1] != made[2]
+
+
+@pytest.mark.parametrize(
+    ("does", "outcome"),
+    [
+        ("raise KeyError('x')", "tracebacks"),
+        ("return 'garbage'", "accepted garbage"),
+        ("raise ValueError('a: b')", "refused"),
+        ("raise ValueError('a\\nb')", "tracebacks"),
+        ("return ''", "read"),
+        ("raise MemoryError", "refused"),
+    ],
+)
+def test_what_counts_as_a_finding(does, outcome, tmp_path):
+    space = {}
+    exec(f"def read(path):\n    {does}", space)
+    assert mutated_inputs._outcome(space["read"], tmp_path)[0] == outcome
+
+
+DEATHS = """
+import os, sys, time, types
+from validation.robustness import mutated_inputs
+mutated_inputs.HANG = 0.3
+start = int(sys.argv[1])
+made = []
+def read(path):
+    if path.read_bytes() == b"die":
+        os.kill(os.getpid(), 11)
+    if path.read_bytes() == b"hang":
+        time.sleep(60)
+def mutation(rng):
+    made.append(0)
+    return {3: b"die", 5: b"hang"}.get(start + len(made) - 1, b"")
+parser = types.SimpleNamespace(suffix=".x", read=read, mutation=mutation)
+sys.modules["validation.robustness.parsers"] = types.SimpleNamespace(parsers=lambda folder: {"p": parser})
+mutated_inputs._child(0, start, 8)
+"""
+
+
+def test_a_hang_and_a_death_are_findings_and_the_rest_is_read(monkeypatch):
+    run = subprocess.run
+
+    def child(command, **how):
+        return run([sys.executable, "-c", DEATHS, command[-2]], env=processes.ENVIRONMENT, **how)
+
+    monkeypatch.setattr(mutated_inputs.subprocess, "run", child)
+    counts, findings = mutated_inputs.fuzz(8)
+    assert [each["input"] for each in findings] == [3, 5]
+    assert {each["outcome"] for each in findings} == {"hangs or deaths"}
+    assert counts["p"]["read"] == 6
+
+
+@pytest.mark.parametrize("kills, commands", [(3, ["accept", "diff --report", "validation"]), (1, ["render"])])
+def test_killed_commands_leave_whole_files_and_end_well_when_started_again(kills, commands):
+    words = [sys.executable, "-m", "validation.robustness.killed_commands", str(kills), *commands]
+    done = subprocess.run(words, env=processes.ENVIRONMENT, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(done.stdout)
+    assert [*rows] == commands
+    for values in rows.values():
+        assert values == {"kills": kills, "torn files": 0, "wrong ends": 0, "bad restarts": 0}
