@@ -40,6 +40,7 @@ def compare_renders(
     equivalence_margin: Annotated[float, "relative difference of a tile that counts as none"] = 0.001,
     resolution: Annotated[float, "relative difference that must be visible in a tile, or it is inconclusive"] = 0.05,
     hidden: Annotated[float, "share of the tiles, in any channel, whose noise may hide that difference"] = 0.1,
+    pixels: Annotated[str, "test them, too: yes, or no for renders that share a fixed grid of samples"] = "yes",
     spp: Annotated[int, "samples per pixel of images with variance channels; 0: as their headers say"] = 0,
 ) -> Comparison:
     """Independent renders: Welch's t-test on the means of tiles and channels.
@@ -53,12 +54,14 @@ def compare_renders(
     renders, the same render twice, options out of range, images that cannot be compared.
     """
     _check(tile, family_error, correction, equivalence_margin, resolution, hidden)
+    if pixels not in ("yes", "no"):
+        raise ValueError(f"pixels = {pixels!r}: accepted: yes, no")
     for image in (*reference[1:], *test):
         if reason := preconditions(reference[0], image, allow_nonfinite):
             return nonfinite_result("welch", reason, reference[0].pixels, aligned(reference[0], image)[1])
     tile = min(tile, max(reference[0].pixels.shape[:2]))
-    one, two, pixels, channels = _sides(reference, test, tile, spp)
-    found = list(levels(one, two, equivalence_margin, pixels))
+    one, two, of_pixels, channels = _sides(reference, test, tile, spp)
+    found = list(levels(one, two, equivalence_margin, of_pixels if pixels == "yes" else None))
     a, b = (_finite(side[0].select(channels)) for side in (reference, test))
     found[0] = with_silent_pixels(found[0], a, b, equivalence_margin, tile)
     tests = TileTests(found, family_error, correction)

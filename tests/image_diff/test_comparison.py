@@ -373,6 +373,7 @@ def test_a_method_runs_once(method, monkeypatch):
         ("welch", {"correction": "none"}, "sidak, holm"),
         ("welch", {"equivalence_margin": float("nan")}, "at least 0"),
         ("welch", {"hidden": float("nan")}, "0 to 1"),
+        ("welch", {"pixels": "perhaps"}, "yes, no"),
     ],
 )
 def test_options_that_do_not_fit(method, options, match):
