@@ -135,6 +135,17 @@ def test_the_sums_of_the_pixels_are_their_own():
     np.testing.assert_allclose(found.squares[2, 0], np.square(u[16:20, :8]).sum((0, 1)))
 
 
+@pytest.mark.parametrize("value", [1.0, 0.7, 1e-5])
+def test_light_that_one_render_found_alone_is_no_difference(value):
+    """(h/n)² less its variance is 0. Its rounding, the same in all 256 pixels, must not add up to S = 16."""
+    area = np.full((1, 1, 1), 256.0)
+    black = np.zeros((16, 16, 1), np.float32)
+    for count in range(2, 10):
+        found = [np.full_like(black, value), *[black] * (count - 1)]
+        for one, two in (([black] * 2, found), (found[::-1], [black] * 3)):
+            assert pixel_statistics.sums_of_renders(one, two, 16).p(area, 0 * area, 1.0, np.inf).item() == 1
+
+
 def test_what_is_not_finite_is_an_alarm():
     broken = np.ones((16, 16, 1))
     broken[3, 3] = np.nan
