@@ -265,26 +265,28 @@ def seen(rows: list[Row]) -> str:
     alarms = {name: [row for row in found if row.subject == f"null pairs, {name}"] for name in METHODS}
     if not defects or not all(alarms.values()):
         raise ValueError("README: no defects were planted; its table needs a compiled variant")
-    cells = [
-        [name, *(_percent([row.values[method] for row in trials]) for method in METHODS)]
-        for name, trials in defects.items()
-    ]
-    cells.append(
-        [
-            "nothing: other seeds, or the same",
-            *(
-                f"{sum(r.values['false alarms'] * r.values['null pairs'] for r in each):.0f} of "
-                f"{sum(r.values['null pairs'] for r in each):.0f}"
-                for each in alarms.values()
-            ),
-        ]
-    )
+    cells = [[name, *(_shares(method, trials) for method in METHODS)] for name, trials in defects.items()]
+    cells.append(["nothing: other seeds, or other last bits", *map(_false_alarms, alarms.values())])
     trials = next(iter(defects.values()))
     detectable = _percent([row.values[self_test.DETECTABLE] for row in trials], digits=1)
     replay, scenes = trials[0].replay, ", ".join(row.case for row in trials)
     text = f"{scenes}; {replay['trials']} trials each of {replay['renders a side']} renders a side. "
     text += f"Minimum detectable difference in a tile: {detectable}."
     return _table(text, ["planted", *(f"`{name}`" for name in METHODS)], cells)
+
+
+def _shares(method: str, trials: list[Row]) -> str:
+    if any(method not in row.values for row in trials):
+        return "not read" if all(self_test.UNREADABLE in row.values for row in trials) else "–"
+    return _percent([row.values[method] for row in trials])
+
+
+def _false_alarms(rows: list[Row]) -> str:
+    if any(row.reason == self_test.IDENTICAL for row in rows):
+        return "identical"
+    pairs = [row.values["null pairs"] for row in rows]
+    alarms = sum(row.values["false alarms"] * count for row, count in zip(rows, pairs, strict=True))
+    return f"{alarms:.0f} of {sum(pairs):.0f}"
 
 
 def suite(rows: list[Row]) -> str:

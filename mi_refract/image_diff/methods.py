@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -12,11 +12,10 @@ import numpy as np
 
 from mi_refract.io.image_file import Image
 
-from . import flip, pixelwise, welch
+from . import black, flip, pixelwise, welch
 from .comparison import Comparison, Verdict, aligned, not_compared
 
 AUTO = "auto"
-ROW_STEP = 16  # every so many rows show whether a method would see that an image is black
 
 Side = Image | Sequence[Image]
 
@@ -37,11 +36,12 @@ class Method:
 
     `function(reference, test, **options)` takes one image a side; where `takes_renders`, a sequence of independent
     renders. `passes_black(reference, options)`: whether these options would let an all-black test image pass; None
-    where that is impossible.
+    where that is impossible. `accepts_black(pixels, options)`: in which pixels; None where they are not judged alone.
     """
 
     function: Callable[..., Comparison]
-    passes_black: Callable[[Image, Mapping[str, Any]], bool] | None = None
+    passes_black: black.PassesBlack | None = None
+    accepts_black: black.AcceptsBlack | None = None
     takes_renders: bool = False
 
     @property
@@ -72,8 +72,8 @@ class Method:
 
 METHODS = {
     "exact": Method(pixelwise.exact),
-    "tolerance": Method(pixelwise.tolerance, pixelwise.tolerance_passes_black),
-    "paired": Method(pixelwise.paired, pixelwise.paired_passes_black),
+    "tolerance": Method(pixelwise.tolerance, pixelwise.tolerance_passes_black, pixelwise.tolerance_accepts_black),
+    "paired": Method(pixelwise.paired, pixelwise.paired_passes_black, pixelwise.paired_accepts_black),
     "welch": Method(welch.compare_renders, takes_renders=True),
     "flip": Method(flip.flip, flip.flip_passes_black),
 }
@@ -83,7 +83,9 @@ def compare(method: str, reference: Side, test: Side, *, allow_nonfinite: bool =
     """Compare two images, or two sequences of renders of one image, by a method of the table.
 
     "auto" is `welch` where it can be, else `tolerance`. Where a method calls the images equal but would call a black
-    one equal, too, or where no value of a channel is finite, the verdict is INCONCLUSIVE.
+    one equal, too, or one with some of its channels black, the verdict is INCONCLUSIVE; so it is where channels whose
+    variance `welch` does not know differ by more than `tolerance` allows.
+    Where no value of a channel is finite, it is INCONCLUSIVE as well.
 
     ValueError for an unknown method or option, an option of another type or out of its range, several renders for a
     method that takes one, and images that cannot be compared.
@@ -96,16 +98,19 @@ def compare(method: str, reference: Side, test: Side, *, allow_nonfinite: bool =
     sides = [[side] if isinstance(side, Image) else list(side) for side in (reference, test)]
     if not all(sides):
         raise ValueError(f"{method}: no image on one side; accepted: at least one")
+    one, two = sides
     if chosen.takes_renders:
-        return _of_the_finite(chosen.function(*sides, allow_nonfinite=allow_nonfinite, **checked), sides[0][0])
-    if [len(side) for side in sides] != [1, 1]:
-        raise ValueError(f"{method}: {len(sides[0])} and {len(sides[1])} images; accepted: one a side")
-    one, two = sides[0][0], sides[1][0]
-    found = chosen.function(one, two, allow_nonfinite=allow_nonfinite, **checked)
-    if found.verdict is Verdict.EQUAL and _sees_nothing(chosen, one, two, checked):
-        reason = f"an all-black image would pass, too, with these options; {found.reason}"
-        return replace(found, verdict=Verdict.INCONCLUSIVE, reason=reason)
-    return _of_the_finite(found, one)
+        found = chosen.function(one, two, allow_nonfinite=allow_nonfinite, **checked)
+    elif [len(side) for side in sides] != [1, 1]:
+        raise ValueError(f"{method}: {len(one)} and {len(two)} images; accepted: one a side")
+    else:
+        found = chosen.function(one[0], two[0], allow_nonfinite=allow_nonfinite, **checked)
+    if found.verdict is not Verdict.EQUAL:
+        return found
+    doubt = _untested(one, two, allow_nonfinite) if chosen.takes_renders else _blind_to(chosen, one[0], two[0], checked)
+    if doubt:
+        return replace(found, verdict=Verdict.INCONCLUSIVE, reason=f"{doubt}; {found.reason}")
+    return _of_the_finite(found, one[0])
 
 
 def _of_the_finite(found: Comparison, reference: Image) -> Comparison:
@@ -119,16 +124,24 @@ def _of_the_finite(found: Comparison, reference: Image) -> Comparison:
     return replace(found, reason=f"{found.reason}; not compared: {count} of {reference.pixels.size} values, not finite")
 
 
-def _sees_nothing(method: Method, reference: Image, test: Image, options: dict[str, Any]) -> bool:
-    """Whether a black test image would pass. False where both images are the same, or the reference is black."""
+def _blind_to(method: Method, reference: Image, test: Image, options: dict[str, Any]) -> str:
+    """What the method could not have seen. "" where both images are the same, or the reference is black."""
     if method.passes_black is None:
-        return False
-    a, b = (np.nan_to_num(x, posinf=0, neginf=0) for x in aligned(reference, test))
-    if not a.any() or np.array_equal(a, b):
-        return False
+        return ""
+    a, b = (replace(reference, pixels=np.nan_to_num(x, posinf=0, neginf=0)) for x in aligned(reference, test))
     values = {name: option.default for name, option in method.options.items()} | options
-    # Where black would be seen in some of the rows, the others need not be asked.
-    return all(method.passes_black(replace(reference, pixels=rows), values) for rows in (a[::ROW_STEP], a))
+    text = black.blind_to(a, b, values, method.passes_black, method.accepts_black)
+    return text and f"{text} with these options"
+
+
+def _untested(reference: Sequence[Image], test: Sequence[Image], allow_nonfinite: bool) -> str:
+    """Which channels of single images with channels of variance have none themselves, and are not equal without."""
+    names = welch.untested(reference[0].channels) if len(reference) == len(test) == 1 else []
+    if not names:
+        return ""
+    one, two = (replace(side[0], pixels=side[0].select(names), channels=tuple(names)) for side in (reference, test))
+    found = compare("tolerance", one, two, allow_nonfinite=allow_nonfinite)
+    return "" if found.verdict is Verdict.EQUAL else f"not tested, without variance: {', '.join(names)}: {found.reason}"
 
 
 def automatic(reference: Side, test: Side) -> str:

@@ -1,7 +1,7 @@
 """Methods that look at every pixel alone: `exact`, `tolerance` and `paired`.
 
 `tolerance_passes_black` and `paired_passes_black` say whether an all-black test image would pass with the same
-options: then the method could not have seen a difference.
+options, `tolerance_accepts_black` and `paired_accepts_black` in which pixels: there the method sees no difference.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels
@@ -82,16 +83,31 @@ def tolerance_passes_black(reference: Image, options: Mapping[str, Any]) -> bool
     return bool(beyond <= options["fail_percent"] and difference.max() <= options["hard_fail"])
 
 
+def tolerance_accepts_black(a: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
+    """The pixels of the reference, H × W × C, in which `tolerance` would take black for equal; H × W."""
+    difference = np.abs(a)
+    accepted: NDArray[np.bool_] = (difference <= options["hard_fail"]).all(-1)
+    beyond = _beyond(difference, a, np.zeros_like(a), options["fail"], options["fail_relative"])
+    accepted.reshape(-1)[beyond] = False
+    return accepted
+
+
 def _place(difference: Pixels, image: Image) -> str:
     y, x, _ = np.unravel_index(int(difference.argmax()), difference.shape)
     return f" at x = {x + image.origin[0]}, y = {y + image.origin[1]}"
 
 
 def _percent(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float) -> float:
-    """Of the pixels, those with a channel that differs by more than `most`, and than that share of the mean of both."""
+    """The percentage of the pixels that `_beyond` finds."""
+    return 100 * _beyond(difference, a, b, most, share).size / a[..., 0].size
+
+
+def _beyond(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float) -> NDArray[np.intp]:
+    """The pixels with a channel that differs by more than `most`, and than that share of the mean of both; flat."""
     pixels = np.flatnonzero((difference > most).any(-1))  # few: the rest is cheaper there
     x, y, z = (each.reshape(-1, a.shape[2])[pixels] for each in (difference, a, b))
-    return 100 * int((x > np.maximum(most, share * (np.abs(y) / 2 + np.abs(z) / 2))).any(-1).sum()) / a[..., 0].size
+    found: NDArray[np.intp] = pixels[(x > np.maximum(most, share * (np.abs(y) / 2 + np.abs(z) / 2))).any(-1)]
+    return found
 
 
 def _difference(a: Pixels, b: Pixels) -> Pixels:
@@ -166,6 +182,12 @@ def paired_passes_black(reference: Image, options: Mapping[str, Any]) -> bool:
     black = np.zeros_like(a)
     measured = changes(a / _scale(a, black), black, options["threshold"])
     return bool(measured.share <= options["changed"] and measured.largest <= options["largest"])
+
+
+def paired_accepts_black(a: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
+    """The pixels of the reference, H × W × C, that `paired` would take for unchanged if they were black; H × W."""
+    accepted: NDArray[np.bool_] = (np.abs(a) / _scale(a, np.zeros_like(a)) <= options["threshold"]).all(-1)
+    return accepted
 
 
 def _scale(a: Pixels, b: Pixels) -> Pixels:

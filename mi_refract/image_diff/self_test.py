@@ -3,7 +3,9 @@
 A method for single images compares two renders with the same random numbers, one of them with a defect. A method for
 several renders compares clean renders with defective ones of other seeds. A defect is seen where the method calls the
 images different, or refuses to compare them; "inconclusive" counts as not seen. There is one row for each defect: the
-share of trials in which each method saw it.
+share of trials in which each method saw it. Of a file that cannot be read there is no such share: that is an error
+before any method is asked. Equal pairs have other seeds for a method that takes several renders, and other last bits
+for one that does not; `exact` sees those, and is given the same image twice.
 
 The row fails where a method misses a defect that it must see. Every method must see values that are not finite, another
 size, and a file that cannot be read; `exact` any changed bit; and a method that models the noise a defect larger than
@@ -42,11 +44,14 @@ CONFIDENCE = 0.95  # of the bound on that share, one-sided
 SEED = 2026
 RENDERS = 4  # at least: two a side
 DETECTABLE, RATIO = "minimum detectable difference", "size / minimum detectable"
+UNREADABLE = "unreadable"
+IDENTICAL = "the pairs are identical bit for bit"
 TERMS = {
     "size": "of a defect: relative change of a tile's mean, in the tile where it is largest compared with the noise",
     DETECTABLE: "smallest relative difference that `welch` would have seen in a tile, median over the trials",
     RATIO: "above 1 the defect must be seen; tiles noisier than the median one have a larger minimum",
     "missed": "trials in which a method missed a defect that it must see, see the introduction",
+    UNREADABLE: "share of the trials with a file that cannot be read, an error whatever the method",
     "bound": f"{CONFIDENCE:.0%} upper bound of a rate, exact binomial (Clopper and Pearson)",
     "noise": "standard deviation of a pixel over its mean, median over the image",
 }
@@ -87,10 +92,6 @@ class Tally:
         found = stats.binomtest(self.seen, self.trials, alternative="less")
         return float(found.proportion_ci(CONFIDENCE, method="exact").high)
 
-    def refuse(self) -> None:
-        """Count a trial whose images could not be compared: that is seen."""
-        self.seen, self.trials = self.seen + 1, self.trials + 1
-
     def ask(self, method: str, reference: Renders, test: Renders) -> None:
         """Compare the first image of each side, or all where the method takes several. A refusal counts as seen."""
         sides = [[image_file.named(name, x) for x in side] for name, side in (("reference", reference), ("test", test))]
@@ -98,7 +99,7 @@ class Tally:
         try:
             found = methods.compare(method, *(side if whole else side[0] for side in sides))
         except (ValueError, OSError):
-            self.refuse()
+            self.seen, self.trials = self.seen + 1, self.trials + 1
             return
         self.trials += 1
         self.seen += found.verdict is Verdict.DIFFERENT
@@ -118,13 +119,13 @@ def _asked(renders: Pixels) -> list[str]:
 def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, setting: str) -> Row:
     """The share of trials in which each method saw the defect; "missed" counts the trials in which it had to."""
     tallies = {method: Tally() for method in _asked(trials[0].other)}
-    changes, cleans = [], []
+    changes, cleans, unread = [], [], 0
+    replay = {"trials": len(trials), "renders a side": len(trials[0].clean)}
     for trial in trials:
         try:
             spoilt = trial.spoil()
         except (ValueError, OSError):
-            for tally in tallies.values():
-                tally.refuse()
+            unread += 1
             continue
         if np.array_equal(spoilt[0], trial.clean[0]):
             return Row(STUDY, name, case, setting, reason="left out: it changes nothing in these images")
@@ -133,8 +134,10 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
         if not always_due:
             cleans.append([block_mean(image, TILE) for image in trial.clean])
             changes.append(np.mean([block_mean(image, TILE) for image in spoilt], 0) - np.mean(cleans[-1], 0))
+    if unread == len(trials):
+        values = {UNREADABLE: 1.0, "missed": 0.0}
+        return Row(STUDY, name, case, setting, values, {"missed": 0.0}, reason="not read", replay=replay)
     sizes = _sizes(np.array(changes), np.concatenate(cleans), tallies) if cleans else {}
-    replay = {"trials": len(trials), "renders a side": len(trials[0].clean)}
     return _row(name, always_due, tallies, sizes, replay, case, setting)
 
 
@@ -183,16 +186,26 @@ def false_alarms(
     """A row for each method: how often it called equal pairs different.
 
     `pairs` have renders of other seeds on either side, for methods that take several renders; `repeats` have renders of
-    the same seeds, for the others. `independent`: no render is in two pairs; then the upper bound of the rate must be
-    at most FALSE_ALARMS, otherwise the rate itself.
+    the same seeds, for the others: `exact` is given these, the rest a test side with `last_bits` moved. `independent`:
+    no render is in two pairs; then the upper bound of the rate must be at most FALSE_ALARMS, otherwise the rate itself.
     """
     tallies = {method: Tally() for method in METHODS}
-    for takes_renders, given in ((True, pairs), (False, repeats)):
-        for reference, test in given:
-            for method in METHODS:
-                if METHODS[method].takes_renders is takes_renders:
-                    tallies[method].ask(method, reference, test)
+    several = [method for method in METHODS if METHODS[method].takes_renders]
+    for reference, test in pairs:
+        for method in several:
+            tallies[method].ask(method, reference, test)
+    rng = np.random.default_rng(SEED)
+    for reference, test in repeats:
+        moved = last_bits(test, rng)
+        for method in METHODS.keys() - several:
+            tallies[method].ask(method, reference, test if method == "exact" else moved)
     return [_null_row(method, tally, case, setting, independent) for method, tally in tallies.items() if tally.trials]
+
+
+def last_bits(pixels: Pixels, rng: np.random.Generator) -> Pixels:
+    """Every value as one of its two neighbours in float32, at random, as another processor may round it."""
+    towards = np.where(rng.random(pixels.shape) < 0.5, -np.inf, np.inf).astype(np.float32)
+    return np.nextafter(pixels.astype(np.float32), towards)
 
 
 def _null_row(method: str, tally: Tally, case: str, setting: str, independent: bool) -> Row:
@@ -204,7 +217,8 @@ def _null_row(method: str, tally: Tally, case: str, setting: str, independent: b
         values[budget] = tally.bound
     if tally.detectable and METHODS[method].takes_renders:
         values[DETECTABLE] = float(np.median(tally.detectable))
-    return Row(STUDY, f"null pairs, {method}", case, setting, values, {budget: FALSE_ALARMS})
+    reason = IDENTICAL if method == "exact" else ""
+    return Row(STUDY, f"null pairs, {method}", case, setting, values, {budget: FALSE_ALARMS}, reason=reason)
 
 
 # Given images ------------------------------------------------------------------------------------------------
@@ -283,7 +297,7 @@ def table(rows: Sequence[Row]) -> RenderableType:
         if row.subject in DEFECTS:
             size = f"{row.values['size']:.2%}" if "size" in row.values else ""
             cells = [_share(row.values.get(name)) for name in METHODS]
-            shares.add_row(row.subject, *cells, size, "" if row.values else row.reason)
+            shares.add_row(row.subject, *cells, size, row.reason)
         elif row.values:
             lines.append(f"{row.subject}: " + ", ".join(f"{name} {x:.3g}" for name, x in row.values.items()))
     broken = [f"{row.subject}: {', '.join(row.broken)}" for row in rows if row.verdict == "fail"]

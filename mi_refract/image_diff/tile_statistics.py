@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,11 +19,14 @@ from numpy.typing import NDArray
 from mi_refract.io.pixels import Pixels as Array
 from mi_refract.io.pixels import block_area, block_sum
 
+from .pixel_statistics import PixelSums
+
 DARK = 1e-3  # a tile darker than this share of its channel's `median_nonblack` counts as that bright in ratios
 GROWTH = 4  # from one level of tiles to the next
 HEAVY = 4.0  # a tile whose noise comes from fewer pixels than this is heavy-tailed: its t is not a Student's
 POOLED = 30  # blocks of tiles from which the correlation of pixels is estimated again, at least
 MISSED = 0.01  # the minimum detectable difference is missed with this probability
+FAR = 10.0  # times the margin: a pixel without noise that is so far off is evidence, see `with_silent_pixels`
 WORKERS = 2
 
 CORRECTIONS = ("sidak", "holm")
@@ -116,7 +119,8 @@ class Level:
 
     `t`: positive where the test is brighter. `p`: of no difference; `beyond`: of none beyond the margin; both 0 where a
     value is not finite. `silent`: no noise on either side, of which a t-test knows nothing: p is 1 there, and `off`
-    where the means differ beyond the margin. `heavy`: noise from a few pixels only.
+    where the means differ beyond the margin. `heavy`: noise from a few pixels only. `of_pixels`: p of no pixel beyond
+    the margin; `of_silent`: the same of tiles without noise; None where that is not tested.
     """
 
     t: Array
@@ -129,28 +133,39 @@ class Level:
     allowed: Array
     error: Array
     freedom: Array
+    of_pixels: Array | None = None
+    of_silent: Array | None = None
+
+    @property
+    def lit(self) -> Flags:
+        """The tiles and channels with light; darker ones are not asked for relative differences."""
+        return self.mean > DARK * median_nonblack(self.mean)
 
     def detectable(self, threshold: float) -> Array:
-        """Relative differences that are seen with probability 1 − MISSED at that p, of the tiles with light and noise.
+        """Relative differences that are seen with probability 1 − MISSED at that p; NaN without light or noise.
 
-        One dimension. A difference δ is seen where δ ≥ margin + (t(1 − p/2) + t(1 − MISSED)) · error.
+        A difference δ is seen where δ ≥ margin + (t(1 − p/2) + t(1 − MISSED)) · error.
         """
         from scipy import special
 
-        asked = ~self.silent & (self.mean > DARK * median_nonblack(self.mean))
+        asked = ~self.silent & self.lit
         freedom = self.freedom[asked]
         reach = -special.stdtrit(freedom, threshold / 2) - special.stdtrit(freedom, MISSED)
-        return (reach * self.error[asked] + self.allowed[asked]) / self.mean[asked]
+        found = np.full(self.mean.shape, np.nan)
+        found[asked] = (reach * self.error[asked] + self.allowed[asked]) / self.mean[asked]
+        return found
 
 
-def levels(reference: Side, test: Side, equivalence_margin: float) -> Iterator[Level]:
+def levels(reference: Side, test: Side, equivalence_margin: float, pixels: PixelSums | None = None) -> Iterator[Level]:
     """The test of single tiles, then of blocks GROWTH times as wide, and so on to the whole image."""
     inflations = reference.inflation(), test.inflation()
     while True:
-        yield compare_tiles(reference, test, equivalence_margin, inflations)
+        level = compare_tiles(reference, test, equivalence_margin, inflations)
+        yield level if pixels is None else _with_pixels(level, pixels, reference.area, max(inflations))
         if reference.area.size == 1:
             return
         reference, test = reference.coarser(), test.coarser()
+        pixels = pixels and pixels.coarser(GROWTH)
         if reference.area.size >= POOLED:
             inflations = max(inflations[0], reference.inflation()), max(inflations[1], test.inflation())
 
@@ -179,6 +194,31 @@ def compare_tiles(
     # NaN becomes 0: what is not finite equals nothing.
     p, p_beyond = (np.nan_to_num(2 * special.stdtr(freedom, -np.abs(x)), nan=0.0) for x in (t, beyond))
     return Level(t, p, p_beyond, silent, off, few & ~silent, np.abs(m1), allowed, error, freedom)
+
+
+def _with_pixels(level: Level, pixels: PixelSums, area: Array, inflation: Inflation) -> Level:
+    p = pixels.p(area, level.allowed, inflation.factor, inflation.freedom)
+    return replace(level, of_pixels=np.where(level.silent, 1.0, np.nan_to_num(p, nan=0.0)))
+
+
+def with_silent_pixels(level: Level, a: Array, b: Array, margin: float, tile: int) -> Level:
+    """The level of single tiles with those without noise `off` where a pixel is, too, and with their p.
+
+    The mean of such a tile does not show what was moved about inside. `a`, `b`: one render of each side.
+
+    A value that comes up in every render can still be chance, as black is where light is rarely found. Let a pixel take
+    values with probabilities pₓ. All renders of each side, two or more, agree with probability s = Σ pₓ⁴ at most in
+    the same value, and with d = (Σ pₓ²)² − s in two different ones. As s + 7d ≤ 1, no tile of independent pixels is
+    without noise and has k different pixels with a probability above 7⁻ᵏ.
+    """
+    if not level.silent.any():
+        return level
+    difference = np.abs(b - a.astype(np.float64))
+    allowed = margin * np.maximum(np.abs(a), DARK * median_nonblack(np.abs(a)))
+    moved = block_sum(difference > allowed, tile) > 0
+    far = block_sum((difference > FAR * allowed).astype(np.float64), tile)
+    p = np.where(level.silent, 7.0**-far, 1.0)
+    return replace(level, off=level.off | (level.silent & moved), of_silent=p)
 
 
 def median_nonblack(sizes: Array) -> Array:
@@ -220,8 +260,11 @@ class TileTests:
 
     @cached_property
     def p(self) -> Array:
-        """Of all levels the p of tiles with noise, in one dimension."""
-        return np.concatenate([level.beyond[~level.silent] for level in self.levels])
+        """The p of every test, in one dimension: of tiles with noise, of their pixels, and of tiles without noise."""
+        found = [level.beyond[~level.silent] for level in self.levels]
+        found += [level.of_pixels[~level.silent] for level in self.levels if level.of_pixels is not None]
+        found += [level.of_silent[level.silent] for level in self.levels if level.of_silent is not None]
+        return np.concatenate(found)
 
     @cached_property
     def threshold(self) -> float:
@@ -232,7 +275,7 @@ class TileTests:
 
     @property
     def differing(self) -> int:
-        """The number of tests that are alarms; heavy-tailed tiles are not among them."""
+        """The number of tests of tiles that are alarms; heavy-tailed tiles are not among them."""
         return sum(int((self._seen(level) & ~level.heavy).sum()) for level in self.levels)
 
     @property
@@ -241,14 +284,24 @@ class TileTests:
         return sum(int((self._seen(level) & level.heavy).sum()) for level in self.levels)
 
     @property
+    def pixels_differing(self) -> int:
+        """The number of tests of the pixels of a tile that are alarms."""
+        return sum(int((p <= self.threshold).sum()) for level in self.levels if (p := level.of_pixels) is not None)
+
+    @property
     def silent_differing(self) -> int:
-        """The number of single tiles and channels without noise whose means differ beyond the margin."""
+        """The number of single tiles and channels without noise whose means or pixels differ beyond the margin."""
         return int(self.levels[0].off.sum())
+
+    @property
+    def silent_far(self) -> int:
+        """The number of those that are so far beyond it, in so many pixels, that they are alarms."""
+        return sum(int((p <= self.threshold).sum()) for level in self.levels if (p := level.of_silent) is not None)
 
     @property
     def alarms(self) -> int:
         """The number of tests that differ, whatever is known of their noise."""
-        return self.differing + self.heavy_differing + self.silent_differing
+        return self.differing + self.heavy_differing + self.pixels_differing + self.silent_differing
 
     @property
     def smallest_p(self) -> float:
@@ -258,7 +311,13 @@ class TileTests:
     def minimum_detectable(self, level: int = 0) -> float:
         """The smallest relative difference that is seen in the median tile of a level; NaN where none has noise."""
         found = self.levels[level].detectable(self.threshold)
-        return float(np.median(found)) if found.size else np.nan
+        return float(np.nanmedian(found)) if np.isfinite(found).any() else np.nan
+
+    def hidden_share(self, resolution: float) -> float:
+        """The share of the tiles with light whose noise hides a difference of `resolution`, in the worst channel."""
+        finest = self.levels[0]
+        hidden = (finest.detectable(self.threshold) > resolution).sum((0, 1)).max()
+        return float(hidden / max(finest.lit.any(-1).sum(), 1))
 
     def _seen(self, level: Level) -> Flags:
         return (level.beyond <= self.threshold) & ~level.silent

@@ -5,26 +5,25 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
 
 from mi_refract.io.image_file import Image
-from mi_refract.io.pixels import Pixels, block_sum
+from mi_refract.io.pixels import Pixels
 from mi_refract.io.toml_schema import shown
 
 from .comparison import Comparison, Maps, Metric, Verdict, aligned, nonfinite_result, preconditions
+from .pixel_statistics import PixelSums, sums, sums_of_renders
 from .tile_statistics import (
     CORRECTIONS,
-    DARK,
     Level,
     Side,
     TileTests,
     from_renders,
     from_variances,
     levels,
-    median_nonblack,
+    with_silent_pixels,
 )
 
 # A second image beside the mean: of the squares of the samples (Mitsuba's `moment`), or of their variance.
@@ -42,35 +41,38 @@ def compare_renders(
     correction: Annotated[str, "for the number of tiles: sidak or holm"] = "sidak",
     equivalence_margin: Annotated[float, "relative difference of a tile that counts as none"] = 0.001,
     resolution: Annotated[float, "relative difference that must be visible in a tile, or it is inconclusive"] = 0.05,
+    hidden: Annotated[float, "share of the tiles, in any channel, whose noise may hide that difference"] = 0.1,
+    pixels: Annotated[str, "test them, too: yes, or no for renders that share a fixed grid of samples"] = "yes",
     spp: Annotated[int, "samples per pixel of images with variance channels; 0: as their headers say"] = 0,
 ) -> Comparison:
     """Independent renders: Welch's t-test on the means of tiles and channels.
 
     Two or more renders a side, or one a side with channels of the variance or second moment of its channels: then
-    pixels are taken for independent, as under a box filter. Tests single tiles, blocks of them, and the whole image.
+    pixels are taken for independent, as under a box filter. Tests the mean of single tiles, of blocks of them, and of
+    the whole image; and whether their pixels scatter more than their noise explains.
 
-    INCONCLUSIVE where only tiles differ of which a t-test knows little (without noise, or with the noise of a few
-    pixels), and where the noise hides differences of `resolution`. ValueError for fewer renders, the same render
-    twice, options out of range, images that cannot be compared.
+    INCONCLUSIVE where only tiles differ of which a t-test knows little (with the noise of a few pixels, or without
+    noise and by little or in a few pixels), and where the noise hides differences of `resolution`. ValueError for fewer
+    renders, the same render twice, options out of range, images that cannot be compared.
     """
-    _check(tile, family_error, correction, equivalence_margin, resolution)
+    _check(tile, family_error, correction, equivalence_margin, resolution, hidden)
+    if pixels not in ("yes", "no"):
+        raise ValueError(f"pixels = {pixels!r}: accepted: yes, no")
     for image in (*reference[1:], *test):
         if reason := preconditions(reference[0], image, allow_nonfinite):
             return nonfinite_result("welch", reason, reference[0].pixels, aligned(reference[0], image)[1])
     tile = min(tile, max(reference[0].pixels.shape[:2]))
-    one, two, channels = _sides(reference, test, tile, spp)
-    found = list(levels(one, two, equivalence_margin))
-    a, b = (side[0].select(channels) for side in (reference, test))
-    found[0] = _with_silent_pixels(found[0], a, b, equivalence_margin, tile)
+    one, two, of_pixels, channels = _sides(reference, test, tile, spp)
+    found = list(levels(one, two, equivalence_margin, of_pixels if pixels == "yes" else None))
+    a, b = (_finite(side[0].select(channels)) for side in (reference, test))
+    found[0] = with_silent_pixels(found[0], a, b, equivalence_margin, tile)
     tests = TileTests(found, family_error, correction)
-    verdict, reason = _verdict(tests, resolution)
-    if untested := [name for name in reference[0].channels if name not in channels]:
-        reason += f"; not tested: {', '.join(untested)}"
+    verdict, reason = _verdict(tests, resolution, hidden)
     maps = _maps(found[0], tile, reference[0].pixels.shape)
-    return Comparison("welch", verdict, reason, _metrics(tests, resolution), tests.minimum_detectable(), maps)
+    return Comparison("welch", verdict, reason, _metrics(tests, resolution, hidden), tests.minimum_detectable(), maps)
 
 
-def _check(tile: int, family_error: float, correction: str, margin: float, resolution: float) -> None:
+def _check(tile: int, family_error: float, correction: str, margin: float, resolution: float, hidden: float) -> None:
     if tile < 1:
         raise ValueError(f"tile = {tile}: accepted: a positive whole number")
     if not 0 < family_error < 1:
@@ -81,35 +83,28 @@ def _check(tile: int, family_error: float, correction: str, margin: float, resol
         raise ValueError(f"equivalence_margin = {margin}: accepted: at least 0")
     if not resolution > 0:
         raise ValueError(f"resolution = {resolution}: accepted: more than 0")
+    if not 0 <= hidden <= 1:
+        raise ValueError(f"hidden = {hidden}: accepted: 0 to 1")
 
 
-def _sides(reference: Sequence[Image], test: Sequence[Image], tile: int, spp: int) -> tuple[Side, Side, Sequence[str]]:
-    """Both sides and the channels that are tested."""
+def _sides(
+    reference: Sequence[Image], test: Sequence[Image], tile: int, spp: int
+) -> tuple[Side, Side, PixelSums, Sequence[str]]:
+    """Both sides, the sums over their pixels, and the channels that are tested."""
     if min(len(reference), len(test)) >= 2:
         first = reference[0]
         for side in (reference, test):
             _distinct(side)
-        one, two = ([_finite(aligned(first, image)[1]) for image in side] for side in (reference, test))
-        return from_renders(one, tile), from_renders(two, tile), first.channels
+        a, b = ([_finite(aligned(first, image)[1]) for image in side] for side in (reference, test))
+        return from_renders(a, tile), from_renders(b, tile), sums_of_renders(a, b, tile), first.channels
     if len(reference) == len(test) == 1 and (pairs := spreads(reference[0].channels)):
-        return _moments(reference[0], pairs, tile, spp), _moments(test[0], pairs, tile, spp), list(pairs)
+        (m1, v1, spp1), (m2, v2, spp2) = (_moments(side[0], pairs, spp) for side in (reference, test))
+        one, two = from_variances(m1, v1, spp1 - 1.0, tile), from_variances(m2, v2, spp2 - 1.0, tile)
+        return one, two, sums(m1, v1, m2, v2, tile), list(pairs)
     raise ValueError(
         f"welch: {len(reference)} and {len(test)} renders; accepted: at least 2 a side, or one a side with channels "
         f"of its variance, as {', '.join(form.format('R') for form in (*MOMENTS[:1], *VARIANCES[:1]))}"
     )
-
-
-def _with_silent_pixels(level: Level, a: Pixels, b: Pixels, margin: float, tile: int) -> Level:
-    """The level with the tiles without noise `off` where a pixel is, too.
-
-    The mean of such a tile does not show what was moved about inside.
-    """
-    if not level.silent.any():
-        return level
-    a, b = _finite(a).astype(np.float64), _finite(b)
-    allowed = margin * np.maximum(np.abs(a), DARK * median_nonblack(np.abs(a)))
-    moved = block_sum(np.abs(b - a) > allowed, tile) > 0
-    return replace(level, off=level.off | (level.silent & moved))
 
 
 def _distinct(side: Sequence[Image]) -> None:
@@ -140,13 +135,20 @@ def spreads(channels: Sequence[str]) -> dict[str, tuple[str, bool]]:
     }
 
 
-def _moments(image: Image, pairs: dict[str, tuple[str, bool]], tile: int, spp: int) -> Side:
+def untested(channels: Sequence[str]) -> list[str]:
+    """Of an image with channels of variance: those that have none, and are none."""
+    pairs = spreads(channels)
+    return [name for name in channels if name not in pairs and name not in {spread for spread, _ in pairs.values()}]
+
+
+def _moments(image: Image, pairs: dict[str, tuple[str, bool]], spp: int) -> tuple[Pixels, Pixels, int]:
+    """The mean, the variance of the mean, and the samples per pixel."""
     spp = _spp(image, spp)
     mean = _finite(image.select(list(pairs))).astype(np.float64)
     spread = _finite(image.select([name for name, _ in pairs.values()])).astype(np.float64)
     is_moment = np.array([moment for _, moment in pairs.values()])
     variance = np.where(is_moment, (spread - mean**2) * spp / (spp - 1), spread) / spp
-    return from_variances(mean, np.maximum(variance, 0), spp - 1.0, tile)
+    return mean, np.maximum(variance, 0), spp
 
 
 def _spp(image: Image, given: int) -> int:
@@ -157,24 +159,32 @@ def _spp(image: Image, given: int) -> int:
     return int(float(text))
 
 
-def _verdict(tests: TileTests, resolution: float) -> tuple[Verdict, str]:
-    visible = tests.minimum_detectable()
-    if tests.differing:
-        return Verdict.DIFFERENT, f"{tests.differing} of {tests.p.size} tests of tiles and channels differ"
+def _verdict(tests: TileTests, resolution: float, hidden: float) -> tuple[Verdict, str]:
+    counts = {
+        "tests of tiles and channels": tests.differing,
+        "of their pixels": tests.pixels_differing,
+        "of tiles without noise": tests.silent_far,
+    }
+    if found := ", ".join(f"{count} {name}" for name, count in counts.items() if count):
+        return Verdict.DIFFERENT, f"{found} differ, of {tests.p.size} tests"
     if tests.silent_differing or tests.heavy_differing:
         where = f"{tests.silent_differing} tiles noise-free, {tests.heavy_differing} heavy-tailed"
         return Verdict.INCONCLUSIVE, f"differences only where a t-test knows little: {where}"
-    if not tests.p.size:
+    visible, share = tests.minimum_detectable(), tests.hidden_share(resolution)
+    if tests.levels[0].silent.all():
         return Verdict.EQUAL, "no noise, and no tile differs beyond the margin"
-    if not visible <= resolution:
-        return Verdict.INCONCLUSIVE, f"no difference is seen, but noise hides one of {visible:.2g} in the median tile"
-    return Verdict.EQUAL, f"no difference; one of {visible:.2g} would have been seen in a tile of median noise"
+    if not visible <= resolution or share > hidden:
+        where = f"one of {visible:.2g} in the median tile, and one of {resolution:.2g} in {share:.3g} of the tiles"
+        return Verdict.INCONCLUSIVE, f"no difference is seen, but noise hides {where}"
+    where = f"in a tile of median noise, and noise hides one of {resolution:.2g} in {share:.3g} of the tiles"
+    return Verdict.EQUAL, f"no difference; one of {visible:.2g} would have been seen {where}"
 
 
-def _metrics(tests: TileTests, resolution: float) -> tuple[Metric, ...]:
-    finest = tests.levels[0]
+def _metrics(tests: TileTests, resolution: float, hidden: float) -> tuple[Metric, ...]:
+    finest, share = tests.levels[0], tests.hidden_share(resolution)
     return (
         Metric("tests of tiles and channels that differ", tests.differing, 0.0),
+        Metric("tests of the pixels of tiles that differ", tests.pixels_differing, 0.0),
         Metric("smallest p, adjusted for the number of tests", tests.smallest_p),
         Metric("family error", tests.family_error),
         Metric("tiles and channels", finest.t.size),
@@ -183,6 +193,7 @@ def _metrics(tests: TileTests, resolution: float) -> tuple[Metric, ...]:
         Metric("heavy-tailed tiles", int(finest.heavy.sum())),
         Metric("heavy-tailed tiles and blocks that differ", tests.heavy_differing, 0.0),
         Metric("minimum detectable difference in a tile", tests.minimum_detectable(), resolution),
+        Metric(f"share of the tiles whose noise hides a difference of {resolution:.2g}", share, hidden),
         Metric("minimum detectable difference of the whole image", tests.minimum_detectable(-1)),
     )
 

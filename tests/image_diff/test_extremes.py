@@ -130,9 +130,7 @@ def test_without_noise_what_moves_within_a_tile_is_seen():
     board = np.where(np.indices((32, 32)).sum(0) % 2, 1.0, 0.5)[..., None] * np.ones(3)
     one, other = [image(board)] * 3, [image(np.roll(board, 1, 1))] * 3
     assert compare("welch", one, one).verdict is EQUAL
-    found = compare("welch", one, other)
-    assert found.verdict is INCONCLUSIVE
-    assert {m.name: m.value for m in found.metrics}["smallest p, adjusted for the number of tests"] == 1
+    assert compare("welch", one, other).verdict is DIFFERENT
 
 
 def test_a_tile_larger_than_the_image_is_the_image():

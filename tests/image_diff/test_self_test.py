@@ -30,6 +30,9 @@ def found():
 def test_what_is_due_is_seen(found, name):
     row = found[name]
     assert row.verdict == "pass"
+    if name == "truncated":  # no method is asked of what cannot be read
+        assert row.values == {self_test.UNREADABLE: 1, "missed": 0} and row.reason == "not read"
+        return
     assert row.values["exact"] == 1
     if DEFECTS[name].always_due:
         assert row.replay["due"] == list(methods.METHODS)
@@ -47,6 +50,31 @@ def test_equal_pairs_alarm_nowhere(found):
     rows = [found[f"null pairs, {method}"] for method in methods.METHODS]
     assert all(row.verdict == "pass" and row.values["false alarms"] == 0 for row in rows)
     assert found["null pairs, welch"].values["null pairs"] == 40
+    assert {row.subject for row in rows if row.reason == self_test.IDENTICAL} == {"null pairs, exact"}
+
+
+def test_single_images_are_equal_but_for_their_last_bits(monkeypatch):
+    """A method that calls every changed bit a difference alarms; the same image twice would not show it."""
+    pixels = IMAGE.astype(np.float32)
+    moved = self_test.last_bits(pixels, np.random.default_rng(1))
+    steps = np.abs(moved.view(np.int32) - pixels.view(np.int32))
+    assert (steps == 1).all() and 0.4 < (moved > pixels).mean() < 0.6
+    real = methods.compare
+    monkeypatch.setattr(methods, "compare", lambda m, *sides: real("exact" if m != "welch" else m, *sides))
+    rows = by_subject(self_test.false_alarms([], [(pixels[None], pixels[None])] * 3, "noise", ""))
+    assert {name for name, row in rows.items() if row.verdict == "fail"} == {
+        f"null pairs, {method}" for method in ("tolerance", "paired", "flip")
+    }
+
+
+def test_where_only_some_files_cannot_be_read_the_methods_are_asked_of_the_others():
+    def unread():
+        raise ValueError("truncated")
+
+    clean, other = np.split(renders(8), 2)
+    trials = [self_test.Trial(clean, other, lambda: 1.5 * clean), self_test.Trial(clean, other, unread)]
+    row = self_test.detection("gain", True, trials, "noise", "")
+    assert row.values["exact"] == row.values["welch"] == 1 and row.values["missed"] == 0
 
 
 @pytest.mark.parametrize("method", methods.METHODS)

@@ -7,6 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_refract.image_diff import self_test
+from mi_refract.image_diff.methods import METHODS
+from mi_refract.report.row import Row
+from validation import readme_tables
 from validation.diff import planted_defects as study
 
 
@@ -73,3 +77,21 @@ def test_the_study_sees_its_defects_and_no_other_sampler(llvm_variant, monkeypat
     assert rows["flipped normal"].verdict == "pass"
     assert rows["other sampler"].values["welch"] == 0
     assert rows["other sampler"].values["exact"] == 1
+
+
+def test_the_table_says_where_no_method_was_asked_and_which_pairs_are_identical():
+    def row(subject, values, reason=""):
+        replay = {"trials": 8, "renders a side": 6}
+        return Row(self_test.STUDY, subject, "prism", "", values, reason=reason, replay=replay)
+
+    seen = dict.fromkeys(METHODS, 1.0)
+    alarms = {"false alarms": 0.5, "null pairs": 4.0}
+    rows = [
+        row("gain", seen | {"missed": 0.0, self_test.DETECTABLE: 0.02}),
+        row("truncated", {self_test.UNREADABLE: 1.0, "missed": 0.0}, "not read"),
+        *(row(f"null pairs, {m}", alarms, self_test.IDENTICAL if m == "exact" else "") for m in METHODS),
+    ]
+    lines = {line.split("|")[1].strip(): line for line in readme_tables.seen(rows).splitlines() if "|" in line}
+    assert lines["truncated"].count("not read") == len(METHODS) and "%" not in lines["truncated"]
+    (nothing,) = (line for name, line in lines.items() if name.startswith("nothing"))
+    assert nothing.count("identical") == 1 and nothing.count("2 of 4") == len(METHODS) - 1

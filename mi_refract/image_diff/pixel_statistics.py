@@ -1,0 +1,86 @@
+"""A test of the pixels of two sets of renders: what a tile's mean does not show, such as stripes that trade places.
+
+At every pixel the means m₁, m₂ of the two sides have the estimated variances v₁, v₂. Then u = (m₂ − m₁)² − v₁ − v₂ has
+the expectation δ², where δ is the true difference: it is χ² less its own expectation, for noise of any distribution.
+Over the pixels of a tile S = Σu / √(Σu²) is tested.
+
+Level: for independent pixels whose u is symmetric, P(S ≥ s) ≤ exp(−s²/2) (Efron 1969, of Hoeffding's bound for signs).
+Where renders are equal u is skewed to the right at every pixel: as a form Σ aⱼₖ xⱼ xₖ in the renders, without j = k, it
+has one positive eigenvalue among many negative ones, and Σ aⱼₖ³ ≥ 0. That makes large S rarer: a long right tail is
+in Σu² twice. Where pixels correlate, Σu² is too small by at most the inflation F of tile means, since ρ² ≤ |ρ|; with F
+estimated at f degrees of freedom the expectation of the bound over that estimate is (1 + s²/f)^(−f/2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_refract.io.pixels import Pixels as Array
+from mi_refract.io.pixels import block_sum
+
+WORKERS = 2
+ROUNDING = 1e-12  # of m²: more than that of u in float64, which is some 1e-16 (m² + u)
+
+
+@dataclass(frozen=True)
+class PixelSums:
+    """Sums of u and of its square over the pixels of each tile and channel: tiles × tiles × C."""
+
+    total: Array
+    squares: Array
+
+    def coarser(self, growth: int) -> PixelSums:
+        """The same in tiles `growth` times as wide."""
+        return PixelSums(block_sum(self.total, growth), block_sum(self.squares, growth))
+
+    def p(self, area: Array, allowed: Array, factor: float, freedom: float) -> Array:
+        """Upper bounds of the p of no pixel beyond `allowed`, which is that of a tile; NaN for what is not finite.
+
+        `area`: pixels of a tile. `factor`, `freedom`: by how much tile means vary more than with independent pixels,
+        and the degrees of freedom of that estimate.
+        """
+        least = np.square(allowed)
+        total = self.total - area * least
+        squares = self.squares - 2 * least * self.total + area * np.square(least)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            s2 = np.where(total <= 0, 0.0, np.square(total) / (factor * squares))
+        exponent = s2 if np.isinf(freedom) else freedom * np.log1p(s2 / freedom)
+        bound: Array = np.exp(-exponent / 2)
+        return bound
+
+
+def sums(m1: Array, v1: Array, m2: Array, v2: Array, tile: int) -> PixelSums:
+    """Of the means of both sides and the variances of these means, float64, H × W × C."""
+    # Light that one render found alone has u = 0: its rounding, the same everywhere, must not add up.
+    excess = np.square(m2 - m1) - v1 - v2 - ROUNDING * (np.square(m1) + np.square(m2))
+    return PixelSums(block_sum(excess, tile), block_sum(np.square(excess), tile))
+
+
+def sums_of_renders(reference: Sequence[Array], test: Sequence[Array], tile: int) -> PixelSums:
+    """Of two sets of independent renders, each H × W × C, at least 2 a side; needs memory for rows of tiles only."""
+
+    def band(top: int) -> PixelSums:
+        one, two = (_mean_and_variance([each[top : top + tile] for each in side]) for side in (reference, test))
+        return sums(*one, *two, tile)
+
+    with ThreadPoolExecutor(WORKERS) as pool:
+        bands = list(pool.map(band, range(0, reference[0].shape[0], tile)))
+    return PixelSums(*(np.concatenate(each) for each in ([b.total for b in bands], [b.squares for b in bands])))
+
+
+def _mean_and_variance(renders: Sequence[Array]) -> tuple[Array, Array]:
+    """The mean of renders, and the variance of that mean, in float64."""
+    count, first = len(renders), renders[0].astype(np.float64)
+    total, squares = np.zeros((2, *first.shape))
+    with np.errstate(invalid="ignore", over="ignore"):
+        for each in renders[1:]:
+            off = each - first
+            total += off
+            squares += np.square(off, out=off)
+        total /= count
+        variance = (squares / count - np.square(total)) / (count - 1)
+    return first + total, variance
