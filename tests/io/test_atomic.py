@@ -169,11 +169,11 @@ def test_a_temporary_in_use_is_not_swept(tmp_path, started_anew, monkeypatch):
         assert file.exists() and folder.exists()
     check = image_file.read_exr
 
-    def sweep_then_read(path):
+    def sweep_then_read(path, *options):
         atomic._swept.clear()
         atomic.sweep(tmp_path)
         seen.append(path.exists())
-        return check(path)
+        return check(path, *options)
 
     monkeypatch.setattr(image_file, "read_exr", sweep_then_read)
     image_file.write_exr(tmp_path / "d.exr", np.ones((4, 4, 3)))
