@@ -28,7 +28,7 @@ from validation.run.context import Context
 from validation.study import Study, Task, about
 
 HANG = 10.0  # seconds for one input
-MEMORY = 3 << 30  # bytes of address space beyond what the imports take
+MEMORY = 12 << 30  # bytes of address space beyond what the imports take: a reader may ask for the most it accepts
 COUNTS = {"quick": 500, "standard": 10_000, "full": 50_000}
 FINDINGS = ("tracebacks", "accepted garbage", "hangs or deaths")
 TERMS = {
