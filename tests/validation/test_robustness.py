@@ -19,6 +19,15 @@ def test_garbage_is_answered_in_one_line_by_every_parser(monkeypatch):
     assert findings == []
     assert len(counts) == 9
     assert all(found.total() == INPUTS / 9 and found["refused"] > 0 for found in counts.values())
+    assert counts["answers, CSV"]["read"] > 0 and "rays, CSV" in counts
+
+
+def test_the_good_inputs_are_good(tmp_path):
+    for name, parser in parsers.parsers(tmp_path).items():
+        for content in parser.good:
+            path = tmp_path / f"good{parser.suffix}"
+            path.write_bytes(content)
+            assert parser.read(path) == "", name
 
 
 def test_the_same_seed_gives_the_same_input_and_another_one_another():

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from mi_refract.image_diff import folders, html_report
-from mi_refract.io import exit_code, image_file, lock
+from mi_refract.io import atomic, exit_code, image_file, lock
 from mi_refract.report import run_report
 from mi_refract.report.row import Row
 from validation.run.context import PROFILES, SCENES, Context
@@ -165,6 +165,11 @@ def examine(command: Command, kills: int, seed: int) -> dict[str, float]:
             else:
                 _run(command, new, kill=rng.uniform(0, took))
             torn += _torn(_state(command, new), before, after)
+        for place in {path.parent for path in new.glob(command.outputs)}:  # as a kill in the middle of a file leaves it
+            atomic.temporary_name(place / "half", "").write_text("half")
+        if command.content is Path.read_bytes and before:  # so that something is left to do
+            first = next(path for path in new.glob(command.outputs) if path.name in before)
+            first.write_bytes(before[first.name])
         last, _ = _run(command, new)
         hidden = [path.name for path in new.rglob("*") if path.name.startswith(".") or path.name == "validation.lock"]
         well = code == last == command.code and _state(command, new).keys() == after.keys() and not hidden

@@ -36,7 +36,7 @@ reason = "single-precision caustic: last bits differ"
 [[image]]
 name = "noise.exr"
 method = "welch"
-alpha = 0.01
+family_error = 0.01
 allow_nonfinite = true
 reason = "an estimate"
 """
