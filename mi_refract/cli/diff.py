@@ -10,18 +10,18 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console, RenderableType
 from rich.progress import Progress
 
 from mi_refract.image_diff import accept as accepting
-from mi_refract.image_diff import folders, html_report, text_reports
+from mi_refract.image_diff import folders, html_report, pairing, settings_file, text_reports
 from mi_refract.image_diff import self_test as self_tests
-from mi_refract.image_diff import settings as diff_settings
-from mi_refract.image_diff.folders import Results, Status
 from mi_refract.image_diff.methods import AUTO
+from mi_refract.image_diff.results import Results, Status, as_word
+from mi_refract.image_diff.settings import Settings
 from mi_refract.io.atomic import writable
 from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.outside_text import printable
@@ -35,12 +35,15 @@ NotAlways = Annotated[
     Path | None, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them; optional with --self-test.")
 ]
 NotWithSelfTest = Annotated[Path | None, typer.Argument(metavar="TEST", help="The image or folder to compare with it.")]
-Method = Annotated[str, typer.Option(help=f"How: {'|'.join(diff_settings.ACCEPTED)}; see --methods.")]
+Names = Annotated[
+    list[str] | None, typer.Argument(metavar="[NAME]...", help="Only these images: paths in the folders, * and ?.")
+]
+Method = Annotated[str, typer.Option(help=f"How: {'|'.join(settings_file.ACCEPTED)}; see --methods.")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="An option of the method.")]
 File = Annotated[
     Path | None,
     typer.Option(
-        metavar="FILE.toml", help=f"Settings of single images; by default {diff_settings.FILE} beside the references."
+        metavar="FILE.toml", help=f"Settings of single images; by default {settings_file.FILE} beside the references."
     ),
 ]
 Nonfinite = Annotated[
@@ -62,7 +65,7 @@ class Inconclusive(enum.StrEnum):
 
 def _print_methods(asked: bool) -> None:
     if asked:
-        text = diff_settings.reference()
+        text = settings_file.reference()
         if sys.stdout.isatty():
             from rich.markdown import Markdown
 
@@ -85,6 +88,9 @@ GitHub = Annotated[bool, typer.Option("--github", help="Print GitHub annotations
 Methods = Annotated[
     bool, typer.Option("--methods", is_eager=True, callback=_print_methods, help="Print the methods and their options.")
 ]
+CheckSettings = Annotated[
+    bool, typer.Option("--check-settings", help="Print how each image would be compared, and which settings say so.")
+]
 SelfTest = Annotated[
     bool,
     typer.Option(
@@ -96,6 +102,7 @@ SelfTest = Annotated[
 def diff(
     reference: NotAlways = None,
     test: NotWithSelfTest = None,
+    names: Names = None,
     method: Method = AUTO,
     options: Set = None,
     renders: Renders = False,
@@ -110,6 +117,7 @@ def diff(
     github: GitHub = False,
     methods: Methods = False,
     self_test: SelfTest = False,
+    check_settings: CheckSettings = False,
 ) -> None:
     """Compare images with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
     _require_extra("scipy", *(("jinja2", "matplotlib") if report else ()))
@@ -119,6 +127,9 @@ def diff(
         if any(others) or method != AUTO:
             raise ValueError("--self-test asks every method and prints; accepted: no other option but --max-values")
         raise typer.Exit(_self_test(reference, test, max_values))
+    if check_settings and reference:
+        chosen = _settings(reference, method, options, settings, allow_nonfinite, max_values)
+        raise typer.Exit(_check_settings(reference, test, names or [], chosen))
     if reference is None or test is None:
         raise ValueError("two paths are needed; accepted: mi-refract diff REFERENCE TEST")
     for path, suffixes in zip((report, junit, json), OUTPUTS, strict=True):
@@ -128,11 +139,18 @@ def diff(
     wanted = inconclusive or ""
     with _progress() as tell:
         found = folders.diff(
-            reference, test, chosen, renders=renders, inconclusive=wanted, maps=bool(report), tell=tell
+            reference,
+            test,
+            chosen,
+            names=names or [],
+            renders=renders,
+            inconclusive=wanted,
+            maps=bool(report),
+            tell=tell,
         )
     _say(found)
     if report:
-        _write_page(report, found, _replay(found, chosen, settings))
+        _write_page(report, found, _replay(found, names or []))
     _write(found, junit, json, github)
     raise typer.Exit(found.exit_code)
 
@@ -157,6 +175,7 @@ def _write(found: Results, junit: Path | None, json: Path | None, github: bool) 
 def accept(
     reference: Folder,
     test: Other,
+    names: Names = None,
     method: Method = AUTO,
     options: Set = None,
     settings: File = None,
@@ -168,7 +187,7 @@ def accept(
     _require_extra("scipy")
     chosen = _settings(reference, method, options, settings, allow_nonfinite, max_values)
     with _progress() as tell:
-        found = folders.diff(reference, test, chosen, to_accept=True, tell=tell)
+        found = folders.diff(reference, test, chosen, names=names or [], to_accept=True, tell=tell)
     _say(found)
     copies = list(accepting.changes(found))
     for copy in copies:
@@ -203,16 +222,10 @@ def _agreed(count: int) -> bool:
     return typer.confirm(f"Accept {count} as the reference{'' if count == 1 else 's'}?")
 
 
-def _replay(found: Results, chosen: diff_settings.Settings, file: Path | None) -> str:
+def _replay(found: Results, names: Sequence[str]) -> str:
     """The command that repeats the whole comparison."""
-    flags = [*chosen.default.flags, *_flags("--allow-nonfinite", chosen.allow_nonfinite)]
-    flags += _flags("--settings", [file] if file else []) + ["--renders"] * found.renders
-    sides = (folders.as_word(path) for path in (found.reference, found.test))
-    return shlex.join(["mi-refract", "diff", *sides, *flags])
-
-
-def _flags(name: str, values: Sequence[Any]) -> list[str]:
-    return [word for value in values for word in (name, str(value))]
+    sides = (as_word(path) for path in (found.reference, found.test))
+    return shlex.join(["mi-refract", "diff", *sides, *names, *found.flags, *["--renders"] * found.renders])
 
 
 def _self_test(path: Path | None, other: Path | None, max_values: int) -> int:
@@ -236,12 +249,25 @@ def _settings(
     file: Path | None,
     nonfinite: list[str] | None,
     max_values: int,
-) -> diff_settings.Settings:
-    default = replace(diff_settings.from_words(method, words or []), max_values=max_values)
-    beside = (reference if reference.is_dir() else reference.parent) / diff_settings.FILE
+) -> Settings:
+    default = replace(settings_file.from_words(method, words or []), max_values=max_values)
+    beside = (reference if reference.is_dir() else reference.parent) / settings_file.FILE
     path = file or (beside if beside.exists() else None)
-    rules = diff_settings.load(path) if path else ()
-    return diff_settings.Settings(default, rules, tuple(nonfinite or ()))
+    if path is None:
+        return Settings(default, allow_nonfinite=tuple(nonfinite or ()))
+    return replace(settings_file.load(path, default, nonfinite or ()), path=str(file or ""))
+
+
+def _check_settings(reference: Path, test: Path | None, names: Sequence[str], chosen: Settings) -> int:
+    """Print how each image would be compared, and which entries say so; 2 where that is wrong for one."""
+    pairs = pairing.named(pairing.pairs(reference, test or reference, chosen), names)
+    _print(text_reports.settings_table(pairs))
+    for pattern in chosen.unused([pair.name for pair in pairs]):
+        print(f"mi-refract: {printable(pattern)}: matches no image", file=sys.stderr)
+    wrong = [pair for pair in pairs if pair.error or pair.how.error]
+    for pair in wrong:
+        print(f"mi-refract: {printable(pair.name)}: {printable(pair.error or pair.how.error)}", file=sys.stderr)
+    return 2 if wrong else 0
 
 
 def _say(found: Results) -> None:

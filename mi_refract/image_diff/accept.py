@@ -13,7 +13,8 @@ import numpy as np
 from mi_refract.io import image_file
 from mi_refract.io.atomic import replacing
 
-from .folders import Results, Status, digest, opened
+from .folders import digest, opened
+from .results import Results, Status
 
 BLOCK = 2**20  # bytes that are copied at once
 
@@ -47,7 +48,7 @@ def changes(results: Results) -> Iterator[Copy]:
         image = image_file.read(result.test, result.how.max_values)
         if not result.how.options.get("allow_nonfinite") and not np.isfinite(image.pixels).all():
             raise ValueError(f"{result.test}: values that are not finite; accepted with --allow-nonfinite")
-        target = results.target(result)
+        target = result.target or results.reference
         if target.suffix.lower() != result.test.suffix.lower():
             raise ValueError(f"{target}: accepted: a name that ends in {result.test.suffix}, as {result.test} does")
         replaced, shown = result.digests

@@ -1,19 +1,17 @@
-"""Pairs of image files, and folders of them: which image is compared with which, and the results.
+"""Comparing files, and folders of them: every pair, as its settings say, and the results.
 
 A pair that cannot be compared does not stop the others. Nothing here writes a file.
 """
 
 from __future__ import annotations
 
-import enum
 import functools
 import hashlib
 import os
-import shlex
 import stat
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from io import BufferedReader
 from pathlib import Path
 
@@ -22,129 +20,15 @@ import numpy as np
 from mi_refract.io import exit_code, image_file
 from mi_refract.io.image_file import MAX_VALUES, Image
 
-from . import methods
+from . import masks, methods, pairing, settings_file
 from .comparison import Comparison, Verdict
-from .settings import How, Settings
+from .pairing import Pair
+from .results import STATUSES, Result, Results, Status
+from .settings import Settings
 
-
-class Status(enum.StrEnum):
-    """A verdict, or ERROR where there is none. The most important first."""
-
-    ERROR = "error"
-    DIFFERENT = "different"
-    INCONCLUSIVE = "inconclusive"
-    EQUAL = "equal"
-
-
-class Category(enum.StrEnum):
-    """What happened to an image between the two folders; UNKNOWN without a verdict."""
-
-    ADDED = "added"
-    REMOVED = "removed"
-    CHANGED = "changed"
-    UNCHANGED = "unchanged"
-    UNKNOWN = "unknown"
-
-
-STATUSES = {Verdict.EQUAL: Status.EQUAL, Verdict.DIFFERENT: Status.DIFFERENT, Verdict.INCONCLUSIVE: Status.INCONCLUSIVE}
-CATEGORIES = {Status.EQUAL: Category.UNCHANGED, Status.DIFFERENT: Category.CHANGED}
 AS_ASKED = Settings()
 WORKERS = min(os.cpu_count() or 1, 8)  # each holds a pair of images in memory
 HELD = 250_000_000  # bytes of images that stay in memory for a page; a full page shows fewer
-INCONCLUSIVE = {"": 3, "pass": 0, "fail": 1}  # exit codes by what the user wants of it
-
-
-@dataclass(frozen=True)
-class Result:
-    """One image: its name, and what was found. `error` is the line that says why there is no verdict.
-
-    `reference`, `test`: its files, or with renders its folders; None where that side has none. `how`: what was asked.
-    `images`: both sides as they were read, of several renders the mean; empty where they were not kept. `digests`: of
-    both files when they were compared, as `digest` gives them; None where that was not asked, or a file is unreadable.
-    """
-
-    name: str
-    status: Status
-    reference: Path | None
-    test: Path | None
-    how: How = field(default_factory=How)
-    comparison: Comparison | None = None
-    error: str = ""
-    images: tuple[Image, ...] = ()
-    digests: tuple[str, str] | None = None
-
-    @property
-    def category(self) -> Category:
-        """What happened to the image between the two folders."""
-        if self.status is Status.ERROR:
-            return Category.UNKNOWN
-        if self.reference is None or self.test is None:
-            return Category.ADDED if self.reference is None else Category.REMOVED
-        return CATEGORIES.get(self.status, Category.UNKNOWN)
-
-    @property
-    def reason(self) -> str:
-        """The reason for the status in one sentence."""
-        if self.comparison:
-            return self.comparison.reason
-        sides = {Category.ADDED: "only among the new images", Category.REMOVED: "only among the references"}
-        return self.error or sides[self.category]
-
-
-@dataclass(frozen=True)
-class Results:
-    """What `diff` found, failures first.
-
-    `reference`, `test`: the paths as given; `renders`: each of them holds renders of one image. `inconclusive`: what
-    that counts as ("pass", "fail", or "" for an exit code of its own). `unused`: patterns of the settings that matched
-    no image.
-    """
-
-    reference: Path
-    test: Path
-    results: tuple[Result, ...]
-    renders: bool = False
-    inconclusive: str = ""
-    unused: tuple[str, ...] = ()
-
-    def of(self, *statuses: Status) -> list[Result]:
-        """The results with one of these statuses."""
-        return [result for result in self.results if result.status in statuses]
-
-    @property
-    def exit_code(self) -> int:
-        """2: something could not be compared, or nothing was; 1: different; 3: inconclusive; 0: all equal."""
-        if self.of(Status.ERROR) or not self.results:
-            return 2
-        if self.of(Status.DIFFERENT):
-            return 1
-        return INCONCLUSIVE[self.inconclusive] if self.of(Status.INCONCLUSIVE) else 0
-
-    def target(self, result: Result) -> Path:
-        """Where the reference is, or would be."""
-        return result.reference or (self.reference / result.name if self.test.is_dir() else self.reference)
-
-    def reproduce(self, result: Result) -> str:
-        """The command that compares this image again; "" where one side has none."""
-        flags = (["--renders"] if self.renders else []) + result.how.flags
-        return _line("diff", result.reference, result.test, flags) if result.reference else ""
-
-    def accept(self, result: Result) -> str:
-        """The command that makes the new image the reference; "" where there is none, or no need."""
-        flags = [] if self.renders else result.how.flags
-        return _line("accept", self.target(result), result.test, flags) if result.status is not Status.EQUAL else ""
-
-
-def _line(verb: str, reference: Path, test: Path | None, flags: Sequence[str]) -> str:
-    return shlex.join(["mi-refract", verb, as_word(reference), as_word(test), *flags]) if test else ""
-
-
-def as_word(path: Path) -> str:
-    """The path as a word of a command line, with ./ before a name that would be read as an option."""
-    return f"./{path}" if str(path).startswith("-") else str(path)
-
-
-# Comparing --------------------------------------------------------------------------------------------------------
 
 
 def diff(
@@ -152,6 +36,7 @@ def diff(
     test: str | Path,
     settings: Settings = AS_ASKED,
     *,
+    names: Sequence[str] = (),
     renders: bool = False,
     inconclusive: str = "",
     maps: bool = False,
@@ -160,101 +45,123 @@ def diff(
 ) -> Results:
     """Compare two files, two folders by the names of their images, or, with `renders`, two folders as one image.
 
-    `maps`: keep the maps of images that are not equal, and the images themselves as far as HELD goes. `to_accept`: the
-    reference need not exist yet, and the results have `digests`. `tell(done, of)` is called after each image.
+    `names`: patterns of the images to compare; none: all. `maps`: keep the maps of images that are not equal, and the
+    images themselves as far as HELD goes. `to_accept`: the reference need not exist yet, and the results have
+    `digests`. `tell(done, of)` is called after each image.
     Whatever goes wrong with one image is the error of its result. ValueError or OSError where there is nothing to
-    compare: a path that does not exist, a file against a folder, an empty folder, a path within the other.
+    compare: a path that does not exist, a file against a folder, an empty folder, a path within the other, a name that
+    matches no image.
     """
     reference, test = Path(reference), Path(test)
-    require_apart(reference, test, to_accept)
-    if renders and not (reference.is_dir() and test.is_dir()):
-        raise NotADirectoryError(f"{test if reference.is_dir() else reference}: accepted with --renders: a folder")
-    name = reference.resolve().name
-    paired = [Result(name, Status.DIFFERENT, reference, test)] if renders else pairs(reference, test)
-    asked = [replace(result, how=settings.of(result.name)) for result in paired]
+    pairing.require_apart(reference, test, settings.maps, to_accept)
+    every = _pairs(reference, test, settings, renders)
+    unused = settings.unused([pair.name for pair in every]) if reference.is_dir() and not renders else []
+    pairs = [*pairing.named(every, names), *_wrong_entries(settings, every)]
+    root = reference if reference.is_dir() else reference.parent
     found, held = [], 0
     with ThreadPoolExecutor(WORKERS) as pool:
-        for result in pool.map(lambda result: _compared(result, renders, maps, to_accept), asked):
+        for result in pool.map(lambda pair: _compared(pair, root, renders, maps, to_accept), pairs):
             held += sum(image.pixels.nbytes for image in result.images)
             found.append(result if held <= HELD else replace(result, images=()))
-            tell(len(found), len(asked))
+            tell(len(found), len(pairs))
     found.sort(key=lambda result: list(Status).index(result.status))
-    unused = settings.unused([result.name for result in paired]) if reference.is_dir() and not renders else []
-    return Results(reference, test, tuple(found), renders, inconclusive, tuple(unused))
+    by_file = bool(settings.maps)
+    return Results(reference, test, tuple(found), renders, inconclusive, tuple(unused), tuple(settings.flags), by_file)
 
 
-def require_apart(reference: Path, test: Path, new: bool = False) -> None:
-    """ValueError where one path is the other or lies within it, OSError where one does not exist."""
-    for role, path in {"test": test, **({} if new else {"reference": reference})}.items():
-        if not path.exists():
-            raise FileNotFoundError(f"{path}: no such {role} file or folder; accepted: one that is there")
-    if reference.exists() and reference.samefile(test):
-        raise ValueError(f"{test}: the same as the reference {reference}; accepted: two")
-    inner, outer = reference.resolve(), test.resolve()
-    if inner.is_relative_to(outer) or outer.is_relative_to(inner):
-        raise ValueError(f"{test}: one within the other, {reference}; accepted: two apart")
+def _pairs(reference: Path, test: Path, settings: Settings, renders: bool) -> list[Pair]:
+    if not renders:
+        return pairing.pairs(reference, test, settings)
+    if not (reference.is_dir() and test.is_dir()):
+        raise NotADirectoryError(f"{test if reference.is_dir() else reference}: accepted with --renders: a folder")
+    name = reference.resolve().name
+    return [Pair(name, reference, test, reference, settings.of(name))]
 
 
-def pairs(reference: Path, test: Path) -> list[Result]:
-    """The images of both sides by name, not yet compared; those of one side only are different."""
-    known = reference.exists()
-    if known and reference.is_dir() != test.is_dir():
-        raise ValueError(f"{reference}, {test}: a folder and a file; accepted: two of a kind")
-    if not test.is_dir():
-        return [Result(reference.name, Status.DIFFERENT, reference if known else None, test)]
-    (old, lost), (new, missed) = images_in(reference) if known else ({}, []), images_in(test)
-    for folder, nothing in ((reference, known and not old and not lost), (test, not new and not missed)):
-        if nothing:
-            raise ValueError(f"{folder}: holds no image; accepted: at least one")
-    found = [Result(name, Status.DIFFERENT, old.get(name), new.get(name)) for name in sorted(old | new)]
-    return [*found, *(Result(name, Status.ERROR, None, None, error=error) for name, error in lost + missed)]
+def _wrong_entries(settings: Settings, pairs: Sequence[Pair]) -> list[Pair]:
+    """A pair without sides for each entry that is wrong and matches no image: where it does, that image says so."""
+    used = {pair.how.error for pair in pairs}
+    wrong = [rule for rule in settings.rules if rule.error and rule.error not in used]
+    return [Pair(f"{settings_file.FILE}: {rule.where}", None, None, Path(), error=rule.error) for rule in wrong]
 
 
-def images_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
-    """The files whose names end as an image's, by their path inside; (name, error) of folders that cannot be read.
-
-    Names that begin with a dot are left out. Links to folders are not followed, and an error: nobody would look there.
-    """
-    found: dict[str, Path] = {}
-    failed: list[tuple[str, str]] = []
-
-    def note(error: OSError) -> None:
-        failed.append((Path(error.filename).relative_to(folder).as_posix(), str(error)))
-
-    for parent, folders, names in os.walk(folder, onerror=note):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        for path in (Path(parent, name) for name in folders):
-            if path.is_symlink():
-                failed.append((path.relative_to(folder).as_posix(), f"{path}: a link to a folder; accepted: a folder"))
-        for name in names:
-            path = Path(parent, name)
-            if path.suffix[1:].lower() in endings() and not name.startswith("."):
-                found[path.relative_to(folder).as_posix()] = path
-    return found, failed
-
-
-@functools.cache
-def endings() -> frozenset[str]:
-    """The file name endings, lower case without the dot, of the images that OpenImageIO reads."""
-    import OpenImageIO as oiio
-
-    formats = (each.split(":") for each in oiio.get_string_attribute("extension_list").split(";") if each)
-    return frozenset(e for name, listed in formats if name not in ("null", "term", "zfile") for e in listed.split(","))
-
-
-def _compared(result: Result, renders: bool, maps: bool, to_accept: bool) -> Result:
-    """The result of comparing its two sides, where it has both; ERROR for whatever goes wrong."""
+def _compared(pair: Pair, root: Path, renders: bool, maps: bool, to_accept: bool) -> Result:
+    """The result of comparing the two sides of a pair, where it has both; ERROR for whatever goes wrong."""
+    result = Result(pair.name, Status.DIFFERENT, pair.reference, pair.test, pair.how)
+    result = replace(result, target=pair.target, variants=pair.variants, error=pair.error or pair.how.error)
     if result.error:
-        return result
+        return replace(result, status=Status.ERROR)
+    if result.how.skip:
+        return replace(result, status=Status.SKIPPED)
     try:
         if to_accept:  # before the images are read: what is read later and has the same digest is what was compared
             result = replace(result, digests=(digest(result.reference), digest(result.test)))
-        return _judged(result, result.reference, result.test, renders, maps)
+        return _judged(result, root, renders, maps)
     except Exception as error:  # of whatever kind: the other images are still to be compared
         exit_code.print_traceback(error)
         text = exit_code.describe(error)
         known = isinstance(error, ValueError | OSError)
         return replace(result, status=Status.ERROR, error=text if known else f"{result.test}: {text}")
+
+
+def _judged(result: Result, root: Path, renders: bool, maps: bool) -> Result:
+    """The verdict against the reference, or that of a variant to which the new image is equal."""
+    if not (result.reference and result.test):
+        return result
+    read = functools.cache(lambda path: _images(path, result.how.max_values, renders))
+    judged, failed = [], None
+    for path in (result.reference, *result.variants):
+        try:
+            one = _against(path, result.test, read, result, root)
+        except (ValueError, OSError, MemoryError) as error:
+            failed = failed or error  # unless another reference is equal
+            continue
+        if one.comparison.verdict is Verdict.EQUAL:
+            matched = path if path != result.reference else None
+            return _with(replace(result, matched=matched), one, maps)
+        judged.append(one)
+    if failed:
+        raise failed
+    doubt = [one for one in judged if one.comparison.verdict is Verdict.INCONCLUSIVE]
+    return _with(result, (doubt or judged)[0], maps)
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """Both sides, as they were compared, and what was found."""
+
+    sides: tuple[list[Image], list[Image]]
+    comparison: Comparison
+    warning: str
+
+
+def _against(path: Path, other: Path, read: Callable[[Path], list[Image]], result: Result, root: Path) -> _Judged:
+    how = result.how
+    if path.samefile(other):
+        raise ValueError(f"{other}: the same file as the reference {path}; accepted: two")
+    reference, test = read(path), read(other)
+    file = pairing.beside(how.mask, result.target or path, root) if how.mask else None
+    mask = masks.made(reference[0], file, how.ignore, how.max_values)
+    sides = _masked(reference, mask), _masked(test, mask)
+    return _Judged(sides, methods.compare(how.method, *sides, **how.options), masks.warning(mask))
+
+
+def _images(path: Path, most: int, renders: bool) -> list[Image]:
+    return read_renders(path, most) if renders else [image_file.read(path, most)]
+
+
+def _masked(images: list[Image], mask: masks.Mask | None) -> list[Image]:
+    return [masks.applied(image, mask) for image in images]
+
+
+def _with(result: Result, one: _Judged, maps: bool) -> Result:
+    found = one.comparison
+    kept = maps and found.verdict is not Verdict.EQUAL  # a thousand images' maps would fill the memory
+    images = tuple(map(mean_image, one.sides)) if kept else ()
+    left_out = {} if one.sides[0][0].mask is None else {"left out": (~one.sides[0][0].mask).astype(np.float32)}
+    comparison = replace(found, maps=found.maps | left_out if kept else {})
+    warnings = tuple(filter(None, (one.warning,)))
+    return replace(result, status=STATUSES[found.verdict], comparison=comparison, images=images, warnings=warnings)
 
 
 def digest(path: Path | None) -> str:
@@ -275,23 +182,9 @@ def opened(path: Path) -> BufferedReader:
     raise ValueError(f"{path}: accepted: a regular file")
 
 
-def _judged(result: Result, reference: Path | None, test: Path | None, renders: bool, maps: bool) -> Result:
-    if not (reference and test):
-        return result
-    if reference.samefile(test):
-        raise ValueError(f"{test}: the same file as the reference {reference}; accepted: two")
-    most = result.how.max_values
-    sides = [read_renders(path, most) if renders else [image_file.read(path, most)] for path in (reference, test)]
-    found = methods.compare(result.how.method, *sides, **result.how.options)
-    kept = maps and found.verdict is not Verdict.EQUAL  # a thousand images' maps would fill the memory
-    images = tuple(map(mean_image, sides)) if kept else ()
-    comparison = found if kept else replace(found, maps={})
-    return replace(result, status=STATUSES[found.verdict], comparison=comparison, images=images)
-
-
 def read_renders(folder: Path, max_values: int = MAX_VALUES) -> list[Image]:
     """The renders of one image in a folder. ValueError where two are the same, seed and all; otherwise as `read`."""
-    found, failed = images_in(folder)
+    found, failed = pairing.images_in(folder)
     if failed:
         raise OSError(failed[0][1])
     if not found:

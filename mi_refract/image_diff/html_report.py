@@ -28,7 +28,7 @@ from mi_refract.report.plots import histogram_svg
 
 from . import flip, folders
 from .comparison import Maps, Metric
-from .folders import Result, Results, Status
+from .results import Result, Results, Status
 from .text_reports import sentence
 
 PAGE = 14_000_000  # bytes of images on a page of at most 15 MB

@@ -82,7 +82,8 @@ METHODS = {
 def compare(method: str, reference: Side, test: Side, *, allow_nonfinite: bool = False, **options: Any) -> Comparison:
     """Compare two images, or two sequences of renders of one image, by a method of the table.
 
-    "auto" is `welch` where it can be, else `tolerance`. Where a method calls the images equal but would call a black
+    "auto" is `welch` where it can be, else `tolerance`; of the options it takes those of the other one and leaves them
+    out. Where a method calls the images equal but would call a black
     one equal, too, or one with some of its channels black, the verdict is INCONCLUSIVE; so it is where channels whose
     variance `welch` does not know differ by more than `tolerance` allows.
     Where no value of a channel is finite, it is INCONCLUSIVE as well.
@@ -90,7 +91,9 @@ def compare(method: str, reference: Side, test: Side, *, allow_nonfinite: bool =
     ValueError for an unknown method or option, an option of another type or out of its range, several renders for a
     method that takes one, and images that cannot be compared.
     """
-    method = automatic(reference, test) if method == AUTO else method
+    if method == AUTO:
+        method = automatic(reference, test)
+        options = {name: value for name, value in options.items() if name in METHODS[method].options or _unknown(name)}
     if method not in METHODS:
         raise ValueError(f"method {method!r}: accepted: {AUTO}, {', '.join(METHODS)}")
     chosen = METHODS[method]
@@ -142,6 +145,18 @@ def _untested(reference: Sequence[Image], test: Sequence[Image], allow_nonfinite
     one, two = (replace(side[0], pixels=side[0].select(names), channels=tuple(names)) for side in (reference, test))
     found = compare("tolerance", one, two, allow_nonfinite=allow_nonfinite)
     return "" if found.verdict is Verdict.EQUAL else f"not tested, without variance: {', '.join(names)}: {found.reason}"
+
+
+CHOSEN_BY_AUTO = ("welch", "tolerance")
+
+
+def options_of_auto() -> dict[str, Option]:
+    """The options of the methods that "auto" chooses from; each is used where its method is chosen."""
+    return {name: option for method in CHOSEN_BY_AUTO for name, option in METHODS[method].options.items()}
+
+
+def _unknown(name: str) -> bool:
+    return name not in options_of_auto()
 
 
 def automatic(reference: Side, test: Side) -> str:

@@ -1,72 +1,52 @@
-"""How each image is compared: what the command line says for all of them, and `mi-refract.toml` for some.
+"""How each image is compared: what the command line says for all of them, and a settings file for some.
 
-The file holds `[[image]]` tables. Of the tables that match an image's name the last one counts, and it goes before the
-command line:
-
-    [[image]]
-    name = "glass/caustic*.exr"
-    method = "tolerance"
-    fail = 0.02
-    reason = "single-precision caustic: last bits differ between processors"
+Three layers: the file's `[defaults]`, then the command line, then every `[[image]]` of the file whose name matches, in
+their order. A later layer replaces the keys that it gives, and inherits the others. Where it changes the method, the
+options of the method before it are dropped.
 """
 
 from __future__ import annotations
 
-import tomllib
+import platform
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from fnmatch import fnmatchcase
-from pathlib import Path
 from typing import Any
 
 from mi_refract.io.image_file import MAX_VALUES
-from mi_refract.io.toml_schema import TABLES, TEXT, Key, Type, key_table, read
 
-from .methods import AUTO, METHODS
+from .masks import Rectangle
+from .methods import AUTO, METHODS, options_of_auto
+from .name_patterns import matches
 
-FILE = "mi-refract.toml"
-ACCEPTED = (AUTO, *METHODS)
-BOOL = Type("true or false", lambda value: value if isinstance(value, bool) else None)
-METHOD = Type(", ".join(ACCEPTED), lambda value: value if isinstance(value, str) and value in ACCEPTED else None)
-COMMON = {
-    "name": Key(TEXT, "the image's path inside its folder; `*` stands for anything, `/` included"),
-    "reason": Key(TEXT, "why this image is not compared like the others"),
-    "method": Key(METHOD, "the method; that of the command line by default", None),
-    "allow_nonfinite": Key(BOOL, "whether NaN or Inf is allowed where the other image has the same", None),
-}
-
-
-def _finite_or_inf(value: Any) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        return float(value) if value == value else None
-    except OverflowError:
-        return None
-
-
-TYPES: dict[type, Type] = {
-    float: Type("a number or inf", _finite_or_inf),
-    int: Type("a whole number", lambda value: value if type(value) is int else None),
-    str: TEXT,
-}
+SYSTEMS = {"linux": "linux", "darwin": "macos", "win32": "windows"}  # by sys.platform
+PROCESSORS = {"x86_64": "x86_64", "amd64": "x86_64", "arm64": "arm64", "aarch64": "arm64"}  # by platform.machine()
+FILE_ONLY = ("accept", "mask", "ignore")  # keys of `How` that no option of the command line says
 
 
 @dataclass(frozen=True)
 class How:
     """A method, those of its options that are given, and the `reason` from a settings file.
 
-    `max_values`: width × height × channels of an image, at most.
+    `max_values`: width × height × channels of an image, at most. `skip`: not compared at all. `accept`: templates of
+    other references, each as good as the first. `mask`, `ignore`: pixels that do not count, as a template of an image
+    and as rectangles. `entries`: the tables of the settings file that say so. `error`: why they cannot be followed.
     """
 
     method: str = AUTO
     options: Mapping[str, Any] = field(default_factory=dict)
     reason: str = ""
     max_values: int = MAX_VALUES
+    skip: bool = False
+    accept: tuple[str, ...] = ()
+    mask: str = ""
+    ignore: tuple[Rectangle, ...] = ()
+    entries: tuple[str, ...] = ()
+    error: str = ""
 
     @property
     def flags(self) -> list[str]:
-        """The command line's options that say the same."""
+        """The command line's options that say the same, but for what FILE_ONLY names."""
         words = [] if self.method == AUTO else ["--method", self.method]
         for name, value in self.options.items():
             if name != "allow_nonfinite":
@@ -75,89 +55,139 @@ class How:
                 words += ["--allow-nonfinite", "*"]
         return words + ([] if self.max_values == MAX_VALUES else ["--max-values", str(self.max_values)])
 
+    @property
+    def needs_file(self) -> bool:
+        """Whether the command line alone cannot say the same."""
+        return any(getattr(self, name) for name in FILE_ONLY)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An `[[image]]` table, or `[defaults]`: a pattern of names, and the keys that it gives.
+
+    `values`: of `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `allow_nonfinite` and the options of methods.
+    `when`: platforms, one of which must be this one; none: all. `error`: what is wrong with it.
+    """
+
+    pattern: str
+    values: Mapping[str, Any]
+    where: str = "image[0]"
+    when: tuple[str, ...] = ()
+    error: str = ""
+
+    @property
+    def here(self) -> bool:
+        """Whether it is for this platform."""
+        return not self.when or any(set(each.split()) <= this_platform() for each in self.when)
+
+
+@dataclass(frozen=True)
+class Map:
+    """Which reference belongs to which new image: templates of both paths, with the same fields."""
+
+    reference: str
+    test: str
+
 
 @dataclass(frozen=True)
 class Settings:
-    """`default` for all images, `rules` by pattern of names, and the patterns whose values need not be finite."""
+    """`default` for all images, `rules` by pattern of names, and the patterns whose values need not be finite.
+
+    `defaults`: what the settings file says of all images; `default`, the command line's, goes before it.
+    """
 
     default: How = How()
-    rules: tuple[tuple[str, How], ...] = ()
+    rules: tuple[Entry, ...] = ()
     allow_nonfinite: tuple[str, ...] = ()
+    defaults: Entry = Entry("*", {}, "defaults")
+    maps: tuple[Map, ...] = ()
+    path: str = ""
 
     def of(self, name: str) -> How:
-        """How the image of this name is compared."""
-        how = next((how for pattern, how in reversed(self.rules) if fnmatchcase(name, pattern)), self.default)
-        if how.method in (AUTO, self.default.method):
-            how = replace(how, method=self.default.method, options={**self.default.options, **how.options})
-        if any(fnmatchcase(name, pattern) for pattern in self.allow_nonfinite):
-            how = replace(how, options={"allow_nonfinite": True, **how.options})
-        return replace(how, max_values=self.default.max_values)
+        """How the image of this name is compared. Entries that cannot be followed are the `error` of what is found."""
+        entries = [each for each in self.rules if each.here and matches(each.pattern, name)]
+        reasons = [str(each.values["reason"]) for each in entries if "reason" in each.values]
+        how = replace(
+            self.default,
+            options={},
+            entries=tuple(each.where for each in entries),
+            reason="; ".join(dict.fromkeys(reasons)),
+        )
+        if error := next((each.error for each in entries if each.error), "") or _fight(entries):
+            return replace(how, error=error)
+        try:
+            method, options = _method(
+                [("[defaults]", self.defaults.values), *self._command_line(name), *_layers(entries)]
+            )
+        except ValueError as error:
+            return replace(how, error=str(error))
+        others = {**self.defaults.values, **{key: value for each in entries for key, value in each.values.items()}}
+        kept = {key: others[key] for key in ("skip", *FILE_ONLY) if key in others}
+        return replace(how, method=method, options=options, **kept)
+
+    def _command_line(self, name: str) -> list[tuple[str, Mapping[str, Any]]]:
+        given = dict(self.default.options) | ({} if self.default.method == AUTO else {"method": self.default.method})
+        if any(matches(pattern, name) for pattern in self.allow_nonfinite):
+            given["allow_nonfinite"] = True
+        return [("the command line", given)]
+
+    @property
+    def flags(self) -> list[str]:
+        """The command line's options that say the same; `path`: the settings file, where it was named there."""
+        nonfinite = [word for name in self.allow_nonfinite for word in ("--allow-nonfinite", name)]
+        return [*self.default.flags, *nonfinite, *(["--settings", self.path] if self.path else [])]
 
     def unused(self, names: Sequence[str]) -> list[str]:
-        """The patterns that match none of these names."""
-        patterns = [*(pattern for pattern, _ in self.rules), *self.allow_nonfinite]
-        return [pattern for pattern in patterns if not any(fnmatchcase(name, pattern) for name in names)]
+        """The patterns for this platform that match none of these names."""
+        patterns = [*(each.pattern for each in self.rules if each.here), *self.allow_nonfinite]
+        return [pattern for pattern in patterns if not any(matches(pattern, name) for name in names)]
 
 
-def load(path: str | Path) -> tuple[tuple[str, How], ...]:
-    """The rules of a settings file: pattern of names, and how such images are compared.
-
-    ValueError names the file and the key, whose images count from 0; OSError as the system raises it.
-    """
-    path = Path(path)
-    try:
-        table = tomllib.loads(path.read_bytes().decode())
-        images = read(table, {"image": Key(TABLES, "", [])})["image"]
-        return tuple(_rule(image, f"image[{i}].") for i, image in enumerate(images))
-    except (ValueError, RecursionError) as error:
-        text = str(error) if isinstance(error, ValueError) else "brackets nested too deeply; accepted: TOML"
-        raise ValueError(" ".join(f"{path}: {text}".split())) from None
+def this_platform() -> frozenset[str]:
+    """The words that `when` may hold and that are true here: the system and the processor."""
+    words = SYSTEMS.get(sys.platform), PROCESSORS.get(platform.machine().lower())
+    return frozenset(word for word in words if word)
 
 
-def _rule(table: dict[str, Any], where: str) -> tuple[str, How]:
-    method = read({k: v for k, v in table.items() if k == "method"}, {"method": COMMON["method"]}, where)["method"]
-    values = read(table, COMMON | keys_of(method or AUTO), where)
-    options = {name: values[name] for name in table if name not in ("name", "reason", "method")}
-    return values["name"], How(method or AUTO, options, values["reason"])
+def _layers(entries: Sequence[Entry]) -> list[tuple[str, Mapping[str, Any]]]:
+    return [(each.where, each.values) for each in entries]
 
 
-def keys_of(method: str) -> dict[str, Key]:
-    """The options of a method as keys; none for "auto", which chooses by the images."""
-    options = METHODS[method].options if method != AUTO else {}
-    return {name: Key(TYPES[option.type], option.help, option.default) for name, option in options.items()}
+def _method(layers: Sequence[tuple[str, Mapping[str, Any]]]) -> tuple[str, dict[str, Any]]:
+    """The method and its options. ValueError for an option that the method does not have."""
+    method, options, given_by = AUTO, dict[str, Any](), dict[str, str]()
+    for where, values in layers:
+        if values.get("method", method) != method:
+            method = values["method"]
+            options = {name: value for name, value in options.items() if name in options_of(method)}
+        for name in values:
+            if name == "allow_nonfinite" or name in ALL_OPTIONS:
+                options[name], given_by[name] = values[name], where
+    for name in options:
+        if name not in options_of(method):
+            accepted = ", ".join(sorted(options_of(method) - {"allow_nonfinite"})) or "none"
+            raise ValueError(f"{given_by[name]}.{name}: not an option of {method}; accepted: {accepted}")
+    return method, options
 
 
-def from_words(method: str, words: Sequence[str]) -> How:
-    """The method and its options from the command line's `NAME=VALUE`. ValueError for anything else."""
-    if method not in ACCEPTED:
-        raise ValueError(f"--method {method}: accepted: {METHOD.accepted}")
-    if words and method == AUTO:
-        raise ValueError(f"--set {words[0]}: the options of which method? accepted: after --method {'|'.join(METHODS)}")
-    keys = keys_of(method)
-    table: dict[str, Any] = {}
-    for word in words:
-        name, equals, text = word.partition("=")
-        if not equals or name in table:
-            raise ValueError(f"--set {word}: accepted: NAME=VALUE, each name once")
-        table[name] = _value(text, keys[name].type) if name in keys else text
-    values = read(table, keys, "--set ")
-    return How(method, {name: values[name] for name in table})
+def options_of(method: str) -> frozenset[str]:
+    """The names of the options that a method takes, `allow_nonfinite` among them."""
+    names = options_of_auto() if method == AUTO else METHODS[method].options
+    return frozenset(names) | {"allow_nonfinite"}
 
 
-def _value(text: str, kind: Type) -> Any:
-    """A number where the option is one; the text itself where that fails, for `read` to refuse."""
-    for numeric in (int, float) if kind is not TEXT else ():
-        try:
-            return numeric(text)
-        except ValueError:
-            continue
-    return text
+def _fight(entries: Sequence[Entry]) -> str:
+    """Two entries of the same pattern that give the same key other values; "" where there are none."""
+    for i, one in enumerate(entries):
+        for other in entries[i + 1 :]:
+            both = [key for key in one.values if key in other.values and key != "reason"]
+            for key in both if one.pattern == other.pattern else []:
+                if one.values[key] != other.values[key]:
+                    return (
+                        f"{other.where}.{key}: {other.values[key]!r}, but {one.values[key]!r} in {one.where} for the "
+                        f"same name {one.pattern!r}; accepted: one of them"
+                    )
+    return ""
 
 
-def reference() -> str:
-    """What a settings file may hold, and the options of each method, in Markdown."""
-    parts = [key_table("`[[image]]`", COMMON)]
-    for name, method in METHODS.items():
-        parts.append(f"`{name}`: {method.summary}")
-        parts += [key_table("option", keys_of(name))] if keys_of(name) else []
-    return "\n\n".join(parts)
+ALL_OPTIONS = frozenset(name for method in METHODS.values() for name in method.options)

@@ -10,6 +10,7 @@ import math
 import os
 import re
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -20,7 +21,9 @@ from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.row import strict
 
 from .comparison import Metric
-from .folders import Result, Results, Status
+from .pairing import Pair
+from .results import Result, Results, Status
+from .settings import How
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -33,8 +36,15 @@ WORDS = {
     Status.DIFFERENT: "different",
     Status.INCONCLUSIVE: "inconclusive",
     Status.EQUAL: "equal",
+    Status.SKIPPED: "skipped",
 }
-STYLES = {Status.ERROR: "bold red", Status.DIFFERENT: "bold red", Status.INCONCLUSIVE: "yellow", Status.EQUAL: "green"}
+STYLES = {
+    Status.ERROR: "bold red",
+    Status.DIFFERENT: "bold red",
+    Status.INCONCLUSIVE: "yellow",
+    Status.EQUAL: "green",
+    Status.SKIPPED: "dim",
+}
 
 
 def sentence(results: Results) -> str:
@@ -52,18 +62,40 @@ def table(results: Results) -> RenderableType:
     from rich.text import Text
 
     failed = results.of(Status.DIFFERENT, Status.INCONCLUSIVE)
-    equal = results.of(Status.EQUAL)
+    equal, skipped = results.of(Status.EQUAL), results.of(Status.SKIPPED)
     rows = Table("verdict", "image", "method", "why", box=None, pad_edge=False)
-    for result in [*failed, *equal[:FEW]]:
+    for result in [*failed, *equal[:FEW], *skipped]:
         status = Text(_word(result), style=STYLES[result.status])
         rows.add_row(status, *(Text(printable(text)) for text in (result.name, _method(result), why(result))))
     more = [Text(f"… and {len(equal) - FEW} more that are equal", style="dim")] if len(equal) > FEW else []
     return Group(*([rows] if rows.row_count else []), *more, Text(sentence(results)))
 
 
+def settings_table(pairs: Sequence[Pair]) -> RenderableType:
+    """How each image would be compared, and the tables of the settings file that say so; for rich's console."""
+    from rich.table import Table
+    from rich.text import Text
+
+    rows = Table("image", "compared by", "from", "why", box=None, pad_edge=False)
+    for pair in pairs:
+        how = pair.how
+        options = [f"{name}={value}" for name, value in how.options.items()]
+        others = [f"{count} variant{'s' * (count > 1)}"] if (count := len(pair.variants)) else []
+        parts = ["skipped"] if how.skip else [how.method, *options, *others, *_pixels(how)]
+        cells = pair.name, ", ".join(parts), ", ".join(how.entries) or "–", how.reason
+        rows.add_row(*(Text(printable(cell)) for cell in cells))
+    return rows
+
+
+def _pixels(how: How) -> list[str]:
+    mask = [f"mask {how.mask}"] if how.mask else []
+    return [*mask, *(f"without {list(each)}" for each in how.ignore)]
+
+
 def why(result: Result) -> str:
-    """The reason of the verdict, and the settings' reason where the image has settings of its own."""
-    return result.reason + (f" [{result.how.reason}]" if result.how.reason else "")
+    """The reason of the verdict, warnings, and the settings' reason where the image has settings of its own."""
+    parts = result.reason, *(f"warning: {text}" for text in result.warnings)
+    return "; ".join(parts) + (f" [{result.how.reason}]" if result.how.reason else "")
 
 
 def _word(result: Result) -> str:
@@ -107,6 +139,10 @@ def _entry(results: Results, result: Result) -> dict[str, Any]:
         "method": _method(result),
         "options": dict(result.how.options),
         "why_so": result.how.reason,
+        "entries": list(result.how.entries),
+        "matched": result.matched,
+        "variants": list(result.variants),
+        "warnings": list(result.warnings),
         "metrics": [{"name": m.name, "value": m.value, "bound": m.bound} for m in (found.metrics if found else ())],
         "minimum_detectable_difference": found.minimum_detectable if found else math.nan,
         "reproduce": results.reproduce(result),
@@ -125,6 +161,8 @@ def write_junit(path: str | Path, results: Results) -> None:
 
 def _case(results: Results, result: Result) -> junit.Case:
     kind = _kind(results, result)
+    if result.status is Status.SKIPPED:
+        return junit.Case(_method(result), result.name, "skipped", why(result))
     if not kind:
         return junit.Case(_method(result), result.name)
     return junit.Case(_method(result), result.name, kind, why(result), _details(results, result), _word(result))
@@ -134,7 +172,9 @@ def _kind(results: Results, result: Result) -> Literal["", "failure", "error"]:
     """ "error", "failure", or "" for what does not fail the run."""
     if result.status is Status.ERROR:
         return "error"
-    passes = result.status is Status.EQUAL or (result.status is Status.INCONCLUSIVE and results.inconclusive == "pass")
+    passes = result.status in (Status.EQUAL, Status.SKIPPED) or (
+        result.status is Status.INCONCLUSIVE and results.inconclusive == "pass"
+    )
     return "" if passes else "failure"
 
 
@@ -159,7 +199,7 @@ def workflow_commands(results: Results) -> list[str]:
     """A workflow command for each image that is not equal."""
     lines = []
     for result in results.results:
-        if result.status is not Status.EQUAL:
+        if result.warnings or result.status not in (Status.EQUAL, Status.SKIPPED):
             level = "error" if _kind(results, result) else "warning"
             file = _property(result.test or result.reference or result.name)
             title = _property(f"{result.name}: {_word(result)}")

@@ -200,10 +200,10 @@ BAD = {
     "samples of files": (["{}/old/equal.exr", "{}/new/equal.exr", "--renders"], "accepted with --renders: a folder"),
     "method": (["{}/old", "{}/new", "--method", "idiff"], "--method idiff: accepted: auto, exact"),
     "option": (["{}/old", "{}/new", "--method", "exact", "--set", "fail=1"], "--set fail: unknown"),
-    "option of none": (["{}/old", "{}/new", "--set", "fail=1"], "the options of which method?"),
+    "option of neither": (["{}/old", "{}/new", "--set", "threshold=1"], "--set threshold: unknown; accepted: tile"),
     "inconclusive": (["{}/old", "{}/new", "--inconclusive", "maybe"], "maybe"),
     "no settings": (["{}/old", "{}/new", "--settings", "{}/none.toml"], "none.toml"),
-    "bad settings": (["{}/old", "{}/new", "--settings", "{}/bad.toml"], "bad.toml: image[0].fale: unknown"),
+    "bad settings": (["{}/old", "{}/new", "--settings", "{}/bad.toml"], "bad.toml: defaults.fale: unknown"),
     "report's name": (["{}/old", "{}/new", "--report", "{}/out.exr"], "accepted: a file name that ends in .html"),
     "report's folder": (["{}/old", "{}/new", "--report", "{}/none/out.html"], "is not a folder"),
     "junit's name": (["{}/old", "{}/new", "--junit", "{}/out.json"], "accepted: a file name that ends in .xml"),
@@ -220,7 +220,7 @@ def test_bad_words(run, pair, tmp_path, verb, words, message):
     if verb == "accept" and {"--renders", "--inconclusive", "--report", "--junit", "--json"} & {*words}:
         pytest.skip("not one of its options")
     (tmp_path / "empty").mkdir()
-    (tmp_path / "bad.toml").write_text('[[image]]\nname = "a"\nreason = "r"\nfale = 1')
+    (tmp_path / "bad.toml").write_text("[defaults]\nfale = 1")
     before = tree(tmp_path)
     code, out, err = run(verb, *(word.format(tmp_path) for word in words))
     assert (code, out, err.count("\n")) == (2, "", 1)

@@ -10,7 +10,7 @@ import pytest
 from support.diff_images import BROKEN, image
 
 from mi_refract.image_diff import text_reports
-from mi_refract.image_diff.folders import Result, Results, Status
+from mi_refract.image_diff.results import Result, Results, Status
 
 EVIL = 'a"b<script>alert(1)</script>|`*[x](y)*`,:%0A::error::.exr'
 
@@ -35,7 +35,7 @@ def test_json(run, strange, tmp_path):
     data = json.loads(out.read_text(), parse_constant=refuse)
     assert data["schema"] == 1
     assert data["exit_code"] == 1
-    assert data["counts"] == {"error": 0, "different": 2, "inconclusive": 0, "equal": 1}
+    assert data["counts"] == {"error": 0, "different": 2, "inconclusive": 0, "equal": 1, "skipped": 0}
     by_name = {result["name"]: result for result in data["results"]}
     assert by_name[name]["category"] == "added"
     assert by_name[name]["reference"] is None

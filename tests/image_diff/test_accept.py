@@ -15,7 +15,7 @@ from support.diff_images import BROKEN, found, image, tree
 from mi_refract.cli import diff as cli_diff
 from mi_refract.image_diff import accept
 from mi_refract.image_diff import folders as diff
-from mi_refract.image_diff.folders import Category
+from mi_refract.image_diff.results import Category
 from mi_refract.image_diff.settings import How, Settings
 
 

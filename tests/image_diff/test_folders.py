@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
-from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
@@ -13,9 +11,8 @@ from support.diff_images import BROKEN, found, image, samples
 
 from mi_refract.image_diff import folders as diff
 from mi_refract.image_diff import methods
-from mi_refract.image_diff import settings as diff_settings
-from mi_refract.image_diff.folders import Result, Results, Status
-from mi_refract.image_diff.settings import How, Settings
+from mi_refract.image_diff.results import Result, Results, Status
+from mi_refract.image_diff.settings import Entry, How, Settings
 from mi_refract.io import image_file
 
 
@@ -136,7 +133,7 @@ def test_images_larger_than_allowed_are_not_compared(folders):
     assert results.reproduce(results.results[0]).endswith(f"changed.exr --max-values {most - 1}")
     with pytest.raises(ValueError, match="max-values"):
         diff.read_renders(folders[0], most - 1)
-    ruled = Settings(How(max_values=most - 1), rules=(("same.exr", How("exact")),))
+    ruled = Settings(How(max_values=most - 1), rules=(Entry("same.exr", {"method": "exact"}),))
     assert found(diff.diff(*folders, ruled))["same.exr"] == ("error", "unknown")
 
 
@@ -262,174 +259,3 @@ def test_bad_samples(tmp_path):
             raise ValueError(results.results[0].error)
     with pytest.raises(NotADirectoryError, match=r"0\.exr: accepted with --renders: a folder"):
         diff.diff(good, twice / "0.exr", renders=True)
-
-
-# Settings ---------------------------------------------------------------------------------------------------------
-
-RULES = """
-[[image]]
-name = "inner/*"
-method = "tolerance"
-fail = 1
-reason = "glass"
-
-[[image]]
-name = "inner/changed.exr"
-method = "tolerance"
-fail = 0.2
-fail_relative = 0.0
-reason = "more glass"
-"""
-
-
-@pytest.fixture
-def rules(tmp_path):
-    def write(text):
-        path = tmp_path / "rules.toml"
-        path.write_text(text)
-        return diff_settings.load(path)
-
-    return write
-
-
-def test_the_last_rule_that_matches_holds(rules):
-    settings = Settings(rules=rules(RULES))
-    assert settings.of("inner/changed.exr") == How("tolerance", {"fail": 0.2, "fail_relative": 0.0}, "more glass")
-    assert settings.of("inner/deep/other.exr") == How("tolerance", {"fail": 1.0}, "glass")
-    assert settings.of("changed.exr") == How()
-    assert Settings(rules=rules("")).of("changed.exr") == How()
-
-
-def test_a_rule_goes_before_the_command_line(rules):
-    settings = Settings(How("tolerance", {"fail": 0.5, "hard_fail": 0.6}), rules(RULES))
-    assert settings.of("inner/changed.exr").options == {"fail": 0.2, "fail_relative": 0.0, "hard_fail": 0.6}
-    assert settings.of("other.exr").options == {"fail": 0.5, "hard_fail": 0.6}
-    exact = Settings(How("exact"), rules(RULES))
-    assert exact.of("inner/changed.exr").method == "tolerance"
-    assert exact.of("other.exr") == How("exact")
-    silent = Settings(How("exact"), rules('[[image]]\nname = "a"\nreason = "NaN"\nallow_nonfinite = true'))
-    assert silent.of("a") == How("exact", {"allow_nonfinite": True}, "NaN")
-
-
-def test_a_rule_that_allows_no_nan_holds_and_its_command_says_the_same(rules):
-    settings = Settings(
-        rules=rules('[[image]]\nname = "a"\nreason = "never"\nallow_nonfinite = false'), allow_nonfinite=("*",)
-    )
-    assert settings.of("a").options == {"allow_nonfinite": False}
-    assert settings.of("a").flags == []
-    assert settings.of("b").flags == ["--allow-nonfinite", "*"]
-
-
-def test_what_is_set_is_what_is_compared_by(folders, rules):
-    settings = Settings(rules=rules(RULES))
-    by_name = {result.name: result for result in diff.diff(*folders, settings).results}
-    assert by_name["inner/changed.exr"].status is Status.EQUAL
-    assert by_name["inner/changed.exr"].how.reason == "more glass"
-    tight = Settings(rules=rules(RULES.replace("fail = 0.2", "fail = 0.05")))
-    assert diff.diff(*folders, tight).results[1].status is Status.DIFFERENT
-
-
-def test_patterns_that_match_nothing_are_told(folders, rules):
-    stale = RULES + '[[image]]\nname = "gone.exr"\nreason = "was noisy"\n'
-    assert diff.diff(*folders, Settings(rules=rules(stale), allow_nonfinite=("sane.exr",))).unused == (
-        "gone.exr",
-        "sane.exr",
-    )
-    assert diff.diff(*folders, Settings(rules=rules(RULES), allow_nonfinite=("same*",))).unused == ()
-
-
-def test_nan_is_allowed_where_it_is_named(tmp_path):
-    for side in ("old", "new"):
-        image(tmp_path / side / "a.exr", value=np.nan)
-        image(tmp_path / side / "b.exr", value=np.nan)
-    settings = Settings(allow_nonfinite=("a.exr",))
-    statuses = found(diff.diff(tmp_path / "old", tmp_path / "new", settings))
-    assert statuses == {"a.exr": ("equal", "unchanged"), "b.exr": ("different", "changed")}
-
-
-def test_the_readme_names_every_method_and_its_settings_are_accepted(rules):
-    text = (Path(diff.__file__).parent / "README.md").read_text("utf-8")
-    assert all(f"| `{name}` |" in text for name in methods.METHODS)
-    (example,) = re.findall("```toml\n(.*?)```", text, re.DOTALL)
-    assert rules(example)[0][1].method == "tolerance"
-
-
-BAD_RULES = {
-    "no name": ('[[image]]\nreason = "r"', "image[0].name: missing"),
-    "no reason": ('[[image]]\nname = "a"', "image[0].reason: missing; accepted: a text"),
-    "empty reason": ('[[image]]\nname = "a"\nreason = " "', "image[0].reason: ' '"),
-    "unknown key": ('[[image]]\nname = "a"\nreason = "r"\nfale = 1', "image[0].fale: unknown; accepted: name"),
-    "option of no method": ('[[image]]\nname = "a"\nreason = "r"\nfail = 1', "image[0].fail: unknown"),
-    "option of another": (
-        '[[image]]\nname = "a"\nreason = "r"\nmethod = "exact"\nfail = 1',
-        "image[0].fail: unknown",
-    ),
-    "method": ('[[image]]\nname = "a"\nreason = "r"\nmethod = "idiff"', "image[0].method: 'idiff'; accepted: auto, "),
-    "type of method": ('[[image]]\nname = "a"\nreason = "r"\nmethod = 3', "image[0].method: 3; accepted: auto, "),
-    "type": (RULES.replace("fail = 0.2", 'fail = "0.2"'), "image[1].fail: '0.2'; accepted: a number"),
-    "bool for number": (RULES.replace("fail = 0.2", "fail = true"), "image[1].fail: true"),
-    "nan": (RULES.replace("fail = 0.2", "fail = nan"), "image[1].fail: nan"),
-    "flag": ('[[image]]\nname = "a"\nreason = "r"\nallow_nonfinite = 1', "image[0].allow_nonfinite: 1"),
-    "table": ("[images]", "images: unknown; accepted: image"),
-    "top": ('method = "exact"', "method: unknown; accepted: image"),
-    "no list": ('[image]\nname = "a"', "image: "),
-    "no TOML": ("[[", "rules.toml: "),
-    "nested": ("a = " + "[" * 5000, "rules.toml: "),
-}
-
-
-@pytest.mark.parametrize("text, message", BAD_RULES.values(), ids=BAD_RULES)
-def test_bad_settings(rules, text, message):
-    with pytest.raises(ValueError) as error:
-        rules(text)
-    assert message in str(error.value)
-    assert "rules.toml: " in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def test_settings_that_are_no_text(tmp_path):
-    path = tmp_path / "rules.toml"
-    path.write_bytes(b"\xff\xfe")
-    with pytest.raises(ValueError, match=r"rules\.toml: "):
-        diff_settings.load(path)
-
-
-def test_options_in_words():
-    assert diff_settings.from_words("auto", []) == How()
-    how = diff_settings.from_words("welch", ["tile=8", "equivalence_margin=1", "correction=holm"])
-    assert how == How("welch", {"tile": 8, "equivalence_margin": 1.0, "correction": "holm"})
-    assert type(how.options["equivalence_margin"]) is float
-    assert diff_settings.from_words("tolerance", ["fail=inf"]).options == {"fail": np.inf}
-
-
-@pytest.mark.parametrize("method", methods.METHODS)
-def test_every_option_of_every_method_in_words_and_back(method):
-    defaults = {name: option.default for name, option in methods.METHODS[method].options.items()}
-    flags = How(method, defaults).flags
-    assert flags[:2] == ["--method", method]
-    assert diff_settings.from_words(method, flags[3::2]).options == defaults
-
-
-@pytest.mark.parametrize(
-    "method, words, message",
-    [
-        ("idiff", [], "--method idiff: accepted: auto, exact"),
-        ("auto", ["fail=1"], "--set fail=1: the options of which method?"),
-        ("tolerance", ["fail"], "--set fail: accepted: NAME=VALUE"),
-        ("tolerance", ["fail=1", "fail=2"], "--set fail=2: accepted: NAME=VALUE, each name once"),
-        ("tolerance", ["fale=1"], "--set fale: unknown; accepted: fail"),
-        ("tolerance", ["fail=much"], "--set fail: 'much'; accepted: a number"),
-        ("tolerance", ["fail=nan"], "--set fail: nan"),
-        ("welch", ["tile=1.5"], "--set tile: 1.5; accepted: a whole number"),
-        ("welch", ["correction="], "--set correction: ''"),
-    ],
-)
-def test_bad_options_in_words(method, words, message):
-    with pytest.raises(ValueError) as error:
-        diff_settings.from_words(method, words)
-    assert str(error.value).startswith(message)
-
-
-def test_an_option_out_of_its_range_is_no_verdict(folders):
-    results = diff.diff(*folders, Settings(How("tolerance", {"fail": -1.0})))
-    assert {result.status for result in results.results if None not in (result.reference, result.test)} == {"error"}

@@ -11,7 +11,7 @@ from support.browser import browse, needs_chromium, seen
 
 from mi_refract.image_diff import flip, folders, html_report
 from mi_refract.image_diff.comparison import Comparison, Metric, Verdict
-from mi_refract.image_diff.folders import Result, Results, Status
+from mi_refract.image_diff.results import Result, Results, Status
 from mi_refract.image_diff.settings import How, Settings
 from mi_refract.io import image_file
 from mi_refract.io.image_file import write_exr

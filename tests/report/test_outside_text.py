@@ -10,7 +10,7 @@ from support.hostile import NAME, shows_more_than_text
 
 from mi_refract.image_diff import html_report, text_reports
 from mi_refract.image_diff.comparison import Comparison, Metric, Verdict
-from mi_refract.image_diff.folders import Result, Results, Status
+from mi_refract.image_diff.results import Result, Results, Status
 from mi_refract.image_diff.settings import How
 from mi_refract.planar import figure, path_tree, scene_file
 from mi_refract.ray_sets import check_answers, reports

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mi_refract.image_diff import folders, settings
-from mi_refract.image_diff.folders import Status
+from mi_refract.image_diff import folders, settings_file
+from mi_refract.image_diff.results import Status
 from mi_refract.io import image_file
 from mi_refract.planar import scene_file
 from mi_refract.ray_sets import check_answers, files, ray_set
@@ -107,7 +107,7 @@ def parsers(folder: Path) -> dict[str, Parser]:
     scenes = tuple((SCENES / f"{name}.toml").read_bytes() for name in ("lens", "nested", "prism", "doublet"))
     return {
         "planar scene, TOML": Parser(".toml", scenes, lambda path: str(scene_file.load(path))[:0]),
-        "diff settings, TOML": Parser(".toml", (SETTINGS,), lambda path: str(settings.load(path))[:0]),
+        "diff settings, TOML": Parser(".toml", (SETTINGS,), lambda path: str(settings_file.load(path))[:0]),
         "rows, JSON": Parser(".json", (rows_json,), lambda path: str(run_report.read_json(path))[:0]),
         "rays, CSV": Parser(".csv", ((folder / "rays.csv").read_bytes(),), same_rays),
         "rays, NPZ": Parser(".npz", ((folder / "rays.npz").read_bytes(),), same_rays),

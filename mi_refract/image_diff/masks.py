@@ -1,0 +1,71 @@
+"""Which pixels of an image count: a mask, an image in which white counts, and rectangles that are left out.
+
+What does not count is 0 in both images before a method sees them, and shares of pixels are of those that count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_refract.io import image_file
+from mi_refract.io.image_file import MAX_VALUES, Image
+
+Mask = NDArray[np.bool_]  # H × W; True where a pixel counts
+Rectangle = tuple[int, int, int, int]  # x, y, width and height, as the messages of the methods count pixels
+WHITE = 0.5  # of a mask's largest colour: from there on a pixel counts
+MOST = 0.5  # share of the pixels that may be left out without a warning
+
+
+def made(reference: Image, path: Path | None, rectangles: Sequence[Rectangle], most: int = MAX_VALUES) -> Mask | None:
+    """The pixels of the image that count; None where there is neither a mask nor a rectangle.
+
+    OSError for a mask that cannot be read; ValueError for one of another size, for a rectangle without a pixel of the
+    image, and where no pixel is left.
+    """
+    if path is None and not rectangles:
+        return None
+    counts = np.ones(reference.pixels.shape[:2], bool) if path is None else _read(path, reference, most)
+    for rectangle in rectangles:
+        part = counts[_slices(reference, rectangle)]
+        if not part.size:
+            raise ValueError(f"ignore = {list(rectangle)}: accepted: a rectangle that holds pixels of {reference.path}")
+        part[:] = False
+    if not counts.any():
+        raise ValueError(f"{path or 'ignore'}: leaves no pixel of {reference.path}; accepted: at least one")
+    return counts
+
+
+def applied(image: Image, mask: Mask | None) -> Image:
+    """The image with 0 where the mask does not count, and with the mask."""
+    return image if mask is None else replace(image, pixels=np.where(mask[..., None], image.pixels, 0), mask=mask)
+
+
+def warning(mask: Mask | None) -> str:
+    """What to tell of a mask that leaves out more than MOST; "" of others."""
+    left_out = 0.0 if mask is None else 1 - float(mask.mean())
+    return f"the mask leaves out {left_out:.0%} of the pixels" if left_out > MOST else ""
+
+
+def _read(path: Path, reference: Image, most: int) -> Mask:
+    found = image_file.read(path, most)
+    if found.pixels.shape[:2] != reference.pixels.shape[:2]:
+        height, width = reference.pixels.shape[:2]
+        raise ValueError(
+            f"{path}: {found.pixels.shape[1]} × {found.pixels.shape[0]}; accepted: a mask of {width} × {height}"
+        )
+    colours = found.select([name for name in found.channels if name != "A"] or found.channels)
+    if not np.isfinite(colours).all():
+        raise ValueError(f"{path}: values that are not finite; accepted: a mask from 0 to 1")
+    counts: Mask = colours.max(-1) >= WHITE
+    return counts
+
+
+def _slices(image: Image, rectangle: Rectangle) -> tuple[slice, slice]:
+    x, y, width, height = rectangle
+    left, top = x - image.origin[0], y - image.origin[1]
+    return slice(max(top, 0), max(top + height, 0)), slice(max(left, 0), max(left + width, 0))

@@ -1,0 +1,183 @@
+"""Which image of one folder is compared with which of the other: by their paths, or as the settings map them.
+
+In: two paths and the settings. Out: pairs with names, the other references that each may match, and what cannot be
+looked at. No image is read here.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from . import name_patterns
+from .settings import How, Map, Settings
+
+ROOT = "{root}/"  # before a template of a path that is not beside the reference
+
+
+@dataclass(frozen=True)
+class Pair:
+    """The two sides of an image; None where that side has none.
+
+    `name`: the path of the new image in its folder, or what it would be. `target`: where the reference is, or would be.
+    `variants`: other references that it may match. `error`: why it cannot be compared.
+    """
+
+    name: str
+    reference: Path | None
+    test: Path | None
+    target: Path
+    how: How = field(default_factory=How)
+    variants: tuple[Path, ...] = ()
+    error: str = ""
+
+
+def require_apart(reference: Path, test: Path, maps: Sequence[Map] = (), new: bool = False) -> None:
+    """ValueError where one path is the other or lies within it, OSError where one does not exist.
+
+    `maps`: where the settings have any, references and new images may share a folder. `new`: the reference need not
+    exist yet.
+    """
+    for role, path in {"test": test, **({} if new else {"reference": reference})}.items():
+        if not path.exists():
+            raise FileNotFoundError(f"{path}: no such {role} file or folder; accepted: one that is there")
+    if maps and test.is_dir():
+        return
+    if reference.exists() and reference.samefile(test):
+        raise ValueError(f"{test}: the same as the reference {reference}; accepted: two")
+    inner, outer = reference.resolve(), test.resolve()
+    if inner.is_relative_to(outer) or outer.is_relative_to(inner):
+        raise ValueError(f"{test}: one within the other, {reference}; accepted: two apart")
+
+
+def pairs(reference: Path, test: Path, settings: Settings) -> list[Pair]:
+    """The images of both sides by name, each with how it is compared. ValueError where a folder holds no image."""
+    known = reference.exists()
+    if known and reference.is_dir() != test.is_dir():
+        raise ValueError(f"{reference}, {test}: a folder and a file; accepted: two of a kind")
+    if not test.is_dir():
+        return [_single(reference, test, settings)]
+    (old, lost), (new, missed) = images_in(reference) if known else ({}, []), images_in(test)
+    for folder, nothing in ((reference, known and not old and not lost), (test, not new and not missed)):
+        if nothing:
+            raise ValueError(f"{folder}: holds no image; accepted: at least one")
+    found = _mapped(old, new, settings.maps) if settings.maps else _of_one_name(old, new)
+    found = [replace(pair, target=reference / pair.target, how=settings.of(pair.name)) for pair in found]
+    found = _without_variants(found, reference, old)
+    return [*found, *(Pair(name, None, None, reference / name, error=error) for name, error in lost + missed)]
+
+
+def named(pairs: list[Pair], names: Sequence[str]) -> list[Pair]:
+    """Those pairs whose names are of one of the patterns; all without patterns. ValueError for one that fits none."""
+    for name in names:
+        if not any(name_patterns.matches(name, pair.name) for pair in pairs):
+            raise ValueError(f"{name}: matches no image; accepted: the path of an image in its folder, * and ?")
+    return [pair for pair in pairs if not names or any(name_patterns.matches(name, pair.name) for name in names)]
+
+
+def _single(reference: Path, test: Path, settings: Settings) -> Pair:
+    pair = Pair(reference.name, reference if reference.exists() else None, test, reference, settings.of(reference.name))
+    if not pair.how.accept:
+        return pair
+    return _with_variants(
+        pair, sorted(path for path in reference.parent.iterdir() if path.is_file() and path != reference)
+    )
+
+
+def _of_one_name(old: dict[str, Path], new: dict[str, Path]) -> list[Pair]:
+    return [Pair(name, old.get(name), new.get(name), Path(name)) for name in sorted(old | new)]
+
+
+def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> list[Pair]:
+    """Pairs by the first map that fits. What no map calls a reference is none; a reference is no new image."""
+    found: dict[str, Pair] = {}
+    for each, (path, file) in itertools.product(maps, old.items()):
+        if (values := name_patterns.parsed(each.reference, path)) is None:
+            continue
+        name = name_patterns.filled(each.test, values)
+        before = found.setdefault(name, Pair(name, file, new.get(name), Path(path)))
+        if before.reference != file:
+            error = f"{file}: a second reference, beside {before.reference}; accepted: one for {name}"
+            found[name] = replace(before, error=error)
+    references = {pair.reference.resolve() for pair in found.values() if pair.reference}
+    for name, file in new.items():
+        if name not in found and file.resolve() not in references and (target := _target(name, maps)):
+            found[name] = Pair(name, None, file, Path(target))
+    return [found[name] for name in sorted(found)]
+
+
+def _target(name: str, maps: Sequence[Map]) -> str:
+    """Where the reference of a new image would be; "" where no map says."""
+    parsed = ((each, name_patterns.parsed(each.test, name)) for each in maps)
+    return next((name_patterns.filled(each.reference, values) for each, values in parsed if values is not None), "")
+
+
+# Files beside a reference -------------------------------------------------------------------------------------------
+
+
+def _without_variants(found: list[Pair], root: Path, old: dict[str, Path]) -> list[Pair]:
+    """The pairs with their variants. A reference that is one, and has no new image, is not one that was removed."""
+    with_new = {pair.target for pair in found if pair.test}
+    others = [path for path in old.values() if path not in with_new]
+    found = [_with_variants(pair, others) for pair in found]
+    taken = {path for pair in found for path in pair.variants}
+    return [pair for pair in found if pair.test or pair.target not in taken]
+
+
+def _with_variants(pair: Pair, others: Sequence[Path]) -> Pair:
+    """The pair with those of the other references that its settings accept as well."""
+    beside, own = pair.target.parent, pair.target.name
+    values = name_patterns.fields(own)
+    names = {path.relative_to(beside).as_posix(): path for path in others if path.is_relative_to(beside)}
+    matched: dict[str, Path] = {}
+    for template in pair.how.accept:
+        if name_patterns.expanded(template, values, [own]):
+            error = f"accept = {template!r} matches the reference {pair.target} itself; accepted: names of others"
+            return replace(pair, error=error)
+        matched |= {name: names[name] for name in name_patterns.expanded(template, values, sorted(names))}
+    return replace(pair, variants=tuple(matched.values()))
+
+
+def beside(template: str, target: Path, root: Path) -> Path:
+    """The file that a template means for a reference: beside it, or below `root` after "{root}/"."""
+    base, rest = (root, template[len(ROOT) :]) if template.startswith(ROOT) else (target.parent, template)
+    return base / name_patterns.filled(rest, name_patterns.fields(target.relative_to(root).as_posix()))
+
+
+# Folders ------------------------------------------------------------------------------------------------------------
+
+
+def images_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
+    """The files whose names end as an image's, by their path inside; (name, error) of folders that cannot be read.
+
+    Names that begin with a dot are left out. Links to folders are not followed, and an error: nobody would look there.
+    """
+    found: dict[str, Path] = {}
+    failed: list[tuple[str, str]] = []
+
+    def note(error: OSError) -> None:
+        failed.append((Path(error.filename).relative_to(folder).as_posix(), str(error)))
+
+    for parent, folders, names in os.walk(folder, onerror=note):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for path in (Path(parent, name) for name in folders):
+            if path.is_symlink():
+                failed.append((path.relative_to(folder).as_posix(), f"{path}: a link to a folder; accepted: a folder"))
+        for name in names:
+            path = Path(parent, name)
+            if path.suffix[1:].lower() in endings() and not name.startswith("."):
+                found[path.relative_to(folder).as_posix()] = path
+    return found, failed
+
+
+@functools.cache
+def endings() -> frozenset[str]:
+    """The file name endings, lower case without the dot, of the images that OpenImageIO reads."""
+    import OpenImageIO as oiio
+
+    formats = (each.split(":") for each in oiio.get_string_attribute("extension_list").split(";") if each)
+    return frozenset(e for name, listed in formats if name not in ("null", "term", "zfile") for e in listed.split(","))
