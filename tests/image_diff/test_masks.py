@@ -1,0 +1,103 @@
+"""Masks: pixels that do not count, by an image or by rectangles, in every method."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.diff_images import image, samples
+
+from mi_refract.image_diff import folders as diff
+from mi_refract.image_diff import masks, methods
+from mi_refract.image_diff.settings import Entry, How, Settings
+from mi_refract.io import image_file
+
+SIZE = (32, 48, 3)
+
+
+def settings(**values):
+    return Settings(rules=(Entry("*", values),))
+
+
+@pytest.fixture
+def pair(tmp_path):
+    """Two images that differ in the rectangle x = 4 … 7, y = 10 … 11 only, and a mask that is black there."""
+    image(tmp_path / "old/a.exr")
+    pixels = image(tmp_path / "new/a.exr")
+    pixels[10:12, 4:8] *= 3
+    image_file.write_exr(tmp_path / "new/a.exr", pixels)
+    mask = np.ones(SIZE)
+    mask[10:12, 4:8] = 0
+    image_file.write_exr(tmp_path / "old/a_mask.exr", mask)
+    return tmp_path / "old/a.exr", tmp_path / "new/a.exr"
+
+
+@pytest.mark.parametrize("method", [name for name, method in methods.METHODS.items() if not method.takes_renders])
+@pytest.mark.parametrize(
+    "left_out", [{"mask": "{stem}_mask.exr"}, {"ignore": ((4, 10, 4, 2),)}, {"ignore": ((0, 10, 6, 2), (6, 0, 2, 12))}]
+)
+def test_what_is_left_out_does_not_count(pair, method, left_out):
+    assert diff.diff(*pair, settings(method=method)).exit_code == 1
+    assert diff.diff(*pair, settings(method=method, **left_out)).exit_code == 0
+    assert diff.diff(*pair, settings(method=method, ignore=((4, 10, 3, 2),))).exit_code == 1
+
+
+def test_welch(tmp_path):
+    old, new = (samples(tmp_path / name, first=first) for name, first in (("old", 0), ("new", 100)))
+    for path in new.iterdir():
+        pixels = image_file.read(path).pixels.copy()
+        pixels[16:, :16] *= 2
+        image_file.write_exr(path, pixels)
+    whole, masked = (
+        diff.diff(old, new, settings(**values), renders=True) for values in ({}, {"ignore": ((0, 16, 16, 16),)})
+    )
+    assert (whole.exit_code, masked.exit_code) == (1, 0)
+
+
+def test_shares_are_of_the_pixels_that_count(pair):
+    """8 of 1536 pixels differ: 0.52 %; of the 16 that count they are half."""
+    only = np.zeros(SIZE)
+    only[10:12, 2:10] = 1
+    image_file.write_exr(pair[0].parent / "a_mask.exr", only)
+    how = {"method": "tolerance", "fail_percent": 1.0}
+    assert diff.diff(*pair, settings(**how)).exit_code == 0
+    (found,) = diff.diff(*pair, settings(**how, mask="{stem}_mask.exr")).results
+    assert found.comparison.metrics[0].value == 50
+    assert found.warnings == ("the mask leaves out 99% of the pixels",)
+
+
+def test_nan_that_is_left_out(pair):
+    pixels = image_file.read(pair[1]).pixels.copy()
+    pixels[10, 5] = np.nan
+    image_file.write_exr(pair[1], pixels)
+    assert diff.diff(*pair, settings(method="exact", ignore=((4, 10, 4, 2),))).exit_code == 0
+
+
+def test_a_data_window_that_does_not_begin_at_zero(pair):
+    one = image_file.Image(pair[0], np.ones(SIZE), ("R", "G", "B"), origin=(100, 50))
+    assert not masks.made(one, None, [(104, 60, 4, 2)])[10:12, 4:8].any()
+    assert masks.made(one, None, [(104, 60, 4, 2)]).sum() == 32 * 48 - 8
+
+
+BAD = {
+    "size": ({"mask": "small.exr"}, "a mask of 48 × 32"),
+    "missing": ({"mask": "none.exr"}, "none.exr: No such file"),
+    "nan": ({"mask": "nan.exr"}, "values that are not finite"),
+    "nothing left": ({"ignore": ((0, 0, 48, 32),)}, "leaves no pixel"),
+    "outside": ({"ignore": ((48, 0, 5, 5),)}, "a rectangle that holds pixels"),
+}
+
+
+@pytest.mark.parametrize(("values", "message"), BAD.values(), ids=BAD)
+def test_bad_masks(pair, values, message):
+    image(pair[0].parent / "small.exr", shape=(8, 8, 3))
+    image(pair[0].parent / "nan.exr", value=np.nan)
+    results = diff.diff(*pair, settings(**values))
+    assert results.exit_code == 2
+    assert message in results.results[0].error
+    assert "\n" not in results.results[0].error
+
+
+def test_a_mask_is_shown(pair):
+    (found,) = diff.diff(*pair, settings(method="exact", ignore=((0, 0, 2, 2),)), maps=True).results
+    assert found.comparison.maps["left out"].sum() == 4
+    assert How(mask="x.png").needs_file
