@@ -104,6 +104,11 @@ def checked_pixels(method: str, reference: Image, test: Image, allow: bool) -> t
     return a, b, None
 
 
+def counted_share(image: Image) -> float:
+    """The share of the pixels that count; 1 without a mask."""
+    return 1.0 if image.mask is None else float(image.mask.mean())
+
+
 def not_compared(reference: Image) -> tuple[int, list[str]]:
     """How many values are not finite, and the channels that hold no other ones: there nothing was compared."""
     finite = np.isfinite(reference.pixels).reshape(-1, len(reference.channels))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels
 
-from .comparison import Comparison, Metric, Verdict, checked_pixels, verdict_of
+from .comparison import Comparison, Metric, Verdict, checked_pixels, counted_share, verdict_of
 from .tile_statistics import median_nonblack, same_shape
 
 
@@ -59,7 +59,8 @@ def tolerance(
     with np.errstate(over="ignore"):
         difference = np.abs(b - a)
         maps = {"difference": difference.astype(np.float32, copy=False)}
-    failed, warned = (_percent(difference, a, b, *x) for x in ((fail, fail_relative), (warn, warn_relative)))
+    limits = (fail, fail_relative), (warn, warn_relative)
+    failed, warned = (_percent(difference, a, b, *each) / counted_share(reference) for each in limits)
     largest = float(difference.max())
     metrics = (
         Metric("pixels beyond the tolerance, %", failed, fail_percent),
@@ -166,13 +167,14 @@ def paired(
         return found
     scale = _scale(a, b)
     measured = changes(a / scale, b / scale, threshold)
+    share = measured.share / counted_share(reference)
     metrics = (
-        Metric("share of changed pixels", measured.share, changed),
+        Metric("share of changed pixels", share, changed),
         Metric("largest change", measured.largest, largest),
         Metric("RMS change", measured.rms),
         Metric("ratio of the means", _mean_ratio(a, b)),
     )
-    reason = f"{measured.share:.3%} of the pixels are changed, the largest by {measured.largest:.3g} of its value"
+    reason = f"{share:.3%} of the pixels are changed, the largest by {measured.largest:.3g} of its value"
     return Comparison("paired", verdict_of(metrics), reason, metrics, maps={"difference": _difference(a, b)})
 
 

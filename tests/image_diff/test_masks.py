@@ -47,10 +47,8 @@ def test_welch(tmp_path):
         pixels = image_file.read(path).pixels.copy()
         pixels[16:, :16] *= 2
         image_file.write_exr(path, pixels)
-    whole, masked = (
-        diff.diff(old, new, settings(**values), renders=True) for values in ({}, {"ignore": ((0, 16, 16, 16),)})
-    )
-    assert (whole.exit_code, masked.exit_code) == (1, 0)
+    assert diff.diff(old, new, renders=True).exit_code == 1
+    assert diff.diff(old, new, settings(ignore=((0, 16, 16, 16),)), renders=True).exit_code == 0
 
 
 def test_shares_are_of_the_pixels_that_count(pair):
