@@ -104,9 +104,9 @@ def checked_pixels(method: str, reference: Image, test: Image, allow: bool) -> t
     return a, b, None
 
 
-def counted_share(image: Image) -> float:
-    """The share of the pixels that count; 1 without a mask."""
-    return 1.0 if image.mask is None else float(image.mask.mean())
+def counted(image: Image) -> int:
+    """How many pixels count; all without a mask."""
+    return image.pixels[..., 0].size if image.mask is None else int(image.mask.sum())
 
 
 def not_compared(reference: Image) -> tuple[int, list[str]]:

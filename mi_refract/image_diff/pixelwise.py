@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels
 
-from .comparison import Comparison, Metric, Verdict, checked_pixels, counted_share, verdict_of
+from .comparison import Comparison, Metric, Verdict, checked_pixels, counted, verdict_of
 from .tile_statistics import median_nonblack, same_shape
 
 
@@ -60,7 +60,7 @@ def tolerance(
         difference = np.abs(b - a)
         maps = {"difference": difference.astype(np.float32, copy=False)}
     limits = (fail, fail_relative), (warn, warn_relative)
-    failed, warned = (_percent(difference, a, b, *each) / counted_share(reference) for each in limits)
+    failed, warned = (_percent(difference, a, b, *each, counted(reference)) for each in limits)
     largest = float(difference.max())
     metrics = (
         Metric("pixels beyond the tolerance, %", failed, fail_percent),
@@ -80,7 +80,8 @@ def tolerance_passes_black(reference: Image, options: Mapping[str, Any]) -> bool
     """Whether `tolerance` would call a black test image equal to `reference`; `options`: all of them, by name."""
     a = reference.pixels
     difference = np.abs(a)
-    beyond = _percent(difference, a, np.zeros_like(a), options["fail"], options["fail_relative"])
+    black = np.zeros_like(a)
+    beyond = _percent(difference, a, black, options["fail"], options["fail_relative"], counted(reference))
     return bool(beyond <= options["fail_percent"] and difference.max() <= options["hard_fail"])
 
 
@@ -98,9 +99,9 @@ def _place(difference: Pixels, image: Image) -> str:
     return f" at x = {x + image.origin[0]}, y = {y + image.origin[1]}"
 
 
-def _percent(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float) -> float:
-    """The percentage of the pixels that `_beyond` finds."""
-    return 100 * _beyond(difference, a, b, most, share).size / a[..., 0].size
+def _percent(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float, of: int) -> float:
+    """The pixels that `_beyond` finds, as a percentage of `of`."""
+    return 100 * _beyond(difference, a, b, most, share).size / of
 
 
 def _beyond(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float) -> NDArray[np.intp]:
@@ -167,7 +168,7 @@ def paired(
         return found
     scale = _scale(a, b)
     measured = changes(a / scale, b / scale, threshold)
-    share = measured.share / counted_share(reference)
+    share = measured.share * a[..., 0].size / counted(reference)
     metrics = (
         Metric("share of changed pixels", share, changed),
         Metric("largest change", measured.largest, largest),
