@@ -13,9 +13,12 @@ __all__ = [
     "folders",
     "html_report",
     "methods",
+    "pairing",
     "pixelwise",
+    "results",
     "self_test",
     "settings",
+    "settings_file",
     "text_reports",
     "tile_statistics",
 ]
