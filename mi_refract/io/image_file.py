@@ -6,6 +6,8 @@ Pixels are arrays of H × W × C float32, row 0 at the top. A file is written co
 from __future__ import annotations
 
 import os
+import re
+import shlex
 import threading
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,6 +25,7 @@ SUFFIXES = (".exr",)
 MAX_VALUES = 2**28  # width × height × channels of an image: 1 GiB as float32
 # How files begin that OpenImageIO decodes when it opens them: GIF, JPEG 2000, JPEG XL.
 WHEN_OPENED = (b"GIF", b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51", b"\0\0\0\x0cJXL ", b"\xff\x0a")
+LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\n"  # how a file begins that Git LFS has not brought yet
 NO_DATE = {"DateTime": "1970:01:01 00:00:00"}  # for the same bytes every day: without it OpenImageIO writes today's
 
 
@@ -123,9 +126,11 @@ def read(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> Image:
     if path.exists() and not (path.is_file() or path.is_dir()):  # reading a pipe might never end
         raise ValueError(f"{path}: accepted: a regular file")
     with path.open("rb") as file:  # the operating system's own words for what is missing or forbidden
-        begin = file.read(8)
+        begin = file.read(len(LFS_POINTER))
     if not begin:
         raise ValueError(f"{path}: corrupt {kind} file: it is empty")
+    if begin == LFS_POINTER:
+        raise ValueError(f"{path}: a Git LFS pointer, not the image; `{_lfs_pull(path)}` brings it")
     # Others hold 8 bytes a value or fewer, and are asked below.
     source = _opened(path, kind, max_values, max_values * (1 if begin.startswith(WHEN_OPENED) else 8))
     try:
@@ -134,6 +139,14 @@ def read(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> Image:
         raise ValueError(f"{path}: more pixels than there is memory for; accepted: a smaller image") from None
     finally:
         source.close()
+
+
+def _lfs_pull(path: Path) -> str:
+    """The command that brings a file of Git LFS; its pattern begins at the repository's root."""
+    full = path.absolute()
+    root = next((folder for folder in full.parents if (folder / ".git").exists()), None)
+    pattern = re.sub(r"[][*?,\\]", "?", (full.relative_to(root) if root else path).as_posix())
+    return shlex.join(["git", "lfs", "pull", f"--include={pattern}"])
 
 
 _opening = threading.Lock()  # OpenImageIO has one limit for all that it opens

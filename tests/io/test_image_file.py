@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
+import shlex
+import shutil
 import struct
+import subprocess
 
 import numpy as np
 import OpenImageIO as oiio
@@ -197,3 +201,57 @@ def test_what_the_system_does_not_give(tmp_path):
         pytest.skip("this user may read everything")
     with pytest.raises(PermissionError, match=r"a\.exr"):
         read(path)
+
+
+# Git LFS ----------------------------------------------------------------------------------------------------------
+
+POINTER = """version https://git-lfs.github.com/spec/v1
+oid sha256:4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1258daaa5e2ca24d17e2393
+size 12345
+"""
+
+
+def command_in(error):
+    return re.fullmatch(r".*: a Git LFS pointer, not the image; `(.*)` brings it", str(error.value))[1]
+
+
+@pytest.mark.parametrize("name", ["a.exr", "a.png", "in a folder/a[1],*.tif"])
+def test_a_pointer_of_git_lfs_is_named_with_the_command_that_brings_the_image(tmp_path, name):
+    path = tmp_path / "repository" / name
+    path.parent.mkdir(parents=True)
+    path.write_text(POINTER)
+    with pytest.raises(ValueError, match=r"^/.*: a Git LFS pointer") as outside:
+        read(path)
+    assert shlex.split(command_in(outside))[3].startswith("--include=/")
+    (tmp_path / "repository" / ".git").mkdir()
+    with pytest.raises(ValueError, match=r"^[^\n]*$") as inside:
+        read(path)
+    pattern = {"in a folder/a[1],*.tif": "in a folder/a?1???.tif"}.get(name, name)
+    assert shlex.split(command_in(inside)) == ["git", "lfs", "pull", f"--include={pattern}"]
+
+
+@pytest.mark.skipif(shutil.which("git-lfs") is None, reason="no git-lfs (apt-get install git-lfs)")
+def test_that_command_brings_it(tmp_path):
+    """A repository with two images, and a clone of it that did not ask for them."""
+    home = {"HOME": str(tmp_path), "GIT_CONFIG_NOSYSTEM": "1", "GIT_LFS_SKIP_SMUDGE": "1"}
+    home |= {f"GIT_{role}_{what}": "a@b" for role in ("AUTHOR", "COMMITTER") for what in ("NAME", "EMAIL")}
+
+    def git(folder, *words):
+        subprocess.run(["git", *words], cwd=folder, env=os.environ | home, check=True, capture_output=True, timeout=60)
+
+    origin, clone = tmp_path / "origin", tmp_path / "clone"
+    git(tmp_path, "init", str(origin))
+    (origin / "ref").mkdir()
+    save(origin / "ref" / "a[1].exr", PIXELS)
+    save(origin / "b.exr", PIXELS)
+    for words in (["install"], ["track", "*.exr"]):
+        git(origin, "lfs", *words)
+    git(origin, "add", ".")
+    git(origin, "commit", "-m", "images")
+    git(tmp_path, "clone", origin.as_uri(), str(clone))
+    with pytest.raises(ValueError, match="Git LFS pointer") as error:
+        read(clone / "ref" / "a[1].exr")
+    git(clone, *shlex.split(command_in(error))[1:])
+    assert np.array_equal(read(clone / "ref" / "a[1].exr").pixels, PIXELS)
+    with pytest.raises(ValueError, match="Git LFS pointer"):
+        read(clone / "b.exr")
