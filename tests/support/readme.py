@@ -8,4 +8,9 @@ from pathlib import Path
 
 def python_blocks(path: Path) -> list[str]:
     """The code of every ```python block of a Markdown file, in order."""
-    return re.findall(r"^```python\n(.*?)^```", path.read_text(), re.MULTILINE | re.DOTALL)
+    return blocks(path, "python")
+
+
+def blocks(path: Path, language: str) -> list[str]:
+    """The text of every block of a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", path.read_text("utf-8"), re.MULTILINE | re.DOTALL)
