@@ -18,4 +18,5 @@ __all__ = [
     "settings",
     "text_reports",
     "tile_statistics",
+    "tolerance",
 ]

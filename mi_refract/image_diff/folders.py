@@ -22,7 +22,7 @@ import numpy as np
 from mi_refract.io import exit_code, image_file
 from mi_refract.io.image_file import MAX_VALUES, Image
 
-from . import methods
+from . import methods, parts
 from .comparison import Comparison, Verdict
 from .settings import How, Settings
 
@@ -83,10 +83,15 @@ class Result:
         return CATEGORIES.get(self.status, Category.UNKNOWN)
 
     @property
+    def warning(self) -> str:
+        """What an equal image is near to failing; "" for nothing."""
+        return self.comparison.warning if self.comparison else ""
+
+    @property
     def reason(self) -> str:
-        """The reason for the status in one sentence."""
+        """The reason for the status in one sentence, and the warning, if there is one."""
         if self.comparison:
-            return self.comparison.reason
+            return self.comparison.reason + (f"; warning: {self.warning}" if self.warning else "")
         sides = {Category.ADDED: "only among the new images", Category.REMOVED: "only among the references"}
         return self.error or sides[self.category]
 
@@ -247,6 +252,8 @@ def _compared(result: Result, renders: bool, maps: bool, to_accept: bool) -> Res
     if result.error:
         return result
     try:
+        if result.how.error:
+            raise ValueError(result.how.error)
         if to_accept:  # before the images are read: what is read later and has the same digest is what was compared
             result = replace(result, digests=(digest(result.reference), digest(result.test)))
         return _judged(result, result.reference, result.test, renders, maps)
@@ -280,11 +287,15 @@ def _judged(result: Result, reference: Path | None, test: Path | None, renders: 
         return result
     if reference.samefile(test):
         raise ValueError(f"{test}: the same file as the reference {reference}; accepted: two")
-    most = result.how.max_values
-    sides = [read_renders(path, most) if renders else [image_file.read(path, most)] for path in (reference, test)]
-    found = methods.compare(result.how.method, *sides, **result.how.options)
+    how = result.how
+    images: tuple[Image, ...]
+    if renders:
+        sides = [read_renders(path, how.max_values) for path in (reference, test)]
+        found, images = methods.compare(how.method, *sides, **how.options), tuple(map(mean_image, sides))
+    else:
+        found, images = parts.compare(how, parts.read(reference, how), parts.read(test, how))
     kept = maps and found.verdict is not Verdict.EQUAL  # a thousand images' maps would fill the memory
-    images = tuple(map(mean_image, sides)) if kept else ()
+    images = images if kept else ()
     comparison = found if kept else replace(found, maps={})
     return replace(result, status=STATUSES[found.verdict], comparison=comparison, images=images)
 

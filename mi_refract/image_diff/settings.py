@@ -22,9 +22,11 @@ from typing import Any
 from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.toml_schema import TABLES, TEXT, Key, Type, key_table, read
 
+from . import idiff_flags
 from .methods import AUTO, METHODS
 
 FILE = "mi-refract.toml"
+TOLERANCE = "tolerance"
 ACCEPTED = (AUTO, *METHODS)
 BOOL = Type("true or false", lambda value: value if isinstance(value, bool) else None)
 METHOD = Type(", ".join(ACCEPTED), lambda value: value if isinstance(value, str) and value in ACCEPTED else None)
@@ -34,6 +36,10 @@ COMMON = {
     "method": Key(METHOD, "the method; that of the command line by default", None),
     "allow_nonfinite": Key(BOOL, "whether NaN or Inf is allowed where the other image has the same", None),
 }
+
+
+WORDS = Type("a text", lambda value: value if isinstance(value, str) else None)
+IDIFF = {"idiff": Key(WORDS, "flags of OpenImageIO's `idiff`, as they stand; the method is `tolerance`", None)}
 
 
 def _finite_or_inf(value: Any) -> float | None:
@@ -56,19 +62,27 @@ TYPES: dict[type, Type] = {
 class How:
     """A method, those of its options that are given, and the `reason` from a settings file.
 
-    `max_values`: width × height × channels of an image, at most.
+    `max_values`: width × height × channels of an image, at most. `idiff`: the flags of `idiff` that the options come
+    from; `error`: why the entry of the settings file cannot be used.
     """
 
     method: str = AUTO
     options: Mapping[str, Any] = field(default_factory=dict)
     reason: str = ""
     max_values: int = MAX_VALUES
+    idiff: str | None = None
+    error: str = ""
 
     @property
     def flags(self) -> list[str]:
         """The command line's options that say the same."""
         words = [] if self.method == AUTO else ["--method", self.method]
+        given: Mapping[str, Any] = {}
+        if self.idiff is not None:
+            words, given = ["--idiff", self.idiff], idiff_flags.parse(self.idiff).options
         for name, value in self.options.items():
+            if name in given and given[name] == value:
+                continue
             if name != "allow_nonfinite":
                 words += ["--set", f"{name}={value}"]
             elif value:
@@ -89,6 +103,7 @@ class Settings:
         how = next((how for pattern, how in reversed(self.rules) if fnmatchcase(name, pattern)), self.default)
         if how.method in (AUTO, self.default.method):
             how = replace(how, method=self.default.method, options={**self.default.options, **how.options})
+            how = replace(how, idiff=self.default.idiff if how.idiff is None else how.idiff)
         if any(fnmatchcase(name, pattern) for pattern in self.allow_nonfinite):
             how = replace(how, options={"allow_nonfinite": True, **how.options})
         return replace(how, max_values=self.default.max_values)
@@ -108,17 +123,32 @@ def load(path: str | Path) -> tuple[tuple[str, How], ...]:
     try:
         table = tomllib.loads(path.read_bytes().decode())
         images = read(table, {"image": Key(TABLES, "", [])})["image"]
-        return tuple(_rule(image, f"image[{i}].") for i, image in enumerate(images))
+        return tuple(_rule(image, f"image[{i}].", path) for i, image in enumerate(images))
     except (ValueError, RecursionError) as error:
         text = str(error) if isinstance(error, ValueError) else "brackets nested too deeply; accepted: TOML"
         raise ValueError(" ".join(f"{path}: {text}".split())) from None
 
 
-def _rule(table: dict[str, Any], where: str) -> tuple[str, How]:
+def _rule(table: dict[str, Any], where: str, path: Path) -> tuple[str, How]:
+    if "idiff" in table and table.get("method", AUTO) == AUTO:
+        table = {**table, "method": TOLERANCE}
     method = read({k: v for k, v in table.items() if k == "method"}, {"method": COMMON["method"]}, where)["method"]
-    values = read(table, COMMON | keys_of(method or AUTO), where)
-    options = {name: values[name] for name in table if name not in ("name", "reason", "method")}
-    return values["name"], How(method or AUTO, options, values["reason"])
+    keys = COMMON | (IDIFF if method == TOLERANCE else {}) | keys_of(method or AUTO)
+    values = read(table, keys, where)
+    options = {name: values[name] for name in table if name not in ("name", "reason", "method", "idiff")}
+    how = How(method or AUTO, options, values["reason"])
+    if "idiff" not in table:
+        return values["name"], how
+    try:
+        return values["name"], with_idiff(how, values["idiff"])
+    except ValueError as error:  # of this entry's images; the others are compared
+        return values["name"], replace(how, error=f"{path}: {where}idiff: {error}")
+
+
+def with_idiff(how: How, flags: str) -> How:
+    """The same with the thresholds of `idiff`'s flags where `how` gives none of its own. ValueError for bad flags."""
+    options = {**idiff_flags.parse(flags).options, **how.options}
+    return replace(how, method=TOLERANCE, options=options, idiff=flags)
 
 
 def keys_of(method: str) -> dict[str, Key]:
@@ -127,10 +157,12 @@ def keys_of(method: str) -> dict[str, Key]:
     return {name: Key(TYPES[option.type], option.help, option.default) for name, option in options.items()}
 
 
-def from_words(method: str, words: Sequence[str]) -> How:
-    """The method and its options from the command line's `NAME=VALUE`. ValueError for anything else."""
+def from_words(method: str, words: Sequence[str], idiff: str | None = None) -> How:
+    """The method and its options from the command line's `NAME=VALUE` and `--idiff`. ValueError for anything else."""
     if method not in ACCEPTED:
         raise ValueError(f"--method {method}: accepted: {METHOD.accepted}")
+    if idiff is not None:
+        return _from_idiff(method, words, idiff)
     if words and method == AUTO:
         raise ValueError(f"--set {words[0]}: the options of which method? accepted: after --method {'|'.join(METHODS)}")
     keys = keys_of(method)
@@ -142,6 +174,16 @@ def from_words(method: str, words: Sequence[str]) -> How:
         table[name] = _value(text, keys[name].type) if name in keys else text
     values = read(table, keys, "--set ")
     return How(method, {name: values[name] for name in table})
+
+
+def _from_idiff(method: str, words: Sequence[str], flags: str) -> How:
+    if method not in (AUTO, TOLERANCE):
+        raise ValueError(f"--idiff with --method {method}; accepted with --method {TOLERANCE}, or alone")
+    how = from_words(TOLERANCE, words)
+    try:
+        return with_idiff(how, flags)
+    except ValueError as error:
+        raise ValueError(f"--idiff: {error}") from None
 
 
 def _value(text: str, kind: Type) -> Any:
