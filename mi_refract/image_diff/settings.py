@@ -198,7 +198,7 @@ def _value(text: str, kind: Type) -> Any:
 
 def reference() -> str:
     """What a settings file may hold, and the options of each method, in Markdown."""
-    parts = [key_table("`[[image]]`", COMMON)]
+    parts = [key_table("`[[image]]`", COMMON | IDIFF)]
     for name, method in METHODS.items():
         parts.append(f"`{name}`: {method.summary}")
         parts += [key_table("option", keys_of(name))] if keys_of(name) else []

@@ -1,4 +1,4 @@
-"""Files of several parts or MIP levels: each is compared, the verdict says which it is about, none is left out unsaid."""
+"""Files of several parts or MIP levels: each is compared, and the verdict says which of them it is about."""
 
 from __future__ import annotations
 
