@@ -46,6 +46,7 @@ class Comparison:
 
     `minimum_detectable`: the smallest relative difference that the method would have seen; NaN where it is not known.
     `maps`: H × W or H × W × C arrays by name, of the images' size. `warning`: what an equal image is near to failing.
+    `part`: of files of several images, which it is about: its number and that of its MIP level.
     """
 
     method: str
@@ -55,6 +56,7 @@ class Comparison:
     minimum_detectable: float = np.nan
     maps: Maps = field(default_factory=dict)
     warning: str = ""
+    part: tuple[int, int] = (0, 0)
 
 
 def verdict_of(metrics: Sequence[Metric]) -> Verdict:

@@ -153,11 +153,18 @@ def _sides(result: Result) -> tuple[dict[str, Image], list[str]]:
         try:
             if path:
                 most = result.how.max_values
-                several = folders.read_renders(path, most) if path.is_dir() else parts.read(path, result.how)[:1]
+                several = folders.read_renders(path, most) if path.is_dir() else [_part(path, result)]
                 sides[role] = _in_shown_channels(folders.mean_image(several))
         except (ValueError, OSError) as error:
             notes.append(one_line(str(error)))
     return sides, notes
+
+
+def _part(path: Path, result: Result) -> Image:
+    """Of a file of several images the one that the verdict is about, else the first."""
+    images = parts.read(path, result.how)
+    part = result.comparison.part if result.comparison else (0, 0)
+    return next((image for image in images if image.part == part), images[0])
 
 
 def _in_shown_channels(image: Image) -> Image:

@@ -43,7 +43,7 @@ def compare(how: How, reference: Sequence[Image], test: Sequence[Image]) -> tupl
     found = {part: _of_one(how, one[part], two[part], places[part]) for part in both}
     shown = min(both, key=lambda part: WORST.index(found[part].verdict))
     images = one[shown], two[shown]
-    chosen = replace(found[shown], reason=_reason(found, places, shown))
+    chosen = replace(found[shown], reason=_reason(found, places, shown), part=shown)
     if lone := [*(one.keys() - two.keys()), *(two.keys() - one.keys())]:
         reason = f"{_lone(min(lone), one | two, min(lone) in one, len(lone))}; {chosen.reason}"
         return replace(chosen, verdict=Verdict.DIFFERENT, reason=reason, warning=""), images

@@ -23,6 +23,8 @@ from mi_refract.report.number_text import compact, distinguishable
 from .comparison import Comparison, Metric, Verdict, checked_pixels, verdict_of
 from .pixelwise import require_nonnegative
 
+BLOCK = 2**16  # pixels whose ratios are formed at once, in float64
+
 
 def tolerance(
     reference: Image,
@@ -112,14 +114,20 @@ def _rounded(bound: float, kind: np.dtype[Any] | type[np.floating[Any]] = np.flo
 
 def _beyond(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float) -> NDArray[np.intp]:
     """The pixels with a channel that differs by more than `most`, and than that share of the mean of both; flat."""
-    kind = difference.dtype
-    most, share = _rounded(most, kind), _rounded(share, kind)
+    most, share = (_rounded(each, difference.dtype) for each in (most, share))
     pixels = np.flatnonzero((difference > most).any(-1))  # few: the rest is cheaper there
-    x, y, z = (each.reshape(-1, a.shape[2])[pixels].astype(np.float64) for each in (difference, a, b))
-    mean = (np.abs(y) / 2 + np.abs(z) / 2).astype(kind)  # rounded, as idiff has it; the ratio is not
-    relative = np.divide(x, mean, out=np.zeros_like(x), where=mean > 0)
-    found: NDArray[np.intp] = pixels[((x > most) & (relative > share)).any(-1)]
-    return found
+    x, y, z = (each.reshape(-1, a.shape[2]) for each in (difference, a, b))
+    blocks = np.array_split(pixels, pixels.size // BLOCK + 1)
+    return np.concatenate([block[_differ(x[block], y[block], z[block], most, share)] for block in blocks])
+
+
+def _differ(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float) -> NDArray[np.bool_]:
+    """Which of these pixels, N × C, differ; in idiff's precision: a mean is rounded, the ratio to it is not."""
+    mean = (np.abs(a) * 0.5).astype(np.float64) + np.abs(b) * 0.5
+    mean = mean.astype(difference.dtype)
+    relative = np.divide(difference, mean, out=np.zeros(mean.shape), where=mean > 0, dtype=np.float64)
+    differs: NDArray[np.bool_] = np.any((difference > most) & (relative > share), axis=-1)
+    return differs
 
 
 # The words ------------------------------------------------------------------------------------------------------
