@@ -248,6 +248,8 @@ def _image(path: Path, source: Any, kind: str, values: tuple[int, int], as_idiff
     formats = {str(each) for each in (spec.channelformats or [spec.format])}
     if formats & {"uint64", "int64"}:
         raise ValueError(f"{path}: integers of 64 bits; accepted: up to 32")
+    if found == "tiff" and "double" in formats and spec.height == 1:  # OpenImageIO 2.4 to 3.2 reads what lay in memory
+        raise ValueError(f"{path}: one row of 64-bit numbers in a TIFF file; accepted: several rows, or 32 bits")
     wide = not as_idiff and formats & {"double", "uint32", "int32", "uint", "int"}
     at = source.current_subimage(), source.current_miplevel()
     pixels = source.read_image(*at, 0, spec.nchannels, "double" if wide else "float")

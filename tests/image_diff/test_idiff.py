@@ -50,8 +50,6 @@ def write(path, images, kind):
         spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
         spec.attribute("oiio:UnassociatedAlpha", int(path.suffix != ".exr"))
         spec.attribute("oiio:subimagename", str(number))
-        if path.suffix == ".tif":  # OpenImageIO 3.2 writes anything for one row of doubles that are compressed
-            spec.attribute("compression", "none")
         specs.append(spec)
     output = oiio.ImageOutput.create(str(path))
     for number, (spec, pixels) in enumerate(zip(specs, images, strict=True)):
@@ -97,7 +95,8 @@ def test_random_images_and_flags(idiff, tmp_path):
     for number in range(idiff.pairs):
         suffix, kind = FORMATS[number % len(FORMATS)]
         count = 1 if suffix == "png" or rng.random() < 0.6 else int(rng.integers(2, 4))
-        shape = *rng.integers(1, 9, 2), rng.integers(1, 4 if suffix == "png" else 6)
+        rows = rng.integers(2 if kind == "double" else 1, 9)  # OpenImageIO cannot read one row of them in a TIFF
+        shape = rows, rng.integers(1, 9), rng.integers(1, 4 if suffix == "png" else 6)
         sides = zip(*(pair(rng, shape) for _ in range(count)), strict=True)
         files = [write(tmp_path / f"{side}.{suffix}", images, kind) for side, images in zip("ab", sides, strict=True)]
         words = flags(rng)

@@ -69,6 +69,22 @@ def test_random_images_and_thresholds():
     assert min(seen[EQUAL, False], seen[EQUAL, True], seen[DIFFERENT, False]) > 40, seen
 
 
+def test_the_ends_of_the_thresholds():
+    """At a threshold nothing differs yet; ratios are of float32 means, percentages of float32 numbers, as in `idiff`."""
+    a, b = image(np.full((1, 5, 3), 1.5)), image(np.full((1, 5, 3), 0.5))
+    assert tolerance(a, b, fail=1.0).verdict is EQUAL
+    assert tolerance(a, b, fail=0.999, fail_relative=1.0).verdict is EQUAL
+    assert tolerance(a, b, fail=0.999, fail_relative=0.999).verdict is DIFFERENT
+    tiny = [image(np.full((1, 5, 3), x, np.float32)) for x in (1e-45, 0.0)]  # whose mean is 0 in float32
+    assert tolerance(*tiny, fail=0.0, fail_relative=0.0).verdict is EQUAL
+    one = np.full((1, 5, 3), 0.5, np.float32)
+    one[0, 0] = 1
+    # 1/5 is 20 %; the number next below it in float64 is 20 in float32.
+    for percent, verdict in ((20.0, EQUAL), (np.nextafter(20.0, 0), EQUAL), (19.99, DIFFERENT)):
+        found = tolerance(image(np.full((1, 5, 3), 0.5)), image(one), fail_percent=float(percent))
+        assert found.verdict is verdict
+
+
 SIX = np.full((20, 30, 3), 0.5, np.float32)  # of 600 pixels 6 differ, one by more
 SIX[3, :6, 1] += 0.02
 SIX[3, 4, 1] += 0.03
