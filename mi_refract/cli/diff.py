@@ -40,6 +40,10 @@ Names = Annotated[
 ]
 Method = Annotated[str, typer.Option(help=f"How: {'|'.join(settings_file.ACCEPTED)}; see --methods.")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="An option of the method.")]
+Idiff = Annotated[
+    str | None,
+    typer.Option("--idiff", metavar="FLAGS", help="Flags of OpenImageIO's idiff: --method tolerance with them."),
+]
 File = Annotated[
     Path | None,
     typer.Option(
@@ -107,6 +111,7 @@ def diff(
     options: Set = None,
     renders: Renders = False,
     samples: OldRenders = False,
+    idiff: Idiff = None,
     settings: File = None,
     allow_nonfinite: Nonfinite = None,
     max_values: MaxValues = MAX_VALUES,
@@ -123,19 +128,30 @@ def diff(
     _require_extra("scipy", *(("jinja2", "matplotlib") if report else ()))
     renders = renders or samples
     if self_test:
-        others = (options, renders, settings, allow_nonfinite, inconclusive, report, junit, json, github)
+        others = (
+            options,
+            idiff is not None,
+            renders,
+            settings,
+            allow_nonfinite,
+            inconclusive,
+            report,
+            junit,
+            json,
+            github,
+        )
         if any(others) or method != AUTO:
             raise ValueError("--self-test asks every method and prints; accepted: no other option but --max-values")
         raise typer.Exit(_self_test(reference, test, max_values))
     if check_settings and reference:
-        chosen = _settings(reference, method, options, settings, allow_nonfinite, max_values)
+        chosen = _settings(reference, method, options, idiff, settings, allow_nonfinite, max_values)
         raise typer.Exit(_check_settings(reference, test, names or [], chosen))
     if reference is None or test is None:
         raise ValueError("two paths are needed; accepted: mi-refract diff REFERENCE TEST")
     for path, suffixes in zip((report, junit, json), OUTPUTS, strict=True):
         if path:
             writable(path, suffixes)
-    chosen = _settings(reference, method, options, settings, allow_nonfinite, max_values)
+    chosen = _settings(reference, method, options, idiff, settings, allow_nonfinite, max_values)
     wanted = inconclusive or ""
     with _progress() as tell:
         found = folders.diff(
@@ -178,6 +194,7 @@ def accept(
     names: Names = None,
     method: Method = AUTO,
     options: Set = None,
+    idiff: Idiff = None,
     settings: File = None,
     allow_nonfinite: Nonfinite = None,
     max_values: MaxValues = MAX_VALUES,
@@ -185,7 +202,7 @@ def accept(
 ) -> None:
     """Show which images are not equal to their references, ask, and copy them over. Nothing is deleted."""
     _require_extra("scipy")
-    chosen = _settings(reference, method, options, settings, allow_nonfinite, max_values)
+    chosen = _settings(reference, method, options, idiff, settings, allow_nonfinite, max_values)
     with _progress() as tell:
         found = folders.diff(reference, test, chosen, names=names or [], to_accept=True, tell=tell)
     _say(found)
@@ -246,11 +263,12 @@ def _settings(
     reference: Path,
     method: str,
     words: list[str] | None,
+    idiff: str | None,
     file: Path | None,
     nonfinite: list[str] | None,
     max_values: int,
 ) -> Settings:
-    default = replace(settings_file.from_words(method, words or []), max_values=max_values)
+    default = replace(settings_file.from_words(method, words or [], idiff), max_values=max_values)
     beside = (reference if reference.is_dir() else reference.parent) / settings_file.FILE
     path = file or (beside if beside.exists() else None)
     if path is None:
@@ -274,6 +292,8 @@ def _say(found: Results) -> None:
     """The table on stdout, what could not be compared on stderr, a line each."""
     for result in found.of(Status.ERROR):
         print(f"mi-refract: {printable(result.error)}", file=sys.stderr)
+    for flags in text_reports.without_effect(found):
+        print(f"mi-refract: {printable(flags)}", file=sys.stderr)
     for pattern in found.unused:
         print(f"mi-refract: {printable(pattern)}: matches no image", file=sys.stderr)
     if len(found.results) > len(found.of(Status.ERROR)):

@@ -21,4 +21,5 @@ __all__ = [
     "settings_file",
     "text_reports",
     "tile_statistics",
+    "tolerance",
 ]

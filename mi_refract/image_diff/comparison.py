@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,8 @@ class Comparison:
     """The result of a method.
 
     `minimum_detectable`: the smallest relative difference that the method would have seen; NaN where it is not known.
-    `maps`: H × W or H × W × C arrays by name, of the images' size.
+    `maps`: H × W or H × W × C arrays by name, of the images' size. `warning`: what an equal image is near to failing.
+    `part`: of files of several images, which it is about: its number and that of its MIP level.
     """
 
     method: str
@@ -54,6 +55,8 @@ class Comparison:
     metrics: tuple[Metric, ...] = ()
     minimum_detectable: float = np.nan
     maps: Maps = field(default_factory=dict)
+    warning: str = ""
+    part: tuple[int, int] = (0, 0)
 
 
 def verdict_of(metrics: Sequence[Metric]) -> Verdict:
@@ -88,6 +91,30 @@ def aligned(reference: Image, test: Image) -> tuple[Pixels, Pixels]:
             raise ValueError(f"{test.path}: {name} {of(test)}; accepted: {of(reference)}, as in {reference.path}")
     same_order = reference.channels == test.channels
     return reference.pixels, test.pixels if same_order else test.select(reference.channels)
+
+
+def shared_channels(reference: Image, test: Image) -> tuple[Image, Image, str]:
+    """Both images with the channels that both have, and what one has besides; "" where neither has more.
+
+    Where each of them has channels that the other lacks nothing is said: these images cannot be compared.
+    """
+    added, missing = ([c for c in x.channels if c not in y.channels] for x, y in ((test, reference), (reference, test)))
+    shared = [name for name in reference.channels if name in test.channels]
+    if bool(added) == bool(missing) or not shared:
+        return reference, test, ""
+    text = f"channels added: {_values(test, added)}" if added else f"channels missing: {_values(reference, missing)}"
+    one, two = (replace(x, pixels=x.select(shared), channels=tuple(shared)) for x in (reference, test))
+    return one, two, text
+
+
+def _values(image: Image, names: Sequence[str]) -> str:
+    """The channels, and their value where it is one: an opaque alpha is 1."""
+    pixels = image.select(names)
+    first = float(pixels.flat[0])
+    if not (pixels == first).all():
+        return ", ".join(names)
+    opaque = "opaque: " if first == 1 and all(name.rpartition(".")[2] == "A" for name in names) else ""
+    return f"{', '.join(names)} ({opaque}{first:g} everywhere)"
 
 
 def checked_pixels(method: str, reference: Image, test: Image, allow: bool) -> tuple[Pixels, Pixels, Comparison | None]:

@@ -16,7 +16,8 @@ from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels, srgb_decode
 
 from .comparison import Comparison, Metric, Verdict, checked_pixels, verdict_of
-from .pixelwise import require_nonnegative, tolerance, tolerance_passes_black
+from .pixelwise import require_nonnegative
+from .tolerance import tolerance, tolerance_passes_black
 
 PIXELS_PER_DEGREE = 67.0  # of the viewer's field: FLIP's default, a screen of 0.7 m and 3840 pixels at 0.7 m
 RGB = ("R", "G", "B")

@@ -20,7 +20,7 @@ import numpy as np
 from mi_refract.io import exit_code, image_file
 from mi_refract.io.image_file import MAX_VALUES, Image
 
-from . import masks, methods, pairing, settings_file
+from . import masks, methods, pairing, parts, settings_file
 from .comparison import Comparison, Verdict
 from .pairing import Pair
 from .results import STATUSES, Result, Results, Status
@@ -108,11 +108,13 @@ def _judged(result: Result, root: Path, renders: bool, maps: bool) -> Result:
     """The verdict against the reference, or that of a variant to which the new image is equal."""
     if not (result.reference and result.test):
         return result
-    read = functools.cache(lambda path: _images(path, result.how.max_values, renders))
+    read = functools.partial(_read, result, renders=renders)
+    new = result.test
+    test = functools.cache(lambda: read(new))  # once, and after the reference: what it lacks is said first
     judged, failed = [], None
     for path in (result.reference, *result.variants):
         try:
-            one = _against(path, result.test, read, result, root)
+            one = _against(path, read(path), test(), result, root)
         except (ValueError, OSError, MemoryError) as error:
             failed = failed or error  # unless another reference is equal
             continue
@@ -128,37 +130,40 @@ def _judged(result: Result, root: Path, renders: bool, maps: bool) -> Result:
 
 @dataclass(frozen=True)
 class _Judged:
-    """Both sides, as they were compared, and what was found."""
+    """Both images that the comparison is about, and what was found."""
 
-    sides: tuple[list[Image], list[Image]]
+    images: tuple[Image, Image]
     comparison: Comparison
     warning: str
 
 
-def _against(path: Path, other: Path, read: Callable[[Path], list[Image]], result: Result, root: Path) -> _Judged:
+def _read(result: Result, path: Path, renders: bool) -> list[Image]:
+    """All renders of a folder, or all images of a file."""
+    if path != result.test and result.test and path.samefile(result.test):
+        raise ValueError(f"{result.test}: the same file as the reference {path}; accepted: two")
+    return read_renders(path, result.how.max_values) if renders else parts.read(path, result.how)
+
+
+def _against(path: Path, reference: list[Image], test: list[Image], result: Result, root: Path) -> _Judged:
     how = result.how
-    if path.samefile(other):
-        raise ValueError(f"{other}: the same file as the reference {path}; accepted: two")
-    reference, test = read(path), read(other)
     file = pairing.beside(how.mask, result.target or path, root) if how.mask else None
+    if (file or how.ignore) and reference[-1].place:
+        raise ValueError(f"{path}: several parts or MIP levels; accepted with a mask: one image")
     mask = masks.made(reference[0], file, how.ignore, how.max_values)
-    sides = _masked(reference, mask), _masked(test, mask)
-    return _Judged(sides, methods.compare(how.method, *sides, **how.options), masks.warning(mask))
-
-
-def _images(path: Path, most: int, renders: bool) -> list[Image]:
-    return read_renders(path, most) if renders else [image_file.read(path, most)]
-
-
-def _masked(images: list[Image], mask: masks.Mask | None) -> list[Image]:
-    return [masks.applied(image, mask) for image in images]
+    reference, test = ([masks.applied(image, mask) for image in side] for side in (reference, test))
+    if path.is_dir():
+        found = methods.compare(how.method, reference, test, **how.options)
+        return _Judged((mean_image(reference), mean_image(test)), found, masks.warning(mask))
+    found, images = parts.compare(how, reference, test)
+    return _Judged(images, found, masks.warning(mask))
 
 
 def _with(result: Result, one: _Judged, maps: bool) -> Result:
     found = one.comparison
     kept = maps and found.verdict is not Verdict.EQUAL  # a thousand images' maps would fill the memory
-    images = tuple(map(mean_image, one.sides)) if kept else ()
-    left_out = {} if one.sides[0][0].mask is None else {"left out": (~one.sides[0][0].mask).astype(np.float32)}
+    images = one.images if kept else ()
+    mask = one.images[0].mask
+    left_out = {} if mask is None else {"left out": (~mask).astype(np.float32)}
     comparison = replace(found, maps=found.maps | left_out if kept else {})
     warnings = tuple(filter(None, (one.warning,)))
     return replace(result, status=STATUSES[found.verdict], comparison=comparison, images=images, warnings=warnings)

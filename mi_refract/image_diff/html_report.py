@@ -19,14 +19,14 @@ from typing import Any
 import numpy as np
 
 from mi_refract.io import exit_code
-from mi_refract.io.image_file import Image, one_line, read
+from mi_refract.io.image_file import Image, one_line
 from mi_refract.io.pixels import Pixels, block_mean
 from mi_refract.report.embedded_images import EmbeddedImages, encoded, shown, strongest
 from mi_refract.report.html_page import write_page
 from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.plots import histogram_svg
 
-from . import flip, folders
+from . import flip, folders, parts
 from .comparison import Maps, Metric
 from .results import Result, Results, Status
 from .text_reports import sentence
@@ -153,11 +153,18 @@ def _sides(result: Result) -> tuple[dict[str, Image], list[str]]:
         try:
             if path:
                 most = result.how.max_values
-                several = folders.read_renders(path, most) if path.is_dir() else [read(path, most)]
+                several = folders.read_renders(path, most) if path.is_dir() else [_part(path, result)]
                 sides[role] = _in_shown_channels(folders.mean_image(several))
         except (ValueError, OSError) as error:
             notes.append(one_line(str(error)))
     return sides, notes
+
+
+def _part(path: Path, result: Result) -> Image:
+    """Of a file of several images the one that the verdict is about, else the first."""
+    images = parts.read(path, result.how)
+    part = result.comparison.part if result.comparison else (0, 0)
+    return next((image for image in images if image.part == part), images[0])
 
 
 def _in_shown_channels(image: Image) -> Image:

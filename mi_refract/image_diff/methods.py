@@ -12,8 +12,8 @@ import numpy as np
 
 from mi_refract.io.image_file import Image
 
-from . import black, flip, pixelwise, welch
-from .comparison import Comparison, Verdict, aligned, not_compared
+from . import black, flip, pixelwise, tolerance, welch
+from .comparison import Comparison, Verdict, aligned, not_compared, shared_channels
 
 AUTO = "auto"
 
@@ -72,7 +72,7 @@ class Method:
 
 METHODS = {
     "exact": Method(pixelwise.exact),
-    "tolerance": Method(pixelwise.tolerance, pixelwise.tolerance_passes_black, pixelwise.tolerance_accepts_black),
+    "tolerance": Method(tolerance.tolerance, tolerance.tolerance_passes_black, tolerance.tolerance_accepts_black),
     "paired": Method(pixelwise.paired, pixelwise.paired_passes_black, pixelwise.paired_accepts_black),
     "welch": Method(welch.compare_renders, takes_renders=True),
     "flip": Method(flip.flip, flip.flip_passes_black),
@@ -85,7 +85,8 @@ def compare(method: str, reference: Side, test: Side, *, allow_nonfinite: bool =
     "auto" is `welch` where it can be, else `tolerance`; of the options it takes those of the other one and leaves them
     out. Where a method calls the images equal but would call a black
     one equal, too, or one with some of its channels black, the verdict is INCONCLUSIVE; so it is where channels whose
-    variance `welch` does not know differ by more than `tolerance` allows.
+    variance `welch` does not know differ by more than `tolerance` allows. Channels that one of two images has besides
+    make them DIFFERENT.
     Where no value of a channel is finite, it is INCONCLUSIVE as well.
 
     ValueError for an unknown method or option, an option of another type or out of its range, several renders for a
@@ -107,7 +108,10 @@ def compare(method: str, reference: Side, test: Side, *, allow_nonfinite: bool =
     elif [len(side) for side in sides] != [1, 1]:
         raise ValueError(f"{method}: {len(one)} and {len(two)} images; accepted: one a side")
     else:
-        found = chosen.function(one[0], two[0], allow_nonfinite=allow_nonfinite, **checked)
+        a, b, other = shared_channels(one[0], two[0])
+        found = chosen.function(a, b, allow_nonfinite=allow_nonfinite, **checked)
+        if other:
+            return replace(found, verdict=Verdict.DIFFERENT, reason=f"{other}; the others: {found.reason}", warning="")
     if found.verdict is not Verdict.EQUAL:
         return found
     doubt = _untested(one, two, allow_nonfinite) if chosen.takes_renders else _blind_to(chosen, one[0], two[0], checked)

@@ -1,7 +1,7 @@
-"""Methods that look at every pixel alone: `exact`, `tolerance` and `paired`.
+"""Methods that look at every pixel alone: `exact` and `paired`; `tolerance` has a module of its own.
 
-`tolerance_passes_black` and `paired_passes_black` say whether an all-black test image would pass with the same
-options, `tolerance_accepts_black` and `paired_accepts_black` in which pixels: there the method sees no difference.
+`paired_passes_black` says whether an all-black test image would pass with the same options, `paired_accepts_black` in
+which pixels: there the method sees no difference.
 """
 
 from __future__ import annotations
@@ -31,85 +31,6 @@ def exact(reference: Image, test: Image, *, allow_nonfinite: bool = False) -> Co
     reason = f"{changed} of {a[..., 0].size} pixels differ" if changed else "every value is the same"
     metrics = (Metric("changed pixels", changed, 0.0), Metric("largest difference", float(difference.max()), 0.0))
     return Comparison("exact", verdict, reason, metrics, 0.0, {"difference": difference})
-
-
-# Absolute and relative thresholds ------------------------------------------------------------------------------
-
-
-def tolerance(
-    reference: Image,
-    test: Image,
-    *,
-    allow_nonfinite: bool = False,
-    fail: Annotated[float, "difference up to which values count as equal"] = 0.004,
-    fail_relative: Annotated[float, "the same, as a share of the mean of both"] = 0.001,
-    fail_percent: Annotated[float, "percentage of the pixels that may differ by more"] = 0.02,
-    hard_fail: Annotated[float, "no value may differ by more than this"] = np.inf,
-    warn: Annotated[float, "difference above which a pixel gives a warning"] = np.inf,
-    warn_relative: Annotated[float, "the same, as a share of the mean of both"] = 0.0,
-    warn_percent: Annotated[float, "percentage of the pixels that may do so without a warning"] = 0.0,
-    hard_warn: Annotated[float, "any larger difference gives a warning"] = np.inf,
-) -> Comparison:
-    """Differences within absolute and relative thresholds, except for a share of the pixels, as `idiff` counts them."""
-    require_nonnegative(locals())
-    a, b, found = checked_pixels("tolerance", reference, test, allow_nonfinite)
-    if found:
-        return found
-    # Not OpenImageIO's own `compare`: it rounds to float32, and what that does not hold would be equal.
-    with np.errstate(over="ignore"):
-        difference = np.abs(b - a)
-        maps = {"difference": difference.astype(np.float32, copy=False)}
-    limits = (fail, fail_relative), (warn, warn_relative)
-    failed, warned = (_percent(difference, a, b, *each, counted(reference)) for each in limits)
-    largest = float(difference.max())
-    metrics = (
-        Metric("pixels beyond the tolerance, %", failed, fail_percent),
-        Metric("largest difference", largest, hard_fail),
-        Metric("mean difference", float(difference.mean(dtype=np.float64))),
-        Metric("RMS difference", float(np.sqrt(np.einsum("ijk,ijk->", *2 * [difference], dtype=float) / a.size))),
-        Metric("pixels worth a warning, %", warned),
-    )
-    reason = f"{failed:.3g} % of the pixels beyond the tolerance; largest difference {largest:.3g}"
-    reason += _place(difference, reference) if largest else ""
-    if warned > warn_percent or largest > hard_warn:
-        reason += f"; warning: {warned:.3g} % of the pixels"
-    return Comparison("tolerance", verdict_of(metrics), reason, metrics, maps=maps)
-
-
-def tolerance_passes_black(reference: Image, options: Mapping[str, Any]) -> bool:
-    """Whether `tolerance` would call a black test image equal to `reference`; `options`: all of them, by name."""
-    a = reference.pixels
-    difference = np.abs(a)
-    black = np.zeros_like(a)
-    beyond = _percent(difference, a, black, options["fail"], options["fail_relative"], counted(reference))
-    return bool(beyond <= options["fail_percent"] and difference.max() <= options["hard_fail"])
-
-
-def tolerance_accepts_black(a: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
-    """The pixels of the reference, H × W × C, in which `tolerance` would take black for equal; H × W."""
-    difference = np.abs(a)
-    accepted: NDArray[np.bool_] = (difference <= options["hard_fail"]).all(-1)
-    beyond = _beyond(difference, a, np.zeros_like(a), options["fail"], options["fail_relative"])
-    accepted.reshape(-1)[beyond] = False
-    return accepted
-
-
-def _place(difference: Pixels, image: Image) -> str:
-    y, x, _ = np.unravel_index(int(difference.argmax()), difference.shape)
-    return f" at x = {x + image.origin[0]}, y = {y + image.origin[1]}"
-
-
-def _percent(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float, of: int) -> float:
-    """The pixels that `_beyond` finds, as a percentage of `of`."""
-    return 100 * _beyond(difference, a, b, most, share).size / of
-
-
-def _beyond(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float) -> NDArray[np.intp]:
-    """The pixels with a channel that differs by more than `most`, and than that share of the mean of both; flat."""
-    pixels = np.flatnonzero((difference > most).any(-1))  # few: the rest is cheaper there
-    x, y, z = (each.reshape(-1, a.shape[2])[pixels] for each in (difference, a, b))
-    found: NDArray[np.intp] = pixels[(x > np.maximum(most, share * (np.abs(y) / 2 + np.abs(z) / 2))).any(-1)]
-    return found
 
 
 def _difference(a: Pixels, b: Pixels) -> Pixels:
@@ -206,7 +127,7 @@ def _mean_ratio(reference: Pixels, test: Pixels) -> float:
 
 
 def require_nonnegative(options: Mapping[str, Any]) -> None:
-    """ValueError for a float among the options that is negative or NaN."""
+    """ValueError for a number among the options that is negative or NaN."""
     for name, value in options.items():
-        if isinstance(value, float) and not value >= 0:
+        if isinstance(value, float | int) and not value >= 0:
             raise ValueError(f"{name} = {value}: accepted: a number of at least 0")

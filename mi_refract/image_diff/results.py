@@ -47,7 +47,7 @@ class Result:
     `images`: both sides as they were read, of several renders the mean; empty where they were not kept. `digests`: of
     both files when they were compared, as `digest` gives them; None where that was not asked, or a file is unreadable.
     `target`: where the reference is, or would be. `variants`: other references that the settings accept; `matched`: the
-    one of them that the new image is equal to. `warnings`: what does not change the verdict.
+    one of them that the new image is equal to. `warnings`: of its mask.
     """
 
     name: str
@@ -74,10 +74,15 @@ class Result:
         return CATEGORIES.get(self.status, Category.UNKNOWN)
 
     @property
+    def warning(self) -> str:
+        """What does not change the verdict, but is to be looked at; "" for nothing."""
+        return "; ".join([*self.warnings, *filter(None, [self.comparison.warning if self.comparison else ""])])
+
+    @property
     def reason(self) -> str:
         """The reason for the status in one sentence."""
         if self.comparison:
-            return self.comparison.reason + self._of_variants
+            return self.comparison.reason + self._of_variants + (f"; warning: {self.warning}" if self.warning else "")
         if self.status is Status.SKIPPED:
             return "skipped by the settings"
         sides = {Category.ADDED: "only among the new images", Category.REMOVED: "only among the references"}

@@ -15,12 +15,14 @@ from typing import Any
 
 from mi_refract.io.image_file import MAX_VALUES
 
+from . import idiff_flags
 from .masks import Rectangle
 from .methods import AUTO, METHODS, options_of_auto
 from .name_patterns import matches
 
 SYSTEMS = {"linux": "linux", "darwin": "macos", "win32": "windows"}  # by sys.platform
 PROCESSORS = {"x86_64": "x86_64", "amd64": "x86_64", "arm64": "arm64", "aarch64": "arm64"}  # by platform.machine()
+TOLERANCE = "tolerance"  # the method that the flags of idiff are for
 FILE_ONLY = ("accept", "mask", "ignore")  # keys of `How` that no option of the command line says
 
 
@@ -30,7 +32,8 @@ class How:
 
     `max_values`: width × height × channels of an image, at most. `skip`: not compared at all. `accept`: templates of
     other references, each as good as the first. `mask`, `ignore`: pixels that do not count, as a template of an image
-    and as rectangles. `entries`: the tables of the settings file that say so. `error`: why they cannot be followed.
+    and as rectangles. `idiff`: the flags of `idiff` that the options come from. `entries`: the tables of the settings
+    file that say so. `error`: why they cannot be followed.
     """
 
     method: str = AUTO
@@ -41,6 +44,7 @@ class How:
     accept: tuple[str, ...] = ()
     mask: str = ""
     ignore: tuple[Rectangle, ...] = ()
+    idiff: str | None = None
     entries: tuple[str, ...] = ()
     error: str = ""
 
@@ -48,7 +52,12 @@ class How:
     def flags(self) -> list[str]:
         """The command line's options that say the same, but for what FILE_ONLY names."""
         words = [] if self.method == AUTO else ["--method", self.method]
+        given: Mapping[str, Any] = {}
+        if self.idiff is not None:
+            words, given = ["--idiff", self.idiff], idiff_flags.parse(self.idiff).options
         for name, value in self.options.items():
+            if name in given and given[name] == value:
+                continue
             if name != "allow_nonfinite":
                 words += ["--set", f"{name}={value}"]
             elif value:
@@ -123,7 +132,8 @@ class Settings:
             return replace(how, error=str(error))
         others = {**self.defaults.values, **{key: value for each in entries for key, value in each.values.items()}}
         kept = {key: others[key] for key in ("skip", *FILE_ONLY) if key in others}
-        return replace(how, method=method, options=options, **kept)
+        flags = others.get("idiff", self.default.idiff) if method == TOLERANCE else None
+        return replace(how, method=method, options=options, idiff=flags, **kept)
 
     def _command_line(self, name: str) -> list[tuple[str, Mapping[str, Any]]]:
         given = dict(self.default.options) | ({} if self.default.method == AUTO else {"method": self.default.method})

@@ -19,9 +19,9 @@ from typing import Any
 
 from mi_refract.io.toml_schema import TABLES, TEXT, Key, Type, first_of, key_table, list_of, read, table, text
 
-from . import name_patterns
+from . import idiff_flags, name_patterns
 from .methods import AUTO, METHODS, options_of_auto
-from .settings import ALL_OPTIONS, PROCESSORS, SYSTEMS, Entry, How, Map, Settings
+from .settings import ALL_OPTIONS, PROCESSORS, SYSTEMS, TOLERANCE, Entry, How, Map, Settings
 
 FILE = "mi-refract.toml"
 ACCEPTED = (AUTO, *METHODS)
@@ -68,6 +68,8 @@ RECTANGLES = Type("a list of [x, y, width, height], in pixels", _rectangles)
 PLATFORM = Type(f"of {', '.join(WORDS)}: one, two words, or a list of such", _platforms)
 MAP = Type("{ reference = …, test = … } or a list of such", first_of(table, list_of(table)))
 
+ANY_TEXT = Type("a text", lambda value: value if isinstance(value, str) else None)
+IDIFF = {"idiff": Key(ANY_TEXT, "flags of OpenImageIO's `idiff`, as they stand; the method is `tolerance`", None)}
 EVERYWHERE = {
     "method": Key(METHOD, "the method; that of the command line by default", None),
     "allow_nonfinite": Key(BOOL, "whether NaN or Inf is allowed where the other image has the same", None),
@@ -138,8 +140,14 @@ def _entry(given: dict[str, Any], where: str, path: str) -> Entry:
 def _values(given: dict[str, Any], keys: dict[str, Key], where: str) -> dict[str, Any]:
     """The values of the keys that are given. Options are those of the method where there is one, else of any."""
     method = read({k: v for k, v in given.items() if k == "method"}, {"method": EVERYWHERE["method"]}, where)["method"]
-    values = read(given, keys | keys_of(method), where)
-    return {key: tuple(values[key]) if key == "accept" else values[key] for key in given}
+    values = read(given, keys | (IDIFF if method in (None, TOLERANCE) else {}) | keys_of(method), where)
+    values = {key: tuple(values[key]) if key == "accept" else values[key] for key in given}
+    if "idiff" not in given:
+        return values
+    try:
+        return {**idiff_flags.parse(values["idiff"]).options, "method": TOLERANCE, **values}
+    except ValueError as error:
+        raise ValueError(f"{where}idiff: {error}") from None
 
 
 def keys_of(method: str | None) -> dict[str, Key]:
@@ -158,10 +166,12 @@ def _any_of(keys: list[Key]) -> Key:
     return Key(one, keys[0].meaning, keys[0].default)
 
 
-def from_words(method: str, words: Sequence[str]) -> How:
-    """The method and its options from the command line's `NAME=VALUE`. ValueError for anything else."""
+def from_words(method: str, words: Sequence[str], idiff: str | None = None) -> How:
+    """The method and its options from the command line's `NAME=VALUE` and `--idiff`. ValueError for anything else."""
     if method not in ACCEPTED:
         raise ValueError(f"--method {method}: accepted: {METHOD.accepted}")
+    if idiff is not None:
+        return _from_idiff(method, words, idiff)
     keys = keys_of(method)
     given: dict[str, Any] = {}
     for word in words:
@@ -171,6 +181,16 @@ def from_words(method: str, words: Sequence[str]) -> How:
         given[name] = _value(value, keys[name].type) if name in keys else value
     values = read(given, keys, "--set ")
     return How(method, {name: values[name] for name in given})
+
+
+def _from_idiff(method: str, words: Sequence[str], flags: str) -> How:
+    if method not in (AUTO, TOLERANCE):
+        raise ValueError(f"--idiff with --method {method}; accepted with --method {TOLERANCE}, or alone")
+    try:
+        given = idiff_flags.parse(flags).options
+    except ValueError as error:
+        raise ValueError(f"--idiff: {error}") from None
+    return How(TOLERANCE, {**given, **from_words(TOLERANCE, words).options}, idiff=flags)
 
 
 def _value(value: str, kind: Type) -> Any:
@@ -185,7 +205,7 @@ def _value(value: str, kind: Type) -> Any:
 
 def reference() -> str:
     """What a settings file may hold, and the options of each method, in Markdown."""
-    parts = [key_table("`[defaults]`", DEFAULTS), key_table("`[[image]]`", IMAGE)]
+    parts = [key_table("`[defaults]`", DEFAULTS | IDIFF), key_table("`[[image]]`", IMAGE | IDIFF)]
     for name, method in METHODS.items():
         parts.append(f"`{name}`: {method.summary}")
         parts += [key_table("option", keys_of(name))] if keys_of(name) else []

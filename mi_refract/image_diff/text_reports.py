@@ -20,6 +20,7 @@ from mi_refract.report import junit
 from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.row import strict
 
+from . import idiff_flags
 from .comparison import Metric
 from .pairing import Pair
 from .results import Result, Results, Status
@@ -51,18 +52,20 @@ def sentence(results: Results) -> str:
     """All statuses in one line: "12 images: 1 different, 11 equal"."""
     counts = Counter(result.status for result in results.results)
     counted = ", ".join(f"{counts[status]} {WORDS[status]}" for status in Status if counts[status])
-    number = len(results.results)
-    return f"{number} image{'' if number == 1 else 's'}: {counted}"
+    number, warnings = len(results.results), sum(bool(result.warning) for result in results.results)
+    warned = f", {warnings} with a warning" if warnings else ""
+    return f"{number} image{'' if number == 1 else 's'}: {counted}{warned}"
 
 
 def table(results: Results) -> RenderableType:
-    """Failures first, then the equal images, FEW at most, then the sentence; for rich's console."""
+    """Failures first, then equal images with a warning, FEW others, and the sentence; for rich's console."""
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
-    failed = results.of(Status.DIFFERENT, Status.INCONCLUSIVE)
-    equal, skipped = results.of(Status.EQUAL), results.of(Status.SKIPPED)
+    failed = [*results.of(Status.DIFFERENT, Status.INCONCLUSIVE), *_warned(results)]
+    equal = [result for result in results.of(Status.EQUAL) if not result.warning]
+    skipped = results.of(Status.SKIPPED)
     rows = Table("verdict", "image", "method", "why", box=None, pad_edge=False)
     for result in [*failed, *equal[:FEW], *skipped]:
         status = Text(_word(result), style=STYLES[result.status])
@@ -92,10 +95,20 @@ def _pixels(how: How) -> list[str]:
     return [*mask, *(f"without {list(each)}" for each in how.ignore)]
 
 
+def _warned(results: Results) -> list[Result]:
+    return [result for result in results.of(Status.EQUAL) if result.warning]
+
+
+def without_effect(results: Results) -> list[str]:
+    """A line for each set of `idiff`'s flags with some that are taken and do nothing."""
+    given = {result.how.idiff for result in results.results} - {None}
+    ignored = (idiff_flags.parse(flags or "").ignored for flags in sorted(given, key=str))
+    return [f"idiff {' '.join(flags)}: no effect; --report OUT.html shows the difference" for flags in ignored if flags]
+
+
 def why(result: Result) -> str:
-    """The reason of the verdict, warnings, and the settings' reason where the image has settings of its own."""
-    parts = result.reason, *(f"warning: {text}" for text in result.warnings)
-    return "; ".join(parts) + (f" [{result.how.reason}]" if result.how.reason else "")
+    """The reason of the verdict, and the settings' reason where the image has settings of its own."""
+    return result.reason + (f" [{result.how.reason}]" if result.how.reason else "")
 
 
 def _word(result: Result) -> str:
@@ -133,6 +146,7 @@ def _entry(results: Results, result: Result) -> dict[str, Any]:
         "status": str(result.status),
         "category": str(result.category),
         "reason": result.reason,
+        "warning": result.warning,
         "error": result.error,
         "reference": result.reference,
         "test": result.test,
@@ -142,7 +156,6 @@ def _entry(results: Results, result: Result) -> dict[str, Any]:
         "entries": list(result.how.entries),
         "matched": result.matched,
         "variants": list(result.variants),
-        "warnings": list(result.warnings),
         "metrics": [{"name": m.name, "value": m.value, "bound": m.bound} for m in (found.metrics if found else ())],
         "minimum_detectable_difference": found.minimum_detectable if found else math.nan,
         "reproduce": results.reproduce(result),
@@ -196,10 +209,10 @@ def metric_text(metric: Metric) -> str:
 
 
 def workflow_commands(results: Results) -> list[str]:
-    """A workflow command for each image that is not equal."""
+    """A workflow command for each image that is not equal, or has a warning."""
     lines = []
     for result in results.results:
-        if result.warnings or result.status not in (Status.EQUAL, Status.SKIPPED):
+        if result.warning or result.status not in (Status.EQUAL, Status.SKIPPED):
             level = "error" if _kind(results, result) else "warning"
             file = _property(result.test or result.reference or result.name)
             title = _property(f"{result.name}: {_word(result)}")
@@ -223,8 +236,8 @@ def append_summary(results: Results) -> None:
 
 
 def markdown(results: Results) -> str:
-    """A heading with the sentence and a table of the images that are not equal."""
-    failed = results.of(Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE)
+    """A heading with the sentence and a table of the images that are not equal, or have a warning."""
+    failed = [*results.of(Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE), *_warned(results)]
     lines = [f"### mi-refract diff: {sentence(results)}", ""]
     if failed:
         lines += ["| verdict | image | method | why |", "|---|---|---|---|"]

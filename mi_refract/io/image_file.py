@@ -9,9 +9,9 @@ import os
 import re
 import shlex
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +92,8 @@ class Image:
     `pixels`: H × W × C, float32, or float64 where the file holds numbers that float32 cannot; integers of a file are
     mapped to 0 … 1. `channels`: C names. `origin`: (x, y) where the data window begins. `metadata`: the header.
     `display`: x, y, width and height of the display window; None where it is the data window. `mask`: H × W, the
-    pixels that count; None where all do. The others are 0.
+    pixels that count; None where all do. The others are 0. `part`: its number and
+    that of its MIP level, from 0 on as OpenImageIO counts; `place`: the same in words, "" in a file of one image.
     """
 
     path: Path
@@ -102,6 +103,8 @@ class Image:
     metadata: Metadata = field(default_factory=dict)
     display: tuple[int, int, int, int] | None = None
     mask: NDArray[np.bool_] | None = None
+    part: tuple[int, int] = (0, 0)
+    place: str = ""
 
     def select(self, channels: Sequence[str]) -> NDArray[np.floating[Any]]:
         """The pixels of these channels, in this order: H × W × len(channels). ValueError for a name not there."""
@@ -113,9 +116,24 @@ class Image:
 def read(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> Image:
     """Read a file that holds one image, of any format that OpenImageIO reads; the name's ending tells which.
 
-    `max_values`: width × height × channels, at most; asked of the header, before memory is allocated. OSError for a
-    file that cannot be read; ValueError for one that is empty, truncated, too large, of another format than its name
-    says, of several parts, deep, or without pixels. Both are one line that begins with the path.
+    Raises what `read_parts` raises, and ValueError for a file of several parts or MIP levels.
+    """
+    image = read_parts(path, max_values, first_only=True)[0]
+    if image.place:
+        raise ValueError(f"{path}: several parts or MIP levels in one file; accepted: one image")
+    return image
+
+
+def read_parts(
+    path: str | os.PathLike[str], max_values: int = MAX_VALUES, *, first_only: bool = False, as_idiff: bool = False
+) -> list[Image]:
+    """Read every image of a file, by part and MIP level; a file of any format that OpenImageIO reads, told by its name.
+
+    `max_values`: width × height × channels of all together, at most; asked of each header, before memory is allocated.
+    `first_only`: of several images only the first, which has its `place` nevertheless. `as_idiff`: in the numbers that
+    `idiff` compares, float32 and colours multiplied by alpha. OSError for a file that cannot be read; ValueError for
+    one that is empty, truncated, too large, of another format than its name says, deep, or without pixels. Both are
+    one line that begins with the path.
     """
     path = Path(path)
     kind = path.suffix[1:].upper() or "image"
@@ -132,9 +150,10 @@ def read(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> Image:
     if begin == LFS_POINTER:
         raise ValueError(f"{path}: a Git LFS pointer, not the image; `{_lfs_pull(path)}` brings it")
     # Others hold 8 bytes a value or fewer, and are asked below.
-    source = _opened(path, kind, max_values, max_values * (1 if begin.startswith(WHEN_OPENED) else 8))
+    max_bytes = max_values * (1 if begin.startswith(WHEN_OPENED) else 8)
+    source = _opened(path, kind, max_values, max_bytes, as_idiff)
     try:
-        return _image(path, source, kind, max_values)
+        return _images(path, source, kind, max_values, first_only, as_idiff)
     except MemoryError:
         raise ValueError(f"{path}: more pixels than there is memory for; accepted: a smaller image") from None
     finally:
@@ -152,12 +171,13 @@ def _lfs_pull(path: Path) -> str:
 _opening = threading.Lock()  # OpenImageIO has one limit for all that it opens
 
 
-def _opened(path: Path, kind: str, max_values: int, max_bytes: int) -> Any:
+def _opened(path: Path, kind: str, max_values: int, max_bytes: int, multiplied: bool) -> Any:
     """OpenImageIO's reader of the file, if its pixels take up to `max_bytes`. Some formats are decoded here."""
     import OpenImageIO as oiio
 
     config = oiio.ImageSpec()
-    config.attribute("oiio:UnassociatedAlpha", 1)  # else colours under a transparent alpha are read as black
+    if not multiplied:
+        config.attribute("oiio:UnassociatedAlpha", 1)  # else colours under a transparent alpha are read as black
     with _opening:
         before = oiio.get_int_attribute("limits:imagesize_MB")
         oiio.attribute("limits:imagesize_MB", min(-(-max_bytes >> 20), 2**31 - 1))
@@ -194,7 +214,39 @@ def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Image]:
         return list(pool.map(read, paths))
 
 
-def _image(path: Path, source: Any, kind: str, max_values: int) -> Image:
+def _images(path: Path, source: Any, kind: str, most: int, first_only: bool, as_idiff: bool) -> list[Image]:
+    """The images of an open file, in the order of parts and MIP levels, with their places."""
+    found: list[Image] = []
+    for part in _parts(source):
+        image = _image(path, source, kind, (most - sum(each.pixels.size for each in found), most), as_idiff)
+        found.append(replace(image, part=part))
+        if first_only:
+            break
+    if not found:
+        raise ValueError(f"{path}: corrupt {kind} file: {_without(path, source.geterror()) or 'no image'}")
+    several = found[-1].part[0] > 0 or (first_only and source.seek_subimage(1, 0))
+    levelled = {image.part[0] for image in found if image.part[1]}
+    levelled |= {0} if first_only and source.seek_subimage(0, 1) else set()
+    return [replace(image, place=_place(image.part, several, image.part[0] in levelled)) for image in found]
+
+
+def _parts(source: Any) -> Iterator[tuple[int, int]]:
+    """Each part and MIP level by number; the source is at it. Not counted first: some formats are decoded here."""
+    part = 0
+    while source.seek_subimage(part, 0):
+        level = 0
+        while source.seek_subimage(part, level):
+            yield part, level
+            level += 1
+        part += 1
+
+
+def _place(part: tuple[int, int], several: bool, levelled: bool) -> str:
+    return ", ".join([f"part {part[0]}"] * several + [f"MIP level {part[1]}"] * levelled)
+
+
+def _image(path: Path, source: Any, kind: str, values: tuple[int, int], as_idiff: bool) -> Image:
+    """The part and MIP level that the source is at; `values`: how many there may be here, and in the whole file."""
     spec = source.spec()
     found = source.format_name()
     if path.suffix[1:].lower() not in _endings(found) or found == "null":  # which is black, whatever the file holds
@@ -203,19 +255,22 @@ def _image(path: Path, source: Any, kind: str, max_values: int) -> Image:
         raise ValueError(f"{path}: accepted: an image without deep samples")
     if min(spec.width, spec.height, spec.nchannels) < 1 or spec.depth > 1:
         raise ValueError(f"{path}: {spec.width} × {spec.height} × {spec.depth} pixels; accepted: a plane with pixels")
-    if spec.width * spec.height * spec.nchannels > max_values:
-        size = f"{spec.width} × {spec.height} × {spec.nchannels} values"
-        raise ValueError(f"{path}: {size}; accepted: up to {max_values} values (max-values)")
+    left, most = values
+    if spec.width * spec.height * spec.nchannels > left:
+        beside = f" beside {most - left} of other parts and MIP levels" if left < most else ""
+        size = f"{spec.width} × {spec.height} × {spec.nchannels} values{beside}"
+        raise ValueError(f"{path}: {size}; accepted: up to {most} values (max-values)")
     formats = {str(each) for each in (spec.channelformats or [spec.format])}
     if formats & {"uint64", "int64"}:
         raise ValueError(f"{path}: integers of 64 bits; accepted: up to 32")
-    wide = formats & {"double", "uint32", "int32", "uint", "int"}
-    pixels = source.read_image("double" if wide else "float")
+    if found == "tiff" and "double" in formats and spec.height == 1:  # OpenImageIO 2.4 to 3.2 reads what lay in memory
+        raise ValueError(f"{path}: one row of 64-bit numbers in a TIFF file; accepted: several rows, or 32 bits")
+    wide = not as_idiff and formats & {"double", "uint32", "int32", "uint", "int"}
+    at = source.current_subimage(), source.current_miplevel()
+    pixels = source.read_image(*at, 0, spec.nchannels, "double" if wide else "float")
     if message := _without(path, source.geterror()) or ("" if pixels is not None else "no pixels"):
         raise ValueError(f"{path}: corrupt {kind} file: {message}")
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
-    if source.seek_subimage(1, 0):
-        raise ValueError(f"{path}: several parts in one file; accepted: one image")
     metadata = {attribute.name: attribute.value for attribute in spec.extra_attribs}
     display = (spec.full_x, spec.full_y, spec.full_width, spec.full_height)
     return Image(path, pixels, tuple(spec.channelnames), (spec.x, spec.y), metadata, display)

@@ -80,7 +80,7 @@ def test_every_method(run, pair, tmp_path, method):
 
 def test_an_option_of_the_method(run, pair):
     assert run("diff", *pair, "--method", "tolerance", "--set", "fail=0.2", "--set", "hard_fail=1")[0] == 0
-    assert run("diff", *pair, "--method", "tolerance", "--set", "fail=0.2", "--set", "hard_fail=0.01")[0] == 1
+    assert run("diff", *pair, "--method", "tolerance", "--set", "fail_percent=100", "--set", "hard_fail=0.01")[0] == 1
 
 
 def test_settings_lie_beside_the_references(run, pair, tmp_path):

@@ -64,14 +64,14 @@ def test_one_bad_image_keeps_no_other_from_being_compared(folders, side, spoil):
 
 def test_no_permission(folders, monkeypatch):
     """By a planted error: who runs as root may read everything."""
-    read = image_file.read
+    read = image_file.read_parts
 
     def refuse(path, *most):
         if path.name == "same.exr":
             raise PermissionError(13, "Permission denied", str(path))
         return read(path, *most)
 
-    monkeypatch.setattr(image_file, "read", refuse)
+    monkeypatch.setattr(image_file, "read_parts", refuse)
     results = diff.diff(*folders)
     assert [(r.name, r.error) for r in results.of(Status.ERROR)] == [
         ("same.exr", f"{folders[0] / 'same.exr'}: Permission denied")

@@ -144,9 +144,8 @@ def test_renders_in_a_folder_are_shown_as_their_mean(tmp_path):
 def test_every_file_is_read_once_and_flip_runs_once_for_verdict_and_page(tmp_path, monkeypatch, method):
     sides = [image(tmp_path / side / "a.exr", value) for side, value in (("r", 0.25), ("t", 0.5))]
     reads, runs = [], []
-    read, flip_map = image_file.read, flip.flip_map
-    for module, name in ((image_file, "read"), (html_report, "read")):
-        monkeypatch.setattr(module, name, lambda path, *most: reads.append(path) or read(path, *most))
+    read, flip_map = image_file.read_parts, flip.flip_map
+    monkeypatch.setattr(image_file, "read_parts", lambda path, *most: reads.append(path) or read(path, *most))
     monkeypatch.setattr(flip, "flip_map", lambda *sides: runs.append(sides) or flip_map(*sides))
     settings = Settings(How(method))
     whole = html(tmp_path, folders.diff(*sides, settings, maps=True))

@@ -74,10 +74,29 @@ def test_colour_under_a_transparent_alpha_is_kept(tmp_path):
 
 
 def test_numbers_that_float32_does_not_hold_stay_apart(tmp_path):
-    wide = np.array([[[1.0], [1 + 2.0**-40]]])
+    wide = np.array([[[1.0]], [[1 + 2.0**-40]]])
     values = read(save(tmp_path / "a.tif", wide, "double")).pixels
     assert values.dtype == np.float64
-    assert values[0, 0, 0] != values[0, 1, 0]
+    np.testing.assert_array_equal(values, wide)
+
+
+def test_the_numbers_that_idiff_compares(tmp_path):
+    """float32, and colours multiplied by alpha."""
+    path = save(tmp_path / "a.tif", np.full((2, 2, 3), 1 + 2.0**-40), "double")
+    (image,) = image_file.read_parts(path, as_idiff=True)
+    assert image.pixels.dtype == np.float32 and (image.pixels == 1).all()
+    spec = oiio.ImageSpec(1, 1, 4, "float")
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec) and output.write_image(np.float32([[[1, 1, 1, 0.5]]])) and output.close()
+    assert image_file.read_parts(path, as_idiff=True)[0].pixels[0, 0, 0] == 0.5
+    assert read(path).pixels[0, 0, 0] == 1
+
+
+def test_what_openimageio_reads_wrongly_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"a\.tif: one row of 64-bit numbers in a TIFF file; accepted: several rows"):
+        read(save(tmp_path / "a.tif", np.ones((1, 4, 3)), "double"))
+    assert read(save(tmp_path / "b.tif", np.ones((1, 4, 3), np.float32), "float")).pixels.shape == (1, 4, 3)
 
 
 def multipart(path):

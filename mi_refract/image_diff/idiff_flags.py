@@ -1,0 +1,94 @@
+"""The flags of OpenImageIO's `idiff`, as a project has them, as options of the method `tolerance`.
+
+`idiff`'s own defaults hold for flags that are not there: a difference of 1e-6 in one pixel fails. Checked against
+`idiff` 2.4 and 3.2, which have the same flags and defaults.
+"""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+# By flag: the option of `tolerance`, and idiff's default.
+THRESHOLDS: Mapping[str, tuple[str, float]] = {
+    "-fail": ("fail", 1e-6),
+    "-failrelative": ("fail_relative", 0.0),
+    "-failpercent": ("fail_percent", 0.0),
+    "-hardfail": ("hard_fail", math.inf),
+    "-allowfailures": ("allow_failures", 0),
+    "-warn": ("warn", 1e-6),
+    "-warnrelative": ("warn_relative", 0.0),
+    "-warnpercent": ("warn_percent", 0.0),
+    "-hardwarn": ("hard_warn", math.inf),
+}
+EVERY = "-a"
+WORDS = {"-q", "-v"}  # how much idiff prints
+IMAGE = {"-o": 1, "-od": 0, "-abs": 0, "-scale": 1}  # of its image of the difference, and how many words follow
+ACCEPTED = ", ".join((*THRESHOLDS, EVERY, *sorted(WORDS), *IMAGE))
+
+
+@dataclass(frozen=True)
+class Flags:
+    """What the flags ask for.
+
+    `options`: all thresholds of `tolerance`. `every`: every part and MIP level is compared, not the first alone.
+    `ignored`: those of the image of the difference, which is not written.
+    """
+
+    options: Mapping[str, Any]
+    every: bool
+    ignored: tuple[str, ...]
+
+
+def parse(text: str) -> Flags:
+    """The flags in a text, as a shell would divide it. Of one that is given twice the last counts, as with `idiff`.
+
+    ValueError, one line that begins with the flag, for what `idiff` does not know or reads as 0, and for `-p`.
+    """
+    try:
+        words = shlex.split(text)
+    except ValueError as error:
+        raise ValueError(f"{text!r}: {error}; accepted: flags of idiff") from None
+    options: dict[str, Any] = dict(THRESHOLDS.values())
+    every, ignored = False, []
+    while words:
+        word = words.pop(0)
+        flag = word[1:] if word.startswith("--") else word  # idiff takes both
+        if flag in THRESHOLDS:
+            option, default = THRESHOLDS[flag]
+            options[option] = _number(word, _next(word, words), whole=isinstance(default, int))
+        elif flag in IMAGE:
+            ignored.append(" ".join([word, *(_next(word, words) for _ in range(IMAGE[flag]))]))
+        elif flag == EVERY:
+            every = True
+        elif flag not in WORDS:
+            raise ValueError(_refused(word, flag))
+    return Flags(options, every, tuple(ignored))
+
+
+def _next(flag: str, words: list[str]) -> str:
+    if not words:
+        raise ValueError(f"{flag}: nothing follows; accepted: {flag} VALUE")
+    return words.pop(0)
+
+
+def _number(flag: str, text: str, whole: bool) -> float:
+    """idiff reads what is no number as 0, and a negative number of pixels as one that lets everything pass."""
+    try:
+        value = math.nan if "_" in text else float(text)
+    except ValueError:
+        value = math.nan
+    if not value >= 0 or (whole and not value.is_integer()):
+        raise ValueError(f"{flag} {text}: accepted: a {'whole ' * whole}number of at least 0")
+    return int(value) if whole else value
+
+
+def _refused(word: str, flag: str) -> str:
+    if flag == "-p":
+        return "-p: idiff's perceptual test; accepted: --method flip, which replaces it"
+    if not flag.startswith("-"):
+        return f"{word}: no flag; accepted: the flags alone, without idiff and the images"
+    return f"{word}: no flag of idiff; accepted: {ACCEPTED}"

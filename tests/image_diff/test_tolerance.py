@@ -1,0 +1,197 @@
+"""`tolerance`: the counts of OpenImageIO, `idiff`'s order of bounds, and the words that name the bound that failed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from mi_refract.image_diff.comparison import Verdict
+from mi_refract.image_diff.idiff_flags import parse
+from mi_refract.image_diff.methods import compare
+from mi_refract.image_diff.tolerance import tolerance, tolerance_accepts_black, tolerance_passes_black
+from mi_refract.io.image_file import Image
+
+THRESHOLDS = (0.0, 1e-6, 1 / 255, 0.004, 0.01, 0.1, 1.0)
+FACTORS = (1, 1, 1, 0.5, 2, 1 + 6e-8, 1 - 6e-8, 1 + 1e-6)
+EQUAL, DIFFERENT, INCONCLUSIVE = Verdict.EQUAL, Verdict.DIFFERENT, Verdict.INCONCLUSIVE
+
+
+def image(pixels, channels=("R", "G", "B"), **rest):
+    return Image(Path("a.exr"), np.asarray(pixels, np.float32), channels, **rest)
+
+
+def random_pair(rng):
+    """Differences of exactly a threshold in float32 among them, also relative to the mean of both."""
+    shape = *rng.integers(1, 9, 2), 3
+    a = (rng.choice([1, -1, 100, 1e-3]) * rng.random(shape)).astype(np.float32)
+    share = np.float32(rng.choice(THRESHOLDS[:-1])) * np.float32(rng.choice(FACTORS))
+    if rng.random() < 0.3:
+        return a, (a * (1 + share / 2) / (1 - share / 2)).astype(np.float32)  # by that share of the mean
+    if rng.random() < 0.5:
+        a[:] = 0
+    return a, np.where(rng.random(shape) < 0.3, a + share, a).astype(np.float32)
+
+
+def expected(a, b, options):
+    """The verdict and whether there is a warning, from OpenImageIO's counts, as `idiff` asks for them."""
+    names = ("fail", "warn", "fail_relative", "warn_relative")
+    found = oiio.ImageBufAlgo.compare(oiio.ImageBuf(a), oiio.ImageBuf(b), *(options[name] for name in names))
+    single, pixels = np.float32, a[..., 0].size
+    if found.nfail <= options["allow_failures"]:
+        return EQUAL, False
+    share = {each: float(single(options[f"{each}_percent"])) / 100 * pixels for each in ("fail", "warn")}
+    if found.nfail > share["fail"] or found.maxerror > single(options["hard_fail"]):
+        return DIFFERENT, False
+    return EQUAL, bool(found.nwarn > share["warn"] or found.maxerror > single(options["hard_warn"]))
+
+
+def test_random_images_and_thresholds():
+    rng = np.random.default_rng(7)
+    seen = {}
+    for _ in range(2000):
+        a, b = random_pair(rng)
+        options = {name: float(rng.choice(THRESHOLDS)) for name in parse("").options}
+        options |= {f"{x}_percent": float(rng.choice([0, 5, 12.5, 100 / 3, 50, 100])) for x in ("fail", "warn")}
+        options |= {
+            "allow_failures": int(rng.choice([0, 0, 1, 3])),
+            "hard_fail": float(rng.choice([*THRESHOLDS, np.inf])),
+        }
+        if rng.random() < 0.4:  # what leads to a warning
+            options |= {"fail": 1e-6, "fail_relative": 0.0, "fail_percent": 50.0, "hard_fail": 1.0}
+        found = tolerance(image(a), image(b), **options)
+        key = expected(a, b, options)
+        assert (found.verdict, bool(found.warning)) == key, (a, b, options, found.reason)
+        assert all(metric.holds for metric in found.metrics) is (found.verdict is EQUAL)
+        seen[key] = seen.get(key, 0) + 1
+    assert min(seen[EQUAL, False], seen[EQUAL, True], seen[DIFFERENT, False]) > 40, seen
+
+
+def test_the_ends_of_the_thresholds():
+    """At a threshold nothing differs yet; ratios are of float32 means, percentages float32, as in `idiff`."""
+    a, b = image(np.full((1, 5, 3), 1.5)), image(np.full((1, 5, 3), 0.5))
+    assert tolerance(a, b, fail=1.0).verdict is EQUAL
+    assert tolerance(a, b, fail=0.999, fail_relative=1.0).verdict is EQUAL
+    assert tolerance(a, b, fail=0.999, fail_relative=0.999).verdict is DIFFERENT
+    tiny = [image(np.full((1, 5, 3), x, np.float32)) for x in (1e-45, 0.0)]  # whose mean is 0 in float32
+    assert tolerance(*tiny, fail=0.0, fail_relative=0.0).verdict is EQUAL
+    one = np.full((1, 5, 3), 0.5, np.float32)
+    one[0, 0] = 1
+    # 1/5 is 20 %; the number next below it in float64 is 20 in float32.
+    for percent, verdict in ((20.0, EQUAL), (np.nextafter(20.0, 0), EQUAL), (19.99, DIFFERENT)):
+        found = tolerance(image(np.full((1, 5, 3), 0.5)), image(one), fail_percent=float(percent))
+        assert found.verdict is verdict
+
+
+SIX = np.full((20, 30, 3), 0.5, np.float32)  # of 600 pixels 6 differ, one by more
+SIX[3, :6, 1] += 0.02
+SIX[3, 4, 1] += 0.03
+FLAT = np.full((20, 30, 3), 0.5, np.float32)
+
+
+@pytest.mark.parametrize(
+    "options, verdict, reason",
+    [
+        (
+            {"fail": 0.01, "fail_percent": 0.5},
+            DIFFERENT,
+            "1 % of the pixels (6 of 600) differ by more than fail = 0.01 (> fail_percent = 0.5); "
+            "largest difference 0.05 at x = 4, y = 3, channel G",
+        ),
+        (
+            {"fail": 0.01, "fail_percent": 1, "hard_fail": 0.03},
+            DIFFERENT,
+            "largest difference 0.05 > hard_fail = 0.03 at x = 4, y = 3, channel G; "
+            "1 % of the pixels (6 of 600) differ by more than fail = 0.01 (≤ fail_percent = 1)",
+        ),
+        (
+            {"fail": 0.01, "allow_failures": 5, "hard_fail": 0.03},
+            DIFFERENT,
+            "1 % of the pixels (6 of 600) differ by more than fail = 0.01 (> fail_percent = 0, allow_failures = 5); "
+            "largest difference 0.05 > hard_fail = 0.03 at x = 4, y = 3, channel G",
+        ),
+        (
+            {"fail": 0.01, "fail_relative": 0.03, "allow_failures": 6, "hard_fail": 0.03},
+            EQUAL,
+            "1 % of the pixels (6 of 600) differ by more than fail = 0.01, fail_relative = 0.03 "
+            "(≤ allow_failures = 6); largest difference 0.05 at x = 4, y = 3, channel G",
+        ),
+        (
+            {"fail": 0.1, "hard_fail": 0.03},
+            EQUAL,
+            "no pixel of 600 differs by more than fail = 0.1; largest difference 0.05 at x = 4, y = 3, channel G",
+        ),
+    ],
+)
+def test_the_bound_that_failed_is_named_first(options, verdict, reason):
+    options = {"fail_relative": 0.0, "fail_percent": 0.0} | options
+    found = compare("tolerance", image(FLAT), image(SIX), **options)
+    assert (found.verdict, found.reason, found.warning) == (verdict, reason, "")
+
+
+def test_a_warning_is_no_failure_and_names_its_bounds():
+    options = {"fail": 0.01, "fail_percent": 1.0, "warn": 0.03, "hard_warn": 0.04}
+    found = compare("tolerance", image(FLAT), image(SIX), **options)
+    assert found.verdict is EQUAL
+    assert found.warning == (
+        "0.167 % of the pixels (1 of 600) differ by more than warn = 0.03 (> warn_percent = 0); "
+        "largest difference 0.05 > hard_warn = 0.04"
+    )
+    quiet = {"warn_percent": 0.2, "hard_warn": 0.06}
+    assert compare("tolerance", image(FLAT), image(SIX), **options | quiet).warning == ""
+    different = compare("tolerance", image(FLAT), image(SIX), **options | {"fail_percent": 0.5})
+    assert (different.verdict, different.warning) == (DIFFERENT, "")
+
+
+def test_failures_that_are_allowed_would_let_black_pass():
+    """A method that allows as many pixels as there are sees nothing."""
+    bright = image(np.full((3, 3, 3), 0.5))
+    other = image(np.full((3, 3, 3), 0.4))
+    assert compare("tolerance", bright, other, allow_failures=8).verdict is DIFFERENT
+    found = compare("tolerance", bright, other, allow_failures=9)
+    assert found.verdict is INCONCLUSIVE
+    assert found.reason.startswith("an all-black image would pass, too")
+
+
+def test_where_black_is_accepted_is_where_it_passes_alone():
+    rng = np.random.default_rng(3)
+    pixels = rng.choice([0.0, 0.003, 0.004, 0.05, 0.5], (8, 8, 3)).astype(np.float32)
+    options = {**parse("-fail .004 -hardfail .001").options}
+    accepted = tolerance_accepts_black(pixels, options)
+    for y, x in np.ndindex(8, 8):
+        assert accepted[y, x] == tolerance_passes_black(image(pixels[y : y + 1, x : x + 1]), options)
+
+
+@pytest.mark.parametrize("bad", [{"allow_failures": -1}, {"fail_percent": -1.0}, {"hard_fail": float("nan")}])
+def test_bounds_below_zero_are_refused(bad):
+    with pytest.raises(ValueError, match="accepted: a number of at least 0"):
+        compare("tolerance", image(FLAT), image(SIX), **bad)
+
+
+# Channels that one image has besides -----------------------------------------------------------------------------
+
+
+def with_channel(name, values):
+    return image(np.dstack([FLAT, np.broadcast_to(np.float32(values), FLAT.shape[:2])]), ("R", "G", "B", name))
+
+
+@pytest.mark.parametrize("method", ["auto", "exact", "tolerance", "paired", "flip"])
+def test_an_added_opaque_alpha_is_a_difference_with_a_name(method):
+    for pair, word in (
+        ((image(FLAT), with_channel("A", 1)), "added"),
+        ((with_channel("A", 1), image(FLAT)), "missing"),
+    ):
+        found = compare(method, *pair)
+        assert found.verdict is DIFFERENT
+        assert found.reason.startswith(f"channels {word}: A (opaque: 1 everywhere); the others: ")
+
+
+def test_other_channels_are_named_too():
+    ramp = np.arange(FLAT[..., 0].size).reshape(FLAT.shape[:2])
+    for name, values, words in (("Z", ramp, "Z"), ("Z", 0, "Z (0 everywhere)"), ("l.A", 0.5, "l.A (0.5 everywhere)")):
+        found = compare("tolerance", image(FLAT), with_channel(name, values))
+        assert (found.verdict, found.reason.partition(";")[0]) == (DIFFERENT, f"channels added: {words}")
+    seen = compare("tolerance", with_channel("A", 1), image(SIX))
+    assert "the others: 1 % of the pixels (6 of 600)" in seen.reason
