@@ -123,8 +123,8 @@ def _beyond(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float)
 
 def _differ(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float) -> NDArray[np.bool_]:
     """Which of these pixels, N × C, differ; in idiff's precision: a mean is rounded, the ratio to it is not."""
-    mean = (np.abs(a) * 0.5).astype(np.float64) + np.abs(b) * 0.5
-    mean = mean.astype(difference.dtype)
+    half = np.float64(0.5)  # of this type: half of a float32 would be rounded where it is subnormal
+    mean = (np.abs(a) * half + np.abs(b) * half).astype(difference.dtype)
     relative = np.divide(difference, mean, out=np.zeros(mean.shape), where=mean > 0, dtype=np.float64)
     differs: NDArray[np.bool_] = np.any((difference > most) & (relative > share), axis=-1)
     return differs

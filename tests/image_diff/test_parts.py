@@ -110,6 +110,18 @@ def test_without_a_the_first_is_compared_as_idiff_does_and_that_is_said(tmp_path
     assert str(compared(one, two, from_words("auto", [], "-a -fail .01")).status) == "different"
 
 
+def test_with_flags_of_idiff_colours_are_multiplied_by_alpha(tmp_path):
+    for name, colour in (("a.tif", 0.5), ("b.tif", 0.25)):
+        spec = oiio.ImageSpec(4, 4, 4, "uint8")
+        spec.attribute("oiio:UnassociatedAlpha", 1)
+        output = oiio.ImageOutput.create(str(tmp_path / name))
+        pixels = np.full((4, 4, 4), colour, np.float32) * np.float32([1, 1, 1, 0])
+        assert output.open(str(tmp_path / name), spec) and output.write_image(pixels) and output.close()
+    pair = tmp_path / "a.tif", tmp_path / "b.tif"
+    assert str(compared(*pair, from_words("auto", [], "-fail 0")).status) == "equal"
+    assert str(compared(*pair).status) == "different"
+
+
 def test_a_warning_says_where(tmp_path):
     one, two = parts(tmp_path / "a.exr", SMALL), parts(tmp_path / "b.exr", with_change(SMALL, 1, 0.01))
     found = compared(one, two, from_words("auto", [], "-a -fail .001 -failpercent 99"))
