@@ -88,7 +88,8 @@ class Image:
 
     `pixels`: H × W × C, float32, or float64 where the file holds numbers that float32 cannot; integers of a file are
     mapped to 0 … 1. `channels`: C names. `origin`: (x, y) where the data window begins. `metadata`: the header.
-    `display`: x, y, width and height of the display window; None where it is the data window.
+    `display`: x, y, width and height of the display window; None where it is the data window. `stored`: the type of
+    the file's numbers, in OpenImageIO's word (uint8, half, float …); "" without a file.
     """
 
     path: Path
@@ -97,6 +98,7 @@ class Image:
     origin: tuple[int, int] = (0, 0)
     metadata: Metadata = field(default_factory=dict)
     display: tuple[int, int, int, int] | None = None
+    stored: str = ""
 
     def select(self, channels: Sequence[str]) -> NDArray[np.floating[Any]]:
         """The pixels of these channels, in this order: H × W × len(channels). ValueError for a name not there."""
@@ -203,7 +205,7 @@ def _image(path: Path, source: Any, kind: str, max_values: int) -> Image:
         raise ValueError(f"{path}: several parts in one file; accepted: one image")
     metadata = {attribute.name: attribute.value for attribute in spec.extra_attribs}
     display = (spec.full_x, spec.full_y, spec.full_width, spec.full_height)
-    return Image(path, pixels, tuple(spec.channelnames), (spec.x, spec.y), metadata, display)
+    return Image(path, pixels, tuple(spec.channelnames), (spec.x, spec.y), metadata, display, str(spec.format))
 
 
 def _without(path: Path, message: str) -> str:
