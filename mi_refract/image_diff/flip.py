@@ -27,7 +27,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear Rec. 709
 # Half of the largest error, on average over a letter: above a black edge on white that moves by one pixel (0.45), below
 # a white line one pixel wide on black that vanishes (0.65). `validation.diff.visible_changes` measures these and more.
 LOCAL = 0.5
-PATCH = 0.15  # 10 to 14 of 255 codes of gray; no antialiasing that was tried fills a patch with half of it
+PATCH = 0.12  # 7 to 10 of 255 codes of gray; no antialiasing that was tried fills a patch with two thirds of it
 CODED = re.compile(r"srgb|gamma|^g\d\d")  # colour spaces, in OpenImageIO's words, of what a display is sent
 LINEAR = re.compile(r"^lin|linear|^aces|^raw$|^data$")
 INTEGERS = ("uint8", "uint16")  # a file of these that names no colour space holds what a display is sent
