@@ -29,7 +29,7 @@ ROOMS = {
     "renders": ("renders", ("scene_needs", "against_dielectric", "unused_features")),
     "efficiency": ("efficiency", ("error_against_time", "scaling")),
     "planar": ("planar", ("against_retrace", "closed_paths", "extruded_scenes", "times")),
-    "diff": ("diff", ("planted_defects", "times")),
+    "diff": ("diff", ("planted_defects", "visible_changes", "times")),
     "ground-truth": ("ground_truth", ("traced_bodies",)),
     "robustness": ("robustness", ("mutated_inputs", "killed_commands")),
     "suite": ("suite", ("matrix", "per_ray", "rendered_images")),

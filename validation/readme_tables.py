@@ -23,6 +23,7 @@ from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
 from validation import limits
+from validation.diff import visible_changes
 from validation.directions import per_formula
 from validation.efficiency import error_against_time
 from validation.planar import against_retrace
@@ -289,6 +290,38 @@ def _false_alarms(rows: list[Row]) -> str:
     return f"{alarms:.0f} of {sum(pairs):.0f}"
 
 
+def visible(rows: list[Row]) -> str:
+    """Markdown: how large the errors of FLIP are in changes that nobody sees and that a person sees."""
+    study = visible_changes
+    found = [row for row in rows if row.study == study.NAME and row.values]
+    kinds, limits_found = ([r for r in found if (r.case == study.LIMIT) is limit] for limit in (False, True))
+    if not kinds or not limits_found:
+        raise ValueError("README: no visible changes were planted; its table needs them")
+    metrics = (study.LOCAL, study.THROUGHOUT, study.ERROR)
+    cells = [
+        [
+            row.subject,
+            row.reason,
+            row.case,
+            *(compact(row.values[m]) for m in metrics),
+            f"{row.values[study.ALARMS]:.1%}",
+        ]
+        for row in kinds
+    ]
+    replay, bounds = kinds[0].replay, METHODS["flip"].options
+    heading = [
+        f"{name} (bound {compact(bounds[o].default)})" for name, o in zip(metrics, ("local", "patch"), strict=False)
+    ]
+    text = f"{replay['trials']} pairs of {replay['size']}² pixels each, {kinds[0].setting}."
+    first = _table(text, ["change", "", "by a person", *heading, study.ERROR, study.ALARMS], cells)
+    squares = [row for row in limits_found if study.CODES in row.values]
+    codes = [compact(row.values[study.CODES]) if row.values[study.CODES] < 255 else "never" for row in squares]
+    edge = next(compact(row.values[study.PIXELS]) for row in limits_found if row.subject == study.EDGE)
+    text = f"Smallest change of a gray square that is different; a black edge on white must move by {edge} pixels."
+    sides = [row.subject.split()[2] for row in squares]
+    return "\n\n".join([first, _table(text, ["pixels a side", *sides], [["codes of 255", *codes]])])
+
+
 def suite(rows: list[Row]) -> str:
     """Markdown: how far every system is off at most, check by check."""
     cells: dict[str, dict[str, Row]] = {}
@@ -331,6 +364,7 @@ TABLES = {
     "efficiency": Table("mi_refract/plugins/README.md", "efficiency", efficiency),
     "planar": Table("mi_refract/planar/README.md", "planar", planar),
     "defects": Table("mi_refract/image_diff/README.md", "diff", seen),
+    "visible": Table("mi_refract/image_diff/README.md", "diff", visible),
     "suite": Table("validation/README.md", "suite", suite),
 }
 

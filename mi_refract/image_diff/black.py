@@ -51,8 +51,9 @@ def blind_to(a: Image, b: Image, options: Options, passes: PassesBlack, accepts:
         if not one.pixels.any() or np.array_equal(one.pixels, two.pixels):
             continue
         of = f" in {text}," if len(parts) > 1 else ""
-        # Where black would be seen in some of the rows, the others need not be asked.
-        if all(passes(replace(one, pixels=rows), options) for rows in (one.pixels[::ROW_STEP], one.pixels)):
+        # Where black would be seen in some of the rows, the others need not be asked, if pixels are judged alone.
+        views = (one.pixels[::ROW_STEP], one.pixels) if accepts else (one.pixels,)
+        if all(passes(replace(one, pixels=view), options) for view in views):
             return f"an all-black image would pass, too,{of}"
         share = _share(one.pixels, two.pixels, accepts(one.pixels, options)) if accepts else 0.0
         if share > UNSEEN:

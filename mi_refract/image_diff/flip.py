@@ -6,22 +6,34 @@ Rendered High Dynamic Range Images", Eurographics Short Papers 2021; computed by
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
 
 from mi_refract.io.image_file import Image
-from mi_refract.io.pixels import Pixels, srgb_decode
+from mi_refract.io.pixels import Pixels, block_mean, srgb_decode
 
 from .comparison import Comparison, Metric, Verdict, checked_pixels, verdict_of
+from .local_error import WINDOW, local_error, patch_error
 from .pixelwise import require_nonnegative
 from .tolerance import tolerance, tolerance_passes_black
 
 PIXELS_PER_DEGREE = 67.0  # of the viewer's field: FLIP's default, a screen of 0.7 m and 3840 pixels at 0.7 m
 RGB = ("R", "G", "B")
+ALPHA = "A"
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of linear Rec. 709
+# Half of the largest error, on average over a letter: above a black edge on white that moves by one pixel (0.45), below
+# a white line one pixel wide on black that vanishes (0.65). `validation.diff.visible_changes` measures these and more.
+LOCAL = 0.5
+PATCH = 0.12  # 7 to 10 of 255 codes of gray; no antialiasing that was tried fills a patch with two thirds of it
+CODED = re.compile(r"srgb|gamma|^g\d\d")  # colour spaces, in OpenImageIO's words, of what a display is sent
+LINEAR = re.compile(r"^lin|linear|^aces|^raw$|^data$")
+INTEGERS = ("uint8", "uint16")  # a file of these that names no colour space holds what a display is sent
+DARKER = 4.0  # two stops: where the brightest light is shown nearly white, light twice as bright is, too
+AROUND = 0.5  # degrees: where black is seen so near to the brightest window, the rest need not be asked
 
 
 def flip(
@@ -29,14 +41,18 @@ def flip(
     test: Image,
     *,
     allow_nonfinite: bool = False,
-    mean: Annotated[float, "mean FLIP error that is allowed, 0 to 1"] = 0.01,
+    local: Annotated[
+        float, "mean FLIP error allowed in any square of 0.12 degrees, 0 to 1; in wider ones less"
+    ] = LOCAL,
+    patch: Annotated[float, "FLIP error that may fill a square of 0.24 degrees, 0 to 1"] = PATCH,
     largest: Annotated[float, "FLIP error that no pixel may exceed, 0 to 1"] = 1.0,
     hdr: Annotated[str, "auto (by the file's format), yes or no"] = "auto",
     ppd: Annotated[float, "pixels per degree of the viewer's field"] = PIXELS_PER_DEGREE,
 ) -> Comparison:
     """The differences that a person flipping between the images would see: FLIP, for LDR and HDR images.
 
-    Channels other than R, G, B are compared by `tolerance` with its defaults.
+    The verdict is that of the worst window, see `local_error`. Alpha is looked at as a gray image; any other channels
+    than R, G, B are compared by `tolerance` with its defaults.
     """
     require_nonnegative(locals())
     if hdr not in ("auto", "yes", "no"):
@@ -46,41 +62,81 @@ def flip(
     _, _, found = checked_pixels("flip", reference, test, allow_nonfinite)
     if found:
         return found
-    wide = is_hdr(reference, test, hdr)
-    error = flip_map(reference, test, wide, ppd)
+    options = {"local": local, "patch": patch, "largest": largest, "hdr": hdr, "ppd": ppd}
+    found = _seen(reference, test, options)
+    others = [name for name in reference.channels if name not in _colours(reference)]
+    for names in filter(None, ([n for n in others if n == ALPHA], [n for n in others if n != ALPHA])):
+        found = _with_others(found, _only(reference, names), _only(test, names), options, allow_nonfinite)
+    return found
+
+
+def _seen(reference: Image, test: Image, options: Mapping[str, Any]) -> Comparison:
+    """What FLIP sees in the colours; `options`: all of them, by name."""
+    wide = is_hdr(reference, test, options["hdr"])
+    error = flip_map(reference, test, wide, options["ppd"])
+    (worst, around), patch = local_error(error, options["ppd"]), patch_error(error, options["ppd"])
     metrics = (
-        Metric("mean FLIP error", float(error.mean()), mean),
-        Metric("largest FLIP error", float(error.max()), largest),
+        Metric("local FLIP error", worst.value, options["local"]),
+        Metric("FLIP error throughout a patch", patch.value, options["patch"]),
+        Metric("largest FLIP error", float(error.max()), options["largest"]),
+        Metric("mean FLIP error", float(error.mean())),
         Metric("99th percentile of the FLIP error", float(np.percentile(error, 99))),
     )
-    reason = f"mean FLIP error {error.mean():.3g}, largest {error.max():.3g} ({'HDR' if wide else 'LDR'})"
-    found = Comparison("flip", verdict_of(metrics), reason, metrics, maps={"flip": error})
-    others = tuple(name for name in reference.channels if name not in _colours(reference))
-    return _with_others(found, _only(reference, others), _only(test, others), allow_nonfinite) if others else found
+    reason = f"local FLIP error {worst.value:.3g}, largest {error.max():.3g} ({'HDR' if wide else 'LDR'})"
+    if worst.value:
+        kind, window = ("mean", worst) if metrics[1].holds or not metrics[0].holds else ("at least", patch)
+        x, y = window.x + reference.origin[0], window.y + reference.origin[1]
+        reason += f"; {kind} {window.error:.3g} in {window.width} × {window.height} pixels from x = {x}, y = {y}"
+    return Comparison("flip", verdict_of(metrics), reason, metrics, maps={"flip": error, "local": around})
 
 
-def _only(image: Image, channels: tuple[str, ...]) -> Image:
-    return replace(image, pixels=image.select(channels), channels=channels)
+def _only(image: Image, channels: Sequence[str]) -> Image:
+    return replace(image, pixels=image.select(channels), channels=tuple(channels))
 
 
-def _with_others(found: Comparison, reference: Image, test: Image, allow_nonfinite: bool) -> Comparison:
-    """FLIP's comparison with that of the channels that it does not look at."""
+def _with_others(
+    found: Comparison, reference: Image, test: Image, options: Mapping[str, Any], allow_nonfinite: bool
+) -> Comparison:
+    """FLIP's comparison with that of the channels, alpha or others, that it does not look at."""
     names = ", ".join(reference.channels)
     if np.array_equal(reference.pixels, test.pixels, equal_nan=True):
         return replace(found, reason=f"{found.reason}; not looked at, but the same: {names}")
-    others = tolerance(reference, test, allow_nonfinite=allow_nonfinite)
-    metrics = (*found.metrics, replace(others.metrics[0], name=f"{others.metrics[0].name}, in {names}"))
-    verdict, reason = verdict_of(metrics), f"{found.reason}; by tolerance {names}: {others.reason}"
-    if verdict is Verdict.EQUAL and tolerance_passes_black(reference, tolerance.__kwdefaults__ or {}):
+    if reference.channels == (ALPHA,) and all(_is_coverage(image) for image in (reference, test)):
+        reference, test = (replace(image, metadata={"oiio:ColorSpace": "sRGB"}) for image in (reference, test))
+        options = {**options, "hdr": "no"}
+        others, method = _seen(reference, test, options), "FLIP"
+        bounded, maps, blind = others.metrics[:3], {f"flip of {ALPHA}": others.maps["flip"]}, flip_passes_black
+    else:
+        others, method = tolerance(reference, test, allow_nonfinite=allow_nonfinite), "tolerance"
+        bounded, maps, blind = others.metrics[:1], {}, tolerance_passes_black
+        options = tolerance.__kwdefaults__ or {}
+    metrics = (*found.metrics, *(replace(each, name=f"{each.name}, in {names}") for each in bounded))
+    verdict, reason = verdict_of(metrics), f"{found.reason}; by {method} {names}: {others.reason}"
+    if verdict is Verdict.EQUAL and blind(reference, options):
         verdict, reason = Verdict.INCONCLUSIVE, f"{reason}, as would be if they were black"
-    return replace(found, verdict=verdict, reason=reason, metrics=metrics)
+    return replace(found, verdict=verdict, reason=reason, metrics=metrics, maps=found.maps | maps)
+
+
+def _is_coverage(image: Image) -> bool:
+    return bool(((image.pixels >= 0) & (image.pixels <= 1)).all())
 
 
 def flip_passes_black(reference: Image, options: Mapping[str, Any]) -> bool:
     """Whether `flip` would call a black test image equal to `reference`; `options`: all of them, by name."""
-    black = replace(reference, pixels=np.zeros_like(reference.pixels))
-    error = flip_map(reference, black, is_hdr(reference, black, options["hdr"]), options["ppd"])
-    return bool(error.mean() <= options["mean"] and error.max() <= options["largest"])
+    for part in (_brightest(reference, options["ppd"]), reference):
+        black = replace(part, pixels=np.zeros_like(part.pixels))
+        if _seen(part, black, options).verdict is Verdict.DIFFERENT:
+            return False
+    return True
+
+
+def _brightest(image: Image, ppd: float) -> Image:
+    """The part of the image around its brightest window."""
+    side, around = max(1, round(WINDOW * ppd)), max(1, round(AROUND * ppd))
+    light = block_mean(_linear(image), side).sum(-1)
+    y, x = (side * int(i) for i in np.unravel_index(int(light.argmax()), light.shape))
+    rows, columns = (slice(max(at - around, 0), at + side + around) for at in (y, x))
+    return replace(image, pixels=image.pixels[rows, columns])
 
 
 def is_hdr(reference: Image, test: Image, hdr: str = "auto") -> bool:
@@ -89,10 +145,10 @@ def is_hdr(reference: Image, test: Image, hdr: str = "auto") -> bool:
 
 
 def flip_map(reference: Image, test: Image, hdr: bool, ppd: float = PIXELS_PER_DEGREE) -> Pixels:
-    """FLIP error of every pixel, H × W float32 from 0 to 1, of the channels R, G, B, or of images with one channel.
+    """FLIP error of every pixel, H × W float32 from 0 to 1, of the channels R, G, B, or of one that is alone.
 
-    HDR looks at the image at the exposures between the reference's median luminance, without black pixels, and that of
-    its brightest thousandth, one FLIP for each. ValueError for images without these channels.
+    HDR looks at the image at the exposures between the reference's median luminance, without black pixels, and DARKER
+    times that of its brightest thousandth, one FLIP for each. ValueError for images without these channels.
     """
     import OpenImageIO as oiio
 
@@ -102,7 +158,7 @@ def flip_map(reference: Image, test: Image, hdr: bool, ppd: float = PIXELS_PER_D
     # Not the very largest: one firefly would ask for many exposures at which all else is black.
     median, brightest = map(float, np.quantile(lit, (0.5, 0.999))) if lit.size else (0.18, 2.0)
     one, two = (oiio.ImageBuf(pixels) for pixels in linear)
-    found = oiio.ImageBufAlgo.FLIP_diff(one, two, int(hdr), brightest, median, ppd)
+    found = oiio.ImageBufAlgo.FLIP_diff(one, two, int(hdr), DARKER * brightest, median, ppd)
     if found.has_error:
         raise ValueError(f"{test.path}: FLIP: {found.geterror()}")
     error: Pixels = np.asarray(found.get_pixels(), np.float32)[..., 0]
@@ -110,9 +166,11 @@ def flip_map(reference: Image, test: Image, hdr: bool, ppd: float = PIXELS_PER_D
 
 
 def encoding(image: Image) -> str:
-    """ "sRGB" for the formats of displays, by the file's own word or its type; else "linear"."""
-    space = str(image.metadata.get("oiio:ColorSpace", ""))
-    return "sRGB" if "srgb" in space.lower() and not space.lower().startswith("lin") else "linear"
+    """ "sRGB" for what a display is sent, by the file's own word, or its type where it says nothing; else "linear"."""
+    space = str(image.metadata.get("oiio:ColorSpace", "")).lower()
+    if LINEAR.search(space):
+        return "linear"
+    return "sRGB" if CODED.search(space) or image.stored in INTEGERS else "linear"
 
 
 def _linear(image: Image) -> Pixels:
@@ -130,4 +188,5 @@ def _linear(image: Image) -> Pixels:
 
 
 def _colours(image: Image) -> tuple[str, ...]:
-    return RGB if set(RGB) <= set(image.channels) else image.channels
+    """R, G, B; else every channel but alpha."""
+    return RGB if set(RGB) <= set(image.channels) else tuple(n for n in image.channels if n != ALPHA) or image.channels

@@ -91,9 +91,10 @@ class Image:
 
     `pixels`: H × W × C, float32, or float64 where the file holds numbers that float32 cannot; integers of a file are
     mapped to 0 … 1. `channels`: C names. `origin`: (x, y) where the data window begins. `metadata`: the header.
-    `display`: x, y, width and height of the display window; None where it is the data window. `mask`: H × W, the
-    pixels that count; None where all do. The others are 0. `part`: its number and
-    that of its MIP level, from 0 on as OpenImageIO counts; `place`: the same in words, "" in a file of one image.
+    `display`: x, y, width and height of the display window; None where it is the data window. `stored`: the type of
+    the file's numbers, in OpenImageIO's word (uint8, half, float …); "" without a file. `mask`: H × W, the pixels that
+    count; None where all do. The others are 0. `part`: its number and that of its MIP level, from 0 on as OpenImageIO
+    counts; `place`: the same in words, "" in a file of one image.
     """
 
     path: Path
@@ -102,6 +103,7 @@ class Image:
     origin: tuple[int, int] = (0, 0)
     metadata: Metadata = field(default_factory=dict)
     display: tuple[int, int, int, int] | None = None
+    stored: str = ""
     mask: NDArray[np.bool_] | None = None
     part: tuple[int, int] = (0, 0)
     place: str = ""
@@ -273,7 +275,7 @@ def _image(path: Path, source: Any, kind: str, values: tuple[int, int], as_idiff
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
     metadata = {attribute.name: attribute.value for attribute in spec.extra_attribs}
     display = (spec.full_x, spec.full_y, spec.full_width, spec.full_height)
-    return Image(path, pixels, tuple(spec.channelnames), (spec.x, spec.y), metadata, display)
+    return Image(path, pixels, tuple(spec.channelnames), (spec.x, spec.y), metadata, display, str(spec.format))
 
 
 def _without(path: Path, message: str) -> str:

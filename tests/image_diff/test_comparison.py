@@ -218,57 +218,6 @@ def test_a_channel_of_another_scale_hides_nothing(method):
     assert methods.compare(method, two[0], two[0]).verdict is EQUAL
 
 
-@pytest.mark.parametrize("hdr", ["yes", "no"])
-def test_flip_sees_a_shift_and_a_gain(hdr):
-    lines = np.repeat((np.indices((40, 48))[1] // 4 % 2)[..., None], 3, 2) * 0.8 + 0.1
-    assert judge("flip", image(lines), image(lines), hdr=hdr).metrics[0].value == 0
-    for other in (np.roll(lines, 1, 1), lines * 1.3):
-        found = judge("flip", image(lines), image(other), hdr=hdr)
-        assert found.verdict is DIFFERENT
-        assert found.maps["flip"].shape == (40, 48)
-
-
-def test_flip_of_hdr_sees_what_is_too_bright_for_a_display():
-    bright, other = image(50 * (1 + SMOOTH)), image(60 * (1 + SMOOTH))
-    assert judge("flip", bright, other, hdr="yes").verdict is DIFFERENT
-    assert judge("flip", bright, other, hdr="no").metrics[0].value == 0
-
-
-def test_flip_says_what_it_does_not_look_at():
-    four = image(np.dstack([SMOOTH, SMOOTH[..., :1]]), ("R", "G", "B", "A"))
-    assert judge("flip", four, four).reason.endswith("not looked at, but the same: A")
-    with pytest.raises(ValueError, match="accepted by FLIP"):
-        judge("flip", image(SMOOTH, ("X", "Y", "Z")), image(SMOOTH, ("X", "Y", "Z")))
-
-
-@pytest.mark.parametrize(
-    "change, verdict",
-    [
-        (lambda alpha: 1 - alpha, DIFFERENT),
-        (lambda alpha: 0 * alpha, DIFFERENT),
-        (lambda alpha: alpha + 0.01, DIFFERENT),
-        (lambda alpha: alpha + 0.003, EQUAL),
-        (lambda alpha: alpha + np.where(alpha > 0.899, 9.0, 0.0), DIFFERENT),
-    ],
-)
-@pytest.mark.parametrize("names", [("R", "G", "B", "A"), ("Z", "B", "G", "R")])
-def test_flip_with_another_channel_that_changes(change, verdict, names):
-    alpha = SMOOTH[..., :1]
-    where = names.index("A") if "A" in names else 0
-    one, two = (image(np.insert(SMOOTH, [where], each, axis=2), names) for each in (alpha, change(alpha)))
-    found = judge("flip", one, two)
-    assert (found.verdict, found.metrics[0].value) == (verdict, 0)
-    assert f"; by tolerance {names[where]}: " in found.reason
-    assert judge("flip", two, one).verdict is verdict
-
-
-def test_flip_with_another_channel_that_is_dark():
-    depth = 0.004 * SMOOTH[..., :1]
-    one, two = (image(np.dstack([SMOOTH, each]), ("R", "G", "B", "Z")) for each in (depth, 0.5 * depth))
-    assert judge("flip", one, two).verdict is INCONCLUSIVE
-    assert judge("flip", one, one).verdict is EQUAL
-
-
 # Samples -------------------------------------------------------------------------------------------------------
 
 

@@ -70,7 +70,7 @@ def test_tolerance_counts_what_openimageio_counts(fail, relative):
 
 
 @pytest.mark.parametrize(
-    "method, options", [("tolerance", {}), ("paired", {"threshold": 2.0}), ("flip", {"mean": 1.0, "largest": 1.0})]
+    "method, options", [("tolerance", {}), ("paired", {"threshold": 2.0}), ("flip", {"local": 9.0, "patch": 1.0})]
 )
 def test_a_method_that_black_would_pass_knows_nothing(method, options):
     dark = 0.004 * SMOOTH

@@ -22,7 +22,7 @@ from mi_refract.report.row import Row
 from mi_refract.report.run_report import read_json
 from validation import __main__ as command
 from validation import limits, readme_tables, runner
-from validation.diff import planted_defects
+from validation.diff import planted_defects, visible_changes
 from validation.directions import bsdf_samples, keep_worst, per_formula
 from validation.renders import against_dielectric
 from validation.renders import scene_needs as scenes
@@ -352,6 +352,7 @@ NOTHING_MEASURED = {
     "efficiency": "no efficiency was measured",
     "planar": "no planar paths were traced",
     "seen": "no defects were planted",
+    "visible": "no visible changes were planted",
     "suite": "no other renderer was run",
 }
 
@@ -373,6 +374,7 @@ def test_the_readmes_hold_their_tables():
         "efficiency": ways,
         "planar": [path.stem for path in SCENES.glob("planar/*.toml")],
         "defects": [*planted_defects.GLASSES, *DEFECTS, *METHODS],
+        "visible": [*visible_changes.KINDS, *map(str, visible_changes.SQUARES)],
         "suite": [*others, *IMAGE_RENDERERS],
     }
     assert words_of.keys() == readme_tables.TABLES.keys()
@@ -386,7 +388,7 @@ def test_the_readmes_hold_their_tables():
 def test_the_table_of_other_renderers_is_written_where_the_suite_is_named():
     assert readme_tables.chosen([]).keys() == readme_tables.TABLES.keys() - {"suite"}
     assert readme_tables.chosen(["suite"]).keys() == {"suite"}
-    assert readme_tables.chosen(["planar", "diff"]).keys() == {"planar", "defects"}
+    assert readme_tables.chosen(["planar", "diff"]).keys() == {"planar", "defects", "visible"}
     assert {table.study for table in readme_tables.TABLES.values()} <= command.ROOMS.keys()
 
 

@@ -1,0 +1,340 @@
+"""FLIP: what a person sees is different wherever it is, and what nobody sees is equal."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from mi_refract.image_diff.comparison import Verdict
+from mi_refract.image_diff.flip import encoding, flip
+from mi_refract.image_diff.local_error import local_error, patch_error, windows
+from mi_refract.image_diff.methods import compare
+from mi_refract.io import image_file
+from mi_refract.io.image_file import Image
+
+SMOOTH = np.dstack([np.linspace(0.1, 0.9, 48 * 40).reshape(40, 48) ** k for k in (1, 2, 3)]).astype(np.float32)
+EQUAL, DIFFERENT, INCONCLUSIVE = Verdict.EQUAL, Verdict.DIFFERENT, Verdict.INCONCLUSIVE
+GRAY, SIZE = 76, 512
+Y, X = np.mgrid[:SIZE, :SIZE]
+
+
+def linear(pixels, channels=("R", "G", "B"), **rest):
+    return Image(Path("a.exr"), np.asarray(pixels, np.float32), channels, **rest)
+
+
+def shown(codes):
+    """An image of 8-bit codes, H × W or H × W × 3."""
+    codes = np.asarray(codes, np.float32)
+    codes = np.round(codes if codes.ndim == 3 else np.dstack([codes] * 3)) / 255
+    return Image(Path("a.png"), codes, ("R", "G", "B"), stored="uint8")
+
+
+def with_square(x, y, side, colour, codes=None):
+    codes = np.full((SIZE, SIZE, 3), GRAY, float) if codes is None else codes.copy()
+    codes[y : y + side, x : x + side] = colour
+    return codes
+
+
+def edge(position, angle=0.1, samples=8, size=64):
+    """A black half-plane on white, `samples`² samples a pixel."""
+    offsets = (np.arange(samples) + 0.5) / samples
+    x, y = (at[..., None] + offsets - size / 2 for at in (X[:size, :size], Y[:size, :size]))
+    distance = x[..., None, :] * np.cos(angle) + y[..., None] * np.sin(angle)
+    return 255.0 * (distance > position).mean((-1, -2))
+
+
+def line(code, at=256):
+    codes = np.zeros((SIZE, SIZE))
+    codes[:, at] = code
+    return codes
+
+
+CUBE = with_square(200, 100, 20, (128, 128, 128))
+ROW = np.where((Y // 12 == 20) & (X // 12 % 4 == 0), 200, GRAY)
+HIGHLIGHT = 90 + 150 * np.exp(-((X - 300) ** 2 + (Y - 90) ** 2) / (2 * 5.0**2))
+VISIBLE = {
+    "a cube turned from gray to yellow": (CUBE, with_square(200, 100, 20, (200, 180, 20))),
+    "a highlight is gone": (HIGHLIGHT, np.full((SIZE, SIZE), 90)),
+    "a row of cubes moved by three pixels": (ROW, np.roll(ROW, 3, 1)),
+    "a line of one pixel is gone": (line(255), line(0)),
+    "an edge moved by two pixels": (edge(0), edge(2)),
+    "a cube is 16 codes brighter": (CUBE, with_square(200, 100, 20, (144, 144, 144))),
+    "half of the image is 10 codes brighter": (np.full((SIZE, SIZE), GRAY), GRAY + 10 * (X > 255)),
+    "a cube of 4 pixels is gone": (with_square(200, 100, 4, 255), with_square(200, 100, 0, 0)),
+}
+CLOSE = {
+    "one code": (np.full((SIZE, SIZE), GRAY), np.full((SIZE, SIZE), GRAY + 1)),
+    "an edge without antialiasing": (edge(0), edge(0, samples=1)),
+    "another antialiasing": (edge(0), edge(0, samples=2)),
+    "an edge moved by half a pixel": (edge(0), edge(0.5)),
+    "codes at random off by one": (HIGHLIGHT, HIGHLIGHT + np.random.default_rng(1).integers(-1, 2, (SIZE, SIZE))),
+}
+
+
+@pytest.mark.parametrize("name", VISIBLE)
+def test_what_a_person_sees_is_different(name):
+    one, two = map(shown, VISIBLE[name])
+    assert compare("flip", one, two).verdict is DIFFERENT
+    assert compare("flip", two, one).verdict is DIFFERENT
+
+
+@pytest.mark.parametrize("name", CLOSE)
+def test_what_nobody_sees_is_equal(name):
+    one, two = map(shown, CLOSE[name])
+    assert compare("flip", one, two).verdict is EQUAL
+    assert compare("flip", two, one).verdict is EQUAL
+
+
+@pytest.mark.parametrize("gray", [0, 1, 10, 20, 40, 80, 160, 254])
+def test_one_code_more_everywhere_is_equal_by_a_margin(gray):
+    found = flip(shown(np.full((SIZE, SIZE), gray)), shown(np.full((SIZE, SIZE), gray + 1)))
+    assert found.verdict is EQUAL
+    assert all(metric.value < 0.7 * metric.bound for metric in found.metrics[:2])
+
+
+def test_a_change_counts_as_much_wherever_it_is():
+    places = [(x, y) for x in (0, 1, 3, 60, 61, 122) for y in (0, 4, 67, 122)]
+    plain = np.full((128, 128, 3), GRAY, float)
+    found = [flip(shown(plain), shown(with_square(x, y, 6, 120, plain))) for x, y in places]
+    inside = [each.metrics[0].value for each, at in zip(found, places, strict=True) if {*at} <= {60, 61, 67}]
+    assert max(inside) == pytest.approx(min(inside), rel=1e-3)
+    assert min(each.metrics[0].value for each in found) > 0.9 * inside[0]  # at the border its halo is cut off
+
+
+VISIBLE_LINES = VISIBLE["a line of one pixel is gone"]
+
+
+def test_the_rest_of_the_image_does_not_hide_a_change():
+    for size in (64, 256, 512):
+        part = slice(256 - size // 2, 256 + size // 2)
+        one, two = (shown(codes[part, part]) for codes in VISIBLE_LINES)
+        assert compare("flip", one, two).metrics[0].value == pytest.approx(0.65, abs=0.02)
+
+
+def test_windows_are_angles():
+    for ppd, side in ((67, 8), (33.5, 4), (134, 16), (1000, 120)):
+        (height, width, weight), (_, wider, more), *_ = windows(5000, 5000, ppd)
+        assert (height, width, wider) == (side, side, 2 * side)
+        assert weight == pytest.approx(1, rel=0.02) and more == pytest.approx(2**0.5 * weight, rel=0.02)
+    assert [h for h, _, _ in windows(9999, 9999, 67)] == [8, 16, 32, 64, 129, 257, 515]
+    assert [(h, w) for h, w, _ in windows(5, 20, 67)] == [(5, 8), (5, 16), (5, 20)]
+    assert list(windows(1, 1, 67)) == [(1, 1, 1.0)]
+    assert next(windows(50, 50, 1.0))[2] == pytest.approx((1 / 0.12) ** 0.5)  # a pixel of one degree
+
+
+def test_the_same_image_at_twice_the_size_and_pixels_per_degree_looks_the_same():
+    one, two = VISIBLE["a cube turned from gray to yellow"]
+    small, large = ([np.kron(each[50:178, 150:278], np.ones((k, k, 1))) for each in (one, two)] for k in (1, 2))
+    values = [
+        flip(*map(shown, sides), ppd=ppd).metrics[0].value for sides, ppd in ((small, 67), (large, 134), (large, 67))
+    ]
+    assert values[1] == pytest.approx(values[0], rel=0.03)
+    assert values[2] > 1.2 * values[0]
+
+
+def test_the_worst_window_is_found_and_named():
+    error = np.zeros((100, 90), np.float32)
+    error[30:38, 50:58] = 0.8
+    worst, around = local_error(error, 67)
+    assert (worst.x, worst.y, worst.width, worst.height) == (50, 30, 8, 8)
+    assert worst.value == worst.error == pytest.approx(0.8) == around.max()
+    assert around.shape == error.shape and around[33, 53] == around.max() and around[0, 0] < 0.1
+    assert patch_error(error, 67).value == 0
+    error[20:40, 40:60] = np.maximum(error[20:40, 40:60], 0.3)
+    patch = patch_error(error, 67)
+    assert (patch.value, patch.width, patch.height) == (pytest.approx(0.3), 16, 16)
+    error[25, 45] = 0.1
+    assert patch_error(error, 67).value == pytest.approx(0.1)
+    found = compare("flip", *map(shown, VISIBLE["a cube is 16 codes brighter"]))
+    assert "at least 0.2" in found.reason and "in 16 × 16 pixels from x = 20" in found.reason
+
+
+def test_every_window_against_its_definition():
+    error = np.random.default_rng(3).random((41, 29)).astype(np.float32)
+    worst, _ = local_error(error, 40)
+    direct = max(
+        (weight * error[y : y + h, x : x + w].mean(), x, y, w, h)
+        for h, w, weight in windows(41, 29, 40)
+        for y in range(42 - h)
+        for x in range(30 - w)
+    )
+    assert (worst.value, worst.x, worst.y, worst.width, worst.height) == (
+        pytest.approx(direct[0], rel=1e-5),
+        *direct[1:],
+    )
+    side = 10  # 0.24 degrees
+    smallest = [error[y : y + side, x : x + side].min() for y in range(42 - side) for x in range(30 - side)]
+    assert patch_error(error, 40).value == pytest.approx(max(smallest))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 64), (64, 1), (3, 5), (8, 8), (17, 9)])
+def test_images_smaller_than_a_window(shape):
+    black, white = (shown(np.full(shape, code)) for code in (0, 255))
+    assert compare("flip", white, white).metrics[0].value == 0
+    found = compare("flip", white, black)
+    assert found.verdict is DIFFERENT and found.maps["local"].shape == found.maps["flip"].shape == shape
+    assert compare("flip", white, shown(np.full(shape, 254))).verdict is EQUAL
+
+
+def test_the_bounds_are_options():
+    one, two = shown(CUBE), shown(with_square(200, 100, 20, (133, 133, 133)))
+    assert compare("flip", one, two).verdict is EQUAL
+    for name, metric in (("local", 0), ("patch", 1), ("largest", 2)):
+        value = compare("flip", one, two).metrics[metric].value
+        assert compare("flip", one, two, **{name: 1.1 * value}).verdict is EQUAL
+        assert compare("flip", one, two, **{name: 0.9 * value}).verdict is DIFFERENT
+    one, two = map(shown, VISIBLE_LINES)
+    assert compare("flip", one, two, local=3.0).verdict is INCONCLUSIVE  # as black would be
+
+
+# What the numbers of a file mean -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name, stored, space, expected",
+    [
+        ("a.png", "uint8", None, "sRGB"),
+        ("a.png", "uint16", None, "sRGB"),
+        ("a.png", "uint8", "lin_rec709_scene", "linear"),
+        ("a.png", "uint8", "g22_rec709_scene", "sRGB"),
+        ("a.jpg", "uint8", None, "sRGB"),
+        ("a.bmp", "uint8", None, "sRGB"),
+        ("a.gif", "uint8", None, "sRGB"),
+        ("a.webp", "uint8", None, "sRGB"),
+        ("a.tif", "uint8", None, "sRGB"),
+        ("a.tif", "uint16", None, "sRGB"),
+        ("a.tif", "float", None, "linear"),
+        ("a.tif", "float", "srgb_rec709_scene", "sRGB"),
+        ("a.tga", "uint8", None, "sRGB"),
+        ("a.tga", "uint8", "lin_rec709_scene", "linear"),
+        ("a.sgi", "uint8", None, "sRGB"),
+        ("a.ppm", "uint8", None, "sRGB"),
+        ("a.pfm", "float", None, "linear"),
+        ("a.hdr", "float", None, "linear"),
+        ("a.exr", "half", None, "linear"),
+        ("a.exr", "float", "srgb_rec709_scene", "sRGB"),
+    ],
+)
+def test_integers_without_a_colour_space_are_for_a_display(tmp_path, name, stored, space, expected):
+    path = tmp_path / name
+    spec = oiio.ImageSpec(8, 8, 3, stored)
+    if space:
+        spec.attribute("oiio:ColorSpace", space)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec) and output.write_image(SMOOTH[:8, :8]) and output.close()
+    assert encoding(image_file.read(path)) == expected
+
+
+def test_arrays_are_linear():
+    assert encoding(image_file.named("reference", SMOOTH)) == "linear"
+
+
+@pytest.mark.parametrize("hdr", ["yes", "no"])
+def test_a_shift_and_a_gain(hdr):
+    lines = np.repeat((np.indices((40, 48))[1] // 4 % 2)[..., None], 3, 2) * 0.8 + 0.1
+    assert compare("flip", linear(lines), linear(lines), hdr=hdr).metrics[0].value == 0
+    for other in (np.roll(lines, 1, 1), lines * 1.5):
+        found = compare("flip", linear(lines), linear(other), hdr=hdr)
+        assert found.verdict is DIFFERENT
+        assert found.maps["flip"].shape == (40, 48)
+
+
+def test_hdr_sees_what_is_too_bright_for_a_display():
+    bright, other = linear(50 * (1 + SMOOTH)), linear(75 * (1 + SMOOTH))
+    assert compare("flip", bright, other, hdr="yes").verdict is DIFFERENT
+    assert compare("flip", bright, other, hdr="no").metrics[0].value == 0
+
+
+@pytest.mark.parametrize("light", [1e-3, 0.25, 1.0, 1e4])
+def test_hdr_sees_twice_as_much_light_in_an_image_of_one_brightness(light):
+    one = np.full((16, 16, 3), light)
+    assert compare("flip", linear(one), linear(2 * one)).verdict is DIFFERENT
+    assert compare("flip", linear(one), linear(1.01 * one)).verdict is EQUAL
+
+
+# Black ---------------------------------------------------------------------------------------------------------
+
+
+def test_an_image_in_which_black_would_not_be_seen_knows_nothing():
+    dark = np.full((64, 64), 8.0)
+    assert compare("flip", shown(dark), shown(dark - 1)).verdict is INCONCLUSIVE
+    stars = np.zeros((128, 128))
+    stars[::16, ::16] = 255  # single pixels, in the very rows that the other methods look at first
+    moved = stars.copy()
+    moved[32, 32] = 254
+    assert compare("flip", shown(stars), shown(moved)).verdict is INCONCLUSIVE
+    stars[40:60, 40:60] = 255
+    moved[40:60, 40:60] = 255
+    assert compare("flip", shown(stars), shown(moved)).verdict is EQUAL
+
+
+def test_what_is_lit_is_asked_of_the_brightest_part_first(monkeypatch):
+    sizes = []
+    real = oiio.ImageBufAlgo.FLIP_diff
+    monkeypatch.setattr(oiio.ImageBufAlgo, "FLIP_diff", lambda a, *rest: sizes.append(a.spec().width) or real(a, *rest))
+    assert compare("flip", shown(CUBE), shown(CUBE + 1)).verdict is EQUAL
+    assert sizes[0] == SIZE and max(sizes[1:]) < 100
+
+
+# Other channels ------------------------------------------------------------------------------------------------
+
+
+def test_what_it_does_not_look_at():
+    four = linear(np.dstack([SMOOTH, SMOOTH[..., :1]]), ("R", "G", "B", "A"))
+    assert compare("flip", four, four).reason.endswith("not looked at, but the same: A")
+    xyz = linear(SMOOTH, ("X", "Y", "Z"))
+    with pytest.raises(ValueError, match="accepted by FLIP"):
+        compare("flip", xyz, xyz)
+
+
+def test_gray_with_alpha():
+    one = linear(np.dstack([SMOOTH[..., :1], np.ones((40, 48, 1))]), ("Y", "A"))
+    assert compare("flip", one, one).verdict is EQUAL
+    assert compare("flip", one, replace(one, pixels=one.pixels * [0.3, 1])).verdict is DIFFERENT
+
+
+@pytest.mark.parametrize(
+    "change, by_flip, by_tolerance",
+    [
+        (lambda other: 1 - other, DIFFERENT, DIFFERENT),
+        (lambda other: 0 * other, DIFFERENT, DIFFERENT),
+        (lambda other: other + 0.01, EQUAL, DIFFERENT),
+        (lambda other: other + 0.003, EQUAL, EQUAL),
+        (lambda other: other + np.where(other > 0.899, 9.0, 0.0), DIFFERENT, DIFFERENT),
+    ],
+)
+@pytest.mark.parametrize("names", [("R", "G", "B", "A"), ("Z", "B", "G", "R")])
+def test_another_channel_that_changes(change, by_flip, by_tolerance, names):
+    other = SMOOTH[..., :1]
+    where, verdict = (3, by_flip) if "A" in names else (0, by_tolerance)
+    sides = (other, change(other))
+    one, two = (linear(np.insert(SMOOTH, [where], each, axis=2), names) for each in sides)
+    found = compare("flip", one, two)
+    assert (found.verdict, found.metrics[0].value) == (verdict, 0)
+    method = "FLIP" if "A" in names and max(map(np.max, sides)) <= 1 else "tolerance"
+    assert f"; by {method} {names[where]}: " in found.reason
+    assert compare("flip", two, one).verdict is verdict
+
+
+def test_the_antialiasing_of_alpha_is_not_seen_but_a_hole_is():
+    alpha = [edge(0) / 255, edge(0, samples=1) / 255, np.clip(edge(0) / 255, 0, 0.5)]
+    one, other, hole = (
+        Image(Path("a.png"), np.dstack([np.full((64, 64, 3), 0.5), each]).astype("f4"), tuple("RGBA"), stored="uint8")
+        for each in alpha
+    )
+    assert compare("flip", one, other).verdict is EQUAL
+    found = compare("flip", one, hole)
+    assert found.verdict is DIFFERENT and "flip of A" in found.maps
+    assert next(metric.name for metric in found.metrics if not metric.holds).endswith(", in A")
+
+
+def test_another_channel_that_is_dark():
+    depth = 0.004 * SMOOTH[..., :1]
+    for name in "ZA":
+        one, two = (linear(np.dstack([SMOOTH, each]), ("R", "G", "B", name)) for each in (depth, 0.5 * depth))
+        assert compare("flip", one, two).verdict is INCONCLUSIVE
+        assert compare("flip", one, one).verdict is EQUAL

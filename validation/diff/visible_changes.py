@@ -1,0 +1,338 @@
+"""Where the bounds of `flip` stand: changes that nobody sees, and changes that a person sees at once.
+
+The images are shapes of random colours, some of them a pixel wide, drawn with 16 samples a pixel and rounded to 8-bit
+sRGB. Changes that nobody sees are what other machines, formats and samplers do to an image; changes that a person sees
+are small and faint ones of their kind. "error / bound" is the larger of the local FLIP error over its bound and of the
+error throughout a patch over its bound: `flip` calls images equal up to 1. The bounds stand where the largest of the
+first and the smallest of the second leave room on both sides.
+
+The last rows state what `flip` does not see: how many of 255 codes a gray square must change by, and how far a black
+edge on white must move, to be different. These are records of what the bounds mean, not measurements of people.
+"""
+
+from __future__ import annotations
+
+import functools
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from mi_refract.image_diff import flip
+from mi_refract.image_diff.self_test import CONFIDENCE, FALSE_ALARMS, Tally
+from mi_refract.io import image_file
+from mi_refract.io.image_file import Image
+from mi_refract.io.pixels import Pixels
+from mi_refract.report.row import Row
+from validation.run.context import Context
+from validation.study import Study, Task, about
+
+NAME = "visible_changes"
+SEED = 2027
+TRIALS = {"quick": 20, "standard": 300, "full": 2000}  # of 300, none may be called different: the bound is 0.99 %
+SIZE, SHAPES, SAMPLES = 96, 14, 4  # pixels a side; shapes; the square root of the samples a pixel
+ERROR, LOCAL, THROUGHOUT = "error / bound", "local FLIP error", "FLIP error throughout a patch"
+ALARMS, MISSED, BOUND = "called different", "missed", "bound"
+CODES, PIXELS = "codes of 255", "pixels"
+SETTING, LIMIT, EDGE = "67 pixels per degree", "limit", "edge"
+SQUARES = (1, 2, 3, 4, 8, 16, 32, 64, 128)  # pixels a side, of what is recorded
+GRAY, WIDE = 100, 160  # codes of their background, pixels of that image
+TERMS = {
+    ERROR: "largest of the changes that nobody sees, smallest of those that a person sees",
+    LOCAL: "mean in the worst window, its median over the trials",
+    THROUGHOUT: "exceeded in all of 0.24 degrees, its median over the trials",
+    BOUND: f"{CONFIDENCE:.0%} upper bound of the share that is called different, exact binomial (Clopper and Pearson)",
+    CODES: "the smallest change of a gray square that is called different; none where even white is not",
+    PIXELS: "the smallest move of a black edge on white that is called different, in quarters of a pixel",
+}
+
+
+# Images --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A disk, a box, or a bar one pixel wide, in codes."""
+
+    kind: int
+    x: float
+    y: float
+    radius: float
+    angle: float
+    colour: Pixels
+
+    def holds(self, x: Pixels, y: Pixels) -> Pixels:
+        """Which points lie in it."""
+        cos, sin = np.cos(self.angle), np.sin(self.angle)
+        u, v = (x - self.x) * cos + (y - self.y) * sin, (y - self.y) * cos - (x - self.x) * sin
+        if self.kind == 0:
+            return u * u + v * v < self.radius**2
+        return (np.abs(u) < self.radius) & (np.abs(v) < (0.7 * self.radius if self.kind == 1 else 0.5))
+
+
+def scene(rng: np.random.Generator) -> list[Shape]:
+    """The shapes of an image; the first one covers it."""
+    shapes = [Shape(1, SIZE / 2, SIZE / 2, 2.0 * SIZE, 0.0, rng.uniform(0, 255, 3))]
+    for _ in range(SHAPES):
+        x, y, radius = rng.uniform(0, SIZE), rng.uniform(0, SIZE), 8 * np.exp(rng.normal(0, 0.6))
+        shapes.append(Shape(int(rng.integers(3)), x, y, radius, rng.uniform(0, np.pi), rng.uniform(0, 255, 3)))
+    return shapes
+
+
+def drawn(shapes: list[Shape], samples: int = SAMPLES, turn: float = 0.0, shift: float = 0.0) -> Pixels:
+    """The image in codes, of `samples`² samples a pixel on a grid that is turned within the pixel and shifted."""
+    grid = (np.arange(samples) + 0.5) / samples - 0.5
+    dx, dy = (each.ravel() for each in np.meshgrid(grid, grid))
+    dx, dy = dx * np.cos(turn) - dy * np.sin(turn) + 0.5 + shift, dx * np.sin(turn) + dy * np.cos(turn) + 0.5
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    x, y = columns[..., None] + dx, rows[..., None] + dy
+    codes = np.zeros((*x.shape, 3))
+    for shape in shapes:
+        codes[shape.holds(x, y)] = shape.colour
+    return codes.mean(2)
+
+
+def shown(codes: Pixels, rounded: bool = True) -> Image:
+    """Codes as an image for a display."""
+    codes = np.clip(np.round(codes) if rounded else codes, 0, 255) / 255
+    return Image(Path("codes.png"), codes.astype(np.float32), ("R", "G", "B"), stored="uint8")
+
+
+Pair = tuple[Image, Image]
+
+
+def _last_bits(rng: np.random.Generator) -> Pair:
+    image = drawn(scene(rng))
+    return shown(image, rounded=False), shown(image * (1 + rng.choice([-1, 1], image.shape) * 2.0**-23), rounded=False)
+
+
+def _one_code(rng: np.random.Generator) -> Pair:
+    image = np.clip(drawn(scene(rng)), 0, 254)
+    return shown(image), shown(np.round(image) + 1)
+
+
+def _dithered(rng: np.random.Generator) -> Pair:
+    image = drawn(scene(rng))
+    return shown(image), shown(image + rng.uniform(-0.5, 0.5, image.shape))
+
+
+def _other_pattern(rng: np.random.Generator) -> Pair:
+    shapes = scene(rng)
+    return shown(drawn(shapes)), shown(drawn(shapes, turn=0.46))
+
+
+def _fewer_samples(rng: np.random.Generator) -> Pair:
+    shapes = scene(rng)
+    return shown(drawn(shapes)), shown(drawn(shapes, samples=2))
+
+
+def _quarter_pixel(rng: np.random.Generator) -> Pair:
+    shapes = scene(rng)
+    return shown(drawn(shapes)), shown(drawn(shapes, shift=0.25))
+
+
+def light(codes: Pixels) -> Image:
+    """Codes as stops: an HDR image of 6 stops."""
+    return Image(Path("light.exr"), np.exp2(codes / 255 * 6 - 3).astype(np.float32), ("R", "G", "B"))
+
+
+def _half_floats(rng: np.random.Generator) -> Pair:
+    image = light(drawn(scene(rng)))
+    return image, replace(image, pixels=image.pixels.astype(np.float16).astype(np.float32))
+
+
+def _no_antialiasing(rng: np.random.Generator) -> Pair:
+    shapes = scene(rng)
+    return shown(drawn(shapes)), shown(drawn(shapes, samples=1))
+
+
+def _jpeg(rng: np.random.Generator) -> Pair:
+    import OpenImageIO as oiio
+
+    image = shown(drawn(scene(rng)))
+    with tempfile.TemporaryDirectory() as folder:
+        path = str(Path(folder) / "a.jpg")
+        buffer = oiio.ImageBuf(image.pixels)
+        buffer.specmod().attribute("Compression", "jpeg:98")
+        buffer.specmod().attribute("jpeg:subsampling", "4:4:4")
+        if not buffer.write(path):
+            raise OSError(f"{path}: {buffer.geterror()}")
+        return image, image_file.read(path)
+
+
+def _with(rng: np.random.Generator, change: Callable[[Pixels, float, float], tuple[Pixels, Pixels]]) -> Pair:
+    """`change(codes, x, y)` at a place at least 28 pixels from the border."""
+    x, y = rng.uniform(28, SIZE - 28, 2)
+    one, two = change(drawn(scene(rng)), x, y)
+    return shown(one), shown(two)
+
+
+def _patch(image: Pixels, x: float, y: float, side: int, colour: Pixels | float) -> Pixels:
+    image = image.copy()
+    left, top = int(x) - side // 2, int(y) - side // 2
+    image[top : top + side, left : left + side] = colour
+    return image
+
+
+def _recoloured(rng: np.random.Generator) -> Pair:
+    """A box of 0.12 to 0.18 degrees, from a gray to one that is 140 codes brighter, or in one or two primaries only."""
+    side, gray, primaries = int(rng.integers(8, 13)), rng.uniform(20, 100), rng.choice([0, 1], 3)
+    other = gray + 140 * (primaries if primaries.any() else np.ones(3))
+    return _with(rng, lambda image, x, y: (_patch(image, x, y, side, gray), _patch(image, x, y, side, other)))
+
+
+def _highlight(rng: np.random.Generator) -> Pair:
+    """Of a standard deviation of 0.05 to 0.07 degrees and 140 to 180 codes, on dark gray; gone."""
+    sigma, height, gray = rng.uniform(3.3, 4.7), rng.uniform(140, 180), rng.uniform(30, 75)
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+
+    def change(image: Pixels, x: float, y: float) -> tuple[Pixels, Pixels]:
+        plain = _patch(image, x, y, 40, gray)
+        light = height * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2))
+        return plain + light[..., None], plain
+
+    return _with(rng, change)
+
+
+def _moved(rng: np.random.Generator) -> Pair:
+    """A box of 0.12 to 0.24 degrees and a contrast of 180 codes, by three pixels."""
+    side, gray = int(rng.integers(8, 17)), rng.uniform(10, 70)
+
+    def change(image: Pixels, x: float, y: float) -> tuple[Pixels, Pixels]:
+        plain = _patch(image, x, y, 40, gray)
+        return _patch(plain, x, y, side, gray + 180), _patch(plain, x + 3, y, side, gray + 180)
+
+    return _with(rng, change)
+
+
+def _line(rng: np.random.Generator) -> Pair:
+    """A line of one pixel and 0.3 degrees, of a contrast of 225 to 255 codes; gone."""
+    contrast = rng.uniform(225, 255)
+
+    def change(image: Pixels, x: float, y: float) -> tuple[Pixels, Pixels]:
+        plain = _patch(image, x, y, 40, 255 - contrast)
+        line = plain.copy()
+        line[int(y), int(x) - 10 : int(x) + 10] = 255
+        return line, plain
+
+    return _with(rng, change)
+
+
+def _surface(rng: np.random.Generator) -> Pair:
+    """A surface of 0.3 to 0.6 degrees, 14 to 20 codes brighter."""
+    side, more = int(rng.integers(20, 41)), rng.uniform(14, 20)
+    gray = rng.uniform(30, 200)
+    return _with(rng, lambda image, x, y: (_patch(image, x, y, side, gray), _patch(image, x, y, side, gray + more)))
+
+
+def _lit_surface(rng: np.random.Generator) -> Pair:
+    """HDR: a surface of 0.3 to 0.6 degrees in a quarter more light."""
+    side, (x, y), stops = int(rng.integers(20, 41)), rng.uniform(28, SIZE - 28, 2), drawn(scene(rng))
+    codes = float(stops[int(y), int(x)].mean())
+    one, two = (light(_patch(stops, x, y, side, codes + more)) for more in (0.0, np.log2(1.25) * 255 / 6))
+    return one, two
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of change: `make(rng)` gives a reference and a test image.
+
+    `due`: whether a person sees it; None where that depends, and nothing is demanded.
+    """
+
+    text: str
+    make: Callable[[np.random.Generator], Pair]
+    due: bool | None = False
+
+
+KINDS = {
+    "last bits": Kind("relative 2⁻²³", _last_bits),
+    "one code": Kind("everywhere one more of 255", _one_code),
+    "dithering": Kind("rounded with and without noise of half a code", _dithered),
+    "other antialiasing": Kind("the 16 samples on a grid that is turned", _other_pattern),
+    "less antialiasing": Kind("4 samples instead of 16", _fewer_samples),
+    "a quarter pixel": Kind("the camera has moved so far", _quarter_pixel),
+    "JPEG": Kind("quality 98, without subsampling of the colours", _jpeg),
+    "half floats": Kind("an HDR image of 6 stops, rounded to 11 bits", _half_floats),
+    "no antialiasing": Kind("1 sample instead of 16; seen in some images", _no_antialiasing, due=None),
+    "colour of an object": Kind(_recoloured.__doc__ or "", _recoloured, due=True),
+    "highlight": Kind(_highlight.__doc__ or "", _highlight, due=True),
+    "moved object": Kind(_moved.__doc__ or "", _moved, due=True),
+    "line": Kind(_line.__doc__ or "", _line, due=True),
+    "brighter surface": Kind(_surface.__doc__ or "", _surface, due=True),
+    "light on a surface": Kind(_lit_surface.__doc__ or "", _lit_surface, due=True),
+}
+CASES = {False: "not seen", True: "seen", None: "seen in part"}
+
+
+# Judged --------------------------------------------------------------------------------------------------------
+
+
+def tasks(context: Context) -> list[Task]:
+    """One task for the kinds, one for the record."""
+    count = TRIALS[context.profile.name]
+    return [
+        Task("visible changes", lambda: [kind_row(name, count) for name in KINDS]),
+        Task("visible changes, limits", limit_rows),
+    ]
+
+
+def errors(pair: Pair) -> tuple[float, float, float]:
+    """The local FLIP error, the error throughout a patch, and the larger of both over their bounds."""
+    local, patch = flip.flip(*pair).metrics[:2]
+    return local.value, patch.value, max(each.value / (each.bound or np.nan) for each in (local, patch))
+
+
+def kind_row(name: str, count: int) -> Row:
+    """What `flip` finds in pairs of one kind."""
+    kind = KINDS[name]
+    seeds = np.random.SeedSequence((SEED, list(KINDS).index(name))).spawn(count)
+    found = np.array([errors(kind.make(np.random.default_rng(seed))) for seed in seeds])
+    different = int((found[:, 2] > 1).sum())
+    values = {LOCAL: float(np.median(found[:, 0])), THROUGHOUT: float(np.median(found[:, 1]))}
+    if kind.due is True:
+        values |= {ERROR: float(found[:, 2].min()), ALARMS: different / count, MISSED: float(count - different)}
+        budgets = {MISSED: 0.0}
+    else:
+        values |= {ERROR: float(found[:, 2].max()), ALARMS: different / count}
+        values[BOUND] = Tally(seen=different, trials=count).bound
+        budgets = {ALARMS: FALSE_ALARMS} | ({BOUND: FALSE_ALARMS} if count >= TRIALS["standard"] else {})
+    budgets = {} if kind.due is None else budgets
+    replay = {"seed": SEED, "trials": count, "size": SIZE}
+    return Row(NAME, name, CASES[kind.due], SETTING, values, budgets, reason=kind.text, replay=replay)
+
+
+def limit_rows() -> list[Row]:
+    """The smallest changes that are called different: of gray squares by their side, and of an edge."""
+    rows = [
+        Row(NAME, f"square of {side} pixels", LIMIT, SETTING, {CODES: _smallest(functools.partial(_square, side), 155)})
+        for side in SQUARES
+    ]
+    return [*rows, Row(NAME, EDGE, LIMIT, SETTING, {PIXELS: _smallest(_edge, 40) / 4})]
+
+
+def _smallest(make: Callable[[int], Pair], most: int) -> float:
+    """The smallest number up to `most` for which the pair is different; NaN where there is none."""
+    low, high = 0, most + 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if errors(make(middle))[2] > 1 else (middle, high)
+    return float(high) if high <= most else float("nan")
+
+
+def _square(side: int, codes: int) -> Pair:
+    plain = np.full((WIDE, WIDE, 3), float(GRAY))
+    return shown(plain), shown(_patch(plain, WIDE / 2, WIDE / 2, side, GRAY + codes))
+
+
+def _edge(quarters: int) -> Pair:
+    """A black half-plane on white, at the angle where a move by one pixel makes the largest error of those tried."""
+    shapes = [Shape(1, SIZE / 2, SIZE / 2, 4.0 * SIZE, 0.0, np.full(3, 255.0))]
+    moved = [Shape(1, SIZE / 2 - 2 * SIZE + x, SIZE / 2, 2.0 * SIZE, 0.4, np.zeros(3)) for x in (0.0, quarters / 4)]
+    one, two = (shown(drawn([*shapes, each])) for each in moved)
+    return one, two
+
+
+STUDY = Study(NAME, "Image comparison, visible changes", about(__doc__), TERMS, tasks)
