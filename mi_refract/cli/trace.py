@@ -9,11 +9,12 @@ from typing import Annotated, Any
 
 import typer
 
-from mi_refract import backend
 from mi_refract.io import atomic
 from mi_refract.io.outside_text import printable
 from mi_refract.planar import figure, focal_points, scene_file, scene_schema
 from mi_refract.planar.path_tree import as_data, follow_scene, summary, with_rays
+
+from . import variants
 
 
 def _print_keys(asked: bool) -> None:
@@ -44,7 +45,7 @@ def trace(
     ] = False,
 ) -> None:
     """Trace the rays of a planar scene; draw them, print their paths, or print focal points."""
-    backend.restart_if_needed()
+    variants.probe()
     if output:
         atomic.writable(output, figure.FORMATS)
         figure.require_matplotlib()

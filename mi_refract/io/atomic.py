@@ -12,14 +12,21 @@ import re
 import secrets
 import shutil
 import stat
+import tempfile
+import threading
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from .lock import is_at
 
 _OURS = re.compile(r"\..*\.[0-9a-f]{32}\.part(\.\w+)?", re.DOTALL)  # as `temporary_name` makes them
 _KEPT = 40  # characters of the file's own name: a name of 255 bytes has no room for more
+_LONGEST_CHANGE = 5.0  # seconds that one file system may take for it
+_OPENING = 0.1  # seconds
 _unfinished: set[Path] = set()
+_changing = threading.Lock()  # held where `_unfinished` changes, and what is in it
 _swept: set[Path] = set()
 
 
@@ -57,17 +64,21 @@ def replacing(path: str | os.PathLike[str], suffix: str = "", *, folder: bool = 
     """
     path = Path(path)
     sweep(path.parent)
-    temporary, lock = _new(path, suffix, folder)
-    _unfinished.add(temporary)
+    with _changing:
+        temporary, lock = _new(path, suffix, folder)
+        _unfinished.add(temporary)
     try:
         yield temporary
-        _copy_mode(path, lock)
-        temporary.replace(path)
+        with _changing:
+            _copy_mode(path, lock)
+            temporary.replace(path)
+            _unfinished.discard(temporary)
     except BaseException:
-        _remove(temporary)
+        with _changing:
+            _remove(temporary)
+            _unfinished.discard(temporary)
         raise
     finally:
-        _unfinished.discard(temporary)
         os.close(lock)
 
 
@@ -135,10 +146,30 @@ def _remove_stale(temporary: Path) -> None:
             os.close(file)
 
 
-def remove_unfinished() -> None:
-    """Remove the temporary files of this process, for code that ends it by `os._exit`."""
+@contextlib.contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """A new folder for temporary files, removed at the end, also by `end_process`."""
+    with _changing:
+        folder = Path(tempfile.mkdtemp(prefix="mi_refract-"))
+        _unfinished.add(folder)
+    try:
+        yield folder
+    finally:
+        with _changing:
+            _remove(folder)
+            _unfinished.discard(folder)
+
+
+def end_process(code: int) -> NoReturn:
+    """End this process at once, whatever its other threads do, without its temporary files and folders."""
+    _changing.acquire(timeout=_LONGEST_CHANGE)  # for ever: nothing is begun, finished or found missing from here on
     for temporary in tuple(_unfinished):
         _remove(temporary)
+    if _unfinished:  # a thread that was about to open one by its name has made it anew
+        time.sleep(_OPENING)
+    for temporary in tuple(_unfinished):
+        _remove(temporary)
+    os._exit(code)
 
 
 def _remove(temporary: Path) -> None:

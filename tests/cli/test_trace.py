@@ -253,7 +253,7 @@ PYTHON = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(app.__file__).pa
 def shell(before, *arguments):
     """The command in a process of its own, with something done `before`."""
     imports = "import sys\nfrom mi_refract import cli\nfrom mi_refract.io import atomic"
-    code = f"{imports}\n{before}\nsys.exit(cli.main(sys.argv[1:]))"
+    code = f"{imports}\n{before}\nsys.exit(cli.main())"
     command = [sys.executable, "-c", code, *map(str, arguments)]
     return subprocess.Popen(command, env=PYTHON, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
