@@ -129,6 +129,7 @@ def export(
     regimes: Regimes = False,
 ) -> None:
     """Write rays for another program: incident directions, normals and indices of refraction."""
+    writable(output, files.SUFFIXES)
     rays = ray_set.make(_names(regime), count, precision, seed, two_sided=two_sided)
     files.write(output, rays)
     print(printable(f"{output}: {_summary(rays)}"))

@@ -110,6 +110,7 @@ BAD = {
     "no scene": ({"scene": "none.xml"}, (), "none.xml: no such scene file"),
     "no variant": ({"variant": "llvm_rgb"}, (), "variant 'llvm_rgb': unknown; accepted: scalar_rgb"),
     "no folder": ({"output": "none/out.exr"}, (), "is not a folder"),
+    "a device": ({"output": "device.exr"}, (), "device.exr: is a device; accepted: the name of a file"),
     "no EXR": ({"output": "out.png"}, (), "accepted: a file name that ends in .exr"),
     "define without a value": ({}, ("-D", "bsdf"), "-D bsdf: accepted: NAME=VALUE"),
     "define without a name": ({}, ("-D", "=dielectric"), "-D =dielectric: accepted: NAME=VALUE"),
@@ -128,12 +129,14 @@ BAD = {
 @pytest.mark.parametrize("paths, options, message", BAD.values(), ids=BAD)
 def test_bad_input(render, scene, paths, options, message):
     paths = {key: scene.parent / value if key != "variant" else value for key, value in paths.items()}
+    if "output" in paths and paths["output"].stem == "device":
+        paths["output"].symlink_to("/dev/null")
     code, out, err = render(*options, **paths)
     assert (code, out) == (2, "")
     assert err.startswith("mi-refract: ")
     assert err.count("\n") == 1
     assert message in err
-    assert list(scene.parent.iterdir()) == [scene]
+    assert [path for path in scene.parent.iterdir() if not path.is_symlink()] == [scene]
 
 
 @pytest.mark.parametrize(
