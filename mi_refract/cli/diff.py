@@ -50,6 +50,7 @@ Nonfinite = Annotated[
 MaxValues = Annotated[
     int, typer.Option("--max-values", metavar="N", min=1, help="Width × height × channels of an image, at most.")
 ]
+SCENE = ".xml"
 OUTPUTS = ((".html", ".htm"), (".xml",), (".json",))  # of --report, --junit, --json
 
 
@@ -92,6 +93,11 @@ SelfTest = Annotated[
     ),
 ]
 
+AllowPlugins = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME", help="Run this plugin, which the scene of --self-test brings, too."),
+]
+
 
 def diff(
     reference: NotAlways = None,
@@ -110,15 +116,19 @@ def diff(
     github: GitHub = False,
     methods: Methods = False,
     self_test: SelfTest = False,
+    allow_plugins: AllowPlugins = None,
 ) -> None:
     """Compare images with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
     _require_extra("scipy", *(("jinja2", "matplotlib") if report else ()))
     renders = renders or samples
+    if allow_plugins and not (self_test and reference and reference.suffix == SCENE):
+        raise ValueError("--allow-plugins: only a scene brings plugins; accepted: with --self-test SCENE.xml")
     if self_test:
         others = (options, renders, settings, allow_nonfinite, inconclusive, report, junit, json, github)
         if any(others) or method != AUTO:
-            raise ValueError("--self-test asks every method and prints; accepted: no other option but --max-values")
-        raise typer.Exit(_self_test(reference, test, max_values))
+            accepted = "no other option but --max-values, --allow-plugins"
+            raise ValueError(f"--self-test asks every method and prints; accepted: {accepted}")
+        raise typer.Exit(_self_test(reference, test, max_values, allow_plugins or []))
     if reference is None or test is None:
         raise ValueError("two paths are needed; accepted: mi-refract diff REFERENCE TEST")
     for path, suffixes in zip((report, junit, json), OUTPUTS, strict=True):
@@ -215,15 +225,16 @@ def _flags(name: str, values: Sequence[Any]) -> list[str]:
     return [word for value in values for word in (name, str(value))]
 
 
-def _self_test(path: Path | None, other: Path | None, max_values: int) -> int:
+def _self_test(path: Path | None, other: Path | None, max_values: int, allow_plugins: Sequence[str]) -> int:
     """Print which defects are seen; 1 where one that was due is not."""
     if other:
         raise ValueError(f"{other}: --self-test takes one path; accepted: an image, a folder of renders, a scene")
     if path is None:
         renders = self_test_scenes.glass_ball()
+    elif path.suffix == SCENE:
+        renders = self_test_scenes.of_file(path, allow_plugins)
     else:
-        scene = path.suffix == ".xml"
-        renders = self_test_scenes.of_file(path) if scene else self_tests.read_images(path, max_values)
+        renders = self_tests.read_images(path, max_values)
     rows = self_tests.examine(renders, str(path or "a glass ball"))
     _print(self_tests.table(rows))
     return int(self_tests.failed(rows))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,13 @@ RENDERS, SPP = 16, 16
 RESOLUTION = 64
 
 
-def of_file(path: Path) -> Pixels:
-    """Independent renders of a scene file, number × H × W × C. Errors: those of `load_scene`."""
+def of_file(path: Path, allow_plugins: Collection[str] = ()) -> Pixels:
+    """Independent renders of a scene file, number × H × W × C.
+
+    `allow_plugins`: names of plugins that the scene may bring, which are code. Errors: those of `load_scene`.
+    """
     variants.activate()
-    return _rendered(load_scene(path))
+    return _rendered(load_scene(path, allow_plugins=allow_plugins))
 
 
 def glass_ball() -> Pixels:
