@@ -23,6 +23,7 @@ from mi_refract.image_diff import settings as diff_settings
 from mi_refract.image_diff.folders import Results, Status
 from mi_refract.image_diff.methods import AUTO
 from mi_refract.io.atomic import writable
+from mi_refract.io.exit_code import MISUSE, describe
 from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import provenance
@@ -180,7 +181,7 @@ def accept(
     with _progress() as tell:
         found = folders.diff(reference, test, chosen, to_accept=True, tell=tell)
     _say(found)
-    copies = list(accepting.changes(found))
+    copies = _changes(found)
     for copy in copies:
         print(printable(f"{copy.new} → {copy.reference}{'' if copy.replaced else ' (new)'}"))
     if not copies:
@@ -191,6 +192,16 @@ def accept(
     else:
         print("nothing accepted")
         raise typer.Exit(1)
+
+
+def _changes(found: Results) -> list[accepting.Copy]:
+    """What is to be copied. Where an image can be no reference, `_say` may have said so already."""
+    try:
+        return list(accepting.changes(found))
+    except (ValueError, OSError) as error:
+        if describe(error) in {printable(result.error) for result in found.of(Status.ERROR)}:
+            raise typer.Exit(MISUSE) from None
+        raise
 
 
 def _require_extra(*packages: str) -> None:
