@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from mi_refract.io import atomic
-from mi_refract.io.outside_text import printable
+from mi_refract.io.outside_text import json_text, printable
 from mi_refract.planar import figure, focal_points, scene_file, scene_schema
 from mi_refract.planar.path_tree import as_data, follow_scene, summary, with_rays
 
@@ -59,7 +58,7 @@ def trace(
     found = focal_points.groups(loaded, traced) if table else []
     if as_json:
         focal = {"foci": [asdict(group) for group in found]} if table else {}
-        print(json.dumps(as_data(loaded, traced) | focal, allow_nan=False))
+        print(json_text(as_data(loaded, traced) | focal))
     else:
         print(printable(f"{scene.name}: {summary(loaded, traced)}"))
         if found:
