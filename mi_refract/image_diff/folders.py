@@ -5,6 +5,7 @@ A pair that cannot be compared does not stop the others. Nothing here writes a f
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import functools
 import hashlib
@@ -20,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_refract.io import exit_code, image_file
+from mi_refract.io.bounded_map import bounded_map
 from mi_refract.io.image_file import MAX_VALUES, Image
 
 from . import methods
@@ -49,7 +51,7 @@ class Category(enum.StrEnum):
 STATUSES = {Verdict.EQUAL: Status.EQUAL, Verdict.DIFFERENT: Status.DIFFERENT, Verdict.INCONCLUSIVE: Status.INCONCLUSIVE}
 CATEGORIES = {Status.EQUAL: Category.UNCHANGED, Status.DIFFERENT: Category.CHANGED}
 AS_ASKED = Settings()
-WORKERS = min(os.cpu_count() or 1, 8)  # each holds a pair of images in memory
+WORKERS = min(os.cpu_count() or 1, 8)
 HELD = 250_000_000  # bytes of images that stay in memory for a page; a full page shows fewer
 INCONCLUSIVE = {"": 3, "pass": 0, "fail": 1}  # exit codes by what the user wants of it
 
@@ -173,11 +175,12 @@ def diff(
     paired = [Result(name, Status.DIFFERENT, reference, test)] if renders else pairs(reference, test)
     asked = [replace(result, how=settings.of(result.name)) for result in paired]
     found, held = [], 0
-    with ThreadPoolExecutor(WORKERS) as pool:
-        for result in pool.map(lambda result: _compared(result, renders, maps, to_accept), asked):
-            held += sum(image.pixels.nbytes for image in result.images)
-            found.append(result if held <= HELD else replace(result, images=()))
-            tell(len(found), len(asked))
+    # Together, the pairs that are compared at once have no more values than one pair may have.
+    most = 2 * settings.default.max_values
+    for result in bounded_map(lambda each: _compared(each, renders, maps, to_accept), asked, _values, most, WORKERS):
+        held += sum(image.pixels.nbytes for image in result.images)
+        found.append(result if held <= HELD else replace(result, images=()))
+        tell(len(found), len(asked))
     found.sort(key=lambda result: list(Status).index(result.status))
     unused = settings.unused([result.name for result in paired]) if reference.is_dir() and not renders else []
     return Results(reference, test, tuple(found), renders, inconclusive, tuple(unused))
@@ -240,6 +243,16 @@ def endings() -> frozenset[str]:
 
     formats = (each.split(":") for each in oiio.get_string_attribute("extension_list").split(";") if each)
     return frozenset(e for name, listed in formats if name not in ("null", "term", "zfile") for e in listed.split(","))
+
+
+def _values(result: Result) -> int:
+    """The values of its two images; 0 for what cannot be read, or is no pair of files."""
+    files = [path for path in (result.reference, result.test) if path and path.is_file()]
+    if len(files) < 2:
+        return 0
+    with contextlib.suppress(Exception):  # of whatever kind: the comparison says it
+        return sum(image_file.count_values(path, result.how.max_values) for path in files)
+    return 0
 
 
 def _compared(result: Result, renders: bool, maps: bool, to_accept: bool) -> Result:

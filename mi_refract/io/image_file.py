@@ -113,6 +113,27 @@ def read(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> Image:
     says, of several parts, deep, or without pixels. Both are one line that begins with the path.
     """
     path = Path(path)
+    source, kind = _checked(path, max_values)
+    try:
+        return _image(path, source, kind, max_values)
+    except MemoryError:
+        raise ValueError(f"{path}: more pixels than there is memory for; accepted: a smaller image") from None
+    finally:
+        source.close()
+
+
+def count_values(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> int:
+    """Width × height × channels of an image, as its header says. Errors: those of `read`."""
+    source, _ = _checked(Path(path), max_values)
+    try:
+        spec = source.spec()
+        return int(spec.width * spec.height * spec.nchannels)
+    finally:
+        source.close()
+
+
+def _checked(path: Path, max_values: int) -> tuple[Any, str]:
+    """OpenImageIO's reader of a file that may hold an image, and its kind for error messages."""
     kind = path.suffix[1:].upper() or "image"
     try:
         str(path).encode()
@@ -125,13 +146,7 @@ def read(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> Image:
     if not begin:
         raise ValueError(f"{path}: corrupt {kind} file: it is empty")
     # Others hold 8 bytes a value or fewer, and are asked below.
-    source = _opened(path, kind, max_values, max_values * (1 if begin.startswith(WHEN_OPENED) else 8))
-    try:
-        return _image(path, source, kind, max_values)
-    except MemoryError:
-        raise ValueError(f"{path}: more pixels than there is memory for; accepted: a smaller image") from None
-    finally:
-        source.close()
+    return _opened(path, kind, max_values, max_values * (1 if begin.startswith(WHEN_OPENED) else 8)), kind
 
 
 _opening = threading.Lock()  # OpenImageIO has one limit for all that it opens
