@@ -6,19 +6,27 @@ options, call the rooms below, and print; everything they do can be done from Py
 
 import sys
 
-from mi_refract import __version__
-from mi_refract.io.exit_code import exit_code
-
 __all__ = ["app", "main"]
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line, or `arguments`; the exit code."""
-    return exit_code("mi-refract", lambda: _run(sys.argv[1:] if arguments is None else arguments))
+    """Run `arguments`, or the command line of this process, which Ctrl-C then ends at once; the exit code."""
+    # Imported no sooner than needed: until SIGINT is blocked, Ctrl-C interrupts an import, with a traceback.
+    if arguments is None:
+        from .interrupts import end_at_once
+
+        arguments = sys.argv[1:]
+        # Mitsuba heeds SIGINT also where it is ignored, so a rendering in the background ends, too.
+        end_at_once(even_if_ignored=arguments[:1] == ["render"])
+    from mi_refract.io.exit_code import exit_code
+
+    return exit_code("mi-refract", lambda: _run(arguments))
 
 
 def _run(arguments: list[str]) -> int:
     if arguments == ["--version"]:  # importing the parser takes ten times as long as all the rest of this
+        from mi_refract import __version__
+
         print(__version__)
         return 0
     from .app import main

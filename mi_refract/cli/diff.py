@@ -23,6 +23,7 @@ from mi_refract.image_diff.methods import AUTO
 from mi_refract.image_diff.results import Results, Status, as_word
 from mi_refract.image_diff.settings import Settings
 from mi_refract.io.atomic import writable
+from mi_refract.io.exit_code import MISUSE, describe
 from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import provenance
@@ -57,6 +58,7 @@ Nonfinite = Annotated[
 MaxValues = Annotated[
     int, typer.Option("--max-values", metavar="N", min=1, help="Width × height × channels of an image, at most.")
 ]
+SCENE = ".xml"
 OUTPUTS = ((".html", ".htm"), (".xml",), (".json",))  # of --report, --junit, --json
 
 
@@ -102,6 +104,11 @@ SelfTest = Annotated[
     ),
 ]
 
+AllowPlugins = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME", help="Run this plugin, which the scene of --self-test brings, too."),
+]
+
 
 def diff(
     reference: NotAlways = None,
@@ -122,11 +129,14 @@ def diff(
     github: GitHub = False,
     methods: Methods = False,
     self_test: SelfTest = False,
+    allow_plugins: AllowPlugins = None,
     check_settings: CheckSettings = False,
 ) -> None:
     """Compare images with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
     _require_extra("scipy", *(("jinja2", "matplotlib") if report else ()))
     renders = renders or samples
+    if allow_plugins and not (self_test and reference and reference.suffix == SCENE):
+        raise ValueError("--allow-plugins: only a scene brings plugins; accepted: with --self-test SCENE.xml")
     if self_test:
         others = (
             options,
@@ -141,8 +151,9 @@ def diff(
             github,
         )
         if any(others) or method != AUTO:
-            raise ValueError("--self-test asks every method and prints; accepted: no other option but --max-values")
-        raise typer.Exit(_self_test(reference, test, max_values))
+            accepted = "no other option but --max-values, --allow-plugins"
+            raise ValueError(f"--self-test asks every method and prints; accepted: {accepted}")
+        raise typer.Exit(_self_test(reference, test, max_values, allow_plugins or []))
     if check_settings and reference:
         chosen = _settings(reference, method, options, idiff, settings, allow_nonfinite, max_values)
         raise typer.Exit(_check_settings(reference, test, names or [], chosen))
@@ -206,7 +217,7 @@ def accept(
     with _progress() as tell:
         found = folders.diff(reference, test, chosen, names=names or [], to_accept=True, tell=tell)
     _say(found)
-    copies = list(accepting.changes(found))
+    copies = _changes(found)
     for copy in copies:
         print(printable(f"{copy.new} → {copy.reference}{'' if copy.replaced else ' (new)'}"))
     if not copies:
@@ -217,6 +228,16 @@ def accept(
     else:
         print("nothing accepted")
         raise typer.Exit(1)
+
+
+def _changes(found: Results) -> list[accepting.Copy]:
+    """What is to be copied. Where an image can be no reference, `_say` may have said so already."""
+    try:
+        return list(accepting.changes(found))
+    except (ValueError, OSError) as error:
+        if describe(error) in {printable(result.error) for result in found.of(Status.ERROR)}:
+            raise typer.Exit(MISUSE) from None
+        raise
 
 
 def _require_extra(*packages: str) -> None:
@@ -245,15 +266,16 @@ def _replay(found: Results, names: Sequence[str]) -> str:
     return shlex.join(["mi-refract", "diff", *sides, *names, *found.flags, *["--renders"] * found.renders])
 
 
-def _self_test(path: Path | None, other: Path | None, max_values: int) -> int:
+def _self_test(path: Path | None, other: Path | None, max_values: int, allow_plugins: Sequence[str]) -> int:
     """Print which defects are seen; 1 where one that was due is not."""
     if other:
         raise ValueError(f"{other}: --self-test takes one path; accepted: an image, a folder of renders, a scene")
     if path is None:
         renders = self_test_scenes.glass_ball()
+    elif path.suffix == SCENE:
+        renders = self_test_scenes.of_file(path, allow_plugins)
     else:
-        scene = path.suffix == ".xml"
-        renders = self_test_scenes.of_file(path) if scene else self_tests.read_images(path, max_values)
+        renders = self_tests.read_images(path, max_values)
     rows = self_tests.examine(renders, str(path or "a glass ball"))
     _print(self_tests.table(rows))
     return int(self_tests.failed(rows))

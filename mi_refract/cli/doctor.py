@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from typing import Annotated, Any
 
 import typer
 
 from mi_refract import __version__, backend
-from mi_refract.io.outside_text import printable_lines
+from mi_refract.io.outside_text import json_text, printable_lines
 from mi_refract.io.provenance import installed_version
+
+from . import variants
 
 
 def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
     """Show which Mitsuba variants run on this machine, why the others do not, and what to install."""
-    backend.restart_if_needed()
+    variants.probe()
     facts = diagnose()
-    print(json.dumps(facts, indent=2) if as_json else printable_lines(_as_text(facts)))
+    print(json_text(facts, indent=2) if as_json else printable_lines(_as_text(facts)))
     if None not in facts["variants"].values():
         raise ValueError("no variant of Mitsuba runs here; accepted: at least one")
 

@@ -20,6 +20,8 @@ from mi_refract.ray_sets import files, ray_set, run_program
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.regimes import REGIMES
 
+from .interrupts import as_exceptions
+
 app = typer.Typer(
     help="Check the refraction of other programs against certified answers.",
     add_completion=False,
@@ -127,6 +129,7 @@ def export(
     regimes: Regimes = False,
 ) -> None:
     """Write rays for another program: incident directions, normals and indices of refraction."""
+    writable(output, files.SUFFIXES)
     rays = ray_set.make(_names(regime), count, precision, seed, two_sided=two_sided)
     files.write(output, rays)
     print(printable(f"{output}: {_summary(rays)}"))
@@ -188,7 +191,8 @@ def run(
     """
     options = CheckOptions(tir, formula or old_formula, report, junit, json)
     rays, chosen = _rays(file, regime, count, precision, seed, two_sided)
-    given = run_program.answers_of(command, rays, timeout=timeout, adopt=True)
+    with as_exceptions():
+        given = run_program.answers_of(command, rays, timeout=timeout, adopt=True)
     name = shlex.join(command)
     print(printable(f"{name}: {_summary(rays)}"))
     raise typer.Exit(options.check(rays, given, name, ["run", *chosen, *options.words, "--", *command]))

@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
-from mi_refract import backend
 from mi_refract.io.outside_text import printable
 from mi_refract.rendering import scene_files
+
+from . import variants
 
 app = typer.Typer(
     help="Write scenes for other renderers.", no_args_is_help=True, add_completion=False, rich_markup_mode=None
@@ -38,7 +39,7 @@ def export(
 ) -> None:
     """Write a Mitsuba scene as triangles for another renderer, with a README.txt that says how to render it."""
     defines = scene_files.parse_defines(define or [])
-    backend.activate("scalar_rgb", may_restart=True)
+    variants.activate("scalar_rgb")
     from mi_refract.scene_export import from_mitsuba
     from mi_refract.scene_export.write_files import write
 

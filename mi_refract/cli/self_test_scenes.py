@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mi_refract import backend
 from mi_refract.io.pixels import Pixels
 from mi_refract.rendering.scene_files import load_scene
+
+from . import variants
 
 RENDERS, SPP = 16, 16
 RESOLUTION = 64
 
 
-def of_file(path: Path) -> Pixels:
-    """Independent renders of a scene file, number × H × W × C. Errors: those of `load_scene`."""
-    backend.activate(may_restart=True)
-    return _rendered(load_scene(path))
+def of_file(path: Path, allow_plugins: Collection[str] = ()) -> Pixels:
+    """Independent renders of a scene file, number × H × W × C.
+
+    `allow_plugins`: names of plugins that the scene may bring, which are code. Errors: those of `load_scene`.
+    """
+    variants.activate()
+    return _rendered(load_scene(path, allow_plugins=allow_plugins))
 
 
 def glass_ball() -> Pixels:
     """Independent renders of a glass ball on a floor under a sky and a lamp, number × H × W × 3."""
-    backend.activate(may_restart=True)
+    variants.activate()
     import mitsuba as mi
 
     return _rendered(mi.load_dict(_glass_ball()))

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from mi_refract import backend
 from mi_refract.io import atomic
-from mi_refract.io.outside_text import printable
+from mi_refract.io.outside_text import json_text, printable
 from mi_refract.planar import figure, focal_points, scene_file, scene_schema
 from mi_refract.planar.path_tree import as_data, follow_scene, summary, with_rays
+
+from . import variants
 
 
 def _print_keys(asked: bool) -> None:
@@ -44,7 +44,7 @@ def trace(
     ] = False,
 ) -> None:
     """Trace the rays of a planar scene; draw them, print their paths, or print focal points."""
-    backend.restart_if_needed()
+    variants.probe()
     if output:
         atomic.writable(output, figure.FORMATS)
         figure.require_matplotlib()
@@ -58,7 +58,7 @@ def trace(
     found = focal_points.groups(loaded, traced) if table else []
     if as_json:
         focal = {"foci": [asdict(group) for group in found]} if table else {}
-        print(json.dumps(as_data(loaded, traced) | focal, allow_nan=False))
+        print(json_text(as_data(loaded, traced) | focal))
     else:
         print(printable(f"{scene.name}: {summary(loaded, traced)}"))
         if found:

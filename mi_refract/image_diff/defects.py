@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from mi_refract.io import image_file
+from mi_refract.io import atomic, image_file
 from mi_refract.io.pixels import Pixels, srgb_decode, srgb_encode
 
 Renders = Pixels | list[Pixels]  # of one image, renders × H × W × C; a list where one of them is of another size
@@ -67,8 +65,8 @@ def _truncated(image: Pixels) -> Pixels:
 def through_a_file(image: Pixels, share: float = 1.0) -> Pixels:
     """The image written as EXR, cut to a share of the bytes, and read again. ValueError for what cannot be read."""
     channels = image_file.named("", image).channels
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "image.exr"
+    with atomic.temporary_folder() as folder:
+        path = folder / "image.exr"
         image_file.write_exr(path, image, channels)
         written = path.read_bytes()
         path.write_bytes(written[: int(share * len(written))])

@@ -5,6 +5,7 @@ A pair that cannot be compared does not stop the others. Nothing here writes a f
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
@@ -18,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_refract.io import exit_code, image_file
+from mi_refract.io.bounded_map import bounded_map
 from mi_refract.io.image_file import MAX_VALUES, Image
 
 from . import masks, methods, pairing, parts, settings_file
@@ -27,7 +29,7 @@ from .results import STATUSES, Result, Results, Status
 from .settings import Settings
 
 AS_ASKED = Settings()
-WORKERS = min(os.cpu_count() or 1, 8)  # each holds a pair of images in memory
+WORKERS = min(os.cpu_count() or 1, 8)
 HELD = 250_000_000  # bytes of images that stay in memory for a page; a full page shows fewer
 
 
@@ -59,11 +61,13 @@ def diff(
     pairs = [*pairing.named(every, names), *_wrong_entries(settings, every)]
     root = reference if reference.is_dir() else reference.parent
     found, held = [], 0
-    with ThreadPoolExecutor(WORKERS) as pool:
-        for result in pool.map(lambda pair: _compared(pair, root, renders, maps, to_accept), pairs):
-            held += sum(image.pixels.nbytes for image in result.images)
-            found.append(result if held <= HELD else replace(result, images=()))
-            tell(len(found), len(pairs))
+    # Together, the pairs that are compared at once have no more values than one pair may have.
+    most = 2 * settings.default.max_values
+    compare = functools.partial(_compared, root=root, renders=renders, maps=maps, to_accept=to_accept)
+    for result in bounded_map(compare, pairs, _values, most, WORKERS):
+        held += sum(image.pixels.nbytes for image in result.images)
+        found.append(result if held <= HELD else replace(result, images=()))
+        tell(len(found), len(pairs))
     found.sort(key=lambda result: list(Status).index(result.status))
     by_file = bool(settings.maps)
     return Results(reference, test, tuple(found), renders, inconclusive, tuple(unused), tuple(settings.flags), by_file)
@@ -83,6 +87,16 @@ def _wrong_entries(settings: Settings, pairs: Sequence[Pair]) -> list[Pair]:
     used = {pair.how.error for pair in pairs}
     wrong = [rule for rule in settings.rules if rule.error and rule.error not in used]
     return [Pair(f"{settings_file.FILE}: {rule.where}", None, None, Path(), error=rule.error) for rule in wrong]
+
+
+def _values(pair: Pair) -> int:
+    """The values of its two images; 0 for what cannot be read, or is no pair of files."""
+    files = [path for path in (pair.reference, pair.test) if path and path.is_file()]
+    if len(files) < 2:
+        return 0
+    with contextlib.suppress(Exception):  # of whatever kind: the comparison says it
+        return sum(image_file.count_values(path, pair.how.max_values) for path in files)
+    return 0
 
 
 def _compared(pair: Pair, root: Path, renders: bool, maps: bool, to_accept: bool) -> Result:

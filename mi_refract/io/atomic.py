@@ -12,30 +12,49 @@ import re
 import secrets
 import shutil
 import stat
+import tempfile
+import threading
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from .lock import is_at
 
 _OURS = re.compile(r"\..*\.[0-9a-f]{32}\.part(\.\w+)?", re.DOTALL)  # as `temporary_name` makes them
 _KEPT = 40  # characters of the file's own name: a name of 255 bytes has no room for more
+_KINDS = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
+_LONGEST_CHANGE = 5.0  # seconds that one file system may take for it
+_OPENING = 0.1  # seconds
 _unfinished: set[Path] = set()
+_changing = threading.Lock()  # held where `_unfinished` changes, and what is in it
 _swept: set[Path] = set()
 
 
 def writable(path: str | os.PathLike[str], suffixes: Sequence[str]) -> Path:
     """`path` as a Path, if a file can be written there.
 
-    `suffixes`: accepted endings of the name, in lower case, with the dot. ValueError for another name, OSError for a
-    folder that is missing or not writable.
+    `suffixes`: accepted endings of the name, in lower case, with the dot. ValueError for another name, OSError for what
+    exists and is no file, or for a folder that is missing or not writable.
     """
     path = Path(path)
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{path}: accepted: a file name that ends in {' or '.join(suffixes)}")
-    if path.is_dir():
-        raise IsADirectoryError(f"{path}: is a folder; accepted: the name of a file")
+    _require_file(path)
     check_parent(path)
     return path
+
+
+def _require_file(path: Path) -> None:
+    """OSError where `path` exists and is no file: a new file cannot take its place, or others would lose it."""
+    names = [path, path.parent / path.readlink()] if path.is_symlink() else [path]
+    if any(name.parent.resolve().is_relative_to("/proc") for name in names):  # /dev/stdout, /dev/fd/3: may be of a file
+        raise OSError(f"{path}: is a stream of a process; accepted: the name of a file")
+    kind = stat.S_IFMT(path.stat().st_mode) if path.exists() else stat.S_IFREG
+    if kind == stat.S_IFDIR:
+        raise IsADirectoryError(f"{path}: is a folder; accepted: the name of a file")
+    if kind != stat.S_IFREG:
+        raise OSError(f"{path}: is {_KINDS.get(kind, 'a device')}; accepted: the name of a file")
 
 
 def check_parent(path: Path) -> None:
@@ -53,21 +72,27 @@ def replacing(path: str | os.PathLike[str], suffix: str = "", *, folder: bool = 
     An empty file is there already, or with `folder` an empty folder: made exclusively, under a name that nobody can
     guess, with the permissions of the old one. A reader sees the old file, or folder, or the new one. On any exception,
     the caller's or OSError from the system, the old one stays and the temporary one is removed; what a killed process
-    left behind goes with the next file that is written beside it.
+    left behind goes with the next file that is written beside it. OSError for a file where `path` exists and is none.
     """
     path = Path(path)
+    if not folder:
+        _require_file(path)
     sweep(path.parent)
-    temporary, lock = _new(path, suffix, folder)
-    _unfinished.add(temporary)
+    with _changing:
+        temporary, lock = _new(path, suffix, folder)
+        _unfinished.add(temporary)
     try:
         yield temporary
-        _copy_mode(path, lock)
-        temporary.replace(path)
+        with _changing:
+            _copy_mode(path, lock)
+            temporary.replace(path)
+            _unfinished.discard(temporary)
     except BaseException:
-        _remove(temporary)
+        with _changing:
+            _remove(temporary)
+            _unfinished.discard(temporary)
         raise
     finally:
-        _unfinished.discard(temporary)
         os.close(lock)
 
 
@@ -135,10 +160,30 @@ def _remove_stale(temporary: Path) -> None:
             os.close(file)
 
 
-def remove_unfinished() -> None:
-    """Remove the temporary files of this process, for code that ends it by `os._exit`."""
+@contextlib.contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """A new folder for temporary files, removed at the end, also by `end_process`."""
+    with _changing:
+        folder = Path(tempfile.mkdtemp(prefix="mi_refract-"))
+        _unfinished.add(folder)
+    try:
+        yield folder
+    finally:
+        with _changing:
+            _remove(folder)
+            _unfinished.discard(folder)
+
+
+def end_process(code: int) -> NoReturn:
+    """End this process at once, whatever its other threads do, without its temporary files and folders."""
+    _changing.acquire(timeout=_LONGEST_CHANGE)  # for ever: nothing is begun, finished or found missing from here on
     for temporary in tuple(_unfinished):
         _remove(temporary)
+    if _unfinished:  # a thread that was about to open one by its name has made it anew
+        time.sleep(_OPENING)
+    for temporary in tuple(_unfinished):
+        _remove(temporary)
+    os._exit(code)
 
 
 def _remove(temporary: Path) -> None:

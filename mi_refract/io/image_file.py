@@ -138,6 +138,27 @@ def read_parts(
     one line that begins with the path.
     """
     path = Path(path)
+    source, kind = _checked(path, max_values, as_idiff)
+    try:
+        return _images(path, source, kind, max_values, first_only, as_idiff)
+    except MemoryError:
+        raise ValueError(f"{path}: more pixels than there is memory for; accepted: a smaller image") from None
+    finally:
+        source.close()
+
+
+def count_values(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> int:
+    """Width × height × channels of all images in a file, as their headers say. Errors: those of `read_parts`."""
+    source, _ = _checked(Path(path), max_values, False)
+    try:
+        specs = (source.spec() for _ in _parts(source))
+        return sum(int(spec.width * spec.height * spec.nchannels) for spec in specs)
+    finally:
+        source.close()
+
+
+def _checked(path: Path, max_values: int, multiplied: bool) -> tuple[Any, str]:
+    """OpenImageIO's reader of a file that may hold an image, and its kind for error messages."""
     kind = path.suffix[1:].upper() or "image"
     try:
         str(path).encode()
@@ -152,14 +173,7 @@ def read_parts(
     if begin == LFS_POINTER:
         raise ValueError(f"{path}: a Git LFS pointer, not the image; `{_lfs_pull(path)}` brings it")
     # Others hold 8 bytes a value or fewer, and are asked below.
-    max_bytes = max_values * (1 if begin.startswith(WHEN_OPENED) else 8)
-    source = _opened(path, kind, max_values, max_bytes, as_idiff)
-    try:
-        return _images(path, source, kind, max_values, first_only, as_idiff)
-    except MemoryError:
-        raise ValueError(f"{path}: more pixels than there is memory for; accepted: a smaller image") from None
-    finally:
-        source.close()
+    return _opened(path, kind, max_values, max_values * (1 if begin.startswith(WHEN_OPENED) else 8), multiplied), kind
 
 
 def _lfs_pull(path: Path) -> str:

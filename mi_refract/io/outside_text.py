@@ -1,11 +1,12 @@
 """Text that somebody else wrote: names of files, channels and regimes, titles, reasons, messages of other programs.
 
 All of it passes through `printable` on its way to a terminal, a log, HTML, XML, SVG or Markdown, each of which then
-escapes what is markup there. U+FFFD stands where something was taken out.
+escapes what is markup there. U+FFFD stands where something was taken out. JSON that is printed is made by `json_text`.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from typing import Any
 
@@ -42,3 +43,12 @@ def printable(text: Any) -> str:
 def printable_lines(text: Any) -> str:
     """The same for a text of several lines, of which \\n is kept."""
     return "\n".join(map(printable, str(text).split("\n")))
+
+
+def json_text(value: Any, indent: int | None = None) -> str:
+    """JSON of the value, for a terminal or a log: any string comes back unchanged from it, but is not shown as such.
+
+    ValueError for numbers that are not finite.
+    """
+    text = json.dumps(value, ensure_ascii=True, allow_nan=False, indent=indent)
+    return text.replace("##", "#\\u0023")  # which only strings hold

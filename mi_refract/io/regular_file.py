@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import BinaryIO
 
+_PIECE = 2**20  # bytes
+
 
 @contextmanager
 def opened(path: str | os.PathLike[str], most: int) -> Iterator[BinaryIO]:
@@ -33,7 +35,11 @@ def _without_waiting(path: str, flags: int) -> int:
 def read_bytes(path: str | os.PathLike[str], most: int) -> bytes:
     """The bytes of the file. Errors as of `opened`; ValueError also where it grew meanwhile."""
     with opened(path, most) as file:
-        content = file.read(most + 1)
+        # `read(n)` asks for n bytes of memory before it reads: not for `most`, which may be all there are.
+        size = os.fstat(file.fileno()).st_size
+        content = file.read(size + 1)
+        while size < len(content) <= most and (more := file.read(_PIECE)):  # it grew meanwhile
+            content += more
     if len(content) > most:
         raise ValueError(f"{path}: more than {most} bytes; accepted: up to {most}")
     return content

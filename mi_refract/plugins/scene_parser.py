@@ -116,7 +116,7 @@ def check_faces(path: Path) -> None:
 def check_plugins(path: Path, names: Any, allowed: Collection[str]) -> None:
     """ValueError for a plugin that is neither Mitsuba's nor ours nor in `allowed`."""
     if unknown := sorted({*names} - known_plugins() - {*allowed}):
-        accepted = f"those; to `render` also code that the scene brings, by --allow-plugins {unknown[0]}"
+        accepted = f"those; code that a scene brings: where it is rendered, by --allow-plugins {unknown[0]}"
         raise ValueError(f"{path}: plugin {unknown[0]!r}: neither Mitsuba's nor mi_refract's; accepted: {accepted}")
 
 

@@ -276,7 +276,7 @@ def test_self_test_renders_a_scene(run, tmp_path, quick, monkeypatch):
     scene = tmp_path / "sphere.xml"
     scene.write_text(text.replace('name="res" value="128"', 'name="res" value="24"'))
     monkeypatch.setattr(self_test_scenes, "SPP", 2)
-    monkeypatch.setattr(backend, "activate", lambda **how: None)
+    monkeypatch.setattr(backend, "activate", lambda *chosen: None)
     code, out, err = run("diff", "--self-test", scene)
     assert (code in (0, 1), err) == (True, "")
     assert "renders: noise " in out

@@ -363,3 +363,11 @@ def test_everything_at_once(call, program):
     assert "mi-refract rays run --regime generic --regime critical --count 60 -- " in page
     assert ElementTree.parse("out.xml").getroot().get("failures") == "3"
     assert json.loads(Path("out.json").read_text())["diagnosis"] == "eta inverted"
+
+
+def test_a_pipe_is_refused_before_rays_are_made(run, tmp_path, monkeypatch):
+    os.mkfifo(tmp_path / "rays.csv")
+    monkeypatch.setattr(ray_set, "make", lambda *names, **how: pytest.fail("made"))
+    code, out, err = run("rays", "export", "-o", tmp_path / "rays.csv")
+    assert (code, out) == (2, "")
+    assert err == f"mi-refract: {tmp_path / 'rays.csv'}: is a pipe; accepted: the name of a file\n"

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.hostile import shows_more_than_text
 
 from mi_refract import backend
 from mi_refract.cli import app
@@ -95,6 +96,16 @@ def test_json_is_the_paths(trace, ball):
         assert path["hits"] == expected.hits[i, :2].tolist()
         assert path["events"] == ["refracted", "refracted", "escaped"]
         assert path["indices"] == [1.0, 1.5, 1.0]
+
+
+def test_json_shows_nothing_of_a_title_but_ascii(trace, ball):
+    scene = ball.with_name("##[error]\u202e.toml")
+    scene.write_text(BALL.replace("A glass ball", r"\u001b[31m\u007f\u202e ##[error]::error::"))
+    code, out, err = trace("--json", scene=scene)
+    assert (code, err) == (0, "")
+    assert out[:-1].isascii() and out[:-1].isprintable() and not shows_more_than_text(out)
+    assert json.loads(out)["title"] == "\x1b[31m\x7f\u202e ##[error]::error::"
+    assert json.loads(out)["scene"] == str(scene)
 
 
 def test_json_and_an_image(trace, ball):
@@ -253,7 +264,7 @@ PYTHON = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(app.__file__).pa
 def shell(before, *arguments):
     """The command in a process of its own, with something done `before`."""
     imports = "import sys\nfrom mi_refract import cli\nfrom mi_refract.io import atomic"
-    code = f"{imports}\n{before}\nsys.exit(cli.main(sys.argv[1:]))"
+    code = f"{imports}\n{before}\nsys.exit(cli.main())"
     command = [sys.executable, "-c", code, *map(str, arguments)]
     return subprocess.Popen(command, env=PYTHON, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 

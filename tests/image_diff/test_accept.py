@@ -317,12 +317,23 @@ def test_accept_judges_like_diff(run, pair):
 
 
 def test_accept_takes_all_or_nothing(run, pair):
-    BROKEN["truncated"](pair[1] / "equal.exr")
-    before = tree(pair[0])
+    """And says once why: each image that cannot be compared has a line."""
+    for broken in (["equal.exr"], ["equal.exr", "louder.exr"]):
+        BROKEN["truncated"](pair[1] / broken[-1])
+        before = tree(pair[0])
+        code, out, err = run("accept", *pair, "--yes")
+        assert code == 2 and "→" not in out
+        assert [line.partition(".exr:")[0] for line in err.splitlines()] == [
+            f"mi-refract: {pair[1] / name}".removesuffix(".exr") for name in broken
+        ]
+        assert tree(pair[0]) == before
+
+
+def test_accept_says_what_diff_does_not_mind(run, pair):
+    for side in pair:
+        image(side / "louder.exr", value=np.nan)
     code, _, err = run("accept", *pair, "--yes")
-    assert code == 2
-    assert "equal.exr" in err
-    assert tree(pair[0]) == before
+    assert code == 2 and len({*err.splitlines()}) == err.count("\n") > 0
 
 
 def test_accept_keeps_what_was_removed(run, pair):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import threading
+import time
 
 import numpy as np
 import OpenImageIO as oiio
@@ -135,6 +137,40 @@ def test_images_larger_than_allowed_are_not_compared(folders):
         diff.read_renders(folders[0], most - 1)
     ruled = Settings(How(max_values=most - 1), rules=(Entry("same.exr", {"method": "exact"}),))
     assert found(diff.diff(*folders, ruled))["same.exr"] == ("error", "unknown")
+
+
+def test_pairs_that_are_compared_at_once_have_no_more_values_than_one_may(tmp_path, monkeypatch):
+    """The large image has as many as four small ones, and is as large as allowed; then where more is allowed."""
+    for side in ("old", "new"):
+        for i in range(12):
+            image(tmp_path / side / f"{i}.exr", shape=(8, 8, 3))
+        image(tmp_path / side / "large.exr", shape=(8, 32, 3))
+        (tmp_path / side / "broken.exr").write_text("none")
+    compare, lock, now, most = methods.compare, threading.Lock(), [0], [0]
+
+    def slowly(method, one, two, **options):
+        values = one[0].pixels.size + two[0].pixels.size
+        with lock:
+            now[0] += values
+            most[0] = max(*most, *now)
+        time.sleep(0.05)
+        with lock:
+            now[0] -= values
+        return compare(method, one, two, **options)
+
+    monkeypatch.setattr(methods, "compare", slowly)
+    monkeypatch.setattr(diff, "WORKERS", 8)
+    pair = 2 * 8 * 8 * 3
+    for limit, least, largest in ((8 * 32 * 3, 2 * pair, 4 * pair), (10**6, 5 * pair, 11 * pair)):
+        most[0] = 0
+        results = diff.diff(tmp_path / "old", tmp_path / "new", Settings(How(max_values=limit)))
+        assert [r.name for r in results.results] == [
+            "broken.exr",
+            *sorted([f"{i}.exr" for i in range(12)]),
+            "large.exr",
+        ]
+        assert {r.status for r in results.results[1:]} == {Status.EQUAL}
+        assert least <= most[0] <= largest
 
 
 def test_a_folder_inside_without_permission(folders, monkeypatch):

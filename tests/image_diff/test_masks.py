@@ -33,7 +33,8 @@ def pair(tmp_path):
 
 @pytest.mark.parametrize("method", [name for name, method in methods.METHODS.items() if not method.takes_renders])
 @pytest.mark.parametrize(
-    "left_out", [{"mask": "{stem}_mask.exr"}, {"ignore": ((4, 10, 16, 12),)}, {"ignore": ((0, 10, 10, 12), (10, 0, 10, 22))}]
+    "left_out",
+    [{"mask": "{stem}_mask.exr"}, {"ignore": ((4, 10, 16, 12),)}, {"ignore": ((0, 10, 10, 12), (10, 0, 10, 22))}],
 )
 def test_what_is_left_out_does_not_count(pair, method, left_out):
     assert diff.diff(*pair, settings(method=method)).exit_code == 1

@@ -40,6 +40,50 @@ def test_a_replaced_file_keeps_its_permissions(tmp_path):
     assert path.read_text() == "new" and path.stat().st_mode & 0o777 == 0o640
 
 
+@pytest.fixture(params=["pipe", "socket", "device", "stream", "stream by number", "folder", "link to a pipe"])
+def no_file(request, tmp_path, monkeypatch):
+    """A path with the ending .x of something that is no file, and what it is."""
+    path = tmp_path / "out.x"
+    match request.param:
+        case "pipe":
+            os.mkfifo(path)
+        case "socket":
+            monkeypatch.chdir(tmp_path)  # a socket's name is short
+            with socket.socket(socket.AF_UNIX) as made:
+                made.bind(path.name)
+        case "device":
+            path.symlink_to("/dev/null")
+        case "stream":  # to a regular file
+            path.symlink_to("/proc/self/fd/0")
+        case "stream by number":
+            path = Path("/dev/fd/1")
+        case "folder":
+            path.mkdir()
+        case "link to a pipe":
+            os.mkfifo(tmp_path / "pipe")
+            path.symlink_to(tmp_path / "pipe")
+    return path, request.param.replace("link to a ", "").replace(" by number", " of a process")
+
+
+def test_what_is_no_file_is_not_replaced(no_file, tmp_path):
+    path, kind = no_file
+    before = {each: each.lstat() for each in tmp_path.iterdir()}
+    for write in (lambda: atomic.writable(path, (path.suffix,)), lambda: write_atomically(path, "new")):
+        with pytest.raises(OSError, match=rf"{path}: is a {kind}.*; accepted: the name of a file"):
+            write()
+    assert {each: each.lstat() for each in tmp_path.iterdir()} == before
+
+
+def test_a_link_to_a_file_or_to_nothing_is_replaced(tmp_path):
+    for target in (tmp_path / "target", tmp_path / "nothing"):
+        (tmp_path / "target").write_text("old")
+        path = tmp_path / f"to {target.name}"
+        path.symlink_to(target)
+        write_atomically(atomic.writable(path, ("",)), "new")
+        assert path.read_text() == "new" and not path.is_symlink()
+        assert (tmp_path / "target").read_text() == "old"
+
+
 BEGIN, END = "<!-- begin: t -->", "<!-- end: t -->"
 
 

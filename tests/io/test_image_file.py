@@ -40,6 +40,7 @@ def test_formats(tmp_path, name, kind, error):
     assert image.pixels.dtype == np.float32
     assert image.channels == ("R", "G", "B")
     np.testing.assert_allclose(image.pixels, PIXELS, atol=error, rtol=0)
+    assert image_file.count_values(tmp_path / name) == PIXELS.size
 
 
 def test_several_at_once_keep_their_order_and_their_errors(tmp_path):

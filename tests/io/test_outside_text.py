@@ -1,12 +1,15 @@
 """Names and messages of others stay text: they steer no terminal, no direction of writing and no CI runner."""
 
+import json
 import unicodedata
+from pathlib import Path
 
 import pytest
 from support.hostile import BIDI, CONTROLS, NAME, shows_more_than_text
 
+from mi_refract import cli
 from mi_refract.io import exit_code
-from mi_refract.io.outside_text import MARK, printable, printable_lines
+from mi_refract.io.outside_text import MARK, json_text, printable, printable_lines
 
 EVIL = "a\nb\x1b[31m\udcff\uffff\u2028\u202e<>&\x85"
 
@@ -69,3 +72,18 @@ def test_errors_are_printed_by_it(capsys):
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and said.endswith(": accepted: another name\n")
     assert not shows_more_than_text(said)
+
+
+@pytest.mark.parametrize("indent", [None, 2])
+def test_json_holds_every_string_and_shows_none_of_it(indent):
+    value = {NAME: [NAME, "###[x]", "a##", CONTROLS, {"b": "##vso[x]"}], "###": 1.5}
+    text = json_text(value, indent)
+    assert json.loads(text) == value
+    assert text.isascii() and not shows_more_than_text(text) and "##" not in text
+    with pytest.raises(ValueError):
+        json_text([float("nan")])
+
+
+def test_no_command_prints_json_by_itself():
+    for path in Path(cli.__file__).parent.glob("*.py"):
+        assert "json.dumps" not in path.read_text(), path

@@ -1,9 +1,11 @@
 """Killed commands and full disks: what is left is old or new, never half, and the same command again ends well.
 
-Each command runs once undisturbed. Then it is killed (SIGKILL) at random times within that time, each time where the
-last one left off, and runs with a random limit on the size of files (`ulimit -f`), as on a full disk. After each of
-these every file must be the old or the new one; with the limit the exit code is 2 with one line, or the command's own
-where the files fit. At last it runs to its end: with its exit code, and with nothing temporary left.
+Each command runs once undisturbed. Then it gets a signal (SIGKILL, SIGTERM, SIGHUP, or SIGINT as by Ctrl-C) at random
+times within that time, each time where the last one left off, and runs with a random limit on the size of files
+(`ulimit -f`), as on a full disk. After each of these every file must be the old or the new one. The signal ends the
+command, SIGINT with exit code 130 and with nothing temporary left; with the limit the exit code is 2 with one line. Or
+the command has its own exit code, where the signal was late or the files fit. At last it runs to its end: with its exit
+code, and with nothing temporary left.
 
 `python -m validation.robustness.killed_commands KILLS [COMMAND …]` prints the rows as JSON.
 """
@@ -35,12 +37,14 @@ from validation.run.context import PROFILES, SCENES, Context
 from validation.study import Study, Task, about
 
 HANG = 60  # seconds; the signal ends the process
+SIGNALS = (signal.SIGINT, signal.SIGKILL, signal.SIGINT, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 OLD = "<html>old</html>"
 KILLS = {"quick": 4, "standard": 20, "full": 100}
 TERMS = {
     "kills": "runs that were killed, or met a full disk",
     "torn files": "files that were neither the old nor the new one",
-    "wrong ends": "of runs on a full disk: no line, several lines, or a wrong exit code",
+    "wrong ends": "runs without an end, or with a wrong exit code; after Ctrl-C with something temporary left, on a "
+    "full disk without a line or with several",
     "bad restarts": "1 where the last run did not end well, or left something temporary",
 }
 BUDGETS = dict.fromkeys(("torn files", "wrong ends", "bad restarts"), 0.0)
@@ -118,7 +122,7 @@ def _validate(folder: Path) -> int:
 
 def _render(folder: Path) -> int:
     words = ["render", str(SCENES / "sphere.xml"), "-o", str(folder / "out.exr"), "-D", "res=16"]
-    options = ["--variant", "scalar_rgb", "--spp", "1"]
+    options = ["--spp", "1"]
     os.execv(sys.executable, [sys.executable, "-m", "mi_refract.cli", *words, *options])
 
 
@@ -158,12 +162,12 @@ def examine(command: Command, kills: int, seed: int) -> dict[str, float]:
         torn = ends = 0
         for i in range(kills):
             if i % 2:
-                size = rng.choice((0, 100, 1000, rng.randrange(60_000)))
-                code_then, said = _run(command, new, size=size)
+                code_then, said = _run(command, new, size=rng.choice((0, 100, 1000, rng.randrange(60_000))))
                 lines = [line for line in said.splitlines() if not line.startswith("task ")]  # which tell the progress
                 ends += not ((code_then == 2 and len(lines) == 1) or code_then == command.code)
             else:
-                _run(command, new, kill=rng.uniform(0, took))
+                number = SIGNALS[i // 2 % len(SIGNALS)]
+                ends += not _ends_well(command, new, rng.uniform(0, took), number)
             torn += _torn(_state(command, new), before, after)
         for place in {path.parent for path in new.glob(command.outputs)}:  # as a kill in the middle of a file leaves it
             atomic.temporary_name(place / "half", "").write_text("half")
@@ -171,10 +175,25 @@ def examine(command: Command, kills: int, seed: int) -> dict[str, float]:
             first = next(path for path in new.glob(command.outputs) if path.name in before)
             first.write_bytes(before[first.name])
         last, _ = _run(command, new)
-        hidden = [path.name for path in new.rglob("*") if path.name.startswith(".") or path.name == "validation.lock"]
-        well = code == last == command.code and _state(command, new).keys() == after.keys() and not hidden
+        well = code == last == command.code and _state(command, new).keys() == after.keys() and not _temporary(new)
         bad = not well or _torn(_state(command, new), after, after)
     return {"kills": float(kills), "torn files": float(torn), "wrong ends": float(ends), "bad restarts": float(bad)}
+
+
+def _ends_well(command: Command, folder: Path, after: float, number: signal.Signals) -> bool:
+    """Whether a signal that comes `after` so many seconds ends the command as it should, or comes too late."""
+    before = _temporary(folder)
+    code, said = _run(command, folder, kill=after, number=number)
+    if number != signal.SIGINT:
+        return code in (-number, command.code)
+    if code == command.code or "Fatal Python error: init" in said:  # Python itself was not there yet
+        return True
+    return code in (exit_code.INTERRUPTED, -number) and _temporary(folder) <= before
+
+
+def _temporary(folder: Path) -> set[Path]:
+    """What only a command that is still running may have there."""
+    return {path for path in folder.rglob("*") if path.name.startswith(".") or path.name == "validation.lock"}
 
 
 def _state(command: Command, folder: Path) -> dict[str, Any]:
@@ -193,8 +212,14 @@ def _torn(state: dict[str, Any], *known: dict[str, Any]) -> int:
     return sum(not any(found == each.get(name) for each in known) for name, found in state.items())
 
 
-def _run(command: Command, folder: Path, kill: float | None = None, size: int | None = None) -> tuple[int, str]:
-    """Exit code (−9: killed) and stderr of the command in a process of its own, killed after `kill` seconds."""
+def _run(
+    command: Command,
+    folder: Path,
+    kill: float | None = None,
+    number: signal.Signals = signal.SIGKILL,
+    size: int | None = None,
+) -> tuple[int, str]:
+    """Exit code (−9: by SIGKILL) and stderr of the command in a process of its own, with a signal after `kill` s."""
     reading, writing = os.pipe()
     child = os.fork()
     if not child:
@@ -202,7 +227,7 @@ def _run(command: Command, folder: Path, kill: float | None = None, size: int | 
     os.close(writing)
     if kill is not None:
         time.sleep(kill)
-        os.kill(child, signal.SIGKILL)
+        os.kill(child, number)
     with os.fdopen(reading, "rb") as said:
         text = said.read().decode(errors="replace")
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), text
@@ -218,6 +243,8 @@ def _become(command: Command, folder: Path, writing: int, size: int | None) -> N
         if size is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
         code = command.run(folder)
+    except KeyboardInterrupt:
+        code = exit_code.INTERRUPTED
     finally:
         os._exit(code)
 

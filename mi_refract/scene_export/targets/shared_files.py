@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import tempfile
 import textwrap
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract import __version__
+from mi_refract.io.atomic import temporary_folder
 from mi_refract.io.image_file import NO_DATE, write_exr
 
 from ..plain_scene import Mesh, PlainScene
@@ -32,8 +31,8 @@ def ply(mesh: Mesh) -> bytes:
 
 def exr(pixels: NDArray[np.floating]) -> bytes:
     """An OpenEXR file of pixels (H, W, 3)."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "map.exr"
+    with temporary_folder() as folder:
+        path = folder / "map.exr"
         write_exr(path, pixels, metadata=NO_DATE)
         return path.read_bytes()
 

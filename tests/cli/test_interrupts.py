@@ -1,0 +1,155 @@
+"""Ctrl-C ends the process of a command at once, whatever its threads do; nobody else's SIGINT changes."""
+
+from __future__ import annotations
+
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from support.processes import ENVIRONMENT, python
+
+from mi_refract import cli
+from mi_refract.io import atomic
+from validation.run.context import SCENES
+
+
+def interrupted(process, code):
+    """Send SIGINT; it ends with this code, soon."""
+    try:
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=30) == code, process.stderr.read()
+    finally:
+        process.kill()  # or a failure would wait for it without end
+
+
+def test_at_any_time(tmp_path, needs_variant):
+    """From the first line of ours, which blocks SIGINT, to the end: 130, or 0 where it was too late."""
+    needs_variant("llvm_ad_rgb")
+    words = ["render", SCENES / "sphere.xml", "-o", tmp_path / "out.exr", "-D", "res=64", "--variant", "llvm_ad_rgb"]
+    command = [sys.executable, "-m", "mi_refract.cli", *map(str, words)]
+    start = time.monotonic()
+    subprocess.run(command, env=ENVIRONMENT, check=True, capture_output=True)
+    took = time.monotonic() - start
+    for _ in range(4):
+        process = subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
+        time.sleep(took * random.uniform(0.1, 1.1))
+        process.send_signal(signal.SIGINT)
+        said = process.communicate(timeout=30)[1]
+        assert process.returncode in (130, 0, -signal.SIGINT), said
+        assert process.returncode != -signal.SIGINT or b"mi_refract.cli.app" not in said
+        assert [path.name for path in tmp_path.iterdir()] in ([], ["out.exr"])
+
+
+# A libLLVM is tried, which takes a minute; it says so itself.
+PROBING = """
+import sys
+from mi_refract import backend, cli
+backend.candidates = lambda: ["/proc/self/exe"]
+backend._PROBE = '''
+import os, signal, time
+blocked = signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+os.write(os.open("/proc/%d/fd/1" % os.getppid(), os.O_WRONLY), b"blocked\\\\n" if blocked else b"free\\\\n")
+time.sleep(60)
+'''
+sys.exit(cli.main())
+"""
+# And so does a program that is given rays.
+PROGRAM = """
+import os, signal, time
+blocked = signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+os.write(2, b"blocked\\n" if blocked else b"free\\n")
+time.sleep(60)
+"""
+
+
+def test_programs_that_are_started_heed_it_and_leave_nothing(tmp_path):
+    words = ["render", SCENES / "sphere.xml", "-o", tmp_path / "out.exr"]
+    with python(PROBING, *words, TMPDIR=str(tmp_path), XDG_CACHE_HOME=str(tmp_path / "none")) as process:
+        assert process.stdout.readline() == "free\n"
+        assert [*tmp_path.iterdir()]
+        interrupted(process, 130)
+    assert not [*tmp_path.iterdir()]
+    code = "import sys\nfrom mi_refract import cli\nsys.exit(cli.main())"
+    with python(code, "rays", "run", "--count", "10", "--", sys.executable, "-c", PROGRAM) as process:
+        assert process.stderr.readline() == "free\n"
+        interrupted(process, 130)
+
+
+# Interrupted while a temporary folder and a temporary file are there; the thread that makes them goes on regardless.
+UNFINISHED = """
+import sys, time
+from pathlib import Path
+from mi_refract import cli
+from mi_refract.cli import app
+from mi_refract.io import atomic
+remove = atomic._remove
+def remove_slowly(temporary):
+    remove(temporary)
+    time.sleep(0.05)
+atomic._remove = remove_slowly
+def command(arguments):
+    with atomic.temporary_folder() as folder, atomic.replacing(Path(sys.argv[1], "file")) as file:
+        (folder / "half").touch()
+        print("there", flush=True)
+        while file.exists():
+            time.sleep(0.001)
+        file.write_text("anew")
+        raise OSError("a file of mine has gone")
+app.main = command
+sys.exit(cli.main())
+"""
+
+
+def test_what_is_unfinished_is_removed_also_where_a_thread_makes_it_anew(tmp_path):
+    with python(UNFINISHED, tmp_path, TMPDIR=str(tmp_path)) as process:
+        assert process.stdout.readline() == "there\n"
+        assert len([*tmp_path.iterdir()]) == 2
+        interrupted(process, 130)
+        assert process.stderr.read() == ""
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_another_signal_ends_it_and_the_next_command_sweeps(number, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("old")
+    code = f"import signal\nsignal.signal({number:d}, signal.SIG_DFL)\n{UNFINISHED}"  # nohup has it ignored
+    with python(code, tmp_path) as process:
+        assert process.stdout.readline() == "there\n"
+        process.send_signal(number)
+        assert process.wait(timeout=30) == -number
+    left = [path.name for path in tmp_path.iterdir()]
+    assert len(left) == 2 and (tmp_path / "file").read_text() == "old"
+    monkeypatch.setattr(atomic, "_swept", set())
+    atomic.write_atomically(tmp_path / "file", "new")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+BACKGROUND = """
+import os, signal, sys, time
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+from mi_refract import cli
+from mi_refract.cli import app
+def command(arguments):
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.3)
+    return 7
+app.main = command
+sys.exit(cli.main())
+"""
+
+
+def test_a_background_job_goes_on_where_nothing_is_rendered():
+    with python(BACKGROUND, "trace") as process:
+        assert (process.communicate(timeout=60), process.returncode) == (("", ""), 7)
+
+
+def test_a_caller_from_python_keeps_his_own(capsys):
+    def state():
+        return signal.getsignal(signal.SIGINT), signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+    before = state()
+    assert cli.main(["trace", "--help"]) == 0
+    assert state() == before and capsys.readouterr().out
