@@ -175,7 +175,14 @@ REFUSED = {
         '<bsdf type="twosided" id="a"><ref id="b"/></bsdf><bsdf type="twosided" id="b"><ref id="a"/></bsdf>',
         "in a circle",
     ),
-    "files": ('<include filename="s.xml"/>' * 2, "more than 1000 files included"),
+    "files": ('<include filename="empty.xml"/>' * 1001, "empty.xml: more than 1000 files included"),
+    "files in files": ('<include filename="s.xml"/>' * 20_000, "s.xml: more than 14 files, each included by the one"),
+    "elements": ("<a/>" * 2**20, "more than 1048576 XML elements"),
+    "parameters": (
+        "".join(f'<default name="a{i}" value=""/>' for i in range(4097)),
+        "more than 4096 parameters",
+    ),
+    "folders": ('<path value="."/>' * 20_000, "more than 100 <path> elements"),
     "long value": (f'<default name="a0" value="xxxxxxxxxx"/>{LAUGHS}', "<default>: a value of 10000 characters"),
     "document type": (b'<!DOCTYPE a [<!ENTITY b "c">]><scene version="3.0.0"/>', "a document type"),
     "another encoding": ('<scene version="3.0.0"/>'.encode("utf-16"), "zero bytes; accepted: XML in UTF-8"),
@@ -204,11 +211,18 @@ def test_what_would_end_the_process_is_refused(case, load, tmp_path, monkeypatch
     monkeypatch.setattr(mi.parser, "instantiate", lambda *arguments: pytest.fail("ran"))
     begin = time.process_time()
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
-        load(elements, other=nested(20000))
+        load(elements, other=nested(20000), empty="")
     assert "accepted: " in str(caught.value) and "\n" not in str(caught.value)
     assert time.process_time() - begin < 10
     # Only what cannot be told from the text alone comes to Mitsuba's parser.
     assert bool(seen) == case.startswith(("deep by", "many", "circle", "pipe as an image", "device as"))
+
+
+def test_files_are_included_as_deep_as_mitsuba_includes_them(load):
+    links = {f"f{i}": f'<include filename="f{i + 1}.xml"/>' for i in range(1, 14)}
+    load('<include filename="f1.xml"/>', **links, f14=SENSOR)
+    with pytest.raises(ValueError, match="more than 14 files"):
+        load('<include filename="f1.xml"/>', **links, f14='<include filename="f15.xml"/>', f15=SENSOR)
 
 
 def test_limits_of_size(load, monkeypatch):
