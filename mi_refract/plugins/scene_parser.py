@@ -8,7 +8,7 @@ is an error, unless it is allowed by name.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,8 @@ from .scene_limits import DEPTH, LOBES, check_files, refuse_special, resolved
 OURS = (PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS), INTEGRATOR)
 # Registered by Mitsuba's own Python modules, or known to its parser.
 PYTHON = ("direct_projective", "flat_sensor", "prb", "prb_basic", "prb_projective", "prbvolpath", "volprim_rf_basic")
-BUILT_IN = ("rgb", "scene", "spectrum")
+BUILT_IN = ("scene",)  # its "rgb" and "spectrum" as a type end the process
+NEEDED = {"bitmap": "filename", "blendbsdf": "weight"}  # without it Mitsuba reads memory that is not there
 _untyped: Any = mi  # its stubs have no types for file resolvers
 
 
@@ -87,6 +88,7 @@ def load(path: Path, defines: Mapping[str, str], allowed: Collection[str] = ()) 
     with folders(path.parent) as inside:
         state = parse(path, config, defines)
         check_plugins(path, (node.props.plugin_name() for node in state.nodes), allowed)
+        _check_needed(path, (node.props for node in state.nodes))
         inside.prepend(str(own_folder()))  # before every <path>
         for file in {node.props["filename"] for node in state.nodes if _is_mesh(node.props)}:
             check_faces(resolved(file, [path.parent, *(Path(str(folder)) for folder in inside)]))
@@ -118,6 +120,13 @@ def check_plugins(path: Path, names: Any, allowed: Collection[str]) -> None:
     if unknown := sorted({*names} - known_plugins() - {*allowed}):
         accepted = f"those; to `render` also code that the scene brings, by --allow-plugins {unknown[0]}"
         raise ValueError(f"{path}: plugin {unknown[0]!r}: neither Mitsuba's nor mi_refract's; accepted: {accepted}")
+
+
+def _check_needed(path: Path, every: Iterable[Any]) -> None:
+    for props in every:
+        name = NEEDED.get(plugin := props.plugin_name())
+        if name and name not in props:
+            raise ValueError(f"{path}: plugin {plugin!r} without {name!r}; accepted: one with it")
 
 
 def _children(props: Any, by_id: Mapping[str, int]) -> list[int]:

@@ -144,6 +144,34 @@ def test_a_face_without_its_vertices_is_refused(last, load, tmp_path):
         load(scene)
 
 
+EMPTY = """
+import sys
+from pathlib import Path
+import mitsuba as mi
+mi.set_variant("scalar_rgb")
+from mi_refract.plugins import scene_parser
+KINDS = "bsdf", "emitter", "integrator", "medium", "rfilter", "sensor", "shape", "texture", "volume"
+for name in sys.argv[1].split():
+    for kind in KINDS:
+        with open("s.xml", "w") as file:
+            file.write(f'<scene version="3.0.0"><sensor type="perspective"/><{kind} type="{name}"/></scene>')
+        print(name, kind, flush=True)
+        try:
+            scene_parser.load(Path("s.xml"), {})
+        except (RuntimeError, ValueError):
+            pass
+"""
+
+
+def test_no_plugin_ends_the_process_for_want_of_a_parameter(tmp_path, monkeypatch):
+    """Each one of Mitsuba's, with nothing inside, in the place of each kind of plugin."""
+    monkeypatch.chdir(tmp_path)
+    names = {*scene_parser.known_plugins(), "rgb", "spectrum"}
+    with python(EMPTY, " ".join(sorted(names))) as process:
+        out, _ = process.communicate(timeout=120)
+    assert process.returncode == 0, out.splitlines()[-1]
+
+
 # Limits -----------------------------------------------------------------------------------------------------------
 
 
