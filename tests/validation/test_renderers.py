@@ -1,6 +1,7 @@
 """Other systems: what is wrong with one of them never passes, and what is absent says what would bring it."""
 
 import ast
+import dataclasses
 import hashlib
 import json
 import re
@@ -13,7 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mi_refract import oracle
+from mi_refract import oracle, regimes
 from mi_refract.ray_sets import ray_set
 from validation import __main__ as command
 from validation import limits
@@ -68,7 +69,7 @@ REASONS = {
 @pytest.fixture
 def few(monkeypatch):
     """Sets of forty rays."""
-    smaller = {name: per_ray.Set(40, kind.draw, kind.text) for name, kind in per_ray.SETS.items()}
+    smaller = {name: dataclasses.replace(kind, count=40) for name, kind in per_ray.SETS.items()}
     monkeypatch.setattr(per_ray, "SETS", smaller)
     per_ray.given.cache_clear()
     yield
@@ -144,6 +145,26 @@ def test_the_sets_are_what_they_say(precision, few):
     assert (through["grazing"], through[TOTAL]) == (1, 0)
     assert through["near-critical"] > 0.9, "rounding may put a ray on the other side"
     assert ray_set.checksum(rays) == rays.header["checksum"]
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_the_random_rays_are_those_of_before_any_result(precision):
+    """None is left out: rays near the critical angle stay where they were drawn."""
+    count, dtype = 10_000, ray_set.PRECISIONS[precision]
+    rng = np.random.default_rng([2040, 0])
+    n = regimes.normalised(rng.normal(size=(count, 3))).astype(dtype)
+    cosine, k = rng.uniform(0, 1, count), 1.5 ** rng.choice([-1.0, 1.0], count)
+    across = np.cross(n.astype(float), rng.normal(size=n.shape))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    rays = per_ray.given(precision)
+    rays = rays.rays[rays.regime == "random"]
+    np.testing.assert_array_equal(rays.n, n)
+    np.testing.assert_array_equal(rays.k, k.astype(dtype))
+    tolerance = 8 * np.finfo(dtype).eps
+    np.testing.assert_allclose(np.abs((rays.a * n).sum(1)), cosine, atol=tolerance)
+    sine = np.sqrt(1 - cosine**2)
+    np.testing.assert_allclose((rays.a * across).sum(1), sine, atol=tolerance)
+    assert (np.abs(1 - k**2 * sine**2) < per_ray.LEFT_OUT).any()
 
 
 def test_the_built_in_runs_and_is_right(few):

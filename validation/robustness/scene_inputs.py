@@ -94,6 +94,9 @@ def _rendered(path: Path, defines: Mapping[str, str]) -> str:
     import mitsuba as mi
 
     scene = scene_files.load_scene(path, defines)
+    meshes = (shape for shape in scene.shapes() if shape.is_mesh())
+    if any(np.max(np.array(mesh.faces_buffer()), initial=0) >= mesh.vertex_count() for mesh in meshes):
+        return "a face without its vertices"
     film = scene.sensors()[0].film()
     if math.prod(film.crop_size()) <= PIXELS:
         mi.render(scene, spp=1)
