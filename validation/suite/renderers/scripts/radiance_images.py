@@ -35,7 +35,7 @@ def main():
     step = max(BATCH // (size[0] * size[1]), 1)
     for batch in (samples[start : start + step] for start in range(0, len(samples), step)):
         bundle = np.stack([rays(view, rng.random((*size, 2))) for _, rng in batch])
-        for (seed, _), image in zip(batch, traced(rtrace, bundle)):
+        for (seed, _), image in zip(batch, traced(rtrace, bundle), strict=True):
             images[seed] += image / int(spp)
     for seed, image in images.items():
         path = Path(out, f"seed{seed}.f32")
