@@ -331,6 +331,32 @@ def test_an_installation_that_fails_is_one_line_and_leaves_the_system_absent(
     assert environments.absent(SYSTEMS["thing"])
 
 
+def test_another_version_of_a_distribution_is_absent_and_not_installed(elsewhere, monkeypatch, capsys, tmp_path):
+    """The error says which versions there are."""
+    programs = tmp_path / "bin"
+    programs.mkdir()
+
+    def program(name, text):
+        (programs / name).write_text(f"#!/bin/sh\n{text}\n")
+        (programs / name).chmod(0o755)
+        environments._said_version.cache_clear()
+
+    monkeypatch.setenv("PATH", f"{programs}:/bin")
+    assert SYSTEMS["povray"].needs.packages == (f"povray=1:{SYSTEMS['povray'].needs.version}-*",)
+    program("povray", "echo POV-Ray 3.7.0.10.unofficial >&2")
+    assert not environments.absent(SYSTEMS["povray"])
+    program("povray", "echo POV-Ray 3.7.0.8 >&2")
+    assert environments.absent(SYSTEMS["povray"])
+    program("apt-get", "echo \"E: Version '1:3.7.0.10-*' for 'povray' was not found\" >&2; exit 100")
+    program("sudo", 'shift; exec "$@"')
+    program("apt-cache", "echo 'povray | 1:3.7.0.8-5 | http://deb.debian.org/debian bullseye/main amd64 Packages'")
+    assert command.main(["renderers", "--install", "povray"]) == 1
+    _, line = capsys.readouterr().err.strip().splitlines()
+    assert "'1:3.7.0.10-*' for 'povray' was not found" in line
+    assert line.endswith("; this distribution has povray 1:3.7.0.8-5")
+    environments._said_version.cache_clear()
+
+
 def test_an_installation_is_made_once_and_anew_for_another_version(elsewhere, monkeypatch):
     done = []
     monkeypatch.setattr(environments, "_do", lambda system, given: done.append(given))

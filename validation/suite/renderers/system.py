@@ -44,10 +44,14 @@ class Npm:
 
 @dataclass(frozen=True)
 class Apt:
-    """A program of the whole machine; found wherever it is in PATH."""
+    """A program of the whole machine, found wherever it is in PATH.
+
+    `packages`: each as PACKAGE=VERSION, with * for the distribution's part. `version`: what the program says of itself.
+    """
 
     program: str
     packages: tuple[str, ...]
+    version: str = ""
 
 
 @dataclass(frozen=True)
