@@ -134,6 +134,19 @@ def read(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> Image:
         source.close()
 
 
+def check_header(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> None:
+    """ValueError, one line, for a file whose header is not that of an image of up to `max_values`; no pixels are read.
+
+    For readers that believe a header and allocate what it says.
+    """
+    path = Path(path)
+    source = _opened(path, path.suffix[1:].upper() or "image", max_values, max_values * 8)
+    try:
+        _check_size(path, source.spec(), max_values)
+    finally:
+        source.close()
+
+
 _opening = threading.Lock()  # OpenImageIO has one limit for all that it opens
 
 
@@ -179,6 +192,12 @@ def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Image]:
         return list(pool.map(read, paths))
 
 
+def _check_size(path: Path, spec: Any, max_values: int) -> None:
+    if spec.width * spec.height * spec.nchannels > max_values:
+        size = f"{spec.width} × {spec.height} × {spec.nchannels} values"
+        raise ValueError(f"{path}: {size}; accepted: up to {max_values} values (max-values)")
+
+
 def _image(path: Path, source: Any, kind: str, max_values: int) -> Image:
     spec = source.spec()
     found = source.format_name()
@@ -188,9 +207,7 @@ def _image(path: Path, source: Any, kind: str, max_values: int) -> Image:
         raise ValueError(f"{path}: accepted: an image without deep samples")
     if min(spec.width, spec.height, spec.nchannels) < 1 or spec.depth > 1:
         raise ValueError(f"{path}: {spec.width} × {spec.height} × {spec.depth} pixels; accepted: a plane with pixels")
-    if spec.width * spec.height * spec.nchannels > max_values:
-        size = f"{spec.width} × {spec.height} × {spec.nchannels} values"
-        raise ValueError(f"{path}: {size}; accepted: up to {max_values} values (max-values)")
+    _check_size(path, spec, max_values)
     formats = {str(each) for each in (spec.channelformats or [spec.format])}
     if formats & {"uint64", "int64"}:
         raise ValueError(f"{path}: integers of 64 bits; accepted: up to 32")

@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refract.formulas import FORMULAS
+from mi_refract.io import image_file
 
 from .refract import PLUGIN
 from .refract_path import INTEGRATOR
@@ -90,13 +91,21 @@ def load(path: Path, defines: Mapping[str, str], allowed: Collection[str] = ()) 
         check_plugins(path, (node.props.plugin_name() for node in state.nodes), allowed)
         _check_needed(path, (node.props for node in state.nodes))
         inside.prepend(str(own_folder()))  # before every <path>
-        for file in {node.props["filename"] for node in state.nodes if _is_mesh(node.props)}:
-            check_faces(resolved(file, [path.parent, *(Path(str(folder)) for folder in inside)]))
+        places = [path.parent, *(Path(str(folder)) for folder in inside)]
+        for check, plugins in ((check_faces, ("ply",)), (_check_image, ("bitmap", "envmap"))):
+            for file in {node.props["filename"] for node in state.nodes if _names_file(node.props, plugins)}:
+                check(resolved(file, places))
         return mi.parser.instantiate(config, state)
 
 
-def _is_mesh(props: Any) -> bool:
-    return props.plugin_name() == "ply" and isinstance(props.get("filename", None), str)
+def _names_file(props: Any, plugins: Collection[str]) -> bool:
+    return props.plugin_name() in plugins and isinstance(props.get("filename", None), str)
+
+
+def _check_image(path: Path) -> None:
+    """ValueError for an image whose header is damaged or asks for much memory: Mitsuba believes it."""
+    if path.is_file():
+        image_file.check_header(path)
 
 
 def check_faces(path: Path) -> None:

@@ -172,6 +172,23 @@ def test_no_plugin_ends_the_process_for_want_of_a_parameter(tmp_path, monkeypatc
     assert process.returncode == 0, out.splitlines()[-1]
 
 
+@pytest.mark.parametrize("element", ["emitter type='envmap'", "texture type='bitmap'"])
+def test_an_image_is_refused_by_its_header(element, load, tmp_path):
+    """Mitsuba believes it: a width of 8 million took minutes, an attribute of 800 MB as much memory."""
+    good = (SCENES / "lamps.exr").read_bytes()
+    scene = f'{SENSOR}<{element}><string name="filename" value="sky.exr"/></{element.split()[0]}>'
+    (tmp_path / "sky.exr").write_bytes(good)
+    load(scene)
+    place = good.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4 + 8
+    wide = good[:place] + (2**23).to_bytes(4, "little") + good[place + 4 :]
+    place = good.index(b"channels\0chlist\0") + len(b"channels\0chlist\0")
+    long = good[:place] + (2**29).to_bytes(4, "little") + good[place + 4 :]
+    for content in (wide, long):
+        (tmp_path / "sky.exr").write_bytes(content)
+        with pytest.raises(ValueError, match=r"sky\.exr: "):
+            load(scene)
+
+
 # Limits -----------------------------------------------------------------------------------------------------------
 
 

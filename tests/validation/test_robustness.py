@@ -11,15 +11,15 @@ from support import processes
 from mi_refract.plugins import scene_parser
 from validation.robustness import mutate, mutated_inputs, parsers, scene_inputs
 
-INPUTS = 600
+INPUTS = 650
 
 
 def test_garbage_is_answered_in_one_line_by_every_parser(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", processes.ENVIRONMENT["PYTHONPATH"])
     counts, findings = mutated_inputs.fuzz(INPUTS)
     assert findings == []
-    assert len(counts) == 12
-    assert all(found.total() == INPUTS / 12 and found["refused"] > 0 for found in counts.values())
+    assert len(counts) == 13
+    assert all(found.total() == INPUTS / 13 and found["refused"] > 0 for found in counts.values())
     assert counts["answers, CSV"]["read"] > 0 and "rays, CSV" in counts
 
 

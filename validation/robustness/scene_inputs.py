@@ -27,6 +27,7 @@ LEVEL = 1  # of the tessellation
 MEMORY = 2 << 30  # bytes: the largest film is accepted
 SMALL = {"res": "4", "bsdf": "dielectric", "max_depth": "8"}
 PIXELS = 64
+HEADER = 700  # bytes of the sky in front of its pixels
 TARGETS = [name for name in write_files.TARGETS if name != "povray"]  # which has glass and lights only
 WORD = re.compile(r"[A-Za-z_][\w-]*")
 MESH = """<scene version="3.0.0">
@@ -47,10 +48,12 @@ def parsers(folder: Path) -> dict[str, Parser]:
     (folder / "mesh.xml").write_text(MESH)
     scenes = tuple((SCENES / f"{name}.xml").read_bytes() for name in NAMES)
     _set_bait(folder / "plugins", scenes)
-    mesh = (SCENES / "meshes" / "prism.ply").read_bytes()
+    mesh, sky = (SCENES / "meshes" / "prism.ply").read_bytes(), (SCENES / "lamps.exr").read_bytes()
+    (folder / "sky.xml").write_text((SCENES / "balls.xml").read_text().replace("lamps.exr", "mutated.exr"))
     return {
         "scene, XML": Parser(".xml", scenes, _bounded(_rendered_by_turns)),
         "scene to export, XML": Parser(".xml", scenes, _bounded(_exported)),
+        "sky, EXR": Parser(".exr", (sky,), _bounded(lambda path: _rendered(folder / "sky.xml", SMALL)), HEADER),
         "mesh, PLY": Parser(".ply", (mesh,), _bounded(lambda path: _rendered(folder / "mesh.xml", {}))),
     }
 
