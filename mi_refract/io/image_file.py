@@ -21,6 +21,7 @@ from . import atomic
 Metadata = dict[str, Any]
 SUFFIXES = (".exr",)
 MAX_VALUES = 2**28  # width × height × channels of an image: 1 GiB as float32
+OPTION = " (max-values)"  # for errors: where the limit can be changed
 # How files begin that OpenImageIO decodes when it opens them: GIF, JPEG 2000, JPEG XL.
 WHEN_OPENED = (b"GIF", b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51", b"\0\0\0\x0cJXL ", b"\xff\x0a")
 NO_DATE = {"DateTime": "1970:01:01 00:00:00"}  # for the same bytes every day: without it OpenImageIO writes today's
@@ -134,15 +135,15 @@ def read(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> Image:
         source.close()
 
 
-def check_header(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> None:
+def check_header(path: str | os.PathLike[str], max_values: int) -> None:
     """ValueError, one line, for a file whose header is not that of an image of up to `max_values`; no pixels are read.
 
     For readers that believe a header and allocate what it says.
     """
     path = Path(path)
-    source = _opened(path, path.suffix[1:].upper() or "image", max_values, max_values * 8)
+    source = _opened(path, path.suffix[1:].upper() or "image", max_values, max_values * 8, option="")
     try:
-        _check_size(path, source.spec(), max_values)
+        _check_size(path, source.spec(), max_values, option="")
     finally:
         source.close()
 
@@ -150,7 +151,7 @@ def check_header(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> 
 _opening = threading.Lock()  # OpenImageIO has one limit for all that it opens
 
 
-def _opened(path: Path, kind: str, max_values: int, max_bytes: int) -> Any:
+def _opened(path: Path, kind: str, max_values: int, max_bytes: int, option: str = OPTION) -> Any:
     """OpenImageIO's reader of the file, if its pixels take up to `max_bytes`. Some formats are decoded here."""
     import OpenImageIO as oiio
 
@@ -166,7 +167,7 @@ def _opened(path: Path, kind: str, max_values: int, max_bytes: int) -> Any:
     if source is None:
         message = _without(path, oiio.geterror())
         if "MB limit" in message:
-            raise ValueError(f"{path}: {message}; accepted: up to {max_values} values (max-values)")
+            raise ValueError(f"{path}: {message}; accepted: up to {max_values} values{option}")
         raise ValueError(f"{path}: corrupt {kind} file: {message}")
     return source
 
@@ -192,10 +193,10 @@ def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Image]:
         return list(pool.map(read, paths))
 
 
-def _check_size(path: Path, spec: Any, max_values: int) -> None:
+def _check_size(path: Path, spec: Any, max_values: int, option: str = OPTION) -> None:
     if spec.width * spec.height * spec.nchannels > max_values:
         size = f"{spec.width} × {spec.height} × {spec.nchannels} values"
-        raise ValueError(f"{path}: {size}; accepted: up to {max_values} values (max-values)")
+        raise ValueError(f"{path}: {size}; accepted: up to {max_values} values{option}")
 
 
 def _image(path: Path, source: Any, kind: str, max_values: int) -> Image:

@@ -23,6 +23,9 @@ FOLDERS = 100  # of <path> elements: each file that a scene names is looked for 
 DEPTH = 32  # of elements in elements, and of nodes that refer to nodes; scenes have up to 10
 INCLUDES = 14  # of files in files; Mitsuba's own limit
 VALUE = 4096  # characters of the value of a <default>
+VALUES = 2**29  # of an image that a scene names: 16384 × 8192 × 4
+# More values than these and DENSEST for each byte of the file are no picture: deflate packs up to 1032 bytes into one.
+FEW_VALUES, DENSEST = 2**24, 1032
 LOBES = 2**16  # of a BSDF, if every BSDF in it were two-sided
 
 _ELEMENT = re.compile(rb"""<(/?)([^\s<>"'/]*+)((?:[^"'>]++|"[^"]*+"|'[^']*+')*+)>""")

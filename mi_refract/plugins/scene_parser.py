@@ -20,7 +20,7 @@ from mi_refract.io import image_file
 
 from .refract import PLUGIN
 from .refract_path import INTEGRATOR
-from .scene_limits import DEPTH, LOBES, check_files, refuse_special, resolved
+from .scene_limits import DENSEST, DEPTH, FEW_VALUES, LOBES, VALUES, check_files, refuse_special, resolved
 
 OURS = (PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS), INTEGRATOR)
 # Registered by Mitsuba's own Python modules, or known to its parser.
@@ -103,9 +103,9 @@ def _names_file(props: Any, plugins: Collection[str]) -> bool:
 
 
 def _check_image(path: Path) -> None:
-    """ValueError for an image whose header is damaged or asks for much memory: Mitsuba believes it."""
+    """ValueError for an image whose header is damaged or asks for too much memory: Mitsuba believes it."""
     if path.is_file():
-        image_file.check_header(path)
+        image_file.check_header(path, min(VALUES, FEW_VALUES + DENSEST * path.stat().st_size))
 
 
 def check_faces(path: Path) -> None:
