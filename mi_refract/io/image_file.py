@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from . import atomic
 Metadata = dict[str, Any]
 SUFFIXES = (".exr",)
 MAX_VALUES = 2**28  # width × height × channels of an image: 1 GiB as float32
+ATTRIBUTES = 4096  # of an EXR file
 OPTION = " (max-values)"  # for errors: where the limit can be changed
 # How files begin that OpenImageIO decodes when it opens them: GIF, JPEG 2000, JPEG XL.
 WHEN_OPENED = (b"GIF", b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51", b"\0\0\0\x0cJXL ", b"\xff\x0a")
@@ -141,11 +142,37 @@ def check_header(path: str | os.PathLike[str], max_values: int) -> None:
     For readers that believe a header and allocate what it says.
     """
     path = Path(path)
+    _check_attributes(path)
     source = _opened(path, path.suffix[1:].upper() or "image", max_values, max_values * 8, option="")
     try:
         _check_size(path, source.spec(), max_values, option="")
     finally:
         source.close()
+
+
+def _check_attributes(path: Path) -> None:
+    """ValueError where an attribute of an OpenEXR file is larger than the file. OpenImageIO may not look."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        if file.read(8)[:4] != b"\x76\x2f\x31\x01":
+            return
+        for _ in range(ATTRIBUTES):
+            if not _text(file):  # the name; behind the last attribute it is empty
+                return
+            _text(file)  # the type
+            length = int.from_bytes(file.read(4), "little")
+            if file.tell() + length > size:
+                raise ValueError(f"{path}: corrupt EXR file: an attribute of {length} bytes")
+            file.seek(length, os.SEEK_CUR)
+    raise ValueError(f"{path}: over {ATTRIBUTES} attributes; accepted: up to that")
+
+
+def _text(file: BinaryIO) -> bytes:
+    """The bytes up to a zero, which is read, too; EXR's names have up to 255."""
+    begin = file.read(256)
+    text, zero, _ = begin.partition(b"\0")
+    file.seek(len(text) + len(zero) - len(begin), os.SEEK_CUR)
+    return text
 
 
 _opening = threading.Lock()  # OpenImageIO has one limit for all that it opens

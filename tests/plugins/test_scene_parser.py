@@ -183,8 +183,15 @@ def test_an_image_is_refused_by_its_header(element, load, tmp_path):
     wide = good[:place] + (2**23).to_bytes(4, "little") + good[place + 4 :]
     place = good.index(b"channels\0chlist\0") + len(b"channels\0chlist\0")
     long = good[:place] + (2**29).to_bytes(4, "little") + good[place + 4 :]
+    place = good.index(b"dataWindow\0")
+    cut = good[:place] + b"x\0string\0" + (2**30).to_bytes(4, "little") + good[place:]
     large = wide.replace((2**23).to_bytes(4, "little"), (2**19).to_bytes(4, "little"))
-    for content, message in ((wide, "resolution"), (long, "corrupt"), (large, "accepted: up to 21116")):
+    for content, message in (
+        (wide, "resolution"),
+        (long, "corrupt"),
+        (large, "accepted: up to 21116"),
+        (cut, "corrupt"),
+    ):
         (tmp_path / "sky.exr").write_bytes(content)
         with pytest.raises(ValueError, match=rf"sky\.exr: .*{message}") as caught:
             load(scene)
