@@ -32,7 +32,7 @@ ROOMS = {
     "diff": ("diff", ("planted_defects", "visible_changes", "times")),
     "ground-truth": ("ground_truth", ("traced_bodies",)),
     "robustness": ("robustness", ("mutated_inputs", "killed_commands")),
-    "suite": ("suite", ("matrix", "per_ray", "rendered_images")),
+    "suite": ("suite", ("matrix", "per_ray", "rendered_images", "exports")),
 }
 # What the profile `quick` runs where no study is named.
 QUICK = (

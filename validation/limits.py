@@ -170,3 +170,12 @@ def table() -> dict[str, Limit]:
         if name.isupper():
             collect(name, value)
     return found
+
+
+EXPORT_SYSTEMATIC = limit(
+    0.01,
+    "of the image's mean: half floats err by 2⁻¹¹; a grid of 16 × 16 samples by 1/16 of a pixel's contrast where an "
+    "edge crosses it along the grid, in a tenth of the pixels; a resampled sky by less",
+)
+EXPORT_NOISE = limit(0.02, "of the image's mean: with more noise than this a defect could hide")
+EXPORT_SIGMAS = limit(2.0, "RMSE over predicted noise; the mean of squares of 144 pixels is below 4 but once in 10⁶⁰")

@@ -335,7 +335,7 @@ def suite(rows: list[Row]) -> str:
     text = (
         "Rays: radians; images: share of the mean. ✓: every ray within its bound; ✗: a bound is broken, and the run "
         f"fails.\nTo be within a factor of {limits.RECORDED:g} of the error recorded earlier is a goal: what misses it "
-        'says\n"× recorded", and fails nothing.'
+        'says\n"× recorded", or "recorded /" where the error is smaller, and fails nothing.'
     )
     return _table(text, ["", *checks], lines)
 
@@ -347,7 +347,9 @@ def _off(row: Row | None) -> str:
         return "✗" if row.broken else "✓"
     word = " **different**" if row.values.get("differs") else ""
     if per_ray.OFF_RECORDED in row.missed:
-        word += f" ({compact(row.values[per_ray.OFF_RECORDED])} × recorded)"
+        factor = compact(row.values[per_ray.OFF_RECORDED])
+        less = row.values[matrix.OFF] < row.values.get(per_ray.RECORDED, 0)
+        word += f" (recorded / {factor})" if less else f" ({factor} × recorded)"
     return compact(row.values[matrix.OFF]) + word + (" ✗" if row.broken else "")
 
 

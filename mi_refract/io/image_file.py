@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ from . import atomic
 Metadata = dict[str, Any]
 SUFFIXES = (".exr",)
 MAX_VALUES = 2**28  # width × height × channels of an image: 1 GiB as float32
+ATTRIBUTES = 4096  # of an EXR file
+OPTION = " (max-values)"  # for errors: where the limit can be changed
 # How files begin that OpenImageIO decodes when it opens them: GIF, JPEG 2000, JPEG XL.
 WHEN_OPENED = (b"GIF", b"\0\0\0\x0cjP  ", b"\xff\x4f\xff\x51", b"\0\0\0\x0cJXL ", b"\xff\x0a")
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\n"  # how a file begins that Git LFS has not brought yet
@@ -184,10 +186,51 @@ def _lfs_pull(path: Path) -> str:
     return shlex.join(["git", "lfs", "pull", f"--include={pattern}"])
 
 
+def check_header(path: str | os.PathLike[str], max_values: int) -> None:
+    """ValueError, one line, for a file whose header is not that of an image of up to `max_values`; no pixels are read.
+
+    For readers that believe a header and allocate what it says.
+    """
+    path = Path(path)
+    _check_attributes(path)
+    source = _opened(path, path.suffix[1:].upper() or "image", max_values, max_values * 8, option="")
+    try:
+        _check_size(path, source.spec(), max_values, option="")
+    finally:
+        source.close()
+
+
+def _check_attributes(path: Path) -> None:
+    """ValueError where an attribute of an OpenEXR file is larger than the file. OpenImageIO may not look."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        if file.read(8)[:4] != b"\x76\x2f\x31\x01":
+            return
+        for _ in range(ATTRIBUTES):
+            if not _text(file):  # the name; behind the last attribute it is empty
+                return
+            _text(file)  # the type
+            length = int.from_bytes(file.read(4), "little")
+            if file.tell() + length > size:
+                raise ValueError(f"{path}: corrupt EXR file: an attribute of {length} bytes")
+            file.seek(length, os.SEEK_CUR)
+    raise ValueError(f"{path}: over {ATTRIBUTES} attributes; accepted: up to that")
+
+
+def _text(file: BinaryIO) -> bytes:
+    """The bytes up to a zero, which is read, too; EXR's names have up to 255."""
+    begin = file.read(256)
+    text, zero, _ = begin.partition(b"\0")
+    file.seek(len(text) + len(zero) - len(begin), os.SEEK_CUR)
+    return text
+
+
 _opening = threading.Lock()  # OpenImageIO has one limit for all that it opens
 
 
-def _opened(path: Path, kind: str, max_values: int, max_bytes: int, multiplied: bool) -> Any:
+def _opened(
+    path: Path, kind: str, max_values: int, max_bytes: int, multiplied: bool = False, option: str = OPTION
+) -> Any:
     """OpenImageIO's reader of the file, if its pixels take up to `max_bytes`. Some formats are decoded here."""
     import OpenImageIO as oiio
 
@@ -204,7 +247,7 @@ def _opened(path: Path, kind: str, max_values: int, max_bytes: int, multiplied: 
     if source is None:
         message = _without(path, oiio.geterror())
         if "MB limit" in message:
-            raise ValueError(f"{path}: {message}; accepted: up to {max_values} values (max-values)")
+            raise ValueError(f"{path}: {message}; accepted: up to {max_values} values{option}")
         raise ValueError(f"{path}: corrupt {kind} file: {message}")
     return source
 
@@ -234,7 +277,7 @@ def _images(path: Path, source: Any, kind: str, most: int, first_only: bool, as_
     """The images of an open file, in the order of parts and MIP levels, with their places."""
     found: list[Image] = []
     for part in _parts(source):
-        image = _image(path, source, kind, (most - sum(each.pixels.size for each in found), most), as_idiff)
+        image = _image(path, source, kind, (most, sum(each.pixels.size for each in found)), as_idiff)
         found.append(replace(image, part=part))
         if first_only:
             break
@@ -261,8 +304,16 @@ def _place(part: tuple[int, int], several: bool, levelled: bool) -> str:
     return ", ".join([f"part {part[0]}"] * several + [f"MIP level {part[1]}"] * levelled)
 
 
+def _check_size(path: Path, spec: Any, max_values: int, taken: int = 0, option: str = OPTION) -> None:
+    """ValueError for more values than are allowed, beside those that other images of the file have taken."""
+    if spec.width * spec.height * spec.nchannels > max_values - taken:
+        beside = f" beside {taken} of other parts and MIP levels" if taken else ""
+        size = f"{spec.width} × {spec.height} × {spec.nchannels} values{beside}"
+        raise ValueError(f"{path}: {size}; accepted: up to {max_values} values{option}")
+
+
 def _image(path: Path, source: Any, kind: str, values: tuple[int, int], as_idiff: bool) -> Image:
-    """The part and MIP level that the source is at; `values`: how many there may be here, and in the whole file."""
+    """The part and MIP level that the source is at; `values`: how many a file may have, and has so far."""
     spec = source.spec()
     found = source.format_name()
     if path.suffix[1:].lower() not in _endings(found) or found == "null":  # which is black, whatever the file holds
@@ -271,11 +322,7 @@ def _image(path: Path, source: Any, kind: str, values: tuple[int, int], as_idiff
         raise ValueError(f"{path}: accepted: an image without deep samples")
     if min(spec.width, spec.height, spec.nchannels) < 1 or spec.depth > 1:
         raise ValueError(f"{path}: {spec.width} × {spec.height} × {spec.depth} pixels; accepted: a plane with pixels")
-    left, most = values
-    if spec.width * spec.height * spec.nchannels > left:
-        beside = f" beside {most - left} of other parts and MIP levels" if left < most else ""
-        size = f"{spec.width} × {spec.height} × {spec.nchannels} values{beside}"
-        raise ValueError(f"{path}: {size}; accepted: up to {most} values (max-values)")
+    _check_size(path, spec, *values)
     formats = {str(each) for each in (spec.channelformats or [spec.format])}
     if formats & {"uint64", "int64"}:
         raise ValueError(f"{path}: integers of 64 bits; accepted: up to 32")

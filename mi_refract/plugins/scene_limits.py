@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from html import unescape
 from pathlib import Path
 
@@ -17,9 +17,15 @@ from mi_refract.io import regular_file
 
 SIZE = 2**26  # bytes of all XML files of a scene, each counted as often as it is included
 FILES = 1000  # XML files, counted so, too
+ELEMENTS = 2**20  # XML elements, counted so, too: seconds for Mitsuba
+PARAMETERS = 4096  # Mitsuba's time grows as their square: 34,000 take 8 s
+FOLDERS = 100  # of <path> elements: each file that a scene names is looked for in every one
 DEPTH = 32  # of elements in elements, and of nodes that refer to nodes; scenes have up to 10
-INCLUDES = 15  # of files in files; Mitsuba's own limit
+INCLUDES = 14  # of files in files; Mitsuba's own limit
 VALUE = 4096  # characters of the value of a <default>
+VALUES = 2**29  # of an image that a scene names: 16384 × 8192 × 4
+# More values than these and DENSEST for each byte of the file are no picture: deflate packs up to 1032 bytes into one.
+FEW_VALUES, DENSEST = 2**24, 1032
 LOBES = 2**16  # of a BSDF, if every BSDF in it were two-sided
 
 _ELEMENT = re.compile(rb"""<(/?)([^\s<>"'/]*+)((?:[^"'>]++|"[^"]*+"|'[^']*+')*+)>""")
@@ -36,8 +42,9 @@ class Walk:
     parameters: dict[str, str]
     size: int = 0
     files: int = 0
+    elements: int = 0
+    folders: int = 0
     dollars: int = 0
-    named: list[bytes] = field(default_factory=list)
 
 
 def check_files(path: Path, folders: Iterable[Path], defines: Mapping[str, str]) -> None:
@@ -53,10 +60,14 @@ def check_files(path: Path, folders: Iterable[Path], defines: Mapping[str, str])
         raise ValueError(f"{path}: parameters expand to over {SIZE} bytes; accepted: up to that")
 
 
+def _refuse_more(path: Path, count: int, limit: int, what: str) -> None:
+    if count > limit:
+        raise ValueError(f"{path}: more than {limit} {what}; accepted: up to that")
+
+
 def _walk_file(path: Path, folders: list[Path], walk: Walk, depth: int) -> None:
     walk.files += 1
-    if walk.files > FILES:
-        raise ValueError(f"{path}: more than {FILES} files included; accepted: up to that")
+    _refuse_more(path, walk.files, FILES, "files included")
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; accepted: a scene file")
     content = regular_file.read_bytes(path, SIZE - walk.size)
@@ -65,7 +76,9 @@ def _walk_file(path: Path, folders: list[Path], walk: Walk, depth: int) -> None:
     if b"\0" in content:
         raise ValueError(f"{path}: zero bytes; accepted: XML in UTF-8")
     for name, text in _elements(path, content):
-        if name in (b"default", b"path", *_OPENED) and depth < INCLUDES:
+        walk.elements += 1
+        _refuse_more(path, walk.elements, ELEMENTS, "XML elements")
+        if name in (b"default", b"path", *_OPENED):
             _follow(name, _attributes(text, walk.parameters), path, folders, walk, depth)
 
 
@@ -76,12 +89,16 @@ def _follow(name: bytes, values: Mapping[str, str], path: Path, folders: list[Pa
         if len(value) > VALUE:
             raise ValueError(f"{path}: <default>: a value of {len(value)} characters; accepted: up to {VALUE}")
         walk.parameters.setdefault(values.get("name", ""), value)
+        _refuse_more(path, len(walk.parameters), PARAMETERS, "parameters")
     elif name == b"path":
+        walk.folders += 1
+        _refuse_more(path, walk.folders, FOLDERS, "<path> elements")
         folders.insert(0, resolved(values.get("value", ""), [path.parent, *folders]))
     elif values.get("filename"):
         found = resolved(values["filename"], [path.parent, *folders])
         refuse_special(found)
         if name == b"include" and found.is_file():
+            _refuse_more(path, depth + 1, INCLUDES, "files, each included by the one before")
             _walk_file(found, [path.parent, *folders], walk, depth + 1)
 
 

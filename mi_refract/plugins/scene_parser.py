@@ -8,7 +8,7 @@ is an error, unless it is allowed by name.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +16,17 @@ import mitsuba as mi
 import numpy as np
 
 from mi_refract.formulas import FORMULAS
+from mi_refract.io import image_file
 
 from .refract import PLUGIN
 from .refract_path import INTEGRATOR
-from .scene_limits import DEPTH, LOBES, check_files, refuse_special, resolved
+from .scene_limits import DENSEST, DEPTH, FEW_VALUES, LOBES, VALUES, check_files, refuse_special, resolved
 
 OURS = (PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS), INTEGRATOR)
 # Registered by Mitsuba's own Python modules, or known to its parser.
 PYTHON = ("direct_projective", "flat_sensor", "prb", "prb_basic", "prb_projective", "prbvolpath", "volprim_rf_basic")
-BUILT_IN = ("rgb", "scene", "spectrum")
+BUILT_IN = ("scene",)  # its "rgb" and "spectrum" as a type end the process
+NEEDED = {"bitmap": "filename", "blendbsdf": "weight"}  # without it Mitsuba reads memory that is not there
 _untyped: Any = mi  # its stubs have no types for file resolvers
 
 
@@ -87,14 +89,23 @@ def load(path: Path, defines: Mapping[str, str], allowed: Collection[str] = ()) 
     with folders(path.parent) as inside:
         state = parse(path, config, defines)
         check_plugins(path, (node.props.plugin_name() for node in state.nodes), allowed)
+        _check_needed(path, (node.props for node in state.nodes))
         inside.prepend(str(own_folder()))  # before every <path>
-        for file in {node.props["filename"] for node in state.nodes if _is_mesh(node.props)}:
-            check_faces(resolved(file, [path.parent, *(Path(str(folder)) for folder in inside)]))
+        places = [path.parent, *(Path(str(folder)) for folder in inside)]
+        for check, plugins in ((check_faces, ("ply",)), (_check_image, ("bitmap", "envmap"))):
+            for file in {node.props["filename"] for node in state.nodes if _names_file(node.props, plugins)}:
+                check(resolved(file, places))
         return mi.parser.instantiate(config, state)
 
 
-def _is_mesh(props: Any) -> bool:
-    return props.plugin_name() == "ply" and isinstance(props.get("filename", None), str)
+def _names_file(props: Any, plugins: Collection[str]) -> bool:
+    return props.plugin_name() in plugins and isinstance(props.get("filename", None), str)
+
+
+def _check_image(path: Path) -> None:
+    """ValueError for an image whose header is damaged or asks for too much memory: Mitsuba believes it."""
+    if path.is_file():
+        image_file.check_header(path, min(VALUES, FEW_VALUES + DENSEST * path.stat().st_size))
 
 
 def check_faces(path: Path) -> None:
@@ -118,6 +129,13 @@ def check_plugins(path: Path, names: Any, allowed: Collection[str]) -> None:
     if unknown := sorted({*names} - known_plugins() - {*allowed}):
         accepted = f"those; code that a scene brings: where it is rendered, by --allow-plugins {unknown[0]}"
         raise ValueError(f"{path}: plugin {unknown[0]!r}: neither Mitsuba's nor mi_refract's; accepted: {accepted}")
+
+
+def _check_needed(path: Path, every: Iterable[Any]) -> None:
+    for props in every:
+        name = NEEDED.get(plugin := props.plugin_name())
+        if name and name not in props:
+            raise ValueError(f"{path}: plugin {plugin!r} without {name!r}; accepted: one with it")
 
 
 def _children(props: Any, by_id: Mapping[str, int]) -> list[int]:

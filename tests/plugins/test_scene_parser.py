@@ -144,6 +144,60 @@ def test_a_face_without_its_vertices_is_refused(last, load, tmp_path):
         load(scene)
 
 
+EMPTY = """
+import sys
+from pathlib import Path
+import mitsuba as mi
+mi.set_variant("scalar_rgb")
+from mi_refract.plugins import scene_parser
+KINDS = "bsdf", "emitter", "integrator", "medium", "rfilter", "sensor", "shape", "texture", "volume"
+for name in sys.argv[1].split():
+    for kind in KINDS:
+        with open("s.xml", "w") as file:
+            file.write(f'<scene version="3.0.0"><sensor type="perspective"/><{kind} type="{name}"/></scene>')
+        print(name, kind, flush=True)
+        try:
+            scene_parser.load(Path("s.xml"), {})
+        except (RuntimeError, ValueError):
+            pass
+"""
+
+
+def test_no_plugin_ends_the_process_for_want_of_a_parameter(tmp_path, monkeypatch):
+    """Each one of Mitsuba's, with nothing inside, in the place of each kind of plugin."""
+    monkeypatch.chdir(tmp_path)
+    names = {*scene_parser.known_plugins(), "rgb", "spectrum"}
+    with python(EMPTY, " ".join(sorted(names))) as process:
+        out, _ = process.communicate(timeout=120)
+    assert process.returncode == 0, out.splitlines()[-1]
+
+
+@pytest.mark.parametrize("element", ["emitter type='envmap'", "texture type='bitmap'"])
+def test_an_image_is_refused_by_its_header(element, load, tmp_path):
+    """Mitsuba believes it: a width of 8 million took minutes, an attribute of 800 MB as much memory."""
+    good = (SCENES / "lamps.exr").read_bytes()
+    scene = f'{SENSOR}<{element}><string name="filename" value="sky.exr"/></{element.split()[0]}>'
+    (tmp_path / "sky.exr").write_bytes(good)
+    load(scene)
+    place = good.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4 + 8
+    wide = good[:place] + (2**23).to_bytes(4, "little") + good[place + 4 :]
+    place = good.index(b"channels\0chlist\0") + len(b"channels\0chlist\0")
+    long = good[:place] + (2**29).to_bytes(4, "little") + good[place + 4 :]
+    place = good.index(b"dataWindow\0")
+    cut = good[:place] + b"x\0string\0" + (2**30).to_bytes(4, "little") + good[place:]
+    large = wide.replace((2**23).to_bytes(4, "little"), (2**19).to_bytes(4, "little"))
+    for content, message in (
+        (wide, "resolution"),
+        (long, "corrupt"),
+        (large, "accepted: up to 21116"),
+        (cut, "corrupt"),
+    ):
+        (tmp_path / "sky.exr").write_bytes(content)
+        with pytest.raises(ValueError, match=rf"sky\.exr: .*{message}") as caught:
+            load(scene)
+        assert "max-values" not in str(caught.value)
+
+
 # Limits -----------------------------------------------------------------------------------------------------------
 
 
@@ -175,7 +229,14 @@ REFUSED = {
         '<bsdf type="twosided" id="a"><ref id="b"/></bsdf><bsdf type="twosided" id="b"><ref id="a"/></bsdf>',
         "in a circle",
     ),
-    "files": ('<include filename="s.xml"/>' * 2, "more than 1000 files included"),
+    "files": ('<include filename="empty.xml"/>' * 1001, "empty.xml: more than 1000 files included"),
+    "files in files": ('<include filename="s.xml"/>' * 20_000, "s.xml: more than 14 files, each included by the one"),
+    "elements": ("<a/>" * 2**20, "more than 1048576 XML elements"),
+    "parameters": (
+        "".join(f'<default name="a{i}" value=""/>' for i in range(4097)),
+        "more than 4096 parameters",
+    ),
+    "folders": ('<path value="."/>' * 20_000, "more than 100 <path> elements"),
     "long value": (f'<default name="a0" value="xxxxxxxxxx"/>{LAUGHS}', "<default>: a value of 10000 characters"),
     "document type": (b'<!DOCTYPE a [<!ENTITY b "c">]><scene version="3.0.0"/>', "a document type"),
     "another encoding": ('<scene version="3.0.0"/>'.encode("utf-16"), "zero bytes; accepted: XML in UTF-8"),
@@ -204,11 +265,18 @@ def test_what_would_end_the_process_is_refused(case, load, tmp_path, monkeypatch
     monkeypatch.setattr(mi.parser, "instantiate", lambda *arguments: pytest.fail("ran"))
     begin = time.process_time()
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
-        load(elements, other=nested(20000))
+        load(elements, other=nested(20000), empty="")
     assert "accepted: " in str(caught.value) and "\n" not in str(caught.value)
     assert time.process_time() - begin < 10
     # Only what cannot be told from the text alone comes to Mitsuba's parser.
     assert bool(seen) == case.startswith(("deep by", "many", "circle", "pipe as an image", "device as"))
+
+
+def test_files_are_included_as_deep_as_mitsuba_includes_them(load):
+    links = {f"f{i}": f'<include filename="f{i + 1}.xml"/>' for i in range(1, 14)}
+    load('<include filename="f1.xml"/>', **links, f14=SENSOR)
+    with pytest.raises(ValueError, match="more than 14 files"):
+        load('<include filename="f1.xml"/>', **links, f14='<include filename="f15.xml"/>', f15=SENSOR)
 
 
 def test_limits_of_size(load, monkeypatch):

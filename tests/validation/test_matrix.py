@@ -39,12 +39,14 @@ def test_numbers_and_verdicts_are_those_of_the_rows():
 def test_a_missed_goal_is_shown_beside_the_number_and_fails_nothing():
     missed = Row(per_ray.NAME, "A", "random", "f32", {"worst rad": 5e-6, "off the recorded": 3.67}, goals=GOAL)
     reached = Row(per_ray.NAME, "B", "random", "f32", {"worst rad": 5e-6, "off the recorded": 2.9}, goals=GOAL)
-    rows = matrix.summary([missed, reached])
-    assert [row.verdict for row in rows] == ["pass", "pass"]
-    assert [bool(row.missed) for row in rows] == [True, False]
+    better = {"worst rad": 2e-15, "recorded": 9e-15, "off the recorded": 4.5}
+    rows = matrix.summary([missed, reached, Row(per_ray.NAME, "C", "random", "f64", better, goals=GOAL)])
+    assert [row.verdict for row in rows] == ["pass"] * 3
+    assert [bool(row.missed) for row in rows] == [True, False, True]
     table = readme_tables.suite(rows)
     assert "| A, f32 | 5e-6 (3.67 × recorded) |" in table
     assert "| B, f32 | 5e-6 |" in table
+    assert "| C, f64 | 2e-15 (recorded / 4.5) |" in table
     assert "a goal" in table and "fails nothing" in table
 
 

@@ -1,6 +1,7 @@
 """Other systems: what is wrong with one of them never passes, and what is absent says what would bring it."""
 
 import ast
+import dataclasses
 import hashlib
 import json
 import re
@@ -68,7 +69,7 @@ REASONS = {
 @pytest.fixture
 def few(monkeypatch):
     """Sets of forty rays."""
-    smaller = {name: per_ray.Set(40, kind.draw, kind.text) for name, kind in per_ray.SETS.items()}
+    smaller = {name: dataclasses.replace(kind, count=40) for name, kind in per_ray.SETS.items()}
     monkeypatch.setattr(per_ray, "SETS", smaller)
     per_ray.given.cache_clear()
     yield
@@ -308,6 +309,26 @@ def test_an_installation_that_fails_is_one_line_and_leaves_the_system_absent(
     assert first.startswith("thing: ") and len(rest) == 1
     assert rest[0].startswith("validation renderers: thing: ") and said in rest[0]
     assert environments.absent(SYSTEMS["thing"])
+
+
+def test_another_version_of_a_distribution_is_absent_and_not_installed(elsewhere, monkeypatch, capsys, tmp_path):
+    def program(name, text):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+        environments._said_version.cache_clear()
+
+    monkeypatch.setenv("PATH", f"{tmp_path}:/bin")
+    assert SYSTEMS["povray"].needs.packages == (f"povray=1:{SYSTEMS['povray'].needs.version}-*",)
+    for version, here in (("3.7.0.10.unofficial", True), ("3.7.0.8", False)):
+        program("povray", f"echo POV-Ray {version} >&2")
+        assert bool(environments.absent(SYSTEMS["povray"])) != here
+    program("apt-get", "echo \"E: Version '1:3.7.0.10-*' for 'povray' was not found\" >&2; exit 100")
+    program("sudo", 'shift; exec "$@"')
+    program("apt-cache", "echo 'povray | 1:3.7.0.8-5 | http://deb.debian.org/debian bullseye/main amd64 Packages'")
+    assert command.main(["renderers", "--install", "povray"]) == 1
+    _, line = capsys.readouterr().err.strip().splitlines()
+    assert "'1:3.7.0.10-*' for 'povray' was not found" in line
+    assert line.endswith("; this distribution has povray 1:3.7.0.8-5")
 
 
 def test_an_installation_is_made_once_and_anew_for_another_version(elsewhere, monkeypatch):

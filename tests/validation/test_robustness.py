@@ -8,26 +8,68 @@ import sys
 import pytest
 from support import processes
 
-from validation.robustness import mutate, mutated_inputs, parsers
+from mi_refract.plugins import scene_parser
+from validation.robustness import mutate, mutated_inputs, parsers, scene_inputs
 
-INPUTS = 450
+INPUTS = 650
 
 
 def test_garbage_is_answered_in_one_line_by_every_parser(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", processes.ENVIRONMENT["PYTHONPATH"])
     counts, findings = mutated_inputs.fuzz(INPUTS)
     assert findings == []
-    assert len(counts) == 9
-    assert all(found.total() == INPUTS / 9 and found["refused"] > 0 for found in counts.values())
+    assert len(counts) == 13
+    assert all(found.total() == INPUTS / 13 and found["refused"] > 0 for found in counts.values())
     assert counts["answers, CSV"]["read"] > 0 and "rays, CSV" in counts
 
 
+@pytest.mark.usefixtures("scalar_variant")
 def test_the_good_inputs_are_good(tmp_path):
     for name, parser in parsers.parsers(tmp_path).items():
         for content in parser.good:
-            path = tmp_path / f"good{parser.suffix}"
+            path = tmp_path / f"mutated{parser.suffix}"
             path.write_bytes(content)
             assert parser.read(path) == "", name
+
+
+BAIT = b'<bsdf type="checkerboard"><bsdf type="near_clip"/></bsdf></scene>'
+# What lets it through: the module, what of it is replaced, and by what; and what the study says then.
+LET_THROUGH = {
+    "plugin": (
+        "scene, XML",
+        b"</scene>",
+        BAIT,
+        scene_parser,
+        "check_plugins",
+        "a plugin of the scene's own was opened",
+    ),
+    "vertex": ("mesh, PLY", b"3 0 3 4", b"3 0 3 6", scene_parser, "check_faces", "a face without its vertices"),
+}
+
+
+@pytest.mark.usefixtures("scalar_variant")
+@pytest.mark.parametrize("case", LET_THROUGH)
+def test_what_a_scene_must_not_do_is_refused_and_would_be_seen(case, tmp_path, monkeypatch):
+    name, old, new, module, check, message = LET_THROUGH[case]
+    flat = '<boolean name="face_normals" value="true"/></shape>'  # without it memory would be overwritten
+    monkeypatch.setattr(scene_inputs, "MESH", scene_inputs.MESH.replace("</shape>", flat))
+    parser = parsers.parsers(tmp_path)[name]
+    path = tmp_path / f"mutated{parser.suffix}"
+    assert parser.good[-1].count(old) == 1
+    path.write_bytes(parser.good[-1].replace(old, new))
+    with pytest.raises(ValueError, match="accepted: "):
+        parser.read(path)
+    monkeypatch.setattr(module, check, lambda *arguments: None)
+    assert message in parser.read(path)
+
+
+@pytest.mark.parametrize("answer", ["return ''", "raise ValueError('a: b')"])
+def test_what_takes_memory_is_seen(answer, tmp_path, monkeypatch):
+    space = {}
+    exec(f"def read(path):\n    peaks.append(peaks[-1] + 2**31 + 1)\n    {answer}", space)
+    space["peaks"] = peaks = [5]
+    monkeypatch.setattr(scene_inputs, "_peak", lambda: peaks[-1])
+    assert scene_inputs._bounded(space["read"])(tmp_path) == "took 2147483649 bytes of memory"
 
 
 def test_the_same_seed_gives_the_same_input_and_another_one_another():

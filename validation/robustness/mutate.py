@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 WORDS = (
     *(b"nan", b"inf", b"-inf", b"NaN(ind)", b"nan(", b"1e999", b"-0", b"0", b"1e-320", b"18446744073709551616"),
@@ -26,8 +26,40 @@ WORDS = (
     *(b"::error::", b"[/red]", b"#", b",", b"\n", b"\r", b'"', b"'", b"=", b"../../x", b"2147483648", b"4294967295"),
 )
 INTEGERS = (0, 1, 2, 127, 128, 255, 32767, 65535, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)
+XML_WORDS = (
+    *(
+        b"",
+        b"&amp;",
+        b"&#0;",
+        b"$",
+        b"$res",
+        b"$" * 3000,
+        b"1000000",
+        b"1e30",
+        b"nan",
+        b"inf",
+        b"-1",
+        b"0",
+        b"1, nan, 0",
+    ),
+    *(b"2147483647", b"4294967295", b"bk7", b"../x", b"/dev/zero", b"mutated.xml", b"plugins", b"x" * 5000),
+)
+XML_ELEMENTS = (
+    *(
+        b'<bsdf type="twosided">%s</bsdf>',
+        b'<shape type="instance">%s</shape>',
+        b"<a>%s</a>",
+        b"<!-- %s -->",
+        b"<![CDATA[%s",
+    ),
+    *(b'<include filename="mutated.xml"/>%s', b'<default name="res" value="99999"/>%s', b'<path value="meshes"/>%s'),
+    *(b'<ref id="glass"/>%s', b'<bsdf type="mask" id="glass"><ref id="glass"/></bsdf>%s', b"<!DOCTYPE a>%s"),
+)
 NUMBER = re.compile(rb"-?\d+(\.\d+)?([eE][-+]?\d+)?")
 TOKEN = re.compile(rb"[A-Za-z_][\w.]*|\"[^\"\n]*\"")
+
+ATTRIBUTE = re.compile(rb'(?<==")[^"]*(?=")')
+ELEMENT = re.compile(rb"<[a-z]")
 
 
 def mutated(data: bytes, rng: random.Random, head: int | None = None) -> bytes:
@@ -35,6 +67,21 @@ def mutated(data: bytes, rng: random.Random, head: int | None = None) -> bytes:
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
         near = len(data) if head is None or rng.random() < 0.25 else min(head, len(data))
         data = rng.choice(MUTATIONS)(data, rng, near)
+    return data
+
+
+def mutated_xml(data: bytes, rng: random.Random) -> bytes:
+    """`data` after one to four mutations that leave most of it XML: of the values of attributes, and of elements."""
+    for _ in range(rng.choice((1, 1, 1, 2, 4))):
+        if rng.random() < 0.8:
+            data = _replace(ATTRIBUTE, XML_WORDS)(data, rng, len(data))
+        else:
+            begin, end = rng.choice(XML_ELEMENTS).split(b"%s")
+            at, count = (
+                rng.choice([0, *(found.start() for found in ELEMENT.finditer(data))]),
+                rng.choice((1, 2, 40, 20_000)),
+            )
+            data = data[:at] + begin * count + end * count + data[at:]
     return data
 
 
@@ -81,13 +128,15 @@ def _insert(data: bytes, rng: random.Random, near: int) -> bytes:
     return data[:at] + rng.choice(WORDS) + data[at:]
 
 
-def _replace(pattern: re.Pattern[bytes]) -> Callable[[bytes, random.Random, int], bytes]:
+def _replace(
+    pattern: re.Pattern[bytes], words: Sequence[bytes] = WORDS
+) -> Callable[[bytes, random.Random, int], bytes]:
     def replace(data: bytes, rng: random.Random, near: int) -> bytes:
         found = list(pattern.finditer(data, 0, near))
         if not found:
             return _insert(data, rng, near)
         one, other = rng.choice(found), rng.choice(found)[0]
-        return data[: one.start()] + (rng.choice(WORDS) if rng.random() < 0.6 else other) + data[one.end() :]
+        return data[: one.start()] + (rng.choice(words) if rng.random() < 0.6 else other) + data[one.end() :]
 
     return replace
 

@@ -74,6 +74,8 @@ def _child(seed: int, first: int, end: int) -> None:
     """Read the inputs; a line of JSON on stdout after each one."""
     from .parsers import parsers
 
+    records = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # for what Mitsuba prints
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         every = list(parsers(folder).items())
@@ -87,7 +89,7 @@ def _child(seed: int, first: int, end: int) -> None:
             outcome, said = _outcome(parser.read, path)
             faulthandler.cancel_dump_traceback_later()
             record = {"input": index, "parser": parser_name, "outcome": outcome}
-            print(json.dumps(record | ({"said": said[:300]} if outcome in FINDINGS else {})), flush=True)
+            print(json.dumps(record | ({"said": said[:300]} if outcome in FINDINGS else {})), file=records, flush=True)
 
 
 def _outcome(read: Any, path: Path) -> tuple[str, str]:

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import random
-import zipfile
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +16,8 @@ from mi_refract.regimes import Rays
 from mi_refract.report import run_report
 from mi_refract.report.row import Row
 
-from .mutate import mutated
+from . import scene_inputs
+from .parser import Parser
 
 SCENES = Path(__file__).parents[2] / "scenes" / "planar"
 HEADER = 700  # bytes of an EXR file in front of its pixels
@@ -40,34 +36,6 @@ family_error = 0.01
 allow_nonfinite = true
 reason = "an estimate"
 """
-
-
-@dataclass(frozen=True)
-class Parser:
-    """A good input, and `read`: of a bad one it raises one line, or returns what is wrong with accepting it, or ""."""
-
-    suffix: str
-    good: tuple[bytes, ...]
-    read: Callable[[Path], str]
-    head: int | None = None
-
-    def mutation(self, rng: random.Random) -> bytes:
-        """A bad input."""
-        good = rng.choice(self.good)
-        if self.suffix == ".npz" and rng.random() < 0.7:  # past the checksums of the archive
-            return _mutated_member(good, rng)
-        return mutated(good, rng, self.head)
-
-
-def _mutated_member(good: bytes, rng: random.Random) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(good)) as old, zipfile.ZipFile(buffer, "w") as new:
-        names = old.namelist()
-        chosen = rng.choice(names)
-        for name in names:
-            content = old.read(name)
-            new.writestr(name, mutated(content, rng, rng.choice((128, None))) if name == chosen else content)
-    return buffer.getvalue()
 
 
 def parsers(folder: Path) -> dict[str, Parser]:
@@ -105,7 +73,7 @@ def parsers(folder: Path) -> dict[str, Parser]:
 
     reference, rows_json = image_file.read(image), (folder / "rows.json").read_bytes()
     scenes = tuple((SCENES / f"{name}.toml").read_bytes() for name in ("lens", "nested", "prism", "doublet"))
-    return {
+    return scene_inputs.parsers(folder) | {
         "planar scene, TOML": Parser(".toml", scenes, lambda path: str(scene_file.load(path))[:0]),
         "diff settings, TOML": Parser(".toml", (SETTINGS,), lambda path: str(settings_file.load(path))[:0]),
         "rows, JSON": Parser(".json", (rows_json,), lambda path: str(run_report.read_json(path))[:0]),

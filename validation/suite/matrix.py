@@ -21,6 +21,7 @@ OFF = "off by"
 TERMS = {
     OFF: "rays: the largest angle, in radians, without misclassified rays; images: |test / reference − 1| of the means",
     "disagrees": "1 where a budget is broken in the row that this comes from",
+    per_ray.RECORDED: per_ray.TERMS[per_ray.RECORDED],
     per_ray.OFF_RECORDED: "how many times the error recorded earlier, or that over it; a goal, which fails no run",
     "differs": "1 where the images are different and this is known of the system; see its remark",
 }
@@ -47,7 +48,7 @@ def _cells(row: Row) -> list[Row]:
     values["disagrees"] = float(bool(row.broken))
     goals = {}
     if per_ray.OFF_RECORDED in row.goals:
-        values[per_ray.OFF_RECORDED] = row.values[per_ray.OFF_RECORDED]
+        values |= {name: row.values[name] for name in (per_ray.RECORDED, per_ray.OFF_RECORDED) if name in row.values}
         goals[per_ray.OFF_RECORDED] = row.goals[per_ray.OFF_RECORDED]
     if row.study == rendered_images.NAME:
         values["differs"], goals["differs"] = float(differs), 0.0

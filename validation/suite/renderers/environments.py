@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
@@ -19,6 +20,7 @@ COMMAND = "python -m validation renderers --install"
 CANNOT = 77  # the exit code of a script that cannot run on this machine
 TIMEOUT = 600.0  # seconds; a busy machine is slow, a program that hangs is slower
 _INSTALLING = 3600.0
+_ASKING = 60.0
 _FOREIGN = ("PYTHONPATH", "PYTHONHOME", "PYTHONSTARTUP", "VIRTUAL_ENV")
 
 
@@ -45,8 +47,20 @@ def absent(system: System) -> str:
 
 def _present(system: System) -> bool:
     if isinstance(system.needs, Apt):
-        return shutil.which(system.needs.program) is not None
+        found = shutil.which(system.needs.program)
+        wanted = system.needs.version
+        return found is not None and (not wanted or wanted in _said_version(found))
     return system.needs is None or _marked(system)
+
+
+@functools.cache
+def _said_version(program: str) -> str:
+    """What a program says to --version; "" where it does not say it in time."""
+    try:
+        ended = process_group.run([program, "--version"], b"", _ASKING, keep_stderr=True)
+    except (OSError, TimeoutError, process_group.TooMuchOutputError):
+        return ""
+    return (ended.out + ended.said).decode(errors="replace")
 
 
 def _marked(system: System) -> bool:
@@ -87,7 +101,11 @@ def install(system: System) -> None:
         return
     if isinstance(needs, Apt):
         root = [] if os.geteuid() == 0 else ["sudo", "-n"]
-        _do(system, [*root, "apt-get", "install", "-y", "-qq", "--no-install-recommends", *needs.packages])
+        try:
+            _do(system, [*root, "apt-get", "install", "-y", "-qq", "--no-install-recommends", *needs.packages])
+        except OSError as error:
+            raise OSError(f"{error}; {_carried(needs)}") from None
+        _said_version.cache_clear()
         return
     if not locked(system).exists():
         raise OSError(f"{system.name}: no lock of its packages; accepted: {locked(system)}")
@@ -107,6 +125,18 @@ def install(system: System) -> None:
         safe = ["--require-hashes", "--only-binary", ":all:"]
         _do(system, [*pip, *options, *safe, "--requirement", str(locked(system))])
     write_atomically(_marker(system), json.dumps(_mark(system)))
+
+
+def _carried(needs: Apt) -> str:
+    """Which versions of the packages the distribution has."""
+    try:
+        listed = run(
+            ["apt-cache", "madison", *(package.partition("=")[0] for package in needs.packages)], timeout=_ASKING
+        )
+    except (Broken, Unable):
+        listed = ""
+    found = sorted({" ".join(line.split("|")[:2]).strip() for line in listed.splitlines()})
+    return f"this distribution has {', '.join(' '.join(each.split()) for each in found) or 'none'}"
 
 
 def _interpreter(system: System, version: str) -> str:

@@ -56,7 +56,7 @@ def _by_script(target: str) -> Callable[[PlainScene, Path, int, Sequence[int]], 
 def _radiance(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
     write_files.write(plain, "radiance", folder / "scene")
     camera = plain.camera
-    sizes = map(str, (camera.width, spp, plain.max_depth, *seeds))
+    sizes = map(str, (camera.width, camera.height, spp, *seeds))
     places = str(folder / "scene"), str(folder)
     script = environments.script(SYSTEMS["radiance"], "radiance_images.py", *places, *sizes)
     environments.run(script, timeout=HOURS)
@@ -72,7 +72,8 @@ def _povray(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> 
     width, height = side * camera.width, side * camera.height
     finer = dataclasses.replace(plain, camera=dataclasses.replace(camera, width=width, height=height))
     write_files.write(finer, "povray", folder / "scene")
-    command = ["povray", "+Iscene.pov", "+Oimage.exr", "+FE", f"+W{width}", f"+H{height}", "-A", "-D", "File_Gamma=1.0"]
+    lines = (folder / "scene" / "README.txt").read_text().splitlines()
+    command = next(line.split() for line in lines if line.split()[:1] == ["povray"])
     environments.run(command, timeout=HOURS, where=folder / "scene")
     fine = _rgb(image_file.read(folder / "scene" / "image.exr")).pixels
     coarse = fine.reshape(camera.height, side, camera.width, side, 3).mean((1, 3), dtype=np.float64)
@@ -96,7 +97,7 @@ def _three(mis: str) -> Callable[[PlainScene, Path, int, Sequence[int]], list[Im
             (folder / "scene" / name).write_bytes(content)
         script = environments.SCRIPTS / "three_images.mjs"
         places = [str(script), str(environments.folder(SYSTEMS["three"])), chromium, str(folder / "scene"), str(folder)]
-        sizes = map(str, (plain.camera.width, spp, mis, *seeds))
+        sizes = map(str, (plain.camera.width, plain.camera.height, spp, mis, *seeds))
         environments.run([node, *places, *sizes], timeout=HOURS)
         return [_raw(folder / f"seed{seed}.f32", plain) for seed in seeds]
 

@@ -10,13 +10,15 @@ SCRIPTS = Path(__file__).parent / "scripts"
 LOCKS = Path(__file__).parent / "locks"
 
 # The sets of rays of `validation.suite.per_ray`, by name.
-RANDOM, CRITICAL, GRAZING, MATCHED, TOTAL = "random", "near-critical", "grazing", "η ≈ 1", "total reflection"
+RANDOM, APART, CRITICAL, GRAZING = "random", "random, apart", "near-critical", "grazing"
+MATCHED, TOTAL = "η ≈ 1", "total reflection"
 RecordedError = Mapping[str, tuple[float, float]]  # worst angle in radians by set, from … to
 
 
 def recorded_error(random: float, critical: float, grazing: float | tuple, matched: float | tuple) -> RecordedError:
-    """Worst angles in radians by set of rays, a number or a range (from, to)."""
-    figures = zip((RANDOM, CRITICAL, GRAZING, MATCHED), (random, critical, grazing, matched), strict=True)
+    """Worst angles in radians by set of rays, a number or a range (from, to); of random rays one for both sets."""
+    sets = (RANDOM, APART, CRITICAL, GRAZING, MATCHED)
+    figures = zip(sets, (random, random, critical, grazing, matched), strict=True)
     return {name: x if isinstance(x, tuple) else (x, x) for name, x in figures}
 
 
@@ -42,10 +44,14 @@ class Npm:
 
 @dataclass(frozen=True)
 class Apt:
-    """A program of the whole machine; found wherever it is in PATH."""
+    """A program of the whole machine, found wherever it is in PATH.
+
+    `packages`: each as PACKAGE=VERSION, with * for the distribution's part. `version`: what the program says of itself.
+    """
 
     program: str
     packages: tuple[str, ...]
+    version: str = ""
 
 
 @dataclass(frozen=True)

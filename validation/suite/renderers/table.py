@@ -121,7 +121,14 @@ _SYSTEMS = (
         calls=(RefractFunction("Cycles, refraction closure", "f32", "cycles_rays.py", RECORDED_F32, "zero"),),
     ),
     System("luxcore", "LuxCore", "Apache-2.0", Pip(("pyluxcore==2.11.2", "numpy")), megabytes=390, draws=True),
-    System("povray", "POV-Ray", "AGPL-3.0-or-later", Apt("povray", ("povray",)), megabytes=60, draws=True),
+    System(
+        "povray",
+        "POV-Ray",
+        "AGPL-3.0-or-later",
+        Apt("povray", ("povray=1:3.7.0.10-*",), "3.7.0.10"),
+        megabytes=60,
+        draws=True,
+    ),
     System(  # in a headless Chromium, whose WebGL2 runs on the processor
         "three",
         "three-gpu-pathtracer",

@@ -1,36 +1,43 @@
-"""Render `scene.rad` by Radiance's rtrace: `python radiance_images.py FOLDER OUT WIDTH SPP DEPTH SEED…`
+"""Render `scene.rad` by Radiance's rtrace: `python radiance_images.py FOLDER OUT WIDTH HEIGHT SPP SEED…`
 
-Run by the Python that has pyradiance. The rays of every pixel are random within it; one `seedN.f32` per seed: rows
-from the top, three float32 a pixel.
+Run by the Python that has pyradiance, with the options of the exported README.txt. The rays of every pixel are random
+within it; one `seedN.f32` per seed: rows from the top, three float32 a pixel.
 """
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 
-# Every diffuse reflection sends one random ray, and nothing is remembered or sampled besides: a path tracer. Weak rays
-# are played for by Russian roulette, which a negative -lr asks for.
-RTRACE = "-h -w -u+ -fdf -ov -aa 0 -ad 1 -as 0 -av 0 0 0 -dj 0 -st 0 -ss 1 -lw 1e-2"
+# Beside the exported options: nothing is remembered or sampled, so that Radiance is a path tracer.
+RTRACE = "-ov -av 0 0 0 -dj 0 -st 0 -ss 1"
+BATCH = 2**20  # rays a process: its random numbers depend on the second in which it begins
 
 
 def main():
     import pyradiance
 
     home = Path(pyradiance.__file__).parent
-    folder, out, width, spp, depth, *seeds = sys.argv[1:]
+    folder, out, width, height, spp, *seeds = sys.argv[1:]
     os.chdir(folder)
     os.environ["RAYPATH"] = f".:{home / 'lib'}"
     octree = Path(out, "scene.oct")
     octree.write_bytes(subprocess.run([home / "bin/oconv", "-w", "scene.rad"], check=True, stdout=-1).stdout)
-    rtrace = [home / "bin/rtrace", *RTRACE.split(), "-ab", depth, "-lr", f"-{depth}", octree]
+    exported = re.search(r"rtrace (.*?)scene\.oct", Path("README.txt").read_text(), re.DOTALL)[1]
+    rtrace = [home / "bin/rtrace", *exported.replace("\\", " ").split(), *RTRACE.split(), octree]
     view = Path("camera.vf").read_text()
-    for seed in seeds:
-        rng = np.random.default_rng(int(seed))
-        places = (rng.random((int(width), int(width), 2)) for _ in range(int(spp)))
-        image = sum(traced(rtrace, rays(view, within)) for within in places) / int(spp)
+    size = int(height), int(width)
+    samples = [(seed, rng) for seed in seeds for rng in [np.random.default_rng(int(seed))] * int(spp)]
+    images = {seed: np.zeros((*size, 3)) for seed in seeds}
+    step = max(BATCH // (size[0] * size[1]), 1)
+    for batch in (samples[start : start + step] for start in range(0, len(samples), step)):
+        bundle = np.stack([rays(view, rng.random((*size, 2))) for _, rng in batch])
+        for (seed, _), image in zip(batch, traced(rtrace, bundle), strict=True):
+            images[seed] += image / int(spp)
+    for seed, image in images.items():
         path = Path(out, f"seed{seed}.f32")
         path.write_bytes(image.astype("<f4").tobytes())
         print(path, flush=True)

@@ -1,5 +1,5 @@
 // Render scene.json by three-gpu-pathtracer in a headless browser, WebGL2 on the processor:
-//   node three_images.mjs NPM_FOLDER CHROMIUM SCENE_FOLDER OUT_FOLDER WIDTH SPP MIS SEED…
+//   node three_images.mjs NPM_FOLDER CHROMIUM SCENE_FOLDER OUT_FOLDER WIDTH HEIGHT SPP MIS SEED…
 // One seedN.f32 per seed: rows from the top, three float32 a pixel. MIS: 1 for multiple importance
 // sampling of the sky, as the library comes, 0 without.
 import { createServer } from "node:http";
@@ -7,7 +7,7 @@ import { readFile, writeFile } from "node:fs/promises";
 import { createRequire } from "node:module";
 import { extname, join, resolve } from "node:path";
 
-const [npm, chromium, scene, out, width, spp, mis, ...seeds] = process.argv.slice(2);
+const [npm, chromium, scene, out, width, height, spp, mis, ...seeds] = process.argv.slice(2);
 const puppeteer = createRequire(join(resolve(npm), "package.json"))("puppeteer-core");
 const PATIENCE = 3_600_000; // ms: a busy machine is slow
 const page = new URL("three_images.html", import.meta.url);
@@ -46,7 +46,8 @@ try {
     throw undefined;
   }
   await tab.waitForFunction("window.prepare");
-  await tab.evaluate((width, mis) => window.prepare(width, mis), Number(width), mis === "1");
+  const size = [Number(width), Number(height)];
+  await tab.evaluate((size, mis) => window.prepare(size, mis), size, mis === "1");
   for (const seed of seeds) {
     const pixels = await tab.evaluate((spp, seed) => window.render(spp, seed), Number(spp), Number(seed));
     await writeFile(join(out, `seed${seed}.f32`), Buffer.from(pixels, "base64"));

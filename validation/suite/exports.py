@@ -1,0 +1,138 @@
+"""Exports: what is written for another renderer, rendered by it on 16 × 9 pixels, is Mitsuba's image of the same scene.
+
+Nothing in the scene is symmetric: four balls of different glass under a turned sky, a lamp and a coloured patch (which
+POV-Ray is not given: it has glass and lights only), a tilted camera, a film that is not square. The renderers read what
+users get: the exported files, and the options in the exported README.txt. The images are some renders a side; their
+RMSE may be twice what the spread between renders predicts, and 1 % of the mean. A camera, a sky or an index that is
+wrong exceeds that many times.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from mi_refract.plugins.refract import PLUGIN
+from mi_refract.rendering import scene_files
+from mi_refract.report.row import Row
+from mi_refract.scene_export import from_mitsuba, write_files
+from mi_refract.scene_export.plain_scene import Diffuse, Light, Material, Mesh, PlainScene
+from validation import limits
+from validation.run.context import SCENES, Context
+from validation.run.render_methods import Camera
+from validation.study import Study, Task, about
+from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
+
+from .rendered_images import COMPILED, THREE, askew
+from .renderers import SYSTEMS, environments
+
+NAME = "exports"
+RENDERS = 4  # a side
+SPP = 512
+SIZE = (16, 9)
+OVER = "RMSE / allowed"
+NOISE = "noise / mean"
+TERMS = {
+    OVER: "of the two means by pixel and channel; allowed: twice the noise that the spread between renders predicts, "
+    "and 1 % of the mean",
+    NOISE: "the predicted noise of the difference of the two means",
+}
+LEVEL = 2  # of the spheres
+LEFT_OUT = {THREE: "it counts the light of the sky twice, see the study of images; without MIS it is here"}
+THEIRS = {"POV-Ray": 256, "Cycles": 512, "LuxCore": 1024, "Radiance": 512}  # samples a pixel and render
+
+
+def scene(diffuse: bool = True) -> PlainScene:
+    """The balls of `balls`, seen from another place, with a lamp; `diffuse`: and with a patch."""
+    given = from_mitsuba.load(SCENES / "balls.xml", level=LEVEL)
+    width, height = SIZE
+    camera = dataclasses.replace(
+        given.camera,
+        origin=(30.0, 15.0, 240.0),
+        target=(3.0, -4.0, 0.0),
+        up=(0.3, 1.0, 0.2),
+        fov_x_degrees=48.0,
+        width=width,
+        height=height,
+    )
+    extra = [_quad("lamp", (-100.0, 22.0), (-72.0, 50.0), Light((3.0, 2.0, 1.0)))]
+    if diffuse:
+        extra.append(_quad("patch", (70.0, -50.0), (105.0, 10.0), Diffuse((0.2, 0.5, 0.9))))
+    return dataclasses.replace(given, name="balls", meshes=(*given.meshes, *extra), sky=askew(), camera=camera)
+
+
+def _quad(name: str, low: tuple[float, float], high: tuple[float, float], material: Material) -> Mesh:
+    """A rectangle in the plane z = 0 that faces +z."""
+    corners = [(low[0], low[1], 0.0), (high[0], low[1], 0.0), (high[0], high[1], 0.0), (low[0], high[1], 0.0)]
+    return Mesh(name, np.array(corners), np.array([(0, 1, 2), (0, 2, 3)]), material)
+
+
+def tasks(context: Context) -> list[Task]:
+    """One per renderer."""
+    return [
+        Task(f"exports: {title}", functools.partial(rows, context, title))
+        for title in IMAGE_RENDERERS
+        if title not in LEFT_OUT
+    ]
+
+
+def rows(context: Context, title: str) -> list[Row]:
+    """A renderer against `refract`: one row."""
+    renderer = IMAGE_RENDERERS[title]
+    system, setting = SYSTEMS[renderer.system], f"{SIZE[0]} × {SIZE[1]}"
+    reason = environments.absent(system)
+    if not reason and not system.small and context.profile.name != "full":
+        reason = f"{system.megabytes} MB: in the full profile only"
+    if not reason and context.variant.startswith("scalar"):
+        reason = COMPILED
+    if reason:
+        return [Row(NAME, title, "balls", setting, reason=reason)]
+    try:
+        theirs = drawn(title)
+    except environments.Unable as why:
+        return [Row(NAME, title, "balls", setting, reason=" ".join(str(why).split()))]
+    except (environments.Broken, OSError, ValueError) as defect:
+        values = {"not rendered": float(RENDERS)}
+        return [Row(NAME, title, "balls", setting, values, {"not rendered": 0.0}, reason=str(defect))]
+    values = compared(reference(diffuse=title != "POV-Ray"), theirs)
+    budgets = {OVER: 1.0, NOISE: float(limits.EXPORT_NOISE)}
+    replay = {"renderer": system.source, "spp": spp(title), "reference spp": SPP, "seeds": [*range(1, RENDERS + 1)]}
+    return [Row(NAME, title, "balls", setting, values, budgets, replay=replay)]
+
+
+def spp(title: str) -> int:
+    """Samples a pixel of each render of theirs."""
+    return THEIRS.get(title, 256)
+
+
+def drawn(title: str) -> np.ndarray:
+    """Renders by another renderer: renders × height × width × 3."""
+    given, seeds = scene(diffuse=title != "POV-Ray"), range(1, RENDERS + 1)
+    with tempfile.TemporaryDirectory() as folder:
+        images = IMAGE_RENDERERS[title].draw(given, Path(folder), spp(title), seeds)
+    return np.stack([image.pixels for image in images]).astype(np.float64)
+
+
+@functools.cache
+def reference(diffuse: bool) -> np.ndarray:
+    """Renders by this plugin, in the present variant: renders × height × width × 3."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_files.write(scene(diffuse), "mitsuba", Path(folder) / "scene")
+        camera = Camera(scene_files.load_scene(Path(folder) / "scene" / "scene.xml", {"bsdf": PLUGIN}))
+        return np.stack([camera(SPP, 1000 + i)[0] for i in range(RENDERS)])
+
+
+def compared(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
+    """The numbers of a pair; a value that is not finite makes both of them NaN, which breaks a budget."""
+    noise = float(np.sqrt(sum((side.var(0, ddof=1) / len(side)).mean() for side in (ours, theirs))))
+    rmse = float(np.sqrt(np.square(theirs.mean(0) - ours.mean(0)).mean()))
+    mean = float(ours.mean())
+    allowed = limits.EXPORT_SIGMAS * noise + limits.EXPORT_SYSTEMATIC * mean
+    return {OVER: rmse / allowed, NOISE: noise / mean, "RMSE / mean": rmse / mean}
+
+
+STUDY = Study(NAME, "Exports", about(__doc__), TERMS, tasks)
