@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.io.image_file import Image
-from mi_refract.io.pixels import Pixels
+from mi_refract.io.pixels import Pixels, any_channel
 
 from .comparison import Comparison, Metric, Verdict, checked_pixels, counted, verdict_of
 from .tile_statistics import median_nonblack, same_shape
@@ -88,7 +88,7 @@ def tolerance_passes_black(reference: Image, options: Mapping[str, Any]) -> bool
 def tolerance_accepts_black(a: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
     """The pixels of the reference, H × W × C, in which `tolerance` would take black for equal; H × W."""
     difference = np.abs(a)
-    accepted: NDArray[np.bool_] = (difference <= options["hard_fail"]).all(-1)
+    accepted = ~any_channel(~(difference <= options["hard_fail"]))
     beyond = _beyond(difference, a, np.zeros_like(a), options["fail"], options["fail_relative"])
     accepted.reshape(-1)[beyond] = False
     return accepted
@@ -106,9 +106,9 @@ def _percent(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float
 
 def _beyond(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float) -> NDArray[np.intp]:
     """The pixels with a channel that differs by more than `most`, and than that share of the mean of both; flat."""
-    pixels = np.flatnonzero((difference > most).any(-1))  # few: the rest is cheaper there
+    pixels = np.flatnonzero(any_channel(difference > most))  # few: the rest is cheaper there
     x, y, z = (each.reshape(-1, a.shape[2])[pixels] for each in (difference, a, b))
-    found: NDArray[np.intp] = pixels[(x > np.maximum(most, share * (np.abs(y) / 2 + np.abs(z) / 2))).any(-1)]
+    found: NDArray[np.intp] = pixels[any_channel(x > np.maximum(most, share * (np.abs(y) / 2 + np.abs(z) / 2)))]
     return found
 
 
