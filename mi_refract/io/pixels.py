@@ -25,7 +25,7 @@ def srgb_decode(code: Pixels) -> Pixels:
 def any_channel(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """`flags.any(-1)`, of few channels ten times as fast: NumPy takes long for many short reductions."""
     few = 0 < flags.shape[-1] <= FEW_CHANNELS
-    found: NDArray[np.bool_] = functools.reduce(np.logical_or, np.moveaxis(flags, -1, 0)) if few else flags.any(-1)
+    found: NDArray[np.bool_] = functools.reduce(np.logical_or, np.moveaxis(flags, -1, 0)) if few else np.any(flags, -1)
     return found
 
 
