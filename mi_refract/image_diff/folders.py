@@ -9,11 +9,11 @@ import functools
 import hashlib
 import os
 import stat
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from io import BufferedReader
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -26,6 +26,8 @@ from .pairing import Pair
 from .results import STATUSES, Result, Results, Status
 from .settings import Settings
 
+Given = TypeVar("Given")
+Found = TypeVar("Found")
 AS_ASKED = Settings()
 WORKERS = min(os.cpu_count() or 1, 8)  # each holds a pair of images in memory
 HELD = 250_000_000  # bytes of images that stay in memory for a page; a full page shows fewer
@@ -59,14 +61,24 @@ def diff(
     pairs = [*pairing.named(every, names), *_wrong_entries(settings, every)]
     root = reference if reference.is_dir() else reference.parent
     found, held = [], 0
-    with ThreadPoolExecutor(WORKERS) as pool:
-        for result in pool.map(lambda pair: _compared(pair, root, renders, maps, to_accept), pairs):
-            held += sum(image.pixels.nbytes for image in result.images)
-            found.append(result if held <= HELD else replace(result, images=()))
-            tell(len(found), len(pairs))
+    for result in _in_threads(lambda pair: _compared(pair, root, renders, maps, to_accept), pairs):
+        held += sum(image.pixels.nbytes for image in result.images)
+        found.append(result if held <= HELD else replace(result, images=()))
+        tell(len(found), len(pairs))
     found.sort(key=lambda result: list(Status).index(result.status))
     by_file = bool(settings.maps)
     return Results(reference, test, tuple(found), renders, inconclusive, tuple(unused), tuple(settings.flags), by_file)
+
+
+def _in_threads(function: Callable[[Given], Found], items: Sequence[Given]) -> Iterator[Found]:
+    """`map`, by WORKERS threads: OpenImageIO and NumPy let go of the interpreter's lock. One item needs none."""
+    if len(items) == 1:
+        yield function(items[0])
+        return
+    from concurrent.futures import ThreadPoolExecutor
+
+    with ThreadPoolExecutor(WORKERS) as pool:
+        yield from pool.map(function, items)
 
 
 def _pairs(reference: Path, test: Path, settings: Settings, renders: bool) -> list[Pair]:
@@ -189,8 +201,7 @@ def read_renders(folder: Path, max_values: int = MAX_VALUES) -> list[Image]:
         raise OSError(failed[0][1])
     if not found:
         raise ValueError(f"{folder}: holds no image; accepted: several renders of one")
-    with ThreadPoolExecutor(WORKERS) as pool:
-        images = list(pool.map(lambda path: image_file.read(path, max_values), found.values()))
+    images = list(_in_threads(lambda path: image_file.read(path, max_values), list(found.values())))
     sums: dict[float, Image] = {}
     for image in images:
         other = sums.setdefault(float(image.pixels.sum(dtype=np.float64)), image)

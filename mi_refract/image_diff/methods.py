@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import typing
 from collections.abc import Callable, Sequence
@@ -50,7 +51,7 @@ class Method:
         """The first line of the function's docstring."""
         return (self.function.__doc__ or "").partition("\n")[0]
 
-    @property
+    @functools.cached_property
     def options(self) -> dict[str, Option]:
         """The keyword arguments by name, without `allow_nonfinite`, which every method has."""
         hints = typing.get_type_hints(self.function, include_extras=True)
