@@ -134,7 +134,8 @@ DIFF_SECONDS = {
     "tolerance": limit(0.5, "seconds of a 1080p pair, two cores"),
     "welch": limit(3.0, "seconds of 8 + 8 renders of 1080p, two cores"),
     "page": limit(5.0, "seconds of the page of a 1080p image, two cores"),
-    "auto": limit(60.0, "seconds of a folder of 1000 pairs of 256², two cores"),
+    "auto": limit(24.0, "seconds of a folder of 1000 pairs of 256², two cores"),
+    "from the shell": limit(0.35, "seconds of a process that compares a pair of 256²: a test suite starts hundreds"),
 }
 PAGE_MEGABYTES = limit(15.0, "MB: a page that can be sent by mail")
 MEMORY_MEGABYTES = limit(1024.0 * 2**20 / 1e6, "MB, 1 GiB: what the smallest machines of a CI have to spare")

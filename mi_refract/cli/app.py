@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple
 
 try:
     import typer
-    from typer.core import TyperGroup
+    from typer.core import TyperCommand, TyperGroup
 except ModuleNotFoundError as missing:
     if missing.name not in ("typer", "rich"):
         raise
@@ -21,6 +21,8 @@ except ModuleNotFoundError as missing:
 
 from mi_refract import __version__
 from mi_refract.io.exit_code import exit_code
+
+from .plain_values import PlainValues
 
 
 class Command(NamedTuple):
@@ -42,7 +44,11 @@ COMMANDS = {
 }
 
 
-class Commands(TyperGroup):
+class PlainCommand(PlainValues, TyperCommand):
+    """A command that starts quickly."""
+
+
+class Commands(PlainValues, TyperGroup):
     """The commands of COMMANDS, each imported when it is called."""
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -57,7 +63,7 @@ class Commands(TyperGroup):
         command = getattr(importlib.import_module(f".{found.module}", __package__), found.attribute)
         if not isinstance(command, typer.Typer):
             single = typer.Typer(add_completion=False, rich_markup_mode=None)
-            single.command(cmd_name)(command)
+            single.command(cmd_name, cls=PlainCommand)(command)
             command = single
         return typer.main.get_command(command)
 

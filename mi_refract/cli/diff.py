@@ -1,24 +1,25 @@
-"""The commands `mi-refract diff` and `mi-refract accept`: their options, and their output."""
+"""The commands `mi-refract diff` and `mi-refract accept`: their options, and their output.
+
+What only some calls need is imported there: of a comparison that takes a third of a second the imports are the most.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import enum
 import importlib.util
+import os
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console, RenderableType
-from rich.progress import Progress
 
 from mi_refract.image_diff import accept as accepting
-from mi_refract.image_diff import folders, html_report, pairing, settings_file, text_reports
-from mi_refract.image_diff import self_test as self_tests
+from mi_refract.image_diff import folders, pairing, settings_file, text_reports
 from mi_refract.image_diff.methods import AUTO
 from mi_refract.image_diff.results import Results, Status, as_word
 from mi_refract.image_diff.settings import Settings
@@ -26,9 +27,10 @@ from mi_refract.io.atomic import writable
 from mi_refract.io.exit_code import MISUSE, describe
 from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.outside_text import printable
-from mi_refract.io.provenance import provenance
+from mi_refract.report.text_table import Plain
 
-from . import self_test_scenes
+if TYPE_CHECKING:
+    from rich.console import RenderableType
 
 Folder = Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")]
 Other = Annotated[Path, typer.Argument(metavar="TEST", help="The image or folder to compare with it.")]
@@ -73,6 +75,7 @@ def _print_methods(asked: bool) -> None:
     if asked:
         text = settings_file.reference()
         if sys.stdout.isatty():
+            from rich.console import Console
             from rich.markdown import Markdown
 
             Console().print(Markdown(text))
@@ -183,6 +186,9 @@ def diff(
 
 
 def _write_page(path: Path, found: Results, replay: str) -> None:
+    from mi_refract.image_diff import html_report
+    from mi_refract.io.provenance import provenance
+
     software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
     html_report.write(path, found, software, replay)
 
@@ -249,7 +255,13 @@ def _require_extra(*packages: str) -> None:
 @contextlib.contextmanager
 def _progress() -> Iterator[Callable[[int, int], None]]:
     """A function to call with the numbers of images done and of all; a progress bar on a terminal."""
-    with Progress(console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
+    if not sys.stderr.isatty():
+        yield lambda done, of: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("comparing", total=None)
         yield lambda done, of: progress.update(task, completed=done, total=of)
 
@@ -268,6 +280,10 @@ def _replay(found: Results, names: Sequence[str]) -> str:
 
 def _self_test(path: Path | None, other: Path | None, max_values: int, allow_plugins: Sequence[str]) -> int:
     """Print which defects are seen; 1 where one that was due is not."""
+    from mi_refract.image_diff import self_test as self_tests
+
+    from . import self_test_scenes
+
     if other:
         raise ValueError(f"{other}: --self-test takes one path; accepted: an image, a folder of renders, a scene")
     if path is None:
@@ -322,7 +338,12 @@ def _say(found: Results) -> None:
         _print(text_reports.table(found))
 
 
-def _print(table: RenderableType) -> None:
+def _print(table: Plain | RenderableType) -> None:
+    if isinstance(table, Plain) and not (sys.stdout.isatty() or os.environ.get("FORCE_COLOR")):
+        print(table)
+        return
+    from rich.console import Console
+
     # As wide as it must be where nobody looks on: no line of a log is a wrapped one.
     console = Console() if sys.stdout.isatty() else Console(width=10_000)
     console.print(table, highlight=False)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.io.image_file import Image
-from mi_refract.io.pixels import Pixels
+from mi_refract.io.pixels import Pixels, any_channel
 
 Options = Mapping[str, Any]
 PassesBlack = Callable[[Image, Options], bool]
@@ -65,5 +65,5 @@ def _share(a: Pixels, b: Pixels, accepted: NDArray[np.bool_]) -> float:
     """Of the pixels of `a` that are not black: those where black is accepted, and `b` is not much closer than that."""
     y, x = np.nonzero(accepted)
     dim, other = a[y, x], b[y, x]
-    far = (np.abs(dim - other) > np.abs(dim) / CLOSER).any(-1) & dim.any(-1)
-    return float(far.sum() / max(a.any(-1).sum(), 1))
+    far = any_channel(np.abs(dim - other) > np.abs(dim) / CLOSER) & any_channel(dim != 0)
+    return float(far.sum() / max(any_channel(a != 0).sum(), 1))

@@ -139,6 +139,8 @@ def counted(image: Image) -> int:
 def not_compared(reference: Image) -> tuple[int, list[str]]:
     """How many values are not finite, and the channels that hold no other ones: there nothing was compared."""
     finite = np.isfinite(reference.pixels).reshape(-1, len(reference.channels))
+    if finite.all():
+        return 0, []
     seen = zip(reference.channels, finite.any(0), strict=True)
     return int(finite.size - finite.sum()), [name for name, any_value in seen if not any_value]
 

@@ -11,7 +11,6 @@ import hashlib
 import os
 import stat
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from io import BufferedReader
 from pathlib import Path
@@ -64,7 +63,8 @@ def diff(
     # Together, the pairs that are compared at once have no more values than one pair may have.
     most = 2 * settings.default.max_values
     compare = functools.partial(_compared, root=root, renders=renders, maps=maps, to_accept=to_accept)
-    for result in bounded_map(compare, pairs, _values, most, WORKERS):
+    results = map(compare, pairs) if len(pairs) == 1 else bounded_map(compare, pairs, _values, most, WORKERS)
+    for result in results:
         held += sum(image.pixels.nbytes for image in result.images)
         found.append(result if held <= HELD else replace(result, images=()))
         tell(len(found), len(pairs))
@@ -208,8 +208,8 @@ def read_renders(folder: Path, max_values: int = MAX_VALUES) -> list[Image]:
         raise OSError(failed[0][1])
     if not found:
         raise ValueError(f"{folder}: holds no image; accepted: several renders of one")
-    with ThreadPoolExecutor(WORKERS) as pool:
-        images = list(pool.map(lambda path: image_file.read(path, max_values), found.values()))
+    read = functools.partial(image_file.read, max_values=max_values)
+    images = list(bounded_map(read, found.values(), lambda path: 0, 0, WORKERS))
     sums: dict[float, Image] = {}
     for image in images:
         other = sums.setdefault(float(image.pixels.sum(dtype=np.float64)), image)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import typing
 from collections.abc import Callable, Sequence
@@ -11,6 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from mi_refract.io.image_file import Image
+from mi_refract.io.pixels import Pixels
 
 from . import black, flip, pixelwise, tolerance, welch
 from .comparison import Comparison, Verdict, aligned, not_compared, shared_channels
@@ -49,7 +51,7 @@ class Method:
         """The first line of the function's docstring."""
         return (self.function.__doc__ or "").partition("\n")[0]
 
-    @property
+    @functools.cached_property
     def options(self) -> dict[str, Option]:
         """The keyword arguments by name, without `allow_nonfinite`, which every method has."""
         hints = typing.get_type_hints(self.function, include_extras=True)
@@ -135,10 +137,15 @@ def _blind_to(method: Method, reference: Image, test: Image, options: dict[str, 
     """What the method could not have seen. "" where both images are the same, or the reference is black."""
     if method.passes_black is None:
         return ""
-    a, b = (replace(reference, pixels=np.nan_to_num(x, posinf=0, neginf=0)) for x in aligned(reference, test))
+    a, b = (replace(reference, pixels=_finite(x)) for x in aligned(reference, test))
     values = {name: option.default for name, option in method.options.items()} | options
     text = black.blind_to(a, b, values, method.passes_black, method.accepts_black)
     return text and f"{text} with these options"
+
+
+def _finite(pixels: Pixels) -> Pixels:
+    """The pixels with 0 for what is not finite."""
+    return pixels if np.isfinite(pixels).all() else np.nan_to_num(pixels, posinf=0, neginf=0)
 
 
 def _untested(reference: Sequence[Image], test: Sequence[Image], allow_nonfinite: bool) -> str:

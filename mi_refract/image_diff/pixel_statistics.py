@@ -14,7 +14,6 @@ estimated at f degrees of freedom the expectation of the bound over that estimat
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,6 +65,8 @@ def sums_of_renders(reference: Sequence[Array], test: Sequence[Array], tile: int
     def band(top: int) -> PixelSums:
         one, two = (_mean_and_variance([each[top : top + tile] for each in side]) for side in (reference, test))
         return sums(*one, *two, tile)
+
+    from concurrent.futures import ThreadPoolExecutor
 
     with ThreadPoolExecutor(WORKERS) as pool:
         bands = list(pool.map(band, range(0, reference[0].shape[0], tile)))

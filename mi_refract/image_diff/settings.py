@@ -7,6 +7,7 @@ options of the method before it are dropped.
 
 from __future__ import annotations
 
+import functools
 import platform
 import sys
 from collections.abc import Mapping, Sequence
@@ -171,13 +172,19 @@ def _method(layers: Sequence[tuple[str, Mapping[str, Any]]]) -> tuple[str, dict[
             method = values["method"]
             options = {name: value for name, value in options.items() if name in options_of(method)}
         for name in values:
-            if name == "allow_nonfinite" or name in ALL_OPTIONS:
+            if name == "allow_nonfinite" or name in all_options():
                 options[name], given_by[name] = values[name], where
     for name in options:
         if name not in options_of(method):
             accepted = ", ".join(sorted(options_of(method) - {"allow_nonfinite"})) or "none"
             raise ValueError(f"{given_by[name]}.{name}: not an option of {method}; accepted: {accepted}")
     return method, options
+
+
+@functools.cache
+def all_options() -> frozenset[str]:
+    """The names of the options of all methods."""
+    return frozenset(name for method in METHODS.values() for name in method.options)
 
 
 def options_of(method: str) -> frozenset[str]:
@@ -198,6 +205,3 @@ def _fight(entries: Sequence[Entry]) -> str:
                         f"same name {one.pattern!r}; accepted: one of them"
                     )
     return ""
-
-
-ALL_OPTIONS = frozenset(name for method in METHODS.values() for name in method.options)

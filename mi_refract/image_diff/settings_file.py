@@ -12,7 +12,6 @@ reason = "single-precision caustic: last bits differ between processors"
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from mi_refract.io.toml_schema import TABLES, TEXT, Key, Type, first_of, key_tab
 
 from . import idiff_flags, name_patterns
 from .methods import AUTO, METHODS, options_of_auto
-from .settings import ALL_OPTIONS, PROCESSORS, SYSTEMS, TOLERANCE, Entry, How, Map, Settings
+from .settings import PROCESSORS, SYSTEMS, TOLERANCE, Entry, How, Map, Settings, all_options
 
 FILE = "mi-refract.toml"
 ACCEPTED = (AUTO, *METHODS)
@@ -101,6 +100,8 @@ def load(path: str | Path, default: How = How(), allow_nonfinite: Sequence[str] 
     An entry with a name that is wrong in anything else is kept with its error: its images cannot be compared, the
     others can. ValueError names the file and the key for whatever else is wrong; OSError as the system raises it.
     """
+    import tomllib  # where there is a file: it compiles its patterns
+
     path = Path(path)
     try:
         document = tomllib.loads(path.read_bytes().decode())
@@ -154,7 +155,7 @@ def keys_of(method: str | None) -> dict[str, Key]:
     """The options of a method as keys; of all methods for None, of those that "auto" chooses from for that."""
     if method is None:
         every = [keys_of(name) for name in METHODS]
-        return {name: _any_of([keys[name] for keys in every if name in keys]) for name in sorted(ALL_OPTIONS)}
+        return {name: _any_of([keys[name] for keys in every if name in keys]) for name in sorted(all_options())}
     options = options_of_auto() if method == AUTO else METHODS[method].options
     return {name: Key(TYPES[option.type], option.help, option.default) for name, option in options.items()}
 

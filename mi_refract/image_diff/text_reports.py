@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.outside_text import printable
-from mi_refract.report import junit
 from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.row import strict
+from mi_refract.report.text_table import Group, Table, Text
 
 from . import idiff_flags
 from .comparison import Metric
@@ -27,7 +27,7 @@ from .results import Result, Results, Status
 from .settings import How
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from mi_refract.report import junit
 
 SCHEMA = 1
 FEW = 20  # equal images that are listed one by one
@@ -57,29 +57,22 @@ def sentence(results: Results) -> str:
     return f"{number} image{'' if number == 1 else 's'}: {counted}{warned}"
 
 
-def table(results: Results) -> RenderableType:
-    """Failures first, then equal images with a warning, FEW others, and the sentence; for rich's console."""
-    from rich.console import Group
-    from rich.table import Table
-    from rich.text import Text
-
+def table(results: Results) -> Group:
+    """Failures first, then equal images with a warning, FEW others, and the sentence."""
     failed = [*results.of(Status.DIFFERENT, Status.INCONCLUSIVE), *_warned(results)]
     equal = [result for result in results.of(Status.EQUAL) if not result.warning]
     skipped = results.of(Status.SKIPPED)
-    rows = Table("verdict", "image", "method", "why", box=None, pad_edge=False)
+    rows = Table(("verdict", "image", "method", "why"))
     for result in [*failed, *equal[:FEW], *skipped]:
         status = Text(_word(result), style=STYLES[result.status])
         rows.add_row(status, *(Text(printable(text)) for text in (result.name, _method(result), why(result))))
     more = [Text(f"… and {len(equal) - FEW} more that are equal", style="dim")] if len(equal) > FEW else []
-    return Group(*([rows] if rows.row_count else []), *more, Text(sentence(results)))
+    return Group((*([rows] if rows.rows else []), *more, Text(sentence(results))))
 
 
-def settings_table(pairs: Sequence[Pair]) -> RenderableType:
-    """How each image would be compared, and the tables of the settings file that say so; for rich's console."""
-    from rich.table import Table
-    from rich.text import Text
-
-    rows = Table("image", "compared by", "from", "why", box=None, pad_edge=False)
+def settings_table(pairs: Sequence[Pair]) -> Table:
+    """How each image would be compared, and the tables of the settings file that say so."""
+    rows = Table(("image", "compared by", "from", "why"))
     for pair in pairs:
         how = pair.how
         options = [f"{name}={value}" for name, value in how.options.items()]
@@ -168,11 +161,15 @@ def write_junit(path: str | Path, results: Results) -> None:
 
     Errors: OSError.
     """
+    from mi_refract.report import junit
+
     cases = [_case(results, result) for result in results.results]
     junit.write_junit(path, "mi-refract diff", {str(results.test): cases})
 
 
 def _case(results: Results, result: Result) -> junit.Case:
+    from mi_refract.report import junit
+
     kind = _kind(results, result)
     if result.status is Status.SKIPPED:
         return junit.Case(_method(result), result.name, "skipped", why(result))

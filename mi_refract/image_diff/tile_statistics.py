@@ -9,7 +9,6 @@ Dachsbacher, "Detecting Bias in Monte Carlo Renderers using Welch's t-test", JCG
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -100,6 +99,8 @@ def from_renders(renders: Sequence[Array], tile: int) -> Side:
         variance = np.einsum("n...,n...->...", rows, rows) / (len(rows) * (len(rows) - 1))
         noise = np.stack([variance.sum(0), np.einsum("y...,y...->...", variance, variance)])
         return each, np.add.reduceat(noise, columns, -2)
+
+    from concurrent.futures import ThreadPoolExecutor
 
     with ThreadPoolExecutor(WORKERS) as pool:
         each, noise = (np.stack(x, -3) for x in zip(*pool.map(band, range(0, height, tile)), strict=True))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.io.image_file import Image
-from mi_refract.io.pixels import Pixels
+from mi_refract.io.pixels import Pixels, any_channel
 from mi_refract.report.number_text import compact, distinguishable
 
 from .comparison import Comparison, Metric, Verdict, checked_pixels, counted, verdict_of
@@ -115,7 +115,7 @@ def _rounded(bound: float, kind: np.dtype[Any] | type[np.floating[Any]] = np.flo
 def _beyond(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float) -> NDArray[np.intp]:
     """The pixels with a channel that differs by more than `most`, and than that share of the mean of both; flat."""
     most, share = (_rounded(each, difference.dtype) for each in (most, share))
-    pixels = np.flatnonzero((difference > most).any(-1))  # few: the rest is cheaper there
+    pixels = np.flatnonzero(any_channel(difference > most))  # few: the rest is cheaper there
     x, y, z = (each.reshape(-1, a.shape[2]) for each in (difference, a, b))
     blocks = np.array_split(pixels, pixels.size // BLOCK + 1)
     return np.concatenate([block[_differ(x[block], y[block], z[block], most, share)] for block in blocks])
@@ -126,7 +126,7 @@ def _differ(difference: Pixels, a: Pixels, b: Pixels, most: float, share: float)
     half = np.float64(0.5)  # of this type: half of a float32 would be rounded where it is subnormal
     mean = (np.abs(a) * half + np.abs(b) * half).astype(difference.dtype)
     relative = np.divide(difference, mean, out=np.zeros(mean.shape), where=mean > 0, dtype=np.float64)
-    differs: NDArray[np.bool_] = np.any((difference > most) & (relative > share), axis=-1)
+    differs: NDArray[np.bool_] = any_channel((difference > most) & (relative > share))
     return differs
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
 
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
@@ -19,6 +21,8 @@ def bounded_map(
 
     Items at work, and answers that wait for their turn, take `most` together; one that takes more is alone.
     """
+    from concurrent.futures import ThreadPoolExecutor  # not needed for one item
+
     pending: deque[tuple[Future[Answer], int]] = deque()
     taken = 0
     with ThreadPoolExecutor(threads) as pool:

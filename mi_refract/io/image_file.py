@@ -10,7 +10,6 @@ import re
 import shlex
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -269,6 +268,8 @@ def named(name: str, pixels: Any) -> Image:
 
 def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Image]:
     """Read several images, two at a time, as decompression takes most of the time. Raises what `read` raises."""
+    from concurrent.futures import ThreadPoolExecutor
+
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(read, paths))
 

@@ -10,7 +10,6 @@ import contextlib
 import fcntl
 import json
 import os
-import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,6 +28,8 @@ def held(path: Path, what: str) -> Iterator[None]:
     if file is None:
         raise BlockingIOError(f"{path.parent}: {what} runs there already, {_holder(path)}; accepted: another folder")
     try:
+        import socket  # the others who import this module do without
+
         since = time.strftime("%Y-%m-%d %H:%M:%S %z")
         os.ftruncate(file, 0)
         os.write(file, json.dumps({"process": os.getpid(), "host": socket.gethostname(), "since": since}).encode())

@@ -6,4 +6,14 @@ fills a template of `templates/`, `embedded_images` puts EXR files on a page, `p
 numbers, `junit` the XML of test results). Nothing is measured or judged here.
 """
 
-__all__ = ["embedded_images", "first_page", "html_page", "junit", "number_text", "plots", "row", "run_report"]
+__all__ = [
+    "embedded_images",
+    "first_page",
+    "html_page",
+    "junit",
+    "number_text",
+    "plots",
+    "row",
+    "run_report",
+    "text_table",
+]

@@ -73,3 +73,18 @@ def test_the_help_has_a_line_for_each_command_and_each_command_its_own(name, cap
     assert [line.split(None, 1)[1] for line in lines if line.startswith(f"  {name} ")] == [app.COMMANDS[name].help]
     assert app.main([name, "--help"]) == 0
     assert capfd.readouterr().out.startswith(f"Usage: mi-refract {name} ")
+
+
+# What a comparison of two images needs none of, but for its report, a terminal, or another method.
+UNUSED = ("mitsuba", "drjit", "scipy", "matplotlib", "jinja2", "rich", "pydantic", "xml", "email", "asyncio")
+
+
+@pytest.mark.parametrize("options", [[], ["--method", "tolerance", "--set", "fail=0.5", "--json", "out.json"]])
+def test_a_comparison_imports_what_it_needs(pair, tmp_path, options):
+    code = "import sys\nfrom mi_refract.cli import main\nmain(sys.argv[1:])\nprint([*sys.modules], file=sys.stderr)"
+    options = [str(tmp_path / word) if word == "out.json" else word for word in options]
+    with python(code, "diff", *pair, *options) as process:
+        out, err = process.communicate(timeout=60)
+    assert "2 images: " in out
+    assert "'OpenImageIO'" in err
+    assert not [name for name in UNUSED if f"'{name}'" in err]

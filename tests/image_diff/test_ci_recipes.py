@@ -174,7 +174,9 @@ def test_no_input_is_a_command(act, project, name):
     assert (job.code == 0) is (name == "artifact")
     for word in ("--methods", "--version"):
         if name in ("references", "test", "settings"):
-            assert act(**{name: word}).code == 2
+            job = act(**{name: word})
+            assert job.code == 2
+            assert re.search(f"mi-refract: {word}: no such", job.log, re.IGNORECASE)
 
 
 def test_names_that_github_refuses_and_hostile_ones_are_left_out(tmp_path, capsys):
@@ -287,6 +289,7 @@ def test_the_ctest_of_the_readme(project, environment, tmp_path, render, failed)
     done = call("ctest", "--test-dir", build, "--output-on-failure")
     assert re.findall(r"^\t *\d+ - (\w+) \(", done.stdout, re.MULTILINE) == failed, done.stdout
     assert done.returncode == (8 if failed else 0)
+    assert ("images (Not Run)" in done.stdout) is (render is None)
     assert ("different  inner/other.exr" in done.stdout) is (render == 1.1)
     assert (build / "images.html").exists() is (render is not None)
 

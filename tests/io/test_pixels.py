@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mi_refract.io.pixels import block_area, block_mean, block_sum, srgb_decode, srgb_encode
+from mi_refract.io.pixels import any_channel, block_area, block_mean, block_sum, srgb_decode, srgb_encode
 
 
 def test_the_srgb_curve_is_that_of_the_standard():
@@ -20,3 +20,15 @@ def test_blocks_at_the_edge_are_of_what_is_left():
     assert means[1, 1] == pytest.approx(pixels[0, 4:, 4:].mean((0, 1)))
     assert block_area(7, 5, 4)[..., 0].tolist() == [[16, 4], [12, 3]]
     assert block_mean(pixels[0].astype(np.float32), 4).dtype == np.float32
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 8, 9, 40])
+@pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
+def test_any_channel(channels, share):
+    flags = np.random.default_rng(channels).random((6, 7, channels)) < share
+    assert np.array_equal(any_channel(flags), flags.any(-1))
+    assert any_channel(flags.reshape(-1, channels)).shape == (42,)
+
+
+def test_any_of_no_channel():
+    assert not any_channel(np.ones((2, 3, 0), bool)).any()

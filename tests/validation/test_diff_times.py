@@ -33,12 +33,15 @@ def test_rows():
     rows = {row.subject: row for row in times.measure(SMALL, "any")}
     assert rows.keys() >= {"welch", "tolerance", "auto", "page", "memory", "size of the page"}
     assert {name for name, row in rows.items() if "time / reading" in row.values} == {*times.METHODS, "auto"}
+    assert 1 < rows["from the shell"].values["time / libraries"] < 10
     assert not [row for row in rows.values() if row.goals]  # they are those of another size
     assert rows["memory"].values["MB of memory"] > 10
     assert 0.02 < rows["size of the page"].values["MB of page"] < limits.PAGE_MEGABYTES
 
 
 def test_a_process_that_fails_is_no_measurement(root, monkeypatch):
+    with pytest.raises(OSError, match=r"none\.exr"):
+        times._process("-m", "mi_refract.cli", "diff", str(root / "none.exr"), str(root / "a" / "0.exr"))
     monkeypatch.setattr(times, "PROCESS", "raise SystemExit('no memory')")
     with pytest.raises(OSError, match="no memory"):
         times._memory_row(root, SMALL, "any")
