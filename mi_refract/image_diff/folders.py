@@ -20,11 +20,11 @@ import numpy as np
 from mi_refract.io import exit_code, image_file
 from mi_refract.io.image_file import MAX_VALUES, Image
 
-from . import masks, methods, pairing, settings_file
+from . import channels, masks, methods, pairing, settings_file, variances
 from .comparison import Comparison, Verdict
 from .pairing import Pair
 from .results import STATUSES, Result, Results, Status
-from .settings import Settings
+from .settings import How, Settings
 
 AS_ASKED = Settings()
 WORKERS = min(os.cpu_count() or 1, 8)  # each holds a pair of images in memory
@@ -57,10 +57,10 @@ def diff(
     every = _pairs(reference, test, settings, renders)
     unused = settings.unused([pair.name for pair in every]) if reference.is_dir() and not renders else []
     pairs = [*pairing.named(every, names), *_wrong_entries(settings, every)]
-    root = reference if reference.is_dir() else reference.parent
+    roots = tuple(path if path.is_dir() else path.parent for path in (reference, test))
     found, held = [], 0
     with ThreadPoolExecutor(WORKERS) as pool:
-        for result in pool.map(lambda pair: _compared(pair, root, renders, maps, to_accept), pairs):
+        for result in pool.map(lambda pair: _compared(pair, roots, renders, maps, to_accept), pairs):
             held += sum(image.pixels.nbytes for image in result.images)
             found.append(result if held <= HELD else replace(result, images=()))
             tell(len(found), len(pairs))
@@ -85,7 +85,7 @@ def _wrong_entries(settings: Settings, pairs: Sequence[Pair]) -> list[Pair]:
     return [Pair(f"{settings_file.FILE}: {rule.where}", None, None, Path(), error=rule.error) for rule in wrong]
 
 
-def _compared(pair: Pair, root: Path, renders: bool, maps: bool, to_accept: bool) -> Result:
+def _compared(pair: Pair, roots: tuple[Path, ...], renders: bool, maps: bool, to_accept: bool) -> Result:
     """The result of comparing the two sides of a pair, where it has both; ERROR for whatever goes wrong."""
     result = Result(pair.name, Status.DIFFERENT, pair.reference, pair.test, pair.how)
     result = replace(result, target=pair.target, variants=pair.variants, error=pair.error or pair.how.error)
@@ -96,7 +96,7 @@ def _compared(pair: Pair, root: Path, renders: bool, maps: bool, to_accept: bool
     try:
         if to_accept:  # before the images are read: what is read later and has the same digest is what was compared
             result = replace(result, digests=(digest(result.reference), digest(result.test)))
-        return _judged(result, root, renders, maps)
+        return _judged(result, roots, renders, maps)
     except Exception as error:  # of whatever kind: the other images are still to be compared
         exit_code.print_traceback(error)
         text = exit_code.describe(error)
@@ -104,7 +104,7 @@ def _compared(pair: Pair, root: Path, renders: bool, maps: bool, to_accept: bool
         return replace(result, status=Status.ERROR, error=text if known else f"{result.test}: {text}")
 
 
-def _judged(result: Result, root: Path, renders: bool, maps: bool) -> Result:
+def _judged(result: Result, roots: tuple[Path, ...], renders: bool, maps: bool) -> Result:
     """The verdict against the reference, or that of a variant to which the new image is equal."""
     if not (result.reference and result.test):
         return result
@@ -112,7 +112,7 @@ def _judged(result: Result, root: Path, renders: bool, maps: bool) -> Result:
     judged, failed = [], None
     for path in (result.reference, *result.variants):
         try:
-            one = _against(path, result.test, read, result, root)
+            one = _against(path, result.test, read, result, roots)
         except (ValueError, OSError, MemoryError) as error:
             failed = failed or error  # unless another reference is equal
             continue
@@ -135,12 +135,19 @@ class _Judged:
     warning: str
 
 
-def _against(path: Path, other: Path, read: Callable[[Path], list[Image]], result: Result, root: Path) -> _Judged:
+def _against(
+    path: Path, other: Path, read: Callable[[Path], list[Image]], result: Result, roots: tuple[Path, ...]
+) -> _Judged:
     how = result.how
     if path.samefile(other):
         raise ValueError(f"{other}: the same file as the reference {path}; accepted: two")
-    reference, test = read(path), read(other)
-    file = pairing.beside(how.mask, result.target or path, root) if how.mask else None
+    reference, test = (
+        channels.chosen(_with_variance(read(each), root, how), how.channels, side)
+        for side, (each, root) in enumerate(zip((path, other), roots, strict=True))
+    )
+    if _wants_variance(how) and not (len(reference) > 1 or variances.has_variance(reference[0])):
+        raise FileNotFoundError(f"{pairing.beside(how.variance, path, roots[0])}: no such file; accepted: a variance")
+    file = pairing.beside(how.mask, result.target or path, roots[0]) if how.mask else None
     mask = masks.made(reference[0], file, how.ignore, how.max_values)
     sides = _masked(reference, mask), _masked(test, mask)
     return _Judged(sides, methods.compare(how.method, *sides, **how.options), masks.warning(mask))
@@ -148,6 +155,20 @@ def _against(path: Path, other: Path, read: Callable[[Path], list[Image]], resul
 
 def _images(path: Path, most: int, renders: bool) -> list[Image]:
     return read_renders(path, most) if renders else [image_file.read(path, most)]
+
+
+def _wants_variance(how: How) -> bool:
+    return bool(how.variance) and how.method in (methods.AUTO, "welch")
+
+
+def _with_variance(images: list[Image], root: Path, how: How) -> list[Image]:
+    """A single image with the variance that lies beside it, where the settings name one and it is there."""
+    if not _wants_variance(how) or len(images) > 1:
+        return images
+    file = pairing.beside(how.variance, images[0].path, root)
+    if file == images[0].path:
+        raise ValueError(f"variance = {how.variance!r}: is {file} itself; accepted: the name of another image")
+    return [variances.with_file(images[0], file, how.max_values)] if file.exists() else images
 
 
 def _masked(images: list[Image], mask: masks.Mask | None) -> list[Image]:

@@ -15,6 +15,7 @@ from typing import Any
 
 from mi_refract.io.image_file import MAX_VALUES
 
+from .channels import Names
 from .masks import Rectangle
 from .methods import AUTO, METHODS, options_of_auto
 from .name_patterns import matches
@@ -22,6 +23,7 @@ from .name_patterns import matches
 SYSTEMS = {"linux": "linux", "darwin": "macos", "win32": "windows"}  # by sys.platform
 PROCESSORS = {"x86_64": "x86_64", "amd64": "x86_64", "arm64": "arm64", "aarch64": "arm64"}  # by platform.machine()
 FILE_ONLY = ("accept", "mask", "ignore")  # keys of `How` that no option of the command line says
+OF_BOTH = ("variance", "channels")  # those that one of the file's tables and an option of its own say
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,9 @@ class How:
 
     `max_values`: width × height × channels of an image, at most. `skip`: not compared at all. `accept`: templates of
     other references, each as good as the first. `mask`, `ignore`: pixels that do not count, as a template of an image
-    and as rectangles. `entries`: the tables of the settings file that say so. `error`: why they cannot be followed.
+    and as rectangles. `variance`: a template of the image that holds the variance of one sample of each pixel.
+    `channels`: those that are compared, by their names in the reference and in the new image; none: all. `entries`: the
+    tables of the settings file that say so. `error`: why they cannot be followed.
     """
 
     method: str = AUTO
@@ -41,6 +45,8 @@ class How:
     accept: tuple[str, ...] = ()
     mask: str = ""
     ignore: tuple[Rectangle, ...] = ()
+    variance: str = ""
+    channels: Names = ()
     entries: tuple[str, ...] = ()
     error: str = ""
 
@@ -53,6 +59,8 @@ class How:
                 words += ["--set", f"{name}={value}"]
             elif value:
                 words += ["--allow-nonfinite", "*"]
+        words += ["--variance", self.variance] if self.variance else []
+        words += ["--channels", written(self.channels)] if self.channels else []
         return words + ([] if self.max_values == MAX_VALUES else ["--max-values", str(self.max_values)])
 
     @property
@@ -65,8 +73,8 @@ class How:
 class Entry:
     """An `[[image]]` table, or `[defaults]`: a pattern of names, and the keys that it gives.
 
-    `values`: of `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `allow_nonfinite` and the options of methods.
-    `when`: platforms, one of which must be this one; none: all. `error`: what is wrong with it.
+    `values`: of `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `variance`, `channels`, `allow_nonfinite` and
+    the options of methods. `when`: platforms, one of which must be this one; none: all. `error`: what is wrong with it.
     """
 
     pattern: str
@@ -121,8 +129,10 @@ class Settings:
             )
         except ValueError as error:
             return replace(how, error=str(error))
-        others = {**self.defaults.values, **{key: value for each in entries for key, value in each.values.items()}}
-        kept = {key: others[key] for key in ("skip", *FILE_ONLY) if key in others}
+        given = {key: value for key in OF_BOTH if (value := getattr(self.default, key))}
+        of_entries = {key: value for each in entries for key, value in each.values.items()}
+        others = {**self.defaults.values, **given, **of_entries}
+        kept = {key: others[key] for key in ("skip", *FILE_ONLY, *OF_BOTH) if key in others}
         return replace(how, method=method, options=options, **kept)
 
     def _command_line(self, name: str) -> list[tuple[str, Mapping[str, Any]]]:
@@ -141,6 +151,11 @@ class Settings:
         """The patterns for this platform that match none of these names."""
         patterns = [*(each.pattern for each in self.rules if each.here), *self.allow_nonfinite]
         return [pattern for pattern in patterns if not any(matches(pattern, name) for name in names)]
+
+
+def written(channels: Names) -> str:
+    """The channels as `--channels` takes them."""
+    return ",".join(one if one == two else f"{one}={two}" for one, two in channels)
 
 
 def this_platform() -> frozenset[str]:

@@ -23,7 +23,7 @@ from mi_refract.report.row import strict
 from .comparison import Metric
 from .pairing import Pair
 from .results import Result, Results, Status
-from .settings import How
+from .settings import How, written
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -88,8 +88,11 @@ def settings_table(pairs: Sequence[Pair]) -> RenderableType:
 
 
 def _pixels(how: How) -> list[str]:
-    mask = [f"mask {how.mask}"] if how.mask else []
-    return [*mask, *(f"without {list(each)}" for each in how.ignore)]
+    given = {"mask": how.mask, "variance": how.variance, "channels": written(how.channels)}
+    return [
+        *(f"{name} {each}" for name, each in given.items() if each),
+        *(f"without {list(each)}" for each in how.ignore),
+    ]
 
 
 def why(result: Result) -> str:

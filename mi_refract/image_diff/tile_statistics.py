@@ -201,7 +201,7 @@ def _with_pixels(level: Level, pixels: PixelSums, area: Array, inflation: Inflat
     return replace(level, of_pixels=np.where(level.silent, 1.0, np.nan_to_num(p, nan=0.0)))
 
 
-def with_silent_pixels(level: Level, a: Array, b: Array, margin: float, tile: int) -> Level:
+def with_silent_pixels(level: Level, a: Array, b: Array, margin: float, tile: int, odds: Array | float = 7.0) -> Level:
     """The level of single tiles with those without noise `off` where a pixel is, too, and with their p.
 
     The mean of such a tile does not show what was moved about inside. `a`, `b`: one render of each side.
@@ -209,7 +209,8 @@ def with_silent_pixels(level: Level, a: Array, b: Array, margin: float, tile: in
     A value that comes up in every render can still be chance, as black is where light is rarely found. Let a pixel take
     values with probabilities pₓ. All renders of each side, two or more, agree with probability s = Σ pₓ⁴ at most in
     the same value, and with d = (Σ pₓ²)² − s in two different ones. As s + 7d ≤ 1, no tile of independent pixels is
-    without noise and has k different pixels with a probability above 7⁻ᵏ.
+    without noise and has k different pixels with a probability above 7⁻ᵏ. `odds`, per channel: what stands for 7 where
+    the noise of one side is all that is known.
     """
     if not level.silent.any():
         return level
@@ -217,7 +218,7 @@ def with_silent_pixels(level: Level, a: Array, b: Array, margin: float, tile: in
     allowed = margin * np.maximum(np.abs(a), DARK * median_nonblack(np.abs(a)))
     moved = block_sum(difference > allowed, tile) > 0
     far = block_sum((difference > FAR * allowed).astype(np.float64), tile)
-    p = np.where(level.silent, 7.0**-far, 1.0)
+    p = np.where(level.silent, odds**-far, 1.0)
     return replace(level, off=level.off | (level.silent & moved), of_silent=p)
 
 

@@ -89,7 +89,8 @@ class Image:
     `pixels`: H × W × C, float32, or float64 where the file holds numbers that float32 cannot; integers of a file are
     mapped to 0 … 1. `channels`: C names. `origin`: (x, y) where the data window begins. `metadata`: the header.
     `display`: x, y, width and height of the display window; None where it is the data window. `mask`: H × W, the
-    pixels that count; None where all do. The others are 0.
+    pixels that count; None where all do. The others are 0. `variances`: H × W by channel, of one sample per
+    pixel, where another file holds them.
     """
 
     path: Path
@@ -99,6 +100,7 @@ class Image:
     metadata: Metadata = field(default_factory=dict)
     display: tuple[int, int, int, int] | None = None
     mask: NDArray[np.bool_] | None = None
+    variances: Mapping[str, NDArray[np.floating[Any]]] = field(default_factory=dict)
 
     def select(self, channels: Sequence[str]) -> NDArray[np.floating[Any]]:
         """The pixels of these channels, in this order: H × W × len(channels). ValueError for a name not there."""
