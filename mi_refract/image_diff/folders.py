@@ -145,7 +145,7 @@ def _against(
         channels.chosen(_with_variance(read(each), root, how), how.channels, side)
         for side, (each, root) in enumerate(zip((path, other), roots, strict=True))
     )
-    if _wants_variance(how) and not (len(reference) > 1 or variances.has_variance(reference[0])):
+    if how.reads_variance and not (len(reference) > 1 or variances.has_variance(reference[0])):
         raise FileNotFoundError(f"{pairing.beside(how.variance, path, roots[0])}: no such file; accepted: a variance")
     file = pairing.beside(how.mask, result.target or path, roots[0]) if how.mask else None
     mask = masks.made(reference[0], file, how.ignore, how.max_values)
@@ -157,13 +157,9 @@ def _images(path: Path, most: int, renders: bool) -> list[Image]:
     return read_renders(path, most) if renders else [image_file.read(path, most)]
 
 
-def _wants_variance(how: How) -> bool:
-    return bool(how.variance) and how.method in (methods.AUTO, "welch")
-
-
 def _with_variance(images: list[Image], root: Path, how: How) -> list[Image]:
     """A single image with the variance that lies beside it, where the settings name one and it is there."""
-    if not _wants_variance(how) or len(images) > 1:
+    if not how.reads_variance or len(images) > 1:
         return images
     file = pairing.beside(how.variance, images[0].path, root)
     if file == images[0].path:

@@ -64,6 +64,11 @@ class How:
         return words + ([] if self.max_values == MAX_VALUES else ["--max-values", str(self.max_values)])
 
     @property
+    def reads_variance(self) -> bool:
+        """Whether the method is one that knows what to do with the variance."""
+        return bool(self.variance) and self.method in (AUTO, "welch")
+
+    @property
     def needs_file(self) -> bool:
         """Whether the command line alone cannot say the same."""
         return any(getattr(self, name) for name in FILE_ONLY)
