@@ -103,16 +103,15 @@ def chosen(images: Sequence[Image], names: Names, side: int) -> list[Image]:
 def matched(reference: Image, test: Image) -> tuple[Image, Image]:
     """Both with the same channels as far as Mitsuba's layouts say, apart from those of variance.
 
-    Colours of the film that repeat what `moment` holds with its squares are left out; integrators of other names are
-    the same; and what one side has as "nested.X", "nested.Y", "nested.Z" is compared with the colours of the other.
+    What `moment` holds as "nested.X", "nested.Y", "nested.Z" with its squares takes the place of the film's colours, if
+    these repeat it, as X, Y, Z; whatever the nested integrator is called. They are compared with the colours of a film
+    that has no moments.
     """
-    one, two = moment_layer(reference), moment_layer(test)
-    if one and two:
-        return _of_layer(reference, one, one), _of_layer(test, two, one)
-    if (one or two) and set(means(reference.channels)) != set(means(test.channels)):
-        sides = (reference, one), (test, two)
-        left, right = (_of_layer(image, layer, "") if layer else _as_xyz(image) for image, layer in sides)
-        return left, right
+    layers = moment_layer(reference), moment_layer(test)
+    if all(layers) or (any(layers) and set(means(reference.channels)) != set(means(test.channels))):
+        sides = zip((reference, test), layers, strict=True)
+        one, two = (_of_layer(image, layer) if layer else _as_xyz(image) for image, layer in sides)
+        return one, two
     if any(set(XYZ) <= set(image.variances) - set(image.channels) for image in (reference, test)):
         return _as_xyz(reference), _as_xyz(test)
     return reference, test
@@ -144,13 +143,10 @@ def _repeats(film: Pixels, nested: Pixels) -> bool:
         )
 
 
-def _of_layer(image: Image, layer: str, name: str) -> Image:
-    """The image without the film's colours, and with the layer's channels under another name."""
-    names = {each: each for each in means(image.channels) if each not in (*RGB, *XYZ)}
-    for each in names:
-        if each.startswith(f"{layer}."):
-            names[each] = f"{name}.{each[len(layer) + 1 :]}" if name else each[len(layer) + 1 :]
-    return selected(image, names)
+def _of_layer(image: Image, layer: str) -> Image:
+    """The image with the layer's channels, without its name before theirs, in place of the film's colours."""
+    others = (each for each in means(image.channels) if each not in (*RGB, *XYZ))
+    return selected(image, {each: each.removeprefix(f"{layer}.") for each in others})
 
 
 def _as_xyz(image: Image) -> Image:

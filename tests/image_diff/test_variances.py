@@ -220,7 +220,7 @@ def test_rounding_below_zero_is_none():
 def test_infinite_squares_cannot_be_compared():
     pixels = moments(samples(1, 8))
     pixels.pixels[2, 3, pixels.channels.index("m2_nested.Y")] = np.inf
-    with pytest.raises(ValueError, match=r"variance of nested.Y is not finite at x = 3, y = 2"):
+    with pytest.raises(ValueError, match=r"variance of Y is not finite at x = 3, y = 2"):
         compare("auto", pixels, moments(samples(2, 8)), spp=8)
 
 
@@ -253,6 +253,18 @@ def test_films_are_recognised(reference, test):
     squared = [1.1**2 if name in wanted else 1.0 if name == "A" else 1.1 for name in test.channels]
     brighter = replace(test, pixels=test.pixels * np.float32(squared))
     assert compare("auto", reference, brighter, spp=16).verdict is Verdict.DIFFERENT
+
+
+def test_an_alpha_has_at_most_the_variance_of_a_coin():
+    """One of a half is equal to another of as many samples, and not to one of 0.4."""
+    reference, test, other = (moments(samples(seed, 64), (*RGB, "A")) for seed in (1, 2, 3))
+    for each, share, seed in ((reference, 0.5, 4), (test, 0.5, 5), (other, 0.4, 6)):
+        each.pixels[..., 3] = np.random.default_rng(seed).binomial(64, share, SHAPE[:2]) / 64
+    how = {"spp": 64, "resolution": 0.2}
+    assert compare("auto", reference, test, **how).verdict is Verdict.EQUAL
+    assert compare("auto", reference, other, **how).verdict is Verdict.DIFFERENT
+    reference.pixels[..., 3], other.pixels[..., 3] = 2.0, 2.5  # no alpha: nothing bounds the variance
+    assert "without variance: A" in compare("auto", reference, other, **how).reason
 
 
 def test_the_order_of_channels_does_not_matter():

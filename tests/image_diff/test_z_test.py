@@ -129,6 +129,8 @@ def test_one_known_variance_is_that_of_both_sides(n, m, known_side):
     spp = (n, m) if known_side == 0 else (m, n)
     found = compare("welch", *sides, spp_reference=spp[0], spp_test=spp[1], equivalence_margin=0.0)
     t = 0.5 / np.sqrt(v * (1 / n + 1 / m))
+    again = compare("welch", *sides, spp=7, spp_reference=spp[0], spp_test=spp[1], equivalence_margin=0.0)
+    assert again.maps["t"].item() == found.maps["t"].item()  # what is said of a side goes before what is said of both
     assert found.maps["t"].item() == pytest.approx(t, rel=1e-5)
     assert found.maps["p"].item() == pytest.approx(2 * stats.t.sf(t, n - 1), rel=1e-5)
 
