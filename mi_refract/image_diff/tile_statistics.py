@@ -24,6 +24,9 @@ from .pixel_statistics import PixelSums
 DARK = 1e-3  # a tile darker than this share of its channel's `median_nonblack` counts as that bright in ratios
 GROWTH = 4  # from one level of tiles to the next
 HEAVY = 4.0  # a tile whose noise comes from fewer pixels than this is heavy-tailed: its t is not a Student's
+# Where the variance comes from the other side, a mean does not vary with its own noise. Noise of 0.1 of it may be that
+# of 100 rare events, ten times as frequent beyond 5 σ as normal noise: such a tile is heavy-tailed, too.
+BORROWED = 0.1
 POOLED = 30  # blocks of tiles from which the correlation of pixels is estimated again, at least
 MISSED = 0.01  # the minimum detectable difference is missed with this probability
 FAR = 10.0  # times the margin: a pixel without noise that is so far off is evidence, see `with_silent_pixels`
@@ -49,7 +52,8 @@ class Inflation:
 class Side:
     """Totals per tile and channel: `mean`, `variance` of the means and its square, over pixels; `renders` one by one.
 
-    `freedom`: degrees of freedom of a pixel's variance. Without `renders` pixels are taken for independent.
+    `freedom`: degrees of freedom of a pixel's variance. Without `renders` pixels are taken for independent. `borrowed`:
+    the channels whose noise only the other side knows; its `variance` is that of both.
     """
 
     area: Array
@@ -58,6 +62,7 @@ class Side:
     squares: Array
     freedom: float
     renders: Array | None = None
+    borrowed: Flags | None = None
 
     def coarser(self) -> Side:
         """The same side in tiles GROWTH times as wide."""
@@ -65,7 +70,7 @@ class Side:
             block_sum(x, GROWTH) for x in (self.area, self.mean, self.variance, self.squares)
         )
         renders = None if self.renders is None else block_sum(self.renders, GROWTH)
-        return Side(area, mean, variance, squares, self.freedom, renders)
+        return Side(area, mean, variance, squares, self.freedom, renders, self.borrowed)
 
     def spread(self, inflation: Inflation) -> tuple[Array, Array]:
         """The variance of the tile means, and its square over its degrees of freedom, summed over pixels."""
@@ -190,6 +195,9 @@ def compare_tiles(
         t = np.where(silent, 0.0, difference / error)
         beyond = np.where(silent, 0.0, np.maximum(np.abs(difference) - allowed, 0) / error)
         few = (one.variance + two.variance) ** 2 < HEAVY * (one.squares + two.squares)
+        for side in (one, two):
+            if side.borrowed is not None:
+                few |= side.borrowed & (error > BORROWED * np.maximum(np.abs(m1), np.abs(m2)))
         off = silent & (np.abs(difference) > allowed)
     # NaN becomes 0: what is not finite equals nothing.
     p, p_beyond = (np.nan_to_num(2 * special.stdtr(freedom, -np.abs(x)), nan=0.0) for x in (t, beyond))

@@ -133,6 +133,7 @@ def _of_estimates(a: Estimate, b: Estimate, tile: int) -> _Sides:
     # pⁿ⁺ᵐ + odds pⁿ(1 − pᵐ) ≤ p over all values is at most 1, as that of 7 in `with_silent_pixels` is.
     odds = np.where(only_one, 1 + (a.spp - 1) / b.spp, np.where(only_two, 1 + (b.spp - 1) / a.spp, 7.0))
     one, two = from_variances(m1, w1, a.spp - 1.0, tile), from_variances(m2, w2, b.spp - 1.0, tile)
+    one, two = replace(one, borrowed=only_two), replace(two, borrowed=only_one)
     return _Sides(one, two, sums(m1, w1, m2, w2, tile), names, odds)
 
 

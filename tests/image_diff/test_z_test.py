@@ -144,3 +144,13 @@ def test_what_no_sample_of_the_reference_found_is_evidence_by_how_many_it_had():
         found = compare("welch", known, image(wrong, channels=("Y",)), spp_reference=1001, spp_test=100)
         assert (found.verdict is Verdict.DIFFERENT) is seen  # 11⁻² > 0.001 > 11⁻³
         assert found.verdict is not Verdict.EQUAL
+
+
+def test_rare_events_are_no_evidence_against_a_side_that_does_not_know_its_noise():
+    """A tile of 5.5 σ where σ is a quarter of the mean: so are a few paths that find a lamp."""
+    mean, far, variance = (np.full((16, 16, 1), x) for x in (1.0, 2.375, 256 * 1000 * 0.25**2))
+    known, other = image(mean, variance, ("Y",)), image(far, channels=("Y",))
+    found = compare("welch", known, other, spp_reference=10**9, spp_test=1000)
+    assert (found.verdict, "heavy-tailed" in found.reason) == (Verdict.INCONCLUSIVE, True)
+    both = image(far, np.full_like(mean, 1e-9), ("Y",)), image(mean, variance, ("Y",))
+    assert compare("welch", *both, spp_reference=10**9, spp_test=1000).verdict is Verdict.DIFFERENT
