@@ -57,6 +57,12 @@ Nonfinite = Annotated[
     list[str] | None,
     typer.Option(metavar="NAME", help="An image (or pattern of names) where both sides may have the same NaN or Inf."),
 ]
+Variance = Annotated[
+    str, typer.Option(metavar="TEMPLATE", help='Images of the variance of a sample beside both: "{stem}_var.exr".')
+]
+Channels = Annotated[
+    str, typer.Option(metavar="NAMES", help='Those that are compared: "X,Y,Z"; "nested.X=X" if names differ.')
+]
 MaxValues = Annotated[
     int, typer.Option("--max-values", metavar="N", min=1, help="Width × height × channels of an image, at most.")
 ]
@@ -124,6 +130,8 @@ def diff(
     idiff: Idiff = None,
     settings: File = None,
     allow_nonfinite: Nonfinite = None,
+    variance: Variance = "",
+    channels: Channels = "",
     max_values: MaxValues = MAX_VALUES,
     inconclusive: CountsAs = None,
     report: Report = None,
@@ -152,20 +160,22 @@ def diff(
             junit,
             json,
             github,
+            variance,
+            channels,
         )
         if any(others) or method != AUTO:
             accepted = "no other option but --max-values, --allow-plugins"
             raise ValueError(f"--self-test asks every method and prints; accepted: {accepted}")
         raise typer.Exit(_self_test(reference, test, max_values, allow_plugins or []))
     if check_settings and reference:
-        chosen = _settings(reference, method, options, idiff, settings, allow_nonfinite, max_values)
+        chosen = _settings(reference, method, options, idiff, settings, allow_nonfinite, max_values, variance, channels)
         raise typer.Exit(_check_settings(reference, test, names or [], chosen))
     if reference is None or test is None:
         raise ValueError("two paths are needed; accepted: mi-refract diff REFERENCE TEST")
     for path, suffixes in zip((report, junit, json), OUTPUTS, strict=True):
         if path:
             writable(path, suffixes)
-    chosen = _settings(reference, method, options, idiff, settings, allow_nonfinite, max_values)
+    chosen = _settings(reference, method, options, idiff, settings, allow_nonfinite, max_values, variance, channels)
     wanted = inconclusive or ""
     with _progress() as tell:
         found = folders.diff(
@@ -214,12 +224,14 @@ def accept(
     idiff: Idiff = None,
     settings: File = None,
     allow_nonfinite: Nonfinite = None,
+    variance: Variance = "",
+    channels: Channels = "",
     max_values: MaxValues = MAX_VALUES,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
     """Show which images are not equal to their references, ask, and copy them over. Nothing is deleted."""
     _require_extra("scipy")
-    chosen = _settings(reference, method, options, idiff, settings, allow_nonfinite, max_values)
+    chosen = _settings(reference, method, options, idiff, settings, allow_nonfinite, max_values, variance, channels)
     with _progress() as tell:
         found = folders.diff(reference, test, chosen, names=names or [], to_accept=True, tell=tell)
     _say(found)
@@ -305,8 +317,15 @@ def _settings(
     file: Path | None,
     nonfinite: list[str] | None,
     max_values: int,
+    variance: str,
+    channels: str,
 ) -> Settings:
-    default = replace(settings_file.from_words(method, words or [], idiff), max_values=max_values)
+    default = replace(
+        settings_file.from_words(method, words or [], idiff),
+        max_values=max_values,
+        variance=settings_file.variance_from(variance) if variance else "",
+        channels=settings_file.channels_from(channels) if channels else (),
+    )
     beside = (reference if reference.is_dir() else reference.parent) / settings_file.FILE
     path = file or (beside if beside.exists() else None)
     if path is None:

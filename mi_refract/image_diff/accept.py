@@ -13,8 +13,10 @@ import numpy as np
 from mi_refract.io import image_file
 from mi_refract.io.atomic import replacing
 
+from . import pairing
 from .folders import digest, opened
 from .results import Results, Status
+from .settings import How
 
 BLOCK = 2**20  # bytes that are copied at once
 
@@ -54,6 +56,19 @@ def changes(results: Results) -> Iterator[Copy]:
             raise ValueError(f"{target}: accepted: a name that ends in {result.test.suffix}, as {result.test} does")
         replaced, shown = result.digests
         yield Copy(result.test, target, shown, replaced)
+        yield from _of_variance(result.test, target, results, result.how)
+
+
+def _of_variance(new: Path, target: Path, results: Results, how: How) -> Iterator[Copy]:
+    """A copy of the new image's variance, where the reference has one; ValueError where the new image has none."""
+    roots = (path if path.is_dir() else path.parent for path in (results.test, results.reference))
+    if not how.reads_variance:
+        return
+    source, to = (pairing.beside(how.variance, path, root) for path, root in zip((new, target), roots, strict=True))
+    if source.exists():
+        yield Copy(source, to, digest(source), digest(to))
+    elif to.exists():
+        raise ValueError(f"{source}: no such file, and {to} is of another render; accepted: a variance of {new}")
 
 
 def accept(copies: Sequence[Copy]) -> None:

@@ -21,11 +21,11 @@ from mi_refract.io import exit_code, image_file
 from mi_refract.io.bounded_map import bounded_map
 from mi_refract.io.image_file import MAX_VALUES, Image
 
-from . import masks, methods, pairing, parts, settings_file
+from . import channels, masks, methods, pairing, parts, settings_file, variances
 from .comparison import Comparison, Verdict
 from .pairing import Pair
 from .results import STATUSES, Result, Results, Status
-from .settings import Settings
+from .settings import How, Settings
 
 AS_ASKED = Settings()
 WORKERS = min(os.cpu_count() or 1, 8)
@@ -58,11 +58,11 @@ def diff(
     every = _pairs(reference, test, settings, renders)
     unused = settings.unused([pair.name for pair in every]) if reference.is_dir() and not renders else []
     pairs = [*pairing.named(every, names), *_wrong_entries(settings, every)]
-    root = reference if reference.is_dir() else reference.parent
+    roots = tuple(path if path.is_dir() else path.parent for path in (reference, test))
     found, held = [], 0
     # Together, the pairs that are compared at once have no more values than one pair may have.
     most = 2 * settings.default.max_values
-    compare = functools.partial(_compared, root=root, renders=renders, maps=maps, to_accept=to_accept)
+    compare = functools.partial(_compared, roots=roots, renders=renders, maps=maps, to_accept=to_accept)
     results = map(compare, pairs) if len(pairs) == 1 else bounded_map(compare, pairs, _values, most, WORKERS)
     for result in results:
         held += sum(image.pixels.nbytes for image in result.images)
@@ -99,7 +99,7 @@ def _values(pair: Pair) -> int:
     return 0
 
 
-def _compared(pair: Pair, root: Path, renders: bool, maps: bool, to_accept: bool) -> Result:
+def _compared(pair: Pair, roots: tuple[Path, ...], renders: bool, maps: bool, to_accept: bool) -> Result:
     """The result of comparing the two sides of a pair, where it has both; ERROR for whatever goes wrong."""
     result = Result(pair.name, Status.DIFFERENT, pair.reference, pair.test, pair.how)
     result = replace(result, target=pair.target, variants=pair.variants, error=pair.error or pair.how.error)
@@ -110,7 +110,7 @@ def _compared(pair: Pair, root: Path, renders: bool, maps: bool, to_accept: bool
     try:
         if to_accept:  # before the images are read: what is read later and has the same digest is what was compared
             result = replace(result, digests=(digest(result.reference), digest(result.test)))
-        return _judged(result, root, renders, maps)
+        return _judged(result, roots, renders, maps)
     except Exception as error:  # of whatever kind: the other images are still to be compared
         exit_code.print_traceback(error)
         text = exit_code.describe(error)
@@ -118,7 +118,7 @@ def _compared(pair: Pair, root: Path, renders: bool, maps: bool, to_accept: bool
         return replace(result, status=Status.ERROR, error=text if known else f"{result.test}: {text}")
 
 
-def _judged(result: Result, root: Path, renders: bool, maps: bool) -> Result:
+def _judged(result: Result, roots: tuple[Path, ...], renders: bool, maps: bool) -> Result:
     """The verdict against the reference, or that of a variant to which the new image is equal."""
     if not (result.reference and result.test):
         return result
@@ -128,7 +128,7 @@ def _judged(result: Result, root: Path, renders: bool, maps: bool) -> Result:
     judged, failed = [], None
     for path in (result.reference, *result.variants):
         try:
-            one = _against(path, read(path), test(), result, root)
+            one = _against(path, read(path), test(), result, roots)
         except (ValueError, OSError, MemoryError) as error:
             failed = failed or error  # unless another reference is equal
             continue
@@ -158,9 +158,15 @@ def _read(result: Result, path: Path, renders: bool) -> list[Image]:
     return read_renders(path, result.how.max_values) if renders else parts.read(path, result.how)
 
 
-def _against(path: Path, reference: list[Image], test: list[Image], result: Result, root: Path) -> _Judged:
+def _against(path: Path, reference: list[Image], test: list[Image], result: Result, roots: tuple[Path, ...]) -> _Judged:
     how = result.how
-    file = pairing.beside(how.mask, result.target or path, root) if how.mask else None
+    reference, test = (
+        channels.chosen(_with_variance(images, root, how), how.channels, side)
+        for side, (images, root) in enumerate(zip((reference, test), roots, strict=True))
+    )
+    if how.reads_variance and not (len(reference) > 1 or variances.has_variance(reference[0])):
+        raise FileNotFoundError(f"{pairing.beside(how.variance, path, roots[0])}: no such file; accepted: a variance")
+    file = pairing.beside(how.mask, result.target or path, roots[0]) if how.mask else None
     if (file or how.ignore) and reference[-1].place:
         raise ValueError(f"{path}: several parts or MIP levels; accepted with a mask: one image")
     mask = masks.made(reference[0], file, how.ignore, how.max_values)
@@ -170,6 +176,16 @@ def _against(path: Path, reference: list[Image], test: list[Image], result: Resu
         return _Judged((mean_image(reference), mean_image(test)), found, masks.warning(mask))
     found, images = parts.compare(how, reference, test)
     return _Judged(images, found, masks.warning(mask))
+
+
+def _with_variance(images: list[Image], root: Path, how: How) -> list[Image]:
+    """A single image with the variance that lies beside it, where the settings name one and it is there."""
+    if not how.reads_variance or len(images) > 1:
+        return images
+    file = pairing.beside(how.variance, images[0].path, root)
+    if file == images[0].path:
+        raise ValueError(f"variance = {how.variance!r}: is {file} itself; accepted: the name of another image")
+    return [variances.with_file(images[0], file, how.max_values)] if file.exists() else images
 
 
 def _with(result: Result, one: _Judged, maps: bool) -> Result:

@@ -42,7 +42,10 @@ def made(reference: Image, path: Path | None, rectangles: Sequence[Rectangle], m
 
 def applied(image: Image, mask: Mask | None) -> Image:
     """The image with 0 where the mask does not count, and with the mask."""
-    return image if mask is None else replace(image, pixels=np.where(mask[..., None], image.pixels, 0), mask=mask)
+    if mask is None:
+        return image
+    variances = {name: np.where(mask, each, 0) for name, each in image.variances.items()}
+    return replace(image, pixels=np.where(mask[..., None], image.pixels, 0), mask=mask, variances=variances)
 
 
 def warning(mask: Mask | None) -> str:

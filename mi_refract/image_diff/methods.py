@@ -14,7 +14,7 @@ import numpy as np
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels
 
-from . import black, flip, pixelwise, tolerance, welch
+from . import black, flip, pixelwise, tolerance, variances, welch
 from .comparison import Comparison, Verdict, aligned, not_compared, shared_channels
 
 AUTO = "auto"
@@ -149,13 +149,13 @@ def _finite(pixels: Pixels) -> Pixels:
 
 
 def _untested(reference: Sequence[Image], test: Sequence[Image], allow_nonfinite: bool) -> str:
-    """Which channels of single images with channels of variance have none themselves, and are not equal without."""
-    names = welch.untested(reference[0].channels) if len(reference) == len(test) == 1 else []
-    if not names:
+    """Which channels of single images whose variance is known have none themselves, and are not equal without."""
+    sides = variances.untested(reference[0], test[0]) if len(reference) == len(test) == 1 else []
+    if not sides:
         return ""
-    one, two = (replace(side[0], pixels=side[0].select(names), channels=tuple(names)) for side in (reference, test))
-    found = compare("tolerance", one, two, allow_nonfinite=allow_nonfinite)
-    return "" if found.verdict is Verdict.EQUAL else f"not tested, without variance: {', '.join(names)}: {found.reason}"
+    found = compare("tolerance", *sides, allow_nonfinite=allow_nonfinite)
+    names = ", ".join(sides[0].channels)
+    return "" if found.verdict is Verdict.EQUAL else f"not tested, without variance: {names}: {found.reason}"
 
 
 CHOSEN_BY_AUTO = ("welch", "tolerance")
@@ -171,8 +171,8 @@ def _unknown(name: str) -> bool:
 
 
 def automatic(reference: Side, test: Side) -> str:
-    """The method for these images: welch where a side has several renders or both have variances; else tolerance."""
+    """The method for these images: welch where a side has several renders, or its variance is known; else tolerance."""
     sides = [[side] if isinstance(side, Image) else side for side in (reference, test)]
-    if any(len(side) > 1 for side in sides) or all(welch.spreads(side[0].channels) for side in sides if side):
+    if any(len(side) > 1 or any(map(variances.has_variance, side)) for side in sides):
         return "welch"
     return "tolerance"

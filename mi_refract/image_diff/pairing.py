@@ -67,6 +67,7 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Pair]:
             raise ValueError(f"{folder}: holds no image; accepted: at least one")
     found = _mapped(old, new, settings.maps) if settings.maps else _of_one_name(old, new)
     found = [replace(pair, target=reference / pair.target, how=settings.of(pair.name)) for pair in found]
+    found, old = _without_variance_files(found, (reference, old), (test, new))
     found = _without_variants(found, reference, old)
     return [*found, *(Pair(name, None, None, reference / name, error=error) for name, error in lost + missed)]
 
@@ -117,6 +118,22 @@ def _target(name: str, maps: Sequence[Map]) -> str:
 
 
 # Files beside a reference -------------------------------------------------------------------------------------------
+
+
+def _without_variance_files(
+    found: list[Pair], *sides: tuple[Path, dict[str, Path]]
+) -> tuple[list[Pair], dict[str, Path]]:
+    """The pairs, and the references, without files that hold the variance of another image of their side."""
+    templates = {pair.how.variance for pair in found if pair.how.variance}
+    of_others = {
+        file
+        for root, images in sides
+        for path in images.values()
+        for template in templates
+        if (file := beside(template, path, root)) != path
+    }
+    found = [pair for pair in found if not {pair.reference, pair.test} - {None} <= of_others]
+    return found, {name: path for name, path in sides[0][1].items() if path not in of_others}
 
 
 def _without_variants(found: list[Pair], root: Path, old: dict[str, Path]) -> list[Pair]:

@@ -17,6 +17,7 @@ from typing import Any
 from mi_refract.io.image_file import MAX_VALUES
 
 from . import idiff_flags
+from .channels import Names
 from .masks import Rectangle
 from .methods import AUTO, METHODS, options_of_auto
 from .name_patterns import matches
@@ -25,6 +26,7 @@ SYSTEMS = {"linux": "linux", "darwin": "macos", "win32": "windows"}  # by sys.pl
 PROCESSORS = {"x86_64": "x86_64", "amd64": "x86_64", "arm64": "arm64", "aarch64": "arm64"}  # by platform.machine()
 TOLERANCE = "tolerance"  # the method that the flags of idiff are for
 FILE_ONLY = ("accept", "mask", "ignore")  # keys of `How` that no option of the command line says
+OF_BOTH = ("variance", "channels")  # those that one of the file's tables and an option of its own say
 
 
 @dataclass(frozen=True)
@@ -33,8 +35,10 @@ class How:
 
     `max_values`: width × height × channels of an image, at most. `skip`: not compared at all. `accept`: templates of
     other references, each as good as the first. `mask`, `ignore`: pixels that do not count, as a template of an image
-    and as rectangles. `idiff`: the flags of `idiff` that the options come from. `entries`: the tables of the settings
-    file that say so. `error`: why they cannot be followed.
+    and as rectangles. `idiff`: the flags of `idiff` that the options come from. `variance`: a template of the image
+    that holds the variance of one sample of each pixel. `channels`: those that are compared, by their names in the
+    reference and in the new image; none: all. `entries`: the tables of the settings file that say so. `error`: why they
+    cannot be followed.
     """
 
     method: str = AUTO
@@ -46,6 +50,8 @@ class How:
     mask: str = ""
     ignore: tuple[Rectangle, ...] = ()
     idiff: str | None = None
+    variance: str = ""
+    channels: Names = ()
     entries: tuple[str, ...] = ()
     error: str = ""
 
@@ -63,7 +69,14 @@ class How:
                 words += ["--set", f"{name}={value}"]
             elif value:
                 words += ["--allow-nonfinite", "*"]
+        words += ["--variance", self.variance] if self.variance else []
+        words += ["--channels", written(self.channels)] if self.channels else []
         return words + ([] if self.max_values == MAX_VALUES else ["--max-values", str(self.max_values)])
+
+    @property
+    def reads_variance(self) -> bool:
+        """Whether the method is one that knows what to do with the variance."""
+        return bool(self.variance) and self.method in (AUTO, "welch")
 
     @property
     def needs_file(self) -> bool:
@@ -75,8 +88,8 @@ class How:
 class Entry:
     """An `[[image]]` table, or `[defaults]`: a pattern of names, and the keys that it gives.
 
-    `values`: of `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `allow_nonfinite` and the options of methods.
-    `when`: platforms, one of which must be this one; none: all. `error`: what is wrong with it.
+    `values`: of `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `variance`, `channels`, `allow_nonfinite` and
+    the options of methods. `when`: platforms, one of which must be this one; none: all. `error`: what is wrong with it.
     """
 
     pattern: str
@@ -131,8 +144,10 @@ class Settings:
             )
         except ValueError as error:
             return replace(how, error=str(error))
-        others = {**self.defaults.values, **{key: value for each in entries for key, value in each.values.items()}}
-        kept = {key: others[key] for key in ("skip", *FILE_ONLY) if key in others}
+        given = {key: value for key in OF_BOTH if (value := getattr(self.default, key))}
+        of_entries = {key: value for each in entries for key, value in each.values.items()}
+        others = {**self.defaults.values, **given, **of_entries}
+        kept = {key: others[key] for key in ("skip", *FILE_ONLY, *OF_BOTH) if key in others}
         flags = others.get("idiff", self.default.idiff) if method == TOLERANCE else None
         return replace(how, method=method, options=options, idiff=flags, **kept)
 
@@ -152,6 +167,11 @@ class Settings:
         """The patterns for this platform that match none of these names."""
         patterns = [*(each.pattern for each in self.rules if each.here), *self.allow_nonfinite]
         return [pattern for pattern in patterns if not any(matches(pattern, name) for name in names)]
+
+
+def written(channels: Names) -> str:
+    """The channels as `--channels` takes them."""
+    return ",".join(one if one == two else f"{one}={two}" for one, two in channels)
 
 
 def this_platform() -> frozenset[str]:

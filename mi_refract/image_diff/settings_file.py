@@ -19,6 +19,7 @@ from typing import Any
 from mi_refract.io.toml_schema import TABLES, TEXT, Key, Type, first_of, key_table, list_of, read, table, text
 
 from . import idiff_flags, name_patterns
+from .channels import Names
 from .methods import AUTO, METHODS, options_of_auto
 from .settings import PROCESSORS, SYSTEMS, TOLERANCE, Entry, How, Map, Settings, all_options
 
@@ -51,6 +52,15 @@ def _rectangles(value: Any) -> tuple[tuple[int, ...], ...] | None:
     return tuple(map(tuple, found)) if found and all(min(x[2:]) > 0 for x in found) else None
 
 
+def channels_of(value: Any) -> Names | None:
+    """The names of channels of the reference and of the new image, from a list or a table; None for anything else."""
+    table = {name: name for name in value if text(name)} if isinstance(value, list) else value
+    if not isinstance(table, dict) or not table or len(table) != len(value):
+        return None
+    known = all(text(each) for pair in table.items() for each in pair)
+    return tuple(table.items()) if known and len(set(table.values())) == len(table) else None
+
+
 def _platforms(value: Any) -> tuple[str, ...] | None:
     found = [value] if isinstance(value, str) else value
     known = list_of(lambda each: each if text(each) and set(each.split()) <= set(WORDS) else None)(found)
@@ -65,6 +75,7 @@ MASK = _template(("root", *name_patterns.FIELDS))
 TEMPLATES = Type(f"a list, each {BESIDE.accepted}, and *", list_of(BESIDE.parse))
 RECTANGLES = Type("a list of [x, y, width, height], in pixels", _rectangles)
 PLATFORM = Type(f"of {', '.join(WORDS)}: one, two words, or a list of such", _platforms)
+CHANNELS = Type("a list of channels, or a table { <of the reference> = <of the new image>, … }", channels_of)
 MAP = Type("{ reference = …, test = … } or a list of such", first_of(table, list_of(table)))
 
 ANY_TEXT = Type("a text", lambda value: value if isinstance(value, str) else None)
@@ -76,6 +87,10 @@ EVERYWHERE = {
     "mask": Key(
         MASK, "an image beside the reference in which white counts, black does not; {root}: their folder", None
     ),
+    "variance": Key(
+        MASK, "an image of the variance of one sample of each pixel, beside each side's own; {root}: their folder", None
+    ),
+    "channels": Key(CHANNELS, "those that are compared; X, Y, Z are made of R, G, B where an image has none", None),
     "ignore": Key(RECTANGLES, "rectangles of pixels that do not count", None),
 }
 DEFAULTS = EVERYWHERE | {
@@ -165,6 +180,24 @@ def _any_of(keys: list[Key]) -> Key:
     kinds = list(dict.fromkeys(key.type for key in keys))
     one = Type(" or ".join(kind.accepted for kind in kinds), first_of(*(kind.parse for kind in kinds)))
     return Key(one, keys[0].meaning, keys[0].default)
+
+
+def channels_from(words: str) -> Names:
+    """The channels of the command line: names, or REFERENCE=TEST, between commas. ValueError for anything else."""
+    parts = [each.strip() for each in words.split(",")]
+    pairs = [
+        (one.strip(), two.strip() if equals else one.strip()) for one, equals, two in (p.partition("=") for p in parts)
+    ]
+    if (found := channels_of(dict(pairs))) is None or len(found) != len(pairs):
+        raise ValueError(f"--channels {words}: accepted: distinct names, or REFERENCE=TEST, between commas")
+    return found
+
+
+def variance_from(words: str) -> str:
+    """The template of the command line's `--variance`. ValueError for what is none."""
+    if MASK.parse(words) is None:
+        raise ValueError(f"--variance {words}: accepted: {MASK.accepted}")
+    return words
 
 
 def from_words(method: str, words: Sequence[str], idiff: str | None = None) -> How:

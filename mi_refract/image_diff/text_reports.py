@@ -24,7 +24,7 @@ from . import idiff_flags
 from .comparison import Metric
 from .pairing import Pair
 from .results import Result, Results, Status
-from .settings import How
+from .settings import How, written
 
 if TYPE_CHECKING:
     from mi_refract.report import junit
@@ -84,8 +84,11 @@ def settings_table(pairs: Sequence[Pair]) -> Table:
 
 
 def _pixels(how: How) -> list[str]:
-    mask = [f"mask {how.mask}"] if how.mask else []
-    return [*mask, *(f"without {list(each)}" for each in how.ignore)]
+    given = {"mask": how.mask, "variance": how.variance, "channels": written(how.channels)}
+    return [
+        *(f"{name} {each}" for name, each in given.items() if each),
+        *(f"without {list(each)}" for each in how.ignore),
+    ]
 
 
 def _warned(results: Results) -> list[Result]:

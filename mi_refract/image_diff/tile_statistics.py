@@ -23,6 +23,9 @@ from .pixel_statistics import PixelSums
 DARK = 1e-3  # a tile darker than this share of its channel's `median_nonblack` counts as that bright in ratios
 GROWTH = 4  # from one level of tiles to the next
 HEAVY = 4.0  # a tile whose noise comes from fewer pixels than this is heavy-tailed: its t is not a Student's
+# Where the variance comes from the other side, a mean does not vary with its own noise. Noise of 0.1 of it may be that
+# of 100 rare events, ten times as frequent beyond 5 σ as normal noise: such a tile is heavy-tailed, too.
+BORROWED = 0.1
 POOLED = 30  # blocks of tiles from which the correlation of pixels is estimated again, at least
 MISSED = 0.01  # the minimum detectable difference is missed with this probability
 FAR = 10.0  # times the margin: a pixel without noise that is so far off is evidence, see `with_silent_pixels`
@@ -48,7 +51,8 @@ class Inflation:
 class Side:
     """Totals per tile and channel: `mean`, `variance` of the means and its square, over pixels; `renders` one by one.
 
-    `freedom`: degrees of freedom of a pixel's variance. Without `renders` pixels are taken for independent.
+    `freedom`: degrees of freedom of a pixel's variance. Without `renders` pixels are taken for independent. `borrowed`:
+    the channels whose noise only the other side knows; its `variance` is that of both.
     """
 
     area: Array
@@ -57,6 +61,7 @@ class Side:
     squares: Array
     freedom: float
     renders: Array | None = None
+    borrowed: Flags | None = None
 
     def coarser(self) -> Side:
         """The same side in tiles GROWTH times as wide."""
@@ -64,7 +69,7 @@ class Side:
             block_sum(x, GROWTH) for x in (self.area, self.mean, self.variance, self.squares)
         )
         renders = None if self.renders is None else block_sum(self.renders, GROWTH)
-        return Side(area, mean, variance, squares, self.freedom, renders)
+        return Side(area, mean, variance, squares, self.freedom, renders, self.borrowed)
 
     def spread(self, inflation: Inflation) -> tuple[Array, Array]:
         """The variance of the tile means, and its square over its degrees of freedom, summed over pixels."""
@@ -191,6 +196,9 @@ def compare_tiles(
         t = np.where(silent, 0.0, difference / error)
         beyond = np.where(silent, 0.0, np.maximum(np.abs(difference) - allowed, 0) / error)
         few = (one.variance + two.variance) ** 2 < HEAVY * (one.squares + two.squares)
+        for side in (one, two):
+            if side.borrowed is not None:
+                few |= side.borrowed & (error > BORROWED * np.maximum(np.abs(m1), np.abs(m2)))
         off = silent & (np.abs(difference) > allowed)
     # NaN becomes 0: what is not finite equals nothing.
     p, p_beyond = (np.nan_to_num(2 * special.stdtr(freedom, -np.abs(x)), nan=0.0) for x in (t, beyond))
@@ -202,7 +210,7 @@ def _with_pixels(level: Level, pixels: PixelSums, area: Array, inflation: Inflat
     return replace(level, of_pixels=np.where(level.silent, 1.0, np.nan_to_num(p, nan=0.0)))
 
 
-def with_silent_pixels(level: Level, a: Array, b: Array, margin: float, tile: int) -> Level:
+def with_silent_pixels(level: Level, a: Array, b: Array, margin: float, tile: int, odds: Array | float = 7.0) -> Level:
     """The level of single tiles with those without noise `off` where a pixel is, too, and with their p.
 
     The mean of such a tile does not show what was moved about inside. `a`, `b`: one render of each side.
@@ -210,7 +218,8 @@ def with_silent_pixels(level: Level, a: Array, b: Array, margin: float, tile: in
     A value that comes up in every render can still be chance, as black is where light is rarely found. Let a pixel take
     values with probabilities pₓ. All renders of each side, two or more, agree with probability s = Σ pₓ⁴ at most in
     the same value, and with d = (Σ pₓ²)² − s in two different ones. As s + 7d ≤ 1, no tile of independent pixels is
-    without noise and has k different pixels with a probability above 7⁻ᵏ.
+    without noise and has k different pixels with a probability above 7⁻ᵏ. `odds`, per channel: what stands for 7 where
+    the noise of one side is all that is known.
     """
     if not level.silent.any():
         return level
@@ -218,7 +227,7 @@ def with_silent_pixels(level: Level, a: Array, b: Array, margin: float, tile: in
     allowed = margin * np.maximum(np.abs(a), DARK * median_nonblack(np.abs(a)))
     moved = block_sum(difference > allowed, tile) > 0
     far = block_sum((difference > FAR * allowed).astype(np.float64), tile)
-    p = np.where(level.silent, 7.0**-far, 1.0)
+    p = np.where(level.silent, odds**-far, 1.0)
     return replace(level, off=level.off | (level.silent & moved), of_silent=p)
 
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels
-from mi_refract.io.toml_schema import shown
 
 from .comparison import Comparison, Maps, Metric, Verdict, aligned, nonfinite_result, preconditions
 from .pixel_statistics import PixelSums, sums, sums_of_renders
@@ -25,10 +24,7 @@ from .tile_statistics import (
     levels,
     with_silent_pixels,
 )
-
-# A second image beside the mean: of the squares of the samples (Mitsuba's `moment`), or of their variance.
-MOMENTS = ("m2_{}", "{}.m2")
-VARIANCES = ("{}.variance", "{}.Variance", "variance.{}", "Variance.{}", "variance_{}")
+from .variances import Estimate, estimates, has_variance
 
 
 def compare_renders(
@@ -43,13 +39,19 @@ def compare_renders(
     resolution: Annotated[float, "relative difference that must be visible in a tile, or it is inconclusive"] = 0.05,
     hidden: Annotated[float, "share of the tiles, in any channel, whose noise may hide that difference"] = 0.1,
     pixels: Annotated[str, "test them, too: yes, or no for renders that share a fixed grid of samples"] = "yes",
-    spp: Annotated[int, "samples per pixel of images with variance channels; 0: as their headers say"] = 0,
+    spp: Annotated[int, "samples per pixel of images whose variance is known; 0: as their headers say"] = 0,
+    spp_reference: Annotated[int, "the reference's, where the sides differ; 0: `spp`"] = 0,
+    spp_test: Annotated[int, "the new image's, where the sides differ; 0: `spp`"] = 0,
 ) -> Comparison:
     """Independent renders: Welch's t-test on the means of tiles and channels.
 
-    Two or more renders a side, or one a side with channels of the variance or second moment of its channels: then
-    pixels are taken for independent, as under a box filter. Tests the mean of single tiles, of blocks of them, and of
-    the whole image; and whether their pixels scatter more than their noise explains.
+    Two or more renders a side, or one a side whose variance is known (module `variances`): then pixels are taken for
+    independent, as under a box filter. A wider filter leaves the means of tiles as they are, and hides differences of
+    pixels. Tests the mean of single tiles, of blocks of them, and of the whole image; and whether their pixels scatter
+    more than their noise explains.
+
+    Where the variance of one side alone is known, that of a sample is taken to be the same on the other (a z-test, for
+    many samples). A renderer that samples worse than the reference did is different, then, however right its mean is.
 
     INCONCLUSIVE where only tiles differ of which a t-test knows little (with the noise of a few pixels, or without
     noise and by little or in a few pixels), and where the noise hides differences of `resolution`. ValueError for fewer
@@ -58,14 +60,18 @@ def compare_renders(
     _check(tile, family_error, correction, equivalence_margin, resolution, hidden)
     if pixels not in ("yes", "no"):
         raise ValueError(f"pixels = {pixels!r}: accepted: yes, no")
+    known = None
+    if len(reference) == len(test) == 1 and (has_variance(reference[0]) or has_variance(test[0])):
+        known = estimates(reference[0], test[0], (spp_reference or spp, spp_test or spp), allow_nonfinite)
+        reference, test = [known[0].image], [known[1].image]
     for image in (*reference[1:], *test):
         if reason := preconditions(reference[0], image, allow_nonfinite):
             return nonfinite_result("welch", reason, reference[0].pixels, aligned(reference[0], image)[1])
     tile = min(tile, max(reference[0].pixels.shape[:2]))
-    one, two, of_pixels, channels = _sides(reference, test, tile, spp)
-    found = list(levels(one, two, equivalence_margin, of_pixels if pixels == "yes" else None))
-    a, b = (_finite(side[0].select(channels)) for side in (reference, test))
-    found[0] = with_silent_pixels(found[0], a, b, equivalence_margin, tile)
+    sides = _of_estimates(*known, tile) if known else _of_renders(reference, test, tile)
+    found = list(levels(sides.one, sides.two, equivalence_margin, sides.pixels if pixels == "yes" else None))
+    a, b = (_finite(side[0].select(sides.channels)) for side in (reference, test))
+    found[0] = with_silent_pixels(found[0], a, b, equivalence_margin, tile, sides.odds)
     tests = TileTests(found, family_error, correction)
     verdict, reason = _verdict(tests, resolution, hidden)
     maps = _maps(found[0], tile, reference[0].pixels.shape)
@@ -87,24 +93,48 @@ def _check(tile: int, family_error: float, correction: str, margin: float, resol
         raise ValueError(f"hidden = {hidden}: accepted: 0 to 1")
 
 
-def _sides(
-    reference: Sequence[Image], test: Sequence[Image], tile: int, spp: int
-) -> tuple[Side, Side, PixelSums, Sequence[str]]:
-    """Both sides, the sums over their pixels, and the channels that are tested."""
-    if min(len(reference), len(test)) >= 2:
-        first = reference[0]
-        for side in (reference, test):
-            _distinct(side)
-        a, b = ([_finite(aligned(first, image)[1]) for image in side] for side in (reference, test))
-        return from_renders(a, tile), from_renders(b, tile), sums_of_renders(a, b, tile), first.channels
-    if len(reference) == len(test) == 1 and (pairs := spreads(reference[0].channels)):
-        (m1, v1, spp1), (m2, v2, spp2) = (_moments(side[0], pairs, spp) for side in (reference, test))
-        one, two = from_variances(m1, v1, spp1 - 1.0, tile), from_variances(m2, v2, spp2 - 1.0, tile)
-        return one, two, sums(m1, v1, m2, v2, tile), list(pairs)
-    raise ValueError(
-        f"welch: {len(reference)} and {len(test)} renders; accepted: at least 2 a side, or one a side with channels "
-        f"of its variance, as {', '.join(form.format('R') for form in (*MOMENTS[:1], *VARIANCES[:1]))}"
-    )
+@dataclass(frozen=True)
+class _Sides:
+    """Both sides, the sums over their pixels, the channels that are tested, and the `odds` of `with_silent_pixels`."""
+
+    one: Side
+    two: Side
+    pixels: PixelSums
+    channels: Sequence[str]
+    odds: Pixels | float = 7.0
+
+
+def _of_renders(reference: Sequence[Image], test: Sequence[Image], tile: int) -> _Sides:
+    if min(len(reference), len(test)) < 2:
+        raise ValueError(
+            f"welch: {len(reference)} and {len(test)} renders; accepted: at least 2 a side, or one a side with its "
+            "variance, in channels as m2_R, R.variance or in a file (`variance`)"
+        )
+    for side in (reference, test):
+        _distinct(side)
+    a, b = ([_finite(aligned(reference[0], image)[1]) for image in side] for side in (reference, test))
+    return _Sides(from_renders(a, tile), from_renders(b, tile), sums_of_renders(a, b, tile), reference[0].channels)
+
+
+def _of_estimates(a: Estimate, b: Estimate, tile: int) -> _Sides:
+    """Where one side alone knows the variance of a sample, that is all there is: it carries both means' variances."""
+    b = replace(b, variance=b.variance[..., [b.image.channels.index(name) for name in a.image.channels]])
+    known = a.known | b.known
+    if not known.any():
+        raise ValueError(
+            f"{b.image.path}: no variance of a channel of {a.image.path}; accepted: `channels`, `variance`"
+        )
+    names = [name for name, each in zip(a.image.channels, known, strict=True) if each]
+    (m1, v1), (m2, v2) = ((_finite(x.image.select(names)).astype(np.float64), x.variance[..., known]) for x in (a, b))
+    only_one, only_two = ~b.known[known], ~a.known[known]
+    w1 = np.where(only_two, 0, v1 * (1 / a.spp + only_one / b.spp))
+    w2 = np.where(only_one, 0, v2 * (1 / b.spp + only_two / a.spp))
+    # Let all n samples have one value of probability p, and of m others not all. For odds = 1 + (n − 1)/m the sum of
+    # pⁿ⁺ᵐ + odds pⁿ(1 − pᵐ) ≤ p over all values is at most 1, as that of 7 in `with_silent_pixels` is.
+    odds = np.where(only_one, 1 + (a.spp - 1) / b.spp, np.where(only_two, 1 + (b.spp - 1) / a.spp, 7.0))
+    one, two = from_variances(m1, w1, a.spp - 1.0, tile), from_variances(m2, w2, b.spp - 1.0, tile)
+    one, two = replace(one, borrowed=only_two), replace(two, borrowed=only_one)
+    return _Sides(one, two, sums(m1, w1, m2, w2, tile), names, odds)
 
 
 def _distinct(side: Sequence[Image]) -> None:
@@ -123,40 +153,6 @@ def _identical(a: Image, b: Image) -> bool:
 
 def _finite(pixels: Pixels) -> Pixels:
     return pixels if np.isfinite(pixels).all() else np.where(np.isfinite(pixels), pixels, 0)
-
-
-def spreads(channels: Sequence[str]) -> dict[str, tuple[str, bool]]:
-    """Of every channel that has one: the name of the channel of its variance (False) or second moment (True)."""
-    return {
-        name: (form.format(name), form in MOMENTS)
-        for name in channels
-        for form in (*MOMENTS, *VARIANCES)
-        if form.format(name) in channels
-    }
-
-
-def untested(channels: Sequence[str]) -> list[str]:
-    """Of an image with channels of variance: those that have none, and are none."""
-    pairs = spreads(channels)
-    return [name for name in channels if name not in pairs and name not in {spread for spread, _ in pairs.values()}]
-
-
-def _moments(image: Image, pairs: dict[str, tuple[str, bool]], spp: int) -> tuple[Pixels, Pixels, int]:
-    """The mean, the variance of the mean, and the samples per pixel."""
-    spp = _spp(image, spp)
-    mean = _finite(image.select(list(pairs))).astype(np.float64)
-    spread = _finite(image.select([name for name, _ in pairs.values()])).astype(np.float64)
-    is_moment = np.array([moment for _, moment in pairs.values()])
-    variance = np.where(is_moment, (spread - mean**2) * spp / (spp - 1), spread) / spp
-    return mean, np.maximum(variance, 0), spp
-
-
-def _spp(image: Image, given: int) -> int:
-    """The samples per pixel that are given, or else those of the header, which may hold anything."""
-    found = given or image.metadata.get("mi_refract:spp", "no samples per pixel")
-    if not re.fullmatch(r"[0-9]{1,15}(\.0)?", text := str(found)) or float(text) < 2:
-        raise ValueError(f"{image.path}: its header names {shown(found)}; accepted: `spp`, 2 to 10¹⁵")
-    return int(float(text))
 
 
 def _verdict(tests: TileTests, resolution: float, hidden: float) -> tuple[Verdict, str]:

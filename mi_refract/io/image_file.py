@@ -95,7 +95,8 @@ class Image:
     `display`: x, y, width and height of the display window; None where it is the data window. `stored`: the type of
     the file's numbers, in OpenImageIO's word (uint8, half, float …); "" without a file. `mask`: H × W, the pixels that
     count; None where all do. The others are 0. `part`: its number and that of its MIP level, from 0 on as OpenImageIO
-    counts; `place`: the same in words, "" in a file of one image.
+    counts; `place`: the same in words, "" in a file of one image. `variances`: H × W by channel, of one sample per
+    pixel, where another file holds them.
     """
 
     path: Path
@@ -108,6 +109,7 @@ class Image:
     mask: NDArray[np.bool_] | None = None
     part: tuple[int, int] = (0, 0)
     place: str = ""
+    variances: Mapping[str, NDArray[np.floating[Any]]] = field(default_factory=dict)
 
     def select(self, channels: Sequence[str]) -> NDArray[np.floating[Any]]:
         """The pixels of these channels, in this order: H × W × len(channels). ValueError for a name not there."""

@@ -6,6 +6,7 @@ import html
 import importlib.util
 import json
 import os
+import shlex
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
@@ -18,6 +19,7 @@ from mi_refract import backend
 from mi_refract.cli import app, self_test_scenes
 from mi_refract.image_diff import methods, self_test
 from mi_refract.io import exit_code
+from mi_refract.io.image_file import read, write_exr
 
 # Verdicts ---------------------------------------------------------------------------------------------------------
 
@@ -316,3 +318,67 @@ def test_report(run, pair, tmp_path):
     one = f"mi-refract accept {pair[0]}/louder.exr {pair[1]}/louder.exr --method tolerance --set fail=0.01"
     assert whole in text
     assert one in text
+
+
+# Variances and channels -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def noisy(tmp_path):
+    """A reference of 1000 samples with its variance, and new images of 200: an equal one, and one 3 % brighter."""
+    mean = np.ones((32, 32, 3))
+    rng = np.random.default_rng(8)
+    for folder, spp, gains in (("old", 1000, (1, 1)), ("new", 200, (1, 1.03))):
+        (tmp_path / folder).mkdir()
+        for name, gain in zip(("equal", "off"), gains, strict=True):
+            write_exr(tmp_path / folder / f"{name}.exr", gain * rng.gamma(spp, mean / spp))
+    for name in ("equal", "off"):
+        write_exr(tmp_path / f"old/{name}_var.exr", mean)
+    return tmp_path / "old", tmp_path / "new"
+
+
+def test_spp_with_auto(run, noisy):
+    words = ("--variance", "{stem}_var.exr", "--set", "spp_reference=1000")
+    code, out, err = run("diff", *noisy, *words, "--set", "spp_test=200")
+    assert (code, err) == (1, "")
+    assert [line.split()[:3] for line in out.splitlines()[1:3]] == [
+        ["different", "off.exr", "welch"],
+        ["equal", "equal.exr", "welch"],
+    ]
+    assert run("diff", *noisy, *words, "--set", "spp=200")[0] == 1
+    code, _, err = run("diff", *noisy, *words)
+    assert (code, len(err.splitlines())) == (2, 2)
+    assert "accepted: `spp` or `spp_test`" in err
+    assert run("diff", *noisy, *words, "--set", "spp_test=1")[0] == 2
+
+
+def test_spp_counts_where_welch_is_chosen(run, pair):
+    """And is no mistake where `tolerance` is: one setting serves a folder of both."""
+    assert run("diff", *pair, "--set", "spp=16")[0] == run("diff", *pair)[0]
+
+
+def test_channels(run, noisy):
+    old, new = noisy
+    words = ("--variance", "{stem}_var.exr", "--set", "spp=200")
+    broken = read(new / "equal.exr").pixels.copy()
+    broken[..., 2] *= 2
+    write_exr(new / "equal.exr", broken)
+    assert run("diff", old, new, "equal.exr", *words)[0] == 1
+    assert run("diff", old, new, "equal.exr", *words, "--channels", "R,G")[0] == 0
+    assert run("diff", old, new, "equal.exr", *words, "--channels", "R=G,G=R")[0] == 0
+    assert run("diff", old, new, "equal.exr", *words, "--channels", "Q")[0] == 2
+    assert run("diff", old, new, *words, "--channels", "R,R") == (
+        2,
+        "",
+        "mi-refract: --channels R,R: accepted: distinct names, or REFERENCE=TEST, between commas\n",
+    )
+
+
+def test_the_command_that_compares_again_says_both(run, noisy, tmp_path):
+    words = ("--variance", "{stem}_var.exr", "--channels", "R=G,G=R", "--set", "spp=200")
+    run("diff", *noisy, *words, "--json", tmp_path / "a.json")
+    (again,) = (
+        each["reproduce"] for each in json.loads((tmp_path / "a.json").read_text())["results"] if "off" in each["name"]
+    )
+    code, out, _ = run(*shlex.split(again)[1:])
+    assert (code, out.splitlines()[1].split()[:3]) == (1, ["different", "off.exr", "welch"])

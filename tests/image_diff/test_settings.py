@@ -101,8 +101,10 @@ def test_nan_is_allowed_where_it_is_named(tmp_path):
 def test_the_readme_names_every_method_and_its_settings_are_accepted(rules):
     text = (Path(diff.__file__).parent / "README.md").read_text("utf-8")
     assert all(f"| `{name}` |" in text for name in methods.METHODS)
-    (example,) = re.findall("```toml\n(.*?)```", text, re.DOTALL)
+    example, *others = re.findall("```toml\n(.*?)```", text, re.DOTALL)
     assert rules(example)[0].values["method"] == "tolerance"
+    for each in others:
+        rules(each)
 
 
 BAD_RULES = {

@@ -1,0 +1,156 @@
+"""The channels of images: which of both sides are compared, and which of them hold the variance of others.
+
+Recognised are the films that Mitsuba writes: colours (R, G, B, A; X, Y, Z; Y), outputs of the `aov` integrator, and of
+the `moment` integrator, which are X, Y, Z of every integrator that it holds ("nested.X") and their squares
+("m2_nested.X"), beside the film's own colours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mi_refract.io.image_file import Image
+from mi_refract.io.pixels import Pixels
+
+RGB, XYZ = ("R", "G", "B"), ("X", "Y", "Z")
+# Linear sRGB to CIE XYZ, as Mitsuba converts it.
+TO_XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
+# A film of half floats rounds by up to 2⁻¹¹ on either side; what that hides is less than a comparison's own margin.
+ROUNDED = 2.0**-10
+SMALLEST = 2.0**-24  # of half floats, and their absolute error near 0
+
+# A second image beside the mean: of the squares of the samples (Mitsuba's `moment`), or of their variance.
+SQUARES = "{}.m2"
+VARIANCES = ("{}.variance", "{}.Variance", "variance.{}", "Variance.{}", "variance_{}")
+
+Names = tuple[tuple[str, str], ...]  # of the reference and of the test
+
+
+def spreads(channels: Sequence[str]) -> dict[str, tuple[str, bool]]:
+    """Of every channel that has one: the name of the channel of its variance (False) or second moment (True)."""
+    there = set(channels)
+    return {
+        name: (spread, moment)
+        for name in channels
+        for spread, moment in (
+            *((each, True) for each in (*_squares(name), SQUARES.format(name))),
+            *((form.format(name), False) for form in VARIANCES),
+        )
+        if spread in there
+    }
+
+
+def _squares(name: str) -> list[str]:
+    """What `moment` may call the squares of "img.nested.X": "m2_" stands before the name of one integrator."""
+    parts = name.split(".")
+    return [".".join([*parts[:i], f"m2_{parts[i]}", *parts[i + 1 :]]) for i in range(len(parts))]
+
+
+def means(channels: Sequence[str]) -> list[str]:
+    """The channels that hold no variance of others."""
+    others = {spread for spread, _ in spreads(channels).values()}
+    return [name for name in channels if name not in others]
+
+
+def selected(image: Image, names: Mapping[str, str]) -> Image:
+    """These channels, each under its new name, with what is known of their variances. `names`: the new by the old.
+
+    X, Y and Z of an image that has R, G, B instead are made of these. So are variances from a file: they are taken for
+    variances of X, Y, Z that were converted to R, G, B like a colour, as in Mitsuba's test data. (Those of R, G and B
+    would not do, as they do not say how the three correlate.) ValueError for a channel that is not there.
+    """
+    image = _with_xyz(image, set(names))
+    pairs = spreads(image.channels)
+    missing = [name for name in names if name not in image.channels]
+    if missing:
+        accepted = ", ".join(means(image.channels))
+        raise ValueError(f"{image.path}: no channel {missing[0]!r}; accepted in `channels`: {accepted}")
+    kept = dict(names)
+    for old, new in names.items():
+        if old in pairs:
+            spread, moment = pairs[old]
+            kept[spread] = f"m2_{new}" if moment else f"{new}.variance"
+    variances = {new: image.variances[old] for old, new in names.items() if old in image.variances}
+    return replace(image, pixels=image.select(list(kept)), channels=tuple(kept.values()), variances=variances)
+
+
+def _with_xyz(image: Image, wanted: set[str]) -> Image:
+    """The image with X, Y and Z, where one of them is wanted and it has R, G, B but none of these."""
+    if not wanted & set(XYZ) or set(XYZ) & set(image.channels) or not set(RGB) <= set(image.channels):
+        return image
+    pixels = np.concatenate([image.pixels, image.select(RGB) @ TO_XYZ.T], -1)
+    variances = dict(image.variances)
+    if set(RGB) <= set(variances):
+        colour = np.stack([variances[name] for name in RGB], -1).astype(np.float64) @ TO_XYZ.T
+        variances |= {name: colour[..., i] for i, name in enumerate(XYZ)}
+    return replace(image, pixels=pixels, channels=(*image.channels, *XYZ), variances=variances)
+
+
+def chosen(images: Sequence[Image], names: Names, side: int) -> list[Image]:
+    """Images with these channels only, under the reference's names; as they are where none are named.
+
+    `side`: 0 for images of the reference, 1 for new ones.
+    """
+    return [selected(image, {pair[side]: pair[0] for pair in names}) if names else image for image in images]
+
+
+# Films of the moment integrator -------------------------------------------------------------------------------------
+
+
+def matched(reference: Image, test: Image) -> tuple[Image, Image]:
+    """Both with the same channels as far as Mitsuba's layouts say, apart from those of variance.
+
+    What `moment` holds as "nested.X", "nested.Y", "nested.Z" with its squares takes the place of the film's colours, if
+    these repeat it, as X, Y, Z; whatever the nested integrator is called. They are compared with the colours of a film
+    that has no moments.
+    """
+    layers = moment_layer(reference), moment_layer(test)
+    if all(layers) or (any(layers) and set(means(reference.channels)) != set(means(test.channels))):
+        sides = zip((reference, test), layers, strict=True)
+        one, two = (_of_layer(image, layer) if layer else _as_xyz(image) for image, layer in sides)
+        return one, two
+    if any(set(XYZ) <= set(image.variances) - set(image.channels) for image in (reference, test)):
+        return _as_xyz(reference), _as_xyz(test)
+    return reference, test
+
+
+def moment_layer(image: Image) -> str:
+    """The name before ".X" of the channels that have squares and repeat the film's own colours; "" where none do."""
+    pairs = spreads(image.channels)
+    layers = [name[:-2] for name in image.channels if name.endswith(".X") and name in pairs]
+    film = next((each for each in (RGB, XYZ, ("Y",)) if set(each) <= set(image.channels)), ())
+    for layer in layers if film else []:
+        nested = [f"{layer}.{name}" for name in XYZ]
+        if set(nested) <= set(pairs) and _repeats(image.select(film), image.select(nested)):
+            return layer
+    return ""
+
+
+def _repeats(film: Pixels, nested: Pixels) -> bool:
+    """Whether the film's colours, R, G, B or X, Y, Z or Y, are X, Y, Z of `nested` but for rounding, or NaN with it."""
+    shown = nested[..., 1:2] if film.shape[-1] == 1 else nested
+    ways = [(film, np.abs(film))]
+    if film.shape[-1] == len(RGB):
+        ways.append((film @ TO_XYZ.T, np.abs(film) @ TO_XYZ.T))
+    broken = ~np.isfinite(film).all(-1, keepdims=True) & ~np.isfinite(shown).all(-1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        return any(
+            bool((broken | (np.abs(colours - shown) <= ROUNDED * (size + np.abs(shown)) + SMALLEST)).all())
+            for colours, size in ways
+        )
+
+
+def _of_layer(image: Image, layer: str) -> Image:
+    """The image with the layer's channels, without its name before theirs, in place of the film's colours."""
+    others = (each for each in means(image.channels) if each not in (*RGB, *XYZ))
+    return selected(image, {each: each.removeprefix(f"{layer}.") for each in others})
+
+
+def _as_xyz(image: Image) -> Image:
+    """The image with X, Y, Z in place of R, G, B."""
+    colours = set(RGB) <= set(image.channels)
+    names = {each: each for each in means(image.channels) if not (colours and each in RGB)}
+    return selected(image, names | {each: each for each in XYZ}) if colours else image

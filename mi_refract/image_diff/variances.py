@@ -1,0 +1,158 @@
+"""What is known of the noise of single images: variances from files beside them, or from channels of their own.
+
+A variance is that of one sample per pixel, as Mitsuba's test data and its `moment` integrator have it; that of the
+image follows by dividing by the samples per pixel.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mi_refract.io import image_file
+from mi_refract.io.image_file import MAX_VALUES, Image
+from mi_refract.io.pixels import Pixels
+from mi_refract.io.toml_schema import shown
+
+from .channels import ROUNDED, XYZ, matched, means, selected, spreads
+
+# m2 − m² below 0 by its rounding, in half floats 2⁻¹¹ of m2 and twice that of m²: no error. In Mitsuba's test data
+# 0.0022 is the most as X, Y, Z; as R, G, B 100 of its 111 files of colour are further below.
+NEGATIVE = 4 * ROUNDED
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An image without channels of variance, and `variance`: H × W × C of one sample per pixel; NaN where unknown."""
+
+    image: Image
+    variance: Pixels
+    spp: int
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Of every channel, whether its variance is known."""
+        return np.asarray(np.isfinite(self.variance).all((0, 1)))
+
+
+def has_variance(image: Image) -> bool:
+    """Whether the variance of any of its channels is known."""
+    return bool(image.variances or spreads(image.channels))
+
+
+# Files --------------------------------------------------------------------------------------------------------------
+
+
+def with_file(image: Image, path: Path, most: int = MAX_VALUES) -> Image:
+    """The image with the variances that another file holds for its channels, by their names.
+
+    A file of one channel is for an image of one, whatever the names. OSError for a file that cannot be read;
+    ValueError for one of another size, and for one that has none of the channels.
+    """
+    found = image_file.read(path, most)
+    if found.pixels.shape[:2] != image.pixels.shape[:2]:
+        (height, width), wrong = image.pixels.shape[:2], found.pixels.shape[:2]
+        raise ValueError(f"{path}: {wrong[1]} × {wrong[0]}; accepted: a variance of {width} × {height}")
+    if len(found.channels) == len(image.channels) == 1:
+        return replace(image, variances={image.channels[0]: found.pixels[..., 0]})
+    both = [name for name in found.channels if name in image.channels]
+    colours = list(XYZ) if set(XYZ) <= set(found.channels) and not set(XYZ) & set(image.channels) else []
+    if not both + colours:
+        has, needed = ", ".join(found.channels), ", ".join(image.channels)
+        raise ValueError(f"{path}: variances of {has}; accepted: of channels of {image.path}, {needed}")
+    variances = {name: found.pixels[..., found.channels.index(name)] for name in both + colours}
+    return replace(image, variances=variances)
+
+
+# Estimates ----------------------------------------------------------------------------------------------------------
+
+
+def estimates(reference: Image, test: Image, spp: tuple[int, int], allow_nonfinite: bool) -> tuple[Estimate, Estimate]:
+    """Both sides with the same channels, as far as `matched` says. `spp`: of each side; 0: as its header says.
+
+    ValueError for variances that are negative or not finite, and where the samples per pixel are not known.
+    """
+    one, two = matched(reference, test)
+    return _estimate(one, "reference", spp[0], allow_nonfinite), _estimate(two, "test", spp[1], allow_nonfinite)
+
+
+def untested(reference: Image, test: Image) -> list[Image]:
+    """Both images with those channels alone whose variance neither side knows; none where there are none."""
+    sides = matched(reference, test)
+    known = {name for image in sides for name in (*image.variances, *spreads(image.channels))}
+    alphas = [name for name in means(sides[0].channels) if all(_is_alpha(image, name) for image in sides)]
+    names = [name for name in means(sides[0].channels) if name not in (*known, *alphas)]
+    return [selected(image, {name: name for name in names}) for image in sides] if names else []
+
+
+def _estimate(image: Image, side: str, given: int, allow_nonfinite: bool) -> Estimate:
+    names, pairs, spp = means(image.channels), spreads(image.channels), _spp(image, side, given)
+    mean = image.select(names).astype(np.float64)
+    variance = np.full(mean.shape, np.nan)
+    for i, name in enumerate(names):
+        if name in image.variances:
+            variance[..., i] = _not_negative(image, name)
+        elif name in pairs:
+            spread, moment = pairs[name]
+            found = image.select([spread])[..., 0].astype(np.float64)
+            with np.errstate(invalid="ignore", over="ignore"):
+                found = (found - mean[..., i] ** 2) * spp / (spp - 1) if moment else found
+            variance[..., i] = np.maximum(found, 0)
+        else:
+            continue
+        variance[..., i] = _finite(image, name, mean[..., i], variance[..., i], allow_nonfinite)
+    for i, name in enumerate(names):
+        if name not in (*image.variances, *pairs) and _is_alpha(image, name):
+            # Bhatia and Davis (2000): no variance of samples from 0 to 1 is larger.
+            variance[..., i] = np.maximum(mean[..., i] * (1 - mean[..., i]), 0) * spp / (spp - 1)
+    bare = replace(image, pixels=image.select(names), channels=tuple(names), variances={})
+    return Estimate(bare, variance, spp)
+
+
+def _spp(image: Image, side: str, given: int) -> int:
+    """The samples per pixel that are given, or else those of the header, which may hold anything."""
+    found = given or image.metadata.get("mi_refract:spp", "no samples per pixel")
+    if not re.fullmatch(r"[0-9]{1,15}(\.0)?", text := str(found)) or float(text) < 2:
+        where = "given are" if given else "its header names"
+        raise ValueError(f"{image.path}: {where} {shown(found)}; accepted: `spp` or `spp_{side}`, 2 to 10¹⁵")
+    return int(float(text))
+
+
+def _not_negative(image: Image, name: str) -> Pixels:
+    """The variance from a file, with 0 for what is below by rounding. ValueError for what is negative beyond that."""
+    found = np.asarray(image.variances[name], np.float64)
+    size = np.square(image.pixels, dtype=np.float64).max(-1)
+    for each in image.variances.values():
+        size = np.maximum(size, np.abs(each))
+    if (below := found < -NEGATIVE * size).any():
+        y, x = np.unravel_index(int(below.argmax()), below.shape)
+        hint = (
+            f"; of X, Y, Z that were written as colours, as Mitsuba's: channels = {list(XYZ)}" if name in "RGB" else ""
+        )
+        raise ValueError(
+            f"{image.path}: its variance of {name} is negative in {below.sum()} pixels, the first at x = "
+            f"{x + image.origin[0]}, y = {y + image.origin[1]}; accepted: at least 0{hint}"
+        )
+    return np.maximum(found, 0)
+
+
+def _finite(image: Image, name: str, mean: Pixels, variance: Pixels, allow: bool) -> Pixels:
+    """The variance with 0 where the mean, or where that is allowed it, is not finite. ValueError elsewhere."""
+    unknown = ~np.isfinite(variance)
+    if (wrong := unknown & np.isfinite(mean)).any() and not allow:
+        y, x = np.unravel_index(int(wrong.argmax()), wrong.shape)
+        where = f"x = {x + image.origin[0]}, y = {y + image.origin[1]}"
+        raise ValueError(f"{image.path}: its variance of {name} is not finite at {where}; accepted: finite ones")
+    return np.where(unknown, 0, variance)
+
+
+def _is_alpha(image: Image, name: str) -> bool:
+    """Whether it is an alpha whose samples were from 0 to 1."""
+    if name != "A" and not name.endswith(".A"):
+        return False
+    alpha = image.select([name])
+    return bool((alpha >= 0).all() and (alpha <= 1 + ROUNDED).all())
