@@ -20,7 +20,7 @@ from . import idiff_flags
 from .channels import Names
 from .masks import Rectangle
 from .methods import AUTO, METHODS, options_of_auto
-from .name_patterns import matches
+from .name_patterns import fields_of, matches
 
 SYSTEMS = {"linux": "linux", "darwin": "macos", "win32": "windows"}  # by sys.platform
 PROCESSORS = {"x86_64": "x86_64", "amd64": "x86_64", "arm64": "arm64", "aarch64": "arm64"}  # by platform.machine()
@@ -80,8 +80,9 @@ class How:
 
     @property
     def needs_file(self) -> bool:
-        """Whether the command line alone cannot say the same."""
-        return any(getattr(self, name) for name in FILE_ONLY)
+        """Whether the command line alone cannot say the same of two files."""
+        in_folder = bool({"root", "dir"} & fields_of(self.variance))
+        return in_folder or any(getattr(self, name) for name in FILE_ONLY)
 
 
 @dataclass(frozen=True)

@@ -130,6 +130,10 @@ def test_files_elsewhere_and_maps(tmp_path, pair):
     (old / "a_var.exr").rename(old / "noise/a.exr")
     given = BESIDE | {"variance": "{root}/noise/{name}"}
     assert one(folders.diff(old, new, settings(**given))).status is Status.EQUAL
+    default = How(variance=given["variance"], options={"spp": 16})
+    results = folders.diff(old, new, Settings(default))
+    words = f"mi-refract diff {old} {new} a.exr --set spp=16 --variance '{given['variance']}'"
+    assert results.reproduce(one(results)) == words  # of two files, {root} would be another folder
 
 
 def test_a_variance_counts_for_welch_alone(pair):
