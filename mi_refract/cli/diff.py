@@ -17,7 +17,7 @@ from rich.console import Console, RenderableType
 from rich.progress import Progress
 
 from mi_refract.image_diff import accept as accepting
-from mi_refract.image_diff import folders, html_report, pairing, settings_file, text_reports
+from mi_refract.image_diff import folders, html_report, pairing, results_file, settings_file, text_reports
 from mi_refract.image_diff import self_test as self_tests
 from mi_refract.image_diff.methods import AUTO
 from mi_refract.image_diff.results import Results, Status, as_word
@@ -29,8 +29,6 @@ from mi_refract.io.provenance import provenance
 
 from . import self_test_scenes
 
-Folder = Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")]
-Other = Annotated[Path, typer.Argument(metavar="TEST", help="The image or folder to compare with it.")]
 NotAlways = Annotated[
     Path | None, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them; optional with --self-test.")
 ]
@@ -98,6 +96,22 @@ SelfTest = Annotated[
     ),
 ]
 
+# Of `accept` alone.
+NotWithFrom = Annotated[
+    Path | None, typer.Argument(help="As of diff; with --from optional: by default the paths that were compared.")
+]
+From = Annotated[
+    Path | None,
+    typer.Option("--from", metavar="OUT.json", help="What diff --json wrote: exactly the images that it compared."),
+]
+AsVariant = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        help="Keep the references: the new images become further ones, named by `accept` of the settings.",
+    ),
+]
+
 
 def diff(
     reference: NotAlways = None,
@@ -146,6 +160,7 @@ def diff(
             renders=renders,
             inconclusive=wanted,
             maps=bool(report),
+            digests=bool(json),
             tell=tell,
         )
     _say(found)
@@ -173,23 +188,44 @@ def _write(found: Results, junit: Path | None, json: Path | None, github: bool) 
 
 
 def accept(
-    reference: Folder,
-    test: Other,
+    reference: NotWithFrom = None,
+    test: NotWithFrom = None,
     names: Names = None,
     method: Method = AUTO,
     options: Set = None,
     settings: File = None,
     allow_nonfinite: Nonfinite = None,
     max_values: MaxValues = MAX_VALUES,
+    source: From = None,
+    as_variant: AsVariant = "",
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
     """Show which images are not equal to their references, ask, and copy them over. Nothing is deleted."""
     _require_extra("scipy")
-    chosen = _settings(reference, method, options, settings, allow_nonfinite, max_values)
-    with _progress() as tell:
-        found = folders.diff(reference, test, chosen, names=names or [], to_accept=True, tell=tell)
-    _say(found)
-    copies = list(accepting.changes(found))
+    if source:
+        if options or allow_nonfinite or method != AUTO:
+            raise ValueError("--from takes what was compared; accepted: no --method, --set or --allow-nonfinite")
+        found = _read_results(source, reference, test, names or [], settings, max_values)
+    elif reference is None or test is None:
+        raise ValueError("two paths are needed; accepted: mi-refract accept REFERENCE TEST, or --from OUT.json")
+    else:
+        chosen = _settings(reference, method, options, settings, allow_nonfinite, max_values)
+        with _progress() as tell:
+            found = folders.diff(reference, test, chosen, names=names or [], to_accept=True, tell=tell)
+        _say(found)
+    _copy(list(accepting.changes(found, as_variant)), yes)
+
+
+def _read_results(
+    source: Path, reference: Path | None, test: Path | None, names: Sequence[str], file: Path | None, most: int
+) -> Results:
+    """The results in a file, with the settings as they are now."""
+    found = results_file.read(source, reference, test)
+    found = replace(found, results=tuple(pairing.named(found.results, names)))
+    return results_file.with_settings(found, _settings(found.reference, AUTO, None, file, None, most))
+
+
+def _copy(copies: Sequence[accepting.Copy], yes: bool) -> None:
     for copy in copies:
         print(printable(f"{copy.new} → {copy.reference}{'' if copy.replaced else ' (new)'}"))
     if not copies:

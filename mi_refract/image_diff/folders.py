@@ -9,7 +9,7 @@ import functools
 import hashlib
 import os
 import stat
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from io import BufferedReader
@@ -23,12 +23,12 @@ from mi_refract.io.image_file import MAX_VALUES, Image
 from . import masks, methods, pairing, settings_file
 from .comparison import Comparison, Verdict
 from .pairing import Pair
-from .results import STATUSES, Result, Results, Status
+from .results import FAILED, STATUSES, Result, Results, Status
 from .settings import Settings
 
 AS_ASKED = Settings()
 WORKERS = min(os.cpu_count() or 1, 8)  # each holds a pair of images in memory
-HELD = 250_000_000  # bytes of images that stay in memory for a page; a full page shows fewer
+View = Callable[[Result], None]
 
 
 def diff(
@@ -39,15 +39,18 @@ def diff(
     names: Sequence[str] = (),
     renders: bool = False,
     inconclusive: str = "",
+    view: View | None = None,
     maps: bool = False,
+    digests: bool = False,
     to_accept: bool = False,
     tell: Callable[[int, int], None] = lambda done, of: None,
 ) -> Results:
     """Compare two files, two folders by the names of their images, or, with `renders`, two folders as one image.
 
-    `names`: patterns of the images to compare; none: all. `maps`: keep the maps of images that are not equal, and the
-    images themselves as far as HELD goes. `to_accept`: the reference need not exist yet, and the results have
-    `digests`. `tell(done, of)` is called after each image.
+    `names`: patterns of the images to compare; none: all. `view`: called with each result that is not equal, while it
+    has its images and maps, by several threads at once; what it raises ends the comparison. `maps`: the results keep
+    them, which takes memory for all of them. `digests`: the results have those of their files. `to_accept`: so they
+    do, and the reference need not exist yet. `tell(done, of)` is called after each image.
     Whatever goes wrong with one image is the error of its result. ValueError or OSError where there is nothing to
     compare: a path that does not exist, a file against a folder, an empty folder, a path within the other, a name that
     matches no image.
@@ -58,11 +61,11 @@ def diff(
     unused = settings.unused([pair.name for pair in every]) if reference.is_dir() and not renders else []
     pairs = [*pairing.named(every, names), *_wrong_entries(settings, every)]
     root = reference if reference.is_dir() else reference.parent
-    found, held = [], 0
+    asked = _Asked(root, renders, view, maps, (digests or to_accept) and not renders)
+    found = []
     with ThreadPoolExecutor(WORKERS) as pool:
-        for result in pool.map(lambda pair: _compared(pair, root, renders, maps, to_accept), pairs):
-            held += sum(image.pixels.nbytes for image in result.images)
-            found.append(result if held <= HELD else replace(result, images=()))
+        for result in pool.map(asked.result, pairs):
+            found.append(result)
             tell(len(found), len(pairs))
     found.sort(key=lambda result: list(Status).index(result.status))
     by_file = bool(settings.maps)
@@ -85,7 +88,25 @@ def _wrong_entries(settings: Settings, pairs: Sequence[Pair]) -> list[Pair]:
     return [Pair(f"{settings_file.FILE}: {rule.where}", None, None, Path(), error=rule.error) for rule in wrong]
 
 
-def _compared(pair: Pair, root: Path, renders: bool, maps: bool, to_accept: bool) -> Result:
+@dataclass(frozen=True)
+class _Asked:
+    """What is asked of every pair; see `diff`. `root`: the folder that paths of the settings are in."""
+
+    root: Path
+    renders: bool
+    view: View | None
+    maps: bool
+    digests: bool
+
+    def result(self, pair: Pair) -> Result:
+        """The result of comparing the two sides of a pair, after it was viewed."""
+        found = _compared(pair, self)
+        if self.view and found.status in FAILED:
+            self.view(found)
+        return found if self.maps or not found.images else _without_images(found)
+
+
+def _compared(pair: Pair, asked: _Asked) -> Result:
     """The result of comparing the two sides of a pair, where it has both; ERROR for whatever goes wrong."""
     result = Result(pair.name, Status.DIFFERENT, pair.reference, pair.test, pair.how)
     result = replace(result, target=pair.target, variants=pair.variants, error=pair.error or pair.how.error)
@@ -94,9 +115,9 @@ def _compared(pair: Pair, root: Path, renders: bool, maps: bool, to_accept: bool
     if result.how.skip:
         return replace(result, status=Status.SKIPPED)
     try:
-        if to_accept:  # before the images are read: what is read later and has the same digest is what was compared
-            result = replace(result, digests=(digest(result.reference), digest(result.test)))
-        return _judged(result, root, renders, maps)
+        if asked.digests:  # before the images are read: what is read later and has the same digest is what was compared
+            result = replace(result, digests=_digests(result))
+        return _judged(result, asked)
     except Exception as error:  # of whatever kind: the other images are still to be compared
         exit_code.print_traceback(error)
         text = exit_code.describe(error)
@@ -104,26 +125,38 @@ def _compared(pair: Pair, root: Path, renders: bool, maps: bool, to_accept: bool
         return replace(result, status=Status.ERROR, error=text if known else f"{result.test}: {text}")
 
 
-def _judged(result: Result, root: Path, renders: bool, maps: bool) -> Result:
+def _digests(result: Result) -> Mapping[Path, str]:
+    paths = (result.reference, result.test, *result.variants)
+    return {path: digest(path) for path in paths if path}
+
+
+def _without_images(result: Result) -> Result:
+    """The result as it is kept: the images of hundreds would fill the memory."""
+    comparison = replace(result.comparison, maps={}) if result.comparison else None
+    return replace(result, images=(), comparison=comparison)
+
+
+def _judged(result: Result, asked: _Asked) -> Result:
     """The verdict against the reference, or that of a variant to which the new image is equal."""
     if not (result.reference and result.test):
         return result
-    read = functools.cache(lambda path: _images(path, result.how.max_values, renders))
+    read = functools.cache(lambda path: _images(path, result.how.max_values, asked.renders))
+    kept = asked.maps or asked.view is not None
     judged, failed = [], None
     for path in (result.reference, *result.variants):
         try:
-            one = _against(path, result.test, read, result, root)
+            one = _against(path, result.test, read, result, asked.root)
         except (ValueError, OSError, MemoryError) as error:
             failed = failed or error  # unless another reference is equal
             continue
         if one.comparison.verdict is Verdict.EQUAL:
             matched = path if path != result.reference else None
-            return _with(replace(result, matched=matched), one, maps)
+            return _with(replace(result, matched=matched), one, kept)
         judged.append(one)
     if failed:
         raise failed
     doubt = [one for one in judged if one.comparison.verdict is Verdict.INCONCLUSIVE]
-    return _with(result, (doubt or judged)[0], maps)
+    return _with(result, (doubt or judged)[0], kept)
 
 
 @dataclass(frozen=True)
@@ -154,9 +187,9 @@ def _masked(images: list[Image], mask: masks.Mask | None) -> list[Image]:
     return [masks.applied(image, mask) for image in images]
 
 
-def _with(result: Result, one: _Judged, maps: bool) -> Result:
+def _with(result: Result, one: _Judged, kept: bool) -> Result:
     found = one.comparison
-    kept = maps and found.verdict is not Verdict.EQUAL  # a thousand images' maps would fill the memory
+    kept = kept and found.verdict is not Verdict.EQUAL
     images = tuple(map(mean_image, one.sides)) if kept else ()
     left_out = {} if one.sides[0][0].mask is None else {"left out": (~one.sides[0][0].mask).astype(np.float32)}
     comparison = replace(found, maps=found.maps | left_out if kept else {})

@@ -28,7 +28,7 @@ from mi_refract.report.plots import histogram_svg
 
 from . import flip, folders
 from .comparison import Maps, Metric
-from .results import Result, Results, Status
+from .results import FAILED, Result, Results, Status
 from .text_reports import sentence
 
 PAGE = 14_000_000  # bytes of images on a page of at most 15 MB
@@ -37,7 +37,6 @@ IMAGE, MAP = 4_600_000, 1_200_000  # bytes of one: two images and three maps are
 MAP_WIDTH, FLIP_WIDTH = 960, 640
 SIGNED = ("difference", "t")
 UNSEEN = {"p"}  # a histogram shows it better
-FAILED = (Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE)
 
 
 Maker = Callable[[], dict[str, Any]]

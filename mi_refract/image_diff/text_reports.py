@@ -22,7 +22,7 @@ from mi_refract.report.row import strict
 
 from .comparison import Metric
 from .pairing import Pair
-from .results import Result, Results, Status
+from .results import FAILED, Result, Results, Status
 from .settings import How
 
 if TYPE_CHECKING:
@@ -136,6 +136,8 @@ def _entry(results: Results, result: Result) -> dict[str, Any]:
         "error": result.error,
         "reference": result.reference,
         "test": result.test,
+        "target": result.target,
+        "digests": _digests(result),
         "method": _method(result),
         "options": dict(result.how.options),
         "why_so": result.how.reason,
@@ -148,6 +150,15 @@ def _entry(results: Results, result: Result) -> dict[str, Any]:
         "reproduce": results.reproduce(result),
         "accept": results.accept(result),
     }
+
+
+def _digests(result: Result) -> dict[str, Any] | None:
+    """The SHA-256 of the files of an image that is not equal, as they were compared; "" where there is no file."""
+    if result.digests is None or result.status not in FAILED:
+        return None
+    sides = {"reference": result.reference, "test": result.test}
+    of = {role: result.digests[path] if path else "" for role, path in sides.items()}
+    return of | {"variants": [result.digests[path] for path in result.variants]}
 
 
 def write_junit(path: str | Path, results: Results) -> None:
