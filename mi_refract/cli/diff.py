@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import enum
 import importlib.util
+import os
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +18,16 @@ from rich.console import Console, RenderableType
 from rich.progress import Progress
 
 from mi_refract.image_diff import accept as accepting
-from mi_refract.image_diff import folders, html_report, pairing, results_file, settings_file, text_reports
+from mi_refract.image_diff import (
+    folders,
+    html_report,
+    pairing,
+    report_folder,
+    report_rows,
+    results_file,
+    settings_file,
+    text_reports,
+)
 from mi_refract.image_diff import self_test as self_tests
 from mi_refract.image_diff.methods import AUTO
 from mi_refract.image_diff.results import Results, Status, as_word
@@ -51,7 +61,8 @@ Nonfinite = Annotated[
 MaxValues = Annotated[
     int, typer.Option("--max-values", metavar="N", min=1, help="Width × height × channels of an image, at most.")
 ]
-OUTPUTS = ((".html", ".htm"), (".xml",), (".json",))  # of --report, --junit, --json
+OUTPUTS = ((".xml",), (".json",))  # of --junit, --json
+PAGES = (".html", ".htm")
 
 
 class Inconclusive(enum.StrEnum):
@@ -79,7 +90,20 @@ OldRenders = Annotated[bool, typer.Option("--samples", hidden=True)]
 CountsAs = Annotated[
     Inconclusive | None, typer.Option(help="What an inconclusive image counts as; exit code 3 by default.")
 ]
-Report = Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML page with the images.")]
+Report = Annotated[
+    str,
+    typer.Option(
+        metavar="OUT.html|FOLDER/", help="Write an HTML page with the images; a folder has them all, one page a pair."
+    ),
+]
+ReportUrl = Annotated[
+    str,
+    typer.Option(
+        metavar="URL",
+        envvar="MI_REFRACT_REPORT_URL",
+        help="Where the report will be found, for the job's summary; below URL/ every page is linked.",
+    ),
+]
 JUnit = Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")]
 Json = Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")]
 GitHub = Annotated[bool, typer.Option("--github", help="Print GitHub annotations, write the job's summary.")]
@@ -125,7 +149,8 @@ def diff(
     allow_nonfinite: Nonfinite = None,
     max_values: MaxValues = MAX_VALUES,
     inconclusive: CountsAs = None,
-    report: Report = None,
+    report: Report = "",
+    report_url: ReportUrl = "",
     junit: JUnit = None,
     json: Json = None,
     github: GitHub = False,
@@ -146,36 +171,61 @@ def diff(
         raise typer.Exit(_check_settings(reference, test, names or [], chosen))
     if reference is None or test is None:
         raise ValueError("two paths are needed; accepted: mi-refract diff REFERENCE TEST")
-    for path, suffixes in zip((report, junit, json), OUTPUTS, strict=True):
+    for path, suffixes in zip((junit, json), OUTPUTS, strict=True):
         if path:
             writable(path, suffixes)
     chosen = _settings(reference, method, options, settings, allow_nonfinite, max_values)
     wanted = inconclusive or ""
-    with _progress() as tell:
-        found = folders.diff(
-            reference,
-            test,
-            chosen,
-            names=names or [],
-            renders=renders,
-            inconclusive=wanted,
-            maps=bool(report),
-            digests=bool(json),
-            tell=tell,
-        )
-    _say(found)
-    if report:
-        _write_page(report, found, _replay(found, names or []))
-    _write(found, junit, json, github)
+    with _reporting(report, reference, test) as page:
+        with _progress() as tell:
+            found = folders.diff(
+                reference,
+                test,
+                chosen,
+                names=names or [],
+                renders=renders,
+                inconclusive=wanted,
+                view=page.view if page else None,
+                digests=bool(json),
+                tell=tell,
+            )
+        _say(found)
+        if page:
+            software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
+            page.write(found, software, _replay(found, names or []), str(json or ""))
+    _write(found, junit, json, _pages(report, report_url) if github else None, github)
     raise typer.Exit(found.exit_code)
 
 
-def _write_page(path: Path, found: Results, replay: str) -> None:
-    software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
-    html_report.write(path, found, software, replay)
+@contextlib.contextmanager
+def _reporting(report: str, *sides: Path) -> Iterator[html_report.Page | report_folder.Folder | None]:
+    """What writes the report that was asked for. ValueError or OSError where that cannot be written."""
+    if not report:
+        yield None
+    elif _is_folder(report):
+        report_folder.require_free(Path(report), *sides)
+        with report_folder.writing(Path(report)) as folder:
+            yield folder
+    else:
+        yield html_report.Page(writable(report, PAGES))
 
 
-def _write(found: Results, junit: Path | None, json: Path | None, github: bool) -> None:
+def _is_folder(report: str) -> bool:
+    """Whether the report is a folder: it ends in /, has no ending, or is one already."""
+    path = Path(report)
+    return report.endswith(("/", os.sep)) or (path.suffix.lower() not in PAGES and (not path.suffix or path.is_dir()))
+
+
+def _pages(report: str, url: str) -> text_reports.Pages | None:
+    if not report:
+        return None
+    page = report_rows.page_of if _is_folder(report) else lambda result: ""
+    return text_reports.Pages(report, page, url)
+
+
+def _write(
+    found: Results, junit: Path | None, json: Path | None, pages: text_reports.Pages | None, github: bool
+) -> None:
     """Write the JSON and JUnit files, and the GitHub annotations, that were asked for."""
     if junit:
         text_reports.write_junit(junit, found)
@@ -184,7 +234,7 @@ def _write(found: Results, junit: Path | None, json: Path | None, github: bool) 
     if github:
         for line in text_reports.workflow_commands(found):
             print(line)
-        text_reports.append_summary(found)
+        text_reports.append_summary(found, pages)
 
 
 def accept(

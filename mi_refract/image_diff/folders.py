@@ -28,7 +28,7 @@ from .settings import Settings
 
 AS_ASKED = Settings()
 WORKERS = min(os.cpu_count() or 1, 8)  # each holds a pair of images in memory
-View = Callable[[Result], None]
+View = Callable[[Result, Results], None]
 
 
 def diff(
@@ -48,7 +48,8 @@ def diff(
     """Compare two files, two folders by the names of their images, or, with `renders`, two folders as one image.
 
     `names`: patterns of the images to compare; none: all. `view`: called with each result that is not equal, while it
-    has its images and maps, by several threads at once; what it raises ends the comparison. `maps`: the results keep
+    has its images and maps, and with what is known of all; by several threads at once. What it raises ends the
+    comparison. `maps`: the results keep
     them, which takes memory for all of them. `digests`: the results have those of their files. `to_accept`: so they
     do, and the reference need not exist yet. `tell(done, of)` is called after each image.
     Whatever goes wrong with one image is the error of its result. ValueError or OSError where there is nothing to
@@ -61,15 +62,17 @@ def diff(
     unused = settings.unused([pair.name for pair in every]) if reference.is_dir() and not renders else []
     pairs = [*pairing.named(every, names), *_wrong_entries(settings, every)]
     root = reference if reference.is_dir() else reference.parent
-    asked = _Asked(root, renders, view, maps, (digests or to_accept) and not renders)
+    all_of_them = Results(
+        reference, test, (), renders, inconclusive, tuple(unused), tuple(settings.flags), bool(settings.maps)
+    )
+    asked = _Asked(root, all_of_them, view, maps, (digests or to_accept) and not renders)
     found = []
     with ThreadPoolExecutor(WORKERS) as pool:
         for result in pool.map(asked.result, pairs):
             found.append(result)
             tell(len(found), len(pairs))
     found.sort(key=lambda result: list(Status).index(result.status))
-    by_file = bool(settings.maps)
-    return Results(reference, test, tuple(found), renders, inconclusive, tuple(unused), tuple(settings.flags), by_file)
+    return replace(all_of_them, results=tuple(found))
 
 
 def _pairs(reference: Path, test: Path, settings: Settings, renders: bool) -> list[Pair]:
@@ -93,7 +96,7 @@ class _Asked:
     """What is asked of every pair; see `diff`. `root`: the folder that paths of the settings are in."""
 
     root: Path
-    renders: bool
+    results: Results  # without the results of pairs
     view: View | None
     maps: bool
     digests: bool
@@ -102,7 +105,7 @@ class _Asked:
         """The result of comparing the two sides of a pair, after it was viewed."""
         found = _compared(pair, self)
         if self.view and found.status in FAILED:
-            self.view(found)
+            self.view(found, self.results)
         return found if self.maps or not found.images else _without_images(found)
 
 
@@ -140,7 +143,7 @@ def _judged(result: Result, asked: _Asked) -> Result:
     """The verdict against the reference, or that of a variant to which the new image is equal."""
     if not (result.reference and result.test):
         return result
-    read = functools.cache(lambda path: _images(path, result.how.max_values, asked.renders))
+    read = functools.cache(lambda path: _images(path, result.how.max_values, asked.results.renders))
     kept = asked.maps or asked.view is not None
     judged, failed = [], None
     for path in (result.reference, *result.variants):

@@ -10,9 +10,11 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from urllib.parse import quote
 
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.outside_text import printable
@@ -226,25 +228,61 @@ def _property(text: Any) -> str:
     return _message(text).replace(":", "%3A").replace(",", "%2C")
 
 
-def append_summary(results: Results) -> None:
+@dataclass(frozen=True)
+class Pages:
+    """Where a report is, for links: `name`, and `page` of each result ("" in one file). `url`: where it is published.
+
+    Below a URL that ends in / every page has its own; another one is that of an archive, in which none has.
+    """
+
+    name: str
+    page: Callable[[Result], str]
+    url: str = ""
+
+
+def append_summary(results: Results, pages: Pages | None = None) -> None:
     """Append the Markdown to the file that GitHub names in $GITHUB_STEP_SUMMARY, where it does. OSError."""
     if path := os.environ.get("GITHUB_STEP_SUMMARY"):
         with Path(path).open("a", encoding="utf-8") as file:
-            file.write(markdown(results))
+            file.write(markdown(results, pages))
 
 
-def markdown(results: Results) -> str:
-    """A heading with the sentence and a table of the images that are not equal."""
-    failed = results.of(Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE)
-    lines = [f"### mi-refract diff: {sentence(results)}", ""]
+def markdown(results: Results, pages: Pages | None = None) -> str:
+    """A heading with the sentence, where the report is, and a table of the images that are not equal."""
+    failed = results.of(*FAILED)
+    lines = [f"### mi-refract diff: {sentence(results)}", "", *(_where(pages) if pages else [])]
+    paged = pages is not None and any(map(pages.page, failed[:1]))
     if failed:
-        lines += ["| verdict | image | method | why |", "|---|---|---|---|"]
+        lines += ["| verdict | image | method | why |" + " page |" * paged, "|---|---|---|---|" + "---|" * paged]
     for result in failed[:SUMMARY_ROWS]:
-        cells = (_word(result), result.name, _method(result), why(result))
-        lines.append(f"| {' | '.join(map(_literal, cells))} |")
+        cells = [_literal(cell) for cell in (_word(result), result.name, _method(result), why(result))]
+        cells += [_linked(pages, pages.page(result))] if pages and paged else []
+        lines.append(f"| {' | '.join(cells)} |")
     if len(failed) > SUMMARY_ROWS:
         lines += ["", f"… and {len(failed) - SUMMARY_ROWS} more"]
     return "\n".join(lines) + "\n\n"
+
+
+def _where(pages: Pages) -> list[str]:
+    """Where a reader finds the report: no summary can show an image of an artefact, nor link into one."""
+    if pages.url:
+        first = "index.html" if pages.url.endswith("/") else ""
+        return [f"Report: [{_literal(pages.name)}]({_address(pages.url + first)})", ""]
+    run = [os.environ.get(f"GITHUB_{name}", "") for name in ("SERVER_URL", "REPOSITORY", "RUN_ID")]
+    if not all(run):
+        return [f"Report: {_literal(pages.name)}", ""]
+    artefacts = _address(f"{run[0]}/{run[1]}/actions/runs/{run[2]}#artifacts")
+    return [f"Report: {_literal(pages.name)}, where it is uploaded among the [artefacts of this run]({artefacts})", ""]
+
+
+def _linked(pages: Pages, page: str) -> str:
+    url = pages.url + page if pages.url.endswith("/") else ""
+    return f"[{_literal(page)}]({_address(url)})" if url else _literal(page)
+
+
+def _address(url: str) -> str:
+    """A URL that ends where the link does."""
+    return quote(printable(url), safe=":/?#&=%@+,;~$!*[]-._")
 
 
 def _literal(text: str) -> str:

@@ -189,6 +189,7 @@ function listen() {
     figure.addEventListener("pointerleave", () => probe(figure));
   }
   addEventListener("keydown", (e) => {
+    if (e.target.matches("input[type=search]")) return;
     const editing = e.target.matches("input[type=range], select") && e.key.startsWith("Arrow");
     const pressing = e.target.matches("summary, select, input, a") && e.key === " ";
     if (e.ctrlKey || e.metaKey || e.altKey || editing || pressing || !(e.key in KEYS) || !all(".viewer").length) return;
