@@ -113,7 +113,7 @@ def _cut(failures: list[dict[str, Any]], equal: list[dict[str, Any]], articles: 
     without = sum(each["note"] == FULL for each in failures[:articles])
     said = {
         f"images of {without} of {len(failures)} failures": without,
-        f"{len(further)} failures but for a line each": len(further) - more,
+        f"all but a line of {len(further) - more} failures": len(further) - more,
         f"{more} failures": more,
         f"{more_equal} equal images": more_equal,
     }

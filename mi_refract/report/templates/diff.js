@@ -40,15 +40,16 @@ function arrange() {
 function headings() {
   for (const old of all("h2.folder")) old.remove();
   if (!document.querySelector("[name=group]")?.checked) return;
-  const folders = Map.groupBy(all(".item").filter(visible), folderOf);
-  for (const [folder, members] of folders) {
+  const shown = all(".item").filter(visible);
+  shown.forEach((item, at) => {
+    if (at && folderOf(item) === folderOf(shown[at - 1])) return;
     const heading = document.createElement("h2"), count = document.createElement("small");
     heading.className = "folder";
-    heading.textContent = folder || "(no folder)";
-    count.textContent = members.length;
+    heading.textContent = folderOf(item) || "(no folder)";
+    count.textContent = shown.filter((other) => folderOf(other) === folderOf(item)).length;
     heading.append(count);
-    members[0].before(heading);
-  }
+    item.before(heading);
+  });
 }
 
 // The command. Words are quoted for a shell already; after -- none is an option.
@@ -70,6 +71,10 @@ async function copy() {
   }
   button.textContent = "Copied";
   setTimeout(() => (button.textContent = "Copy"), 1500);
+}
+function tickShown() {
+  for (const box of all(".tick input")) box.checked ||= visible(box.closest("[data-text]"));
+  build();
 }
 function clear() {
   for (const box of all(".tick input:checked")) box.checked = false;
@@ -126,6 +131,7 @@ if (form) {
   form.addEventListener("submit", (e) => e.preventDefault());
   form.querySelector(".copy").addEventListener("click", copy);
   form.querySelector(".clear").addEventListener("click", clear);
+  for (const button of all(".tick-shown")) button.addEventListener("click", tickShown);
   for (const box of all(".tick input")) box.addEventListener("input", build);
   build();
 }
