@@ -13,7 +13,7 @@ from mi_refract.io.pixels import block_mean, srgb_encode
 
 from .embedded_images import strongest
 
-SIDE = 160  # pixels of the longer side, at most
+SIDE, DIFFERENCE_SIDE = 160, 64  # pixels of the longer side, at most; of a difference one alone is to be seen
 NOT_A_NUMBER = (255, 0, 255)  # as in the page's script
 EQUAL, LESS, MORE = np.array((247, 247, 247)), np.array((33, 102, 172)), np.array((178, 24, 43))
 Bytes = NDArray[np.uint8]
@@ -21,7 +21,7 @@ Bytes = NDArray[np.uint8]
 
 def of_image(pixels: Any, coded: bool) -> bytes:
     """H × W × (1 or 3) pixels; `coded`: they are sRGB codes, else linear light."""
-    small = block_mean(pixels, _side(pixels))
+    small = block_mean(pixels, _block(pixels, SIDE))
     unit = np.clip(np.nan_to_num(small), 0, 1)
     codes = unit if coded else srgb_encode(unit)
     rgb = np.broadcast_to(np.rint(255 * codes), (*small.shape[:2], 3)).astype(np.uint8)
@@ -30,7 +30,7 @@ def of_image(pixels: Any, coded: bool) -> bytes:
 
 def of_difference(values: Any) -> bytes:
     """H × W × C differences, of every block the strongest; colours are full at the upper hundredth of what is not 0."""
-    small = strongest(values, max(values.shape[1] // _side(values), 1))[..., 0]
+    small = strongest(values, max(values.shape[1] // _block(values, DIFFERENCE_SIDE), 1))[..., 0]
     finite = np.where(np.isfinite(small), small, np.copysign(np.inf, small))
     some = np.abs(finite[np.isfinite(small) & (small != 0)])
     full = float(np.quantile(some, 0.99)) if some.size else 1.0
@@ -39,8 +39,8 @@ def of_difference(values: Any) -> bytes:
     return png(_marked(np.rint(rgb).astype(np.uint8), np.isnan(small)))
 
 
-def _side(pixels: Any) -> int:
-    return -(-int(max(pixels.shape[:2])) // SIDE)
+def _block(pixels: Any, side: int) -> int:
+    return -(-int(max(pixels.shape[:2])) // side)
 
 
 def _marked(rgb: Bytes, bad: Any) -> Bytes:
