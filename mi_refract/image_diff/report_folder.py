@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_refract.io import atomic
+from mi_refract.io.outside_text import printable
 from mi_refract.report.embedded_images import EmbeddedImages
 from mi_refract.report.html_page import rendered, write_beside
 
@@ -70,7 +71,7 @@ class Folder:
             "ticks": report_rows.ticked(results, source),
         }
         (self.path / INDEX).write_bytes(rendered("diff_index.html.j2", content, beside=""))
-        listed = json.dumps([[page, result.name] for page, result in zip(pages, failed, strict=True)])
+        listed = json.dumps([[page, printable(result.name)] for page, result in zip(pages, failed, strict=True)])
         (self.path / PAGES).write_text(f"const PAGES = {listed};\n", "utf-8")
 
 

@@ -107,7 +107,7 @@ def _moved(where: str, path: Path | None, key: str, before: Path, now: Path) -> 
     if path is None:
         return None
     inside = path.relative_to(before) if path.is_relative_to(before) else None
-    moved = now / inside if inside is not None and ".." not in inside.parts else None
+    moved = now / inside if inside is not None else None
     if moved is None or not (moved == now or moved.parent.resolve().is_relative_to(now.resolve())):
         raise ValueError(f"{where}.{key}: {path}: accepted: a path in {before}")
     return moved

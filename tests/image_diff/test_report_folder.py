@@ -12,8 +12,9 @@ import pytest
 from support.browser import needs_chromium, seen
 from support.diff_images import BROKEN, image, tree
 
-from mi_refract.image_diff import folders, panes, report_folder
+from mi_refract.image_diff import folders, panes, report_folder, report_rows
 from mi_refract.image_diff import text_reports as text
+from mi_refract.image_diff.results import Result, Status
 from mi_refract.image_diff.settings import Entry, How, Settings
 
 EVIL = 'a"b<script>alert(1)<∕script>.exr'
@@ -86,6 +87,13 @@ def test_every_failure_has_a_row_and_a_page_with_its_images(sides, tmp_path):
     for words in ("1 & 2", "mi-refract diff old new", "9 images: 1 could not be compared", "needs <i>a</i> GPU"):
         assert words in index.text
     assert "equal.exr" in index.text[index.text.index("Equal") :]
+
+
+def test_images_of_alike_names_have_pages_of_their_own(tmp_path):
+    names = ["a/b.exr", "a-b.exr", "A/b.exr", "a/\udcff.exr", "a/\u202e.exr", "x" * 300 + "b.exr", "y" * 300 + "b.exr"]
+    pages = {report_rows.page_of(Result(name, Status.DIFFERENT, None, None)) for name in names}
+    assert len({page.lower() for page in pages}) == len(names)
+    assert all(re.fullmatch(r"pairs/\w[\w.-]{0,90}\.html", page, re.ASCII) for page in pages)
 
 
 def test_rows_say_how_far_and_in_which_folder(sides, tmp_path):
