@@ -32,8 +32,9 @@ from mi_refract.report.text_table import Plain
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-Folder = Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")]
-Other = Annotated[Path, typer.Argument(metavar="TEST", help="The image or folder to compare with it.")]
+    from mi_refract.image_diff.html_report import Page
+    from mi_refract.image_diff.report_folder import Folder as ReportFolder
+
 NotAlways = Annotated[
     Path | None, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them; optional with --self-test.")
 ]
@@ -67,7 +68,8 @@ MaxValues = Annotated[
     int, typer.Option("--max-values", metavar="N", min=1, help="Width × height × channels of an image, at most.")
 ]
 SCENE = ".xml"
-OUTPUTS = ((".html", ".htm"), (".xml",), (".json",))  # of --report, --junit, --json
+OUTPUTS = ((".xml",), (".json",))  # of --junit, --json
+PAGES = (".html", ".htm")
 
 
 class Inconclusive(enum.StrEnum):
@@ -96,7 +98,20 @@ OldRenders = Annotated[bool, typer.Option("--samples", hidden=True)]
 CountsAs = Annotated[
     Inconclusive | None, typer.Option(help="What an inconclusive image counts as; exit code 3 by default.")
 ]
-Report = Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML page with the images.")]
+Report = Annotated[
+    str,
+    typer.Option(
+        metavar="OUT.html|FOLDER/", help="Write an HTML page with the images; a folder has them all, one page a pair."
+    ),
+]
+ReportUrl = Annotated[
+    str,
+    typer.Option(
+        metavar="URL",
+        envvar="MI_REFRACT_REPORT_URL",
+        help="Where the report will be found, for the job's summary; below URL/ every page is linked.",
+    ),
+]
 JUnit = Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")]
 Json = Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")]
 GitHub = Annotated[bool, typer.Option("--github", help="Print GitHub annotations, write the job's summary.")]
@@ -118,6 +133,22 @@ AllowPlugins = Annotated[
     typer.Option(metavar="NAME", help="Run this plugin, which the scene of --self-test brings, too."),
 ]
 
+# Of `accept` alone.
+NotWithFrom = Annotated[
+    Path | None, typer.Argument(help="As of diff; with --from optional: by default the paths that were compared.")
+]
+From = Annotated[
+    Path | None,
+    typer.Option("--from", metavar="OUT.json", help="What diff --json wrote: exactly the images that it compared."),
+]
+AsVariant = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        help="Keep the references: the new images become further ones, named by `accept` of the settings.",
+    ),
+]
+
 
 def diff(
     reference: NotAlways = None,
@@ -134,7 +165,8 @@ def diff(
     channels: Channels = "",
     max_values: MaxValues = MAX_VALUES,
     inconclusive: CountsAs = None,
-    report: Report = None,
+    report: Report = "",
+    report_url: ReportUrl = "",
     junit: JUnit = None,
     json: Json = None,
     github: GitHub = False,
@@ -172,38 +204,68 @@ def diff(
         raise typer.Exit(_check_settings(reference, test, names or [], chosen))
     if reference is None or test is None:
         raise ValueError("two paths are needed; accepted: mi-refract diff REFERENCE TEST")
-    for path, suffixes in zip((report, junit, json), OUTPUTS, strict=True):
+    for path, suffixes in zip((junit, json), OUTPUTS, strict=True):
         if path:
             writable(path, suffixes)
     chosen = _settings(reference, method, options, idiff, settings, allow_nonfinite, max_values, variance, channels)
     wanted = inconclusive or ""
-    with _progress() as tell:
-        found = folders.diff(
-            reference,
-            test,
-            chosen,
-            names=names or [],
-            renders=renders,
-            inconclusive=wanted,
-            maps=bool(report),
-            tell=tell,
-        )
-    _say(found)
-    if report:
-        _write_page(report, found, _replay(found, names or []))
-    _write(found, junit, json, github)
+    with _reporting(report, reference, test) as page:
+        with _progress() as tell:
+            found = folders.diff(
+                reference,
+                test,
+                chosen,
+                names=names or [],
+                renders=renders,
+                inconclusive=wanted,
+                view=page.view if page else None,
+                digests=bool(json),
+                tell=tell,
+            )
+        _say(found)
+        if page:
+            from mi_refract.io.provenance import provenance
+
+            software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
+            page.write(found, software, _replay(found, names or []), str(json or ""))
+    _write(found, junit, json, _pages(report, report_url) if github else None, github)
     raise typer.Exit(found.exit_code)
 
 
-def _write_page(path: Path, found: Results, replay: str) -> None:
-    from mi_refract.image_diff import html_report
-    from mi_refract.io.provenance import provenance
+@contextlib.contextmanager
+def _reporting(report: str, *sides: Path) -> Iterator[Page | ReportFolder | None]:
+    """What writes the report that was asked for. ValueError or OSError where that cannot be written."""
+    if not report:
+        yield None
+        return
+    from mi_refract.image_diff import html_report, report_folder
 
-    software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
-    html_report.write(path, found, software, replay)
+    if _is_folder(report):
+        report_folder.require_free(Path(report), *sides)
+        with report_folder.writing(Path(report)) as folder:
+            yield folder
+    else:
+        yield html_report.Page(writable(report, PAGES))
 
 
-def _write(found: Results, junit: Path | None, json: Path | None, github: bool) -> None:
+def _is_folder(report: str) -> bool:
+    """Whether the report is a folder: it ends in /, has no ending, or is one already."""
+    path = Path(report)
+    return report.endswith(("/", os.sep)) or (path.suffix.lower() not in PAGES and (not path.suffix or path.is_dir()))
+
+
+def _pages(report: str, url: str) -> text_reports.Pages | None:
+    if not report:
+        return None
+    from mi_refract.image_diff import report_rows
+
+    page = report_rows.page_of if _is_folder(report) else lambda result: ""
+    return text_reports.Pages(report, page, url)
+
+
+def _write(
+    found: Results, junit: Path | None, json: Path | None, pages: text_reports.Pages | None, github: bool
+) -> None:
     """Write the JSON and JUnit files, and the GitHub annotations, that were asked for."""
     if junit:
         text_reports.write_junit(junit, found)
@@ -212,12 +274,12 @@ def _write(found: Results, junit: Path | None, json: Path | None, github: bool) 
     if github:
         for line in text_reports.workflow_commands(found):
             print(line)
-        text_reports.append_summary(found)
+        text_reports.append_summary(found, pages)
 
 
 def accept(
-    reference: Folder,
-    test: Other,
+    reference: NotWithFrom = None,
+    test: NotWithFrom = None,
     names: Names = None,
     method: Method = AUTO,
     options: Set = None,
@@ -227,15 +289,38 @@ def accept(
     variance: Variance = "",
     channels: Channels = "",
     max_values: MaxValues = MAX_VALUES,
+    source: From = None,
+    as_variant: AsVariant = "",
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
     """Show which images are not equal to their references, ask, and copy them over. Nothing is deleted."""
     _require_extra("scipy")
-    chosen = _settings(reference, method, options, idiff, settings, allow_nonfinite, max_values, variance, channels)
-    with _progress() as tell:
-        found = folders.diff(reference, test, chosen, names=names or [], to_accept=True, tell=tell)
-    _say(found)
-    copies = _changes(found)
+    if source:
+        if options or allow_nonfinite or method != AUTO or idiff is not None or variance or channels:
+            raise ValueError("--from takes what was compared; accepted: no option that says how")
+        found = _read_results(source, reference, test, names or [], settings, max_values)
+    elif reference is None or test is None:
+        raise ValueError("two paths are needed; accepted: mi-refract accept REFERENCE TEST, or --from OUT.json")
+    else:
+        chosen = _settings(reference, method, options, idiff, settings, allow_nonfinite, max_values, variance, channels)
+        with _progress() as tell:
+            found = folders.diff(reference, test, chosen, names=names or [], to_accept=True, tell=tell)
+        _say(found)
+    _copy(_changes(found, as_variant), yes)
+
+
+def _read_results(
+    source: Path, reference: Path | None, test: Path | None, names: Sequence[str], file: Path | None, most: int
+) -> Results:
+    """The results in a file, with the settings as they are now."""
+    from mi_refract.image_diff import results_file
+
+    found = results_file.read(source, reference, test)
+    found = replace(found, results=tuple(pairing.named(found.results, names)))
+    return results_file.with_settings(found, _settings(found.reference, AUTO, None, None, file, None, most, "", ""))
+
+
+def _copy(copies: Sequence[accepting.Copy], yes: bool) -> None:
     for copy in copies:
         print(printable(f"{copy.new} → {copy.reference}{'' if copy.replaced else ' (new)'}"))
     if not copies:
@@ -248,10 +333,10 @@ def accept(
         raise typer.Exit(1)
 
 
-def _changes(found: Results) -> list[accepting.Copy]:
+def _changes(found: Results, variant: str) -> list[accepting.Copy]:
     """What is to be copied. Where an image can be no reference, `_say` may have said so already."""
     try:
-        return list(accepting.changes(found))
+        return list(accepting.changes(found, variant))
     except (ValueError, OSError) as error:
         if describe(error) in {printable(result.error) for result in found.of(Status.ERROR)}:
             raise typer.Exit(MISUSE) from None

@@ -15,7 +15,7 @@ from mi_refract.io.atomic import replacing
 
 from . import pairing
 from .folders import digest, opened
-from .results import Results, Status
+from .results import FAILED, Result, Results
 from .settings import How
 
 BLOCK = 2**20  # bytes that are copied at once
@@ -34,28 +34,32 @@ class Copy:
     replaced: str
 
 
-def changes(results: Results) -> Iterator[Copy]:
+def changes(results: Results, variant: str = "") -> Iterator[Copy]:
     """A copy for each image that is not equal to its reference, or has none. `results`: of a `diff(to_accept=True)`.
 
+    `variant`: the copies become other references beside the old ones, of that name; see `pairing.variant`.
     ValueError or OSError for a new image that can be no reference: unreadable, with values that are not finite, or of
     another format than the reference's name says.
     """
-    for result in results.of(Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE):
+    taken = {result.target for result in results.results} if variant else set()
+    for result in results.of(*FAILED):
         if result.test is None or result.digests is None:
             if result.error:
                 raise ValueError(result.error)
             if result.test:
                 raise ValueError(f"{result.test}: compared without digests; accepted: results of diff(to_accept=True)")
             continue
+        target = _target(result, results, variant)
+        if target in taken:
+            raise ValueError(f"{target}: the reference of another image; accepted: another --as-variant")
+        taken |= {target} if variant else set()
         images = image_file.read_parts(result.test, result.how.max_values)
         finite = all(np.isfinite(image.pixels).all() for image in images)
         if not result.how.options.get("allow_nonfinite") and not finite:
             raise ValueError(f"{result.test}: values that are not finite; accepted with --allow-nonfinite")
-        target = result.target or results.reference
         if target.suffix.lower() != result.test.suffix.lower():
             raise ValueError(f"{target}: accepted: a name that ends in {result.test.suffix}, as {result.test} does")
-        replaced, shown = result.digests
-        yield Copy(result.test, target, shown, replaced)
+        yield Copy(result.test, target, result.digests[result.test], result.digests.get(target, ""))
         yield from _of_variance(result.test, target, results, result.how)
 
 
@@ -69,6 +73,15 @@ def _of_variance(new: Path, target: Path, results: Results, how: How) -> Iterato
         yield Copy(source, to, digest(source), digest(to))
     elif to.exists():
         raise ValueError(f"{source}: no such file, and {to} is of another render; accepted: a variance of {new}")
+
+
+def _target(result: Result, results: Results, variant: str) -> Path:
+    target = result.target or results.reference
+    if not variant:
+        return target
+    if result.reference is None:
+        raise ValueError(f"{result.test}: has no reference yet; accepted: without --as-variant")
+    return pairing.variant(target, result.how, variant)
 
 
 def accept(copies: Sequence[Copy]) -> None:

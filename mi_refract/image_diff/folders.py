@@ -10,7 +10,7 @@ import functools
 import hashlib
 import os
 import stat
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from io import BufferedReader
 from pathlib import Path
@@ -24,12 +24,12 @@ from mi_refract.io.image_file import MAX_VALUES, Image
 from . import channels, masks, methods, pairing, parts, settings_file, variances
 from .comparison import Comparison, Verdict
 from .pairing import Pair
-from .results import STATUSES, Result, Results, Status
+from .results import FAILED, STATUSES, Result, Results, Status
 from .settings import How, Settings
 
 AS_ASKED = Settings()
 WORKERS = min(os.cpu_count() or 1, 8)
-HELD = 250_000_000  # bytes of images that stay in memory for a page; a full page shows fewer
+View = Callable[[Result, Results], None]
 
 
 def diff(
@@ -40,15 +40,19 @@ def diff(
     names: Sequence[str] = (),
     renders: bool = False,
     inconclusive: str = "",
+    view: View | None = None,
     maps: bool = False,
+    digests: bool = False,
     to_accept: bool = False,
     tell: Callable[[int, int], None] = lambda done, of: None,
 ) -> Results:
     """Compare two files, two folders by the names of their images, or, with `renders`, two folders as one image.
 
-    `names`: patterns of the images to compare; none: all. `maps`: keep the maps of images that are not equal, and the
-    images themselves as far as HELD goes. `to_accept`: the reference need not exist yet, and the results have
-    `digests`. `tell(done, of)` is called after each image.
+    `names`: patterns of the images to compare; none: all. `view`: called with each result that is not equal, while it
+    has its images and maps, and with what is known of all; by several threads at once. What it raises ends the
+    comparison. `maps`: the results keep
+    them, which takes memory for all of them. `digests`: the results have those of their files. `to_accept`: so they
+    do, and the reference need not exist yet. `tell(done, of)` is called after each image.
     Whatever goes wrong with one image is the error of its result. ValueError or OSError where there is nothing to
     compare: a path that does not exist, a file against a folder, an empty folder, a path within the other, a name that
     matches no image.
@@ -59,18 +63,20 @@ def diff(
     unused = settings.unused([pair.name for pair in every]) if reference.is_dir() and not renders else []
     pairs = [*pairing.named(every, names), *_wrong_entries(settings, every)]
     roots = tuple(path if path.is_dir() else path.parent for path in (reference, test))
-    found, held = [], 0
+    all_of_them = Results(
+        reference, test, (), renders, inconclusive, tuple(unused), tuple(settings.flags), bool(settings.maps)
+    )
+    asked = _Asked(roots, all_of_them, view, maps, (digests or to_accept) and not renders)
     # Together, the pairs that are compared at once have no more values than one pair may have.
     most = 2 * settings.default.max_values
-    compare = functools.partial(_compared, roots=roots, renders=renders, maps=maps, to_accept=to_accept)
-    results = map(compare, pairs) if len(pairs) == 1 else bounded_map(compare, pairs, _values, most, WORKERS)
+    one = len(pairs) == 1
+    results = map(asked.result, pairs) if one else bounded_map(asked.result, pairs, _values, most, WORKERS)
+    found = []
     for result in results:
-        held += sum(image.pixels.nbytes for image in result.images)
-        found.append(result if held <= HELD else replace(result, images=()))
+        found.append(result)
         tell(len(found), len(pairs))
     found.sort(key=lambda result: list(Status).index(result.status))
-    by_file = bool(settings.maps)
-    return Results(reference, test, tuple(found), renders, inconclusive, tuple(unused), tuple(settings.flags), by_file)
+    return replace(all_of_them, results=tuple(found))
 
 
 def _pairs(reference: Path, test: Path, settings: Settings, renders: bool) -> list[Pair]:
@@ -89,6 +95,24 @@ def _wrong_entries(settings: Settings, pairs: Sequence[Pair]) -> list[Pair]:
     return [Pair(f"{settings_file.FILE}: {rule.where}", None, None, Path(), error=rule.error) for rule in wrong]
 
 
+@dataclass(frozen=True)
+class _Asked:
+    """What is asked of every pair; see `diff`. `roots`: the folders of both sides."""
+
+    roots: tuple[Path, ...]
+    results: Results  # without the results of pairs
+    view: View | None
+    maps: bool
+    digests: bool
+
+    def result(self, pair: Pair) -> Result:
+        """The result of comparing the two sides of a pair, after it was viewed."""
+        found = _compared(pair, self)
+        if self.view and found.status in FAILED:
+            self.view(found, self.results)
+        return found if self.maps or not found.images else _without_images(found)
+
+
 def _values(pair: Pair) -> int:
     """The values of its two images; 0 for what cannot be read, or is no pair of files."""
     files = [path for path in (pair.reference, pair.test) if path and path.is_file()]
@@ -99,7 +123,7 @@ def _values(pair: Pair) -> int:
     return 0
 
 
-def _compared(pair: Pair, roots: tuple[Path, ...], renders: bool, maps: bool, to_accept: bool) -> Result:
+def _compared(pair: Pair, asked: _Asked) -> Result:
     """The result of comparing the two sides of a pair, where it has both; ERROR for whatever goes wrong."""
     result = Result(pair.name, Status.DIFFERENT, pair.reference, pair.test, pair.how)
     result = replace(result, target=pair.target, variants=pair.variants, error=pair.error or pair.how.error)
@@ -108,9 +132,9 @@ def _compared(pair: Pair, roots: tuple[Path, ...], renders: bool, maps: bool, to
     if result.how.skip:
         return replace(result, status=Status.SKIPPED)
     try:
-        if to_accept:  # before the images are read: what is read later and has the same digest is what was compared
-            result = replace(result, digests=(digest(result.reference), digest(result.test)))
-        return _judged(result, roots, renders, maps)
+        if asked.digests:  # before the images are read: what is read later and has the same digest is what was compared
+            result = replace(result, digests=_digests(result))
+        return _judged(result, asked)
     except Exception as error:  # of whatever kind: the other images are still to be compared
         exit_code.print_traceback(error)
         text = exit_code.describe(error)
@@ -118,28 +142,40 @@ def _compared(pair: Pair, roots: tuple[Path, ...], renders: bool, maps: bool, to
         return replace(result, status=Status.ERROR, error=text if known else f"{result.test}: {text}")
 
 
-def _judged(result: Result, roots: tuple[Path, ...], renders: bool, maps: bool) -> Result:
+def _digests(result: Result) -> Mapping[Path, str]:
+    paths = (result.reference, result.test, *result.variants)
+    return {path: digest(path) for path in paths if path}
+
+
+def _without_images(result: Result) -> Result:
+    """The result as it is kept: the images of hundreds would fill the memory."""
+    comparison = replace(result.comparison, maps={}) if result.comparison else None
+    return replace(result, images=(), comparison=comparison)
+
+
+def _judged(result: Result, asked: _Asked) -> Result:
     """The verdict against the reference, or that of a variant to which the new image is equal."""
     if not (result.reference and result.test):
         return result
-    read = functools.partial(_read, result, renders=renders)
+    read = functools.partial(_read, result, renders=asked.results.renders)
     new = result.test
     test = functools.cache(lambda: read(new))  # once, and after the reference: what it lacks is said first
+    kept = asked.maps or asked.view is not None
     judged, failed = [], None
     for path in (result.reference, *result.variants):
         try:
-            one = _against(path, read(path), test(), result, roots)
+            one = _against(path, read(path), test(), result, asked.roots)
         except (ValueError, OSError, MemoryError) as error:
             failed = failed or error  # unless another reference is equal
             continue
         if one.comparison.verdict is Verdict.EQUAL:
             matched = path if path != result.reference else None
-            return _with(replace(result, matched=matched), one, maps)
+            return _with(replace(result, matched=matched), one, kept)
         judged.append(one)
     if failed:
         raise failed
     doubt = [one for one in judged if one.comparison.verdict is Verdict.INCONCLUSIVE]
-    return _with(result, (doubt or judged)[0], maps)
+    return _with(result, (doubt or judged)[0], kept)
 
 
 @dataclass(frozen=True)
@@ -188,9 +224,9 @@ def _with_variance(images: list[Image], root: Path, how: How) -> list[Image]:
     return [variances.with_file(images[0], file, how.max_values)] if file.exists() else images
 
 
-def _with(result: Result, one: _Judged, maps: bool) -> Result:
+def _with(result: Result, one: _Judged, kept: bool) -> Result:
     found = one.comparison
-    kept = maps and found.verdict is not Verdict.EQUAL  # a thousand images' maps would fill the memory
+    kept = kept and found.verdict is not Verdict.EQUAL
     images = one.images if kept else ()
     mask = one.images[0].mask
     left_out = {} if mask is None else {"left out": (~mask).astype(np.float32)}

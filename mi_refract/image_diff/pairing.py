@@ -12,6 +12,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Protocol, TypeVar
 
 from . import name_patterns
 from .settings import How, Map, Settings
@@ -72,8 +73,23 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Pair]:
     return [*found, *(Pair(name, None, None, reference / name, error=error) for name, error in lost + missed)]
 
 
-def named(pairs: list[Pair], names: Sequence[str]) -> list[Pair]:
-    """Those pairs whose names are of one of the patterns; all without patterns. ValueError for one that fits none."""
+class Named(Protocol):
+    """What has the name of an image."""
+
+    @property
+    def name(self) -> str:
+        """The path of the image in its folder."""
+        ...
+
+
+Each = TypeVar("Each", bound=Named)
+
+
+def named(pairs: Sequence[Each], names: Sequence[str]) -> list[Each]:
+    """Those pairs, or results, whose names are of one of the patterns; all without patterns.
+
+    ValueError for a pattern that fits none.
+    """
     for name in names:
         if not any(name_patterns.matches(name, pair.name) for pair in pairs):
             raise ValueError(f"{name}: matches no image; accepted: the path of an image in its folder, * and ?")
@@ -157,6 +173,23 @@ def _with_variants(pair: Pair, others: Sequence[Path]) -> Pair:
             return replace(pair, error=error)
         matched |= {name: names[name] for name in name_patterns.expanded(template, values, sorted(names))}
     return replace(pair, variants=tuple(matched.values()))
+
+
+def variant(target: Path, how: How, name: str) -> Path:
+    """Where a variant of the reference `target` lies: by the first template of `accept` with one `*`, for the name.
+
+    ValueError where there is none, or for a name that would not match it.
+    """
+    if not name.strip() or name.startswith(".") or set(name) & set("/\\*?\0"):
+        raise ValueError(f"--as-variant {name!r}: accepted: a part of a file name, as macos")
+    fitting = [each for each in how.accept if each.count("*") == 1 and "?" not in each]
+    if not fitting:
+        raise ValueError(
+            f"{target}: its settings have no `accept` with one *; accepted: in mi-refract.toml, below [defaults], "
+            'accept = ["{stem}-*{suffix}"]'
+        )
+    filled = name_patterns.filled(fitting[0].replace("*", "{*}"), name_patterns.fields(target.name) | {"*": name})
+    return target.parent / filled
 
 
 def beside(template: str, target: Path, root: Path) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -35,6 +35,7 @@ class Category(enum.StrEnum):
 
 
 STATUSES = {Verdict.EQUAL: Status.EQUAL, Verdict.DIFFERENT: Status.DIFFERENT, Verdict.INCONCLUSIVE: Status.INCONCLUSIVE}
+FAILED = (Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE)
 CATEGORIES = {Status.EQUAL: Category.UNCHANGED, Status.DIFFERENT: Category.CHANGED}
 INCONCLUSIVE = {"": 3, "pass": 0, "fail": 1}  # exit codes by what the user wants of it
 
@@ -45,7 +46,7 @@ class Result:
 
     `reference`, `test`: its files, or with renders its folders; None where that side has none. `how`: what was asked.
     `images`: both sides as they were read, of several renders the mean; empty where they were not kept. `digests`: of
-    both files when they were compared, as `digest` gives them; None where that was not asked, or a file is unreadable.
+    its files, variants too, when they were compared; None where that was not asked, or a file is unreadable.
     `target`: where the reference is, or would be. `variants`: other references that the settings accept; `matched`: the
     one of them that the new image is equal to. `warnings`: of its mask.
     """
@@ -58,7 +59,7 @@ class Result:
     comparison: Comparison | None = None
     error: str = ""
     images: tuple[Image, ...] = ()
-    digests: tuple[str, str] | None = None
+    digests: Mapping[Path, str] | None = None
     target: Path | None = None
     variants: tuple[Path, ...] = ()
     matched: Path | None = None
@@ -82,7 +83,7 @@ class Result:
     def reason(self) -> str:
         """The reason for the status in one sentence."""
         if self.comparison:
-            return self.comparison.reason + self._of_variants + (f"; warning: {self.warning}" if self.warning else "")
+            return self.comparison.reason + self._of_variants
         if self.status is Status.SKIPPED:
             return "skipped by the settings"
         sides = {Category.ADDED: "only among the new images", Category.REMOVED: "only among the references"}

@@ -10,9 +10,11 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from urllib.parse import quote
 
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.outside_text import printable
@@ -23,7 +25,7 @@ from mi_refract.report.text_table import Group, Table, Text
 from . import idiff_flags
 from .comparison import Metric
 from .pairing import Pair
-from .results import Result, Results, Status
+from .results import FAILED, Result, Results, Status
 from .settings import How, written
 
 if TYPE_CHECKING:
@@ -103,8 +105,9 @@ def without_effect(results: Results) -> list[str]:
 
 
 def why(result: Result) -> str:
-    """The reason of the verdict, and the settings' reason where the image has settings of its own."""
-    return result.reason + (f" [{result.how.reason}]" if result.how.reason else "")
+    """The reason of the verdict, the warning, and the settings' reason where the image has settings of its own."""
+    warned = f"; warning: {result.warning}" if result.warning else ""
+    return result.reason + warned + (f" [{result.how.reason}]" if result.how.reason else "")
 
 
 def _word(result: Result) -> str:
@@ -146,6 +149,8 @@ def _entry(results: Results, result: Result) -> dict[str, Any]:
         "error": result.error,
         "reference": result.reference,
         "test": result.test,
+        "target": result.target,
+        "digests": _digests(result),
         "method": _method(result),
         "options": dict(result.how.options),
         "why_so": result.how.reason,
@@ -157,6 +162,15 @@ def _entry(results: Results, result: Result) -> dict[str, Any]:
         "reproduce": results.reproduce(result),
         "accept": results.accept(result),
     }
+
+
+def _digests(result: Result) -> dict[str, Any] | None:
+    """The SHA-256 of the files of an image that is not equal, as they were compared; "" where there is no file."""
+    if result.digests is None or result.status not in FAILED:
+        return None
+    sides = {"reference": result.reference, "test": result.test}
+    of = {role: result.digests[path] if path else "" for role, path in sides.items()}
+    return of | {"variants": [result.digests[path] for path in result.variants]}
 
 
 def write_junit(path: str | Path, results: Results) -> None:
@@ -228,25 +242,61 @@ def _property(text: Any) -> str:
     return _message(text).replace(":", "%3A").replace(",", "%2C")
 
 
-def append_summary(results: Results) -> None:
+@dataclass(frozen=True)
+class Pages:
+    """Where a report is, for links: `name`, and `page` of each result ("" in one file). `url`: where it is published.
+
+    Below a URL that ends in / every page has its own; another one is that of an archive, in which none has.
+    """
+
+    name: str
+    page: Callable[[Result], str]
+    url: str = ""
+
+
+def append_summary(results: Results, pages: Pages | None = None) -> None:
     """Append the Markdown to the file that GitHub names in $GITHUB_STEP_SUMMARY, where it does. OSError."""
     if path := os.environ.get("GITHUB_STEP_SUMMARY"):
         with Path(path).open("a", encoding="utf-8") as file:
-            file.write(markdown(results))
+            file.write(markdown(results, pages))
 
 
-def markdown(results: Results) -> str:
-    """A heading with the sentence and a table of the images that are not equal, or have a warning."""
-    failed = [*results.of(Status.ERROR, Status.DIFFERENT, Status.INCONCLUSIVE), *_warned(results)]
-    lines = [f"### mi-refract diff: {sentence(results)}", ""]
+def markdown(results: Results, pages: Pages | None = None) -> str:
+    """A heading with the sentence, where the report is, and a table of what is not equal or has a warning."""
+    failed = [*results.of(*FAILED), *_warned(results)]
+    lines = [f"### mi-refract diff: {sentence(results)}", "", *(_where(pages) if pages else [])]
+    paged = pages is not None and any(map(pages.page, failed[:1]))
     if failed:
-        lines += ["| verdict | image | method | why |", "|---|---|---|---|"]
+        lines += ["| verdict | image | method | why |" + " page |" * paged, "|---|---|---|---|" + "---|" * paged]
     for result in failed[:SUMMARY_ROWS]:
-        cells = (_word(result), result.name, _method(result), why(result))
-        lines.append(f"| {' | '.join(map(_literal, cells))} |")
+        cells = [_literal(cell) for cell in (_word(result), result.name, _method(result), why(result))]
+        cells += [_linked(pages, pages.page(result))] if pages and paged else []
+        lines.append(f"| {' | '.join(cells)} |")
     if len(failed) > SUMMARY_ROWS:
         lines += ["", f"… and {len(failed) - SUMMARY_ROWS} more"]
     return "\n".join(lines) + "\n\n"
+
+
+def _where(pages: Pages) -> list[str]:
+    """Where a reader finds the report: no summary can show an image of an artefact, nor link into one."""
+    if pages.url:
+        first = "index.html" if pages.url.endswith("/") else ""
+        return [f"Report: [{_literal(pages.name)}]({_address(pages.url + first)})", ""]
+    run = [os.environ.get(f"GITHUB_{name}", "") for name in ("SERVER_URL", "REPOSITORY", "RUN_ID")]
+    if not all(run):
+        return [f"Report: {_literal(pages.name)}", ""]
+    artefacts = _address(f"{run[0]}/{run[1]}/actions/runs/{run[2]}#artifacts")
+    return [f"Report: {_literal(pages.name)}, where it is uploaded among the [artefacts of this run]({artefacts})", ""]
+
+
+def _linked(pages: Pages, page: str) -> str:
+    url = pages.url + page if pages.url.endswith("/") else ""
+    return f"[{_literal(page)}]({_address(url)})" if url else _literal(page)
+
+
+def _address(url: str) -> str:
+    """A URL that ends where the link does."""
+    return quote(printable(url), safe=":/?#&=%@+,;~$!*[]-._")
 
 
 def _literal(text: str) -> str:

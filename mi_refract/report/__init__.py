@@ -16,4 +16,5 @@ __all__ = [
     "row",
     "run_report",
     "text_table",
+    "thumbnails",
 ]

@@ -13,6 +13,7 @@ from mi_refract.io.image_file import read
 from mi_refract.io.pixels import block_mean
 
 LARGEST = 65504.0  # of the finite halves
+LINES = 64  # that are converted at once
 # Mantissa bits given up, by twos, before an image is made smaller: at 6 a value is within 1/32 of itself.
 ROUNDED = (0, 2, 4, 6)
 
@@ -55,11 +56,11 @@ def encoded(pixels: Any, limit: float = np.inf, scale: float = 1.0) -> dict[str,
 
     Where they do not fit, values are rounded, then blocks of pixels averaged.
     """
-    pixels, side, notes = pixels / np.float32(scale), 1, []
-    codes = _halves(pixels)
+    side, notes = 1, []
+    codes = _halves(pixels, scale)
     while (bits := _fitting(codes, limit)) is None and min(pixels.shape[:2]) > side:
         side *= 2
-        codes = _halves(block_mean(pixels, side))
+        codes = _halves(block_mean(pixels, side), scale)
     if side > 1:
         notes.append(f"means of {side} × {side} pixels")
     if bits:
@@ -102,8 +103,17 @@ def strongest(values: Any, width: int) -> Any:
     return np.take_along_axis(blocks, place, -1)
 
 
-def _halves(pixels: Any) -> Any:
-    """The bits of little-endian halves. Finite stays finite, and every NaN is the same."""
+def _halves(pixels: Any, scale: float) -> Any:
+    """The bits of little-endian halves, of pixels / `scale`. Finite stays finite, and every NaN is the same."""
+    codes = np.empty(pixels.shape, "<u2")
+    for start in range(
+        0, len(pixels), LINES
+    ):  # in parts: the intermediates of a whole image are several times its size
+        codes[start : start + LINES] = _half_lines(pixels[start : start + LINES] / np.float32(scale))
+    return codes
+
+
+def _half_lines(pixels: Any) -> Any:
     with np.errstate(over="ignore", invalid="ignore"):
         clipped = np.where(np.isinf(pixels), pixels, np.clip(pixels, -LARGEST, LARGEST)).astype("<f2")
     return np.where(np.isnan(clipped), np.float16(np.nan), clipped).astype("<f2").view("<u2")

@@ -1,10 +1,11 @@
-"""One HTML page that needs no other file and no network: a template with style, script and images inlined."""
+"""HTML pages that need no network: a template with style, script and images inlined, or with files beside it."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.outside_text import printable_lines
@@ -13,11 +14,44 @@ from .embedded_images import EmbeddedImages
 from .first_page import code
 from .number_text import compact
 
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
 HERE = Path(__file__).parent / "templates"
 
 
 def write_page(path: str | Path, template: str, content: Mapping[str, Any], images: EmbeddedImages) -> None:
     """Write `template`, one of this package's, filled with `content`, made printable and escaped. Errors: OSError."""
+    write_atomically(path, rendered(template, content, images))
+
+
+def rendered(
+    template: str, content: Mapping[str, Any], images: EmbeddedImages | None = None, beside: str | None = None
+) -> bytes:
+    """The page. `beside`: the folder, relative to the page, with the styles and scripts; None: they are inlined."""
+    from markupsafe import Markup
+
+    def part(name: str) -> Markup:
+        style = name.endswith(".css")
+        if beside is None:
+            text = (HERE / name).read_text("utf-8")
+            return Markup(f"<style>\n{text}</style>" if style else f"<script>\n{text}</script>")
+        place = beside + name
+        return Markup(f'<link rel="stylesheet" href="{place}">' if style else f'<script src="{place}"></script>')
+
+    embedded = images.embedded if images else []
+    text = _environment().get_template(template).render(**content, part=part, beside=beside, images=embedded)
+    return text.encode("utf-8", "replace")
+
+
+def write_beside(folder: Path, *names: str) -> None:
+    """Write styles and scripts of the templates to a folder, for pages that are `rendered` beside them. OSError."""
+    for name in names:
+        (folder / name).write_bytes((HERE / name).read_bytes())
+
+
+@functools.cache
+def _environment() -> Environment:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
@@ -26,9 +60,7 @@ def write_page(path: str | Path, template: str, content: Mapping[str, Any], imag
     environment = Environment(loader=FileSystemLoader(HERE), **options)
     filters: dict[str, Any] = {"compact": compact, "words": words, "code": code}
     environment.filters |= filters
-    inline = {name: Markup((HERE / f"report.{name}").read_text("utf-8")) for name in ("css", "js")}
-    text = environment.get_template(template).render(**content, **inline, images=images.embedded)
-    write_atomically(path, text.encode("utf-8", "replace"))
+    return environment
 
 
 def _text(value: Any) -> Any:

@@ -208,6 +208,11 @@ BAD = {
     "bad settings": (["{}/old", "{}/new", "--settings", "{}/bad.toml"], "bad.toml: defaults.fale: unknown"),
     "report's name": (["{}/old", "{}/new", "--report", "{}/out.exr"], "accepted: a file name that ends in .html"),
     "report's folder": (["{}/old", "{}/new", "--report", "{}/none/out.html"], "is not a folder"),
+    "report in nothing": (["{}/old", "{}/new", "--report", "{}/none/report/"], "is not a folder"),
+    "report a file": (["{}/old", "{}/new", "--report", "{}/bad.toml/"], "a file name that ends in .html, or a folder"),
+    "report among others": (["{}/old", "{}/new", "--report", "{}"], "no report of ours; accepted: a new or empty"),
+    "report among images": (["{}/old", "{}/new", "--report", "{}/new/report/"], "where it would be compared"),
+    "report over images": (["{}/old", "{}/new", "--report", "{}/old"], "where it would be compared"),
     "junit's name": (["{}/old", "{}/new", "--junit", "{}/out.json"], "accepted: a file name that ends in .xml"),
     "json's name": (["{}/old", "{}/new", "--json", "{}/old/equal.exr"], "accepted: a file name that ends in .json"),
     "one path": (["{}/old"], "TEST"),
@@ -382,3 +387,21 @@ def test_the_command_that_compares_again_says_both(run, noisy, tmp_path):
     )
     code, out, _ = run(*shlex.split(again)[1:])
     assert (code, out.splitlines()[1].split()[:3]) == (1, ["different", "off.exr", "welch"])
+
+
+@pytest.mark.parametrize(
+    "name, index",
+    [
+        ("out/", "out/index.html"),
+        ("out", "out/index.html"),
+        ("v1.2/", "v1.2/index.html"),
+        ("a.html/", "a.html/index.html"),
+        ("a.HTM", "a.HTM"),
+    ],
+)
+def test_a_report_is_a_folder_unless_it_is_named_as_a_page(run, pair, tmp_path, name, index):
+    for _ in range(2):
+        code, _, err = run("diff", *pair, "--report", f"{tmp_path}/{name}", "--json", tmp_path / "out.json")
+        assert (code, err) == (1, "")
+        assert f"mi-refract accept {pair[0]} {pair[1]} --from {tmp_path}/out.json" in (tmp_path / index).read_text()
+    assert run("diff", *pair, "--report", tmp_path / "v1.2")[0] == (1 if name == "v1.2/" else 2)

@@ -4,12 +4,13 @@ import base64
 import math
 import re
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from support.browser import browse, needs_chromium, seen
 
-from mi_refract.image_diff import flip, folders, html_report
+from mi_refract.image_diff import flip, folders, html_report, panes
 from mi_refract.image_diff.comparison import Comparison, Metric, Verdict
 from mi_refract.image_diff.results import Result, Results, Status
 from mi_refract.image_diff.settings import How, Settings
@@ -47,6 +48,12 @@ def results(folder):
     )
 
 
+def several(found, count):
+    """The results of a pair that differs, under that many names."""
+    each = found.results[1]
+    return Results(found.reference, found.test, tuple(replace(each, name=f"{i}.exr") for i in range(count)))
+
+
 def html(folder, found=None):
     html_report.write(folder / "report.html", found or results(folder), {"version": "1 & 2"}, "mi-refract diff a b")
     return (folder / "report.html").read_text("utf-8")
@@ -57,14 +64,14 @@ def roles(text):
 
 
 def test_an_image_that_cannot_be_shown_keeps_no_other_from_being_shown(tmp_path, monkeypatch):
-    panes = html_report._panes
+    made = panes._all
 
-    def fail(result):
+    def fail(result, most):
         if result.name == EVIL:
             raise MemoryError("Unable to allocate 9 GiB")
-        return panes(result)
+        return made(result, most)
 
-    monkeypatch.setattr(html_report, "_panes", fail)
+    monkeypatch.setattr(panes, "_all", fail)
     text = html(tmp_path)
     assert "Cannot be shown: out of memory: Unable to allocate 9 GiB" in text
     assert dict(roles(text)).keys() == {"test", "reference"}  # of the one that cannot be compared, and of the removed
@@ -95,7 +102,7 @@ def test_failures_come_first_with_numbers_thresholds_and_commands(tmp_path):
     for result in found.results[:2]:
         for command in (found.reproduce(result), found.accept(result)):
             assert f"<dd><code>{command}</code></dd>" in text
-    assert "mi-refract accept" not in text[text.index('id="equal"') :]
+    assert "mi-refract accept" not in text[text.index('id="equal"') : text.index("</main>")]
 
 
 def test_the_page_asks_for_nothing_and_runs_no_name(tmp_path):
@@ -150,25 +157,30 @@ def test_every_file_is_read_once_and_flip_runs_once_for_verdict_and_page(tmp_pat
     settings = Settings(How(method))
     whole = html(tmp_path, folders.diff(*sides, settings, maps=True))
     assert sorted(reads) == sorted(sides) and len(runs) == 1 and "flip" in dict(roles(whole))
-    monkeypatch.setattr(folders, "HELD", 0)
-    again = html(tmp_path, folders.diff(*sides, settings, maps=True))
-    assert len(reads) == 6 and roles(again) == roles(whole)
+    page = html_report.Page(tmp_path / "viewed.html")
+    found = folders.diff(*sides, settings, view=page.view)
+    page.write(found, {})
+    assert len(reads) == 4 and roles((tmp_path / "viewed.html").read_text()) == roles(whole)
+    assert not found.results[0].images and not found.results[0].comparison.maps
+    again = html(tmp_path, found)
+    assert len(reads) == 6 and roles(again) == [each for each in roles(whole) if each[0] != "local"]
 
 
 def test_a_pair_that_does_not_fit_any_more_is_left_out(tmp_path, monkeypatch):
     found = results(tmp_path)
     alone = html(tmp_path, Results(found.reference, found.test, found.results[1:2]))
-    size = sum(len(data) for data in re.findall(r'data-scale="[^"]*">([^<]*)<', alone))
+    size = panes.of_result(found.results[1], html_report.MOST).size
+    assert sum(len(data) for data in re.findall(r'data-scale="[^"]*">([^<]*)<', alone)) < size
     for pairs, factor in ((1, 1.9), (2, 2.1)):
         monkeypatch.setattr(html_report, "PAGE", factor * size)
-        text = html(tmp_path, Results(found.reference, found.test, found.results[1:2] * 3))
+        text = html(tmp_path, several(found, 3))
         assert len(roles(text)) == 6 * pairs and text.count("the page is full") == 3 - pairs
 
 
 def test_a_full_page_keeps_the_numbers_and_says_what_is_left_out(tmp_path, monkeypatch):
     found = results(tmp_path)
     monkeypatch.setattr(html_report, "PAGE", 1)
-    text = html(tmp_path, Results(found.reference, found.test, found.results[1:2] * 3))
+    text = html(tmp_path, several(found, 3))
     assert len(roles(text)) == 6 and text.count("the page is full") == 2 and text.count("12 tiles differ.") == 3
 
 

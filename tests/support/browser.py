@@ -1,5 +1,6 @@
 """A real browser, where there is one: what a page's own script did to it."""
 
+import html
 import json
 import re
 import shutil
@@ -41,4 +42,4 @@ def seen(page, profile):
     assert console == []
     tag = re.search("<html[^>]*>", dom)[0]
     assert 'data-ready="1"' in tag and "data-error" not in tag
-    return json.loads(re.search('data-seen="([^"]*)"', tag)[1].replace("&quot;", '"'))
+    return json.loads(html.unescape(re.search('data-seen="([^"]*)"', tag)[1]))

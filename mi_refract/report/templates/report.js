@@ -122,7 +122,7 @@ function setSplit(percent) {
 
 // The next failure or image below the bars that stay on top, or the one before.
 function go(step) {
-  const places = all(".failure, .compare:not(.failure *)"), top = 120;
+  const places = all(".failure, .compare:not(.failure *)").filter((place) => !place.hidden), top = 120;
   const offset = (place) => place.getBoundingClientRect().top - top;
   const next = step > 0 ? places.find((p) => offset(p) > 2) : places.findLast((p) => offset(p) < -2);
   if (next) scrollBy({ top: offset(next), behavior: still.matches ? "auto" : "smooth" });
@@ -189,6 +189,7 @@ function listen() {
     figure.addEventListener("pointerleave", () => probe(figure));
   }
   addEventListener("keydown", (e) => {
+    if (e.target.matches("input[type=search]")) return;
     const editing = e.target.matches("input[type=range], select") && e.key.startsWith("Arrow");
     const pressing = e.target.matches("summary, select, input, a") && e.key === " ";
     if (e.ctrlKey || e.metaKey || e.altKey || editing || pressing || !(e.key in KEYS) || !all(".viewer").length) return;
