@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -92,11 +93,12 @@ def examine(
     with mutant_runs.folder_of_copies() as name:
         times = _unmutated(sorted({mutant.room for mutant in chosen}), Path(name), workers, root)
         jobs = [Job(str(m), guards(root, m), 5 * times[m.room] + 60, m) for m in chosen]
-        for outcome in mutant_runs.run(jobs, Path(name), workers, root):
-            assert outcome.job.mutant
-            reason = reasons.get(outcome.job.mutant.key, "") if outcome.passed else ""
-            found.append(Found(outcome.job.mutant, not outcome.passed, outcome.said, outcome.seconds, reason))
-            told(found[-1])
+        with closing(mutant_runs.run(jobs, Path(name), workers, root)) as outcomes:
+            for outcome in outcomes:
+                assert outcome.job.mutant
+                reason = reasons.get(outcome.job.mutant.key, "") if outcome.passed else ""
+                found.append(Found(outcome.job.mutant, not outcome.passed, outcome.said, outcome.seconds, reason))
+                told(found[-1])
     return sorted(found, key=lambda each: chosen.index(each.mutant))
 
 

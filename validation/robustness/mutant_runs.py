@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -61,7 +61,7 @@ def folder_of_copies() -> Any:
     return tempfile.TemporaryDirectory(prefix="mutants-", ignore_cleanup_errors=True)
 
 
-def run(jobs: Sequence[Job], folder: Path, workers: int, root: Path = ROOT) -> Iterator[Outcome]:
+def run(jobs: Sequence[Job], folder: Path, workers: int, root: Path = ROOT) -> Generator[Outcome, None, None]:
     """The outcomes, as they come; `folder` keeps the copies of `root` that the workers mutate, one each."""
     waiting = list(jobs)
     free = [_Worker(copy, MEMORY // workers) for copy in _copies(folder, workers, root)]
