@@ -65,6 +65,15 @@ def test_what_is_not_finite_equals_nothing_not_even_itself(method, bad):
         assert found.maps["nonfinite"].sum() == 1
 
 
+def test_what_is_not_finite_is_marked_in_the_channels_of_the_first_render():
+    turned = image(SMOOTH[..., ::-1], ("B", "G", "R"))
+    broken = image(altered(np.nan, c=0).pixels[..., ::-1], ("B", "G", "R"))
+    for reference, test in (([image(SMOOTH), turned], [turned, broken]), ([image(SMOOTH), broken], [turned] * 2)):
+        found = methods.compare("welch", reference, test)
+        assert "x = 5, y = 3, channel R" in found.reason, reference
+        assert np.argwhere(found.maps["nonfinite"]).tolist() == [[3, 5, 0]]
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_allowed_values_must_be_the_same_ones(method):
     assert judge(method, altered(np.nan), altered(np.nan), allow_nonfinite=True).verdict is EQUAL

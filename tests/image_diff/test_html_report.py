@@ -214,6 +214,13 @@ def test_one_pixel_and_one_nan_survive_a_smaller_map():
     assert small.shape == (10, 100, 1) and small[1, 50] == -3 and np.isnan(small[9, 99]) and (small != 0).sum() == 2
 
 
+@pytest.mark.parametrize("shape, note", [((3, 1), "strongest of 2 × 2 pixels"), ((1, 0), ""), ((1025, 0), "")])
+def test_a_map_says_how_many_of_its_pixels_became_one(shape, note):
+    height, wider = shape
+    pane = html_report._map("difference", np.ones((height, html_report.MAP_WIDTH + wider, 1), np.float32))
+    assert pane["note"] == note
+
+
 def test_images_of_a_page_have_keys_of_their_own():
     page = EmbeddedImages()
     keys = [page.add(encoded(np.ones((2, 2, 1))))["key"] for _ in range(3)]

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_refract.io import image_file
 from mi_refract.scene_export import from_mitsuba, meshes_from_shapes, write_files
 from mi_refract.scene_export.plain_scene import Diffuse, Environment, Glass, Light
 from mi_refract.scene_export.targets.environment_map import radiance
@@ -204,6 +205,54 @@ def test_turned_environment(scene, tmp_path):
     assert not np.allclose(radiance(sky, directions * [1, 1, -1]), expected, rtol=0.1, atol=0.1)
 
 
+CONSTANT = '<emitter type="constant"><rgb name="radiance" value="0.5, 0.25, 1"/></emitter>'
+SKY = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
+
+
+def test_the_smallest_map_and_image(scene, tmp_path):
+    """A map of 2 × 2 pixels, black in part, as bright as it is; an image of one pixel."""
+    pixels = np.array([[[0, 0.25, 0.5], [3, 4, 5]], [[6, 7, 8], [0, 0, 0]]], np.float32)
+    image_file.write_exr(tmp_path / "sky.exr", pixels)
+    film = '<integer name="width" value="16"/><integer name="height" value="8"/>'
+    found = from_mitsuba.load(scene(CONSTANT, SKY, film, film.replace("16", "1").replace("8", "1")))
+    np.testing.assert_array_equal(found.sky.pixels, pixels)
+    assert (found.camera.width, found.camera.height) == (1, 1)
+
+
+MAPS = {
+    "one row": np.ones((1, 4, 3)),
+    "one column": np.ones((4, 1, 3)),
+    "grey": np.ones((4, 4, 1)),
+    "alpha": np.ones((4, 4, 4)),
+    "NaN": np.full((4, 4, 3), np.nan),
+    "infinite": np.full((4, 4, 3), np.inf),
+    "negative": np.full((4, 4, 3), -1e-3),
+}
+
+
+@pytest.mark.parametrize("case", MAPS)
+def test_a_map_that_is_no_sky_is_refused(case, scene, tmp_path):
+    pixels = MAPS[case].astype(np.float32)
+    image_file.write_exr(tmp_path / "sky.exr", pixels, "RGBA"[: pixels.shape[2]])
+    height, width, channels = pixels.shape
+    with pytest.raises(ValueError, match=f"sky.exr: {width} × {height} × {channels}; accepted: finite RGB"):
+        from_mitsuba.load(scene(CONSTANT, SKY))
+
+
+def test_a_checkerboard_has_mitsubas_colours_where_none_are_given(scene):
+    board = f'{AREA}{BOARD.replace("/>", "")}><transform name="to_uv"><scale value="0.5"/></transform></texture>'
+    found = from_mitsuba.load(scene(LIGHT, board.replace("0.5", "1")), level=0)
+    texture = mi.load_dict({"type": "checkerboard"})
+    si, colours = mi.SurfaceInteraction3f(), []
+    for u in (0.25, 0.75):
+        si.uv = [u, 0.25]
+        colours.append(texture.eval(si)[0])
+    assert [mesh.material for mesh in found.meshes[2:]] == [
+        Light((x, x, x)) for x in (pytest.approx(c) for c in colours)
+    ]
+    assert len(from_mitsuba.load(scene(LIGHT, board), level=0).meshes) == 3  # one cell: one colour
+
+
 # --- what cannot be said ---------------------------------------------------------------------------------
 
 BALL = 'type="sphere" id="ball">'
@@ -327,7 +376,7 @@ def test_other_errors(scene):
         from_mitsuba.load(scene('<integrator type="path"><integer name="max_depth" value="5"/></integrator>', ""))
     with pytest.raises(FileNotFoundError):
         from_mitsuba.load("none.xml")
-    with pytest.raises(ValueError, match="level = 9"):
+    with pytest.raises(ValueError, match=r"level = 9: accepted: a whole number from 0 to 8$"):
         from_mitsuba.load(scene(), level=9)
     with pytest.raises(ValueError, match="oops"):
         from_mitsuba.load(scene(), oops="1")

@@ -32,11 +32,11 @@ COUNTS = {"quick": 3, "standard": 20, "full": 220}
 ALL = "all packages"
 # Tests by package; those named after a module come first.
 GUARDS = {
-    "plugins": ("plugins", "rendering"),
-    "image_diff": ("image_diff", "cli/test_diff.py", "cli/test_diff_forms.py"),
-    "ray_sets": ("ray_sets", "cli/test_rays.py"),
-    "accuracy": ("accuracy", "ray_sets", "formulas", "validation/test_sweep.py"),
-    "scene_export": ("scene_export", "cli/test_scene.py"),
+    "plugins": ("plugins", "rendering", "test_rooms.py"),
+    "image_diff": ("image_diff", "cli/test_diff.py", "cli/test_diff_forms.py", "test_rooms.py"),
+    "ray_sets": ("ray_sets", "cli/test_rays.py", "test_rooms.py"),
+    "accuracy": ("accuracy", "ray_sets", "formulas", "validation/test_sweep.py", "test_rooms.py"),
+    "scene_export": ("scene_export", "cli/test_scene.py", "test_rooms.py"),
 }
 LONGEST = 600.0  # seconds of a package's tests without a mutant
 TERMS = {
