@@ -68,9 +68,14 @@ def test_what_is_not_finite_equals_nothing_not_even_itself(method, bad):
 def test_what_is_not_finite_is_marked_in_the_channels_of_the_first_render():
     turned = image(SMOOTH[..., ::-1], ("B", "G", "R"))
     broken = image(altered(np.nan, c=0).pixels[..., ::-1], ("B", "G", "R"))
-    for reference, test in (([image(SMOOTH), turned], [turned, broken]), ([image(SMOOTH), broken], [turned] * 2)):
+    whole, first = image(SMOOTH), altered(np.nan, c=0)
+    for reference, test in (
+        ([whole, turned], [turned, broken]),
+        ([whole, broken], [turned] * 2),
+        ([first, whole], [whole] * 2),
+    ):
         found = methods.compare("welch", reference, test)
-        assert "x = 5, y = 3, channel R" in found.reason, reference
+        assert found.reason == "a.exr: 1 NaN, the first at x = 5, y = 3, channel R"
         assert np.argwhere(found.maps["nonfinite"]).tolist() == [[3, 5, 0]]
 
 

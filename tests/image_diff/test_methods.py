@@ -44,6 +44,8 @@ def test_shapes_must_agree():
         compare_stacks(np.ones((3, 16, 16, 3)), np.ones((3, 16, 8, 3)), 8, 1e-3)
     with pytest.raises(ValueError, match="at least 2"):
         compare_stacks(np.ones((1, 16, 16, 3)), np.ones((3, 16, 16, 3)), 8, 1e-3)
+    with pytest.raises(ValueError, match="3 and 1 renders: at least 2"):
+        compare_stacks(np.ones((3, 16, 16, 3)), np.ones((1, 16, 16, 3)), 8, 1e-3)
 
 
 def test_equal_images_alarm_no_more_often_than_stated():
