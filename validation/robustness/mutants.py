@@ -88,7 +88,7 @@ def mutated(source: str, operator: str, occurrence: int) -> str:
     """The source after the mutation. Errors: ValueError where there is no such place."""
     from cosmic_ray.mutating import mutate_code
 
-    changed = mutate_code(source, _operators()[operator], occurrence)
+    changed = mutate_code(source, operators()[operator], occurrence)
     if changed is None:
         raise ValueError(f"{operator} does not apply {occurrence + 1} times")
     return str(changed)
@@ -102,21 +102,16 @@ def every(root: Path, path: str) -> Iterator[Mutant]:
                 yield mutant
 
 
-def exists(root: Path, path: str, operator: str, line: str, becomes: str) -> bool:
-    """Whether the file has such a mutant, in any line of this text."""
-    source = (root / path).read_text("utf-8")
-    texts = [_plain(text) for text in source.splitlines()]
-    starts = _starts(operator, _nodes(root / path))
-    here = [occurrence for occurrence, (number, _) in enumerate(starts) if texts[number - 1] == line]
-    found = [of(root, path, operator, occurrence) for occurrence in here]
-    return any(mutant and mutant.key == (path, operator, line, becomes) for mutant in found)
+def lines(root: Path, path: str) -> set[str]:
+    """The lines of a file as mutants name them."""
+    return {_plain(text) for text in (root / path).read_text("utf-8").splitlines()}
 
 
 def _places(path: Path) -> list[list[tuple[str, int]]]:
     """Operators and occurrences at each place; a place belongs to one family of operators."""
     nodes = _nodes(path)
     found: dict[tuple[Any, ...], list[tuple[str, int]]] = {}
-    for operator in _operators():
+    for operator in operators():
         for occurrence, start in enumerate(_starts(operator, nodes)):
             found.setdefault((start, operator.partition("_")[0]), []).append((operator, occurrence))
     return [found[key] for key in sorted(found)]
@@ -132,12 +127,12 @@ def _nodes(path: Path) -> list[Any]:
 def _starts(operator: str, nodes: list[Any]) -> list[tuple[int, int]]:
     """Line and column of every place where an operator applies."""
     kinds = NODES.get(operator.partition("_")[0])
-    positions = _operators()[operator].mutation_positions
+    positions = operators()[operator].mutation_positions
     return [start for node in nodes if kinds is None or node.type in kinds for start, _ in positions(node)]
 
 
 @cache
-def _operators() -> dict[str, Any]:
+def operators() -> dict[str, Any]:
     """Cosmic-ray's operators by name, but for those that need arguments and draw random numbers."""
     from cosmic_ray.operators.provider import OperatorProvider
 
