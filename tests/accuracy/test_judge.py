@@ -112,7 +112,7 @@ def test_what_is_no_direction_is_not_compared():
 
 
 def test_the_bound_covers_the_error_that_it_was_derived_from():
-    """`linear_needed` of an error L u K plus that of the root is L; `radicand_needed` of a misclassified ray, its own."""
+    """`linear_needed` of an error L u K, and that of the root, is L; `radicand_needed` of a missed ray its own."""
     exact, budget = certified(rays()), FORMULAS["decomposed"].budget
     bounds = verdict(exact.direction, exact.transmitted).bounds
     found = verdict(turned(exact, (3 * bounds.of_terms + bounds.of_root)[:, None]), exact.transmitted)
