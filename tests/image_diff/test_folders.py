@@ -433,3 +433,12 @@ def test_bad_options_in_words(method, words, message):
 def test_an_option_out_of_its_range_is_no_verdict(folders):
     results = diff.diff(*folders, Settings(How("tolerance", {"fail": -1.0})))
     assert {result.status for result in results.results if None not in (result.reference, result.test)} == {"error"}
+
+
+def test_the_mean_of_renders_is_that_of_all_and_one_stays_as_it_is():
+    pixels = np.arange(36, dtype=np.float32).reshape(3, 2, 2, 3) ** 2
+    several = [image_file.Image(Path(f"{i}.exr"), each, ("R", "G", "B")) for i, each in enumerate(pixels)]
+    found = diff.mean_image(several)
+    np.testing.assert_allclose(found.pixels, pixels.mean(0), rtol=1e-6)
+    assert (found.path, found.pixels.dtype) == (Path("0.exr"), np.float32)
+    assert diff.mean_image(several[1:2]) is several[1]
