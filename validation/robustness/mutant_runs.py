@@ -29,10 +29,15 @@ NO_TESTS = 5  # pytest's exit code
 STARTER = """
 import resource, sys
 memory = int(sys.argv[1])
-resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+try:
+    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+except (ValueError, OSError):  # not every system limits address space
+    pass
 import pytest
 sys.exit(pytest.main(sys.argv[2:]))
 """
+# Without the tests that some machines skip: a browser takes more address space than a process may here.
+OPTIONS = ("-x", "-q", "-p", "no:cacheprovider", "-m", "not skipif")
 _POLL = 0.05  # seconds
 
 
@@ -112,8 +117,8 @@ class _Worker:
         self.source = job.mutant and (self.copy / job.mutant.path).read_text("utf-8")
         if job.mutant and self.source:
             self._write(mutated(self.source, job.mutant.operator, job.mutant.occurrence))
-        options = ("-x", "-q", "-p", "no:cacheprovider", "-m", "not skipif", f"--basetemp={self.copy / 'temporary'}")
-        command = [sys.executable, "-c", STARTER, str(self.memory), *options, *job.tests]
+        place = f"--basetemp={self.copy / 'temporary'}"
+        command = [sys.executable, "-c", STARTER, str(self.memory), *OPTIONS, place, *job.tests]
         with self._log.open("wb") as log:
             self.process = subprocess.Popen(
                 command, cwd=self.copy, env=_environment(self.copy), stdin=subprocess.DEVNULL, stdout=log, stderr=log,
@@ -157,6 +162,7 @@ class _Worker:
 def _environment(copy: Path) -> Mapping[str, str]:
     """Modules come from the copy, temporary files go there, and options of a pytest around us do not apply."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    shutil.rmtree(copy / "tmp", ignore_errors=True)  # what the last tests left
     (copy / "tmp").mkdir(exist_ok=True)
     return kept | {"PYTHONPATH": str(copy), "TMPDIR": str(copy / "tmp")}
 
