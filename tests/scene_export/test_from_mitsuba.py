@@ -219,6 +219,19 @@ def test_the_smallest_map_and_image(scene, tmp_path):
     assert (found.camera.width, found.camera.height) == (1, 1)
 
 
+@pytest.mark.parametrize(
+    ("text", "colour"),
+    [
+        ('<spectrum name="radiance" value="0.75"/>', (0.75, 0.75, 0.75)),
+        ('<rgb name="radiance" value="0.75"/>', (0.75, 0.75, 0.75)),
+        ('<float name="radiance" value="0"/>', (0, 0, 0)),
+        ("", (1, 1, 1)),
+    ],
+)
+def test_a_colour_of_one_number_is_grey(text, colour, scene):
+    assert from_mitsuba.load(scene('<rgb name="radiance" value="0.5, 0.25, 1"/>', text), level=0).sky == colour
+
+
 MAPS = {
     "one row": np.ones((1, 4, 3)),
     "one column": np.ones((4, 1, 3)),
