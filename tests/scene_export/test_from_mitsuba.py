@@ -381,6 +381,20 @@ def test_the_count_of_triangles_is_the_number_that_is_made(name, scene, monkeypa
         from_mitsuba.load(path, level=2)
 
 
+@pytest.mark.parametrize(("scale", "cells"), [((2, 3), 24), ((1.3, 0.4), 3), ((0.2, 0.2), 1)])
+def test_the_cells_of_a_checkerboard_are_counted_before_they_are_made(scale, cells, scene, monkeypatch):
+    uv = f'<transform name="to_uv"><scale x="{scale[0]}" y="{scale[1]}"/></transform>'
+    path = scene(LIGHT, f"{AREA}{BOARD.replace('/>', '>')}{uv}</texture>")
+    made = sum(len(mesh.faces) for mesh in from_mitsuba.load(path, level=0).meshes)
+    assert made == 20 + 12 + 2 * cells
+    monkeypatch.setattr(from_mitsuba, "MOST", made)
+    assert len(from_mitsuba.load(path, level=0).meshes) > 2
+    monkeypatch.setattr(from_mitsuba, "MOST", made - 1)
+    monkeypatch.setattr(meshes_from_shapes.tessellation, "checkerboard", lambda *scales: pytest.fail("made"))
+    with pytest.raises(ValueError, match=f"{2 * cells} triangles where {2 * cells - 1} are left"):
+        from_mitsuba.load(path, level=0)
+
+
 def test_other_errors(scene):
     without = re.search("<sensor.*</sensor>", SCENE, re.DOTALL)[0]
     with pytest.raises(ValueError, match="no sensor"):
