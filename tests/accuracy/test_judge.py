@@ -77,6 +77,17 @@ def verdict(b, transmitted, **more) -> Judgement:
     return judge(b, transmitted, RayBounds(given, exact, FORMULAS["decomposed"].budget, U), **more)
 
 
+def test_vectors_off_unit_widen_the_bound_by_what_making_them_unit_would_cost():
+    """By 3 u, where the program may have made them unit; otherwise by as much as they are off."""
+    given = rays(a_length=1 + 2.0**-40, n_length=1 - 2.0**-41)
+    exact = certified(given)
+    for budget, normalised, u in (("decomposed", True, 3 * U), ("decomposed", False, 2.0**-40), ("promoted", False, U)):
+        bounds = RayBounds(given, exact, FORMULAS[budget].budget, U, normalised)
+        np.testing.assert_allclose(bounds.u, u, rtol=1e-3)
+        assert np.all(bounds.unit) == normalised
+    assert np.all(RayBounds(rays(), exact, FORMULAS["decomposed"].budget, U).unit)
+
+
 def test_an_error_is_judged_by_the_bound_of_its_ray():
     exact = certified(rays())
     assert exact.transmitted.tolist() == [True, True, True, False]

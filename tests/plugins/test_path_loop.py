@@ -74,14 +74,20 @@ def test_light_that_a_popped_branch_meets_counts_whole():
     assert found == pytest.approx(SLANTED * RADIANCE, rel=1e-5)
 
 
-def test_a_popped_branch_splits_again():
-    """It has met glass only, whatever the branch before it met. It goes on from inside the second sheet into air."""
+@pytest.mark.parametrize(("weight", "splits"), [(0.0, True), (0.004, True), (0.007, False), (0.04, False)])
+def test_a_popped_branch_splits_again_where_its_share_is_large_enough(weight, splits):
+    """It has met glass only, whatever the branch before it met. It goes on from inside the second sheet into air.
+
+    Its share is that of the reflected light, 5 %, of which the second sheet reflects 11 %. Without a split chance picks
+    that, and the lamp beyond is not met.
+    """
     sine = 0.6 * 1.5
     beyond = lamp(3, 2.25 + sine / math.sqrt(1 - sine**2))
     parts = {"glass": sheet(0, bsdf=GLASS), "wall": wall(), "second": sheet(2, bsdf=GLASS), "lamp": beyond}
     points = [TRANSMITTED, UPWARD, REFLECTED]
-    found, _ = follow(parts, points, max_depth=3, split_depth=2, split_weight=0.0)
-    expected = SLANTED * (1 - reflectance(0.8, 1.5)) * RADIANCE * 1.5**2  # n² times the radiance inside
+    found, _ = follow(parts, points, max_depth=3, split_depth=2, split_weight=weight)
+    assert SLANTED * reflectance(0.8, 1.5) == pytest.approx(0.0054, abs=1e-3)
+    expected = splits * SLANTED * (1 - reflectance(0.8, 1.5)) * RADIANCE * 1.5**2  # n² times the radiance inside
     assert found == pytest.approx(expected, rel=1e-5)
 
 
