@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refract.plugins import path_loop
+from mi_refract.plugins import emitter_sampling, path_loop
 
 pytestmark = pytest.mark.usefixtures("scalar_variant")
 
@@ -128,6 +128,30 @@ def test_a_pixel_is_transparent_where_light_goes_straight_through(bsdf, point, a
 def test_samples_are_weighted_by_their_densities(a, b, weight):
     """An infinite density has no weight, as in Mitsuba's `path`."""
     assert path_loop.power_heuristic(float(a), float(b)) == pytest.approx(weight)
+
+
+@pytest.mark.parametrize("weights", [(1.0,), (1.0, 3.0), (0.0, 2.0, 2.0)])
+def test_lamps_are_sampled_as_if_there_were_no_sky(weights):
+    """By their weights: as Mitsuba samples the same lamps without the sky."""
+    lamps = {
+        f"lamp{i}": lamp(2, 3.0 * i) | {"emitter": {"type": "area", "radiance": 1.0 + i, "sampling_weight": weight}}
+        for i, weight in enumerate(weights)
+    }
+    dark, lit = (mi.load_dict({"type": "scene"} | lamps | sky) for sky in ({}, {"sky": {"type": "constant"}}))
+    ours = emitter_sampling.NonConstantEmitters(mi.scalar_rgb, lit)
+    si = dark.ray_intersect(mi.Ray3f([0.1, 0, -2], [0, 0, 1]))
+    si.p = mi.Point3f(0.1, 0.2, -1)
+    for x in (0.1, 0.3, 0.6, 0.9):
+        (found, radiance), (expected, light) = (
+            each(si, mi.Point2f(x, 0.4), True)
+            for each in (ours.sample, lambda *given: dark.sample_emitter_direction(*given[:2], False, True))
+        )
+        assert np.allclose(found.p, expected.p, atol=1e-5)
+        assert (found.pdf, list(radiance)) == (pytest.approx(expected.pdf), pytest.approx(list(light)))
+        assert ours.pdf(si, found, True) == pytest.approx(found.pdf)
+        assert ours.pdf(si, found, False) == 0
+    sky = lit.environment().sample_direction(si, mi.Point2f(0.1, 0.2), True)[0]
+    assert sky.pdf > 0 and ours.pdf(si, sky, True) == 0
 
 
 @pytest.mark.parametrize(("max_depth", "lit"), [(-1, True), (800, False), (900, True)])

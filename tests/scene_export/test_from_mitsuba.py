@@ -219,6 +219,14 @@ def test_the_smallest_map_and_image(scene, tmp_path):
     assert (found.camera.width, found.camera.height) == (1, 1)
 
 
+@pytest.mark.parametrize("content", [None, b"", b"no image", b"\x76\x2f\x31\x01\x02"])
+def test_a_map_that_cannot_be_read_is_an_error_of_the_sky(content, scene, tmp_path):
+    if content is not None:
+        (tmp_path / "sky.exr").write_bytes(content)
+    with pytest.raises(ValueError, match=r"scene\.xml: envmap.*sky\.exr.*; accepted: an OpenEXR file$"):
+        from_mitsuba.load(scene(CONSTANT, SKY))
+
+
 @pytest.mark.parametrize(
     ("text", "colour"),
     [
