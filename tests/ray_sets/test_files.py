@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -211,6 +213,19 @@ def test_what_else_is_in_an_npz_may_have_16_megabytes(tmp_path, megabytes, accep
     else:
         with pytest.raises(ValueError, match=r"a\.npz: .* bytes; accepted"):
             files.read_answers(tmp_path / "a.npz", most=2)
+
+
+@pytest.mark.parametrize(("version", "accepted"), [((1, 0), True), ((2, 0), True), ((3, 0), False)])
+def test_versions_of_numpys_format(tmp_path, version, accepted):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        for name, array in (("id", IDS), ("b", np.ones((2, 3)))):
+            with archive.open(f"{name}.npy", "w") as file:
+                np.lib.format.write_array(file, array, version)
+    if accepted:
+        np.testing.assert_array_equal(files.read_answers(tmp_path / "a.npz").b, np.ones((2, 3)))
+    else:
+        with pytest.raises(ValueError, match=r"id is in version \(3, 0\) of NumPy's format; accepted"):
+            files.read_answers(tmp_path / "a.npz")
 
 
 def test_a_pickle_is_not_opened(tmp_path):

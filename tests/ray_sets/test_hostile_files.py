@@ -89,6 +89,21 @@ def test_the_ids_of_a_regime_that_would_be_accepted_are_named():
         header.check(ours | {"regimes": ours["regimes"] | {"critical": [3, 6]}}, 9)
 
 
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        ("x" * 58, f"'{'x' * 58}'"),
+        ("x" * 59, f"'{'x' * 59}…"),
+        (["é"], r"['\xe9']"),
+        (10**5000, "int"),
+        (json.loads("[" * 900 + "]" * 900), "[" * 60 + "…"),
+    ],
+    ids=["60", "61", "accent", "digits", "deep"],
+)
+def test_a_value_is_shown_in_60_characters_of_ascii(value, text):
+    assert header.shown(value) == text
+
+
 def test_a_forged_header_that_is_ours_is_read(tmp_path, four):
     """So the cases above are refused for what they say they are."""
     files.write(tmp_path / "rays.csv", forged(four, seed=9))

@@ -205,6 +205,17 @@ def test_turned_environment(scene, tmp_path):
     assert not np.allclose(radiance(sky, directions * [1, 1, -1]), expected, rtol=0.1, atol=0.1)
 
 
+def test_a_basis_is_orthonormal_and_right_handed():
+    directions = np.random.default_rng(4).normal(size=(20, 3))
+    directions[:3] = [0, 0, 1], [0, 0, -1], [1, 0, -1e-9]
+    for z in directions / np.linalg.norm(directions, axis=1, keepdims=True):
+        found = meshes_from_shapes._basis(z)
+        np.testing.assert_allclose(found.T @ found, np.eye(3), atol=1e-12)
+        assert np.linalg.det(found) == pytest.approx(1)
+        np.testing.assert_array_equal(found[:, 2], z)
+    np.testing.assert_array_equal(meshes_from_shapes._basis(np.array([0.0, 0.0, 1.0])), np.eye(3))
+
+
 CONSTANT = '<emitter type="constant"><rgb name="radiance" value="0.5, 0.25, 1"/></emitter>'
 SKY = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
 
