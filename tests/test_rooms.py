@@ -60,6 +60,25 @@ def test_a_room_says_what_it_is_for_and_what_it_offers(room: str) -> None:
         assert hasattr(module, name) or importlib.util.find_spec(f"mi_refract.{room}.{name}"), f"{room} has no {name}"
 
 
+# Dataclasses that are filled while something is done; all others are results, and nobody may change them.
+FILLED = {"_Conversation", "Hit", "LoopState", "PathState", "Ray", "Scatter", "SearchState", "Start", "Tally", "Walk"}
+
+
+def dataclasses_of(source: str) -> Iterator[tuple[str, bool]]:
+    """The name of every dataclass, and whether it is frozen."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ClassDef):
+            for decorator in map(ast.unparse, node.decorator_list):
+                if decorator.startswith("dataclass"):
+                    yield node.name, "frozen=True" in decorator
+
+
+def test_results_are_frozen() -> None:
+    found = [pair for path in sorted(PACKAGE.rglob("*.py")) for pair in dataclasses_of(path.read_text("utf-8"))]
+    assert len(found) > 50
+    assert {name for name, frozen in found if not frozen} == FILLED
+
+
 @pytest.mark.parametrize(
     "source",
     [

@@ -31,7 +31,7 @@ ROOMS = {
     "planar": ("planar", ("against_retrace", "closed_paths", "extruded_scenes", "times")),
     "diff": ("diff", ("planted_defects", "visible_changes", "times")),
     "ground-truth": ("ground_truth", ("traced_bodies",)),
-    "robustness": ("robustness", ("mutated_inputs", "killed_commands")),
+    "robustness": ("robustness", ("mutated_inputs", "killed_commands", "code_mutants")),
     "suite": ("suite", ("matrix", "per_ray", "rendered_images", "exports")),
 }
 # What the profile `quick` runs where no study is named.

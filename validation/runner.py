@@ -92,6 +92,7 @@ def _fingerprint(context: Context) -> str:
     digest = hashlib.sha256(repr((context.profile, context.variant, installed, describe(context, 0))).encode())
     ours, here = Path(mi_refract.__file__).parent, Path(__file__).parent
     sources = [ours.rglob("*.py"), here.rglob("*.py"), here.rglob("*.json"), SCENES.rglob("*")]
+    sources.append(here.with_name("tests").rglob("*.py"))  # which mutants of our code must not pass
     for path in sorted(path for group in sources for path in group if path.is_file()):
         digest.update(path.read_bytes())
     return digest.hexdigest()

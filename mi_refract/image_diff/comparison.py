@@ -74,7 +74,9 @@ def preconditions(reference: Image, test: Image, allow_nonfinite: bool = False) 
     if np.isfinite(a).all() and np.isfinite(b).all():
         return None
     if not allow_nonfinite:
-        found = [_located(image, values, ~np.isfinite(values)) for image, values in ((reference, a), (test, b))]
+        # Both have the reference's order of channels here.
+        two = replace(test, channels=reference.channels)
+        found = [_located(image, values, ~np.isfinite(values)) for image, values in ((reference, a), (two, b))]
         return "; ".join(text for text in found if text)
     lone = ~(np.isfinite(a) & np.isfinite(b)) & ~_same(a, b)
     return f"not finite in one image only, or otherwise: {_located(reference, a, lone)}" if lone.any() else None

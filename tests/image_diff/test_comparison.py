@@ -65,6 +65,20 @@ def test_what_is_not_finite_equals_nothing_not_even_itself(method, bad):
         assert found.maps["nonfinite"].sum() == 1
 
 
+def test_what_is_not_finite_is_marked_in_the_channels_of_the_first_render():
+    turned = image(SMOOTH[..., ::-1], ("B", "G", "R"))
+    broken = image(altered(np.nan, c=0).pixels[..., ::-1], ("B", "G", "R"))
+    whole, first = image(SMOOTH), altered(np.nan, c=0)
+    for reference, test in (
+        ([whole, turned], [turned, broken]),
+        ([whole, broken], [turned] * 2),
+        ([first, whole], [whole] * 2),
+    ):
+        found = methods.compare("welch", reference, test)
+        assert found.reason == "a.exr: 1 NaN, the first at x = 5, y = 3, channel R"
+        assert np.argwhere(found.maps["nonfinite"]).tolist() == [[3, 5, 0]]
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_allowed_values_must_be_the_same_ones(method):
     assert judge(method, altered(np.nan), altered(np.nan), allow_nonfinite=True).verdict is EQUAL

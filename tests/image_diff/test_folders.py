@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
@@ -295,3 +296,12 @@ def test_bad_samples(tmp_path):
             raise ValueError(results.results[0].error)
     with pytest.raises(NotADirectoryError, match=r"0\.exr: accepted with --renders: a folder"):
         diff.diff(good, twice / "0.exr", renders=True)
+
+
+def test_the_mean_of_renders_is_that_of_all_and_one_stays_as_it_is():
+    pixels = np.arange(36, dtype=np.float32).reshape(3, 2, 2, 3) ** 2
+    several = [image_file.Image(Path(f"{i}.exr"), each, ("R", "G", "B")) for i, each in enumerate(pixels)]
+    found = diff.mean_image(several)
+    np.testing.assert_allclose(found.pixels, pixels.mean(0), rtol=1e-6)
+    assert (found.path, found.pixels.dtype) == (Path("0.exr"), np.float32)
+    assert diff.mean_image(several[1:2]) is several[1]

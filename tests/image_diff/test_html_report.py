@@ -5,6 +5,7 @@ import math
 import re
 import zlib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -223,6 +224,38 @@ def test_one_pixel_and_one_nan_survive_a_smaller_map():
     values[10, 501, 1], values[10, 500, 0], values[99, 999, 2] = -3, 2, np.nan
     small = strongest(values, 100)
     assert small.shape == (10, 100, 1) and small[1, 50] == -3 and np.isnan(small[9, 99]) and (small != 0).sum() == 2
+
+
+@pytest.mark.parametrize(("peak", "gain"), [(1.0, 0), (10.0, 1), (31.7, 1.5), (100.0, 2), (1e9, 6), (0.0, 0)])
+def test_a_map_is_full_of_colour_where_its_upper_hundredth_is(peak, gain):
+    """One pixel of 2500 is `peak` times as large as the others; the gain is in tenths of a power of ten."""
+    values = np.full((50, 50, 1), float(peak > 0), np.float32)
+    values[7, 9] = -peak
+    assert panes._map("difference", values, html_report.MOST.map)["gain"] == pytest.approx(gain)
+
+
+def test_the_first_channel_stands_for_those_that_are_no_colours():
+    pixels = np.random.default_rng(2).random((3, 4, 2)).astype(np.float32)
+    found = panes._in_shown_channels(image_file.Image(Path("a.exr"), pixels, ("depth.Z", "id")))
+    np.testing.assert_array_equal(found.pixels, pixels[..., :1])
+    assert found.channels == ("depth.Z",)
+
+
+@pytest.mark.parametrize(("rows", "kept"), [(1, 1), (512, 512), (513, 257), (1300, 434)])
+def test_a_histogram_is_of_512_rows_at_most(rows, kept, monkeypatch):
+    seen = []
+    monkeypatch.setattr(panes, "histogram_svg", lambda values, *words, salt: seen.append(values) or "")
+    p_values = np.linspace(0, 1, 2 * rows, dtype=np.float32).reshape(rows, 2)
+    p_values[0, 1] = np.nan
+    panes._histogram(p_values, "x")
+    assert len(seen[0]) == 2 * kept - 1
+
+
+@pytest.mark.parametrize("shape, note", [((3, 1), "strongest of 2 × 2 pixels"), ((1, 0), ""), ((1025, 0), "")])
+def test_a_map_says_how_many_of_its_pixels_became_one(shape, note):
+    height, wider = shape
+    pane = panes._map("difference", np.ones((height, panes.MAP_WIDTH + wider, 1), np.float32), html_report.MOST.map)
+    assert pane["note"] == note
 
 
 def test_images_of_a_page_have_keys_of_their_own():

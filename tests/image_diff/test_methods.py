@@ -26,6 +26,14 @@ def test_paired_counts_pixels_not_channels():
     assert found.mean_ratio == pytest.approx(1 + (3e-3 + 2e-6) / reference.size)
 
 
+@pytest.mark.parametrize(("one", "two", "ratio"), [(2, 3, 1.5), (4, 1, 0.25), (0, 3, 4), (0, 0, 1), (-2, 1, -0.5)])
+def test_the_ratio_of_the_means(one, two, ratio):
+    """Against black, where there is no ratio, it is 1 and as much as is added."""
+    found = changes(np.full(SHAPE, float(one)), np.full(SHAPE, float(two)), 1e-5)
+    assert found.mean_ratio == pytest.approx(ratio)
+    assert found.rms == found.largest == abs(one - two)
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_pixel_that_is_not_finite_equals_nothing_not_even_itself(bad):
     image = np.ones(SHAPE)
@@ -44,6 +52,8 @@ def test_shapes_must_agree():
         compare_stacks(np.ones((3, 16, 16, 3)), np.ones((3, 16, 8, 3)), 8, 1e-3)
     with pytest.raises(ValueError, match="at least 2"):
         compare_stacks(np.ones((1, 16, 16, 3)), np.ones((3, 16, 16, 3)), 8, 1e-3)
+    with pytest.raises(ValueError, match="3 and 1 renders: at least 2"):
+        compare_stacks(np.ones((3, 16, 16, 3)), np.ones((1, 16, 16, 3)), 8, 1e-3)
 
 
 def test_equal_images_alarm_no_more_often_than_stated():

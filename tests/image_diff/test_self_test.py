@@ -46,6 +46,47 @@ def test_the_size_of_a_defect_is_measured(found):
     assert found["renders"].values["noise"] == pytest.approx(0.02, rel=0.1)
 
 
+def test_a_defect_is_as_large_as_in_the_tile_where_it_stands_out():
+    """Three tiles with noise, one without light, one without noise. The median noise is 0.2 of the mean."""
+    mean = np.array([[[1.0], [2.0], [4.0], [0.0], [1.0]]])
+    spread = np.array([[[0.1], [0.4], [3.2], [0.5], [0.0]]])  # of two values: their deviation is √2 of it
+    clean = np.stack([mean + spread / np.sqrt(2), mean - spread / np.sqrt(2)])
+    changes = np.array([[[-0.05], [0.1], [0.72], [9.0], [9.0]]])
+    tally = self_test.Tally(detectable=[0.01, 0.02, 0.04])
+    found = self_test._sizes(np.stack([changes, changes]), clean, {"welch": tally, "exact": self_test.Tally()})
+    # 5 % in the quietest tile, 5 % in the median one, 18 % in one four times as noisy.
+    assert found["size"] == pytest.approx(0.05)
+    assert found[self_test.RATIO] == pytest.approx(0.05 / 0.02)
+    assert found[self_test.DETECTABLE] == 0.02
+    louder = changes * [[[1], [1], [2], [1], [1]]]
+    found = self_test._sizes(louder[None], clean, {"welch": tally})
+    assert (found["size"], found[self_test.RATIO]) == pytest.approx((0.36, 0.36 / (0.02 * 4)))
+    assert self_test._sizes(changes[None], clean[:1], {"welch": tally}) == {}
+    assert self_test._sizes(changes[None], clean, {"welch": self_test.Tally()}) == {}
+    assert self_test._sizes(changes[None], np.stack([mean, mean]), {"welch": tally}) == {}
+
+
+def test_the_noise_is_that_of_the_lit_pixels():
+    one, dark = np.full((1, 4, 1), 2.0), np.array([[[1.0], [1.0], [0.0], [0.0]]])
+    found = self_test.noise(np.stack([one * dark * 0.9, one * dark * 1.1]))
+    assert found == pytest.approx(0.2 * np.sqrt(2) / 2)
+    assert self_test.noise(np.zeros((3, 2, 2, 3))) == 0
+
+
+def test_renders_are_read_in_one_order_of_channels(tmp_path):
+    pixels = renders(2).astype(np.float32)
+    image_file.write_exr(tmp_path / "0.exr", pixels[0], ("R", "G", "B"))
+    image_file.write_exr(tmp_path / "1.exr", pixels[1][..., [2, 0, 1]], ("B", "R", "G"))
+    found = self_test.read_images(tmp_path)
+    assert found.shape == pixels.shape
+    for image in pixels:  # of all renders one is this, in the order of either file
+        assert any(np.array_equal(each[..., order], image) for each in found for order in ([0, 1, 2], [1, 2, 0]))
+    assert np.ptp(found.mean((1, 2)), axis=0).max() < 1e-3  # channels differ by 9e-3, renders by a few 1e-4
+    image_file.write_exr(tmp_path / "1.exr", pixels[1], ("R", "G", "A"))
+    with pytest.raises(ValueError, match="size or channels differ from those of"):
+        self_test.read_images(tmp_path)
+
+
 def test_equal_pairs_alarm_nowhere(found):
     rows = [found[f"null pairs, {method}"] for method in methods.METHODS]
     assert all(row.verdict == "pass" and row.values["false alarms"] == 0 for row in rows)

@@ -33,6 +33,17 @@ def test_correlated_pixels_cost_variance_and_degrees_of_freedom():
     assert side.spread(Inflation())[1].item() == pytest.approx(2**2 / 6)
 
 
+def test_an_image_and_its_variance_give_the_same_tiles_as_its_renders():
+    """Of an image that is not square, and fills its last tiles in part."""
+    renders = np.random.default_rng(2).random((5, 20, 40, 2))
+    one = from_renders([*renders], 16)
+    two = tile_statistics.from_variances(renders.mean(0), renders.var(0, ddof=1) / 5, 4.0, 16)
+    assert one.area[..., 0].tolist() == [[256, 256, 128], [64, 64, 32]]
+    for name in ("area", "mean", "variance", "squares", "freedom"):
+        np.testing.assert_allclose(getattr(two, name), getattr(one, name))
+    assert two.renders is None and two.inflation() == Inflation(1.0, np.inf)
+
+
 def test_correlation_that_only_coarser_tiles_show_is_estimated_again():
     """Noise in blocks of 8² in tiles of 4²: those of 16² vary 4 times as much as their own tiles let expect."""
     rng = np.random.default_rng(5)

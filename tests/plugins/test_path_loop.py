@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refract.plugins import path_loop
+from mi_refract.plugins import emitter_sampling, path_loop
 
 pytestmark = pytest.mark.usefixtures("scalar_variant")
 
@@ -74,14 +74,20 @@ def test_light_that_a_popped_branch_meets_counts_whole():
     assert found == pytest.approx(SLANTED * RADIANCE, rel=1e-5)
 
 
-def test_a_popped_branch_splits_again():
-    """It has met glass only, whatever the branch before it met. It goes on from inside the second sheet into air."""
+@pytest.mark.parametrize(("weight", "splits"), [(0.0, True), (0.004, True), (0.007, False), (0.04, False)])
+def test_a_popped_branch_splits_again_where_its_share_is_large_enough(weight, splits):
+    """It has met glass only, whatever the branch before it met. It goes on from inside the second sheet into air.
+
+    Its share is that of the reflected light, 5 %, of which the second sheet reflects 11 %. Without a split chance picks
+    that, and the lamp beyond is not met.
+    """
     sine = 0.6 * 1.5
     beyond = lamp(3, 2.25 + sine / math.sqrt(1 - sine**2))
     parts = {"glass": sheet(0, bsdf=GLASS), "wall": wall(), "second": sheet(2, bsdf=GLASS), "lamp": beyond}
     points = [TRANSMITTED, UPWARD, REFLECTED]
-    found, _ = follow(parts, points, max_depth=3, split_depth=2, split_weight=0.0)
-    expected = SLANTED * (1 - reflectance(0.8, 1.5)) * RADIANCE * 1.5**2  # n² times the radiance inside
+    found, _ = follow(parts, points, max_depth=3, split_depth=2, split_weight=weight)
+    assert SLANTED * reflectance(0.8, 1.5) == pytest.approx(0.0054, abs=1e-3)
+    expected = splits * SLANTED * (1 - reflectance(0.8, 1.5)) * RADIANCE * 1.5**2  # n² times the radiance inside
     assert found == pytest.approx(expected, rel=1e-5)
 
 
@@ -122,6 +128,30 @@ def test_a_pixel_is_transparent_where_light_goes_straight_through(bsdf, point, a
 def test_samples_are_weighted_by_their_densities(a, b, weight):
     """An infinite density has no weight, as in Mitsuba's `path`."""
     assert path_loop.power_heuristic(float(a), float(b)) == pytest.approx(weight)
+
+
+@pytest.mark.parametrize("weights", [(1.0,), (1.0, 3.0), (0.0, 2.0, 2.0)])
+def test_lamps_are_sampled_as_if_there_were_no_sky(weights):
+    """By their weights: as Mitsuba samples the same lamps without the sky."""
+    lamps = {
+        f"lamp{i}": lamp(2, 3.0 * i) | {"emitter": {"type": "area", "radiance": 1.0 + i, "sampling_weight": weight}}
+        for i, weight in enumerate(weights)
+    }
+    dark, lit = (mi.load_dict({"type": "scene"} | lamps | sky) for sky in ({}, {"sky": {"type": "constant"}}))
+    ours = emitter_sampling.NonConstantEmitters(mi.scalar_rgb, lit)
+    si = dark.ray_intersect(mi.Ray3f([0.1, 0, -2], [0, 0, 1]))
+    si.p = mi.Point3f(0.1, 0.2, -1)
+    for x in (0.1, 0.3, 0.6, 0.9):
+        (found, radiance), (expected, light) = (
+            each(si, mi.Point2f(x, 0.4), True)
+            for each in (ours.sample, lambda *given: dark.sample_emitter_direction(*given[:2], False, True))
+        )
+        assert np.allclose(found.p, expected.p, atol=1e-5)
+        assert (found.pdf, list(radiance)) == (pytest.approx(expected.pdf), pytest.approx(list(light)))
+        assert ours.pdf(si, found, True) == pytest.approx(found.pdf)
+        assert ours.pdf(si, found, False) == 0
+    sky = lit.environment().sample_direction(si, mi.Point2f(0.1, 0.2), True)[0]
+    assert sky.pdf > 0 and ours.pdf(si, sky, True) == 0
 
 
 @pytest.mark.parametrize(("max_depth", "lit"), [(-1, True), (800, False), (900, True)])

@@ -382,6 +382,24 @@ def test_what_cannot_be_is_refused_in_one_line(parameters, said, rgb_variant):
     assert said in message
 
 
+@pytest.mark.parametrize(
+    ("parameters", "written"),
+    [
+        ({}, (-1, 5, False, 0, 0.01, False)),
+        ({"max_depth": 7, "rr_depth": 3, "hide_emitters": True, "split_depth": 2}, (7, 3, True, 2, 0.01, False)),
+        ({"max_depth": 0, "deterministic": True}, (0, 5, False, 64, 0.001, True)),
+        ({"split_depth": 12, "split_weight": 0.0}, (-1, 5, False, 12, 0.0, False)),
+        ({"split_depth": 64, "split_weight": 1 / 4096}, (-1, 5, False, 64, 1 / 4096, False)),
+    ],
+    ids=str,
+)
+def test_parameters_and_their_defaults_are_written_out(parameters, written, scalar_variant):
+    names = ("max_depth", "rr_depth", "hide_emitters", "split_depth", "split_weight", "deterministic")
+    lines = [f"  {name} = {value}," for name, value in zip(names, written, strict=True)]
+    said = str(mi.load_dict({"type": "refract_path"} | parameters))
+    assert said.splitlines() == ["RefractPath[", *lines, "  left out = no scene seen yet,", "]"]
+
+
 def test_an_unknown_parameter_is_refused():
     with pytest.raises(RuntimeError, match="unreferenced"):
         mi.load_dict({"type": "refract_path", "max_dept": 3})

@@ -9,9 +9,12 @@ import pytest
 from support.ray_programs import GOOD, dot, glsl, mirrored
 
 from mi_refract import oracle
-from mi_refract.ray_sets import ray_set, reports
+from mi_refract.accuracy import RayBounds
+from mi_refract.formulas import FORMULAS
+from mi_refract.ray_sets import certain_parts, ray_set, reports
 from mi_refract.ray_sets.check_answers import check
 from mi_refract.ray_sets.ray_set import Answers
+from mi_refract.ray_sets.tir_signal import LOOSEST
 
 STEEP = ("k ≫ 1", "generic")
 
@@ -77,6 +80,27 @@ def test_the_textbook_passes_there_at_any_length(tir, made_unit):
         b = np.where(b.any(1, keepdims=True), unit(np.where(b.any(1, keepdims=True), b, 1)), 0)
     found = check(to, Answers(to.ids, b), tir=tir)
     assert (found.exit_code, found.problems) == (0, ())
+
+
+def test_only_right_answers_are_possible_where_the_bound_is_tight():
+    """In float64 and far from the critical angle no other direction is, however the answer is long."""
+    to = ray_set.make(("generic", "k ≪ 1", "critical"), 60, "f64", 4)
+    a, n, k = to.rays.a, to.rays.n, to.rays.k
+    exact = oracle.refract(a, n, k, fresnel=False, progress=False)
+    bounds = RayBounds(to.rays, exact, FORMULAS[LOOSEST].budget, to.roundoff, normalised=True)
+    for possible, b, asked in (
+        (certain_parts.possible, 3 * exact.direction, exact.transmitted),
+        (certain_parts.possible_tangent, 3 * tangent(a, n), ~exact.transmitted),
+        (certain_parts.possible_mirror, 3 * mirrored(a, n, k), ~exact.transmitted),
+    ):
+        some = np.flatnonzero(asked & (bounds.chord < 1e-9))
+        assert len(some) > 20
+        assert possible(b, bounds, some).all()
+        across = np.cross(a, n)
+        for wrong in (-b, b + 1e-6 * across, turned(b, n, 1e-6)):
+            assert not possible(wrong, bounds, some).any()
+        if possible is not certain_parts.possible_tangent:
+            assert not possible(b + 1e-6 * n, bounds, some).any()
 
 
 def test_undecidable_rays_are_counted():

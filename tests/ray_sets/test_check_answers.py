@@ -12,14 +12,16 @@ from support.ray_programs import BAD, GOOD
 from mi_refract import oracle
 from mi_refract.accuracy import lengths
 from mi_refract.formulas import FORMULAS
-from mi_refract.ray_sets import ray_set, tir_signal
+from mi_refract.ray_sets import diagnosis, ray_set, tir_signal
 from mi_refract.ray_sets.check_answers import LOOSEST, check
 from mi_refract.ray_sets.diagnosis import MISTAKES
+from mi_refract.ray_sets.judged_answers import judge_answers
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.regimes import Rays
 
 PRECISIONS = list(ray_set.PRECISIONS)
 COUNT = 40
+BUDGET = FORMULAS[LOOSEST].budget
 
 
 @functools.cache
@@ -186,6 +188,19 @@ def test_float32_where_float64_was_claimed():
     assert (found.exit_code, found.diagnosis.mistake) == (1, "missing normalisation")
 
 
+@pytest.mark.parametrize("share, mistake", [(0.8, "f32 where f64 was claimed"), (1.3, None)])
+def test_errors_of_float32_are_those_of_its_inputs_and_its_formula(share, mistake):
+    """Both at once: 2u in the bound. A turn by less of the bound is float32, a turn by more is not."""
+    to, (certified, answers) = some("f64", ("generic",)), exact("f64", ("generic",))
+    rows = np.flatnonzero(certified.transmitted)
+    bound = FORMULAS[LOOSEST].budget.chord(2 * 2.0**-24, to.rays.k, certified.cos_t, cos_i=certified.cos_i)[rows]
+    b = answers.b[rows]
+    across = np.cross(b, to.rays.n[rows])
+    across *= (share * bound / lengths(across).astype(float))[:, None]
+    diagnosis = check(to, changed(answers, rows, (b + across) / np.hypot(1, share * bound)[:, None])).diagnosis
+    assert (diagnosis and diagnosis.mistake) == mistake
+
+
 @pytest.mark.parametrize("precision, digits", [("f32", 4), ("f64", 6), ("f64", 8), ("f64", 12)])
 @pytest.mark.parametrize("form, word", [("f", "decimals"), ("g", "significant digits")])
 def test_too_few_digits(precision, digits, form, word):
@@ -195,6 +210,19 @@ def test_too_few_digits(precision, digits, form, word):
     found = check(to, Answers(to.ids, printed))
     assert (found.exit_code, found.diagnosis.mistake) == (1, "too few digits")
     assert found.diagnosis.text == f"numbers are rounded to {digits} {word}"
+
+
+def test_a_mistake_that_changes_nothing_explains_nothing():
+    """Its share is 0, and not that of the answers to no ray: the variant with an effect is the one that is named."""
+    to = some("f32", ("generic",))
+    judged = judge_answers(answered(to, lambda a, n, k: programs.glsl(a, n, 1 / k)).b, None, to.rays, "f32", BUDGET)
+    case = diagnosis.Case.of(judged.verdict.bounds, np.arange(len(to)))
+    table = {"none": lambda case: case.right, "some": lambda case: -case.right}
+    found = diagnosis._best_variant("x", table, case, judged.b, judged.verdict.wrong)
+    assert (found.share, found.explains) == (0, False)
+    with np.errstate(invalid="ignore"):
+        found = diagnosis._best_variant("x", table | {"it": lambda case: case.inverted}, case, judged.b, judged.wrong)
+    assert (found.text, found.share, found.explains) == ("it", 1, True)
 
 
 def test_two_mistakes_have_no_name():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -120,6 +122,17 @@ def test_another_image_is_refused(tmp_path):
         files.read(tmp_path / "a.exr")
 
 
+def test_exr_holds_ids_up_to_those_of_float32(tmp_path, monkeypatch):
+    made = ray_set.make(("generic",), 4)
+    with pytest.raises(ValueError, match=r"4 rays in f64; accepted in EXR: f32, up to 16777216$"):
+        files.write(tmp_path / "rays.exr", ray_set.make(("generic",), 4, "f64"))
+    monkeypatch.setattr(files, "_EXR_IDS", 3)
+    with pytest.raises(ValueError, match=r"4 rays in f32; accepted in EXR: f32, up to 3$"):
+        files.write(tmp_path / "rays.exr", made)
+    monkeypatch.setattr(files, "_EXR_IDS", 4)
+    assert len(files.read(files.write(tmp_path / "rays.exr", made))) == 4
+
+
 # Answers
 
 
@@ -189,6 +202,30 @@ def test_invalid_npz(tmp_path, arrays):
     np.savez(tmp_path / "a.npz", **arrays)
     with pytest.raises(ValueError, match=r"a\.npz: .*accepted: an \.npz file with id, b"):
         files.read_answers(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize(("megabytes", "accepted"), [(12, True), (20, False)])
+def test_what_else_is_in_an_npz_may_have_16_megabytes(tmp_path, megabytes, accepted):
+    """Beside twice the bytes of the numbers: the file is not read where it is larger."""
+    np.savez(tmp_path / "a.npz", id=IDS, b=np.zeros((2, 3)), more=np.zeros(megabytes << 20, np.uint8))
+    if accepted:
+        assert len(files.read_answers(tmp_path / "a.npz", most=2).ids) == 2
+    else:
+        with pytest.raises(ValueError, match=r"a\.npz: .* bytes; accepted"):
+            files.read_answers(tmp_path / "a.npz", most=2)
+
+
+@pytest.mark.parametrize(("version", "accepted"), [((1, 0), True), ((2, 0), True), ((3, 0), False)])
+def test_versions_of_numpys_format(tmp_path, version, accepted):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        for name, array in (("id", IDS), ("b", np.ones((2, 3)))):
+            with archive.open(f"{name}.npy", "w") as file:
+                np.lib.format.write_array(file, array, version)
+    if accepted:
+        np.testing.assert_array_equal(files.read_answers(tmp_path / "a.npz").b, np.ones((2, 3)))
+    else:
+        with pytest.raises(ValueError, match=r"id is in version \(3, 0\) of NumPy's format; accepted"):
+            files.read_answers(tmp_path / "a.npz")
 
 
 def test_a_pickle_is_not_opened(tmp_path):

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from mi_refract.io import image_file
-from mi_refract.ray_sets import check_answers, files, ray_set, reports
+from mi_refract.ray_sets import check_answers, files, header, ray_set, reports
 from mi_refract.ray_sets.ray_set import Answers, RaySet
+from mi_refract.regimes import Rays
 
 DEEP = "[" * 100_000
 
@@ -82,6 +83,27 @@ def _text(rays):
     return "\n".join([*lines, files.as_csv(rays).partition(f"{rays.header['checksum']}\n")[2]])
 
 
+def test_the_ids_of_a_regime_that_would_be_accepted_are_named():
+    ours = ray_set.make(["generic", "critical", "Brewster"], 3).header
+    with pytest.raises(ValueError, match=r"'critical' has the ids \[3, 6\]; accepted: \[3, 5\]$"):
+        header.check(ours | {"regimes": ours["regimes"] | {"critical": [3, 6]}}, 9)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        ("x" * 58, f"'{'x' * 58}'"),
+        ("x" * 59, f"'{'x' * 59}…"),
+        (["é"], r"['\xe9']"),
+        (10**5000, "int"),
+        (json.loads("[" * 900 + "]" * 900), "[" * 60 + "…"),
+    ],
+    ids=["60", "61", "accent", "digits", "deep"],
+)
+def test_a_value_is_shown_in_60_characters_of_ascii(value, text):
+    assert header.shown(value) == text
+
+
 def test_a_forged_header_that_is_ours_is_read(tmp_path, four):
     """So the cases above are refused for what they say they are."""
     files.write(tmp_path / "rays.csv", forged(four, seed=9))
@@ -125,6 +147,15 @@ def test_rays_without_refraction_are_refused(tmp_path, four, column, value):
             split = {"id": four.ids, "a": numbers[:, 1:4], "n": numbers[:, 4:7], "n_from": numbers[:, 7]}
             np.savez(tmp_path / "rays.npz", **split, n_to=numbers[:, 8], header=json.dumps(forged(rays).header))
             refused(tmp_path / "rays.npz", "accepted")
+
+
+@pytest.mark.parametrize("k", [0.0, -0.5, -1.5, np.inf])
+def test_an_index_that_is_not_above_0_is_refused(tmp_path, four, k):
+    ratios = np.append(four.rays.k[:3], four.rays.k.dtype.type(k))
+    rays = forged(RaySet(Rays(four.rays.a, four.rays.n, ratios), four.ids, four.regime, four.header))
+    with np.errstate(invalid="ignore"):
+        files.write(tmp_path / "rays.npz", rays)
+        refused(tmp_path / "rays.npz", "ray 3 is none" if np.isfinite(k) else "accepted")
 
 
 # Text

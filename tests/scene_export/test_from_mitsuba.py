@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_refract.io import image_file
 from mi_refract.scene_export import from_mitsuba, meshes_from_shapes, write_files
 from mi_refract.scene_export.plain_scene import Diffuse, Environment, Glass, Light
 from mi_refract.scene_export.targets.environment_map import radiance
@@ -204,6 +205,86 @@ def test_turned_environment(scene, tmp_path):
     assert not np.allclose(radiance(sky, directions * [1, 1, -1]), expected, rtol=0.1, atol=0.1)
 
 
+def test_a_basis_is_orthonormal_and_right_handed():
+    directions = np.random.default_rng(4).normal(size=(20, 3))
+    directions[:3] = [0, 0, 1], [0, 0, -1], [1, 0, -1e-9]
+    for z in directions / np.linalg.norm(directions, axis=1, keepdims=True):
+        found = meshes_from_shapes._basis(z)
+        np.testing.assert_allclose(found.T @ found, np.eye(3), atol=1e-12)
+        assert np.linalg.det(found) == pytest.approx(1)
+        np.testing.assert_array_equal(found[:, 2], z)
+    np.testing.assert_array_equal(meshes_from_shapes._basis(np.array([0.0, 0.0, 1.0])), np.eye(3))
+
+
+CONSTANT = '<emitter type="constant"><rgb name="radiance" value="0.5, 0.25, 1"/></emitter>'
+SKY = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
+
+
+def test_the_smallest_map_and_image(scene, tmp_path):
+    """A map of 2 × 2 pixels, black in part, as bright as it is; an image of one pixel."""
+    pixels = np.array([[[0, 0.25, 0.5], [3, 4, 5]], [[6, 7, 8], [0, 0, 0]]], np.float32)
+    image_file.write_exr(tmp_path / "sky.exr", pixels)
+    film = '<integer name="width" value="16"/><integer name="height" value="8"/>'
+    found = from_mitsuba.load(scene(CONSTANT, SKY, film, film.replace("16", "1").replace("8", "1")))
+    np.testing.assert_array_equal(found.sky.pixels, pixels)
+    assert (found.camera.width, found.camera.height) == (1, 1)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no image", b"\x76\x2f\x31\x01\x02"])
+def test_a_map_that_cannot_be_read_is_an_error_of_the_sky(content, scene, tmp_path):
+    if content is not None:
+        (tmp_path / "sky.exr").write_bytes(content)
+    with pytest.raises(ValueError, match=r"scene\.xml: envmap.*sky\.exr.*; accepted: an OpenEXR file$"):
+        from_mitsuba.load(scene(CONSTANT, SKY))
+
+
+@pytest.mark.parametrize(
+    ("text", "colour"),
+    [
+        ('<spectrum name="radiance" value="0.75"/>', (0.75, 0.75, 0.75)),
+        ('<rgb name="radiance" value="0.75"/>', (0.75, 0.75, 0.75)),
+        ('<float name="radiance" value="0"/>', (0, 0, 0)),
+        ("", (1, 1, 1)),
+    ],
+)
+def test_a_colour_of_one_number_is_grey(text, colour, scene):
+    assert from_mitsuba.load(scene('<rgb name="radiance" value="0.5, 0.25, 1"/>', text), level=0).sky == colour
+
+
+MAPS = {
+    "one row": np.ones((1, 4, 3)),
+    "one column": np.ones((4, 1, 3)),
+    "grey": np.ones((4, 4, 1)),
+    "alpha": np.ones((4, 4, 4)),
+    "NaN": np.full((4, 4, 3), np.nan),
+    "infinite": np.full((4, 4, 3), np.inf),
+    "negative": np.full((4, 4, 3), -1e-3),
+}
+
+
+@pytest.mark.parametrize("case", MAPS)
+def test_a_map_that_is_no_sky_is_refused(case, scene, tmp_path):
+    pixels = MAPS[case].astype(np.float32)
+    image_file.write_exr(tmp_path / "sky.exr", pixels, "RGBA"[: pixels.shape[2]])
+    height, width, channels = pixels.shape
+    with pytest.raises(ValueError, match=f"sky.exr: {width} × {height} × {channels}; accepted: finite RGB"):
+        from_mitsuba.load(scene(CONSTANT, SKY))
+
+
+def test_a_checkerboard_has_mitsubas_colours_where_none_are_given(scene):
+    board = f'{AREA}{BOARD.replace("/>", "")}><transform name="to_uv"><scale value="0.5"/></transform></texture>'
+    found = from_mitsuba.load(scene(LIGHT, board.replace("0.5", "1")), level=0)
+    texture = mi.load_dict({"type": "checkerboard"})
+    si, colours = mi.SurfaceInteraction3f(), []
+    for u in (0.25, 0.75):
+        si.uv = [u, 0.25]
+        colours.append(texture.eval(si)[0])
+    assert [mesh.material for mesh in found.meshes[2:]] == [
+        Light((x, x, x)) for x in (pytest.approx(c) for c in colours)
+    ]
+    assert len(from_mitsuba.load(scene(LIGHT, board), level=0).meshes) == 3  # one cell: one colour
+
+
 # --- what cannot be said ---------------------------------------------------------------------------------
 
 BALL = 'type="sphere" id="ball">'
@@ -319,6 +400,20 @@ def test_the_count_of_triangles_is_the_number_that_is_made(name, scene, monkeypa
         from_mitsuba.load(path, level=2)
 
 
+@pytest.mark.parametrize(("scale", "cells"), [((2, 3), 24), ((1.3, 0.4), 3), ((0.2, 0.2), 1)])
+def test_the_cells_of_a_checkerboard_are_counted_before_they_are_made(scale, cells, scene, monkeypatch):
+    uv = f'<transform name="to_uv"><scale x="{scale[0]}" y="{scale[1]}"/></transform>'
+    path = scene(LIGHT, f"{AREA}{BOARD.replace('/>', '>')}{uv}</texture>")
+    made = sum(len(mesh.faces) for mesh in from_mitsuba.load(path, level=0).meshes)
+    assert made == 20 + 12 + 2 * cells
+    monkeypatch.setattr(from_mitsuba, "MOST", made)
+    assert len(from_mitsuba.load(path, level=0).meshes) > 2
+    monkeypatch.setattr(from_mitsuba, "MOST", made - 1)
+    monkeypatch.setattr(meshes_from_shapes.tessellation, "checkerboard", lambda *scales: pytest.fail("made"))
+    with pytest.raises(ValueError, match=f"{2 * cells} triangles where {2 * cells - 1} are left"):
+        from_mitsuba.load(path, level=0)
+
+
 def test_other_errors(scene):
     without = re.search("<sensor.*</sensor>", SCENE, re.DOTALL)[0]
     with pytest.raises(ValueError, match="no sensor"):
@@ -327,7 +422,7 @@ def test_other_errors(scene):
         from_mitsuba.load(scene('<integrator type="path"><integer name="max_depth" value="5"/></integrator>', ""))
     with pytest.raises(FileNotFoundError):
         from_mitsuba.load("none.xml")
-    with pytest.raises(ValueError, match="level = 9"):
+    with pytest.raises(ValueError, match=r"level = 9: accepted: a whole number from 0 to 8$"):
         from_mitsuba.load(scene(), level=9)
     with pytest.raises(ValueError, match="oops"):
         from_mitsuba.load(scene(), oops="1")

@@ -208,6 +208,15 @@ def test_povray_refuses_what_it_does_not_follow(small, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_povray_surfaces():
+    """Glass is clear, a lamp emits from its front only, and a black surface nothing."""
+    scene = PlainScene("lit", meshes(Light((1.0, 2.0, 3.0)), Diffuse((0.0, 0.0, 0.0))), (1.0, 1.0, 1.0), CAMERA, 8)
+    text = povray.files(scene)["scene.pov"].decode()
+    front = "texture { pigment { rgb <%s> } finish { ambient 0 diffuse 0 emission 1 } }"
+    assert text.count(front % "1.0, 2.0, 3.0") == text.count(front % "0.0, 0.0, 0.0") == 1
+    assert text.count("interior_texture { pigment { rgb 0 } finish { ambient 0 diffuse 0 } }") == 2
+
+
 def test_povray_indices_are_relative_to_what_is_outside():
     inner, outer = Mesh("in", *tessellation.sphere(0), Glass(1.2, 1.6)), tessellation.sphere(0)
     scene = PlainScene(

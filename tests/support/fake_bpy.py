@@ -89,16 +89,18 @@ def named(**attributes):
     return types.SimpleNamespace(new=new, made=made)
 
 
-def run(folder, monkeypatch):
-    """Run the script up to its rendering; Blender's `bpy` as the script leaves it."""
+def run(folder, monkeypatch, *words):
+    """Run the script with these options; Blender's `bpy` as the script leaves it, and `rendered`: seeds and files."""
     bpy = mock.MagicMock()
+    scene, bpy.rendered = bpy.context.scene, []
+    bpy.ops.render.render = lambda write_still: bpy.rendered.append((scene.cycles.seed, scene.render.filepath))
     bpy.data.materials, bpy.data.worlds = named(node_tree=Tree), named(node_tree=Tree)
     bpy.data.meshes, bpy.data.cameras = named(materials=list, from_pydata=mock.Mock), named()
     bpy.data.objects = named(data=lambda data: data)
     bpy.context.scene.render.resolution_x = None
     monkeypatch.setitem(sys.modules, "bpy", bpy)
     monkeypatch.setitem(sys.modules, "mathutils", types.SimpleNamespace(Vector=Vector, Matrix=Matrix))
-    monkeypatch.setattr(sys, "argv", ["render.py", "--spp", "3", "--out", str(folder)])
+    monkeypatch.setattr(sys, "argv", ["render.py", "--spp", "3", "--out", str(folder), *words])
     script = folder / "render.py"
     space = {"__file__": str(script), "__name__": "script"}
     exec(compile(script.read_text(), str(script), "exec"), space)

@@ -28,6 +28,7 @@ OTHERWISE = {
     "diff.times": "times",
     "suite.rendered_images": "several seeds a side",
     "robustness.mutated_inputs": "no figure: each input is a case of its own, and the study is longer in full",
+    "robustness.code_mutants": "each mutant is a case of its own, and the study is longer in full",
     "robustness.killed_commands": "the moments of the signals are random; no figure has a bound",
     "ground_truth.traced_bodies": "bodies are fixed; the rainbow's seeds are its sample",
 }

@@ -1,6 +1,6 @@
-"""What commands do with inputs that are garbage, and what is left when they are killed or the disk is full.
+"""What commands do with inputs that are garbage, when they are killed, and what tests do when our code is mutated.
 
 In: seeds and numbers of inputs. Out: rows; every finding names the seed and the index that make the input again.
 """
 
-__all__ = ["killed_commands", "mutated_inputs"]
+__all__ = ["code_mutants", "killed_commands", "mutated_inputs"]

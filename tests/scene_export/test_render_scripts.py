@@ -1,0 +1,128 @@
+"""What the scripts of exports ask of their renderers: each seed once, and a plain path tracer."""
+
+import runpy
+import sys
+import types
+from unittest import mock
+
+import pytest
+from support import fake_bpy
+
+from mi_refract.scene_export import tessellation, write_files
+from mi_refract.scene_export.plain_scene import Camera, Diffuse, Glass, Light, Mesh, PlainScene
+
+CAMERA = Camera((0.0, 0.0, 9.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, 8, 4)
+MATERIALS = Glass(1.5, 1.25), Diffuse((0.1, 0.2, 0.3)), Light((1.0, 2.0, 3.0))
+
+
+def written(target, folder, max_depth=12):
+    meshes = tuple(Mesh(f"mesh_{i}", *tessellation.sphere(0), material) for i, material in enumerate(MATERIALS))
+    write_files.write(PlainScene("small", meshes, (0.5, 0.25, 1.0), CAMERA, max_depth), target, folder)
+    return folder
+
+
+@pytest.mark.parametrize("words, seeds", [((), [1]), (("--seeds", "4", "2"), [4, 2])])
+def test_cycles_renders_each_seed_into_a_file_of_its_own(words, seeds, tmp_path, monkeypatch, capsys):
+    bpy = fake_bpy.run(written("cycles", tmp_path / "new"), monkeypatch, *words)
+    files = [str(tmp_path / "new" / f"seed{seed}.exr") for seed in seeds]
+    assert bpy.rendered == list(zip(seeds, files, strict=True))
+    assert capsys.readouterr().out.split() == files
+    bpy.ops.wm.read_factory_settings.assert_called_once_with(use_empty=True)
+
+
+def test_cycles_is_a_plain_path_tracer(tmp_path, monkeypatch):
+    bpy = fake_bpy.run(written("cycles", tmp_path / "new"), monkeypatch, "--threads", "2")
+    render, cycles = bpy.context.scene.render, bpy.context.scene.cycles
+    assert (render.engine, cycles.device, cycles.samples) == ("CYCLES", "CPU", 3)
+    assert (render.resolution_x, render.resolution_y, render.resolution_percentage) == (8, 4, 100)
+    assert (render.threads_mode, render.threads) == ("FIXED", 2)
+    file = render.image_settings
+    assert (file.file_format, file.color_mode, file.color_depth) == ("OPEN_EXR", "RGB", "32")
+    assert (cycles.pixel_filter_type, cycles.filter_width) == ("BOX", 1)
+    for biased in ("blur_glossy", "sample_clamp_direct", "sample_clamp_indirect", "light_sampling_threshold"):
+        assert getattr(cycles, biased) == 0
+    assert (cycles.caustics_reflective, cycles.caustics_refractive) == (True, True)
+    assert (cycles.use_adaptive_sampling, cycles.use_denoising) == (False, False)
+    assert (render.use_compositing, render.use_sequencer) == (False, False)
+    assert cycles.min_light_bounces == cycles.max_bounces == 10
+    lens = bpy.data.cameras.made["camera"]
+    assert 0 < lens.clip_start <= 1e-3 and lens.clip_end >= 1e6
+
+
+def test_cycles_has_a_limit_of_bounces(tmp_path, monkeypatch):
+    bpy = fake_bpy.run(written("cycles", tmp_path / "new", max_depth=5000), monkeypatch)
+    assert bpy.context.scene.cycles.max_bounces == bpy.context.scene.cycles.transmission_bounces == 1024
+    assert bpy.context.scene.render.threads_mode != "FIXED"
+
+
+def test_cycles_materials(tmp_path, monkeypatch):
+    bpy = fake_bpy.run(written("cycles", tmp_path / "new"), monkeypatch)
+    glass, diffuse, light = (bpy.data.materials.made[f"material{i}"] for i in range(3))
+    inputs = {}
+    for kind, made in (("BsdfGlass", glass), ("BsdfDiffuse", diffuse), ("Emission", light)):
+        assert made.use_nodes
+        node = made.node_tree.only(f"ShaderNode{kind}")
+        inputs[kind] = {key: each.default_value for key, each in node.inputs.items()}
+    assert inputs == {
+        "BsdfGlass": {"Color": (1, 1, 1, 1), "Roughness": 0, "IOR": 1.2},
+        "BsdfDiffuse": {"Color": (0.1, 0.2, 0.3, 1), "Roughness": 0},
+        "Emission": {"Color": (1, 2, 3, 1), "Strength": 1},
+    }
+    back = light.node_tree.only("ShaderNodeBsdfDiffuse")
+    assert back.inputs["Color"].default_value == (0, 0, 0, 1)
+    sky = bpy.context.scene.world.node_tree.only("ShaderNodeBackground")
+    assert sky.inputs["Color"].default_value == (0.5, 0.25, 1, 1)
+
+
+class Session:
+    """A render that has ended when it was asked three times."""
+
+    def __init__(self, config):
+        self.config, self.calls = config, []
+
+    def HasDone(self):
+        self.calls.append("HasDone")
+        return self.calls.count("HasDone") > 2
+
+    def __getattr__(self, name):
+        return lambda: self.calls.append(name) or self
+
+    def GetFilm(self):
+        return types.SimpleNamespace(Save=lambda: self.calls.append("Save"))
+
+
+@pytest.mark.parametrize(
+    "words, seeds, threads",
+    [((), [1], None), (("--seeds", "4", "2", "--threads", "3", "--spp", "9"), [4, 2], 3)],
+)
+def test_luxcore_renders_each_seed_into_a_file_of_its_own(words, seeds, threads, tmp_path, monkeypatch, capsys):
+    folder, out = written("luxcore", tmp_path / "new"), tmp_path / "out"
+    sessions, waits = [], []
+
+    class Properties(dict):
+        def __init__(self, name):
+            super().__init__(name=name)
+
+        def Set(self, pair):
+            self.update([pair])
+
+    lux = mock.MagicMock(Properties=Properties, Property=lambda key, value: (key, value))
+    lux.RenderConfig = lambda config, scene: config
+    lux.RenderSession = lambda config: sessions.append(Session(config)) or sessions[-1]
+    monkeypatch.setitem(sys.modules, "pyluxcore", lux)
+    monkeypatch.setattr("time.sleep", waits.append)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["render.py", "--out", "out", *words])
+    runpy.run_path(str(folder / "render.py"))["main"]()
+    files = [str(out / f"seed{seed}.exr") for seed in seeds]
+    assert capsys.readouterr().out.split() == files
+    for session, seed, file in zip(sessions, seeds, files, strict=True):
+        assert session.config == {
+            "name": "scene.cfg",
+            "batch.haltspp": 9 if words else 256,
+            "renderengine.seed": seed,
+            "film.outputs.0.filename": file,
+        } | ({"native.threads.count": threads} if threads else {})
+        assert session.calls == ["Start", *["HasDone", "UpdateStats"] * 2, "HasDone", "Stop", "Save"]
+    assert lux.Scene.return_value.Parse.call_args.args == ({"name": "scene.scn"},)
+    assert 0 < max(waits) < 1
