@@ -134,7 +134,7 @@ class Settings:
         how = replace(
             self.default,
             options={},
-            entries=tuple(each.where for each in entries),
+            entries=tuple(each.where for each in (self.defaults, *entries) if each.values or each.error),
             reason="; ".join(dict.fromkeys(reasons)),
         )
         if error := next((each.error for each in entries if each.error), "") or _fight(entries):

@@ -38,10 +38,10 @@ def test_check_settings(run, settled):
     rows = {line[0]: [cell.strip() for cell in line[1:] if cell.strip()] for line in lines}
     assert rows["louder.exr"] == [
         "tolerance, fail=0.15, 1 variant, without [0, 0, 2, 2]",
-        "image[0]",
+        "defaults, image[0]",
         "loud",
     ]
-    assert rows["equal.exr"] == ["auto", "–"]
+    assert rows["equal.exr"] == ["auto", "defaults"]
 
 
 def test_check_settings_of_one_folder_and_one_image(run, settled):
