@@ -33,7 +33,7 @@ class Text:
         return RichText(self.text, style=self.style)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Table:
     """A line of names and a line for each row, in columns."""
 
