@@ -37,7 +37,7 @@ COMMANDS = {
     "render": Command("render", "render", "Render a Mitsuba scene, with our plugins, into an EXR file."),
     "trace": Command("trace", "trace", "Trace rays through a planar scene; draw them, print focal points."),
     "diff": Command("diff", "diff", "Compare images with their references: equal or different?"),
-    "accept": Command("diff", "accept", "Make the images that differ the new references."),
+    "accept": Command("accept", "accept", "Make the images that differ the new references."),
     "rays": Command("rays", "app", "Check another program's refraction, ray by ray."),
     "scene": Command("scene", "app", "Export a Mitsuba scene for another renderer."),
     "doctor": Command("doctor", "doctor", "Show which Mitsuba variants run here, and what is missing."),

@@ -12,7 +12,7 @@ import pytest
 import typer
 from support.diff_images import BROKEN, found, image, tree
 
-from mi_refract.cli import diff as cli_diff
+from mi_refract.cli import accept as cli_accept
 from mi_refract.image_diff import accept
 from mi_refract.image_diff import folders as diff
 from mi_refract.image_diff.results import Category
@@ -279,7 +279,7 @@ def test_accept_takes_nothing_that_changed_since(run, pair, monkeypatch):
         image(pair[1] / "louder.exr", value=0.1)
         return True
 
-    monkeypatch.setattr(cli_diff, "_agreed", late)
+    monkeypatch.setattr(cli_accept, "_agreed", late)
     code, out, err = run("accept", *pair)
     assert code == 2
     assert "accepted\n" not in out

@@ -192,14 +192,14 @@ def test_a_variant_stands_beside_the_reference(run, pair):
 
 
 def test_a_variant_is_replaced_where_it_is_what_was_compared(run, pair, tmp_path, monkeypatch):
-    from mi_refract.cli import diff as cli_diff
+    from mi_refract.cli import accept as cli_accept
 
     old, new = pair
     (old / "mi-refract.toml").write_text(SETTINGS)
     image(old / "louder-macos.exr", gain=2.0)
     out = tmp_path / "out.json"
     run("diff", old, new, "--json", out)
-    monkeypatch.setattr(cli_diff, "_agreed", lambda count: image(old / "louder-macos.exr", gain=3.0) is not None)
+    monkeypatch.setattr(cli_accept, "_agreed", lambda count: image(old / "louder-macos.exr", gain=3.0) is not None)
     before = tree(new)
     for words in ([old, new], ["--from", out]):
         code, _, err = run("accept", *words, "--as-variant", "macos")
