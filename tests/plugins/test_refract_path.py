@@ -201,6 +201,25 @@ def test_strata_are_those_of_correlated_multi_jitter(llvm_variant):
     assert (np.array(numbers.one(sampler, mi.UInt32(7))).reshape(5, 12) == one).all()  # whatever was drawn before
 
 
+def test_rows_and_columns_are_permuted_within_their_cells(llvm_variant):
+    """Of 3 rows all 6 orders, of 4 columns the 8 that Kensler's function has; other ones for another key."""
+    sampler = mi.load_dict({"type": "independent", "sample_count": 12})
+    sampler.seed(3, 12 * 400)
+    numbers = keyed_sampler.KeyedMultijitter(mi, sampler, 3)
+    seen = []
+    for key in (8, 9):
+        x, y = np.array(numbers.two(sampler, mi.UInt32(key))).reshape(2, 400, 12)
+        column, row = np.floor(x * 4).astype(int), np.floor(y * 3).astype(int)
+        inner_row, inner_column = np.floor(x * 12).astype(int) % 3, np.floor(y * 12).astype(int) % 4
+        orders = [
+            [tuple(inner[p, np.unique(outer[p], return_index=True)[1]].tolist()) for p in range(400)]
+            for inner, outer in ((inner_row, row), (inner_column, column))
+        ]
+        assert [len(set(each)) for each in orders] == [6, 8]
+        seen.append(orders)
+    assert all(one != other for one, other in zip(*seen, strict=True))
+
+
 def test_a_deterministic_image_errs_by_what_it_says_was_truncated(llvm_variant):
     """The ball from one point: no noise but the position in the pixel, which is its centre in every sample."""
     scene = glass_ball(sky=sky(), sampler={"type": "multijitter", "jitter": False})

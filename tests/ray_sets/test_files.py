@@ -228,6 +228,10 @@ def test_versions_of_numpys_format(tmp_path, version, accepted):
             files.read_answers(tmp_path / "a.npz")
 
 
+def test_the_numbers_of_the_largest_set_take_2_gib():
+    assert files.MOST_RAYS * len(files.COLUMNS) * 8 <= 2**31 < (files.MOST_RAYS + 1) * len(files.COLUMNS) * 8
+
+
 def test_a_pickle_is_not_opened(tmp_path):
     np.savez(tmp_path / "a.npz", id=np.arange(2), b=np.array([print, None], dtype=object))
     with pytest.raises(ValueError, match=r"a\.npz: .*accepted"):
