@@ -232,7 +232,7 @@ def test_defaults_come_before_the_command_line_and_that_before_entries(tmp_path)
 def test_another_method_drops_the_options_of_the_one_before(tmp_path):
     text = '[defaults]\nmethod = "tolerance"\nfail = 0.1\n' + A + 'method = "paired"\nlargest = 3'
     assert load(tmp_path, text).of("a").options == {"largest": 3.0}
-    assert load(tmp_path, text, How("exact")).of("b") == How("exact")
+    assert load(tmp_path, text, How("exact")).of("b") == How("exact", entries=("defaults",))
 
 
 def test_options_without_a_method_are_those_that_auto_may_use(tmp_path):

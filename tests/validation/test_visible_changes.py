@@ -21,6 +21,8 @@ def test_what_nobody_sees_is_equal_and_what_a_person_sees_is_different(rows):
     dues = [kind.due for kind in study.KINDS.values()]
     assert dues.count(False) >= 3 and dues.count(True) >= 3
     for name, row in rows.items():
+        if study.KINDS[name].due is None:  # seen by some, in some images: nothing is demanded
+            continue
         assert (row.values[study.ERROR] > 1) == (study.KINDS[name].due is True)
 
 

@@ -26,6 +26,7 @@ from mi_refract.io import image_file
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels
 from mi_refract.report.row import Row
+from validation.run import seeds
 from validation.run.context import Context
 from validation.study import Study, Task, about
 
@@ -177,9 +178,16 @@ def _patch(image: Pixels, x: float, y: float, side: int, colour: Pixels | float)
 
 
 def _recoloured(rng: np.random.Generator) -> Pair:
-    """A box of 0.12 to 0.18 degrees, from a gray to one that is 140 codes brighter, or in one or two primaries only."""
+    """A box of 0.12 to 0.18 degrees, 140 codes more of red or green, with or without another primary, or of all."""
     side, gray, primaries = int(rng.integers(8, 13)), rng.uniform(20, 100), rng.choice([0, 1], 3)
-    other = gray + 140 * (primaries if primaries.any() else np.ones(3))
+    other = gray + 140 * (primaries if primaries[:2].any() else np.ones(3))
+    return _with(rng, lambda image, x, y: (_patch(image, x, y, side, gray), _patch(image, x, y, side, other)))
+
+
+def _blued(rng: np.random.Generator) -> Pair:
+    """A box of 0.12 to 0.18 degrees, 140 codes more of blue alone, for which the eye is the least sharp."""
+    side, gray = int(rng.integers(8, 13)), rng.uniform(20, 100)
+    other = gray + 140 * np.array([0, 0, 1])
     return _with(rng, lambda image, x, y: (_patch(image, x, y, side, gray), _patch(image, x, y, side, other)))
 
 
@@ -263,6 +271,7 @@ KINDS = {
     "line": Kind(_line.__doc__ or "", _line, due=True),
     "brighter surface": Kind(_surface.__doc__ or "", _surface, due=True),
     "light on a surface": Kind(_lit_surface.__doc__ or "", _lit_surface, due=True),
+    "blue of an object": Kind(_blued.__doc__ or "", _blued, due=None),
 }
 CASES = {False: "not seen", True: "seen", None: "seen in part"}
 
@@ -288,8 +297,8 @@ def errors(pair: Pair) -> tuple[float, float, float]:
 def kind_row(name: str, count: int) -> Row:
     """What `flip` finds in pairs of one kind."""
     kind = KINDS[name]
-    seeds = np.random.SeedSequence((SEED, list(KINDS).index(name))).spawn(count)
-    found = np.array([errors(kind.make(np.random.default_rng(seed))) for seed in seeds])
+    own = np.random.SeedSequence((seeds.current(SEED), list(KINDS).index(name))).spawn(count)
+    found = np.array([errors(kind.make(np.random.default_rng(each))) for each in own])
     different = int((found[:, 2] > 1).sum())
     values = {LOCAL: float(np.median(found[:, 0])), THROUGHOUT: float(np.median(found[:, 1]))}
     if kind.due is True:
@@ -300,7 +309,7 @@ def kind_row(name: str, count: int) -> Row:
         values[BOUND] = Tally(seen=different, trials=count).bound
         budgets = {ALARMS: FALSE_ALARMS} | ({BOUND: FALSE_ALARMS} if count >= TRIALS["standard"] else {})
     budgets = {} if kind.due is None else budgets
-    replay = {"seed": SEED, "trials": count, "size": SIZE}
+    replay = {"seed": seeds.current(SEED), "trials": count, "size": SIZE}
     return Row(NAME, name, CASES[kind.due], SETTING, values, budgets, reason=kind.text, replay=replay)
 
 
@@ -335,4 +344,8 @@ def _edge(quarters: int) -> Pair:
     return one, two
 
 
-STUDY = Study(NAME, "Image comparison, visible changes", about(__doc__), TERMS, tasks)
+def _again(context: Context) -> list[Row]:
+    return [kind_row(name, TRIALS[context.profile.name]) for name in KINDS]
+
+
+STUDY = Study(NAME, "Image comparison, visible changes", about(__doc__), TERMS, tasks, again=_again)
