@@ -69,6 +69,8 @@ def accept(
     """Show which images are not equal to their references, ask, and copy them over. Nothing is deleted."""
     require_extra("scipy")
     if source:
+        if (reference is None) != (test is None):
+            raise ValueError(f"{reference}: one path; accepted with --from: both folders before any names, or none")
         if options or allow_nonfinite or method != AUTO or idiff is not None or variance or channels:
             raise ValueError("--from takes what was compared; accepted: no option that says how")
         found = _read_results(source, reference, test, names or [], settings, max_values)
@@ -109,7 +111,7 @@ def _copy(copies: Sequence[accepting.Copy], yes: bool) -> None:
 
 
 def _changes(found: Results, variant: str) -> list[accepting.Copy]:
-    """What is to be copied. Where an image can be no reference, `_say` may have said so already."""
+    """What is to be copied. Where an image can be no reference, `say` may have said so already."""
     try:
         return list(accepting.changes(found, variant))
     except (ValueError, OSError) as error:

@@ -265,11 +265,13 @@ def _self_test(path: Path | None, other: Path | None, max_values: int, allow_plu
 
 def _check_settings(reference: Path, test: Path | None, names: Sequence[str], chosen: Settings) -> int:
     """Print how each image would be compared, and which entries say so; 2 where that is wrong for one."""
-    pairs = pairing.named(pairing.pairs(reference, test or reference, chosen), names)
+    every = pairing.pairs(reference, test or reference, chosen)
+    pairs = pairing.named(every, names)
     print_table(text_reports.settings_table(pairs))
     for pattern in chosen.unused([pair.name for pair in pairs]):
         print(f"mi-refract: {printable(pattern)}: matches no image", file=sys.stderr)
-    wrong = [pair for pair in pairs if pair.error or pair.how.error]
-    for pair in wrong:
-        print(f"mi-refract: {printable(pair.name)}: {printable(pair.error or pair.how.error)}", file=sys.stderr)
-    return 2 if wrong else 0
+    wrong = {pair.name: pairing.error_of(pair, reference) for pair in (*pairs, *pairing.wrong_entries(chosen, every))}
+    for name, error in wrong.items():
+        if error:
+            print(f"mi-refract: {printable(name)}: {printable(error)}", file=sys.stderr)
+    return 2 if any(wrong.values()) else 0

@@ -16,7 +16,6 @@ from mi_refract.io.atomic import replacing
 from . import pairing
 from .folders import digest, opened
 from .results import FAILED, Result, Results
-from .settings import How
 
 BLOCK = 2**20  # bytes that are copied at once
 
@@ -50,9 +49,9 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
                 raise ValueError(f"{result.test}: compared without digests; accepted: results of diff(to_accept=True)")
             continue
         target = _target(result, results, variant)
-        if target in taken:
-            raise ValueError(f"{target}: the reference of another image; accepted: another --as-variant")
-        taken |= {target} if variant else set()
+        if target in taken or (variant and target.exists() and target not in result.variants):
+            raise ValueError(f"{target}: the reference of another image, too; accepted: one new image for each")
+        taken.add(target)
         images = image_file.read_parts(result.test, result.how.max_values)
         finite = all(np.isfinite(image.pixels).all() for image in images)
         if not result.how.options.get("allow_nonfinite") and not finite:
@@ -60,17 +59,18 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
         if target.suffix.lower() != result.test.suffix.lower():
             raise ValueError(f"{target}: accepted: a name that ends in {result.test.suffix}, as {result.test} does")
         yield Copy(result.test, target, result.digests[result.test], result.digests.get(target, ""))
-        yield from _of_variance(result.test, target, results, result.how)
+        yield from _of_variance(result.test, target, results, result)
 
 
-def _of_variance(new: Path, target: Path, results: Results, how: How) -> Iterator[Copy]:
+def _of_variance(new: Path, target: Path, results: Results, result: Result) -> Iterator[Copy]:
     """A copy of the new image's variance, where the reference has one; ValueError where the new image has none."""
     roots = (path if path.is_dir() else path.parent for path in (results.test, results.reference))
+    how, digests = result.how, result.digests or {}
     if not how.reads_variance:
         return
     source, to = (pairing.beside(how.variance, path, root) for path, root in zip((new, target), roots, strict=True))
     if source.exists():
-        yield Copy(source, to, digest(source), digest(to))
+        yield Copy(source, to, digests.get(source, ""), digests.get(to, ""))
     elif to.exists():
         raise ValueError(f"{source}: no such file, and {to} is of another render; accepted: a variance of {new}")
 

@@ -21,7 +21,7 @@ from mi_refract.io import exit_code, image_file
 from mi_refract.io.bounded_map import bounded_map
 from mi_refract.io.image_file import MAX_VALUES, Image
 
-from . import channels, masks, methods, pairing, parts, settings_file, variances
+from . import channels, masks, methods, pairing, parts, variances
 from .comparison import Comparison, Verdict
 from .pairing import Pair
 from .results import FAILED, STATUSES, Result, Results, Status
@@ -61,10 +61,10 @@ def diff(
     pairing.require_apart(reference, test, settings.maps, to_accept)
     every = _pairs(reference, test, settings, renders)
     unused = settings.unused([pair.name for pair in every]) if reference.is_dir() and not renders else []
-    pairs = [*pairing.named(every, names), *_wrong_entries(settings, every)]
+    pairs = [*pairing.named(every, names), *pairing.wrong_entries(settings, every)]
     roots = tuple(path if path.is_dir() else path.parent for path in (reference, test))
     all_of_them = Results(
-        reference, test, (), renders, inconclusive, tuple(unused), tuple(settings.flags), bool(settings.maps)
+        reference, test, (), renders, inconclusive, tuple(unused), tuple(settings.flags), settings.of_file
     )
     asked = _Asked(roots, all_of_them, view, maps, (digests or to_accept) and not renders)
     # Together, the pairs that are compared at once have no more values than one pair may have.
@@ -86,13 +86,6 @@ def _pairs(reference: Path, test: Path, settings: Settings, renders: bool) -> li
         raise NotADirectoryError(f"{test if reference.is_dir() else reference}: accepted with --renders: a folder")
     name = reference.resolve().name
     return [Pair(name, reference, test, reference, settings.of(name))]
-
-
-def _wrong_entries(settings: Settings, pairs: Sequence[Pair]) -> list[Pair]:
-    """A pair without sides for each entry that is wrong and matches no image: where it does, that image says so."""
-    used = {pair.how.error for pair in pairs}
-    wrong = [rule for rule in settings.rules if rule.error and rule.error not in used]
-    return [Pair(f"{settings_file.FILE}: {rule.where}", None, None, Path(), error=rule.error) for rule in wrong]
 
 
 @dataclass(frozen=True)
@@ -133,7 +126,7 @@ def _compared(pair: Pair, asked: _Asked) -> Result:
         return replace(result, status=Status.SKIPPED)
     try:
         if asked.digests:  # before the images are read: what is read later and has the same digest is what was compared
-            result = replace(result, digests=_digests(result))
+            result = replace(result, digests=_digests(result, asked.roots))
         return _judged(result, asked)
     except Exception as error:  # of whatever kind: the other images are still to be compared
         exit_code.print_traceback(error)
@@ -142,8 +135,12 @@ def _compared(pair: Pair, asked: _Asked) -> Result:
         return replace(result, status=Status.ERROR, error=text if known else f"{result.test}: {text}")
 
 
-def _digests(result: Result) -> Mapping[Path, str]:
-    paths = (result.reference, result.test, *result.variants)
+def _digests(result: Result, roots: tuple[Path, ...]) -> Mapping[Path, str]:
+    """Of its images, and of their variances."""
+    how, paths = result.how, [result.reference, result.test, *result.variants]
+    if how.reads_variance:
+        sides = zip((result.target, result.test), roots, strict=True)
+        paths += [pairing.beside(how.variance, path, root) for path, root in sides if path]
     return {path: digest(path) for path in paths if path}
 
 
@@ -164,6 +161,8 @@ def _judged(result: Result, asked: _Asked) -> Result:
     judged, failed = [], None
     for path in (result.reference, *result.variants):
         try:
+            if path.samefile(new):
+                raise ValueError(f"{new}: the same file as the reference {path}; accepted: two")
             one = _against(path, read(path), test(), result, asked.roots)
         except (ValueError, OSError, MemoryError) as error:
             failed = failed or error  # unless another reference is equal
@@ -189,13 +188,11 @@ class _Judged:
 
 def _read(result: Result, path: Path, renders: bool) -> list[Image]:
     """All renders of a folder, or all images of a file."""
-    if path != result.test and result.test and path.samefile(result.test):
-        raise ValueError(f"{result.test}: the same file as the reference {path}; accepted: two")
     return read_renders(path, result.how.max_values) if renders else parts.read(path, result.how)
 
 
 def _against(path: Path, reference: list[Image], test: list[Image], result: Result, roots: tuple[Path, ...]) -> _Judged:
-    how = result.how
+    how, whole = result.how, reference[0].channels
     reference, test = (
         channels.chosen(_with_variance(images, root, how), how.channels, side)
         for side, (images, root) in enumerate(zip((reference, test), roots, strict=True))
@@ -209,8 +206,12 @@ def _against(path: Path, reference: list[Image], test: list[Image], result: Resu
     reference, test = ([masks.applied(image, mask) for image in side] for side in (reference, test))
     if path.is_dir():
         found = methods.compare(how.method, reference, test, **how.options)
-        return _Judged((mean_image(reference), mean_image(test)), found, masks.warning(mask))
-    found, images = parts.compare(how, reference, test)
+        images = mean_image(reference), mean_image(test)
+    else:
+        found, images = parts.compare(how, reference, test)
+    if how.channels:  # what nobody looked at is said
+        left = [name for name in whole if name not in dict(how.channels)]
+        found = replace(found, reason=f"{found.reason}; not compared: {', '.join(left)}" if left else found.reason)
     return _Judged(images, found, masks.warning(mask))
 
 

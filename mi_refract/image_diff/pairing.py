@@ -68,8 +68,9 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Pair]:
             raise ValueError(f"{folder}: holds no image; accepted: at least one")
     found = _mapped(old, new, settings.maps) if settings.maps else _of_one_name(old, new)
     found = [replace(pair, target=reference / pair.target, how=settings.of(pair.name)) for pair in found]
-    found, old = _without_variance_files(found, (reference, old), (test, new))
-    found = _without_variants(found, reference, old)
+    found = _without_variants(*_without_own_files(found, old, (reference, test)))
+    if not found and not lost and not missed:
+        raise ValueError(f"defaults.map fits no image in {reference} and {test}; accepted: templates of their paths")
     return [*found, *(Pair(name, None, None, reference / name, error=error) for name, error in lost + missed)]
 
 
@@ -100,9 +101,28 @@ def _single(reference: Path, test: Path, settings: Settings) -> Pair:
     pair = Pair(reference.name, reference if reference.exists() else None, test, reference, settings.of(reference.name))
     if not pair.how.accept:
         return pair
-    return _with_variants(
-        pair, sorted(path for path in reference.parent.iterdir() if path.is_file() and path != reference)
-    )
+    deep = any("/" in template for template in pair.how.accept)
+    beside = reference.parent.rglob("*") if deep else reference.parent.iterdir()
+    others = sorted(path for path in beside if path.is_file() and path != reference)
+    return _with_variants(pair, [path for path in others if not path.samefile(test)])
+
+
+def wrong_entries(settings: Settings, pairs: Sequence[Pair]) -> list[Pair]:
+    """A pair without sides for each entry that is wrong and matches no image: where it does, that image says so."""
+    used = {pair.how.error for pair in pairs}
+    wrong = [rule for rule in settings.rules if rule.error and rule.error not in used]
+    return [Pair(f"the settings, {rule.where}", None, None, Path(), error=rule.error) for rule in wrong]
+
+
+def error_of(pair: Pair, reference: Path) -> str:
+    """Why the pair cannot be compared, as far as that is known before it is; "" for nothing."""
+    file = _mask(pair, reference if reference.is_dir() else reference.parent)
+    missing = f"{file}: no such file; accepted: a mask" if file and pair.reference and not file.exists() else ""
+    return pair.error or pair.how.error or missing
+
+
+def _mask(pair: Pair, root: Path) -> Path | None:
+    return beside(pair.how.mask, pair.target, root) if pair.how.mask else None
 
 
 def _of_one_name(old: dict[str, Path], new: dict[str, Path]) -> list[Pair]:
@@ -136,26 +156,28 @@ def _target(name: str, maps: Sequence[Map]) -> str:
 # Files beside a reference -------------------------------------------------------------------------------------------
 
 
-def _without_variance_files(
-    found: list[Pair], *sides: tuple[Path, dict[str, Path]]
-) -> tuple[list[Pair], dict[str, Path]]:
-    """The pairs, and the references, without files that hold the variance of another image of their side."""
-    templates = {pair.how.variance for pair in found if pair.how.variance}
-    of_others = {
-        file
-        for root, images in sides
-        for path in images.values()
-        for template in templates
-        if (file := beside(template, path, root)) != path
-    }
-    found = [pair for pair in found if not {pair.reference, pair.test} - {None} <= of_others]
-    return found, {name: path for name, path in sides[0][1].items() if path not in of_others}
+def _without_own_files(
+    found: list[Pair], old: dict[str, Path], roots: tuple[Path, Path]
+) -> tuple[list[Pair], list[Path]]:
+    """The pairs, and the references, without the masks and variances of other pairs: they are no images to compare."""
+    own = {file for pair in found for file in _own_files(pair, roots)}
+    kept = [pair for pair in found if not {pair.reference, pair.test} - {None} <= own]
+    return kept, [path for path in old.values() if path not in own]
 
 
-def _without_variants(found: list[Pair], root: Path, old: dict[str, Path]) -> list[Pair]:
+def _own_files(pair: Pair, roots: tuple[Path, Path]) -> list[Path]:
+    """The mask and the variances that the settings name for a pair."""
+    how, sides = pair.how, zip((pair.reference, pair.test), roots, strict=True)
+    files = [file] if (file := _mask(pair, roots[0])) else []
+    files += [beside(how.variance, path, root) for path, root in sides if path] if how.reads_variance else []
+    return [file for file in files if file not in (pair.reference, pair.test)]
+
+
+def _without_variants(found: list[Pair], references: list[Path]) -> list[Pair]:
     """The pairs with their variants. A reference that is one, and has no new image, is not one that was removed."""
     with_new = {pair.target for pair in found if pair.test}
-    others = [path for path in old.values() if path not in with_new]
+    tests = {pair.test.resolve() for pair in found if pair.test}  # in a tree of both no image is its own reference
+    others = [path for path in references if path not in with_new and path.resolve() not in tests]
     found = [_with_variants(pair, others) for pair in found]
     taken = {path for pair in found for path in pair.variants}
     return [pair for pair in found if pair.test or pair.target not in taken]
@@ -176,17 +198,20 @@ def _with_variants(pair: Pair, others: Sequence[Path]) -> Pair:
 
 
 def variant(target: Path, how: How, name: str) -> Path:
-    """Where a variant of the reference `target` lies: by the first template of `accept` with one `*`, for the name.
+    """Where a variant of the reference `target` lies: by the first template of `accept` that holds the name, or one `*`.
 
     ValueError where there is none, or for a name that would not match it.
     """
     if not name.strip() or name.startswith(".") or set(name) & set("/\\*?\0"):
         raise ValueError(f"--as-variant {name!r}: accepted: a part of a file name, as macos")
+    plain = [each for each in how.accept if not set(each) & set("*?")]
+    if named := [each for each in plain if name in each]:
+        return target.parent / name_patterns.filled(named[0], name_patterns.fields(target.name))
     fitting = [each for each in how.accept if each.count("*") == 1 and "?" not in each]
     if not fitting:
         raise ValueError(
-            f"{target}: its settings have no `accept` with one *; accepted: in mi-refract.toml, below [defaults], "
-            'accept = ["{stem}-*{suffix}"]'
+            f"{target}: its settings have no `accept` with {name} or one *; accepted: in mi-refract.toml, below "
+            f'[defaults], accept = ["{{stem}}-{name}{{suffix}}"]'
         )
     filled = name_patterns.filled(fitting[0].replace("*", "{*}"), name_patterns.fields(target.name) | {"*": name})
     return target.parent / filled

@@ -46,7 +46,13 @@ def read(path: str | Path, reference: Path | None = None, test: Path | None = No
 
 
 def with_settings(found: Results, settings: Settings) -> Results:
-    """The results with `settings`, of which the file says no more than whether values need be finite."""
+    """The results with `settings`, of which the file says no more than whether values need be finite.
+
+    ValueError for an image with a variance in a file of its own, of which the file has no digest.
+    """
+    for each in found.results:
+        if each.status in FAILED and (each.how.variance or settings.of(each.name).reads_variance):
+            raise ValueError(f"{each.name}: has a variance in a file of its own; accepted: accept without --from")
     kept = [replace(settings.of(each.name), options=each.how.options) for each in found.results]
     return replace(found, results=tuple(replace(each, how=how) for each, how in zip(found.results, kept, strict=True)))
 
@@ -90,7 +96,8 @@ def _result(where: str, entry: Table, roots: Mapping[str, tuple[Path, Path]]) ->
 
 def _how(entry: Table) -> How:
     options = entry.get("options")
-    return How(options={"allow_nonfinite": isinstance(options, dict) and options.get("allow_nonfinite") is True})
+    nonfinite = isinstance(options, dict) and options.get("allow_nonfinite") is True
+    return How(options={"allow_nonfinite": nonfinite}, variance=str(entry.get("variance") or ""))
 
 
 def _variants(where: str, entry: Table, before: Path, now: Path) -> list[Path]:

@@ -149,7 +149,8 @@ class Settings:
         of_entries = {key: value for each in entries for key, value in each.values.items()}
         others = {**self.defaults.values, **given, **of_entries}
         kept = {key: others[key] for key in ("skip", *FILE_ONLY, *OF_BOTH) if key in others}
-        flags = others.get("idiff", self.default.idiff) if method == TOLERANCE else None
+        flags = of_entries.get("idiff", self.default.idiff)
+        flags = (self.defaults.values.get("idiff") if flags is None else flags) if method == TOLERANCE else None
         return replace(how, method=method, options=options, idiff=flags, **kept)
 
     def _command_line(self, name: str) -> list[tuple[str, Mapping[str, Any]]]:
@@ -157,6 +158,11 @@ class Settings:
         if any(matches(pattern, name) for pattern in self.allow_nonfinite):
             given["allow_nonfinite"] = True
         return [("the command line", given)]
+
+    @property
+    def of_file(self) -> bool:
+        """Whether a settings file says anything."""
+        return bool(self.rules or self.maps or self.defaults.values)
 
     @property
     def flags(self) -> list[str]:

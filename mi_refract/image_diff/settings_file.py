@@ -63,8 +63,14 @@ def channels_of(value: Any) -> Names | None:
 
 def _platforms(value: Any) -> tuple[str, ...] | None:
     found = [value] if isinstance(value, str) else value
-    known = list_of(lambda each: each if text(each) and set(each.split()) <= set(WORDS) else None)(found)
+    known = list_of(lambda each: each if text(each) and _platform(each.split()) else None)(found)
     return tuple(known) if known else None
+
+
+def _platform(words: list[str]) -> bool:
+    """Whether there may be one that is all of it: one system, one processor."""
+    known = set(words) <= set(WORDS)
+    return known and all(len(set(words) & set(kind.values())) <= 1 for kind in (SYSTEMS, PROCESSORS))
 
 
 BOOL = Type("true or false", lambda value: value if isinstance(value, bool) else None)

@@ -56,7 +56,9 @@ def sentence(results: Results) -> str:
     counted = ", ".join(f"{counts[status]} {WORDS[status]}" for status in Status if counts[status])
     number, warnings = len(results.results), sum(bool(result.warning) for result in results.results)
     warned = f", {warnings} with a warning" if warnings else ""
-    return f"{number} image{'' if number == 1 else 's'}: {counted}{warned}"
+    further = len({path for result in results.results for path in result.variants})
+    also = f"; {further} further reference{'s' if further > 1 else ''}" if further else ""
+    return f"{number} image{'' if number == 1 else 's'}: {counted}{warned}{also}"
 
 
 def table(results: Results) -> Group:
@@ -78,7 +80,8 @@ def settings_table(pairs: Sequence[Pair]) -> Table:
     for pair in pairs:
         how = pair.how
         options = [f"{name}={value}" for name, value in how.options.items()]
-        others = [f"{count} variant{'s' * (count > 1)}"] if (count := len(pair.variants)) else []
+        names = ", ".join(path.relative_to(pair.target.parent).as_posix() for path in pair.variants)
+        others = [f"or {names}"] if names else []
         parts = ["skipped"] if how.skip else [how.method, *options, *others, *_pixels(how)]
         cells = pair.name, ", ".join(parts), ", ".join(how.entries) or "–", how.reason
         rows.add_row(*(Text(printable(cell)) for cell in cells))
@@ -153,6 +156,11 @@ def _entry(results: Results, result: Result) -> dict[str, Any]:
         "digests": _digests(result),
         "method": _method(result),
         "options": dict(result.how.options),
+        "idiff": result.how.idiff,
+        "channels": [list(pair) for pair in result.how.channels],
+        "variance": result.how.variance if result.how.reads_variance else "",
+        "mask": result.how.mask,
+        "ignore": [list(each) for each in result.how.ignore],
         "why_so": result.how.reason,
         "entries": list(result.how.entries),
         "matched": result.matched,
@@ -191,7 +199,8 @@ def _case(results: Results, result: Result) -> junit.Case:
     if result.status is Status.SKIPPED:
         return junit.Case(_method(result), result.name, "skipped", why(result))
     if not kind:
-        return junit.Case(_method(result), result.name)
+        warned = [f"warning: {result.warning}"] if result.warning else []
+        return junit.Case(_method(result), result.name, details=warned)
     return junit.Case(_method(result), result.name, kind, why(result), _details(results, result), _word(result))
 
 

@@ -117,7 +117,7 @@ def _spp(image: Image, side: str, given: int) -> int:
     """The samples per pixel that are given, or else those of the header, which may hold anything."""
     found = given or image.metadata.get("mi_refract:spp", "no samples per pixel")
     if not re.fullmatch(r"[0-9]{1,15}(\.0)?", text := str(found)) or float(text) < 2:
-        where = "given are" if given else "its header names"
+        where = "samples per pixel:" if given else "its header names"
         raise ValueError(f"{image.path}: {where} {shown(found)}; accepted: `spp` or `spp_{side}`, 2 to 10¹⁵")
     return int(float(text))
 

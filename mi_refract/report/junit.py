@@ -18,7 +18,7 @@ class Case:
     """One test case; `outcome` "" means that it passed.
 
     `group`: what JUnit calls its class. `kind`: the type of a failure or an error. `message` is one line; `details`
-    are the lines below it.
+    are the lines below it, of a case that passed its output.
     """
 
     group: str
@@ -57,3 +57,5 @@ def _append(suite: xml.Element, case: Case) -> None:
         kind = {"type": printable(case.kind)} if case.kind else {}
         end = xml.SubElement(element, case.outcome, kind | {"message": printable(case.message)})
         end.text = "\n".join(map(printable, case.details)) or None
+    elif case.details:
+        xml.SubElement(element, "system-out").text = "\n".join(map(printable, case.details))

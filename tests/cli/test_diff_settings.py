@@ -37,7 +37,7 @@ def test_check_settings(run, settled):
     lines = [line.split("  ") for line in out.splitlines()]
     rows = {line[0]: [cell.strip() for cell in line[1:] if cell.strip()] for line in lines}
     assert rows["louder.exr"] == [
-        "tolerance, fail=0.15, 1 variant, without [0, 0, 2, 2]",
+        "tolerance, fail=0.15, or louder-mac.exr, without [0, 0, 2, 2]",
         "defaults, image[0]",
         "loud",
     ]

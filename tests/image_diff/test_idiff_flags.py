@@ -116,6 +116,14 @@ def test_a_rule_without_flags_inherits_those_of_the_command_line(rules):
     assert (own.options["fail"], own.idiff) == (0.25, "-fail .25")
 
 
+def test_the_command_line_goes_before_the_flags_of_all(tmp_path):
+    path = tmp_path / "rules.toml"
+    path.write_text('[defaults]\nidiff = "-fail .01"')
+    own = diff_settings.load(path, diff_settings.from_words("auto", [], "-a -fail .5")).of("x")
+    assert (own.idiff, own.options["fail"]) == ("-a -fail .5", 0.5)
+    assert diff_settings.load(path).of("x").idiff == "-fail .01"
+
+
 def test_a_rule_with_bad_flags_is_an_error_of_its_images_alone(pair, rules, run, tmp_path):
     rules('idiff = "-fale 1"', "louder.exr")
     code, out, err = run("diff", *pair, "--settings", tmp_path / "rules.toml")

@@ -100,3 +100,19 @@ def test_a_mask_is_shown(pair):
     (found,) = diff.diff(*pair, settings(method="exact", ignore=((0, 0, 2, 2),)), maps=True).results
     assert found.comparison.maps["left out"].sum() == 4
     assert How(mask="x.png").needs_file
+
+
+@pytest.mark.parametrize("template", ["{stem}_mask.exr", "{root}/masks/{stem}.exr"])
+def test_a_mask_among_the_references_is_no_image(pair, template):
+    old, new = (path.parent for path in pair)
+    if "root" in template:
+        (old / "masks").mkdir()
+        (old / "a_mask.exr").rename(old / "masks/a.exr")
+    results = diff.diff(old, new, settings(method="exact", mask=template))
+    assert ([each.name for each in results.results], results.exit_code) == (["a.exr"], 0)
+
+
+def test_channels_that_are_left_out_are_said(pair):
+    chosen = settings(method="exact", channels=(("R", "R"),), ignore=((4, 10, 16, 12),))
+    (found,) = diff.diff(*pair, chosen).results
+    assert found.reason.endswith("; not compared: G, B")

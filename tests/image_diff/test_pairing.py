@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from support.diff_images import found, image
 
 from mi_refract.image_diff import folders as diff
-from mi_refract.image_diff import name_patterns, pairing
+from mi_refract.image_diff import name_patterns, pairing, text_reports
 from mi_refract.image_diff.settings import Entry, How, Map, Settings
 
 OSL = Settings(maps=(Map("{dir}/ref/{name}", "{dir}/{name}"),))
@@ -169,3 +171,47 @@ def test_what_the_file_alone_says_is_repeated_by_name(variants):
     (ball,) = [result for result in results.results if result.name == "a/ball.exr"]
     old, new = variants
     assert results.reproduce(ball) == f"mi-refract diff {old} {new} a/ball.exr --method tolerance"
+
+
+# What a review found ----------------------------------------------------------------------------------------------
+
+
+def test_a_new_image_is_never_its_own_reference(tmp_path):
+    image(tmp_path / "ball.exr")
+    image(tmp_path / "ball-new.exr", gain=1.5)
+    settings = replace(VARIANTS, default=How("exact"))
+    assert found(diff.diff(tmp_path / "ball.exr", tmp_path / "ball-new.exr", settings))["ball.exr"][0] == "different"
+    mapped = replace(settings, maps=(Map("{stem}.exr", "{stem}-new.exr"),))
+    assert found(diff.diff(tmp_path, tmp_path, mapped))["ball-new.exr"] == ("different", "changed")
+    deep = replace(mapped, defaults=Entry("*", {"accept": ("*/{name}",)}), maps=(Map("{name}", "out/{name}"),))
+    image(tmp_path / "out/ball.exr", gain=1.5)
+    by_name = {each.name: each.status for each in diff.diff(tmp_path, tmp_path, deep, names=["out/ball.exr"]).results}
+    assert by_name == {"out/ball.exr": "different"}
+
+
+def test_references_that_are_only_variants_are_counted(variants):
+    results = diff.diff(*variants, VARIANTS)
+    assert text_reports.sentence(results) == "2 images: 2 equal; 2 further references"
+
+
+def test_a_map_that_fits_nothing(folders):
+    with pytest.raises(ValueError, match=r"defaults\.map fits no image in .*; accepted: templates of their paths"):
+        diff.diff(*folders, Settings(maps=(Map("nowhere/{name}", "neither/{name}"),)))
+
+
+def test_variants_in_folders_below_of_two_files(tmp_path):
+    image(tmp_path / "old/a.exr", gain=1.5)
+    image(tmp_path / "old/mac/a.exr")
+    image(tmp_path / "new/a.exr")
+    settings = Settings(defaults=Entry("*", {"accept": ("mac/{name}",)}))
+    for sides in (("old", "new"), ("old/a.exr", "new/a.exr")):
+        (result,) = diff.diff(*(tmp_path / side for side in sides), settings).results
+        assert result.matched == tmp_path / "old/mac/a.exr"
+
+
+def test_a_variant_by_a_template_that_holds_its_name(tmp_path):
+    how = How(accept=("{stem}-arm64{suffix}", "{stem}-macos{suffix}", "{stem}-*{suffix}"))
+    for name in ("macos", "arm64", "icx"):
+        assert pairing.variant(tmp_path / "a/ball.exr", how, name) == tmp_path / f"a/ball-{name}.exr"
+    with pytest.raises(ValueError, match=r"no `accept` with icx or one \*; accepted: .*-icx\{suffix\}"):
+        pairing.variant(tmp_path / "ball.exr", How(accept=("{stem}-macos{suffix}",)), "icx")

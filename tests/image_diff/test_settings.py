@@ -139,6 +139,7 @@ BAD_ENTRIES = {
     "nan": (f"{A}fail = nan", "image[0].fail: nan"),
     "flag": (f"{A}allow_nonfinite = 1", "image[0].allow_nonfinite: 1"),
     "platform": (f'{A}when = "mcos"', "image[0].when: 'mcos'; accepted: of linux, macos, windows"),
+    "two systems": (f'{A}when = "linux macos"', "image[0].when: 'linux macos'; accepted: of linux"),
     "rectangle": (f"{A}ignore = [[0, 0, 3]]", "image[0].ignore: [[0, 0, 3]]; accepted: a list of [x, y, width"),
     "empty rectangle": (f"{A}ignore = [[0, 0, 0, 3]]", "image[0].ignore: [[0, 0, 0, 3]]; accepted: a list of [x,"),
     "option of neither": (f"{A}changed = 1", "image[0].changed: not an option of auto; accepted: "),
@@ -273,6 +274,6 @@ def test_skipped_images_are_said_and_count_as_nothing(folders):
 def test_a_wrong_entry_that_matches_nothing_is_told(folders):
     results = diff.diff(*folders, Settings(rules=(Entry("gone", {}, error="rules.toml: image[0].fale: unknown"),)))
     (wrong,) = results.of(Status.ERROR)
-    assert (wrong.name, wrong.error) == ("mi-refract.toml: image[0]", "rules.toml: image[0].fale: unknown")
+    assert (wrong.name, wrong.error) == ("the settings, image[0]", "rules.toml: image[0].fale: unknown")
     assert results.exit_code == 2
     assert len(results.results) == 5

@@ -71,6 +71,7 @@ def test_what_is_read(scene):
 
 def test_defines_replace_defaults(scene):
     assert from_mitsuba.load(scene('value="5"', 'value="$depth"'), depth="7").max_depth == 7
+    assert from_mitsuba.load(scene('value="5"', 'value="$depth"'), depth="1").max_depth == 1
     for name in ("dielectric", "refract_promoted"):
         assert from_mitsuba.load(scene(), bsdf=name).meshes[0].material == Glass(1.333, 1.000277)
 
