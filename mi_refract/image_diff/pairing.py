@@ -198,7 +198,7 @@ def _with_variants(pair: Pair, others: Sequence[Path]) -> Pair:
 
 
 def variant(target: Path, how: How, name: str) -> Path:
-    """Where a variant of the reference `target` lies: by the first template of `accept` that holds the name, or one `*`.
+    """Where a variant of the reference `target` lies: by the first template of `accept` with the name or one `*`.
 
     ValueError where there is none, or for a name that would not match it.
     """
