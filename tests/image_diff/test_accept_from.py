@@ -223,7 +223,7 @@ def test_a_variant_of_the_json(run, pair, tmp_path):
         (
             "",
             "macos",
-            'settings have no `accept` with macos or one *; accepted: in mi-refract.toml, below [defaults]',
+            "settings have no `accept` with macos or one *; accepted: in mi-refract.toml, below [defaults]",
         ),
         ('[defaults]\naccept = ["{stem}-*-*.exr"]', "macos", "settings have no `accept` with macos or one *"),
         (SETTINGS, "a/b", "--as-variant 'a/b': accepted: a part of a file name"),
