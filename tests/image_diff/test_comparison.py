@@ -336,6 +336,13 @@ def test_corrections_are_those_of_the_papers():
     assert tile_statistics.sidak(0.05, 2) == pytest.approx(1 - np.sqrt(0.95))
 
 
+@pytest.mark.parametrize(("correction", "threshold"), [("holm", 0.016), ("sidak", 1 - 0.95**0.25)])
+def test_the_correction_is_the_one_that_is_asked_for(correction, threshold):
+    tests = tile_statistics.TileTests([], 0.05, correction)
+    vars(tests)["p"] = np.array([0.03, 0.01, 0.016, 0.9])
+    assert tests.threshold == pytest.approx(threshold)
+
+
 def with_spread(count, kind, gain=1.0):
     """One image of `count` samples a pixel, with channels of their second moments or variance, and of nothing."""
     samples = gain * np.stack([each.pixels for each in renders(count, shape=(64, 64, 1))]).astype(np.float64)
