@@ -41,8 +41,11 @@ def made(reference: Image, path: Path | None, rectangles: Sequence[Rectangle], m
 
 
 def applied(image: Image, mask: Mask | None) -> Image:
-    """The image with 0 where the mask does not count, and with the mask."""
-    if mask is None:
+    """The image with 0 where the mask does not count, and with the mask; one of another size as it is.
+
+    An image of another size is refused by every method. Here a single pixel would be spread over the mask's size.
+    """
+    if mask is None or image.pixels.shape[:2] != mask.shape:
         return image
     variances = {name: np.where(mask, each, 0) for name, each in image.variances.items()}
     return replace(image, pixels=np.where(mask[..., None], image.pixels, 0), mask=mask, variances=variances)

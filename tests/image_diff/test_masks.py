@@ -116,3 +116,12 @@ def test_channels_that_are_left_out_are_said(pair):
     chosen = settings(method="exact", channels=(("R", "R"),), ignore=((4, 10, 16, 12),))
     (found,) = diff.diff(*pair, chosen).results
     assert found.reason.endswith("; not compared: G, B")
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (32, 1, 3), (1, 48, 3), (8, 8, 3)])
+def test_a_new_image_of_another_size_is_not_spread_over_the_mask(pair, shape):
+    image(pair[0], value=None, gain=0.0)  # black all over, as the new one
+    image(pair[1], shape=shape, gain=0.0)
+    (found,) = diff.diff(*pair, settings(method="exact", ignore=((0, 0, 2, 2),))).results
+    assert found.status == "error"
+    assert f"size {shape[1]} × {shape[0]}; accepted: 48 × 32" in found.error
