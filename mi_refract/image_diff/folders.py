@@ -50,9 +50,10 @@ def diff(
 
     `names`: patterns of the images to compare; none: all. `view`: called with each result that is not equal, while it
     has its images and maps, and with what is known of all; by several threads at once. What it raises ends the
-    comparison. `maps`: the results keep
-    them, which takes memory for all of them. `digests`: the results have those of their files. `to_accept`: so they
-    do, and the reference need not exist yet. `tell(done, of)` is called after each image.
+    comparison. `maps`: the results keep images and maps, which takes memory for all of them. `digests`: the results
+    have those of their files. `to_accept`: so they do, and the reference need not exist yet. `tell(done, of)` is called
+    after each image.
+
     Whatever goes wrong with one image is the error of its result. ValueError or OSError where there is nothing to
     compare: a path that does not exist, a file against a folder, an empty folder, a path within the other, a name that
     matches no image.
@@ -192,7 +193,7 @@ def _read(result: Result, path: Path, renders: bool) -> list[Image]:
 
 
 def _against(path: Path, reference: list[Image], test: list[Image], result: Result, roots: tuple[Path, ...]) -> _Judged:
-    how, whole = result.how, reference[0].channels
+    how, whole = result.how, dict.fromkeys((*reference[0].channels, *test[0].channels))
     reference, test = (
         channels.chosen(_with_variance(images, root, how), how.channels, side)
         for side, (images, root) in enumerate(zip((reference, test), roots, strict=True))
@@ -210,7 +211,7 @@ def _against(path: Path, reference: list[Image], test: list[Image], result: Resu
     else:
         found, images = parts.compare(how, reference, test)
     if how.channels:  # what nobody looked at is said
-        left = [name for name in whole if name not in dict(how.channels)]
+        left = [name for name in whole if name not in {each for pair in how.channels for each in pair}]
         found = replace(found, reason=f"{found.reason}; not compared: {', '.join(left)}" if left else found.reason)
     return _Judged(images, found, masks.warning(mask))
 
@@ -262,7 +263,7 @@ def read_renders(folder: Path, max_values: int = MAX_VALUES) -> list[Image]:
     if not found:
         raise ValueError(f"{folder}: holds no image; accepted: several renders of one")
     read = functools.partial(image_file.read, max_values=max_values)
-    images = list(bounded_map(read, found.values(), lambda path: 0, 0, WORKERS))
+    images = list(bounded_map(read, found.values(), lambda path: 0, max_values, WORKERS))  # all are needed at once
     sums: dict[float, Image] = {}
     for image in images:
         other = sums.setdefault(float(image.pixels.sum(dtype=np.float64)), image)

@@ -84,12 +84,11 @@ METHODS = {
 def compare(method: str, reference: Side, test: Side, *, allow_nonfinite: bool = False, **options: Any) -> Comparison:
     """Compare two images, or two sequences of renders of one image, by a method of the table.
 
-    "auto" is `welch` where it can be, else `tolerance`; of the options it takes those of the other one and leaves them
-    out. Where a method calls the images equal but would call a black
-    one equal, too, or one with some of its channels black, the verdict is INCONCLUSIVE; so it is where channels whose
-    variance `welch` does not know differ by more than `tolerance` allows. Channels that one of two images has besides
-    make them DIFFERENT.
-    Where no value of a channel is finite, it is INCONCLUSIVE as well.
+    "auto" is `welch` where it can be, else `tolerance`; options of the other one are accepted and not used.
+
+    INCONCLUSIVE where a method calls the images equal but would call a black one equal, too, or one with some of its
+    channels black; where channels whose variance `welch` does not know differ by more than `tolerance` allows; and
+    where no value of a channel is finite. DIFFERENT where one of two images has channels besides.
 
     ValueError for an unknown method or option, an option of another type or out of its range, several renders for a
     method that takes one, and images that cannot be compared.

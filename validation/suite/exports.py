@@ -27,7 +27,7 @@ from validation.run.render_methods import Camera
 from validation.study import Study, Task, about
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
-from .rendered_images import COMPILED, THREE, askew
+from .rendered_images import THREE, askew, why_not
 from .renderers import SYSTEMS, environments
 
 NAME = "exports"
@@ -84,12 +84,7 @@ def rows(context: Context, title: str) -> list[Row]:
     """A renderer against `refract`: one row."""
     renderer = IMAGE_RENDERERS[title]
     system, setting = SYSTEMS[renderer.system], f"{SIZE[0]} × {SIZE[1]}"
-    reason = environments.absent(system)
-    if not reason and not system.small and context.profile.name != "full":
-        reason = f"{system.megabytes} MB: in the full profile only"
-    if not reason and context.variant.startswith("scalar"):
-        reason = COMPILED
-    if reason:
+    if reason := why_not(system, context):
         return [Row(NAME, title, "balls", setting, reason=reason)]
     try:
         theirs = drawn(title)

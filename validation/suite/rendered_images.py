@@ -35,7 +35,7 @@ from validation.run.render_methods import Camera
 from validation.study import Study, Task, about
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
-from .renderers import SYSTEMS, environments
+from .renderers import SYSTEMS, System, environments
 
 NAME = "images"
 TERMS = {
@@ -132,17 +132,21 @@ def tasks(context: Context) -> list[Task]:
     ]
 
 
+def why_not(system: System, context: Context) -> str:
+    """Why the images of a renderer are not compared in this run; "" where they are."""
+    if reason := environments.absent(system):
+        return reason
+    if not system.small and context.profile.name != "full":
+        return f"{system.megabytes} MB: in the full profile only"
+    return COMPILED if context.variant.startswith("scalar") else ""
+
+
 def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
     """A renderer against `refract` in a scene: one row."""
     renderer, size = IMAGE_RENDERERS[title], SIZES[context.profile.name]
     system = SYSTEMS[renderer.system]
     setting = f"{size.resolution}²"
-    reason = environments.absent(system)
-    if not reason and not system.small and context.profile.name != "full":
-        reason = f"{system.megabytes} MB: in the full profile only"
-    if not reason and context.variant.startswith("scalar"):
-        reason = COMPILED
-    if reason:
+    if reason := why_not(system, context):
         return [Row(NAME, title, scene, setting, reason=reason)]
     given, seeds = SCENES[scene].load(size.resolution), range(1, RENDERS + 1)
     spp = max(renderer.spp[scene] // size.less, 1)
