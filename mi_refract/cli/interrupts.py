@@ -2,7 +2,7 @@
 
 While Mitsuba renders, a handler of its own takes SIGINT: it allocates memory, also where it has interrupted `malloc`,
 and then both wait for ever; or it makes the rendering return early. Python's own handler waits until Mitsuba or an
-import returns. So no handler runs here: SIGINT is blocked in every thread, and one thread waits for it.
+import returns. So no handler runs here: signals are blocked in every thread, and one thread waits for them.
 """
 
 from __future__ import annotations
@@ -11,43 +11,60 @@ import contextlib
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import NoReturn
 
 SHOW_CURSOR = b"\x1b[?25h"  # which a spinner hides
 _SIGINT = {signal.SIGINT}
+_signals = set(_SIGINT)  # that are blocked from `end_at_once` on
 _blocked = threading.Event()  # from `end_at_once` on
 _unblocked = threading.Event()  # within `as_exceptions`
+_last_acts: list[Callable[[], None]] = []  # of which the last one counts
 
 
-def end_at_once(*, even_if_ignored: bool) -> None:
-    """From here on, SIGINT ends this process with 130; for the process's own command line, in its main thread.
+def end_at_once(*, even_if_ignored: bool, also: Collection[signal.Signals] = ()) -> None:
+    """From here on, SIGINT and the signals in `also` end this process with 128 + their number; 130 for Ctrl-C.
 
-    Call it before numpy, Mitsuba or Dr.Jit is imported: the threads that they start block what their parent blocks.
-    Where the shell has SIGINT ignored, in a background job, it stays so, unless `even_if_ignored`.
+    For the process's own command line, in its main thread. Call it before numpy, Mitsuba or Dr.Jit is imported: the
+    threads that they start block what their parent blocks. Where the shell has SIGINT ignored, in a background job, it
+    stays so, unless `even_if_ignored`; the others stay ignored where they are, as by `nohup`.
     """
     ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    signal.pthread_sigmask(signal.SIG_BLOCK, _SIGINT)
+    _signals.update(each for each in also if signal.getsignal(each) is not signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_BLOCK, _signals)
     from mi_refract.io import atomic  # it takes longer than all before it
 
     _blocked.set()
-    if ignored and not even_if_ignored:
+    waited = _signals - (_SIGINT if ignored and not even_if_ignored else set())
+    if not waited:
         return
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # macOS does not queue what is ignored
-    threading.Thread(target=_watch, args=(atomic.end_process,), name="Ctrl-C", daemon=True).start()
+    for each in waited:
+        signal.signal(each, signal.default_int_handler)  # macOS does not queue what is ignored
+    threading.Thread(target=_watch, args=(atomic.end_process, waited), name="Ctrl-C", daemon=True).start()
+
+
+@contextlib.contextmanager
+def last_act(act: Callable[[], None]) -> Iterator[None]:
+    """Within, `act` is called before a signal ends the process. A second signal ends it without waiting for that."""
+    _last_acts.append(act)
+    try:
+        yield
+    finally:
+        _last_acts.remove(act)
 
 
 @contextlib.contextmanager
 def as_exceptions() -> Iterator[None]:
     """Within, SIGINT is a KeyboardInterrupt, as usual: for starting other programs, which inherit what is blocked.
 
-    Nothing that installs a handler of its own may be called. Without `end_at_once` nothing changes.
+    The others that are blocked are so, too. Nothing that installs a handler of its own may be called. Without
+    `end_at_once` nothing changes.
     """
     if not _blocked.is_set():
         yield
         return
     _unblocked.set()
-    before = signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGINT)
+    before = signal.pthread_sigmask(signal.SIG_UNBLOCK, _signals)
     try:
         yield
     finally:
@@ -55,11 +72,16 @@ def as_exceptions() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _watch(end_process: Callable[[int], NoReturn]) -> None:
-    signal.sigwait(_SIGINT)
+def _watch(end_process: Callable[[int], NoReturn], signals: Collection[signal.Signals]) -> None:
+    caught = signal.sigwait(signals)
     while _unblocked.is_set():  # the system has the main thread take the signal, as a rule
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-        signal.sigwait(_SIGINT)
+        signal.pthread_kill(threading.main_thread().ident or 0, caught)
+        caught = signal.sigwait(signals)
+    if _last_acts:
+        acting = threading.Thread(target=_last_acts[-1], name="last act", daemon=True)
+        acting.start()
+        while acting.is_alive() and signal.sigtimedwait(signals, 0.05) is None:
+            pass
     if os.isatty(2):
         os.write(2, SHOW_CURSOR)
-    end_process(130)
+    end_process(128 + caught)

@@ -1,8 +1,9 @@
-"""The command `mi-refract render`: a Mitsuba scene into an EXR file."""
+"""The command `mi-refract render`: a Mitsuba scene into an EXR file, in passes."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +16,9 @@ from mi_refract import backend
 from mi_refract.io.outside_text import printable
 from mi_refract.rendering import scene_files
 
-from . import variants
+from . import interrupts, variants
+from .quantities import parse_seconds, parse_share, shown_error
+from .render_progress import shown
 
 
 def render(
@@ -31,27 +34,69 @@ def render(
     spp: Annotated[
         int | None, typer.Option(min=1, max=2**32 - 1, help="Samples per pixel; without it what the scene says.")
     ] = None,
+    until: Annotated[
+        str | None, typer.Option(metavar="SHARE", help="Stop at this error: RMSE over mean, such as 1%.")
+    ] = None,
+    until_tile: Annotated[
+        str | None, typer.Option(metavar="SHARE", help="Stop at this error of the worst 16 × 16 tile but 1 % of them.")
+    ] = None,
+    duration: Annotated[str | None, typer.Option("--time", metavar="TIME", help="Stop after it: 90s, 10m, 1h30m.")] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the sampler.")] = 0,
+    pass_spp: Annotated[
+        int | None, typer.Option(min=1, max=2**32 - 1, help="Samples per pixel of a pass, which bound the memory.")
+    ] = None,
+    restart: Annotated[bool, typer.Option("--restart", help="Begin anew, whatever there is already.")] = False,
+    preview: Annotated[Path | None, typer.Option(metavar="X.png", help="Write the image so far, now and then.")] = None,
     allow_plugins: Annotated[
         list[str] | None,
         typer.Option("--allow-plugins", metavar="NAME", help="Run this plugin, which the scene brings, too."),
     ] = None,
 ) -> None:
-    """Render a Mitsuba scene into an EXR file that says how it was made.
+    """Render a Mitsuba scene into an EXR file that holds its own noise, and says how it was made.
 
-    The scene may use the plugins `refract` and `refract_path`, which Mitsuba's own executable does not know.
+    The render goes on where it was left: from a checkpoint after it was ended, from a finished image that has fewer
+    samples. The scene may use the plugins `refract` and `refract_path`, which Mitsuba's own executable does not know.
     """
+    from mi_refract.io.atomic import writable
+
     defines = scene_files.parse_defines(define or [])
+    shares = [
+        None if text is None else parse_share(text, option)
+        for text, option in ((until, "--until"), (until_tile, "--until-tile"))
+    ]
+    seconds = None if duration is None else parse_seconds(duration, "--time")
+    if preview is not None:
+        writable(preview, (".png",))
     chosen = variants.activate(variant)
+    from mi_refract.rendering.long_render import Job, Limits, LongRender
+
+    limits = Limits(spp, shares[0], shares[1], seconds, pass_spp)
+    job = Job(scene, defines, seed, tuple(allow_plugins or ()))
     console = Console(stderr=True)
     with _spinner(console, f"{scene.name}, {chosen}"):
-        header = scene_files.render_to_exr(
-            scene, output, defines=defines, spp=spp, seed=seed, allow_plugins=allow_plugins or []
-        )
-    done = f"{header['mi_refract:spp']} spp, {header['mi_refract:render_seconds']:.2f} s"
-    print(printable(f"{output}: {chosen}, {done}"))
+        rendering = LongRender(job, output, limits, restart=restart)
+    if rendering.progress.passes:
+        print(printable(f"{output}: goes on from {rendering.progress.done} spp"), file=sys.stderr)
+    with interrupts.last_act(rendering.give_up), shown(console, rendering, preview) as watch:
+        header = rendering.run(watch)
+    print(printable(f"{output}: {chosen}, {_summary(rendering, header)}"))
+    if count := header["mi_refract:nonfinite_pixels"]:
+        print(printable(f"mi-refract: {output}: {count} pixels are not finite"), file=sys.stderr)
     if variant is None and not backend.llvm().usable:
         print(printable(f"mi-refract: {chosen} is slow; {backend.summary()}"), file=sys.stderr)
+
+
+def _summary(rendering: Any, header: dict[str, Any]) -> str:
+    text = f"{header['mi_refract:spp']} spp in {_passes(rendering.progress.passes)}, "
+    text += f"{header['mi_refract:render_seconds']:.2f} s"
+    error = rendering.error()
+    if error is not None and math.isfinite(error.value):
+        text += f", relative error {shown_error(error)}"
+    return f"{text}; ended by {rendering.ended_by}" if rendering.ended_by else text
+
+
+def _passes(count: int) -> str:
+    return f"{count} pass{'es' if count != 1 else ''}"
 
 
 def _spinner(console: Console, text: str) -> contextlib.AbstractContextManager[Any]:

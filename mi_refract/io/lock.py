@@ -1,4 +1,4 @@
-"""A lock on a folder's name: one process at a time, and the others are told who holds it.
+"""A lock on a name: one process at a time, and the others are told who holds it.
 
 The lock is the operating system's, on a file: it ends with the process that holds it, however that ends. The file says
 who that is, and is removed at the end.
@@ -18,15 +18,17 @@ _SAID = 1000  # bytes that are read of a lock file, which may be anything
 
 
 @contextlib.contextmanager
-def held(path: Path, what: str) -> Iterator[None]:
+def held(path: Path, what: str, place: Path | None = None, accepted: str = "another folder") -> Iterator[None]:
     """Hold the lock file `path` for the time of a `with` block.
 
-    BlockingIOError, at once and in one line, where another process holds it: `what` it is, who, and since when. OSError
+    BlockingIOError, at once and in one line, where another process holds it: `what` runs at the `place`, by default the
+    folder of the lock file, who runs it, and since when. OSError
     where the file cannot be made. A file that a killed process left is taken over.
     """
     file = _locked(path)
     if file is None:
-        raise BlockingIOError(f"{path.parent}: {what} runs there already, {_holder(path)}; accepted: another folder")
+        where = path.parent if place is None else place
+        raise BlockingIOError(f"{where}: {what} runs there already, {_holder(path)}; accepted: {accepted}")
     try:
         import socket  # the others who import this module do without
 

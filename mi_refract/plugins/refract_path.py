@@ -78,8 +78,12 @@ def integrator_class(v: Any) -> type:
             self.seed: Any = 0
             self.seen: tuple[Any, SceneFeatures] | None = None
 
-        def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, *more: Any, **named: Any) -> Any:
+        def begin_render(self, seed: Any) -> None:
+            """To be called before `sample`, where no `render` is: the seed of the sampler, and a scene as if not seen."""
             self.seed, self.seen = seed, None
+
+        def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, *more: Any, **named: Any) -> Any:
+            self.begin_render(seed)
             return super().render(scene, sensor, seed, *more, **named)
 
         def aov_names(self) -> list[str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import unescape
 from pathlib import Path
 
@@ -37,9 +37,14 @@ _OPENED = {b"include", b"spectrum"}  # elements that name a file which the parse
 
 @dataclass
 class Walk:
-    """What was seen of a scene so far. `parameters`: what Mitsuba replaces, by name; the first value counts."""
+    """What was seen of a scene so far. `parameters`: what Mitsuba replaces, by name; the first value counts.
+
+    `xml`: the files, the scene's own first; `opened`: files that the parser opens besides, by their names in the scene.
+    """
 
     parameters: dict[str, str]
+    xml: list[Path] = field(default_factory=list)
+    opened: dict[str, Path] = field(default_factory=dict)
     size: int = 0
     files: int = 0
     elements: int = 0
@@ -47,10 +52,10 @@ class Walk:
     dollars: int = 0
 
 
-def check_files(path: Path, folders: Iterable[Path], defines: Mapping[str, str]) -> None:
-    """ValueError where a scene file, or one that it includes, is not a regular file, too large, or nested too deeply.
+def check_files(path: Path, folders: Iterable[Path], defines: Mapping[str, str]) -> Walk:
+    """What was seen of a scene file and of those that it includes.
 
-    `folders`: where Mitsuba looks for what a scene names. OSError for a file that cannot be read. A file that is no
+    ValueError where one is not a regular file, too large, or nested too deeply. `folders`: where Mitsuba looks for what a scene names. OSError for a file that cannot be read. A file that is no
     XML may pass: Mitsuba says better what is wrong with it.
     """
     walk = Walk(dict(defines))
@@ -58,6 +63,7 @@ def check_files(path: Path, folders: Iterable[Path], defines: Mapping[str, str])
     longest = max(map(len, walk.parameters.values()), default=0)
     if walk.dollars * max(longest, len(walk.parameters)) > SIZE:  # Mitsuba tries each parameter at each place
         raise ValueError(f"{path}: parameters expand to over {SIZE} bytes; accepted: up to that")
+    return walk
 
 
 def _refuse_more(path: Path, count: int, limit: int, what: str) -> None:
@@ -67,6 +73,7 @@ def _refuse_more(path: Path, count: int, limit: int, what: str) -> None:
 
 def _walk_file(path: Path, folders: list[Path], walk: Walk, depth: int) -> None:
     walk.files += 1
+    walk.xml.append(path)
     _refuse_more(path, walk.files, FILES, "files included")
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; accepted: a scene file")
@@ -97,7 +104,9 @@ def _follow(name: bytes, values: Mapping[str, str], path: Path, folders: list[Pa
     elif values.get("filename"):
         found = resolved(values["filename"], [path.parent, *folders])
         refuse_special(found)
-        if name == b"include" and found.is_file():
+        if name == b"spectrum":
+            walk.opened[values["filename"]] = found
+        elif found.is_file():
             _refuse_more(path, depth + 1, INCLUDES, "files, each included by the one before")
             _walk_file(found, [path.parent, *folders], walk, depth + 1)
 

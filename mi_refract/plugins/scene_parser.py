@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -69,18 +70,47 @@ def parse(path: Path, config: Any, defines: Mapping[str, str]) -> Any:
     _check_nesting(path, [node.type.name for node in nodes], children)
     places = [Path(str(folder)) for folder in _untyped.file_resolver()]
     for node in nodes:
-        for name in node.props.keys():  # noqa: SIM118 (no dict)
-            if isinstance(value := node.props[name], str):
-                refuse_special(resolved(value, places))
+        for value in _texts(node.props):
+            refuse_special(resolved(value, places))
     mi.parser.transform_all(config, state)
     return state
 
 
-def load(path: Path, defines: Mapping[str, str], allowed: Collection[str] = ()) -> Any:
+@dataclass(frozen=True)
+class SceneFiles:
+    """The files that a scene consists of: `xml`, its own first, and the others by their names in it."""
+
+    xml: tuple[Path, ...]
+    others: dict[str, Path]
+
+
+def files_of(path: Path, defines: Mapping[str, str]) -> SceneFiles:
+    """The files that a scene names and that are there, in the present variant. Errors: those of `parse`."""
+    config = mi.parser.ParserConfig(str(mi.variant()))
+    with folders(path.parent) as inside:
+        walk = check_files(path, map(Path, map(str, inside)), defines)
+        state = parse(path, config, defines)
+        places = [path.parent, *(Path(str(folder)) for folder in inside)]
+        named = {name: resolved(name, places) for node in state.nodes for name in _texts(node.props)}
+    others = {name: file for name, file in (walk.opened | named).items() if name and file.is_file()}
+    return SceneFiles(tuple(dict.fromkeys(walk.xml)), dict(sorted(others.items())))
+
+
+def _texts(props: Any) -> Iterator[str]:
+    """The values of a plugin's parameters that are strings."""
+    for name in props.keys():  # noqa: SIM118 (no dict)
+        if isinstance(value := props[name], str):
+            yield value
+
+
+def load(
+    path: Path, defines: Mapping[str, str], allowed: Collection[str] = (), moved: Mapping[str, str] | None = None
+) -> Any:
     """Load a scene file in the present variant, so that the same seed gives the same image.
 
     `defines` replace its `<default>`s; `allowed`: names of plugins beside Mitsuba's and ours, which are found where
-    Mitsuba looks, in the folder of the scene among others. Errors: those of `parse`, and ValueError for other plugins.
+    Mitsuba looks, in the folder of the scene among others; `moved`: where files are now, by their names in the scene.
+    Errors: those of `parse`, and ValueError for other plugins.
     """
     config = mi.parser.ParserConfig(str(mi.variant()))
     # Mitsuba orders merged meshes by address, and what it loads in parallel by thread. Emitters are in the same order,
@@ -90,6 +120,10 @@ def load(path: Path, defines: Mapping[str, str], allowed: Collection[str] = ()) 
         state = parse(path, config, defines)
         check_plugins(path, (node.props.plugin_name() for node in state.nodes), allowed)
         _check_needed(path, (node.props for node in state.nodes))
+        for node in state.nodes if moved else ():
+            for name in node.props.keys():  # noqa: SIM118 (no dict)
+                if isinstance(value := node.props[name], str) and value in moved:
+                    node.props[name] = moved[value]
         inside.prepend(str(own_folder()))  # before every <path>
         places = [path.parent, *(Path(str(folder)) for folder in inside)]
         for check, plugins in ((check_faces, ("ply",)), (_check_image, ("bitmap", "envmap"))):

@@ -1,0 +1,139 @@
+"""What a render has so far, in a file beside its output: a render that was ended goes on from it, with the same bits.
+
+The file is an uncompressed `.npz`, whose checksums tell a truncated or damaged one. It holds the sums of every level of
+the tree of passes, and as JSON what is rendered.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_refract.io.atomic import replacing
+
+from .pass_sums import PassSums, PassTree
+
+FORMAT = 1
+PASS = "samples of a pass"  # of the identity: a render may go on with passes of another size
+_ARRAYS = ("total", "between", "within")
+
+
+@dataclass
+class Progress:
+    """A render so far: `base` is an older image that it goes on from; `passes` counts the base's as well."""
+
+    identity: dict[str, Any]
+    tree: PassTree = field(default_factory=PassTree)
+    base: PassSums | None = None
+    rest: PassSums | None = None  # the last pass, where it has fewer samples than the others
+    seconds: float = 0.0
+    machines: list[str] = field(default_factory=list)
+
+    @property
+    def first(self) -> int:
+        """The number of the first pass of the tree."""
+        return self.base.passes if self.base else 0
+
+    @property
+    def passes(self) -> int:
+        """Passes that are done."""
+        return self.first + self.tree.passes + (self.rest is not None)
+
+    @property
+    def done(self) -> int:
+        """Samples per pixel that are done."""
+        return sum(each.spp for each in (self.base, *self.tree.levels, self.rest) if each is not None)
+
+    def sums(self) -> PassSums | None:
+        """The sums of all that is done; None where that is nothing."""
+        found = self.base.copy() if self.base else None
+        for each in (self.tree.sums(), self.rest):
+            if each is not None and found is not None:
+                found.add(each)
+            elif each is not None:
+                found = each.copy()
+        return found
+
+
+def path_of(output: Path) -> Path:
+    """The checkpoint of a render into this file."""
+    return output.with_name(f"{output.name}.checkpoint")
+
+
+def write(path: Path, progress: Progress) -> None:
+    """Replace the file, complete or not at all. OSError as the system raises it; the old one stays then."""
+    nodes = {"base": progress.base} | {f"level{i}": sums for i, sums in enumerate(progress.tree.levels)}
+    header = {
+        "format": FORMAT,
+        "identity": progress.identity,
+        "passes": progress.tree.passes,
+        "counts": progress.tree.counts,
+        "seconds": progress.seconds,
+        "machines": progress.machines,
+        "nodes": {name: _figures(sums) for name, sums in nodes.items() if sums is not None},
+    }
+    arrays = {"header": np.frombuffer(json.dumps(header).encode(), np.uint8)}
+    for name, sums in nodes.items():
+        for kind in _ARRAYS if sums is not None else ():
+            if (array := getattr(sums, kind)) is not None:
+                arrays[f"{name}.{kind}"] = array
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+
+
+def _figures(sums: PassSums) -> dict[str, Any]:
+    return {"spp": sums.spp, "passes": sums.passes, "contrasts": sums.contrasts, "colours": sums.colours}
+
+
+def read(path: Path, identity: dict[str, Any]) -> Progress:
+    """The render that a file holds. ValueError, one line, for a damaged file, and for one of another render."""
+    again = "accepted: the same render, or --restart, which begins anew"
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            header = json.loads(bytes(file["header"]))
+            if header["format"] != FORMAT:
+                raise ValueError(f"format {header['format']}")
+            if different := changed(apart_from_passes(header["identity"]), identity):
+                raise ValueError(f"{path}: of another render: {different}; {again}")
+            nodes = {
+                name: PassSums(**figures, **{k: file[f"{name}.{k}"] for k in _ARRAYS if f"{name}.{k}" in file})
+                for name, figures in header["nodes"].items()
+            }
+            tree = PassTree()
+            tree.passes, tree.counts = header["passes"], header["counts"]
+            tree.levels = [nodes.get(f"level{i}") for i in range(len(tree.counts))]
+            return Progress(
+                header["identity"], tree, nodes.get("base"), None, float(header["seconds"]), [str(m) for m in header["machines"]]
+            )
+    except ValueError as error:
+        if again in str(error):
+            raise
+        raise _damaged(path, error) from None
+    except (zipfile.BadZipFile, KeyError, TypeError, EOFError, AttributeError) as error:
+        raise _damaged(path, error) from None
+
+
+def _damaged(path: Path, error: Exception) -> ValueError:
+    return ValueError(
+        f"{path}: is no complete checkpoint ({type(error).__name__}); accepted: one that is, or --restart, which begins anew"
+    )
+
+
+def apart_from_passes(identity: dict[str, Any]) -> dict[str, Any]:
+    """What must be the same in a render that goes on."""
+    return {name: value for name, value in identity.items() if name != PASS}
+
+
+def changed(before: dict[str, Any], now: dict[str, Any]) -> str:
+    """What is different, by name; "" where nothing is."""
+    found = []
+    for name in {**before, **now}:
+        if before.get(name) != now.get(name):
+            long = name == "scene"
+            found.append(f"the {name} has changed" if long else f"{name} was {before.get(name)}, is {now.get(name)}")
+    return ", ".join(found)

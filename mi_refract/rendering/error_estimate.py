@@ -1,0 +1,77 @@
+"""The error of a render as its own passes tell it: the RMSE over all pixels, relative to the image's mean.
+
+    relative error = √(s²/n) / |mean|,    s²: variance of one sample, averaged over pixels and colours; n: spp
+
+s² is the mean of m independent contrasts between passes (`PassSums.contrasts`), and the squared error of this image is
+one more quantity of their distribution. So with 95 % probability it lies within  s² ± t s_c √(1 + 1/m),  s_c their
+standard deviation, as far as passes are normally distributed: what no sample has met yet is in no estimate.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from .pass_sums import Doubles, PassSums
+
+LEVEL = 0.95
+TILE = 16  # pixels
+LEFT_OUT = 0.01  # share of the tiles that may be worse
+DARK = 0.01  # of the image's mean: a darker tile is judged as if it were so bright
+
+
+@dataclass(frozen=True)
+class RelativeError:
+    """The estimate, and where the error of this image lies with probability LEVEL; NaN where too little is known."""
+
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+
+
+def relative_error(sums: PassSums) -> RelativeError:
+    """The error of an image over all its pixels that are finite."""
+    colours = sums.total[..., : sums.colours] / sums.spp
+    known = np.isfinite(colours)
+    mean = abs(float(colours[known].mean())) if known.any() else math.nan
+    found = np.asarray([each for each in sums.contrasts if math.isfinite(each)])
+    if not found.size or not mean > 0:
+        return RelativeError(math.nan)
+    squared, spread = float(found.mean()), math.nan
+    if found.size > 1:
+        spread = _quantile(found.size - 1) * float(found.std(ddof=1)) * math.sqrt(1 + 1 / found.size)
+    value, low, high = (math.sqrt(max(x, 0) / sums.spp) / mean for x in (squared, squared - spread, squared + spread))
+    return RelativeError(value, low, high)
+
+
+def _quantile(freedom: int) -> float:
+    from scipy.stats import t  # a second to import, and an extra
+
+    return float(t.ppf((1 + LEVEL) / 2, freedom))
+
+
+def worst_tile(sums: PassSums) -> float:
+    """The relative error of the worst tile of TILE² pixels but LEFT_OUT of them; NaN where too little is known."""
+    variance = sums.variance
+    if variance is None:
+        return math.nan
+    squared = _tile_means(variance[..., : sums.colours] / sums.spp)
+    means = np.abs(_tile_means(sums.total[..., : sums.colours] / sums.spp))
+    if not (size := float(np.nanmean(means)) if np.isfinite(means).any() else 0.0) > 0:
+        return math.nan
+    return float(np.nanquantile(np.sqrt(squared) / np.maximum(means, DARK * size), 1 - LEFT_OUT, method="higher"))
+
+
+def _tile_means(values: Doubles) -> Doubles:
+    """Means over tiles and channels, of what is finite; NaN for a tile where nothing is."""
+    known = np.isfinite(values)
+    rows, columns = (np.arange(0, n, TILE) for n in values.shape[:2])
+
+    def over_tiles(each: Doubles) -> Doubles:
+        return np.asarray(np.add.reduceat(np.add.reduceat(each.sum(-1), rows, 0), columns, 1))
+
+    counts = over_tiles(known.astype(np.float64))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(over_tiles(np.where(known, values, 0)) / counts)

@@ -1,0 +1,336 @@
+"""A render in passes: from where it was left, until it has what was asked for.
+
+    for each node of passes:  render it, add it to the tree, keep a checkpoint;  at 8, 12, 16, 24 … passes: look at the error
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from mi_refract import backend
+from mi_refract.io import lock
+from mi_refract.io.atomic import writable
+from mi_refract.io.image_file import SUFFIXES, Metadata
+from mi_refract.io.provenance import installed_version, provenance
+from mi_refract.plugins import scene_parser
+
+from . import checkpoint, rendered_file
+from .checkpoint import PASS, Progress
+from .error_estimate import RelativeError, relative_error, worst_tile
+from .pass_plan import PassPlan, next_stop, plan_passes
+from .pass_sums import PassSums
+from .render_pass import PassRenderer, pass_renderer
+from .scene_files import formulas_in, load_scene
+
+BETWEEN_CHECKPOINTS = 20.0  # seconds: with the pass that a kill interrupts at most 30 are lost, if a pass takes up to 10
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is rendered: the scene in a file, in the present variant, with its first sensor.
+
+    `defines`: values of its `<default>`s. `allow_plugins`: names of plugins that it may bring, which are code.
+    """
+
+    scene: Path
+    defines: Mapping[str, str] = field(default_factory=dict)
+    seed: int = 0
+    allow_plugins: Collection[str] = ()
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What ends a render: the first of these that is reached. `until`, `until_tile`: relative errors; `seconds`: of this run.
+
+    `spp`: samples per pixel; None: as the scene says, where nothing else ends the render. `pass_spp`: those of a pass.
+    """
+
+    spp: int | None = None
+    until: float | None = None
+    until_tile: float | None = None
+    seconds: float | None = None
+    pass_spp: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("spp", "pass_spp"):
+            if (value := getattr(self, name)) is not None and not 1 <= value < 2**32:
+                raise ValueError(f"{name} = {value}: accepted: a whole number from 1 to 2³² − 1")
+        for name in ("until", "until_tile"):
+            if (value := getattr(self, name)) is not None and not 0 < value <= 1:
+                raise ValueError(f"{name} = {value:g}: accepted: more than 0 %, up to 100 %")
+        if self.seconds is not None and not 0 < self.seconds < float("inf"):
+            raise ValueError(f"time = {self.seconds:g} s: accepted: more than 0")
+
+    @property
+    def open_ended(self) -> bool:
+        """Whether something else than a number of samples ends the render."""
+        return any(limit is not None for limit in (self.until, self.until_tile, self.seconds))
+
+
+UNLIMITED = Limits()
+
+
+class Passes(Protocol):
+    """Who renders passes."""
+
+    def nodes(self, first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
+        """Level, sums and machine of nodes that make up the passes from `first` to `stop`, in their order.
+
+        Passes up to `last` may be begun, as they will probably be asked for next. `offset`: added to their numbers for
+        their seeds. `spp`: samples per pixel of each.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class ThisProcess:
+    """Renders passes here, one after the other."""
+
+    renderer: PassRenderer
+
+    def nodes(self, first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
+        """Each pass by itself."""
+        for number in range(first, stop):
+            yield 0, self.renderer.render(offset + number, spp), os.uname().nodename
+
+
+class LongRender:
+    """A job, its limits, and what there is of it: nothing, a checkpoint, or a finished image to go on from."""
+
+    def __init__(
+        self, job: Job, output: str | os.PathLike[str], limits: Limits = UNLIMITED, *, restart: bool = False
+    ) -> None:
+        """Load the scene and look for what there is; with `restart` nothing of it counts.
+
+        ValueError or OSError in one line: what can be known before the first pass.
+        """
+        self.job, self.limits, self.output = job, limits, writable(output, SUFFIXES)
+        if not 0 <= job.seed < 2**32:
+            raise ValueError(f"seed = {job.seed}: accepted: a whole number from 0 to 2³² − 1")
+        self.checkpoint = checkpoint.path_of(self.output)
+        self.scene = load_scene(job.scene, job.defines, job.allow_plugins)
+        self.renderer = pass_renderer(self.scene, job.seed)
+        self.spp = limits.spp
+        if self.spp is None and not limits.open_ended:
+            self.spp = int(self.scene.sensors()[0].sampler().sample_count())
+        self.progress = self._found(_identity(job, self.renderer), restart)
+        self.plan = self._plan()
+        self.progress.identity[PASS] = self.plan.spp
+        self.ended_by = ""
+        self.warnings: list[str] = []
+        self._state = threading.Lock()  # held where the progress changes or is written
+        self._last_kept = time.monotonic()
+        self._writer: threading.Thread | None = None
+
+    def _found(self, identity: dict[str, Any], restart: bool) -> Progress:
+        if restart:
+            return Progress(identity)
+        if self.checkpoint.exists():
+            return checkpoint.read(self.checkpoint, identity)
+        found = rendered_file.read(self.output, self.renderer.channels, identity)
+        enough = found is not None and (self.spp is None or found.done <= self.spp)
+        return found if found is not None and enough else Progress(identity)
+
+    def _plan(self) -> PassPlan:
+        """The passes that follow those of the base; of the size that a checkpoint's passes have."""
+        width, height = self.renderer.size
+        recorded, asked = self.progress.identity.get(PASS), self.limits.pass_spp
+        if self.progress.tree.passes and asked not in (None, recorded):
+            raise ValueError(f"{self.checkpoint}: passes of {recorded} samples per pixel; accepted: those, or --restart")
+        begun = recorded if self.progress.tree.passes else None
+        base = self.progress.base.spp if self.progress.base else 0
+        total = None if self.spp is None else max(0, self.spp - base)
+        return plan_passes(
+            width * height, total, begun or asked, self.renderer.accepted, moments=self.renderer.moments
+        )
+
+    # Rendering --------------------------------------------------------------------------------------------------------
+
+    def run(
+        self, watch: Callable[[LongRender], None] = lambda render: None, passes: Passes | None = None
+    ) -> Metadata:
+        """Render what is left and write the image; its header. `watch` is called after every node of passes.
+
+        `passes`: who renders them, else this process. On any error what is done is kept in the checkpoint.
+        """
+        with lock.held(lock_of(self.output), "a render", self.output, "another file"):
+            began = time.monotonic()
+            source = passes or ThisProcess(self.renderer)
+            try:
+                while not self.ended_by:
+                    self._advance(source, began, watch)
+                return self._finish()
+            except BaseException:
+                self.keep()
+                raise
+
+    def _advance(self, source: Passes, began: float, watch: Callable[[LongRender], None]) -> None:
+        """Render up to where the next look is due, and say in `ended_by` what ends the render, if anything."""
+        tree, full, before = self.progress.tree, self.plan.full_passes, time.monotonic()
+        first, last = tree.passes, full if full is not None else next_stop(next_stop(tree.passes))
+        stop = min(self._next_look(first), last)
+        for level, sums, machine in source.nodes(first, stop, last, self.progress.first, self.plan.spp):
+            with self._state:
+                tree.add(sums, level)
+                self.progress.seconds += time.monotonic() - before
+                self.progress.machines = sorted({*self.progress.machines, machine})
+            before = time.monotonic()
+            watch(self)
+            self._keep_sometimes()
+            if self.limits.seconds is not None and time.monotonic() - began >= self.limits.seconds:
+                self.ended_by = f"--time {self.limits.seconds:g} s"
+                return
+        if first == 0 and tree.passes == 1 and self._without_noise():
+            self.ended_by = "no noise: the samples of every pixel agree"
+        elif (passes := tree.passes) and next_stop(passes - 1) == passes and (reason := self._good_enough()):
+            self.ended_by = reason
+        elif tree.passes == full:
+            self._render_rest(source)
+            self.ended_by = f"{self.progress.done} spp"
+            watch(self)
+
+    def _next_look(self, passes: int) -> int:
+        return 1 if passes == 0 and self.renderer.moments and not self.progress.base else next_stop(passes)
+
+    def _render_rest(self, source: Passes) -> None:
+        """The last pass, where it has fewer samples than the others."""
+        if rest := self.plan.rest:
+            before, number = time.monotonic(), self.plan.full_passes or 0
+            [(_, sums, machine)] = source.nodes(number, number + 1, number + 1, self.progress.first, rest)
+            with self._state:
+                self.progress.rest = sums
+                self.progress.machines = sorted({*self.progress.machines, machine})
+                self.progress.seconds += time.monotonic() - before
+
+    def _without_noise(self) -> bool:
+        """Whether all samples of each pixel are the same, and none is black: there light may be that is seldom met."""
+        sums = self.progress.sums()
+        if sums is None or sums.within is None or sums.spp < 2 or sums.within.any():
+            return False
+        return bool((np.isfinite(sums.total) & (sums.total != 0)).all())
+
+    def _good_enough(self) -> str:
+        """What error is reached that was asked for; "" where none is."""
+        sums = self.progress.sums() if self.limits.until or self.limits.until_tile else None
+        if sums and self.limits.until and (error := relative_error(sums)).high <= self.limits.until:
+            return f"--until {self.limits.until:.3g}: the error is {error.value:.3g}, at most {error.high:.3g}"
+        if sums and self.limits.until_tile and (worst := worst_tile(sums)) <= self.limits.until_tile:
+            return f"--until-tile {self.limits.until_tile:.3g}: the error of the worst tile is {worst:.3g}"
+        return ""
+
+    def error(self) -> RelativeError | None:
+        """The present error; None where nothing is done yet."""
+        with self._state:
+            sums = self.progress.sums()
+        return None if sums is None else relative_error(sums)
+
+    def image(self) -> np.ndarray | None:
+        """The image so far, H × W × channels; None where nothing is done yet."""
+        with self._state:
+            sums = self.progress.sums()
+        return None if sums is None else sums.mean
+
+    def _finish(self) -> Metadata:
+        self._wait()
+        formulas = ", ".join(formulas_in(self.scene)) or "none"
+        header = rendered_file.write(self.output, self.renderer.channels, self.progress, _metadata(self.job, formulas))
+        self.checkpoint.unlink(missing_ok=True)
+        return header
+
+    # Checkpoints ------------------------------------------------------------------------------------------------------
+
+    def keep(self) -> None:
+        """Write a checkpoint of what is done, if anything is. A failure is a warning: the render goes on without."""
+        with self._state:
+            if not self.progress.tree.passes:
+                return
+            try:
+                checkpoint.write(self.checkpoint, self.progress)
+            except OSError as error:
+                self.warnings.append(f"{self.checkpoint}: no checkpoint: {error.strerror or error}; tried again later")
+
+    def give_up(self) -> None:
+        """For a process that is about to end: keep what is done, and leave no lock."""
+        self.keep()
+        lock_of(self.output).unlink(missing_ok=True)
+
+    def _keep_sometimes(self) -> None:
+        """Write a checkpoint beside the next pass, if the last one is old."""
+        self._wait()
+        if time.monotonic() - self._last_kept >= BETWEEN_CHECKPOINTS:
+            self._last_kept = time.monotonic()
+            self._writer = threading.Thread(target=self.keep, name="checkpoint")
+            self._writer.start()
+
+    def _wait(self) -> None:
+        if self._writer is not None:
+            self._writer.join()
+            self._writer = None
+
+
+def render_to_exr(
+    scene: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    defines: Mapping[str, str] | None = None,
+    spp: int | None = None,
+    seed: int = 0,
+    allow_plugins: Collection[str] = (),
+) -> Metadata:
+    """Render a scene file from its first pass on, and return the header of the EXR file.
+
+    `defines`: values for the scene's `<default>`s. `spp`: samples per pixel; None: what the scene says.
+    `allow_plugins`: names of plugins that the scene may bring, which are code. ValueError or OSError in one line,
+    before the rendering where possible; InterruptedError for a rendering that was cut short. No file is written then.
+    """
+    job = Job(Path(scene), dict(defines or {}), seed, allow_plugins)
+    return LongRender(job, output, Limits(spp=spp), restart=True).run()
+
+
+def lock_of(output: Path) -> Path:
+    """The lock of a render into this file."""
+    return output.with_name(f".{output.name}.lock")
+
+
+def _identity(job: Job, renderer: PassRenderer) -> dict[str, Any]:
+    """All that the bits of a render depend on, by names for messages; of what is to be the size of a pass see PASS."""
+    import mitsuba as mi
+
+    files = scene_parser.files_of(job.scene, job.defines)
+    digest = hashlib.sha256()
+    for name, path in [("", each) for each in files.xml] + list(files.others.items()):
+        digest.update(json.dumps([name, hashlib.sha256(path.read_bytes()).hexdigest()]).encode())
+    width, height = renderer.size
+    llvm = "llvm" in str(mi.variant())
+    return {
+        "scene": digest.hexdigest(),
+        "defines": dict(job.defines),
+        "seed": job.seed,
+        "variant": str(mi.variant()),
+        "film": f"{width} × {height} {', '.join(renderer.channels)}",
+        "colours": renderer.colours,
+        **{f"version of {name}": installed_version(name) for name in ("mi_refract", "mitsuba", "drjit")},
+        "libLLVM": backend.llvm().library if llvm else "none",
+    }
+
+
+def _metadata(job: Job, formulas: str) -> Metadata:
+    import mitsuba as mi
+
+    return provenance() | {
+        "mi_refract:variant": str(mi.variant()),
+        "mi_refract:seed": job.seed,
+        "mi_refract:scene": str(job.scene),
+        "mi_refract:defines": json.dumps(dict(job.defines), sort_keys=True),
+        "mi_refract:formulas": formulas,
+    }

@@ -1,0 +1,89 @@
+"""How a render is cut into passes, and which seed each of them has. It depends on the film and on the samples asked for.
+
+    seed(s, p) = s ⊕ mix(p),    mix: the finaliser of MurmurHash3 on 32 bits, a bijection with mix(0) = 0
+
+For one s all passes have different seeds, for one p all s have; and pass 0 has the seed that was given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+LANES = 2**24  # samples of a pass, at most, unless one sample per pixel is more
+# A pass costs about 10 ms beside its samples, and its sums the time of a quarter of a sample in every pixel.
+LEAST_LANES, LEAST_SPP = 2**20, 8
+FEW = 8  # passes: with fewer the spread between them says little
+MASK = 2**32 - 1
+
+
+def seed_of(seed: int, number: int) -> int:
+    """The seed of pass `number` of a render with this seed, both from 0 to 2³² − 1."""
+    x = number & MASK
+    for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
+        x = (x ^ x >> shift) * factor & MASK
+    return seed ^ x ^ x >> 16
+
+
+def usual_spp(pixels: int) -> int:
+    """Samples per pixel of a pass over so many pixels: a power of two, and no more than LANES samples in all."""
+    wanted = min(max(LEAST_SPP, LEAST_LANES // pixels), LANES // pixels)
+    return 1 << max(0, wanted.bit_length() - 1)
+
+
+@dataclass(frozen=True)
+class PassPlan:
+    """Passes of `spp` samples per pixel each, and a last one of fewer where `total` is no multiple.
+
+    `total`: samples per pixel in all; None where another limit ends the render.
+    """
+
+    spp: int
+    total: int | None
+
+    @property
+    def full_passes(self) -> int | None:
+        """How many passes have `spp` samples; None where that is not known before."""
+        return None if self.total is None else self.total // self.spp
+
+    @property
+    def passes(self) -> int | None:
+        """How many passes there are; None where that is not known before."""
+        return None if self.total is None else -(-self.total // self.spp)
+
+    @property
+    def rest(self) -> int:
+        """Samples per pixel of the last pass, where it has fewer; else 0."""
+        return 0 if self.total is None else self.total % self.spp
+
+
+def plan_passes(
+    pixels: int, total: int | None, asked: int | None, accepted: Callable[[int], int], *, moments: bool
+) -> PassPlan:
+    """The passes of a render.
+
+    `asked`: samples per pixel of a pass, where the user says. `accepted`: what a sampler makes of a number of samples,
+    which it may round up. `moments`: whether second moments within a pass are known. Where they are not, a render of
+    few samples is cut into FEW passes, for their spread. ValueError for a pass that the sampler does not take.
+    """
+    spp = asked or usual_spp(pixels)
+    if asked and accepted(asked) != asked:
+        raise ValueError(f"{asked} samples per pixel in a pass; accepted by the sampler: {accepted(asked)}")
+    if total and not asked:
+        spp = spp if moments else min(spp, max(1, total // FEW))
+    while accepted(spp) != spp:  # one sample is always accepted
+        spp -= 1
+    if total and (rest := total % spp):
+        total += accepted(rest) - rest
+    return PassPlan(spp, total)
+
+
+def next_stop(passes: int) -> int:
+    """The first of 8, 12, 16, 24, 32, 48 … passes that is more than `passes`: where an estimated error may end a render.
+
+    The fewer looks at an estimate, the less its chance: what is stopped where it first falls short is too good.
+    """
+    stop = FEW
+    while stop <= passes:
+        stop = stop * 3 // 2 if stop & (stop - 1) == 0 else stop // 3 * 4
+    return stop
