@@ -38,8 +38,8 @@ def end_at_once(*, even_if_ignored: bool, also: Collection[signal.Signals] = ())
     waited = _signals - (_SIGINT if ignored and not even_if_ignored else set())
     if not waited:
         return
-    for each in waited:
-        signal.signal(each, signal.default_int_handler)  # macOS does not queue what is ignored
+    for each in waited:  # macOS does not queue what is ignored
+        signal.signal(each, signal.default_int_handler if each == signal.SIGINT else _exit)
     threading.Thread(target=_watch, args=(atomic.end_process, waited), name="Ctrl-C", daemon=True).start()
 
 
@@ -70,6 +70,11 @@ def as_exceptions() -> Iterator[None]:
     finally:
         _unblocked.clear()
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _exit(number: int, frame: object) -> NoReturn:
+    """For a thread that was there before, and has the signal unblocked."""
+    raise SystemExit(128 + number)
 
 
 def _watch(end_process: Callable[[int], NoReturn], signals: Collection[signal.Signals]) -> None:

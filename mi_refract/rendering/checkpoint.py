@@ -94,7 +94,7 @@ def read(path: Path, identity: dict[str, Any]) -> Progress:
     """The render that a file holds. ValueError, one line, for a damaged file, and for one of another render."""
     again = "accepted: the same render, or --restart, which begins anew"
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             header = json.loads(bytes(file["header"]))
             if header["format"] != FORMAT:
                 raise ValueError(f"format {header['format']}")

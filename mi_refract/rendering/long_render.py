@@ -11,7 +11,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -27,7 +27,7 @@ from mi_refract.plugins import scene_parser
 from . import checkpoint, rendered_file
 from .checkpoint import PASS, Progress
 from .error_estimate import RelativeError, relative_error, worst_tile
-from .pass_plan import PassPlan, next_stop, plan_passes
+from .pass_plan import FEW, PassPlan, next_stop, plan_passes
 from .pass_sums import PassSums
 from .render_pass import PassRenderer, pass_renderer
 from .scene_files import formulas_in, load_scene
@@ -125,6 +125,7 @@ class LongRender:
             self.spp = int(self.scene.sensors()[0].sampler().sample_count())
         self.progress = self._found(_identity(job, self.renderer), restart)
         self.plan = self._plan()
+        self.renderer = replace(self.renderer, few=self._may_have_few_passes())
         self.progress.identity[PASS] = self.plan.spp
         self.ended_by = ""
         self.warnings: list[str] = []
@@ -153,6 +154,10 @@ class LongRender:
         return plan_passes(
             width * height, total, begun or asked, self.renderer.accepted, moments=self.renderer.moments
         )
+
+    def _may_have_few_passes(self) -> bool:
+        passes = self.plan.passes
+        return self.limits.seconds is not None or (passes is not None and self.progress.first + passes < FEW)
 
     # Rendering --------------------------------------------------------------------------------------------------------
 

@@ -31,6 +31,7 @@ class PassRenderer:
     seed: int
     channels: tuple[str, ...]
     moments: bool  # whether samples can be kept: then second moments are known, too
+    few: bool = True  # whether they are needed of more than the first pass
 
     @property
     def size(self) -> tuple[int, int]:
@@ -55,7 +56,7 @@ class PassRenderer:
         seed = seed_of(self.seed, number)
         with _quiet():
             if self.moments:
-                mean, within = _pixels(self.scene, self.channels, spp, seed, squares=number < FEW - 1)
+                mean, within = _pixels(self.scene, self.channels, spp, seed, squares=number == 0 or (self.few and number < FEW - 1))
             else:
                 mean, within = _rendered(self.scene, spp, seed), None
         if self.scene.integrator().should_stop():
@@ -100,7 +101,8 @@ def _rendered(scene: Any, spp: int, seed: int) -> np.ndarray:
     if one:
         dr.set_thread_count(1)
     try:
-        return np.array(mi.render(scene, spp=spp, seed=seed))
+        mi.render(scene, spp=spp, seed=seed)
+        return np.array(scene.sensors()[0].film().bitmap())  # what `aov` returns has fewer channels
     finally:
         if one:
             dr.set_thread_count(threads)
@@ -111,18 +113,19 @@ def _rendered(scene: Any, spp: int, seed: int) -> np.ndarray:
 
 def _pixels(scene: Any, channels: tuple[str, ...], spp: int, seed: int, *, squares: bool) -> tuple[Any, Any]:
     """Means of all pixels and, for `squares`, Σ (v − mean)² over their samples, H × W × C."""
-    film = scene.sensors()[0].film()
+    sensors_film = scene.sensors()[0].film()
+    rfilter = sensors_film.rfilter()
+    width, height = (int(n) for n in sensors_film.crop_size())
+    film = _Film(width, height, spp, None if rfilter.is_box_filter() else rfilter)
     with dr.suspend_grad():
         values, place = _samples(scene, channels, spp, seed)
-        totals, weights = _film_sums(values, place, film, spp)
-        means = [mi.Float(total / weights) for total in totals]
+        means, weights = _weighted_means(values, place, film)
         dr.eval(means)
-        spreads = _film_sums(values, place, film, spp, means)[0] if squares else []
+        spreads = _squared_sums(values, place, means, film) if squares else []
         within = [spread * dr.square(spp / weights) for spread in spreads]
         dr.eval(within)
-    width, height = film.crop_size()
     mean, spread = (np.stack([np.array(v) for v in each], -1) if each else None for each in (means, within))
-    shape = (int(height), int(width), len(channels))
+    shape = (height, width, len(channels))
     return mean.reshape(shape), None if spread is None else spread.reshape(shape)
 
 
@@ -162,53 +165,111 @@ def _colours(channels: tuple[str, ...], radiance: Any, wavelengths: Any) -> list
     return [mi.luminance(rgb)]
 
 
-def _film_sums(values: list[Any], place: Any, film: Any, spp: int, means: list[Any] | None = None) -> tuple[Any, Any]:
-    """Of every pixel Σ w v by channels, or with `means` Σ w² (v − mean)², and Σ w, over the samples that reach it.
+class _Film:
+    """Pixels, one lane each, and the filter by which samples reach those around their own; None: they do not.
 
-    One lane sums a pixel, always in the same order.
+    No dataclass: Dr.Jit would take it for a part of a loop's state.
     """
-    width, height = (int(n) for n in film.crop_size())
-    rfilter = film.rfilter()
-    if rfilter.is_box_filter():
-        rfilter, reach = None, 0
-    else:
-        reach = math.ceil(rfilter.radius() - 0.5)  # pixels
-    pixel = dr.arange(mi.Int32, width * height)
-    size = mi.Point2i(dr.opaque(mi.Int32, width), dr.opaque(mi.Int32, height))
-    y = pixel // size.x
-    return _sum_of_lanes(values, place, means, mi.Point2i(pixel - y * size.x, y), size, reach, spp, rfilter)
+
+    def __init__(self, width: int, height: int, spp: int, rfilter: Any) -> None:
+        self.width, self.height, self.spp, self.rfilter = width, height, spp, rfilter
+
+    @property
+    def reach(self) -> int:
+        """To how many pixels on each side."""
+        return 0 if self.rfilter is None else math.ceil(self.rfilter.radius() - 0.5)
+
+    def pixels(self) -> tuple[Any, Any]:
+        """Their x and y."""
+        index, width = dr.arange(mi.Int32, self.width * self.height), dr.opaque(mi.Int32, self.width)
+        y = index // width
+        return index - y * width, y
+
+    def at(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Whether there is a pixel x, y, and its number."""
+        inside = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+        return inside, mi.UInt32(dr.select(inside, x + y * dr.opaque(mi.Int32, self.width), 0))
+
+    def weight(self, apart: Any) -> Any:
+        """Of a sample so far from the middle of a pixel, along one axis."""
+        near = dr.abs(apart) <= self.rfilter.radius()
+        return dr.select(near, self.rfilter.eval(apart), 0)
+
+
+def _weighted_means(values: list[Any], place: Any, film: _Film) -> tuple[list[Any], Any]:
+    """Of every pixel Σ w v / Σ w by channels, and Σ w, over the samples that reach it, always added in the same order.
+
+    For each row of neighbours every pixel adds up its own samples with the weights that they have in each of them.
+    """
+    x, y = film.pixels()
+    totals = [dr.zeros(mi.Float64, film.width * film.height) for _ in (*values, "weight")]
+    for j in range(-film.reach, film.reach + 1):
+        row = _own_samples(values, place, mi.Float(x), mi.Float(y) + dr.opaque(mi.Float, j), film)
+        dr.eval(row)
+        for i, sums in zip(range(-film.reach, film.reach + 1), row, strict=True):
+            inside, source = film.at(x - i, y - j)
+            totals = [t + dr.gather(mi.Float64, each, source, inside) for t, each in zip(totals, sums, strict=True)]
+        dr.eval(totals)
+    *sums, weights = totals
+    return [mi.Float(each / weights) for each in sums], weights
 
 
 @dr.syntax
-def _sum_of_lanes(values, place, means, pixel, size, reach, spp, rfilter):  # type: ignore[no-untyped-def]  # rewritten
-    spp = dr.opaque(mi.UInt32, spp)
+def _own_samples(values, place, x, y, film):  # type: ignore[no-untyped-def]  # Dr.Jit rewrites it
+    """Σ w v by channels, and Σ w, over the samples of each pixel, with their weights in the pixels of a row."""
+    spp = dr.opaque(mi.UInt32, film.spp)
+    first = dr.arange(mi.UInt32, film.width * film.height) * spp
+    row = [[mi.Float64(0) for _ in range(len(values) + 1)] for _ in range(2 * film.reach + 1)]
+    k = mi.UInt32(0)
+    while k < spp:
+        sample = [dr.gather(mi.Float, each, first + k) for each in values]
+        if dr.hint(film.rfilter is None, mode="scalar"):
+            for c in range(len(values)):
+                row[0][c] += mi.Float64(sample[c])
+            row[0][len(values)] += 1
+        else:
+            along = dr.gather(mi.Float, place.x, first + k) - (x + 0.5)
+            across = film.weight(dr.gather(mi.Float, place.y, first + k) - (y + 0.5))
+            for i in range(2 * film.reach + 1):
+                w = mi.Float64(across * film.weight(along - (i - film.reach)))
+                for c in range(len(values)):
+                    row[i][c] += w * mi.Float64(sample[c])
+                row[i][len(values)] += w
+        k += 1
+    return row
+
+
+@dr.syntax
+def _squared_sums(values, place, means, film):  # type: ignore[no-untyped-def]  # Dr.Jit rewrites it
+    """Of every pixel Σ (z − z̄)², by channels, of z = w (v − mean) over the samples that reach it.
+
+    z̄ is the mean over those that lie in one pixel: their number there is fixed, so that pixels are strata.
+    """
+    spp = dr.opaque(mi.UInt32, film.spp)
+    x, y = film.pixels()
+    means = [mi.Float64(mean) for mean in means]
     totals = [mi.Float64(0) for _ in values]
-    weights = mi.Float64(0)
-    j = mi.Int32(-reach)
-    while j <= reach:
-        i = mi.Int32(-reach)
-        while i <= reach:
-            x, y = pixel.x + i, pixel.y + j
-            inside = (x >= 0) & (x < size.x) & (y >= 0) & (y < size.y)
-            first = mi.UInt32(dr.select(inside, x + y * size.x, 0)) * spp
+    j = mi.Int32(-film.reach)
+    while j <= film.reach:
+        i = mi.Int32(-film.reach)
+        while i <= film.reach:
+            inside, source = film.at(x + i, y + j)
+            sums = [mi.Float64(0) for _ in values]
+            squares = [mi.Float64(0) for _ in values]
             k = mi.UInt32(0)
             while inside & (k < spp):
-                w = mi.Float64(1) if rfilter is None else _weight(rfilter, dr.gather(mi.Point2f, place, first + k), pixel)
+                w = mi.Float64(1)
+                if dr.hint(film.rfilter is not None, mode="scalar"):
+                    along = dr.gather(mi.Float, place.x, source * spp + k) - (mi.Float(x) + 0.5)
+                    across = dr.gather(mi.Float, place.y, source * spp + k) - (mi.Float(y) + 0.5)
+                    w = mi.Float64(film.weight(along) * film.weight(across))
                 for c in range(len(values)):
-                    value = mi.Float64(dr.gather(mi.Float, values[c], first + k))
-                    if dr.hint(means is None, mode="scalar"):
-                        totals[c] += w * value
-                    else:
-                        totals[c] += (w * (value - mi.Float64(means[c]))) ** 2
-                weights += w
+                    z = w * (mi.Float64(dr.gather(mi.Float, values[c], source * spp + k)) - means[c])
+                    sums[c] += z
+                    squares[c] += z * z
                 k += 1
+            for c in range(len(values)):
+                totals[c] += dr.maximum(squares[c] - sums[c] * sums[c] / mi.Float64(spp), 0)
             i += 1
         j += 1
-    return totals, weights
-
-
-def _weight(rfilter: Any, place: Any, pixel: Any) -> Any:
-    """The filter's weight in a pixel of a sample at `place`."""
-    apart = place - (mi.Point2f(pixel) + 0.5)
-    near = (dr.abs(apart.x) <= rfilter.radius()) & (dr.abs(apart.y) <= rfilter.radius())
-    return mi.Float64(dr.select(near, rfilter.eval(apart.x) * rfilter.eval(apart.y), 0))
+    return totals

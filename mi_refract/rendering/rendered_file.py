@@ -30,7 +30,7 @@ def write(output: Path, channels: tuple[str, ...], progress: Progress, metadata:
         "mi_refract:spp": sums.spp,
         "mi_refract:passes": sums.passes,
         "mi_refract:variance_freedom": sums.freedom,
-        "mi_refract:variance_from": "samples" if sums.within is not None else "passes" if sums.freedom else "nothing",
+        "mi_refract:variance_from": _source(sums),
         "mi_refract:nonfinite_pixels": nonfinite_pixels(sums),
         "mi_refract:identity": json.dumps(progress.identity, sort_keys=True),
         "mi_refract:render_seconds": progress.seconds,
@@ -39,6 +39,11 @@ def write(output: Path, channels: tuple[str, ...], progress: Progress, metadata:
     with np.errstate(over="ignore"):
         write_exr(output, np.concatenate(pixels, -1, dtype=np.float32, casting="same_kind"), names, header)
     return header
+
+
+def _source(sums: PassSums) -> str:
+    """What the variance was estimated from."""
+    return "nothing" if not sums.freedom else "passes" if sums.within is None else "samples"
 
 
 def nonfinite_pixels(sums: PassSums) -> int:

@@ -1,0 +1,419 @@
+"""Renders in passes from end to end: what ends them, what they go on from, and the same bits whatever happened."""
+
+from __future__ import annotations
+
+import errno
+import json
+import random
+import signal
+import time
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.processes import python
+from support.readme import python_blocks
+
+from mi_refract.io.image_file import read, read_exr
+from mi_refract.rendering import checkpoint, long_render, rendered_file
+from mi_refract.rendering.long_render import Job, Limits, LongRender, render_to_exr
+
+ROOT = Path(__file__).parents[2]
+SCENE, SMALL = ROOT / "scenes" / "nested.xml", {"res": "8"}
+BALL = ROOT / "scenes" / "sphere.xml"
+TIMES = ("mi_refract:render_seconds", "mi_refract:scene")
+
+
+pytestmark = pytest.mark.usefixtures("scalar_variant")
+
+
+@pytest.fixture
+def llvm(needs_variant):
+    needs_variant("llvm_ad_rgb")
+    mi.set_variant("llvm_ad_rgb")
+
+
+def rendering(output, seed=0, scene=BALL, defines=SMALL, restart=False, **limits):
+    return LongRender(Job(scene, defines, seed), output, Limits(**limits), restart=restart)
+
+
+def pixels(path):
+    return read_exr(path)[0]
+
+
+# The image and its header ---------------------------------------------------------------------------------------------
+
+
+def test_the_header_renders_the_same_image_again(tmp_path):
+    first = render_to_exr(SCENE, tmp_path / "a.exr", defines=SMALL, spp=2, seed=5)
+    again = {"spp": first["mi_refract:spp"], "seed": first["mi_refract:seed"]}
+    render_to_exr(first["mi_refract:scene"], tmp_path / "b.exr", defines=SMALL, **again)
+    (image, header), (same, _) = (read_exr(tmp_path / name) for name in ("a.exr", "b.exr"))
+    np.testing.assert_array_equal(image, same)
+    assert image.shape[:2] == (8, 8)
+    assert {name: header[name] for name in first if name not in TIMES} == {
+        name: value for name, value in first.items() if name not in TIMES
+    }
+
+
+WRONG = [
+    {"spp": 0},
+    {"spp": -1},
+    {"pass_spp": 0},
+    {"until": 0.0},
+    {"until": -0.1},
+    {"until": 1.01},
+    {"until": float("nan")},
+    {"until_tile": 2.0},
+    {"seconds": 0.0},
+    {"seconds": float("inf")},
+]
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=str)
+def test_wrong_limits(wrong):
+    with pytest.raises(ValueError, match="accepted: ") as error:
+        Limits(**wrong)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("wrong", [{"seed": -1}, {"seed": 2**32}, {"defines": {"config": "x"}}])
+def test_wrong_numbers_are_refused_before_the_rendering(tmp_path, monkeypatch, wrong):
+    monkeypatch.setattr(mi, "render", lambda *arguments, **named: pytest.fail("rendered"))
+    with pytest.raises(ValueError, match="accepted: ") as error:
+        render_to_exr(SCENE, tmp_path / "a.exr", **wrong)
+    assert "\n" not in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_variance_is_that_of_the_passes(tmp_path, llvm):
+    render = rendering(tmp_path / "a.exr", spp=60, pass_spp=4)
+    header = render.run()
+    image = read(tmp_path / "a.exr")
+    passes = np.array([render.renderer.render(p, 4).mean for p in range(15)])
+    names = ["R", "G", "B"]
+    np.testing.assert_allclose(image.select(names), passes.mean(0), rtol=1e-7)
+    found = image.select([f"{name}.variance" for name in names])
+    np.testing.assert_allclose(found, 4 * passes.var(0, ddof=1), rtol=1e-6, atol=1e-12)
+    assert (header["mi_refract:passes"], header["mi_refract:variance_freedom"]) == (15, 14)
+    assert header["mi_refract:variance_from"] == "passes"
+
+
+def test_few_passes_have_the_variance_of_their_samples(tmp_path, llvm):
+    header = rendering(tmp_path / "a.exr", spp=30, pass_spp=8).run()
+    assert (header["mi_refract:passes"], header["mi_refract:variance_freedom"]) == (4, 29)
+    assert header["mi_refract:variance_from"] == "samples"
+    few = read(tmp_path / "a.exr").select(["R.variance"])
+    rendering(tmp_path / "b.exr", spp=2048, pass_spp=16).run()
+    many = read(tmp_path / "b.exr").select(["R.variance"])
+    # 64 pixels of 29 degrees of freedom, of samples with kurtosis up to 20 or so: a standard error of about 10 %.
+    assert few.mean() == pytest.approx(many.mean(), rel=0.5)
+
+
+def test_one_sample_has_no_variance(tmp_path, llvm):
+    header = rendering(tmp_path / "a.exr", spp=1).run()
+    assert read(tmp_path / "a.exr").channels == ("R", "G", "B")
+    assert header["mi_refract:variance_from"] == "nothing"
+
+
+def test_a_scene_without_noise_needs_one_pass(tmp_path, llvm):
+    sky = '<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"><film type="hdrfilm">'
+    sky += '<integer name="width" value="8"/><integer name="height" value="8"/></film></sensor>{}</scene>'
+    (tmp_path / "light.xml").write_text(sky.format('<emitter type="constant"/>'))
+    (tmp_path / "dark.xml").write_text(sky.format(""))
+    found = {}
+    for name in ("light", "dark"):
+        render = rendering(tmp_path / f"{name}.exr", scene=tmp_path / f"{name}.xml", defines={}, spp=64, pass_spp=4)
+        found[name] = (render.run()["mi_refract:passes"], render.ended_by)
+    assert found["light"] == (1, "no noise: the samples of every pixel agree")
+    assert found["dark"] == (16, "64 spp")  # what no sample has met may be there
+
+
+def test_pixels_that_are_not_finite_are_counted(tmp_path, llvm, monkeypatch):
+    render = rendering(tmp_path / "a.exr", spp=64, pass_spp=4)
+    original = type(render.renderer).render
+
+    def broken(self, number, spp):
+        sums = original(self, number, spp)
+        if number == 5:
+            sums.total[2, 3] = np.nan
+        return sums
+
+    monkeypatch.setattr(type(render.renderer), "render", broken)
+    assert render.run()["mi_refract:nonfinite_pixels"] == 1
+    assert np.isnan(pixels(tmp_path / "a.exr")).any(-1).sum() == 1
+
+
+# What ends it ---------------------------------------------------------------------------------------------------------
+
+
+def test_it_ends_at_the_error_that_was_asked_for_and_only_at_a_look(tmp_path, llvm):
+    render = rendering(tmp_path / "a.exr", until=0.1, pass_spp=2)
+    header = render.run()
+    assert header["mi_refract:passes"] in (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
+    assert render.error().high <= 0.1 and "--until 0.1" in render.ended_by
+    assert rendering(tmp_path / "b.exr", until=0.1, spp=8, pass_spp=2).run()["mi_refract:spp"] == 8
+
+
+def test_it_ends_at_the_error_of_the_worst_tile(tmp_path, llvm):
+    render = rendering(tmp_path / "a.exr", until_tile=0.2, pass_spp=2)
+    render.run()
+    assert "--until-tile 0.2" in render.ended_by
+
+
+def test_it_ends_after_its_time(tmp_path, llvm):
+    render = rendering(tmp_path / "a.exr", seconds=0.2, pass_spp=1)
+    start = time.monotonic()
+    header = render.run()
+    assert 0.2 <= time.monotonic() - start < 20
+    assert render.ended_by == "--time 0.2 s"
+    expected = rendering(tmp_path / "b.exr", spp=header["mi_refract:spp"], pass_spp=1)
+    expected.run()
+    np.testing.assert_array_equal(pixels(tmp_path / "a.exr"), pixels(tmp_path / "b.exr"))
+
+
+# What it goes on from -------------------------------------------------------------------------------------------------
+
+
+class Stop(Exception):
+    pass
+
+
+def stopped_after(render, passes):
+    def watch(render):
+        if render.progress.passes == passes:
+            raise Stop
+
+    with pytest.raises(Stop):
+        render.run(watch)
+
+
+@pytest.mark.parametrize("passes", [1, 7, 8, 9, 20])
+def test_a_checkpoint_goes_on_with_the_same_bits(tmp_path, llvm, passes):
+    output = tmp_path / "a.exr"
+    stopped_after(rendering(output, spp=90, pass_spp=4), passes)
+    assert checkpoint.path_of(output).exists() and not output.exists()
+    render = rendering(output, spp=90, pass_spp=4)
+    assert render.progress.passes == passes
+    render.run()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+    rendering(tmp_path / "b.exr", spp=90, pass_spp=4).run()
+    np.testing.assert_array_equal(pixels(output), pixels(tmp_path / "b.exr"))
+
+
+def test_a_finished_image_goes_on(tmp_path, llvm):
+    output = tmp_path / "a.exr"
+    rendering(output, spp=32, pass_spp=4).run()
+    render = rendering(output, spp=64, pass_spp=4)
+    assert render.progress.done == 32
+    seen = []
+    header = render.run(lambda render: seen.append(render.progress.passes))
+    assert header["mi_refract:spp"] == 64 and seen[0] == 9 and seen[-1] == 16
+    rendering(tmp_path / "b.exr", spp=64, pass_spp=4).run()
+    # The same samples, but the first half by way of float32.
+    np.testing.assert_allclose(pixels(output)[..., :3], pixels(tmp_path / "b.exr")[..., :3], rtol=3e-7)
+
+
+def test_a_finished_image_has_nothing_left(tmp_path, llvm, monkeypatch):
+    output = tmp_path / "a.exr"
+    rendering(output, spp=32, pass_spp=4).run()
+    before = pixels(output)
+    render = rendering(output, spp=32, pass_spp=4)
+    monkeypatch.setattr(type(render.renderer), "render", lambda *arguments: pytest.fail("rendered"))
+    render.run()
+    np.testing.assert_array_equal(pixels(output), before)
+
+
+@pytest.mark.parametrize("other", [{"seed": 1}, {"spp": 16}, {"restart": True}], ids=str)
+def test_another_image_is_replaced(tmp_path, llvm, other):
+    output = tmp_path / "a.exr"
+    rendering(output, spp=32, pass_spp=4).run()
+    assert rendering(output, **{"spp": 64, "pass_spp": 4} | other).progress.done == 0
+
+
+def test_a_picture_of_somebody_else_is_no_start(tmp_path, llvm):
+    output = tmp_path / "a.exr"
+    output.write_bytes(b"no EXR")
+    assert rendering(output, spp=8).progress.done == 0
+    assert rendered_file.read(output, ("R", "G", "B"), {}) is None
+
+
+CHANGES = {
+    "seed": ({"seed": 1}, "seed was 0, is 1"),
+    "passes": ({"pass_spp": 8}, "passes of 4 samples per pixel"),
+}
+
+
+@pytest.mark.parametrize("other, said", CHANGES.values(), ids=CHANGES)
+def test_a_checkpoint_of_another_render_is_refused_by_name(tmp_path, llvm, other, said):
+    output = tmp_path / "a.exr"
+    stopped_after(rendering(output, spp=64, pass_spp=4), 3)
+    again = {"spp": 64, "pass_spp": 4} | other
+    with pytest.raises(ValueError, match=said) as error:
+        rendering(output, **again)
+    assert "--restart" in str(error.value) and "\n" not in str(error.value)
+    assert rendering(output, restart=True, **again).progress.passes == 0
+
+
+def test_a_changed_scene_variant_or_version_is_refused_by_name(tmp_path, llvm, monkeypatch):
+    scene, output = tmp_path / "scene.xml", tmp_path / "a.exr"
+    scene.write_text(BALL.read_text())
+    stopped_after(rendering(output, scene=scene, spp=64, pass_spp=4), 3)
+    scene.write_text(BALL.read_text().replace("30.5", "30.6"))
+    with pytest.raises(ValueError, match="the scene has changed"):
+        rendering(output, scene=scene, spp=64)
+    scene.write_text(BALL.read_text())
+    with monkeypatch.context() as patch:
+        patch.setattr(long_render, "installed_version", lambda name: "0")
+        with pytest.raises(ValueError, match=r"version of mitsuba was \S+, is 0"):
+            rendering(output, scene=scene, spp=64)
+    mi.set_variant("scalar_rgb")
+    with pytest.raises(ValueError, match="variant was llvm_ad_rgb, is scalar_rgb"):
+        rendering(output, scene=scene, spp=64)
+
+
+def test_a_file_that_the_scene_names_is_part_of_it(tmp_path, llvm):
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    for path in (SCENE.parent / "meshes").iterdir():
+        (meshes / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "scene.xml").write_text(SCENE.read_text())
+    output = tmp_path / "a.exr"
+    stopped_after(rendering(output, scene=tmp_path / "scene.xml", spp=64, pass_spp=4), 1)
+    mesh = next(meshes.glob("tumbler_air.ply"))
+    mesh.write_bytes(mesh.read_bytes().replace(b"comment", b"comment ", 1) + b"\n")
+    with pytest.raises(ValueError, match="the scene has changed"):
+        rendering(output, scene=tmp_path / "scene.xml", spp=64)
+
+
+@pytest.mark.parametrize("damage", ["truncated", "flipped", "empty", "text", "another format"])
+def test_a_damaged_checkpoint_is_refused(tmp_path, llvm, damage):
+    output = tmp_path / "a.exr"
+    stopped_after(rendering(output, spp=64, pass_spp=4), 3)
+    path = checkpoint.path_of(output)
+    content = path.read_bytes()
+    damaged = {
+        "truncated": content[:-100],
+        "flipped": content[:1500] + bytes([content[1500] ^ 1]) + content[1501:],
+        "empty": b"",
+        "text": b"hello",
+        "another format": content.replace(b'"format": 1', b'"format": 2'),
+    }
+    path.write_bytes(damaged[damage])
+    with pytest.raises(ValueError, match=r"a\.exr\.checkpoint: is no complete checkpoint .*--restart") as error:
+        rendering(output, spp=64, pass_spp=4)
+    assert "\n" not in str(error.value)
+
+
+# What goes wrong ------------------------------------------------------------------------------------------------------
+
+
+def test_two_renders_into_one_file(tmp_path, llvm):
+    first, second = rendering(tmp_path / "a.exr", spp=16, pass_spp=4), rendering(tmp_path / "a.exr", spp=16, pass_spp=4)
+    said = []
+
+    def watch(_):
+        with pytest.raises(BlockingIOError, match=r"a\.exr: a render runs there already, process \d+ .* another file"):
+            second.run()
+        said.append(True)
+
+    first.run(watch)
+    assert said
+
+
+def test_a_full_disk_at_a_checkpoint_is_a_warning(tmp_path, llvm, monkeypatch):
+    monkeypatch.setattr(long_render, "BETWEEN_CHECKPOINTS", 0.0)
+    write, failures = checkpoint.write, []
+
+    def full(path, progress):
+        if len(failures) < 2:
+            failures.append(path)
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(path, progress)
+
+    monkeypatch.setattr(checkpoint, "write", full)
+    render = rendering(tmp_path / "a.exr", spp=32, pass_spp=4)
+    written = []
+    render.run(lambda render: written.append(render.checkpoint.exists()))
+    assert len(render.warnings) == 2 and "No space left on device; tried again" in render.warnings[0]
+    assert any(written) and (tmp_path / "a.exr").exists()
+
+
+def test_an_output_that_cannot_be_written_is_found_before(tmp_path, monkeypatch):
+    monkeypatch.setattr(long_render, "load_scene", lambda *arguments: pytest.fail("loaded"))
+    with pytest.raises(NotADirectoryError, match="accepted"):
+        rendering(tmp_path / "none" / "a.exr", spp=1)
+
+
+KILLED = """
+import sys
+from mi_refract import cli
+run = cli._run
+def run_with_checkpoints(arguments):
+    from mi_refract.rendering import long_render  # numpy's threads start here
+    long_render.BETWEEN_CHECKPOINTS = 0.05
+    return run(arguments)
+cli._run = run_with_checkpoints
+sys.argv[1:] = ["render", sys.argv[1], "-o", sys.argv[2], "-D", "res=32", "--spp", "1200", "--pass-spp", "4", *sys.argv[3:]]
+sys.exit(cli.main())
+"""
+
+
+def ended_by(number, output, *options):
+    """Whether a render was ended by a signal, sent after some passes; its exit code and what it printed."""
+    with python(KILLED, BALL, output, "--variant", "llvm_ad_rgb", *options) as process:
+        deadline = time.monotonic() + 120
+        before = checkpoint.path_of(output).stat().st_mtime_ns if checkpoint.path_of(output).exists() else 0
+        while process.poll() is None and time.monotonic() < deadline:
+            path = checkpoint.path_of(output)
+            if path.exists() and path.stat().st_mtime_ns != before:
+                break
+            time.sleep(0.01)
+        time.sleep(random.uniform(0, 0.3))
+        process.send_signal(number)
+        out, err = process.communicate(timeout=60)
+        return process.returncode, out, err
+
+
+def test_sigkill_at_random_times_leaves_a_checkpoint_and_the_same_bits(tmp_path, llvm):
+    output, codes = tmp_path / "a.exr", []
+    for _ in range(4):
+        codes.append(ended_by(signal.SIGKILL, output)[0])
+        if codes[-1] == 0:
+            break
+    assert codes[0] == -signal.SIGKILL
+    if not output.exists():
+        job = Job(BALL, {"res": "32"})
+        render = LongRender(job, output, Limits(spp=1200, pass_spp=4))
+        assert render.progress.passes
+        render.run()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+    LongRender(Job(BALL, {"res": "32"}), tmp_path / "b.exr", Limits(spp=1200, pass_spp=4)).run()
+    np.testing.assert_array_equal(pixels(output), pixels(tmp_path / "b.exr"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_keeps_what_is_done(tmp_path, llvm, number):
+    output = tmp_path / "a.exr"
+    code, _, err = ended_by(number, output)
+    assert code == 128 + number, err
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr.checkpoint"]
+    render = LongRender(Job(BALL, {"res": "32"}), output, Limits(spp=1200, pass_spp=4))
+    assert render.progress.passes > 0
+
+
+def test_the_example_of_the_readme(tmp_path, monkeypatch):
+    (code,) = python_blocks(Path(long_render.__file__).with_name("README.md"))
+    monkeypatch.chdir(ROOT)
+    for old, new in (
+        ('"nested.exr"', f'r"{tmp_path}/nested.exr"'),
+        ("spp=256", "spp=1"),
+        ('{"bsdf"', '{"res": "8", "bsdf"'),
+    ):
+        assert old in code
+        code = code.replace(old, new)
+    exec(code, {})
+    header = read_exr(tmp_path / "nested.exr")[1]
+    assert header["mi_refract:seed"] == 1
+    assert json.loads(header["mi_refract:identity"])["seed"] == 1
