@@ -7,7 +7,7 @@ the `moment` integrator, which are X, Y, Z of every integrator that it holds ("n
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -53,6 +53,13 @@ def means(channels: Sequence[str]) -> list[str]:
     """The channels that hold no variance of others."""
     others = {spread for spread, _ in spreads(channels).values()}
     return [name for name in channels if name not in others]
+
+
+def without_variances(image: Image, named: Collection[str] = ()) -> Image:
+    """The image without its channels NAME.variance of channels NAME, but for those that are `named`."""
+    left_out = {VARIANCES[0].format(name) for name in image.channels} - set(named)
+    kept = tuple(name for name in image.channels if name not in left_out)
+    return image if kept == image.channels else replace(image, pixels=image.select(kept), channels=kept)
 
 
 def selected(image: Image, names: Mapping[str, str]) -> Image:

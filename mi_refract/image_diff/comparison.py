@@ -46,7 +46,8 @@ class Comparison:
 
     `minimum_detectable`: the smallest relative difference that the method would have seen; NaN where it is not known.
     `maps`: H × W or H × W × C arrays by name, of the images' size. `warning`: what an equal image is near to failing.
-    `part`: of files of several images, which it is about: its number and that of its MIP level.
+    `part`: of files of several images, which it is about: its number and that of its MIP level. `chosen`: why the
+    method is this one, where that was left to `auto`.
     """
 
     method: str
@@ -57,6 +58,12 @@ class Comparison:
     maps: Maps = field(default_factory=dict)
     warning: str = ""
     part: tuple[int, int] = (0, 0)
+    chosen: str = ""
+
+    @property
+    def method_in_words(self) -> str:
+        """The method, and why it is this one: "welch (the variance of both is known)"."""
+        return f"{self.method} ({self.chosen})" if self.chosen else self.method
 
 
 def verdict_of(metrics: Sequence[Metric]) -> Verdict:

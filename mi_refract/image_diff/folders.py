@@ -193,7 +193,8 @@ def _read(result: Result, path: Path, renders: bool) -> list[Image]:
 
 
 def _against(path: Path, reference: list[Image], test: list[Image], result: Result, roots: tuple[Path, ...]) -> _Judged:
-    how, whole = result.how, dict.fromkeys((*reference[0].channels, *test[0].channels))
+    how, firsts = result.how, (channels.without_variances(images[0]) for images in (reference, test))
+    whole = dict.fromkeys(name for image in firsts for name in image.channels)
     reference, test = (
         channels.chosen(_with_variance(images, root, how), how.channels, side)
         for side, (images, root) in enumerate(zip((reference, test), roots, strict=True))
@@ -206,7 +207,7 @@ def _against(path: Path, reference: list[Image], test: list[Image], result: Resu
     mask = masks.made(reference[0], file, how.ignore, how.max_values)
     reference, test = ([masks.applied(image, mask) for image in side] for side in (reference, test))
     if path.is_dir():
-        found = methods.compare(how.method, reference, test, **how.options)
+        found = methods.compare(how.method, reference, test, named=[name for name, _ in how.channels], **how.options)
         images = mean_image(reference), mean_image(test)
     else:
         found, images = parts.compare(how, reference, test)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels
 
-from . import black, flip, pixelwise, tolerance, variances, welch
+from . import black, channels, flip, pixelwise, tolerance, variances, welch
 from .comparison import Comparison, Verdict, aligned, not_compared, shared_channels
 
 AUTO = "auto"
@@ -81,10 +81,19 @@ METHODS = {
 }
 
 
-def compare(method: str, reference: Side, test: Side, *, allow_nonfinite: bool = False, **options: Any) -> Comparison:
+def compare(
+    method: str,
+    reference: Side,
+    test: Side,
+    *,
+    allow_nonfinite: bool = False,
+    named: Collection[str] = (),
+    **options: Any,
+) -> Comparison:
     """Compare two images, or two sequences of renders of one image, by a method of the table.
 
-    "auto" is `welch` where it can be, else `tolerance`; options of the other one are accepted and not used.
+    "auto" is `welch` where it can be, else `tolerance`; options of the other one are accepted and not used. Channels
+    NAME.variance are what `welch` reads of single images, and otherwise left out, but for those that are `named`.
 
     INCONCLUSIVE where a method calls the images equal but would call a black one equal, too, or one with some of its
     channels black; where channels whose variance `welch` does not know differ by more than `tolerance` allows; and
@@ -93,20 +102,33 @@ def compare(method: str, reference: Side, test: Side, *, allow_nonfinite: bool =
     ValueError for an unknown method or option, an option of another type or out of its range, several renders for a
     method that takes one, and images that cannot be compared.
     """
+    sides = [[side] if isinstance(side, Image) else list(side) for side in (reference, test)]
     if method == AUTO:
-        method = automatic(reference, test)
+        method, why = choice(*sides)
         options = {name: value for name, value in options.items() if name in METHODS[method].options or _unknown(name)}
+        return replace(_compare(method, sides, allow_nonfinite, named, options), chosen=why)
+    return _compare(method, sides, allow_nonfinite, named, options)
+
+
+def _compare(
+    method: str,
+    sides: list[list[Image]],
+    allow_nonfinite: bool,
+    named: Collection[str],
+    options: Mapping[str, Any],
+) -> Comparison:
     if method not in METHODS:
         raise ValueError(f"method {method!r}: accepted: {AUTO}, {', '.join(METHODS)}")
     chosen = METHODS[method]
     checked = {name: chosen.checked(method, name, value) for name, value in options.items()}
-    sides = [[side] if isinstance(side, Image) else list(side) for side in (reference, test)]
     if not all(sides):
         raise ValueError(f"{method}: no image on one side; accepted: at least one")
-    one, two = sides
+    one, two = bare = [[channels.without_variances(image, named) for image in side] for side in sides]
+    single = len(one) == len(two) == 1
     if chosen.takes_renders:
+        one, two = sides if single else bare
         found = chosen.function(one, two, allow_nonfinite=allow_nonfinite, **checked)
-    elif [len(side) for side in sides] != [1, 1]:
+    elif not single:
         raise ValueError(f"{method}: {len(one)} and {len(two)} images; accepted: one a side")
     else:
         a, b, other = shared_channels(one[0], two[0])
@@ -118,7 +140,7 @@ def compare(method: str, reference: Side, test: Side, *, allow_nonfinite: bool =
     doubt = _untested(one, two, allow_nonfinite) if chosen.takes_renders else _blind_to(chosen, one[0], two[0], checked)
     if doubt:
         return replace(found, verdict=Verdict.INCONCLUSIVE, reason=f"{doubt}; {found.reason}")
-    return _of_the_finite(found, one[0])
+    return _of_the_finite(found, bare[0][0])
 
 
 def _of_the_finite(found: Comparison, reference: Image) -> Comparison:
@@ -171,7 +193,16 @@ def _unknown(name: str) -> bool:
 
 def automatic(reference: Side, test: Side) -> str:
     """The method for these images: welch where a side has several renders, or its variance is known; else tolerance."""
-    sides = [[side] if isinstance(side, Image) else side for side in (reference, test)]
-    if any(len(side) > 1 or any(map(variances.has_variance, side)) for side in sides):
-        return "welch"
-    return "tolerance"
+    return choice(*([side] if isinstance(side, Image) else side for side in (reference, test)))[0]
+
+
+def choice(reference: Sequence[Image], test: Sequence[Image]) -> tuple[str, str]:
+    """The method for these images, and why it is that one; "" for the one that needs no reason."""
+    if max(len(reference), len(test)) > 1:
+        return "welch", "several renders"
+    known = [any(map(variances.has_variance, side)) for side in (reference, test)]
+    if all(known):
+        return "welch", "the variance of both is known"
+    if any(known):
+        return "welch", f"the variance of the {'reference' if known[0] else 'new image'} is known"
+    return "tolerance", ""

@@ -52,7 +52,8 @@ def compare(how: How, reference: Sequence[Image], test: Sequence[Image]) -> tupl
 
 def _of_one(how: How, one: Image, two: Image, place: str) -> Comparison:
     try:
-        return methods.compare(how.method, [one], [two], **how.options)
+        named = [name for name, _ in how.channels]
+        return methods.compare(how.method, [one], [two], named=named, **how.options)
     except ValueError as error:
         raise ValueError(f"{error} ({place})" if place else str(error)) from None
 

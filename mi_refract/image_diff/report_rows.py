@@ -62,7 +62,7 @@ def line(result: Result) -> dict[str, Any]:
         "name": result.name,
         "status": str(result.status),
         "category": str(result.category),
-        "method": found.method if found else "",
+        "method": found.method_in_words if found else "",
         "reason": result.reason,
         "asked": result.how.reason,
         "warnings": [result.warning] if result.warning else [],

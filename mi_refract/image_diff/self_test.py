@@ -27,6 +27,7 @@ from mi_refract.io.pixels import Pixels, block_mean
 from mi_refract.report.row import Row
 
 from . import methods
+from .channels import without_variances
 from .comparison import Verdict
 from .defects import DEFECTS, Defect, Renders, through_a_file
 from .folders import read_renders
@@ -225,8 +226,12 @@ def _null_row(method: str, tally: Tally, case: str, setting: str, independent: b
 
 
 def read_images(path: Path, max_values: int = image_file.MAX_VALUES) -> Pixels:
-    """The renders of one image in a folder, or the image in a file, number × H × W × C. Errors: those of `read`."""
+    """The renders of one image in a folder, or the image in a file, number × H × W × C; errors: those of `read`.
+
+    Without channels that hold the variance of others.
+    """
     images = read_renders(path, max_values) if path.is_dir() else [image_file.read(path, max_values)]
+    images = [without_variances(image) for image in images]
     first = images[0]
     for image in images[1:]:
         if image.pixels.shape[:2] != first.pixels.shape[:2] or set(image.channels) != set(first.channels):

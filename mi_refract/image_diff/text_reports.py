@@ -69,7 +69,7 @@ def table(results: Results) -> Group:
     rows = Table(("verdict", "image", "method", "why"))
     for result in [*failed, *equal[:FEW], *skipped]:
         status = Text(_word(result), style=STYLES[result.status])
-        rows.add_row(status, *(Text(printable(text)) for text in (result.name, _method(result), why(result))))
+        rows.add_row(status, *(Text(printable(text)) for text in (result.name, _method_in_words(result), why(result))))
     more = [Text(f"… and {len(equal) - FEW} more that are equal", style="dim")] if len(equal) > FEW else []
     return Group((*([rows] if rows.rows else []), *more, Text(sentence(results))))
 
@@ -121,6 +121,10 @@ def _method(result: Result) -> str:
     return result.comparison.method if result.comparison else result.how.method
 
 
+def _method_in_words(result: Result) -> str:
+    return result.comparison.method_in_words if result.comparison else result.how.method
+
+
 def write_json(path: str | Path, results: Results) -> None:
     """Write `as_data` as strict JSON: NaN and the infinities become words. OSError."""
     write_atomically(path, json.dumps(strict(as_data(results)), indent=1, allow_nan=False) + "\n")
@@ -155,6 +159,7 @@ def _entry(results: Results, result: Result) -> dict[str, Any]:
         "target": result.target,
         "digests": _digests(result),
         "method": _method(result),
+        "method_why": found.chosen if found else "",
         "options": dict(result.how.options),
         "idiff": result.how.idiff,
         "channels": [list(pair) for pair in result.how.channels],
@@ -278,7 +283,7 @@ def markdown(results: Results, pages: Pages | None = None) -> str:
     if failed:
         lines += ["| verdict | image | method | why |" + " page |" * paged, "|---|---|---|---|" + "---|" * paged]
     for result in failed[:SUMMARY_ROWS]:
-        cells = [_literal(cell) for cell in (_word(result), result.name, _method(result), why(result))]
+        cells = [_literal(cell) for cell in (_word(result), result.name, _method_in_words(result), why(result))]
         cells += [_linked(pages, pages.page(result))] if pages and paged else []
         lines.append(f"| {' | '.join(cells)} |")
     if len(failed) > SUMMARY_ROWS:

@@ -9,7 +9,7 @@ Dachsbacher, "Detecting Bias in Monte Carlo Renderers using Welch's t-test", JCG
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -52,7 +52,8 @@ class Side:
     """Totals per tile and channel: `mean`, `variance` of the means and its square, over pixels; `renders` one by one.
 
     `freedom`: degrees of freedom of a pixel's variance. Without `renders` pixels are taken for independent. `borrowed`:
-    the channels whose noise only the other side knows; its `variance` is that of both.
+    the channels whose noise only the other side knows; its `variance` is that of both. `correlated`: its `inflation`,
+    where that is known without `renders`.
     """
 
     area: Array
@@ -62,6 +63,7 @@ class Side:
     freedom: float
     renders: Array | None = None
     borrowed: Flags | None = None
+    correlated: Inflation = field(default_factory=Inflation)
 
     def coarser(self) -> Side:
         """The same side in tiles GROWTH times as wide."""
@@ -69,7 +71,7 @@ class Side:
             block_sum(x, GROWTH) for x in (self.area, self.mean, self.variance, self.squares)
         )
         renders = None if self.renders is None else block_sum(self.renders, GROWTH)
-        return Side(area, mean, variance, squares, self.freedom, renders, self.borrowed)
+        return replace(self, area=area, mean=mean, variance=variance, squares=squares, renders=renders)
 
     def spread(self, inflation: Inflation) -> tuple[Array, Array]:
         """The variance of the tile means, and its square over its degrees of freedom, summed over pixels."""
@@ -79,10 +81,10 @@ class Side:
         return variance, squares + variance**2 / inflation.freedom
 
     def inflation(self) -> Inflation:
-        """The inflation of all tiles of the image; 1 where it is not known, without `renders` or without noise."""
+        """The inflation of all tiles of the image; 1 where it is not known, or without noise."""
         noisy = self.variance > 0
         if self.renders is None or not noisy.any():
-            return Inflation()
+            return self.correlated
         between = self.renders.var(0, ddof=1)[noisy] / len(self.renders)
         # The channels of a tile may share their noise: tiles count, not tiles and channels.
         freedom = self.freedom * int(noisy.any(-1).sum())

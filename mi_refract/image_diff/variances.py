@@ -1,7 +1,8 @@
 """What is known of the noise of single images: variances from files beside them, or from channels of their own.
 
 A variance is that of one sample per pixel, as Mitsuba's test data and its `moment` integrator have it; that of the
-image follows by dividing by the samples per pixel.
+image follows by dividing by the samples per pixel. Its degrees of freedom are the samples per pixel − 1, unless the
+header says otherwise: where it was estimated from the spread between a few passes they are passes − 1.
 """
 
 from __future__ import annotations
@@ -23,25 +24,42 @@ from .channels import ROUNDED, XYZ, matched, means, selected, spreads
 # m2 − m² below 0 by its rounding, in half floats 2⁻¹¹ of m2 and twice that of m²: no error. In Mitsuba's test data
 # 0.0022 is the most as X, Y, Z; as R, G, B 100 of its 111 files of colour are further below.
 NEGATIVE = 4 * ROUNDED
+FREEDOM = "mi_refract:variance_freedom"  # of a header
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """An image without channels of variance, and `variance`: H × W × C of one sample per pixel; NaN where unknown."""
+    """An image without channels of variance, and `variance`: H × W × C of one sample per pixel; NaN where unknown.
+
+    `freedom`: degrees of freedom of these variances.
+    """
 
     image: Image
     variance: Pixels
     spp: int
+    freedom: int
 
     @property
     def known(self) -> NDArray[np.bool_]:
         """Of every channel, whether its variance is known."""
         return np.asarray(np.isfinite(self.variance).all((0, 1)))
 
+    @property
+    def of_passes(self) -> bool:
+        """Whether the variance was estimated from the spread between passes of several samples a pixel."""
+        return self.freedom < self.spp - 1
+
 
 def has_variance(image: Image) -> bool:
     """Whether the variance of any of its channels is known."""
     return bool(image.variances or spreads(image.channels))
+
+
+def same_noise(reference: Image, test: Image) -> bool:
+    """Whether both hold variances in channels of their own, and are the same in every value of every channel."""
+    if not spreads(reference.channels) or set(reference.channels) != set(test.channels):
+        return False
+    return np.array_equal(reference.pixels, test.select(reference.channels), equal_nan=True)
 
 
 # Files --------------------------------------------------------------------------------------------------------------
@@ -50,13 +68,16 @@ def has_variance(image: Image) -> bool:
 def with_file(image: Image, path: Path, most: int = MAX_VALUES) -> Image:
     """The image with the variances that another file holds for its channels, by their names.
 
-    A file of one channel is for an image of one, whatever the names. OSError for a file that cannot be read;
-    ValueError for one of another size, and for one that has none of the channels.
+    A file of one channel is for an image of one, whatever the names. Where its header names degrees of freedom they go
+    before those of the image's. OSError for a file that cannot be read; ValueError for one of another size, for one
+    that has none of the channels, and for degrees of freedom that are none.
     """
     found = image_file.read(path, most)
     if found.pixels.shape[:2] != image.pixels.shape[:2]:
         (height, width), wrong = image.pixels.shape[:2], found.pixels.shape[:2]
         raise ValueError(f"{path}: {wrong[1]} × {wrong[0]}; accepted: a variance of {width} × {height}")
+    if FREEDOM in found.metadata:
+        image = replace(image, metadata=image.metadata | {FREEDOM: _freedom(found)})
     if len(found.channels) == len(image.channels) == 1:
         return replace(image, variances={image.channels[0]: found.pixels[..., 0]})
     both = [name for name in found.channels if name in image.channels]
@@ -110,7 +131,8 @@ def _estimate(image: Image, side: str, given: int, allow_nonfinite: bool) -> Est
             # Bhatia and Davis (2000): no variance of samples from 0 to 1 is larger.
             variance[..., i] = np.maximum(mean[..., i] * (1 - mean[..., i]), 0) * spp / (spp - 1)
     bare = replace(image, pixels=image.select(names), channels=tuple(names), variances={})
-    return Estimate(bare, variance, spp)
+    freedom = _freedom(image) if FREEDOM in image.metadata and (image.variances or pairs) else spp - 1
+    return Estimate(bare, variance, spp, freedom)
 
 
 def _spp(image: Image, side: str, given: int) -> int:
@@ -119,6 +141,14 @@ def _spp(image: Image, side: str, given: int) -> int:
     if not re.fullmatch(r"[0-9]{1,15}(\.0)?", text := str(found)) or float(text) < 2:
         where = "samples per pixel:" if given else "its header names"
         raise ValueError(f"{image.path}: {where} {shown(found)}; accepted: `spp` or `spp_{side}`, 2 to 10¹⁵")
+    return int(float(text))
+
+
+def _freedom(image: Image) -> int:
+    """The degrees of freedom that the header names, which may hold anything."""
+    found = image.metadata[FREEDOM]
+    if not re.fullmatch(r"[0-9]{1,15}(\.0)?", text := str(found)) or float(text) < 1:
+        raise ValueError(f"{image.path}: {FREEDOM} = {shown(found)}; accepted: a whole number, 1 to 10¹⁵")
     return int(float(text))
 
 

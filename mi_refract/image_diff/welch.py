@@ -13,9 +13,11 @@ from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels
 
 from .comparison import Comparison, Maps, Metric, Verdict, aligned, nonfinite_result, preconditions
+from .pixel_correlation import inflation
 from .pixel_statistics import PixelSums, sums, sums_of_renders
 from .tile_statistics import (
     CORRECTIONS,
+    Inflation,
     Level,
     Side,
     TileTests,
@@ -24,7 +26,9 @@ from .tile_statistics import (
     levels,
     with_silent_pixels,
 )
-from .variances import Estimate, estimates, has_variance
+from .variances import Estimate, estimates, has_variance, same_noise
+
+IDENTICAL = Metric("values that differ", 0.0, 0.0)
 
 
 def compare_renders(
@@ -47,12 +51,14 @@ def compare_renders(
 
     Two or more renders a side, or one a side whose variance is known (module `variances`): then pixels are taken for
     independent, as under a box filter. A wider filter leaves the means of tiles as they are, and hides differences of
-    pixels. Tests the mean of single tiles, of blocks of them, and of the whole image; and whether their pixels scatter
-    more than their noise explains.
+    pixels. Where the variance is that of filtered pixels, from a few passes, `pixel_correlation` is asked. Tests the
+    mean of single tiles, of blocks of them, and of the whole image; and whether their pixels scatter more than their
+    noise explains.
 
     Where the variance of one side alone is known, that of a sample is taken to be the same on the other (a z-test, for
     many samples). A renderer that samples worse than the reference did is different, then, however right its mean is.
 
+    EQUAL, however noisy, where both hold the variance themselves and are the same in every value of every channel.
     INCONCLUSIVE where only tiles differ of which a t-test knows little (with the noise of a few pixels, or without
     noise and by little or in a few pixels), and where the noise hides differences of `resolution`. ValueError for fewer
     renders, the same render twice, options out of range, images that cannot be compared.
@@ -60,13 +66,15 @@ def compare_renders(
     _check(tile, family_error, correction, equivalence_margin, resolution, hidden)
     if pixels not in ("yes", "no"):
         raise ValueError(f"pixels = {pixels!r}: accepted: yes, no")
-    known = None
+    known, whole = None, (reference[0], test[0])
     if len(reference) == len(test) == 1 and (has_variance(reference[0]) or has_variance(test[0])):
         known = estimates(reference[0], test[0], (spp_reference or spp, spp_test or spp), allow_nonfinite)
         reference, test = [known[0].image], [known[1].image]
     for image in (*reference[1:], *test):
         if reason := preconditions(reference[0], image, allow_nonfinite):
             return nonfinite_result("welch", reason, reference[0].pixels, aligned(reference[0], image)[1])
+    if known and same_noise(*whole):
+        return Comparison("welch", Verdict.EQUAL, "the same in every value, noise and all", (IDENTICAL,))
     tile = min(tile, max(reference[0].pixels.shape[:2]))
     sides = _of_estimates(*known, tile) if known else _of_renders(reference, test, tile)
     found = list(levels(sides.one, sides.two, equivalence_margin, sides.pixels if pixels == "yes" else None))
@@ -132,8 +140,11 @@ def _of_estimates(a: Estimate, b: Estimate, tile: int) -> _Sides:
     # Let all n samples have one value of probability p, and of m others not all. For odds = 1 + (n − 1)/m the sum of
     # pⁿ⁺ᵐ + odds pⁿ(1 − pᵐ) ≤ p over all values is at most 1, as that of 7 in `with_silent_pixels` is.
     odds = np.where(only_one, 1 + (a.spp - 1) / b.spp, np.where(only_two, 1 + (b.spp - 1) / a.spp, 7.0))
-    one, two = from_variances(m1, w1, a.spp - 1.0, tile), from_variances(m2, w2, b.spp - 1.0, tile)
-    one, two = replace(one, borrowed=only_two), replace(two, borrowed=only_one)
+    # A variance that carries both means' is as well known as the side that knows it does; the other one's is 0 there.
+    one, two = from_variances(m1, w1, a.freedom, tile), from_variances(m2, w2, b.freedom, tile)
+    found = inflation(m2 - m1, w1 + w2, tile) if a.of_passes or b.of_passes else Inflation()
+    one = replace(one, borrowed=only_two, correlated=found if a.of_passes else Inflation())
+    two = replace(two, borrowed=only_one, correlated=found if b.of_passes else Inflation())
     return _Sides(one, two, sums(m1, w1, m2, w2, tile), names, odds)
 
 

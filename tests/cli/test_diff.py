@@ -62,6 +62,24 @@ def test_samples(run, tmp_path):
     assert run("diff", old, samples(tmp_path / "same", first=200), "--renders")[0] == 0
 
 
+def test_renders_that_hold_their_variance_are_compared_by_welch(run, tmp_path):
+    """Without any option; the table says why. `tolerance`, asked for, does not compare the variance."""
+    rng, header = np.random.default_rng(1), {"mi_refract:spp": 32, "mi_refract:variance_freedom": 7}
+    for name, gain in (("old", 1.0), ("new", 1.0), ("off", 1.2)):
+        passes = gain + rng.standard_normal((8, 16, 16, 3)) / 40
+        pixels = np.concatenate([passes.mean(0), 4 * passes.var(0, ddof=1)], -1)
+        write_exr(tmp_path / f"{name}.exr", pixels, (*"RGB", "R.variance", "G.variance", "B.variance"), header)
+    old, new, off = (tmp_path / f"{name}.exr" for name in ("old", "new", "off"))
+    for test, word, expected in ((new, "equal", 0), (off, "different", 1)):
+        code, out, err = run("diff", old, test)
+        assert (code, err) == (expected, "")
+        assert out.splitlines()[1].startswith(word)
+        assert " welch (the variance of both is known) " in out
+    assert run("diff", old, new, "--method", "tolerance", "--set", "fail=0.1", "--set", "fail_relative=0.1")[0] == 0
+    code, out, err = run("diff", "--self-test", old)
+    assert (code, err) == (0, "")
+
+
 def test_the_old_word_for_renders_still_works(run, tmp_path):
     old, new = samples(tmp_path / "old"), samples(tmp_path / "new", first=100, gain=1.3)
     assert run("diff", old, new, "--samples") == run("diff", old, new, "--renders")
