@@ -24,7 +24,10 @@ def parse_share(text: str, option: str) -> float:
 
 def parse_seconds(text: str, option: str) -> float:
     """`90`, `90s`, `10m`, `1h30m` or `2d` in seconds, more than 0. ValueError for anything else."""
-    parts = re.fullmatch(r"(?=.)" + "".join(rf"(?:(\d{{1,9}}(?:\.\d{{1,9}})?){unit}{'?' if unit == 's' else ''})?" for unit in _SECONDS), text)
+    parts = re.fullmatch(
+        r"(?=.)" + "".join(rf"(?:(\d{{1,9}}(?:\.\d{{1,9}})?){unit}{'?' if unit == 's' else ''})?" for unit in _SECONDS),
+        text,
+    )
     given = zip(parts.groups(), _SECONDS.values(), strict=True) if parts else ()
     seconds = sum(float(number) * unit for number, unit in given if number)
     if not seconds > 0:

@@ -40,7 +40,9 @@ def render(
     until_tile: Annotated[
         str | None, typer.Option(metavar="SHARE", help="Stop at this error of the worst 16 × 16 tile but 1 % of them.")
     ] = None,
-    duration: Annotated[str | None, typer.Option("--time", metavar="TIME", help="Stop after it: 90s, 10m, 1h30m.")] = None,
+    duration: Annotated[
+        str | None, typer.Option("--time", metavar="TIME", help="Stop after it: 90s, 10m, 1h30m.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the sampler.")] = 0,
     pass_spp: Annotated[
         int | None, typer.Option(min=1, max=2**32 - 1, help="Samples per pixel of a pass, which bound the memory.")

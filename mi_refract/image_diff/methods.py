@@ -104,7 +104,7 @@ def compare(
     """
     sides = [[side] if isinstance(side, Image) else list(side) for side in (reference, test)]
     if method == AUTO:
-        method, why = choice(*sides)
+        method, why = choice(*sides, spp=any(options.get(name) for name in ("spp", "spp_reference", "spp_test")))
         options = {name: value for name, value in options.items() if name in METHODS[method].options or _unknown(name)}
         return replace(_compare(method, sides, allow_nonfinite, named, options), chosen=why)
     return _compare(method, sides, allow_nonfinite, named, options)
@@ -196,13 +196,21 @@ def automatic(reference: Side, test: Side) -> str:
     return choice(*([side] if isinstance(side, Image) else side for side in (reference, test)))[0]
 
 
-def choice(reference: Sequence[Image], test: Sequence[Image]) -> tuple[str, str]:
-    """The method for these images, and why it is that one; "" for the one that needs no reason."""
+def choice(reference: Sequence[Image], test: Sequence[Image], *, spp: bool = False) -> tuple[str, str]:
+    """The method for these images, and why it is that one; "" for the one that needs no reason.
+
+    `spp`: whether an option says how many samples per pixel there are. A render of `mi-refract render` holds its
+    variance unasked: beside an image of somebody else, of which nothing is known, it is compared as that is.
+    """
     if max(len(reference), len(test)) > 1:
         return "welch", "several renders"
     known = [any(map(variances.has_variance, side)) for side in (reference, test)]
     if all(known):
         return "welch", "the variance of both is known"
     if any(known):
-        return "welch", f"the variance of the {'reference' if known[0] else 'new image'} is known"
+        (one,), (two,) = (reference, test) if known[0] else (test, reference)
+        name, other = ("reference", "new image") if known[0] else ("new image", "reference")
+        if not one.variances and variances.SPP in one.metadata and not spp and variances.SPP not in two.metadata:
+            return "tolerance", f"of the {other} neither variance nor samples per pixel are known"
+        return "welch", f"the variance of the {name} is known"
     return "tolerance", ""

@@ -24,6 +24,7 @@ from .channels import ROUNDED, XYZ, matched, means, selected, spreads
 # m2 − m² below 0 by its rounding, in half floats 2⁻¹¹ of m2 and twice that of m²: no error. In Mitsuba's test data
 # 0.0022 is the most as X, Y, Z; as R, G, B 100 of its 111 files of colour are further below.
 NEGATIVE = 4 * ROUNDED
+SPP = "mi_refract:spp"  # of a header
 FREEDOM = "mi_refract:variance_freedom"  # of a header
 
 
@@ -137,7 +138,7 @@ def _estimate(image: Image, side: str, given: int, allow_nonfinite: bool) -> Est
 
 def _spp(image: Image, side: str, given: int) -> int:
     """The samples per pixel that are given, or else those of the header, which may hold anything."""
-    found = given or image.metadata.get("mi_refract:spp", "no samples per pixel")
+    found = given or image.metadata.get(SPP, "no samples per pixel")
     if not re.fullmatch(r"[0-9]{1,15}(\.0)?", text := str(found)) or float(text) < 2:
         where = "samples per pixel:" if given else "its header names"
         raise ValueError(f"{image.path}: {where} {shown(found)}; accepted: `spp` or `spp_{side}`, 2 to 10¹⁵")

@@ -79,7 +79,7 @@ def integrator_class(v: Any) -> type:
             self.seen: tuple[Any, SceneFeatures] | None = None
 
         def begin_render(self, seed: Any) -> None:
-            """To be called before `sample`, where no `render` is: the seed of the sampler, and a scene as if not seen."""
+            """To be called before `sample`, where no `render` is. `seed`: of the sampler."""
             self.seed, self.seen = seed, None
 
         def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, *more: Any, **named: Any) -> Any:

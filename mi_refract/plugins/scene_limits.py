@@ -55,8 +55,9 @@ class Walk:
 def check_files(path: Path, folders: Iterable[Path], defines: Mapping[str, str]) -> Walk:
     """What was seen of a scene file and of those that it includes.
 
-    ValueError where one is not a regular file, too large, or nested too deeply. `folders`: where Mitsuba looks for what a scene names. OSError for a file that cannot be read. A file that is no
-    XML may pass: Mitsuba says better what is wrong with it.
+    ValueError where one is not a regular file, too large, or nested too deeply. `folders`: where Mitsuba looks for what
+    a scene names. OSError for a file that cannot be read. A file that is no XML may pass: Mitsuba says better what is
+    wrong with it.
     """
     walk = Walk(dict(defines))
     _walk_file(path, list(folders), walk, 0)

@@ -120,16 +120,21 @@ def load(
         state = parse(path, config, defines)
         check_plugins(path, (node.props.plugin_name() for node in state.nodes), allowed)
         _check_needed(path, (node.props for node in state.nodes))
-        for node in state.nodes if moved else ():
-            for name in node.props.keys():  # noqa: SIM118 (no dict)
-                if isinstance(value := node.props[name], str) and value in moved:
-                    node.props[name] = moved[value]
+        _move(state, moved or {})
         inside.prepend(str(own_folder()))  # before every <path>
         places = [path.parent, *(Path(str(folder)) for folder in inside)]
         for check, plugins in ((check_faces, ("ply",)), (_check_image, ("bitmap", "envmap"))):
             for file in {node.props["filename"] for node in state.nodes if _names_file(node.props, plugins)}:
                 check(resolved(file, places))
         return mi.parser.instantiate(config, state)
+
+
+def _move(state: Any, moved: Mapping[str, str]) -> None:
+    """Put new names of files where a scene has old ones."""
+    for node in state.nodes if moved else ():
+        for name in node.props.keys():  # noqa: SIM118 (no dict)
+            if isinstance(value := node.props[name], str) and value in moved:
+                node.props[name] = moved[value]
 
 
 def _names_file(props: Any, plugins: Collection[str]) -> bool:

@@ -108,7 +108,12 @@ def read(path: Path, identity: dict[str, Any]) -> Progress:
             tree.passes, tree.counts = header["passes"], header["counts"]
             tree.levels = [nodes.get(f"level{i}") for i in range(len(tree.counts))]
             return Progress(
-                header["identity"], tree, nodes.get("base"), None, float(header["seconds"]), [str(m) for m in header["machines"]]
+                header["identity"],
+                tree,
+                nodes.get("base"),
+                None,
+                float(header["seconds"]),
+                [str(m) for m in header["machines"]],
             )
     except ValueError as error:
         if again in str(error):
@@ -119,9 +124,8 @@ def read(path: Path, identity: dict[str, Any]) -> Progress:
 
 
 def _damaged(path: Path, error: Exception) -> ValueError:
-    return ValueError(
-        f"{path}: is no complete checkpoint ({type(error).__name__}); accepted: one that is, or --restart, which begins anew"
-    )
+    what = f"{path}: is no complete checkpoint ({type(error).__name__})"
+    return ValueError(f"{what}; accepted: one that is, or --restart, which begins anew")
 
 
 def apart_from_passes(identity: dict[str, Any]) -> dict[str, Any]:

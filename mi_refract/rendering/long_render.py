@@ -1,6 +1,7 @@
 """A render in passes: from where it was left, until it has what was asked for.
 
-    for each node of passes:  render it, add it to the tree, keep a checkpoint;  at 8, 12, 16, 24 … passes: look at the error
+Each pass is rendered and added to the tree of sums; every 20 s or so a checkpoint is written; after 8, 12, 16, 24 …
+passes the error is looked at, where it may end the render.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ from .pass_sums import PassSums
 from .render_pass import PassRenderer, pass_renderer
 from .scene_files import formulas_in, load_scene
 
-BETWEEN_CHECKPOINTS = 20.0  # seconds: with the pass that a kill interrupts at most 30 are lost, if a pass takes up to 10
+BETWEEN_CHECKPOINTS = (
+    20.0  # seconds: with the pass that a kill interrupts at most 30 are lost, if a pass takes up to 10
+)
 
 
 @dataclass(frozen=True)
@@ -50,8 +53,9 @@ class Job:
 
 @dataclass(frozen=True)
 class Limits:
-    """What ends a render: the first of these that is reached. `until`, `until_tile`: relative errors; `seconds`: of this run.
+    """What ends a render: the first of these that is reached.
 
+    `until`, `until_tile`: relative errors, of the image and of its worst tiles; `seconds`: of this run.
     `spp`: samples per pixel; None: as the scene says, where nothing else ends the render. `pass_spp`: those of a pass.
     """
 
@@ -62,6 +66,7 @@ class Limits:
     pass_spp: int | None = None
 
     def __post_init__(self) -> None:
+        """ValueError for what is out of range."""
         for name in ("spp", "pass_spp"):
             if (value := getattr(self, name)) is not None and not 1 <= value < 2**32:
                 raise ValueError(f"{name} = {value}: accepted: a whole number from 1 to 2³² − 1")
@@ -147,13 +152,13 @@ class LongRender:
         width, height = self.renderer.size
         recorded, asked = self.progress.identity.get(PASS), self.limits.pass_spp
         if self.progress.tree.passes and asked not in (None, recorded):
-            raise ValueError(f"{self.checkpoint}: passes of {recorded} samples per pixel; accepted: those, or --restart")
+            raise ValueError(
+                f"{self.checkpoint}: passes of {recorded} samples per pixel; accepted: those, or --restart"
+            )
         begun = recorded if self.progress.tree.passes else None
         base = self.progress.base.spp if self.progress.base else 0
         total = None if self.spp is None else max(0, self.spp - base)
-        return plan_passes(
-            width * height, total, begun or asked, self.renderer.accepted, moments=self.renderer.moments
-        )
+        return plan_passes(width * height, total, begun or asked, self.renderer.accepted, moments=self.renderer.moments)
 
     def _may_have_few_passes(self) -> bool:
         passes = self.plan.passes
@@ -161,9 +166,7 @@ class LongRender:
 
     # Rendering --------------------------------------------------------------------------------------------------------
 
-    def run(
-        self, watch: Callable[[LongRender], None] = lambda render: None, passes: Passes | None = None
-    ) -> Metadata:
+    def run(self, watch: Callable[[LongRender], None] = lambda render: None, passes: Passes | None = None) -> Metadata:
         """Render what is left and write the image; its header. `watch` is called after every node of passes.
 
         `passes`: who renders them, else this process. On any error what is done is kept in the checkpoint.

@@ -1,4 +1,4 @@
-"""How a render is cut into passes, and which seed each of them has. It depends on the film and on the samples asked for.
+"""How a render is cut into passes, and which seed each has: by its film and the samples asked for, nothing else.
 
     seed(s, p) = s ⊕ mix(p),    mix: the finaliser of MurmurHash3 on 32 bits, a bijection with mix(0) = 0
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 LANES = 2**24  # samples of a pass, at most, unless one sample per pixel is more
 # A pass costs about 10 ms beside its samples, and its sums the time of a quarter of a sample in every pixel.
-LEAST_LANES, LEAST_SPP = 2**20, 8
+LEAST_LANES, LEAST_SPP = 2**21, 8
 FEW = 8  # passes: with fewer the spread between them says little
 MASK = 2**32 - 1
 
@@ -79,7 +79,7 @@ def plan_passes(
 
 
 def next_stop(passes: int) -> int:
-    """The first of 8, 12, 16, 24, 32, 48 … passes that is more than `passes`: where an estimated error may end a render.
+    """The first of 8, 12, 16, 24, 32, 48 … that is more than `passes`: where an estimated error may end a render.
 
     The fewer looks at an estimate, the less its chance: what is stopped where it first falls short is too good.
     """

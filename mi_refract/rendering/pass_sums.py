@@ -1,7 +1,7 @@
 """Sums over passes in float64, in an order that depends on their numbers alone.
 
-Passes are summed in a tree: each ARITY nodes in a row, from the first on, make one of the next level, and within it they
-are added from the left. Whoever adds which nodes where, the bits of the result are the same.
+Passes are summed in a tree: each ARITY nodes in a row, from the first on, make one of the next level, and within it
+they are added from the left. Whoever adds which nodes where, the bits of the result are the same.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ Doubles = NDArray[np.float64]
 class PassSums:
     """Sums over some passes in a row, H × W × C each.
 
-    `total`: Σ nᵢ xᵢ, for passes of nᵢ samples per pixel and mean xᵢ. `between`: Σ nᵢ (xᵢ − x)², of the means' spread.
+    `total`: Σ nᵢ xᵢ, for passes of nᵢ samples per pixel and mean xᵢ. `between`: Σ nᵢ (xᵢ − x)², their spread.
     `within`: Σ of (v − xᵢ)² over the samples v of every pass; None where unknown, or where FEW passes make it needless.
-    `contrasts`: one less than passes, independent estimates of a sample's variance, each a mean over all pixels: the mean
+    `contrasts`: one less than passes, independent estimates of a sample's variance, each a mean over all pixels: that
     of what `between` grew by, in the first `colours` channels.
     """
 
@@ -87,14 +87,17 @@ class PassSums:
         self.contrasts = [*self.contrasts, *other.contrasts, sums / count if count else np.nan]
         self.passes += other.passes
         self.spp += n
-        few = self.within is not None and other.within is not None and self.passes < FEW
-        self.within = self.within + other.within if few and self.within is not None else None
+        if self.within is None or other.within is None or self.passes >= FEW:
+            self.within = None
+        else:
+            self.within = self.within + other.within
 
 
 class PassTree:
     """The sums of all passes so far: of every level the nodes that do not yet make one of the next."""
 
     def __init__(self) -> None:
+        """Without a pass."""
         self.levels: list[PassSums | None] = []
         self.counts: list[int] = []  # nodes in each level's sum, fewer than ARITY
         self.passes = 0
@@ -136,7 +139,7 @@ class PassTree:
 
 
 def aligned_nodes(first: int, stop: int, largest: int) -> list[tuple[int, int]]:
-    """Nodes that make up the passes from `first` to `stop`: (level, number of the first pass), up to level `largest`."""
+    """Nodes that make up the passes from `first` to `stop`: level, up to `largest`, and number of the first pass."""
     found = []
     while first < stop:
         level = 0

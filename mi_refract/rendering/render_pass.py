@@ -1,8 +1,8 @@
-"""One pass of a render: the mean of every pixel's samples, and their squares, with the same bits on any number of threads.
+"""One pass of a render: the mean of every pixel's samples, and their squares. The number of threads does not show.
 
-Mitsuba adds samples to the film in the order in which threads come by, and the last bits of an image change with it. Here
-the samples of the JIT variants are kept, and each pixel is summed by one lane, from its first sample to its last, in
-float64. Under a filter w that is wider than a pixel a pixel is Σ w v / Σ w over the samples of its neighbours.
+Mitsuba adds samples to the film in the order in which threads come by, and the last bits of an image change with it.
+Here the samples of the JIT variants are kept, and each pixel is summed by one lane, from its first sample to its last,
+in float64. Under a filter w that is wider than a pixel, a pixel is Σ w v / Σ w over the samples of its neighbours, too.
 """
 
 from __future__ import annotations
@@ -56,7 +56,9 @@ class PassRenderer:
         seed = seed_of(self.seed, number)
         with _quiet():
             if self.moments:
-                mean, within = _pixels(self.scene, self.channels, spp, seed, squares=number == 0 or (self.few and number < FEW - 1))
+                mean, within = _pixels(
+                    self.scene, self.channels, spp, seed, squares=number == 0 or (self.few and number < FEW - 1)
+                )
             else:
                 mean, within = _rendered(self.scene, spp, seed), None
         if self.scene.integrator().should_stop():
@@ -74,7 +76,7 @@ def pass_renderer(scene: Any, seed: int) -> PassRenderer:
 
 
 def _keeps_samples(scene: Any) -> bool:
-    """Whether `_pixels` can render the scene: its integrator gives samples and does nothing else, its film takes them."""
+    """Whether `_pixels` can render the scene: its integrator only gives samples, and its film only takes them."""
     film, integrator = scene.sensors()[0].film(), scene.integrator()
     plain = type(integrator).render is mi.SamplingIntegrator.render or hasattr(integrator, "begin_render")
     special = film.sample_border() or mi.has_flag(film.flags(), mi.FilmFlags.Special)
@@ -84,7 +86,7 @@ def _keeps_samples(scene: Any) -> bool:
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Without Mitsuba's warning, at every pass, that a sampler rounds up: it is taken into account."""
-    logger: Any = mi.logger()
+    logger: Any = mi.logger()  # type: ignore[operator]
     before = logger.log_level()
     logger.set_log_level(mi.LogLevel.Error)
     try:
@@ -124,9 +126,9 @@ def _pixels(scene: Any, channels: tuple[str, ...], spp: int, seed: int, *, squar
         spreads = _squared_sums(values, place, means, film) if squares else []
         within = [spread * dr.square(spp / weights) for spread in spreads]
         dr.eval(within)
-    mean, spread = (np.stack([np.array(v) for v in each], -1) if each else None for each in (means, within))
     shape = (height, width, len(channels))
-    return mean.reshape(shape), None if spread is None else spread.reshape(shape)
+    found = [np.stack([np.array(v) for v in each], -1).reshape(shape) if each else None for each in (means, within)]
+    return found[0], found[1]
 
 
 def _samples(scene: Any, channels: tuple[str, ...], spp: int, seed: int) -> tuple[list[Any], Any]:
@@ -215,7 +217,7 @@ def _weighted_means(values: list[Any], place: Any, film: _Film) -> tuple[list[An
 
 
 @dr.syntax
-def _own_samples(values, place, x, y, film):  # type: ignore[no-untyped-def]  # Dr.Jit rewrites it
+def _own_samples(values, place, x, y, film):  # Dr.Jit rewrites it
     """Σ w v by channels, and Σ w, over the samples of each pixel, with their weights in the pixels of a row."""
     spp = dr.opaque(mi.UInt32, film.spp)
     first = dr.arange(mi.UInt32, film.width * film.height) * spp
@@ -240,7 +242,7 @@ def _own_samples(values, place, x, y, film):  # type: ignore[no-untyped-def]  # 
 
 
 @dr.syntax
-def _squared_sums(values, place, means, film):  # type: ignore[no-untyped-def]  # Dr.Jit rewrites it
+def _squared_sums(values, place, means, film):  # Dr.Jit rewrites it
     """Of every pixel Σ (z − z̄)², by channels, of z = w (v − mean) over the samples that reach it.
 
     z̄ is the mean over those that lie in one pixel: their number there is fixed, so that pixels are strata.

@@ -68,9 +68,10 @@ def read(output: Path, channels: tuple[str, ...], identity: dict[str, Any]) -> P
         return None
     variance = np.broadcast_to(variance.astype(np.float64), mean.shape)
     colours = int(identity["colours"])
-    within = variance * (spp - 1) if passes < FEW and image.metadata.get("mi_refract:variance_from") == "samples" else None
+    within = (
+        variance * (spp - 1) if passes < FEW and image.metadata.get("mi_refract:variance_from") == "samples" else None
+    )
     sums = PassSums(spp, passes, mean * spp, variance * (passes - 1), within, colours=colours)
     machines = [name for name in str(image.metadata.get("mi_refract:machines", "")).split(", ") if name]
     seconds = float(image.metadata.get("mi_refract:render_seconds", 0.0))
     return Progress(identity, base=sums, seconds=seconds, machines=machines)
-

@@ -67,7 +67,14 @@ def test_the_image_is_mitsubas(render, scene):
     pixels, metadata = read_exr(scene.with_name("out.exr"))
     mean, variance = passes_by_mitsuba(scene, 9, 3)
     np.testing.assert_array_equal(pixels[..., :3], mean)
-    assert metadata["channels"] == ("R", "G", "B", "B.variance", "G.variance", "R.variance")  # as OpenImageIO sorts them
+    assert metadata["channels"] == (
+        "R",
+        "G",
+        "B",
+        "B.variance",
+        "G.variance",
+        "R.variance",
+    )  # as OpenImageIO sorts them
     np.testing.assert_allclose(pixels[..., :2:-1], variance, rtol=1e-6)
     assert mean.std() > 0
     assert sorted(path.name for path in scene.parent.iterdir()) == ["out.exr", "scene.xml"]

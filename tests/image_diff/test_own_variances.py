@@ -16,7 +16,7 @@ from scipy import stats
 
 from mi_refract.image_diff import accept, folders, panes, report_folder, self_test, settings_file, text_reports
 from mi_refract.image_diff.comparison import Verdict
-from mi_refract.image_diff.methods import METHODS, compare
+from mi_refract.image_diff.methods import METHODS, choice, compare
 from mi_refract.image_diff.pixel_correlation import inflation
 from mi_refract.image_diff.results import Status
 from mi_refract.image_diff.settings import How, Settings
@@ -343,3 +343,15 @@ def test_the_self_test_plants_defects_in_the_image(pair):
     renders = self_test.read_images(pair[0] / "same.exr")
     np.testing.assert_array_equal(renders[0], read(pair[0] / "same.exr").select(RGB))
     assert self_test.read_images(pair[0]).shape == (2, *SHAPE)
+
+
+def test_a_render_beside_an_image_of_which_nothing_is_known(tmp_path):
+    """It holds its variance unasked: then the other one decides. Where samples per pixel are known, so is enough."""
+    names = (*RGB, *(f"{name}.variance" for name in RGB))
+    render = Image(tmp_path / "a", np.ones((16, 16, 6), np.float32), names, metadata={SPP: 64})
+    other = Image(tmp_path / "b", np.ones((16, 16, 3), np.float32), RGB)
+    why = "of the reference neither variance nor samples per pixel are known"
+    assert choice([other], [render]) == ("tolerance", why)
+    assert choice([render], [other])[0] == "tolerance"
+    assert choice([other], [render], spp=True)[0] == "welch"
+    assert choice([replace(other, metadata={SPP: 9})], [render])[0] == "welch"

@@ -355,7 +355,8 @@ def run_with_checkpoints(arguments):
     long_render.BETWEEN_CHECKPOINTS = 0.05
     return run(arguments)
 cli._run = run_with_checkpoints
-sys.argv[1:] = ["render", sys.argv[1], "-o", sys.argv[2], "-D", "res=32", "--spp", "1200", "--pass-spp", "4", *sys.argv[3:]]
+limits = ["-D", "res=32", "--spp", "1200", "--pass-spp", "4"]
+sys.argv[1:] = ["render", sys.argv[1], "-o", sys.argv[2], *limits, *sys.argv[3:]]
 sys.exit(cli.main())
 """
 

@@ -26,7 +26,10 @@ def llvm(needs_variant):
 
 def scene_of(tmp_path, rfilter="box", pixel_format="rgb", name="sphere", **defines):
     text = (SCENES / f"{name}.xml").read_text()
-    for old, new in (('"box"', f'"{rfilter}"'), ('"pixel_format" value="rgb"', f'"pixel_format" value="{pixel_format}"')):
+    for old, new in (
+        ('"box"', f'"{rfilter}"'),
+        ('"pixel_format" value="rgb"', f'"pixel_format" value="{pixel_format}"'),
+    ):
         assert old in text
         text = text.replace(old, new)
     path = tmp_path / "scene.xml"
@@ -124,8 +127,8 @@ def test_the_spread_of_samples_is_that_of_passes(tmp_path, llvm, rfilter):
     assert all((sums.within is not None) == (number < FEW - 1) for number, sums in enumerate(passes))
     between = 16 * np.var([sums.mean for sums in passes], 0, ddof=1)
     within = np.mean([sums.within / 15 for sums in passes[: FEW - 1]], 0)
-    # Of 63 and of 105 degrees of freedom in each of 256 pixels, that share samples under the wide filter: an estimate of
-    # standard error √(2/63 · 9/256) = 3.3 % at most. Without strata the wide filter's is 13 % too large here.
+    # Of 63 and of 105 degrees of freedom in each of 256 pixels, that share samples under the wide filter: a standard
+    # error of √(2/63 · 9/256) = 3.3 % at most. Without strata the wide filter's is 13 % too large here.
     np.testing.assert_allclose(within.mean(), between.mean(), rtol=0.1)
 
 

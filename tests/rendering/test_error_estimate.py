@@ -1,0 +1,121 @@
+"""The error of a render from its own passes: right on average, and seldom too small where it ends a render."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from mi_refract.rendering.error_estimate import RelativeError, relative_error, worst_tile
+from mi_refract.rendering.pass_plan import next_stop
+from mi_refract.rendering.pass_sums import PassSums, PassTree
+
+RNG = np.random.default_rng(17)
+SIZE = (12, 12, 3)
+
+
+def noisy(kind, truth, spp):
+    """A pass of `spp` samples per pixel, each with a standard deviation of its mean."""
+    if kind == "normal":
+        return RNG.normal(truth, truth * spp**-0.5)
+    if kind == "exponential":
+        return truth * RNG.gamma(spp, 1 / spp, SIZE)
+    # One sample in 20 is bright: what comes of caustics. The same in all colours.
+    return truth * RNG.binomial(spp, 0.05, SIZE[:2])[..., None] / (spp * 0.05)
+
+
+def leaf(image, spp=4):
+    image = image.astype(np.float32).astype(np.float64)
+    return PassSums(spp, 1, image * spp, np.zeros_like(image))
+
+
+def sums_of(kind, truth, passes, spp=4):
+    tree = PassTree()
+    for _ in range(passes):
+        tree.add(leaf(noisy(kind, truth, spp)))
+    return tree.sums()
+
+
+def true_error(sums, truth):
+    return math.sqrt(np.mean((sums.mean - truth) ** 2)) / truth.mean()
+
+
+@pytest.mark.parametrize("kind", ["normal", "exponential", "rare"])
+def test_the_estimate_is_right_on_average(kind):
+    truth = RNG.uniform(0.2, 2, SIZE)
+    squares = [
+        (relative_error(sums).value ** 2, true_error(sums, truth) ** 2)
+        for sums in (sums_of(kind, truth, 16) for _ in range(60))
+    ]
+    estimated, true = np.mean(squares, 0)
+    # Of 60 each, over 144 pixels and more: standard errors of 1.5 % where samples are rare, of kurtosis 20.
+    assert estimated == pytest.approx(true, rel=0.08)
+
+
+def count_beyond(kind, judge):
+    """Of 500 renders that end where `judge(sums)` says: how many have an error above the one asked for.
+
+    It is asked for exactly the error that 12 passes have on average: there an estimate ends a render by chance.
+    """
+    truth = np.ones(SIZE)
+    asked = math.sqrt({"normal": 1, "exponential": 1, "rare": 19}[kind] / 48)
+    beyond = 0
+    for _ in range(500):
+        tree = PassTree()
+        while not tree.passes or not judge(tree.sums()) <= asked:
+            for _ in range(next_stop(tree.passes) - tree.passes):
+                tree.add(leaf(noisy(kind, truth, 4)))
+        beyond += true_error(tree.sums(), truth) > asked
+    return beyond
+
+
+MOST = int(binom.ppf(0.999, 500, 0.05))  # a test that fails once in 1000 times
+
+
+@pytest.mark.parametrize("kind", ["normal", "exponential", "rare"])
+def test_what_ends_a_render_is_true_as_often_as_stated(kind):
+    """The error is above the one asked for with a probability of 5 % at most."""
+    assert count_beyond(kind, lambda sums: relative_error(sums).high) <= MOST
+
+
+def test_the_estimate_without_its_interval_would_not_do():
+    """Or the test above could not fail."""
+    assert count_beyond("rare", lambda sums: relative_error(sums).value) > MOST
+
+
+def test_little_is_known_of_one_pass_or_of_black():
+    assert math.isnan(relative_error(leaf(np.ones(SIZE))).value)
+    assert math.isnan(relative_error(sums_of("normal", np.zeros(SIZE), 9)).value)
+    two = relative_error(sums_of("normal", np.ones(SIZE), 2))
+    assert two.value > 0 and math.isnan(two.high)
+    assert not two.high <= 1 and not RelativeError(math.nan).high <= 1
+
+
+def test_pixels_that_are_not_finite_are_left_out():
+    truth, tree = np.ones(SIZE), PassTree()
+    for number in range(32):
+        image = noisy("normal", truth, 4)
+        if number == 3:
+            image[0, 0, 0], image[1, 1] = np.nan, np.inf
+        tree.add(leaf(image))
+    assert relative_error(tree.sums()).value == pytest.approx(1 / math.sqrt(128), rel=0.1)
+    assert worst_tile(tree.sums()) == pytest.approx(1 / math.sqrt(128), rel=0.2)
+
+
+def test_the_worst_tile_but_one_in_a_hundred():
+    truth, tree = np.ones((16 * 12, 16 * 12, 1)), PassTree()
+    noise = np.full_like(truth, 0.1)
+    noise[:16, :16], noise[16:32, :32] = 5, 1  # of 144 tiles one with five times the noise, and two
+    for _ in range(16):
+        tree.add(leaf(RNG.normal(truth, noise)))
+    assert worst_tile(tree.sums()) == pytest.approx(1 / 4, rel=0.1)
+
+
+def test_a_dark_tile_is_judged_as_one_of_a_hundredth():
+    truth, tree = np.ones((64, 64, 1)), PassTree()
+    truth[:16, :16] = 0
+    for _ in range(16):
+        tree.add(leaf(RNG.normal(truth, 0.04 * 0.01)))
+    assert worst_tile(tree.sums()) == pytest.approx(0.01, rel=0.1)
