@@ -99,6 +99,9 @@ EDIT = limit(
 )
 FROZEN = limit(1e-5, "of a pixel: the order in which samples are added up")
 
+STOPPED_WRONGLY = limit(1e-3, "probability of more renders beyond the error that they ended by, if it is below 5 %")
+PASSES_TIME = limit(1.03, "over one call of `mi.render`: each pass is traced anew, and its samples are read again")
+
 # Efficiency ----------------------------------------------------------------------------------------------------
 
 ONLY_GLASS_TIME = limit(0.8, "of the built-in's time: `refract_path` leaves emitter sampling out where all is glass")

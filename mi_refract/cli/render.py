@@ -94,7 +94,7 @@ def _summary(rendering: Any, header: dict[str, Any]) -> str:
     error = rendering.error()
     if error is not None and math.isfinite(error.value):
         text += f", relative error {shown_error(error)}"
-    return f"{text}; ended by {rendering.ended_by}" if rendering.ended_by else text
+    return text if rendering.has_all_samples else f"{text}; ended by {rendering.ended_by}"
 
 
 def _passes(count: int) -> str:

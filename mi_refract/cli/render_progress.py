@@ -73,18 +73,19 @@ class _Watch:
         self.warned = len(rendering.warnings)
 
     def _said(self, rendering: LongRender, now: float) -> str:
-        passes = rendering.plan.passes
-        count = rendering.progress.passes
-        parts = [f"pass {count} of {passes + rendering.progress.first}" if passes else f"{count} passes"]
-        parts.append(f"{rendering.progress.done} spp")
+        passes, count, done = rendering.plan.passes, rendering.progress.passes, rendering.progress.done
+        parts = [f"pass {count} of {passes + rendering.progress.first}" if passes else f"{count} passes", f"{done} spp"]
         width, height = rendering.renderer.size
-        rate = (rendering.progress.done - self.done) * width * height / (now - self.began)
-        parts.append(f"{rate / 1e6:.3g} M samples/s")
-        if passes and rate and rendering.spp:
-            parts.append(f"{(rendering.spp - rendering.progress.done) * width * height / rate:.0f} s left")
+        rate = (done - self.done) / (now - self.began)  # spp a second
+        parts.append(f"{rate * width * height / 1e6:.3g} M samples/s")
         error = rendering.error()
+        wanted = [rendering.spp] if rendering.spp else []
         if error is not None and math.isfinite(error.value):
+            if until := rendering.limits.until:
+                wanted.append(done * (error.value / until) ** 2)
             parts.append(f"error {shown_error(error)}")
+        if wanted and rate:
+            parts.append(f"{max(0, min(wanted) - done) / rate:.0f} s left")
         return ", ".join(parts)
 
 

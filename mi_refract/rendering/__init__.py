@@ -1,7 +1,8 @@
-"""Renders Mitsuba scene files into EXR files that say how they were made: the work of `mi-refract render`.
+"""Renders Mitsuba scene files in passes into EXR files that hold their own noise: the work of `mi-refract render`.
 
-In: a scene file, values for its `<default>`s, samples per pixel, a seed; Mitsuba's present variant. Out: an EXR file
-with the film's channels and, in its header, all that is needed to render it again.
+In: a scene file, values for its `<default>`s, what ends the render, a seed; Mitsuba's present variant. Out: an EXR file
+with the film's channels, the variance of each, and in its header all that is needed to render it again; meanwhile a
+checkpoint from which the same command goes on. The bits depend on none of: threads, order, interruptions.
 """
 
-__all__ = ["scene_files"]
+__all__ = ["error_estimate", "long_render", "pass_plan", "pass_sums", "render_pass", "scene_files"]

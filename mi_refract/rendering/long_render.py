@@ -236,6 +236,11 @@ class LongRender:
             return f"--until-tile {self.limits.until_tile:.3g}: the error of the worst tile is {worst:.3g}"
         return ""
 
+    @property
+    def has_all_samples(self) -> bool:
+        """Whether it has as many samples per pixel as were asked for."""
+        return self.progress.done == self.spp
+
     def error(self) -> RelativeError | None:
         """The present error; None where nothing is done yet."""
         with self._state:

@@ -122,7 +122,7 @@ def _validate(folder: Path) -> int:
 
 def _render(folder: Path) -> int:
     words = ["render", str(SCENES / "sphere.xml"), "-o", str(folder / "out.exr"), "-D", "res=16"]
-    options = ["--spp", "1"]
+    options = ["--spp", "2", "--pass-spp", "1", "--restart"]
     os.execv(sys.executable, [sys.executable, "-m", "mi_refract.cli", *words, *options])
 
 
@@ -185,7 +185,7 @@ def _ends_well(command: Command, folder: Path, after: float, number: signal.Sign
     before = _temporary(folder)
     code, said = _run(command, folder, kill=after, number=number)
     if number != signal.SIGINT:
-        return code in (-number, command.code)
+        return code in (-number, 128 + number, command.code)  # a render that keeps what it has says 128 + number
     if code == command.code or "Fatal Python error: init" in said:  # Python itself was not there yet
         return True
     return code in (exit_code.INTERRUPTED, -number) and _temporary(folder) <= before
