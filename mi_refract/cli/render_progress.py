@@ -79,7 +79,7 @@ class _Watch:
         rate = (done - self.done) / (now - self.began)  # spp a second
         parts.append(f"{rate * width * height / 1e6:.3g} M samples/s")
         error = rendering.error()
-        wanted = [rendering.spp] if rendering.spp else []
+        wanted: list[float] = [rendering.spp] if rendering.spp else []
         if error is not None and math.isfinite(error.value):
             if until := rendering.limits.until:
                 wanted.append(done * (error.value / until) ** 2)
