@@ -9,6 +9,7 @@ standard deviation, as far as passes are normally distributed: what no sample ha
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from dataclasses import dataclass
 
@@ -51,9 +52,18 @@ def relative_error(sums: PassSums) -> RelativeError:
     return RelativeError(value, low, high)
 
 
-def _quantile(freedom: int) -> float:
-    from scipy.stats import t  # a second to import, and an extra
+def require_interval() -> None:
+    """ImportError, in one line, where the interval cannot be had."""
+    if importlib.util.find_spec("scipy") is None:
+        raise ImportError("--until needs SciPy; accepted: pip install 'mi-refract[diff]', or --until-tile")
 
+
+def _quantile(freedom: int) -> float:
+    """Of Student's distribution; NaN without SciPy, which is an extra."""
+    try:
+        from scipy.stats import t  # takes a second
+    except ImportError:
+        return math.nan
     return float(t.ppf((1 + LEVEL) / 2, freedom))
 
 

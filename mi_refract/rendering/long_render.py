@@ -27,7 +27,7 @@ from mi_refract.plugins import scene_parser
 
 from . import checkpoint, rendered_file
 from .checkpoint import PASS, Progress
-from .error_estimate import RelativeError, relative_error, worst_tile
+from .error_estimate import RelativeError, relative_error, require_interval, worst_tile
 from .pass_plan import FEW, PassPlan, next_stop, plan_passes
 from .pass_sums import PassSums
 from .render_pass import PassRenderer, pass_renderer
@@ -122,6 +122,8 @@ class LongRender:
         self.job, self.limits, self.output = job, limits, writable(output, SUFFIXES)
         if not 0 <= job.seed < 2**32:
             raise ValueError(f"seed = {job.seed}: accepted: a whole number from 0 to 2³² − 1")
+        if limits.until is not None:
+            require_interval()
         self.checkpoint = checkpoint.path_of(self.output)
         self.scene = load_scene(job.scene, job.defines, job.allow_plugins)
         self.renderer = pass_renderer(self.scene, job.seed)
@@ -230,6 +232,8 @@ class LongRender:
     def _good_enough(self) -> str:
         """What error is reached that was asked for; "" where none is."""
         sums = self.progress.sums() if self.limits.until or self.limits.until_tile else None
+        if sums and self.spp is None and not np.any(sums.total[..., : sums.colours] > 0) and not self.warnings:
+            self.warnings.append(f"{self.output}: is black so far: it has no relative error that could end it")
         if sums and self.limits.until and (error := relative_error(sums)).high <= self.limits.until:
             return f"--until {self.limits.until:.3g}: the error is {error.value:.3g}, at most {error.high:.3g}"
         if sums and self.limits.until_tile and (worst := worst_tile(sums)) <= self.limits.until_tile:

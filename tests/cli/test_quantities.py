@@ -20,7 +20,8 @@ def test_what_is_no_share(text):
 
 
 @pytest.mark.parametrize(
-    "text, value", [("90", 90), ("90s", 90), ("10m", 600), ("1h30m", 5400), ("2d", 172800), ("0.5h", 1800), ("1m1s", 61)]
+    "text, value",
+    [("90", 90), ("90s", 90), ("10m", 600), ("1h30m", 5400), ("2d", 172800), ("0.5h", 1800), ("1m1s", 61)],
 )
 def test_times(text, value):
     assert parse_seconds(text, "--time") == value

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import numpy as np
 import pytest
 from scipy.stats import binom
 
+from mi_refract.rendering import error_estimate
 from mi_refract.rendering.error_estimate import RelativeError, relative_error, worst_tile
 from mi_refract.rendering.pass_plan import next_stop
 from mi_refract.rendering.pass_sums import PassSums, PassTree
@@ -119,3 +121,12 @@ def test_a_dark_tile_is_judged_as_one_of_a_hundredth():
     for _ in range(16):
         tree.add(leaf(RNG.normal(truth, 0.04 * 0.01)))
     assert worst_tile(tree.sums()) == pytest.approx(0.01, rel=0.1)
+
+
+def test_without_scipy_there_is_no_interval(monkeypatch):
+    monkeypatch.setitem(sys.modules, "scipy.stats", None)
+    found = relative_error(sums_of("normal", np.ones(SIZE), 9))
+    assert found.value > 0 and math.isnan(found.high)
+    monkeypatch.setattr(error_estimate.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"pip install 'mi-refract\[diff\]'"):
+        error_estimate.require_interval()
