@@ -44,7 +44,8 @@ def test_lines_where_there_is_no_terminal(rendering, monkeypatch, capsys):
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 9  # after every pass, and at the end
     number = r"[\d.e+-]+"
-    form = rf"\S+a\.exr: pass 6 of 8, 48 spp, {number} M samples/s, error {number} % \({number} to {number} %\), \d+ s left"
+    error = rf"error {number} % \({number} to {number} %\)"
+    form = rf"\S+a\.exr: pass 6 of 8, 48 spp, {number} M samples/s, {error}, \d+ s left"
     assert re.fullmatch(form, lines[5]), lines[5]
 
 
