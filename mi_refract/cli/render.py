@@ -13,11 +13,13 @@ from rich.console import Console
 from rich.text import Text
 
 from mi_refract import backend
+from mi_refract.cluster.connection import Tls
 from mi_refract.io.outside_text import printable
 from mi_refract.rendering import scene_files
 
 from . import interrupts, variants
 from .quantities import parse_seconds, parse_share, shown_error
+from .render_cluster import ClusterOptions, cluster_passes
 from .render_progress import shown
 
 
@@ -53,6 +55,22 @@ def render(
         list[str] | None,
         typer.Option("--allow-plugins", metavar="NAME", help="Run this plugin, which the scene brings, too."),
     ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Render on the workers of this Dask scheduler: tcp://host:8786.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=1024, help="Render in so many processes of one thread each, by Dask.")
+    ] = None,
+    tls_ca_file: Annotated[Path | None, typer.Option(metavar="FILE", help="For tls://…: the authority, PEM.")] = None,
+    tls_cert: Annotated[Path | None, typer.Option(metavar="FILE", help="For tls://…: our certificate, PEM.")] = None,
+    tls_key: Annotated[Path | None, typer.Option(metavar="FILE", help="For tls://…: our key, PEM.")] = None,
+    bundle_limit: Annotated[
+        int, typer.Option(min=1, metavar="MIB", help="MiB of a scene's files that may be sent to workers.")
+    ] = 256,
+    mixed_workers: Annotated[
+        bool,
+        typer.Option("--mixed-workers", help="Accept another libLLVM or vector width; the bits then depend on the workers."),
+    ] = False,
 ) -> None:
     """Render a Mitsuba scene into an EXR file that holds its own noise, and says how it was made.
 
@@ -62,6 +80,10 @@ def render(
     from mi_refract.io.atomic import writable
 
     defines = scene_files.parse_defines(define or [])
+    cluster = ClusterOptions(
+        scheduler, workers, Tls(tls_ca_file, tls_cert, tls_key), bundle_limit, mixed_workers=mixed_workers
+    )
+    cluster.check(allow_plugins or ())
     shares = [
         None if text is None else parse_share(text, option)
         for text, option in ((until, "--until"), (until_tile, "--until-tile"))
@@ -79,8 +101,9 @@ def render(
         rendering = LongRender(job, output, limits, restart=restart)
     if rendering.progress.passes:
         print(printable(f"{output}: goes on from {rendering.progress.done} spp"), file=sys.stderr)
-    with interrupts.last_act(rendering.give_up), shown(console, rendering, preview) as watch:
-        header = rendering.run(watch)
+    with cluster_passes(cluster, rendering, str(chosen)) as passes:
+        with interrupts.last_act(rendering.give_up), shown(console, rendering, preview) as watch:
+            header = rendering.run(watch, passes)
     print(printable(f"{output}: {chosen}, {_summary(rendering, header)}"))
     if count := header["mi_refract:nonfinite_pixels"]:
         print(printable(f"mi-refract: {output}: {count} pixels are not finite"), file=sys.stderr)

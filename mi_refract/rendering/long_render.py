@@ -89,7 +89,7 @@ class Passes(Protocol):
     """Who renders passes."""
 
     def nodes(self, first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
-        """Level, sums and machine of nodes that make up the passes from `first` to `stop`, in their order.
+        """Level, sums and machines (separated by ", ") of nodes that make up the passes from `first` to `stop`, in order.
 
         Passes up to `last` may be begun, as they will probably be asked for next. `offset`: added to their numbers for
         their seeds. `spp`: samples per pixel of each.
@@ -193,7 +193,7 @@ class LongRender:
             with self._state:
                 tree.add(sums, level)
                 self.progress.seconds += time.monotonic() - before
-                self.progress.machines = sorted({*self.progress.machines, machine})
+                self.progress.machines = sorted({*self.progress.machines, *machine.split(", ")})
             before = time.monotonic()
             watch(self)
             self._keep_sometimes()
@@ -219,7 +219,7 @@ class LongRender:
             [(_, sums, machine)] = source.nodes(number, number + 1, number + 1, self.progress.first, rest)
             with self._state:
                 self.progress.rest = sums
-                self.progress.machines = sorted({*self.progress.machines, machine})
+                self.progress.machines = sorted({*self.progress.machines, *machine.split(", ")})
                 self.progress.seconds += time.monotonic() - before
 
     def _without_noise(self) -> bool:

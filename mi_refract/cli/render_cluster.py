@@ -1,0 +1,77 @@
+"""The options of `mi-refract render` that have other processes render: on a Dask cluster, or on this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from mi_refract.cluster import connection, worker_facts
+from mi_refract.cluster.connection import NO_TLS, Tls
+from mi_refract.cluster.workers import Workers
+from mi_refract.io.outside_text import printable
+
+if TYPE_CHECKING:  # they import Mitsuba
+    from mi_refract.rendering.long_render import LongRender, Passes
+
+
+@dataclass(frozen=True)
+class ClusterOptions:
+    """Who renders, this process where neither `scheduler` nor `workers` is given. `bundle_limit` in MiB."""
+
+    scheduler: str | None = None
+    workers: int | None = None
+    tls: Tls = NO_TLS
+    bundle_limit: int = 256
+    mixed_workers: bool = False
+
+    @property
+    def given(self) -> bool:
+        """Whether other processes render."""
+        return self.scheduler is not None or self.workers is not None
+
+    def check(self, plugins: Collection[str]) -> None:
+        """ValueError for options that exclude each other; ImportError where Dask is missing. `plugins` of the scene's own."""
+        if self.scheduler is not None and self.workers is not None:
+            raise ValueError("--scheduler and --workers; accepted: one of them")
+        if not self.given and (self.tls.given or self.mixed_workers):
+            raise ValueError("--tls-ca-file, --tls-cert, --tls-key, --mixed-workers: accepted with --scheduler ADDRESS")
+        if self.given and plugins:
+            raise ValueError(
+                f"--allow-plugins {min(plugins)}: native code, which is not sent to workers; "
+                "accepted: without --scheduler and --workers"
+            )
+        if self.given:
+            connection.require_dask()
+
+
+@contextlib.contextmanager
+def cluster_passes(options: ClusterOptions, rendering: LongRender, variant: str) -> Iterator[Passes | None]:
+    """Who renders the passes; None for this process. Workers that are refused are named on stderr.
+
+    ValueError for a scene that cannot be sent; ConnectionError where no scheduler answers or no worker may render.
+    """
+    if not options.given:
+        yield None
+        return
+    from mi_refract.rendering import scene_bundle
+    from mi_refract.rendering.cluster_passes import ClusterPasses, RenderedScene
+
+    job = rendering.job
+    bundle = scene_bundle.pack(job.scene, job.defines, options.bundle_limit)
+    with connection.connected(options.scheduler, options.workers, options.tls) as client:
+        tolerated = worker_facts.MIXED if options.mixed_workers else ()
+        workers = Workers(client, variant, worker_facts.facts(variant), tolerated, _say)
+        workers.wait()
+        scene = RenderedScene(variant, dict(job.defines), job.seed)
+        passes = ClusterPasses(workers, bundle, scene, rendering.warnings.append)
+        try:
+            yield passes
+        finally:
+            passes.close()
+
+
+def _say(text: str) -> None:
+    print(printable(f"mi-refract: {text}"), file=sys.stderr, flush=True)

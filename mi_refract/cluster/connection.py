@@ -1,0 +1,136 @@
+"""A connection to a Dask scheduler, whose failures are one line."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import re
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from . import local_process
+
+PATIENCE = 6.0  # seconds until a scheduler must have answered
+_CLOSING = 2.0  # seconds
+_LOGGERS = ("distributed", "tornado", "asyncio")
+_ACCEPTED = "accepted: the address of a Dask scheduler, such as tcp://host:8786 or tls://host:8786"
+
+
+class LostSchedulerError(ConnectionError):
+    """The scheduler has ended, or cannot be reached any more."""
+
+
+@dataclass(frozen=True)
+class Tls:
+    """Files in PEM format for a `tls://` scheduler; None: as Dask's own configuration says."""
+
+    ca_file: Path | None = None
+    cert: Path | None = None
+    key: Path | None = None
+
+    @property
+    def given(self) -> bool:
+        """Whether any is given."""
+        return any((self.ca_file, self.cert, self.key))
+
+    def security(self) -> Any:
+        """A `distributed.Security`; None where nothing is given. FileNotFoundError for a missing file."""
+        from distributed.security import Security
+
+        for option, path in (("--tls-ca-file", self.ca_file), ("--tls-cert", self.cert), ("--tls-key", self.key)):
+            if path is not None and not path.is_file():
+                raise FileNotFoundError(f"{option} {path}: no such file; accepted: a file in PEM format")
+        files = {"tls_ca_file": self.ca_file, "tls_client_cert": self.cert, "tls_client_key": self.key}
+        named = {name: str(path) for name, path in files.items() if path is not None}
+        return Security(**named, require_encryption=True) if named else None
+
+
+NO_TLS = Tls()
+
+
+def require_dask() -> None:
+    """ImportError, one line, where Dask's `distributed` is missing."""
+    try:
+        import distributed  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ImportError(
+            f"--scheduler and --workers need Dask ({error.name} is missing): pip install 'mi-refract[cluster]'"
+        ) from None
+
+
+@contextlib.contextmanager
+def connected(scheduler: str | None = None, workers: int | None = None, tls: Tls = NO_TLS) -> Iterator[Any]:
+    """A `distributed.Client` of the scheduler at an address, or of so many processes of one thread each on this machine.
+
+    ConnectionError, one line, after PATIENCE where no scheduler answers; ImportError without Dask; ValueError unless
+    exactly one of the two is given.
+    """
+    if (scheduler is None) == (workers is None):
+        raise ValueError("accepted: either --scheduler ADDRESS or --workers N")
+    if tls.given and scheduler is None:
+        raise ValueError("--tls-ca-file, --tls-cert, --tls-key: accepted with --scheduler tls://HOST:PORT")
+    require_dask()
+    with _silent(), contextlib.ExitStack() as stack:
+        if workers is not None:
+            scheduler = stack.enter_context(local_process.started(workers))
+        client = _client(str(scheduler), tls)
+        try:
+            yield client
+        finally:
+            with contextlib.suppress(Exception):  # a scheduler that is gone
+                client.close(timeout=_CLOSING)
+
+
+def _client(address: str, tls: Tls) -> Any:
+    from distributed import Client
+    from distributed.security import Security
+
+    security = tls.security() or Security()
+    try:
+        # First, as a client that found nobody would take 16 s to give up.
+        kind = asyncio.run(_kind(address, security.get_connection_args("client")))
+        if kind != "Scheduler":
+            raise ValueError(f"a {kind} answers")
+        return Client(address, security=security, timeout=PATIENCE, set_as_default=False)
+    except Exception as error:
+        reason = error.__cause__ or error
+        text = re.sub(r"in <[^>]*>: ", "", " ".join(str(reason).split())) or f"not within {PATIENCE:.0f} s"
+        raise ConnectionError(f"--scheduler {address}: no Dask scheduler answers: {text[:200]}; {_ACCEPTED}") from None
+
+
+async def _kind(address: str, arguments: Mapping[str, Any]) -> str:
+    """What answers at an address, as it says."""
+    from distributed import rpc
+
+    async with asyncio.timeout(PATIENCE), rpc(address, timeout=PATIENCE - 1, connection_args=arguments) as there:
+        return str((await there.identity()).get("type"))
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Without Dask's own messages: what matters of them is raised or warned of here."""
+    loggers = [logging.getLogger(name) for name in _LOGGERS]
+    loggers += [logging.getLogger(name) for name in logging.root.manager.loggerDict if name.startswith("distributed.")]
+    before = [each.level for each in loggers]
+    for each in loggers:
+        each.setLevel(logging.CRITICAL + 1)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of versions, large graphs: versions that matter are compared by `workers`
+            yield
+    finally:
+        for each, level in zip(loggers, before, strict=True):
+            each.setLevel(level)
+
+
+def require_scheduler(client: Any) -> None:
+    """LostSchedulerError, one line, where the scheduler of a client has gone."""
+    if client.status != "running":
+        address = getattr(client.scheduler, "address", "") or "the scheduler"
+        raise LostSchedulerError(
+            f"{address}: the Dask scheduler is gone; accepted: one that runs, or none, to go on here"
+        )

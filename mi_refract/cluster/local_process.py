@@ -1,0 +1,47 @@
+"""A local cluster in a process of its own, which ends with ours."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+
+from .local import FAILED
+
+MOST = 1024  # workers
+_ENDING = 10.0  # seconds
+
+
+@contextlib.contextmanager
+def started(workers: int) -> Iterator[str]:
+    """The address of a scheduler with so many workers, processes of one thread each. They end at the end.
+
+    They also end where this process is killed. ConnectionError, one line, where they cannot be started.
+    """
+    if not 1 <= workers <= MOST:
+        raise ValueError(f"--workers {workers}: accepted: a whole number from 1 to {MOST}")
+    # -P: no module of the working folder takes the place of one of ours.
+    command = [sys.executable, "-P", "-m", "mi_refract.cluster.local", str(workers)]
+    process = subprocess.Popen(
+        command,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=None if os.environ.get("MI_REFRACT_TRACEBACK") == "1" else subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdin and process.stdout
+    try:
+        said = process.stdout.readline().strip()
+        if not said or said.startswith(FAILED):
+            reason = said.removeprefix(FAILED) or f"ended with status {process.wait()}"
+            raise ConnectionError(f"--workers {workers}: no local cluster: {reason}; accepted: fewer, or none")
+        yield said
+    finally:
+        process.stdin.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_ENDING)
+        process.stdout.close()

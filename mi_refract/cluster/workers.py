@@ -1,0 +1,112 @@
+"""The workers of a scheduler that may have work: each is asked for its facts before it gets any."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
+
+from . import worker_facts
+from .connection import require_scheduler
+
+PATIENCE = 120.0  # seconds until the first workers must have said what they are: they import Mitsuba, and try libLLVM
+_NOBODY = 30.0  # seconds until a scheduler must have a worker at all
+ALONE = 120.0  # seconds until new workers must have come where all have gone
+_POLL, _BETWEEN_LOOKS = 0.05, 2.0  # seconds
+
+
+class Workers:
+    """Of a client's scheduler. `accepted`: threads by the addresses of those that are there and may have work.
+
+    `refused`: why, by address; `machines`: the names of all that ever were accepted.
+    """
+
+    def __init__(
+        self,
+        client: Any,
+        variant: str,
+        expected: Mapping[str, str],
+        tolerated: Collection[str] = (),
+        warn: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        """`expected`: facts that workers must have, but for `tolerated`. `warn` is told of every one that is refused."""
+        self.client, self.variant, self.expected, self.tolerated, self.warn = client, variant, expected, tolerated, warn
+        self.accepted: dict[str, int] = {}
+        self.refused: dict[str, str] = {}
+        self.machines: dict[str, str] = {}
+        self._asked: dict[str, Any] = {}
+        self._looked = -_BETWEEN_LOOKS
+        self._alone_since: float | None = None
+
+    def wait(self) -> None:
+        """Until those that are there have answered. ConnectionError, one line, where none may have work."""
+        began = time.monotonic()
+        while True:
+            self.look(at_once=True)
+            waited = time.monotonic() - began
+            if self.accepted and not self._asked:
+                return
+            if not self._asked and (self.refused or waited > _NOBODY):
+                break
+            if waited > PATIENCE:
+                if self.accepted:
+                    return
+                break
+            time.sleep(_POLL)
+        found = "; ".join(self.refused.values()) or ("workers do not answer" if self._asked else "no workers")
+        raise ConnectionError(
+            f"{self._address}: no worker that may render: {found}; accepted: at least one like this process"
+        )
+
+    @property
+    def _address(self) -> str:
+        return str(self.client.scheduler.address)
+
+    def look(self, *, at_once: bool = False) -> None:
+        """Ask those that are new, note what they answered and who has gone; nobody is waited for. Seldom, or `at_once`.
+
+        LostSchedulerError where the scheduler has gone, ConnectionError where all workers have, and none came for ALONE.
+        """
+        require_scheduler(self.client)
+        if not at_once and time.monotonic() - self._looked < _BETWEEN_LOOKS:
+            return
+        self._looked = time.monotonic()
+        try:
+            present = dict(self.client.nthreads())
+        except Exception:
+            require_scheduler(self.client)
+            raise
+        for known in (self.accepted, self.refused, self._asked):
+            for address in [each for each in known if each not in present]:
+                del known[address]
+        for address, threads in present.items():
+            if address in self._asked and self._asked[address].done():
+                self._judge(address, threads, self._asked.pop(address))
+            elif address not in self._asked and address not in self.accepted and address not in self.refused:
+                self._asked[address] = self.client.submit(
+                    worker_facts.facts, self.variant, workers=[address], pure=False, priority=1000
+                )
+        self._require_some()
+
+    def _require_some(self) -> None:
+        if self.accepted or not self.machines:
+            self._alone_since = None
+        elif self._alone_since is None:
+            self._alone_since = time.monotonic()
+        elif time.monotonic() - self._alone_since > ALONE:
+            raise ConnectionError(f"{self._address}: all workers have gone; accepted: new ones within {ALONE:.0f} s")
+
+    def _judge(self, address: str, threads: int, answer: Any) -> None:
+        if answer.status != "finished":
+            error = answer.exception() if answer.status == "error" else None
+            different, there = [f"{type(error).__name__}: {error}" if error else answer.status], {}
+        else:
+            there = answer.result()
+            different = worker_facts.differences(there, self.expected, self.tolerated)
+        if not different:
+            self.accepted[address] = threads
+            self.machines[address] = worker_facts.machine(there, self.expected)
+            return
+        host = f" on {there[worker_facts.HOST]}" if there else ""
+        self.refused[address] = f"worker {address}{host} is refused: {'; '.join(different)}"
+        self.warn(self.refused[address])

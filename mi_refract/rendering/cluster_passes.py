@@ -1,0 +1,306 @@
+"""Passes of a render on the workers of a cluster, summed there in the tree's own nodes before they come back.
+
+A task renders ARITY**k passes in a row, so that it takes seconds; other tasks fold ARITY nodes into one of the next
+level, so that a node comes back every few seconds. Sums are made in the order of `PassTree`: who made them is not seen.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+from mi_refract.cluster import on_worker
+from mi_refract.cluster.connection import require_scheduler
+from mi_refract.cluster.workers import Workers
+
+from . import scene_bundle
+from .pass_plan import next_stop
+from .pass_sums import ARITY, PassSums, aligned_nodes
+from .rendered_file import nonfinite_pixels
+from .scene_bundle import SceneBundle
+
+TASK_SECONDS = 3.0  # of a task that renders more than one pass, at most: nobody waits longer for a slow worker
+# Between two nodes, at most. What a kill may lose: BETWEEN_CHECKPOINTS, and what is not yet a whole node.
+NODE_SECONDS = 5.0
+LEVELS = 4  # of a node, at most
+AHEAD = 3  # tasks for each thread of the workers
+NODES = 64  # that are begun at a time, at least; the workers keep what is finished of them
+RETRIES = 2
+_MEASURED = 16  # nodes whose time counts
+_POLL = 0.5  # seconds
+
+
+@dataclass(frozen=True)
+class Part:
+    """The sums of a node; the addresses of the workers that rendered it, and their pixels that are not finite.
+
+    `seconds`: of the workers, for all its passes.
+    """
+
+    sums: PassSums
+    nonfinite: dict[str, int]
+    seconds: float
+
+
+@dataclass(frozen=True)
+class RenderedScene:
+    """What a worker must know beside the bundle: the variant, the `<default>`s, the seed of the render."""
+
+    variant: str
+    defines: Mapping[str, str]
+    seed: int
+
+
+# On a worker ----------------------------------------------------------------------------------------------------------
+
+
+def keep(bundle: SceneBundle) -> SceneBundle:
+    """The task whose result the others ask for: so the bundle goes to each worker once, also from the others."""
+    return bundle
+
+
+def render_node(bundle: SceneBundle, scene: RenderedScene, level: int, first: int, spp: int) -> Part:
+    """Render ARITY**level passes of `spp` samples per pixel each, from number `first` on, and sum them.
+
+    Errors: those of `load_scene` and of the scene itself, with the paths of the machine that made the bundle.
+    """
+    with on_worker.ONE_AT_A_TIME:
+        return _rendered(bundle, scene, level, first, spp)
+
+
+def _rendered(bundle: SceneBundle, scene: RenderedScene, level: int, first: int, spp: int) -> Part:
+    from mi_refract import backend
+
+    began = time.monotonic()
+    if on_worker.variant() != scene.variant:
+        backend.activate(scene.variant)
+    on_worker.limit_threads()
+    from .render_pass import pass_renderer
+
+    loaded, root = scene_bundle.load(bundle, scene.variant, scene.defines, on_worker.scratch_folder())
+    renderer, bad = pass_renderer(loaded, scene.seed), 0
+
+    def node(level: int, first: int) -> PassSums:
+        nonlocal bad
+        if level:
+            size = ARITY ** (level - 1)
+            found = node(level - 1, first)
+            for i in range(1, ARITY):
+                found.add(node(level - 1, first + i * size))
+            return found
+        sums = renderer.render(first, spp)
+        bad = max(bad, nonfinite_pixels(sums))
+        return sums
+
+    with scene_bundle.original_paths(root):
+        sums = node(level, first)
+    return Part(sums, {on_worker.address(): bad}, time.monotonic() - began)
+
+
+def fold(*parts: Part) -> Part:
+    """The node that these make, which follow each other. They stay as they are: Dask may want them again."""
+    sums = parts[0].sums.copy()
+    for part in parts[1:]:
+        sums.add(part.sums)
+    nonfinite: dict[str, int] = {}
+    for part in parts:
+        for address, count in part.nonfinite.items():
+            nonfinite[address] = max(count, nonfinite.get(address, 0))
+    return Part(sums, nonfinite, sum(part.seconds for part in parts))
+
+
+# Here -----------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Node:
+    """A node that was asked for. `needed`: of these workers one must be there; `tasks`: its unfinished ones that render."""
+
+    level: int
+    first: int
+    needed: frozenset[str]
+    result: Any
+    tasks: list[Any]
+
+    @property
+    def stop(self) -> int:
+        return self.first + ARITY**self.level
+
+
+class ClusterPasses:
+    """Renders passes on workers that were accepted. To be closed at the end: what is still asked for is cancelled then.
+
+    `received`: bytes of the nodes that came back.
+    """
+
+    def __init__(
+        self,
+        workers: Workers,
+        bundle: SceneBundle,
+        scene: RenderedScene,
+        warn: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        """`warn` is told of machines whose pixels are not finite."""
+        self.workers, self.bundle, self.scene, self.warn = workers, bundle, scene, warn
+        self.received = 0
+        self._begun: deque[_Node] = deque()
+        self._series = (0, 0)  # offset and samples of what is begun
+        self._pass_seconds: deque[float] = deque(maxlen=_MEASURED)
+        self._kept: tuple[Any, frozenset[str]] = (None, frozenset())  # the bundle there, and who may make it
+        self._warned: set[str] = set()
+        self._count = itertools.count()
+
+    def nodes(self, first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
+        """As `Passes`. What is begun beyond `stop` stays so for the next call, unless this iterator is closed early.
+
+        ConnectionError, one line, where the scheduler or all workers have gone; errors of the scene as they are.
+        """
+        if self._series != (offset, spp) or (self._begun and self._begun[0].first != first):
+            self.close()
+        self._series = offset, spp
+        try:
+            while first < stop:
+                if self._begun and self._begun[0].stop > stop:
+                    self.close()
+                node, part = self._next(first, stop, last)
+                first = node.stop
+                self._note(node, part)
+                yield node.level, part.sums.copy(), self._machines(part)  # a copy: what Dask gives may be read-only
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Cancel all that is begun."""
+        futures = [future for node in self._begun for future in (node.result, *node.tasks)]
+        self._begun.clear()
+        if futures and self.workers.client.status == "running":
+            self.workers.client.cancel(futures, force=True)
+
+    def _next(self, first: int, stop: int, last: int) -> tuple[_Node, Part]:
+        """The node that begins at `first`, when it is finished; more are begun meanwhile."""
+        from distributed import wait
+
+        while True:
+            self.workers.look()
+            self._begin_again()
+            self._begin(first, stop, last)
+            if not self._begun:
+                time.sleep(_POLL)
+                continue
+            try:
+                with self.workers.client.as_current():
+                    wait(self._begun[0].result, timeout=_POLL)
+            except TimeoutError:
+                continue
+            except Exception:
+                require_scheduler(self.workers.client)
+                raise
+            node = self._begun.popleft()
+            return node, self._result(node)
+
+    def _result(self, node: _Node) -> Part:
+        from distributed import KilledWorker
+        from distributed.client import FutureCancelledError
+
+        try:
+            part: Part = node.result.result()
+        except KilledWorker as error:
+            passes = f"passes {node.first} to {node.stop - 1}"
+            raise ConnectionError(
+                f"{passes}: {error.allowed_failures + 1} workers were lost that rendered them, the last {error.last_worker}; "
+                "accepted: workers with enough memory"
+            ) from None
+        except FutureCancelledError:
+            require_scheduler(self.workers.client)
+            raise ConnectionError(f"pass {node.first}: was cancelled on the cluster; accepted: not to") from None
+        return part
+
+    def _note(self, node: _Node, part: Part) -> None:
+        self._pass_seconds.append(part.seconds / part.sums.passes)
+        arrays = (part.sums.total, part.sums.between, part.sums.within)
+        self.received += sum(array.nbytes for array in arrays if array is not None)
+        for address, count in part.nonfinite.items():
+            machine = self.workers.machines.get(address, address)
+            if count and machine not in self._warned:
+                self._warned.add(machine)
+                self.warn(f"{machine}: {count} pixels of a pass are not finite")
+
+    def _machines(self, part: Part) -> str:
+        return ", ".join(sorted({self.workers.machines.get(address, address) for address in part.nonfinite}))
+
+    # What is begun ----------------------------------------------------------------------------------------------------
+
+    def levels(self) -> tuple[int, int]:
+        """The levels of a task and of a node, from the times so far; 0 before the first."""
+        if not self._pass_seconds:
+            return 0, 0
+        seconds, count = median(self._pass_seconds), len(self.workers.accepted)
+        task = max((k for k in range(LEVELS) if ARITY**k * seconds <= TASK_SECONDS), default=0)
+        node = max((k for k in range(LEVELS + 1) if ARITY**k * seconds <= NODE_SECONDS * max(1, count)), default=0)
+        return min(task, node), node
+
+    def _begin(self, first: int, stop: int, last: int) -> None:
+        """Begin nodes until each thread has AHEAD tasks; at least the one that is asked for."""
+        while True:
+            begin = self._begun[-1].stop if self._begun else first
+            if begin >= last or (self._begun and self._enough()):
+                return
+            while stop <= begin:
+                stop = min(next_stop(stop), last)
+            task, largest = self.levels()
+            level, begin = aligned_nodes(begin, stop, largest)[0]
+            if not (node := self._asked(level, begin, min(task, level))):
+                return
+            self._begun.append(node)
+
+    def _enough(self) -> bool:
+        threads, tasks = sum(self.workers.accepted.values()), 0
+        for node in self._begun:
+            node.tasks[:] = [
+                task for task in node.tasks if not task.done()
+            ]  # what is done need not be kept there for us
+            tasks += len(node.tasks)
+        return tasks >= AHEAD * threads or len(self._begun) >= max(NODES, AHEAD * threads)
+
+    def _asked(self, level: int, first: int, task: int) -> _Node | None:
+        """A node, asked of the workers that are accepted now; None where there are none."""
+        allowed = frozenset(self.workers.accepted)
+        if not allowed:
+            return None
+        (offset, spp), bundle, client = self._series, self._bundle(allowed), self.workers.client
+        options = {"workers": sorted(allowed), "retries": RETRIES, "pure": False, "priority": -next(self._count)}
+        size = ARITY**task
+        parts = tasks = [
+            client.submit(render_node, bundle, self.scene, task, offset + number, spp, **options)
+            for number in range(first, first + ARITY**level, size)
+        ]
+        while len(parts) > 1:
+            parts = [client.submit(fold, *parts[i : i + ARITY], **options) for i in range(0, len(parts), ARITY)]
+        return _Node(level, first, self._kept[1] & allowed, parts[0], list(tasks))
+
+    def _bundle(self, allowed: frozenset[str]) -> Any:
+        """The bundle on the workers; sent again where all have gone that were allowed to have it."""
+        future, holders = self._kept
+        if not holders & allowed:
+            future, holders = (
+                self.workers.client.submit(keep, self.bundle, workers=sorted(allowed), pure=False),
+                allowed,
+            )
+            self._kept = future, holders
+        return future
+
+    def _begin_again(self) -> None:
+        """Ask others for nodes whose workers have all gone: Dask would wait for these to come back."""
+        there = self.workers.accepted.keys()
+        for i, node in enumerate(self._begun):
+            if not node.result.done() and not node.needed & there and there:
+                again = self._asked(node.level, node.first, 0)
+                if again is not None:
+                    self.workers.client.cancel([node.result, *node.tasks], force=True)
+                    self._begun[i] = again
