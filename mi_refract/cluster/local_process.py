@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from .local import FAILED
 
 MOST = 1024  # workers
+MODULE = "mi_refract.cluster.local"
 _ENDING = 10.0  # seconds
 
 
@@ -23,7 +24,7 @@ def started(workers: int) -> Iterator[str]:
     if not 1 <= workers <= MOST:
         raise ValueError(f"--workers {workers}: accepted: a whole number from 1 to {MOST}")
     # -P: no module of the working folder takes the place of one of ours.
-    command = [sys.executable, "-P", "-m", "mi_refract.cluster.local", str(workers)]
+    command = [sys.executable, "-P", "-m", MODULE, str(workers)]
     process = subprocess.Popen(
         command,
         env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},

@@ -12,6 +12,8 @@ from .connection import require_scheduler
 PATIENCE = 120.0  # seconds until the first workers must have said what they are: they import Mitsuba, and try libLLVM
 _NOBODY = 30.0  # seconds until a scheduler must have a worker at all
 ALONE = 120.0  # seconds until new workers must have come where all have gone
+# As text: a worker that cannot import a function which it is sent ends, and its nanny starts it again, without end.
+_QUESTION = "__import__('mi_refract.cluster.worker_facts', fromlist=['facts']).facts({!r})"
 _POLL, _BETWEEN_LOOKS = 0.05, 2.0  # seconds
 
 
@@ -84,7 +86,7 @@ class Workers:
                 self._judge(address, threads, self._asked.pop(address))
             elif address not in self._asked and address not in self.accepted and address not in self.refused:
                 self._asked[address] = self.client.submit(
-                    worker_facts.facts, self.variant, workers=[address], pure=False, priority=1000
+                    eval, _QUESTION.format(self.variant), workers=[address], pure=False, priority=1000
                 )
         self._require_some()
 

@@ -1,0 +1,112 @@
+"""Connections to a Dask scheduler: none there, no Dask, and a local one that ends with whoever started it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+
+import pytest
+from support.dask_workers import until
+from support.processes import python
+
+from mi_refract.cluster import connection, local_process
+from mi_refract.cluster.connection import Tls, connected
+
+
+def refusal(**options):
+    with pytest.raises((ConnectionError, ValueError, ImportError, FileNotFoundError)) as caught, connected(**options):
+        pass
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_no_scheduler():
+    began = time.monotonic()
+    text = refusal(scheduler="tcp://127.0.0.1:9")
+    assert time.monotonic() - began < 10
+    assert text.startswith("--scheduler tcp://127.0.0.1:9: no Dask scheduler answers: ") and "refused" in text
+    assert "accepted: the address of a Dask scheduler" in text
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"scheduler": "nonsense"}, "--scheduler nonsense: no Dask scheduler answers: missing port"),
+        ({"scheduler": "tcp://h:1", "workers": 1}, "accepted: either --scheduler ADDRESS or --workers N"),
+        ({"workers": 0}, "--workers 0: accepted: a whole number from 1 to 1024"),
+        ({"workers": 1, "tls": Tls(key="x")}, "accepted with --scheduler tls://HOST:PORT"),
+        ({"scheduler": "tls://h:1", "tls": Tls(cert=connection.Path("none.pem"))}, "--tls-cert none.pem: no such file"),
+    ],
+)
+def test_misuse(options, message):
+    assert message in refusal(**options)
+
+
+def test_encryption_is_not_given_up(tmp_path):
+    """Where TLS is asked for, a connection without is refused."""
+    path = tmp_path / "ca.pem"
+    path.write_text("")
+    assert "encryption required" in refusal(scheduler="tcp://127.0.0.1:9", tls=Tls(ca_file=path))
+
+
+def test_without_dask(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert refusal(workers=1).endswith("pip install 'mi-refract[cluster]'")
+
+
+def test_dask_is_not_imported_before_it_is_needed():
+    code = """import sys, mi_refract.cli.app, mi_refract.cli.render, mi_refract.cluster.workers, mi_refract.cluster.connection
+mi_refract.cli.app.main(["--help"])
+sys.exit(str([name for name in sys.modules if name.partition(".")[0] in ("dask", "distributed")]))"""
+    with python(code) as process:
+        assert process.communicate()[1].splitlines()[-1] == "[]"
+
+
+def group(leader):
+    """The processes of a process group that have not ended."""
+    found = []
+    for entry in connection.Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                state, _, own = (entry / "stat").read_text().rpartition(")")[2].split()[:3]
+            except OSError:
+                continue
+            found += [int(entry.name)] if int(own) == leader and state != "Z" else []
+    return found
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks /proc")
+def test_local_workers_end_with_a_killed_process():
+    code = """import signal, subprocess, sys, time
+signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+from mi_refract.cluster import local_process
+popen = subprocess.Popen
+def told(*arguments, **options):
+    process = popen(*arguments, **options)
+    print(process.pid, flush=True)
+    return process
+subprocess.Popen = told
+with local_process.started(1) as address:
+    print(address, flush=True)
+    time.sleep(600)"""
+    with python(code) as process:
+        leader, address = int(process.stdout.readline()), process.stdout.readline()
+        try:
+            assert address.startswith("tcp://127.0.0.1:")
+            assert len(group(leader)) >= 2  # the scheduler's process, and a worker's
+            for pid in group(leader):
+                status = connection.Path(f"/proc/{pid}/status").read_text()
+                assert not int(status.partition("SigBlk:")[2].split()[0], 16) >> (signal.SIGTERM - 1) & 1
+            process.kill()
+            until(lambda: not group(leader), 10)
+        finally:
+            process.kill()
+            if group(leader):
+                os.killpg(leader, signal.SIGKILL)
+
+
+def test_a_cluster_that_cannot_start(monkeypatch):
+    monkeypatch.setattr(local_process, "MODULE", "mi_refract.cluster.none")
+    assert refusal(workers=1) == "--workers 1: no local cluster: ended with status 1; accepted: fewer, or none"

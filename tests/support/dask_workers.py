@@ -1,0 +1,52 @@
+"""Dask workers of the tests: started once a module, killed, and made to lie."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from support.processes import ENVIRONMENT
+
+from mi_refract.cluster.worker_facts import facts
+from mi_refract.cluster.workers import Workers
+
+_PID = "import os; from distributed import get_worker"
+
+
+def accepted(client: Any, variant: str, **options: Any) -> Workers:
+    """The workers of a client that are like this process, after all have answered."""
+    workers = Workers(client, variant, facts(variant), **options)
+    workers.wait()
+    return workers
+
+
+def kill(client: Any, address: str) -> None:
+    """End a worker's process with SIGKILL; its nanny starts another one."""
+    pid = client.run(os.getpid, workers=[address])[address]
+    os.kill(pid, signal.SIGKILL)
+
+
+@contextlib.contextmanager
+def joined(scheduler: str) -> Iterator[subprocess.Popen[bytes]]:
+    """One more worker of one thread, without a nanny."""
+    command = [sys.executable, "-m", "distributed.cli.dask_worker", scheduler, "--nthreads", "1", "--no-nanny", "--no-dashboard"]
+    process = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def until(reached: Callable[[], Any], seconds: float = 60.0) -> None:
+    """Wait until something is so; a failure after `seconds`."""
+    deadline = time.monotonic() + seconds
+    while not reached():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
