@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
-from typing import Any
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
 
-ONE_AT_A_TIME = threading.Lock()  # for what uses all threads of the worker, or switches what is one for the process
+Result = TypeVar("Result")
+# Mitsuba's variant is one of a thread, what it loads is best left to the thread that loaded it, and a pass uses all
+# threads that the worker has.
+_renderer = ThreadPoolExecutor(1, "renderer")
+
+
+def one_at_a_time(call: Callable[[], Result]) -> Result:
+    """What `call` returns, in the thread of this process that has all calls, one after the other."""
+    return _renderer.submit(call).result()
 
 
 def _worker() -> Any:
@@ -29,15 +38,19 @@ def scratch_folder() -> str:
 
 
 def variant() -> str | None:
-    """Mitsuba's variant, of which each thread has its own; None where none is set. Mitsuba is not imported for it."""
+    """This thread's variant of Mitsuba, which is not imported for it; None where none is set."""
     found = sys.modules.get("mitsuba")
     return None if found is None else found.variant()
 
 
-def limit_threads() -> None:
-    """Have Dr.Jit use as many threads as the worker was given, so that workers of one machine share its cores."""
+def threads() -> int:
+    """How many the worker was given. ValueError outside of a task."""
+    return int(_worker().state.nthreads)
+
+
+def limit_threads(threads: int) -> None:
+    """Have Dr.Jit use so many threads, so that workers of one machine share its cores."""
     import drjit as dr
 
-    threads = int(_worker().state.nthreads)
     if dr.thread_count() != threads:
         dr.set_thread_count(threads)

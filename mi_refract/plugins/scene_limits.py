@@ -39,12 +39,14 @@ _OPENED = {b"include", b"spectrum"}  # elements that name a file which the parse
 class Walk:
     """What was seen of a scene so far. `parameters`: what Mitsuba replaces, by name; the first value counts.
 
-    `xml`: the files, the scene's own first; `opened`: files that the parser opens besides, by their names in the scene.
+    `xml`: the files, the scene's own first; `opened`: files that the parser opens besides, by their names in the scene;
+    `searched`: the folders of <path> elements.
     """
 
     parameters: dict[str, str]
     xml: list[Path] = field(default_factory=list)
     opened: dict[str, Path] = field(default_factory=dict)
+    searched: list[Path] = field(default_factory=list)
     size: int = 0
     files: int = 0
     elements: int = 0
@@ -101,7 +103,8 @@ def _follow(name: bytes, values: Mapping[str, str], path: Path, folders: list[Pa
     elif name == b"path":
         walk.folders += 1
         _refuse_more(path, walk.folders, FOLDERS, "<path> elements")
-        folders.insert(0, resolved(values.get("value", ""), [path.parent, *folders]))
+        walk.searched.append(resolved(values.get("value", ""), [path.parent, *folders]))
+        folders.insert(0, walk.searched[-1])
     elif values.get("filename"):
         found = resolved(values["filename"], [path.parent, *folders])
         refuse_special(found)

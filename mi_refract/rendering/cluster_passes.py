@@ -7,13 +7,16 @@ level, so that a node comes back every few seconds. Sums are made in the order o
 from __future__ import annotations
 
 import itertools
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from concurrent import futures
 from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
+from mi_refract import backend
 from mi_refract.cluster import on_worker
 from mi_refract.cluster.connection import require_scheduler
 from mi_refract.cluster.workers import Workers
@@ -69,37 +72,39 @@ def render_node(bundle: SceneBundle, scene: RenderedScene, level: int, first: in
 
     Errors: those of `load_scene` and of the scene itself, with the paths of the machine that made the bundle.
     """
-    with on_worker.ONE_AT_A_TIME:
-        return _rendered(bundle, scene, level, first, spp)
+    address, threads, folder = on_worker.address(), on_worker.threads(), on_worker.scratch_folder()
+
+    def rendered() -> Part:
+        began = time.monotonic()
+        if on_worker.variant() != scene.variant:
+            backend.activate(scene.variant)
+        on_worker.limit_threads(threads)
+        sums, bad = _rendered(bundle, scene, folder, (level, first, spp))
+        return Part(sums, {address: bad}, time.monotonic() - began)
+
+    return on_worker.one_at_a_time(rendered)
 
 
-def _rendered(bundle: SceneBundle, scene: RenderedScene, level: int, first: int, spp: int) -> Part:
-    from mi_refract import backend
-
-    began = time.monotonic()
-    if on_worker.variant() != scene.variant:
-        backend.activate(scene.variant)
-    on_worker.limit_threads()
+def _rendered(bundle: SceneBundle, scene: RenderedScene, folder: str, node: tuple[int, int, int]) -> tuple[PassSums, int]:
+    """The sums of a node (level, first pass, samples of a pass), and the most pixels of a pass that are not finite."""
     from .render_pass import pass_renderer
 
-    loaded, root = scene_bundle.load(bundle, scene.variant, scene.defines, on_worker.scratch_folder())
-    renderer, bad = pass_renderer(loaded, scene.seed), 0
+    loaded, root = scene_bundle.load(bundle, scene.variant, scene.defines, folder)
+    renderer, spp, bad = pass_renderer(loaded, scene.seed), node[2], [0]
 
-    def node(level: int, first: int) -> PassSums:
-        nonlocal bad
+    def made(level: int, first: int) -> PassSums:
         if level:
             size = ARITY ** (level - 1)
-            found = node(level - 1, first)
+            sums = made(level - 1, first)
             for i in range(1, ARITY):
-                found.add(node(level - 1, first + i * size))
-            return found
+                sums.add(made(level - 1, first + i * size))
+            return sums
         sums = renderer.render(first, spp)
-        bad = max(bad, nonfinite_pixels(sums))
+        bad.append(nonfinite_pixels(sums))
         return sums
 
     with scene_bundle.original_paths(root):
-        sums = node(level, first)
-    return Part(sums, {on_worker.address(): bad}, time.monotonic() - began)
+        return made(*node[:2]), max(bad)
 
 
 def fold(*parts: Part) -> Part:
@@ -112,6 +117,20 @@ def fold(*parts: Part) -> Part:
         for address, count in part.nonfinite.items():
             nonfinite[address] = max(count, nonfinite.get(address, 0))
     return Part(sums, nonfinite, sum(part.seconds for part in parts))
+
+
+def _in_thread(call: Callable[[], Part]) -> futures.Future[Part]:
+    """What `call` returns, some day: it waits for ever for data that was lost with workers which do not come back."""
+    found: futures.Future[Part] = futures.Future()
+
+    def run() -> None:
+        try:
+            found.set_result(call())
+        except BaseException as error:
+            found.set_exception(error)
+
+    threading.Thread(target=run, name="node", daemon=True).start()
+    return found
 
 
 # Here -----------------------------------------------------------------------------------------------------------------
@@ -177,15 +196,14 @@ class ClusterPasses:
 
     def close(self) -> None:
         """Cancel all that is begun."""
-        futures = [future for node in self._begun for future in (node.result, *node.tasks)]
+        asked = [future for node in self._begun for future in (node.result, *node.tasks)]
         self._begun.clear()
-        if futures and self.workers.client.status == "running":
-            self.workers.client.cancel(futures, force=True)
+        if asked and self.workers.client.status == "running":
+            self.workers.client.cancel(asked, force=True)
 
     def _next(self, first: int, stop: int, last: int) -> tuple[_Node, Part]:
-        """The node that begins at `first`, when it is finished; more are begun meanwhile."""
-        from distributed import wait
-
+        """The node that begins at `first`, when it is here; more are begun meanwhile."""
+        asked, coming = None, None
         while True:
             self.workers.look()
             self._begin_again()
@@ -193,33 +211,26 @@ class ClusterPasses:
             if not self._begun:
                 time.sleep(_POLL)
                 continue
-            try:
-                with self.workers.client.as_current():
-                    wait(self._begun[0].result, timeout=_POLL)
-            except TimeoutError:
-                continue
-            except Exception:
-                require_scheduler(self.workers.client)
-                raise
-            node = self._begun.popleft()
-            return node, self._result(node)
+            if coming is None or self._begun[0] is not asked:
+                asked, coming = self._begun[0], _in_thread(self._begun[0].result.result)
+            if coming in futures.wait([coming], _POLL).done:
+                self._begun.popleft()
+                return asked, self._part(asked, coming)
 
-    def _result(self, node: _Node) -> Part:
+    def _part(self, node: _Node, coming: futures.Future[Part]) -> Part:
         from distributed import KilledWorker
         from distributed.client import FutureCancelledError
 
         try:
-            part: Part = node.result.result()
+            return coming.result()
         except KilledWorker as error:
-            passes = f"passes {node.first} to {node.stop - 1}"
             raise ConnectionError(
-                f"{passes}: {error.allowed_failures + 1} workers were lost that rendered them, the last {error.last_worker}; "
-                "accepted: workers with enough memory"
+                f"passes {node.first} to {node.stop - 1}: {error.allowed_failures + 1} workers were lost that rendered "
+                f"them, the last {error.last_worker.address}; accepted: workers with enough memory"
             ) from None
         except FutureCancelledError:
             require_scheduler(self.workers.client)
             raise ConnectionError(f"pass {node.first}: was cancelled on the cluster; accepted: not to") from None
-        return part
 
     def _note(self, node: _Node, part: Part) -> None:
         self._pass_seconds.append(part.seconds / part.sums.passes)
@@ -299,7 +310,7 @@ class ClusterPasses:
         """Ask others for nodes whose workers have all gone: Dask would wait for these to come back."""
         there = self.workers.accepted.keys()
         for i, node in enumerate(self._begun):
-            if not node.result.done() and not node.needed & there and there:
+            if there and not node.needed & there and node.result.status != "error":
                 again = self._asked(node.level, node.first, 0)
                 if again is not None:
                     self.workers.client.cancel([node.result, *node.tasks], force=True)

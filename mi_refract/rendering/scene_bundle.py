@@ -58,7 +58,9 @@ def pack(scene: Path, defines: Mapping[str, str], limit: int = LIMIT) -> SceneBu
     }
     contents = [[path, hashlib.sha256(content).hexdigest()] for path, content in sorted(files.items())]
     digest = hashlib.sha256(json.dumps([_absolute(scene), contents, moved]).encode()).hexdigest()
-    folders = tuple({os.path.join(Path.cwd(), each.parent) for each in (*found.xml, *found.others.values())})  # noqa: PTH118
+    searched = scene_limits.check_files(scene, _search_folders(scene), defines).searched
+    named_folders = {each.parent for each in (*found.xml, *found.others.values())} | set(searched)
+    folders = tuple(sorted(os.path.join(Path.cwd(), each) for each in named_folders))  # noqa: PTH118
     bundle = SceneBundle(digest, _absolute(scene), files, folders, moved)
     _check_places(bundle, [_absolute(path) for path in found.xml], defines)
     return bundle
@@ -83,27 +85,26 @@ def _check_size(scene: Path, paths: list[str], limit: int) -> None:
         raise ValueError(f"{scene}: {told}; accepted with a cluster: {limit} MiB, or {more}")
 
 
+def _search_folders(scene: Path) -> list[Path]:
+    with scene_parser.folders(scene.parent) as inside:
+        return [Path(str(folder)) for folder in inside]
+
+
 def _check_places(bundle: SceneBundle, xml: list[str], defines: Mapping[str, str]) -> None:
     """ValueError where Mitsuba's parser would not find in the bundle what it opens itself."""
     texts = {path: bundle.files[path] for path in xml}
-    with scene_parser.folders() as inside:
-        places = [Path(str(folder)) for folder in inside]
     with tempfile.TemporaryDirectory(prefix="mi_refract-") as folder:
         _write(Path(folder), texts | dict.fromkeys(bundle.files.keys() - texts.keys(), b""), bundle.folders)
         scene = _below(folder, bundle.scene)
-        walk = scene_limits.check_files(scene, [scene.parent, *places], defines)
-        found = {os.path.normpath(path).removeprefix(folder) for path in walk.xml}
-        for path in xml:
-            if path not in found:
-                raise ValueError(f"{path}: {_ONLY_HERE.format('included')}")
-        for opened in walk.opened.values():
-            if opened.exists() and not os.path.normpath(opened).startswith(folder):
-                raise ValueError(f"{opened}: {_ONLY_HERE.format('opened by <spectrum>')}")
+        walk = scene_limits.check_files(scene, _search_folders(scene), defines)
+        ways = {"included": walk.xml, "opened by <spectrum>": walk.opened.values(), "the folder of a <path>": walk.searched}
+        for how, paths in ways.items():
+            for path in paths:
+                if path.exists() and not Path(os.path.normpath(path)).is_relative_to(folder):
+                    raise ValueError(f"{path}: {how}, {_ONLY_HERE}")
 
 
-_ONLY_HERE = (
-    "{} by an absolute path, a <path> or from the working folder; accepted with a cluster: relative to the scene"
-)
+_ONLY_HERE = "by an absolute name or from the working folder; accepted with a cluster: a name relative to the scene's folder"
 
 
 def _below(root: str | Path, path: str) -> Path:
@@ -121,7 +122,7 @@ def _write(root: Path, files: Mapping[str, bytes], folders: Iterable[str]) -> No
 
 # Where it is rendered -------------------------------------------------------------------------------------------------
 
-_unpacked: OrderedDict[tuple[str, str], Path] = OrderedDict()
+_unpacked: OrderedDict[str, Path] = OrderedDict()
 _loaded: OrderedDict[tuple[str, ...], Any] = OrderedDict()
 
 
@@ -133,7 +134,7 @@ def load(bundle: SceneBundle, variant: str, defines: Mapping[str, str], folder: 
     from .scene_files import load_scene
 
     root = _root(bundle, folder)
-    key = (bundle.digest, folder, variant, json.dumps(dict(defines), sort_keys=True))
+    key = (bundle.digest, variant, json.dumps(dict(defines), sort_keys=True))
     if key not in _loaded:
         moved = {name: str(_below(root, path)) for name, path in bundle.moved.items()}
         with original_paths(str(root)):
@@ -142,12 +143,12 @@ def load(bundle: SceneBundle, variant: str, defines: Mapping[str, str], folder: 
 
 
 def _root(bundle: SceneBundle, folder: str) -> Path:
-    key = (bundle.digest, folder)
-    if key not in _unpacked or not _unpacked[key].is_dir():
+    root = _unpacked.get(bundle.digest)
+    if root is None or not root.is_dir():
         root = Path(tempfile.mkdtemp(prefix="scene-", dir=folder))
         _write(root, bundle.files, bundle.folders)
-        _keep(_unpacked, key, root)
-    return _unpacked[key]
+        _keep(_unpacked, bundle.digest, root)
+    return root
 
 
 def _keep(kept: OrderedDict[Any, Any], key: Any, value: Any) -> None:
