@@ -127,10 +127,21 @@ def _silent() -> Iterator[None]:
             each.setLevel(level)
 
 
-def require_scheduler(client: Any) -> None:
-    """LostSchedulerError, one line, where the scheduler of a client has gone."""
-    if client.status != "running":
-        address = getattr(client.scheduler, "address", "") or "the scheduler"
-        raise LostSchedulerError(
-            f"{address}: the Dask scheduler is gone; accepted: one that runs, or none, to go on here"
-        )
+@contextlib.contextmanager
+def scheduler_needed(client: Any) -> Iterator[None]:
+    """Within, whatever Dask raises where the scheduler of a client has gone is a LostSchedulerError, one line."""
+    from distributed import CancelledError
+    from distributed.comm import CommClosedError
+
+    address = getattr(client.scheduler, "address", "") or "--scheduler"
+    lost = f"{address}: the Dask scheduler is gone, or has given up its tasks; accepted: one that runs, or none, to go on here"
+    try:
+        if client.status != "running":
+            raise LostSchedulerError(lost)
+        yield
+    except (CommClosedError, CancelledError):
+        raise LostSchedulerError(lost) from None
+    except (OSError, RuntimeError) as error:
+        if client.status != "running" and not isinstance(error, LostSchedulerError):
+            raise LostSchedulerError(lost) from None
+        raise

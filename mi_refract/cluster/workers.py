@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from . import worker_facts
-from .connection import require_scheduler
+from .connection import scheduler_needed
 
 PATIENCE = 120.0  # seconds until the first workers must have said what they are: they import Mitsuba, and try libLLVM
 _NOBODY = 30.0  # seconds until a scheduler must have a worker at all
@@ -69,15 +69,14 @@ class Workers:
 
         LostSchedulerError where the scheduler has gone, ConnectionError where all workers have, and none came for ALONE.
         """
-        require_scheduler(self.client)
         if not at_once and time.monotonic() - self._looked < _BETWEEN_LOOKS:
             return
         self._looked = time.monotonic()
-        try:
-            present = dict(self.client.nthreads())
-        except Exception:
-            require_scheduler(self.client)
-            raise
+        with scheduler_needed(self.client):
+            self._ask(dict(self.client.nthreads()))
+        self._require_some()
+
+    def _ask(self, present: Mapping[str, int]) -> None:
         for known in (self.accepted, self.refused, self._asked):
             for address in [each for each in known if each not in present]:
                 del known[address]
@@ -88,7 +87,6 @@ class Workers:
                 self._asked[address] = self.client.submit(
                     eval, _QUESTION.format(self.variant), workers=[address], pure=False, priority=1000
                 )
-        self._require_some()
 
     def _require_some(self) -> None:
         if self.accepted or not self.machines:

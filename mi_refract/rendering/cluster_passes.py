@@ -18,7 +18,7 @@ from typing import Any
 
 from mi_refract import backend
 from mi_refract.cluster import on_worker
-from mi_refract.cluster.connection import require_scheduler
+from mi_refract.cluster.connection import scheduler_needed
 from mi_refract.cluster.workers import Workers
 
 from . import scene_bundle
@@ -186,7 +186,8 @@ class ClusterPasses:
             while first < stop:
                 if self._begun and self._begun[0].stop > stop:
                     self.close()
-                node, part = self._next(first, stop, last)
+                with scheduler_needed(self.workers.client):
+                    node, part = self._next(first, stop, last)
                 first = node.stop
                 self._note(node, part)
                 yield node.level, part.sums.copy(), self._machines(part)  # a copy: what Dask gives may be read-only
@@ -219,7 +220,6 @@ class ClusterPasses:
 
     def _part(self, node: _Node, coming: futures.Future[Part]) -> Part:
         from distributed import KilledWorker
-        from distributed.client import FutureCancelledError
 
         try:
             return coming.result()
@@ -228,9 +228,6 @@ class ClusterPasses:
                 f"passes {node.first} to {node.stop - 1}: {error.allowed_failures + 1} workers were lost that rendered "
                 f"them, the last {error.last_worker.address}; accepted: workers with enough memory"
             ) from None
-        except FutureCancelledError:
-            require_scheduler(self.workers.client)
-            raise ConnectionError(f"pass {node.first}: was cancelled on the cluster; accepted: not to") from None
 
     def _note(self, node: _Node, part: Part) -> None:
         self._pass_seconds.append(part.seconds / part.sums.passes)
