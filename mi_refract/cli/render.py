@@ -56,7 +56,8 @@ def render(
         typer.Option("--allow-plugins", metavar="NAME", help="Run this plugin, which the scene brings, too."),
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Render on the workers of this Dask scheduler: tcp://host:8786.")
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Render on the workers of this Dask scheduler: tcp://host:8786."),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, max=1024, help="Render in so many processes of one thread each, by Dask.")
@@ -69,7 +70,9 @@ def render(
     ] = 256,
     mixed_workers: Annotated[
         bool,
-        typer.Option("--mixed-workers", help="Accept another libLLVM or vector width; the bits then depend on the workers."),
+        typer.Option(
+            "--mixed-workers", help="Accept another libLLVM or vector width; the bits then depend on the workers."
+        ),
     ] = False,
 ) -> None:
     """Render a Mitsuba scene into an EXR file that holds its own noise, and says how it was made.
@@ -101,9 +104,12 @@ def render(
         rendering = LongRender(job, output, limits, restart=restart)
     if rendering.progress.passes:
         print(printable(f"{output}: goes on from {rendering.progress.done} spp"), file=sys.stderr)
-    with cluster_passes(cluster, rendering, str(chosen)) as passes:
-        with interrupts.last_act(rendering.give_up), shown(console, rendering, preview) as watch:
-            header = rendering.run(watch, passes)
+    with (
+        cluster_passes(cluster, rendering, str(chosen)) as passes,
+        interrupts.last_act(rendering.give_up),
+        shown(console, rendering, preview) as watch,
+    ):
+        header = rendering.run(watch, passes)
     print(printable(f"{output}: {chosen}, {_summary(rendering, header)}"))
     if count := header["mi_refract:nonfinite_pixels"]:
         print(printable(f"mi-refract: {output}: {count} pixels are not finite"), file=sys.stderr)

@@ -33,7 +33,7 @@ class ClusterOptions:
         return self.scheduler is not None or self.workers is not None
 
     def check(self, plugins: Collection[str]) -> None:
-        """ValueError for options that exclude each other; ImportError where Dask is missing. `plugins` of the scene's own."""
+        """ValueError for options that exclude each other, ImportError without Dask. `plugins`: the scene's own."""
         if self.scheduler is not None and self.workers is not None:
             raise ValueError("--scheduler and --workers; accepted: one of them")
         if not self.given and (self.tls.given or self.mixed_workers):

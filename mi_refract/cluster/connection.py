@@ -64,7 +64,7 @@ def require_dask() -> None:
 
 @contextlib.contextmanager
 def connected(scheduler: str | None = None, workers: int | None = None, tls: Tls = NO_TLS) -> Iterator[Any]:
-    """A `distributed.Client` of the scheduler at an address, or of so many processes of one thread each on this machine.
+    """A `distributed.Client` of the scheduler at an address, or of so many processes of one thread each, started here.
 
     ConnectionError, one line, after PATIENCE where no scheduler answers; ImportError without Dask; ValueError unless
     exactly one of the two is given.
@@ -134,7 +134,9 @@ def scheduler_needed(client: Any) -> Iterator[None]:
     from distributed.comm import CommClosedError
 
     address = getattr(client.scheduler, "address", "") or "--scheduler"
-    lost = f"{address}: the Dask scheduler is gone, or has given up its tasks; accepted: one that runs, or none, to go on here"
+    lost = (
+        f"{address}: the Dask scheduler is gone, or has given up its tasks; accepted: one that runs, or none: then here"
+    )
     try:
         if client.status != "running":
             raise LostSchedulerError(lost)

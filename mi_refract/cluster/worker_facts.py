@@ -22,7 +22,7 @@ _WIDTH_SYMBOL = "_Z21jit_llvm_vector_widthv"  # Dr.Jit does not show it to Pytho
 
 @functools.cache
 def facts(variant: str) -> dict[str, str]:
-    """Of this process, by name: the versions that the bits depend on, and why the variant cannot run, "" where it can."""
+    """Of this process, by name: versions that the bits depend on, and why the variant cannot run, "" where it can."""
     family = variant.partition("_")[0]
     here = backend.detect()[family]
     found = {name: installed_version(name) for name in ("mitsuba", "drjit")}

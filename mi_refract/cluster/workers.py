@@ -31,7 +31,7 @@ class Workers:
         tolerated: Collection[str] = (),
         warn: Callable[[str], None] = lambda text: None,
     ) -> None:
-        """`expected`: facts that workers must have, but for `tolerated`. `warn` is told of every one that is refused."""
+        """`expected`: facts that workers must have, but for `tolerated`. `warn` is told of who is refused."""
         self.client, self.variant, self.expected, self.tolerated, self.warn = client, variant, expected, tolerated, warn
         self.accepted: dict[str, int] = {}
         self.refused: dict[str, str] = {}
@@ -67,7 +67,7 @@ class Workers:
     def look(self, *, at_once: bool = False) -> None:
         """Ask those that are new, note what they answered and who has gone; nobody is waited for. Seldom, or `at_once`.
 
-        LostSchedulerError where the scheduler has gone, ConnectionError where all workers have, and none came for ALONE.
+        LostSchedulerError where the scheduler has gone, ConnectionError where all workers have, for longer than ALONE.
         """
         if not at_once and time.monotonic() - self._looked < _BETWEEN_LOOKS:
             return

@@ -2,7 +2,17 @@
 
 In: a scene file, values for its `<default>`s, what ends the render, a seed; Mitsuba's present variant. Out: an EXR file
 with the film's channels, the variance of each, and in its header all that is needed to render it again; meanwhile a
-checkpoint from which the same command goes on. The bits depend on none of: threads, order, interruptions.
+checkpoint from which the same command goes on. The bits depend on none of: threads, order, interruptions,
+workers that are alike.
 """
 
-__all__ = ["error_estimate", "long_render", "pass_plan", "pass_sums", "render_pass", "scene_files"]
+__all__ = [
+    "cluster_passes",
+    "error_estimate",
+    "long_render",
+    "pass_plan",
+    "pass_sums",
+    "render_pass",
+    "scene_bundle",
+    "scene_files",
+]

@@ -6,6 +6,7 @@ level, so that a node comes back every few seconds. Sums are made in the order o
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import threading
 import time
@@ -85,7 +86,9 @@ def render_node(bundle: SceneBundle, scene: RenderedScene, level: int, first: in
     return on_worker.one_at_a_time(rendered)
 
 
-def _rendered(bundle: SceneBundle, scene: RenderedScene, folder: str, node: tuple[int, int, int]) -> tuple[PassSums, int]:
+def _rendered(
+    bundle: SceneBundle, scene: RenderedScene, folder: str, node: tuple[int, int, int]
+) -> tuple[PassSums, int]:
     """The sums of a node (level, first pass, samples of a pass), and the most pixels of a pass that are not finite."""
     from .render_pass import pass_renderer
 
@@ -138,7 +141,7 @@ def _in_thread(call: Callable[[], Part]) -> futures.Future[Part]:
 
 @dataclass(frozen=True)
 class _Node:
-    """A node that was asked for. `needed`: of these workers one must be there; `tasks`: its unfinished ones that render."""
+    """A node that was asked for. `needed`: one of these workers must be there; `tasks`: those that still render."""
 
     level: int
     first: int
@@ -200,7 +203,8 @@ class ClusterPasses:
         asked = [future for node in self._begun for future in (node.result, *node.tasks)]
         self._begun.clear()
         if asked and self.workers.client.status == "running":
-            self.workers.client.cancel(asked, force=True)
+            with contextlib.suppress(Exception):  # it may go now
+                self.workers.client.cancel(asked, force=True)
 
     def _next(self, first: int, stop: int, last: int) -> tuple[_Node, Part]:
         """The node that begins at `first`, when it is here; more are begun meanwhile."""

@@ -89,7 +89,7 @@ class Passes(Protocol):
     """Who renders passes."""
 
     def nodes(self, first: int, stop: int, last: int, offset: int, spp: int) -> Iterator[tuple[int, PassSums, str]]:
-        """Level, sums and machines (separated by ", ") of nodes that make up the passes from `first` to `stop`, in order.
+        """Level, sums and machines ("a, b") of nodes that make up the passes from `first` to `stop`, in their order.
 
         Passes up to `last` may be begun, as they will probably be asked for next. `offset`: added to their numbers for
         their seeds. `spp`: samples per pixel of each.

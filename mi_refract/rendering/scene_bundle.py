@@ -97,14 +97,20 @@ def _check_places(bundle: SceneBundle, xml: list[str], defines: Mapping[str, str
         _write(Path(folder), texts | dict.fromkeys(bundle.files.keys() - texts.keys(), b""), bundle.folders)
         scene = _below(folder, bundle.scene)
         walk = scene_limits.check_files(scene, _search_folders(scene), defines)
-        ways = {"included": walk.xml, "opened by <spectrum>": walk.opened.values(), "the folder of a <path>": walk.searched}
+        ways = {
+            "included": walk.xml,
+            "opened by <spectrum>": walk.opened.values(),
+            "the folder of a <path>": walk.searched,
+        }
         for how, paths in ways.items():
             for path in paths:
                 if path.exists() and not Path(os.path.normpath(path)).is_relative_to(folder):
                     raise ValueError(f"{path}: {how}, {_ONLY_HERE}")
 
 
-_ONLY_HERE = "by an absolute name or from the working folder; accepted with a cluster: a name relative to the scene's folder"
+_ONLY_HERE = (
+    "by an absolute name or from the working folder; accepted with a cluster: a name relative to the scene's folder"
+)
 
 
 def _below(root: str | Path, path: str) -> Path:

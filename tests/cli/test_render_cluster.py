@@ -69,7 +69,10 @@ def started(scene):
         (("--workers", 0), "--workers"),
         (("--tls-key", "key.pem"), "accepted with --scheduler ADDRESS"),
         (("--mixed-workers",), "accepted with --scheduler ADDRESS"),
-        (("--workers", 1, "--allow-plugins", "evil"), "--allow-plugins evil: native code, which is not sent to workers"),
+        (
+            ("--workers", 1, "--allow-plugins", "evil"),
+            "--allow-plugins evil: native code, which is not sent to workers",
+        ),
         (("--scheduler", "nonsense"), "--scheduler nonsense: no Dask scheduler answers: missing port number"),
     ],
 )
@@ -138,7 +141,9 @@ def test_the_scheduler_ends_and_the_render_goes_on_here(started, render, scene, 
     until(lambda: group_ended(leader), 10)
     assert process.returncode == (130 if ended_by == signal.SIGINT else 2)
     if ended_by == signal.SIGKILL:
-        assert err.count("\n") == 1 and "the Dask scheduler is gone, or has given up its tasks; accepted: one that" in err
+        assert (
+            err.count("\n") == 1 and "the Dask scheduler is gone, or has given up its tasks; accepted: one that" in err
+        )
     assert scene.with_name("out.exr.checkpoint").exists()
     goes_on(render, scene)
 

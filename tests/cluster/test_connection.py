@@ -57,7 +57,8 @@ def test_without_dask(monkeypatch):
 
 
 def test_dask_is_not_imported_before_it_is_needed():
-    code = """import sys, mi_refract.cli.app, mi_refract.cli.render, mi_refract.cluster.workers, mi_refract.cluster.connection
+    code = """import sys, mi_refract.cli.app, mi_refract.cli.render
+import mi_refract.cluster.workers, mi_refract.cluster.connection
 mi_refract.cli.app.main(["--help"])
 sys.exit(str([name for name in sys.modules if name.partition(".")[0] in ("dask", "distributed")]))"""
     with python(code) as process:

@@ -57,7 +57,9 @@ def client():
 def test_who_differs_is_refused_by_name_and_gets_nothing(client, variant):
     said = []
     liar, honest = sorted(client.nthreads())
-    lie = "import mi_refract.cluster.worker_facts as w; own = w.facts; w.facts = lambda v: own(v) | {'mitsuba': '3.0.0'}"
+    lie = (
+        "import mi_refract.cluster.worker_facts as w; own = w.facts; w.facts = lambda v: own(v) | {'mitsuba': '3.0.0'}"
+    )
     client.run(exec, f"global own\n{lie}", workers=[liar])
     try:
         found = accepted(client, variant, warn=said.append)
@@ -81,12 +83,12 @@ def test_nobody_is_left(client, variant):
 @pytest.mark.usefixtures("scalar_variant")
 def test_a_worker_without_the_package_is_refused(client, variant):
     liar, honest = sorted(client.nthreads())
-    block = "import sys; kept = sys.modules['mi_refract.cluster.worker_facts']; sys.modules['mi_refract.cluster.worker_facts'] = None"
-    client.run(exec, f"global kept\n{block}", workers=[liar])
+    there = "sys.modules['mi_refract.cluster.worker_facts']"
+    client.run(exec, f"global kept\nimport sys; kept = {there}; {there} = None", workers=[liar])
     try:
         found = accepted(client, variant)
     finally:
-        client.run(exec, "import sys; sys.modules['mi_refract.cluster.worker_facts'] = kept", workers=[liar])
+        client.run(exec, f"import sys; {there} = kept", workers=[liar])
     assert list(found.accepted) == [honest]
     assert "ModuleNotFoundError: import of mi_refract.cluster.worker_facts halted" in found.refused[liar]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -84,7 +84,7 @@ def test_a_define_may_name_a_file(folder):
 def test_unpacked_and_loaded_once(folder, tmp_path_factory):
     bundle, target = pack(written(folder), {}), str(tmp_path_factory.mktemp("there"))
     first, second = (scene_bundle.load(bundle, "scalar_rgb", {}, target) for _ in range(2))
-    assert first[0] is second[0] and len(os.listdir(target)) == 1
+    assert first[0] is second[0] and len([*Path(target).iterdir()]) == 1
 
 
 def test_the_digest_is_of_every_byte(folder):
@@ -111,7 +111,9 @@ def test_too_large(folder):
     assert text.endswith("accepted with a cluster: 1 MiB, or --bundle-limit 2, if all workers have the memory")
 
 
-ONLY_HERE = "by an absolute name or from the working folder; accepted with a cluster: a name relative to the scene's folder"
+ONLY_HERE = (
+    "by an absolute name or from the working folder; accepted with a cluster: a name relative to the scene's folder"
+)
 
 
 def test_an_include_that_is_found_only_here(folder):

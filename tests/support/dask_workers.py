@@ -35,7 +35,16 @@ def kill(client: Any, address: str) -> None:
 @contextlib.contextmanager
 def joined(scheduler: str) -> Iterator[subprocess.Popen[bytes]]:
     """One more worker of one thread, without a nanny."""
-    command = [sys.executable, "-m", "distributed.cli.dask_worker", scheduler, "--nthreads", "1", "--no-nanny", "--no-dashboard"]
+    command = [
+        sys.executable,
+        "-m",
+        "distributed.cli.dask_worker",
+        scheduler,
+        "--nthreads",
+        "1",
+        "--no-nanny",
+        "--no-dashboard",
+    ]
     process = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         yield process
