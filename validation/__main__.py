@@ -27,7 +27,7 @@ ROOMS = {
     "directions": ("directions", ("per_formula", "planted_defects", "bsdf_samples", "sweep", "search")),
     "stability": ("stability", ("optical_chains", "energy", "derivatives", "layered_paths")),
     "renders": ("renders", ("scene_needs", "against_dielectric", "unused_features", "rendering_passes")),
-    "efficiency": ("efficiency", ("error_against_time", "scaling")),
+    "efficiency": ("efficiency", ("error_against_time", "scaling", "cluster_scale")),
     "planar": ("planar", ("against_retrace", "closed_paths", "extruded_scenes", "times")),
     "diff": ("diff", ("planted_defects", "visible_changes", "times")),
     "ground-truth": ("ground_truth", ("traced_bodies",)),
