@@ -25,7 +25,7 @@ from mi_refract.report.row import Row
 from validation import limits
 from validation.diff import visible_changes
 from validation.directions import per_formula
-from validation.efficiency import error_against_time
+from validation.efficiency import cluster_scale, error_against_time
 from validation.planar import against_retrace
 from validation.planar import times as planar_times
 from validation.reference.layered_scenes import MIRAGE
@@ -209,6 +209,24 @@ def efficiency(rows: list[Row]) -> str:
     return _table(size, ["scene", "method", "sampler", *EFFICIENCY.values()], cells)
 
 
+def cluster(rows: list[Row]) -> str:
+    """Markdown: the model's efficiency by scene and workers, as the package is and as proposed."""
+    study = cluster_scale
+    found = {(r.case, r.subject): r for r in rows if r.study == study.NAME and study.BEST in r.values}
+    if not found:
+        raise ValueError("README: no scale was modelled; its table needs a compiled variant and Dask")
+    usual = f"{study.EFFICIENCY}, {study.PASS} spp"
+    heading = ["scene, workers", *(f"{s.name}, {study.PASS} spp a pass" for s in study.TABLED), "its limit"]
+    cells = []
+    for case in dict.fromkeys(case for case, _ in found):
+        now, then = (found[case, scheme.name] for scheme in study.TABLED)
+        limit = now.reason.rpartition(study.USUAL_LIMIT)[2]
+        best = f"{compact(then.values[study.EFFICIENCY])} ({then.values[study.BEST]:.0f} spp)"
+        cells.append([case, *(compact(row.values[usual]) for row in (now, then)), limit, best])
+    text = f"1080p at {study.TOTAL:,} spp, workers of one thread; efficiency by the model, with costs measured here."
+    return _table(text, [*heading, "as proposed, best pass"], cells)
+
+
 def planar(rows: list[Row]) -> str:
     """Markdown: by scene the distance of paths from the retrace, and the time per path by the number of segments."""
     retraced, timed = _planar_errors(rows), _planar_times(rows)
@@ -365,6 +383,7 @@ TABLES = {
     "renders": Table("validation/README.md", "renders", renders),
     "paths": Table("validation/README.md", "stability", paths),
     "efficiency": Table("mi_refract/plugins/README.md", "efficiency", efficiency),
+    "cluster": Table("mi_refract/rendering/README.md", "efficiency", cluster),
     "planar": Table("mi_refract/planar/README.md", "planar", planar),
     "defects": Table("mi_refract/image_diff/README.md", "diff", seen),
     "visible": Table("mi_refract/image_diff/README.md", "diff", visible),

@@ -31,7 +31,7 @@ def test_the_model_by_hand():
 
 
 def test_the_model_by_hand_with_folds():
-    """64 passes on 8 workers, whole nodes first: 0, 1 … 7 singly up to the stop at 8, then nodes of 8 where they fit."""
+    """64 passes on 8 workers, whole nodes first: 0, 1 … 7 up to the stop at 8, then nodes of 8 where they fit."""
     costs = Costs(10, 0, 0.5, 0.25, 100, 50, 0.001, 9.0, 0.01, 9.0, 9.0, 9.0, 9.0, begin=7)
     nodes = list(asked(64, 10, 8, PROPOSED))
     singles, eights = nodes.count((0, 0)), nodes.count((0, 1))
@@ -101,13 +101,18 @@ def test_the_simulation_never_beats_the_model_by_more_than_its_end():
     costs = Costs(0.3, 0.9, 0.02, 0.03, 1e8, 1e9, 1.5e-3, 4e-6, 9e-4, 4e-7, 3e-8, 0.13, 1.1, begin=0.7)
     for scheme in (PRESENT, PROPOSED):
         for workers in (1, 10, 100):
-            took, model = cluster_simulation.simulate(512, 8, workers, costs, scheme), predict(512, 8, workers, costs, scheme)
+            took, model = (
+                cluster_simulation.simulate(512, 8, workers, costs, scheme),
+                predict(512, 8, workers, costs, scheme),
+            )
             assert model.seconds - model.end <= took * (1 + 1e-9)
 
 
 def test_the_best_pass_is_the_one_that_ends_first():
     spp, best = cluster_scale.best_pass(100, Costs(fixed=1.0, sample=0.1, begin=1.0), PROPOSED)
-    others = [cluster_scale.predicted(1 << k, 100, Costs(fixed=1.0, sample=0.1, begin=1.0), PROPOSED) for k in range(10)]
+    others = [
+        cluster_scale.predicted(1 << k, 100, Costs(fixed=1.0, sample=0.1, begin=1.0), PROPOSED) for k in range(10)
+    ]
     assert best.seconds == min(each.seconds for each in others) and 1 < spp < 512
 
 

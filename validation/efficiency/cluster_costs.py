@@ -1,8 +1,8 @@
 """What each thing costs that is done for a render on a cluster, measured here.
 
 Seconds of computing are CPU seconds of one thread, which a busy machine stretches least; of sending they are seconds of
-the fastest of some tries. `python -m validation.efficiency.cluster_costs SCENE`: what a new process does before its first
-pass, as JSON.
+the fastest of some tries. `python -m validation.efficiency.cluster_costs SCENE`: what a new process does before its
+first pass, as JSON.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -40,7 +41,7 @@ LIMIT = 300.0  # seconds of a process
 
 @dataclass(frozen=True)
 class Extent:
-    """`side`: of the film on which passes are timed, their seconds scaled to PIXELS. `tasks`, `listed`: empty ones sent."""
+    """Passes are timed on `side` squared pixels, scaled to PIXELS. `tasks`, `listed`: empty ones that are sent."""
 
     side: int
     tasks: int
@@ -63,7 +64,19 @@ def measured(scene: str, shared: dict[str, float], extent: Extent) -> dict[str, 
 def as_costs(found: dict[str, float], *, process: bool = False) -> Costs:
     """For the model. `process`: workers are started with the render."""
     begin = found["scene"] + found["kernels"] + (found["process"] if process else 0)
-    same = ("fixed", "sample", "copy", "add", "task", "task_worker", "submit", "submit_worker", "look", "relay", "receive")
+    same = (
+        "fixed",
+        "sample",
+        "copy",
+        "add",
+        "task",
+        "task_worker",
+        "submit",
+        "submit_worker",
+        "look",
+        "relay",
+        "receive",
+    )
     node = {"node_bytes": found["node MB"] * 1e6, "bandwidth": min(LINK, 1e6 * found["MB/s, workers"])}
     return Costs(**{name: found[name] for name in same}, **node, begin=begin)
 
@@ -81,8 +94,7 @@ def pass_seconds(scene: str, extent: Extent) -> dict[str, float]:
     try:
         renderer.render(FIRST, 1)
         one, five = (
-            scale * _fastest(lambda spp=spp: renderer.render(FIRST, spp), extent.tries, time.process_time)
-            for spp in (1, 5)
+            scale * _fastest(partial(renderer.render, FIRST, spp), extent.tries, time.process_time) for spp in (1, 5)
         )
     finally:
         dr.set_thread_count(threads)
@@ -151,8 +163,7 @@ def shared(extent: Extent) -> dict[str, float]:
         addresses = sorted(client.nthreads())
         found |= _sending(client, addresses, extent.tries)
         few, many = (
-            _messages(client, addresses, names, count)
-            for names, count in ((0, extent.tasks), (LISTED, extent.listed))
+            _messages(client, addresses, names, count) for names, count in ((0, extent.tasks), (LISTED, extent.listed))
         )
     for name in ("task", "submit"):
         each = max(0.0, many[name] - few[name]) / LISTED
@@ -172,8 +183,8 @@ def sums_seconds(extent: Extent) -> dict[str, float]:
 
 def make_part(value: float) -> Part:
     """A node of PIXELS."""
-    arrays = (np.full((1080, 1920, 3), value) for _ in range(2))
-    return Part(PassSums(1, 1, *arrays), {}, 0.0)
+    total, between = (np.full((1080, 1920, 3), value) for _ in range(2))
+    return Part(PassSums(1, 1, total, between), {}, 0.0)
 
 
 def take(*_: Any) -> None:
@@ -181,18 +192,18 @@ def take(*_: Any) -> None:
 
 
 def _sending(client: Any, addresses: list[str], tries: int) -> dict[str, float]:
-    """Seconds of a node from one worker to another and to the client, and CPU seconds of the scheduler for the latter."""
+    """MB/s of a node between workers and to the client; `receive`, `relay`: its seconds through the scheduler."""
     giver, taker = ({"workers": [address], "pure": False} for address in addresses)
     found: dict[str, list[float]] = {"between": [], "here": [], "direct": [], "relay": []}
     client.submit(take, **taker).result()
     for i in range(tries):
         part = client.submit(make_part, float(i), **giver)
         client.submit(take, part, **giver).result()
-        found["between"].append(_fastest(lambda p=part: client.submit(take, p, **taker).result(), 1))  # type: ignore[misc]
+        found["between"].append(_fastest(client.submit(take, part, **taker).result, 1))
         before = client.run_on_scheduler(time.process_time)
         found["here"].append(_fastest(part.result, 1))
         found["relay"].append(client.run_on_scheduler(time.process_time) - before)
-        found["direct"].append(_fastest(lambda p=part: client.gather(p, direct=True), 1))  # type: ignore[misc]
+        found["direct"].append(_fastest(partial(client.gather, part, direct=True), 1))
         del part
     least, size = {name: min(seconds) for name, seconds in found.items()}, make_part(0.0).sums.total.nbytes * 2 / 1e6
     rates = {"MB/s, workers": size / least["between"], "MB/s, client, direct": size / least["direct"]}
@@ -205,9 +216,7 @@ def _messages(client: Any, addresses: list[str], names: int, count: int) -> dict
     bundle = client.submit(take, pure=False, workers=listed)
     bundle.result()
     before, own = client.run_on_scheduler(time.process_time), time.process_time()
-    tasks = [
-        client.submit(take, bundle, i, workers=listed, retries=2, pure=False, priority=-i) for i in range(count)
-    ]
+    tasks = [client.submit(take, bundle, i, workers=listed, retries=2, pure=False, priority=-i) for i in range(count)]
     client.gather(tasks)
     found = {"submit": time.process_time() - own, "task": client.run_on_scheduler(time.process_time) - before}
     client.cancel(tasks, force=True)

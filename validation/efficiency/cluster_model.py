@@ -4,14 +4,14 @@
 
 P passes of c seconds each on W workers. What is done beside each other counts by its largest part:
 
-    workers    the tasks, each given to the worker that is free first: ⌈T/W⌉ of them where all T are alike; F folds over W
+    workers    the tasks, each given to the worker that is free first: ⌈T/W⌉ where all T are alike; F folds over W
     links      7 of 8 nodes of each fold go to another worker, at b bytes a second in each direction of each worker
     scheduler  (T + F) (s + s′ W): one task after the other; s′ where each task lists the workers that may run it;
                and r for each of N nodes, where these reach the client through it
     client     (T + F) (q + q′ W) to ask, and of each of N nodes its way here, a copy, a sum, and a look at all others
 
-`end`: the folds of the last node, one level after the other, and its way to the client. S: what a worker does before its
-first pass. What this leaves out only makes t longer: so it is a bound, which the simulation comes near.
+`end`: the folds of the last node, one level after the other, and its way to the client. S: what a worker does before
+its first pass. What this leaves out only makes t longer: so it is a bound, which the simulation comes near.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ PARTS = ("workers", "links", "scheduler", "client")
 class Costs:
     """Seconds of one thing each, where nothing else is said; the film is the same for all.
 
-    `fixed`, `sample`: of a pass, beside its samples and for one sample in every pixel. `copy`, `add`: of a node's arrays.
-    `bandwidth`: bytes a second of a link. `task`, `task_worker`: s and s′; `submit`, `submit_worker`: q and q′. `look`: the
-    client's, for each node that is begun and each worker, whenever a node comes. `begin`: S.
+    `fixed`, `sample`: of a pass, beside its samples and for one sample in every pixel. `copy`, `add`: of a node's
+    arrays. `bandwidth`: bytes a second of a link. `task`, `task_worker`: s and s′; `submit`, `submit_worker`: q and q′.
+    `look`: the client's, for each node that is begun and each worker, whenever a node comes. `begin`: S.
     """
 
     fixed: float = 0.0
@@ -72,7 +72,8 @@ class Scheme:
     """What is asked of the cluster.
 
     `single_first`: the client asks for single passes until the first has come, and then for nodes that come every
-    NODE_SECONDS; else from the start for nodes of as many passes as there are workers, or more by that rule. `listed`: each task lists its workers, and at every node the client looks at all others.
+    NODE_SECONDS; else from the start for nodes of as many passes as there are workers, or more by that rule. `listed`:
+    each task lists its workers, and at every node the client looks at all others.
     `relayed`: nodes reach the client through the scheduler, instead of over its own link.
     """
 
@@ -194,4 +195,3 @@ def _makespan(sizes: list[int], workers: int) -> float:
     for size in sizes:
         heapq.heapreplace(free, free[0] + size)
     return max(free)
-

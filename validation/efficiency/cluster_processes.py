@@ -1,4 +1,4 @@
-"""Renders on local processes that sleep instead of rendering, through the client's code, a Dask scheduler and its workers."""
+"""Local processes that sleep instead of rendering, through the client's code, a Dask scheduler and its workers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIZE = (4, 4, 3)  # of an image: memory and links do not count
 
 
 def sleep(bundle: SceneBundle, scene: RenderedScene, level: int, first: int, spp: int) -> Part:
-    """In place of `cluster_passes.render_node`: passes that take the seconds that the scene says, and are their number."""
+    """In place of `cluster_passes.render_node`: passes that take the seconds the scene says, and are their number."""
     began, passes = time.monotonic(), ARITY**level
     time.sleep(passes * float(scene.defines["seconds"]))
     total = float(spp * sum(range(first, first + passes)))

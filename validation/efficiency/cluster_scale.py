@@ -32,9 +32,9 @@ TERMS = {
     BEST: "samples per pixel of the pass, a power of two up to 512, with which the model ends first",
     STARTED: "the efficiency where the workers' processes are started with the render",
     "fixed": "CPU seconds of a pass of 1080p beside its samples; sample: for each sample in every pixel, one thread",
-    "process": "CPU seconds of a new process until it has imported Mitsuba; scene: to load it; kernels: to compile them",
-    "task": "CPU seconds of the scheduler for a task; _worker: more for each worker that it lists; submit: the client's",
-    "relay": "CPU seconds of the scheduler for a node that goes to the client through it; receive: seconds of the client",
+    "process": "CPU seconds of a new process until Mitsuba is imported; scene: to load it; kernels: to compile them",
+    "task": "CPU seconds of the scheduler for a task; _worker: more for each worker listed; submit: of the client",
+    "relay": "CPU seconds of the scheduler for a node that goes through it to the client; receive: the client's",
     "look": "CPU seconds of the client for each node that is begun and each worker, whenever a node comes",
     cluster_model.PRESENT.name: "lists of workers at every task, single passes first, nodes through the scheduler",
     cluster_model.NODES_FIRST.name: "from the start, nodes of as many passes as workers where that is more than now",
@@ -45,6 +45,8 @@ AXES = {"x": "workers", "y": EFFICIENCY, "y_scale": "linear"}
 TOTAL = 65_536  # samples per pixel
 SCENES = ("sphere", "diamond")  # a cheap and an expensive one
 PASS, PASSES, LARGEST = 8, (2, 8, 32), 512  # samples per pixel: the usual one of 1080p, others, the largest tried
+USUAL_LIMIT = f"; with {PASS} it is "
+TABLED = (PRESENT, PROPOSED)
 SHOWN = (10, 100, 1000, 10_000)
 GRID = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000)
 SIMULATED = {"standard": (1, 10, 100, 1000), "full": (1, 10, 100, 1000, 10_000)}
@@ -114,7 +116,7 @@ def model_rows(context: Context) -> list[Row]:
     costs, started = costs_of(context), costs_of(context, process=True)
     rows = []
     for scene in SCENES:
-        for scheme in (PRESENT, PROPOSED):
+        for scheme in TABLED:
             rows += [_size_row(scene, scheme, spp, costs[scene]) for spp in PASSES]
             rows += [_best_row(scene, scheme, workers, costs[scene], started[scene]) for workers in SHOWN]
             curves = _curves(costs[scene], scheme)
@@ -142,9 +144,11 @@ def _best_row(scene: str, scheme: Scheme, workers: int, costs: Costs, started: C
         STARTED: predicted(spp, workers, started, scheme).efficiency,
         f"{EFFICIENCY}, {PASS} spp": usual.efficiency,
     }
-    remark = f"with {spp} spp a pass the limit is {best.limit}; with {PASS} {usual.limit}"
+    remark = f"with {spp} spp a pass the limit is {best.limit}{USUAL_LIMIT}{usual.limit}"
     replay = {f"seconds, {name}": round(seconds, 3) for name, seconds in best.parts.items()}
-    return Row(NAME, scheme.name, f"{scene}, {workers} workers", "model, best pass", values, reason=remark, replay=replay)
+    return Row(
+        NAME, scheme.name, f"{scene}, {workers} workers", "model, best pass", values, reason=remark, replay=replay
+    )
 
 
 def _curves(costs: Costs, scheme: Scheme) -> dict[str, list[tuple[float, float]]]:
@@ -161,7 +165,7 @@ def simulated_rows(context: Context) -> list[Row]:
     rows = []
     for scene, costs in costs_of(context).items():
         for scheme in SCHEMES:
-            for workers in SIMULATED[context.profile.name] if scheme in (PRESENT, PROPOSED) else (GOAL,):
+            for workers in SIMULATED[context.profile.name] if scheme in TABLED else (GOAL,):
                 rows.append(simulated_row(scene, scheme, workers, costs, PASS))
         best, _ = best_pass(GOAL, costs, PROPOSED)
         if best != PASS:

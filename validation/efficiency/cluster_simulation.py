@@ -1,10 +1,10 @@
 """A render on many workers in simulated time: the client's own code, and beside it a scheduler, workers and links.
 
-`ClusterPasses` decides what is asked for and when, as it does on a cluster. The scheduler handles one message at a time,
-half of a task's cost when it is asked for and half when it is finished. A worker does one thing at a time, the earliest
-node's first; an idle one gets the first task that waits (as if Dask's work stealing cost nothing). A fold is done where
-one of its nodes is, on the least busy of these workers; the others come over links that carry one node at a time in each
-direction. All passes take the same time.
+`ClusterPasses` decides what is asked for and when, as it does on a cluster. The scheduler handles one message at a
+time, half of a task's cost when it is asked for and half when it is finished. A worker does one thing at a time, the
+earliest node's first; an idle one gets the first task that waits (as if Dask's work stealing cost nothing). A fold is
+done where one of its nodes is, on the least busy of these workers; the others come over links that carry one node at a
+time in each direction. All passes take the same time.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _POLL = 0.5  # seconds: as the client's
 
 @dataclass(eq=False)
 class _Task:
-    """A task and its future. `worker`: where its result is; `waiting`: parts, and then transfers, that are not there yet."""
+    """A task and its future. `worker`: where its result is; `waiting`: parts, then transfers, that are not there."""
 
     world: World
     passes: int
@@ -97,7 +97,7 @@ class World:
 
     # The client's client ----------------------------------------------------------------------------------------------
 
-    status = "running"
+    status, scheduler = "running", None
 
     def submit(self, function: Callable[..., Any], *arguments: Any, priority: int = 0, **_: Any) -> _Task:
         """As `distributed.Client.submit`."""
