@@ -211,20 +211,7 @@ def efficiency(rows: list[Row]) -> str:
 
 def cluster(rows: list[Row]) -> str:
     """Markdown: the model's efficiency by scene and workers, as the package is and as proposed."""
-    study = cluster_scale
-    found = {(r.case, r.subject): r for r in rows if r.study == study.NAME and study.BEST in r.values}
-    if not found:
-        raise ValueError("README: no scale was modelled; its table needs a compiled variant and Dask")
-    usual = f"{study.EFFICIENCY}, {study.PASS} spp"
-    heading = ["scene, workers", *(f"{s.name}, {study.PASS} spp a pass" for s in study.TABLED), "its limit"]
-    cells = []
-    for case in dict.fromkeys(case for case, _ in found):
-        now, then = (found[case, scheme.name] for scheme in study.TABLED)
-        limit = now.reason.rpartition(study.USUAL_LIMIT)[2]
-        best = f"{compact(then.values[study.EFFICIENCY])} ({then.values[study.BEST]:.0f} spp)"
-        cells.append([case, *(compact(row.values[usual]) for row in (now, then)), limit, best])
-    text = f"1080p at {study.TOTAL:,} spp, workers of one thread; efficiency by the model, with costs measured here."
-    return _table(text, [*heading, "as proposed, best pass"], cells)
+    return _table(*cluster_scale.table(rows))
 
 
 def planar(rows: list[Row]) -> str:

@@ -15,6 +15,7 @@ import os
 from collections.abc import Callable
 from typing import Any
 
+from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
 from validation import limits
 from validation.efficiency import cluster_costs, cluster_model, cluster_processes, cluster_simulation
@@ -202,6 +203,27 @@ def process_rows(context: Context) -> list[Row]:
         case = f"{workers} processes"
         rows.append(Row(NAME, scheme.name, case, "measured here", values, goals=goals, replay=replay))
     return rows
+
+
+def table(rows: list[Row]) -> tuple[str, list[str], list[list[str]]]:
+    """For the README: text, heading, and by scene and workers the efficiency as it is and as proposed."""
+    found = {(r.case, r.subject): r for r in rows if r.study == NAME and BEST in r.values}
+    if not found:
+        raise ValueError("README: no scale was modelled; its table needs a compiled variant and Dask")
+    usual, cells = f"{EFFICIENCY}, {PASS} spp", []
+    for case in dict.fromkeys(case for case, _ in found):
+        now, then = (found[case, scheme.name] for scheme in TABLED)
+        best = f"{compact(then.values[EFFICIENCY])} ({then.values[BEST]:.0f} spp)"
+        limit = now.reason.rpartition(USUAL_LIMIT)[2]
+        cells.append([case, compact(now.values[usual]), limit, compact(then.values[usual]), best])
+    heading = [
+        "scene, workers",
+        f"{PASS} spp a pass",
+        "its limit",
+        f"as proposed, {PASS} spp",
+        "as proposed, best pass",
+    ]
+    return f"1080p at {TOTAL:,} spp, workers of one thread; by the model, with costs measured here.", heading, cells
 
 
 STUDY = Study(NAME, "Scale on a cluster", about(__doc__), TERMS, tasks, axes=AXES)
