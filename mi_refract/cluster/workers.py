@@ -30,8 +30,13 @@ class Workers:
         expected: Mapping[str, str],
         tolerated: Collection[str] = (),
         warn: Callable[[str], None] = lambda text: None,
+        facts: Callable[[str], dict[str, str]] = worker_facts.facts,
     ) -> None:
-        """`expected`: facts that workers must have, but for `tolerated`. `warn` is told of every one that is refused."""
+        """`expected`: facts that workers must have, but for `tolerated`; `facts(variant)` is what they are asked for.
+
+        `warn` is told of every one that is refused.
+        """
+        self.facts = facts
         self.client, self.variant, self.expected, self.tolerated, self.warn = client, variant, expected, tolerated, warn
         self.accepted: dict[str, int] = {}
         self.refused: dict[str, str] = {}
