@@ -74,7 +74,7 @@ class Elsewhere:
         """
         with connection.connected(self.scheduler, self.workers) as client:
             expected = facts(self.asked.variant)
-            workers = Workers(client, self.asked.variant, expected, warn=_say, facts=facts)
+            workers = Workers(client, self.asked.variant, expected, warn=_say, facts=__name__)
             workers.wait()
             found = calls.results(workers, run_here, [(self.asked, name) for _, name in work])
             for number, outcome, machine in found:
@@ -106,7 +106,7 @@ def run_here(asked: Asked, name: str) -> Outcome:
     with on_worker.ONE_AT_A_TIME, tempfile.TemporaryDirectory(dir=on_worker.scratch_folder()) as folder:
         if on_worker.variant() != asked.variant:
             backend.activate(asked.variant)
-        on_worker.limit_threads()
+        on_worker.limit_threads(on_worker.threads())
         chosen = profiles(asked.variant)[asked.profile]
         context = Context(chosen, Path(folder), asked.variant, backend.detect(), backend.usable_variants())
         studies = [import_module(f"validation.{module}").STUDY for module in asked.modules]
