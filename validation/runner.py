@@ -32,7 +32,9 @@ class Elsewhere(Protocol):
         ...
 
 
-def run(tasks: list[Task], context: Context, elsewhere: Elsewhere | None = None) -> Finished:
+def run(
+    tasks: list[Task], context: Context, elsewhere: Elsewhere | None = None
+) -> tuple[list[Row], list[dict[str, Any]]]:
     """All rows, in the order of the tasks, and what each task took: its name, seconds, and seconds of all processors.
 
     `elsewhere` first runs those that are not timed. When it has ended the others run here, one after the other: what is

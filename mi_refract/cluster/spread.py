@@ -26,7 +26,7 @@ class _Call:
 def results(
     workers: Workers, function: Callable[..., Any], calls: Iterable[tuple[Any, ...]]
 ) -> Iterator[tuple[int, Any, str]]:
-    """Of every `function(*call)` its number from 0, its result and the worker's machine, in the order in which they end.
+    """Of every `function(*call)` its number from 0, its result and the worker's machine, in the order of their ends.
 
     `calls` is asked for the next one as soon as a worker has room. A call whose worker is lost is made again by another
     one. The errors of a call pass as they are; ConnectionError, one line, where the scheduler or all workers have gone,
