@@ -101,13 +101,18 @@ def facts(variant: str) -> dict[str, str]:
 
 def run_here(asked: Asked, name: str) -> Outcome:
     """The task of that name, in a folder of its own. Its errors pass."""
+    threads, scratch = on_worker.threads(), on_worker.scratch_folder()
+    return on_worker.one_at_a_time(lambda: _run(asked, name, threads, scratch))
+
+
+def _run(asked: Asked, name: str, threads: int, scratch: str) -> Outcome:
     from mi_refract import backend
 
-    with on_worker.ONE_AT_A_TIME, tempfile.TemporaryDirectory(dir=on_worker.scratch_folder()) as folder:
-        if on_worker.variant() != asked.variant:
-            backend.activate(asked.variant)
-        on_worker.limit_threads(on_worker.threads())
-        chosen = profiles(asked.variant)[asked.profile]
+    if on_worker.variant() != asked.variant:
+        backend.activate(asked.variant)
+    on_worker.limit_threads(threads)
+    chosen = profiles(asked.variant)[asked.profile]
+    with tempfile.TemporaryDirectory(dir=scratch) as folder:
         context = Context(chosen, Path(folder), asked.variant, backend.detect(), backend.usable_variants())
         studies = [import_module(f"validation.{module}").STUDY for module in asked.modules]
         finished = runner.timed(next(task for task in tasks(studies, context) if task.name == name))

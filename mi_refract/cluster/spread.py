@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from .connection import require_scheduler
+from .connection import scheduler_needed
 from .workers import Workers
 
 AHEAD = 2  # calls for each thread of the workers
-_POLL = 0.5  # seconds
+_POLL, _FETCHED = 0.5, 20.0  # seconds
 
 
 @dataclass(frozen=True)
@@ -38,12 +39,14 @@ def results(
     try:
         while more or begun:
             workers.look()
-            _begin_again(workers, function, begun)
+            with scheduler_needed(workers.client):
+                _begin_again(workers, function, begun)
             more = more and _begin(workers, function, begun, waiting)
-            for future in _finished(workers, list(begun)):
-                call = begun.pop(future)
-                address, found = _result(workers, future, call.number)
-                yield call.number, found, workers.machines.get(address, address)
+            for future in _ended(workers, list(begun)):
+                with scheduler_needed(workers.client):
+                    found = _result(future, begun[future].number)
+                if found is not None:
+                    yield begun.pop(future).number, found[1], workers.machines.get(found[0], found[0])
     finally:
         if begun and workers.client.status == "running":
             workers.client.cancel(list(begun), force=True)
@@ -89,35 +92,31 @@ def _with_address(function: Callable[..., Any], *arguments: Any) -> tuple[str, A
     return on_worker.address(), function(*arguments)
 
 
-def _finished(workers: Workers, futures: list[Any]) -> list[Any]:
+def _ended(workers: Workers, futures: list[Any]) -> list[Any]:
     """Those that have ended, after a short wait for the first."""
     from distributed import wait
 
     if not futures:
         time.sleep(_POLL)
         return []
-    try:
-        with workers.client.as_current():
-            wait(futures, timeout=_POLL, return_when="FIRST_COMPLETED")
-    except TimeoutError:
-        return []
-    except Exception:  # cancelled, as the scheduler has gone
-        require_scheduler(workers.client)
+    with contextlib.suppress(TimeoutError), scheduler_needed(workers.client), workers.client.as_current():
+        wait(futures, timeout=_POLL, return_when="FIRST_COMPLETED")
     return [future for future in futures if future.done()]
 
 
-def _result(workers: Workers, future: Any, number: int) -> tuple[str, Any]:
+def _result(future: Any, number: int) -> tuple[str, Any] | None:
+    """The worker's address and what it returned; None where that was lost with the worker, and is computed again."""
     from distributed import KilledWorker
-    from distributed.client import FutureCancelledError
 
     try:
-        address, found = future.result()
+        found: tuple[str, Any] = future.result() if future.status != "finished" else future.result(timeout=_FETCHED)
     except KilledWorker as error:
         raise ConnectionError(
-            f"task {number}: {error.allowed_failures + 1} workers were lost that ran it, the last {error.last_worker}; "
-            "accepted: workers with enough memory"
+            f"task {number}: {error.allowed_failures + 1} workers were lost that ran it, the last "
+            f"{error.last_worker.address}; accepted: workers with enough memory"
         ) from None
-    except FutureCancelledError:
-        require_scheduler(workers.client)
-        raise ConnectionError(f"task {number}: was cancelled on the cluster; accepted: not to") from None
-    return address, found
+    except TimeoutError:
+        if future.status == "error":
+            raise
+        return None
+    return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterable, Iterator
 
 from mi_refract.cluster import connection, on_worker, spread, worker_facts
@@ -40,5 +41,4 @@ def judging(scheduler: str | None, workers: int | None, warn: Callable[[str], No
 
 
 def _judged(piece: Piece, question: Question) -> JudgedPart:
-    with on_worker.ONE_AT_A_TIME:  # the precision of ball arithmetic is one for the process
-        return judge_part(piece, question)
+    return on_worker.one_at_a_time(functools.partial(judge_part, piece, question))  # Python's, all of it: one core
