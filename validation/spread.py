@@ -51,12 +51,8 @@ class Outcome:
 
 
 def tasks(studies: Sequence[Study], context: Context) -> list[Task]:
-    """All tasks of these studies, and those that repeat them. ValueError where two have one name."""
-    work = [task for study in studies for task in (*study.tasks(context), *repeated.tasks(study, context))]
-    names = [task.name for task in work]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"two tasks are called {twice[0]!r}; accepted: a name for each, by which workers find it")
-    return work
+    """All tasks of these studies, and those that repeat them."""
+    return [task for study in studies for task in (*study.tasks(context), *repeated.tasks(study, context))]
 
 
 @dataclass(frozen=True)
@@ -70,8 +66,11 @@ class Elsewhere:
     def run(self, work: Sequence[tuple[int, str]], context: Context) -> Iterator[tuple[int, runner.Finished]]:
         """As `runner.Elsewhere.run`. ConnectionError, one line, where nobody is there who may run tasks.
 
-        Workers that are refused are named on stderr.
+        Workers that are refused are named on stderr. ValueError where two tasks have one name.
         """
+        names = [name for _, name in work]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"two tasks are called {twice[0]!r}; accepted: a name for each, by which workers find it")
         with connection.connected(self.scheduler, self.workers) as client:
             expected = facts(self.asked.variant)
             workers = Workers(client, self.asked.variant, expected, warn=_say, facts=__name__)

@@ -123,16 +123,17 @@ def test_a_worker_sends_files_and_errors_as_they_are(monkeypatch, scalar_variant
 
 
 def test_two_tasks_of_one_name_are_refused(context):
-    study = Study("s", "", "", {}, lambda c: [Task("a", list), Task("a", list)])
+    elsewhere = spread.Elsewhere(ASKED, "tcp://127.0.0.1:9")
     with pytest.raises(ValueError, match="two tasks are called 'a'; accepted: a name for each"):
-        spread.tasks([study], context)
+        runner.run([Task("a", list), Task("a", list)], context, elsewhere)
 
 
 def test_names_of_tasks_are_their_own_in_every_profile(context):
     every = [importlib.import_module(f"validation.{name}").STUDY for name in command.modules([], "full")]
     for variant in ("scalar_rgb", "llvm_ad_rgb"):
         for profile in profiles(variant).values():
-            assert spread.tasks(every, dataclasses.replace(context, profile=profile, variant=variant))
+            tasks = spread.tasks(every, dataclasses.replace(context, profile=profile, variant=variant))
+            assert len({task.name for task in tasks}) == len(tasks) > 0
 
 
 def test_workers_with_other_sources_are_refused_by_name():
