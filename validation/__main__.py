@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mi_refract.cluster import connection
 from mi_refract.io import lock
 from mi_refract.io.outside_text import printable
 from validation.run import command_line
@@ -46,6 +47,8 @@ QUICK = (
 )
 LOCK = "validation.lock"  # in the folder of the report, while it is being made
 PROFILES = {"quick": "seconds", "standard": "minutes", "full": "hours"}
+Cluster = tuple[str | None, int | None]  # the address of a scheduler, or a number of processes
+NOBODY: Cluster = (None, None)
 
 app = command_line.application()
 
@@ -73,12 +76,23 @@ def _command(
         bool, typer.Option("--write-tables", help="Write the tables of the READMEs and the gallery, too.")
     ] = False,
     goals: Annotated[bool, typer.Option("--goals", help="Print the goals of timing, too.")] = False,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Run what times nothing on this Dask scheduler's workers.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=1024, help="Run what times nothing in so many processes, by Dask.")
+    ] = None,
 ) -> int:
     """Measure the formulas and the plugin against certified answers, and write the report."""
     _check(studies or [], profile, out, write_tables)
+    if scheduler is not None and workers is not None:
+        raise Misuse("--scheduler and --workers; accepted: one of them")
+    if scheduler is not None or workers is not None:
+        connection.require_dask()
+    cluster = scheduler, workers
     try:
         with lock.held(out / LOCK, "a validation"):
-            return _run(studies or [], profile, out, write_tables, goals)
+            return _run(studies or [], profile, out, write_tables, goals, cluster)
     except KeyboardInterrupt:
         print("validation: interrupted; the same command goes on from here", file=sys.stderr)
         raise
@@ -111,12 +125,12 @@ def modules(studies: list[str], profile: str) -> list[str]:
     return list(dict.fromkeys(f"{room}.{module}" for room, members in chosen for module in members))
 
 
-def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: bool) -> int:
+def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: bool, cluster: Cluster = NOBODY) -> int:
     from mi_refract import backend
     from mi_refract.report import run_report
     from validation.run.context import Context, profiles
 
-    from . import repeated, runner
+    from . import runner, spread
     from .run import headline, tightness
 
     start = time.perf_counter()
@@ -126,8 +140,9 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
     chosen = profiles(variant)[profile]
     context = Context(chosen, out, variant, backend.detect(), backend.usable_variants())
     studies: list[Study] = [import_module(f"validation.{name}").STUDY for name in modules(names, profile)]
-    work = [task for study in studies for task in (*study.tasks(context), *repeated.tasks(study, context))]
-    rows, spent = runner.run(work, context)
+    asked = spread.Asked(tuple(modules(names, profile)), profile, variant)
+    elsewhere = None if cluster == NOBODY else spread.Elsewhere(asked, *cluster)
+    rows, spent = runner.run(spread.tasks(studies, context), context, elsewhere)
     for study in studies:
         rows = study.summarise(rows)
     if not chosen.quick:  # whose few cases need not come near any bound

@@ -8,11 +8,11 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import mi_refract
 from mi_refract.io.atomic import write_atomically
@@ -21,32 +21,51 @@ from validation.run.context import SCENES, Context
 from validation.study import Task
 from validation.suite.renderers import SYSTEMS, environments
 
+Finished = tuple[list[Row], dict[str, Any]]  # of a task: its rows, and what it took
 
-def run(tasks: list[Task], context: Context) -> tuple[list[Row], list[dict[str, Any]]]:
+
+class Elsewhere(Protocol):
+    """Other processes that run tasks."""
+
+    def run(self, work: Sequence[tuple[int, str]], context: Context) -> Iterator[tuple[int, Finished]]:
+        """Of every task (number, name) what it gave, in the order in which they end. A task's own errors pass."""
+        ...
+
+
+def run(
+    tasks: list[Task], context: Context, elsewhere: Elsewhere | None = None
+) -> tuple[list[Row], list[dict[str, Any]]]:
     """All rows, in the order of the tasks, and what each task took: its name, seconds, and seconds of all processors.
 
-    KeyboardInterrupt passes, with the finished tasks kept.
+    `elsewhere` first runs those that are not timed. When it has ended the others run here, one after the other: what is
+    timed is alone. Errors and KeyboardInterrupt pass, with the finished tasks kept.
     """
     store = context.out / "unfinished"
     store.mkdir(parents=True, exist_ok=True)
     fingerprint = _fingerprint(context)
-    rows: list[Row] = []
-    spent: list[dict[str, Any]] = []
+    kept = [store / f"{hashlib.sha256((fingerprint + task.name).encode()).hexdigest()[:24]}.json" for task in tasks]
+    found: dict[int, Finished] = {}
     with _progress(len(tasks)) as advance:
-        for task in tasks:
-            advance(task.name)
-            kept = store / f"{hashlib.sha256((fingerprint + task.name).encode()).hexdigest()[:24]}.json"
-            finished = _recall(kept)
-            if finished is None:
-                finished = _timed(task)
-                record = {"spent": finished[1], "rows": [row.as_dict() for row in finished[0]]}
-                write_atomically(kept, json.dumps(record))
-            rows += finished[0]
-            spent.append(finished[1])
-    return rows, spent
+        if elsewhere and (work := [(i, t.name) for i, t in enumerate(tasks) if not t.timed and not _recall(kept[i])]):
+            for i, finished in elsewhere.run(work, context):
+                advance(tasks[i].name)
+                found[i] = _keep(kept[i], finished)
+        for i, task in enumerate(tasks):
+            if i not in found:
+                advance(task.name)
+                found[i] = _recall(kept[i]) or _keep(kept[i], timed(task))
+    order = [found[i] for i in range(len(tasks))]
+    return [row for rows, _ in order for row in rows], [spent for _, spent in order]
 
 
-def _timed(task: Task) -> tuple[list[Row], dict[str, Any]]:
+def _keep(kept: Path, finished: Finished) -> Finished:
+    rows, spent = finished
+    write_atomically(kept, json.dumps({"spent": spent, "rows": [row.as_dict() for row in rows]}))
+    return finished
+
+
+def timed(task: Task) -> Finished:
+    """Run a task; its rows and what it took."""
     start, processors = time.perf_counter(), sum(os.times()[:4])
     rows = task.run()
     seconds, cpu = time.perf_counter() - start, sum(os.times()[:4]) - processors
@@ -77,7 +96,7 @@ def _processor() -> str:
     return f"{len(names)} × {names[0]}" if names else platform.machine()
 
 
-def _recall(kept: Path) -> tuple[list[Row], dict[str, Any]] | None:
+def _recall(kept: Path) -> Finished | None:
     """The rows of a finished task and its time; None if there are none or they cannot be read."""
     try:
         record = json.loads(kept.read_text())
@@ -88,8 +107,18 @@ def _recall(kept: Path) -> tuple[list[Row], dict[str, Any]] | None:
 
 def _fingerprint(context: Context) -> str:
     """Rows are taken up again only for the same sources, scenes, profile, variant, versions and other renderers."""
-    installed = [name for name, system in SYSTEMS.items() if not environments.absent(system)]
-    digest = hashlib.sha256(repr((context.profile, context.variant, installed, describe(context, 0))).encode())
+    about = (context.profile, context.variant, installed(), describe(context, 0))
+    return hashlib.sha256((repr(about) + sources()).encode()).hexdigest()
+
+
+def installed() -> list[str]:
+    """The other renderers that are installed here."""
+    return [name for name, system in SYSTEMS.items() if not environments.absent(system)]
+
+
+def sources() -> str:
+    """A digest of all that rows are made from: the package, the validation, scenes and tests."""
+    digest = hashlib.sha256()
     ours, here = Path(mi_refract.__file__).parent, Path(__file__).parent
     sources = [ours.rglob("*.py"), here.rglob("*.py"), here.rglob("*.json"), SCENES.rglob("*")]
     sources.append(here.with_name("tests").rglob("*.py"))  # which mutants of our code must not pass

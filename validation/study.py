@@ -15,10 +15,15 @@ from validation.run.context import Context
 
 @dataclass(frozen=True)
 class Task:
-    """A unit of work that is finished or not: an interrupted run keeps the rows of finished tasks."""
+    """A unit of work that is finished or not: an interrupted run keeps the rows of finished tasks.
+
+    `name`: no other task of a run has it. `timed`: rows hold times or ratios of times, or depend on how fast something
+    is; it runs alone on this machine, never on a worker.
+    """
 
     name: str
     run: Callable[[], list[Row]]
+    timed: bool = False
 
 
 @dataclass(frozen=True)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import importlib.util
 import shlex
 import sys
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
+from mi_refract.cluster import connection
 from mi_refract.io.atomic import writable
 from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import provenance
@@ -27,6 +31,10 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
 )
+
+if TYPE_CHECKING:  # they need python-flint
+    from mi_refract.ray_sets.check_answers import Judge
+    from mi_refract.ray_sets.judged_parts import JudgedPart, Piece, Question
 
 OUTPUTS = ((".html", ".htm"), (".xml",), (".json",))  # of --report, --junit, --json
 UNWRAPPED = 10_000  # columns: wider than any line
@@ -78,6 +86,8 @@ class CheckOptions:
     report: Path | None
     junit: Path | None
     json: Path | None
+    scheduler: str | None = None
+    workers: int | None = None
 
     def __post_init__(self) -> None:
         """ValueError or OSError, before anything runs, for an option that cannot be met."""
@@ -91,6 +101,10 @@ class CheckOptions:
             raise ValueError(f"--tir {self.tir}: unknown; accepted: {', '.join((AUTO, *TIR))}")
         if self.formula not in (None, *FORMULAS):
             raise ValueError(f"--error-bound {self.formula}: unknown; accepted: {', '.join(FORMULAS)}")
+        if self.scheduler is not None and self.workers is not None:
+            raise ValueError("--scheduler and --workers; accepted: one of them")
+        if self.scheduler is not None or self.workers is not None:
+            connection.require_dask()
         for path, suffixes in zip((self.report, self.junit, self.json), OUTPUTS, strict=True):
             if path:
                 writable(path, suffixes)
@@ -101,11 +115,24 @@ class CheckOptions:
         chosen = ["--tir", self.tir] if self.tir != "auto" else []
         return chosen + (["--error-bound", self.formula] if self.formula else [])
 
+    @contextlib.contextmanager
+    def _judge(self) -> Iterator[Judge]:
+        """Who judges pieces of the set, with a bar on a terminal."""
+        from mi_refract.ray_sets import judged_parts, spread_check
+
+        with contextlib.ExitStack() as stack:
+            judge: Judge = judged_parts.here
+            if self.scheduler is not None or self.workers is not None:
+                judge = stack.enter_context(spread_check.judging(self.scheduler, self.workers, _say))
+            yield functools.partial(_watched, judge)
+
     def check(self, rays: RaySet, answers: Answers, name: str, replay: list[str]) -> int:
         """Check the answers, print and write the reports; the exit code. `replay`: the words of the command."""
         from mi_refract.ray_sets import check_answers, reports
 
-        found = check_answers.check(rays, answers, tir=self.tir, error_bound=self.formula or check_answers.LOOSEST)
+        bound = self.formula or check_answers.LOOSEST
+        with self._judge() as judge:
+            found = check_answers.check(rays, answers, tir=self.tir, error_bound=bound, judge=judge)
         # On a terminal, too: a wrapped line is easier to read than a squeezed column.
         Console(width=UNWRAPPED).print(reports.table(found), highlight=False)
         if self.report:
@@ -116,6 +143,22 @@ class CheckOptions:
         if self.json:
             reports.write_json(self.json, found)
         return found.exit_code
+
+
+def _watched(judge: Judge, calls: Iterable[tuple[Piece, Question]]) -> Iterator[tuple[int, JudgedPart]]:
+    """As `judge`, with the number of rays so far on a terminal's stderr."""
+    console, rays = Console(stderr=True), 0
+    status = console.status("certified: 0 rays") if console.is_terminal else None
+    with status or contextlib.nullcontext():
+        for number, part in judge(calls):
+            rays += part.rays
+            if status:
+                status.update(f"certified: {rays} rays")
+            yield number, part
+
+
+def _say(text: str) -> None:
+    print(printable(f"mi-refract: {text}"), file=sys.stderr, flush=True)
 
 
 @app.command()
@@ -150,13 +193,19 @@ def check(
     report: Report = None,
     junit: Junit = None,
     json: Json = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Certify and judge on the workers of this Dask scheduler.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=1024, help="Certify and judge in so many processes, by Dask.")
+    ] = None,
 ) -> None:
     """Check answers against certified ones. Exit code 0: right, 1: wrong, 2: the answers do not match the rays.
 
     The rays are those of --rays, or those that `export` makes with the same options as here, or without any. The
     answers do not choose them.
     """
-    options = CheckOptions(tir, formula or old_formula, report, junit, json)
+    options = CheckOptions(tir, formula or old_formula, report, junit, json, scheduler, workers)
     rays, chosen = _rays(file, regime, count, precision, seed, two_sided)
     given = files.read_answers(answers, most=files.most_answers(rays))
     origin = "" if chosen else ", as of `export` without options; others: --rays FILE"

@@ -49,8 +49,12 @@ def threads() -> int:
 
 
 def limit_threads(threads: int) -> None:
-    """Have Dr.Jit use so many threads, so that workers of one machine share its cores."""
+    """Have Dr.Jit use so many threads, so that workers of one machine share its cores.
+
+    Two at least: by one thread, a kernel runs on the caller's, which keeps denormals; the others take them for 0.
+    """
     import drjit as dr
 
+    threads = max(2, threads)
     if dr.thread_count() != threads:
         dr.set_thread_count(threads)

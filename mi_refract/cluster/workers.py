@@ -13,7 +13,7 @@ PATIENCE = 120.0  # seconds until the first workers must have said what they are
 _NOBODY = 30.0  # seconds until a scheduler must have a worker at all
 ALONE = 120.0  # seconds until new workers must have come where all have gone
 # As text: a worker that cannot import a function which it is sent ends, and its nanny starts it again, without end.
-_QUESTION = "__import__('mi_refract.cluster.worker_facts', fromlist=['facts']).facts({!r})"
+_QUESTION = "__import__({!r}, fromlist=['facts']).facts({!r})"
 _POLL, _BETWEEN_LOOKS = 0.05, 2.0  # seconds
 
 
@@ -30,8 +30,13 @@ class Workers:
         expected: Mapping[str, str],
         tolerated: Collection[str] = (),
         warn: Callable[[str], None] = lambda text: None,
+        facts: str = worker_facts.__name__,
     ) -> None:
-        """`expected`: facts that workers must have, but for `tolerated`. `warn` is told of who is refused."""
+        """`expected`: facts that workers must have, but for `tolerated`. `warn` is told of who is refused.
+
+        `facts`: the name of the module whose `facts(variant)` workers are asked for.
+        """
+        self.facts = facts
         self.client, self.variant, self.expected, self.tolerated, self.warn = client, variant, expected, tolerated, warn
         self.accepted: dict[str, int] = {}
         self.refused: dict[str, str] = {}
@@ -85,7 +90,7 @@ class Workers:
                 self._judge(address, threads, self._asked.pop(address))
             elif address not in self._asked and address not in self.accepted and address not in self.refused:
                 self._asked[address] = self.client.submit(
-                    eval, _QUESTION.format(self.variant), workers=[address], pure=False, priority=1000
+                    eval, _QUESTION.format(self.facts, self.variant), workers=[address], pure=False, priority=1000
                 )
 
     def _require_some(self) -> None:

@@ -7,21 +7,25 @@ of the length is reported separately.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+import functools
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from mi_refract.accuracy import lengths
 from mi_refract.formulas import FORMULAS
 
-from .diagnosis import Explanation, explain
+from . import diagnosis, evidence, judged_parts, tir_signal
+from .diagnosis import Explanation
 from .header import Header, shown
-from .judged_answers import JudgedAnswers, judge_answers
+from .judged_answers import judge_answers
+from .judged_parts import LISTED_IDS, PIECE, JudgedPart, Piece, Question
 from .ray_set import Answers, RaySet
-from .tir_signal import AUTO, FLAG, LOOSEST, TIR, UNCLEAR
+from .tir_signal import AUTO, FLAG, LOOSEST, NONE, TIR, UNCLEAR
 
-LISTED_IDS = 5
+SEEN, GUESSED = 2**16, 2**9  # rays that are looked at, and judged, to guess the signal of total internal reflection
 
 
 @dataclass(frozen=True)
@@ -116,12 +120,18 @@ class Findings:
         return int(self.wrong > 0 or self.tir == UNCLEAR or bool(self.problems) or not self.total("judged"))
 
 
-def check(rays: RaySet, answers: Answers, *, tir: str = AUTO, error_bound: str = LOOSEST) -> Findings:
+Judge = Callable[[Iterable[tuple[Piece, Question]]], Iterator[tuple[int, JudgedPart]]]
+
+
+def check(
+    rays: RaySet, answers: Answers, *, tir: str = AUTO, error_bound: str = LOOSEST, judge: Judge = judged_parts.here
+) -> Findings:
     """Compare every answer with the certified direction.
 
     `tir`: how the answers signal total internal reflection, one of TIR; detected where it is AUTO. `error_bound`: the
-    formula of FORMULAS whose a-priori bound the errors must keep. ValueError for an unknown name, for tir = FLAG
-    without the column `transmitted`, or for answers whose header is that of other rays.
+    formula of FORMULAS whose a-priori bound the errors must keep. `judge`: who judges pieces of the set; the findings
+    do not depend on it. ValueError for an unknown name, for tir = FLAG without the column `transmitted`, or for answers
+    whose header is that of other rays.
     """
     _check_name("tir", tir, (AUTO, *TIR))
     _check_name("error_bound", error_bound, FORMULAS)
@@ -131,21 +141,96 @@ def check(rays: RaySet, answers: Answers, *, tir: str = AUTO, error_bound: str =
         accepted = f"{rays.header['checksum']}, or other rays with --rays FILE"
         raise ValueError(f"the answers are to rays with the checksum {shown(given)}; accepted: {accepted}")
     problems, order = _match_ids(rays, answers)
-    kept = np.flatnonzero(order >= 0)
-    b = answers.b[order[kept]]
-    flag = None if answers.transmitted is None else answers.transmitted[order[kept]]
-    judged = judge_answers(b, flag, rays.rays[kept], rays.precision, FORMULAS[error_bound].budget, tir)
+    pieces = Pieces(rays, answers, order, np.flatnonzero(order >= 0))
+    signal, parts = _parts(pieces, Question(rays.precision, error_bound, tir), judge)
     return Findings(
         precision=rays.precision,
         ulp=2 * rays.roundoff,
         error_bound=error_bound,
-        tir=judged.tir,
+        tir=signal,
         tir_given=tir != AUTO,
-        regimes=tuple(_by_regime(rays, judged, kept)),
-        problems=(*problems, *_not_directions(judged, rays.ids[kept])),
-        explanations=tuple(explain(judged)) if judged.verdict.wrong.any() else (),
+        regimes=tuple(_by_regime(rays, parts)),
+        problems=(*problems, *_not_directions(parts)),
+        explanations=_explanations(pieces, parts, Question(rays.precision, error_bound, signal)),
         header=rays.header,
     )
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Rays with their answers. `order`: (N,) for each ray the row of its answer; `kept`: the rays that have one."""
+
+    rays: RaySet
+    answers: Answers
+    order: np.ndarray
+    kept: np.ndarray
+
+    @functools.cached_property
+    def index(self) -> list[tuple[str, np.ndarray]]:
+        """Of each piece its regime and its rays."""
+        names, found = self.rays.regime[self.kept], []
+        for name in self.rays.header["regimes"]:
+            of_regime = self.kept[np.flatnonzero(names == name)]
+            found += [(name, of_regime[i : i + PIECE]) for i in range(0, len(of_regime), PIECE)]
+        return found
+
+    def piece(self, name: str, index: np.ndarray) -> Piece:
+        """Some rays with their answers."""
+        rows, flags = self.order[index], self.answers.transmitted
+        flag = None if flags is None else flags[rows]
+        return Piece(name, self.rays.rays[index], self.rays.ids[index], self.answers.b[rows], flag)
+
+    def sampled(self, index: np.ndarray) -> Piece:
+        """Some rays by their places in the order of the pieces."""
+        ends = np.cumsum([len(each) for _, each in self.index])
+        which = np.searchsorted(ends, index, side="right")
+        found = [self.index[i][1][j - (ends[i] - len(self.index[i][1]))] for i, j in zip(which, index, strict=True)]
+        return self.piece("", np.array(found, int))
+
+
+def _parts(pieces: Pieces, question: Question, judge: Judge) -> tuple[str, list[JudgedPart]]:
+    """The signal of total internal reflection, and the parts judged by it.
+
+    The signal is known after all rays are: that of a sample is taken first, and all are judged again if it was wrong.
+    """
+    detected = question.tir == AUTO and pieces.answers.transmitted is None
+    tir = FLAG if question.tir == AUTO else question.tir
+    if detected:
+        tir = _guess(pieces, question)
+    while True:
+        asked = replace(question, tir=tir, counted=detected)
+        found = dict(judge((pieces.piece(*each), asked) for each in pieces.index))
+        parts = [found[number] for number in range(len(found))]
+        signal = tir_signal.joined([part.signals for part in parts if part.signals]).signal if detected else tir
+        if signal == tir:
+            return tir, parts
+        tir, detected = signal, False
+
+
+def _guess(pieces: Pieces, question: Question) -> str:
+    """The signal of a few rays, evenly over the set; of those that seem totally reflected, where there are any."""
+    total = sum(len(each) for _, each in pieces.index)
+    some = pieces.sampled(np.arange(0, total, max(1, total // SEEN)))
+    across = np.cross(some.rays.n.astype(float), some.rays.a.astype(float))
+    with np.errstate(all="ignore"):
+        sine = some.rays.k * (lengths(across) / (lengths(some.rays.a) * lengths(some.rays.n)))
+    which = np.flatnonzero(sine > 1)
+    which = which[:: max(1, len(which) // GUESSED)]
+    if not len(which):
+        return NONE
+    flag = None if some.flag is None else some.flag[which]
+    budget = FORMULAS[question.error_bound].budget
+    return judge_answers(some.b[which], flag, some.rays[which], question.precision, budget).tir
+
+
+def _explanations(pieces: Pieces, parts: list[JudgedPart], question: Question) -> tuple[Explanation, ...]:
+    if not any(part.evidence.wrong_count for part in parts):
+        return ()
+    found = evidence.joined([(part.evidence, part.angles) for part in parts])
+    some, printed = (pieces.sampled(of(found)) for of in (diagnosis.sample, diagnosis.printed_sample))
+    budget = FORMULAS[question.error_bound].budget
+    judged = judge_answers(some.b, some.flag, some.rays, question.precision, budget, question.tir)
+    return tuple(diagnosis.explain(judged, found, printed.b))
 
 
 def _check_name(name: str, value: str, accepted: Collection[str]) -> None:
@@ -167,65 +252,47 @@ def _match_ids(rays: RaySet, answers: Answers) -> tuple[list[Problem], np.ndarra
 
 
 def _problem(kind: str, ids: np.ndarray) -> Problem:
-    some = ", ".join(map(str, ids[:LISTED_IDS]))
-    plural, more = "" if len(ids) == 1 else "s", ", …" if len(ids) > LISTED_IDS else ""
-    return Problem(kind, len(ids), f"id{plural} {some}{more}")
+    return _listed(kind, len(ids), ids[:LISTED_IDS].tolist())
 
 
-def _not_directions(judged: JudgedAnswers, ids: np.ndarray) -> Iterator[Problem]:
+def _listed(kind: str, count: int, first: list[int]) -> Problem:
+    some = ", ".join(map(str, first[:LISTED_IDS]))
+    plural, more = "" if count == 1 else "s", ", …" if count > LISTED_IDS else ""
+    return Problem(kind, count, f"id{plural} {some}{more}")
+
+
+def _not_directions(parts: list[JudgedPart]) -> Iterator[Problem]:
     """Answers that are neither a direction nor the signal of total internal reflection, or an impossible one."""
-    zero = ~judged.b.any(axis=1)
-    for kind, mask in (("non-finite", judged.verdict.blank & ~zero), ("zero", judged.verdict.blank & zero)):
-        if mask.any():
-            yield _problem(kind, ids[mask])
-    if judged.impossible.any():
-        yield _problem("impossible", ids[judged.impossible])
+    for kind in parts[0].listed if parts else ():
+        counts, ids = zip(*(part.listed[kind] for part in parts), strict=True)
+        if sum(counts):
+            yield _listed(kind, sum(counts), [id_ for some in ids for id_ in some])
 
 
 # By regime ---------------------------------------------------------------------------------------------------------
 
 
-def _by_regime(rays: RaySet, judged: JudgedAnswers, kept: np.ndarray) -> Iterator[RegimeErrors]:
-    names = rays.regime[kept]
+def _by_regime(rays: RaySet, parts: list[JudgedPart]) -> Iterator[RegimeErrors]:
     for name in rays.header["regimes"]:
-        index = np.flatnonzero(names == name)
-        if len(index):
-            yield _regime_errors(name, rays.ids[kept], judged, index)
+        if of_regime := [part for part in parts if part.regime == name]:
+            yield _regime_errors(name, of_regime)
 
 
-def _regime_errors(name: str, ids: np.ndarray, judged: JudgedAnswers, index: np.ndarray) -> RegimeErrors:
-    verdict = judged.verdict
-    compared = index[verdict.compared[index]]
-    angle, length = (x[compared] if len(compared) else np.full(1, np.nan) for x in (verdict.angle, verdict.drift))
-    worst = index[
-        np.lexsort((verdict.share[index], judged.impossible[index], verdict.far[index], verdict.blank[index]))[-1]
-    ]
+def _regime_errors(name: str, parts: list[JudgedPart]) -> RegimeErrors:
+    angles = np.concatenate([part.angles for part in parts])
+    compared = len(angles)
+    known = angles if compared else np.full(1, np.nan)
+    lengths_ = [part.length_error for part in parts if len(part.angles)]
+    worst = judged_parts.last_of_largest([part.worst.rank for part in parts])
     return RegimeErrors(
         name,
-        len(index),
-        len(compared),
-        worst=float(angle.max()),
-        p99=float(np.quantile(angle, 0.99)),
-        mean=float(angle.mean()),
-        length_error=float(length.max()),
-        tir_misclassified=int(verdict.misjudged[index].sum()),
-        tir_beyond_bound=int(verdict.far[index].sum()),
-        error_over_bound=float(verdict.share[index].max()),
-        undecidable=int(judged.undecidable[index].sum()),
-        judged=int((~judged.undecidable)[compared].sum()),
-        wrong=int(judged.wrong[index].sum()),
-        exact=int(judged.rounded_exact[index].sum()),
-        replay=_replay(judged, int(worst), int(ids[worst])),
+        rays=sum(part.rays for part in parts),
+        compared=compared,
+        worst=float(known.max()),
+        p99=float(np.quantile(known, 0.99)),
+        mean=float(known.mean()),
+        length_error=float(np.max(lengths_)) if lengths_ else np.nan,
+        error_over_bound=float(np.max([part.error_over_bound for part in parts])),
+        replay=parts[worst].worst.replay,
+        **{count: sum(part.counts[count] for part in parts) for count in judged_parts.COUNTS},
     )
-
-
-def _replay(judged: JudgedAnswers, row: int, id_: int) -> dict[str, Any]:
-    """A ray and its answer in hexadecimal floats."""
-    bounds = judged.verdict.bounds
-    return {
-        "id": id_,
-        **bounds.rays.hexed(row),
-        "answer": [float(x).hex() for x in judged.b[row]],
-        "exact": [float(x).hex() for x in bounds.exact.direction[row]],
-        "transmitted": bool(bounds.exact.transmitted[row]),
-    }

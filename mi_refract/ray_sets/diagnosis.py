@@ -15,9 +15,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mi_refract.accuracy import Judgement, RayBounds, absolute_radicand, lengths
+from mi_refract.accuracy import RayBounds, lengths
 from mi_refract.regimes import Rays
 
+from .evidence import F32, FLOAT32, LENGTHS, AllEvidence
 from .judged_answers import JudgedAnswers
 from .ray_set import indices
 
@@ -25,8 +26,6 @@ VISIBLE, SAME = 0.1, 5e-3  # radians
 MOST, ALL = 0.9, 0.99  # the share of the answers that a mistake, or a loss of precision, must explain
 FEWEST = 10  # answers: fewer are no evidence
 SAMPLE = 150  # wrong answers, and as many right ones
-WIDEST_BOUND = 1e-3  # radians: under a wider bound an answer is no evidence
-F32 = 2.0**-24
 DIGITS = {2.0**-24: 7, 2.0**-53: 15}  # by roundoff: fewer digits than distinguish its numbers
 
 
@@ -210,23 +209,31 @@ MISTAKES: dict[str, dict[str, Predict]] = {
 # Comparison with the answers ---------------------------------------------------------------------------------------
 
 
-def explain(judged: JudgedAnswers) -> list[Explanation]:
-    """Every mistake, and the share of the answers that it explains. Precondition: some answers are wrong."""
+def sample(evidence: AllEvidence) -> np.ndarray:
+    """Indices of wrong and of right answers, evenly over the set, without rays whose bound excuses large errors."""
+    return np.concatenate([_evenly(mask, SAMPLE) for mask in (evidence.wrong, evidence.right)])
+
+
+def printed_sample(evidence: AllEvidence) -> np.ndarray:
+    """Indices of answers whose digits are looked at."""
+    return _evenly(evidence.compared, SAMPLE)
+
+
+def explain(judged: JudgedAnswers, evidence: AllEvidence, printed: np.ndarray) -> list[Explanation]:
+    """Every mistake, and the share of the answers that it explains. Precondition: some answers are wrong.
+
+    `judged`: the answers of `sample`; `printed` (M, 3): those of `printed_sample`, as given.
+    """
     verdict = judged.verdict
-    index = _sample(verdict)
-    case, wrong = Case.of(verdict.bounds, index), verdict.wrong[index]
+    case, wrong = Case.of(verdict.bounds, np.arange(len(judged.b))), verdict.wrong
     with np.errstate(all="ignore"):
-        found = [_best_variant(name, table, case, judged.b[index], wrong) for name, table in MISTAKES.items()]
-        lengths_only, digits, float32 = _wrong_lengths(verdict), _few_digits(verdict, judged.raw), _float32(verdict)
+        found = [_best_variant(name, table, case, judged.b, wrong) for name, table in MISTAKES.items()]
+        roundoff = verdict.bounds.roundoff
+        lengths_only, float32 = _wrong_lengths(evidence), _float32(evidence, roundoff)
+        digits = _few_digits(evidence, printed, roundoff)
     found[-1] = max(found[-1], lengths_only, key=_strength)
     # Numbers of few digits may keep the bound of float32, too.
     return [*found, replace(float32, explains=float32.explains and not digits.explains), digits]
-
-
-def _sample(verdict: Judgement) -> np.ndarray:
-    """Indices of wrong and of right answers, evenly over the set, without rays whose bound excuses large errors."""
-    evidence = verdict.bounds.decided & (verdict.bounds.chord <= WIDEST_BOUND)
-    return np.concatenate([_evenly(evidence & mask, SAMPLE) for mask in (verdict.wrong, ~verdict.wrong)])
 
 
 def _evenly(mask: np.ndarray, count: int) -> np.ndarray:
@@ -258,43 +265,34 @@ def _angle(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.where((across == 0) & (along == 0), np.nan, np.arctan2(across, along))
 
 
-def _of_wrong(name: str, text: str, verdict: Judgement, holds: np.ndarray, enough: bool) -> Explanation:
-    """`holds`: the answers that the mistake accounts for."""
-    share = float(holds[verdict.wrong].mean()) if verdict.wrong.any() else 0.0
-    compared = verdict.compared & verdict.wrong
-    median = float(np.median(verdict.angle[compared])) if compared.any() else math.nan
-    return Explanation(name, text, share, median, bool(enough and share >= ALL and verdict.wrong.sum() >= FEWEST))
+def _of_wrong(name: str, text: str, evidence: AllEvidence, accounted: int, enough: bool) -> Explanation:
+    """`accounted`: how many of the wrong answers the mistake accounts for."""
+    share = accounted / evidence.wrong_count if evidence.wrong_count else 0.0
+    angles = evidence.angles[evidence.wrong_compared]
+    median = float(np.median(angles)) if len(angles) else math.nan
+    return Explanation(name, text, share, median, bool(enough and share >= ALL and evidence.wrong_count >= FEWEST))
 
 
-def _wrong_lengths(verdict: Judgement) -> Explanation:
-    holds = verdict.compared & (verdict.angle <= verdict.bounds.chord)
-    return _of_wrong("missing normalisation", "directions are right, but not of length 1", verdict, holds, True)
+def _wrong_lengths(evidence: AllEvidence) -> Explanation:
+    text = "directions are right, but not of length 1"
+    return _of_wrong("missing normalisation", text, evidence, evidence.accounted.get(LENGTHS, 0), True)
 
 
-def _within(verdict: Judgement, bound: np.ndarray) -> np.ndarray:
-    return verdict.compared & (verdict.error <= bound)
-
-
-def _float32(verdict: Judgement) -> Explanation:
+def _float32(evidence: AllEvidence, roundoff: float) -> Explanation:
     """float32 where float64 was claimed: errors of float32's size nearly everywhere, and none that is larger."""
-    bounds, u = verdict.bounds, 2 * F32  # u of the inputs, u of the formula
-    k, exact = bounds.k, bounds.exact
-    bound = bounds.budget.chord(u, k, exact.cos_t, exact.transmitted, cos_i=exact.cos_i)
-    lost = verdict.misjudged & (absolute_radicand(bounds.rays) <= bounds.budget.radicand_error_bound(u, k))
-    everywhere = verdict.compared.any() and np.median(verdict.angle[verdict.compared]) > F32 / 50
-    holds, claimed = _within(verdict, bound) | lost, bounds.roundoff < F32
-    enough = claimed and bool(everywhere)
-    return _of_wrong("f32 where f64 was claimed", "errors are those of float32", verdict, holds, enough)
+    everywhere = len(evidence.angles) and np.median(evidence.angles) > F32 / 50
+    enough, text = roundoff < F32 and bool(everywhere), "errors are those of float32"
+    return _of_wrong("f32 where f64 was claimed", text, evidence, evidence.accounted.get(FLOAT32, 0), enough)
 
 
-def _few_digits(verdict: Judgement, raw: np.ndarray) -> Explanation:
+def _few_digits(evidence: AllEvidence, printed: np.ndarray, roundoff: float) -> Explanation:
     """Numbers that were printed with too few digits."""
-    values = raw[_evenly(verdict.compared, SAMPLE)].ravel()
+    values = printed.ravel()
     values = values[np.rint(values) != values].tolist()
-    candidates = range(1, DIGITS[verdict.bounds.roundoff] + 1) if len(values) >= FEWEST else range(0)
+    candidates = range(1, DIGITS[roundoff] + 1) if len(values) >= FEWEST else range(0)
     for digits, (form, word) in itertools.product(candidates, (("f", "decimals"), ("g", "significant digits"))):
         if all(float(f"{x:.{digits}{form}}") == x for x in values):
             # Half a unit of the last digit in each of three components.
-            bound, text = verdict.bounds.chord + 10.0**-digits, f"numbers are rounded to {digits} {word}"
-            return _of_wrong("too few digits", text, verdict, _within(verdict, bound), True)
+            text = f"numbers are rounded to {digits} {word}"
+            return _of_wrong("too few digits", text, evidence, evidence.accounted.get(str(digits), 0), True)
     return Explanation("too few digits", "numbers have all their digits", 0.0, math.nan, False)

@@ -21,6 +21,8 @@ from .tir_signal import LOOSEST
 class JudgedAnswers:
     """Answers (N, 3) as given and in the set's precision, how they signal TIR, and the verdict on each.
 
+    `signals`: how many rays give each signal; None unless they were counted.
+
     `impossible`: (N,) where the error bound excuses the direction, and no documented formula gives it all the same.
     """
 
@@ -29,6 +31,7 @@ class JudgedAnswers:
     tir: str
     verdict: Judgement
     impossible: np.ndarray
+    signals: tir_signal.Signals | None = None
 
     @property
     def undecidable(self) -> np.ndarray:
@@ -47,24 +50,35 @@ class JudgedAnswers:
 
 
 def judge_answers(
-    b: np.ndarray, flag: np.ndarray | None, rays: Rays, precision: str, budget: Budget, tir: str = tir_signal.AUTO
+    b: np.ndarray,
+    flag: np.ndarray | None,
+    rays: Rays,
+    precision: str,
+    budget: Budget,
+    tir: str = tir_signal.AUTO,
+    *,
+    counted: bool = False,
 ) -> JudgedAnswers:
     """Compare `b` (N, 3) with the certified answers, within `budget`.
 
     `flag`: the column `transmitted` (N,), if there is one. `precision`: f32 or f64. `tir`: one of TIR, or AUTO.
+    `counted`: count the rays of each signal.
     """
-    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False)
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
     bounds = RayBounds(rays, exact, budget, float(np.finfo(PRECISIONS[precision]).eps) / 2, normalised=True)
     with np.errstate(over="ignore"):
         rounded = b.astype(PRECISIONS[precision]).astype(np.float64)
     seen = tir_signal.SeenAnswers(rounded, rays, exact, bounds.roundoff)
-    if tir == tir_signal.AUTO:
-        tir = tir_signal.detect(seen, flag)
+    if tir == tir_signal.AUTO and flag is not None:
+        tir = tir_signal.FLAG
+    signals = tir_signal.count(seen) if counted or tir == tir_signal.AUTO else None
+    if tir == tir_signal.AUTO and signals:
+        tir = signals.signal
     reflected = tir_signal.reflected(seen, flag, tir, bounds.decided)
     blank = ~seen.is_direction & (~reflected | tir_signal.has_direction(tir))
     directed = exact.transmitted | (tir == "reflected")
     verdict = judge(rounded, ~reflected, bounds, directed, blank)
-    return JudgedAnswers(b, rounded, tir, verdict, _impossible(seen, reflected, tir, verdict))
+    return JudgedAnswers(b, rounded, tir, verdict, _impossible(seen, reflected, tir, verdict), signals)
 
 
 def _impossible(seen: tir_signal.SeenAnswers, reflected: np.ndarray, tir: str, verdict: Judgement) -> np.ndarray:

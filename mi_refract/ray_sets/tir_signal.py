@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,19 +92,43 @@ DETECTORS = {
 TIR = (*DETECTORS, FLAG)
 
 
-def detect(seen: SeenAnswers, flag: np.ndarray | None) -> str:
-    """FLAG where there is one; otherwise the signal that certainly reflected rays agree on, or NONE, or UNCLEAR."""
-    if flag is not None:
-        return FLAG
+@dataclass(frozen=True)
+class Signals:
+    """How many rays are totally reflected, and how many of these give each signal; the same of those certainly so."""
+
+    total: int
+    certain: int
+    of_total: dict[str, int]
+    of_certain: dict[str, int]
+
+    @property
+    def signal(self) -> str:
+        """The signal that certainly reflected rays agree on, or NONE, or UNCLEAR."""
+        if not self.total:
+            return NONE
+        among, found = (self.certain, self.of_certain) if self.certain else (self.total, self.of_total)
+        shares = {name: count / among for name, count in found.items()}
+        best = max(shares, key=lambda name: shares[name])
+        return best if shares[best] >= AGREEING else UNCLEAR
+
+
+def count(seen: SeenAnswers) -> Signals:
+    """The signals of some answers."""
     total = ~seen.exact.transmitted & (seen.exact.cos_i > 0)
-    if not total.any():
-        return NONE
     bound = FORMULAS[LOOSEST].budget.radicand_error_bound(seen.u, seen.rays.k.astype(float))
     certain = total & (absolute_radicand(seen.rays) > np.maximum(CERTAIN, bound))
-    among = certain if certain.any() else total
-    shares = {name: float(detector(seen)[among].mean()) for name, detector in DETECTORS.items()}
-    best = max(shares, key=lambda name: shares[name])
-    return best if shares[best] >= AGREEING else UNCLEAR
+    given = {name: detector(seen) for name, detector in DETECTORS.items()} if total.any() else {}
+    of_total, of_certain = ({name: int(each[of].sum()) for name, each in given.items()} for of in (total, certain))
+    return Signals(int(total.sum()), int(certain.sum()), of_total, of_certain)
+
+
+def joined(parts: Sequence[Signals]) -> Signals:
+    """Those of all parts."""
+    sums = [
+        {name: sum(getattr(part, of).get(name, 0) for part in parts) for name in DETECTORS}
+        for of in ("of_total", "of_certain")
+    ]
+    return Signals(sum(part.total for part in parts), sum(part.certain for part in parts), *sums)
 
 
 def reflected(seen: SeenAnswers, flag: np.ndarray | None, tir: str, decided: np.ndarray) -> np.ndarray:

@@ -71,7 +71,7 @@ print([line.split()[1] for line in open("/proc/self/status") if line.startswith(
 
 def tasks(context: Context) -> list[Task]:
     """One task: its subjects take turns."""
-    return [Task("diff, times", functools.partial(measure, SIZES[context.profile.name], context.variant))]
+    return [Task("diff, times", functools.partial(measure, SIZES[context.profile.name], context.variant), timed=True)]
 
 
 def measure(size: Size, setting: str) -> list[Row]:

@@ -73,7 +73,7 @@ SEED = 2026
 def tasks(context: Context) -> list[Task]:
     """One task per backend and precision."""
     return [
-        Task(f"directions: {setting.label}", functools.partial(_setting_rows, context, setting))
+        Task(f"directions: {setting.label}", functools.partial(_setting_rows, context, setting), timed=True)
         for setting in settings(context)
     ]
 

@@ -109,7 +109,9 @@ Found = dict[str, dict[int, Measured]]  # by subject and samples per pixel
 def tasks(context: Context) -> list[Task]:
     """One task per scene."""
     paths = sorted(SCENES.glob("*.xml"))
-    return [Task(f"efficiency: {path.stem}", functools.partial(scene_rows, context, path)) for path in paths]
+    return [
+        Task(f"efficiency: {path.stem}", functools.partial(scene_rows, context, path), timed=True) for path in paths
+    ]
 
 
 def scene_rows(context: Context, path: Path, methods: tuple[Method, ...] = METHODS) -> list[Row]:

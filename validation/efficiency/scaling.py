@@ -226,7 +226,7 @@ def _files(folder: str) -> int:
 def tasks(context: Context) -> list[Task]:
     """One task per knob; in the profile `quick` the number of glasses only."""
     knobs = ("glasses",) if context.profile.quick else tuple(KNOBS)
-    return [Task(f"scaling: {name}", functools.partial(knob_rows, context, name)) for name in knobs]
+    return [Task(f"scaling: {name}", functools.partial(knob_rows, context, name), timed=True) for name in knobs]
 
 
 def knob_rows(context: Context, knob: str, methods: tuple[Method, ...] = METHODS) -> list[Row]:

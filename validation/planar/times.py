@@ -52,7 +52,10 @@ BOUNDARIES = 2
 
 def tasks(context: Context) -> list[Task]:
     """One task per backend and precision."""
-    return [Task(f"planar, times: {s.label}", functools.partial(_setting_rows, context, s)) for s in settings(context)]
+    return [
+        Task(f"planar, times: {s.label}", functools.partial(_setting_rows, context, s), timed=True)
+        for s in settings(context)
+    ]
 
 
 def _setting_rows(context: Context, setting: Setting) -> list[Row]:

@@ -55,7 +55,7 @@ def tasks(context: Context) -> list[Task]:
     """One task per scene and plugin of ours."""
     plugins = [PLUGIN] + [f"{PLUGIN}_{name}" for name in FORMULAS if context.profile.every_formula]
     return [
-        Task(f"renders: {path.stem}, {plugin}", functools.partial(_compare, context, path, plugin))
+        Task(f"renders: {path.stem}, {plugin}", functools.partial(_compare, context, path, plugin), timed=True)
         for path in context.scenes
         for plugin in plugins
     ]

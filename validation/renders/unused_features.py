@@ -53,7 +53,7 @@ SCALAR = "scalar variants have no kernels"
 
 def tasks(context: Context) -> list[Task]:
     """One per feature; in the profile `quick` those without scenes of many glasses."""
-    calls = Task("features: scalar calls", functools.partial(scalar_rows, context))
+    calls = Task("features: scalar calls", functools.partial(scalar_rows, context), timed=True)
     if context.variant.startswith("scalar"):
         return [Task("features", lambda: [Row(NAME, PLUGIN, "kernels", context.variant, reason=SCALAR)]), calls]
     operations_only = Task("features: operations", functools.partial(operation_rows, context))
@@ -64,11 +64,11 @@ def tasks(context: Context) -> list[Task]:
         Task("features: glasses", functools.partial(glass_rows, context)),
         Task("features: optimisation", functools.partial(optimisation_rows, context)),
         *(
-            Task(f"features: first image, {n} glasses", functools.partial(first_image_rows, context, n))
+            Task(f"features: first image, {n} glasses", functools.partial(first_image_rows, context, n), timed=True)
             for n in limits.FIRST_IMAGE
         ),
-        Task("features: edit", functools.partial(edit_rows, context)),
-        Task("features: frozen", functools.partial(frozen_rows, context)),
+        Task("features: edit", functools.partial(edit_rows, context), timed=True),
+        Task("features: frozen", functools.partial(frozen_rows, context), timed=True),
         Task("features: boundaries", functools.partial(boundary_rows, context)),
         calls,
     ]

@@ -156,7 +156,7 @@ STUDY = Study(
     "Mutants of our own code",
     about(__doc__),
     TERMS,
-    lambda context: [Task("code mutants", lambda: _rows(context))],
+    lambda context: [Task("code mutants", lambda: _rows(context), timed=True)],
 )
 
 

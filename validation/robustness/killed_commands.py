@@ -267,7 +267,7 @@ STUDY = Study(
     "Killed commands and full disks",
     about(__doc__),
     TERMS,
-    lambda context: [Task("killed commands", lambda: _rows(context))],
+    lambda context: [Task("killed commands", lambda: _rows(context), timed=True)],
 )
 
 

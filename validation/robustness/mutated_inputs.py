@@ -119,7 +119,7 @@ STUDY = Study(
     "Garbage in",
     about(__doc__),
     TERMS,
-    lambda context: [Task("mutated inputs", lambda: _rows(context))],
+    lambda context: [Task("mutated inputs", lambda: _rows(context), timed=True)],
 )
 
 

@@ -1,0 +1,136 @@
+"""What is kept of judged rays, so that a set is judged in pieces, here or elsewhere, and no piece is kept whole.
+
+Of every ray the angle is kept, for quantiles and means over all, and three bits, for a sample of the answers. The parts
+in the order of the rays give the same findings, whatever the pieces were and whoever judged them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mi_refract.accuracy import Judgement
+from mi_refract.formulas import FORMULAS
+from mi_refract.regimes import Rays
+
+from .evidence import Evidence, evidence
+from .judged_answers import JudgedAnswers, judge_answers
+from .tir_signal import Signals
+
+PIECE = 2**14  # rays of a piece, at most: about a second
+LISTED_IDS = 5
+COUNTS = {  # of `RegimeErrors`, where they are sums
+    "tir_misclassified": lambda judged: judged.verdict.misjudged,
+    "tir_beyond_bound": lambda judged: judged.verdict.far,
+    "undecidable": lambda judged: judged.undecidable,
+    "judged": lambda judged: judged.verdict.compared & ~judged.undecidable,
+    "wrong": lambda judged: judged.wrong,
+    "exact": lambda judged: judged.rounded_exact,
+}
+
+
+@dataclass(frozen=True)
+class Question:
+    """How answers are judged: their precision, the formula of the error bound, the signal of TIR.
+
+    `counted`: whether to count the rays of each signal.
+    """
+
+    precision: str
+    error_bound: str
+    tir: str
+    counted: bool = False
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Rays (N) of one regime, their ids (N,), the answers b (N, 3), and `transmitted` (N,) if there is the column."""
+
+    regime: str
+    rays: Rays
+    ids: np.ndarray
+    b: np.ndarray
+    flag: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Worst:
+    """Of some rays the last of the largest rank: without a direction, TIR beyond its bound, impossible, share."""
+
+    rank: tuple[float, ...]
+    replay: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class JudgedPart:
+    """What is kept of a piece."""
+
+    regime: str
+    rays: int
+    counts: dict[str, int]
+    angles: np.ndarray  # of the rays compared, in their order
+    length_error: float  # the largest; NaN without any compared
+    error_over_bound: float
+    worst: Worst
+    listed: dict[str, tuple[int, list[int]]]  # by kind of problem: how many rays have it, and the first ids
+    signals: Signals | None
+    evidence: Evidence
+
+
+def judge_part(piece: Piece, question: Question) -> JudgedPart:
+    """Judge a piece; with the certified answers, which take most of the time."""
+    budget = FORMULAS[question.error_bound].budget
+    judged = judge_answers(
+        piece.b, piece.flag, piece.rays, question.precision, budget, question.tir, counted=question.counted
+    )
+    verdict = judged.verdict
+    compared = verdict.compared
+    return JudgedPart(
+        regime=piece.regime,
+        rays=len(piece.ids),
+        counts={name: int(mask(judged).sum()) for name, mask in COUNTS.items()},
+        angles=verdict.angle[compared],
+        length_error=float(verdict.drift[compared].max()) if compared.any() else np.nan,
+        error_over_bound=float(verdict.share.max()),
+        worst=_worst(judged, piece.ids),
+        listed=_not_directions(judged, piece.ids),
+        signals=judged.signals,
+        evidence=evidence(judged),
+    )
+
+
+def here(calls: Iterable[tuple[Piece, Question]]) -> Iterator[tuple[int, JudgedPart]]:
+    """The parts by their numbers, judged in this process one after the other."""
+    for number, call in enumerate(calls):
+        yield number, judge_part(*call)
+
+
+def last_of_largest(ranks: Iterable[tuple[float, ...]]) -> int:
+    """The index of the last of the largest ranks; NaN is larger than any number."""
+    columns = np.array(list(ranks), float).T
+    return int(np.lexsort(columns[::-1])[-1])
+
+
+def _worst(judged: JudgedAnswers, ids: np.ndarray) -> Worst:
+    verdict: Judgement = judged.verdict
+    row = int(np.lexsort((verdict.share, judged.impossible, verdict.far, verdict.blank))[-1])
+    bounds = verdict.bounds
+    rank = verdict.blank[row], verdict.far[row], judged.impossible[row], verdict.share[row]
+    replay = {
+        "id": int(ids[row]),
+        **bounds.rays.hexed(row),
+        "answer": [float(x).hex() for x in judged.b[row]],
+        "exact": [float(x).hex() for x in bounds.exact.direction[row]],
+        "transmitted": bool(bounds.exact.transmitted[row]),
+    }
+    return Worst(tuple(map(float, rank)), replay)
+
+
+def _not_directions(judged: JudgedAnswers, ids: np.ndarray) -> dict[str, tuple[int, list[int]]]:
+    """Answers that are neither a direction nor the signal of total internal reflection, or an impossible one."""
+    zero, blank = ~judged.b.any(axis=1), judged.verdict.blank
+    masks = {"non-finite": blank & ~zero, "zero": blank & zero, "impossible": judged.impossible}
+    return {kind: (int(mask.sum()), ids[mask][:LISTED_IDS].tolist()) for kind, mask in masks.items()}
