@@ -6,13 +6,16 @@ import os
 import signal
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
+from distributed import CancelledError
+from distributed.comm import CommClosedError
 from support.dask_workers import until
 from support.processes import python
 
 from mi_refract.cluster import connection, local_process
-from mi_refract.cluster.connection import Tls, connected
+from mi_refract.cluster.connection import LostSchedulerError, Tls, connected, scheduler_needed
 
 
 def refusal(**options):
@@ -54,6 +57,31 @@ def test_encryption_is_not_given_up(tmp_path):
 def test_without_dask(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert refusal(workers=1).endswith("pip install 'mi-refract[cluster]'")
+
+
+@pytest.mark.parametrize(
+    "status, raised, lost",
+    [
+        ("running", CommClosedError("x"), True),
+        ("running", CancelledError("x"), True),
+        ("closed", None, True),
+        ("running", OSError("of the scene"), False),
+        ("running", ValueError("of the scene"), False),
+    ],
+)
+def test_a_lost_scheduler_is_one_line(status, raised, lost):
+    client = SimpleNamespace(status=status, scheduler=SimpleNamespace(address="tcp://h:1"))
+    with pytest.raises(LostSchedulerError if lost else type(raised)) as caught, scheduler_needed(client):
+        raise raised
+    text = "tcp://h:1: the Dask scheduler is gone, or has given up its tasks; accepted: one that runs, or none: then here"
+    assert str(caught.value) == (text if lost else "of the scene")
+
+
+def test_what_is_raised_where_the_scheduler_has_gone_meanwhile():
+    client = SimpleNamespace(status="running", scheduler=None)
+    with pytest.raises(LostSchedulerError), scheduler_needed(client):
+        client.status = "connecting"
+        raise RuntimeError("cannot schedule")
 
 
 def test_dask_is_not_imported_before_it_is_needed():

@@ -16,10 +16,10 @@ from support.processes import python
 from mi_refract.cluster import workers as workers_module
 from mi_refract.cluster.connection import connected
 from mi_refract.cluster.worker_facts import facts
-from mi_refract.io.image_file import read_exr
 from mi_refract.rendering import cluster_passes, scene_bundle
-from mi_refract.rendering.cluster_passes import ClusterPasses, RenderedScene
+from mi_refract.rendering.cluster_passes import ClusterPasses, Part, RenderedScene
 from mi_refract.rendering.long_render import Job, Limits, LongRender
+from mi_refract.rendering.pass_sums import PassSums
 
 SCENE = """<scene version="3.0.0">
   <integrator type="path"><integer name="max_depth" value="5"/></integrator>
@@ -64,23 +64,30 @@ def source(client, scene, variant, warn=lambda text: None, **options):
 
 
 def local(scene, spp):
-    rendering(scene, scene.with_name(f"local{spp}.exr"), spp).run()
-    return read_exr(scene.with_name(f"local{spp}.exr"))
+    return result(rendering(scene, scene.with_name(f"local{spp}.exr"), spp))
 
 
 def remote(client, scene, variant, spp, watch=lambda render: None, passes=None):
     passes = passes or source(client, scene, variant)
-    rendering(scene, scene.with_name("remote.exr"), spp).run(watch, passes)
+    found = result(rendering(scene, scene.with_name("remote.exr"), spp), watch, passes)
     assert not passes._begun
-    return read_exr(scene.with_name("remote.exr"))
+    return found
+
+
+def result(render, *arguments):
+    """The sums of a render, and the header of its image."""
+    header = render.run(*arguments)
+    return render.progress.sums(), header
 
 
 def same(found, expected):
-    """The same image, and the same of its variance; and some light."""
-    np.testing.assert_array_equal(found[0], expected[0])
-    assert found[0].std() > 0
+    """The same sums, to the last bit of float64, which the image does not show; and the same header."""
+    (a, header), (b, other) = found, expected
+    np.testing.assert_array_equal(a.total, b.total)
+    np.testing.assert_array_equal(a.between, b.between)
+    assert a.contrasts == b.contrasts and a.total.std() > 0
     names = ("spp", "passes", "variance_from", "nonfinite_pixels", "identity")
-    assert [found[1][f"mi_refract:{n}"] for n in names] == [expected[1][f"mi_refract:{n}"] for n in names]
+    assert [header[f"mi_refract:{n}"] for n in names] == [other[f"mi_refract:{n}"] for n in names]
 
 
 def test_two_workers(client, scene, variant):
@@ -218,6 +225,24 @@ def test_what_was_begun_ahead_serves_the_next_call(client, scene, variant):
     expected = next(iter(passes.nodes(13, 14, 14, 0, 1)))[1]
     np.testing.assert_array_equal(other[0].total, expected.total)
     passes.close()
+
+
+def test_who_is_refused_gets_no_task(client, scene, variant):
+    passes = source(client, scene, variant)
+    finished(passes)
+    honest, liar = sorted(passes.workers.accepted)
+    del passes.workers.accepted[liar]
+    passes.workers.refused[liar] = "made up"
+    same(remote(client, scene, variant, 40, passes=passes), local(scene, 40))
+    assert set(passes.addresses) == {honest}
+
+
+def test_what_is_folded_stays_as_it_is():
+    """Dask keeps it, and may fold it again."""
+    parts = [Part(PassSums(1, 1, np.full((1, 1, 3), x), np.zeros((1, 1, 3))), {"a": x, "b": 1}, 0.5) for x in range(8)]
+    folded = cluster_passes.fold(*parts)
+    assert [part.sums.total[0, 0, 0] for part in parts] == [*range(8)]
+    assert (folded.sums.total[0, 0, 0], folded.nonfinite, folded.seconds) == (28, {"a": 7, "b": 1}, 4.0)
 
 
 def test_a_machine_whose_pixels_are_not_finite_is_named(client, scene, variant):
