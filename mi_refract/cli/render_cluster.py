@@ -62,10 +62,11 @@ def cluster_passes(options: ClusterOptions, rendering: LongRender, variant: str)
     job = rendering.job
     bundle = scene_bundle.pack(job.scene, job.defines, options.bundle_limit)
     with connection.connected(options.scheduler, options.workers, options.tls) as client:
-        tolerated = worker_facts.MIXED if options.mixed_workers else ()
-        workers = Workers(client, variant, worker_facts.facts(variant), tolerated, _say)
+        tolerated: frozenset[str] = worker_facts.MIXED if options.mixed_workers else frozenset()
+        expected = worker_facts.facts(variant)
+        workers = Workers(client, variant, expected, tolerated, _say)
         workers.wait()
-        scene = RenderedScene(variant, dict(job.defines), job.seed)
+        scene = RenderedScene(variant, dict(job.defines), job.seed, expected, tolerated)
         passes = ClusterPasses(workers, bundle, scene, rendering.warnings.append)
         try:
             yield passes

@@ -95,7 +95,8 @@ def _client(address: str, tls: Tls) -> Any:
         kind = asyncio.run(_kind(address, security.get_connection_args("client")))
         if kind != "Scheduler":
             raise ValueError(f"a {kind} answers")
-        return Client(address, security=security, timeout=PATIENCE, set_as_default=False)
+        # Results come from the workers themselves where these can be reached, else through the scheduler.
+        return Client(address, security=security, timeout=PATIENCE, set_as_default=False, direct_to_workers=True)
     except Exception as error:
         reason = error.__cause__ or error
         text = re.sub(r"in <[^>]*>: ", "", " ".join(str(reason).split())) or f"not within {PATIENCE:.0f} s"

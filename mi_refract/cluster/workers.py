@@ -45,6 +45,11 @@ class Workers:
         self._looked = -_BETWEEN_LOOKS
         self._alone_since: float | None = None
 
+    @property
+    def all_accepted(self) -> bool:
+        """Whether everyone who was there at the last look may have work."""
+        return bool(self.accepted) and not self.refused and not self._asked
+
     def wait(self) -> None:
         """Until those that are there have answered. ConnectionError, one line, where none may have work."""
         began = time.monotonic()

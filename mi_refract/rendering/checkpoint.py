@@ -7,7 +7,9 @@ the tree of passes, and as JSON what is rendered.
 from __future__ import annotations
 
 import json
+import struct
 import zipfile
+import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,9 @@ from .pass_sums import PassSums, PassTree
 FORMAT = 1
 PASS = "samples of a pass"  # of the identity: a render may go on with passes of another size
 _ARRAYS = ("total", "between", "within")
+# What NumPy, zipfile and json raise for a file with wrong bits; OSError: a seek to where it has nothing.
+_OF_PYTHON = (ValueError, LookupError, TypeError, AttributeError, RuntimeError, EOFError, OSError)
+_DAMAGE = (*_OF_PYTHON, zipfile.BadZipFile, zlib.error, struct.error)
 
 
 @dataclass
@@ -33,6 +38,7 @@ class Progress:
     rest: PassSums | None = None  # the last pass, where it has fewer samples than the others
     seconds: float = 0.0
     machines: list[str] = field(default_factory=list)
+    base_ended_by: str = ""  # what ended the render of the base
 
     @property
     def first(self) -> int:
@@ -92,14 +98,13 @@ def _figures(sums: PassSums) -> dict[str, Any]:
 
 def read(path: Path, identity: dict[str, Any]) -> Progress:
     """The render that a file holds. ValueError, one line, for a damaged file, and for one of another render."""
-    again = "accepted: the same render, or --restart, which begins anew"
+    path.stat()  # whatever fails below, the file is there
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             header = json.loads(bytes(file["header"]))
             if header["format"] != FORMAT:
                 raise ValueError(f"format {header['format']}")
-            if different := changed(apart_from_passes(header["identity"]), identity):
-                raise ValueError(f"{path}: of another render: {different}; {again}")
+            different = changed(apart_from_passes(header["identity"]), identity)
             nodes = {
                 name: PassSums(**figures, **{k: file[f"{name}.{k}"] for k in _ARRAYS if f"{name}.{k}" in file})
                 for name, figures in header["nodes"].items()
@@ -107,7 +112,7 @@ def read(path: Path, identity: dict[str, Any]) -> Progress:
             tree = PassTree()
             tree.passes, tree.counts = header["passes"], header["counts"]
             tree.levels = [nodes.get(f"level{i}") for i in range(len(tree.counts))]
-            return Progress(
+            found = Progress(
                 header["identity"],
                 tree,
                 nodes.get("base"),
@@ -115,17 +120,14 @@ def read(path: Path, identity: dict[str, Any]) -> Progress:
                 float(header["seconds"]),
                 [str(m) for m in header["machines"]],
             )
-    except ValueError as error:
-        if again in str(error):
-            raise
-        raise _damaged(path, error) from None
-    except (zipfile.BadZipFile, KeyError, TypeError, EOFError, AttributeError) as error:
-        raise _damaged(path, error) from None
-
-
-def _damaged(path: Path, error: Exception) -> ValueError:
-    what = f"{path}: is no complete checkpoint ({type(error).__name__})"
-    return ValueError(f"{what}; accepted: one that is, or --restart, which begins anew")
+    except _DAMAGE as error:
+        what = f"{path}: is no complete checkpoint ({type(error).__name__})"
+        raise ValueError(f"{what}; accepted: one that is, or --restart, which begins anew") from None
+    if different:
+        raise ValueError(
+            f"{path}: of another render: {different}; accepted: the same render, or --restart, which begins anew"
+        )
+    return found
 
 
 def apart_from_passes(identity: dict[str, Any]) -> dict[str, Any]:

@@ -13,12 +13,12 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent import futures
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 from typing import Any
 
 from mi_refract import backend
-from mi_refract.cluster import on_worker
+from mi_refract.cluster import on_worker, worker_facts
 from mi_refract.cluster.connection import scheduler_needed
 from mi_refract.cluster.workers import Workers
 
@@ -53,11 +53,20 @@ class Part:
 
 @dataclass(frozen=True)
 class RenderedScene:
-    """What a worker must know beside the bundle: the variant, the `<default>`s, the seed of the render."""
+    """What a worker must know beside the bundle: the variant, the `<default>`s, the seed of the render.
+
+    `expected`: facts that a worker must have, but for `tolerated`, where any may be given a task; None: none is asked.
+    """
 
     variant: str
     defines: Mapping[str, str]
     seed: int
+    expected: Mapping[str, str] | None = None
+    tolerated: frozenset[str] = frozenset()
+
+
+class RefusedWorkerError(RuntimeError):
+    """A worker that has just come was given a task before it was asked for its facts, and must not have it."""
 
 
 # On a worker ----------------------------------------------------------------------------------------------------------
@@ -71,8 +80,13 @@ def keep(bundle: SceneBundle) -> SceneBundle:
 def render_node(bundle: SceneBundle, scene: RenderedScene, level: int, first: int, spp: int) -> Part:
     """Render ARITY**level passes of `spp` samples per pixel each, from number `first` on, and sum them.
 
-    Errors: those of `load_scene` and of the scene itself, with the paths of the machine that made the bundle.
+    Errors: those of `load_scene` and of the scene itself, with the paths of the machine that made the bundle;
+    RefusedWorkerError.
     """
+    if scene.expected is not None and worker_facts.differences(
+        worker_facts.facts(scene.variant), scene.expected, scene.tolerated
+    ):
+        raise RefusedWorkerError(on_worker.address())
     address, threads, folder = on_worker.address(), on_worker.threads(), on_worker.scratch_folder()
 
     def rendered() -> Part:
@@ -220,7 +234,12 @@ class ClusterPasses:
                 asked, coming = self._begun[0], _in_thread(self._begun[0].result.result)
             if coming in futures.wait([coming], _POLL).done:
                 self._begun.popleft()
-                return asked, self._part(asked, coming)
+                try:
+                    return asked, self._part(asked, coming)
+                except RefusedWorkerError:
+                    self.workers.look(at_once=True)
+                    if again := self._asked(asked.level, asked.first, 0, listed=True):
+                        self._begun.appendleft(again)
 
     def _part(self, node: _Node, coming: futures.Future[Part]) -> Part:
         from distributed import KilledWorker
@@ -249,13 +268,18 @@ class ClusterPasses:
     # What is begun ----------------------------------------------------------------------------------------------------
 
     def levels(self) -> tuple[int, int]:
-        """The levels of a task and of a node, from the times so far; 0 before the first."""
+        """The levels of a task and of a node, by the times so far.
+
+        A node of as many passes as there are workers takes as long as one: of less the client would receive too many.
+        """
+        count = max(1, len(self.workers.accepted))
+        least = max(k for k in range(LEVELS + 1) if ARITY**k <= count)
         if not self._pass_seconds:
-            return 0, 0
-        seconds, count = median(self._pass_seconds), len(self.workers.accepted)
+            return 0, least
+        seconds = median(self._pass_seconds)
         task = max((k for k in range(LEVELS) if ARITY**k * seconds <= TASK_SECONDS), default=0)
-        node = max((k for k in range(LEVELS + 1) if ARITY**k * seconds <= NODE_SECONDS * max(1, count)), default=0)
-        return min(task, node), node
+        node = max((k for k in range(LEVELS + 1) if ARITY**k * seconds <= NODE_SECONDS * count), default=0)
+        return min(task, node), max(node, least)
 
     def _begin(self, first: int, stop: int, last: int) -> None:
         """Begin nodes until each thread has AHEAD tasks; at least the one that is asked for."""
@@ -280,16 +304,22 @@ class ClusterPasses:
             tasks += len(node.tasks)
         return tasks >= AHEAD * threads or len(self._begun) >= max(NODES, AHEAD * threads)
 
-    def _asked(self, level: int, first: int, task: int) -> _Node | None:
-        """A node, asked of the workers that are accepted now; None where there are none."""
+    def _asked(self, level: int, first: int, task: int, *, listed: bool = False) -> _Node | None:
+        """A node, asked of the workers that are accepted now; None where there are none.
+
+        They are listed at each task, which costs the scheduler 5 µs for every one, or where all are accepted and not
+        `listed` each looks by itself whether it may have the task.
+        """
         allowed = frozenset(self.workers.accepted)
         if not allowed:
             return None
-        (offset, spp), bundle, client = self._series, self._bundle(allowed), self.workers.client
-        options = {"workers": sorted(allowed), "retries": RETRIES, "pure": False, "priority": -next(self._count)}
+        (offset, spp), bundle, client, scene = self._series, self._bundle(allowed), self.workers.client, self.scene
+        options: dict[str, Any] = {"retries": RETRIES, "pure": False, "priority": -next(self._count)}
+        if listed or not scene or scene.expected is None or not self.workers.all_accepted:
+            options["workers"], scene = sorted(allowed), scene and replace(scene, expected=None)
         size = ARITY**task
         parts = tasks = [
-            client.submit(render_node, bundle, self.scene, task, offset + number, spp, **options)
+            client.submit(render_node, bundle, scene, task, offset + number, spp, **options)
             for number in range(first, first + ARITY**level, size)
         ]
         while len(parts) > 1:
@@ -311,7 +341,7 @@ class ClusterPasses:
         """Ask others for nodes whose workers have all gone: Dask would wait for these to come back."""
         there = self.workers.accepted.keys()
         for i, node in enumerate(self._begun):
-            if there and not node.needed & there and node.result.status != "error":
+            if there and node.needed.isdisjoint(there) and node.result.status != "error":
                 again = self._asked(node.level, node.first, 0)
                 if again is not None:
                     self.workers.client.cancel([node.result, *node.tasks], force=True)

@@ -33,6 +33,8 @@ from .pass_sums import PassSums
 from .render_pass import PassRenderer, pass_renderer
 from .scene_files import formulas_in, load_scene
 
+NO_NOISE = "no noise: the samples of every pixel agree"
+ENOUGH_FOR_NO_NOISE = 64  # samples per pixel
 BETWEEN_CHECKPOINTS = (
     20.0  # seconds: with the pass that a kill interrupts at most 30 are lost, if a pass takes up to 10
 )
@@ -136,6 +138,8 @@ class LongRender:
         self.progress.identity[PASS] = self.plan.spp
         self.ended_by = ""
         self.warnings: list[str] = []
+        self._seen = _stamps(self.output, self.checkpoint)
+        self._holds_lock = False
         self._state = threading.Lock()  # held where the progress changes or is written
         self._last_kept = time.monotonic()
         self._writer: threading.Thread | None = None
@@ -144,23 +148,29 @@ class LongRender:
         if restart:
             return Progress(identity)
         if self.checkpoint.exists():
-            return checkpoint.read(self.checkpoint, identity)
-        found = rendered_file.read(self.output, self.renderer.channels, identity)
-        enough = found is not None and (self.spp is None or found.done <= self.spp)
-        return found if found is not None and enough else Progress(identity)
+            found = checkpoint.read(self.checkpoint, identity)
+            if self.spp is not None and found.done > self.spp:
+                raise ValueError(f"{self.checkpoint}: holds {found.done} spp; accepted: at least so many, or --restart")
+            return found
+        image = rendered_file.read(self.output, self.renderer.channels, identity)
+        enough = image is not None and (self.spp is None or image.done <= (self._planned(None).total or 0))
+        return image if image is not None and enough else Progress(identity)
+
+    def _planned(self, pass_spp: int | None, done: int = 0) -> PassPlan:
+        """The passes that follow so many samples per pixel."""
+        width, height = self.renderer.size
+        total = None if self.spp is None else max(0, self.spp - done)
+        return plan_passes(width * height, total, pass_spp, self.renderer.accepted, moments=self.renderer.moments)
 
     def _plan(self) -> PassPlan:
         """The passes that follow those of the base; of the size that a checkpoint's passes have."""
-        width, height = self.renderer.size
         recorded, asked = self.progress.identity.get(PASS), self.limits.pass_spp
         if self.progress.tree.passes and asked not in (None, recorded):
             raise ValueError(
                 f"{self.checkpoint}: passes of {recorded} samples per pixel; accepted: those, or --restart"
             )
         begun = recorded if self.progress.tree.passes else None
-        base = self.progress.base.spp if self.progress.base else 0
-        total = None if self.spp is None else max(0, self.spp - base)
-        return plan_passes(width * height, total, begun or asked, self.renderer.accepted, moments=self.renderer.moments)
+        return self._planned(begun or asked, self.progress.base.spp if self.progress.base else 0)
 
     def _may_have_few_passes(self) -> bool:
         passes = self.plan.passes
@@ -174,22 +184,38 @@ class LongRender:
         `passes`: who renders them, else this process. On any error what is done is kept in the checkpoint.
         """
         with lock.held(lock_of(self.output), "a render", self.output, "another file"):
-            began = time.monotonic()
-            source = passes or ThisProcess(self.renderer)
+            if _stamps(self.output, self.checkpoint) != self._seen:
+                raise BlockingIOError(f"{self.output}: another render was there meanwhile; accepted: to try again")
+            self._holds_lock = True
             try:
-                while not self.ended_by:
-                    self._advance(source, began, watch)
-                return self._finish()
+                return self._run(passes or ThisProcess(self.renderer), watch)
             except BaseException:
                 self.keep()
                 raise
+            finally:
+                self._holds_lock = False
+
+    def _run(self, source: Passes, watch: Callable[[LongRender], None]) -> Metadata:
+        began = time.monotonic()
+        nothing_left = bool(self._end())
+        while not (end := self._end()):
+            self._advance(source, began, watch)
+            if self.limits.seconds is not None and time.monotonic() - began >= self.limits.seconds:
+                end = f"--time {self.limits.seconds:g} s"
+                break
+        self.ended_by = end
+        watch(self)
+        return self._finish(nothing_left and not self.progress.tree.passes)
 
     def _advance(self, source: Passes, began: float, watch: Callable[[LongRender], None]) -> None:
-        """Render up to where the next look is due, and say in `ended_by` what ends the render, if anything."""
+        """Render up to where the next look is due, the time is over, or, where no full pass is left, the last pass."""
         tree, full, before = self.progress.tree, self.plan.full_passes, time.monotonic()
-        first, last = tree.passes, full if full is not None else next_stop(next_stop(tree.passes))
-        stop = min(self._next_look(first), last)
-        for level, sums, machine in source.nodes(first, stop, last, self.progress.first, self.plan.spp):
+        if tree.passes == full:
+            self._render_rest(source)
+            return
+        last = full if full is not None else next_stop(next_stop(tree.passes))
+        stop = min(self._next_look(), last)
+        for level, sums, machine in source.nodes(tree.passes, stop, last, self.progress.first, self.plan.spp):
             with self._state:
                 tree.add(sums, level)
                 self.progress.seconds += time.monotonic() - before
@@ -198,45 +224,47 @@ class LongRender:
             watch(self)
             self._keep_sometimes()
             if self.limits.seconds is not None and time.monotonic() - began >= self.limits.seconds:
-                self.ended_by = f"--time {self.limits.seconds:g} s"
                 return
-        if first == 0 and tree.passes == 1 and self._without_noise():
-            self.ended_by = "no noise: the samples of every pixel agree"
-        elif (passes := tree.passes) and next_stop(passes - 1) == passes and (reason := self._good_enough()):
-            self.ended_by = reason
-        elif tree.passes == full:
-            self._render_rest(source)
-            self.ended_by = f"{self.progress.done} spp"
-            watch(self)
-
-    def _next_look(self, passes: int) -> int:
-        return 1 if passes == 0 and self.renderer.moments and not self.progress.base else next_stop(passes)
 
     def _render_rest(self, source: Passes) -> None:
-        """The last pass, where it has fewer samples than the others."""
-        if rest := self.plan.rest:
-            before, number = time.monotonic(), self.plan.full_passes or 0
-            [(_, sums, machine)] = source.nodes(number, number + 1, number + 1, self.progress.first, rest)
-            with self._state:
-                self.progress.rest = sums
-                self.progress.machines = sorted({*self.progress.machines, *machine.split(", ")})
-                self.progress.seconds += time.monotonic() - before
+        """The last pass, which has fewer samples than the others."""
+        before, number = time.monotonic(), self.plan.full_passes or 0
+        [(_, sums, machine)] = source.nodes(number, number + 1, number + 1, self.progress.first, self.plan.rest)
+        with self._state:
+            self.progress.rest = sums
+            self.progress.machines = sorted({*self.progress.machines, *machine.split(", ")})
+            self.progress.seconds += time.monotonic() - before
 
-    def _without_noise(self) -> bool:
-        """Whether all samples of each pixel are the same, and none is black: there light may be that is seldom met."""
-        sums = self.progress.sums()
-        if sums is None or sums.within is None or sums.spp < 2 or sums.within.any():
-            return False
-        return bool((np.isfinite(sums.total) & (sums.total != 0)).all())
+    def _next_look(self) -> int:
+        """After how many passes of the tree the next look is due."""
+        passes = self.progress.tree.passes
+        return 1 if passes == 0 and self.renderer.moments and not self.progress.base else next_stop(passes)
+
+    def _end(self) -> str:
+        """What ends the render with what there is; "" where it goes on."""
+        tree, full = self.progress.tree, self.plan.full_passes
+        if not tree.passes and self.progress.base and self.progress.base_ended_by == NO_NOISE:
+            return NO_NOISE
+        due = tree.passes == 1 or next_stop(tree.passes - 1) == tree.passes if tree.passes else self.progress.base
+        if due and (reason := self._good_enough()):
+            return reason
+        missing = full is None or tree.passes < full or (self.plan.rest and self.progress.rest is None)
+        return "" if missing else f"{self.progress.done} spp"
 
     def _good_enough(self) -> str:
-        """What error is reached that was asked for; "" where none is."""
-        sums = self.progress.sums() if self.limits.until or self.limits.until_tile else None
-        if sums and self.spp is None and not np.any(sums.total[..., : sums.colours] > 0) and not self.warnings:
+        """What ends the render by what its samples are: no noise, or an error that was asked for; "" where nothing."""
+        sums = self.progress.sums()
+        if sums is None:
+            return ""
+        if _without_noise(sums):
+            return NO_NOISE
+        if self.spp is None and not np.any(sums.total[..., : sums.colours] > 0) and not self.warnings:
             self.warnings.append(f"{self.output}: is black so far: it has no relative error that could end it")
-        if sums and self.limits.until and (error := relative_error(sums)).high <= self.limits.until:
+        if self.progress.passes < FEW:
+            return ""
+        if self.limits.until and (error := relative_error(sums)).high <= self.limits.until:
             return f"--until {self.limits.until:.3g}: the error is {error.value:.3g}, at most {error.high:.3g}"
-        if sums and self.limits.until_tile and (worst := worst_tile(sums)) <= self.limits.until_tile:
+        if self.limits.until_tile and (worst := worst_tile(sums)) <= self.limits.until_tile:
             return f"--until-tile {self.limits.until_tile:.3g}: the error of the worst tile is {worst:.3g}"
         return ""
 
@@ -257,10 +285,13 @@ class LongRender:
             sums = self.progress.sums()
         return None if sums is None else sums.mean
 
-    def _finish(self) -> Metadata:
+    def _finish(self, unchanged: bool) -> Metadata:
         self._wait()
-        formulas = ", ".join(formulas_in(self.scene)) or "none"
-        header = rendered_file.write(self.output, self.renderer.channels, self.progress, _metadata(self.job, formulas))
+        metadata = _metadata(self.job, ", ".join(formulas_in(self.scene)) or "none")
+        channels = self.renderer.channels
+        header = rendered_file.header(self.progress, metadata, self.ended_by)
+        if not unchanged:
+            rendered_file.write(self.output, channels, self.progress, header)
         self.checkpoint.unlink(missing_ok=True)
         return header
 
@@ -269,7 +300,7 @@ class LongRender:
     def keep(self) -> None:
         """Write a checkpoint of what is done, if anything is. A failure is a warning: the render goes on without."""
         with self._state:
-            if not self.progress.tree.passes:
+            if not self._holds_lock or not self.progress.tree.passes:
                 return
             try:
                 checkpoint.write(self.checkpoint, self.progress)
@@ -277,9 +308,10 @@ class LongRender:
                 self.warnings.append(f"{self.checkpoint}: no checkpoint: {error.strerror or error}; tried again later")
 
     def give_up(self) -> None:
-        """For a process that is about to end: keep what is done, and leave no lock."""
-        self.keep()
-        lock_of(self.output).unlink(missing_ok=True)
+        """For a process that is about to end while it renders: keep what is done, and leave no lock."""
+        if self._holds_lock:
+            self.keep()
+            lock_of(self.output).unlink(missing_ok=True)
 
     def _keep_sometimes(self) -> None:
         """Write a checkpoint beside the next pass, if the last one is old."""
@@ -308,10 +340,24 @@ def render_to_exr(
 
     `defines`: values for the scene's `<default>`s. `spp`: samples per pixel; None: what the scene says.
     `allow_plugins`: names of plugins that the scene may bring, which are code. ValueError or OSError in one line,
-    before the rendering where possible; InterruptedError for a rendering that was cut short. No file is written then.
+    before the rendering where possible; InterruptedError for a rendering that was cut short. No image is written then,
+    and what is done is kept in a checkpoint.
     """
     job = Job(Path(scene), dict(defines or {}), seed, allow_plugins)
     return LongRender(job, output, Limits(spp=spp), restart=True).run()
+
+
+def _stamps(*paths: Path) -> list[tuple[int, int] | None]:
+    """What changes with each of the files."""
+    found = [path.stat() if path.exists() else None for path in paths]
+    return [None if each is None else (each.st_ino, each.st_mtime_ns) for each in found]
+
+
+def _without_noise(sums: PassSums) -> bool:
+    """Whether all samples of each pixel are the same, and none is black: there light may be that is seldom met."""
+    if sums.spp < ENOUGH_FOR_NO_NOISE or (variance := sums.variance) is None or variance.any():
+        return False
+    return bool((np.isfinite(sums.total) & (sums.total != 0)).all())
 
 
 def lock_of(output: Path) -> Path:

@@ -2,7 +2,12 @@
 
     seed(s, p) = s ⊕ mix(p),    mix: the finaliser of MurmurHash3 on 32 bits, a bijection with mix(0) = 0
 
-For one s all passes have different seeds, for one p all s have; and pass 0 has the seed that was given.
+For one s all passes have different seeds, for one p all s have; and pass 0 has the seed that was given. In scalar
+variants Mitsuba gives pixel k of N the random numbers of sequence seed · N + k, modulo 2³². There
+
+    seed(s, p) = (mix(s) + p) mod M,    M = ⌊2³²/N⌋
+
+so that no two of up to M passes share a sequence; of two renders some passes may be the same, by chance.
 """
 
 from __future__ import annotations
@@ -19,10 +24,23 @@ MASK = 2**32 - 1
 
 def seed_of(seed: int, number: int) -> int:
     """The seed of pass `number` of a render with this seed, both from 0 to 2³² − 1."""
-    x = number & MASK
+    return seed ^ _mix(number)
+
+
+def scalar_seed_of(seed: int, number: int, pixels: int) -> int:
+    """The same in scalar variants, for a film of so many pixels. ValueError where passes would repeat."""
+    if number >= (most := (MASK + 1) // pixels):
+        raise ValueError(
+            f"pass {number} of {pixels} pixels: accepted in scalar variants: up to {most} passes; more --pass-spp"
+        )
+    return (_mix(seed) + number) % most
+
+
+def _mix(x: int) -> int:
+    """MurmurHash3's fmix32."""
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
         x = (x ^ x >> shift) * factor & MASK
-    return seed ^ x ^ x >> 16
+    return x ^ x >> 16
 
 
 def usual_spp(pixels: int) -> int:
@@ -67,6 +85,10 @@ def plan_passes(
     few samples is cut into FEW passes, for their spread. ValueError for a pass that the sampler does not take.
     """
     spp = asked or usual_spp(pixels)
+    if min(spp, total or spp) * pixels > MASK:
+        raise ValueError(
+            f"{spp} samples per pixel in a pass of {pixels} pixels; accepted: up to 2³² − 1 samples in all"
+        )
     if asked and accepted(asked) != asked:
         raise ValueError(f"{asked} samples per pixel in a pass; accepted by the sampler: {accepted(asked)}")
     if total and not asked:

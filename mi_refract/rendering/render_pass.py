@@ -17,9 +17,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .pass_plan import FEW, seed_of
+from .pass_plan import FEW, scalar_seed_of, seed_of
 from .pass_sums import PassSums
 
+# One thread would be the caller's own, which keeps denormals: the others take them for 0, and bits would differ.
+LEAST_THREADS = 2
 COLOURS = ("R", "G", "B", "X", "Y", "Z")
 
 
@@ -41,8 +43,8 @@ class PassRenderer:
 
     @property
     def colours(self) -> int:
-        """How many of the channels, from the first on, are colours."""
-        return sum(name in COLOURS for name in self.channels)
+        """How many of the channels, from the first on, are colours: all, where a film has none of COLOURS."""
+        return sum(name in COLOURS for name in self.channels) or len(self.channels)
 
     def accepted(self, spp: int) -> int:
         """The samples per pixel that the sampler makes of these: it may round up."""
@@ -51,18 +53,24 @@ class PassRenderer:
             sampler.set_sample_count(spp)
         return int(sampler.sample_count())
 
+    def _seed_without_samples(self, number: int) -> int:
+        if dr.is_jit_v(mi.Float):
+            return seed_of(self.seed, number)
+        film = self.scene.sensors()[0].film()
+        border = 2 * film.rfilter().border_size() if film.sample_border() else 0
+        width, height = self.size
+        return scalar_seed_of(self.seed, number, (width + border) * (height + border))
+
     def render(self, number: int, spp: int) -> PassSums:
         """Pass `number`. The scene's own errors pass; InterruptedError where Mitsuba stopped before the last sample."""
-        seed = seed_of(self.seed, number)
         with _quiet():
             if self.moments:
+                seed = seed_of(self.seed, number)
                 mean, within = _pixels(
                     self.scene, self.channels, spp, seed, squares=number == 0 or (self.few and number < FEW - 1)
                 )
             else:
-                mean, within = _rendered(self.scene, spp, seed), None
-        if self.scene.integrator().should_stop():
-            raise InterruptedError("the rendering was stopped before its last sample")
+                mean, within = _rendered(self.scene, spp, self._seed_without_samples(number)), None
         mean = mean.reshape(self.size[1], self.size[0], len(self.channels)).astype(np.float64)
         return PassSums(spp, 1, mean * spp, np.zeros_like(mean), within, colours=self.colours)
 
@@ -104,6 +112,8 @@ def _rendered(scene: Any, spp: int, seed: int) -> np.ndarray:
         dr.set_thread_count(1)
     try:
         mi.render(scene, spp=spp, seed=seed)
+        if scene.integrator().should_stop():  # by its `timeout`, or a signal that Mitsuba has taken
+            raise InterruptedError("the rendering was stopped before its last sample")
         return np.array(scene.sensors()[0].film().bitmap())  # what `aov` returns has fewer channels
     finally:
         if one:
@@ -119,6 +129,8 @@ def _pixels(scene: Any, channels: tuple[str, ...], spp: int, seed: int, *, squar
     rfilter = sensors_film.rfilter()
     width, height = (int(n) for n in sensors_film.crop_size())
     film = _Film(width, height, spp, None if rfilter.is_box_filter() else rfilter)
+    if dr.thread_count() < LEAST_THREADS:
+        dr.set_thread_count(LEAST_THREADS)
     with dr.suspend_grad():
         values, place = _samples(scene, channels, spp, seed)
         means, weights = _weighted_means(values, place, film)

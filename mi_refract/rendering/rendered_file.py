@@ -16,29 +16,37 @@ from .pass_plan import FEW
 from .pass_sums import PassSums
 
 VARIANCE = "{}.variance"
+_KEPT = ("spp", "passes", "identity", "contrasts", "variance_from", "machines", "render_seconds", "ended_by")
 
 
-def write(output: Path, channels: tuple[str, ...], progress: Progress, metadata: Metadata) -> Metadata:
-    """Write what a render has. The header, with what is known of the passes. Errors: those of `write_exr`."""
+def header(progress: Progress, metadata: Metadata, ended_by: str) -> Metadata:
+    """`metadata`, and what is known of the passes."""
     sums = progress.sums()
     assert sums is not None
-    pixels, names = [sums.mean], list(channels)
-    if (variance := sums.variance) is not None:
-        pixels.append(variance)
-        names += [VARIANCE.format(name) for name in channels]
-    header = metadata | {
+    return metadata | {
         "mi_refract:spp": sums.spp,
         "mi_refract:passes": sums.passes,
         "mi_refract:variance_freedom": sums.freedom,
         "mi_refract:variance_from": _source(sums),
         "mi_refract:nonfinite_pixels": nonfinite_pixels(sums),
         "mi_refract:identity": json.dumps(progress.identity, sort_keys=True),
+        "mi_refract:contrasts": json.dumps([float(f"{each:.9g}") for each in sums.contrasts]),
+        "mi_refract:ended_by": ended_by,
         "mi_refract:render_seconds": progress.seconds,
         "mi_refract:machines": ", ".join(sorted(set(progress.machines))),
     }
+
+
+def write(output: Path, channels: tuple[str, ...], progress: Progress, header: Metadata) -> None:
+    """Write what a render has. Errors: those of `write_exr`."""
+    sums = progress.sums()
+    assert sums is not None
+    pixels, names = [sums.mean], list(channels)
+    if (variance := sums.variance) is not None:
+        pixels.append(variance)
+        names += [VARIANCE.format(name) for name in channels]
     with np.errstate(over="ignore"):
         write_exr(output, np.concatenate(pixels, -1, dtype=np.float32, casting="same_kind"), names, header)
-    return header
 
 
 def _source(sums: PassSums) -> str:
@@ -58,20 +66,20 @@ def read(output: Path, channels: tuple[str, ...], identity: dict[str, Any]) -> P
     """
     try:
         image = image_file.read(output, image_file.MAX_VALUES * 4)
-        before = json.loads(str(image.metadata["mi_refract:identity"]))
-        spp, passes = (int(image.metadata[f"mi_refract:{name}"]) for name in ("spp", "passes"))
-        if changed(apart_from_passes(before), identity) or not 1 <= passes <= spp:
+        said = {name: image.metadata[f"mi_refract:{name}"] for name in _KEPT}
+        spp, passes = int(said["spp"]), int(said["passes"])
+        different = changed(apart_from_passes(json.loads(said["identity"])), identity)
+        contrasts = [float(each) for each in json.loads(said["contrasts"])]
+        if different or not 1 <= passes <= spp or len(contrasts) != passes - 1:
             return None
         mean = image.select(channels).astype(np.float64)
         variance = image.select([VARIANCE.format(name) for name in channels]) if spp > 1 else np.zeros(())
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
     variance = np.broadcast_to(variance.astype(np.float64), mean.shape)
-    colours = int(identity["colours"])
-    within = (
-        variance * (spp - 1) if passes < FEW and image.metadata.get("mi_refract:variance_from") == "samples" else None
-    )
-    sums = PassSums(spp, passes, mean * spp, variance * (passes - 1), within, colours=colours)
-    machines = [name for name in str(image.metadata.get("mi_refract:machines", "")).split(", ") if name]
-    seconds = float(image.metadata.get("mi_refract:render_seconds", 0.0))
-    return Progress(identity, base=sums, seconds=seconds, machines=machines)
+    # Their sum over freedom is the variance that the file holds.
+    within = variance * (spp - passes) if said["variance_from"] == "samples" and passes < FEW else None
+    sums = PassSums(spp, passes, mean * spp, variance * (passes - 1), within, contrasts, int(identity["colours"]))
+    machines = [name for name in str(said["machines"]).split(", ") if name]
+    seconds = float(said["render_seconds"])
+    return Progress(identity, base=sums, seconds=seconds, machines=machines, base_ended_by=str(said["ended_by"]))

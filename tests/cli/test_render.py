@@ -16,7 +16,7 @@ from support.processes import python
 import mi_refract
 from mi_refract import backend
 from mi_refract.io.image_file import read_exr
-from mi_refract.rendering.pass_plan import seed_of
+from mi_refract.rendering.pass_plan import scalar_seed_of
 
 SCENE = """<scene version="3.0.0">
   <default name="bsdf" value="refract"/>
@@ -56,7 +56,9 @@ def render(scene, run):
 def passes_by_mitsuba(scene, spp, seed=0, **parameters):
     """Passes of one sample each, and their variance: what a short render in a scalar variant is made of."""
     loaded = mi.load_file(str(scene), **parameters)
-    passes = np.array([np.array(mi.render(loaded, spp=1, seed=seed_of(seed, p))) for p in range(spp)], np.float64)
+    passes = np.array(
+        [np.array(mi.render(loaded, spp=1, seed=scalar_seed_of(seed, p, 48))) for p in range(spp)], np.float64
+    )
     return passes.mean(0).astype(np.float32), passes.var(0, ddof=1)
 
 

@@ -73,7 +73,9 @@ def test_a_lost_scheduler_is_one_line(status, raised, lost):
     client = SimpleNamespace(status=status, scheduler=SimpleNamespace(address="tcp://h:1"))
     with pytest.raises(LostSchedulerError if lost else type(raised)) as caught, scheduler_needed(client):
         raise raised
-    text = "tcp://h:1: the Dask scheduler is gone, or has given up its tasks; accepted: one that runs, or none: then here"
+    text = (
+        "tcp://h:1: the Dask scheduler is gone, or has given up its tasks; accepted: one that runs, or none: then here"
+    )
     assert str(caught.value) == (text if lost else "of the scene")
 
 

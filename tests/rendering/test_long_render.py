@@ -124,10 +124,18 @@ def test_a_scene_without_noise_needs_one_pass(tmp_path, llvm):
     (tmp_path / "dark.xml").write_text(sky.format(""))
     found = {}
     for name in ("light", "dark"):
-        render = rendering(tmp_path / f"{name}.exr", scene=tmp_path / f"{name}.xml", defines={}, spp=64, pass_spp=4)
-        found[name] = (render.run()["mi_refract:passes"], render.ended_by)
-    assert found["light"] == (1, "no noise: the samples of every pixel agree")
-    assert found["dark"] == (16, "64 spp")  # what no sample has met may be there
+        for spp in (64, 4):
+            again = []
+            for _ in range(2):
+                job = Job(tmp_path / f"{name}.xml")
+                render = LongRender(job, tmp_path / f"{name}{spp}.exr", Limits(spp=256, pass_spp=spp))
+                again.append((render.run()["mi_refract:passes"], render.ended_by))
+            assert again[0] == again[1]
+            found[name, spp] = again[0]
+    ended = "no noise: the samples of every pixel agree"
+    assert found["light", 64] == (1, ended)
+    assert found["light", 4] == (16, ended)  # 4 samples would say too little
+    assert found["dark", 64] == (4, "256 spp")  # what no sample has met may be there
 
 
 def test_pixels_that_are_not_finite_are_counted(tmp_path, llvm, monkeypatch):
@@ -230,6 +238,79 @@ def test_another_image_is_replaced(tmp_path, llvm, other):
     output = tmp_path / "a.exr"
     rendering(output, spp=32, pass_spp=4).run()
     assert rendering(output, **{"spp": 64, "pass_spp": 4} | other).progress.done == 0
+
+
+@pytest.mark.parametrize("spp", [6, 40])
+def test_the_same_command_again_changes_nothing(tmp_path, llvm, spp):
+    output = tmp_path / "a.exr"
+    rendering(output, spp=spp, pass_spp=4).run()
+    content = output.read_bytes()
+    for _ in range(2):
+        rendering(output, spp=spp, pass_spp=4).run()
+    assert output.read_bytes() == content
+
+
+def test_the_variance_of_few_passes_stays_what_it_is(tmp_path, llvm):
+    output = tmp_path / "a.exr"
+    rendering(output, spp=12, pass_spp=4).run()
+    before = rendering(output, spp=16, pass_spp=4).progress.sums()
+    np.testing.assert_allclose(
+        before.variance, np.stack([read(output).select([f"{n}.variance"])[..., 0] for n in "RGB"], -1)
+    )
+
+
+def test_an_error_that_is_reached_is_reached(tmp_path, llvm):
+    output = tmp_path / "a.exr"
+    first = rendering(output, until=0.2, pass_spp=2).run()
+    again = rendering(output, until=0.2, pass_spp=2)
+    assert again.run()["mi_refract:spp"] == first["mi_refract:spp"] and "--until" in again.ended_by
+
+
+def test_a_sampler_that_rounds_up_has_nothing_left(tmp_path, llvm):
+    scene = tmp_path / "scene.xml"
+    scene.write_text(BALL.read_text().replace('value="independent"', 'value="stratified"'))
+    header = rendering(tmp_path / "a.exr", scene=scene, spp=10).run()
+    assert header["mi_refract:spp"] == 16
+    assert rendering(tmp_path / "a.exr", scene=scene, spp=10).progress.done == 16
+
+
+def test_a_checkpoint_of_more_samples_is_refused(tmp_path, llvm):
+    output = tmp_path / "a.exr"
+    stopped_after(rendering(output, spp=64, pass_spp=4), 5)
+    with pytest.raises(ValueError, match="holds 20 spp; accepted: at least so many, or --restart"):
+        rendering(output, spp=16, pass_spp=4)
+
+
+def test_who_does_not_render_writes_nothing(tmp_path, llvm):
+    output = tmp_path / "a.exr"
+    stopped_after(rendering(output, spp=64, pass_spp=4), 2)
+    late = rendering(output, spp=64, pass_spp=4)
+    stopped_after(rendering(output, spp=64, pass_spp=4), 5)
+    content = checkpoint.path_of(output).read_bytes()
+    late.give_up()
+    late.keep()
+    assert checkpoint.path_of(output).read_bytes() == content
+    with pytest.raises(BlockingIOError, match="another render was there meanwhile"):
+        late.run()
+
+
+def test_a_black_image_is_warned_of(tmp_path, llvm):
+    sky = '<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"><film type="hdrfilm">'
+    sky += '<integer name="width" value="8"/><integer name="height" value="8"/></film></sensor></scene>'
+    (tmp_path / "dark.xml").write_text(sky)
+    render = LongRender(Job(tmp_path / "dark.xml"), tmp_path / "a.exr", Limits(until=0.1, seconds=0.5, pass_spp=1))
+    render.run()
+    assert "is black so far" in render.warnings[0]
+
+
+def test_the_time_of_an_integrator_is_none_of_ours(tmp_path, llvm):
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        BALL.read_text().replace(
+            '<integrator type="$integrator">', '<integrator type="$integrator"><float name="timeout" value="0.01"/>'
+        )
+    )
+    assert rendering(tmp_path / "a.exr", scene=scene, spp=8, pass_spp=4).run()["mi_refract:spp"] == 8
 
 
 def test_a_picture_of_somebody_else_is_no_start(tmp_path, llvm):

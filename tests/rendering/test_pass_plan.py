@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mi_refract.rendering.pass_plan import LANES, PassPlan, next_stop, plan_passes, seed_of, usual_spp
+from mi_refract.rendering.pass_plan import LANES, PassPlan, next_stop, plan_passes, scalar_seed_of, seed_of, usual_spp
 
 
 def exact(spp):
@@ -27,6 +27,14 @@ def test_the_seeds_of_a_render_differ_and_so_do_those_of_seeds_that_follow_each_
     # Of two sets of n random numbers below 2³² n²/2³² = 0.09 are common: more than 3 of them have probability 3e-6.
     assert all(len(a & b) <= 3 for a, b in ((seeds[0], seeds[1]), (seeds[0], seeds[2]), (seeds[1], seeds[2])))
     assert all(0 <= seed < 2**32 for seed in seeds[1])
+
+
+def test_the_seeds_of_scalar_variants_are_in_a_row():
+    most = 2**32 // 3000
+    assert [scalar_seed_of(0, p, 3000) for p in (0, 1, most - 1)] == [0, 1, most - 1]
+    assert scalar_seed_of(1, 5, 3000) == (0x514E28B7 + 5) % most
+    with pytest.raises(ValueError, match="accepted in scalar variants"):
+        scalar_seed_of(0, most, 3000)
 
 
 def test_the_finaliser_is_murmurs():
@@ -60,6 +68,12 @@ def test_a_pass_is_one_that_the_sampler_takes():
     assert plan_passes(2**18, 102, 9, square, moments=True) == PassPlan(9, 103)  # 11 × 9, and 3 become 4
     with pytest.raises(ValueError, match="8 samples per pixel in a pass; accepted by the sampler: 9"):
         plan_passes(64, 100, 8, square, moments=True)
+
+
+def test_a_pass_has_fewer_than_2_to_the_32_samples():
+    with pytest.raises(ValueError, match=r"accepted: up to 2³² − 1 samples in all"):
+        plan_passes(64, None, 2**26, exact, moments=True)
+    assert plan_passes(64, 10, 2**26, exact, moments=True).rest == 10
 
 
 def test_looks_are_few():

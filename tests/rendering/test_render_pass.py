@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refract.rendering.pass_plan import FEW, seed_of
+from mi_refract.rendering.pass_plan import FEW, scalar_seed_of, seed_of
 from mi_refract.rendering.render_pass import pass_renderer
 from mi_refract.rendering.scene_files import load_scene
 
@@ -149,4 +149,16 @@ def test_scalar_variants_render_by_mitsuba(tmp_path):
     one, two = (renderer.render(2, 4).total for _ in range(2))
     np.testing.assert_array_equal(one, two)
     assert not renderer.moments and renderer.colours == 3
-    np.testing.assert_allclose(one / 4, by_mitsuba(renderer.scene, 2, 4), **CLOSE)
+    expected = np.array(mi.render(renderer.scene, spp=4, seed=scalar_seed_of(3, 2, 256)))
+    np.testing.assert_allclose(one / 4, expected, **CLOSE)
+
+
+def test_passes_of_scalar_variants_share_no_random_numbers(tmp_path):
+    """Mitsuba's sequence of pixel k of N is seed · N + k, modulo 2³²: by `seed_of` these two would be the same."""
+    mi.set_variant("scalar_rgb")
+    renderer = pass_renderer(scene_of(tmp_path, res="64"), 0)
+    same = by_mitsuba(renderer.scene, 1105, 1, 0), by_mitsuba(renderer.scene, 2867, 1, 0)
+    np.testing.assert_array_equal(*same)
+    assert not np.array_equal(renderer.render(1105, 1).total, renderer.render(2867, 1).total)
+    with pytest.raises(ValueError, match="pass 1048576 of 4096 pixels: accepted in scalar variants: up to 1048576"):
+        renderer.render(2**20, 1)

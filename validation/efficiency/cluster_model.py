@@ -34,7 +34,7 @@ class Costs:
 
     `fixed`, `sample`: of a pass, beside its samples and for one sample in every pixel. `copy`, `add`: of a node's
     arrays. `bandwidth`: bytes a second of a link. `task`, `task_worker`: s and s′; `submit`, `submit_worker`: q and q′.
-    `look`: the client's, for each node that is begun and each worker, whenever a node comes. `begin`: S.
+    `look`: the client's, for each node that is begun, whenever a node comes. `begin`: S.
     """
 
     fixed: float = 0.0
@@ -71,30 +71,25 @@ class Costs:
 class Scheme:
     """What is asked of the cluster.
 
-    `single_first`: the client asks for single passes until the first has come, and then for nodes that come every
-    NODE_SECONDS; else from the start for nodes of as many passes as there are workers, or more by that rule. `listed`:
-    each task lists its workers, and at every node the client looks at all others.
-    `relayed`: nodes reach the client through the scheduler, instead of over its own link.
+    `listed`: each task lists its workers, as it must where one of those present is refused. `relayed`: nodes reach the
+    client through the scheduler, as they must where it cannot reach the workers; instead of over its own link.
     """
 
     name: str
-    single_first: bool = True
-    listed: bool = True
-    relayed: bool = True
+    listed: bool = False
+    relayed: bool = False
 
     def costs(self, costs: Costs) -> Costs:
         """Those that remain."""
         if not self.listed:
-            costs = replace(costs, task_worker=0.0, submit_worker=0.0, look=0.0)
+            costs = replace(costs, task_worker=0.0, submit_worker=0.0)
         return costs if self.relayed else replace(costs, relay=0.0, receive=costs.transfer)
 
 
 PRESENT = Scheme("as it is")
-# Not in the package: what the study proposes, one change after the other.
-PROPOSED = Scheme("as proposed", single_first=False, listed=False, relayed=False)
-NODES_FIRST = Scheme("whole nodes first", single_first=False)
-UNLISTED = Scheme("whole nodes first, no lists", single_first=False, listed=False)
-SCHEMES = (PRESENT, NODES_FIRST, UNLISTED, PROPOSED)
+LISTED = Scheme("a worker is refused", listed=True)
+RELAYED = Scheme("workers out of reach", relayed=True)
+SCHEMES = (PRESENT, LISTED, RELAYED)
 
 
 @dataclass(frozen=True)
@@ -131,22 +126,21 @@ def levels(seconds: float, workers: int) -> tuple[int, int]:
     """Of a task and of a node, once a pass is known to take so many seconds: as `ClusterPasses.levels`."""
     task = max((k for k in range(LEVELS) if ARITY**k * seconds <= TASK_SECONDS), default=0)
     node = max((k for k in range(LEVELS + 1) if ARITY**k * seconds <= NODE_SECONDS * workers), default=0)
-    return min(task, node), node
+    return min(task, node), max(node, first_level(workers))
 
 
 def first_level(workers: int) -> int:
-    """Of the nodes that are proposed: of no more passes than there are workers, so they take about as long as one."""
+    """Of the nodes that are asked for before: of no more passes than there are workers."""
     return max(k for k in range(LEVELS + 1) if workers >= ARITY**k)
 
 
-def asked(passes: int, seconds: float, workers: int, scheme: Scheme) -> Iterator[tuple[int, int]]:
+def asked(passes: int, seconds: float, workers: int) -> Iterator[tuple[int, int]]:
     """The nodes that the client asks for, in order: (level of their tasks, their own level)."""
     begin, stop, count = 0, min(1, passes), 0
     while begin < passes:
         while stop <= begin:
             stop = min(next_stop(stop), passes)
-        task, largest = levels(seconds, workers) if count >= AHEAD * workers else (0, 0)
-        largest = largest if scheme.single_first else max(largest, first_level(workers))
+        task, largest = levels(seconds, workers) if count >= AHEAD * workers else (0, first_level(workers))
         level = _level(begin, stop, largest)
         task = min(task, level)
         yield task, level
@@ -165,11 +159,11 @@ def _level(begin: int, stop: int, largest: int) -> int:
 def predict(passes: int, spp: int, workers: int, costs: Costs, scheme: Scheme = PRESENT) -> Prediction:
     """So many passes of `spp` samples per pixel."""
     costs, c = scheme.costs(costs), costs.of_pass(spp)
-    nodes = list(asked(passes, c, workers, scheme))
+    nodes = list(asked(passes, c, workers))
     sizes = [ARITY**task for task, level in nodes for _ in range(ARITY ** (level - task))]
     folds = sum(_folds(level - task) for task, level in nodes)
     tasks, begun = len(sizes) + folds, min(len(nodes), max(NODES, AHEAD * workers))
-    per_node = costs.receive + costs.copy + costs.add + costs.look * begun * workers
+    per_node = costs.receive + costs.copy + costs.add + costs.look * begun
     inner = (passes - len(sizes)) * costs.add
     parts = {
         "workers": _makespan(sizes, workers) * c + (folds * costs.fold + inner) / workers,

@@ -4,8 +4,9 @@ Measured here: what a pass, a fold, a message to the scheduler, a node sent and 
 model and a simulation say how long 1080p at 65,536 samples per pixel takes on 1 to 10,000 workers of one thread each.
 The efficiency is the time of all passes on one worker over workers × time; it counts the scene and its kernels on every
 worker, and not the start of its process. Links between machines are assumed to carry 10 Gbit/s, or what Dask reached
-between two processes here, if that is less. The schemes are the package as it is, and changes that are proposed, each
-with those before it. Both models are compared with local processes that sleep instead of rendering.
+between two processes here, if that is less. Besides the package as it is two cases are shown: that a worker is refused,
+and that the client cannot reach the workers. Both models are compared with local processes that sleep instead of
+rendering.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
 from validation import limits
 from validation.efficiency import cluster_costs, cluster_model, cluster_processes, cluster_simulation
-from validation.efficiency.cluster_model import PRESENT, PROPOSED, SCHEMES, Costs, Prediction, Scheme
+from validation.efficiency.cluster_model import PRESENT, SCHEMES, Costs, Prediction, Scheme
 from validation.run.context import Context
 from validation.study import Study, Task, about
 
@@ -37,17 +38,16 @@ TERMS = {
     "task": "CPU seconds of the scheduler for a task; _worker: more for each worker listed; submit: of the client",
     "relay": "CPU seconds of the scheduler for a node that goes through it to the client; receive: the client's",
     "look": "CPU seconds of the client for each node that is begun and each worker, whenever a node comes",
-    cluster_model.PRESENT.name: "lists of workers at every task, single passes first, nodes through the scheduler",
-    cluster_model.NODES_FIRST.name: "from the start, nodes of as many passes as workers where that is more than now",
-    cluster_model.UNLISTED.name: "and no list of workers at tasks; a lost worker is looked for in constant time",
-    cluster_model.PROPOSED.name: "and the client receives nodes from the workers themselves",
+    cluster_model.PRESENT.name: "all workers are accepted, and the client receives nodes from them",
+    cluster_model.LISTED.name: "then each task lists those that are accepted",
+    cluster_model.RELAYED.name: "then nodes reach the client through the scheduler",
 }
 AXES = {"x": "workers", "y": EFFICIENCY, "y_scale": "linear"}
 TOTAL = 65_536  # samples per pixel
 SCENES = ("sphere", "diamond")  # a cheap and an expensive one
 PASS, PASSES, LARGEST = 8, (2, 8, 32), 512  # samples per pixel: the usual one of 1080p, others, the largest tried
 USUAL_LIMIT = f"; with {PASS} it is "
-TABLED = (PRESENT, PROPOSED)
+TABLED = (PRESENT,)
 SHOWN = (10, 100, 1000, 10_000)
 GRID = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000)
 SIMULATED = {"standard": (1, 10, 100, 1000), "full": (1, 10, 100, 1000, 10_000)}
@@ -168,9 +168,9 @@ def simulated_rows(context: Context) -> list[Row]:
         for scheme in SCHEMES:
             for workers in SIMULATED[context.profile.name] if scheme in TABLED else (GOAL,):
                 rows.append(simulated_row(scene, scheme, workers, costs, PASS))
-        best, _ = best_pass(GOAL, costs, PROPOSED)
+        best, _ = best_pass(GOAL, costs, PRESENT)
         if best != PASS:
-            rows.append(simulated_row(scene, PROPOSED, GOAL, costs, best))
+            rows.append(simulated_row(scene, PRESENT, GOAL, costs, best))
     return rows
 
 
@@ -206,23 +206,16 @@ def process_rows(context: Context) -> list[Row]:
 
 
 def table(rows: list[Row]) -> tuple[str, list[str], list[list[str]]]:
-    """For the README: text, heading, and by scene and workers the efficiency as it is and as proposed."""
-    found = {(r.case, r.subject): r for r in rows if r.study == NAME and BEST in r.values}
+    """For the README: text, heading, and by scene and workers the efficiency with the usual pass and the best one."""
+    found = [row for row in rows if row.study == NAME and row.subject == PRESENT.name and BEST in row.values]
     if not found:
         raise ValueError("README: no scale was modelled; its table needs a compiled variant and Dask")
-    usual, cells = f"{EFFICIENCY}, {PASS} spp", []
-    for case in dict.fromkeys(case for case, _ in found):
-        now, then = (found[case, scheme.name] for scheme in TABLED)
-        best = f"{compact(then.values[EFFICIENCY])} ({then.values[BEST]:.0f} spp)"
-        limit = now.reason.rpartition(USUAL_LIMIT)[2]
-        cells.append([case, compact(now.values[usual]), limit, compact(then.values[usual]), best])
-    heading = [
-        "scene, workers",
-        f"{PASS} spp a pass",
-        "its limit",
-        f"as proposed, {PASS} spp",
-        "as proposed, best pass",
-    ]
+    cells = []
+    for row in found:
+        best = f"{compact(row.values[EFFICIENCY])} ({row.values[BEST]:.0f} spp)"
+        limit = row.reason.rpartition(USUAL_LIMIT)[2]
+        cells.append([row.case, compact(row.values[f"{EFFICIENCY}, {PASS} spp"]), limit, best])
+    heading = ["scene, workers", f"{PASS} spp a pass", "its limit", "best pass"]
     return f"1080p at {TOTAL:,} spp, workers of one thread; by the model, with costs measured here.", heading, cells
 
 

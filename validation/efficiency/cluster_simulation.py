@@ -23,7 +23,7 @@ from mi_refract.rendering import cluster_passes
 from mi_refract.rendering.cluster_passes import ClusterPasses, Part
 from mi_refract.rendering.pass_plan import next_stop
 from mi_refract.rendering.pass_sums import ARITY, PassSums
-from validation.efficiency.cluster_model import PRESENT, Costs, Scheme, first_level
+from validation.efficiency.cluster_model import PRESENT, Costs, Scheme
 
 CLIENT = -1  # its number among the workers' links
 _POLL = 0.5  # seconds: as the client's
@@ -198,22 +198,17 @@ class World:
 class SimulatedPasses(ClusterPasses):
     """The client's code; only waiting and receiving are the world's."""
 
-    def __init__(self, world: World, scheme: Scheme) -> None:
+    def __init__(self, world: World) -> None:
         """All workers are accepted."""
-        self.world, self.scheme = world, scheme
+        self.world = world
         accepted = dict.fromkeys(range(world.workers), 1)
         workers: Any = SimpleNamespace(client=world, accepted=accepted, machines={}, look=lambda: None)
         nothing: Any = None
         super().__init__(workers, nothing, nothing)
 
-    def levels(self) -> tuple[int, int]:
-        """As the scheme says."""
-        task, node = super().levels()
-        return task, node if self.scheme.single_first else max(node, first_level(self.world.workers))
-
     def _next(self, first: int, stop: int, last: int) -> Any:
         while True:
-            self.world.client += self.world.costs.look * len(self._begun) * self.world.workers
+            self.world.client += self.world.costs.look * len(self._begun)
             self._begin(first, stop, last)
             task = self._begun[0].result
             if self.world.wait(task, _POLL):
@@ -227,7 +222,7 @@ def simulate(passes: int, spp: int, workers: int, costs: Costs, scheme: Scheme =
     """Seconds from the first task to the whole image, of so many passes of `spp` samples per pixel."""
     costs = scheme.costs(costs)
     world, done = World(workers, costs, spp), 0
-    source = SimulatedPasses(world, scheme)
+    source = SimulatedPasses(world)
     while done < passes:
         stop = min(next_stop(done) if done else 1, passes)
         for _, sums, _ in source.nodes(done, stop, passes, 0, spp):
