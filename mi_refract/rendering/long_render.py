@@ -31,7 +31,7 @@ from .error_estimate import RelativeError, relative_error, require_interval, wor
 from .pass_plan import FEW, PassPlan, next_stop, plan_passes
 from .pass_sums import PassSums
 from .render_pass import PassRenderer, pass_renderer
-from .scene_files import formulas_in, load_scene
+from .scene_files import formulas_in, load_scene, naming
 
 NO_NOISE = "no noise: the samples of every pixel agree"
 ENOUGH_FOR_NO_NOISE = 64  # samples per pixel
@@ -189,8 +189,10 @@ class LongRender:
             self._holds_lock = True
             try:
                 return self._run(passes or ThisProcess(self.renderer), watch)
-            except BaseException:
+            except BaseException as error:
                 self.keep()
+                if isinstance(error, RuntimeError):  # Mitsuba's own
+                    raise ValueError(naming(self.job.scene, error)) from None
                 raise
             finally:
                 self._holds_lock = False

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 LANES = 2**24  # samples of a pass, at most, unless one sample per pixel is more
 # A pass costs about 10 ms beside its samples, and its sums the time of a quarter of a sample in every pixel.
-LEAST_LANES, LEAST_SPP = 2**21, 8
+LEAST_LANES, LEAST_SPP = 2**21, 4
 FEW = 8  # passes: with fewer the spread between them says little
 MASK = 2**32 - 1
 

@@ -7,6 +7,7 @@ import random
 import re
 import socket
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -254,13 +255,24 @@ def test_a_machine_whose_pixels_are_not_finite_is_named(client, scene, variant):
     assert re.fullmatch(rf"{re.escape(socket.gethostname())}: \d+ pixels of a pass are not finite", said[0])
 
 
+def test_a_worker_that_just_came_looks_by_itself_whether_it_may_have_a_task(client, scene, variant):
+    """It is not asked by name then; here none may, by what is expected, and all are accepted when they are asked."""
+    passes = source(client, scene, variant)
+    passes.scene = replace(passes.scene, expected=facts(variant) | {"drjit": "0"})
+    looks, look = [], passes.workers.look
+    passes.workers.look = lambda **options: (looks.append(options), look(**options))[1]
+    same(remote(client, scene, variant, 4, passes=passes), local(scene, 4))
+    assert {"at_once": True} in looks
+
+
 def test_an_error_of_the_scene_is_that_of_a_local_render(client, scene, variant):
-    """The integrator's own time is over before its last sample."""
-    text = scene.read_text().replace('value="5"/>', 'value="5"/><float name="timeout" value="1e-9"/>')
+    """Which is raised when it is rendered: the scene scatters, so that nothing of it is deterministic."""
+    text = scene.read_text().replace('type="path">', 'type="refract_path"><boolean name="deterministic" value="true"/>')
+    assert "deterministic" in text
     scene.write_text(text)
     errors = []
     for passes in (None, source(client, scene, variant)):
-        with pytest.raises(InterruptedError) as caught:
+        with pytest.raises(ValueError, match="deterministic") as caught:
             rendering(scene, scene.with_name("x.exr"), 4).run(passes=passes)
         errors.append(str(caught.value))
     assert errors[0] == errors[1]

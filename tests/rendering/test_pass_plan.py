@@ -48,7 +48,7 @@ def test_a_pass_is_bounded_and_a_power_of_two(pixels):
     spp = usual_spp(pixels)
     assert spp & (spp - 1) == 0
     assert spp == 1 or spp * pixels <= LANES
-    assert 2 * spp * pixels > LANES or spp >= 8
+    assert 2 * spp * pixels > LANES or spp >= 4
 
 
 def test_samples_beyond_whole_passes_are_a_last_one():

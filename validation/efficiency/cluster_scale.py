@@ -16,6 +16,7 @@ import os
 from collections.abc import Callable
 from typing import Any
 
+from mi_refract.rendering.pass_plan import usual_spp
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
 from validation import limits
@@ -45,7 +46,8 @@ TERMS = {
 AXES = {"x": "workers", "y": EFFICIENCY, "y_scale": "linear"}
 TOTAL = 65_536  # samples per pixel
 SCENES = ("sphere", "diamond")  # a cheap and an expensive one
-PASS, PASSES, LARGEST = 8, (2, 8, 32), 512  # samples per pixel: the usual one of 1080p, others, the largest tried
+PASS = usual_spp(1920 * 1080)  # samples per pixel
+PASSES, LARGEST = (1, 4, 16), 512  # those of the curves, and the largest that is tried
 USUAL_LIMIT = f"; with {PASS} it is "
 TABLED = (PRESENT,)
 SHOWN = (10, 100, 1000, 10_000)
