@@ -18,10 +18,10 @@ import numpy as np
 
 from mi_refract.io.atomic import replacing
 
+from .identity import apart_from_passes, changed
 from .pass_sums import PassSums, PassTree
 
 FORMAT = 1
-PASS = "samples of a pass"  # of the identity: a render may go on with passes of another size
 _ARRAYS = ("total", "between", "within")
 # What NumPy, zipfile and json raise for a file with wrong bits; OSError: a seek to where it has nothing.
 _OF_PYTHON = (ValueError, LookupError, TypeError, AttributeError, RuntimeError, EOFError, OSError)
@@ -128,18 +128,3 @@ def read(path: Path, identity: dict[str, Any]) -> Progress:
             f"{path}: of another render: {different}; accepted: the same render, or --restart, which begins anew"
         )
     return found
-
-
-def apart_from_passes(identity: dict[str, Any]) -> dict[str, Any]:
-    """What must be the same in a render that goes on."""
-    return {name: value for name, value in identity.items() if name != PASS}
-
-
-def changed(before: dict[str, Any], now: dict[str, Any]) -> str:
-    """What is different, by name; "" where nothing is."""
-    found = []
-    for name in {**before, **now}:
-        if before.get(name) != now.get(name):
-            long = name == "scene"
-            found.append(f"the {name} has changed" if long else f"{name} was {before.get(name)}, is {now.get(name)}")
-    return ", ".join(found)

@@ -6,7 +6,6 @@ passes the error is looked at, where it may end the render.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import threading
@@ -18,16 +17,15 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mi_refract import backend
 from mi_refract.io import lock
 from mi_refract.io.atomic import writable
 from mi_refract.io.image_file import SUFFIXES, Metadata
-from mi_refract.io.provenance import installed_version, provenance
-from mi_refract.plugins import scene_parser
+from mi_refract.io.provenance import provenance
 
 from . import checkpoint, rendered_file
-from .checkpoint import PASS, Progress
+from .checkpoint import Progress
 from .error_estimate import RelativeError, relative_error, require_interval, worst_tile
+from .identity import PASS, identity_of
 from .pass_plan import FEW, PassPlan, next_stop, plan_passes
 from .pass_sums import PassSums
 from .render_pass import PassRenderer, pass_renderer
@@ -132,7 +130,7 @@ class LongRender:
         self.spp = limits.spp
         if self.spp is None and not limits.open_ended:
             self.spp = int(self.scene.sensors()[0].sampler().sample_count())
-        self.progress = self._found(_identity(job, self.renderer), restart)
+        self.progress = self._found(identity_of(job.scene, job.defines, job.seed, self.renderer), restart)
         self.plan = self._plan()
         self.renderer = replace(self.renderer, few=self._may_have_few_passes())
         self.progress.identity[PASS] = self.plan.spp
@@ -365,28 +363,6 @@ def _without_noise(sums: PassSums) -> bool:
 def lock_of(output: Path) -> Path:
     """The lock of a render into this file."""
     return output.with_name(f".{output.name}.lock")
-
-
-def _identity(job: Job, renderer: PassRenderer) -> dict[str, Any]:
-    """All that the bits of a render depend on, by names for messages; of what is to be the size of a pass see PASS."""
-    import mitsuba as mi
-
-    files = scene_parser.files_of(job.scene, job.defines)
-    digest = hashlib.sha256()
-    for name, path in [("", each) for each in files.xml] + list(files.others.items()):
-        digest.update(json.dumps([name, hashlib.sha256(path.read_bytes()).hexdigest()]).encode())
-    width, height = renderer.size
-    llvm = "llvm" in str(mi.variant())
-    return {
-        "scene": digest.hexdigest(),
-        "defines": dict(job.defines),
-        "seed": job.seed,
-        "variant": str(mi.variant()),
-        "film": f"{width} × {height} {', '.join(renderer.channels)}",
-        "colours": renderer.colours,
-        **{f"version of {name}": installed_version(name) for name in ("mi_refract", "mitsuba", "drjit")},
-        "libLLVM": backend.llvm().library if llvm else "none",
-    }
 
 
 def _metadata(job: Job, formulas: str) -> Metadata:

@@ -11,7 +11,8 @@ import numpy as np
 from mi_refract.io import image_file
 from mi_refract.io.image_file import Metadata, write_exr
 
-from .checkpoint import Progress, apart_from_passes, changed
+from .checkpoint import Progress
+from .identity import apart_from_passes, changed
 from .pass_plan import FEW
 from .pass_sums import PassSums
 

@@ -1,0 +1,344 @@
+"""Renders that go on: from checkpoints and finished images, with the same bits whatever happened; what goes wrong."""
+
+from __future__ import annotations
+
+import errno
+import random
+import signal
+import time
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from support.processes import python
+
+from mi_refract.io.image_file import read, read_exr
+from mi_refract.rendering import checkpoint, identity, long_render, rendered_file
+from mi_refract.rendering.long_render import Job, Limits, LongRender
+
+ROOT = Path(__file__).parents[2]
+SCENE, SMALL = ROOT / "scenes" / "nested.xml", {"res": "8"}
+BALL = ROOT / "scenes" / "sphere.xml"
+TIMES = ("mi_refract:render_seconds", "mi_refract:scene")
+
+
+pytestmark = pytest.mark.usefixtures("scalar_variant")
+
+
+@pytest.fixture
+def llvm(needs_variant):
+    needs_variant("llvm_ad_rgb")
+    mi.set_variant("llvm_ad_rgb")
+
+
+def rendering(output, seed=0, scene=BALL, defines=SMALL, restart=False, **limits):
+    return LongRender(Job(scene, defines, seed), output, Limits(**limits), restart=restart)
+
+
+def pixels(path):
+    return read_exr(path)[0]
+
+
+# What it goes on from -------------------------------------------------------------------------------------------------
+
+
+class Stop(Exception):
+    pass
+
+
+def stopped_after(render, passes):
+    def watch(render):
+        if render.progress.passes == passes:
+            raise Stop
+
+    with pytest.raises(Stop):
+        render.run(watch)
+
+
+@pytest.mark.parametrize("passes", [1, 7, 8, 9, 20])
+def test_a_checkpoint_goes_on_with_the_same_bits(tmp_path, llvm, passes):
+    output = tmp_path / "a.exr"
+    stopped_after(rendering(output, spp=90, pass_spp=4), passes)
+    assert checkpoint.path_of(output).exists() and not output.exists()
+    render = rendering(output, spp=90, pass_spp=4)
+    assert render.progress.passes == passes
+    render.run()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+    rendering(tmp_path / "b.exr", spp=90, pass_spp=4).run()
+    np.testing.assert_array_equal(pixels(output), pixels(tmp_path / "b.exr"))
+
+
+def test_a_finished_image_goes_on(tmp_path, llvm):
+    output = tmp_path / "a.exr"
+    rendering(output, spp=32, pass_spp=4).run()
+    render = rendering(output, spp=64, pass_spp=4)
+    assert render.progress.done == 32
+    seen = []
+    header = render.run(lambda render: seen.append(render.progress.passes))
+    assert header["mi_refract:spp"] == 64 and seen[0] == 9 and seen[-1] == 16
+    rendering(tmp_path / "b.exr", spp=64, pass_spp=4).run()
+    # The same samples, but the first half by way of float32.
+    np.testing.assert_allclose(pixels(output)[..., :3], pixels(tmp_path / "b.exr")[..., :3], rtol=3e-7)
+
+
+def test_a_finished_image_has_nothing_left(tmp_path, llvm, monkeypatch):
+    output = tmp_path / "a.exr"
+    rendering(output, spp=32, pass_spp=4).run()
+    before = pixels(output)
+    render = rendering(output, spp=32, pass_spp=4)
+    monkeypatch.setattr(type(render.renderer), "render", lambda *arguments: pytest.fail("rendered"))
+    render.run()
+    np.testing.assert_array_equal(pixels(output), before)
+
+
+@pytest.mark.parametrize("other", [{"seed": 1}, {"spp": 16}, {"restart": True}], ids=str)
+def test_another_image_is_replaced(tmp_path, llvm, other):
+    output = tmp_path / "a.exr"
+    rendering(output, spp=32, pass_spp=4).run()
+    assert rendering(output, **{"spp": 64, "pass_spp": 4} | other).progress.done == 0
+
+
+@pytest.mark.parametrize("spp", [6, 40])
+def test_the_same_command_again_changes_nothing(tmp_path, llvm, spp):
+    output = tmp_path / "a.exr"
+    rendering(output, spp=spp, pass_spp=4).run()
+    content = output.read_bytes()
+    for _ in range(2):
+        rendering(output, spp=spp, pass_spp=4).run()
+    assert output.read_bytes() == content
+
+
+def test_the_variance_of_few_passes_stays_what_it_is(tmp_path, llvm):
+    output = tmp_path / "a.exr"
+    rendering(output, spp=12, pass_spp=4).run()
+    before = rendering(output, spp=16, pass_spp=4).progress.sums()
+    np.testing.assert_allclose(
+        before.variance, np.stack([read(output).select([f"{n}.variance"])[..., 0] for n in "RGB"], -1)
+    )
+
+
+def test_an_error_that_is_reached_is_reached(tmp_path, llvm):
+    output = tmp_path / "a.exr"
+    first = rendering(output, until=0.2, pass_spp=2).run()
+    again = rendering(output, until=0.2, pass_spp=2)
+    assert again.run()["mi_refract:spp"] == first["mi_refract:spp"] and "--until" in again.ended_by
+
+
+def test_a_sampler_that_rounds_up_has_nothing_left(tmp_path, llvm):
+    scene = tmp_path / "scene.xml"
+    scene.write_text(BALL.read_text().replace('value="independent"', 'value="stratified"'))
+    header = rendering(tmp_path / "a.exr", scene=scene, spp=10).run()
+    assert header["mi_refract:spp"] == 16
+    assert rendering(tmp_path / "a.exr", scene=scene, spp=10).progress.done == 16
+
+
+def test_a_checkpoint_of_more_samples_is_refused(tmp_path, llvm):
+    output = tmp_path / "a.exr"
+    stopped_after(rendering(output, spp=64, pass_spp=4), 5)
+    with pytest.raises(ValueError, match="holds 20 spp; accepted: at least so many, or --restart"):
+        rendering(output, spp=16, pass_spp=4)
+
+
+def test_who_does_not_render_writes_nothing(tmp_path, llvm):
+    output = tmp_path / "a.exr"
+    stopped_after(rendering(output, spp=64, pass_spp=4), 2)
+    late = rendering(output, spp=64, pass_spp=4)
+    stopped_after(rendering(output, spp=64, pass_spp=4), 5)
+    content = checkpoint.path_of(output).read_bytes()
+    late.give_up()
+    late.keep()
+    assert checkpoint.path_of(output).read_bytes() == content
+    with pytest.raises(BlockingIOError, match="another render was there meanwhile"):
+        late.run()
+
+
+def test_a_black_image_is_warned_of(tmp_path, llvm):
+    sky = '<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"><film type="hdrfilm">'
+    sky += '<integer name="width" value="8"/><integer name="height" value="8"/></film></sensor></scene>'
+    (tmp_path / "dark.xml").write_text(sky)
+    render = LongRender(Job(tmp_path / "dark.xml"), tmp_path / "a.exr", Limits(until=0.1, seconds=0.5, pass_spp=1))
+    render.run()
+    assert "is black so far" in render.warnings[0]
+
+
+def test_the_time_of_an_integrator_is_none_of_ours(tmp_path, llvm):
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        BALL.read_text().replace(
+            '<integrator type="$integrator">', '<integrator type="$integrator"><float name="timeout" value="0.01"/>'
+        )
+    )
+    assert rendering(tmp_path / "a.exr", scene=scene, spp=8, pass_spp=4).run()["mi_refract:spp"] == 8
+
+
+def test_a_picture_of_somebody_else_is_no_start(tmp_path, llvm):
+    output = tmp_path / "a.exr"
+    output.write_bytes(b"no EXR")
+    assert rendering(output, spp=8).progress.done == 0
+    assert rendered_file.read(output, ("R", "G", "B"), {}) is None
+
+
+CHANGES = {
+    "seed": ({"seed": 1}, "seed was 0, is 1"),
+    "passes": ({"pass_spp": 8}, "passes of 4 samples per pixel"),
+}
+
+
+@pytest.mark.parametrize("other, said", CHANGES.values(), ids=CHANGES)
+def test_a_checkpoint_of_another_render_is_refused_by_name(tmp_path, llvm, other, said):
+    output = tmp_path / "a.exr"
+    stopped_after(rendering(output, spp=64, pass_spp=4), 3)
+    again = {"spp": 64, "pass_spp": 4} | other
+    with pytest.raises(ValueError, match=said) as error:
+        rendering(output, **again)
+    assert "--restart" in str(error.value) and "\n" not in str(error.value)
+    assert rendering(output, restart=True, **again).progress.passes == 0
+
+
+def test_a_changed_scene_variant_or_version_is_refused_by_name(tmp_path, llvm, monkeypatch):
+    scene, output = tmp_path / "scene.xml", tmp_path / "a.exr"
+    scene.write_text(BALL.read_text())
+    stopped_after(rendering(output, scene=scene, spp=64, pass_spp=4), 3)
+    scene.write_text(BALL.read_text().replace("30.5", "30.6"))
+    with pytest.raises(ValueError, match="the scene has changed"):
+        rendering(output, scene=scene, spp=64)
+    scene.write_text(BALL.read_text())
+    with monkeypatch.context() as patch:
+        patch.setattr(identity, "installed_version", lambda name: "0")
+        with pytest.raises(ValueError, match=r"version of mitsuba was \S+, is 0"):
+            rendering(output, scene=scene, spp=64)
+    mi.set_variant("scalar_rgb")
+    with pytest.raises(ValueError, match="variant was llvm_ad_rgb, is scalar_rgb"):
+        rendering(output, scene=scene, spp=64)
+
+
+def test_a_file_that_the_scene_names_is_part_of_it(tmp_path, llvm):
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    for path in (SCENE.parent / "meshes").iterdir():
+        (meshes / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "scene.xml").write_text(SCENE.read_text())
+    output = tmp_path / "a.exr"
+    stopped_after(rendering(output, scene=tmp_path / "scene.xml", spp=64, pass_spp=4), 1)
+    mesh = next(meshes.glob("tumbler_air.ply"))
+    mesh.write_bytes(mesh.read_bytes().replace(b"comment", b"comment ", 1) + b"\n")
+    with pytest.raises(ValueError, match="the scene has changed"):
+        rendering(output, scene=tmp_path / "scene.xml", spp=64)
+
+
+@pytest.mark.parametrize("damage", ["truncated", "flipped", "empty", "text", "another format"])
+def test_a_damaged_checkpoint_is_refused(tmp_path, llvm, damage):
+    output = tmp_path / "a.exr"
+    stopped_after(rendering(output, spp=64, pass_spp=4), 3)
+    path = checkpoint.path_of(output)
+    content = path.read_bytes()
+    damaged = {
+        "truncated": content[:-100],
+        "flipped": content[:1500] + bytes([content[1500] ^ 1]) + content[1501:],
+        "empty": b"",
+        "text": b"hello",
+        "another format": content.replace(b'"format": 1', b'"format": 2'),
+    }
+    path.write_bytes(damaged[damage])
+    with pytest.raises(ValueError, match=r"a\.exr\.checkpoint: is no complete checkpoint .*--restart") as error:
+        rendering(output, spp=64, pass_spp=4)
+    assert "\n" not in str(error.value)
+
+
+# What goes wrong ------------------------------------------------------------------------------------------------------
+
+
+def test_two_renders_into_one_file(tmp_path, llvm):
+    first, second = rendering(tmp_path / "a.exr", spp=16, pass_spp=4), rendering(tmp_path / "a.exr", spp=16, pass_spp=4)
+    said = []
+
+    def watch(_):
+        with pytest.raises(BlockingIOError, match=r"a\.exr: a render runs there already, process \d+ .* another file"):
+            second.run()
+        said.append(True)
+
+    first.run(watch)
+    assert said
+
+
+def test_a_full_disk_at_a_checkpoint_is_a_warning(tmp_path, llvm, monkeypatch):
+    monkeypatch.setattr(long_render, "BETWEEN_CHECKPOINTS", 0.0)
+    write, failures = checkpoint.write, []
+
+    def full(path, progress):
+        if len(failures) < 2:
+            failures.append(path)
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(path, progress)
+
+    monkeypatch.setattr(checkpoint, "write", full)
+    render = rendering(tmp_path / "a.exr", spp=32, pass_spp=4)
+    written = []
+    render.run(lambda render: written.append(render.checkpoint.exists()))
+    assert len(render.warnings) == 2 and "No space left on device; tried again" in render.warnings[0]
+    assert any(written) and (tmp_path / "a.exr").exists()
+
+
+def test_an_output_that_cannot_be_written_is_found_before(tmp_path, monkeypatch):
+    monkeypatch.setattr(long_render, "load_scene", lambda *arguments: pytest.fail("loaded"))
+    with pytest.raises(NotADirectoryError, match="accepted"):
+        rendering(tmp_path / "none" / "a.exr", spp=1)
+
+
+KILLED = """
+import sys
+from mi_refract import cli
+run = cli._run
+def run_with_checkpoints(arguments):
+    from mi_refract.rendering import long_render  # numpy's threads start here
+    long_render.BETWEEN_CHECKPOINTS = 0.05
+    return run(arguments)
+cli._run = run_with_checkpoints
+limits = ["-D", "res=32", "--spp", "1200", "--pass-spp", "4"]
+sys.argv[1:] = ["render", sys.argv[1], "-o", sys.argv[2], *limits, *sys.argv[3:]]
+sys.exit(cli.main())
+"""
+
+
+def ended_by(number, output, *options):
+    """Whether a render was ended by a signal, sent after some passes; its exit code and what it printed."""
+    with python(KILLED, BALL, output, "--variant", "llvm_ad_rgb", *options) as process:
+        deadline = time.monotonic() + 120
+        before = checkpoint.path_of(output).stat().st_mtime_ns if checkpoint.path_of(output).exists() else 0
+        while process.poll() is None and time.monotonic() < deadline:
+            path = checkpoint.path_of(output)
+            if path.exists() and path.stat().st_mtime_ns != before:
+                break
+            time.sleep(0.01)
+        time.sleep(random.uniform(0, 0.3))
+        process.send_signal(number)
+        out, err = process.communicate(timeout=60)
+        return process.returncode, out, err
+
+
+def test_sigkill_at_random_times_leaves_a_checkpoint_and_the_same_bits(tmp_path, llvm):
+    output, codes = tmp_path / "a.exr", []
+    for _ in range(4):
+        codes.append(ended_by(signal.SIGKILL, output)[0])
+        if codes[-1] == 0:
+            break
+    assert codes[0] == -signal.SIGKILL
+    if not output.exists():
+        job = Job(BALL, {"res": "32"})
+        render = LongRender(job, output, Limits(spp=1200, pass_spp=4))
+        assert render.progress.passes
+        render.run()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+    LongRender(Job(BALL, {"res": "32"}), tmp_path / "b.exr", Limits(spp=1200, pass_spp=4)).run()
+    np.testing.assert_array_equal(pixels(output), pixels(tmp_path / "b.exr"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_keeps_what_is_done(tmp_path, llvm, number):
+    output = tmp_path / "a.exr"
+    code, _, err = ended_by(number, output)
+    assert code == 128 + number, err
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr.checkpoint"]
+    render = LongRender(Job(BALL, {"res": "32"}), output, Limits(spp=1200, pass_spp=4))
+    assert render.progress.passes > 0
