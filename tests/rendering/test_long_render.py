@@ -10,32 +10,17 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from support.readme import python_blocks
+from support.renders import SCENES, SMALL, pixels, rendering
 
 from mi_refract.io.image_file import read, read_exr
 from mi_refract.rendering import long_render
 from mi_refract.rendering.long_render import Job, Limits, LongRender, render_to_exr
 
-ROOT = Path(__file__).parents[2]
-SCENE, SMALL = ROOT / "scenes" / "nested.xml", {"res": "8"}
-BALL = ROOT / "scenes" / "sphere.xml"
+ROOT, SCENE = SCENES.parent, SCENES / "nested.xml"
 TIMES = ("mi_refract:render_seconds", "mi_refract:scene")
 
 
 pytestmark = pytest.mark.usefixtures("scalar_variant")
-
-
-@pytest.fixture
-def llvm(needs_variant):
-    needs_variant("llvm_ad_rgb")
-    mi.set_variant("llvm_ad_rgb")
-
-
-def rendering(output, seed=0, scene=BALL, defines=SMALL, restart=False, **limits):
-    return LongRender(Job(scene, defines, seed), output, Limits(**limits), restart=restart)
-
-
-def pixels(path):
-    return read_exr(path)[0]
 
 
 # The image and its header ---------------------------------------------------------------------------------------------
@@ -178,7 +163,7 @@ def test_it_ends_after_its_time(tmp_path, llvm):
 
 
 def test_the_example_of_the_readme(tmp_path, monkeypatch):
-    (code,) = python_blocks(Path(long_render.__file__).with_name("README.md"))
+    *_, code = python_blocks(Path(long_render.__file__).with_name("README.md"))
     monkeypatch.chdir(ROOT)
     for old, new in (
         ('"nested.exr"', f'r"{tmp_path}/nested.exr"'),

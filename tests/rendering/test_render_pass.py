@@ -18,12 +18,6 @@ SCENES = Path(__file__).parents[2] / "scenes"
 CLOSE = {"rtol": 2e-5, "atol": 2e-6}
 
 
-@pytest.fixture
-def llvm(needs_variant):
-    needs_variant("llvm_ad_rgb")
-    mi.set_variant("llvm_ad_rgb")
-
-
 def scene_of(tmp_path, rfilter="box", pixel_format="rgb", name="sphere", **defines):
     text = (SCENES / f"{name}.xml").read_text()
     for old, new in (

@@ -6,38 +6,22 @@ import errno
 import random
 import signal
 import time
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from support.processes import python
+from support.renders import BALL, SCENES, pixels, rendering
 
-from mi_refract.io.image_file import read, read_exr
+from mi_refract.io.image_file import read
 from mi_refract.rendering import checkpoint, identity, long_render, rendered_file
 from mi_refract.rendering.long_render import Job, Limits, LongRender
 
-ROOT = Path(__file__).parents[2]
-SCENE, SMALL = ROOT / "scenes" / "nested.xml", {"res": "8"}
-BALL = ROOT / "scenes" / "sphere.xml"
+ROOT, SCENE = SCENES.parent, SCENES / "nested.xml"
 TIMES = ("mi_refract:render_seconds", "mi_refract:scene")
 
 
 pytestmark = pytest.mark.usefixtures("scalar_variant")
-
-
-@pytest.fixture
-def llvm(needs_variant):
-    needs_variant("llvm_ad_rgb")
-    mi.set_variant("llvm_ad_rgb")
-
-
-def rendering(output, seed=0, scene=BALL, defines=SMALL, restart=False, **limits):
-    return LongRender(Job(scene, defines, seed), output, Limits(**limits), restart=restart)
-
-
-def pixels(path):
-    return read_exr(path)[0]
 
 
 # What it goes on from -------------------------------------------------------------------------------------------------
