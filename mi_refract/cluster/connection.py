@@ -6,14 +6,17 @@ import asyncio
 import contextlib
 import logging
 import re
+import threading
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from concurrent import futures
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from . import local_process
 
+Result = TypeVar("Result")
 PATIENCE = 6.0  # seconds until a scheduler must have answered
 _CLOSING = 2.0  # seconds
 _LOGGERS = ("distributed", "tornado", "asyncio")
@@ -148,3 +151,17 @@ def scheduler_needed(client: Any) -> Iterator[None]:
         if client.status != "running" and not isinstance(error, LostSchedulerError):
             raise LostSchedulerError(lost) from None
         raise
+
+
+def in_thread(call: Callable[[], Result]) -> futures.Future[Result]:
+    """What `call` returns, some day: Dask waits for ever for a scheduler that hangs, or for data that is lost."""
+    found: futures.Future[Result] = futures.Future()
+
+    def run() -> None:
+        try:
+            found.set_result(call())
+        except BaseException as error:
+            found.set_exception(error)
+
+    threading.Thread(target=run, name="Dask", daemon=True).start()
+    return found

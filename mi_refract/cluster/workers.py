@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Mapping
+from concurrent import futures
 from typing import Any
 
 from . import worker_facts
-from .connection import scheduler_needed
+from .connection import LostSchedulerError, in_thread, scheduler_needed
 
 PATIENCE = 120.0  # seconds until the first workers must have said what they are: they import Mitsuba, and try libLLVM
 _NOBODY = 30.0  # seconds until a scheduler must have a worker at all
+SILENT = 60.0  # seconds until a scheduler must have answered once it did before
 ALONE = 120.0  # seconds until new workers must have come where all have gone
 # As text: a worker that cannot import a function which it is sent ends, and its nanny starts it again, without end.
 _QUESTION = "__import__({!r}, fromlist=['facts']).facts({!r})"
@@ -43,6 +45,8 @@ class Workers:
         self.machines: dict[str, str] = {}
         self._asked: dict[str, Any] = {}
         self._looked = -_BETWEEN_LOOKS
+        self._coming: futures.Future[dict[str, int]] | None = None  # who is there
+        self._seen = False
         self._alone_since: float | None = None
 
     @property
@@ -58,7 +62,7 @@ class Workers:
             waited = time.monotonic() - began
             if self.accepted and not self._asked:
                 return
-            if not self._asked and (self.refused or waited > _NOBODY):
+            if self._seen and not self._asked and (self.refused or waited > _NOBODY):
                 break
             if waited > PATIENCE:
                 if self.accepted:
@@ -79,11 +83,17 @@ class Workers:
 
         LostSchedulerError where the scheduler has gone, ConnectionError where all workers have, for longer than ALONE.
         """
-        if not at_once and time.monotonic() - self._looked < _BETWEEN_LOOKS:
-            return
-        self._looked = time.monotonic()
         with scheduler_needed(self.client):
-            self._ask(dict(self.client.nthreads()))
+            if self._coming is None and (at_once or time.monotonic() - self._looked >= _BETWEEN_LOOKS):
+                self._coming, self._looked = in_thread(self.client.nthreads), time.monotonic()
+            if self._coming is not None and self._coming.done():
+                present, self._coming = self._coming.result(), None
+                self._ask(present)
+                self._seen = True
+        if self._coming is not None and time.monotonic() - self._looked > SILENT:
+            raise LostSchedulerError(
+                f"{self._address}: the Dask scheduler has not answered for {SILENT:.0f} s; accepted: one that does"
+            )
         self._require_some()
 
     def _ask(self, present: Mapping[str, int]) -> None:

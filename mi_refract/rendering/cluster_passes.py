@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -19,7 +18,7 @@ from typing import Any
 
 from mi_refract import backend
 from mi_refract.cluster import on_worker, worker_facts
-from mi_refract.cluster.connection import scheduler_needed
+from mi_refract.cluster.connection import in_thread, scheduler_needed
 from mi_refract.cluster.workers import Workers
 
 from . import scene_bundle
@@ -35,6 +34,7 @@ LEVELS = 4  # of a node, at most
 AHEAD = 3  # tasks for each thread of the workers
 NODES = 64  # that are begun at a time, at least; the workers keep what is finished of them
 RETRIES = 2
+_FIRST = 1000  # priority of what passes wait for
 _MEASURED = 16  # nodes whose time counts
 _POLL = 0.5  # seconds
 
@@ -75,6 +75,12 @@ class RefusedWorkerError(RuntimeError):
 def keep(bundle: SceneBundle) -> SceneBundle:
     """The task whose result the others ask for: so the bundle goes to each worker once, also from the others."""
     return bundle
+
+
+def unpack(bundle: SceneBundle) -> None:
+    """Write the files of the bundle, for `render_node`."""
+    folder = on_worker.scratch_folder()
+    on_worker.one_at_a_time(lambda: scene_bundle.unpack(bundle, folder))
 
 
 def render_node(bundle: SceneBundle, scene: RenderedScene, level: int, first: int, spp: int) -> Part:
@@ -136,20 +142,6 @@ def fold(*parts: Part) -> Part:
     return Part(sums, nonfinite, sum(part.seconds for part in parts))
 
 
-def _in_thread(call: Callable[[], Part]) -> futures.Future[Part]:
-    """What `call` returns, some day: it waits for ever for data that was lost with workers which do not come back."""
-    found: futures.Future[Part] = futures.Future()
-
-    def run() -> None:
-        try:
-            found.set_result(call())
-        except BaseException as error:
-            found.set_exception(error)
-
-    threading.Thread(target=run, name="node", daemon=True).start()
-    return found
-
-
 # Here -----------------------------------------------------------------------------------------------------------------
 
 
@@ -187,6 +179,7 @@ class ClusterPasses:
         self._begun: deque[_Node] = deque()
         self._series = (0, 0)  # offset and samples of what is begun
         self._pass_seconds: deque[float] = deque(maxlen=_MEASURED)
+        self._handed: dict[str, Any] = {}  # who has unpacked the bundle, or will
         self._kept: tuple[Any, frozenset[str]] = (None, frozenset())  # the bundle there, and who may make it
         self._warned: set[str] = set()
         self._count = itertools.count()
@@ -225,13 +218,14 @@ class ClusterPasses:
         asked, coming = None, None
         while True:
             self.workers.look()
+            self._hand_out()
             self._begin_again()
             self._begin(first, stop, last)
             if not self._begun:
                 time.sleep(_POLL)
                 continue
             if coming is None or self._begun[0] is not asked:
-                asked, coming = self._begun[0], _in_thread(self._begun[0].result.result)
+                asked, coming = self._begun[0], in_thread(self._begun[0].result.result)
             if coming in futures.wait([coming], _POLL).done:
                 self._begun.popleft()
                 try:
@@ -336,6 +330,15 @@ class ClusterPasses:
             )
             self._kept = future, holders
         return future
+
+    def _hand_out(self) -> None:
+        """Have each worker unpack the bundle once. Of workers that are listed Dask chooses only who has it already."""
+        there = frozenset(self.workers.accepted)
+        self._handed = {address: done for address, done in self._handed.items() if address in there}
+        for address in there - self._handed.keys():
+            self._handed[address] = self.workers.client.submit(
+                unpack, self._bundle(there), workers=[address], pure=False, priority=_FIRST
+            )
 
     def _begin_again(self) -> None:
         """Ask others for nodes whose workers have all gone: Dask would wait for these to come back."""

@@ -139,7 +139,7 @@ def load(bundle: SceneBundle, variant: str, defines: Mapping[str, str], folder: 
     """
     from .scene_files import load_scene
 
-    root = _root(bundle, folder)
+    root = unpack(bundle, folder)
     key = (bundle.digest, variant, json.dumps(dict(defines), sort_keys=True))
     if key not in _loaded:
         moved = {name: str(_below(root, path)) for name, path in bundle.moved.items()}
@@ -148,7 +148,8 @@ def load(bundle: SceneBundle, variant: str, defines: Mapping[str, str], folder: 
     return _loaded[key], str(root)
 
 
-def _root(bundle: SceneBundle, folder: str) -> Path:
+def unpack(bundle: SceneBundle, folder: str) -> Path:
+    """Write the files of a bundle below `folder`, once in a process: the folder that stands for the root."""
     root = _unpacked.get(bundle.digest)
     if root is None or not root.is_dir():
         root = Path(tempfile.mkdtemp(prefix="scene-", dir=folder))

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import re
+import time
 
 import pytest
 from support.dask_workers import accepted
 
 from mi_refract.cluster import worker_facts, workers
-from mi_refract.cluster.connection import connected
+from mi_refract.cluster.connection import LostSchedulerError, connected
 from mi_refract.cluster.worker_facts import HOST, LLVM, MIXED, UNUSABLE, WIDTH, differences, machine
 from mi_refract.cluster.workers import Workers
 
@@ -98,3 +99,15 @@ def test_no_workers_at_all(client, monkeypatch, variant):
     monkeypatch.setattr(client, "nthreads", dict)
     with pytest.raises(ConnectionError, match="no worker that may render: no workers; accepted"):
         accepted(client, variant)
+
+
+def test_a_scheduler_that_hangs(client, monkeypatch, variant):
+    found = accepted(client, variant)
+    monkeypatch.setattr(workers, "SILENT", 0.1)
+    monkeypatch.setattr(client, "nthreads", lambda: time.sleep(1))
+    found.look(at_once=True)
+    time.sleep(0.2)
+    with pytest.raises(
+        LostSchedulerError, match="the Dask scheduler has not answered for 0 s; accepted: one that does"
+    ):
+        found.look()

@@ -140,7 +140,8 @@ def late(*arguments):
     time.sleep(random.random() / 10)
     return render(*arguments)
 cluster_passes.render_node = late
-cluster = LocalCluster(n_workers=8, threads_per_worker=1, processes=False, protocol="tcp://", dashboard_address=None)
+options = {"protocol": "tcp://", "dashboard_address": None, "silence_logs": 60}
+cluster = LocalCluster(n_workers=8, threads_per_worker=1, processes=False, **options)
 print(cluster.scheduler_address, flush=True)
 time.sleep(600)
 """
