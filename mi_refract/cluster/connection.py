@@ -101,8 +101,8 @@ def _client(address: str, tls: Tls) -> Any:
         # Results come from the workers themselves where these can be reached, else through the scheduler.
         return Client(address, security=security, timeout=PATIENCE, set_as_default=False, direct_to_workers=True)
     except Exception as error:
-        reason = error.__cause__ or error
-        text = re.sub(r"in <[^>]*>: ", "", " ".join(str(reason).split())) or f"not within {PATIENCE:.0f} s"
+        said = [" ".join(str(each).split()) for each in (error.__cause__, error) if each is not None]
+        text = re.sub(r"in <[^>]*>: ", "", next(filter(None, said), f"not within {PATIENCE:.0f} s"))
         raise ConnectionError(f"--scheduler {address}: no Dask scheduler answers: {text[:200]}; {_ACCEPTED}") from None
 
 
@@ -110,7 +110,7 @@ async def _kind(address: str, arguments: Mapping[str, Any]) -> str:
     """What answers at an address, as it says."""
     from distributed import rpc
 
-    async with asyncio.timeout(PATIENCE), rpc(address, timeout=PATIENCE - 1, connection_args=arguments) as there:
+    async with asyncio.timeout(PATIENCE), rpc(address, timeout=PATIENCE / 2, connection_args=arguments) as there:
         return str((await there.identity()).get("type"))
 
 

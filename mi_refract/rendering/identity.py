@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_refract import backend
+from mi_refract.cluster import worker_facts
 from mi_refract.io.provenance import installed_version
 from mi_refract.plugins import scene_parser
 
@@ -39,6 +40,7 @@ def identity_of(scene: Path, defines: Mapping[str, str], seed: int, renderer: Pa
         "colours": renderer.colours,
         **{f"version of {name}": installed_version(name) for name in ("mi_refract", "mitsuba", "drjit")},
         "libLLVM": backend.llvm().library if llvm else "none",
+        "vector width": worker_facts.vector_width() if llvm else "none",
     }
 
 

@@ -29,7 +29,8 @@ def test_no_scheduler():
     began = time.monotonic()
     text = refusal(scheduler="tcp://127.0.0.1:9")
     assert time.monotonic() - began < 10
-    assert text.startswith("--scheduler tcp://127.0.0.1:9: no Dask scheduler answers: ") and "refused" in text
+    assert text.startswith("--scheduler tcp://127.0.0.1:9: no Dask scheduler answers: ")
+    assert "refused" in text or "Timed out trying to connect" in text  # the last attempt may be cut short
     assert "accepted: the address of a Dask scheduler" in text
 
 

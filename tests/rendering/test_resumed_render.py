@@ -192,6 +192,10 @@ def test_a_changed_scene_variant_or_version_is_refused_by_name(tmp_path, llvm, m
         patch.setattr(identity, "installed_version", lambda name: "0")
         with pytest.raises(ValueError, match=r"version of mitsuba was \S+, is 0"):
             rendering(output, scene=scene, spp=64)
+    with monkeypatch.context() as patch:
+        patch.setattr(identity.worker_facts, "vector_width", lambda: "64")
+        with pytest.raises(ValueError, match=r"vector width was \d+, is 64"):
+            rendering(output, scene=scene, spp=64)
     mi.set_variant("scalar_rgb")
     with pytest.raises(ValueError, match="variant was llvm_ad_rgb, is scalar_rgb"):
         rendering(output, scene=scene, spp=64)
