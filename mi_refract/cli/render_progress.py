@@ -40,16 +40,17 @@ def shown(console: Console, rendering: LongRender, preview: Path | None) -> Iter
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    moving = console.is_terminal and not console.is_dumb_terminal
+    with Progress(*columns, console=console, transient=True, disable=not moving) as bar:
         done = rendering.progress.done
         task = bar.add_task(printable(rendering.job.scene.name), total=rendering.spp, completed=done, said="first pass")
 
         def line(text: str) -> None:
             bar.update(task, completed=rendering.progress.done, said=text)
-            if not console.is_terminal and text:
+            if not moving and text:
                 print(printable(f"{rendering.output}: {text}"), file=sys.stderr, flush=True)
 
-        yield _Watch(line, preview, BETWEEN_LOOKS if console.is_terminal else BETWEEN_LINES, done)
+        yield _Watch(line, preview, BETWEEN_LOOKS if moving else BETWEEN_LINES, done)
 
 
 class _Watch:

@@ -29,10 +29,10 @@ def rendering(tmp_path, needs_variant):
     return make
 
 
-def run(render, preview=None, terminal=False):
-    """What was printed on the console's terminal."""
+def run(render, preview=None, terminal=""):
+    """What was printed on the console's terminal, of a kind."""
     text = io.StringIO()
-    console = Console(file=text, force_terminal=terminal, width=160)
+    console = Console(file=text, force_terminal=bool(terminal), width=160, _environ={"TERM": terminal})
     with render_progress.shown(console, render, preview) as watch:
         render.run(watch)
     return text.getvalue()
@@ -57,9 +57,15 @@ def test_few_lines(rendering, capsys):
 
 def test_a_bar_on_a_terminal(rendering, monkeypatch, capsys):
     monkeypatch.setattr(render_progress, "BETWEEN_LOOKS", 0.0)
-    shown = run(rendering(until=0.2, pass_spp=4), terminal=True)
+    shown = run(rendering(until=0.2, pass_spp=4), terminal="xterm")
     assert "sphere.xml" in shown and "spp" in shown and "error" in shown
     assert capsys.readouterr().err == ""
+
+
+def test_lines_on_a_terminal_that_cannot_move_its_cursor(rendering, monkeypatch, capsys):
+    monkeypatch.setattr(render_progress, "BETWEEN_LINES", 0.0)
+    run(rendering(spp=16, pass_spp=8), terminal="dumb")
+    assert len(capsys.readouterr().err.splitlines()) == 3
 
 
 def test_the_preview_is_the_image(rendering, tmp_path, monkeypatch):

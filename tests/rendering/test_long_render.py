@@ -163,7 +163,7 @@ def test_it_ends_after_its_time(tmp_path, llvm):
 
 
 def test_the_example_of_the_readme(tmp_path, monkeypatch):
-    (code,) = python_blocks(Path(long_render.__file__).with_name("README.md"))
+    *_, code = python_blocks(Path(long_render.__file__).with_name("README.md"))
     monkeypatch.chdir(ROOT)
     for old, new in (
         ('"nested.exr"', f'r"{tmp_path}/nested.exr"'),

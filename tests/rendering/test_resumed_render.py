@@ -141,8 +141,8 @@ def test_a_black_image_is_warned_of(tmp_path, llvm):
     sky = '<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"><film type="hdrfilm">'
     sky += '<integer name="width" value="8"/><integer name="height" value="8"/></film></sensor></scene>'
     (tmp_path / "dark.xml").write_text(sky)
-    render = LongRender(Job(tmp_path / "dark.xml"), tmp_path / "a.exr", Limits(until=0.1, seconds=0.5, pass_spp=1))
-    render.run()
+    render = LongRender(Job(tmp_path / "dark.xml"), tmp_path / "a.exr", Limits(until=0.1, pass_spp=1))
+    stopped_after(render, 9)
     assert "is black so far" in render.warnings[0]
 
 
