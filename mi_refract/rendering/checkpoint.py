@@ -19,10 +19,9 @@ import numpy as np
 from mi_refract.io.atomic import replacing
 
 from .identity import apart_from_passes, changed
-from .pass_sums import PassSums, PassTree
+from .pass_sums import ARRAYS, PassSums, PassTree
 
-FORMAT = 1
-_ARRAYS = ("total", "between", "within")
+FORMAT = 2
 # What NumPy, zipfile and json raise for a file with wrong bits; OSError: a seek to where it has nothing.
 _OF_PYTHON = (ValueError, LookupError, TypeError, AttributeError, RuntimeError, EOFError, OSError)
 _DAMAGE = (*_OF_PYTHON, zipfile.BadZipFile, zlib.error, struct.error)
@@ -85,7 +84,7 @@ def write(path: Path, progress: Progress) -> None:
     }
     arrays = {"header": np.frombuffer(json.dumps(header).encode(), np.uint8)}
     for name, sums in nodes.items():
-        for kind in _ARRAYS if sums is not None else ():
+        for kind in ARRAYS if sums is not None else ():
             if (array := getattr(sums, kind)) is not None:
                 arrays[f"{name}.{kind}"] = array
     with replacing(path) as temporary, temporary.open("wb") as file:
@@ -106,7 +105,7 @@ def read(path: Path, identity: dict[str, Any]) -> Progress:
                 raise ValueError(f"format {header['format']}")
             different = changed(apart_from_passes(header["identity"]), identity)
             nodes = {
-                name: PassSums(**figures, **{k: file[f"{name}.{k}"] for k in _ARRAYS if f"{name}.{k}" in file})
+                name: PassSums(**figures, **{k: file[f"{name}.{k}"] for k in ARRAYS if f"{name}.{k}" in file})
                 for name, figures in header["nodes"].items()
             }
             tree = PassTree()

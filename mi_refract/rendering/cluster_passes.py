@@ -248,8 +248,7 @@ class ClusterPasses:
 
     def _note(self, node: _Node, part: Part) -> None:
         self._pass_seconds.append(part.seconds / part.sums.passes)
-        arrays = (part.sums.total, part.sums.between, part.sums.within)
-        self.received += sum(array.nbytes for array in arrays if array is not None)
+        self.received += part.sums.nbytes
         for address, count in part.nonfinite.items():
             machine = self.workers.machines.get(address, address)
             if count and machine not in self._warned:

@@ -34,7 +34,7 @@ class RelativeError:
 
 def relative_error(sums: PassSums) -> RelativeError:
     """The error of an image over all its pixels that are finite."""
-    colours = sums.total[..., : sums.colours] / sums.spp
+    colours = sums.mean[..., : sums.colours]
     known = np.isfinite(colours)
     mean = abs(float(colours[known].mean())) if known.any() else math.nan
     found = np.asarray([each for each in sums.contrasts if math.isfinite(each)])
@@ -73,7 +73,7 @@ def worst_tile(sums: PassSums) -> float:
     if variance is None:
         return math.nan
     squared = _tile_means(variance[..., : sums.colours] / sums.spp)
-    means = np.abs(_tile_means(sums.total[..., : sums.colours] / sums.spp))
+    means = np.abs(_tile_means(sums.mean[..., : sums.colours]))
     if not (size := float(np.nanmean(means)) if np.isfinite(means).any() else 0.0) > 0:
         return math.nan
     return float(np.nanquantile(np.sqrt(squared) / np.maximum(means, DARK * size), 1 - LEFT_OUT, method="higher"))

@@ -33,6 +33,7 @@ from .scene_files import formulas_in, load_scene, naming
 
 NO_NOISE = "no noise: the samples of every pixel agree"
 ENOUGH_FOR_NO_NOISE = 64  # samples per pixel
+SAME = 5e-13  # of a pixel's mean, the standard deviation of samples that are equal but for the rounding of sums
 BETWEEN_CHECKPOINTS = (
     20.0  # seconds: with the pass that a kill interrupts at most 30 are lost, if a pass takes up to 10
 )
@@ -354,10 +355,14 @@ def _stamps(*paths: Path) -> list[tuple[int, int] | None]:
 
 
 def _without_noise(sums: PassSums) -> bool:
-    """Whether all samples of each pixel are the same, and none is black: there light may be that is seldom met."""
-    if sums.spp < ENOUGH_FOR_NO_NOISE or (variance := sums.variance) is None or variance.any():
+    """Whether all samples of each pixel are the same, and none is black: there light may be that is seldom met.
+
+    Sums in float64 differ from equal ones by less than SAME; one sample of n ≤ 2³², by float32's 6e-8/√n ≥ 9e-13.
+    """
+    if sums.spp < ENOUGH_FOR_NO_NOISE or (variance := sums.variance) is None:
         return False
-    return bool((np.isfinite(sums.total) & (sums.total != 0)).all())
+    mean = sums.mean
+    return bool((np.isfinite(mean) & (mean != 0) & (variance <= np.square(SAME * mean))).all())
 
 
 def lock_of(output: Path) -> Path:

@@ -7,6 +7,7 @@ they are added from the left. Whoever adds which nodes where, the bits of the re
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,18 +15,20 @@ from numpy.typing import NDArray
 from .pass_plan import FEW
 
 ARITY = 8
+ARRAYS = ("total", "between", "within", "weights")  # of `PassSums`
 _PIECE = 2**15  # values that are added at a time: what is needed of them stays in the cache
 Doubles = NDArray[np.float64]
 
 
 @dataclass
 class PassSums:
-    """Sums over some passes in a row, H × W × C each.
+    """Sums over some passes in a row, H × W × C each. A pixel's mean is Σ w v / Σ w over the samples v that reach it.
 
-    `total`: Σ nᵢ xᵢ, for passes of nᵢ samples per pixel and mean xᵢ. `between`: Σ nᵢ (xᵢ − x)², their spread.
-    `within`: Σ of (v − xᵢ)² over the samples v of every pass; None where unknown, or where FEW passes make it needless.
-    `contrasts`: one less than passes, independent estimates of a sample's variance, each a mean over all pixels: that
-    of what `between` grew by, in the first `colours` channels.
+    `total`: Σ w v. `weights`: Σ w, H × W × 1, in units in which `spp` of it are expected; None: it is `spp`.
+    `between`: one less than passes, estimates of a sample's variance, summed: Σ nᵢ (xᵢ − x)² without weights.
+    `within`: Σ of (w (v − xᵢ))² over the samples of every pass, where xᵢ is the pass's mean; None where unknown, or
+    where FEW passes make it needless.
+    `contrasts`: these estimates once more, each as its mean over all pixels, in the first `colours` channels.
     """
 
     spp: int
@@ -33,20 +36,28 @@ class PassSums:
     total: Doubles
     between: Doubles
     within: Doubles | None = None
+    weights: Doubles | None = None
     contrasts: list[float] = field(default_factory=list)
     colours: int = 3
 
     def copy(self) -> PassSums:
         """The same, in memory of its own."""
-        within = None if self.within is None else self.within.copy()
-        return replace(
-            self, total=self.total.copy(), between=self.between.copy(), within=within, contrasts=list(self.contrasts)
-        )
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in ARRAYS}
+        arrays = {name: None if array is None else array.copy() for name, array in arrays.items()}
+        return replace(self, contrasts=list(self.contrasts), **arrays)
+
+    @property
+    def nbytes(self) -> int:
+        """Of its arrays."""
+        arrays = (getattr(self, name) for name in ARRAYS)
+        return sum(array.nbytes for array in arrays if array is not None)
 
     @property
     def mean(self) -> Doubles:
-        """The image."""
-        return np.asarray(self.total / self.spp)
+        """The image; 0 where no sample has reached a pixel."""
+        if self.weights is None:
+            return np.asarray(self.total / self.spp)
+        return np.divide(self.total, self.weights, out=np.zeros_like(self.total), where=self.weights != 0)
 
     @property
     def freedom(self) -> int:
@@ -55,42 +66,65 @@ class PassSums:
 
     @property
     def variance(self) -> Doubles | None:
-        """The variance of one sample per pixel, from the samples or from the spread of passes; None where unknown."""
+        """`spp` times that of the mean, from the samples or from the spread of passes; None where unknown."""
         if not self.freedom:
             return None
-        if self.within is not None:
-            return np.asarray((self.within + self.between) / self.freedom)
-        return self.between / self.freedom
+        found = (self.between if self.within is None else self.within + self.between) / self.freedom
+        if self.weights is not None:
+            share = np.divide(self.spp, self.weights, out=np.zeros_like(self.weights), where=self.weights != 0)
+            found *= np.square(share)
+        return np.asarray(found)
 
     def add(self, other: PassSums) -> None:
-        """Take in the sums of the passes that follow.
+        """Take in the sums of the passes that follow: m + n samples per pixel then, with totals a, c and weights u, v.
 
-        With m and n samples per pixel and means x and y the spread grows by (x − y)² mn/(m + n) (Chan et al. 1979),
-        which is exactly 0 where all samples are equal.
+        The next estimate of a sample's variance is  (av − cu)²/(u + v)² (m + n)/(mn) , the squared difference of the
+        totals less the part that their weights explain. Without weights it is (x − y)² mn/(m + n), of the means x and y
+        (Chan et al. 1979), and exactly 0 where all samples are equal.
         """
-        m, n = self.spp, other.spp
-        factor, channels = m * n / (m + n), self.total.shape[-1]
+        channels, count = self.total.shape[-1], 1 / self.spp + 1 / other.spp
         a, b, c, d = (each.reshape(-1, channels) for each in (self.total, self.between, other.total, other.between))
-        sums, count, rows = 0.0, 0, max(1, _PIECE // channels)
-        with np.errstate(invalid="ignore", over="ignore"):
+        growth, known, rows = 0.0, 0, max(1, _PIECE // channels)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             for i in range(0, len(a), rows):
                 piece = slice(i, i + rows)
-                apart = a[piece] / m
-                apart -= c[piece] / n
+                u, v = self._weights_of(piece), other._weights_of(piece)
+                apart = a[piece] * v
+                apart -= c[piece] * u
+                apart /= _not_zero(u + v)
                 apart *= apart
-                apart *= factor
+                apart *= count
                 b[piece] += d[piece]
                 b[piece] += apart
                 a[piece] += c[piece]
-                known = np.isfinite(colours := apart[:, : self.colours])
-                sums, count = sums + float(colours[known].sum()), count + int(known.sum())
-        self.contrasts = [*self.contrasts, *other.contrasts, sums / count if count else np.nan]
+                finite = np.isfinite(colours := apart[:, : self.colours])
+                growth, known = growth + float(colours[finite].sum()), known + int(finite.sum())
+        self.contrasts = [*self.contrasts, *other.contrasts, growth / known if known else np.nan]
+        self._add_counts(other)
+
+    def _weights_of(self, piece: slice) -> Any:
+        """Of some pixels, once for each channel; one number where it is that of all."""
+        if self.weights is None:
+            return float(self.spp)
+        return np.repeat(self.weights.reshape(-1, 1)[piece], self.total.shape[-1], 1)
+
+    def _add_counts(self, other: PassSums) -> None:
+        if self.weights is not None or other.weights is not None:  # one of them may come from a finished image
+            ours, theirs = (each.spp if each.weights is None else each.weights for each in (self, other))
+            self.weights = np.asarray(ours + theirs)
         self.passes += other.passes
-        self.spp += n
+        self.spp += other.spp
         if self.within is None or other.within is None or self.passes >= FEW:
             self.within = None
         else:
             self.within = self.within + other.within
+
+
+def _not_zero(weights: Any) -> Any:
+    """1 in place of 0: no sample has reached such a pixel, and its totals are 0 as well."""
+    if isinstance(weights, np.ndarray):
+        weights[weights == 0] = 1
+    return weights
 
 
 class PassTree:

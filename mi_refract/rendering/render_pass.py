@@ -3,6 +3,8 @@
 Mitsuba adds samples to the film in the order in which threads come by, and the last bits of an image change with it.
 Here the samples of the JIT variants are kept, and each pixel is summed by one lane, from its first sample to its last,
 in float64. Under a filter w that is wider than a pixel, a pixel is Σ w v / Σ w over the samples of its neighbours, too.
+The two sums are kept apart: the mean of such quotients over passes would be biased, by 2 % of a pixel beside a bright
+edge in passes of 4 samples.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from .pass_plan import FEW, scalar_seed_of, seed_of
-from .pass_sums import PassSums
+from .pass_sums import Doubles, PassSums
 
 # One thread would be the caller's own, which keeps denormals: the others take them for 0, and bits would differ.
 LEAST_THREADS = 2
@@ -34,6 +36,7 @@ class PassRenderer:
     channels: tuple[str, ...]
     moments: bool  # whether samples can be kept: then second moments are known, too
     few: bool = True  # whether they are needed of more than the first pass
+    expected: Doubles | None = None  # Σ w of one sample in each pixel, H × W × 1, where the filter is no box
 
     @property
     def size(self) -> tuple[int, int]:
@@ -63,16 +66,20 @@ class PassRenderer:
 
     def render(self, number: int, spp: int) -> PassSums:
         """Pass `number`. The scene's own errors pass; InterruptedError where Mitsuba stopped before the last sample."""
+        within = None
         with _quiet():
             if self.moments:
-                seed = seed_of(self.seed, number)
-                mean, within = _pixels(
-                    self.scene, self.channels, spp, seed, squares=number == 0 or (self.few and number < FEW - 1)
+                squares = number == 0 or (self.few and number < FEW - 1)
+                total, weights, within = _sums(
+                    self.scene, self.channels, spp, seed_of(self.seed, number), squares=squares
                 )
             else:
-                mean, within = _rendered(self.scene, spp, self._seed_without_samples(number)), None
-        mean = mean.reshape(self.size[1], self.size[0], len(self.channels)).astype(np.float64)
-        return PassSums(spp, 1, mean * spp, np.zeros_like(mean), within, colours=self.colours)
+                total, weights = _rendered(self.scene, spp, self._seed_without_samples(number))
+        if self.expected is None or weights is None:
+            return PassSums(spp, 1, total, np.zeros_like(total), within, colours=self.colours)
+        total, weights = total / self.expected, weights / self.expected
+        within = None if within is None else within / np.square(self.expected)
+        return PassSums(spp, 1, total, np.zeros_like(total), within, weights, colours=self.colours)
 
 
 def pass_renderer(scene: Any, seed: int) -> PassRenderer:
@@ -80,7 +87,28 @@ def pass_renderer(scene: Any, seed: int) -> PassRenderer:
     film, integrator = scene.sensors()[0].film(), scene.integrator()
     film.prepare(integrator.aov_names())
     channels = tuple(str(field.name) for field in film.bitmap().struct_())
-    return PassRenderer(scene, seed, channels, _keeps_samples(scene))
+    return PassRenderer(scene, seed, channels, _keeps_samples(scene), expected=_expected_weights(film))
+
+
+def _expected_weights(film: Any) -> Doubles | None:
+    """∫ w over all places of samples, for each pixel, H × W × 1; None for a box. Filters are products of two in 1D."""
+    rfilter = film.rfilter()
+    if rfilter.is_box_filter():
+        return None
+    step = 1 / 256  # of a pixel
+    half = math.ceil(rfilter.radius() / step)
+    places = (np.arange(-half, half) + 0.5) * step
+    found = rfilter.eval(mi.Float(places)) if dr.is_jit_v(mi.Float) else [rfilter.eval(place) for place in places]
+    weights = np.where(np.abs(places) <= rfilter.radius(), np.array(found, np.float64), 0)
+    ends, sums = np.arange(-half, half + 1) * step, np.cumsum([0, *weights]) * step
+
+    def along(pixels: int) -> Doubles:
+        middle = np.arange(pixels) + 0.5
+        border = half if film.sample_border() else 0
+        return np.asarray(np.interp(pixels + border - middle, ends, sums) - np.interp(-border - middle, ends, sums))
+
+    width, height = (int(n) for n in film.crop_size())
+    return np.asarray(along(height)[:, None, None] * along(width)[:, None])
 
 
 def _keeps_samples(scene: Any) -> bool:
@@ -103,9 +131,10 @@ def _quiet() -> Iterator[None]:
         logger.set_log_level(before)
 
 
-def _rendered(scene: Any, spp: int, seed: int) -> np.ndarray:
-    """By `mi.render`; by one thread where it would add in the order of threads."""
-    box = scene.sensors()[0].film().rfilter().is_box_filter()
+def _rendered(scene: Any, spp: int, seed: int) -> tuple[Doubles, Doubles | None]:
+    """`total` and `weights` by `mi.render`; by one thread where it would add in the order of threads."""
+    film = scene.sensors()[0].film()
+    box = film.rfilter().is_box_filter()
     threads = dr.thread_count()
     one = dr.is_jit_v(mi.Float) or not box
     if one:
@@ -114,17 +143,26 @@ def _rendered(scene: Any, spp: int, seed: int) -> np.ndarray:
         mi.render(scene, spp=spp, seed=seed)
         if scene.integrator().should_stop():  # by its `timeout`, or a signal that Mitsuba has taken
             raise InterruptedError("the rendering was stopped before its last sample")
-        return np.array(scene.sensors()[0].film().bitmap())  # what `aov` returns has fewer channels
     finally:
         if one:
             dr.set_thread_count(threads)
+    mean = np.array(film.bitmap(), np.float64)  # what `aov` returns has fewer channels
+    mean = mean.reshape(*mean.shape[:2], -1)
+    raw = film.bitmap(raw=True)
+    names = [field.name for field in raw.struct_()]
+    if box or "W" not in names or not isinstance(scene.integrator(), mi.SamplingIntegrator):
+        return mean * spp, None
+    weights = np.array(raw, np.float64)[..., names.index("W"), None]
+    return mean * weights, weights
 
 
 # Samples ------------------------------------------------------------------------------------------------------------
 
 
-def _pixels(scene: Any, channels: tuple[str, ...], spp: int, seed: int, *, squares: bool) -> tuple[Any, Any]:
-    """Means of all pixels and, for `squares`, Σ (v − mean)² over their samples, H × W × C."""
+def _sums(
+    scene: Any, channels: tuple[str, ...], spp: int, seed: int, *, squares: bool
+) -> tuple[Doubles, Doubles | None, Doubles | None]:
+    """Σ w v of all pixels, H × W × C; Σ w, None under a box; for `squares` Σ (w (v − mean))² over the samples."""
     sensors_film = scene.sensors()[0].film()
     rfilter = sensors_film.rfilter()
     width, height = (int(n) for n in sensors_film.crop_size())
@@ -133,14 +171,16 @@ def _pixels(scene: Any, channels: tuple[str, ...], spp: int, seed: int, *, squar
         dr.set_thread_count(LEAST_THREADS)
     with dr.suspend_grad():
         values, place = _samples(scene, channels, spp, seed)
-        means, weights = _weighted_means(values, place, film)
-        dr.eval(means)
-        spreads = _squared_sums(values, place, means, film) if squares else []
-        within = [spread * dr.square(spp / weights) for spread in spreads]
+        *totals, weights = _weighted_sums(values, place, film)
+        # Rounded: the spread of equal samples is exactly 0 then.
+        means = [mi.Float(dr.select(weights == 0, 0, total / weights)) for total in totals]
+        within = _squared_sums(values, place, means, film) if squares else []
         dr.eval(within)
-    shape = (height, width, len(channels))
-    found = [np.stack([np.array(v) for v in each], -1).reshape(shape) if each else None for each in (means, within)]
-    return found[0], found[1]
+
+    def array(values: list[Any]) -> Doubles:
+        return np.stack([np.array(each) for each in values], -1).reshape(height, width, len(values))
+
+    return array(totals), None if film.rfilter is None else array([weights]), array(within) if squares else None
 
 
 def _samples(scene: Any, channels: tuple[str, ...], spp: int, seed: int) -> tuple[list[Any], Any]:
@@ -210,8 +250,8 @@ class _Film:
         return dr.select(near, self.rfilter.eval(apart), 0)
 
 
-def _weighted_means(values: list[Any], place: Any, film: _Film) -> tuple[list[Any], Any]:
-    """Of every pixel Σ w v / Σ w by channels, and Σ w, over the samples that reach it, always added in the same order.
+def _weighted_sums(values: list[Any], place: Any, film: _Film) -> list[Any]:
+    """Of every pixel Σ w v by channels, and Σ w, over the samples that reach it, always added in the same order.
 
     For each row of neighbours every pixel adds up its own samples with the weights that they have in each of them.
     """
@@ -224,8 +264,7 @@ def _weighted_means(values: list[Any], place: Any, film: _Film) -> tuple[list[An
             inside, source = film.at(x - i, y - j)
             totals = [t + dr.gather(mi.Float64, each, source, inside) for t, each in zip(totals, sums, strict=True)]
         dr.eval(totals)
-    *sums, weights = totals
-    return [mi.Float(each / weights) for each in sums], weights
+    return totals
 
 
 @dr.syntax

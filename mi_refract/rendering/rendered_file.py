@@ -78,9 +78,10 @@ def read(output: Path, channels: tuple[str, ...], identity: dict[str, Any]) -> P
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
     variance = np.broadcast_to(variance.astype(np.float64), mean.shape)
-    # Their sum over freedom is the variance that the file holds.
+    # Their sum over freedom is the variance that the file holds; under a wide filter a pixel has the expected weight.
     within = variance * (spp - passes) if said["variance_from"] == "samples" and passes < FEW else None
-    sums = PassSums(spp, passes, mean * spp, variance * (passes - 1), within, contrasts, int(identity["colours"]))
+    sums = PassSums(spp, passes, mean * spp, variance * (passes - 1), within)
+    sums.contrasts, sums.colours = contrasts, int(identity["colours"])
     machines = [name for name in str(said["machines"]).split(", ") if name]
     seconds = float(said["render_seconds"])
     return Progress(identity, base=sums, seconds=seconds, machines=machines, base_ended_by=str(said["ended_by"]))

@@ -52,6 +52,33 @@ def test_so_it_is_for_other_filters_and_films(tmp_path, llvm, rfilter, pixel_for
     np.testing.assert_allclose(pass_renderer(scene, 3).render(0, 13).mean, by_mitsuba(scene, 0, 13), **CLOSE)
 
 
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"])
+@pytest.mark.parametrize("rfilter", ["gaussian", "lanczos"])
+def test_a_wide_filters_sums_are_those_of_mitsubas_film(tmp_path, needs_variant, variant, rfilter):
+    """Totals and weights apart: a mean over passes of their quotients would be biased."""
+    needs_variant(variant)
+    mi.set_variant(variant)
+    scene = scene_of(tmp_path, rfilter)
+    renderer = pass_renderer(scene, 3)
+    sums = renderer.render(0, 2)
+    mi.render(scene, spp=2, seed=seed_of(3, 0) if renderer.moments else scalar_seed_of(3, 0, 256))
+    raw = np.array(scene.sensors()[0].film().bitmap(raw=True))
+    assert raw.shape == (16, 16, 4) and np.ptp(raw[..., 3]) > 1
+    np.testing.assert_allclose(sums.total * renderer.expected, raw[..., :3], **CLOSE)
+    np.testing.assert_allclose(sums.weights * renderer.expected, raw[..., 3:], **CLOSE)
+
+
+@pytest.mark.parametrize("rfilter", ["gaussian", "lanczos", "tent"])
+def test_the_weights_of_a_wide_filter_are_those_expected(tmp_path, llvm, rfilter):
+    """On average they are spp in every pixel, also at the border, which fewer samples reach."""
+    renderer = pass_renderer(scene_of(tmp_path, rfilter), 3)
+    found = np.array([renderer.render(number, 4).weights for number in range(64)])
+    error = found.std(0, ddof=1) / 8
+    # Of 256 means, with the standard error from 64 values: beyond 6 of them less than once in 1e4 runs.
+    assert np.all(np.abs(found.mean(0) - 4) < 6 * error) and error.max() < 0.2
+    assert np.ptp(renderer.expected) > 0.1
+
+
 def test_so_it_is_for_outputs_beside_colours_and_a_cropped_film(tmp_path, llvm):
     text = (SCENES / "sphere.xml").read_text()
     crop = '<integer name="crop_width" value="7"/><integer name="crop_height" value="5"/>'
@@ -140,11 +167,11 @@ def test_equal_samples_have_no_second_moment(tmp_path, llvm):
 def test_scalar_variants_render_by_mitsuba(tmp_path):
     mi.set_variant("scalar_rgb")
     renderer = pass_renderer(scene_of(tmp_path, "gaussian"), 3)
-    one, two = (renderer.render(2, 4).total for _ in range(2))
-    np.testing.assert_array_equal(one, two)
+    one, two = (renderer.render(2, 4) for _ in range(2))
+    np.testing.assert_array_equal(one.total, two.total)
     assert not renderer.moments and renderer.colours == 3
     expected = np.array(mi.render(renderer.scene, spp=4, seed=scalar_seed_of(3, 2, 256)))
-    np.testing.assert_allclose(one / 4, expected, **CLOSE)
+    np.testing.assert_allclose(one.mean, expected, **CLOSE)
 
 
 def test_passes_of_scalar_variants_share_no_random_numbers(tmp_path):

@@ -226,7 +226,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path, llvm, damage):
         "flipped": content[:1500] + bytes([content[1500] ^ 1]) + content[1501:],
         "empty": b"",
         "text": b"hello",
-        "another format": content.replace(b'"format": 1', b'"format": 2'),
+        "another format": content.replace(b'"format": %d' % checkpoint.FORMAT, b'"format": 99'),
     }
     path.write_bytes(damaged[damage])
     with pytest.raises(ValueError, match=r"a\.exr\.checkpoint: is no complete checkpoint .*--restart") as error:
