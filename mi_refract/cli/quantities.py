@@ -7,18 +7,21 @@ import re
 
 from mi_refract.rendering.error_estimate import RelativeError
 
+PLAIN = 0.1  # the largest share that is understood without a percent sign
 _SECONDS = {"d": 86400.0, "h": 3600.0, "m": 60.0, "s": 1.0}
 
 
 def parse_share(text: str, option: str) -> float:
-    """`1%` or `0.01`, of 100 % at most. ValueError for anything else."""
+    """`1%` or `0.01`, of 100 % at most. ValueError for anything else, also for `1` and `0.5`: is that 0.5 % or 50 %?"""
     number, percent = (text[:-1], True) if text.endswith("%") else (text, False)
     try:
         value = float(number) / (100 if percent else 1)
     except ValueError:
         value = 0.0
-    if not 0 < value <= 1:
-        raise ValueError(f"{option} {text}: accepted: more than 0 %, up to 100 %, such as 1% or 0.01")
+    if not 0 < value <= (1 if percent else PLAIN):
+        raise ValueError(
+            f"{option} {text}: accepted: more than 0 %, up to 100 %, such as 1% or 0.01 (up to {PLAIN} without %)"
+        )
     return value
 
 

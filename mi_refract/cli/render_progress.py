@@ -25,7 +25,8 @@ if TYPE_CHECKING:  # it imports Mitsuba
     from mi_refract.rendering.long_render import LongRender
 
 BETWEEN_LINES = 30.0  # seconds, where there is no terminal
-BETWEEN_LOOKS = 2.0  # seconds between two estimates of the error for the bar
+BETWEEN_LOOKS = 2.0  # seconds between two estimates of the error for the bar, at least
+LOOK_COST = 50.0  # times what an estimate takes is the least time between two
 BETWEEN_PREVIEWS = 10.0  # seconds
 
 
@@ -50,7 +51,11 @@ def shown(console: Console, rendering: LongRender, preview: Path | None) -> Iter
             if not moving and text:
                 print(printable(f"{rendering.output}: {text}"), file=sys.stderr, flush=True)
 
-        yield _Watch(line, preview, BETWEEN_LOOKS if moving else BETWEEN_LINES, done)
+        watch = _Watch(line, preview, BETWEEN_LOOKS if moving else BETWEEN_LINES, done)
+        try:
+            yield watch
+        finally:
+            watch.warn(rendering)  # also of the last checkpoint, after an error
 
 
 class _Watch:
@@ -64,11 +69,16 @@ class _Watch:
     def __call__(self, rendering: LongRender) -> None:
         now = time.monotonic()
         if now - self.last_line >= self.between_lines:
-            self.last_line = now
             self.line(self._said(rendering, now))
+            self.last_line = time.monotonic()
+            self.between_lines = max(self.between_lines, LOOK_COST * (self.last_line - now))
         if self.preview is not None and now - self.last_preview >= BETWEEN_PREVIEWS:
             self.last_preview = now
             write_preview(self.preview, rendering)
+        self.warn(rendering)
+
+    def warn(self, rendering: LongRender) -> None:
+        """Print the warnings that are new."""
         for warning in rendering.warnings[self.warned :]:
             print(printable(f"mi-refract: {warning}"), file=sys.stderr, flush=True)
         self.warned = len(rendering.warnings)
@@ -80,13 +90,15 @@ class _Watch:
         rate = (done - self.done) / (now - self.began)  # spp a second
         parts.append(f"{rate * width * height / 1e6:.3g} M samples/s")
         error = rendering.error()
-        wanted: list[float] = [rendering.spp] if rendering.spp else []
+        left = [(rendering.spp - done) / rate] if rendering.spp and rate else []
         if error is not None and math.isfinite(error.value):
-            if until := rendering.limits.until:
-                wanted.append(done * (error.value / until) ** 2)
+            if (until := rendering.limits.until) and rate and math.isfinite(error.high):
+                left.append(done * ((error.high / until) ** 2 - 1) / rate)
             parts.append(f"error {shown_error(error)}")
-        if wanted and rate:
-            parts.append(f"{max(0, min(wanted) - done) / rate:.0f} s left")
+        if rendering.limits.seconds:
+            left.append(rendering.limits.seconds - (now - self.began))
+        if left:
+            parts.append(f"{max(0.0, min(left)):.0f} s left")
         return ", ".join(parts)
 
 

@@ -26,7 +26,7 @@ def facts(variant: str) -> dict[str, str]:
     family = variant.partition("_")[0]
     here = backend.detect()[family]
     found = {name: installed_version(name) for name in ("mitsuba", "drjit")}
-    found |= {"mi_refract": f"{installed_version('mi-refract')} ({_source()})"}
+    found |= {"mi_refract": our_version()}
     found |= {"Python": ".".join(platform.python_version_tuple()[:2]), "processor": platform.machine()}
     found[UNUSABLE] = "" if here.usable else f"{variant}: {here.reason}"
     if family == "llvm" and here.usable:
@@ -48,12 +48,13 @@ def vector_width() -> str:
     return str(width())
 
 
-def _source() -> str:
-    """A short digest of the package's source: between two releases the version stays the same."""
+@functools.cache
+def our_version() -> str:
+    """With a short digest of the package's source: between two releases the version stays the same."""
     package, digest = Path(__file__).parents[1], hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         digest.update(str(path.relative_to(package)).encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:8]
+    return f"{installed_version('mi-refract')} ({digest.hexdigest()[:8]})"
 
 
 def differences(there: Mapping[str, str], here: Mapping[str, str], tolerated: Collection[str] = ()) -> list[str]:

@@ -5,8 +5,9 @@ from the spread between passes is that of the filtered pixel then, and a tile's 
 the sum of these variances says, over the correlations ρₕ of pixels at every distance h.
 
 The differences d of two images that are equal but for noise have the same correlations: with
-γₕ = Σ (d(x + h) − d(x))², ρₕ = 1 − γₕ/γ∞. A true difference that is smooth cancels in γₕ; one that is not is in all of
-them alike.
+γₕ = Σ (d(x + h) − d(x))², ρₕ = 1 − γₕ/γ∞. A true difference that is smooth cancels in γₕ. One that repeats itself
+every few pixels may make F up to ten times as large, and is detected then from √F times its size on. Under a box
+filter pixels are independent, and F is not asked for.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 A variance is that of one sample per pixel, as Mitsuba's test data and its `moment` integrator have it; that of the
 image follows by dividing by the samples per pixel. Its degrees of freedom are the samples per pixel − 1, unless the
-header says otherwise: where it was estimated from the spread between a few passes they are passes − 1.
+header says otherwise: where it was estimated from the spread between a few passes they are passes − 1. Samples are
+independent, but pixels of a file of `mi-refract render` are not, under a filter wider than a box.
 """
 
 from __future__ import annotations
@@ -26,29 +27,26 @@ from .channels import ROUNDED, XYZ, matched, means, selected, spreads
 NEGATIVE = 4 * ROUNDED
 SPP = "mi_refract:spp"  # of a header
 FREEDOM = "mi_refract:variance_freedom"  # of a header
+FILTER = "mi_refract:filter_radius"  # of a header, in pixels: then variances are those of filtered pixels
 
 
 @dataclass(frozen=True)
 class Estimate:
     """An image without channels of variance, and `variance`: H × W × C of one sample per pixel; NaN where unknown.
 
-    `freedom`: degrees of freedom of these variances.
+    `freedom`: degrees of freedom of these variances. `filtered`: whether they are those of pixels that share samples.
     """
 
     image: Image
     variance: Pixels
     spp: int
     freedom: int
+    filtered: bool
 
     @property
     def known(self) -> NDArray[np.bool_]:
         """Of every channel, whether its variance is known."""
         return np.asarray(np.isfinite(self.variance).all((0, 1)))
-
-    @property
-    def of_passes(self) -> bool:
-        """Whether the variance was estimated from the spread between passes of several samples a pixel."""
-        return self.freedom < self.spp - 1
 
 
 def has_variance(image: Image) -> bool:
@@ -78,7 +76,8 @@ def with_file(image: Image, path: Path, most: int = MAX_VALUES) -> Image:
         (height, width), wrong = image.pixels.shape[:2], found.pixels.shape[:2]
         raise ValueError(f"{path}: {wrong[1]} × {wrong[0]}; accepted: a variance of {width} × {height}")
     if FREEDOM in found.metadata:
-        image = replace(image, metadata=image.metadata | {FREEDOM: _freedom(found)})
+        said = {FREEDOM: _freedom(found), FILTER: found.metadata.get(FILTER, "")}
+        image = replace(image, metadata=image.metadata | said)
     if len(found.channels) == len(image.channels) == 1:
         return replace(image, variances={image.channels[0]: found.pixels[..., 0]})
     both = [name for name in found.channels if name in image.channels]
@@ -133,7 +132,7 @@ def _estimate(image: Image, side: str, given: int, allow_nonfinite: bool) -> Est
             variance[..., i] = np.maximum(mean[..., i] * (1 - mean[..., i]), 0) * spp / (spp - 1)
     bare = replace(image, pixels=image.select(names), channels=tuple(names), variances={})
     freedom = _freedom(image) if FREEDOM in image.metadata and (image.variances or pairs) else spp - 1
-    return Estimate(bare, variance, spp, freedom)
+    return Estimate(bare, variance, spp, freedom, _is_filtered(image, freedom < spp - 1))
 
 
 def _spp(image: Image, side: str, given: int) -> int:
@@ -151,6 +150,12 @@ def _freedom(image: Image) -> int:
     if not re.fullmatch(r"[0-9]{1,15}(\.0)?", text := str(found)) or float(text) < 1:
         raise ValueError(f"{image.path}: {FREEDOM} = {shown(found)}; accepted: a whole number, 1 to 10¹⁵")
     return int(float(text))
+
+
+def _is_filtered(image: Image, of_passes: bool) -> bool:
+    """Whether neighbours share samples, as the header says; where it does not they may, if passes were compared."""
+    found = str(image.metadata.get(FILTER, ""))
+    return float(found) > 0.5 if re.fullmatch(r"[0-9]{1,6}(\.[0-9]{1,15})?", found) else of_passes
 
 
 def _not_negative(image: Image, name: str) -> Pixels:

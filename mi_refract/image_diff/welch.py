@@ -142,9 +142,9 @@ def _of_estimates(a: Estimate, b: Estimate, tile: int) -> _Sides:
     odds = np.where(only_one, 1 + (a.spp - 1) / b.spp, np.where(only_two, 1 + (b.spp - 1) / a.spp, 7.0))
     # A variance that carries both means' is as well known as the side that knows it does; the other one's is 0 there.
     one, two = from_variances(m1, w1, a.freedom, tile), from_variances(m2, w2, b.freedom, tile)
-    found = inflation(m2 - m1, w1 + w2, tile) if a.of_passes or b.of_passes else Inflation()
-    one = replace(one, borrowed=only_two, correlated=found if a.of_passes else Inflation())
-    two = replace(two, borrowed=only_one, correlated=found if b.of_passes else Inflation())
+    found = inflation(m2 - m1, w1 + w2, tile) if a.filtered or b.filtered else Inflation()
+    one = replace(one, borrowed=only_two, correlated=found if a.filtered else Inflation())
+    two = replace(two, borrowed=only_one, correlated=found if b.filtered else Inflation())
     return _Sides(one, two, sums(m1, w1, m2, w2, tile), names, odds)
 
 

@@ -7,6 +7,7 @@ who that is, and is removed at the end.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import json
 import os
@@ -14,6 +15,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+_NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
 _SAID = 1000  # bytes that are read of a lock file, which may be anything
 
 
@@ -22,8 +24,8 @@ def held(path: Path, what: str, place: Path | None = None, accepted: str = "anot
     """Hold the lock file `path` for the time of a `with` block.
 
     BlockingIOError, at once and in one line, where another process holds it: `what` runs at the `place`, by default the
-    folder of the lock file, who runs it, and since when. OSError
-    where the file cannot be made. A file that a killed process left is taken over.
+    folder of the lock file, who runs it, and since when. OSError where the file cannot be made. A file that a killed
+    process left is taken over. Where the file system has no locks, as some networks', nobody is kept out.
     """
     file = _locked(path)
     if file is None:
@@ -50,7 +52,9 @@ def _locked(path: Path) -> int | None:
         except BlockingIOError:
             os.close(file)
             return None
-        except OSError:
+        except OSError as error:
+            if error.errno in _NO_LOCKS:
+                return file
             os.close(file)
             raise
         if is_at(file, path):

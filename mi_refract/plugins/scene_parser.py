@@ -8,6 +8,7 @@ is an error, unless it is allowed by name.
 from __future__ import annotations
 
 import contextlib
+import glob
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -84,15 +85,24 @@ class SceneFiles:
     others: dict[str, Path]
 
 
-def files_of(path: Path, defines: Mapping[str, str]) -> SceneFiles:
-    """The files that a scene names and that are there, in the present variant. Errors: those of `parse`."""
+def files_of(path: Path, defines: Mapping[str, str], allowed: Collection[str] = ()) -> SceneFiles:
+    """The files that a scene names and that are there, in the present variant; and those of `allowed` plugins.
+
+    Errors: those of `parse`.
+    """
     config = mi.parser.ParserConfig(str(mi.variant()))
     with folders(path.parent) as inside:
         walk = check_files(path, map(Path, map(str, inside)), defines)
         state = parse(path, config, defines)
         places = [path.parent, *(Path(str(folder)) for folder in inside)]
         named = {name: resolved(name, places) for node in state.nodes for name in _texts(node.props)}
-    others = {name: file for name, file in (walk.opened | named).items() if name and file.is_file()}
+    code = {
+        f"plugins/{file.name}": file
+        for place in reversed(places)  # Mitsuba takes the first that it finds
+        for name in allowed
+        for file in (place / "plugins").glob(f"{glob.escape(name)}.*")
+    }
+    others = {name: file for name, file in (walk.opened | named | code).items() if name and file.is_file()}
     return SceneFiles(tuple(dict.fromkeys(walk.xml)), dict(sorted(others.items())))
 
 

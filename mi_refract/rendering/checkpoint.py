@@ -72,7 +72,9 @@ def path_of(output: Path) -> Path:
 
 def write(path: Path, progress: Progress) -> None:
     """Replace the file, complete or not at all. OSError as the system raises it; the old one stays then."""
-    nodes = {"base": progress.base} | {f"level{i}": sums for i, sums in enumerate(progress.tree.levels)}
+    nodes = {"base": progress.base, "rest": progress.rest} | {
+        f"level{i}": sums for i, sums in enumerate(progress.tree.levels)
+    }
     header = {
         "format": FORMAT,
         "identity": progress.identity,
@@ -115,7 +117,7 @@ def read(path: Path, identity: dict[str, Any]) -> Progress:
                 header["identity"],
                 tree,
                 nodes.get("base"),
-                None,
+                nodes.get("rest"),
                 float(header["seconds"]),
                 [str(m) for m in header["machines"]],
             )

@@ -161,10 +161,7 @@ class _Node:
 
 
 class ClusterPasses:
-    """Renders passes on workers that were accepted. To be closed at the end: what is still asked for is cancelled then.
-
-    `received`: bytes of the nodes that came back.
-    """
+    """Renders passes on workers that were accepted. To be closed at the end, which cancels what is still asked for."""
 
     def __init__(
         self,
@@ -175,7 +172,6 @@ class ClusterPasses:
     ) -> None:
         """`warn` is told of machines whose pixels are not finite."""
         self.workers, self.bundle, self.scene, self.warn = workers, bundle, scene, warn
-        self.received = 0
         self._begun: deque[_Node] = deque()
         self._series = (0, 0)  # offset and samples of what is begun
         self._pass_seconds: deque[float] = deque(maxlen=_MEASURED)
@@ -198,6 +194,8 @@ class ClusterPasses:
                     self.close()
                 with scheduler_needed(self.workers.client):
                     node, part = self._next(first, stop, last)
+                if node.first != first:
+                    raise RuntimeError(f"pass {node.first} came in place of {first}")
                 first = node.stop
                 self._note(node, part)
                 yield node.level, part.sums.copy(), self._machines(part)  # a copy: what Dask gives may be read-only
@@ -234,6 +232,8 @@ class ClusterPasses:
                     self.workers.look(at_once=True)
                     if again := self._asked(asked.level, asked.first, 0, listed=True):
                         self._begun.appendleft(again)
+                    else:
+                        self.close()  # nobody may have it now: all is begun anew, from it on
 
     def _part(self, node: _Node, coming: futures.Future[Part]) -> Part:
         from distributed import KilledWorker
@@ -248,7 +248,6 @@ class ClusterPasses:
 
     def _note(self, node: _Node, part: Part) -> None:
         self._pass_seconds.append(part.seconds / part.sums.passes)
-        self.received += part.sums.nbytes
         for address, count in part.nonfinite.items():
             machine = self.workers.machines.get(address, address)
             if count and machine not in self._warned:
@@ -281,7 +280,7 @@ class ClusterPasses:
             if begin >= last or (self._begun and self._enough()):
                 return
             while stop <= begin:
-                stop = min(next_stop(stop), last)
+                stop = min(next_stop(stop + self._series[0]) - self._series[0], last)
             task, largest = self.levels()
             level, begin = aligned_nodes(begin, stop, largest)[0]
             if not (node := self._asked(level, begin, min(task, level))):

@@ -38,9 +38,11 @@ def relative_error(sums: PassSums) -> RelativeError:
     known = np.isfinite(colours)
     mean = abs(float(colours[known].mean())) if known.any() else math.nan
     found = np.asarray([each for each in sums.contrasts if math.isfinite(each)])
-    if not mean > 0 or (variance := sums.variance) is None:
+    if not mean > 0 or not sums.freedom:
         return RelativeError(math.nan)
     if sums.within is not None:  # what samples say is more than what so few passes say
+        variance = sums.variance
+        assert variance is not None
         known = np.isfinite(variance := variance[..., : sums.colours])
         return RelativeError(math.sqrt(float(variance[known].mean()) / sums.spp) / mean)
     if not found.size:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +18,16 @@ from .render_pass import PassRenderer
 PASS = "samples of a pass"  # a render may go on with passes of another size
 
 
-def identity_of(scene: Path, defines: Mapping[str, str], seed: int, renderer: PassRenderer) -> dict[str, Any]:
+def identity_of(
+    scene: Path, defines: Mapping[str, str], seed: int, renderer: PassRenderer, allow_plugins: Collection[str] = ()
+) -> dict[str, Any]:
     """All that the bits of a render depend on, by names for messages; but for PASS, which its plan says.
 
-    `renderer`: of the scene in this file, loaded in the present variant.
+    `renderer`: of the scene in this file, loaded in the present variant. `allow_plugins`: as in `load_scene`.
     """
     import mitsuba as mi
 
-    files = scene_parser.files_of(scene, defines)
+    files = scene_parser.files_of(scene, defines, allow_plugins)
     digest = hashlib.sha256()
     for name, path in [("", each) for each in files.xml] + list(files.others.items()):
         digest.update(json.dumps([name, hashlib.sha256(path.read_bytes()).hexdigest()]).encode())
@@ -38,7 +40,8 @@ def identity_of(scene: Path, defines: Mapping[str, str], seed: int, renderer: Pa
         "variant": str(mi.variant()),
         "film": f"{width} × {height} {', '.join(renderer.channels)}",
         "colours": renderer.colours,
-        **{f"version of {name}": installed_version(name) for name in ("mi_refract", "mitsuba", "drjit")},
+        "version of mi_refract": worker_facts.our_version(),
+        **{f"version of {name}": installed_version(name) for name in ("mitsuba", "drjit")},
         "libLLVM": backend.llvm().library if llvm else "none",
         "vector width": worker_facts.vector_width() if llvm else "none",
     }

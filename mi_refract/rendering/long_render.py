@@ -11,7 +11,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -20,6 +20,7 @@ import numpy as np
 from mi_refract.io import lock
 from mi_refract.io.atomic import writable
 from mi_refract.io.image_file import SUFFIXES, Metadata
+from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import provenance
 
 from . import checkpoint, rendered_file
@@ -131,9 +132,8 @@ class LongRender:
         self.spp = limits.spp
         if self.spp is None and not limits.open_ended:
             self.spp = int(self.scene.sensors()[0].sampler().sample_count())
-        self.progress = self._found(identity_of(job.scene, job.defines, job.seed, self.renderer), restart)
+        self.progress = self._found(self._identity(), restart)
         self.plan = self._plan()
-        self.renderer = replace(self.renderer, few=self._may_have_few_passes())
         self.progress.identity[PASS] = self.plan.spp
         self.ended_by = ""
         self.warnings: list[str] = []
@@ -142,6 +142,10 @@ class LongRender:
         self._state = threading.Lock()  # held where the progress changes or is written
         self._last_kept = time.monotonic()
         self._writer: threading.Thread | None = None
+
+    def _identity(self) -> dict[str, Any]:
+        job = self.job
+        return identity_of(job.scene, job.defines, job.seed, self.renderer, job.allow_plugins)
 
     def _found(self, identity: dict[str, Any], restart: bool) -> Progress:
         if restart:
@@ -164,16 +168,14 @@ class LongRender:
     def _plan(self) -> PassPlan:
         """The passes that follow those of the base; of the size that a checkpoint's passes have."""
         recorded, asked = self.progress.identity.get(PASS), self.limits.pass_spp
+        if self.progress.rest is not None and self.progress.done != self.spp:
+            self.progress.rest = None  # it was the last of fewer samples: a whole pass takes its place
         if self.progress.tree.passes and asked not in (None, recorded):
             raise ValueError(
                 f"{self.checkpoint}: passes of {recorded} samples per pixel; accepted: those, or --restart"
             )
         begun = recorded if self.progress.tree.passes else None
         return self._planned(begun or asked, self.progress.base.spp if self.progress.base else 0)
-
-    def _may_have_few_passes(self) -> bool:
-        passes = self.plan.passes
-        return self.limits.seconds is not None or (passes is not None and self.progress.first + passes < FEW)
 
     # Rendering --------------------------------------------------------------------------------------------------------
 
@@ -206,7 +208,7 @@ class LongRender:
                 break
         self.ended_by = end
         watch(self)
-        return self._finish(nothing_left and not self.progress.tree.passes)
+        return self._finish(nothing_left and self.progress.passes == self.progress.first)
 
     def _advance(self, source: Passes, began: float, watch: Callable[[LongRender], None]) -> None:
         """Render up to where the next look is due, the time is over, or, where no full pass is left, the last pass."""
@@ -214,9 +216,10 @@ class LongRender:
         if tree.passes == full:
             self._render_rest(source)
             return
-        last = full if full is not None else next_stop(next_stop(tree.passes))
+        first = self.progress.first
+        last = full if full is not None else next_stop(next_stop(first + tree.passes)) - first
         stop = min(self._next_look(), last)
-        for level, sums, machine in source.nodes(tree.passes, stop, last, self.progress.first, self.plan.spp):
+        for level, sums, machine in source.nodes(tree.passes, stop, last, first, self.plan.spp):
             with self._state:
                 tree.add(sums, level)
                 self.progress.seconds += time.monotonic() - before
@@ -238,15 +241,16 @@ class LongRender:
 
     def _next_look(self) -> int:
         """After how many passes of the tree the next look is due."""
-        passes = self.progress.tree.passes
-        return 1 if passes == 0 and self.renderer.moments and not self.progress.base else next_stop(passes)
+        passes, first = self.progress.passes, self.progress.first
+        return 1 if passes == 0 and self.renderer.moments else next_stop(passes) - first
 
     def _end(self) -> str:
         """What ends the render with what there is; "" where it goes on."""
         tree, full = self.progress.tree, self.plan.full_passes
         if not tree.passes and self.progress.base and self.progress.base_ended_by == NO_NOISE:
             return NO_NOISE
-        due = tree.passes == 1 or next_stop(tree.passes - 1) == tree.passes if tree.passes else self.progress.base
+        passes = self.progress.passes
+        due = passes == 1 or (passes and next_stop(passes - 1) == passes)
         if due and (reason := self._good_enough()):
             return reason
         missing = full is None or tree.passes < full or (self.plan.rest and self.progress.rest is None)
@@ -259,8 +263,8 @@ class LongRender:
             return ""
         if _without_noise(sums):
             return NO_NOISE
-        if self.spp is None and not np.any(sums.total[..., : sums.colours] > 0) and not self.warnings:
-            self.warnings.append(f"{self.output}: is black so far: it has no relative error that could end it")
+        if self.spp is None and not np.any(sums.total[..., : sums.colours] > 0):
+            self._warn_once(f"{self.output}: is black so far: it has no relative error that could end it")
         if self.progress.passes < FEW:
             return ""
         if self.limits.until and (error := relative_error(sums)).high <= self.limits.until:
@@ -268,6 +272,10 @@ class LongRender:
         if self.limits.until_tile and (worst := worst_tile(sums)) <= self.limits.until_tile:
             return f"--until-tile {self.limits.until_tile:.3g}: the error of the worst tile is {worst:.3g}"
         return ""
+
+    def _warn_once(self, text: str) -> None:
+        if text not in self.warnings:
+            self.warnings.append(text)
 
     @property
     def has_all_samples(self) -> bool:
@@ -290,7 +298,7 @@ class LongRender:
         self._wait()
         metadata = _metadata(self.job, ", ".join(formulas_in(self.scene)) or "none")
         channels = self.renderer.channels
-        header = rendered_file.header(self.progress, metadata, self.ended_by)
+        header = rendered_file.header(self.progress, metadata, self.ended_by, self.renderer.filter_radius)
         if not unchanged:
             rendered_file.write(self.output, channels, self.progress, header)
         self.checkpoint.unlink(missing_ok=True)
@@ -301,7 +309,8 @@ class LongRender:
     def keep(self) -> None:
         """Write a checkpoint of what is done, if anything is. A failure is a warning: the render goes on without."""
         with self._state:
-            if not self._holds_lock or not self.progress.tree.passes:
+            new = self.progress.tree.passes or self.progress.rest
+            if not self._holds_lock or not new:
                 return
             try:
                 checkpoint.write(self.checkpoint, self.progress)
@@ -309,9 +318,12 @@ class LongRender:
                 self.warnings.append(f"{self.checkpoint}: no checkpoint: {error.strerror or error}; tried again later")
 
     def give_up(self) -> None:
-        """For a process that is about to end while it renders: keep what is done, and leave no lock."""
+        """For a process that is about to end while it renders: keep what is done, say if that fails, leave no lock."""
         if self._holds_lock:
+            before = len(self.warnings)
             self.keep()
+            for warning in self.warnings[before:]:
+                os.write(2, f"mi-refract: {printable(warning)}\n".encode(errors="replace"))
             lock_of(self.output).unlink(missing_ok=True)
 
     def _keep_sometimes(self) -> None:

@@ -93,8 +93,9 @@ def plan_passes(
         raise ValueError(f"{asked} samples per pixel in a pass; accepted by the sampler: {accepted(asked)}")
     if total and not asked:
         spp = spp if moments else min(spp, max(1, total // FEW))
-    while accepted(spp) != spp:  # one sample is always accepted
+    while spp > 1 and accepted(spp) != spp:
         spp -= 1
+    spp = accepted(spp)  # which may be more than one: some samplers take no fewer than 4
     if total and (rest := total % spp):
         total += accepted(rest) - rest
     return PassPlan(spp, total)

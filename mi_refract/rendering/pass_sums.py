@@ -47,12 +47,6 @@ class PassSums:
         return replace(self, contrasts=list(self.contrasts), **arrays)
 
     @property
-    def nbytes(self) -> int:
-        """Of its arrays."""
-        arrays = (getattr(self, name) for name in ARRAYS)
-        return sum(array.nbytes for array in arrays if array is not None)
-
-    @property
     def mean(self) -> Doubles:
         """The image; 0 where no sample has reached a pixel."""
         if self.weights is None:

@@ -35,7 +35,6 @@ class PassRenderer:
     seed: int
     channels: tuple[str, ...]
     moments: bool  # whether samples can be kept: then second moments are known, too
-    few: bool = True  # whether they are needed of more than the first pass
     expected: Doubles | None = None  # Σ w of one sample in each pixel, H × W × 1, where the filter is no box
 
     @property
@@ -43,6 +42,12 @@ class PassRenderer:
         """Width and height."""
         width, height = self.scene.sensors()[0].film().crop_size()
         return int(width), int(height)
+
+    @property
+    def filter_radius(self) -> float:
+        """In pixels: what is more than 0.5 has neighbours share samples."""
+        rfilter = self.scene.sensors()[0].film().rfilter()
+        return 0.5 if rfilter.is_box_filter() else float(rfilter.radius())
 
     @property
     def colours(self) -> int:
@@ -69,7 +74,7 @@ class PassRenderer:
         within = None
         with _quiet():
             if self.moments:
-                squares = number == 0 or (self.few and number < FEW - 1)
+                squares = number < FEW - 1  # more passes say it better
                 total, weights, within = _sums(
                     self.scene, self.channels, spp, seed_of(self.seed, number), squares=squares
                 )

@@ -20,7 +20,7 @@ VARIANCE = "{}.variance"
 _KEPT = ("spp", "passes", "identity", "contrasts", "variance_from", "machines", "render_seconds", "ended_by")
 
 
-def header(progress: Progress, metadata: Metadata, ended_by: str) -> Metadata:
+def header(progress: Progress, metadata: Metadata, ended_by: str, filter_radius: float) -> Metadata:
     """`metadata`, and what is known of the passes."""
     sums = progress.sums()
     assert sums is not None
@@ -29,6 +29,7 @@ def header(progress: Progress, metadata: Metadata, ended_by: str) -> Metadata:
         "mi_refract:passes": sums.passes,
         "mi_refract:variance_freedom": sums.freedom,
         "mi_refract:variance_from": _source(sums),
+        "mi_refract:filter_radius": filter_radius,
         "mi_refract:nonfinite_pixels": nonfinite_pixels(sums),
         "mi_refract:identity": json.dumps(progress.identity, sort_keys=True),
         "mi_refract:contrasts": json.dumps([float(f"{each:.9g}") for each in sums.contrasts]),

@@ -13,7 +13,7 @@ def test_shares(text, value):
     assert parse_share(text, "--until") == pytest.approx(value, rel=1e-15)
 
 
-@pytest.mark.parametrize("text", ["0", "0%", "-1%", "100.1%", "1.5", "nan", "inf", "%", "", "1 percent", "1%%"])
+@pytest.mark.parametrize("text", ["0", "0%", "-1%", "100.1%", "1.5", "nan", "inf", "%", "", "1 %%", "1", "0.5"])
 def test_what_is_no_share(text):
     with pytest.raises(ValueError, match=r"^--until .*: accepted: more than 0 %, up to 100 %"):
         parse_share(text, "--until")

@@ -20,6 +20,7 @@ from mi_refract.image_diff.methods import METHODS, choice, compare
 from mi_refract.image_diff.pixel_correlation import inflation
 from mi_refract.image_diff.results import Status
 from mi_refract.image_diff.settings import How, Settings
+from mi_refract.image_diff.variances import FILTER as RADIUS
 from mi_refract.image_diff.variances import FREEDOM
 from mi_refract.image_diff.welch import compare_renders
 from mi_refract.io.image_file import Image, read, write_exr
@@ -178,10 +179,24 @@ def test_variances_of_samples_take_pixels_for_independent(known):
     rng = np.random.default_rng(31)
     sides = [render(rng, "filtered") for _ in range(2)]
     sides = [each if side in known else bare(each) for side, each in enumerate(sides)]
-    freedom = {FREEDOM: PASSES * PER_PASS - 1}
+    freedom = {FREEDOM: PASSES * PER_PASS - 1}  # and no filter is named
     of_samples = [replace(each, metadata=each.metadata | freedom) for each in sides]
     passes, samples = (compare("auto", *each, resolution=9.0).minimum_detectable for each in (sides, of_samples))
     assert passes > 1.3 * samples
+
+
+def test_the_filter_says_whether_pixels_share_samples():
+    """Variances of filtered pixels need not be those of passes, and those of passes need no filter."""
+    rng = np.random.default_rng(32)
+    sides = [render(rng, "filtered") for _ in range(2)]
+
+    def promised(**header):
+        named = [replace(each, metadata=each.metadata | header) for each in sides]
+        return compare("auto", *named, resolution=9.0).minimum_detectable
+
+    of_samples, unnamed = {FREEDOM: PASSES * PER_PASS - 1}, promised()
+    assert promised(**{RADIUS: 2.0}) == unnamed > 1.3 * promised(**{RADIUS: 0.5})
+    assert promised(**{RADIUS: 2.0}, **of_samples) > 1.3 * promised(**{RADIUS: 0.5}, **of_samples)
 
 
 # The method that is chosen -----------------------------------------------------------------------------------------

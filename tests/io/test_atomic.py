@@ -1,5 +1,6 @@
 """Files are written whole or not at all, and travel with the package."""
 
+import errno
 import json
 import os
 import shutil
@@ -254,3 +255,13 @@ def test_a_lock_is_not_written_through_a_link(tmp_path):
     with pytest.raises(OSError), lock.held(path, "a run"):
         pass
     assert victim.read_text() == "old"
+
+
+def test_a_file_system_without_locks_keeps_nobody_out(tmp_path, monkeypatch):
+    def flock(*_):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(lock.fcntl, "flock", flock)
+    with lock.held(tmp_path / "a.lock", "a run"):
+        assert (tmp_path / "a.lock").exists()
+    assert not (tmp_path / "a.lock").exists()

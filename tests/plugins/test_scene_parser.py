@@ -325,3 +325,14 @@ def test_a_large_scene_is_read_in_its_own_time(tmp_path):
     begin = time.process_time()
     scene_limits.check_files(tmp_path / "s.xml", [], {})
     assert time.process_time() - begin < 5
+
+
+def test_the_code_of_plugins_that_are_allowed_is_among_the_files(tmp_path, scalar_variant):
+    for place in (tmp_path / "plugins", tmp_path / "more" / "plugins"):
+        place.mkdir(parents=True)
+        (place / "evil.so").write_text(place.parent.name)
+        (place / "other.so").touch()
+    (tmp_path / "s.xml").write_text('<scene version="3.0.0"><path value="more"/><bsdf type="evil"/></scene>')
+    found = scene_parser.files_of(tmp_path / "s.xml", {}, ("evil",)).others
+    assert found["plugins/evil.so"] == tmp_path / "plugins" / "evil.so" and "plugins/other.so" not in found
+    assert not scene_parser.files_of(tmp_path / "s.xml", {}).others.keys() & {"plugins/evil.so"}

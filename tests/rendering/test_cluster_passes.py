@@ -8,6 +8,7 @@ import re
 import socket
 from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -264,6 +265,57 @@ def test_a_worker_that_just_came_looks_by_itself_whether_it_may_have_a_task(clie
     passes.workers.look = lambda **options: (looks.append(options), look(**options))[1]
     same(remote(client, scene, variant, 4, passes=passes), local(scene, 4))
     assert {"at_once": True} in looks
+
+
+class Answer:
+    """A future that is done."""
+
+    status = "finished"
+
+    def __init__(self, value=None, error=None):
+        self.value, self.error = value, error
+
+    def result(self):
+        if self.error:
+            raise self.error
+        return self.value
+
+    def done(self):
+        return True
+
+
+def test_no_pass_is_lost_where_nobody_is_left_who_may_render_it(monkeypatch):
+    """The last worker goes, one that must not have the task gets it and refuses; the next one comes later."""
+    refused = []
+
+    class Client:
+        status, scheduler = "running", None
+
+        def submit(self, task, *arguments, **_):
+            if task is not cluster_passes.render_node:
+                return Answer()
+            first = arguments[3]
+            if first == 0 and not refused:
+                refused.append(first)
+                return Answer(error=cluster_passes.RefusedWorkerError("tcp://bad"))
+            sums = np.full((1, 1, 3), float(first))
+            return Answer(Part(PassSums(1, 1, sums, 0 * sums), {"good": 0}, 1.0))
+
+        def cancel(self, *_, **__):
+            pass
+
+    workers = SimpleNamespace(client=Client(), accepted={"last": 1}, machines={}, all_accepted=True)
+
+    def look(at_once=False):
+        if at_once:
+            workers.accepted.clear()
+        elif not workers.accepted:
+            workers.accepted["good"] = 1
+
+    workers.look = look
+    monkeypatch.setattr(cluster_passes, "_POLL", 0.01)
+    found = ClusterPasses(workers, None, RenderedScene("x", {}, 0, {})).nodes(0, 4, 4, 0, 1)
+    assert [int(sums.total[0, 0, 0]) for _, sums, _ in found] == [0, 1, 2, 3]
 
 
 def test_an_error_of_the_scene_is_that_of_a_local_render(client, scene, variant):

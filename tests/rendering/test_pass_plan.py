@@ -70,6 +70,14 @@ def test_a_pass_is_one_that_the_sampler_takes():
         plan_passes(64, 100, 8, square, moments=True)
 
 
+def test_a_sampler_may_take_no_fewer_than_four():
+    def four(spp):
+        return max(4, spp)
+
+    assert plan_passes(64, 16, None, four, moments=False) == PassPlan(4, 16)  # FEW passes would have 2
+    assert plan_passes(2**23, 3, None, four, moments=True) == PassPlan(4, 4)
+
+
 def test_a_pass_has_fewer_than_2_to_the_32_samples():
     with pytest.raises(ValueError, match=r"accepted: up to 2³² − 1 samples in all"):
         plan_passes(64, None, 2**26, exact, moments=True)

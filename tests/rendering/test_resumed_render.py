@@ -109,6 +109,59 @@ def test_an_error_that_is_reached_is_reached(tmp_path, llvm):
     assert again.run()["mi_refract:spp"] == first["mi_refract:spp"] and "--until" in again.ended_by
 
 
+def test_looks_are_few_also_where_it_goes_on(tmp_path, llvm):
+    """After 9 passes the next look is at 12: an estimate that is looked at often is too small at some time."""
+    output = tmp_path / "a.exr"
+    rendering(output, spp=18, pass_spp=2).run()
+    render, looks = rendering(output, until=1e-3, pass_spp=2), []
+    render._good_enough = lambda: looks.append(render.progress.passes)
+    stopped_after(render, 25)
+    assert looks == [12, 16, 24]
+
+
+def test_a_last_pass_is_kept_where_its_image_cannot_be_written(tmp_path, llvm, monkeypatch):
+    output, write = tmp_path / "a.exr", rendered_file.write
+    for spp in (3, 11):  # alone, and after others
+        monkeypatch.setattr(rendered_file, "write", lambda *a: (_ for _ in ()).throw(OSError(errno.ENOSPC, "full")))
+        with pytest.raises(OSError, match="full"):
+            rendering(output, spp=spp, pass_spp=4, restart=True).run()
+        monkeypatch.setattr(rendered_file, "write", write)
+        render = rendering(output, spp=spp, pass_spp=4)
+        assert render.progress.done == spp
+        with monkeypatch.context() as nothing:
+            nothing.setattr(type(render.renderer), "render", None)
+            render.run()
+        rendering(tmp_path / "b.exr", spp=spp, pass_spp=4, restart=True).run()
+        np.testing.assert_array_equal(pixels(output), pixels(tmp_path / "b.exr"))
+
+
+def test_a_last_pass_gives_way_to_a_whole_one(tmp_path, llvm, monkeypatch):
+    output, write = tmp_path / "a.exr", rendered_file.write
+    monkeypatch.setattr(rendered_file, "write", lambda *a: (_ for _ in ()).throw(OSError(errno.ENOSPC, "full")))
+    with pytest.raises(OSError, match="full"):
+        rendering(output, spp=11, pass_spp=4).run()
+    monkeypatch.setattr(rendered_file, "write", write)
+    rendering(output, spp=16, pass_spp=4).run()
+    rendering(tmp_path / "b.exr", spp=16, pass_spp=4).run()
+    np.testing.assert_array_equal(pixels(output), pixels(tmp_path / "b.exr"))
+
+
+def test_a_checkpoint_that_fails_at_a_signal_is_said(tmp_path, llvm, monkeypatch, capfd):
+    render = rendering(tmp_path / "a.exr", spp=8, pass_spp=2)
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def watch(render):
+        if render.progress.passes == 3:
+            monkeypatch.setattr(checkpoint, "write", full)
+            render.give_up()
+            monkeypatch.undo()
+
+    render.run(watch)
+    assert "mi-refract: " in (said := capfd.readouterr().err) and "no checkpoint: No space left" in said
+
+
 def test_a_sampler_that_rounds_up_has_nothing_left(tmp_path, llvm):
     scene = tmp_path / "scene.xml"
     scene.write_text(BALL.read_text().replace('value="independent"', 'value="stratified"'))

@@ -6,6 +6,7 @@ import importlib
 import inspect
 import json
 import os
+import time
 import types
 
 import pytest
@@ -162,12 +163,16 @@ def test_misuse_is_one_line(arguments, words, capsys):
 
 # What a row of times is made by; `scaling.measure` is so in a process of its own.
 CLOCKS = {"kernel_timing.interval", "scaling.run"}
+READ = {"perf_counter", "process_time"}  # functions that name one of them are clocks, too
+# Theirs are told beside a row, or are limits.
+NOT_JUDGED = {"render_methods.Camera.__call__", "killed_commands.examine"}
 
 
 def reached(start):
     """Names (module.function) of the validation's own functions that `start` may call, however indirectly.
 
-    By the names in their code: what a name means elsewhere may be counted, what is called is not missed.
+    Those in READ are named as they are. By the names in their code: what a name means elsewhere may be counted, what
+    is called is not missed.
     """
     found, left = set(), [start]
     while left:
@@ -182,27 +187,34 @@ def reached(start):
             name = f"{inner.__module__.rpartition('.')[2]}.{inner.__qualname__}"
             if inner.__module__.startswith(("validation", __name__)) and (key := (name, id(inner))) not in found:
                 found.add(key)
+                if name not in NOT_JUDGED:
+                    found |= {(each, 0) for each in READ & names_in(inner)}
                 left += called(inner)
     return {name for name, _ in found}
 
 
 def called(function):
     """Everything of the validation that the code of a function names, and what it closes over."""
-    codes, cells = [function.__code__], [cell.cell_contents for cell in function.__closure__ or ()]
-    names = set()
-    while codes:
-        code = codes.pop()
-        names |= set(code.co_names)
-        codes += [each for each in code.co_consts if isinstance(each, types.CodeType)]
+    names, cells = names_in(function), [cell.cell_contents for cell in function.__closure__ or ()]
     found = [function.__globals__[name] for name in names if name in function.__globals__]
     modules = [each for each in found if inspect.ismodule(each) and each.__name__.startswith("validation")]
     found += [vars(module)[name] for module in modules for name in names if name in vars(module)]
     return [each for each in (*found, *cells) if callable(each) or isinstance(each, Study)]
 
 
+def names_in(function):
+    """All names in the code of a function, and of those inside it."""
+    codes, names = [function.__code__], set()
+    while codes:
+        code = codes.pop()
+        names |= set(code.co_names)
+        codes += [each for each in code.co_consts if isinstance(each, types.CodeType)]
+    return names
+
+
 def unmarked(tasks):
     """Names of the tasks that reach a clock and are not marked."""
-    return {task.name for task in tasks if not task.timed and reached(task.run) & CLOCKS}
+    return {task.name for task in tasks if not task.timed and reached(task.run) & (CLOCKS | READ)}
 
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
@@ -225,15 +237,19 @@ def test_a_task_that_is_not_marked_is_found():
     def through_a_study(study):
         return study.again(None)
 
+    def by_hand():
+        return time.process_time()
+
     again = Study("s", "", "", {}, lambda c: [], again=lambda c: direct())
     tasks = [
         Task("direct", direct),
+        Task("by hand", by_hand),
         Task("inner", functools.partial(inner)),
         Task("study", functools.partial(through_a_study, again)),
         Task("marked", direct, timed=True),
         Task("none", row),
     ]
-    assert unmarked(tasks) == {"direct", "inner", "study"}
+    assert unmarked(tasks) == {"direct", "by hand", "inner", "study"}
 
 
 def test_names_of_clocks_exist():

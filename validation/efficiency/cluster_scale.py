@@ -64,7 +64,10 @@ def tasks(context: Context) -> list[Task]:
     named: dict[str, Callable[[Context], list[Row]]] = {"costs": cost_rows, "model": model_rows}
     if not context.profile.quick:
         named |= {"simulation": simulated_rows, "processes": process_rows}
-    return [Task(f"cluster scale: {name}", functools.partial(_rows, context, run)) for name, run in named.items()]
+    return [
+        Task(f"cluster scale: {name}", functools.partial(_rows, context, run), timed=True)
+        for name, run in named.items()
+    ]
 
 
 def _rows(context: Context, run: Callable[[Context], list[Row]]) -> list[Row]:

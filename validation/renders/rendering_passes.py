@@ -55,7 +55,7 @@ def tasks(context: Context) -> list[Task]:
         reason = "scalar variants render by `mi.render`, a hundred times as slowly"
         return [Task(NAME, lambda: [Row(NAME, "until", "scenes", context.variant, reason=reason)])]
     errors = [Task(f"passes: {name}", functools.partial(error_rows, context, name)) for name in STILLS]
-    timed = Task("passes: time", functools.partial(time_rows, context))
+    timed = Task("passes: time", functools.partial(time_rows, context), timed=True)
     return errors + ([timed] if PAIRS[context.profile.name] else [])
 
 
