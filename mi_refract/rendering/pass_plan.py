@@ -16,8 +16,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 LANES = 2**24  # samples of a pass, at most, unless one sample per pixel is more
-# A pass costs about 10 ms beside its samples, and its sums the time of a quarter of a sample in every pixel.
+# A pass costs about 12 ms beside its samples, 1 or 2 % of 2²¹ of them, and its sums as much as a quarter of a sample in
+# every pixel. A render of many samples has fewer and larger passes, but at least MANY.
 LEAST_LANES, LEAST_SPP = 2**21, 4
+LARGE_LANES, MANY = 2**23, 16
 FEW = 8  # passes: with fewer the spread between them says little
 MASK = 2**32 - 1
 
@@ -43,9 +45,13 @@ def _mix(x: int) -> int:
     return x ^ x >> 16
 
 
-def usual_spp(pixels: int) -> int:
-    """Samples per pixel of a pass over so many pixels: a power of two, and no more than LANES samples in all."""
-    wanted = min(max(LEAST_SPP, LEAST_LANES // pixels), LANES // pixels)
+def usual_spp(pixels: int, total: int | None = None) -> int:
+    """Samples per pixel of a pass over so many pixels: a power of two, and no more than LANES samples in all.
+
+    `total`: those of the render, where that is known.
+    """
+    large = min((total or 0) // MANY, LARGE_LANES // pixels)
+    wanted = min(max(LEAST_SPP, LEAST_LANES // pixels, large), LANES // pixels)
     return 1 << max(0, wanted.bit_length() - 1)
 
 
@@ -84,7 +90,7 @@ def plan_passes(
     which it may round up. `moments`: whether second moments within a pass are known. Where they are not, a render of
     few samples is cut into FEW passes, for their spread. ValueError for a pass that the sampler does not take.
     """
-    spp = asked or usual_spp(pixels)
+    spp = asked or usual_spp(pixels, total)
     if min(spp, total or spp) * pixels > MASK:
         raise ValueError(
             f"{spp} samples per pixel in a pass of {pixels} pixels; accepted: up to 2³² − 1 samples in all"

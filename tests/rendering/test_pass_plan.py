@@ -51,6 +51,12 @@ def test_a_pass_is_bounded_and_a_power_of_two(pixels):
     assert 2 * spp * pixels > LANES or spp >= 4
 
 
+def test_a_render_of_many_samples_has_larger_passes_but_at_least_sixteen():
+    pixels = 2**18
+    assert [usual_spp(pixels, total) for total in (None, 64, 128, 256, 512, 4096)] == [8, 8, 8, 16, 32, 32]
+    assert usual_spp(1920 * 1080, 65536) == 4
+
+
 def test_samples_beyond_whole_passes_are_a_last_one():
     plan = plan_passes(64, 100, 8, exact, moments=True)
     assert (plan.full_passes, plan.rest, plan.passes) == (12, 4, 13)
