@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from mi_refract import backend
-from mi_refract.cluster.connection import Tls
+from mi_refract.cluster.tls import Tls
 from mi_refract.io.outside_text import printable
 from mi_refract.rendering import scene_files
 

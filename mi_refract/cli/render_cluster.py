@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from mi_refract.cluster import connection, worker_facts
-from mi_refract.cluster.connection import NO_TLS, Tls
+from mi_refract.cluster.tls import NO_TLS, Tls
 from mi_refract.cluster.workers import Workers
 from mi_refract.io.outside_text import printable
 

@@ -10,11 +10,11 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent import futures
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypeVar
 
 from . import local_process
+from .tls import ACCEPTED as TLS_ACCEPTED
+from .tls import ENCRYPTED, NO_TLS, Tls
 
 Result = TypeVar("Result")
 PATIENCE = 6.0  # seconds until a scheduler must have answered
@@ -25,34 +25,6 @@ _ACCEPTED = "accepted: the address of a Dask scheduler, such as tcp://host:8786 
 
 class LostSchedulerError(ConnectionError):
     """The scheduler has ended, or cannot be reached any more."""
-
-
-@dataclass(frozen=True)
-class Tls:
-    """Files in PEM format for a `tls://` scheduler; None: as Dask's own configuration says."""
-
-    ca_file: Path | None = None
-    cert: Path | None = None
-    key: Path | None = None
-
-    @property
-    def given(self) -> bool:
-        """Whether any is given."""
-        return any((self.ca_file, self.cert, self.key))
-
-    def security(self) -> Any:
-        """A `distributed.Security`; None where nothing is given. FileNotFoundError for a missing file."""
-        from distributed.security import Security
-
-        for option, path in (("--tls-ca-file", self.ca_file), ("--tls-cert", self.cert), ("--tls-key", self.key)):
-            if path is not None and not path.is_file():
-                raise FileNotFoundError(f"{option} {path}: no such file; accepted: a file in PEM format")
-        files = {"tls_ca_file": self.ca_file, "tls_client_cert": self.cert, "tls_client_key": self.key}
-        named = {name: str(path) for name, path in files.items() if path is not None}
-        return Security(**named, require_encryption=True) if named else None
-
-
-NO_TLS = Tls()
 
 
 def require_dask() -> None:
@@ -75,7 +47,7 @@ def connected(scheduler: str | None = None, workers: int | None = None, tls: Tls
     if (scheduler is None) == (workers is None):
         raise ValueError("accepted: either --scheduler ADDRESS or --workers N")
     if tls.given and scheduler is None:
-        raise ValueError("--tls-ca-file, --tls-cert, --tls-key: accepted with --scheduler tls://HOST:PORT")
+        raise ValueError(f"--workers {workers}: needs no TLS; {TLS_ACCEPTED}")
     require_dask()
     with _silent(), contextlib.ExitStack() as stack:
         if workers is not None:
@@ -90,9 +62,8 @@ def connected(scheduler: str | None = None, workers: int | None = None, tls: Tls
 
 def _client(address: str, tls: Tls) -> Any:
     from distributed import Client
-    from distributed.security import Security
 
-    security = tls.security() or Security()
+    security = tls.security(address)
     try:
         # First, as a client that found nobody would take 16 s to give up.
         kind = asyncio.run(_kind(address, security.get_connection_args("client")))
@@ -103,6 +74,9 @@ def _client(address: str, tls: Tls) -> Any:
     except Exception as error:
         said = [" ".join(str(each).split()) for each in (error.__cause__, error) if each is not None]
         text = re.sub(r"in <[^>]*>: ", "", next(filter(None, said), f"not within {PATIENCE:.0f} s"))
+        if "SSL" in text or "reset by peer" in text:
+            encrypted = address.startswith(ENCRYPTED)
+            text += f": it may {'be without TLS, or of another authority' if encrypted else 'ask for TLS'}"
         raise ConnectionError(f"--scheduler {address}: no Dask scheduler answers: {text[:200]}; {_ACCEPTED}") from None
 
 

@@ -204,12 +204,20 @@ class ClusterPasses:
             raise
 
     def close(self) -> None:
-        """Cancel all that is begun."""
-        asked = [future for node in self._begun for future in (node.result, *node.tasks)]
-        self._begun.clear()
-        if asked and self.workers.client.status == "running":
+        """Give up all that is begun."""
+        while self._begun:
+            self._give_up(self._begun.popleft())
+
+    def _give_up(self, node: _Node) -> None:
+        """Ask for it no more: the scheduler forgets what nobody asks for, and all that only this needs.
+
+        `client.cancel` is not for nodes: at a fold of folds, for which nobody asks, the scheduler fails an assertion
+        and closes the connection (Dask 2026.8).
+        """
+        if self.workers.client.status == "running":
             with contextlib.suppress(Exception):  # it may go now
-                self.workers.client.cancel(asked, force=True)
+                for future in (*node.tasks, node.result):
+                    future.release()
 
     def _next(self, first: int, stop: int, last: int) -> tuple[_Node, Part]:
         """The node that begins at `first`, when it is here; more are begun meanwhile."""
@@ -345,5 +353,5 @@ class ClusterPasses:
             if there and node.needed.isdisjoint(there) and node.result.status != "error":
                 again = self._asked(node.level, node.first, 0)
                 if again is not None:
-                    self.workers.client.cancel([node.result, *node.tasks], force=True)
+                    self._give_up(node)
                     self._begun[i] = again

@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -14,8 +15,9 @@ from distributed.comm import CommClosedError
 from support.dask_workers import until
 from support.processes import python
 
-from mi_refract.cluster import connection, local_process
-from mi_refract.cluster.connection import LostSchedulerError, Tls, connected, scheduler_needed
+from mi_refract.cluster import local_process
+from mi_refract.cluster.connection import LostSchedulerError, connected, scheduler_needed
+from mi_refract.cluster.tls import Tls
 
 
 def refusal(**options):
@@ -41,18 +43,18 @@ def test_no_scheduler():
         ({"scheduler": "tcp://h:1", "workers": 1}, "accepted: either --scheduler ADDRESS or --workers N"),
         ({"workers": 0}, "--workers 0: accepted: a whole number from 1 to 1024"),
         ({"workers": 1, "tls": Tls(key="x")}, "accepted with --scheduler tls://HOST:PORT"),
-        ({"scheduler": "tls://h:1", "tls": Tls(cert=connection.Path("none.pem"))}, "--tls-cert none.pem: no such file"),
+        ({"scheduler": "tls://h:1"}, "--scheduler tls://h:1: no --tls-ca-file or no --tls-cert; accepted: both"),
     ],
 )
 def test_misuse(options, message):
     assert message in refusal(**options)
 
 
-def test_encryption_is_not_given_up(tmp_path):
+def test_encryption_is_not_given_up():
     """Where TLS is asked for, a connection without is refused."""
-    path = tmp_path / "ca.pem"
-    path.write_text("")
-    assert "encryption required" in refusal(scheduler="tcp://127.0.0.1:9", tls=Tls(ca_file=path))
+    for address in ("tcp://127.0.0.1:9", "127.0.0.1:9"):
+        said = refusal(scheduler=address, tls=Tls(ca_file=Path("ca.pem")))
+        assert f"--scheduler {address}: is not encrypted; --tls-ca-file, --tls-cert, --tls-key: accepted with" in said
 
 
 def test_without_dask(monkeypatch):
@@ -99,7 +101,7 @@ sys.exit(str([name for name in sys.modules if name.partition(".")[0] in ("dask",
 def group(leader):
     """The processes of a process group that have not ended."""
     found = []
-    for entry in connection.Path("/proc").iterdir():
+    for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             try:
                 state, _, own = (entry / "stat").read_text().rpartition(")")[2].split()[:3]
@@ -129,7 +131,7 @@ with local_process.started(1) as address:
             assert address.startswith("tcp://127.0.0.1:")
             assert len(group(leader)) >= 2  # the scheduler's process, and a worker's
             for pid in group(leader):
-                status = connection.Path(f"/proc/{pid}/status").read_text()
+                status = Path(f"/proc/{pid}/status").read_text()
                 assert not int(status.partition("SigBlk:")[2].split()[0], 16) >> (signal.SIGTERM - 1) & 1
             process.kill()
             until(lambda: not group(leader), 10)

@@ -217,6 +217,20 @@ def test_what_is_begun_is_cancelled_with_the_iterator(client, scene, variant):
     until(lambda: not [key for keys in client.processing().values() for key in keys], 10)
 
 
+def test_a_node_whose_folds_are_folded_is_given_up(client, scene, variant, monkeypatch):
+    """Nobody asks for the inner folds: a scheduler that is told to cancel what they need closes the connection."""
+    monkeypatch.setattr(ClusterPasses, "levels", lambda self: (0, 2))
+    passes = source(client, scene, variant)
+    passes._series = 0, 1
+    passes.workers.look(at_once=True)
+    passes._begin(0, 64, 64)
+    assert [node.level for node in passes._begun] == [2]
+    passes.close()
+    [(_, sums, _)] = passes.nodes(0, 1, 1, 0, 1)
+    np.testing.assert_array_equal(sums.total, local(scene, 1)[0].total)
+    until(lambda: not [key for keys in client.processing().values() for key in keys], 10)
+
+
 def test_what_was_begun_ahead_serves_the_next_call(client, scene, variant):
     passes = source(client, scene, variant)
     list(passes.nodes(0, 1, 16, 0, 1))
