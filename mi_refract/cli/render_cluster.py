@@ -53,7 +53,7 @@ def cluster_passes(options: ClusterOptions, rendering: LongRender, variant: str)
 
     ValueError for a scene that cannot be sent; ConnectionError where no scheduler answers or no worker may render.
     """
-    if not options.given:
+    if not options.given or rendering.is_done:
         yield None
         return
     from mi_refract.rendering import scene_bundle

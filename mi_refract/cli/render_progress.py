@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn
 
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.outside_text import printable
@@ -24,6 +24,7 @@ from .quantities import shown_error
 if TYPE_CHECKING:  # it imports Mitsuba
     from mi_refract.rendering.long_render import LongRender
 
+BAR = 12  # characters: of a terminal of 80 the text takes the others
 BETWEEN_LINES = 30.0  # seconds, where there is no terminal
 BETWEEN_LOOKS = 2.0  # seconds between two estimates of the error for the bar, at least
 LOOK_COST = 50.0  # times what an estimate takes is the least time between two
@@ -33,18 +34,11 @@ BETWEEN_PREVIEWS = 10.0  # seconds
 @contextlib.contextmanager
 def shown(console: Console, rendering: LongRender, preview: Path | None) -> Iterator[Callable[[LongRender], None]]:
     """Within, what it yields is to be called after every pass."""
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TextColumn("{task.fields[said]}", markup=False),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
+    columns = BarColumn(BAR), TextColumn("{task.fields[said]}", markup=False)
     moving = console.is_terminal and not console.is_dumb_terminal
     with Progress(*columns, console=console, transient=True, disable=not moving) as bar:
         done = rendering.progress.done
-        task = bar.add_task(printable(rendering.job.scene.name), total=rendering.spp, completed=done, said="first pass")
+        task = bar.add_task("", total=rendering.spp, completed=done, said="first pass")
 
         def line(text: str) -> None:
             bar.update(task, completed=rendering.progress.done, said=text)
@@ -85,10 +79,9 @@ class _Watch:
 
     def _said(self, rendering: LongRender, now: float) -> str:
         passes, count, done = rendering.plan.passes, rendering.progress.passes, rendering.progress.done
-        parts = [f"pass {count} of {passes + rendering.progress.first}" if passes else f"{count} passes", f"{done} spp"]
+        parts = [f"pass {count} of {passes + rendering.progress.first}" if passes else f"{count} passes"]
         width, height = rendering.renderer.size
         rate = (done - self.done) / (now - self.began)  # spp a second
-        parts.append(f"{rate * width * height / 1e6:.3g} M samples/s")
         error = rendering.error()
         left = [(rendering.spp - done) / rate] if rendering.spp and rate else []
         if error is not None and math.isfinite(error.value):
@@ -98,7 +91,8 @@ class _Watch:
         if rendering.limits.seconds:
             left.append(rendering.limits.seconds - (now - self.began))
         if left:
-            parts.append(f"{max(0.0, min(left)):.0f} s left")
+            parts.insert(1, f"{max(0.0, min(left)):.0f} s left")
+        parts += [f"{rate * width * height / 1e6:.3g} M samples/s", f"{done} spp"]
         return ", ".join(parts)
 
 

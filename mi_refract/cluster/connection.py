@@ -51,8 +51,10 @@ def connected(scheduler: str | None = None, workers: int | None = None, tls: Tls
     require_dask()
     with _silent(), contextlib.ExitStack() as stack:
         if workers is not None:
-            scheduler = stack.enter_context(local_process.started(workers))
-        client = _client(str(scheduler), tls)
+            local = stack.enter_context(local_process.started(workers))
+            client = _client(local.address, local.security())
+        else:
+            client = _client(str(scheduler), tls.security(str(scheduler)))
         try:
             yield client
         finally:
@@ -60,10 +62,9 @@ def connected(scheduler: str | None = None, workers: int | None = None, tls: Tls
                 client.close(timeout=_CLOSING)
 
 
-def _client(address: str, tls: Tls) -> Any:
+def _client(address: str, security: Any) -> Any:
     from distributed import Client
 
-    security = tls.security(address)
     try:
         # First, as a client that found nobody would take 16 s to give up.
         kind = asyncio.run(_kind(address, security.get_connection_args("client")))

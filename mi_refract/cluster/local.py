@@ -1,12 +1,14 @@
 """`python -m mi_refract.cluster.local N`: a Dask scheduler and N workers of one thread each, until stdin closes.
 
-It prints the scheduler's address. In a process of its own, so that it ends with whoever holds the other end of its
-stdin, however that ends, and so that no signal which is blocked there is blocked in the workers.
+It prints the scheduler's address, with a certificate and a key made for this once: without them every user of this
+machine could have the workers run code. In a process of its own, so that it ends with whoever holds the other end of
+its stdin, however that ends, and so that no signal which is blocked there is blocked in the workers.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import os
 import shutil
@@ -15,6 +17,7 @@ import sys
 import tempfile
 
 FAILED = "failed: "
+PEM = ("tls_ca_file", "tls_client_cert", "tls_client_key")  # of Dask's `Security`: their text
 
 
 def main() -> None:
@@ -24,16 +27,23 @@ def main() -> None:
     folder = tempfile.mkdtemp(prefix="mi_refract-workers-")
     try:
         from distributed import LocalCluster
+        from distributed.security import Security
 
-        address = LocalCluster(
+        security = Security.temporary()
+        cluster = LocalCluster(
             n_workers=int(sys.argv[1]),
             threads_per_worker=1,
             host="127.0.0.1",
+            protocol="tls://",
+            security=security,
             dashboard_address=None,
             local_directory=folder,
             silence_logs=logging.CRITICAL,
-        ).scheduler_address
-        print(address, flush=True)
+        )
+        print(
+            json.dumps({"address": cluster.scheduler_address} | {name: getattr(security, name) for name in PEM}),
+            flush=True,
+        )
         sys.stdin.buffer.read()
     except Exception as error:
         print(f"{FAILED}{type(error).__name__}: {' '.join(str(error).split())}", flush=True)

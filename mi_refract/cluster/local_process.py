@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
 from .local import FAILED
 
@@ -15,9 +18,23 @@ MODULE = "mi_refract.cluster.local"
 _ENDING = 10.0  # seconds
 
 
+@dataclass(frozen=True)
+class LocalScheduler:
+    """Its address, and the texts of certificate and key, by their names in Dask's `Security`."""
+
+    address: str
+    pem: dict[str, str]
+
+    def security(self) -> Any:
+        """A `distributed.Security` for it."""
+        from distributed.security import Security
+
+        return Security(**self.pem, require_encryption=True)
+
+
 @contextlib.contextmanager
-def started(workers: int) -> Iterator[str]:
-    """The address of a scheduler with so many workers, processes of one thread each. They end at the end.
+def started(workers: int) -> Iterator[LocalScheduler]:
+    """A scheduler with so many workers, processes of one thread each. They end at the end.
 
     They also end where this process is killed. ConnectionError, one line, where they cannot be started.
     """
@@ -40,7 +57,8 @@ def started(workers: int) -> Iterator[str]:
         if not said or said.startswith(FAILED):
             reason = said.removeprefix(FAILED) or f"ended with status {process.wait()}"
             raise ConnectionError(f"--workers {workers}: no local cluster: {reason}; accepted: fewer, or none")
-        yield said
+        found = json.loads(said)
+        yield LocalScheduler(found.pop("address"), found)
     finally:
         process.stdin.close()
         with contextlib.suppress(subprocess.TimeoutExpired):

@@ -268,14 +268,21 @@ class LongRender:
         if self.progress.passes < FEW:
             return ""
         if self.limits.until and (error := relative_error(sums)).high <= self.limits.until:
-            return f"--until {self.limits.until:.3g}: the error is {error.value:.3g}, at most {error.high:.3g}"
+            asked, value, high = (f"{100 * each:.3g} %" for each in (self.limits.until, error.value, error.high))
+            return f"--until {asked}: the error is {value}, at most {high}"
         if self.limits.until_tile and (worst := worst_tile(sums)) <= self.limits.until_tile:
-            return f"--until-tile {self.limits.until_tile:.3g}: the error of the worst tile is {worst:.3g}"
+            asked, value = (f"{100 * each:.3g} %" for each in (self.limits.until_tile, worst))
+            return f"--until-tile {asked}: the error of the worst tile is {value}"
         return ""
 
     def _warn_once(self, text: str) -> None:
         if text not in self.warnings:
             self.warnings.append(text)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether nothing is left to render."""
+        return bool(self._end())
 
     @property
     def has_all_samples(self) -> bool:
@@ -318,12 +325,15 @@ class LongRender:
                 self.warnings.append(f"{self.checkpoint}: no checkpoint: {error.strerror or error}; tried again later")
 
     def give_up(self) -> None:
-        """For a process that is about to end while it renders: keep what is done, say if that fails, leave no lock."""
+        """For a process that is about to end while it renders: keep what is done, say so on stderr, leave no lock."""
         if self._holds_lock:
             before = len(self.warnings)
             self.keep()
-            for warning in self.warnings[before:]:
-                os.write(2, f"mi-refract: {printable(warning)}\n".encode(errors="replace"))
+            said = self.warnings[before:]
+            if not said and self.checkpoint.exists():
+                said = [f"{self.checkpoint}: {self.progress.done} spp; the same command goes on from them"]
+            for text in said:
+                os.write(2, f"\nmi-refract: {printable(text)}\n".encode(errors="replace"))
             lock_of(self.output).unlink(missing_ok=True)
 
     def _keep_sometimes(self) -> None:

@@ -161,7 +161,7 @@ def test_it_ends_at_the_error_that_was_asked_for_and_only_at_a_look(tmp_path, ll
     render = rendering(tmp_path / "a.exr", until=0.1, pass_spp=2)
     header = render.run()
     assert header["mi_refract:passes"] in (8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
-    assert render.error().high <= 0.1 and "--until 0.1" in render.ended_by
+    assert render.error().high <= 0.1 and "--until 10 %" in render.ended_by
     assert rendering(tmp_path / "b.exr", until=0.1, spp=8, pass_spp=2).run()["mi_refract:spp"] == 8
 
 
