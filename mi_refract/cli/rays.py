@@ -16,7 +16,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from mi_refract.cluster import connection
+from mi_refract.cluster.connection import HERE, Elsewhere
 from mi_refract.io.atomic import writable
 from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import provenance
@@ -24,6 +24,7 @@ from mi_refract.ray_sets import files, ray_set, run_program
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.regimes import REGIMES
 
+from .cluster_options import TlsCaFile, TlsCert, TlsKey, elsewhere
 from .interrupts import as_exceptions
 
 app = typer.Typer(
@@ -86,8 +87,7 @@ class CheckOptions:
     report: Path | None
     junit: Path | None
     json: Path | None
-    scheduler: str | None = None
-    workers: int | None = None
+    elsewhere: Elsewhere = HERE
 
     def __post_init__(self) -> None:
         """ValueError or OSError, before anything runs, for an option that cannot be met."""
@@ -101,10 +101,7 @@ class CheckOptions:
             raise ValueError(f"--tir {self.tir}: unknown; accepted: {', '.join((AUTO, *TIR))}")
         if self.formula not in (None, *FORMULAS):
             raise ValueError(f"--error-bound {self.formula}: unknown; accepted: {', '.join(FORMULAS)}")
-        if self.scheduler is not None and self.workers is not None:
-            raise ValueError("--scheduler and --workers; accepted: one of them")
-        if self.scheduler is not None or self.workers is not None:
-            connection.require_dask()
+        self.elsewhere.check()
         for path, suffixes in zip((self.report, self.junit, self.json), OUTPUTS, strict=True):
             if path:
                 writable(path, suffixes)
@@ -122,8 +119,8 @@ class CheckOptions:
 
         with contextlib.ExitStack() as stack:
             judge: Judge = judged_parts.here
-            if self.scheduler is not None or self.workers is not None:
-                judge = stack.enter_context(spread_check.judging(self.scheduler, self.workers, _say))
+            if self.elsewhere.given:
+                judge = stack.enter_context(spread_check.judging(self.elsewhere, _say))
             yield functools.partial(_watched, judge)
 
     def check(self, rays: RaySet, answers: Answers, name: str, replay: list[str]) -> int:
@@ -199,13 +196,17 @@ def check(
     workers: Annotated[
         int | None, typer.Option(min=1, max=1024, help="Certify and judge in so many processes, by Dask.")
     ] = None,
+    tls_ca_file: TlsCaFile = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
 ) -> None:
     """Check answers against certified ones. Exit code 0: right, 1: wrong, 2: the answers do not match the rays.
 
     The rays are those of --rays, or those that `export` makes with the same options as here, or without any. The
     answers do not choose them.
     """
-    options = CheckOptions(tir, formula or old_formula, report, junit, json, scheduler, workers)
+    there = elsewhere(scheduler, workers, tls_ca_file, tls_cert, tls_key)
+    options = CheckOptions(tir, formula or old_formula, report, junit, json, there)
     rays, chosen = _rays(file, regime, count, precision, seed, two_sided)
     given = files.read_answers(answers, most=files.most_answers(rays))
     origin = "" if chosen else ", as of `export` without options; others: --rays FILE"

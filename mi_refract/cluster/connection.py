@@ -20,6 +20,7 @@ Result = TypeVar("Result")
 PATIENCE = 6.0  # seconds until a scheduler must have answered
 _CLOSING = 2.0  # seconds
 _LOGGERS = ("distributed", "tornado", "asyncio")
+_TLS_ALONE = "--tls-ca-file, --tls-cert, --tls-key: accepted with --scheduler tls://HOST:PORT"
 _ACCEPTED = "accepted: the address of a Dask scheduler, such as tcp://host:8786 or tls://host:8786"
 
 
@@ -40,19 +41,54 @@ class Tls:
         """Whether any is given."""
         return any((self.ca_file, self.cert, self.key))
 
-    def security(self) -> Any:
-        """A `distributed.Security`; None where nothing is given. FileNotFoundError for a missing file."""
-        from distributed.security import Security
-
+    def check(self) -> None:
+        """FileNotFoundError for a missing file."""
         for option, path in (("--tls-ca-file", self.ca_file), ("--tls-cert", self.cert), ("--tls-key", self.key)):
             if path is not None and not path.is_file():
                 raise FileNotFoundError(f"{option} {path}: no such file; accepted: a file in PEM format")
+
+    def security(self) -> Any:
+        """A `distributed.Security`; None where nothing is given. Errors as of `check`."""
+        from distributed.security import Security
+
+        self.check()
         files = {"tls_ca_file": self.ca_file, "tls_client_cert": self.cert, "tls_client_key": self.key}
         named = {name: str(path) for name, path in files.items() if path is not None}
         return Security(**named, require_encryption=True) if named else None
 
 
 NO_TLS = Tls()
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """Who works, as the options of a command say: this process where neither `scheduler` nor `workers` is given."""
+
+    scheduler: str | None = None
+    workers: int | None = None
+    tls: Tls = NO_TLS
+
+    @property
+    def given(self) -> bool:
+        """Whether other processes work."""
+        return self.scheduler is not None or self.workers is not None
+
+    def check(self) -> None:
+        """ValueError for options that exclude each other, FileNotFoundError for a file, ImportError without Dask."""
+        if self.scheduler is not None and self.workers is not None:
+            raise ValueError("--scheduler and --workers; accepted: one of them")
+        if self.tls.given and self.scheduler is None:
+            raise ValueError(_TLS_ALONE)
+        self.tls.check()
+        if self.given:
+            require_dask()
+
+    def connected(self) -> contextlib.AbstractContextManager[Any]:
+        """As the function `connected`."""
+        return connected(self.scheduler, self.workers, self.tls)
+
+
+HERE = Elsewhere()
 
 
 def require_dask() -> None:
@@ -75,7 +111,7 @@ def connected(scheduler: str | None = None, workers: int | None = None, tls: Tls
     if (scheduler is None) == (workers is None):
         raise ValueError("accepted: either --scheduler ADDRESS or --workers N")
     if tls.given and scheduler is None:
-        raise ValueError("--tls-ca-file, --tls-cert, --tls-key: accepted with --scheduler tls://HOST:PORT")
+        raise ValueError(_TLS_ALONE)
     require_dask()
     with _silent(), contextlib.ExitStack() as stack:
         if workers is not None:

@@ -109,6 +109,16 @@ def test_facts_name_what_findings_depend_on():
     assert "unknown" not in spread_check.facts("scalar_rgb").values()
 
 
-def test_a_scheduler_and_workers_are_misuse(tmp_path, capsys):
-    assert main(["rays", "check", "a.csv", "--scheduler", "tcp://h:1", "--workers", "2"]) == 2
-    assert "--scheduler and --workers; accepted: one of them" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (("--scheduler", "tcp://h:1", "--workers", "2"), "--scheduler and --workers; accepted: one of them"),
+        (("--workers", "2", "--tls-key", "a.csv"), "--tls-key: accepted with --scheduler tls://HOST:PORT"),
+        (("--scheduler", "tls://h:1", "--tls-ca-file", "none.pem"), "--tls-ca-file none.pem: no such file; accepted"),
+        (("--scheduler", "tls://h:1", "--tls-cert", "none.pem"), "--tls-cert none.pem: no such file; accepted"),
+        (("--scheduler", "tls://h:1", "--tls-key", "none.pem"), "--tls-key none.pem: no such file; accepted"),
+    ],
+)
+def test_options_of_a_cluster_that_are_misuse(capsys, options, message):
+    assert main(["rays", "check", "a.csv", *options]) == 2
+    assert message in capsys.readouterr().err
