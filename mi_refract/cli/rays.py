@@ -20,8 +20,10 @@ from mi_refract.cluster.connection import HERE, Elsewhere
 from mi_refract.io.atomic import writable
 from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import provenance
-from mi_refract.ray_sets import files, ray_set, run_program
+from mi_refract.ray_sets import files, ray_set, run_program, stored_rays
 from mi_refract.ray_sets.ray_set import Answers, RaySet
+from mi_refract.ray_sets.stored_answers import StoredAnswers
+from mi_refract.ray_sets.stored_rays import StoredRays
 from mi_refract.regimes import REGIMES
 
 from .cluster_options import TlsCaFile, TlsCert, TlsKey, elsewhere
@@ -123,7 +125,7 @@ class CheckOptions:
                 judge = stack.enter_context(spread_check.judging(self.elsewhere, _say))
             yield functools.partial(_watched, judge)
 
-    def check(self, rays: RaySet, answers: Answers, name: str, replay: list[str]) -> int:
+    def check(self, rays: RaySet | StoredRays, answers: Answers | StoredAnswers, name: str, replay: list[str]) -> int:
         """Check the answers, print and write the reports; the exit code. `replay`: the words of the command."""
         from mi_refract.ray_sets import check_answers, reports
 
@@ -207,8 +209,12 @@ def check(
     """
     there = elsewhere(scheduler, workers, tls_ca_file, tls_cert, tls_key)
     options = CheckOptions(tir, formula or old_formula, report, junit, json, there)
-    rays, chosen = _rays(file, regime, count, precision, seed, two_sided)
-    given = files.read_answers(answers, most=files.most_answers(rays))
+    chosen = _chosen(file, _rays_as_words(regime, count, precision, seed, two_sided))
+    if file:
+        rays = files.read_stored(file)
+    else:
+        rays = stored_rays.make(_names(regime), count, precision, seed, two_sided=two_sided)
+    given = files.read_stored_answers(answers, rays)
     origin = "" if chosen else ", as of `export` without options; others: --rays FILE"
     print(printable(f"{answers}: {_summary(rays)}{origin}"))
     raise typer.Exit(options.check(rays, given, str(answers), ["check", str(answers), *chosen, *options.words]))
@@ -240,7 +246,8 @@ def run(
     Exit code 0: right, 1: wrong, 2: the answers do not match the rays, or the command fails or takes too long.
     """
     options = CheckOptions(tir, formula or old_formula, report, junit, json)
-    rays, chosen = _rays(file, regime, count, precision, seed, two_sided)
+    chosen = _chosen(file, _rays_as_words(regime, count, precision, seed, two_sided))
+    rays = files.read(file) if file else ray_set.make(_names(regime), count, precision, seed, two_sided=two_sided)
     with as_exceptions():
         given = run_program.answers_of(command, rays, timeout=timeout, adopt=True)
     name = shlex.join(command)
@@ -248,16 +255,11 @@ def run(
     raise typer.Exit(options.check(rays, given, name, ["run", *chosen, *options.words, "--", *command]))
 
 
-def _rays(
-    file: Path | None, regime: list[str] | None, count: int, precision: str, seed: int, two_sided: bool
-) -> tuple[RaySet, list[str]]:
-    """The rays, and the options that choose them; none for those of `export` without options."""
-    made = _rays_as_words(regime, count, precision, seed, two_sided)
+def _chosen(file: Path | None, made: list[str]) -> list[str]:
+    """The options that choose the rays, none for those of `export` without options. `made`: those of `export`."""
     if file and made:
         raise ValueError(f"--rays {file} and {made[0]}: both choose the rays; accepted: one of them")
-    if file:
-        return files.read(file), ["--rays", str(file)]
-    return ray_set.make(_names(regime), count, precision, seed, two_sided=two_sided), made
+    return ["--rays", str(file)] if file else made
 
 
 def _names(regime: list[str] | None) -> tuple[str, ...]:
@@ -277,7 +279,7 @@ def _rays_as_words(regime: list[str] | None, count: int, precision: str, seed: i
     return words + ["--two-sided"] * two_sided
 
 
-def _summary(rays: RaySet) -> str:
+def _summary(rays: RaySet | StoredRays) -> str:
     number = len(rays.header["regimes"])
     regimes = f"{number} regime{'' if number == 1 else 's'}"
     return f"{len(rays)} rays, {regimes}, {rays.precision}, seed {rays.header['seed']}"

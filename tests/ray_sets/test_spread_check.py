@@ -11,7 +11,7 @@ from support import ray_programs as programs
 from mi_refract import oracle
 from mi_refract.cli.app import main
 from mi_refract.cluster import local_process
-from mi_refract.ray_sets import check_answers, files, judged_parts, ray_set, reports, spread_check
+from mi_refract.ray_sets import check_answers, files, judged_parts, pieces, ray_set, reports, spread_check
 from mi_refract.ray_sets.ray_set import Answers
 from mi_refract.report.row import strict
 
@@ -54,12 +54,12 @@ def test_findings_do_not_depend_on_the_pieces(rays, right, change, monkeypatch):
     b = CHANGES[change](right)
     whole = shown(rays, b)
     for rays_of_piece in (7, 64):
-        monkeypatch.setattr(check_answers, "PIECE", rays_of_piece)
+        monkeypatch.setattr(pieces, "PIECE", rays_of_piece)
         assert shown(rays, b, backwards) == whole
 
 
 def test_ids_of_a_problem_are_the_first_of_all_pieces(rays, right, monkeypatch):
-    monkeypatch.setattr(check_answers, "PIECE", 8)
+    monkeypatch.setattr(pieces, "PIECE", 8)
     b = right.copy()
     b[[3, 7, 160, 170, 180, 190, 200]] = np.inf
     problems = check_answers.check(rays, Answers(rays.ids, b)).problems
@@ -77,7 +77,7 @@ def test_a_signal_that_was_guessed_wrong_is_found(rays, right, monkeypatch):
             asked.append(question.tir)
             yield number, judged_parts.judge_part(piece, question)
 
-    monkeypatch.setattr(check_answers, "_guess", lambda pieces, question: "nan")
+    monkeypatch.setattr(check_answers, "_guess", lambda given, question: "nan")
     assert shown(rays, right, judge) == whole
     assert asked == ["nan"] * 3 + ["zero"] * 3
 
