@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 IN_MEMORY = 2**24  # bytes: fewer stay in memory
+_SCATTERED = 2**11  # rows that are mapped at once: each may bring 64 KiB around it into the memory, 128 MiB in all
 _ZEROS = 2**20  # bytes at once
 Numbers = NDArray[Any]
 
@@ -47,7 +48,10 @@ class Table:
 
     def take(self, rows: NDArray[np.integer[Any]]) -> Numbers:
         """Those of these numbers."""
-        return np.array(self._rows()[rows])
+        found = np.empty((len(rows), *self.shape[1:]), self.dtype)
+        for start in range(0, len(rows), _SCATTERED):
+            found[start : start + _SCATTERED] = self._rows()[rows[start : start + _SCATTERED]]
+        return found
 
     def write(self, start: int, values: Numbers) -> None:
         """Put rows in place of those from `start` on."""
@@ -55,7 +59,8 @@ class Table:
 
     def put(self, rows: NDArray[np.integer[Any]], values: Numbers) -> None:
         """Put rows in place of those of these numbers."""
-        self._rows()[rows] = values
+        for start in range(0, len(rows), _SCATTERED):
+            self._rows()[rows[start : start + _SCATTERED]] = values[start : start + _SCATTERED]
 
 
 class Log:

@@ -386,6 +386,27 @@ def test_what_is_kept_of_a_ray_is_a_byte(rays, right):
     assert files.MOST_STORED <= 2**30
 
 
+MAPPED = """
+import numpy as np, resource
+from mi_refract.io import scratch
+table = scratch.Table((50_000_000,), float)
+for start in range(0, len(table), 1_000_000):
+    table.write(start, np.full(1_000_000, 2.0))
+rows = np.arange(0, len(table), 1000)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+table.put(rows, 1 + table.take(rows))
+assert table.take(rows).min() == 3
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="kibibytes there")
+def test_scattered_rows_do_not_bring_the_table_into_the_memory():
+    """400 MB, of which every page is near one that is asked for."""
+    found = subprocess.run([sys.executable, "-c", MAPPED], env=ENVIRONMENT, check=True, capture_output=True, text=True)
+    assert int(found.stdout) < 150 * 1024
+
+
 def test_a_full_disk_is_one_line(monkeypatch):
     monkeypatch.setattr(scratch, "IN_MEMORY", 0)
 
