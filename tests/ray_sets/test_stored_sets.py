@@ -176,6 +176,11 @@ def cut(path):
     path.write_bytes(path.read_bytes()[:-300])
 
 
+def headless(path):
+    edited(path, lambda arrays: arrays.pop("header"))
+    damaged(path, "n_to.npy")
+
+
 def damaged(path, name):
     """The last byte of a member is another one."""
     with zipfile.ZipFile(path) as archive:
@@ -188,6 +193,8 @@ def damaged(path, name):
 RAYS = {
     "a component": (lambda path: edited(path, lambda x: x["n"].__setitem__((-1, 2), 0.5)), "checksum does not match"),
     "an id": (lambda path: edited(path, lambda x: x["id"].__setitem__(-1, 7)), "checksum does not match"),
+    "the first id": (lambda path: edited(path, lambda x: x["id"].__setitem__(0, 7)), "checksum does not match"),
+    "a bit, and no header": (lambda path: headless(path), "Bad CRC-32 for file 'n_to.npy'"),
     "a bit": (lambda path: damaged(path, "n_to.npy"), "Bad CRC-32 for file 'n_to.npy'"),
     "the end": (cut, "not a zip file"),
 }
