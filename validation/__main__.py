@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mi_refract.cluster import connection
+from mi_refract.cli.cluster_options import TlsCaFile, TlsCert, TlsKey, elsewhere
+from mi_refract.cluster.connection import HERE, Elsewhere
 from mi_refract.io import lock
 from mi_refract.io.outside_text import printable
 from validation.run import command_line
@@ -47,8 +48,6 @@ QUICK = (
 )
 LOCK = "validation.lock"  # in the folder of the report, while it is being made
 PROFILES = {"quick": "seconds", "standard": "minutes", "full": "hours"}
-Cluster = tuple[str | None, int | None]  # the address of a scheduler, or a number of processes
-NOBODY: Cluster = (None, None)
 
 app = command_line.application()
 
@@ -82,17 +81,20 @@ def _command(
     workers: Annotated[
         int | None, typer.Option(min=1, max=1024, help="Run what times nothing in so many processes, by Dask.")
     ] = None,
+    tls_ca_file: TlsCaFile = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
 ) -> int:
     """Measure the formulas and the plugin against certified answers, and write the report."""
     _check(studies or [], profile, out, write_tables)
-    if scheduler is not None and workers is not None:
-        raise Misuse("--scheduler and --workers; accepted: one of them")
-    if scheduler is not None or workers is not None:
-        connection.require_dask()
-    cluster = scheduler, workers
+    there = elsewhere(scheduler, workers, tls_ca_file, tls_cert, tls_key)
+    try:
+        there.check()
+    except (ValueError, OSError) as error:
+        raise Misuse(str(error)) from None
     try:
         with lock.held(out / LOCK, "a validation"):
-            return _run(studies or [], profile, out, write_tables, goals, cluster)
+            return _run(studies or [], profile, out, write_tables, goals, there)
     except KeyboardInterrupt:
         print("validation: interrupted; the same command goes on from here", file=sys.stderr)
         raise
@@ -125,7 +127,7 @@ def modules(studies: list[str], profile: str) -> list[str]:
     return list(dict.fromkeys(f"{room}.{module}" for room, members in chosen for module in members))
 
 
-def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: bool, cluster: Cluster = NOBODY) -> int:
+def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: bool, there: Elsewhere = HERE) -> int:
     from mi_refract import backend
     from mi_refract.report import run_report
     from validation.run.context import Context, profiles
@@ -141,7 +143,7 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
     context = Context(chosen, out, variant, backend.detect(), backend.usable_variants())
     studies: list[Study] = [import_module(f"validation.{name}").STUDY for name in modules(names, profile)]
     asked = spread.Asked(tuple(modules(names, profile)), profile, variant)
-    elsewhere = None if cluster == NOBODY else spread.Elsewhere(asked, *cluster)
+    elsewhere = spread.Elsewhere(asked, there) if there.given else None
     rows, spent = runner.run(spread.tasks(studies, context), context, elsewhere)
     for study in studies:
         rows = study.summarise(rows)

@@ -16,14 +16,17 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from mi_refract.cluster import connection
+from mi_refract.cluster.connection import HERE, Elsewhere
 from mi_refract.io.atomic import writable
 from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import provenance
-from mi_refract.ray_sets import files, ray_set, run_program
+from mi_refract.ray_sets import files, ray_set, run_program, stored_rays
 from mi_refract.ray_sets.ray_set import Answers, RaySet
+from mi_refract.ray_sets.stored_answers import StoredAnswers
+from mi_refract.ray_sets.stored_rays import StoredRays
 from mi_refract.regimes import REGIMES
 
+from .cluster_options import TlsCaFile, TlsCert, TlsKey, elsewhere
 from .interrupts import as_exceptions
 
 app = typer.Typer(
@@ -86,8 +89,7 @@ class CheckOptions:
     report: Path | None
     junit: Path | None
     json: Path | None
-    scheduler: str | None = None
-    workers: int | None = None
+    elsewhere: Elsewhere = HERE
 
     def __post_init__(self) -> None:
         """ValueError or OSError, before anything runs, for an option that cannot be met."""
@@ -101,10 +103,7 @@ class CheckOptions:
             raise ValueError(f"--tir {self.tir}: unknown; accepted: {', '.join((AUTO, *TIR))}")
         if self.formula not in (None, *FORMULAS):
             raise ValueError(f"--error-bound {self.formula}: unknown; accepted: {', '.join(FORMULAS)}")
-        if self.scheduler is not None and self.workers is not None:
-            raise ValueError("--scheduler and --workers; accepted: one of them")
-        if self.scheduler is not None or self.workers is not None:
-            connection.require_dask()
+        self.elsewhere.check()
         for path, suffixes in zip((self.report, self.junit, self.json), OUTPUTS, strict=True):
             if path:
                 writable(path, suffixes)
@@ -122,11 +121,11 @@ class CheckOptions:
 
         with contextlib.ExitStack() as stack:
             judge: Judge = judged_parts.here
-            if self.scheduler is not None or self.workers is not None:
-                judge = stack.enter_context(spread_check.judging(self.scheduler, self.workers, _say))
+            if self.elsewhere.given:
+                judge = stack.enter_context(spread_check.judging(self.elsewhere, _say))
             yield functools.partial(_watched, judge)
 
-    def check(self, rays: RaySet, answers: Answers, name: str, replay: list[str]) -> int:
+    def check(self, rays: RaySet | StoredRays, answers: Answers | StoredAnswers, name: str, replay: list[str]) -> int:
         """Check the answers, print and write the reports; the exit code. `replay`: the words of the command."""
         from mi_refract.ray_sets import check_answers, reports
 
@@ -199,15 +198,23 @@ def check(
     workers: Annotated[
         int | None, typer.Option(min=1, max=1024, help="Certify and judge in so many processes, by Dask.")
     ] = None,
+    tls_ca_file: TlsCaFile = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
 ) -> None:
     """Check answers against certified ones. Exit code 0: right, 1: wrong, 2: the answers do not match the rays.
 
     The rays are those of --rays, or those that `export` makes with the same options as here, or without any. The
     answers do not choose them.
     """
-    options = CheckOptions(tir, formula or old_formula, report, junit, json, scheduler, workers)
-    rays, chosen = _rays(file, regime, count, precision, seed, two_sided)
-    given = files.read_answers(answers, most=files.most_answers(rays))
+    there = elsewhere(scheduler, workers, tls_ca_file, tls_cert, tls_key)
+    options = CheckOptions(tir, formula or old_formula, report, junit, json, there)
+    chosen = _chosen(file, _rays_as_words(regime, count, precision, seed, two_sided))
+    if file:
+        rays = files.read_stored(file)
+    else:
+        rays = stored_rays.make(_names(regime), count, precision, seed, two_sided=two_sided)
+    given = files.read_stored_answers(answers, rays)
     origin = "" if chosen else ", as of `export` without options; others: --rays FILE"
     print(printable(f"{answers}: {_summary(rays)}{origin}"))
     raise typer.Exit(options.check(rays, given, str(answers), ["check", str(answers), *chosen, *options.words]))
@@ -239,7 +246,8 @@ def run(
     Exit code 0: right, 1: wrong, 2: the answers do not match the rays, or the command fails or takes too long.
     """
     options = CheckOptions(tir, formula or old_formula, report, junit, json)
-    rays, chosen = _rays(file, regime, count, precision, seed, two_sided)
+    chosen = _chosen(file, _rays_as_words(regime, count, precision, seed, two_sided))
+    rays = files.read(file) if file else ray_set.make(_names(regime), count, precision, seed, two_sided=two_sided)
     with as_exceptions():
         given = run_program.answers_of(command, rays, timeout=timeout, adopt=True)
     name = shlex.join(command)
@@ -247,16 +255,11 @@ def run(
     raise typer.Exit(options.check(rays, given, name, ["run", *chosen, *options.words, "--", *command]))
 
 
-def _rays(
-    file: Path | None, regime: list[str] | None, count: int, precision: str, seed: int, two_sided: bool
-) -> tuple[RaySet, list[str]]:
-    """The rays, and the options that choose them; none for those of `export` without options."""
-    made = _rays_as_words(regime, count, precision, seed, two_sided)
+def _chosen(file: Path | None, made: list[str]) -> list[str]:
+    """The options that choose the rays, none for those of `export` without options. `made`: those of `export`."""
     if file and made:
         raise ValueError(f"--rays {file} and {made[0]}: both choose the rays; accepted: one of them")
-    if file:
-        return files.read(file), ["--rays", str(file)]
-    return ray_set.make(_names(regime), count, precision, seed, two_sided=two_sided), made
+    return ["--rays", str(file)] if file else made
 
 
 def _names(regime: list[str] | None) -> tuple[str, ...]:
@@ -276,7 +279,7 @@ def _rays_as_words(regime: list[str] | None, count: int, precision: str, seed: i
     return words + ["--two-sided"] * two_sided
 
 
-def _summary(rays: RaySet) -> str:
+def _summary(rays: RaySet | StoredRays) -> str:
     number = len(rays.header["regimes"])
     regimes = f"{number} regime{'' if number == 1 else 's'}"
     return f"{len(rays)} rays, {regimes}, {rays.precision}, seed {rays.header['seed']}"

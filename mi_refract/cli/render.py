@@ -13,11 +13,11 @@ from rich.console import Console
 from rich.text import Text
 
 from mi_refract import backend
-from mi_refract.cluster.tls import Tls
 from mi_refract.io.outside_text import printable
 from mi_refract.rendering import scene_files
 
 from . import interrupts, variants
+from .cluster_options import TlsCaFile, TlsCert, TlsKey, elsewhere
 from .quantities import parse_seconds, parse_share, shown_error
 from .render_cluster import ClusterOptions, cluster_passes
 from .render_progress import shown
@@ -62,9 +62,9 @@ def render(
     workers: Annotated[
         int | None, typer.Option(min=1, max=1024, help="Render in so many processes of one thread each, by Dask.")
     ] = None,
-    tls_ca_file: Annotated[Path | None, typer.Option(metavar="FILE", help="For tls://…: the authority, PEM.")] = None,
-    tls_cert: Annotated[Path | None, typer.Option(metavar="FILE", help="For tls://…: our certificate, PEM.")] = None,
-    tls_key: Annotated[Path | None, typer.Option(metavar="FILE", help="For tls://…: our key, PEM.")] = None,
+    tls_ca_file: TlsCaFile = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
     bundle_limit: Annotated[
         int, typer.Option(min=1, metavar="MIB", help="MiB of a scene's files that may be sent to workers.")
     ] = 256,
@@ -83,9 +83,8 @@ def render(
     from mi_refract.io.atomic import writable
 
     defines = scene_files.parse_defines(define or [])
-    cluster = ClusterOptions(
-        scheduler, workers, Tls(tls_ca_file, tls_cert, tls_key), bundle_limit, mixed_workers=mixed_workers
-    )
+    there = elsewhere(scheduler, workers, tls_ca_file, tls_cert, tls_key)
+    cluster = ClusterOptions(there, bundle_limit, mixed_workers=mixed_workers)
     cluster.check(allow_plugins or ())
     shares = [
         None if text is None else parse_share(text, option)

@@ -8,8 +8,8 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from mi_refract.cluster import connection, worker_facts
-from mi_refract.cluster.tls import NO_TLS, Tls
+from mi_refract.cluster import worker_facts
+from mi_refract.cluster.connection import HERE, Elsewhere
 from mi_refract.cluster.workers import Workers
 from mi_refract.io.outside_text import printable
 
@@ -19,32 +19,27 @@ if TYPE_CHECKING:  # they import Mitsuba
 
 @dataclass(frozen=True)
 class ClusterOptions:
-    """Who renders, this process where neither `scheduler` nor `workers` is given. `bundle_limit` in MiB."""
+    """Who renders. `bundle_limit` in MiB."""
 
-    scheduler: str | None = None
-    workers: int | None = None
-    tls: Tls = NO_TLS
+    elsewhere: Elsewhere = HERE
     bundle_limit: int = 256
     mixed_workers: bool = False
 
     @property
     def given(self) -> bool:
         """Whether other processes render."""
-        return self.scheduler is not None or self.workers is not None
+        return self.elsewhere.given
 
     def check(self, plugins: Collection[str]) -> None:
         """ValueError for options that exclude each other, ImportError without Dask. `plugins`: the scene's own."""
-        if self.scheduler is not None and self.workers is not None:
-            raise ValueError("--scheduler and --workers; accepted: one of them")
-        if not self.given and (self.tls.given or self.mixed_workers):
+        if not self.given and (self.elsewhere.tls.given or self.mixed_workers):
             raise ValueError("--tls-ca-file, --tls-cert, --tls-key, --mixed-workers: accepted with --scheduler ADDRESS")
+        self.elsewhere.check()
         if self.given and plugins:
             raise ValueError(
                 f"--allow-plugins {min(plugins)}: native code, which is not sent to workers; "
                 "accepted: without --scheduler and --workers"
             )
-        if self.given:
-            connection.require_dask()
 
 
 @contextlib.contextmanager
@@ -61,10 +56,10 @@ def cluster_passes(options: ClusterOptions, rendering: LongRender, variant: str)
 
     job = rendering.job
     bundle = scene_bundle.pack(job.scene, job.defines, options.bundle_limit)
-    with connection.connected(options.scheduler, options.workers, options.tls) as client:
+    with options.elsewhere.connected() as client:
         tolerated: frozenset[str] = worker_facts.MIXED if options.mixed_workers else frozenset()
         expected = worker_facts.facts(variant)
-        workers = Workers(client, variant, expected, tolerated, _say)
+        workers = Workers(client, variant, expected, tolerated, _say, task="render")
         workers.wait()
         scene = RenderedScene(variant, dict(job.defines), job.seed, expected, tolerated)
         passes = ClusterPasses(workers, bundle, scene, rendering.warnings.append)

@@ -10,6 +10,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent import futures
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from . import local_process
@@ -25,6 +26,38 @@ _ACCEPTED = "accepted: the address of a Dask scheduler, such as tcp://host:8786 
 
 class LostSchedulerError(ConnectionError):
     """The scheduler has ended, or cannot be reached any more."""
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """Who works, as the options of a command say: this process where neither `scheduler` nor `workers` is given."""
+
+    scheduler: str | None = None
+    workers: int | None = None
+    tls: Tls = NO_TLS
+
+    @property
+    def given(self) -> bool:
+        """Whether other processes work."""
+        return self.scheduler is not None or self.workers is not None
+
+    def check(self) -> None:
+        """ValueError for options that exclude each other, those of `Tls.security`, ImportError without Dask."""
+        if self.scheduler is not None and self.workers is not None:
+            raise ValueError("--scheduler and --workers; accepted: one of them")
+        if self.tls.given and self.scheduler is None:
+            raise ValueError(TLS_ACCEPTED)
+        if self.given:
+            require_dask()
+        if self.scheduler is not None and self.tls.given:
+            self.tls.security(self.scheduler)
+
+    def connected(self) -> contextlib.AbstractContextManager[Any]:
+        """As the function `connected`."""
+        return connected(self.scheduler, self.workers, self.tls)
+
+
+HERE = Elsewhere()
 
 
 def require_dask() -> None:
@@ -47,7 +80,7 @@ def connected(scheduler: str | None = None, workers: int | None = None, tls: Tls
     if (scheduler is None) == (workers is None):
         raise ValueError("accepted: either --scheduler ADDRESS or --workers N")
     if tls.given and scheduler is None:
-        raise ValueError(f"--workers {workers}: needs no TLS; {TLS_ACCEPTED}")
+        raise ValueError(TLS_ACCEPTED)
     require_dask()
     with _silent(), contextlib.ExitStack() as stack:
         if workers is not None:

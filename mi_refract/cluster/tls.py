@@ -10,6 +10,7 @@ from typing import Any
 
 ENCRYPTED = ("tls://", "wss://")  # addresses
 ACCEPTED = "--tls-ca-file, --tls-cert, --tls-key: accepted with --scheduler tls://HOST:PORT"
+_OPTIONS = ("--tls-ca-file", "--tls-cert", "--tls-key")
 _PEM = "accepted: a file in PEM format"
 
 
@@ -36,6 +37,9 @@ class Tls:
         encrypted = address.startswith(ENCRYPTED)
         if self.given and not encrypted:
             raise ValueError(f"--scheduler {address}: is not encrypted; {ACCEPTED}")
+        for option, path in zip(_OPTIONS, (self.ca_file, self.cert, self.key), strict=True):
+            if path is not None:
+                _require_readable(option, str(path))
         files = {"tls_ca_file": self.ca_file, "tls_client_cert": self.cert, "tls_client_key": self.key}
         named = {name: str(path) for name, path in files.items() if path is not None}
         security = Security(**named, require_encryption=True) if named else Security()
@@ -54,7 +58,7 @@ def _try(address: str, files: Mapping[str, str | None]) -> None:
     if any("\n" in each for each in (ca_file, cert, key)):
         return  # not a file: Dask's configuration holds its text
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    for option, file in (("--tls-ca-file", ca_file), ("--tls-cert", cert), ("--tls-key", key)):
+    for option, file in zip(_OPTIONS, (ca_file, cert, key), strict=True):
         _require_readable(option, file)
         if option == "--tls-key":
             break

@@ -33,12 +33,13 @@ class Workers:
         tolerated: Collection[str] = (),
         warn: Callable[[str], None] = lambda text: None,
         facts: str = worker_facts.__name__,
+        task: str = "work",
     ) -> None:
         """`expected`: facts that workers must have, but for `tolerated`. `warn` is told of who is refused.
 
-        `facts`: the name of the module whose `facts(variant)` workers are asked for.
+        `facts`: the name of the module whose `facts(variant)` workers are asked for. `task`: what they are for, a verb.
         """
-        self.facts = facts
+        self.facts, self._task = facts, task
         self.client, self.variant, self.expected, self.tolerated, self.warn = client, variant, expected, tolerated, warn
         self.accepted: dict[str, int] = {}
         self.refused: dict[str, str] = {}
@@ -71,7 +72,7 @@ class Workers:
             time.sleep(_POLL)
         found = "; ".join(self.refused.values()) or ("workers do not answer" if self._asked else "no workers")
         raise ConnectionError(
-            f"{self._address}: no worker that may render: {found}; accepted: at least one like this process"
+            f"{self._address}: no worker that may {self._task}: {found}; accepted: at least one like this process"
         )
 
     @property

@@ -15,5 +15,6 @@ __all__ = [
     "process_group",
     "provenance",
     "regular_file",
+    "scratch",
     "toml_schema",
 ]

@@ -5,4 +5,15 @@ Out: a file of rays (CSV, .npz or EXR); for each regime the errors against certi
 that explains wrong answers; as text, JSON, JUnit XML or an HTML page. The command is `mi-refract rays`; see README.md.
 """
 
-__all__ = ["check_answers", "files", "judged_parts", "ray_set", "reports", "run_program", "spread_check", "tir_signal"]
+__all__ = [
+    "check_answers",
+    "files",
+    "judged_parts",
+    "ray_set",
+    "reports",
+    "run_program",
+    "spread_check",
+    "stored_answers",
+    "stored_rays",
+    "tir_signal",
+]

@@ -7,7 +7,6 @@ of the length is reported separately.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,12 +16,17 @@ import numpy as np
 from mi_refract.accuracy import lengths
 from mi_refract.formulas import FORMULAS
 
-from . import diagnosis, evidence, judged_parts, tir_signal
+from . import diagnosis, judged_parts, tir_signal
 from .diagnosis import Explanation
-from .header import Header, shown
+from .evidence import AllEvidence
+from .header import PRECISIONS, Header, shown
 from .judged_answers import judge_answers
-from .judged_parts import LISTED_IDS, PIECE, JudgedPart, Piece, Question
+from .judged_parts import JudgedPart, Piece, Question
+from .kept_angles import Angles, KeptAngles
+from .pieces import ArrayPieces, Pieces, StoredPieces
 from .ray_set import Answers, RaySet
+from .stored_answers import LISTED_IDS, StoredAnswers
+from .stored_rays import StoredRays
 from .tir_signal import AUTO, FLAG, LOOSEST, NONE, TIR, UNCLEAR
 
 SEEN, GUESSED = 2**16, 2**9  # rays that are looked at, and judged, to guess the signal of total internal reflection
@@ -124,93 +128,79 @@ Judge = Callable[[Iterable[tuple[Piece, Question]]], Iterator[tuple[int, JudgedP
 
 
 def check(
-    rays: RaySet, answers: Answers, *, tir: str = AUTO, error_bound: str = LOOSEST, judge: Judge = judged_parts.here
+    rays: RaySet | StoredRays,
+    answers: Answers | StoredAnswers,
+    *,
+    tir: str = AUTO,
+    error_bound: str = LOOSEST,
+    judge: Judge = judged_parts.here,
 ) -> Findings:
     """Compare every answer with the certified direction.
 
     `tir`: how the answers signal total internal reflection, one of TIR; detected where it is AUTO. `error_bound`: the
     formula of FORMULAS whose a-priori bound the errors must keep. `judge`: who judges pieces of the set; the findings
-    do not depend on it. ValueError for an unknown name, for tir = FLAG without the column `transmitted`, or for answers
-    whose header is that of other rays.
+    do not depend on it, nor on whether rays and answers are arrays or stored: both are the same. ValueError for an
+    unknown name, for tir = FLAG without the column `transmitted`, or for answers whose header is that of other rays.
     """
     _check_name("tir", tir, (AUTO, *TIR))
     _check_name("error_bound", error_bound, FORMULAS)
-    if tir == FLAG and answers.transmitted is None:
+    flagged = answers.flagged if isinstance(answers, StoredAnswers) else answers.transmitted is not None
+    if tir == FLAG and not flagged:
         raise ValueError("tir = 'flag': there is no column `transmitted`; accepted: answers with one")
     if (given := answers.header.get("checksum")) not in (None, rays.header["checksum"]):
         accepted = f"{rays.header['checksum']}, or other rays with --rays FILE"
         raise ValueError(f"the answers are to rays with the checksum {shown(given)}; accepted: {accepted}")
-    problems, order = _match_ids(rays, answers)
-    pieces = Pieces(rays, answers, order, np.flatnonzero(order >= 0))
-    signal, parts = _parts(pieces, Question(rays.precision, error_bound, tir), judge)
+    pieces, mismatches = _matched(rays, answers)
+    signal, parts, angles = _parts(pieces, Question(rays.precision, error_bound, tir), judge)
     return Findings(
         precision=rays.precision,
-        ulp=2 * rays.roundoff,
+        ulp=float(np.finfo(PRECISIONS[rays.precision]).eps),
         error_bound=error_bound,
         tir=signal,
         tir_given=tir != AUTO,
-        regimes=tuple(_by_regime(rays, parts)),
-        problems=(*problems, *_not_directions(parts)),
-        explanations=_explanations(pieces, parts, Question(rays.precision, error_bound, signal)),
+        regimes=tuple(_by_regime(rays.header, parts, angles)),
+        problems=(*(_listed(kind, *each) for kind, each in mismatches.items()), *_not_directions(parts)),
+        explanations=_explanations(pieces, parts, angles, Question(rays.precision, error_bound, signal)),
         header=rays.header,
     )
 
 
-@dataclass(frozen=True)
-class Pieces:
-    """Rays with their answers. `order`: (N,) for each ray the row of its answer; `kept`: the rays that have one."""
-
-    rays: RaySet
-    answers: Answers
-    order: np.ndarray
-    kept: np.ndarray
-
-    @functools.cached_property
-    def index(self) -> list[tuple[str, np.ndarray]]:
-        """Of each piece its regime and its rays."""
-        names, found = self.rays.regime[self.kept], []
-        for name in self.rays.header["regimes"]:
-            of_regime = self.kept[np.flatnonzero(names == name)]
-            found += [(name, of_regime[i : i + PIECE]) for i in range(0, len(of_regime), PIECE)]
-        return found
-
-    def piece(self, name: str, index: np.ndarray) -> Piece:
-        """Some rays with their answers."""
-        rows, flags = self.order[index], self.answers.transmitted
-        flag = None if flags is None else flags[rows]
-        return Piece(name, self.rays.rays[index], self.rays.ids[index], self.answers.b[rows], flag)
-
-    def sampled(self, index: np.ndarray) -> Piece:
-        """Some rays by their places in the order of the pieces."""
-        ends = np.cumsum([len(each) for _, each in self.index])
-        which = np.searchsorted(ends, index, side="right")
-        found = [self.index[i][1][j - (ends[i] - len(self.index[i][1]))] for i, j in zip(which, index, strict=True)]
-        return self.piece("", np.array(found, int))
+def _matched(
+    rays: RaySet | StoredRays, answers: Answers | StoredAnswers
+) -> tuple[Pieces, dict[str, tuple[int, list[int]]]]:
+    """The rays with their answers; and of each kind of mismatch how many ids have it, and the first of them."""
+    if isinstance(rays, StoredRays) and isinstance(answers, StoredAnswers):
+        return StoredPieces(rays, answers), answers.mismatches
+    if isinstance(rays, RaySet) and isinstance(answers, Answers):
+        mismatches, order = _match_ids(rays, answers)
+        return ArrayPieces(rays, answers, order), mismatches
+    raise TypeError("rays and answers; accepted: both stored, or neither")
 
 
-def _parts(pieces: Pieces, question: Question, judge: Judge) -> tuple[str, list[JudgedPart]]:
-    """The signal of total internal reflection, and the parts judged by it.
+def _parts(pieces: Pieces, question: Question, judge: Judge) -> tuple[str, list[JudgedPart], Angles]:
+    """The signal of total internal reflection, and the parts judged by it, whose angles are kept apart.
 
     The signal is known after all rays are: that of a sample is taken first, and all are judged again if it was wrong.
     """
-    detected = question.tir == AUTO and pieces.answers.transmitted is None
+    detected = question.tir == AUTO and not pieces.flagged
     tir = FLAG if question.tir == AUTO else question.tir
     if detected:
         tir = _guess(pieces, question)
     while True:
-        asked = replace(question, tir=tir, counted=detected)
-        found = dict(judge((pieces.piece(*each), asked) for each in pieces.index))
+        asked, angles, found = replace(question, tir=tir, counted=detected), Angles(pieces.total), {}
+        for number, part in judge((piece, asked) for piece in pieces):
+            angles.put(number, part.angles)
+            found[number] = part.without_angles()
         parts = [found[number] for number in range(len(found))]
         signal = tir_signal.joined([part.signals for part in parts if part.signals]).signal if detected else tir
         if signal == tir:
-            return tir, parts
+            return tir, parts, angles
         tir, detected = signal, False
 
 
 def _guess(pieces: Pieces, question: Question) -> str:
     """The signal of a few rays, evenly over the set; of those that seem totally reflected, where there are any."""
-    total = sum(len(each) for _, each in pieces.index)
-    some = pieces.sampled(np.arange(0, total, max(1, total // SEEN)))
+    some = pieces.sampled(np.arange(0, pieces.total, max(1, pieces.total // SEEN)))
     across = np.cross(some.rays.n.astype(float), some.rays.a.astype(float))
     with np.errstate(all="ignore"):
         sine = some.rays.k * (lengths(across) / (lengths(some.rays.a) * lengths(some.rays.n)))
@@ -223,10 +213,12 @@ def _guess(pieces: Pieces, question: Question) -> str:
     return judge_answers(some.b[which], flag, some.rays[which], question.precision, budget).tir
 
 
-def _explanations(pieces: Pieces, parts: list[JudgedPart], question: Question) -> tuple[Explanation, ...]:
+def _explanations(
+    pieces: Pieces, parts: list[JudgedPart], angles: Angles, question: Question
+) -> tuple[Explanation, ...]:
     if not any(part.evidence.wrong_count for part in parts):
         return ()
-    found = evidence.joined([(part.evidence, part.angles) for part in parts])
+    found = AllEvidence([part.evidence for part in parts], angles.of(range(len(parts))))
     some, printed = (pieces.sampled(of(found)) for of in (diagnosis.sample, diagnosis.printed_sample))
     budget = FORMULAS[question.error_bound].budget
     judged = judge_answers(some.b, some.flag, some.rays, question.precision, budget, question.tir)
@@ -238,8 +230,8 @@ def _check_name(name: str, value: str, accepted: Collection[str]) -> None:
         raise ValueError(f"{name} = {value!r}: unknown; accepted: {', '.join(accepted)}")
 
 
-def _match_ids(rays: RaySet, answers: Answers) -> tuple[list[Problem], np.ndarray]:
-    """Problems of the ids; and (N,) for each ray the row of its first answer, or −1."""
+def _match_ids(rays: RaySet, answers: Answers) -> tuple[dict[str, tuple[int, list[int]]], np.ndarray]:
+    """The mismatches of the ids, as of `_matched`; and (N,) for each ray the row of its first answer, or −1."""
     ids, first, counts = np.unique(answers.ids, return_index=True, return_counts=True)
     found = {
         "missing": np.setdiff1d(rays.ids, ids),
@@ -248,11 +240,7 @@ def _match_ids(rays: RaySet, answers: Answers) -> tuple[list[Problem], np.ndarra
     }
     place = np.searchsorted(ids, rays.ids).clip(max=max(len(ids) - 1, 0))
     order = np.where(ids[place] == rays.ids, first[place], -1) if len(ids) else np.full(len(rays), -1)
-    return [_problem(kind, which) for kind, which in found.items() if len(which)], order
-
-
-def _problem(kind: str, ids: np.ndarray) -> Problem:
-    return _listed(kind, len(ids), ids[:LISTED_IDS].tolist())
+    return {kind: (len(which), which[:LISTED_IDS].tolist()) for kind, which in found.items() if len(which)}, order
 
 
 def _listed(kind: str, count: int, first: list[int]) -> Problem:
@@ -272,25 +260,22 @@ def _not_directions(parts: list[JudgedPart]) -> Iterator[Problem]:
 # By regime ---------------------------------------------------------------------------------------------------------
 
 
-def _by_regime(rays: RaySet, parts: list[JudgedPart]) -> Iterator[RegimeErrors]:
-    for name in rays.header["regimes"]:
-        if of_regime := [part for part in parts if part.regime == name]:
-            yield _regime_errors(name, of_regime)
+def _by_regime(header: Header, parts: list[JudgedPart], angles: Angles) -> Iterator[RegimeErrors]:
+    for name in header["regimes"]:
+        if numbers := [number for number, part in enumerate(parts) if part.regime == name]:
+            yield _regime_errors(name, [parts[number] for number in numbers], angles.of(numbers))
 
 
-def _regime_errors(name: str, parts: list[JudgedPart]) -> RegimeErrors:
-    angles = np.concatenate([part.angles for part in parts])
-    compared = len(angles)
-    known = angles if compared else np.full(1, np.nan)
-    lengths_ = [part.length_error for part in parts if len(part.angles)]
+def _regime_errors(name: str, parts: list[JudgedPart], angles: KeptAngles) -> RegimeErrors:
+    lengths_ = [part.length_error for part in parts if part.compared]
     worst = judged_parts.last_of_largest([part.worst.rank for part in parts])
     return RegimeErrors(
         name,
         rays=sum(part.rays for part in parts),
-        compared=compared,
-        worst=float(known.max()),
-        p99=float(np.quantile(known, 0.99)),
-        mean=float(known.mean()),
+        compared=len(angles),
+        worst=angles.largest,
+        p99=angles.quantile(0.99),
+        mean=angles.mean,
         length_error=float(np.max(lengths_)) if lengths_ else np.nan,
         error_over_bound=float(np.max([part.error_over_bound for part in parts])),
         replay=parts[worst].worst.replay,

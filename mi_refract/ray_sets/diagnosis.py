@@ -211,12 +211,12 @@ MISTAKES: dict[str, dict[str, Predict]] = {
 
 def sample(evidence: AllEvidence) -> np.ndarray:
     """Indices of wrong and of right answers, evenly over the set, without rays whose bound excuses large errors."""
-    return np.concatenate([_evenly(mask, SAMPLE) for mask in (evidence.wrong, evidence.right)])
+    return np.concatenate([evidence.evenly(name, SAMPLE) for name in ("wrong", "right")])
 
 
 def printed_sample(evidence: AllEvidence) -> np.ndarray:
     """Indices of answers whose digits are looked at."""
-    return _evenly(evidence.compared, SAMPLE)
+    return evidence.evenly("compared", SAMPLE)
 
 
 def explain(judged: JudgedAnswers, evidence: AllEvidence, printed: np.ndarray) -> list[Explanation]:
@@ -234,11 +234,6 @@ def explain(judged: JudgedAnswers, evidence: AllEvidence, printed: np.ndarray) -
     found[-1] = max(found[-1], lengths_only, key=_strength)
     # Numbers of few digits may keep the bound of float32, too.
     return [*found, replace(float32, explains=float32.explains and not digits.explains), digits]
-
-
-def _evenly(mask: np.ndarray, count: int) -> np.ndarray:
-    index = np.flatnonzero(mask)
-    return index[:: max(1, -(-len(index) // count))]
 
 
 def _best_variant(name: str, table: dict[str, Predict], case: Case, b: np.ndarray, wrong: np.ndarray) -> Explanation:
@@ -268,21 +263,20 @@ def _angle(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 def _of_wrong(name: str, text: str, evidence: AllEvidence, accounted: int, enough: bool) -> Explanation:
     """`accounted`: how many of the wrong answers the mistake accounts for."""
     share = accounted / evidence.wrong_count if evidence.wrong_count else 0.0
-    angles = evidence.angles[evidence.wrong_compared]
-    median = float(np.median(angles)) if len(angles) else math.nan
-    return Explanation(name, text, share, median, bool(enough and share >= ALL and evidence.wrong_count >= FEWEST))
+    explains = bool(enough and share >= ALL and evidence.wrong_count >= FEWEST)
+    return Explanation(name, text, share, evidence.wrong_median, explains)
 
 
 def _wrong_lengths(evidence: AllEvidence) -> Explanation:
     text = "directions are right, but not of length 1"
-    return _of_wrong("missing normalisation", text, evidence, evidence.accounted.get(LENGTHS, 0), True)
+    return _of_wrong("missing normalisation", text, evidence, evidence.accounted(LENGTHS), True)
 
 
 def _float32(evidence: AllEvidence, roundoff: float) -> Explanation:
     """float32 where float64 was claimed: errors of float32's size nearly everywhere, and none that is larger."""
-    everywhere = len(evidence.angles) and np.median(evidence.angles) > F32 / 50
-    enough, text = roundoff < F32 and bool(everywhere), "errors are those of float32"
-    return _of_wrong("f32 where f64 was claimed", text, evidence, evidence.accounted.get(FLOAT32, 0), enough)
+    everywhere = evidence.median > F32 / 50
+    enough, text = roundoff < F32 and everywhere, "errors are those of float32"
+    return _of_wrong("f32 where f64 was claimed", text, evidence, evidence.accounted(FLOAT32), enough)
 
 
 def _few_digits(evidence: AllEvidence, printed: np.ndarray, roundoff: float) -> Explanation:
@@ -294,5 +288,5 @@ def _few_digits(evidence: AllEvidence, printed: np.ndarray, roundoff: float) -> 
         if all(float(f"{x:.{digits}{form}}") == x for x in values):
             # Half a unit of the last digit in each of three components.
             text = f"numbers are rounded to {digits} {word}"
-            return _of_wrong("too few digits", text, evidence, evidence.accounted.get(str(digits), 0), True)
+            return _of_wrong("too few digits", text, evidence, evidence.accounted(str(digits)), True)
     return Explanation("too few digits", "numbers have all their digits", 0.0, math.nan, False)

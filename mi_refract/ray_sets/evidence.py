@@ -6,7 +6,8 @@ precision accounts for is a count.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from mi_refract.accuracy import Judgement, absolute_radicand
 
 from .judged_answers import JudgedAnswers
+from .kept_angles import KeptAngles, median
 
 WIDEST_BOUND = 1e-3  # radians: under a wider bound an answer is no evidence
 F32 = 2.0**-24
@@ -68,32 +70,43 @@ def _accounted(verdict: Judgement) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class AllEvidence:
-    """That of all rays, in their order. Masks are (N,), `angles` and `wrong_compared` of the rays compared."""
+    """That of all rays: of parts in the order of the rays, and the angles of the rays compared."""
 
-    wrong: np.ndarray
-    right: np.ndarray
-    compared: np.ndarray
-    wrong_compared: np.ndarray
-    angles: np.ndarray
-    wrong_count: int
-    accounted: dict[str, int]
+    parts: Sequence[Evidence]
+    angles: KeptAngles
 
+    @property
+    def wrong_count(self) -> int:
+        """How many answers are wrong."""
+        return sum(each.wrong_count for each in self.parts)
 
-def joined(parts: Sequence[tuple[Evidence, np.ndarray]]) -> AllEvidence:
-    """Parts with their angles, in the order of the rays."""
+    def accounted(self, name: str) -> int:
+        """How many of them a loss of precision accounts for."""
+        return sum(each.accounted.get(name, 0) for each in self.parts)
 
-    def mask(name: str) -> np.ndarray:
-        counts = [len(angles) if name == "wrong_compared" else each.rays for each, angles in parts]
-        bits = [np.unpackbits(getattr(each, name), count=n) for (each, _), n in zip(parts, counts, strict=True)]
-        return np.concatenate(bits).astype(bool)
+    @functools.cached_property
+    def median(self) -> float:
+        """Of all angles."""
+        return median(self.angles.pieces)
 
-    names = {name for each, _ in parts for name in each.accounted}
-    return AllEvidence(
-        wrong=mask("wrong"),
-        right=mask("right"),
-        compared=mask("compared"),
-        wrong_compared=mask("wrong_compared"),
-        angles=np.concatenate([angles for _, angles in parts]),
-        wrong_count=sum(each.wrong_count for each, _ in parts),
-        accounted={name: sum(each.accounted.get(name, 0) for each, _ in parts) for name in names},
-    )
+    @functools.cached_property
+    def wrong_median(self) -> float:
+        """Of the angles of wrong answers."""
+        return median(lambda: (all_[mask] for all_, mask in zip(self.angles.pieces(), self._wrong(), strict=True)))
+
+    def _wrong(self) -> Iterator[np.ndarray]:
+        for each, (_, count) in zip(self.parts, self.angles.runs, strict=True):
+            yield np.unpackbits(each.wrong_compared, count=count).astype(bool)
+
+    def evenly(self, name: str, count: int) -> np.ndarray:
+        """Indices of `count` rays or fewer, evenly over those in the mask of that name."""
+        totals = np.array([int(np.unpackbits(getattr(each, name)).sum()) for each in self.parts])
+        step = max(1, -(-int(totals.sum()) // count))
+        ends, begin, found = np.cumsum(totals), 0, [np.empty(0, np.int64)]
+        for each, total, end in zip(self.parts, totals, ends, strict=True):
+            first = -(int(end) - int(total)) % step
+            if first < total:
+                mask = np.unpackbits(getattr(each, name), count=each.rays)
+                found.append(begin + np.flatnonzero(mask)[first::step])
+            begin += each.rays
+        return np.concatenate(found)

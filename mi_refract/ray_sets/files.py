@@ -9,10 +9,12 @@ back exactly in float32.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +25,23 @@ from mi_refract.io.atomic import writable, write_atomically
 from mi_refract.regimes import Rays
 
 from . import header as headers
-from . import npz_arrays
-from .csv_table import parse_table, with_header
+from . import npz_arrays, stored_answers
+from .csv_table import parse_table, read_table, with_header
 from .header import FORMAT, PRECISIONS, Header
 from .ray_set import Answers, RaySet, checksum, indices, regime_names
+from .stored_answers import StoredAnswers
+from .stored_rays import STEP, RayStore, StoredRays
 
 SUFFIXES = (".csv", ".npz", ".exr")
 COLUMNS = ("id", "ax", "ay", "az", "nx", "ny", "nz", "n_from", "n_to")
 ANSWER_COLUMNS = ("id", "bx", "by", "bz")
 TRANSMITTED = "transmitted"  # the optional column of answers
-MOST_RAYS = 2**28 // len(COLUMNS)  # in a file
+RAY_ARRAYS = {"a": 3, "n": 3, "n_from": 1, "n_to": 1}  # of an .npz file, and their widths
+ANSWER_ARRAYS = {"b": 3, TRANSMITTED: 1}
+MOST_RAYS = 2**28 // len(COLUMNS)  # in memory: their numbers take 2 GiB
+MOST_STORED = 2**30  # in a file: what is kept in memory of each, once it is judged, is a byte at most
 _CSV_BYTES = 2**32
+_ROW_BYTES, _TOP_BYTES = 1024, 2**20  # of a CSV file: five times what the digits of a row need; for the header
 _EXR_WIDTH = 1024
 _EXR_IDS = 2**24  # float32 holds all whole numbers up to this one
 _ATTRIBUTE = "mi_refract:rays"
@@ -97,51 +105,85 @@ def _write_exr(path: Path, rays: RaySet) -> None:
 
 
 def read(path: str | Path) -> RaySet:
-    """The rays of a file that is as `write` left it.
+    """The rays of a file that is as `write` left it, in memory.
 
     ValueError, one line, for another format, a missing header, a cell that is not a number, or a checksum that does not
     match (a file that was edited or cut short). OSError where the file cannot be read.
     """
     path = _with_known_suffix(path)
-    header, numbers = _read(path, {"a": 3, "n": 3, "n_from": 1, "n_to": 1}, COLUMNS, most=MOST_RAYS)
-    if header.get("format") != FORMAT:
-        raise ValueError(f"{path}: not a file of rays; accepted: what `mi-refract rays export` writes ({FORMAT})")
-    try:
-        headers.check(header, len(numbers))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+    header, numbers = _read(path, RAY_ARRAYS, COLUMNS, most=MOST_RAYS)
+    _check_header(path, header, len(numbers))
     rays = _ray_set(header, numbers)
-    if checksum(rays) != header["checksum"] or not np.array_equal(rays.numbers, numbers):
-        found = "the checksum does not match, so it was edited or cut short"
-        raise ValueError(f"{path}: {found}; accepted: the file as it was exported")
-    if wrong := _first_without_meaning(rays):
-        raise ValueError(f"{path}: {wrong}; accepted: finite vectors that are not zero, finite indices above 0")
+    same = checksum(rays) == header["checksum"] and np.array_equal(rays.numbers, numbers)
+    _check_rays(path, same, _first_without_meaning(rays.rays))
     return rays
 
 
+def read_stored(path: str | Path) -> StoredRays:
+    """As `read`, outside of the memory."""
+    path = _with_known_suffix(path)
+    with _opened(path, RAY_ARRAYS, COLUMNS, (), MOST_STORED) as found:
+        _check_header(path, found.header, found.rows)
+        kept, same, wrong = RayStore(found.header), True, ""
+        for numbers in found.pieces(STEP):
+            first, rays = kept.filled, _rays(found.header, numbers)
+            same = np.array_equal(kept.add(rays), numbers) and same
+            wrong = wrong or _first_without_meaning(rays, first)
+    _check_rays(path, same and kept.checksum == found.header["checksum"], wrong)
+    return kept.rays
+
+
+def _check_header(path: Path, header: Header, rays: int) -> None:
+    if header.get("format") != FORMAT:
+        raise ValueError(f"{path}: not a file of rays; accepted: what `mi-refract rays export` writes ({FORMAT})")
+    try:
+        headers.check(header, rays)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _check_rays(path: Path, same: bool, wrong: str) -> None:
+    if not same:
+        found = "the checksum does not match, so it was edited or cut short"
+        raise ValueError(f"{path}: {found}; accepted: the file as it was exported")
+    if wrong:
+        raise ValueError(f"{path}: {wrong}; accepted: finite vectors that are not zero, finite indices above 0")
+
+
 def _ray_set(header: Header, numbers: np.ndarray) -> RaySet:
+    ids = np.arange(len(numbers))
+    return RaySet(_rays(header, numbers), ids, regime_names(header, len(ids)), header)
+
+
+def _rays(header: Header, numbers: np.ndarray) -> Rays:
     precision = PRECISIONS[header["precision"]]
     with np.errstate(all="ignore"):
         a, n, k = numbers[:, 1:4], numbers[:, 4:7], numbers[:, 7] / numbers[:, 8]
-        rays = Rays(*(x.astype(precision) for x in (a, n, k)))
-    ids = np.arange(len(numbers))
-    return RaySet(rays, ids, regime_names(header, len(ids)), header)
+        return Rays(*(x.astype(precision) for x in (a, n, k)))
 
 
-def _first_without_meaning(rays: RaySet) -> str:
-    """Of the rays that have no refraction, the first; "" where there is none."""
-    a, n, k = rays.rays.a, rays.rays.n, rays.rays.k
+def _first_without_meaning(rays: Rays, first: int = 0) -> str:
+    """Of the rays that have no refraction, the first; "" where there is none. `first`: the id of the first ray."""
+    a, n, k = rays.a, rays.n, rays.k
     good = np.isfinite(a).all(1) & np.isfinite(n).all(1) & a.any(1) & n.any(1) & np.isfinite(k) & (k > 0)
-    return "" if good.all() else f"ray {np.argmin(good)} is none"
+    return "" if good.all() else f"ray {first + np.argmin(good)} is none"
 
 
 def read_answers(path: str | Path, *, most: int = MOST_RAYS) -> Answers:
-    """The answers in a file: `most` at most.
+    """The answers in a file, in memory: `most` at most.
 
     ValueError, one line, where it holds none, or more. OSError where it cannot be read.
     """
     path = _with_known_suffix(path)
-    return _answers(str(path), *_read(path, {"b": 3, TRANSMITTED: 1}, ANSWER_COLUMNS, TRANSMITTED, most=most))
+    return _answers(str(path), *_read(path, ANSWER_ARRAYS, ANSWER_COLUMNS, TRANSMITTED, most=most))
+
+
+def read_stored_answers(path: str | Path, rays: Sized) -> StoredAnswers:
+    """The answers to stored rays in a file, outside of the memory. Errors as of `read_answers`."""
+    path = _with_known_suffix(path)
+    with _opened(path, ANSWER_ARRAYS, ANSWER_COLUMNS, (TRANSMITTED,), most_answers(rays)) as found:
+        rows = _answer_rows(str(path), found.pieces(STEP))
+        return stored_answers.match(found.header, rows, len(rays), found.width > len(ANSWER_COLUMNS))
 
 
 def parse_answers(text: str | bytes, name: str = "answers") -> Answers:
@@ -149,14 +191,14 @@ def parse_answers(text: str | bytes, name: str = "answers") -> Answers:
     return _answers(name, *parse_table(name, text, ANSWER_COLUMNS, TRANSMITTED))
 
 
-def most_answers(rays: RaySet) -> int:
+def most_answers(rays: Sized) -> int:
     """The most rows that answers to these rays may have: twice as many, and some for small sets."""
     return 2 * len(rays) + 100
 
 
 def csv_bytes(rows: int) -> int:
-    """The largest size of a CSV file with so many rows: five times what their digits need, and 1 MiB for the header."""
-    return min(rows * 1024 + 2**20, _CSV_BYTES)
+    """The largest size of CSV text with so many rows, in memory."""
+    return min(rows * _ROW_BYTES + _TOP_BYTES, _CSV_BYTES)
 
 
 def _with_known_suffix(path: str | Path) -> Path:
@@ -167,14 +209,39 @@ def _with_known_suffix(path: str | Path) -> Path:
 
 
 def _answers(name: str, header: Header, numbers: np.ndarray) -> Answers:
-    ids = numbers[:, 0]
-    if (wrong := ~(np.abs(ids) < 2**53) | (np.rint(ids) != ids)).any():
-        found = f"{wrong.sum()} ids are not whole numbers below 2^53, the first is {ids[wrong][0]:g}"
+    [(ids, b, flags)] = _answer_rows(name, [numbers])
+    return Answers(ids, b, flags, header)
+
+
+def _answer_rows(name: str, pieces: Iterable[np.ndarray]) -> Iterator[stored_answers.Rows]:
+    """Ids, b and the column `transmitted` of pieces (n, 4 or 5). ValueError at their end, where any is none."""
+    wrong_ids, wrong_flags = _Wrong(), _Wrong()
+    for numbers in pieces:
+        ids, flags = numbers[:, 0], numbers[:, 4] if numbers.shape[1] > 4 else None
+        wrong_ids = wrong_ids.with_more(ids[~(np.abs(ids) < 2**53) | (np.rint(ids) != ids)])
+        if flags is not None:
+            wrong_flags = wrong_flags.with_more(flags[~np.isin(flags, (0, 1))])
+        if not wrong_ids.count and not wrong_flags.count:
+            yield ids.astype(np.int64), numbers[:, 1:4], None if flags is None else flags == 1
+    if wrong_ids.count:
+        found = f"{wrong_ids.count} ids are not whole numbers below 2^53, the first is {wrong_ids.first:g}"
         raise ValueError(f"{name}: {found}; accepted: the ids of the rays")
-    flags = numbers[:, 4] if numbers.shape[1] > 4 else None
-    if flags is not None and (wrong := ~np.isin(flags, (0, 1))).any():
-        raise ValueError(f"{name}: {TRANSMITTED} is {flags[wrong][0]} for {wrong.sum()} rays; accepted: 0 or 1")
-    return Answers(ids.astype(np.int64), numbers[:, 1:4], None if flags is None else flags == 1, header)
+    if wrong_flags.count:
+        found = f"{TRANSMITTED} is {wrong_flags.first} for {wrong_flags.count} rays"
+        raise ValueError(f"{name}: {found}; accepted: 0 or 1")
+
+
+@dataclass(frozen=True)
+class _Wrong:
+    """How many numbers are wrong, and the first of them."""
+
+    count: int = 0
+    first: float = 0.0
+
+    def with_more(self, wrong: np.ndarray) -> _Wrong:
+        return (
+            self if not len(wrong) else _Wrong(self.count + len(wrong), self.first if self.count else float(wrong[0]))
+        )
 
 
 def _read(
@@ -198,10 +265,43 @@ def _read_any(
     if path.suffix.lower() == ".npz":
         text, numbers = npz_arrays.read(path, {"id": 1, **arrays}, optional, most)
         return _header(text), numbers
+    return _read_image(path, columns, optional)
+
+
+def _read_image(path: Path, columns: Sequence[str], optional: Sequence[str]) -> tuple[Header, np.ndarray]:
     image = image_file.read(path)
     chosen = [*columns, *(name for name in optional if name in image.channels)]
     pixels = image.select(chosen).reshape(-1, len(chosen)).astype(np.float64)
     return _header(image.metadata.get(_ATTRIBUTE, "")), pixels[pixels[:, 0] != -1]
+
+
+@dataclass(frozen=True)
+class _Opened:
+    """What a file holds: the header, and (rows, width) float64 in pieces of so many rows."""
+
+    header: Header
+    rows: int
+    width: int
+    pieces: Callable[[int], Iterator[np.ndarray]]
+
+
+@contextlib.contextmanager
+def _opened(
+    path: Path, arrays: dict[str, int], columns: Sequence[str], optional: Sequence[str], most: int
+) -> Iterator[_Opened]:
+    """As `_read`, of which only a piece is in memory; of EXR, whose rows are few, all."""
+    if path.suffix.lower() == ".csv":
+        limit = most * _ROW_BYTES + _TOP_BYTES
+        with regular_file.opened(path, limit) as stream:
+            header, log = read_table(str(path), stream, columns, optional, most, limit)
+        yield _Opened(header, log.rows, log.width, log.pieces)
+    elif path.suffix.lower() == ".npz":
+        with npz_arrays.opened(path, {"id": 1, **arrays}, optional, most) as found:
+            yield _Opened(_header(found.text), found.rows, found.width, found.pieces)
+    else:
+        header, numbers = _read(path, arrays, columns, *optional, most=most)
+        parts = lambda step: (numbers[i : i + step] for i in range(0, len(numbers), step))  # noqa: E731
+        yield _Opened(header, len(numbers), numbers.shape[1], parts)
 
 
 def _header(text: Any) -> Header:

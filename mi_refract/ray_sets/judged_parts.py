@@ -7,7 +7,7 @@ in the order of the rays give the same findings, whatever the pieces were and wh
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,10 +18,10 @@ from mi_refract.regimes import Rays
 
 from .evidence import Evidence, evidence
 from .judged_answers import JudgedAnswers, judge_answers
+from .stored_answers import LISTED_IDS
 from .tir_signal import Signals
 
 PIECE = 2**14  # rays of a piece, at most: about a second
-LISTED_IDS = 5
 COUNTS = {  # of `RegimeErrors`, where they are sums
     "tir_misclassified": lambda judged: judged.verdict.misjudged,
     "tir_beyond_bound": lambda judged: judged.verdict.far,
@@ -71,13 +71,18 @@ class JudgedPart:
     regime: str
     rays: int
     counts: dict[str, int]
-    angles: np.ndarray  # of the rays compared, in their order
+    compared: int
+    angles: np.ndarray  # of the rays compared, in their order; empty once they are kept elsewhere
     length_error: float  # the largest; NaN without any compared
     error_over_bound: float
     worst: Worst
     listed: dict[str, tuple[int, list[int]]]  # by kind of problem: how many rays have it, and the first ids
     signals: Signals | None
     evidence: Evidence
+
+    def without_angles(self) -> JudgedPart:
+        """The rest of it, at most a byte a ray."""
+        return replace(self, angles=np.empty(0))
 
 
 def judge_part(piece: Piece, question: Question) -> JudgedPart:
@@ -92,6 +97,7 @@ def judge_part(piece: Piece, question: Question) -> JudgedPart:
         regime=piece.regime,
         rays=len(piece.ids),
         counts={name: int(mask(judged).sum()) for name, mask in COUNTS.items()},
+        compared=int(compared.sum()),
         angles=verdict.angle[compared],
         length_error=float(verdict.drift[compared].max()) if compared.any() else np.nan,
         error_over_bound=float(verdict.share.max()),

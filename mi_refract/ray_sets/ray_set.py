@@ -66,7 +66,12 @@ class RaySet:
     @property
     def numbers(self) -> np.ndarray:
         """(N, 9) float64: id, a, n, n_from, n_to."""
-        return np.column_stack([self.ids, self.rays.a, self.rays.n, *indices(self.rays.k)]).astype(np.float64)
+        return numbers_of(self.ids, self.rays)
+
+
+def numbers_of(ids: np.ndarray, rays: Rays) -> np.ndarray:
+    """(N, 9) float64: id, a, n, n_from, n_to."""
+    return np.column_stack([ids, rays.a, rays.n, *indices(rays.k)]).astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -95,6 +100,16 @@ def make(
 ) -> RaySet:
     """`count` rays of each regime in `names`. Normals face the ray unless `two_sided`.
 
+    Errors as of `header_of`.
+    """
+    header = header_of(names, count, precision, seed, two_sided)
+    rays = Rays.joined([of_regime(name, header) for name in header["regimes"]])
+    return _with_checksum(RaySet(rays, np.arange(len(rays)), regime_names(header, len(rays)), header))
+
+
+def header_of(names: Iterable[str], count: int, precision: str, seed: int, two_sided: bool) -> Header:
+    """The header of the set that is made so, without its checksum.
+
     ValueError for an unknown regime or precision, a regime given twice, or no ray at all.
     """
     names = tuple(names)
@@ -104,11 +119,13 @@ def make(
         raise ValueError(f"precision {precision!r}: unknown; accepted: {', '.join(PRECISIONS)}")
     if not names or len(set(names)) < len(names) or count < 1 or seed < 0:
         raise ValueError(f"{count} rays of {list(names)}, seed {seed}: accepted: at least one ray, each regime once")
-    rays = Rays.joined([regimes.make(name, count, PRECISIONS[precision], seed) for name in names])
-    if not two_sided:
-        rays = _facing(rays)
-    header = _header(names, count, precision, seed, two_sided)
-    return _with_checksum(RaySet(rays, np.arange(len(rays)), regime_names(header, len(rays)), header))
+    return _header(names, count, precision, seed, two_sided)
+
+
+def of_regime(name: str, header: Header) -> Rays:
+    """The rays of one regime of the set with this header."""
+    rays = regimes.make(name, header["count"], PRECISIONS[header["precision"]], header["seed"])
+    return rays if header["two_sided"] else _facing(rays)
 
 
 def _facing(rays: Rays) -> Rays:
@@ -149,10 +166,25 @@ def _with_checksum(rays: RaySet) -> RaySet:
 
 def checksum(rays: RaySet) -> str:
     """SHA-256 of the header without its own line, and of the numbers. It does not depend on the file format."""
-    hashed = {key: value for key, value in rays.header.items() if key != "checksum"}
-    digest = hashlib.sha256(json.dumps(hashed, sort_keys=True).encode())
+    digest = Checksum(rays.header)
     for i in range(0, len(rays), _HASHED):  # all numbers in float64 take several times what the rays do
-        some = slice(i, i + _HASHED)
-        part = RaySet(rays.rays[some], rays.ids[some], rays.regime[some], rays.header)
-        digest.update(part.numbers.astype("<f8").tobytes())
-    return f"sha256:{digest.hexdigest()}"
+        digest.add_numbers(numbers_of(rays.ids[i : i + _HASHED], rays.rays[i : i + _HASHED]))
+    return digest.text
+
+
+class Checksum:
+    """As `checksum`, of rays that come in pieces."""
+
+    def __init__(self, header: Header) -> None:
+        """`header`: with or without the line of the checksum."""
+        hashed = {key: value for key, value in header.items() if key != "checksum"}
+        self._digest = hashlib.sha256(json.dumps(hashed, sort_keys=True).encode())
+
+    def add_numbers(self, numbers: np.ndarray) -> None:
+        """The next rows of the set's numbers."""
+        self._digest.update(numbers.astype("<f8").tobytes())
+
+    @property
+    def text(self) -> str:
+        """What the header says."""
+        return f"sha256:{self._digest.hexdigest()}"

@@ -40,14 +40,12 @@ def relative_error(sums: PassSums) -> RelativeError:
     found = np.asarray([each for each in sums.contrasts if math.isfinite(each)])
     if not mean > 0 or not sums.freedom:
         return RelativeError(math.nan)
-    if sums.within is not None:  # what samples say is more than what so few passes say
+    squared, spread = float(found.mean()) if found.size else math.nan, math.nan
+    if sums.within is not None:  # what samples say of it is more than what so few passes say
         variance = sums.variance
         assert variance is not None
         known = np.isfinite(variance := variance[..., : sums.colours])
-        return RelativeError(math.sqrt(float(variance[known].mean()) / sums.spp) / mean)
-    if not found.size:
-        return RelativeError(math.nan)
-    squared, spread = float(found.mean()), math.nan
+        squared = float(variance[known].mean())
     if found.size > 1:
         spread = _quantile(found.size - 1) * float(found.std(ddof=1)) * math.sqrt(1 + 1 / found.size)
     value, low, high = (math.sqrt(max(x, 0) / sums.spp) / mean for x in (squared, squared - spread, squared + spread))

@@ -122,13 +122,13 @@ def told(*arguments, **options):
     print(process.pid, flush=True)
     return process
 subprocess.Popen = told
-with local_process.started(1) as address:
-    print(address, flush=True)
+with local_process.started(1) as local:
+    print(local.address, flush=True)
     time.sleep(600)"""
     with python(code) as process:
         leader, address = int(process.stdout.readline()), process.stdout.readline()
         try:
-            assert address.startswith("tcp://127.0.0.1:")
+            assert address.startswith("tls://127.0.0.1:")
             assert len(group(leader)) >= 2  # the scheduler's process, and a worker's
             for pid in group(leader):
                 status = Path(f"/proc/{pid}/status").read_text()

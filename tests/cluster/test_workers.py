@@ -78,7 +78,7 @@ def test_nobody_is_left(client, variant):
         Workers(client, variant, worker_facts.facts(variant) | {"drjit": "9"}).wait()
     text = str(caught.value)
     assert "\n" not in text and text.count("is refused: drjit") == 2
-    assert "no worker that may render" in text and "accepted: at least one like this process" in text
+    assert "no worker that may work: worker tls://" in text and "accepted: at least one like this process" in text
 
 
 @pytest.mark.usefixtures("scalar_variant")
@@ -97,8 +97,10 @@ def test_a_worker_without_the_package_is_refused(client, variant):
 def test_no_workers_at_all(client, monkeypatch, variant):
     monkeypatch.setattr(workers, "_NOBODY", 0.1)
     monkeypatch.setattr(client, "nthreads", dict)
-    with pytest.raises(ConnectionError, match="no worker that may render: no workers; accepted"):
+    with pytest.raises(ConnectionError, match="no worker that may work: no workers; accepted"):
         accepted(client, variant)
+    with pytest.raises(ConnectionError, match="no worker that may render: no workers; accepted"):
+        accepted(client, variant, task="render")
 
 
 def test_a_scheduler_that_hangs(client, monkeypatch, variant):

@@ -10,8 +10,7 @@ from support import ray_programs as programs
 
 from mi_refract import oracle
 from mi_refract.cli.app import main
-from mi_refract.cluster import local_process
-from mi_refract.ray_sets import check_answers, files, judged_parts, ray_set, reports, spread_check
+from mi_refract.ray_sets import check_answers, files, judged_parts, pieces, ray_set, reports, spread_check
 from mi_refract.ray_sets.ray_set import Answers
 from mi_refract.report.row import strict
 
@@ -54,12 +53,12 @@ def test_findings_do_not_depend_on_the_pieces(rays, right, change, monkeypatch):
     b = CHANGES[change](right)
     whole = shown(rays, b)
     for rays_of_piece in (7, 64):
-        monkeypatch.setattr(check_answers, "PIECE", rays_of_piece)
+        monkeypatch.setattr(pieces, "PIECE", rays_of_piece)
         assert shown(rays, b, backwards) == whole
 
 
 def test_ids_of_a_problem_are_the_first_of_all_pieces(rays, right, monkeypatch):
-    monkeypatch.setattr(check_answers, "PIECE", 8)
+    monkeypatch.setattr(pieces, "PIECE", 8)
     b = right.copy()
     b[[3, 7, 160, 170, 180, 190, 200]] = np.inf
     problems = check_answers.check(rays, Answers(rays.ids, b)).problems
@@ -77,7 +76,7 @@ def test_a_signal_that_was_guessed_wrong_is_found(rays, right, monkeypatch):
             asked.append(question.tir)
             yield number, judged_parts.judge_part(piece, question)
 
-    monkeypatch.setattr(check_answers, "_guess", lambda pieces, question: "nan")
+    monkeypatch.setattr(check_answers, "_guess", lambda given, question: "nan")
     assert shown(rays, right, judge) == whole
     assert asked == ["nan"] * 3 + ["zero"] * 3
 
@@ -94,13 +93,12 @@ def test_workers_give_the_same_files(tmp_path, capsys, monkeypatch):
     np.savez(tmp_path / "answers.npz", id=rays.ids, b=b)
     asked = ["rays", "check", str(tmp_path / "answers.npz"), "--rays", str(tmp_path / "rays.npz")]
     said, names = [], ("json", "junit")
-    with local_process.started(1) as address:
-        for folder, more in (("here", []), ("there", ["--scheduler", address])):
-            (tmp_path / folder).mkdir()
-            out = [tmp_path / folder / f"x.{end}" for end in ("json", "xml")]
-            words = [word for name, path in zip(names, out, strict=True) for word in (f"--{name}", str(path))]
-            code = main([*asked, *words, *more])
-            said.append((code, capsys.readouterr().out, *(path.read_bytes() for path in out)))
+    for folder, more in (("here", []), ("there", ["--workers", "1"])):
+        (tmp_path / folder).mkdir()
+        out = [tmp_path / folder / f"x.{end}" for end in ("json", "xml")]
+        words = [word for name, path in zip(names, out, strict=True) for word in (f"--{name}", str(path))]
+        code = main([*asked, *words, *more])
+        said.append((code, capsys.readouterr().out, *(path.read_bytes() for path in out)))
     assert said[0] == said[1] and said[0][0] == 1
 
 
@@ -109,6 +107,16 @@ def test_facts_name_what_findings_depend_on():
     assert "unknown" not in spread_check.facts("scalar_rgb").values()
 
 
-def test_a_scheduler_and_workers_are_misuse(tmp_path, capsys):
-    assert main(["rays", "check", "a.csv", "--scheduler", "tcp://h:1", "--workers", "2"]) == 2
-    assert "--scheduler and --workers; accepted: one of them" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (("--scheduler", "tcp://h:1", "--workers", "2"), "--scheduler and --workers; accepted: one of them"),
+        (("--workers", "2", "--tls-key", "a.csv"), "--tls-key: accepted with --scheduler tls://HOST:PORT"),
+        (("--scheduler", "tls://h:1", "--tls-ca-file", "none.pem"), "--tls-ca-file none.pem: no such file; accepted"),
+        (("--scheduler", "tls://h:1", "--tls-cert", "none.pem"), "--tls-cert none.pem: no such file; accepted"),
+        (("--scheduler", "tls://h:1", "--tls-key", "none.pem"), "--tls-key none.pem: no such file; accepted"),
+    ],
+)
+def test_options_of_a_cluster_that_are_misuse(capsys, options, message):
+    assert main(["rays", "check", "a.csv", *options]) == 2
+    assert message in capsys.readouterr().err

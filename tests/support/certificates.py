@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
+
+from mi_refract.cluster.tls import Tls
 
 
 def authority(folder: Path) -> Path:
@@ -22,3 +25,11 @@ def openssl(*words: str, at: Path) -> None:
         pytest.skip("needs the program openssl, which makes certificates")
     out = ("-out", "cert.pem") if words[0] == "req" else ()
     subprocess.run([program, *words, *out], cwd=at, check=True, capture_output=True)
+
+
+def tls_files(pem: Mapping[str, str], folder: Path) -> Tls:
+    """Files of the authority, certificate and key whose texts Dask's `Security` has under these names."""
+    paths = [folder / f"{name}.pem" for name in ("tls_ca_file", "tls_client_cert", "tls_client_key")]
+    for path in paths:
+        path.write_text(pem[path.stem])
+    return Tls(*paths)

@@ -10,9 +10,12 @@ import time
 import types
 
 import pytest
+from support.certificates import authority, tls_files
 
 from mi_refract import backend
 from mi_refract.cluster import worker_facts
+from mi_refract.cluster.connection import Elsewhere
+from mi_refract.cluster.tls import Tls
 from mi_refract.report.row import Row
 from validation import __main__ as command
 from validation import runner, spread
@@ -25,11 +28,11 @@ ASKED = spread.Asked(MODULES, "quick", "scalar_rgb")
 
 
 @pytest.fixture(scope="module")
-def scheduler():
+def scheduler(tmp_path_factory):
     from mi_refract.cluster import local_process
 
-    with local_process.started(2) as address:
-        yield address
+    with local_process.started(2) as local:
+        yield Elsewhere(local.address, tls=tls_files(local.pem, tmp_path_factory.mktemp("tls")))
 
 
 @pytest.fixture
@@ -48,7 +51,7 @@ def test_the_rows_are_those_of_a_run_here(scheduler, context, tmp_path):
     assert rows == alone and len(rows) > 10
     assert [each["task"] for each in spent] == [task.name for task in work]
     assert all(each["machine"] == os.uname().nodename for each in spent)
-    unreachable = spread.Elsewhere(ASKED, "tcp://127.0.0.1:9")
+    unreachable = spread.Elsewhere(ASKED, Elsewhere("tcp://127.0.0.1:9"))
     kept, _ = runner.run(work, context, unreachable)
     assert [json.dumps(each.as_dict()) for each in kept] == [json.dumps(each.as_dict()) for each in alone]
 
@@ -124,7 +127,7 @@ def test_a_worker_sends_files_and_errors_as_they_are(monkeypatch, scalar_variant
 
 
 def test_two_tasks_of_one_name_are_refused(context):
-    elsewhere = spread.Elsewhere(ASKED, "tcp://127.0.0.1:9")
+    elsewhere = spread.Elsewhere(ASKED, Elsewhere("tcp://127.0.0.1:9"))
     with pytest.raises(ValueError, match="two tasks are called 'a'; accepted: a name for each"):
         runner.run([Task("a", list), Task("a", list)], context, elsewhere)
 
@@ -150,13 +153,24 @@ def test_workers_with_other_sources_are_refused_by_name():
     ("arguments", "words"),
     [
         (["--scheduler", "tcp://h:1", "--workers", "2"], "--scheduler and --workers; accepted: one of them"),
+        (["--tls-key", "key.pem"], "--tls-ca-file, --tls-cert, --tls-key: accepted with --scheduler tls://HOST:PORT"),
+        (["--scheduler", "tls://h:1", "--tls-cert", "none.pem"], "--tls-cert none.pem: no such file; accepted"),
         (["--workers", "0"], "Invalid value for '--workers': Input should be greater than or equal to 1"),
     ],
 )
-def test_misuse_is_one_line(arguments, words, capsys):
-    assert command.main(arguments) == 2
+def test_misuse_is_one_line(arguments, words, capsys, tmp_path):
+    assert command.main([*arguments, "--out", str(tmp_path)]) == 2
     printed = capsys.readouterr().err
     assert words in printed and len(printed.splitlines()) == 1
+
+
+def test_who_works_is_what_the_options_say(tmp_path, monkeypatch):
+    folder, given = authority(tmp_path / "tls"), []
+    files = [folder / name for name in ("cert.pem", "cert.pem", "key.pem")]
+    monkeypatch.setattr(command, "_run", lambda *arguments: given.append(arguments[-1]) or 0)
+    options = zip(("--tls-ca-file", "--tls-cert", "--tls-key"), map(str, files), strict=True)
+    assert command.main(["--scheduler", "tls://h:1", *sum(options, ()), "--out", str(tmp_path / "out")]) == 0
+    assert given == [Elsewhere("tls://h:1", None, Tls(*files))]
 
 
 # Which tasks time something -------------------------------------------------------------------------------------------
