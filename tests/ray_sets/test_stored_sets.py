@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 import pickle
@@ -29,6 +30,7 @@ from mi_refract.ray_sets import (
     stored_answers,
     stored_rays,
 )
+from mi_refract.ray_sets.evidence import AllEvidence, Evidence
 from mi_refract.ray_sets.ray_set import Answers
 from mi_refract.report.row import strict
 
@@ -337,6 +339,29 @@ def test_means_quantiles_and_medians_are_those_of_numpy(count, in_memory, monkey
     assert kept_angles.median(found.pieces) == np.median(x)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_sums_are_cut_where_numpy_cuts_them(seed, monkeypatch):
+    monkeypatch.setattr(kept_angles, "_LEAF", 128)
+    rng = np.random.default_rng(seed)
+    x = rng.random(int(rng.integers(129, 9000)))
+    kept = kept_angles.Angles(len(x))
+    kept.put(0, x)
+    assert kept.of([0]).mean == x.mean()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_sample_is_evenly_over_all_parts(seed):
+    rng = np.random.default_rng(seed)
+    masks = [rng.random(int(rng.integers(0, 40))) < rng.random() for _ in range(9)]
+    parts = [
+        Evidence(len(mask), packed, packed, packed, packed, 0, {}) for mask in masks for packed in [np.packbits(mask)]
+    ]
+    index = np.flatnonzero(np.concatenate(masks))
+    for count in (1, 7, 150):
+        found = AllEvidence(parts, kept_angles.Angles(1).of([])).evenly("right", count)
+        assert found.tolist() == index[:: max(1, -(-len(index) // count))].tolist()
+
+
 def test_no_angle_and_no_number():
     kept = kept_angles.Angles(3)
     kept.put(0, np.array([1.0, np.nan, 2.0]))
@@ -360,7 +385,7 @@ def stub(calls):
     first = None
     for number, (piece, question) in enumerate(calls):
         first = first or judged_parts.judge_part(piece, question)
-        yield number, first
+        yield number, dataclasses.replace(first, angles=np.zeros(len(piece.ids) * 20)[::20])
 
 
 @pytest.mark.parametrize("ending", ["npz", "csv"])
