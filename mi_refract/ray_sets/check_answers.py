@@ -144,12 +144,7 @@ def check(
     """
     _check_name("tir", tir, (AUTO, *TIR))
     _check_name("error_bound", error_bound, FORMULAS)
-    flagged = answers.flagged if isinstance(answers, StoredAnswers) else answers.transmitted is not None
-    if tir == FLAG and not flagged:
-        raise ValueError("tir = 'flag': there is no column `transmitted`; accepted: answers with one")
-    if (given := answers.header.get("checksum")) not in (None, rays.header["checksum"]):
-        accepted = f"{rays.header['checksum']}, or other rays with --rays FILE"
-        raise ValueError(f"the answers are to rays with the checksum {shown(given)}; accepted: {accepted}")
+    _check_header(rays, answers, tir)
     pieces, mismatches = _matched(rays, answers)
     signal, parts, angles = _parts(pieces, Question(rays.precision, error_bound, tir), judge)
     return Findings(
@@ -163,6 +158,15 @@ def check(
         explanations=_explanations(pieces, parts, angles, Question(rays.precision, error_bound, signal)),
         header=rays.header,
     )
+
+
+def _check_header(rays: RaySet | StoredRays, answers: Answers | StoredAnswers, tir: str) -> None:
+    flagged = answers.flagged if isinstance(answers, StoredAnswers) else answers.transmitted is not None
+    if tir == FLAG and not flagged:
+        raise ValueError("tir = 'flag': there is no column `transmitted`; accepted: answers with one")
+    if (given := answers.header.get("checksum")) not in (None, rays.header["checksum"]):
+        accepted = f"{rays.header['checksum']}, or other rays with --rays FILE"
+        raise ValueError(f"the answers are to rays with the checksum {shown(given)}; accepted: {accepted}")
 
 
 def _matched(
