@@ -98,18 +98,18 @@ def test_few_passes_have_the_variance_of_their_samples(tmp_path, llvm):
 def test_renders_under_a_wide_filter_are_equal_to_their_like(tmp_path, llvm, spp, pass_spp):
     """Neighbours share samples there, also in files whose variance has as many degrees of freedom as samples.
 
-    At a family error of 5 % more than 5 of 20 pairs are different once in 3000 runs, where 5 % is what comes up.
+    At a family error of 20 % more than 13 of 30 pairs are different once in 1100 runs, where 20 % is what comes up.
     """
     scene = tmp_path / "scene.xml"
     scene.write_text(BALL.read_text().replace('"box"', '"gaussian"'))
     images, alarms = [], 0
-    for seed in range(40):
+    for seed in range(60):
         output = tmp_path / "a.exr"
         rendering(output, seed, scene, {"res": "64"}, spp=spp, pass_spp=pass_spp, restart=True).run()
         images.append(read(output))
     for a, b in zip(images[::2], images[1::2], strict=True):
-        alarms += compare("auto", a, b, family_error=0.05, resolution=9.0).verdict is Verdict.DIFFERENT
-    assert alarms <= 5
+        alarms += compare("auto", a, b, family_error=0.2, resolution=9.0).verdict is Verdict.DIFFERENT
+    assert alarms <= 13
 
 
 def test_one_sample_has_no_variance(tmp_path, llvm):
