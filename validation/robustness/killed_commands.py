@@ -29,7 +29,6 @@ from typing import Any
 
 import numpy as np
 
-from mi_refract.image_diff import folders, html_report
 from mi_refract.io import atomic, exit_code, image_file, lock
 from mi_refract.report import run_report
 from mi_refract.report.row import Row
@@ -75,19 +74,17 @@ def _images(folder: Path) -> None:
             _image(folder / side / f"{i}.exr", first + i)
 
 
-def _accept(folder: Path) -> int:
-    from mi_refract.cli import app
+def _command(*words: str | Path) -> int:
+    """`mi-refract` with these words, in place of this process: what it does with signals is its program's."""
+    os.execv(sys.executable, [sys.executable, "-m", "mi_refract.cli", *map(str, words)])
 
-    return app.main(["accept", str(folder / "old"), str(folder / "new"), "--yes"])
+
+def _accept(folder: Path) -> int:
+    return _command("accept", folder / "old", folder / "new", "--yes")
 
 
 def _diff(folder: Path) -> int:
-    def body() -> int:
-        found = folders.diff(folder / "old", folder / "new", maps=True)
-        html_report.write(folder / "out.html", found)
-        return found.exit_code
-
-    return exit_code.exit_code("diff", body)
+    return _command("diff", folder / "old", folder / "new", "--report", folder / "out.html")
 
 
 def _old_page(folder: Path) -> None:
@@ -121,9 +118,8 @@ def _validate(folder: Path) -> int:
 
 
 def _render(folder: Path) -> int:
-    words = ["render", str(SCENES / "sphere.xml"), "-o", str(folder / "out.exr"), "-D", "res=16"]
-    options = ["--spp", "2", "--pass-spp", "1", "--restart"]
-    os.execv(sys.executable, [sys.executable, "-m", "mi_refract.cli", *words, *options])
+    words = "render", SCENES / "sphere.xml", "-o", folder / "out.exr", "-D", "res=16"
+    return _command(*words, "--spp", "2", "--pass-spp", "1", "--restart")
 
 
 def _whole_page(path: Path) -> Any:
