@@ -168,7 +168,7 @@ def test_it_ends_at_the_error_that_was_asked_for_and_only_at_a_look(tmp_path, ll
 def test_it_ends_at_the_error_of_the_worst_tile(tmp_path, llvm):
     render = rendering(tmp_path / "a.exr", until_tile=0.2, pass_spp=2)
     render.run()
-    assert "--until-tile 0.2" in render.ended_by
+    assert "--until-tile 20 %" in render.ended_by
 
 
 def test_it_ends_after_its_time(tmp_path, llvm):
