@@ -78,7 +78,7 @@ def test_a_data_window_that_does_not_begin_at_zero(pair):
 
 
 BAD = {
-    "size": ({"mask": "small.exr"}, "a mask of 48 × 32"),
+    "size": ({"mask": "small.exr"}, "small.exr: 7 × 8; accepted: a mask of 48 × 32"),
     "missing": ({"mask": "none.exr"}, "none.exr: No such file"),
     "nan": ({"mask": "nan.exr"}, "values that are not finite"),
     "nothing left": ({"ignore": ((0, 0, 48, 32),)}, "leaves no pixel"),
@@ -88,7 +88,7 @@ BAD = {
 
 @pytest.mark.parametrize(("values", "message"), BAD.values(), ids=BAD)
 def test_bad_masks(pair, values, message):
-    image(pair[0].parent / "small.exr", shape=(8, 8, 3))
+    image(pair[0].parent / "small.exr", shape=(8, 7, 3))
     image(pair[0].parent / "nan.exr", value=np.nan)
     results = diff.diff(*pair, settings(**values))
     assert results.exit_code == 2
@@ -125,3 +125,9 @@ def test_a_new_image_of_another_size_is_not_spread_over_the_mask(pair, shape):
     (found,) = diff.diff(*pair, settings(method="exact", ignore=((0, 0, 2, 2),))).results
     assert found.status == "error"
     assert f"size {shape[1]} × {shape[0]}; accepted: 48 × 32" in found.error
+
+
+@pytest.mark.parametrize("rectangle", [(0, -50, 48, 10), (-50, 0, 10, 32), (-50, -50, 10, 10)])
+def test_a_rectangle_outside_the_image_holds_none_of_its_pixels(pair, rectangle):
+    rows, columns = masks._slices(image_file.read(pair[0]), rectangle)
+    assert np.zeros(SIZE)[rows, columns].size == 0

@@ -188,3 +188,9 @@ def test_the_command_takes_a_folder_or_an_image_and_refuses_what_is_not_finite(t
     image_file.write_exr(tmp_path / "bad.exr", IMAGE[1:])
     code, _, err = run("diff", "--self-test", tmp_path)
     assert code == 2 and "differ from" in err
+
+
+def test_a_method_that_takes_renders_is_asked_where_there_are_two_a_side():
+    enough = np.zeros((self_test.RENDERS // 2, 4, 4, 3))
+    every, single = set(methods.METHODS), {name for name, each in methods.METHODS.items() if not each.takes_renders}
+    assert set(self_test._asked(enough)) == every > single == set(self_test._asked(enough[1:]))

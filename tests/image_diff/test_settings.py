@@ -277,3 +277,8 @@ def test_a_wrong_entry_that_matches_nothing_is_told(folders):
     assert (wrong.name, wrong.error) == ("the settings, image[0]", "rules.toml: image[0].fale: unknown")
     assert results.exit_code == 2
     assert len(results.results) == 5
+
+
+def test_a_rectangle_may_begin_at_zero_but_not_be_empty():
+    assert settings_file._rectangles([[3, 0, 5, 5], [0, 3, 1, 1]]) == ((3, 0, 5, 5), (0, 3, 1, 1))
+    assert settings_file._rectangles([[3, 0, 0, 5]]) is settings_file._rectangles([[3, 0, 5, 0]]) is None

@@ -131,6 +131,11 @@ def test_the_bound_that_failed_is_named_first(options, verdict, reason):
     assert (found.verdict, found.reason, found.warning) == (verdict, reason, "")
 
 
+def test_fewer_failures_than_are_allowed_are_said_so():
+    found = compare("tolerance", image(FLAT), image(SIX), fail=0.01, allow_failures=300)
+    assert found.verdict is EQUAL and "(≤ allow_failures = 300)" in found.reason
+
+
 def test_a_warning_is_no_failure_and_names_its_bounds():
     options = {"fail": 0.01, "fail_percent": 1.0, "warn": 0.03, "hard_warn": 0.04}
     found = compare("tolerance", image(FLAT), image(SIX), **options)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_refract.image_diff import accept, channels, folders, pairing, settings_file, text_reports
+from mi_refract.image_diff import accept, channels, folders, pairing, settings_file, text_reports, variances
 from mi_refract.image_diff.comparison import Verdict
 from mi_refract.image_diff.methods import automatic, compare
 from mi_refract.image_diff.results import Category, Status
@@ -442,3 +442,10 @@ def test_check_settings_shows_them(pair):
     with console.capture() as shown:
         console.print(text_reports.settings_table(pairs))
     assert "spp_reference=64, spp_test=16, variance {stem}_var.exr, channels X=a.X,Y" in shown.get()
+
+
+@pytest.mark.parametrize("allowed", [False, True])
+def test_where_the_mean_is_not_finite_the_variance_is_none(allowed):
+    mean, variance = np.array([[1.0, np.nan]]), np.array([[0.5, np.nan]])
+    bare = Image(Path("a.exr"), mean[..., None].astype(np.float32), ("Y",))
+    assert variances._finite(bare, "Y", mean, variance, allowed).tolist() == [[0.5, 0.0]]

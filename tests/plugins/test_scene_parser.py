@@ -336,3 +336,18 @@ def test_the_code_of_plugins_that_are_allowed_is_among_the_files(tmp_path, scala
     found = scene_parser.files_of(tmp_path / "s.xml", {}, ("evil",)).others
     assert found["plugins/evil.so"] == tmp_path / "plugins" / "evil.so" and "plugins/other.so" not in found
     assert not scene_parser.files_of(tmp_path / "s.xml", {}).others.keys() & {"plugins/evil.so"}
+
+
+def test_as_many_folders_and_files_as_the_limits_say(tmp_path, scalar_variant):
+    def scene(paths, includes):
+        text = '<path value="more"/>' * paths + '<include filename="one.xml"/>' * includes
+        (tmp_path / "s.xml").write_text(f'<scene version="3.0.0">{text}</scene>')
+        return scene_limits.check_files(tmp_path / "s.xml", [], {})
+
+    (tmp_path / "one.xml").write_text('<scene version="3.0.0"/>')
+    most = scene_limits.FOLDERS, scene_limits.FILES - 1  # the scene itself is one
+    assert scene(*most).folders == scene_limits.FOLDERS
+    with pytest.raises(ValueError, match="<path> elements"):
+        scene(most[0] + 1, 0)
+    with pytest.raises(ValueError, match="files included"):
+        scene(0, most[1] + 1)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mi_refract.io import image_file
-from mi_refract.ray_sets import check_answers, files, header, ray_set, reports
+from mi_refract.ray_sets import check_answers, files, header, npz_arrays, ray_set, reports
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.regimes import Rays
 
@@ -330,3 +330,15 @@ def test_a_pipe_is_refused(tmp_path):
     (tmp_path / "b.npz").symlink_to("/dev/zero")
     for name in ("a.csv", "b.npz"):
         refused(tmp_path / name, "is a pipe or a device; accepted: a file", files.read_answers)
+
+
+def test_a_header_that_is_too_long(tmp_path, four):
+    np.savez(tmp_path / "a.npz", id=four.ids, header=np.array("x" * 2**19))  # of 4 bytes each
+    refused(tmp_path / "a.npz", "header is <U524288")
+
+
+def test_a_file_as_large_as_its_numbers_may_be(tmp_path, monkeypatch):
+    """16 bytes a number are let pass: those of a `longdouble`."""
+    monkeypatch.setattr(npz_arrays, "_SPARE", 1000)
+    np.savez(tmp_path / "a.npz", x=np.zeros((1000, 3)))
+    assert npz_arrays.read(tmp_path / "a.npz", {"x": 3}, (), 1000)[1].shape == (1000, 3)
