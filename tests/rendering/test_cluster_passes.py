@@ -191,7 +191,7 @@ def test_a_worker_that_joins_late_is_used(client, scene, variant, monkeypatch):
     finished(passes)
     late = lambda: {*passes.addresses} - before  # noqa: E731
     run = rendering(scene, scene.with_name("remote.exr"), 100_000)
-    with joined(client.scheduler.address):
+    with joined(client):
 
         class Used(Exception):
             """Ends the render."""

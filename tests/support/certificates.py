@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from mi_refract.cluster.local import PEM
 from mi_refract.cluster.tls import Tls
 
 
@@ -29,7 +30,7 @@ def openssl(*words: str, at: Path) -> None:
 
 def tls_files(pem: Mapping[str, str], folder: Path) -> Tls:
     """Files of the authority, certificate and key whose texts Dask's `Security` has under these names."""
-    paths = [folder / f"{name}.pem" for name in ("tls_ca_file", "tls_client_cert", "tls_client_key")]
+    paths = [folder / f"{name}.pem" for name in PEM]
     for path in paths:
         path.write_text(pem[path.stem])
     return Tls(*paths)
