@@ -19,6 +19,8 @@ from .pass_sums import Doubles, PassSums
 
 LEVEL = 0.95
 TILE = 16  # pixels
+ENOUGH_FOR_NO_NOISE = 64  # samples per pixel
+SAME = 5e-13  # of a pixel's mean, the standard deviation of samples that are equal but for the rounding of sums
 LEFT_OUT = 0.01  # share of the tiles that may be worse
 DARK = 0.01  # of the image's mean: a darker tile is judged as if it were so bright
 
@@ -50,6 +52,17 @@ def relative_error(sums: PassSums) -> RelativeError:
         spread = _quantile(found.size - 1) * float(found.std(ddof=1)) * math.sqrt(1 + 1 / found.size)
     value, low, high = (math.sqrt(max(x, 0) / sums.spp) / mean for x in (squared, squared - spread, squared + spread))
     return RelativeError(value, low, high)
+
+
+def without_noise(sums: PassSums) -> bool:
+    """Whether all samples of each pixel are the same, and none is black: there light may be that is seldom met.
+
+    Sums in float64 differ from equal ones by less than SAME; one sample of n ≤ 2³², by float32's 6e-8/√n ≥ 9e-13.
+    """
+    if sums.spp < ENOUGH_FOR_NO_NOISE or (variance := sums.variance) is None:
+        return False
+    mean = sums.mean
+    return bool((np.isfinite(mean) & (mean != 0) & (variance <= np.square(SAME * mean))).all())
 
 
 def require_interval() -> None:

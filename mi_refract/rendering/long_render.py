@@ -25,7 +25,7 @@ from mi_refract.io.provenance import provenance
 
 from . import checkpoint, rendered_file
 from .checkpoint import Progress
-from .error_estimate import RelativeError, relative_error, require_interval, worst_tile
+from .error_estimate import RelativeError, relative_error, require_interval, without_noise, worst_tile
 from .identity import PASS, identity_of
 from .pass_plan import FEW, PassPlan, next_stop, plan_passes
 from .pass_sums import PassSums
@@ -33,8 +33,6 @@ from .render_pass import PassRenderer, pass_renderer
 from .scene_files import formulas_in, load_scene, naming
 
 NO_NOISE = "no noise: the samples of every pixel agree"
-ENOUGH_FOR_NO_NOISE = 64  # samples per pixel
-SAME = 5e-13  # of a pixel's mean, the standard deviation of samples that are equal but for the rounding of sums
 BETWEEN_CHECKPOINTS = (
     20.0  # seconds: with the pass that a kill interrupts at most 30 are lost, if a pass takes up to 10
 )
@@ -261,7 +259,7 @@ class LongRender:
         sums = self.progress.sums()
         if sums is None:
             return ""
-        if _without_noise(sums):
+        if without_noise(sums):
             return NO_NOISE
         if self.spp is None and not np.any(sums.total[..., : sums.colours] > 0):
             self._warn_once(f"{self.output}: is black so far: it has no relative error that could end it")
@@ -374,17 +372,6 @@ def _stamps(*paths: Path) -> list[tuple[int, int] | None]:
     """What changes with each of the files."""
     found = [path.stat() if path.exists() else None for path in paths]
     return [None if each is None else (each.st_ino, each.st_mtime_ns) for each in found]
-
-
-def _without_noise(sums: PassSums) -> bool:
-    """Whether all samples of each pixel are the same, and none is black: there light may be that is seldom met.
-
-    Sums in float64 differ from equal ones by less than SAME; one sample of n ≤ 2³², by float32's 6e-8/√n ≥ 9e-13.
-    """
-    if sums.spp < ENOUGH_FOR_NO_NOISE or (variance := sums.variance) is None:
-        return False
-    mean = sums.mean
-    return bool((np.isfinite(mean) & (mean != 0) & (variance <= np.square(SAME * mean))).all())
 
 
 def lock_of(output: Path) -> Path:

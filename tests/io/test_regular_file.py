@@ -1,23 +1,13 @@
 """Files are read as far as they go, and take no more memory than they hold."""
 
 import sys
-import tracemalloc
 from pathlib import Path
 
 import pytest
+from support.memory import peak
 
 from mi_refract.io import regular_file
 from mi_refract.ray_sets import files, ray_set
-
-
-def peak(work):
-    """The most bytes that were allocated at once."""
-    tracemalloc.start()
-    try:
-        work()
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
 
 
 def test_the_memory_is_that_of_the_file(tmp_path):

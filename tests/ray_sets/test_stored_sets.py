@@ -8,11 +8,11 @@ import json
 import pickle
 import subprocess
 import sys
-import tracemalloc
 import zipfile
 
 import numpy as np
 import pytest
+from support.memory import peak
 from support.processes import ENVIRONMENT
 
 from mi_refract import oracle
@@ -369,15 +369,6 @@ def test_no_angle_and_no_number():
     for found in (kept.of([0]), kept.of([1]), kept.of([])):
         values = found.largest, found.mean, found.quantile(0.99), kept_angles.median(found.pieces)
         assert np.isnan(values).all()
-
-
-def peak(work):
-    tracemalloc.start()
-    try:
-        work()
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
 
 
 def stub(calls):
