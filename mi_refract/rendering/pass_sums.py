@@ -91,8 +91,8 @@ class PassSums:
                 b[piece] += d[piece]
                 b[piece] += apart
                 a[piece] += c[piece]
-                finite = np.isfinite(colours := apart[:, : self.colours])
-                growth, known = growth + float(colours[finite].sum()), known + int(finite.sum())
+                more, of = _finite_sum(apart[:, : self.colours])
+                growth, known = growth + more, known + of
         self.contrasts = [*self.contrasts, *other.contrasts, growth / known if known else np.nan]
         self._add_counts(other)
 
@@ -112,6 +112,14 @@ class PassSums:
             self.within = None
         else:
             self.within = self.within + other.within
+
+
+def _finite_sum(values: Doubles) -> tuple[float, int]:
+    """Of the values that are finite: their sum and number."""
+    if np.isfinite(total := float(values.sum())):
+        return total, values.size
+    finite = np.isfinite(values)
+    return float(values[finite].sum()), int(finite.sum())
 
 
 def _not_zero(weights: Any) -> Any:

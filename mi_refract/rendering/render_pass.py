@@ -21,7 +21,7 @@ import numpy as np
 
 from .pass_plan import FEW, scalar_seed_of, seed_of
 from .pass_sums import Doubles, PassSums
-from .sample_sums import Film, squared_sums, weighted_sums
+from .sample_sums import Film, image_sums
 
 # One thread would be the caller's own, which keeps denormals: the others take them for 0, and bits would differ.
 LEAST_THREADS = 2
@@ -168,7 +168,7 @@ def _rendered(scene: Any, spp: int, seed: int) -> tuple[Doubles, Doubles | None]
 def _sums(
     scene: Any, channels: tuple[str, ...], spp: int, seed: int, *, squares: bool
 ) -> tuple[Doubles, Doubles | None, Doubles | None]:
-    """Σ w v of all pixels, H × W × C; Σ w, None under a box; for `squares` Σ (w (v − mean))² over the samples."""
+    """What `image_sums` gives, of samples with this seed."""
     sensors_film = scene.sensors()[0].film()
     rfilter = sensors_film.rfilter()
     width, height = (int(n) for n in sensors_film.crop_size())
@@ -176,17 +176,7 @@ def _sums(
     if dr.thread_count() < LEAST_THREADS:
         dr.set_thread_count(LEAST_THREADS)
     with dr.suspend_grad():
-        values, place = _samples(scene, channels, spp, seed)
-        *totals, weights = weighted_sums(values, place, film)
-        # Rounded: the spread of equal samples is exactly 0 then.
-        means = [mi.Float(dr.select(weights == 0, 0, total / weights)) for total in totals]
-        within = squared_sums(values, place, means, film) if squares else []
-        dr.eval(within)
-
-    def array(values: list[Any]) -> Doubles:
-        return np.stack([np.array(each) for each in values], -1).reshape(height, width, len(values))
-
-    return array(totals), None if film.rfilter is None else array([weights]), array(within) if squares else None
+        return image_sums(*_samples(scene, channels, spp, seed), film, squares=squares)
 
 
 def _samples(scene: Any, channels: tuple[str, ...], spp: int, seed: int) -> tuple[list[Any], Any]:
@@ -206,9 +196,7 @@ def _samples(scene: Any, channels: tuple[str, ...], spp: int, seed: int) -> tupl
     values += list(others)
     if len(values) != len(channels):
         raise ValueError(f"{len(values)} values in a sample; accepted: {len(channels)}, those of the film")
-    place = mi.Point2f(place) - mi.Point2f(sensor.film().crop_offset())
-    dr.eval(values, place)
-    return values, place
+    return values, mi.Point2f(place) - mi.Point2f(sensor.film().crop_offset())
 
 
 def _colours(channels: tuple[str, ...], radiance: Any, wavelengths: Any) -> list[Any]:

@@ -234,7 +234,7 @@ def test_a_node_whose_folds_are_folded_is_given_up(client, scene, variant, monke
 def test_what_was_begun_ahead_serves_the_next_call(client, scene, variant):
     passes = source(client, scene, variant)
     list(passes.nodes(0, 1, 16, 0, 1))
-    ahead = [node.result.key for node in passes._begun]
+    ahead = [node.result.key for node in passes._begun if node.stop <= 8]
     assert ahead
     list(passes.nodes(1, 8, 16, 0, 1))
     assert not {*ahead} & {node.result.key for node in passes._begun}

@@ -153,13 +153,17 @@ def test_the_spread_of_samples_is_that_of_passes(tmp_path, llvm, rfilter):
     np.testing.assert_allclose(within.mean(), between.mean(), rtol=0.1)
 
 
-def test_equal_samples_have_no_second_moment(tmp_path, llvm):
+@pytest.mark.parametrize("spp", [7, 8])
+@pytest.mark.parametrize("rfilter", ["box", "gaussian"])
+def test_equal_samples_have_no_second_moment(tmp_path, llvm, rfilter, spp):
     (tmp_path / "sky.xml").write_text(
         '<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"><film type="hdrfilm">'
-        '<integer name="width" value="8"/><integer name="height" value="8"/><rfilter type="gaussian"/></film></sensor>'
-        '<emitter type="constant"><rgb name="radiance" value="0.1, 0.7, 0.3"/></emitter></scene>'
+        '<integer name="width" value="8"/><integer name="height" value="8"/><rfilter type="RFILTER"/></film></sensor>'
+        '<emitter type="constant"><rgb name="radiance" value="0.1, 0.7, 0.3"/></emitter></scene>'.replace(
+            "RFILTER", rfilter
+        )
     )
-    sums = pass_renderer(load_scene(tmp_path / "sky.xml"), 0).render(0, 7)
+    sums = pass_renderer(load_scene(tmp_path / "sky.xml"), 0).render(0, spp)
     assert not sums.within.any()
     np.testing.assert_array_equal(sums.mean[0, 0].astype(np.float32), np.float32([0.1, 0.7, 0.3]))
 
