@@ -6,6 +6,7 @@ import os
 import random
 import re
 import socket
+import time
 from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
@@ -190,7 +191,7 @@ def test_a_worker_that_joins_late_is_used(client, scene, variant, monkeypatch):
     passes, before = source(client, scene, variant), set(client.nthreads())
     finished(passes)
     late = lambda: {*passes.addresses} - before  # noqa: E731
-    run = rendering(scene, scene.with_name("remote.exr"), 100_000)
+    run, began = rendering(scene, scene.with_name("remote.exr"), 100_000), time.monotonic()
     with joined(client):
 
         class Used(Exception):
@@ -199,6 +200,8 @@ def test_a_worker_that_joins_late_is_used(client, scene, variant, monkeypatch):
         def watch(render):
             if late():
                 raise Used
+            if time.monotonic() - began > 120:
+                pytest.fail("120 s without the worker that joins")
 
         with pytest.raises(Used):
             run.run(watch, passes)
