@@ -1,6 +1,6 @@
 """A render in passes: from where it was left, until it has what was asked for.
 
-Each pass is rendered and added to the tree of sums; every 20 s or so a checkpoint is written; after 8, 12, 16, 24 …
+Each pass is rendered and added to the tree of sums; every 25 s or so a checkpoint is written; after 8, 12, 16, 24 …
 passes the error is looked at, where it may end the render.
 """
 
@@ -33,9 +33,9 @@ from .render_pass import PassRenderer, pass_renderer
 from .scene_files import formulas_in, load_scene, naming
 
 NO_NOISE = "no noise: the samples of every pixel agree"
-BETWEEN_CHECKPOINTS = (
-    20.0  # seconds: with the pass that a kill interrupts at most 30 are lost, if a pass takes up to 10
-)
+# Seconds from one checkpoint's state to the next one's, unless a pass takes longer. A kill loses as many, and those in
+# which the next one is written: 30 in all are meant.
+BETWEEN_CHECKPOINTS = 25.0
 
 
 @dataclass(frozen=True)
@@ -218,13 +218,14 @@ class LongRender:
         last = full if full is not None else next_stop(next_stop(first + tree.passes)) - first
         stop = min(self._next_look(), last)
         for level, sums, machine in source.nodes(tree.passes, stop, last, first, self.plan.spp):
+            took = time.monotonic() - before
             with self._state:
                 tree.add(sums, level)
-                self.progress.seconds += time.monotonic() - before
+                self.progress.seconds += took
                 self.progress.machines = sorted({*self.progress.machines, *machine.split(", ")})
             before = time.monotonic()
             watch(self)
-            self._keep_sometimes()
+            self._keep_sometimes(took)
             if self.limits.seconds is not None and time.monotonic() - began >= self.limits.seconds:
                 return
 
@@ -334,10 +335,10 @@ class LongRender:
                 os.write(2, f"\nmi-refract: {printable(text)}\n".encode(errors="replace"))
             lock_of(self.output).unlink(missing_ok=True)
 
-    def _keep_sometimes(self) -> None:
-        """Write a checkpoint beside the next pass, if the last one is old."""
+    def _keep_sometimes(self, took: float) -> None:
+        """Write a checkpoint beside the next pass, if the last one would be old after it. `took`: such a pass."""
         self._wait()
-        if time.monotonic() - self._last_kept >= BETWEEN_CHECKPOINTS:
+        if time.monotonic() - self._last_kept + took > BETWEEN_CHECKPOINTS:
             self._last_kept = time.monotonic()
             self._writer = threading.Thread(target=self.keep, name="checkpoint")
             self._writer.start()

@@ -6,6 +6,7 @@ import errno
 import random
 import signal
 import time
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -301,6 +302,25 @@ def test_two_renders_into_one_file(tmp_path, llvm):
 
     first.run(watch)
     assert said
+
+
+@pytest.mark.parametrize("took", [1, 8, 12, 19, 24, 40])
+def test_a_kill_loses_25_s_or_one_pass(tmp_path, llvm, monkeypatch, took):
+    """A clock that only passes move, each by as many seconds."""
+    clock, kept = [0.0], [0.0]
+    monkeypatch.setattr(long_render, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr(checkpoint, "write", lambda path, progress: kept.append(progress.seconds))
+    render = rendering(tmp_path / "a.exr", spp=64, pass_spp=1)
+    of_a_pass = type(render.renderer).render
+
+    def passed(*arguments):
+        clock[0] += took
+        return of_a_pass(*arguments)
+
+    monkeypatch.setattr(type(render.renderer), "render", passed)
+    render.run()
+    apart = np.diff(kept)
+    assert len(apart) > 1 and apart.max() <= max(25, took) and apart.min() + took > 25
 
 
 def test_a_full_disk_at_a_checkpoint_is_a_warning(tmp_path, llvm, monkeypatch):
