@@ -23,9 +23,8 @@ from mi_refract.io.image_file import SUFFIXES, Metadata
 from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import provenance
 
-from . import checkpoint, rendered_file
+from . import checkpoint, error_estimate, rendered_file
 from .checkpoint import Progress
-from .error_estimate import RelativeError, relative_error, require_interval, without_noise, worst_tile
 from .identity import PASS, identity_of
 from .pass_plan import FEW, PassPlan, next_stop, plan_passes
 from .pass_sums import PassSums
@@ -123,7 +122,7 @@ class LongRender:
         if not 0 <= job.seed < 2**32:
             raise ValueError(f"seed = {job.seed}: accepted: a whole number from 0 to 2³² − 1")
         if limits.until is not None:
-            require_interval()
+            error_estimate.require_interval()
         self.checkpoint = checkpoint.path_of(self.output)
         self.scene = load_scene(job.scene, job.defines, job.allow_plugins)
         self.renderer = pass_renderer(self.scene, job.seed)
@@ -257,19 +256,21 @@ class LongRender:
 
     def _good_enough(self) -> str:
         """What ends the render by what its samples are: no noise, or an error that was asked for; "" where nothing."""
+        if self.progress.passes < FEW and self.progress.done < error_estimate.ENOUGH_FOR_NO_NOISE:
+            return ""
         sums = self.progress.sums()
         if sums is None:
             return ""
-        if without_noise(sums):
+        if error_estimate.without_noise(sums):
             return NO_NOISE
         if self.spp is None and not np.any(sums.total[..., : sums.colours] > 0):
             self._warn_once(f"{self.output}: is black so far: it has no relative error that could end it")
         if self.progress.passes < FEW:
             return ""
-        if self.limits.until and (error := relative_error(sums)).high <= self.limits.until:
+        if self.limits.until and (error := error_estimate.relative_error(sums)).high <= self.limits.until:
             asked, value, high = (f"{100 * each:.3g} %" for each in (self.limits.until, error.value, error.high))
             return f"--until {asked}: the error is {value}, at most {high}"
-        if self.limits.until_tile and (worst := worst_tile(sums)) <= self.limits.until_tile:
+        if self.limits.until_tile and (worst := error_estimate.worst_tile(sums)) <= self.limits.until_tile:
             asked, value = (f"{100 * each:.3g} %" for each in (self.limits.until_tile, worst))
             return f"--until-tile {asked}: the error of the worst tile is {value}"
         return ""
@@ -288,11 +289,11 @@ class LongRender:
         """Whether it has as many samples per pixel as were asked for."""
         return self.progress.done == self.spp
 
-    def error(self) -> RelativeError | None:
+    def error(self) -> error_estimate.RelativeError | None:
         """The present error; None where nothing is done yet."""
         with self._state:
             sums = self.progress.sums()
-        return None if sums is None else relative_error(sums)
+        return None if sums is None else error_estimate.relative_error(sums)
 
     def image(self) -> np.ndarray | None:
         """The image so far, H × W × channels; None where nothing is done yet."""
@@ -303,10 +304,11 @@ class LongRender:
     def _finish(self, unchanged: bool) -> Metadata:
         self._wait()
         metadata = _metadata(self.job, ", ".join(formulas_in(self.scene)) or "none")
-        channels = self.renderer.channels
-        header = rendered_file.header(self.progress, metadata, self.ended_by, self.renderer.filter_radius)
+        sums = self.progress.sums()
+        assert sums is not None
+        header = rendered_file.header(self.progress, sums, metadata, self.ended_by, self.renderer.filter_radius)
         if not unchanged:
-            rendered_file.write(self.output, channels, self.progress, header)
+            rendered_file.write(self.output, self.renderer.channels, sums, header)
         self.checkpoint.unlink(missing_ok=True)
         return header
 

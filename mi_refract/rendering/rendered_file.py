@@ -20,10 +20,8 @@ VARIANCE = "{}.variance"
 _KEPT = ("spp", "passes", "identity", "contrasts", "variance_from", "machines", "render_seconds", "ended_by")
 
 
-def header(progress: Progress, metadata: Metadata, ended_by: str, filter_radius: float) -> Metadata:
-    """`metadata`, and what is known of the passes."""
-    sums = progress.sums()
-    assert sums is not None
+def header(progress: Progress, sums: PassSums, metadata: Metadata, ended_by: str, filter_radius: float) -> Metadata:
+    """`metadata`, and what is known of the passes, whose sums are `sums`."""
     return metadata | {
         "mi_refract:spp": sums.spp,
         "mi_refract:passes": sums.passes,
@@ -39,10 +37,8 @@ def header(progress: Progress, metadata: Metadata, ended_by: str, filter_radius:
     }
 
 
-def write(output: Path, channels: tuple[str, ...], progress: Progress, header: Metadata) -> None:
+def write(output: Path, channels: tuple[str, ...], sums: PassSums, header: Metadata) -> None:
     """Write what a render has. Errors: those of `write_exr`."""
-    sums = progress.sums()
-    assert sums is not None
     pixels, names = [sums.mean], list(channels)
     if (variance := sums.variance) is not None:
         pixels.append(variance)

@@ -48,8 +48,8 @@ COUNTS = {"quick": 20, "standard": 100, "full": 500}  # renders of each scene
 STILLS = ("sphere", "nested")
 RESOLUTION, PASS_SPP = 24, 2
 REFERENCE = 100  # times the samples of 12 passes: 1 % of their squared error
-PAIRS = {"quick": 0, "standard": 5, "full": 9}
-TIMED_SPP = {"quick": 0, "standard": 64, "full": 256}
+PAIRS = {"quick": 0, "standard": 7, "full": 9}
+TIMED_SPP = {"quick": (), "standard": (64, 256), "full": (64, 256, 1024)}
 
 
 def tasks(context: Context) -> list[Task]:
@@ -58,8 +58,10 @@ def tasks(context: Context) -> list[Task]:
         reason = "scalar variants render by `mi.render`, a hundred times as slowly"
         return [Task(NAME, lambda: [Row(NAME, "until", "scenes", context.variant, reason=reason)])]
     errors = [Task(f"passes: {name}", functools.partial(error_rows, context, name)) for name in STILLS]
-    timed = Task("passes: time", functools.partial(time_rows, context), timed=True)
-    return errors + ([timed] if PAIRS[context.profile.name] else [])
+    return errors + [
+        Task(f"passes: time, {spp} spp", functools.partial(time_rows, context, spp), timed=True)
+        for spp in TIMED_SPP[context.profile.name]
+    ]
 
 
 @dataclass(frozen=True)
@@ -124,11 +126,11 @@ def _most(count: int) -> float:
     return float(binom.ppf(1 - limits.STOPPED_WRONGLY, count, 1 - error_estimate.LEVEL))
 
 
-def time_rows(context: Context) -> list[Row]:
+def time_rows(context: Context, spp: int) -> list[Row]:
     """One row: processor time of a render in passes over that of one call."""
     import mitsuba as mi
 
-    spp, ratios = TIMED_SPP[context.profile.name], []
+    ratios = []
     with under(context.variant), tempfile.TemporaryDirectory() as folder:
         job, output = Job(SCENES / "sphere.xml", {"res": "512", "bsdf": PLUGIN}), Path(folder) / "passes.exr"
         one = Path(folder) / "one.exr"
@@ -143,7 +145,7 @@ def time_rows(context: Context) -> list[Row]:
     replay = {"scene": "sphere", "resolution": image.shape[0], "spp": spp, "pairs": len(ratios) - 1}
     values = {name: float(value) for name, value in values.items()}
     goals = {ONE_CALL: limits.PASSES_TIME}
-    return [Row(NAME, "passes", "sphere", context.variant, values, goals=goals, replay=replay)]
+    return [Row(NAME, f"{spp} spp", "sphere", context.variant, values, goals=goals, replay=replay)]
 
 
 def _timed(work: Any) -> tuple[float, Any]:
