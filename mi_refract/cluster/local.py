@@ -16,6 +16,12 @@ import signal
 import sys
 import tempfile
 
+# Dask watches itself: its profiler and monitors would take 5 % of the workers' time from kernels.
+SETTINGS = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.system-monitor.interval": "10s",
+    "distributed.admin.tick.interval": "1s",
+}
 FAILED = "failed: "
 PEM = ("tls_ca_file", "tls_client_cert", "tls_client_key")  # of Dask's `Security`: their text
 
@@ -26,9 +32,11 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is for who started us
     folder = tempfile.mkdtemp(prefix="mi_refract-workers-")
     try:
+        import dask
         from distributed import LocalCluster
         from distributed.security import Security
 
+        dask.config.set(SETTINGS)
         security = Security.temporary()
         cluster = LocalCluster(
             n_workers=int(sys.argv[1]),
