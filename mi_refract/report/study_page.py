@@ -92,12 +92,15 @@ def _measured(rows: list[Row]) -> list[Row]:
 
 
 def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> list[dict[str, Any]]:
-    """A table per setting, under a matrix of subjects by cases, where there is enough to see."""
+    """A table per setting, under a matrix of subjects by cases, where there is enough to see.
+
+    Else one of all settings; rows that share no metric with the others have a table of their own.
+    """
     settings = list(dict.fromkeys(row.setting for row in rows))
     parts = {setting: [row for row in rows if row.setting == setting] for setting in settings}
     matrices = {setting: _matrix(part, metrics, scale) for setting, part in parts.items()}
     if not any(matrices.values()):
-        return [{"heading": "", "matrix": None, "table": _table(rows, metrics)}]
+        return [{"heading": "", "matrix": None, "table": _table(part, metrics)} for part in _comparable(rows)]
     return [
         {
             "heading": s,
@@ -106,6 +109,18 @@ def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | No
         }
         for s in settings
     ]
+
+
+def _comparable(rows: list[Row]) -> list[list[Row]]:
+    """The rows with values in parts, so that those with a common metric are in one; in their order."""
+    parts: list[tuple[set[str], set[int]]] = []  # metrics, and numbers of rows
+    for number, row in enumerate(rows := [row for row in rows if row.values]):
+        metrics, numbers = set(row.values), {number}
+        for part in [part for part in parts if part[0] & metrics]:
+            parts.remove(part)
+            metrics, numbers = metrics | part[0], numbers | part[1]
+        parts.append((metrics, numbers))
+    return [[rows[i] for i in sorted(numbers)] for _, numbers in sorted(parts, key=lambda part: min(part[1]))]
 
 
 def _matrix(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> dict[str, Any] | None:
