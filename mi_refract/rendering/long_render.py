@@ -33,7 +33,7 @@ from .scene_files import formulas_in, load_scene, naming
 
 NO_NOISE = "no noise: the samples of every pixel agree"
 # Seconds from one checkpoint's state to the next one's, unless a pass takes longer. A kill loses as many, and those in
-# which the next one is written: 30 in all are meant.
+# which the next one is written: 30 in all, if that takes up to 5.
 BETWEEN_CHECKPOINTS = 25.0
 
 
