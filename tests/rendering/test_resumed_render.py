@@ -356,15 +356,15 @@ def run_with_checkpoints(arguments):
     long_render.BETWEEN_CHECKPOINTS = 0.05
     return run(arguments)
 cli._run = run_with_checkpoints
-limits = ["-D", "res=32", "--spp", "1200", "--pass-spp", "4"]
+limits = ["-D", "res=32", "--pass-spp", "4"]
 sys.argv[1:] = ["render", sys.argv[1], "-o", sys.argv[2], *limits, *sys.argv[3:]]
 sys.exit(cli.main())
 """
 
 
-def ended_by(number, output, *options):
-    """Whether a render was ended by a signal, sent after some passes; its exit code and what it printed."""
-    with python(KILLED, BALL, output, "--variant", "llvm_ad_rgb", *options) as process:
+def ended_by(number, output, *options, spp=4800):
+    """The exit code and the output of a render that a signal ends after its first passes, of seconds of them."""
+    with python(KILLED, BALL, output, "--variant", "llvm_ad_rgb", "--spp", str(spp), *options) as process:
         deadline = time.monotonic() + 120
         before = checkpoint.path_of(output).stat().st_mtime_ns if checkpoint.path_of(output).exists() else 0
         while process.poll() is None and time.monotonic() < deadline:
@@ -379,19 +379,19 @@ def ended_by(number, output, *options):
 
 
 def test_sigkill_at_random_times_leaves_a_checkpoint_and_the_same_bits(tmp_path, llvm):
-    output, codes = tmp_path / "a.exr", []
+    output, codes, spp = tmp_path / "a.exr", [], 2400
     for _ in range(4):
-        codes.append(ended_by(signal.SIGKILL, output)[0])
+        codes.append(ended_by(signal.SIGKILL, output, spp=spp)[0])
         if codes[-1] == 0:
             break
     assert codes[0] == -signal.SIGKILL
     if not output.exists():
         job = Job(BALL, {"res": "32"})
-        render = LongRender(job, output, Limits(spp=1200, pass_spp=4))
+        render = LongRender(job, output, Limits(spp=spp, pass_spp=4))
         assert render.progress.passes
         render.run()
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
-    LongRender(Job(BALL, {"res": "32"}), tmp_path / "b.exr", Limits(spp=1200, pass_spp=4)).run()
+    LongRender(Job(BALL, {"res": "32"}), tmp_path / "b.exr", Limits(spp=spp, pass_spp=4)).run()
     np.testing.assert_array_equal(pixels(output), pixels(tmp_path / "b.exr"))
 
 
@@ -402,5 +402,5 @@ def test_a_signal_keeps_what_is_done(tmp_path, llvm, number):
     assert code == 128 + number, err
     assert "spp; the same command goes on from them" in err
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr.checkpoint"]
-    render = LongRender(Job(BALL, {"res": "32"}), output, Limits(spp=1200, pass_spp=4))
+    render = LongRender(Job(BALL, {"res": "32"}), output, Limits(spp=4800, pass_spp=4))
     assert render.progress.passes > 0
