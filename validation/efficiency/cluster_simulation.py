@@ -112,10 +112,6 @@ class World:
         self._at(self.client, self._message, self._asked, task)
         return task
 
-    def cancel(self, *_: Any, **__: Any) -> None:
-        """Nothing is cancelled in a render that ends with its last pass."""
-        raise NotImplementedError("cancelled tasks are not simulated")
-
     def receive(self, task: _Task) -> None:
         """Have a node come to the client, which waits for it."""
         self._sends[task.worker] = max(self.client, self._sends[task.worker]) + self.costs.transfer
