@@ -11,13 +11,14 @@ The unmutated copy must pass first.
 from __future__ import annotations
 
 import json
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from mi_refract.report.row import Row
 from validation.limits import UNEXPLAINED
@@ -32,7 +33,7 @@ COUNTS = {"quick": 3, "standard": 20, "full": 220}
 ALL = "all packages"
 # Tests by package; those named after a module come first.
 GUARDS = {
-    "plugins": ("plugins", "rendering", "test_rooms.py"),
+    "plugins": ("plugins", "rendering/test_render_pass.py", "rendering/test_scene_files.py", "test_rooms.py"),
     "image_diff": ("image_diff", "cli/test_diff.py", "cli/test_diff_forms.py", "test_rooms.py"),
     "ray_sets": ("ray_sets", "cli/test_rays.py", "test_rooms.py"),
     "accuracy": ("accuracy", "ray_sets", "formulas", "validation/test_sweep.py", "test_rooms.py"),
@@ -165,8 +166,14 @@ def _tell(found: Found) -> None:
     print(f"{outcome} {found.seconds:.0f} s {found.mutant} [{found.reason or found.said}]", file=sys.stderr, flush=True)
 
 
+def _terminated(*_: Any) -> NoReturn:
+    """An exception, for which the tests that run are ended and their copies removed."""
+    sys.exit(128 + signal.SIGTERM)
+
+
 def main(arguments: Sequence[str]) -> int:
     """`COUNT [SEED]`; 1 where the bound is broken."""
+    signal.signal(signal.SIGTERM, _terminated)
     count, seed = int(arguments[0]), int(arguments[1]) if arguments[1:] else 0
     if reason := missing():
         raise SystemExit(f"code mutants: {reason}")

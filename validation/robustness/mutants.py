@@ -9,7 +9,9 @@ does: annotations, `__all__`, blocks under `if TYPE_CHECKING`; and what does not
 from __future__ import annotations
 
 import ast
+import hashlib
 import random
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -53,17 +55,23 @@ class Mutant:
 
 
 def sample(root: Path, count: int, seed: int) -> list[Mutant]:
-    """The first `count` useful mutants of all places, shuffled: a smaller sample begins a larger one."""
-    places = [(path, place) for path in files(root) for place in _places(root / path)]
-    rng = random.Random(seed)
+    """The first `count` useful mutants of all places, shuffled: a smaller sample begins a larger one.
+
+    The order is that of a hash of the seed, the file and the text of the line: an edit changes what is drawn from the
+    lines that it changes, and nothing else.
+    """
+    drawn = [(_key(seed, path, *name), path, place) for path in files(root) for name, place in _places(root / path)]
     found: list[Mutant] = []
-    for path, place in rng.sample(places, len(places)):
+    for key, path, place in sorted(drawn):
         if len(found) == count:
             break
-        mutant = of(root, path, *rng.choice(place))
-        if mutant:
+        if mutant := of(root, path, *random.Random(key).choice(place)):
             found.append(mutant)
     return found
+
+
+def _key(*parts: object) -> str:
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
 def files(root: Path) -> list[str]:
@@ -96,7 +104,7 @@ def mutated(source: str, operator: str, occurrence: int) -> str:
 
 def every(root: Path, path: str) -> Iterator[Mutant]:
     """All useful mutants of one file."""
-    for place in _places(root / path):
+    for _, place in _places(root / path):
         for operator, occurrence in place:
             if mutant := of(root, path, operator, occurrence):
                 yield mutant
@@ -107,14 +115,24 @@ def lines(root: Path, path: str) -> set[str]:
     return {_plain(text) for text in (root / path).read_text("utf-8").splitlines()}
 
 
-def _places(path: Path) -> list[list[tuple[str, int]]]:
-    """Operators and occurrences at each place; a place belongs to one family of operators."""
-    nodes = _nodes(path)
+def _places(path: Path) -> list[tuple[tuple[Any, ...], list[tuple[str, int]]]]:
+    """Names of the places, and operators and occurrences at each; a place belongs to one family of operators.
+
+    A name has the text of the line, the columns, the family, and how often all this came before in the file.
+    """
+    nodes, text = _nodes(path), path.read_text("utf-8").splitlines()
     found: dict[tuple[Any, ...], list[tuple[str, int]]] = {}
     for operator in operators():
         for occurrence, start in enumerate(_starts(operator, nodes)):
             found.setdefault((start, operator.partition("_")[0]), []).append((operator, occurrence))
-    return [found[key] for key in sorted(found)]
+    before: Counter[tuple[Any, ...]] = Counter()
+    named = []
+    for key in sorted(found):
+        ((line, column), family) = key
+        name = (text[line - 1].strip(), column, family)
+        named.append(((*name, before[name]), found[key]))
+        before[name] += 1
+    return named
 
 
 def _nodes(path: Path) -> list[Any]:
