@@ -1,0 +1,13 @@
+"""Refractive indices of materials by wavelength. Wavelengths are in nanometres, in air or in vacuum as the source says.
+
+In: what a scene says of a material, a number or a string (see `parse`), and wavelengths as floats, numpy arrays or
+Dr.Jit arrays. Out: indices in double precision, and their derivatives. Nothing here refracts.
+"""
+
+from . import glass_catalogs
+from .dispersion import LINES
+from .medium import Medium
+from .ratio import relative_index
+from .specification import index, parse
+
+__all__ = ["LINES", "Medium", "glass_catalogs", "index", "parse", "relative_index"]

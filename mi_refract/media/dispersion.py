@@ -1,0 +1,244 @@
+"""Formulas of dispersion: n as a function of the wavelength λ in nm and of coefficients, and its derivatives.
+
+A formula takes floats, numpy arrays or Dr.Jit arrays alike, in double precision.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from mi_refract.numerics import Number
+
+from .number_kinds import root, where
+
+# Spectral lines by their letters, in nm, as catalogues of glass print them.
+LINES = {
+    "i": 365.0146,
+    "h": 404.6561,
+    "g": 435.8343,
+    "F'": 479.9914,
+    "F": 486.1327,
+    "e": 546.0740,
+    "d": 587.5618,
+    "D": 589.2938,
+    "C'": 643.8469,
+    "C": 656.2725,
+    "r": 706.5188,
+    "s": 852.1101,
+    "t": 1013.98,
+}
+Coefficients = Mapping[str, Number]
+
+
+class Dispersion(Protocol):
+    """n(λ) with named coefficients."""
+
+    def index(self, wavelength: Number, c: Coefficients) -> Number:
+        """N, dimensionless."""
+
+    def slope(self, wavelength: Number, c: Coefficients) -> Number:
+        """dn/dλ per nm."""
+
+    def coefficient_slopes(self, wavelength: Number, c: Coefficients) -> dict[str, Number]:
+        """dn/dc for each coefficient c."""
+
+    def poles(self, c: Coefficients) -> dict[str, float]:
+        """Wavelengths at which n is infinite, in nm, by the coefficient that puts them there."""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """n or n² as `constant` + Σ a λ^p + Σ B λ²/(λ² − C): Cauchy's, Sellmeier's and Schott's formulas.
+
+    Powers: pairs of a coefficient's name and p. Resonances: pairs of the names of B and C, C in nm², or in nm where
+    `squared` (the resonance's wavelength itself is given).
+    """
+
+    power: int  # 1: the sum is n, 2: it is n²
+    constant: float = 0.0
+    powers: tuple[tuple[str, int], ...] = ()
+    resonances: tuple[tuple[str, str], ...] = ()
+    squared: bool = False
+
+    def index(self, wavelength: Number, c: Coefficients) -> Number:
+        """See `Dispersion`."""
+        total = self._sum(wavelength, c)
+        return total if self.power == 1 else root(total)
+
+    def _sum(self, wavelength: Number, c: Coefficients) -> Number:
+        square = wavelength * wavelength
+        total = self.constant + 0 * wavelength
+        for name, p in self.powers:
+            total = total + c[name] * _to_power(square, p // 2)
+        for b, r in self.resonances:
+            total = total + c[b] * (square / (square - self._pole(c[r])))
+        return total
+
+    def slope(self, wavelength: Number, c: Coefficients) -> Number:
+        """See `Dispersion`. d/dλ a λ^p = p a λ^p/λ; d/dλ B λ²/(λ² − C) = −2 B C λ/(λ² − C)²."""
+        square = wavelength * wavelength
+        total = 0 * wavelength
+        for name, p in self.powers:
+            total = total + c[name] * p * _to_power(square, p // 2) / wavelength
+        for b, r in self.resonances:
+            pole = self._pole(c[r])
+            apart = square - pole
+            total = total - c[b] * (2 * pole * wavelength / (apart * apart))
+        return self._of_n(total, wavelength, c)
+
+    def coefficient_slopes(self, wavelength: Number, c: Coefficients) -> dict[str, Number]:
+        """See `Dispersion`. d/dC B λ²/(λ² − C) = B λ²/(λ² − C)²."""
+        square = wavelength * wavelength
+        slopes = {name: _to_power(square, p // 2) for name, p in self.powers}
+        for b, r in self.resonances:
+            apart = square - self._pole(c[r])
+            slopes[b] = square / apart
+            slopes[r] = c[b] * square / (apart * apart) * (2 * c[r] if self.squared else 1)
+        return {name: self._of_n(slope, wavelength, c) for name, slope in slopes.items()}
+
+    def _of_n(self, slope: Number, wavelength: Number, c: Coefficients) -> Number:
+        """The derivative of n, from that of the sum."""
+        return slope if self.power == 1 else slope / (2 * self.index(wavelength, c))
+
+    def _pole(self, r: Number) -> Number:
+        return r * r if self.squared else r
+
+    def poles(self, c: Coefficients) -> dict[str, float]:
+        """See `Dispersion`."""
+        found = {r: float(self._pole(c[r])) for _, r in self.resonances}
+        return {name: math.sqrt(pole) for name, pole in found.items() if pole > 0}
+
+
+def _to_power(x: Number, p: int) -> Number:
+    result = 1 + 0 * x
+    for _ in range(abs(p)):
+        result = result * x
+    return 1 / result if p < 0 else result
+
+
+@dataclass(frozen=True)
+class Abbe:
+    """A glass of which n_d and V_d are known: n = n_d + (n_d − 1)/V_d g, g = (λ⁻² − λ_d⁻²)/(λ_F⁻² − λ_C⁻²).
+
+    That is Cauchy's formula with two terms, through n_d, with V_d = (n_d − 1)/(n_F − n_C).
+    """
+
+    @staticmethod
+    def _g(wavelength: Number) -> Number:
+        d, f, c = (LINES[line] ** -2 for line in "dFC")
+        return (1 / (wavelength * wavelength) - d) / (f - c)
+
+    def index(self, wavelength: Number, c: Coefficients) -> Number:
+        """See `Dispersion`."""
+        return c["n_d"] + (c["n_d"] - 1) / c["V_d"] * self._g(wavelength)
+
+    def slope(self, wavelength: Number, c: Coefficients) -> Number:
+        """See `Dispersion`."""
+        span = LINES["F"] ** -2 - LINES["C"] ** -2
+        return -2 * (c["n_d"] - 1) / c["V_d"] / (span * wavelength * wavelength * wavelength)
+
+    def coefficient_slopes(self, wavelength: Number, c: Coefficients) -> dict[str, Number]:
+        """See `Dispersion`."""
+        g = self._g(wavelength)
+        return {"n_d": 1 + g / c["V_d"], "V_d": -(c["n_d"] - 1) * g / (c["V_d"] * c["V_d"])}
+
+    def poles(self, c: Coefficients) -> dict[str, float]:
+        """None: n is infinite at λ = 0 only."""
+        return {}
+
+
+@dataclass(frozen=True)
+class Table:
+    """n at given wavelengths, increasing, and between two of them linear. The coefficients are the values of n."""
+
+    knots: tuple[float, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coefficients: `n_587_6` is n at 587.6 nm."""
+        return tuple("n_" + f"{knot:.9g}".replace(".", "_") for knot in self.knots)
+
+    def _weights(self, wavelength: Number) -> list[Number]:
+        """For each knot, by how much its value counts; they are 0 beyond the first knot and the last."""
+        rising: list[tuple[Number, Number]] = []  # from 0 at a knot to 1 at the next; only between the two
+        for i, (start, end) in enumerate(itertools.pairwise(self.knots)):
+            share = (wavelength - start) / (end - start)
+            after = wavelength >= start if i == 0 else wavelength > start
+            inside = after & (wavelength <= end)
+            rising.append((inside, share))
+        weights = []
+        for i in range(len(self.knots)):
+            up = where(rising[i - 1][0], rising[i - 1][1], 0) if i else 0
+            down = where(rising[i][0], 1 - rising[i][1], 0) if i < len(rising) else 0
+            weights.append(up + down)
+        return weights
+
+    def index(self, wavelength: Number, c: Coefficients) -> Number:
+        """See `Dispersion`."""
+        return sum(c[name] * weight for name, weight in zip(self.names, self._weights(wavelength), strict=True))
+
+    def slope(self, wavelength: Number, c: Coefficients) -> Number:
+        """See `Dispersion`; at a knot, that of the interval which ends there."""
+        total = 0 * wavelength
+        values = [c[name] for name in self.names]
+        for i, (start, end) in enumerate(itertools.pairwise(self.knots)):
+            after = wavelength >= start if i == 0 else wavelength > start
+            total = total + where(after & (wavelength <= end), (values[i + 1] - values[i]) / (end - start), 0)
+        return total
+
+    def coefficient_slopes(self, wavelength: Number, c: Coefficients) -> dict[str, Number]:
+        """See `Dispersion`."""
+        return dict(zip(self.names, self._weights(wavelength), strict=True))
+
+    def poles(self, c: Coefficients) -> dict[str, float]:
+        """None."""
+        return {}
+
+
+@dataclass(frozen=True)
+class Constant:
+    """The same n at all wavelengths."""
+
+    def index(self, wavelength: Number, c: Coefficients) -> Number:
+        """See `Dispersion`."""
+        return c["n"] + 0 * wavelength
+
+    def slope(self, wavelength: Number, c: Coefficients) -> Number:
+        """0."""
+        return 0 * wavelength
+
+    def coefficient_slopes(self, wavelength: Number, c: Coefficients) -> dict[str, Number]:
+        """See `Dispersion`."""
+        return {"n": 1 + 0 * wavelength}
+
+    def poles(self, c: Coefficients) -> dict[str, float]:
+        """None."""
+        return {}
+
+
+CONSTANT = Constant()
+CAUCHY_NAMES = "ABCDEFGH"
+
+
+def cauchy(values: Sequence[float]) -> tuple[Terms, dict[str, float]]:
+    """n = A + B/λ² + C/λ⁴ + …, B in nm², C in nm⁴ (A.-L. Cauchy)."""
+    names = CAUCHY_NAMES[: len(values)]
+    return Terms(1, powers=tuple((name, -2 * i) for i, name in enumerate(names))), dict(zip(names, values, strict=True))
+
+
+def sellmeier(values: Sequence[float], squared: bool = False) -> tuple[Terms, dict[str, float]]:
+    """n² = 1 + Σ B_i λ²/(λ² − C_i), first all B, then all C in nm²; where `squared`, C_i = λ_i², and λ_i is given."""
+    count, letter = len(values) // 2, "L" if squared else "C"
+    pairs = tuple((f"B{i}", f"{letter}{i}") for i in range(1, count + 1))
+    names = [b for b, _ in pairs] + [r for _, r in pairs]
+    return Terms(2, 1.0, resonances=pairs, squared=squared), dict(zip(names, values, strict=True))
+
+
+def polynomial(values: Mapping[int, float]) -> tuple[Terms, dict[str, float]]:
+    """n² = Σ a_p λ^p for even p, λ in nm (Schott's formula of before 1992). Keys: p."""
+    names = {p: f"a{p}" if p >= 0 else f"a_{-p}" for p in values}
+    return Terms(2, powers=tuple((names[p], p) for p in values)), {names[p]: x for p, x in values.items()}

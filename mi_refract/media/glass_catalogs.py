@@ -1,0 +1,107 @@
+"""Optical glasses from the makers' catalogues, as the package `opticalglass` holds them (extra `[glass]`).
+
+It reads the makers' spreadsheets; formulas are evaluated here. Indices are relative to air at the makers' conditions,
+20 to 22 °C and 101325 Pa, dry. A glass has an index at wavelengths between those for which its maker prints an index,
+or a transmittance above 0: the maker's formula is meant for these.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import importlib
+import math
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+from .dispersion import LINES, Terms, polynomial, sellmeier
+from .medium import Medium
+
+CATALOGS = {
+    "CDGM": "cdgm",
+    "HIKARI": "hikari",
+    "HOYA": "hoya",
+    "OHARA": "ohara",
+    "SCHOTT": "schott",
+    "SUMITA": "sumita",
+}
+# Powers of λ of the coefficients in the makers' order; the others are Sellmeier's. λ is in µm there.
+_TO_12TH = (0, 2, 4, -2, -4, -6, -8, -10, -12)
+_TO_8TH = (0, 2, -2, -4, -6, -8)
+POWERS = {"CDGM": _TO_8TH, "HIKARI": _TO_12TH, "HOYA": _TO_8TH, "SUMITA": _TO_8TH}
+NANOMETRES = 1000  # in a µm
+
+
+@dataclass(frozen=True)
+class Glass:
+    """A row of a catalogue."""
+
+    coefficients: tuple[float, ...]  # λ in µm; none where the maker prints none
+    printed: dict[str, float]  # n at spectral lines
+    v_d: float
+    range: tuple[float, float]  # nm
+
+
+def load(catalog: str, glass: str, label: str) -> Medium:
+    """A glass by its name, in any case. ValueError for one that is unknown, and where `opticalglass` is not installed.
+
+    catalog: a key of CATALOGS. label: the parameter and its value, for the message.
+    """
+    try:
+        glasses = read(catalog)
+    except ModuleNotFoundError as error:
+        text = f"{label}: {error.name} is not installed"
+        raise ValueError(f"{text}; accepted: pip install 'mi-refract[glass]' first") from None
+    known = {name.lower(): name for name in glasses}
+    if glass.lower() not in known:
+        near = ", ".join(f"{catalog}:{known[each]}" for each in difflib.get_close_matches(glass.lower(), known, 3, 0.0))
+        raise ValueError(f"{label}: unknown glass; accepted: one of the catalogue's {len(glasses)}; nearest: {near}")
+    name = known[glass.lower()]
+    if not glasses[name].coefficients:
+        raise ValueError(f"{label}: its catalogue prints no formula of this glass; accepted: another, or table(…)")
+    form, coefficients = _in_nanometres(catalog, glasses[name].coefficients)
+    return Medium(f"{catalog}:{name}", form, coefficients, glasses[name].range, "air")
+
+
+def _in_nanometres(catalog: str, values: tuple[float, ...]) -> tuple[Terms, dict[str, float]]:
+    if catalog in POWERS:
+        return polynomial({p: x / NANOMETRES**p for p, x in zip(POWERS[catalog], values, strict=True)})
+    return sellmeier([x * (1 if i < 3 else NANOMETRES**2) for i, x in enumerate(values)])
+
+
+@functools.cache
+def read(catalog: str) -> dict[str, Glass]:
+    """All glasses of a catalogue by name. ModuleNotFoundError where `opticalglass` is not installed."""
+    module: Any = importlib.import_module(f"opticalglass.{CATALOGS[catalog]}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        (name,) = [name for name in vars(module) if name.lower() == f"{CATALOGS[catalog]}catalog"]
+        table = getattr(module, name)()
+        return {str(glass).strip(): _glass(table, glass) for glass in table.df.index}
+
+
+def _glass(table: Any, name: str) -> Glass:
+    row = table.df.loc[name]
+    printed = _finite(row["refractive indices"])
+    transmitting = _finite(row["internal transmission mm, 10"])
+    wavelengths = [LINES.get(line, line) for line in printed if line in LINES or isinstance(line, float)]
+    wavelengths += [float(w) for w, share in transmitting.items() if share > 0]
+    coefficients: tuple[float, ...] = ()
+    if len(_finite(row["dispersion coefficients"])) == len(row["dispersion coefficients"]):
+        coefficients = tuple(map(float, table.glass_coefs(name)))
+    lines = {line: n for line, n in printed.items() if line in LINES}
+    return Glass(coefficients, lines, float(row["abbe number"]["vd"]), (min(wavelengths), max(wavelengths)))
+
+
+def _finite(series: Any) -> dict[Any, float]:
+    """The entries that are numbers, by column: a line's letter or a wavelength in nm."""
+    found = {}
+    for column, value in series.items():
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            continue
+        if math.isfinite(number):
+            found[column] = number
+    return found

@@ -1,0 +1,182 @@
+"""What a scene says of a material, as a `Medium`: a number, a formula, a glass of a catalogue, a material's name."""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import math
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
+from mi_refract.numerics import Number
+
+from . import dispersion, glass_catalogs
+from .dispersion import CAUCHY_NAMES, CONSTANT, Abbe, Dispersion, Table
+from .materials import MATERIALS
+from .medium import ANY, Medium
+
+VISIBLE = 360.0, 830.0  # nm: where the eye, and Mitsuba, have a response to light
+MICROMETRES = 1.0  # nm²: a resonance below is a number of square micrometres, as catalogues print it
+Formula: TypeAlias = tuple[Dispersion, dict[str, float], tuple[float, float]]
+
+
+def index(spec: float | str, wavelength: Number) -> Number:
+    """n of a material at a wavelength in nm; see `parse` and `Medium.index` for what they take, and for errors."""
+    return parse(spec).index(wavelength)
+
+
+def parse(spec: float | str, name: str = "") -> Medium:
+    """The material that `spec` says, λ in nm:
+
+    - a number, or a name of Mitsuba's table of materials: the same n at all λ
+    - `cauchy(A, B, …)`: n = A + B/λ² + C/λ⁴ + …
+    - `sellmeier(B1, …, C1, …)`: n² = 1 + Σ B λ²/(λ² − C), C in nm²
+    - `sellmeier_nm(B1, …, L1, …)`: the same with C = L², L in nm
+    - `abbe(n_d, V_d)`: Cauchy's formula with two terms through both
+    - `table(400: 1.53, 500: 1.52, …)`: linear between its wavelengths
+    - `SCHOTT:N-BK7` and others of the catalogues CDGM, Hikari, Hoya, Ohara, Schott, Sumita (extra `[glass]`)
+    - `MATERIAL:water`, `MATERIAL:fused-silica`, `MATERIAL:diamond`, `AIR:ciddor`, `AIR:edlen`
+
+    ValueError, with `name` (that of the parameter) and what would be accepted, for anything else; for n that is not
+    positive, or infinite, at a wavelength from 360 to 830 nm; and for numbers that are not finite.
+    """
+    label = f"{name} = {spec!r}" if name else repr(spec)
+    if isinstance(spec, (int, float)) and not isinstance(spec, bool):
+        if not 0 < spec < math.inf:
+            raise ValueError(f"{label}: accepted: a positive finite number, or a material's name")
+        return Medium(str(spec), CONSTANT, {"n": float(spec)})
+    if not isinstance(spec, str):
+        raise ValueError(f"{label}: accepted: a positive finite number, or a material's name")
+    text = spec.strip()
+    if ":" in text.partition("(")[0]:
+        return _catalogued(text, label)
+    if "(" in text:
+        return _formula(text, label)
+    return _of_mitsuba(text, label)
+
+
+def _formula(text: str, label: str) -> Medium:
+    call = re.fullmatch(r"(\w+)\s*\((.*)\)", text)
+    if not call or call[1] not in FORMULAS_OF_N:
+        raise ValueError(f"{label}: accepted: {', '.join(f'{known}(…)' for known in FORMULAS_OF_N)}")
+    form, coefficients, valid = FORMULAS_OF_N[call[1]](call[2], label)
+    medium = _between_poles(Medium(text, form, coefficients, valid), label)
+    _check_visible(medium, label)
+    return medium
+
+
+def _numbers(arguments: str, label: str, counts: Sequence[int], says: str) -> list[float]:
+    try:
+        values = [float(x) for x in arguments.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in counts or not all(map(math.isfinite, values)):
+        raise ValueError(f"{label}: accepted: {says}, finite numbers")
+    return values
+
+
+def _cauchy(arguments: str, label: str) -> Formula:
+    counts = range(1, len(CAUCHY_NAMES) + 1)
+    return *dispersion.cauchy(_numbers(arguments, label, counts, "cauchy(A, B, …), λ in nm, up to 8")), ANY
+
+
+def _sellmeier(arguments: str, label: str) -> Formula:
+    values = _numbers(arguments, label, range(2, 14, 2), "sellmeier(B1, …, C1, …), as many C in nm² as B, up to 6")
+    for i, c in enumerate(values[len(values) // 2 :], 1):
+        if 0 < abs(c) < MICROMETRES:
+            raise ValueError(f"{label}: C{i} = {c:g}: accepted: nm²; from µm² multiply by 1e6")
+    return *dispersion.sellmeier(values), ANY
+
+
+def _sellmeier_nm(arguments: str, label: str) -> Formula:
+    values = _numbers(arguments, label, range(2, 14, 2), "sellmeier_nm(B1, …, L1, …), as many L in nm as B, up to 6")
+    for i, wavelength in enumerate(values[len(values) // 2 :], 1):
+        if wavelength < 0 or 0 < wavelength < MICROMETRES:
+            raise ValueError(f"{label}: L{i} = {wavelength:g}: accepted: nm; from µm multiply by 1e3")
+    return *dispersion.sellmeier(values, squared=True), ANY
+
+
+def _abbe(arguments: str, label: str) -> Formula:
+    n_d, v_d = _numbers(arguments, label, [2], "abbe(n_d, V_d)")
+    if v_d == 0:
+        raise ValueError(f"{label}: V_d = 0: accepted: (n_d − 1)/(n_F − n_C), which is not 0")
+    return Abbe(), {"n_d": n_d, "V_d": v_d}, ANY
+
+
+def _table(arguments: str, label: str) -> Formula:
+    accepted = "accepted: table(400: 1.53, 500: 1.52, …), two or more, wavelengths in nm, increasing"
+    try:
+        knots = [(float(w), float(n)) for w, n in (pair.split(":") for pair in arguments.split(","))]
+    except ValueError:
+        raise ValueError(f"{label}: {accepted}") from None
+    wavelengths = tuple(w for w, _ in knots)
+    increasing = all(a < b for a, b in itertools.pairwise(wavelengths))
+    if len(knots) < 2 or not increasing or not 0 < wavelengths[0] < wavelengths[-1] < math.inf:
+        raise ValueError(f"{label}: {accepted}")
+    if bad := [f"{n:g} at {w:g} nm" for w, n in knots if not 0 < n < math.inf]:
+        raise ValueError(f"{label}: n = {bad[0]}: accepted: a positive finite index")
+    form = Table(wavelengths)
+    return form, dict(zip(form.names, (n for _, n in knots), strict=True)), (wavelengths[0], wavelengths[-1])
+
+
+FORMULAS_OF_N: dict[str, Callable[[str, str], Formula]] = {
+    "cauchy": _cauchy,
+    "sellmeier": _sellmeier,
+    "sellmeier_nm": _sellmeier_nm,
+    "abbe": _abbe,
+    "table": _table,
+}
+
+
+def _between_poles(medium: Medium, label: str) -> Medium:
+    """The medium, valid up to the resonances on both sides of the visible. ValueError for one within it."""
+    low, high = medium.valid
+    for name, pole in medium.dispersion.poles(medium.coefficients).items():
+        if VISIBLE[0] <= pole <= VISIBLE[1]:
+            raise ValueError(f"{label}: {name}: n is infinite at {pole:.6g} nm; accepted: no such pole in 360 … 830 nm")
+        low, high = (max(low, pole), high) if pole < VISIBLE[0] else (low, min(high, pole))
+    return Medium(medium.name, medium.dispersion, medium.coefficients, (low, high))
+
+
+def _check_visible(medium: Medium, label: str) -> None:
+    """ValueError where n is not a positive number at a visible wavelength of its range."""
+    import numpy as np
+
+    low, high = max(medium.valid[0], VISIBLE[0]), min(medium.valid[1], VISIBLE[1])
+    wavelengths = np.linspace(low, high, 471)
+    n = medium.index_or_nan(wavelengths)
+    if low <= high and np.isnan(n).any():
+        at = wavelengths[np.isnan(n)][0]
+        raise ValueError(f"{label}: n is no positive number at {at:.6g} nm; accepted: one at all of 360 … 830 nm")
+
+
+def _catalogued(text: str, label: str) -> Medium:
+    known = {name.lower(): medium for name, medium in MATERIALS.items()}
+    if found := known.get(text.lower()):
+        return found
+    catalog, _, glass = (part.strip() for part in text.partition(":"))
+    if catalog.upper() in glass_catalogs.CATALOGS:
+        return glass_catalogs.load(catalog.upper(), glass, label)
+    near = difflib.get_close_matches(text, MATERIALS, 3, 0.0)
+    catalogs = ", ".join(f"{name}:…" for name in glass_catalogs.CATALOGS)
+    raise ValueError(f"{label}: unknown material; nearest: {', '.join(near)}; accepted: these, or {catalogs}")
+
+
+def _of_mitsuba(material: str, label: str) -> Medium:
+    """A name of Mitsuba's table. It holds decimal numbers of at most seven digits in float32: the shortest gives them
+    back.
+    """
+    import mitsuba as mi
+    from mitsuba.mitsuba_ext import Properties
+
+    variant: Any = mi.scalar_rgb  # the table is the same in all of them, and this one need not be set
+    query = Properties()
+    query["ior"] = material
+    try:
+        single = variant.lookup_ior(query, "ior", material)
+    except RuntimeError as error:
+        known = str(error).partition("choices are:")[2] or "the names of Mitsuba's table"
+        raise ValueError(f"{label}: unknown material; accepted: {known.strip()}") from None
+    absolute = "vacuum" if material in ("air", "vacuum") else ""
+    return Medium(material, CONSTANT, {"n": float(f"{single:.7g}")}, relative_to=absolute, is_air=material == "air")

@@ -1,0 +1,106 @@
+"""Glasses of catalogues against the numbers that their makers print."""
+
+import sys
+
+import pytest
+
+from mi_refract import media
+from mi_refract.media import LINES, glass_catalogs
+
+READS = pytest.mark.skipif(
+    not all(__import__("importlib.util").util.find_spec(name) for name in ("opticalglass", "pandas")),
+    reason="opticalglass is not installed: pip install 'mi-refract[glass]'",
+)
+PRINTED = 5e-6 + 1e-6  # half a unit of the fifth decimal, and what is asked for
+
+
+@READS
+@pytest.mark.parametrize(
+    ("glass", "n_d", "v_d"),
+    [
+        ("SCHOTT:N-BK7", 1.51680, 64.17),
+        ("SCHOTT:N-SF11", 1.78472, 25.68),
+        ("SCHOTT:F2", 1.62004, 36.37),
+        ("OHARA:S-BSL 7", 1.51633, 64.14),
+        ("HOYA:FCD1", 1.49700, 81.61),
+        ("HIKARI:J-BK7A", 1.51680, 64.14),
+        ("CDGM:H-K9L", 1.51680, 64.20),
+        ("SUMITA:K-BK7", 1.51633, 64.1),
+    ],
+)
+def test_n_d_and_v_d_are_those_of_the_maker(glass, n_d, v_d):
+    n = {line: media.index(glass, LINES[line]) for line in "dFC"}
+    assert n["d"] == pytest.approx(n_d, abs=PRINTED)
+    assert (n["d"] - 1) / (n["F"] - n["C"]) == pytest.approx(v_d, abs=0.06)
+
+
+def complete(catalog):
+    return {name: glass for name, glass in glass_catalogs.read(catalog).items() if glass.coefficients}
+
+
+@READS
+@pytest.mark.parametrize("catalog", glass_catalogs.CATALOGS)
+def test_each_glass_has_the_index_that_the_package_gives(catalog):
+    """Its own evaluation of the same formula, at all printed lines."""
+    from opticalglass.glass import glass_catalog_factory
+
+    table = glass_catalog_factory(catalog if catalog == "CDGM" else catalog.capitalize())
+    names = {str(name).strip(): name for name in table.df.index}
+
+    assert len(complete(catalog)) > 100
+    for name, glass in complete(catalog).items():
+        medium, other = media.parse(f"{catalog}:{name}"), table.create_glass(names[name], catalog)
+        for line in glass.printed:
+            assert medium.index(LINES[line]) == pytest.approx(other.calc_rindex(LINES[line]), rel=4e-15), name
+
+
+@READS
+@pytest.mark.parametrize("catalog", ["SCHOTT", "HIKARI"])
+def test_every_printed_line_is_met(catalog):
+    """The other makers' formulas miss some of their own printed indices: the study `media` has the figures."""
+    for name, glass in complete(catalog).items():
+        medium = media.parse(f"{catalog}:{name}")
+        for line, n in glass.printed.items():
+            assert medium.index(LINES[line]) == pytest.approx(n, abs=PRINTED), name
+
+
+@READS
+def test_a_glass_has_an_index_where_its_maker_prints_numbers():
+    """From 290 nm, where 10 mm of it pass some light, to 2500 nm."""
+    assert media.parse("SCHOTT:N-BK7").valid == (290.0, 2500.0)
+    with pytest.raises(
+        ValueError, match="SCHOTT:N-BK7: no index at 3000 nm; accepted: a wavelength from 290 to 2500 nm"
+    ):
+        media.index("SCHOTT:N-BK7", 3000.0)
+
+
+@READS
+def test_glasses_are_relative_to_air_and_named_in_any_case():
+    assert media.parse("schott:n-bk7").relative_to == "air"
+    assert media.parse("schott:n-bk7").name == "SCHOTT:N-BK7"
+
+
+@READS
+def test_an_unknown_glass_is_told_the_nearest_three():
+    text = "nearest: SCHOTT:N-BK7, SCHOTT:[^,]+, SCHOTT:[^,]+$"
+    with pytest.raises(ValueError, match=text) as error:
+        media.parse("SCHOTT:N-BK8", "refract: int_ior")
+    assert str(error.value).startswith("refract: int_ior = 'SCHOTT:N-BK8': unknown glass; accepted: one of the ")
+
+
+@READS
+def test_a_glass_that_is_printed_without_a_formula_is_refused():
+    with pytest.raises(ValueError, match="its catalogue prints no formula of this glass; accepted: another, or table"):
+        media.parse("HIKARI:J-PSKH8")
+
+
+def test_without_the_package_a_glass_says_which_command_brings_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "opticalglass", None)
+    for name in [name for name in sys.modules if name.startswith("opticalglass.")]:
+        monkeypatch.delitem(sys.modules, name)
+    glass_catalogs.read.cache_clear()
+    with pytest.raises(
+        ValueError, match=r"^int_ior = 'SCHOTT:N-BK7': .*pip install 'mi-refract\[glass\]' first$"
+    ) as error:
+        media.parse("SCHOTT:N-BK7", "int_ior")
+    assert "\n" not in str(error.value)
