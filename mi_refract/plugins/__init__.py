@@ -22,8 +22,19 @@ def register(variant: Any) -> None:
 # Importing Mitsuba calls `register`, which must be there; the modules below need Mitsuba.
 import mitsuba  # noqa: E402, F401
 
-from .refract import PLUGIN, read_ior  # noqa: E402
+from .index_parameter import PLUGIN, read_ior  # noqa: E402
+from .medium_tracking import check_integrator  # noqa: E402
 from .refract_path import INTEGRATOR  # noqa: E402
 from .scene_features import SceneFeatures, inspect  # noqa: E402
 
-__all__ = ["INTEGRATOR", "PLUGIN", "SceneFeatures", "inspect", "read_ior", "register", "scene_limits", "scene_parser"]
+__all__ = [
+    "INTEGRATOR",
+    "PLUGIN",
+    "SceneFeatures",
+    "check_integrator",
+    "inspect",
+    "read_ior",
+    "register",
+    "scene_limits",
+    "scene_parser",
+]

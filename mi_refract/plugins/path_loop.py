@@ -14,8 +14,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .absorption import absorbed
 from .emitter_sampling import NonConstantEmitters, SceneEmitters
 from .keyed_sampler import ONE
+from .who_asks import DISPERSED, context
 
 # Samples near 0 and near 1 pick the one lobe and the other; a lobe with a smaller power than these is not followed.
 FIRST, LAST = 2.0**-25, ONE
@@ -39,6 +41,8 @@ class PathFeatures:
     first_number: bool  # a BSDF sample takes `sample1`
     second_number: bool  # a BSDF sample takes `sample2`, two numbers; delta lobes need none
     all_of_hit: bool  # a hit needs more than its shading frame
+    dispersion: bool  # some boundary bends light by its wavelength
+    absorption: bool  # some boundary has a medium that absorbs
 
     @property
     def roulette(self) -> bool:
@@ -73,9 +77,12 @@ class LoopState:
     waiting: Any = None  # how many branches are on the stack
     stack: Any = None
     truncated: Any = None
+    carried: Any = None  # how many wavelengths the path carries: all, or one since a dispersive boundary
+    sigma: Any = None  # absorption of the medium that the path is in
+    skipped: Any = None  # from the last vertex to the origin of the ray, which is beside the surface
 
 
-def branch_class(v: Any) -> type:
+def branch_class(v: Any, plan: PathFeatures) -> type:
     """The class of a branch on the stack: a path that goes on from a delta lobe. Local memory needs a type."""
     fields = {
         "o": v.Point3f,
@@ -86,6 +93,8 @@ def branch_class(v: Any) -> type:
         "share": v.Float,
         "node": v.UInt32,
     }
+    fields |= {"carried": v.Float} if plan.dispersion else {}
+    fields |= {"sigma": v.UnpolarizedSpectrum, "skipped": v.Float} if plan.absorption else {}
     return make_dataclass("Branch", fields.items())
 
 
@@ -121,10 +130,12 @@ class Trace:
     In scalar variants a pointer may be None and needs an `if`; in the others its lanes are masked.
     """
 
-    def __init__(self, v: Any, scene: Any, plan: PathFeatures, numbers: Any) -> None:
-        """`v`: the variant's module. `numbers`: `Sampled` or `KeyedMultijitter`."""
+    def __init__(self, v: Any, scene: Any, plan: PathFeatures, numbers: Any, media: Any = None) -> None:
+        """`v`: the variant's module. `numbers`: `Sampled` or `KeyedMultijitter`. `media`: where there is absorption."""
+        self.media = media
         self.v, self.scene, self.plan, self.numbers = v, scene, plan, numbers
-        self.vectorised, self.branch, self.context = dr.is_jit_v(v.Float), branch_class(v), mi.BSDFContext()
+        self.vectorised, self.branch = dr.is_jit_v(v.Float), branch_class(v, plan)
+        self.context = context()
         self.emitters = (NonConstantEmitters if plan.lamps_only else SceneEmitters)(v, scene)
         self.flags = +(mi.RayFlags.All if plan.all_of_hit else mi.RayFlags.ShadingFrame)
 
@@ -151,6 +162,10 @@ class Trace:
             s.stack = dr.alloc_local(self.branch, plan.split_depth) if self.vectorised else ScalarStack()
         if plan.deterministic:
             s.truncated = v.Float(0)
+        if plan.dispersion:
+            s.carried = v.Float(dr.size_v(v.UnpolarizedSpectrum))
+        if plan.absorption:
+            s.sigma, s.skipped = v.UnpolarizedSpectrum(self.media.start), v.Float(0)
         return s
 
     def _past_emitters(self, ray: Any, active: Any) -> Any:
@@ -172,6 +187,8 @@ class Trace:
     def _step(self, s: LoopState) -> tuple[LoopState]:
         si = self.scene.ray_intersect(s.ray, self.flags, s.depth == 0)
         hit = si.is_valid()
+        if self.plan.absorption:
+            s.throughput = self._times(s.throughput, self._left(s.sigma, si.t + s.skipped))
         self._add_emission(s, si, hit)
         onward = hit & (s.depth + 1 < self.plan.max_depth)
         if self.plan.deterministic:
@@ -195,12 +212,14 @@ class Trace:
         second = self.numbers.two(s.sampler, key + 2) if plan.second_number else self.v.Point2f(0.5)
         first = second.x if first is None else first
         bs, weight = bsdf.sample(self.context, si, first, second, onward)
-        ray, throughput = self._next(s, si, bs, weight)
+        ray, throughput, inside = self._next(s, si, bsdf, bs, weight, onward)
         s.valid = s.valid | (hit & (mi.has_flag(bs.sampled_type, LOBES.Null) ^ True))
         s.depth = s.depth + 1
         if plan.split_depth:
             throughput = self._split(s, si, bsdf, bs, second, throughput, onward)
         s.eta = s.eta * bs.eta
+        for name, value in inside.items():
+            setattr(s, name, dr.select(hit, value, getattr(s, name)))
         # A ray that left the scene keeps all that the environment asks for.
         s.ray, s.throughput = dr.select(hit, ray, s.ray), dr.select(hit, throughput, s.throughput)
         if plan.emitter_sampling:
@@ -208,10 +227,22 @@ class Trace:
             s.delta = dr.select(hit, mi.has_flag(bs.sampled_type, LOBES.Delta), s.delta)
         return self._roulette(s, onward, key)
 
-    def _next(self, s: LoopState, si: Any, bs: Any, weight: Any) -> tuple[Any, Any]:
+    def _next(self, s: LoopState, si: Any, bsdf: Any, bs: Any, weight: Any, active: Any) -> tuple[Any, Any, dict]:
+        """The ray after a sample of the BSDF, its throughput, and what else of the state the sample changes."""
         if self.v.is_polarized:
             weight = si.to_world_mueller(weight, -bs.wo, si.wi)
-        return si.spawn_ray(si.to_world(bs.wo)), self._times(s.throughput, weight)
+        throughput, changed = self._times(s.throughput, weight), {}
+        if self.plan.dispersion:
+            # The first wavelength stands for all that end here. Each is the first as often as any other.
+            dispersed = (bs.sampled_type & DISPERSED) != 0
+            throughput = throughput * dr.select(dispersed, s.carried, 1)
+            changed["carried"] = dr.select(dispersed, 1, s.carried)
+        if self.plan.absorption:
+            changed["sigma"] = self.media.cross(s, si, bs, bsdf, active)
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        if self.plan.absorption:
+            changed["skipped"] = dr.dot(ray.o - si.p, ray.d)
+        return ray, throughput, changed
 
     def _roulette(self, s: LoopState, onward: Any, key: Any) -> Any:
         brightest = dr.max(self.v.unpolarized_spectrum(s.throughput))
@@ -228,6 +259,11 @@ class Trace:
 
     def _times(self, a: Any, b: Any) -> Any:
         return a @ b if self.v.is_polarized else a * b
+
+    def _left(self, sigma: Any, length: Any) -> Any:
+        """What a way of this length leaves of the light."""
+        share = absorbed(sigma, length)
+        return self.v.mueller.absorber(share) if self.v.is_polarized else share
 
     # Emitters ------------------------------------------------------------------------------------------------------
 
@@ -270,6 +306,9 @@ class Trace:
         lit = lit & (self.scene.ray_test(si.spawn_ray_to(ds.p), lit) ^ True)
         if self.v.is_polarized:
             value = si.to_world_mueller(value, -wo, si.wi)
+        if self.plan.absorption:
+            endless = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+            radiance = self._times(radiance, self._left(s.sigma, dr.select(endless, dr.inf, ds.dist)))
         found = self._times(self._times(s.throughput, value), radiance)
         found *= dr.select(ds.delta, 1, power_heuristic(ds.pdf, pdf))
         s.result = dr.select(lit, s.result + found, s.result)
@@ -305,11 +344,12 @@ class Trace:
         reflected = mi.has_flag(bs.sampled_type, LOBES.DeltaReflection)
         other, weight = bsdf.sample(self.context, si, dr.select(reflected, LAST, FIRST), second, both)
         both = both & (other.sampled_type != bs.sampled_type)
-        ray, throughput = self._next(s, si, other, weight * other.pdf)
+        ray, throughput, inside = self._next(s, si, bsdf, other, weight * other.pdf, both)
         # The lobe that was sampled has the odd number.
         branch = self.branch(
-            ray.o, ray.d, throughput, s.depth, s.eta * other.eta, s.share * dr.detach(other.pdf), 2 * s.node
-        )
+            ray.o, ray.d, throughput, s.depth, s.eta * other.eta, s.share * dr.detach(other.pdf), 2 * s.node,
+            **inside,
+        )  # fmt: skip
         # The index of an idle lane must be in range as well: local memory is accessed there.
         s.stack.write(branch, dr.select(both, s.waiting, 0), both)
         s.waiting = dr.select(both, s.waiting + 1, s.waiting)
@@ -325,7 +365,7 @@ class Trace:
         s.waiting = dr.select(found, s.waiting - 1, s.waiting)
         branch = s.stack.read(dr.select(found, s.waiting, 0), found)
         s.ray.o, s.ray.d = dr.select(found, branch.o, s.ray.o), dr.select(found, branch.d, s.ray.d)
-        for name in ("throughput", "depth", "eta", "share", "node"):
+        for name in self.branch.__annotations__.keys() - {"o", "d"}:
             setattr(s, name, dr.select(found, getattr(branch, name), getattr(s, name)))
         if self.plan.emitter_sampling:
             s.pdf, s.delta = dr.select(found, 1, s.pdf), s.delta | found

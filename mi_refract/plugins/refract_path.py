@@ -18,7 +18,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .absorption import read_absorption
 from .keyed_sampler import KeyedMultijitter, Sampled
+from .medium_tracking import Crossings, MediumTracker, check_wrappers
 from .path_loop import PathFeatures, Trace
 from .scene_features import SceneFeatures, inspect
 
@@ -75,16 +77,26 @@ def integrator_class(v: Any) -> type:
             self.rr_depth = read_count(props, "rr_depth", 5, 1)
             self.deterministic = read_flag(props, "deterministic")
             self.split_depth, self.split_weight = read_split(props, self.deterministic)
+            self.camera = read_absorption(INTEGRATOR, props, "camera")
             self.seed: Any = 0
-            self.seen: tuple[Any, SceneFeatures] | None = None
+            # With the identity of the scene. Not the scene, which holds its integrator: a circle cannot be frozen.
+            self.seen: tuple[int, SceneFeatures] | None = None
+            self.crossings: list[Crossings] = []  # one a pass; in scalar variants one in all
 
         def begin_render(self, seed: Any) -> None:
             """To be called before `sample`, where no `render` is. `seed`: of the sampler."""
-            self.seed, self.seen = seed, None
+            self.seed, self.seen, self.crossings = seed, None, []
+
+        def end_render(self) -> None:
+            """To be called after what `sample` gave was evaluated. ValueError where absorption was contradictory."""
+            for crossings in self.crossings:
+                crossings.refuse()
 
         def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, *more: Any, **named: Any) -> Any:
             self.begin_render(seed)
-            return super().render(scene, sensor, seed, *more, **named)
+            image = super().render(scene, sensor, seed, *more, **named)
+            self.end_render()
+            return image
 
         def aov_names(self) -> list[str]:
             return ["truncated"] if self.deterministic else []
@@ -96,8 +108,29 @@ def integrator_class(v: Any) -> type:
                 return v.Spectrum(0), v.Bool(False), [v.Float(0)] * len(self.aov_names())
             plan = self.plan(scene)
             numbers = KeyedMultijitter(v, sampler, self.seed) if vectorised and plan.split_depth else Sampled()
-            end = Trace(v, scene, plan, numbers).run(v.Ray3f(ray), sampler, v.Bool(active))
+            media = MediumTracker(v, self._sigma(ray, medium), self._crossings(scene)) if plan.absorption else None
+            end = Trace(v, scene, plan, numbers, media).run(v.Ray3f(ray), sampler, v.Bool(active))
             return dr.select(end.valid, end.result, 0), end.valid, [end.truncated] if self.deterministic else []
+
+        def _crossings(self, scene: Any) -> Crossings:
+            if vectorised or not self.crossings:
+                self.crossings.append(Crossings(v, scene))
+            return self.crossings[-1]
+
+        def _sigma(self, ray: Any, medium: Any) -> Any:
+            """Absorption where the camera is: as told, or of the sensor's medium, or none."""
+            if self.camera:
+                si = dr.zeros(v.SurfaceInteraction3f)
+                si.wavelengths = ray.wavelengths
+                return self.camera.eval(si, v.Bool(True))
+            if medium is None:
+                return 0
+            mei = dr.zeros(v.MediumInteraction3f)
+            mei.wavelengths = ray.wavelengths
+            scattered, _, extinction = medium.get_scattering_coefficients(mei, v.Bool(True))
+            if not medium.is_homogeneous() or dr.any(scattered != 0, axis=None):
+                raise ValueError(f"{INTEGRATOR}: the sensor's medium: accepted: a homogeneous one with an albedo of 0")
+            return extinction
 
         def plan(self, scene: Any) -> PathFeatures:
             """The features that are traced for a scene. ValueError where `deterministic` is set and impossible."""
@@ -122,12 +155,16 @@ def integrator_class(v: Any) -> type:
                 first_number=needs.both_numbers or not (needs.smooth or self.deterministic),
                 second_number=needs.smooth,
                 all_of_hit=needs.smooth or needs.textured,
+                dispersion=needs.dispersive,
+                absorption=needs.absorbing or self.camera is not None,
             )
 
         def _needs(self, scene: Any) -> SceneFeatures:
             """Looked up once a render, as an edit of the scene can change them."""
-            if self.seen is None or self.seen[0] is not scene:
-                self.seen = scene, inspect(scene)
+            if self.seen is None or self.seen[0] != id(scene):
+                self.seen = id(scene), inspect(scene)
+                if self.seen[1].absorbing:
+                    check_wrappers(scene)
                 mi.Log(mi.LogLevel.Info, f"{INTEGRATOR}: left out: {self.left_out()}")  # type: ignore[operator]
             return self.seen[1]
 

@@ -68,6 +68,7 @@ class SceneFeatures:
     null: bool  # some BSDF has a null lobe
     polarising: bool  # some BSDF acts on the state of polarisation
     dispersive: bool  # some BSDF bends light by its wavelength
+    absorbing: bool  # some BSDF has an absorbing medium on one side
     media: bool
     unknown: tuple[str, ...] = ()
 
@@ -91,6 +92,7 @@ class SceneFeatures:
             "textures": "" if self.textured else "no BSDF and no area light varies over its surface",
             "polarisation": "" if self.polarising else "no BSDF acts on it",
             "dispersion": "" if self.dispersive else "no BSDF bends light by its wavelength",
+            "absorption": "" if self.absorbing else "no BSDF has an absorbing medium on a side",
         }
         return {feature: reason for feature, reason in reasons.items() if reason}
 
@@ -101,7 +103,7 @@ def inspect(scene: Any) -> SceneFeatures:
 
     shapes, emitters, sky = scene.shapes(), scene.emitters(), scene.environment()
     opaque = [shape.class_name() for shape in shapes if shape.class_name() == "Instance"]
-    bsdfs = [bsdf for shape in shapes if not _black(outer := shape.bsdf()) for bsdf in _nested(outer)]
+    bsdfs = [bsdf for shape in shapes if not _black(outer := shape.bsdf()) for bsdf in nested(outer)]
     names = [_name(bsdf) for bsdf in bsdfs]
     unknown = tuple(sorted({name for name in names if name not in KNOWN} | set(opaque)))
     everything = bool(unknown)
@@ -126,7 +128,8 @@ def inspect(scene: Any) -> SceneFeatures:
         textured=everything or any(_textured(node) for node in (*bsdfs, *lamps)),
         null=everything or bool(flags & +lobes.Null),
         polarising=any(name not in WRAPPERS | DEPOLARISING for name in names) or everything,
-        dispersive=everything,  # every known plugin has one index for all wavelengths, or only reflects
+        dispersive=everything or any(getattr(bsdf, "dispersive", False) for bsdf in bsdfs),  # no plugin of Mitsuba's is
+        absorbing=everything or any(getattr(bsdf, "absorbing", False) for bsdf in bsdfs),
         media=bool(opaque) or any(medium is not None for medium in media),
         unknown=unknown,
     )
@@ -140,11 +143,12 @@ def _name(bsdf: Any) -> str:
     return kind.__name__ if kind.__module__.startswith("mi_refract.") else f"{kind.__module__}.{kind.__name__}"
 
 
-def _nested(bsdf: Any) -> Iterator[Any]:
+def nested(bsdf: Any) -> Iterator[Any]:
+    """A BSDF, and those that it shows within it."""
     yield bsdf
     for child in _children(bsdf):
         if hasattr(child, "eval_null_transmission"):
-            yield from _nested(child)
+            yield from nested(child)
 
 
 def _textured(node: Any) -> bool:

@@ -105,6 +105,9 @@ def _follow(name: bytes, values: Mapping[str, str], path: Path, folders: list[Pa
         _refuse_more(path, walk.folders, FOLDERS, "<path> elements")
         walk.searched.append(resolved(values.get("value", ""), [path.parent, *folders]))
         folders.insert(0, walk.searched[-1])
+    elif name == b"spectrum" and re.fullmatch(r"[^\s,:]+:[^\s,:]+", values.get("value", "").strip()):
+        accepted = "a number, or two pairs and more of a wavelength in nm and a value"
+        raise ValueError(f"{path}: {values.get('name')} = {values['value']!r}: accepted: {accepted}")
     elif values.get("filename"):
         found = resolved(values["filename"], [path.parent, *folders])
         refuse_special(found)

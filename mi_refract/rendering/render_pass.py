@@ -176,7 +176,10 @@ def _sums(
     if dr.thread_count() < LEAST_THREADS:
         dr.set_thread_count(LEAST_THREADS)
     with dr.suspend_grad():
-        return image_sums(*_samples(scene, channels, spp, seed), film, squares=squares)
+        found = image_sums(*_samples(scene, channels, spp, seed), film, squares=squares)
+    if hasattr(scene.integrator(), "end_render"):
+        scene.integrator().end_render()
+    return found
 
 
 def _samples(scene: Any, channels: tuple[str, ...], spp: int, seed: int) -> tuple[list[Any], Any]:

@@ -43,7 +43,7 @@ def load_scene(
     """
     import mitsuba as mi
 
-    from mi_refract.plugins import scene_parser
+    from mi_refract.plugins import check_integrator, scene_parser
 
     path, defines = Path(path), dict(defines or {})
     if not path.exists():
@@ -60,6 +60,10 @@ def load_scene(
         raise ValueError(f"{path}: holds a {type(scene).__name__}; accepted: a <scene>")
     if not scene.sensors():
         raise ValueError(f"{path}: a scene without a sensor; accepted: at least one")
+    try:
+        check_integrator(scene)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     width, height = scene.sensors()[0].film().crop_size()
     if width * height > PIXELS:
         raise ValueError(f"{path}: a film of {width} × {height} pixels; accepted: up to {PIXELS}")

@@ -257,4 +257,6 @@ def test_ctrl_c(scene, handler, variant, needs_variant):
             assert process.wait(timeout=30) == 130, process.stderr.read()
         finally:
             process.kill()  # or a failure would wait for it without end
-    assert list(scene.parent.iterdir()) == [scene]
+    # Where a pass had ended by then, there is what the same command goes on from.
+    left = {path.name for path in scene.parent.iterdir()}
+    assert left in ({scene.name}, {scene.name, f"{output.name}.checkpoint"})

@@ -92,6 +92,30 @@ def test_a_popped_branch_splits_again_where_its_share_is_large_enough(weight, sp
     assert found == pytest.approx(expected, rel=1e-5)
 
 
+class Recorded(Given):
+    """Keeps the keys of the numbers that choose lobes."""
+
+    def __init__(self):
+        super().__init__()
+        self.keys = []
+
+    def one(self, sampler, key):
+        if key % 4 == 1:
+            self.keys.append(key % 2**32)  # as unsigned numbers have it elsewhere
+        return super().one(sampler, key)
+
+
+def test_no_two_vertices_of_branches_have_the_same_random_number():
+    """Four sheets of glass, of which each splits, two of them on either side."""
+    parts = {f"sheet {z}": sheet(z, bsdf=GLASS) for z in range(4)}
+    scene = mi.load_dict({"type": "scene"} | parts)
+    plan = mi.load_dict({"type": "refract_path", "split_depth": 4, "split_weight": 1e-3, "max_depth": 7}).plan(scene)
+    numbers = Recorded()
+    path_loop.Trace(mi.scalar_rgb, scene, plan, numbers).run(mi.Ray3f((0, 0, 1.5), (0.6, 0, -0.8)), None, True)
+    assert len(numbers.keys) > 10
+    assert len(set(numbers.keys)) == len(numbers.keys)
+
+
 @pytest.mark.parametrize(("lobe", "lit"), [(REFLECTED, False), (TRANSMITTED, True)])
 def test_no_path_splits_after_a_matt_wall(lobe, lit):
     """From the wall straight up to glass: only the lobe that chance picks is followed, and the lamp is beyond it."""

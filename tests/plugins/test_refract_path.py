@@ -390,6 +390,8 @@ def test_a_frozen_render_follows_the_index_and_a_lamp_that_turns_grey(split_dept
         ({"split_depth": 65}, "and split_depth up to 64"),
         ({"split_weight": 1.5}, "split_weight = 1.5: accepted: a number from 0 to 1"),
         ({"split_weight": float("nan")}, "split_weight = nan"),
+        ({"split_weight": True}, "split_weight = True"),
+        ({"split_weight": "half"}, "split_weight = 'half'"),
         ({"deterministic": 1}, "deterministic = 1: accepted: true or false"),
     ],
     ids=str,

@@ -19,11 +19,19 @@ from mi_refract.scene_export.targets.environment_map import radiance
 SCENES = Path(__file__).parents[2] / "scenes"
 NAMES = sorted(path.stem for path in SCENES.glob("*.xml"))
 PLANE = ["diamond", "lightpipe", "nested", "prism", "slab"]  # nothing in them is curved
+# What no plain scene holds, and what is said of it.
+NO_PLAIN_SCENE = {
+    "diamond_fire": "MATERIAL:diamond: accepted here: one index for all wavelengths",
+    "dispersive_prism": r"sellmeier\(.*\): accepted here: one index for all wavelengths",
+    "green_bottle": "glass_air: its int_colour and int_colour_distance; accepted: a plain scene without",
+    "rainbow_drop": "MATERIAL:water: accepted here: one index for all wavelengths",
+}
 
 
 pytestmark = pytest.mark.usefixtures("scalar_variant")
 
 
+TURN = '<transform name="radiance"><rotate x="1" angle="30"/></transform>'
 SCENE = """<scene version="3.0.0">
   <default name="bsdf" value="refract"/>
   <integrator type="path"><integer name="max_depth" value="5"/></integrator>
@@ -135,7 +143,7 @@ def test_plane_scenes_are_the_same(name, tmp_path):
     assert disagreements(original(path), again(from_mitsuba.load(path), tmp_path / "plain")) <= 0.004
 
 
-@pytest.mark.parametrize("name", sorted(set(NAMES) - set(PLANE) - {"glasses64", "mirage"}))
+@pytest.mark.parametrize("name", sorted(set(NAMES) - set(PLANE) - set(NO_PLAIN_SCENE) - {"glasses64", "mirage"}))
 def test_curved_scenes_are_nearly_the_same(name, tmp_path):
     """Where the shapes are not grazed, and as near as the triangles are to the surface."""
     path = SCENES / f"{name}.xml"
@@ -144,6 +152,13 @@ def test_curved_scenes_are_nearly_the_same(name, tmp_path):
     for a, b in zip(one.shapes(), _united(other, one.shapes()), strict=True):
         extent = np.array(a.bbox().extents()).max()
         np.testing.assert_allclose(b, [list(a.bbox().min), list(a.bbox().max)], atol=2e-3 * extent)
+
+
+@pytest.mark.parametrize("name", NO_PLAIN_SCENE)
+def test_scenes_with_dispersion_or_absorption_are_refused(name):
+    """Other renderers would show another image: an index at one wavelength, or clear glass."""
+    with pytest.raises(ValueError, match=NO_PLAIN_SCENE[name]):
+        from_mitsuba.load(SCENES / f"{name}.xml")
 
 
 def _united(scene, shapes):
@@ -287,6 +302,20 @@ def test_a_checkerboard_has_mitsubas_colours_where_none_are_given(scene):
 
 
 # --- what cannot be said ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", ['<string name="radiance" value="red"/>', TURN])
+def test_what_is_no_colour_is_refused_in_one_line(scene, value):
+    path = scene('<rgb name="radiance" value="0.5, 0.25, 1"/>', value)
+    with pytest.raises(ValueError, match=r"constant: radiance = .*; accepted: an RGB colour of finite") as error:
+        from_mitsuba.load(path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_ball_without_a_centre_is_around_the_origin(scene):
+    (mesh,) = [mesh for mesh in from_mitsuba.load(scene()).meshes if mesh.name == "ball"]
+    np.testing.assert_allclose(mesh.vertices.mean(0), 0, atol=1e-12)
+
 
 BALL = 'type="sphere" id="ball">'
 MOVED = '<transform name="to_world"><translate x="3"/></transform>'

@@ -1,0 +1,159 @@
+"""Absorption as parameters of `refract`: what they may be, and what is made of them."""
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refract.plugins import who_asks
+from mi_refract.plugins.absorption import BEYOND, HERE
+
+SPECTRUM = {"type": "irregular", "wavelengths": "360, 830", "values": "0.36, 0.83"}
+WAVELENGTHS = 400.0, 500.0, 600.0, 700.0
+
+
+def load(**parameters):
+    return mi.load_dict({"type": "refract", "int_ior": 1.5, "ext_ior": 1.0} | parameters)
+
+
+def sigma(bsdf, name, outside=True):
+    """What the boundary says of a side, seen from outside or from inside."""
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = mi.Vector3f(0.6, 0, 0.8 if outside else -0.8)
+    if mi.is_spectral:
+        si.wavelengths = type(si.wavelengths)(*WAVELENGTHS)
+    return np.array(bsdf.eval_attribute(name, si, True), dtype=float).ravel()
+
+
+def refusal(**parameters):
+    with pytest.raises(RuntimeError) as caught:
+        load(**parameters)
+    return str(caught.value).splitlines()[-1]
+
+
+def test_each_side_is_here_or_beyond(each_variant):
+    bsdf = load(int_absorption=0.5, ext_absorption=0.25)
+    assert sigma(bsdf, HERE) == pytest.approx(0.25) == sigma(bsdf, BEYOND, outside=False)
+    assert sigma(bsdf, BEYOND) == pytest.approx(0.5) == sigma(bsdf, HERE, outside=False)
+
+
+def test_a_side_of_which_nothing_is_said_does_not_absorb(typical_variant):
+    bsdf = load(ext_absorption=0.25)
+    assert (sigma(bsdf, BEYOND) == 0).all()
+    assert sigma(bsdf, HERE) == pytest.approx(0.25)
+    assert not load().has_attribute(BEYOND)
+
+
+def test_sigma_may_be_greater_than_1(each_variant):
+    assert sigma(load(int_absorption=40.0), BEYOND) == pytest.approx(40)
+
+
+def test_a_colour_is_what_is_left_after_a_distance(each_variant):
+    assert sigma(load(int_colour=0.25, int_colour_distance=2.0), BEYOND) == pytest.approx(math.log(4) / 2, rel=1e-6)
+
+
+def test_of_three_colours(rgb_variant):
+    values = {"type": "rgb", "value": [0.5, 2, 4]}
+    assert sigma(load(int_absorption=values), BEYOND) == pytest.approx([0.5, 2, 4], rel=1e-6)
+    colour = {"type": "rgb", "value": [0.25, 1, 0.5]}
+    found = sigma(load(int_colour=colour, int_colour_distance=0.5), BEYOND)
+    assert found == pytest.approx([2 * math.log(4), 0, 2 * math.log(2)], rel=1e-6, abs=1e-12)
+
+
+def test_of_a_spectrum(spectral_variant):
+    assert sigma(load(int_absorption=SPECTRUM), BEYOND) == pytest.approx([0.4, 0.5, 0.6, 0.7], rel=1e-6)
+    found = sigma(load(int_colour=SPECTRUM, int_colour_distance=1.0), BEYOND)
+    assert found == pytest.approx(-np.log([0.4, 0.5, 0.6, 0.7]), rel=1e-5)
+
+
+def test_three_colours_become_a_spectrum_in_proportion(spectral_variant):
+    """Mitsuba itself makes a spectrum of colours up to 1 only. At 500 nm there is more of green than of red at 700."""
+    low = sigma(load(int_absorption={"type": "rgb", "value": [0.1, 0.3, 0.2]}), BEYOND)
+    high = sigma(load(int_absorption={"type": "rgb", "value": [2.0, 6.0, 4.0]}), BEYOND)
+    assert high == pytest.approx(20 * low, rel=1e-5)
+    assert 3 < high[1] < 9 and high[3] < high[1] / 2
+    assert (sigma(load(int_absorption={"type": "rgb", "value": 0.0}), BEYOND) < 1e-6).all()
+
+
+def test_parameters_are_differentiable(needs_variant):
+    from support.variants import switch
+
+    needs_variant("llvm_ad_rgb")
+    switch("llvm_ad_rgb")
+    bsdf = load(int_colour=0.25, int_colour_distance=2.0)
+    parameters = mi.traverse(bsdf)
+    dr.enable_grad(parameters["int_colour.value"])
+    parameters.update()
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = mi.Vector3f(0, 0, 1)
+    dr.backward(bsdf.eval_attribute(BEYOND, si, True).x)
+    assert dr.grad(parameters["int_colour.value"])[0] == pytest.approx(-1 / 0.25 / 2)
+
+
+BAD = [
+    ({"int_absorption": -0.1}, "int_absorption = -0.1: accepted: a number or a spectrum ≥ 0"),
+    ({"ext_absorption": math.nan}, "ext_absorption = nan: accepted"),
+    ({"int_absorption": math.inf}, "int_absorption = inf: accepted"),
+    ({"int_absorption": "red"}, "int_absorption = red: accepted"),
+    ({"int_absorption": {"type": "checkerboard"}}, "int_absorption = .*: accepted: .*no texture"),
+    ({"int_absorption": {"type": "rgb", "value": [1, -1, 1]}}, "int_absorption = .*: accepted"),
+    ({"int_colour": 0.0, "int_colour_distance": 1.0}, "int_colour = 0.0: accepted: .* above 0 and up to 1"),
+    ({"int_colour": 1.5, "int_colour_distance": 1.0}, "int_colour = 1.5: accepted: .* above 0 and up to 1"),
+    ({"int_colour": {"type": "rgb", "value": [1, 0, 1]}, "int_colour_distance": 1.0}, "int_colour = .*: accepted"),
+    ({"int_colour": 0.5}, "int_colour and int_colour_distance: int_colour_distance is not given"),
+    ({"ext_colour_distance": 0.5}, "ext_colour is not given; accepted: both, or neither"),
+    ({"int_colour": 0.5, "int_colour_distance": 0.0}, "int_colour_distance = 0.0: accepted: a positive finite length"),
+    ({"int_colour": 0.5, "int_colour_distance": math.inf}, "int_colour_distance = inf: accepted"),
+    (
+        {"int_colour": 0.5, "int_colour_distance": 1.0, "int_absorption": 1.0},
+        "int_absorption beside int_colour: accepted: one of the two",
+    ),
+]
+
+
+@pytest.mark.parametrize(("parameters", "said"), BAD)
+def test_what_is_refused_is_named(typical_variant, parameters, said):
+    import re
+
+    assert re.search(f"refract: {said}" if "not given; accepted" not in said else said, refusal(**parameters))
+
+
+def test_a_negative_value_of_a_spectrum_is_refused(each_variant):
+    """Of `<spectrum>` by us; of a plugin `irregular` by Mitsuba."""
+    text = '<bsdf type="refract" version="3.0.0"><spectrum name="int_absorption" value="400:0.3, 700:-0.1"/></bsdf>'
+    with pytest.raises(RuntimeError, match="int_absorption"):
+        mi.load_string(text)
+
+
+def test_an_integrator_that_does_not_track_media_is_refused(each_variant, monkeypatch):
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = mi.Vector3f(0, 0, 1)
+    bsdf = load(ext_colour=0.5, ext_colour_distance=1.0)
+    _, weight = bsdf.sample(who_asks.context(), si, 0.5, [0.5, 0.5])
+    assert np.isfinite(np.array(weight)).all()
+    if not dr.is_jit_v(mi.Float):
+        with pytest.raises(RuntimeError, match=r"refract: ext_colour: accepted: the integrator refract_path"):
+            bsdf.sample(mi.BSDFContext(), si, 0.5, [0.5, 0.5])
+        return
+    monkeypatch.setattr(who_asks, "_said", said := set())
+    _, weight = bsdf.sample(mi.BSDFContext(), si, 0.5, [0.5, 0.5])
+    assert np.isinf(np.array(mi.unpolarized_spectrum(weight))).all()
+    (text,) = said
+    assert text.startswith("refract: ext_colour: accepted: the integrator refract_path, or no absorption")
+
+
+def test_with_path_light_that_meets_absorption_is_infinite_and_no_other_scene(llvm_variant, monkeypatch):
+    """Also while the absorbing scene is in memory."""
+    monkeypatch.setattr(who_asks, "_said", set())
+    eye = {"type": "perspective", "fov": 60, "film": {"type": "hdrfilm", "width": 8, "height": 8}}
+    eye["to_world"] = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    whole = {"type": "scene", "sensor": eye, "light": {"type": "constant"}, "integrator": {"type": "path"}}
+    glass = {"type": "refract", "int_ior": 1.5}
+    absorbing = mi.load_dict(whole | {"ball": {"type": "sphere", "bsdf": glass | {"int_absorption": 0.5}}})
+    clear = mi.load_dict(whole | {"ball": {"type": "sphere", "bsdf": glass}})
+    assert np.isfinite(np.array(mi.render(clear, spp=4))).all()
+    image = np.array(mi.render(absorbing, spp=4))
+    assert not np.isfinite(image[4, 4]).any() and np.isfinite(image[0, 0]).all()
+    assert np.isfinite(np.array(mi.render(clear, spp=4))).all()

@@ -1,0 +1,190 @@
+"""A boundary whose index depends on the wavelength, asked as a BSDF."""
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refract.plugins import who_asks
+
+GLASS = "cauchy(1.5, 20000)"  # n from 1.53 at 830 nm to 1.65 at 360 nm
+WAVELENGTHS = 450.0, 700.0, 550.0, 600.0
+D_LINE = 587.5618
+REFLECTED, REFRACTED = 0.0, 0.999999
+
+
+def n(wavelength):
+    return 1.5 + 20000 / wavelength**2
+
+
+def load(int_ior=GLASS, ext_ior=1.0, **parameters):
+    return mi.load_dict({"type": "refract", "int_ior": int_ior, "ext_ior": ext_ior} | parameters)
+
+
+def interaction(wi, wavelengths=WAVELENGTHS):
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi = mi.Vector3f(*map(float, wi))
+    if mi.is_spectral:
+        si.wavelengths = type(si.wavelengths)(*wavelengths)
+    return si
+
+
+def sample(bsdf, wi, sample1, **more):
+    bs, weight = bsdf.sample(who_asks.context(), interaction(wi, **more), sample1, [0.5, 0.5])
+    return bs, np.array(mi.unpolarized_spectrum(weight), dtype=float).ravel()
+
+
+def vector(x):
+    return np.array(x, dtype=float).ravel()
+
+
+def tilted(angle, side=1):
+    return math.sin(angle), 0.0, side * math.cos(angle)
+
+
+def reflectance(sin_i, eta):
+    """Fresnel's equations for n_to/n_from = eta, unpolarised; 1 where reflection is total."""
+    cos_i, square = math.sqrt(1 - sin_i**2), 1 - (sin_i / eta) ** 2
+    if square <= 0:
+        return 1.0
+    cos_t = math.sqrt(square)
+    s = (cos_i - eta * cos_t) / (cos_i + eta * cos_t)
+    p = (eta * cos_i - cos_t) / (eta * cos_i + cos_t)
+    return (s * s + p * p) / 2
+
+
+def is_dispersed(bs):
+    return bool((vector(bs.sampled_type).astype(int) & who_asks.DISPERSED).any())
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_refracted_light_is_of_the_first_wavelength_in_its_direction(spectral_variant, side):
+    eta = n(WAVELENGTHS[0]) ** side
+    bs, weight = sample(load(), tilted(0.5, side), REFRACTED)
+    assert vector(bs.wo)[0] == pytest.approx(-math.sin(0.5) / eta, rel=1e-6)
+    assert vector(bs.eta)[0] == pytest.approx(eta, rel=1e-6)
+    assert weight == pytest.approx([eta**-2, 0, 0, 0], rel=1e-6)
+    assert vector(bs.pdf)[0] == pytest.approx(1 - reflectance(math.sin(0.5), eta), rel=1e-5)
+    assert is_dispersed(bs)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.5, 1.3])
+def test_reflected_light_keeps_all_wavelengths_each_with_its_power(spectral_variant, angle):
+    powers = np.array([reflectance(math.sin(angle), n(x)) for x in WAVELENGTHS])
+    bs, weight = sample(load(), tilted(angle), REFLECTED)
+    assert vector(bs.pdf)[0] == pytest.approx(powers[0], rel=1e-5)
+    assert weight == pytest.approx(powers / powers[0], rel=1e-4)
+    assert len(set(powers.round(3))) > 1
+    assert not is_dispersed(bs)
+
+
+def test_where_one_wavelength_is_totally_reflected_the_others_keep_what_they_have(spectral_variant):
+    """From within, between the critical angles: blue is reflected whole, red in part."""
+    sin_i = 1 / n(550)
+    powers = np.array([reflectance(sin_i * (1 + 1e-6), 1 / n(x)) for x in WAVELENGTHS])
+    assert powers[0] == 1 > powers[1]
+    bs, weight = sample(load(), tilted(math.asin(sin_i * (1 + 1e-6)), -1), 0.5)
+    assert vector(bs.sampled_component)[0] == 0
+    assert weight == pytest.approx(powers, rel=2e-3)
+
+
+def test_an_index_within_1e_7_of_the_surroundings_is_not_rounded(spectral_variant):
+    """κ = k² − 1 = 4e-7 at grazing incidence: in float32 the index would be off by a third of n − 1."""
+    excess, wavelength = 2e-7, 500.0
+    bsdf = load(f"cauchy(1, {excess * wavelength**2!r})")
+    angle = math.pi / 2 - 1e-3
+    bs, _ = sample(bsdf, tilted(angle), REFRACTED, wavelengths=(wavelength,) * 4)
+    sin_i = float(np.float32(math.sin(angle)))
+    cos_i = float(np.float32(math.cos(angle)))
+    expected = math.sqrt(1 - sin_i**2 / (sin_i**2 + cos_i**2) / (1 + excess) ** 2)
+    assert -vector(bs.wo)[2] == pytest.approx(expected, rel=4e-7)
+    assert abs(expected - cos_i) > 1e-4 * cos_i
+
+
+def test_an_integrator_that_does_not_ask_gets_the_d_line(spectral_variant):
+    bs, weight = load().sample(mi.BSDFContext(), interaction(tilted(0.5)), REFRACTED, [0.5, 0.5])
+    assert vector(bs.wo)[0] == pytest.approx(-math.sin(0.5) / n(D_LINE), rel=1e-6)
+    assert vector(mi.unpolarized_spectrum(weight)) == pytest.approx(n(D_LINE) ** -2, rel=1e-6)
+    assert not is_dispersed(bs)
+
+
+def test_colours_have_the_index_of_the_d_line(rgb_variant):
+    bs, weight = sample(load(), tilted(0.5), REFRACTED)
+    assert vector(bs.wo)[0] == pytest.approx(-math.sin(0.5) / n(D_LINE), rel=1e-6)
+    assert weight == pytest.approx(n(D_LINE) ** -2, rel=1e-6)
+    assert not is_dispersed(bs)
+
+
+def test_both_media_may_be_dispersive(spectral_variant):
+    outside = "cauchy(1.3, 3000)"
+    bs, _ = sample(load(ext_ior=outside), tilted(0.5), REFRACTED)
+    eta = n(450) / (1.3 + 3000 / 450**2)
+    assert vector(bs.wo)[0] == pytest.approx(-math.sin(0.5) / eta, rel=1e-6)
+
+
+def test_light_outside_the_range_of_a_medium_is_lost(spectral_variant):
+    bsdf = load("table(380: 1.5, 800: 1.4)")
+    for number in (REFLECTED, REFRACTED):
+        assert (sample(bsdf, tilted(0.5), number, wavelengths=(370.0, 500, 600, 700))[1] == 0).all()
+        weight = sample(bsdf, tilted(0.5), number, wavelengths=(500.0, 370, 600, 700))[1]
+        assert weight[0] > 0 and weight[1] == 0 and np.isfinite(weight).all()
+
+
+def test_a_medium_whose_range_leaves_out_colour_is_refused(spectral_variant):
+    with pytest.raises(RuntimeError, match=r"int_ior: .* from 420 to 830 nm: outside it is .* accepted: a medium with"):
+        load("table(420: 1.5, 830: 1.4)")
+
+
+def test_coefficients_are_parameters(spectral_variant):
+    bsdf = load(ext_ior="cauchy(1.1, 0)")
+    parameters = mi.traverse(bsdf)
+    assert {"int_ior_A", "int_ior_B", "ext_ior_A", "ext_ior_B"} <= set(parameters.keys())
+    parameters["int_ior_B"] = 40000.0
+    parameters.update()
+    bs, _ = sample(bsdf, tilted(0.5), REFRACTED)
+    assert vector(bs.wo)[0] == pytest.approx(-math.sin(0.5) / (1.5 + 40000 / 450**2) * 1.1, rel=1e-6)
+    plain, _ = bsdf.sample(mi.BSDFContext(), interaction(tilted(0.5)), REFRACTED, [0.5, 0.5])
+    assert vector(plain.wo)[0] == pytest.approx(-math.sin(0.5) / (1.5 + 40000 / D_LINE**2) * 1.1, rel=1e-6)
+
+
+def test_a_coefficient_may_be_set_within_a_scene(spectral_variant):
+    scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "bsdf": {"type": "refract", "int_ior": GLASS}}})
+    parameters = mi.traverse(scene)
+    parameters["ball.bsdf.int_ior_B"] = 40000.0
+    parameters.update()
+    bs, _ = sample(scene.shapes()[0].bsdf(), tilted(0.5), REFRACTED)
+    eta = (1.5 + 40000 / 450**2) / 1.000277
+    assert vector(bs.wo)[0] == pytest.approx(-math.sin(0.5) / eta, rel=1e-6)
+
+
+def test_a_coefficient_is_one_number(needs_variant):
+    from support.variants import switch
+
+    needs_variant("llvm_ad_spectral")
+    switch("llvm_ad_spectral")
+    parameters = mi.traverse(load())
+    parameters["int_ior_B"] = mi.Float(1, 2)
+    with pytest.raises(ValueError, match=r"refract: int_ior_B has 2 entries; accepted: one number"):
+        parameters.update()
+
+
+def test_directions_have_derivatives_in_the_coefficients(needs_variant):
+    from support.variants import switch
+
+    needs_variant("llvm_ad_spectral")
+    switch("llvm_ad_spectral")
+    bsdf = load()
+    parameters = mi.traverse(bsdf)
+    dr.enable_grad(parameters["int_ior_B"])
+    parameters.update()
+    bs, _ = sample(bsdf, tilted(0.5), REFRACTED)
+    dr.backward(bs.wo.x)
+    # wo.x = −sin θ / n, so its derivative in B is sin θ / (n λ)²
+    expected = math.sin(0.5) / (n(450) * 450) ** 2
+    assert dr.grad(parameters["int_ior_B"])[0] == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_text_names_the_media(spectral_variant):
+    assert f"int_ior = {GLASS}" in str(load())
