@@ -10,7 +10,7 @@ import typer
 
 from mi_refract.io import atomic
 from mi_refract.io.outside_text import json_text, printable
-from mi_refract.planar import figure, focal_points, scene_file, scene_schema
+from mi_refract.planar import figure, focal_points, light, scene_file, scene_schema
 from mi_refract.planar.path_tree import as_data, follow_scene, summary, with_rays
 
 from . import variants
@@ -36,6 +36,9 @@ def trace(
     ] = None,
     rays: Annotated[int | None, typer.Option(min=1, help="Number of rays of each beam that has several.")] = None,
     max_depth: Annotated[int | None, typer.Option(min=1, help="Largest number of boundaries on a path.")] = None,
+    wavelengths: Annotated[
+        str | None, typer.Option(metavar="NM,NM|COUNT", help="Wavelengths in nm, or how many, in place of the scene's.")
+    ] = None,
     precision: Annotated[str, typer.Option(help="float64, or float32 with LLVM or CUDA.")] = "float64",
     formula: Annotated[str | None, typer.Option(help="A formula of refraction; the planar one by default.")] = None,
     arrays: Annotated[str | None, typer.Option("--backend", help="llvm, cuda or scalar; see `doctor`.")] = None,
@@ -49,7 +52,9 @@ def trace(
         atomic.writable(output, figure.FORMATS)
         figure.require_matplotlib()
     given: dict[str, Any] = {"branches": branches, "max_depth": max_depth}
-    loaded = replace(scene_file.load(scene), **{name: value for name, value in given.items() if value is not None})
+    asked = light.parsed(wavelengths) if wavelengths else None
+    read = scene_file.load(scene, asked)
+    loaded = replace(read, **{name: value for name, value in given.items() if value is not None})
     if rays:
         loaded = with_rays(loaded, rays)
     traced = follow_scene(loaded, formula=formula, precision=precision, backend=arrays)

@@ -24,6 +24,7 @@ __all__ = [
     "curves",
     "figure",
     "focal_points",
+    "light",
     "path_tree",
     "paths",
     "scene_file",

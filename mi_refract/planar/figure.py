@@ -10,7 +10,7 @@ import importlib.util
 import io
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +18,10 @@ import numpy as np
 
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.outside_text import printable
+from mi_refract.io.pixels import srgb_encode
 
 from .figure_geometry import SHARED, Legs, View, around, curves, density, legs
+from .light import Light, linear_srgb
 from .path_tree import Branches, count, summary
 from .paths import Event
 from .scene_file import PlanarScene
@@ -38,6 +40,7 @@ DENSE, THIN = (
     (0.73, 0.85, 0.97),
     (1.00, 0.92, 0.70),
 )  # tints of the media whose index differs most from the outermost one
+NIGHT, MOON = (0.06, 0.07, 0.09), "#8a93a0"  # around all shapes, and their outlines, behind rays that shine
 LINE = 0.13  # inches
 NAMED = 5  # media in the legend
 TYPICAL = 0.35  # opacity/(1 − opacity) of a typical density, where that is drawn
@@ -106,7 +109,7 @@ def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> 
     panel.set_xlabel("\n".join(caption), loc="left", fontsize=7.5)
     _media(panel, scene)
     _settle(drawn)
-    _boundaries(panel, scene.segments[0])
+    _boundaries(panel, scene.segments[0], MOON if scene.light.wavelengths else INK)
     _rays(panel, scene, legs(traced, view))
     _ends(panel, traced)
     return drawn
@@ -147,7 +150,8 @@ def _media(panel: Axes, scene: PlanarScene) -> None:
     around = float(np.mean(scene.index))
     means = [float(np.mean(region.indices)) for region in scene.regions]
     most = max((abs(n - around) for n in means), default=0)
-    tints = {n: _tint((n - around) / (most or 1)) for n in (around, *means)}
+    tint = _dark if scene.light.wavelengths else _tint
+    tints = {n: tint((n - around) / (most or 1)) for n in (around, *means)}
     panel.set_facecolor(tints[around])
     for region, n in zip(scene.regions, means, strict=True):
         style: dict[str, Any] = {"facecolor": tints[n], "edgecolor": "none", "zorder": 0.5}
@@ -168,18 +172,26 @@ def _tint(contrast: float) -> tuple[float, float, float]:
     return 1 - share * (1 - red), 1 - share * (1 - green), 1 - share * (1 - blue)
 
 
+def _dark(contrast: float) -> tuple[float, float, float]:
+    """As `_tint`, behind rays that shine in their own colours."""
+    share = abs(contrast) and 0.3 + 0.7 * abs(contrast)
+    bright = DENSE if contrast > 0 else THIN
+    red, green, blue = (dark + 0.2 * share * light for dark, light in zip(NIGHT, bright, strict=True))
+    return red, green, blue
+
+
 def _label(indices: Sequence[float]) -> str:
     low, high = (f"{n:.4g}" for n in (min(indices), max(indices)))
     return f"n = {low}" if low == high else f"n = {low} – {high}"
 
 
-def _boundaries(panel: Axes, segments: Segments) -> None:
+def _boundaries(panel: Axes, segments: Segments, ink: str) -> None:
     from matplotlib.collections import LineCollection
 
     many = len(segments) > LINES
     lines = curves(segments, 5 if many else 33)
     width = 0.7 * max(min(1.0, 8 / len(lines)), 0.15)
-    style: dict[str, Any] = {"colors": INK, "linewidths": width, "capstyle": "round", "zorder": 1.5}
+    style: dict[str, Any] = {"colors": ink, "linewidths": width, "capstyle": "round", "zorder": 1.5}
     panel.add_collection(LineCollection(lines, rasterized=many, **style), autolim=False)
     panel.plot(0, 0, "+", color=MUTED, markersize=5, markeredgewidth=0.6, zorder=1.4, scalex=False, scaley=False)
 
@@ -193,14 +205,26 @@ def strength(weight: Any) -> Any:
 
 
 def _rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
-    names = {SHARED: WHITE} | {i: name or RAY for i, name in enumerate(scene.colours)}
-    colours = {i: _rgb(scene, name) for i, name in names.items()}
+    if scene.light.wavelengths:  # light adds up where lines would cover each other
+        _shade(panel, lines, _spectral(scene.light), _add_light)
+        return
+    colours = _named(scene)
     x0, x1, y0, y1 = *panel.get_xlim(), *panel.get_ylim()
     crowd = np.hypot(*(lines.end - lines.start).T).sum() / math.hypot(x1 - x0, y1 - y0)
     if len(lines) > LINES or crowd > DIAGONALS:
-        _shade(panel, lines, colours)
+        _shade(panel, lines, colours, _blend)
     elif len(lines):
         _stroke(panel, lines, colours, min(1.0, (40 / crowd) ** 0.5))
+
+
+def _named(scene: PlanarScene) -> dict[int, Any]:
+    names = {SHARED: WHITE} | {i: name or RAY for i, name in enumerate(scene.light.names)}
+    return {i: _rgb(scene, name) for i, name in names.items()}
+
+
+def _spectral(light: Light) -> dict[int, Any]:
+    """Linear colours by number, those of light; all together are white."""
+    return {SHARED: np.ones(3)} | dict(enumerate(linear_srgb(light)))
 
 
 def _rgb(scene: PlanarScene, name: str) -> Any:
@@ -224,7 +248,7 @@ def _stroke(panel: Axes, lines: Legs, colours: dict[int, Any], room: float) -> N
     panel.add_collection(LineCollection(list(strokes), colors=rgba, linewidths=width, zorder=2), autolim=False)
 
 
-def _shade(panel: Axes, lines: Legs, colours: dict[int, Any]) -> None:
+def _shade(panel: Axes, lines: Legs, colours: dict[int, Any], mix: Callable[[Any, Any], Any]) -> None:
     """Draw the density of the legs as an image, with as many pixels as the panel has."""
     box = panel.get_window_extent()
     view = *panel.get_xlim(), *panel.get_ylim()
@@ -234,7 +258,7 @@ def _shade(panel: Axes, lines: Legs, colours: dict[int, Any]) -> None:
         layer = lines.where(lines.colour == number)
         layers[number] = density(layer, strength(layer.weight), view, width, height)
     style: dict[str, Any] = {"extent": view, "origin": "lower", "aspect": "equal", "zorder": 2}
-    panel.imshow(_blend(layers, colours), **style)
+    panel.imshow(mix(layers, colours), **style)
 
 
 def _blend(layers: dict[int, Any], colours: dict[int, Any]) -> Any:
@@ -253,6 +277,18 @@ def _blend(layers: dict[int, Any], colours: dict[int, Any]) -> Any:
     colour = np.divide(mixed, total[..., None], out=np.ones_like(mixed), where=total[..., None] > 0)
     pixels = np.dstack([colour, dense / (1 + dense)])  # saturates later than 1 − exp(−dense)
     return (pixels * 255).round().astype(np.uint8)
+
+
+def _add_light(layers: dict[int, Any], colours: dict[int, Any]) -> Any:
+    """Densities by wavelength → RGBA in bytes. Light adds up, and is as bright as its typical density is shown."""
+    light = sum(layers[number][..., None] * np.asarray(colours[number]) for number in layers)
+    light = np.clip(light, 0, None)
+    peak = light.max(axis=2)
+    lit = peak[peak > 0]
+    dense = peak * TYPICAL / math.sqrt(lit.mean() * np.median(lit)) if lit.size else peak
+    strong = srgb_encode(dense / (1 + dense))
+    colour = srgb_encode(np.divide(light, peak[..., None], out=np.ones_like(light), where=peak[..., None] > 0))
+    return (np.dstack([colour, strong]) * 255).round().astype(np.uint8)
 
 
 def _ends(panel: Axes, traced: Sequence[Branches]) -> None:

@@ -188,14 +188,17 @@ def _plural(number: int, what: str) -> str:
 
 def as_data(scene: PlanarScene, traced: Sequence[Branches]) -> dict[str, Any]:
     """What `mi-refract trace --json` prints: the paths per colour, without padding; null for unknown numbers."""
-    colours = zip(scene.colours, traced, strict=True)
+    names, wavelengths = scene.light.names, scene.light.wavelengths or (None,) * len(scene.light)
     return {
         "scene": str(scene.path),
         "title": scene.title,
         "max_depth": scene.max_depth,
         "branches": scene.branches,
         "counts": {name.lower(): number for name, number in count(traced).items() if name != "NONE"},
-        "colours": [{"colour": colour or None, "paths": list(_paths(scene, b))} for colour, b in colours],
+        "colours": [
+            {"colour": name or None, "wavelength": wavelength, "paths": list(_paths(scene, branches))}
+            for name, wavelength, branches in zip(names, wavelengths, traced, strict=True)
+        ],
     }
 
 

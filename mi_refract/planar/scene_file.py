@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from mi_refract.io import regular_file
 from mi_refract.io.toml_schema import read, shown
 
 from .curves import affine
+from .light import Light, of_names, of_wavelengths
 from .scene_schema import BEAMS, SCENE, SHAPES, Part
 from .scene_values import Indices, per_colour, read_kind
 from .segments import Array, Segments
@@ -37,7 +39,7 @@ class Region:
 class PlanarScene:
     """The content of a scene file, ready for `planar.trace` (once per colour) and for a figure.
 
-    `colours`: one of matplotlib's names per wavelength; ("",) where there is no dispersion.
+    `light`: its colours, one where there is no dispersion.
     `segments`: one per colour, the same geometry with other indices. `regions`: in drawing order, inner ones last.
     `index`: of the medium around everything, per colour. `origins`, `directions`: N × 2, directions of length 1;
     `beams`: N, the number of the `[[beam]]` (from 0) that a ray belongs to. `branches`: the most partial reflections
@@ -46,7 +48,7 @@ class PlanarScene:
 
     path: Path
     title: str
-    colours: tuple[str, ...]
+    light: Light
     segments: tuple[Segments, ...]
     regions: tuple[Region, ...]
     index: tuple[float, ...]
@@ -57,9 +59,14 @@ class PlanarScene:
     branches: int
     view: tuple[float, float, float, float] | None
 
+    @property
+    def colours(self) -> tuple[str, ...]:
+        """Names of the colours; ("",) where there is no dispersion."""
+        return self.light.names
 
-def load(path: str | Path) -> PlanarScene:
-    """Read a scene file.
+
+def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> PlanarScene:
+    """Read a scene file. `wavelengths`: in place of those that it names, in nm, or how many.
 
     ValueError, one line that names file and key (shapes and beams count from 0), for anything that is no scene;
     OSError for a file that cannot be read.
@@ -69,7 +76,7 @@ def load(path: str | Path) -> PlanarScene:
         raise IsADirectoryError(f"{path}: is a folder; accepted: a scene file")
     content = regular_file.read_bytes(path, SIZE)
     try:
-        return _scene(path, _parsed(content))
+        return _scene(path, _parsed(content), wavelengths)
     except ValueError as error:
         raise ValueError(" ".join(f"{path}: {error}".split())) from None
 
@@ -85,17 +92,26 @@ def _parsed(content: bytes) -> dict[str, Any]:
         raise ValueError(f"{error}; accepted: TOML") from None
 
 
-def _scene(path: Path, table: dict[str, Any]) -> PlanarScene:
+def _light(values: dict[str, Any], wavelengths: Sequence[float] | int | None) -> Light:
+    asked = values["wavelengths"] if wavelengths is None else wavelengths
+    if asked is None:
+        return of_names(values["colours"])
+    if values["colours"]:
+        raise ValueError("colours: beside wavelengths; accepted: one of them")
+    return of_wavelengths(asked, values["light"])
+
+
+def _scene(path: Path, table: dict[str, Any], wavelengths: Sequence[float] | int | None) -> PlanarScene:
     values = read(table, SCENE)
-    colours = tuple(values["colours"] or ("",))
-    values = per_colour(values, SCENE, "", len(colours))
-    parts = _parts(values["shape"], values["index"], len(colours))
+    light = _light(values, wavelengths)
+    values = per_colour(values, SCENE, "", light)
+    parts = _parts(values["shape"], values["index"], light)
     origins, directions, beams = _rays(values["beam"])
     regions = tuple(Region(part.curve.outline(), part.left) for _, part in parts if part.curve.closed)
     return PlanarScene(
         path,
         values["title"] or path.stem,
-        colours,
+        light,
         boundaries(parts),
         regions,
         values["index"],
@@ -111,21 +127,21 @@ def _scene(path: Path, table: dict[str, Any]) -> PlanarScene:
 FARTHEST = 1e100  # of all coordinates: products of two do not overflow
 
 
-def _parts(tables: list[dict[str, Any]], ambient: Indices, colours: int) -> list[Named]:
+def _parts(tables: list[dict[str, Any]], ambient: Indices, light: Light) -> list[Named]:
     """The shapes' parts in their places."""
     parts: list[Named] = []
     media: dict[str, Indices] = {}
     pieces = 0
     for j, table in enumerate(tables):
         where = f"shape[{j}]"
-        kind, values = read_kind(table, SHAPES, f"{where}.", colours)
+        kind, values = read_kind(table, SHAPES, f"{where}.", light)
         values["outside"] = _outside(values, media, where) or ambient
         if values.get("name") in media:
             raise ValueError(f"{where}.name: {shown(values['name'])} is another shape's; accepted: a new one")
         if values.get("name"):
             media[values["name"]] = values["n"]
         each = max(values.get("facets") or 4, len(values.get("points", ())))
-        pieces += values.get("layers", 1) * each * colours
+        pieces += values.get("layers", 1) * each * len(light)
         if pieces > PIECES:
             raise ValueError(
                 f"{where}: {pieces} pieces and more; accepted: {PIECES}, colours times those of all shapes"
@@ -172,7 +188,7 @@ def _rays(tables: list[dict[str, Any]]) -> tuple[Array, Array, NDArray[np.intp]]
     rays: list[tuple[Array, Array]] = []
     count = 0
     for j, table in enumerate(tables):
-        kind, values = read_kind(table, BEAMS, f"beam[{j}].", 1)
+        kind, values = read_kind(table, BEAMS, f"beam[{j}].", Light())
         count += values.get("count", 1)
         if count > RAYS:
             raise ValueError(f"beam[{j}].count: {count} rays with the beams before; accepted: up to {RAYS}")

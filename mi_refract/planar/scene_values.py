@@ -23,10 +23,12 @@ from mi_refract.io.toml_schema import (
     read,
     shown,
     shown_default,
+    text,
     whole,
 )
 
 from .curves import unit
+from .light import MOST, POWERS, Light
 
 Indices = tuple[float, ...]  # refractive indices of a medium, one per colour
 
@@ -50,7 +52,13 @@ def _direction(value: Any) -> NDArray[np.float64] | None:
 
 _pair = list_of(number, 2, 2)
 _factor = only_if(lambda v: 1e-100 <= abs(v) <= 1e100, number)
-INDEX = Type("a number above 0, or a list of one for each colour", first_of(list_of(positive), _single(positive)))
+_index = first_of(list_of(positive), _single(positive), text)
+INDEX = Type('a number above 0, a list of one for each colour, or a material, as "SCHOTT:N-BK7"', _index)
+WAVELENGTHS = Type(
+    f"a number from 2 to {MOST}, or a list of wavelengths in nm",
+    first_of(only_if(lambda v: 2 <= v <= MOST, whole(2, MOST).parse), list_of(positive, 1, MOST)),
+)
+POWER = Type(" or ".join(f'"{name}"' for name in POWERS), only_if(lambda v: v in POWERS, text))
 POSITIVES = Type("two numbers above 0", list_of(positive, 2, 2))
 PAIR = Type("two numbers", _pair)
 POINT = Type("[x, y]", _pair)
@@ -76,7 +84,7 @@ class Kind:
     build: Callable[[Table], Any]
 
 
-def read_kind(table: Table, kinds: dict[str, Kind], where: str, colours: int) -> tuple[Kind, Table]:
+def read_kind(table: Table, kinds: dict[str, Kind], where: str, light: Light) -> tuple[Kind, Table]:
     """The kind of a shape or a beam, and its values; indices per colour. ValueError as for `toml_schema.read`."""
     name = table.get("kind")
     if not isinstance(name, str) or name not in kinds:
@@ -84,14 +92,20 @@ def read_kind(table: Table, kinds: dict[str, Kind], where: str, colours: int) ->
         raise ValueError(f"{where}kind: {found}; accepted: {', '.join(kinds)}")
     keys = kinds[name].keys
     values = read({key: value for key, value in table.items() if key != "kind"}, keys, where)
-    return kinds[name], per_colour(values, keys, where, colours)
+    return kinds[name], per_colour(values, keys, where, light)
 
 
-def per_colour(values: Table, keys: dict[str, Key], where: str, colours: int) -> Table:
-    """`values` with every index as a tuple of one per colour; ValueError for a list of another length."""
+def per_colour(values: Table, keys: dict[str, Key], where: str, light: Light) -> Table:
+    """`values` with every index as a tuple of one per colour.
+
+    ValueError for a list of another length, and for a material as of `Light.indices`.
+    """
+    colours = len(light)
     found = {name: values[name] for name, key in keys.items() if key.type is INDEX and values[name] is not None}
     for name, indices in found.items():
-        if len(indices) not in (1, colours):
+        if isinstance(indices, str):
+            found[name] = light.indices(indices, f"{where}{name}")
+        elif len(indices) not in (1, colours):
             raise ValueError(f"{where}{name}: {len(indices)} numbers; accepted: 1 for all or each of {colours} colours")
     return values | {name: tuple(n) * (colours // len(n)) for name, n in found.items()}
 

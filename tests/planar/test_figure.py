@@ -18,6 +18,7 @@ from support.planar_scenes import SLAB, ball, beam, polygon, scene
 from mi_refract.io import atomic
 from mi_refract.planar import Event
 from mi_refract.planar import figure as drawing
+from mi_refract.planar.light import Light
 from mi_refract.planar.path_tree import follow_scene, with_rays
 
 VIEW = (-2.0, 2.0, -1.5, 1.5)
@@ -85,7 +86,9 @@ def test_tints_grow_with_the_contrast():
 
 def test_of_many_media_a_few_are_named(drawn):
     layers = tuple(replace(SLANTED.regions[0], indices=(1 + i / 20, 1 + i / 25)) for i in range(1, 21))
-    given = replace(SLANTED, regions=layers, index=(1.0, 1.0), colours=("red", "blue"), segments=SLANTED.segments * 2)
+    given = replace(
+        SLANTED, regions=layers, index=(1.0, 1.0), light=Light(("red", "blue")), segments=SLANTED.segments * 2
+    )
     labels = [text.get_text() for text in drawn(given).axes[0].get_legend().get_texts()]
     assert len(labels) == drawing.NAMED
     assert labels[0] == "n = 1"
@@ -104,7 +107,7 @@ def test_colours_part_at_the_first_boundary(drawn):
     given = replace(
         SLANTED,
         segments=(polygon(SLAB, 1.4), polygon(SLAB, 1.6)),
-        colours=("red", "blue"),
+        light=Light(("red", "blue")),
         index=(1.0, 1.0),
         regions=(replace(SLANTED.regions[0], indices=(1.4, 1.6)),),
     )
@@ -115,7 +118,7 @@ def test_colours_part_at_the_first_boundary(drawn):
 
 
 def test_a_colour_that_is_none(drawn):
-    given = replace(SLANTED, colours=("ultraviolent",))
+    given = replace(SLANTED, light=Light(("ultraviolent",)))
     with pytest.raises(ValueError, match=r"test\.toml: colours: 'ultraviolent'; accepted: a colour"):
         drawn(given)
 

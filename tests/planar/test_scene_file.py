@@ -236,7 +236,7 @@ BAD = {  # what is replaced, by what: the key, what was found, what is accepted
     "unknown key of a shape": ("facets = 20", "radius = 3", "shape[2].radius: unknown; accepted: radii"),
     "strange key": ("max_depth = 5", '"a\\nb" = 5', r"'a\nb': unknown"),
     "missing key": ("radius = 0.2", "", "shape[1].radius: missing; accepted: a number above 0"),
-    "missing index": ("n = [1.5, 1.6]", "", "shape[0].n: missing; accepted: a number above 0, or"),
+    "missing index": ("n = [1.5, 1.6]", "", "shape[0].n: missing; accepted: a number above 0, a list"),
     "wrong type": ("radius = 2\n", 'radius = "2"\n', "shape[0].radius: '2'; accepted: a number above 0"),
     "bool": ("radius = 2\n", "radius = true\n", "shape[0].radius: true; accepted: a number"),
     "NaN": ("radius = 2\n", "radius = nan\n", "shape[0].radius: nan; accepted: a number"),

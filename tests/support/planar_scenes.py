@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_refract.planar import Event, Segments
+from mi_refract.planar.light import Light
 from mi_refract.planar.scene_file import PlanarScene, Region
 
 CORNERS = np.array([(1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)], float)
@@ -54,7 +55,7 @@ def scene(segments, origins, directions, **given):
     default = {
         "path": Path("test.toml"),
         "title": "A test",
-        "colours": ("",) * len(segments),
+        "light": Light(given.pop("colours", ("",) * len(segments))),
         "regions": (Region(outline, tuple(s.n_left[0] for s in segments)),),
         "index": (1.0,) * len(segments),
         "beams": np.zeros(len(origins), int),

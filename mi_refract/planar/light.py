@@ -1,0 +1,111 @@
+"""The colours of the rays of a planar scene: by name, or by wavelength with powers and what the eye makes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mi_refract import media
+from mi_refract.backend import activate
+
+from .segments import Array
+
+VISIBLE = 380.0, 730.0  # nm: where a number of wavelengths is spread over
+MOST = 256  # wavelengths
+POWERS = ("flat", "D65")
+AIR = media.parse("AIR:ciddor")
+
+
+@dataclass(frozen=True)
+class Light:
+    """Colours that are followed one by one.
+
+    names: of colours, ("",) where there is one without a name. wavelengths: in nm, one per colour, or () where colours
+    are names only. powers: one per colour, relative; () for equal ones.
+    """
+
+    names: tuple[str, ...] = ("",)
+    wavelengths: tuple[float, ...] = ()
+    powers: tuple[float, ...] = ()
+
+    def __len__(self) -> int:
+        """The number of colours."""
+        return len(self.names)
+
+    def indices(self, spec: str, where: str) -> tuple[float, ...]:
+        """The index of a material for each colour; of colours without wavelengths, that of the d line.
+
+        Relative to air, where the material's own index is relative to vacuum. ValueError as of `media.parse`, and for a
+        wavelength outside the material's range.
+        """
+        medium = media.parse(spec, where)
+        wavelengths = np.array(self.wavelengths or (media.LINES["d"],) * len(self))
+        try:
+            n = medium.index(wavelengths)
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
+        if medium.relative_to == "vacuum":
+            n = n / AIR.index(wavelengths)
+        return tuple(float(x) for x in n)
+
+
+def of_names(names: Sequence[str] | None) -> Light:
+    """Colours by name, or one without."""
+    return Light(tuple(names)) if names else Light()
+
+
+def of_wavelengths(asked: Sequence[float] | int, power: str = "flat") -> Light:
+    """Colours by wavelength in nm, or so many evenly spread over the visible. power: of POWERS."""
+    spread = np.linspace(*VISIBLE, asked) if isinstance(asked, int) else np.array(asked, float)
+    wavelengths = tuple(float(w) for w in spread)
+    powers = _daylight(wavelengths) if power == "D65" else (1.0,) * len(wavelengths)
+    return Light(tuple(f"{w:.6g} nm" for w in wavelengths), wavelengths, powers)
+
+
+def parsed(text: str) -> list[float] | int:
+    """Wavelengths in nm with commas between them, or how many. ValueError for anything else."""
+    accepted = f"accepted: wavelengths in nm as 486.1,587.6, or a number of them from 2 to {MOST}"
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ValueError(f"--wavelengths {text}: {accepted}") from None
+    if len(numbers) == 1 and text.strip().isdigit() and 2 <= numbers[0] <= MOST:
+        return int(numbers[0])
+    if len(numbers) > MOST or not all(100 <= x <= 100_000 for x in numbers):
+        raise ValueError(f"--wavelengths {text}: {accepted}")
+    return numbers
+
+
+def _daylight(wavelengths: Sequence[float]) -> tuple[float, ...]:
+    """The powers of CIE's illuminant D65, as Mitsuba has them."""
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        activate()
+    with mi.util.variant_context("scalar_spectral"):
+        spectrum, si = mi.load_dict({"type": "d65"}), mi.SurfaceInteraction3f()
+        powers = []
+        for w in wavelengths:
+            si.wavelengths = type(si.wavelengths)(w)
+            powers.append(float(spectrum.eval(si)[0]))
+    return tuple(powers)
+
+
+def linear_srgb(light: Light) -> Array:
+    """What the eye makes of each colour (C × 3, linear sRGB; negative where a screen cannot show it).
+
+    All of them together are (1, 1, 1): white.
+    """
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        activate()
+    variant: Any = mi.scalar_rgb
+    matrix = np.array([variant.xyz_to_srgb([float(i == j) for j in range(3)]) for i in range(3)], float)
+    seen = np.array([variant.cie1931_xyz(float(w)) for w in light.wavelengths], float)
+    rgb: Array = (seen * np.array(light.powers)[:, None]) @ matrix
+    total = rgb.sum(0)
+    return rgb / np.where(total > 0, total, np.abs(total).max() or 1)

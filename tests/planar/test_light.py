@@ -1,0 +1,182 @@
+"""Colours by wavelength: their indices, powers, and what the eye makes of them."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mi_refract import media
+from mi_refract.planar import figure, light, path_tree
+from mi_refract.planar.figure_geometry import SHARED
+from mi_refract.planar.focal_points import groups
+from mi_refract.planar.light import Light, of_wavelengths
+from mi_refract.planar.path_tree import as_data, follow_scene
+from mi_refract.planar.scene_file import load
+
+SCENES = Path(__file__).parents[2] / "scenes" / "planar"
+SCENE = """
+wavelengths = [486.1327, 587.5618]
+[[shape]]
+kind = "circle"
+radius = 1
+n = "cauchy(1.5, 4000)"
+[[beam]]
+kind = "parallel"
+from = [-3, -0.5]
+to = [-3, 0.5]
+direction = 0
+count = 3
+"""
+
+
+def written(tmp_path, text=SCENE):
+    path = tmp_path / "scene.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_material_has_the_index_of_each_wavelength(tmp_path):
+    scene = load(written(tmp_path))
+    expected = tuple(1.5 + 4000 / w**2 for w in (486.1327, 587.5618))
+    assert scene.regions[0].indices == pytest.approx(expected, rel=1e-15)
+    assert [segments.n_left[0] for segments in scene.segments] == pytest.approx(expected, rel=1e-15)
+    assert scene.colours == ("486.133 nm", "587.562 nm")
+    assert scene.index == (1.0, 1.0)
+
+
+def test_without_wavelengths_it_has_that_of_the_d_line(tmp_path):
+    scene = load(written(tmp_path, SCENE.replace("wavelengths", "#")))
+    assert scene.regions[0].indices == pytest.approx((1.5 + 4000 / media.LINES["d"] ** 2,), rel=1e-15)
+
+
+def test_wavelengths_may_be_given_from_outside(tmp_path):
+    scene = load(written(tmp_path), [450.0])
+    assert scene.light.wavelengths == (450.0,)
+    spread = load(written(tmp_path), 36).light.wavelengths
+    assert spread == tuple(np.linspace(380, 730, 36))
+
+
+def test_what_is_measured_against_vacuum_is_made_relative_to_air():
+    found = Light(("", ""), (500.0, 600.0)).indices("MATERIAL:water", "n")
+    expected = [media.index("MATERIAL:water", w) / media.index("AIR:ciddor", w) for w in (500.0, 600.0)]
+    assert found == pytest.approx(expected, rel=1e-15)
+    assert Light().indices("AIR:ciddor", "n") == (1.0,)
+
+
+BAD = {
+    "unknown": ('"cauchy(1.5, 4000)"', '"glas"', "shape[0].n = 'glas': unknown material; accepted: vacuum"),
+    "formula": ('"cauchy(1.5, 4000)"', '"cauchy(1.5"', "shape[0].n = 'cauchy(1.5': accepted: cauchy(…)"),
+    "range": (
+        '"cauchy(1.5, 4000)"',
+        '"table(500: 1.5, 900: 1.4)"',
+        "shape[0].n: table(500: 1.5, 900: 1.4): no index at",
+    ),
+    "one": ("[486.1327, 587.5618]", "1", "wavelengths: 1; accepted: a number from 2 to 256, or a list"),
+    "negative": ("[486.1327, 587.5618]", "[-500]", "wavelengths: [-500]; accepted: a number from 2 to 256"),
+    "many": ("[486.1327, 587.5618]", "257", "wavelengths: 257; accepted"),
+    "both": ("wavelengths =", 'colours = ["red", "blue"]\nwavelengths =', "colours: beside wavelengths; accepted: one"),
+    "light": ("wavelengths =", 'light = "A"\nwavelengths =', 'light: \'A\'; accepted: "flat" or "D65"'),
+}
+
+
+@pytest.mark.parametrize(("old", "new", "said"), BAD.values(), ids=BAD)
+def test_what_is_refused_is_one_line(old, new, said, tmp_path):
+    with pytest.raises(ValueError) as caught:
+        load(written(tmp_path, SCENE.replace(old, new, 1)))
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "red", "1", "nan", "450,", "-450", "inf"])
+def test_words_that_are_no_wavelengths(text):
+    with pytest.raises(ValueError, match="accepted: wavelengths in nm as"):
+        light.parsed(text)
+
+
+def test_words_that_are_wavelengths():
+    assert light.parsed("450.5, 600") == [450.5, 600.0]
+    assert light.parsed("450") == [450.0]
+    assert light.parsed("32") == 32
+    assert light.parsed("550") == [550.0]  # more than MOST is no number of them
+
+
+# Seen -----------------------------------------------------------------------------------------------------------
+
+
+def test_daylight_has_the_powers_of_cie():
+    """D65 at 450, 560 and 650 nm: 117.008, 100 and 80.0268."""
+    powers = of_wavelengths([450, 560, 650], "D65").powers
+    assert np.array(powers) / powers[1] == pytest.approx([1.17008, 1, 0.800268], rel=2e-5)
+
+
+@pytest.mark.parametrize("power", light.POWERS)
+def test_all_wavelengths_together_are_white(power):
+    rgb = light.linear_srgb(of_wavelengths(64, power))
+    assert rgb.sum(0) == pytest.approx(1)
+    assert [light.linear_srgb(of_wavelengths([w, 550.0, 450.0, 620.0]))[0].argmax() for w in (450, 540, 640)] == [
+        2,
+        1,
+        0,
+    ]
+
+
+def test_light_adds_up():
+    colours = {SHARED: np.ones(3), 0: np.array([1.0, 0, 0]), 1: np.array([0, 1.0, -0.1])}
+    layers = {SHARED: np.zeros((1, 3)), 0: np.array([[1.0, 1, 0]]), 1: np.array([[0, 1.0, 1]])}
+    red, yellow, green = figure._add_light(layers, colours)[0]
+    assert red[:3].tolist() == [255, 0, 0] and green[:3].tolist() == [0, 255, 0]
+    assert yellow[:3].tolist() == [255, 255, 0]
+    assert red[3] == yellow[3] == green[3] > 0
+
+
+# Scenes that ship -------------------------------------------------------------------------------------------------
+
+
+def test_a_spectrum_is_in_the_order_of_its_wavelengths():
+    scene = load(SCENES / "spectrum.toml", [450.0, 550.0, 650.0])
+    angles = [math.atan2(*b.paths.directions[0][::-1]) for b in follow_scene(scene)]
+    assert angles[0] < angles[1] < angles[2] < 0  # violet is bent most
+
+
+def test_the_achromat_has_a_focus_for_each_wavelength():
+    """Nearest at the d line, and farther on both sides."""
+    scene = load(SCENES / "achromat.toml")
+    found = {float(group.colour.split()[0]): group.spread.focus[0] for group in groups(scene, follow_scene(scene))}
+    assert len(found) == 6
+    nearest = min(found, key=found.get)
+    assert nearest == pytest.approx(587.562)
+    assert max(found.values()) - min(found.values()) < 0.3
+
+
+def test_between_both_bows_no_reflected_ray_goes():
+    """At 51° from the sun's counterpoint red ends at 42.4° in the primary and begins at 50.4° in the secondary."""
+    scene = load(SCENES / "double_rainbow.toml", [650.0])
+    (traced,) = follow_scene(scene)
+    once, twice = (traced.reflect == 2), (traced.reflect == 6)
+    x, y = traced.paths.directions[once | twice].T
+    angle = np.degrees(np.arctan2(np.abs(y), -x))  # from the way back to the sun
+    n = media.index("MATERIAL:water", 650.0) / media.index("AIR:ciddor", 650.0)
+    edges = [bow(n, 1), bow(n, 2)]
+    assert edges == pytest.approx([42.4, 50.4], abs=0.4)
+    one, two = np.split(angle, [int(once.sum())])
+    assert one.max() == pytest.approx(edges[0], abs=0.01) and one.max() < edges[0] + 1e-9
+    assert two.min() == pytest.approx(edges[1], abs=0.05) and two.min() > edges[1] - 1e-9
+
+
+def bow(n, reflections):
+    """The angle of the bow from the way back to the sun, in degrees: cos²θ = (n² − 1)/(p(p + 2)), p reflections."""
+    theta = math.acos(math.sqrt((n * n - 1) / (reflections * (reflections + 2))))
+    deviation = 2 * (theta - math.asin(math.sin(theta) / n)) + reflections * (
+        math.pi - 2 * math.asin(math.sin(theta) / n)
+    )
+    return math.degrees(abs(math.pi - deviation % (2 * math.pi)))
+
+
+def test_json_has_the_wavelengths(tmp_path):
+    scene = load(written(tmp_path))
+    data = json.loads(json.dumps(as_data(scene, follow_scene(scene))))
+    assert [entry["wavelength"] for entry in data["colours"]] == [486.1327, 587.5618]
+    assert path_tree.summary(scene, follow_scene(scene)).startswith("3 rays in 2 colours")
