@@ -7,10 +7,10 @@ import functools
 import importlib.util
 import shlex
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypedDict
 
 import typer
 from rich.console import Console
@@ -62,6 +62,14 @@ Seed = Annotated[int, typer.Option(min=0, help="Seed of the ray generator.")]
 TwoSided = Annotated[
     bool, typer.Option("--two-sided", help="Put normals on either side; by default they face the ray.")
 ]
+Medium = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="SPEC",
+        help="A medium that rays pass into and out of, from and to air, such as SCHOTT:N-BK7; may be repeated.",
+    ),
+]
+Wavelengths = Annotated[str | None, typer.Option(metavar="NM,…", help="Wavelengths in nm, of the media.")]
 Regimes = Annotated[bool, typer.Option("--regimes", is_eager=True, callback=_print_regimes, help="List the regimes.")]
 File = Annotated[Path | None, typer.Option("--rays", metavar="FILE", help="The file of rays, as exported.")]
 Tir = Annotated[
@@ -78,6 +86,59 @@ OldFormula = Annotated[str | None, typer.Option("--as-good-as", hidden=True)]  #
 Report = Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML page.")]
 Junit = Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")]
 Json = Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")]
+
+
+@dataclass(frozen=True)
+class MadeRays:
+    """The options that choose rays, as they were typed."""
+
+    regime: list[str] | None
+    count: int
+    precision: str
+    seed: int
+    two_sided: bool
+    medium: list[str] | None
+    wavelengths: str | None
+
+    @property
+    def arguments(self) -> MadeArguments:
+        """Those of `ray_set.make`. ">>" and "<<" may be typed for ≫ and ≪. ValueError for wrong wavelengths."""
+        names = [name.replace(">>", "≫").replace("<<", "≪") for name in self.regime or []]
+        return {
+            "names": names or None,
+            "count": self.count,
+            "precision": self.precision,
+            "seed": self.seed,
+            "two_sided": self.two_sided,
+            "media": self.medium or (),
+            "wavelengths": _wavelengths(self.wavelengths),
+        }
+
+    @property
+    def words(self) -> list[str]:
+        """The options that choose these rays, without those that have their default."""
+        words = [word for name in self.regime or [] for word in ("--regime", name)]
+        for option, value, default in (
+            ("--count", self.count, ray_set.COUNT),
+            ("--precision", self.precision, ray_set.PRECISION),
+            ("--seed", self.seed, 0),
+            ("--wavelengths", self.wavelengths, None),
+        ):
+            words += [option, str(value)] if value != default else []
+        words += [word for spec in self.medium or [] for word in ("--medium", spec)]
+        return words + ["--two-sided"] * self.two_sided
+
+
+class MadeArguments(TypedDict):
+    """What `ray_set.make` takes."""
+
+    names: list[str] | None
+    count: int
+    precision: str
+    seed: int
+    two_sided: bool
+    media: Sequence[str]
+    wavelengths: Sequence[float]
 
 
 @dataclass(frozen=True)
@@ -168,18 +229,23 @@ def export(
     precision: Precision = ray_set.PRECISION,
     seed: Seed = 0,
     two_sided: TwoSided = False,
+    medium: Medium = None,
+    wavelengths: Wavelengths = None,
     regimes: Regimes = False,
 ) -> None:
     """Write rays for another program: incident directions, normals and indices of refraction."""
     writable(output, files.SUFFIXES)
-    rays = ray_set.make(_names(regime), count, precision, seed, two_sided=two_sided)
+    made = MadeRays(regime, count, precision, seed, two_sided, medium, wavelengths)
+    rays = ray_set.make(**made.arguments)
     files.write(output, rays)
     print(printable(f"{output}: {_summary(rays)}"))
 
 
 @app.command()
 def check(
-    answers: Annotated[Path, typer.Argument(metavar="ANSWERS.csv|.npz|.exr", help="id, bx, by, bz[, transmitted].")],
+    answers: Annotated[
+        Path, typer.Argument(metavar="ANSWERS.csv|.npz|.exr", help="id, bx, by, bz[, transmitted][, n_ratio].")
+    ],
     file: File = None,
     tir: Tir = "auto",
     formula: Formula = None,
@@ -189,6 +255,8 @@ def check(
     precision: Precision = ray_set.PRECISION,
     seed: Seed = 0,
     two_sided: TwoSided = False,
+    medium: Medium = None,
+    wavelengths: Wavelengths = None,
     report: Report = None,
     junit: Junit = None,
     json: Json = None,
@@ -209,11 +277,9 @@ def check(
     """
     there = elsewhere(scheduler, workers, tls_ca_file, tls_cert, tls_key)
     options = CheckOptions(tir, formula or old_formula, report, junit, json, there)
-    chosen = _chosen(file, _rays_as_words(regime, count, precision, seed, two_sided))
-    if file:
-        rays = files.read_stored(file)
-    else:
-        rays = stored_rays.make(_names(regime), count, precision, seed, two_sided=two_sided)
+    made = MadeRays(regime, count, precision, seed, two_sided, medium, wavelengths)
+    chosen = _chosen(file, made.words)
+    rays = files.read_stored(file) if file else stored_rays.make(**made.arguments)
     given = files.read_stored_answers(answers, rays)
     origin = "" if chosen else ", as of `export` without options; others: --rays FILE"
     print(printable(f"{answers}: {_summary(rays)}{origin}"))
@@ -231,6 +297,8 @@ def run(
     precision: Precision = ray_set.PRECISION,
     seed: Seed = 0,
     two_sided: TwoSided = False,
+    medium: Medium = None,
+    wavelengths: Wavelengths = None,
     tir: Tir = "auto",
     formula: Formula = None,
     old_formula: OldFormula = None,
@@ -246,13 +314,22 @@ def run(
     Exit code 0: right, 1: wrong, 2: the answers do not match the rays, or the command fails or takes too long.
     """
     options = CheckOptions(tir, formula or old_formula, report, junit, json)
-    chosen = _chosen(file, _rays_as_words(regime, count, precision, seed, two_sided))
-    rays = files.read(file) if file else ray_set.make(_names(regime), count, precision, seed, two_sided=two_sided)
+    made = MadeRays(regime, count, precision, seed, two_sided, medium, wavelengths)
+    chosen = _chosen(file, made.words)
+    rays = files.read(file) if file else ray_set.make(**made.arguments)
     with as_exceptions():
         given = run_program.answers_of(command, rays, timeout=timeout, adopt=True)
     name = shlex.join(command)
     print(printable(f"{name}: {_summary(rays)}"))
     raise typer.Exit(options.check(rays, given, name, ["run", *chosen, *options.words, "--", *command]))
+
+
+def _wavelengths(text: str | None) -> tuple[float, ...]:
+    """The numbers of --wavelengths; none without. ValueError for anything else."""
+    try:
+        return tuple(map(float, text.split(","))) if text is not None else ()
+    except ValueError:
+        raise ValueError(f"--wavelengths {text}: accepted: numbers in nm, such as 486.1327,587.5618") from None
 
 
 def _chosen(file: Path | None, made: list[str]) -> list[str]:
@@ -262,24 +339,16 @@ def _chosen(file: Path | None, made: list[str]) -> list[str]:
     return ["--rays", str(file)] if file else made
 
 
-def _names(regime: list[str] | None) -> tuple[str, ...]:
-    """Names of regimes; ">>" and "<<" may be typed for ≫ and ≪."""
-    return tuple(name.replace(">>", "≫").replace("<<", "≪") for name in regime or ray_set.DEFAULT)
-
-
-def _rays_as_words(regime: list[str] | None, count: int, precision: str, seed: int, two_sided: bool) -> list[str]:
-    """The options that choose these rays, without those that have their default."""
-    words = [word for name in regime or [] for word in ("--regime", name)]
-    for option, value, default in (
-        ("--count", count, ray_set.COUNT),
-        ("--precision", precision, ray_set.PRECISION),
-        ("--seed", seed, 0),
-    ):
-        words += [option, str(value)] if value != default else []
-    return words + ["--two-sided"] * two_sided
-
-
 def _summary(rays: RaySet | StoredRays) -> str:
     number = len(rays.header["regimes"])
     regimes = f"{number} regime{'' if number == 1 else 's'}"
-    return f"{len(rays)} rays, {regimes}, {rays.precision}, seed {rays.header['seed']}"
+    return f"{len(rays)} rays, {regimes}, {rays.precision}, seed {rays.header['seed']}{_media(rays)}"
+
+
+def _media(rays: RaySet | StoredRays) -> str:
+    """How many media and wavelengths there are; "" without media."""
+    if not (pairs := rays.header.get("media")):
+        return ""
+    media, wavelengths = len(pairs) // 2, len(rays.header["wavelengths"])
+    kinds = "medium" if media == 1 else "media"
+    return f", {media} {kinds} at {wavelengths} wavelength{'' if wavelengths == 1 else 's'}"

@@ -2,7 +2,8 @@
 
 The oracle certifies every ray. An answer is right where its error is within the a-priori bound of a documented formula
 for that very ray. Errors are angles, over the rays whose total internal reflection was classified correctly; the error
-of the length is reported separately.
+of the length is reported separately. Where answers say which ratio of indices the program used, directions are compared
+with the certified ones for that ratio, and the ratio with that of the ray.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from mi_refract.accuracy import lengths
 from mi_refract.formulas import FORMULAS
 
-from . import diagnosis, judged_parts, tir_signal
+from . import diagnosis, judged_parts, media_rays, tir_signal
 from .diagnosis import Explanation
 from .evidence import AllEvidence
 from .header import PRECISIONS, Header, shown
@@ -70,7 +71,19 @@ PROBLEMS = {
     "non-finite": False,
     "zero": False,
     "impossible": False,
+    "index": False,
 }
+SAME_ULPS = 4  # the largest relative difference of a ratio of indices that is none, where the file holds the indices
+
+
+@dataclass(frozen=True)
+class RatioDifference:
+    """The largest relative difference of the ratio that the program used to that of the ray, and this ray."""
+
+    largest: float
+    id: int
+    ray: str  # its media and wavelength; "" without
+    accepted: float
 
 
 @dataclass(frozen=True)
@@ -86,6 +99,7 @@ class Findings:
     problems: tuple[Problem, ...]
     explanations: tuple[Explanation, ...]  # of wrong answers
     header: Header  # of the rays
+    ratio: RatioDifference | None = None  # where answers say which ratio was used
 
     def total(self, name: str) -> int:
         """The sum of a count of `RegimeErrors` over the regimes."""
@@ -146,18 +160,35 @@ def check(
     _check_name("error_bound", error_bound, FORMULAS)
     _check_header(rays, answers, tir)
     pieces, mismatches = _matched(rays, answers)
-    signal, parts, angles = _parts(pieces, Question(rays.precision, error_bound, tir), judge)
+    ulp = float(np.finfo(PRECISIONS[rays.precision]).eps)
+    question = Question(rays.precision, error_bound, tir, same_ratio=_same_ratio(rays.header, ulp))
+    signal, parts, angles = _parts(pieces, question, judge)
     return Findings(
         precision=rays.precision,
-        ulp=float(np.finfo(PRECISIONS[rays.precision]).eps),
+        ulp=ulp,
         error_bound=error_bound,
         tir=signal,
         tir_given=tir != AUTO,
         regimes=tuple(_by_regime(rays.header, parts, angles)),
         problems=(*(_listed(kind, *each) for kind, each in mismatches.items()), *_not_directions(parts)),
-        explanations=_explanations(pieces, parts, angles, Question(rays.precision, error_bound, signal)),
+        explanations=_explanations(pieces, parts, angles, replace(question, tir=signal)),
         header=rays.header,
+        ratio=_ratio_difference(rays.header, answers, parts, question.same_ratio),
     )
+
+
+def _same_ratio(header: Header, ulp: float) -> float:
+    return media_rays.SAME if media_rays.has_media(header) else SAME_ULPS * ulp
+
+
+def _ratio_difference(
+    header: Header, answers: Answers | StoredAnswers, parts: list[JudgedPart], same: float
+) -> RatioDifference | None:
+    given = answers.ratios if isinstance(answers, StoredAnswers) else answers.n_ratio
+    if given is None or not parts:
+        return None
+    largest, id_ = max((part.ratio for part in parts), key=lambda found: found[0])
+    return RatioDifference(largest, id_, media_rays.described(header, id_), same)
 
 
 def _check_header(rays: RaySet | StoredRays, answers: Answers | StoredAnswers, tir: str) -> None:
@@ -205,16 +236,17 @@ def _parts(pieces: Pieces, question: Question, judge: Judge) -> tuple[str, list[
 def _guess(pieces: Pieces, question: Question) -> str:
     """The signal of a few rays, evenly over the set; of those that seem totally reflected, where there are any."""
     some = pieces.sampled(np.arange(0, pieces.total, max(1, pieces.total // SEEN)))
-    across = np.cross(some.rays.n.astype(float), some.rays.a.astype(float))
+    rays = some.used
+    across = np.cross(rays.n.astype(float), rays.a.astype(float))
     with np.errstate(all="ignore"):
-        sine = some.rays.k * (lengths(across) / (lengths(some.rays.a) * lengths(some.rays.n)))
+        sine = rays.k * (lengths(across) / (lengths(rays.a) * lengths(rays.n)))
     which = np.flatnonzero(sine > 1)
     which = which[:: max(1, len(which) // GUESSED)]
     if not len(which):
         return NONE
     flag = None if some.flag is None else some.flag[which]
     budget = FORMULAS[question.error_bound].budget
-    return judge_answers(some.b[which], flag, some.rays[which], question.precision, budget).tir
+    return judge_answers(some.b[which], flag, rays[which], question.precision, budget).tir
 
 
 def _explanations(
@@ -225,7 +257,7 @@ def _explanations(
     found = AllEvidence([part.evidence for part in parts], angles.of(range(len(parts))))
     some, printed = (pieces.sampled(of(found)) for of in (diagnosis.sample, diagnosis.printed_sample))
     budget = FORMULAS[question.error_bound].budget
-    judged = judge_answers(some.b, some.flag, some.rays, question.precision, budget, question.tir)
+    judged = judge_answers(some.b, some.flag, some.used, question.precision, budget, question.tir)
     return tuple(diagnosis.explain(judged, found, printed.b))
 
 

@@ -7,7 +7,7 @@ import contextlib
 import itertools
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -23,32 +23,40 @@ LONGEST = 2**26  # characters of a line in a file
 _SHOWN = 60  # characters of a wrong line that an error quotes
 
 
-def with_header(header: Mapping[str, Any], columns: Sequence[str], numbers: np.ndarray) -> str:
-    """CSV text of `numbers` (N, columns); the first column holds whole numbers.
+def with_header(
+    header: Mapping[str, Any], columns: Sequence[str], numbers: np.ndarray, whole: Collection[str] = ()
+) -> str:
+    """CSV text of `numbers` (N, columns); the first column, and those in `whole`, hold whole numbers.
 
     Each number is the shortest decimal that reads back, in float64, as exactly that number.
     """
     top = [f"# {key}: {value if value == _value(value) else json.dumps(value)}" for key, value in header.items()]
-    row = ",".join(["%d", *["%r"] * (len(columns) - 1)])
+    row = ",".join(["%d", *("%d" if name in whole else "%r" for name in columns[1:])])
     return "\n".join([*top, ",".join(columns), *(row % tuple(each) for each in numbers.tolist()), ""])
 
 
 def parse_table(
     name: str, content: str | bytes, columns: Sequence[str], *optional: str
-) -> tuple[dict[str, Any], np.ndarray]:
-    """(header, (N, columns) float64) of CSV text. All of the `optional` columns may follow, or none of them.
+) -> tuple[dict[str, Any], np.ndarray, tuple[str, ...]]:
+    """(header, (N, columns) float64, their names) of CSV text. Each of the `optional` may follow, in their order: a
+    column, or several with commas between them.
 
     ValueError, one line that begins with `name`: bytes that are not text, a wrong line of column names, rows that are
     too short, too long, or not numbers.
     """
     lines = _decoded(name, content).splitlines()
-    header, numbers = _parsed(name, lambda: iter([lines]), columns, optional, len(lines))
-    return header, np.concatenate([np.empty((0, numbers.width)), *numbers.pieces(max(1, numbers.rows))])
+    header, numbers, names = _parsed(name, lambda: iter([lines]), columns, optional, len(lines))
+    return header, np.concatenate([np.empty((0, numbers.width)), *numbers.pieces(max(1, numbers.rows))]), names
+
+
+def flat(optional: Iterable[str]) -> list[str]:
+    """The names of optional columns, one by one."""
+    return [name for names in optional for name in names.split(",")]
 
 
 def read_table(
     name: str, stream: BinaryIO, columns: Sequence[str], optional: Sequence[str], most: int, limit: int
-) -> tuple[dict[str, Any], Log]:
+) -> tuple[dict[str, Any], Log, tuple[str, ...]]:
     """As `parse_table`, of a file, which is read more than once; its numbers are kept outside of the memory.
 
     ValueError also for more than `most` rows, and for a file that has grown to more than `limit` bytes.
@@ -68,10 +76,11 @@ def read_table(
 
 def _parsed(
     name: str, lines: Callable[[], Iterator[list[str]]], columns: Sequence[str], optional: Sequence[str], most: int
-) -> tuple[dict[str, Any], Log]:
+) -> tuple[dict[str, Any], Log, tuple[str, ...]]:
     """`lines`: those of the table from its first one on, some at a time."""
     header, names, top, rest = _top(lines())
-    accepted = [tuple(columns), *([(*columns, *optional)] if optional else [])]
+    subsets = (some for count in range(len(optional) + 1) for some in itertools.combinations(optional, count))
+    accepted = [(*columns, *flat(some)) for some in subsets]
     if names not in accepted:
         found = f"the first row is {','.join(names)[:_SHOWN]!r}" if names else "the table is empty"
         raise ValueError(f"{name}: {found}; accepted, in this order: {' or '.join(map(','.join, accepted))}")
@@ -84,7 +93,7 @@ def _parsed(
             numbers.append(read)
     if count > most:
         raise ValueError(f"{name}: {count} rows; accepted: up to {most}")
-    return header, numbers
+    return header, numbers, names
 
 
 def _few(lines: list[str]) -> Iterator[list[str]]:

@@ -13,7 +13,10 @@ Header = dict[str, Any]  # the `# key: value` lines of a file
 
 FORMAT = "mi_refract rays 1"
 PRECISIONS: dict[str, type[np.floating]] = {"f32": np.float32, "f64": np.float64}
+LARGEST_WAVELENGTH = 1e9  # nm
 LONGEST = 200  # characters of a text
+MOST_MEDIA, LONGEST_MEDIUM = 64, 512  # media, and wavelengths; characters
+AIR = "air"
 _CHECKSUM = re.compile("sha256:[0-9a-f]{64}")
 
 
@@ -41,6 +44,26 @@ def _is_ranges(value: Any) -> bool:
     )
 
 
+def _is_medium(value: Any) -> bool:
+    return isinstance(value, str) and 0 < len(value) <= LONGEST_MEDIUM and value.isprintable()
+
+
+def _is_media(value: Any) -> bool:
+    """Whether it is [[medium, air], [air, medium], …], each medium once."""
+    if not isinstance(value, list) or not 0 < len(value) <= 2 * MOST_MEDIA or len(value) % 2:
+        return False
+    if not all(isinstance(pair, list) and len(pair) == 2 and all(map(_is_medium, pair)) for pair in value):
+        return False
+    names = [pair[0] for pair in value[::2]]
+    return len(set(names)) == len(names) and value == [p for name in names for p in ([name, AIR], [AIR, name])]
+
+
+def _is_wavelengths(value: Any) -> bool:
+    if not isinstance(value, list) or not 0 < len(value) <= MOST_MEDIA:
+        return False
+    return all(type(each) is float and 0 < each < LARGEST_WAVELENGTH for each in value)
+
+
 Rule = tuple[Callable[[Any], bool], str]  # and what it accepts, in words
 _TEXT: Rule = (_is_text, f"text of up to {LONGEST} characters")
 SCHEMA: dict[str, Rule] = {
@@ -57,6 +80,29 @@ SCHEMA: dict[str, Rule] = {
     "regimes": (_is_ranges, "{name: [first id, last id]} of each regime"),
     "checksum": (lambda value: isinstance(value, str) and bool(_CHECKSUM.fullmatch(value)), "sha256: and 64 digits"),
 }
+MEDIA: dict[str, Rule] = {  # all of them, or none
+    "wavelength, medium": (lambda value: isinstance(value, str) and 0 < len(value) <= LONGEST_MEDIUM, "text"),
+    "media": (_is_media, f"[[medium, {AIR!r}], [{AIR!r}, medium], …], each medium once, up to {MOST_MEDIA}"),
+    "wavelengths": (_is_wavelengths, f"[nm, …], each once, up to {MOST_MEDIA}"),
+}
+
+
+def check_media(header: Mapping[str, Any], precision: str) -> None:
+    """ValueError, one line, for keys of MEDIA whose values have the wrong form."""
+    _check_rules(header, MEDIA)
+    with np.errstate(under="ignore"):
+        rounded = np.array(header["wavelengths"]).astype(PRECISIONS[precision])
+    if len(np.unique(rounded)) < len(rounded) or not rounded.all():
+        found = f"the wavelengths {shown(header['wavelengths'])} are not all different in {precision}"
+        raise ValueError(f"{found}; accepted: each once")
+
+
+def _check_rules(header: Mapping[str, Any], rules: Mapping[str, Rule]) -> None:
+    for key, (accepts, words) in rules.items():
+        if key not in header:
+            raise ValueError(f"the header has no {key}; accepted: {words}")
+        if not accepts(header[key]):
+            raise ValueError(f"the header's {key} is {shown(header[key])}; accepted: {words}")
 
 
 def check(header: Mapping[str, Any], rays: int) -> None:
@@ -64,13 +110,11 @@ def check(header: Mapping[str, Any], rays: int) -> None:
 
     Each regime has `count` rays, one after the other: no ray is without a regime, and none is in two.
     """
-    if unknown := sorted(header.keys() - SCHEMA.keys()):
-        raise ValueError(f"the header has {shown(unknown[0])}; accepted: {', '.join(SCHEMA)}")
-    for key, (accepts, words) in SCHEMA.items():
-        if key not in header:
-            raise ValueError(f"the header has no {key}; accepted: {words}")
-        if not accepts(header[key]):
-            raise ValueError(f"the header's {key} is {shown(header[key])}; accepted: {words}")
+    if unknown := sorted(header.keys() - SCHEMA.keys() - MEDIA.keys()):
+        raise ValueError(f"the header has {shown(unknown[0])}; accepted: {', '.join((*SCHEMA, *MEDIA))}")
+    _check_rules(header, SCHEMA)
+    if header.keys() & MEDIA.keys():
+        check_media(header, header["precision"])
     count, regimes = header["count"], header["regimes"]
     if count * len(regimes) != rays or not rays:
         found = f"the header is of {len(regimes)} × {count} rays, the file has {rays}"

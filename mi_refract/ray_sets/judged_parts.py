@@ -6,6 +6,7 @@ in the order of the rays give the same findings, whatever the pieces were and wh
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -43,17 +44,35 @@ class Question:
     error_bound: str
     tir: str
     counted: bool = False
+    same_ratio: float = 0.0  # the largest relative difference of `n_ratio` to k that is none
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Rays (N) of one regime, their ids (N,), the answers b (N, 3), and `transmitted` (N,) if there is the column."""
+    """Rays (N) of one regime, their ids (N,), the answers b (N, 3), and the columns `transmitted` (N,), `n_ratio` (N,).
+
+    The columns are None where there are none.
+    """
 
     regime: str
     rays: Rays
     ids: np.ndarray
     b: np.ndarray
     flag: np.ndarray | None
+    ratio: np.ndarray | None = None
+
+    @property
+    def used(self) -> Rays:
+        """The rays as the program took them: with the ratio of the indices that it used, where it says so."""
+        if self.ratio is None:
+            return self.rays
+        return Rays(self.rays.a.astype(np.float64), self.rays.n.astype(np.float64), self.ratio)
+
+    @functools.cached_property
+    def ratio_difference(self) -> np.ndarray:
+        """(N,) of the ratio that the program used, relative to that of the ray; zeros where it does not say."""
+        k = self.rays.k.astype(np.float64)
+        return np.zeros(len(k)) if self.ratio is None else np.abs(self.ratio - k) / k
 
 
 @dataclass(frozen=True)
@@ -79,6 +98,7 @@ class JudgedPart:
     listed: dict[str, tuple[int, list[int]]]  # by kind of problem: how many rays have it, and the first ids
     signals: Signals | None
     evidence: Evidence
+    ratio: tuple[float, int]  # the largest relative difference of the ratio used, and the id of its ray
 
     def without_angles(self) -> JudgedPart:
         """The rest of it, at most a byte a ray."""
@@ -89,7 +109,7 @@ def judge_part(piece: Piece, question: Question) -> JudgedPart:
     """Judge a piece; with the certified answers, which take most of the time."""
     budget = FORMULAS[question.error_bound].budget
     judged = judge_answers(
-        piece.b, piece.flag, piece.rays, question.precision, budget, question.tir, counted=question.counted
+        piece.b, piece.flag, piece.used, question.precision, budget, question.tir, counted=question.counted
     )
     verdict = judged.verdict
     compared = verdict.compared
@@ -102,10 +122,22 @@ def judge_part(piece: Piece, question: Question) -> JudgedPart:
         length_error=float(verdict.drift[compared].max()) if compared.any() else np.nan,
         error_over_bound=float(verdict.share.max()),
         worst=_worst(judged, piece.ids),
-        listed=_not_directions(judged, piece.ids),
+        listed=_not_directions(judged, piece.ids) | _other_ratios(piece, question.same_ratio),
         signals=judged.signals,
         evidence=evidence(judged),
+        ratio=_largest_difference(piece),
     )
+
+
+def _largest_difference(piece: Piece) -> tuple[float, int]:
+    row = int(np.argmax(piece.ratio_difference))
+    return float(piece.ratio_difference[row]), int(piece.ids[row])
+
+
+def _other_ratios(piece: Piece, same: float) -> dict[str, tuple[int, list[int]]]:
+    """Answers for which the program used another ratio of indices."""
+    ids = piece.ids[piece.ratio_difference > same]
+    return {"index": (len(ids), ids[:LISTED_IDS].tolist())}
 
 
 def here(calls: Iterable[tuple[Piece, Question]]) -> Iterator[tuple[int, JudgedPart]]:

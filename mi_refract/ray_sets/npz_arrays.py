@@ -31,13 +31,15 @@ _BROKEN = (
 )
 
 
-def read(path: Path, widths: Mapping[str, int], optional: Sequence[str], most: int) -> tuple[str, np.ndarray]:
-    """(text of the array `header` or "", (N, columns) float64). Arguments and errors as of `opened`."""
+def read(
+    path: Path, widths: Mapping[str, int], optional: Sequence[str], most: int
+) -> tuple[str, np.ndarray, tuple[str, ...]]:
+    """Text of the array `header` or "", (N, columns) float64, names of the arrays. Arguments, errors as of `opened`."""
     with opened(path, widths, optional, most) as found:
         numbers = np.empty((found.rows, found.width))
         for i, piece in enumerate(found.pieces(_STEP)):
             numbers[i * _STEP : i * _STEP + len(piece)] = piece
-        return found.text, numbers
+        return found.text, numbers, found.names
 
 
 @contextlib.contextmanager
@@ -110,6 +112,11 @@ class Arrays:
     def width(self) -> int:
         """Columns of all arrays together."""
         return sum(each.width for each in self.members)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Those of the arrays."""
+        return tuple(each.name for each in self.members)
 
     def pieces(self, step: int) -> Iterator[np.ndarray]:
         """(n, width) float64, n up to `step`. ValueError, one line, for a file that has changed."""

@@ -67,9 +67,11 @@ class ArrayPieces:
             yield self._piece(name, index)
 
     def _piece(self, name: str, index: np.ndarray) -> Piece:
-        rows, flags = self.order[index], self.answers.transmitted
-        flag = None if flags is None else flags[rows]
-        return Piece(name, self.rays.rays[index], self.rays.ids[index], self.answers.b[rows], flag)
+        rows = self.order[index]
+        flag, ratio = (
+            None if column is None else column[rows] for column in (self.answers.transmitted, self.answers.n_ratio)
+        )
+        return Piece(name, self.rays.rays[index], self.rays.ids[index], self.answers.b[rows], flag, ratio)
 
     def sampled(self, index: np.ndarray) -> Piece:
         """Some rays by their places in the order of the pieces."""
@@ -103,17 +105,15 @@ class StoredPieces:
                 stop = min(start + PIECE, last + 1)
                 some = self.answers.which(start, stop)
                 if some.any():
-                    b, flag = self.answers.read(start, stop)
+                    b, *columns = self.answers.read(start, stop)
+                    flag, ratio = (None if column is None else column[some] for column in columns)
                     ids = np.arange(start, stop)[some]
-                    yield Piece(
-                        name, self.rays.read(start, stop)[some], ids, b[some], None if flag is None else flag[some]
-                    )
+                    yield Piece(name, self.rays.read(start, stop)[some], ids, b[some], flag, ratio)
 
     def sampled(self, index: np.ndarray) -> Piece:
         """Some rays by their places in the order of the pieces."""
         ids = self._ids(index)
-        b, flag = self.answers.take(ids)
-        return Piece("", self.rays.take(ids), ids, b, flag)
+        return Piece("", self.rays.take(ids), ids, *self.answers.take(ids))
 
     def _ids(self, index: np.ndarray) -> np.ndarray:
         ends = np.cumsum(self.answers.answered)

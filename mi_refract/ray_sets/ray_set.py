@@ -3,6 +3,7 @@
 A set holds one or several regimes of `mi_refract.regimes`, rounded to float32 or float64. The same regimes, count,
 precision and seed give the same set, bit for bit. The ratio n_from / n_to is exact: n_to is a power of two, 1 where it
 can be, and no index is below 1. So a program that divides them, in either precision, gets exactly the k of the ray.
+With media and wavelengths (see `media_rays`), their ratios take the place of the regimes' own.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from mi_refract import regimes
 from mi_refract.numerics import float_expansions
 from mi_refract.regimes import Rays
 
+from . import media_rays
 from .header import FORMAT, PRECISIONS, Header
 
 # Their vectors are unit up to the rounding of each component, as the documented formulas require.
@@ -65,66 +67,99 @@ class RaySet:
 
     @property
     def numbers(self) -> np.ndarray:
-        """(N, 9) float64: id, a, n, n_from, n_to."""
-        return numbers_of(self.ids, self.rays)
+        """(N, 9) float64: id, a, n, n_from, n_to; with media (N, 11): wavelength, medium."""
+        return numbers_of(self.ids, self.rays, self.header)
 
 
-def numbers_of(ids: np.ndarray, rays: Rays) -> np.ndarray:
-    """(N, 9) float64: id, a, n, n_from, n_to."""
-    return np.column_stack([ids, rays.a, rays.n, *indices(rays.k)]).astype(np.float64)
+def numbers_of(ids: np.ndarray, rays: Rays, header: Header) -> np.ndarray:
+    """(N, 9) float64: id, a, n, n_from, n_to; with media (N, 11): wavelength, medium."""
+    return np.column_stack(
+        [ids, rays.a, rays.n, *indices(rays.k), *media_rays.columns(header, ids).T],
+    ).astype(np.float64)
 
 
 @dataclass(frozen=True)
 class Answers:
-    """A program's answers: ids (N,), b (N, 3) float64, the column `transmitted` (N,) if there is one, the header."""
+    """A program's answers: ids (N,), b (N, 3) float64, the column `transmitted` (N,) if there is one, the header.
+
+    `n_ratio`: (N,) the n_from / n_to that the program used, if it says so.
+    """
 
     ids: np.ndarray
     b: np.ndarray
     transmitted: np.ndarray | None = None
     header: Header = field(default_factory=dict)
+    n_ratio: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         """ValueError where the shapes do not match."""
-        flags = () if self.transmitted is None else (self.transmitted.shape,)
-        if self.b.shape != (len(self.ids), 3) or any(shape != self.ids.shape for shape in flags):
+        more = [each.shape for each in (self.transmitted, self.n_ratio) if each is not None]
+        if self.b.shape != (len(self.ids), 3) or any(shape != self.ids.shape for shape in more):
             raise ValueError(f"answers: b is {self.b.shape} for {len(self.ids)} ids; accepted: a direction for each id")
 
 
+def default(media: Sequence[str] = ()) -> tuple[str, ...]:
+    """The names of DEFAULT; with media those whose ratios are not their own."""
+    return tuple(name for name in DEFAULT if not len(media) or name in media_rays.NAMES)
+
+
 def make(
-    names: Iterable[str] = DEFAULT,
+    names: Iterable[str] | None = None,
     count: int = COUNT,
     precision: str = PRECISION,
     seed: int = 0,
     *,
     two_sided: bool = False,
+    media: Sequence[str] = (),
+    wavelengths: Sequence[float] = (),
 ) -> RaySet:
-    """`count` rays of each regime in `names`. Normals face the ray unless `two_sided`.
+    """`count` rays of each regime in `names`, by default those of `default`. Normals face the ray unless `two_sided`.
 
-    Errors as of `header_of`.
+    `media`: what `mi_refract.media` parses; each ray passes between one of them and air, at one of the `wavelengths` in
+    nm. Errors as of `header_of`.
     """
-    header = header_of(names, count, precision, seed, two_sided)
+    header = header_of(names, count, precision, seed, two_sided, media, wavelengths)
     rays = Rays.joined([of_regime(name, header) for name in header["regimes"]])
     return _with_checksum(RaySet(rays, np.arange(len(rays)), regime_names(header, len(rays)), header))
 
 
-def header_of(names: Iterable[str], count: int, precision: str, seed: int, two_sided: bool) -> Header:
+def header_of(
+    names: Iterable[str] | None,
+    count: int,
+    precision: str,
+    seed: int,
+    two_sided: bool,
+    media: Sequence[str] = (),
+    wavelengths: Sequence[float] = (),
+) -> Header:
     """The header of the set that is made so, without its checksum.
 
-    ValueError for an unknown regime or precision, a regime given twice, or no ray at all.
+    ValueError for an unknown regime or precision, a regime given twice, or no ray at all; of media see
+    `media_rays.header_of` and `media_rays.check_regimes`.
     """
-    names = tuple(names)
+    names = default(media) if names is None else tuple(names)
     if unknown := [name for name in names if name not in regimes.REGIMES]:
         raise ValueError(f"regime {unknown[0]!r}: unknown; accepted: {', '.join(map(repr, regimes.REGIMES))}")
     if precision not in PRECISIONS:
         raise ValueError(f"precision {precision!r}: unknown; accepted: {', '.join(PRECISIONS)}")
     if not names or len(set(names)) < len(names) or count < 1 or seed < 0:
         raise ValueError(f"{count} rays of {list(names)}, seed {seed}: accepted: at least one ray, each regime once")
-    return _header(names, count, precision, seed, two_sided)
+    header = _header(names, count, precision, seed, two_sided)
+    if len(media) or len(wavelengths):
+        header |= media_rays.header_of(media, wavelengths, precision)
+        media_rays.check_regimes(header)
+    return header
 
 
 def of_regime(name: str, header: Header) -> Rays:
     """The rays of one regime of the set with this header."""
-    rays = regimes.make(name, header["count"], PRECISIONS[header["precision"]], header["seed"])
+    precision, seed = PRECISIONS[header["precision"]], header["seed"]
+    if media_rays.has_media(header):
+        first, last = header["regimes"][name]
+        k = media_rays.ratios(header, np.arange(first, last + 1))
+        rays = regimes.make_given(name, k, precision, seed)
+    else:
+        rays = regimes.make(name, header["count"], precision, seed)
     return rays if header["two_sided"] else _facing(rays)
 
 
@@ -168,7 +203,7 @@ def checksum(rays: RaySet) -> str:
     """SHA-256 of the header without its own line, and of the numbers. It does not depend on the file format."""
     digest = Checksum(rays.header)
     for i in range(0, len(rays), _HASHED):  # all numbers in float64 take several times what the rays do
-        digest.add_numbers(numbers_of(rays.ids[i : i + _HASHED], rays.rays[i : i + _HASHED]))
+        digest.add_numbers(numbers_of(rays.ids[i : i + _HASHED], rays.rays[i : i + _HASHED], rays.header))
     return digest.text
 
 

@@ -72,11 +72,17 @@ PROBLEM_TEXTS = {
     "zero": "{} answers are the zero vector where that is no signal",
     "impossible": "{} answers are outside the plane of incidence, or on the wrong side of the surface, by more than "
     "the rounding of any documented formula explains",
+    "index": "{} answers used another ratio of indices, n_ratio",
 }
 
 
 def sentence(found: Findings) -> str:
     """The result in one line, such as "200 of 13000 answers are wrong: eta inverted"."""
+    others = sum(each.count for each in found.problems if each.kind == "index")
+    return _directions(found) + (f"; {others} answers are for another ratio of indices" if others else "")
+
+
+def _directions(found: Findings) -> str:
     if not found.answered:
         return "no ray was answered"
     answers = f"{found.answered} answers"
@@ -87,7 +93,7 @@ def sentence(found: Findings) -> str:
         return f"{answers}, but they do not match the rays{wrong}"
     if found.wrong or found.tir == UNCLEAR:
         return f"{found.wrong} of {answers} are wrong"
-    if found.exit_code:
+    if not found.total("judged"):
         return f"{answers}, none of them a direction{' that shows anything' if found.total('compared') else ''}"
     if found.total("exact") == found.answered:
         return f"{answers}, all exact up to rounding"
@@ -105,6 +111,15 @@ def problem_text(problem: Problem) -> str:
 def signal(found: Findings) -> str:
     """How the answers signal total internal reflection, in one line."""
     return SIGNALS[found.tir] + ("" if found.tir_given or found.tir in (NONE, UNCLEAR) else " (detected)")
+
+
+def ratio(found: Findings) -> list[str]:
+    """A line: how far the ratio that the program used is from that of the ray. None where it does not say."""
+    if not found.ratio:
+        return []
+    which = f"id {found.ratio.id}" + (f", {found.ratio.ray}" if found.ratio.ray else "")
+    text = f"n_ratio: the largest relative difference to n_from / n_to is {compact(found.ratio.largest)} ({which})"
+    return [f"{text}; up to {compact(found.ratio.accepted)} is none. Directions are judged for n_ratio"]
 
 
 def explained(found: Findings) -> list[str]:
@@ -147,7 +162,7 @@ def table(found: Findings) -> RenderableType:
             Text(printable(each.regime)),
             *_cells(each, found.ulp).values(),
         )
-    notes = [*map(problem_text, found.problems), signal(found), *explained(found)]
+    notes = [*map(problem_text, found.problems), *ratio(found), signal(found), *explained(found)]
     return Group(*([rows] if found.regimes else []), *(Text(printable(line)) for line in (*notes, sentence(found))))
 
 
@@ -190,6 +205,7 @@ def as_data(found: Findings) -> dict[str, Any]:
         "diagnosis": diagnosis.mistake if diagnosis else None,
         "explanations": [dataclasses.asdict(each) for each in found.explanations],
         "rays": found.header,
+        **({"n_ratio": dataclasses.asdict(found.ratio)} if found.ratio else {}),
     }
 
 
@@ -208,7 +224,7 @@ def _answers_case(found: Findings) -> junit.Case:
     group, name = "answers", "complete and understood"
     if found.answered and not found.problems and found.tir != UNCLEAR:
         return junit.Case(group, name)
-    lines = [*map(problem_text, found.problems), signal(found)]
+    lines = [*map(problem_text, found.problems), *ratio(found), signal(found)]
     return junit.Case(group, name, "error" if found.exit_code == 2 else "failure", lines[0], lines)
 
 
@@ -233,12 +249,13 @@ def write_html(path: str | Path, found: Findings, context: Mapping[str, Any], re
         }
         for each in found.regimes
     ]
+    noted = dict(zip(["ratio of indices"], ratio(found), strict=False))
     content = {
         "title": "mi-refract rays",
         "sentence": sentence(found),
         "state": "fail" if found.exit_code else "pass",
         "counts": [("pass", "right", found.answered - found.wrong), ("fail", "wrong", found.wrong)],
-        "context": {"precision": found.precision, "error bound": found.error_bound, **context},
+        "context": {"precision": found.precision, "error bound": found.error_bound, **context, **noted},
         "problems": [problem_text(each) for each in found.problems],
         "signal": signal(found),
         "unclear": found.tir == UNCLEAR,

@@ -18,13 +18,15 @@ _DISTINCT = 2**22  # ids that are sorted at once
 _STEP = 2**16
 _SPREADER = 0x9E3779B97F4A7C15  # odd: no ids are made one by the multiplication
 Listed = tuple[int, list[int]]  # how many, and the first ids
+Columns = tuple[np.ndarray, np.ndarray | None, np.ndarray | None]  # b (n, 3), transmitted (n,), n_ratio (n,)
 
 
 @dataclass(frozen=True)
 class StoredAnswers:
     """`b`: (N, 3) float64, the first answer to each of N rays. `states`: (N,) bits. `answered`: rays of each BLOCK.
 
-    `flagged`: whether there is the column `transmitted`. `mismatches`: as of `match`.
+    `flagged`: whether there is the column `transmitted`. `mismatches`: as of `match`. `ratios`: (N,) float64, the
+    column `n_ratio`, if there is one.
     """
 
     header: Header
@@ -33,44 +35,49 @@ class StoredAnswers:
     answered: np.ndarray
     flagged: bool
     mismatches: dict[str, Listed]
+    ratios: Table | None = None
 
     def which(self, start: int, stop: int) -> np.ndarray:
         """(stop − start,) the rays that have an answer."""
         return self.states.read(start, stop) & _ANSWERED > 0
 
-    def read(self, start: int, stop: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """b and the column `transmitted` of some rays in their order."""
-        return self.b.read(start, stop), self._flag(self.states.read(start, stop))
+    def read(self, start: int, stop: int) -> Columns:
+        """b and the columns `transmitted` and `n_ratio` of some rays in their order."""
+        ratios = self.ratios.read(start, stop) if self.ratios is not None else None
+        return self.b.read(start, stop), self._flag(self.states.read(start, stop)), ratios
 
-    def take(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    def take(self, ids: np.ndarray) -> Columns:
         """The same of these rays."""
-        return self.b.take(ids), self._flag(self.states.take(ids))
+        ratios = self.ratios.take(ids) if self.ratios is not None else None
+        return self.b.take(ids), self._flag(self.states.take(ids)), ratios
 
     def _flag(self, states: np.ndarray) -> np.ndarray | None:
         return states & _TRANSMITTED > 0 if self.flagged else None
 
 
-Rows = tuple[np.ndarray, np.ndarray, np.ndarray | None]  # ids (n,) int64, b (n, 3), transmitted (n,)
+# ids (n,) int64, b (n, 3), transmitted (n,), n_ratio (n,)
+Rows = tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]
 
 
-def match(header: Header, rows: Iterable[Rows], rays: int, flagged: bool) -> StoredAnswers:
+def match(header: Header, rows: Iterable[Rows], rays: int, flagged: bool, with_ratio: bool = False) -> StoredAnswers:
     """Answers to rays with the ids 0 … `rays` − 1, in any order; the first answer to a ray counts.
 
     Mismatches are "missing", "duplicate" and "unknown" ids, as far as there are any.
     """
     b, states, unknown = Table((rays, 3), np.float64), Table((rays,), np.uint8), Log(np.int64)
+    ratios = Table((rays,), np.float64) if with_ratio else None
     for some in rows:
-        _put(b, states, unknown, some, rays)
+        _put(b, states, ratios, unknown, some, rays)
     answered = [int((part & _ANSWERED > 0).sum()) for part in _parts(states, BLOCK)]
     missing, twice = (_listed(states, bit, wanted) for bit, wanted in ((_ANSWERED, False), (_AGAIN, True)))
     strange, strange_twice = _distinct(unknown)
     found = {"missing": missing, "duplicate": _both(twice, strange_twice), "unknown": strange}
     mismatches = {kind: each for kind, each in found.items() if each[0]}
-    return StoredAnswers(header, b, states, np.array(answered), flagged, mismatches)
+    return StoredAnswers(header, b, states, np.array(answered), flagged, mismatches, ratios)
 
 
-def _put(b: Table, states: Table, unknown: Log, rows: Rows, rays: int) -> None:
-    ids, given, flags = rows
+def _put(b: Table, states: Table, ratios: Table | None, unknown: Log, rows: Rows, rays: int) -> None:
+    ids, given, flags, n_ratio = rows
     known = (ids >= 0) & (ids < rays)
     unknown.append(ids[~known])
     places = np.flatnonzero(known)
@@ -78,6 +85,8 @@ def _put(b: Table, states: Table, unknown: Log, rows: Rows, rays: int) -> None:
     old = states.take(to)
     new, row = old == 0, places[first]
     b.put(to[new], given[row[new]])
+    if ratios is not None and n_ratio is not None:
+        ratios.put(to[new], n_ratio[row[new]])
     fresh = _ANSWERED if flags is None else _ANSWERED + _TRANSMITTED * flags[row]
     again = (counts > 1) | ~new
     states.put(to, np.where(new, fresh, old) | _AGAIN * again)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,8 +58,8 @@ class RayStore:
         self.filled, self._digest = 0, ray_set.Checksum(header)
 
     def add(self, part: Rays) -> np.ndarray:
-        """The numbers (n, 9) of these rays, as a file holds them."""
-        numbers = ray_set.numbers_of(np.arange(self.filled, self.filled + len(part)), part)
+        """The numbers of these rays, as a file holds them: see `ray_set.numbers_of`."""
+        numbers = ray_set.numbers_of(np.arange(self.filled, self.filled + len(part)), part, self.rays.header)
         self._digest.add_numbers(numbers)
         self.rays.vectors.write(self.filled, np.column_stack([part.a, part.n, part.k]))
         self.filled += len(part)
@@ -72,15 +72,17 @@ class RayStore:
 
 
 def make(
-    names: Iterable[str] = ray_set.DEFAULT,
+    names: Iterable[str] | None = None,
     count: int = ray_set.COUNT,
     precision: str = ray_set.PRECISION,
     seed: int = 0,
     *,
     two_sided: bool = False,
+    media: Sequence[str] = (),
+    wavelengths: Sequence[float] = (),
 ) -> StoredRays:
     """The set that `ray_set.make` makes. One regime is in memory at a time, whole: its rays are drawn together."""
-    header = ray_set.header_of(names, count, precision, seed, two_sided)
+    header = ray_set.header_of(names, count, precision, seed, two_sided, media, wavelengths)
     kept = RayStore(header)
     for rays in _drawn(header):
         kept.add(rays)

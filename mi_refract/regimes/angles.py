@@ -11,6 +11,7 @@ from numpy.random import Generator
 from .rays import Array, Build, Triple, either, length, log_uniform, normalised
 
 Draw = Callable[[Generator, int, float], tuple[Array, Array]]  # (rng, count, eps) to (angle of incidence, k)
+AngleAt = Callable[[Array, Generator, int, float], Array]  # (k, rng, count, eps) to angle of incidence
 
 
 def generic(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
@@ -31,7 +32,12 @@ def grazing(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
 def critical(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
     """1e-7 … 1e-2 rad from the critical angle, on both sides."""
     k = rng.uniform(1.05, 2.5, count)
-    return np.arcsin(1 / k) + log_uniform(rng, 1e-7, 1e-2, count) * either(rng, count), k
+    return critical_at(k, rng, count, eps), k
+
+
+def critical_at(k: Array, rng: Generator, count: int, eps: float) -> Array:
+    """The same angles for k (N,) that are given, from 1 on."""
+    return np.arcsin(1 / k) + log_uniform(rng, 1e-7, 1e-2, count) * either(rng, count)
 
 
 def _nearly_matched(rng: Generator, count: int, eps: float) -> Array:
@@ -51,7 +57,12 @@ def matched_grazing(rng: Generator, count: int, eps: float) -> tuple[Array, Arra
 def brewster(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
     """An ulp to 1e-2 rad from Brewster's angle, on both sides."""
     k = rng.uniform(0.4, 2.5, count)
-    return np.arctan(1 / k) + log_uniform(rng, eps, 1e-2, count) * either(rng, count), k
+    return brewster_at(k, rng, count, eps), k
+
+
+def brewster_at(k: Array, rng: Generator, count: int, eps: float) -> Array:
+    """The same angles for k (N,) that are given."""
+    return np.arctan(1 / k) + log_uniform(rng, eps, 1e-2, count) * either(rng, count)
 
 
 def steep(rng: Generator, count: int, eps: float) -> tuple[Array, Array]:
@@ -80,6 +91,11 @@ def rays_at(draw: Draw, rng: Generator, n: Array) -> Triple:
     across = np.cross(wide, rng.normal(size=n.shape))
     side = np.cos(angle) * either(rng, len(n)) / length(wide)
     return normalised(side[:, None] * wide + (np.sin(angle) / length(across))[:, None] * across), n, k
+
+
+def aimed(angle: AngleAt, rng: Generator, n: Array, k: Array) -> Triple:
+    """Rays at angles that depend on the ratios `k` (N,), which are given."""
+    return rays_at(lambda *drawn: (angle(k, *drawn), k), rng, n)
 
 
 def at(draw: Draw) -> Build:

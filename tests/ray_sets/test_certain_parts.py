@@ -134,3 +134,22 @@ def test_a_direction_that_signals_total_reflection_is_in_the_plane_of_incidence(
     assert exact.transmitted.any() and not exact.transmitted.all()
     found = check(to, Answers(to.ids, turned(b, n, 0.1)), tir=tir)
     assert (found.exit_code, found.wrong) == (1, len(to))
+
+
+def test_a_direction_may_be_turned_about_the_normal_by_the_slack_of_its_part_along_the_surface():
+    """cos θ between 0.3 and 0.7, so that none of its powers are alike. The largest angle is found by halving."""
+    to = ray_set.make(("generic",), 800, "f32", 4)
+    a, n, k = to.rays.a, to.rays.n, to.rays.k
+    exact = oracle.refract(a, n, k, fresnel=False, progress=False)
+    bounds = RayBounds(to.rays, exact, FORMULAS[LOOSEST].budget, to.roundoff, normalised=True)
+    some = np.flatnonzero(exact.transmitted & (exact.cos_t > 0.3) & (exact.cos_t < 0.7) & (bounds.chord < 1e-5))
+    assert len(some) > 20
+    low, high = np.zeros((len(a), 1)), np.full((len(a), 1), 1e-3)
+    for _ in range(40):
+        middle = (low + high) / 2
+        accepted = np.zeros(len(a), bool)
+        accepted[some] = certain_parts.possible(turned(exact.direction, unit(n.astype(float)), middle), bounds, some)
+        low, high = np.where(accepted[:, None], middle, low), np.where(accepted[:, None], high, middle)
+    along = np.sqrt(1 - exact.cos_t[some] ** 2)
+    slack = certain_parts._slack(bounds, some)
+    np.testing.assert_allclose(np.sin(low[some, 0]) * along, slack, rtol=0.02)

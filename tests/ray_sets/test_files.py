@@ -194,6 +194,18 @@ def test_answers_in_any_format(tmp_path):
     assert files.read_answers(tmp_path / "a.exr").transmitted is None
 
 
+def test_an_image_leaves_out_only_pixels_that_are_marked_empty(tmp_path):
+    """By −1: what else is no id is not left out in silence."""
+    pixels = np.zeros((1, 4, 4), np.float32)
+    pixels[0, :, 0] = 0, -2, 2, -1
+    image_file.write_exr(tmp_path / "a.exr", pixels, files.ANSWER_COLUMNS)
+    assert files.read_answers(tmp_path / "a.exr").ids.tolist() == [0, -2, 2]
+    pixels[0, 1, 0] = np.nan
+    image_file.write_exr(tmp_path / "a.exr", pixels, files.ANSWER_COLUMNS)
+    with pytest.raises(ValueError, match=r"a\.exr: "):
+        files.read_answers(tmp_path / "a.exr")
+
+
 IDS = np.arange(2)
 
 

@@ -34,6 +34,7 @@ def test_json(tmp_path, findings, name):
         raise AssertionError(word)
 
     data = json.loads((tmp_path / "out.json").read_text(), parse_constant=refuse)
+    assert data["schema"] == 1  # which its readers ask for
     assert data["exit_code"] == found.exit_code == {"right": 0, "wrong": 2}[name]
     assert data["diagnosis"] == {"right": None, "wrong": "eta inverted"}[name]
     assert data["rays"]["checksum"] == found.header["checksum"]

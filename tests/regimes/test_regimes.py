@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from mi_refract.regimes import REGIMES, make, normalised, radicand, radicand_and_gradient
+from mi_refract.regimes import REGIMES, make, make_given, normalised, radicand, radicand_and_gradient
 
 oracle = pytest.importorskip("mi_refract.oracle", reason="needs python-flint", exc_type=ImportError)
 
@@ -213,3 +213,44 @@ def test_the_margin_is_exact_where_it_matters():
     assert margin[:3] == pytest.approx(expected, rel=1e-9, abs=0)
     assert margin[3] == -1
     assert np.isnan(margin[4])
+
+
+# Ratios that are given
+
+GIVEN = [name for name, regime in REGIMES.items() if regime.takes_k]
+
+
+@pytest.mark.parametrize("name", GIVEN)
+def test_ratios_that_are_given_take_the_place_of_the_regimes_own(name, precision):
+    ratios = np.linspace(1.2, 2.0, COUNT)
+    rays, own = make_given(name, ratios, precision, 3), make(name, COUNT, precision, 3)
+    np.testing.assert_array_equal(rays.k, ratios.astype(precision))
+    assert rays.a.dtype == rays.n.dtype == rays.k.dtype == precision
+    same = [np.array_equal(getattr(rays, vector), getattr(own, vector)) for vector in "an"]
+    assert same == [REGIMES[name].any_k, True]
+
+
+def given_angles(name, precision, ratios):
+    rays = make_given(name, ratios, precision)
+    a, n, k = (x.astype(float) for x in (rays.a, rays.n, rays.k))
+    return np.arctan2(np.sqrt((np.cross(a, n) ** 2).sum(1)), np.abs((a * n).sum(1))), k
+
+
+@pytest.mark.parametrize(("name", "angle"), [("critical", np.arcsin), ("Brewster", np.arctan)])
+def test_angles_follow_from_ratios_that_are_given(name, angle, precision):
+    found, k = given_angles(name, precision, np.linspace(1.1, 2.4, COUNT))
+    off = found - angle(1 / k)
+    assert np.abs(off).max() < 1e-2 + 1e-6
+    assert min((off > 0).mean(), (off < 0).mean()) > 0.3
+    assert (np.abs(off) > 1e-4).any() and (np.abs(off) < 1e-5).any()
+
+
+def test_ratios_that_no_regime_takes():
+    for name in set(REGIMES) - set(GIVEN):
+        with pytest.raises(
+            ValueError, match=r"its ratios of indices are its own; accepted: 'generic', .*'tangential'$"
+        ):
+            make_given(name, [1.5], np.float32)
+    with pytest.raises(ValueError, match=r"regime 'critical': k = 0\.9; accepted: 1 or more"):
+        make_given("critical", [1.5, 0.9], np.float64)
+    assert make_given("critical", [1.0], np.float64).k == 1

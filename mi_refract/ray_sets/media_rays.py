@@ -1,0 +1,165 @@
+"""Sets whose ratios of indices are those of media at wavelengths: which ray has which, and what the header says of it.
+
+Each ray has a wavelength and a pair of media, [from, to]: one of them is a medium of `mi_refract.media`, the other is
+air, whose index is 1. Both follow from the header and from the ray's place in its regime, so they are never stored:
+media take turns first, then wavelengths, then from and to. Where a regime needs k ≥ 1, the pair is turned to give it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from mi_refract import media
+from mi_refract.regimes import REGIMES
+
+from .header import AIR, LARGEST_WAVELENGTH, MOST_MEDIA, PRECISIONS, Header, check_media, shown
+
+COLUMNS = ("wavelength", "medium")
+WHOLE = ("medium",)  # those that hold whole numbers
+CONVENTION = (
+    "wavelength in nm; medium: the number, from 0, of the pair [from, to] in `media`; n_from / n_to is the ratio of "
+    "their indices at that wavelength, where air has the index 1"
+)
+SMALLEST, LARGEST = 1e-6, 1e6  # of ratios
+SAME = (
+    1e-5  # the relative difference of indices that a maker's five decimals, or another formula of a glass, leave open
+)
+NAMES = tuple(name for name, regime in REGIMES.items() if regime.takes_k)
+_AIR = dataclasses.replace(media.parse(1.0), name=AIR, relative_to="air")
+
+
+def has_media(header: Mapping[str, Any]) -> bool:
+    """Whether the set with this header has wavelengths and media."""
+    return "media" in header
+
+
+def header_of(specs: Sequence[str], wavelengths: Sequence[float], precision: str) -> Header:
+    """What the header of a set says of its media and of its wavelengths in nm, in addition.
+
+    ValueError, one line, for none of either, too many, one given twice in the set's precision, what is no medium, or no
+    index at one of the wavelengths.
+    """
+    if not len(specs) or not len(wavelengths):
+        found = f"{len(specs)} media and {len(wavelengths)} wavelengths"
+        raise ValueError(f"{found}; accepted: neither, or at least one of each")
+    if max(len(specs), len(wavelengths)) > MOST_MEDIA:
+        found = f"{len(specs)} media and {len(wavelengths)} wavelengths"
+        raise ValueError(f"{found}; accepted: up to {MOST_MEDIA} of each")
+    if wrong := [each for each in wavelengths if not 0 < each < LARGEST_WAVELENGTH]:
+        raise ValueError(f"wavelength {wrong[0]:g}: accepted: nm, above 0")
+    names = [_parsed(spec).name for spec in specs]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"medium {shown(twice[0])}: {names.count(twice[0])} times; accepted: each once")
+    pairs = [pair for name in names for pair in ([name, AIR], [AIR, name])]
+    header = {"wavelength, medium": CONVENTION, "media": pairs, "wavelengths": [float(each) for each in wavelengths]}
+    check_media(header, precision)
+    _ratios(tuple(names), tuple(header["wavelengths"]), precision)
+    return header
+
+
+def check(header: Header) -> None:
+    """ValueError, one line, where it says of media what `header_of` does not. Precondition: `header.check` passed."""
+    if has_media(header):
+        names = [pair[0] for pair in header["media"][::2]]
+        made = header_of(names, header["wavelengths"], header["precision"])
+        if header["media"] != made["media"]:
+            raise ValueError(f"the header's media is {shown(header['media'])}; accepted: {shown(made['media'])}")
+        check_regimes(header)
+
+
+def check_regimes(header: Header) -> None:
+    """ValueError, one line, for a regime whose ratios are its own, or for fewer rays than there are combinations."""
+    if refused := [name for name in header["regimes"] if name in REGIMES and name not in NAMES]:
+        accepted = ", ".join(map(repr, NAMES))
+        raise ValueError(f"regime {refused[0]!r}: its ratios of indices are its own; accepted with media: {accepted}")
+    if header["count"] < (least := len(header["media"]) * len(header["wavelengths"])):
+        found = f"{header['count']} rays of each regime"
+        raise ValueError(f"{found}; accepted: {least} or more, one for each medium, wavelength and side of the surface")
+
+
+def columns(header: Header, ids: np.ndarray) -> np.ndarray:
+    """(N, 2) float64 of the rays with these ids (N,): wavelength in nm, number of the pair; (N, 0) without media."""
+    if not has_media(header):
+        return np.empty((len(ids), 0))
+    pair, at = _combination(header, ids)
+    return np.column_stack([_rounded(header["wavelengths"], header["precision"])[at], pair])
+
+
+def ratios(header: Header, ids: np.ndarray) -> np.ndarray:
+    """(N,) n_from / n_to of the rays with these ids, in the set's precision, as float64. Precondition: `has_media`."""
+    return _table(header)[_combination(header, ids)]
+
+
+def described(header: Header, id_: int) -> str:
+    """The media and the wavelength of a ray, as in "SCHOTT:N-BK7 to air at 486.133 nm"; "" without media."""
+    if not has_media(header):
+        return ""
+    ((wavelength, pair),) = columns(header, np.array([id_]))
+    left, entered = header["media"][int(pair)]
+    return f"{left} to {entered} at {wavelength:.9g} nm"
+
+
+def first_other_ratio(header: Header, k: np.ndarray, first: int = 0) -> str:
+    """Of rays from the id `first` on the first whose `k` (n,) is not the ratio of its media; "" where there is none."""
+    if not has_media(header):
+        return ""
+    expected = ratios(header, np.arange(first, first + len(k)))
+    other = np.flatnonzero(~(np.abs(k.astype(np.float64) - expected) <= SAME * expected))
+    if not len(other):
+        return ""
+    id_, found = first + int(other[0]), float(k[other[0]])
+    return f"ray {id_} has n_from / n_to = {found:.9g}; accepted: {expected[other[0]]:.9g}, {described(header, id_)}"
+
+
+def _combination(header: Header, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The number of the pair and that of the wavelength of each ray, (N,) both."""
+    count, total = header["count"], len(header["media"]) // 2
+    place = ids % count
+    medium, rest = place % total, place // total
+    at, turned = rest % len(header["wavelengths"]), rest // len(header["wavelengths"]) % 2
+    least = np.array([REGIMES[name].least_k if name in REGIMES else 0.0 for name in header["regimes"]])[ids // count]
+    turned = np.where(least > 0, _table(header)[2 * medium, at] < least, turned)
+    return 2 * medium + turned, at
+
+
+def _table(header: Header) -> np.ndarray:
+    names = tuple(pair[0] for pair in header["media"][::2])
+    return _ratios(names, tuple(header["wavelengths"]), header["precision"])
+
+
+@functools.lru_cache(maxsize=8)
+def _ratios(names: tuple[str, ...], wavelengths: tuple[float, ...], precision: str) -> np.ndarray:
+    """(pairs, wavelengths) n_from / n_to in the set's precision, as float64."""
+    at, found = _rounded(wavelengths, precision), []
+    for medium in map(_parsed, names):
+        for wavelength in at.tolist():  # an error names the first that is wrong
+            medium.index(wavelength)
+        found += [media.relative_index(*pair, at) for pair in ((medium, _AIR), (_AIR, medium))]
+    k = _rounded(np.array(found), precision)
+    if not ((k >= SMALLEST) & (k <= LARGEST)).all():
+        pair, i = np.argwhere(~((k >= SMALLEST) & (k <= LARGEST)))[0]
+        text = f"{names[pair // 2]}: n = {float(found[pair - pair % 2][i]):.6g} beside air at {at[i]:.9g} nm"
+        raise ValueError(f"{text}; accepted: {SMALLEST:g} … {LARGEST:g}")
+    return k
+
+
+def _parsed(spec: str) -> media.Medium:
+    """The medium of a text. ValueError, one line, where it is none, or one of Mitsuba's table."""
+    try:
+        return media.parse(float(spec))
+    except ValueError:
+        pass
+    if ":" not in spec and "(" not in spec:
+        accepted = "a number, cauchy(A, B, …) or another formula, SCHOTT:N-BK7 or another glass"
+        raise ValueError(f"medium {shown(spec)}: accepted: {accepted}")
+    return media.parse(spec, "medium")
+
+
+def _rounded(numbers: Iterable[float] | np.ndarray, precision: str) -> np.ndarray:
+    with np.errstate(over="ignore"):
+        return np.asarray(numbers, np.float64).astype(PRECISIONS[precision]).astype(np.float64)
