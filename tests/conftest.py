@@ -85,6 +85,12 @@ def rgb_variant(each_variant: str) -> str:
 
 
 @pytest.fixture(scope="module")
+def spectral_variant(each_variant: str) -> str:
+    """Every variant whose light has wavelengths."""
+    return each_variant
+
+
+@pytest.fixture(scope="module")
 def polarized_variant(each_variant: str) -> str:
     """Every variant with Mueller matrices."""
     return each_variant
@@ -148,6 +154,7 @@ def _case(case: str | tuple[str, str]) -> tuple[str, str, str | None]:
 SUBSETS = {
     "typical_variant": [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb", "_ad_spectral_polarized"))],
     "rgb_variant": [name for name in USABLE if name.endswith(("_ad_rgb", "scalar_rgb"))],
+    "spectral_variant": [name for name in USABLE if "_spectral" in name],
     "polarized_variant": [name for name in USABLE if name.endswith("_polarized")],
 }
 CASES: dict[str, Any] = {"each_variant": list(USABLE), "setting": SETTINGS, "vectorised": SETTINGS[1:]}

@@ -117,7 +117,7 @@ def excess(result: Result) -> tuple[float, Metric | None]:
 
 
 def _times(metric: Metric) -> float:
-    times = metric.value / metric.bound if metric.bound and metric.bound > 0 else math.inf
+    times = metric.value / metric.bound if metric.bound else math.inf
     return math.inf if math.isnan(times) else times
 
 

@@ -170,9 +170,11 @@ def test_preconditions_pass_what_is_whole():
 
 
 def test_exact_sees_the_last_bit():
-    assert judge("exact", image(SMOOTH), image(SMOOTH)).verdict is EQUAL
+    same = judge("exact", image(SMOOTH), image(SMOOTH))
+    assert (same.verdict, same.reason) == (EQUAL, "every value is the same")
     found = judge("exact", image(SMOOTH), altered(np.nextafter(SMOOTH[3, 5, 1], np.float32(1))))
     assert (found.verdict, found.metrics[0].value) == (DIFFERENT, 1)
+    assert found.reason.startswith("1 of ")
     assert np.count_nonzero(found.maps["difference"]) == 1
 
 

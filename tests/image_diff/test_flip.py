@@ -305,6 +305,7 @@ def test_gray_with_alpha():
         (lambda other: other + 0.01, EQUAL, DIFFERENT),
         (lambda other: other + 0.003, EQUAL, EQUAL),
         (lambda other: other + np.where(other > 0.899, 9.0, 0.0), DIFFERENT, DIFFERENT),
+        (lambda other: other + np.where(other > 0.899, 0.9, 0.0), DIFFERENT, DIFFERENT),
     ],
 )
 @pytest.mark.parametrize("names", [("R", "G", "B", "A"), ("Z", "B", "G", "R")])

@@ -370,3 +370,13 @@ def test_a_render_beside_an_image_of_which_nothing_is_known(tmp_path):
     assert choice([render], [other])[0] == "tolerance"
     assert choice([other], [render], spp=True)[0] == "welch"
     assert choice([replace(other, metadata={SPP: 9})], [render])[0] == "welch"
+
+
+@pytest.mark.parametrize(("lag", "factor"), [((2, 0), 2), ((0, 2), 2), ((1, -2), 2), ((3, 0), 1), ((0, 3), 1)])
+def test_pixels_count_as_neighbours_up_to_two_apart(lag, factor):
+    """w(x) + w(x + h) has ρ = ½ at ±h, so that F = 2."""
+    noise = np.random.default_rng(31).standard_normal((512, 512, 1))
+    pair = noise + np.roll(noise, lag, (0, 1))
+    found = inflation(pair, np.full(pair.shape, 2.0), 16)
+    assert found.factor == pytest.approx(factor, abs=0.15)
+    assert found.freedom == 512**2 / 25  # squares of 5 pixels

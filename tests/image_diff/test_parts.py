@@ -132,6 +132,14 @@ def test_a_warning_says_where(tmp_path):
     assert found.warning.startswith("part 1: ") and "> warn_percent = 0" in found.warning
 
 
+def test_of_several_warnings_the_others_are_counted(tmp_path):
+    one = parts(tmp_path / "a.exr", SMALL)
+    two = parts(tmp_path / "b.exr", [np.where(each > 0.9, each + 0.01, each) for each in SMALL])
+    found = compared(one, two, from_words("auto", [], "-a -fail .001 -failpercent 60"))
+    assert found.warning.startswith("part 0: ")
+    assert found.warning.endswith(", and in 2 more parts and MIP levels")
+
+
 def test_what_cannot_be_compared_is_named_with_its_place(tmp_path):
     one, two = (parts(tmp_path / f"{x}.exr", [SMALL[0], SMALL[1][..., : 3 - x]]) for x in (0, 1))
     assert str(compared(one, two).status) == "different"  # a channel is missing

@@ -185,6 +185,7 @@ def test_tiles_without_noise_have_the_p_of_their_pixels():
     (found,) = levels(side, from_renders([moved] * 2, 16), 0.001)
     found = tile_statistics.with_silent_pixels(found, flat, moved, 0.001, 16)
     assert found.off.item() and found.of_silent.item() == pytest.approx(7.0**-3)
+    assert (found.t.item(), found.p.item()) == (0, 1)  # without noise no t-test says anything
     assert TileTests([found], 0.001).silent_far == 0
     assert TileTests([found], 7.0**-3).silent_far == 1
 
@@ -199,3 +200,11 @@ def test_the_verdict_of_equal_renders_is_wrong_no_more_often_than_stated():
             found = compare("welch", *sides, tile=8, family_error=0.05, equivalence_margin=0.0)
             alarms += found.verdict is Verdict.DIFFERENT
     assert alarms <= 17
+
+
+def test_a_tile_has_the_freedom_of_all_of_its_pixels():
+    """Of 16² pixels with one variance, each known with 7 degrees of freedom."""
+    side = tile_statistics.from_variances(np.ones((16, 16, 1)), np.full((16, 16, 1), 3.0), 7.0, 16)
+    variance, squares = side.spread(Inflation())
+    assert variance.item() == pytest.approx(3 / 256)
+    assert (variance**2 / squares).item() == pytest.approx(7 * 256)

@@ -18,7 +18,7 @@ import numpy as np
 
 from mi_refract.image_diff import self_test
 from mi_refract.image_diff.defects import DEFECTS
-from mi_refract.plugins import refract
+from mi_refract.plugins import read_ior, refract
 from mi_refract.rendering.scene_files import REPRODUCIBLE
 from mi_refract.report.row import Row
 from validation.run.context import SCENES, Context
@@ -51,7 +51,7 @@ ONE_ALARM = 1 / TRIALS  # of pairs that are equal: one alarm by chance is one ti
 
 def _with_index(change: Callable[[float], float]) -> Callable[[Any, type], Any]:
     def make(props: Any, plugin: type) -> Any:
-        props["int_ior"] = change(refract.read_ior(props, "int_ior", "bk7"))
+        props["int_ior"] = change(read_ior(props, "int_ior", "bk7"))
         return plugin(props)
 
     return make
@@ -59,7 +59,7 @@ def _with_index(change: Callable[[float], float]) -> Callable[[Any, type], Any]:
 
 def _turned(props: Any, plugin: type) -> Any:
     """Seen from the wrong side of its surface: the media trade places."""
-    inner, outer = refract.read_ior(props, "int_ior", "bk7"), refract.read_ior(props, "ext_ior", "air")
+    inner, outer = read_ior(props, "int_ior", "bk7"), read_ior(props, "ext_ior", "air")
     props["int_ior"], props["ext_ior"] = outer, inner
     return plugin(props)
 
