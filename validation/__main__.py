@@ -28,13 +28,14 @@ if TYPE_CHECKING:
 ROOMS = {
     "directions": ("directions", ("per_formula", "planted_defects", "bsdf_samples", "sweep", "search")),
     "stability": ("stability", ("optical_chains", "energy", "derivatives", "layered_paths")),
-    "renders": ("renders", ("scene_needs", "against_dielectric", "unused_features", "rendering_passes")),
+    "renders": ("renders", ("scene_needs", "against_dielectric", "colours", "unused_features", "rendering_passes")),
     "efficiency": ("efficiency", ("error_against_time", "scaling", "cluster_scale")),
+    "media": ("media", ("catalogs", "ray_directions", "closed_forms", "renders", "hero_wavelength")),
     "planar": ("planar", ("against_retrace", "closed_paths", "extruded_scenes", "times")),
     "diff": ("diff", ("planted_defects", "visible_changes", "times")),
     "ground-truth": ("ground_truth", ("traced_bodies",)),
     "robustness": ("robustness", ("mutated_inputs", "killed_commands", "code_mutants")),
-    "suite": ("suite", ("matrix", "per_ray", "rendered_images", "exports")),
+    "suite": ("suite", ("matrix", "per_ray", "rendered_images", "dispersion", "exports")),
 }
 # What the profile `quick` runs where no study is named.
 QUICK = (

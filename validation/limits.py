@@ -33,6 +33,24 @@ SLACK_FROM_RAYS = limit(50_000, "rays per regime: fewer need not come near a bou
 SCREEN_OFF = limit(0.01, "u: extended precision, which compares with the certified answer, costs as much")
 COPY_TIME = limit(1 / 0.9, "over the time of a copy: nine tenths of the throughput that memory allows")
 
+# Indices of glasses
+PRINTED_INDEX = limit(
+    5e-6 + 1e-6, "half a unit of the fifth decimal, and 1e-6 for coefficients that are rounded as well"
+)
+INDEX_ROUNDING = limit(16.0, "u: a sum of at most five terms of one sign but for one, three roundings each, and a root")
+# Angles add up 8 u of each direction, and the deviation is stationary: a ray that is off by x turns by O(x²).
+PRISM_ANGLE = limit(
+    64 * 2.0**-53, "radians: two boundaries, 8u each and the condition 1/cos θ below 2; sines of the expected"
+)
+# A direction that is off by ε moves the next incidence by up to 2ε, and so on: 8u (1 + 3 + 5 + 7), 2u each for points.
+BOW_ANGLE = limit(160 * 2.0**-53, "radians: four boundaries of 8u, each turned on by those after it, and their points")
+FOCAL_DISTANCE = limit(5.4e-10, "relative: (h/R)² at h = 1e-3 and the steepest R = 43; aberration is tenths of that")
+FURNACE_CHANNEL = limit(3e-3, "relative: what a colour of the furnace would be seen at, in each channel")
+SLAB_ABSORPTION = limit(2e-6, "relative: σ d up to 8 in float32, with a way that is off by 2u: 16u and the exponential")
+DISPERSION_TIME = limit(1.25, "over the same scene with the index of the d line, with as many samples")
+ABSORPTION_TIME = limit(1.5, "over the same scene without absorption: one exponential a colour and leg")
+CATALOG_FORMULA = limit(16 * 2.0**-53, "relative: a sum of nine terms, each with a power of λ, and a root; twice")
+
 # BSDF samples, float32 against the built-in's own
 SAMPLE_FLIPS = limit(1e-6, "probability of more flips than allowed: a random number within rounding of the reflectance")
 SAMPLE_ETA = limit(2e-7, "absolute: one rounding of a ratio up to 1.5, and one of its reciprocal")

@@ -29,7 +29,7 @@ from validation.efficiency import cluster_scale, error_against_time
 from validation.planar import against_retrace
 from validation.planar import times as planar_times
 from validation.reference.layered_scenes import MIRAGE
-from validation.renders import against_dielectric
+from validation.renders import against_dielectric, colours
 from validation.run.array_settings import PLAIN
 from validation.run.context import SCENES, Context
 from validation.run.metrics import (
@@ -55,7 +55,7 @@ from validation.suite import matrix, per_ray
 
 ROOT = SCENES.parent
 GALLERY = SCENES / "gallery.png"
-GALLERY_COLUMNS = 6
+GALLERY_COLUMNS = 5
 
 
 @dataclass(frozen=True)
@@ -379,10 +379,14 @@ TABLES = {
 
 
 def gallery(rows: list[Row], context: Context) -> bytes:
-    """A PNG of every scene as `refract` rendered it, side by side; without the furnace, which is white when right."""
+    """A PNG of every scene as `refract` rendered it, side by side; without the furnace, which is white when right.
+
+    Scenes with dispersion or absorption come last, from a spectral variant.
+    """
     import OpenImageIO as oiio
 
-    paths = [row.images["test"] for row in rows if row.study == against_dielectric.NAME and row.subject == PLUGIN]
+    drawn = [row for row in rows if row.subject == PLUGIN and row.images]
+    paths = [r.images["test"] for study in (against_dielectric, colours) for r in drawn if r.study == study.NAME]
     tiles = [tile for path in paths if (tile := image_file.read_exr(context.out / path)[0]).std() > 1e-3]
     gap = np.ones((tiles[0].shape[0], 4, 3), np.float32)
     strips = []

@@ -25,11 +25,11 @@ from validation import limits, readme_tables, runner
 from validation.diff import planted_defects, visible_changes
 from validation.directions import bsdf_samples, keep_worst, per_formula
 from validation.efficiency import cluster_scale
-from validation.renders import against_dielectric
+from validation.renders import against_dielectric, colours
 from validation.renders import scene_needs as scenes
 from validation.run import array_settings as settings
 from validation.run import render_methods
-from validation.run.context import SCENES
+from validation.run.context import SCENES, beyond_builtin
 from validation.stability import layered_paths
 from validation.study import Study, Task
 from validation.suite.renderers import SYSTEMS
@@ -158,8 +158,19 @@ def test_scenes_say_what_they_need_and_what_is_left_out(context):
         "textured",
         "polarising",
     }
-    assert row.reason == "left out: emitter sampling, a random number, media, null lobes, dispersion"
+    assert row.reason == "left out: emitter sampling, a random number, media, null lobes, dispersion, absorption"
     assert row.replay["left out"]["dispersion"] == "no BSDF bends light by its wavelength"
+
+
+def test_colours_are_shown_where_the_spectral_variant_runs(context, needs_variant):
+    path = SCENES / "rainbow_drop.xml"
+    (row,) = colours.scene_rows(context, path)
+    assert (row.values, row.reason) == ({}, colours.SCALAR)
+    needs_variant("llvm_ad_spectral")
+    (row,) = colours.scene_rows(dataclasses.replace(context, variant="llvm_ad_rgb"), path)
+    assert row.setting == "llvm_ad_spectral" and row.values[colours.COLOUR] > 0.1
+    assert (context.out / row.images["test"]).is_file()
+    assert mi.variant() == "scalar_rgb"
 
 
 # The run -------------------------------------------------------------------------------------------------------
@@ -239,7 +250,7 @@ def test_the_exit_code_follows_the_budgets(tmp_path, monkeypatch, capsys, budget
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["refractions"], "unknown study 'refractions'; accepted: directions, stability, renders, efficiency, planar"),
+        (["refractions"], "unknown study 'refractions'; accepted: directions, stability, renders, efficiency, media"),
         (["--profile", "slow"], "unknown profile 'slow'; accepted: quick, standard, full"),
         (["--out", __file__], "File exists; accepted: a writable folder"),
         (["--speed", "9"], "No such option: --speed"),
@@ -366,7 +377,7 @@ def test_a_readme_is_not_written_from_a_run_that_measured_too_little(table):
 
 
 def test_the_readmes_hold_their_tables():
-    scenes = [path.stem for path in SCENES.glob("*.xml")]
+    scenes = [path.stem for path in SCENES.glob("*.xml") if not beyond_builtin(path)]
     ways = [method.name for method in render_methods.METHODS]
     others = [call.title for system in SYSTEMS.values() for call in system.calls]
     words_of = {

@@ -1,6 +1,8 @@
 """Do the scenes in `scenes/` show what they say they show?
 
-All in `scalar_rgb`, the built-in `dielectric` standing in for `$bsdf`: a scene is judged here, not a BSDF.
+All in `scalar_rgb`, the built-in `dielectric` standing in for `$bsdf`: a scene is judged here, not a BSDF. Scenes that
+show dispersion or absorption, which `dielectric` lacks, are loaded with `refract` and rendered by `refract_path`; their
+colours are looked for in `llvm_ad_spectral`.
 Every check is a function of the thing it judges; the tests named `..._sees_...` hand it a planted defect.
 Seeds are fixed, so a test that passes once passes until the scene, Mitsuba or the check changes.
 """
@@ -14,18 +16,24 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from validation.run.context import beyond_builtin
+
 SCENES = Path(__file__).parents[2] / "scenes"
 NAMES = ["balls", "diamond", "fibre", "furnace", "glasses64", "lightpipe", "matched"]
 NAMES += ["mirage", "nested", "prism", "slab", "sphere"]
+DISPERSIVE = ["diamond_fire", "dispersive_prism", "rainbow_drop"]
+BEYOND = [*DISPERSIVE, "green_bottle"]  # what `dielectric` cannot render
+EVERY = sorted(NAMES + BEYOND)
 DEFAULTS = {"bsdf": "refract", "integrator": "path", "sampler": "independent"}
 DEFAULTS |= {"max_depth": None, "spp": "64", "res": "128"}
-each_scene = pytest.mark.parametrize("name", NAMES)
+each_scene = pytest.mark.parametrize("name", EVERY)
 pytestmark = pytest.mark.usefixtures("scalar_variant")
 
 
 def load(path, **parameters):
     # optimize=False: Mitsuba would merge meshes of equal BSDFs, and their ids with them.
-    return mi.load_file(str(path), optimize=False, **{"bsdf": "dielectric", "res": 16, "spp": 4} | parameters)
+    bsdf = "refract" if Path(path).stem in BEYOND else "dielectric"
+    return mi.load_file(str(path), optimize=False, **{"bsdf": bsdf, "res": 16, "spp": 4} | parameters)
 
 
 def edited(tmp_path, name, old, new, count=-1):
@@ -40,7 +48,7 @@ def edited(tmp_path, name, old, new, count=-1):
 # --- the files -------------------------------------------------------------------------------------------
 
 
-def file_faults(text):
+def file_faults(text, integrator="path"):
     """What the text of a scene file lacks of the form all of them share."""
     root = ET.fromstring(text)
     comment = re.match(r"<!--(.*?)-->", text, re.S)
@@ -48,7 +56,7 @@ def file_faults(text):
         yield "no leading comment that says what the scene exercises"
     defaults = {d.get("name"): d.get("value") for d in root.iter("default")}
     defaults.pop("fov", None)  # the one parameter that a scene may have of its own
-    if defaults | {"max_depth": None} != DEFAULTS:
+    if defaults | {"max_depth": None} != DEFAULTS | {"integrator": integrator}:
         yield "defaults"
     if not root.findall(".//bsdf[@type='$bsdf']"):
         yield "no $bsdf"
@@ -62,13 +70,18 @@ def file_faults(text):
             yield "an IOR that is neither a float nor a name"
 
 
-def test_there_are_twelve():
-    assert sorted(p.stem for p in SCENES.glob("*.xml")) == NAMES
+def test_there_are_sixteen():
+    assert sorted(p.stem for p in SCENES.glob("*.xml")) == EVERY
 
 
 @each_scene
 def test_file_has_the_common_form(name):
-    assert list(file_faults((SCENES / f"{name}.xml").read_text())) == []
+    integrator = "refract_path" if name in BEYOND else "path"
+    assert list(file_faults((SCENES / f"{name}.xml").read_text(), integrator)) == []
+
+
+def test_scenes_that_are_not_compared_with_dielectric():
+    assert sorted(p.stem for p in SCENES.glob("*.xml") if beyond_builtin(p)) == sorted(BEYOND)
 
 
 @pytest.mark.parametrize(
@@ -87,9 +100,14 @@ def test_form_sees_a_defect(old, new):
 
 
 def iors(path):
-    """[(int_ior, ext_ior)] of a scene's `$bsdf`s by id, and the BSDF id of each glass shape."""
+    """[(int_ior, ext_ior)] of a scene's `$bsdf`s by id, and the BSDF id of each glass shape.
+
+    An index is a number, or the text of a dispersive material.
+    """
 
     def value(p):
+        if re.search("[(:]", p.get("value")):
+            return p.get("value")
         props = mi.Properties()
         props["ior"] = p.get("value") if p.tag == "string" else float(p.get("value"))
         return mi.lookup_ior(props, "ior", 1.0)
@@ -240,6 +258,8 @@ def test_media_see_a_wrong_boundary(tmp_path, name, old, new):
 
 # A solid is a list of meshes; "-" turns one inside out.
 SOLIDS = {
+    "bottle": ["bottle_outer.ply"],
+    "hollow": ["bottle_inner.ply"],
     "diamond": ["diamond.ply"],
     "prism": ["prism.ply"],
     "tumbler": ["tumbler_air.ply", "tumbler_wet.ply"],
@@ -300,7 +320,15 @@ def test_solid_is_closed(name):
 
 
 @pytest.mark.parametrize(
-    "name, count", [("diamond", 57 + 16), ("prism", 5), ("tumbler", 12 + 12 + 3), ("water", 12 + 2)]
+    "name, count",
+    [
+        ("diamond", 57 + 16),
+        ("prism", 5),
+        ("tumbler", 12 + 12 + 3),
+        ("water", 12 + 2),
+        ("bottle", 7 * 12 + 2),
+        ("hollow", 4 * 12 + 2),
+    ],
 )
 def test_facets_are_plane(name, count):
     """Plane to the rounding of float32 coordinates: |error| ≤ 3u·size. The rim is one facet, and so are
@@ -364,3 +392,80 @@ def test_light_pipe_reflects_fifty_times():
 def test_light_pipe_sees_a_short_pipe(tmp_path):
     short = edited(tmp_path, "lightpipe", 'z="70"/>', 'z="62"/>')
     assert internal_reflections(short).min() < 50
+
+
+# --- dispersion and absorption ---------------------------------------------------------------------------
+
+
+def hues(image, share=0.5):
+    """Where in columns, 0 to 1, red, green and blue are strongest: the means of the columns above a share of the most.
+
+    Along a row of pixels a spectrum of lines of one wavelength each has another place for each of them.
+    """
+    columns = image.clip(0, None).mean(0)
+    x = (np.arange(len(columns)) + 0.5) / len(columns)
+    strong = columns * (columns > share * columns.max(0))
+    return (strong * x[:, None]).sum(0) / strong.sum(0)
+
+
+def colourfulness(image):
+    """The light that is not grey, as a share of all."""
+    return (image.max(-1) - image.min(-1)).sum() / image.sum()
+
+
+def spectral(name, res=64, spp=64, **parameters):
+    return np.array(mi.render(load(SCENES / f"{name}.xml", res=res, spp=spp, **parameters), seed=1))
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_rgb"])
+def test_the_prism_shows_the_colours_in_order(variant, needs_variant):
+    """From the left, where light is bent most: blue, green, red. In RGB they are in one place."""
+    needs_variant(variant)
+    mi.set_variant(variant)
+    # The spectrum alone: the lamp that is seen directly is at the left, and what lies on the table below.
+    red, green, blue = hues(spectral("dispersive_prism")[14:36, 14:40])
+    if variant.endswith("rgb"):
+        assert red == pytest.approx(green, abs=0.02) and blue == pytest.approx(green, abs=0.02)
+    else:
+        assert blue + 0.1 < green < red - 0.05
+
+
+@pytest.mark.parametrize("name", DISPERSIVE)
+def test_colours_are_in_spectral_variants_only(name, needs_variant):
+    found = {}
+    for variant in ("llvm_ad_rgb", "llvm_ad_spectral"):
+        needs_variant(variant)
+        mi.set_variant(variant)
+        image = spectral(name)
+        found[variant] = colourfulness(image[image.max(2) > 0.3])  # lamps are white, the sky is dark
+    assert found["llvm_ad_spectral"] > 0.3 > 2 * found["llvm_ad_rgb"]
+
+
+def test_the_rainbow_is_red_at_its_borders_and_blue_between(needs_variant):
+    needs_variant("llvm_ad_spectral")
+    mi.set_variant("llvm_ad_spectral")
+    image = spectral("rainbow_drop", res=96, spp=256)
+    y, x = np.mgrid[:96, :96] + 0.5 - 48
+    ring = (np.hypot(x, y) / 1.5).astype(int)
+    red, blue = (np.bincount(ring.ravel(), image[..., c].ravel()) / np.bincount(ring.ravel()) for c in (0, 2))
+    middle = int(blue[12:28].argmax()) + 12
+    assert red[middle - 3 : middle + 4].argmax() != 3
+    assert blue[middle] > 2 * red[middle]
+    assert (red > blue)[middle + 1 : middle + 4].any() and (red > blue)[middle - 4 : middle].any()
+
+
+def test_thick_glass_is_darker():
+    """The stopper is solid, the wall of the neck below it is thin; both are seen before the sky."""
+    image = np.array(mi.render(load(SCENES / "green_bottle.xml", res=64, spp=16), seed=1))
+    stopper, neck = image[3:7, 29:36].mean((0, 1)), image[10:15, 29:36].mean((0, 1))
+    assert (stopper < neck).all() and stopper[0] < 0.5 * neck[0]
+    assert stopper[1] > 2 * stopper[0] and stopper[1] > 1.5 * stopper[2]
+
+
+@pytest.mark.parametrize("value", ['value="0.42, 0.85, 0.50"', 'value="8"'])
+def test_a_bottle_whose_boundaries_contradict_each_other_is_refused(tmp_path, value):
+    text = (SCENES / "green_bottle.xml").read_text()
+    assert text.count(value) == 2
+    other = {'value="8"': 'value="9"'}.get(value, 'value="0.42, 0.80, 0.50"')
+    with pytest.raises(ValueError, match=r"bottle_(inner|outer)"):
+        mi.render(load(edited(tmp_path, "green_bottle", value, other, 1)), seed=1)

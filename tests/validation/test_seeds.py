@@ -20,6 +20,7 @@ MODULES = [f"{room}.{name}" for room, names in command.ROOMS.values() for name i
 # Their random draws decide no verdict on errors: times, noise of several seeds of its own, or a sampled defect.
 OTHERWISE = {
     "renders.against_dielectric": "eight seeds a side, compared by a test with a stated probability of alarm",
+    "renders.colours": "images are shown; no figure has a bound",
     "renders.unused_features": "times and equality to the last bit",
     "efficiency.error_against_time": "several seeds a method, with intervals",
     "efficiency.scaling": "times",
@@ -27,6 +28,9 @@ OTHERWISE = {
     "diff.planted_defects": "trials with seeds of their own",
     "diff.times": "times",
     "suite.rendered_images": "several seeds a side",
+    "suite.dispersion": "four seeds a side, whose noise is taken out; no figure has a bound",
+    "media.hero_wavelength": "times and variances; no figure has a bound",
+    "media.renders": "sixteen seeds a side in the furnace, eight by Welch's test; the rest is times and closed forms",
     "robustness.mutated_inputs": "no figure: each input is a case of its own, and the study is longer in full",
     "robustness.code_mutants": "each mutant is a case of its own, and the study is longer in full",
     "robustness.killed_commands": "the moments of the signals are random; no figure has a bound",

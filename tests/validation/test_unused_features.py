@@ -76,6 +76,15 @@ def test_a_plugin_that_does_not_listen_is_seen(context, monkeypatch):
     }
 
 
+def test_dispersion_and_absorption_cost_nothing_where_they_are_not(context, monkeypatch):
+    rows = by_case(unused_features.wavelength_rows(context))
+    assert {row.verdict for row in rows.values()} == {"pass", "info"}
+    assert rows["dispersion"].values["added"] > 0
+    monkeypatch.setattr(refract, "is_followed", lambda asked: True)  # bends light by its wavelength for everybody
+    rows = by_case(unused_features.wavelength_rows(context))
+    assert {case for case, row in rows.items() if row.verdict == "fail"} == {"dispersion, by `path`"}
+
+
 def test_glasses_share_a_kernel_and_an_edit_compiles_nothing(context, monkeypatch):
     monkeypatch.setattr(unused_features, "GLASSES", (1, 5))
     rows = unused_features.glass_rows(context)

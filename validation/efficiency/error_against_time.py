@@ -23,7 +23,7 @@ from mi_refract.plugins import scene_features
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing
-from validation.run.context import NO_REFERENCE, SCENES, Context
+from validation.run.context import NO_REFERENCE, SCENES, Context, beyond_builtin
 from validation.run.metrics import (
     DETECTABLE,
     EQUAL_TIME,
@@ -107,8 +107,8 @@ Found = dict[str, dict[int, Measured]]  # by subject and samples per pixel
 
 
 def tasks(context: Context) -> list[Task]:
-    """One task per scene."""
-    paths = sorted(SCENES.glob("*.xml"))
+    """One task per scene that the built-in can render."""
+    paths = [path for path in sorted(SCENES.glob("*.xml")) if not beyond_builtin(path)]
     return [
         Task(f"efficiency: {path.stem}", functools.partial(scene_rows, context, path), timed=True) for path in paths
     ]

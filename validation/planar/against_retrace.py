@@ -134,8 +134,10 @@ def file_row(path: Path, setting: Setting, rays: int) -> Row:
 
 
 def colours_row(path: Path, setting: Setting, rays: int) -> Row:
-    """Every ray of a file in every colour, and `rays` scattered around them."""
-    cases = [case_of(path, rays, colour) for colour in range(len(load(path).colours))]
+    """Every ray of a file in every colour, or in three of its wavelengths, and `rays` scattered around them."""
+    light = load(path).light
+    colours = range(len(light)) if not light.wavelengths else sorted({0, len(light) // 2, len(light) - 1})
+    cases = [case_of(path, rays, colour) for colour in colours]
     values = together([judge(case.trace(setting), case, setting.roundoff) for case in cases])
     replay = {
         "scene": path.name,

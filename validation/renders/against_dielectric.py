@@ -1,4 +1,6 @@
-"""Renders: every scene with `refract` and with `dielectric`, with the same and with independent seeds, and times.
+"""Renders: scenes with `refract` and with `dielectric`, with the same and with independent seeds, and times.
+
+Scenes that show dispersion or absorption are left out: `dielectric` has neither.
 
 With the same seed both plugins use the same random numbers, so the images agree except where a last bit changes the
 choice between reflection and refraction. Independent seeds are compared by Welch's t-test on tiles. The error of an
@@ -56,7 +58,7 @@ def tasks(context: Context) -> list[Task]:
     plugins = [PLUGIN] + [f"{PLUGIN}_{name}" for name in FORMULAS if context.profile.every_formula]
     return [
         Task(f"renders: {path.stem}, {plugin}", functools.partial(_compare, context, path, plugin), timed=True)
-        for path in context.scenes
+        for path in context.comparable
         for plugin in plugins
     ]
 

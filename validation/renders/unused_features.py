@@ -17,6 +17,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.formulas import FORMULAS
+from mi_refract.plugins import who_asks
 from mi_refract.plugins.refract import LOBES, PLUGIN
 from mi_refract.report.row import Row
 from validation import limits
@@ -48,6 +49,7 @@ GLASSES = (1, 16, 64, 1000)
 PAIRS = 5
 CALLS = 2000
 STEPS = 4  # of an optimisation
+SPECTRAL, DISPERSIVE = "llvm_ad_spectral", "cauchy(1.5, 4000)"
 SCALAR = "scalar variants have no kernels"
 
 
@@ -56,7 +58,7 @@ def tasks(context: Context) -> list[Task]:
     calls = Task("features: scalar calls", functools.partial(scalar_rows, context), timed=True)
     if context.variant.startswith("scalar"):
         return [Task("features", lambda: [Row(NAME, PLUGIN, "kernels", context.variant, reason=SCALAR)]), calls]
-    operations_only = Task("features: operations", functools.partial(operation_rows, context))
+    operations_only = Task("features: operations", lambda: operation_rows(context) + wavelength_rows(context))
     if context.profile.quick:
         return [operations_only, calls]
     return [
@@ -83,8 +85,12 @@ def operations(
     component: int | None = None,
     importance: bool = False,
     differentiate: bool = False,
+    followed: bool = False,
 ) -> float:
-    """Of a kernel that computes all of what `sample` returns, of directions and samples in memory."""
+    """Of a kernel that computes all of what `sample` returns, of directions and samples in memory.
+
+    `followed`: asked by `refract_path`, which follows wavelengths and media.
+    """
     import mitsuba as mi
 
     bsdf = mi.load_dict({"type": plugin, "int_ior": 1.5, "ext_ior": 1.0} | (parameters or {}))
@@ -92,15 +98,46 @@ def operations(
         params = mi.traverse(bsdf)
         dr.enable_grad(params["eta"])
         params.update()
-    asked = mi.BSDFContext(mi.TransportMode.Importance if importance else mi.TransportMode.Radiance)
+    asked = who_asks.context() if followed else mi.BSDFContext()
+    asked.mode = mi.TransportMode.Importance if importance else mi.TransportMode.Radiance
     if component is not None:
         asked.component = component
     si: Any = dr.zeros(mi.SurfaceInteraction3f)
     x, y = (dr.linspace(mi.Float, low, 0.6, RAYS) for low in (-0.6, -0.1))
     si.wi, si.uv = dr.normalize(mi.Vector3f(x, y, 0.5 * x + y)), mi.Point2f(dr.abs(x), dr.abs(y))
     sample = dr.linspace(mi.Float, 0, 1, RAYS)
-    dr.eval(si.wi, si.uv, sample)
+    if mi.is_spectral:
+        si.wavelengths = type(si.wavelengths)(
+            *(dr.linspace(mi.Float, low, low + 90, RAYS) for low in range(400, 760, 90))
+        )
+    dr.eval(si.wi, si.uv, si.wavelengths, sample)
     return float(max(entry["operation_count"] for entry in kernels(lambda: bsdf.sample(asked, si, sample, [0, 0]))))
+
+
+def wavelength_rows(context: Context) -> list[Row]:
+    """What glass pays for dispersion and absorption that it has not, and dispersive glass where nobody follows it."""
+    if reason := context.variants.get(SPECTRAL, "not in this wheel"):
+        return [Row(NAME, PLUGIN, "dispersion", SPECTRAL, reason=reason)]
+    with under(SPECTRAL):
+        plain = operations(PLUGIN)
+        found = {
+            "no dispersion": operations(PLUGIN, followed=True),
+            "dispersion, by `path`": operations(PLUGIN, {"int_ior": DISPERSIVE}),
+            "dispersion": operations(PLUGIN, {"int_ior": DISPERSIVE}, followed=True),
+            "absorption": operations(PLUGIN, {"int_absorption": 0.5}, followed=True),
+        }
+    return [
+        Row(
+            NAME,
+            PLUGIN,
+            case,
+            SPECTRAL,
+            {"operations": count, "added": count - plain},
+            {} if case == "dispersion" else {"added": 0.0},
+            replay={"rays": RAYS, "int_ior": DISPERSIVE},
+        )
+        for case, count in found.items()
+    ]
 
 
 def scalar_rows(context: Context) -> list[Row]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -80,3 +81,14 @@ class Context:
         """The scene files that are rendered: all, or in the profile `quick` five."""
         every = sorted(SCENES.glob("*.xml"))
         return [path for path in every if path.stem in QUICK_SCENES] if self.profile.quick else every
+
+    @property
+    def comparable(self) -> list[Path]:
+        """Those of `scenes` that the built-in can render, too."""
+        return [path for path in self.scenes if not beyond_builtin(path)]
+
+
+def beyond_builtin(path: Path) -> bool:
+    """Whether a scene is made for `refract_path`: light is dispersed or absorbed in it, as `dielectric` cannot."""
+    defaults = ET.parse(path).getroot().iter("default")
+    return any((each.get("name"), each.get("value")) == ("integrator", "refract_path") for each in defaults)

@@ -36,16 +36,20 @@ class ImageRenderer:
     """
 
     system: str
-    draw: Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]
+    draw: Callable[..., list[Image]]
     spp: Mapping[str, int]
     assumed: Sequence[str]
 
 
 def _by_script(target: str) -> Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]:
-    """By the script that is exported with the scene."""
+    """By the script that is exported with the scene, after `edit(folder)` of its files."""
 
-    def draw(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+    def draw(
+        plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int], edit: Callable[[Path], None] | None = None
+    ) -> list[Image]:
         write_files.write(plain, target, folder / "scene")
+        if edit:
+            edit(folder / "scene")
         program = [environments.python(SYSTEMS[target]), "render.py", "--spp", str(spp), "--out", str(folder)]
         environments.run([*program, "--seeds", *map(str, seeds)], timeout=HOURS, where=folder / "scene")
         return [_rgb(image_file.read(folder / f"seed{seed}.exr")) for seed in seeds]

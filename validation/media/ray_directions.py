@@ -1,0 +1,170 @@
+"""Refracted directions at the index of a wavelength, ray by ray, against the certified oracle.
+
+Every material is asked at random wavelengths of its range. In float32 the BSDF is sampled as `refract_path` samples it;
+in float64 a formula is called with the ratio of indices. The certified answer is that of the same ratio in float64.
+What rounding does to the index is stated apart: the formula of dispersion is evaluated again in ball arithmetic, and in
+float32 the ratio that scales the ray's part along the surface is rounded, which moves the direction by up to u.
+"""
+
+from __future__ import annotations
+
+import functools
+from importlib.util import find_spec
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from mi_refract import media, oracle
+from mi_refract.accuracy import BUDGETS, RayBounds, evaluate, judge
+from mi_refract.formulas import FORMULAS, resolve
+from mi_refract.media import Medium
+from mi_refract.plugins import who_asks
+from mi_refract.regimes import Rays
+from mi_refract.report.row import Row
+from validation import repeated
+from validation.limits import INDEX_ROUNDING
+from validation.run import seeds
+from validation.run.array_settings import settings
+from validation.run.context import Context
+from validation.run.render_methods import under
+from validation.study import Study, Task, about
+
+NAME = "directions by wavelength"
+SPECTRAL = "llvm_ad_spectral"
+SEED = 1717
+N_SF11 = "sellmeier(1.73759695, 0.313747346, 1.89878101, 13188.707, 62306.8142, 155236290)"
+MATERIALS = (
+    "cauchy(1.5046, 4200)",
+    N_SF11,
+    "abbe(1.5168, 64.17)",
+    "table(380: 1.54, 480: 1.52, 600: 1.51, 780: 1.50)",
+    "MATERIAL:water",
+    "MATERIAL:diamond",
+    "SCHOTT:N-BK7",
+)
+CATALOGUES = all(find_spec(name) for name in ("opticalglass", "pandas"))
+TERMS = {
+    "worst / u": "the largest distance of a direction from the certified one, in roundoffs u of the precision",
+    "with the ratio in float32": "the same with what the ratio's rounding adds; the other figures leave it out",
+    "error / bound": "the largest ratio of a direction's error to the formula's a-priori bound for that ray",
+    "TIR misclassified, beyond its bound": "rays",
+    "index error / u": "of the index, relative, in u = 2⁻⁵³; what rounding its coefficients has done is not counted",
+}
+
+
+def tasks(context: Context) -> list[Task]:
+    """One per material."""
+    return [Task(f"{NAME}: {spec}", functools.partial(_rows, context, spec)) for spec in MATERIALS]
+
+
+def _rows(context: Context, spec: str) -> list[Row]:
+    if spec.startswith("SCHOTT") and not CATALOGUES:
+        reason = "opticalglass is not installed: pip install 'mi-refract[glass]'"
+        return [Row(NAME, _subject(spec), "all", "", reason=reason)]
+    medium, count = media.parse(spec), context.profile.rays
+    rows = [_index_row(medium, spec)]
+    missing = context.variants.get(SPECTRAL, "not in this wheel")
+    rows.append(
+        Row(NAME, _subject(spec), "refract", SPECTRAL, reason=missing) if missing else _sampled_row(medium, spec, count)
+    )
+    for setting in settings(context):
+        if setting.label.endswith("float64") and setting.vector is not None:
+            rows.append(_formula_row(medium, spec, setting, count if not setting.is_scalar else 100))
+    return rows
+
+
+def _subject(spec: str) -> str:
+    """The material's text, or its name where that is long."""
+    return {N_SF11: "sellmeier(…), N-SF11", MATERIALS[3]: "table(…)"}.get(spec, spec)
+
+
+def _drawn(medium: Medium, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit wi (count, 3), from both sides, wavelengths in nm, exactly float32 both, and k = n_from/n_to in float64."""
+    rng = np.random.default_rng(seeds.current(SEED))
+    wi = rng.normal(size=(count, 3))
+    wi = (wi / np.linalg.norm(wi, axis=1, keepdims=True)).astype(np.float32).astype(float)
+    low, high = max(medium.valid[0], 360.0), min(medium.valid[1], 830.0)
+    wavelengths = rng.uniform(low + 0.01, high - 0.01, count).astype(np.float32).astype(float)
+    eta = medium.index(wavelengths)
+    return wi, wavelengths, np.where(wi[:, 2] >= 0, 1 / eta, eta)
+
+
+def _judged(b: np.ndarray, transmitted: np.ndarray, rays: Rays, formula: str, u: float) -> dict[str, float]:
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    found = judge(b, transmitted, RayBounds(rays, exact, FORMULAS[formula].budget, u), exact.transmitted)
+    compared = found.compared & exact.transmitted
+    return {"worst / u": float(found.chord[compared].max() / u)} | found.values()
+
+
+def _sampled_row(medium: Medium, spec: str, count: int) -> Row:
+    import mitsuba as mi
+
+    wi, wavelengths, k = _drawn(medium, count)
+    with under(SPECTRAL):
+        bsdf = mi.load_dict({"type": "refract", "int_ior": spec, "ext_ior": 1.0})
+        asked = who_asks.context()
+        asked.component = 1
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wi = mi.Vector3f(wi.T.astype(np.float32))
+        si.wavelengths = type(si.wavelengths)(mi.Float(wavelengths.astype(np.float32)))
+        bs, weight = bsdf.sample(asked, si, 0.5, [0.5, 0.5])
+        b, transmitted = np.array(bs.wo, float).T, np.array(weight, float)[0] > 0
+        formula, _ = resolve("auto", dr.backend_v(mi.Float))
+    rays = Rays(-wi, np.tile([0.0, 0.0, 1.0], (count, 1)), k)
+    rounding = (k.astype(np.float32).astype(float) - k)[:, None] * -wi * [1, 1, 0]
+    values = _judged(b.astype(np.longdouble) - rounding, transmitted, rays, formula, 2.0**-24)
+    whole = _judged(b.astype(np.longdouble), transmitted, rays, formula, 2.0**-24)
+    values["with the ratio in float32"] = whole["worst / u"]
+    replay = {"seed": seeds.current(SEED), "rays": count, "int_ior": spec}
+    return Row(NAME, _subject(spec), "refract", SPECTRAL, values, dict(BUDGETS), replay=replay)
+
+
+def _formula_row(medium: Medium, spec: str, setting: Any, count: int) -> Row:
+    wi, _, k = _drawn(medium, count)
+    rays = Rays(-wi, np.tile([0.0, 0.0, 1.0], (count, 1)), k)
+    name, formula = resolve("compensated", setting.backend)
+    values = _judged(*evaluate(formula, rays, setting.vector), rays, name, 2.0**-53)
+    replay = {"seed": seeds.current(SEED), "rays": count, "medium": spec}
+    return Row(NAME, _subject(spec), name, setting.label, values, dict(BUDGETS), replay=replay)
+
+
+# The index ------------------------------------------------------------------------------------------------------
+
+
+def _index_row(medium: Medium, spec: str) -> Row:
+    _, wavelengths, _ = _drawn(medium, 200)
+    errors = [abs(float(exact_index(medium, w) / _ball(medium.index(w)) - 1)) for w in wavelengths.tolist()]
+    values = {"index error / u": max(errors) / 2.0**-53}
+    return Row(NAME, _subject(spec), "index", "float64", values, {"index error / u": INDEX_ROUNDING})
+
+
+def _ball(x: float) -> Any:
+    from flint import arb
+
+    return arb(x)
+
+
+def exact_index(medium: Medium, wavelength: float) -> Any:
+    """N in ball arithmetic, from the coefficients as they are in float64."""
+    from flint import arb, ctx
+
+    ctx.prec = 200
+    c = {name: arb(x) for name, x in medium.coefficients.items()}
+    form: Any = medium.dispersion
+    w = arb(wavelength)
+    if hasattr(form, "knots"):
+        i = next(i for i in range(1, len(form.knots)) if wavelength <= form.knots[i])
+        (a, b), (one, two) = ((arb(x) for x in form.knots[i - 1 : i + 1]), (c[x] for x in form.names[i - 1 : i + 1]))
+        return one + (two - one) * (w - a) / (b - a)
+    if "V_d" in c:
+        d, f, r = (arb(media.LINES[line]) ** -2 for line in "dFC")
+        return c["n_d"] + (c["n_d"] - 1) / c["V_d"] * (w**-2 - d) / (f - r)
+    total = arb(form.constant) + sum((c[name] * w**p for name, p in form.powers), arb(0))
+    for b_name, r_name in form.resonances:
+        pole = c[r_name] ** 2 if form.squared else c[r_name]
+        total += c[b_name] * w**2 / (w**2 - pole)
+    return total if form.power == 1 else total.sqrt()
+
+
+STUDY = Study(NAME, "Directions by wavelength", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))

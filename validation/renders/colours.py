@@ -1,0 +1,61 @@
+"""Colours: scenes that show dispersion or absorption, in a spectral variant, by `refract_path`.
+
+`dielectric` has neither, and no other integrator follows them: the images are shown, and nothing is demanded of them
+here. What the plugins make of light of several wavelengths is judged by tests.
+"""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_refract.io import image_file
+from mi_refract.plugins.refract import PLUGIN
+from mi_refract.report.row import Row
+from validation.run.context import Context, beyond_builtin
+from validation.run.render_methods import Camera, opened, under
+from validation.study import Study, Task, about
+
+NAME = "colours"
+COLOUR = "colour"
+TERMS = {COLOUR: "per pixel the largest channel minus the smallest, over the sum of all channels; of the whole image"}
+REPEATED = 4  # renders with each of the profile's seeds: the light of one wavelength has more noise than that of three
+SCALAR = "needs a compiled variant: in a scalar one an image takes hours"
+SHOWN = "shown, not judged: no other renderer here has dispersion and absorption"
+
+
+def tasks(context: Context) -> list[Task]:
+    """One task per scene that the built-in cannot render."""
+    paths = [path for path in context.scenes if beyond_builtin(path)]
+    return [Task(f"colours: {path.stem}", functools.partial(scene_rows, context, path)) for path in paths]
+
+
+def scene_rows(context: Context, path: Path) -> list[Row]:
+    """One row with the image; with the reason where the spectral variant does not run."""
+    variant = context.variant.replace("_rgb", "_spectral")
+    reason = SCALAR if context.scalar else context.variants.get(variant, "not in this wheel")
+    if reason:
+        return [Row(NAME, PLUGIN, path.stem, variant, reason=reason)]
+    profile = context.profile
+    with under(variant):
+        camera = Camera(opened(path, PLUGIN, profile.resolution))
+        image = np.mean([camera(profile.spp, seed=seed)[0] for seed in range(REPEATED * profile.pairs)], axis=0)
+    replay: dict[str, Any] = {
+        "scene": path.name,
+        "plugin": PLUGIN,
+        "variant": variant,
+        "resolution": profile.resolution,
+        "spp": profile.spp,
+        "seeds": REPEATED * profile.pairs,
+    }
+    name = Path("images") / path.stem / f"{PLUGIN} spectral.exr"
+    (context.out / name.parent).mkdir(parents=True, exist_ok=True)
+    image_file.write_exr(context.out / name, image.astype(np.float32), metadata=replay)
+    values = {COLOUR: float((image.max(2) - image.min(2)).sum() / image.sum())}
+    return [Row(NAME, PLUGIN, path.stem, variant, values, reason=SHOWN, replay=replay, images={"test": str(name)})]
+
+
+STUDY = Study(NAME, "Colours", about(__doc__), TERMS, tasks)
