@@ -24,6 +24,7 @@ NO_PLAIN_SCENE = {
     "diamond_fire": "MATERIAL:diamond: accepted here: one index for all wavelengths",
     "dispersive_prism": r"sellmeier\(.*\): accepted here: one index for all wavelengths",
     "green_bottle": "glass_air: its int_colour and int_colour_distance; accepted: a plain scene without",
+    "spectrum_on_screen": r"sellmeier\(.*\): accepted here: one index for all wavelengths",
     "rainbow_drop": "MATERIAL:water: accepted here: one index for all wavelengths",
 }
 

@@ -21,7 +21,7 @@ from validation.run.context import beyond_builtin
 SCENES = Path(__file__).parents[2] / "scenes"
 NAMES = ["balls", "diamond", "fibre", "furnace", "glasses64", "lightpipe", "matched"]
 NAMES += ["mirage", "nested", "prism", "slab", "sphere"]
-DISPERSIVE = ["diamond_fire", "dispersive_prism", "rainbow_drop"]
+DISPERSIVE = ["diamond_fire", "dispersive_prism", "rainbow_drop", "spectrum_on_screen"]
 BEYOND = [*DISPERSIVE, "green_bottle"]  # what `dielectric` cannot render
 EVERY = sorted(NAMES + BEYOND)
 DEFAULTS = {"bsdf": "refract", "integrator": "path", "sampler": "independent"}
@@ -452,6 +452,18 @@ def test_the_rainbow_is_red_at_its_borders_and_blue_between(needs_variant):
     assert red[middle - 3 : middle + 4].argmax() != 3
     assert blue[middle] > 2 * red[middle]
     assert (red > blue)[middle + 1 : middle + 4].any() and (red > blue)[middle - 4 : middle].any()
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral"])
+def test_each_colour_has_its_place_on_the_screen(variant, needs_variant):
+    needs_variant(variant)
+    mi.set_variant(variant)
+    band = spectral("spectrum_on_screen", res=64, spp=1024)[12:34, 8:56].sum(0)
+    red, green, blue = np.average(np.mgrid[8:56, 0:3][0], axis=0, weights=np.clip(band - np.median(band, 0), 0, None))
+    if variant.endswith("rgb"):
+        assert red == pytest.approx(green, abs=0.5) and blue == pytest.approx(green, abs=0.5)
+    else:
+        assert red + 2 < green < blue - 2
 
 
 def test_thick_glass_is_darker():
