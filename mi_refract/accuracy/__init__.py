@@ -5,6 +5,7 @@ arrays (`evaluate` gets them from a formula). Out: a `Judgement`, ray by ray, ag
 `formulas.Budget`.
 """
 
+from . import backward_error
 from .direction_errors import (
     DirectionErrors,
     absolute_radicand,
@@ -24,6 +25,7 @@ __all__ = [
     "Subject",
     "absolute_radicand",
     "arrays",
+    "backward_error",
     "errors",
     "errors_of_normalised",
     "evaluate",

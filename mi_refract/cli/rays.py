@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib.util
+import math
 import shlex
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -82,6 +83,15 @@ Formula = Annotated[
         "--error-bound", metavar="FORMULA", help="The formula whose error bound applies; by default the loosest."
     ),
 ]
+Backward = Annotated[
+    float | None,
+    typer.Option(
+        "--backward-error",
+        metavar="M",
+        help="An answer is wrong unless it is exact for inputs within M roundings of those given (a sound program: 4); "
+        "by default it need only be within the error bound.",
+    ),
+]
 OldFormula = Annotated[str | None, typer.Option("--as-good-as", hidden=True)]  # as --error-bound was called
 Report = Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML page.")]
 Junit = Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")]
@@ -147,6 +157,7 @@ class CheckOptions:
 
     tir: str
     formula: str | None
+    backward: float | None
     report: Path | None
     junit: Path | None
     json: Path | None
@@ -164,6 +175,8 @@ class CheckOptions:
             raise ValueError(f"--tir {self.tir}: unknown; accepted: {', '.join((AUTO, *TIR))}")
         if self.formula not in (None, *FORMULAS):
             raise ValueError(f"--error-bound {self.formula}: unknown; accepted: {', '.join(FORMULAS)}")
+        if self.backward is not None and not self.backward > 0:
+            raise ValueError(f"--backward-error {self.backward:g}: accepted: a positive number of roundings")
         self.elsewhere.check()
         for path, suffixes in zip((self.report, self.junit, self.json), OUTPUTS, strict=True):
             if path:
@@ -173,7 +186,8 @@ class CheckOptions:
     def words(self) -> list[str]:
         """The options of the check that are not the default."""
         chosen = ["--tir", self.tir] if self.tir != "auto" else []
-        return chosen + (["--error-bound", self.formula] if self.formula else [])
+        chosen += ["--error-bound", self.formula] if self.formula else []
+        return chosen + (["--backward-error", f"{self.backward:g}"] if self.backward else [])
 
     @contextlib.contextmanager
     def _judge(self) -> Iterator[Judge]:
@@ -192,7 +206,10 @@ class CheckOptions:
 
         bound = self.formula or check_answers.LOOSEST
         with self._judge() as judge:
-            found = check_answers.check(rays, answers, tir=self.tir, error_bound=bound, judge=judge)
+            most = self.backward or math.inf
+            found = check_answers.check(
+                rays, answers, tir=self.tir, error_bound=bound, most_backward=most, judge=judge
+            )
         # On a terminal, too: a wrapped line is easier to read than a squeezed column.
         Console(width=UNWRAPPED).print(reports.table(found), highlight=False)
         if self.report:
@@ -249,6 +266,7 @@ def check(
     file: File = None,
     tir: Tir = "auto",
     formula: Formula = None,
+    backward: Backward = None,
     old_formula: OldFormula = None,
     regime: Regime = None,
     count: Count = ray_set.COUNT,
@@ -276,7 +294,7 @@ def check(
     answers do not choose them.
     """
     there = elsewhere(scheduler, workers, tls_ca_file, tls_cert, tls_key)
-    options = CheckOptions(tir, formula or old_formula, report, junit, json, there)
+    options = CheckOptions(tir, formula or old_formula, backward, report, junit, json, there)
     made = MadeRays(regime, count, precision, seed, two_sided, medium, wavelengths)
     chosen = _chosen(file, made.words)
     rays = files.read_stored(file) if file else stored_rays.make(**made.arguments)
@@ -301,6 +319,7 @@ def run(
     wavelengths: Wavelengths = None,
     tir: Tir = "auto",
     formula: Formula = None,
+    backward: Backward = None,
     old_formula: OldFormula = None,
     timeout: Annotated[
         float, typer.Option(min=0, metavar="SECONDS", help="Time limit of the command, up to a week.")
@@ -313,7 +332,7 @@ def run(
 
     Exit code 0: right, 1: wrong, 2: the answers do not match the rays, or the command fails or takes too long.
     """
-    options = CheckOptions(tir, formula or old_formula, report, junit, json)
+    options = CheckOptions(tir, formula or old_formula, backward, report, junit, json)
     made = MadeRays(regime, count, precision, seed, two_sided, medium, wavelengths)
     chosen = _chosen(file, made.words)
     rays = files.read(file) if file else ray_set.make(**made.arguments)

@@ -23,7 +23,7 @@ from .evidence import AllEvidence
 from .header import PRECISIONS, Header, shown
 from .judged_answers import judge_answers
 from .judged_parts import JudgedPart, Piece, Question
-from .kept_angles import Angles, KeptAngles
+from .kept_errors import KeptErrors, SomeErrors
 from .pieces import ArrayPieces, Pieces, StoredPieces
 from .ray_set import Answers, RaySet
 from .stored_answers import LISTED_IDS, StoredAnswers
@@ -51,6 +51,10 @@ class RegimeErrors:
     judged: int  # rays compared that are not so
     wrong: int  # rays beyond their bound: angle, length or TIR; without a direction, or with an impossible one
     exact: int  # answers that are the certified ones, rounded
+    right: int  # answers that are the exact ones of inputs within RIGHT u, and not wrong
+    backward_median: float  # of the backward errors, in u
+    backward_p99: float
+    backward_worst: float
     replay: dict[str, Any]  # the ray with the largest ratio, in hexadecimal floats
 
 
@@ -116,6 +120,11 @@ class Findings:
         return self.total("wrong")
 
     @property
+    def right(self) -> int:
+        """Rays whose answer is the exact one of inputs within a few roundings."""
+        return self.total("right")
+
+    @property
     def farthest(self) -> RegimeErrors:
         """The regime with the largest angle. ValueError where nothing was answered."""
         return max(self.regimes, key=lambda each: (each.compared > 0, each.worst))
@@ -147,29 +156,34 @@ def check(
     *,
     tir: str = AUTO,
     error_bound: str = LOOSEST,
+    most_backward: float = np.inf,
     judge: Judge = judged_parts.here,
 ) -> Findings:
     """Compare every answer with the certified direction.
 
     `tir`: how the answers signal total internal reflection, one of TIR; detected where it is AUTO. `error_bound`: the
-    formula of FORMULAS whose a-priori bound the errors must keep. `judge`: who judges pieces of the set; the findings
-    do not depend on it, nor on whether rays and answers are arrays or stored: both are the same. ValueError for an
-    unknown name, for tir = FLAG without the column `transmitted`, or for answers whose header is that of other rays.
+    formula of FORMULAS whose a-priori bound the errors must keep. `most_backward`: the largest backward error, in u, of
+    an answer that is not wrong. `judge`: who judges pieces of the set; the findings do not depend on it, nor on whether
+    rays and answers are arrays or stored: both are the same. ValueError for an unknown name or a `most_backward` that is
+    not positive, for tir = FLAG without the column `transmitted`, or for answers whose header is that of other rays.
     """
     _check_name("tir", tir, (AUTO, *TIR))
     _check_name("error_bound", error_bound, FORMULAS)
     _check_header(rays, answers, tir)
     pieces, mismatches = _matched(rays, answers)
     ulp = float(np.finfo(PRECISIONS[rays.precision]).eps)
-    question = Question(rays.precision, error_bound, tir, same_ratio=_same_ratio(rays.header, ulp))
-    signal, parts, angles = _parts(pieces, question, judge)
+    if not most_backward > 0:
+        raise ValueError(f"most_backward = {most_backward}: accepted: a positive number of roundings")
+    same = _same_ratio(rays.header, ulp)
+    question = Question(rays.precision, error_bound, tir, most_backward=most_backward, same_ratio=same)
+    signal, parts, angles, backward = _parts(pieces, question, judge)
     return Findings(
         precision=rays.precision,
         ulp=ulp,
         error_bound=error_bound,
         tir=signal,
         tir_given=tir != AUTO,
-        regimes=tuple(_by_regime(rays.header, parts, angles)),
+        regimes=tuple(_by_regime(rays.header, parts, angles, backward)),
         problems=(*(_listed(kind, *each) for kind, each in mismatches.items()), *_not_directions(parts)),
         explanations=_explanations(pieces, parts, angles, replace(question, tir=signal)),
         header=rays.header,
@@ -212,8 +226,8 @@ def _matched(
     raise TypeError("rays and answers; accepted: both stored, or neither")
 
 
-def _parts(pieces: Pieces, question: Question, judge: Judge) -> tuple[str, list[JudgedPart], Angles]:
-    """The signal of total internal reflection, and the parts judged by it, whose angles are kept apart.
+def _parts(pieces: Pieces, question: Question, judge: Judge) -> tuple[str, list[JudgedPart], KeptErrors, KeptErrors]:
+    """The signal of total internal reflection, and the parts judged by it, whose errors are kept apart.
 
     The signal is known after all rays are: that of a sample is taken first, and all are judged again if it was wrong.
     """
@@ -222,14 +236,16 @@ def _parts(pieces: Pieces, question: Question, judge: Judge) -> tuple[str, list[
     if detected:
         tir = _guess(pieces, question)
     while True:
-        asked, angles, found = replace(question, tir=tir, counted=detected), Angles(pieces.total), {}
+        asked, found = replace(question, tir=tir, counted=detected), {}
+        angles, backward = KeptErrors(pieces.total), KeptErrors(pieces.total)
         for number, part in judge((piece, asked) for piece in pieces):
             angles.put(number, part.angles)
-            found[number] = part.without_angles()
+            backward.put(number, part.backward)
+            found[number] = part.without_errors()
         parts = [found[number] for number in range(len(found))]
         signal = tir_signal.joined([part.signals for part in parts if part.signals]).signal if detected else tir
         if signal == tir:
-            return tir, parts, angles
+            return tir, parts, angles, backward
         tir, detected = signal, False
 
 
@@ -250,7 +266,7 @@ def _guess(pieces: Pieces, question: Question) -> str:
 
 
 def _explanations(
-    pieces: Pieces, parts: list[JudgedPart], angles: Angles, question: Question
+    pieces: Pieces, parts: list[JudgedPart], angles: KeptErrors, question: Question
 ) -> tuple[Explanation, ...]:
     if not any(part.evidence.wrong_count for part in parts):
         return ()
@@ -296,13 +312,16 @@ def _not_directions(parts: list[JudgedPart]) -> Iterator[Problem]:
 # By regime ---------------------------------------------------------------------------------------------------------
 
 
-def _by_regime(header: Header, parts: list[JudgedPart], angles: Angles) -> Iterator[RegimeErrors]:
+def _by_regime(
+    header: Header, parts: list[JudgedPart], angles: KeptErrors, backward: KeptErrors
+) -> Iterator[RegimeErrors]:
     for name in header["regimes"]:
         if numbers := [number for number, part in enumerate(parts) if part.regime == name]:
-            yield _regime_errors(name, [parts[number] for number in numbers], angles.of(numbers))
+            of_regime = [parts[number] for number in numbers]
+            yield _regime_errors(name, of_regime, angles.of(numbers), backward.of(numbers))
 
 
-def _regime_errors(name: str, parts: list[JudgedPart], angles: KeptAngles) -> RegimeErrors:
+def _regime_errors(name: str, parts: list[JudgedPart], angles: SomeErrors, backward: SomeErrors) -> RegimeErrors:
     lengths_ = [part.length_error for part in parts if part.compared]
     worst = judged_parts.last_of_largest([part.worst.rank for part in parts])
     return RegimeErrors(
@@ -314,6 +333,9 @@ def _regime_errors(name: str, parts: list[JudgedPart], angles: KeptAngles) -> Re
         mean=angles.mean,
         length_error=float(np.max(lengths_)) if lengths_ else np.nan,
         error_over_bound=float(np.max([part.error_over_bound for part in parts])),
+        backward_median=backward.quantile(0.5),
+        backward_p99=backward.quantile(0.99),
+        backward_worst=backward.largest,
         replay=parts[worst].worst.replay,
         **{count: sum(part.counts[count] for part in parts) for count in judged_parts.COUNTS},
     )

@@ -15,7 +15,7 @@ import numpy as np
 from mi_refract.accuracy import Judgement, absolute_radicand
 
 from .judged_answers import JudgedAnswers
-from .kept_angles import KeptAngles, median
+from .kept_errors import SomeErrors, median
 
 WIDEST_BOUND = 1e-3  # radians: under a wider bound an answer is no evidence
 F32 = 2.0**-24
@@ -73,7 +73,7 @@ class AllEvidence:
     """That of all rays: of parts in the order of the rays, and the angles of the rays compared."""
 
     parts: Sequence[Evidence]
-    angles: KeptAngles
+    angles: SomeErrors
 
     @property
     def wrong_count(self) -> int:

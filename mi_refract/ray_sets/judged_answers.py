@@ -8,13 +8,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mi_refract import oracle
-from mi_refract.accuracy import Judgement, RayBounds, judge
+from mi_refract.accuracy import Judgement, RayBounds, backward_error, judge
 from mi_refract.formulas import FORMULAS, ROUNDING, Budget
 from mi_refract.regimes import Rays
 
 from . import certain_parts, tir_signal
 from .header import PRECISIONS
 from .tir_signal import LOOSEST
+
+RIGHT = 4.0  # in u: what rounding a, n and k, and a few operations on them, leaves of an answer's backward error
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,7 @@ class JudgedAnswers:
     `signals`: how many rays give each signal; None unless they were counted.
 
     `impossible`: (N,) where the error bound excuses the direction, and no documented formula gives it all the same.
+    `reflected`: (N,) which rays they call totally reflected. `most_backward`: in u, beyond which an answer is wrong.
     """
 
     raw: np.ndarray
@@ -31,6 +34,8 @@ class JudgedAnswers:
     tir: str
     verdict: Judgement
     impossible: np.ndarray
+    reflected: np.ndarray
+    most_backward: float = np.inf
     signals: tir_signal.Signals | None = None
 
     @property
@@ -41,7 +46,26 @@ class JudgedAnswers:
     @property
     def wrong(self) -> np.ndarray:
         """(N,) the wrong answers."""
-        return self.verdict.wrong | self.impossible
+        return self.verdict.wrong | self.impossible | ~(self.backward <= self.most_backward)
+
+    @property
+    def right(self) -> np.ndarray:
+        """(N,) the exact refraction of inputs within RIGHT roundings of those given."""
+        return ~self.wrong & (self.backward <= RIGHT)
+
+    @functools.cached_property
+    def backward(self) -> np.ndarray:
+        """(N,) backward errors in u: of the direction; of the decision, where a transmitted ray is called reflected."""
+        bounds, verdict = self.verdict.bounds, self.verdict
+        mirror = self.reflected & (self.tir == "reflected")
+        found = np.zeros(len(self.b))
+        asked = ~self.reflected | (mirror & ~bounds.exact.transmitted)
+        found[asked] = backward_error.of_directions(self.b[asked], bounds.rays[asked], mirror[asked])
+        lost = self.reflected & bounds.exact.transmitted
+        found[lost] = backward_error.of_decisions(bounds.rays[lost])
+        with np.errstate(over="ignore"):
+            in_u = np.where(verdict.blank, np.inf, found / bounds.roundoff)
+        return in_u
 
     @functools.cached_property
     def rounded_exact(self) -> np.ndarray:
@@ -58,11 +82,13 @@ def judge_answers(
     tir: str = tir_signal.AUTO,
     *,
     counted: bool = False,
+    most_backward: float = np.inf,
 ) -> JudgedAnswers:
     """Compare `b` (N, 3) with the certified answers, within `budget`.
 
     `flag`: the column `transmitted` (N,), if there is one. `precision`: f32 or f64. `tir`: one of TIR, or AUTO.
-    `counted`: count the rays of each signal.
+    `counted`: count the rays of each signal. `most_backward`: the largest backward error, in u, of an answer that is not
+    wrong.
     """
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
     bounds = RayBounds(rays, exact, budget, float(np.finfo(PRECISIONS[precision]).eps) / 2, normalised=True)
@@ -78,7 +104,8 @@ def judge_answers(
     blank = ~seen.is_direction & (~reflected | tir_signal.has_direction(tir))
     directed = exact.transmitted | (tir == "reflected")
     verdict = judge(rounded, ~reflected, bounds, directed, blank)
-    return JudgedAnswers(b, rounded, tir, verdict, _impossible(seen, reflected, tir, verdict), signals)
+    impossible = _impossible(seen, reflected, tir, verdict)
+    return JudgedAnswers(b, rounded, tir, verdict, impossible, reflected, most_backward, signals)
 
 
 def _impossible(seen: tir_signal.SeenAnswers, reflected: np.ndarray, tir: str, verdict: Judgement) -> np.ndarray:

@@ -1,7 +1,8 @@
 """What is kept of judged rays, so that a set is judged in pieces, here or elsewhere, and no piece is kept whole.
 
-Of every ray the angle is kept, for quantiles and means over all, and three bits, for a sample of the answers. The parts
-in the order of the rays give the same findings, whatever the pieces were and whoever judged them.
+Of every ray the angle and the backward error are kept, for quantiles and means over all, and three bits, for a sample
+of the answers. The parts in the order of the rays give the same findings, whatever the pieces were and whoever judged
+them.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ COUNTS = {  # of `RegimeErrors`, where they are sums
     "undecidable": lambda judged: judged.undecidable,
     "judged": lambda judged: judged.verdict.compared & ~judged.undecidable,
     "wrong": lambda judged: judged.wrong,
+    "right": lambda judged: judged.right,
     "exact": lambda judged: judged.rounded_exact,
 }
 
@@ -44,6 +46,7 @@ class Question:
     error_bound: str
     tir: str
     counted: bool = False
+    most_backward: float = np.inf  # in u: an answer of which inputs farther off are needed is wrong
     same_ratio: float = 0.0  # the largest relative difference of `n_ratio` to k that is none
 
 
@@ -92,6 +95,7 @@ class JudgedPart:
     counts: dict[str, int]
     compared: int
     angles: np.ndarray  # of the rays compared, in their order; empty once they are kept elsewhere
+    backward: np.ndarray  # backward errors of all rays, in u; likewise
     length_error: float  # the largest; NaN without any compared
     error_over_bound: float
     worst: Worst
@@ -100,16 +104,23 @@ class JudgedPart:
     evidence: Evidence
     ratio: tuple[float, int]  # the largest relative difference of the ratio used, and the id of its ray
 
-    def without_angles(self) -> JudgedPart:
+    def without_errors(self) -> JudgedPart:
         """The rest of it, at most a byte a ray."""
-        return replace(self, angles=np.empty(0))
+        return replace(self, angles=np.empty(0), backward=np.empty(0))
 
 
 def judge_part(piece: Piece, question: Question) -> JudgedPart:
     """Judge a piece; with the certified answers, which take most of the time."""
     budget = FORMULAS[question.error_bound].budget
     judged = judge_answers(
-        piece.b, piece.flag, piece.used, question.precision, budget, question.tir, counted=question.counted
+        piece.b,
+        piece.flag,
+        piece.used,
+        question.precision,
+        budget,
+        question.tir,
+        counted=question.counted,
+        most_backward=question.most_backward,
     )
     verdict = judged.verdict
     compared = verdict.compared
@@ -119,6 +130,7 @@ def judge_part(piece: Piece, question: Question) -> JudgedPart:
         counts={name: int(mask(judged).sum()) for name, mask in COUNTS.items()},
         compared=int(compared.sum()),
         angles=verdict.angle[compared],
+        backward=judged.backward,
         length_error=float(verdict.drift[compared].max()) if compared.any() else np.nan,
         error_over_bound=float(verdict.share.max()),
         worst=_worst(judged, piece.ids),

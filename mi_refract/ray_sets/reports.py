@@ -20,6 +20,7 @@ from mi_refract.report.row import strict
 
 from .check_answers import Findings, Problem, RegimeErrors
 from .diagnosis import Explanation
+from .judged_answers import RIGHT
 from .tir_signal import NONE, UNCLEAR
 
 if TYPE_CHECKING:
@@ -37,10 +38,14 @@ COLUMNS = (
     "TIR beyond bound",
     "length error",
     "error / bound",
+    "m, median",
+    "m, p99",
+    "m, worst",
+    "right",
     "exact",
     "wrong",
 )
-STYLES = {"wrong": "bold red", "right": "", "exact": "green"}
+STYLES = {"wrong": "bold red", "within bound": "yellow", "right": "", "exact": "green"}
 TERMS = {
     "ulp": "the spacing of numbers at 1: 2⁻²³ in f32, 2⁻⁵² in f64",
     "worst, p99, mean": "angles to the certified direction, over the rays whose total internal reflection was "
@@ -51,6 +56,9 @@ TERMS = {
     "TIR beyond bound": "those of them that are farther from the critical angle than rounding can explain",
     "length error": "the difference between the length of an answer and 1, or the length of a where that is nearer",
     "error / bound": "the largest ratio of an error to the a-priori bound of the chosen formula for that ray",
+    "m": "backward error of all answers: each is the exact refraction of inputs a, n and k that are off by m u, "
+    "relative to their lengths; u is half an ulp. Of a wrong decision on TIR: of inputs beyond the critical angle",
+    "right": f"answers that are not wrong, with m up to {RIGHT:g}; the others are only as good as the error bound",
     "exact": "answers that are the certified direction, rounded: no formula can do better",
     "wrong": "answers whose error is beyond the bound, whose TIR is misclassified beyond it, or that are no direction",
 }
@@ -100,7 +108,10 @@ def _directions(found: Findings) -> str:
     worst = f"the largest error is {compact(found.farthest.worst)} rad ({found.farthest.regime})"
     wide = found.total("undecidable")
     open_ = f"; {wide} of them are to rays whose bound is above 0.1 rad, which shows little" if wide else ""
-    return f"{answers}, all within the error bound of the formula {found.error_bound}; {worst}{open_}"
+    if found.right == found.answered:
+        return f"{answers}, all right: exact for inputs within {RIGHT:g} roundings of those given; {worst}"
+    some = f"{found.right} of {answers} are right: exact for inputs within {RIGHT:g} roundings of those given"
+    return f"{some}; all are within the error bound of the formula {found.error_bound}; {worst}{open_}"
 
 
 def problem_text(problem: Problem) -> str:
@@ -140,8 +151,12 @@ def _line(each: Explanation) -> str:
 
 
 def grade(each: RegimeErrors) -> str:
-    """ "exact", "right" or "wrong"."""
-    return "wrong" if each.wrong else "exact" if each.exact == each.rays else "right"
+    """ "exact", "right", "within bound" or "wrong"."""
+    if each.wrong:
+        return "wrong"
+    if each.right < each.rays:
+        return "within bound"
+    return "exact" if each.exact == each.rays else "right"
 
 
 # Terminal ----------------------------------------------------------------------------------------------------------
@@ -178,6 +193,8 @@ def _cells(each: RegimeErrors, ulp: float) -> dict[str, str]:
         "TIR beyond bound": str(each.tir_beyond_bound),
         "length error": compact(each.length_error) if each.compared else "–",
         "error / bound": compact(each.error_over_bound),
+        **{f"m, {name}": compact(getattr(each, f"backward_{name}")) for name in ("median", "p99", "worst")},
+        "right": f"{each.right / each.rays:.1%}",
         "exact": f"{each.exact / each.rays:.1%}",
         "wrong": str(each.wrong),
     }
@@ -200,6 +217,7 @@ def as_data(found: Findings) -> dict[str, Any]:
         "total_internal_reflection": {"signal": found.tir, "detected": not found.tir_given},
         "answered": found.answered,
         "wrong": found.wrong,
+        "right": found.right,
         "problems": [dataclasses.asdict(each) for each in found.problems],
         "regimes": regimes,
         "diagnosis": diagnosis.mistake if diagnosis else None,
@@ -254,7 +272,11 @@ def write_html(path: str | Path, found: Findings, context: Mapping[str, Any], re
         "title": "mi-refract rays",
         "sentence": sentence(found),
         "state": "fail" if found.exit_code else "pass",
-        "counts": [("pass", "right", found.answered - found.wrong), ("fail", "wrong", found.wrong)],
+        "counts": [
+            ("pass", "right", found.right),
+            ("info", "within the error bound only", found.answered - found.right - found.wrong),
+            ("fail", "wrong", found.wrong),
+        ],
         "context": {"precision": found.precision, "error bound": found.error_bound, **context, **noted},
         "problems": [problem_text(each) for each in found.problems],
         "signal": signal(found),

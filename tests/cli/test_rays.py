@@ -70,8 +70,19 @@ def test_export_and_check(call):
     answer("answers.csv", to)
     code, out, err = call("check", "answers.csv", "--rays", "rays.csv")
     assert (code, err) == (0, "")
-    assert "120 answers, all within the error bound of the formula decomposed; the largest error is" in out
+    assert "120 answers, all right: exact for inputs within 4 roundings of those given; the largest error is" in out
     assert "signalled by the zero vector (detected)" in out
+
+
+def test_the_backward_error_may_be_the_verdict(call):
+    assert call("export", "--regime", "k >> 1", "--count", 60, "-o", "rays.csv")[0] == 0
+    answer("answers.csv", files.read("rays.csv"))
+    assert call("check", "answers.csv", "--rays", "rays.csv")[0] == 0
+    code, out, _ = call("check", "answers.csv", "--rays", "rays.csv", "--backward-error", "4", "--report", "out.html")
+    assert code == 1 and out.splitlines()[-1].endswith("of 60 answers are wrong")
+    assert "--backward-error 4" in Path("out.html").read_text()
+    code, _, err = call("check", "answers.csv", "--rays", "rays.csv", "--backward-error", "0")
+    assert (code, err) == (2, "mi-refract: --backward-error 0: accepted: a positive number of roundings\n")
 
 
 def test_export_in_every_format_is_the_same_set(call):

@@ -1,6 +1,7 @@
 """What a check says in one line, for every kind of result."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -9,14 +10,15 @@ from mi_refract.ray_sets.check_answers import Findings, Problem, RegimeErrors
 from mi_refract.ray_sets.diagnosis import Explanation
 from mi_refract.ray_sets.tir_signal import NONE, UNCLEAR
 
+ERRORS = ("p99", "mean", "length_error", "error_over_bound", "backward_median", "backward_p99", "backward_worst")
 MISSING = Problem("missing", 3, "ids 1, 5, 8")
 CERTAIN = Explanation("eta inverted", "k was n_to / n_from", 0.97, 1e-3, True)
 LIKELY, NEVER = (Explanation("handedness", f"text {share}", share, math.nan, False) for share in (0.25, 0.0))
 
 
 def regime(name="generic", worst=2e-7, **changes):
-    counts = {"rays": 10, "compared": 9, "judged": 9, "wrong": 0, "exact": 4, "undecidable": 0}
-    zero = dict.fromkeys(("p99", "mean", "length_error", "error_over_bound"), 0.0)
+    counts = {"rays": 10, "compared": 9, "judged": 9, "wrong": 0, "right": 8, "exact": 4, "undecidable": 0}
+    zero = dict.fromkeys(ERRORS, 0.0)
     return RegimeErrors(
         name, worst=worst, **zero, **counts | changes, tir_misclassified=0, tir_beyond_bound=0, replay={}
     )
@@ -26,7 +28,9 @@ def found(*regimes, problems=(), explanations=(), tir="zero", tir_given=False):
     return Findings("f32", 2.0**-23, "decomposed", tir, tir_given, regimes, problems, explanations, {})
 
 
-ALL_RIGHT = "20 answers, all within the error bound of the formula decomposed; the largest error is 3e-7 rad (critical)"
+EXACT_FOR = "exact for inputs within 4 roundings of those given; "
+LARGEST = "the largest error is 3e-7 rad (critical)"
+SOME_RIGHT = f"of 20 answers are right: {EXACT_FOR}all are within the error bound of the formula decomposed; {LARGEST}"
 TWO = regime(), regime("critical", 3e-7)
 
 
@@ -34,12 +38,13 @@ TWO = regime(), regime("critical", 3e-7)
     ("result", "code", "said"),
     [
         (found(), 2, "no ray was answered"),
-        (found(*TWO), 0, ALL_RIGHT),
-        (found(*TWO, regime("k", math.nan, rays=0, compared=0, judged=0)), 0, ALL_RIGHT),
+        (found(*TWO), 0, f"16 {SOME_RIGHT}"),
+        (found(*TWO, regime("k", math.nan, rays=0, compared=0, judged=0, right=0)), 0, f"16 {SOME_RIGHT}"),
+        (found(*(replace(x, right=10) for x in TWO)), 0, f"20 answers, all right: {EXACT_FOR}{LARGEST}"),
         (
             found(regime(undecidable=2), TWO[1]),
             0,
-            f"{ALL_RIGHT}; 2 of them are to rays whose bound is above 0.1 rad, which shows little",
+            f"16 {SOME_RIGHT}; 2 of them are to rays whose bound is above 0.1 rad, which shows little",
         ),
         (found(regime(exact=10)), 0, "10 answers, all exact up to rounding"),
         (found(regime(wrong=2)), 1, "2 of 10 answers are wrong"),
@@ -97,7 +102,13 @@ def test_the_explanations(result, lines):
 
 
 @pytest.mark.parametrize(
-    ("changes", "grade"), [({}, "right"), ({"exact": 10}, "exact"), ({"wrong": 1, "exact": 10}, "wrong")]
+    ("changes", "grade"),
+    [
+        ({}, "within bound"),
+        ({"right": 10}, "right"),
+        ({"right": 10, "exact": 10}, "exact"),
+        ({"wrong": 1, "exact": 10, "right": 10}, "wrong"),
+    ],
 )
 def test_a_grade(changes, grade):
     assert reports.grade(regime(**changes)) == grade

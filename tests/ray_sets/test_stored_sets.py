@@ -22,7 +22,7 @@ from mi_refract.ray_sets import (
     csv_table,
     files,
     judged_parts,
-    kept_angles,
+    kept_errors,
     npz_arrays,
     pieces,
     ray_set,
@@ -57,7 +57,7 @@ def in_pieces(monkeypatch, step):
         (npz_arrays, "_STEP"),
         (csv_table, "_LINES"),
         (csv_table, "_BYTES"),
-        (kept_angles, "_LEAF"),
+        (kept_errors, "_LEAF"),
     ):
         monkeypatch.setattr(module, name, max(step, 128) if name == "_LEAF" else step)
     monkeypatch.setattr(scratch, "IN_MEMORY", 0)
@@ -332,22 +332,22 @@ def test_means_quantiles_and_medians_are_those_of_numpy(count, in_memory, monkey
     rng = np.random.default_rng(count)
     x = rng.random(count) * 10.0 ** rng.integers(-20, 1, count) * (rng.random(count) > 0.2)
     step = max(5, count // 30)
-    kept = kept_angles.Angles(count)
+    kept = kept_errors.KeptErrors(count)
     numbers = range(-(-count // step))
     for number in reversed(numbers):
         kept.put(number, x[number * step : (number + 1) * step])
     found = kept.of(numbers)
     assert (found.largest, found.mean) == (x.max(), x.mean())
     assert [found.quantile(share) for share in (0, 0.3, 0.99, 1)] == [np.quantile(x, s) for s in (0, 0.3, 0.99, 1)]
-    assert kept_angles.median(found.pieces) == np.median(x)
+    assert kept_errors.median(found.pieces) == np.median(x)
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_sums_are_cut_where_numpy_cuts_them(seed, monkeypatch):
-    monkeypatch.setattr(kept_angles, "_LEAF", 128)
+    monkeypatch.setattr(kept_errors, "_LEAF", 128)
     rng = np.random.default_rng(seed)
     x = rng.random(int(rng.integers(129, 9000)))
-    kept = kept_angles.Angles(len(x))
+    kept = kept_errors.KeptErrors(len(x))
     kept.put(0, x)
     assert kept.of([0]).mean == x.mean()
 
@@ -361,16 +361,16 @@ def test_a_sample_is_evenly_over_all_parts(seed):
     ]
     index = np.flatnonzero(np.concatenate(masks))
     for count in (1, 7, 150):
-        found = AllEvidence(parts, kept_angles.Angles(1).of([])).evenly("right", count)
+        found = AllEvidence(parts, kept_errors.KeptErrors(1).of([])).evenly("right", count)
         assert found.tolist() == index[:: max(1, -(-len(index) // count))].tolist()
 
 
 def test_no_angle_and_no_number():
-    kept = kept_angles.Angles(3)
+    kept = kept_errors.KeptErrors(3)
     kept.put(0, np.array([1.0, np.nan, 2.0]))
     kept.put(1, np.empty(0))
     for found in (kept.of([0]), kept.of([1]), kept.of([])):
-        values = found.largest, found.mean, found.quantile(0.99), kept_angles.median(found.pieces)
+        values = found.largest, found.mean, found.quantile(0.99), kept_errors.median(found.pieces)
         assert np.isnan(values).all()
 
 
@@ -411,7 +411,7 @@ def test_what_is_kept_of_a_ray_is_a_byte(rays, right):
     many = np.arange(judged_parts.PIECE) % COUNT
     piece = judged_parts.Piece("generic", rays.rays[many], many, right[many].astype(float), None)
     part = judged_parts.judge_part(piece, judged_parts.Question("f32", "promoted", "auto", counted=True))
-    assert len(pickle.dumps(part.without_angles())) < judged_parts.PIECE
+    assert len(pickle.dumps(part.without_errors())) < judged_parts.PIECE
     assert files.MOST_STORED <= 2**30
 
 

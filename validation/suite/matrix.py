@@ -20,6 +20,7 @@ NAME = "matrix"
 OFF = "off by"
 TERMS = {
     OFF: "rays: the largest angle, in radians, without misclassified rays; images: |test / reference − 1| of the means",
+    per_ray.BACKWARD: per_ray.TERMS[per_ray.BACKWARD],
     "disagrees": "1 where a budget is broken in the row that this comes from",
     per_ray.RECORDED: per_ray.TERMS[per_ray.RECORDED],
     per_ray.OFF_RECORDED: "how many times the error recorded earlier, or that over it; a goal, which fails no run",
@@ -46,7 +47,8 @@ def _cells(row: Row) -> list[Row]:
     differs = row.replay.get("verdict") == "different"
     values = {} if off is None else {OFF: off}
     values["disagrees"] = float(bool(row.broken))
-    goals = {}
+    values |= {name: row.values[name] for name in (per_ray.BACKWARD,) if name in row.values}
+    goals = {name: goal for name, goal in row.goals.items() if name == per_ray.BACKWARD}
     if per_ray.OFF_RECORDED in row.goals:
         values |= {name: row.values[name] for name in (per_ray.RECORDED, per_ray.OFF_RECORDED) if name in row.values}
         goals[per_ray.OFF_RECORDED] = row.goals[per_ray.OFF_RECORDED]

@@ -11,7 +11,7 @@ LOCKS = Path(__file__).parent / "locks"
 
 # The sets of rays of `validation.suite.per_ray`, by name.
 RANDOM, APART, CRITICAL, GRAZING = "random", "random, apart", "near-critical", "grazing"
-MATCHED, TOTAL = "η ≈ 1", "total reflection"
+MATCHED, TOTAL, LARGE = "η ≈ 1", "total reflection", "k ≫ 1"
 RecordedError = Mapping[str, tuple[float, float]]  # worst angle in radians by set, from … to
 
 

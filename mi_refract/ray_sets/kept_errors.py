@@ -1,6 +1,6 @@
-"""The angles of judged answers outside of the memory, and what is said of them: mean, quantiles, medians.
+"""The errors of judged answers outside of the memory, and what is said of them: mean, quantiles, medians.
 
-The numbers are those that NumPy gives for one array of all angles, bit for bit.
+The numbers are those that NumPy gives for one array of all errors, bit for bit.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _LEAF = 2**17  # numbers that are added by NumPy itself; it adds 128 without cut
 _DIGIT = 16  # bits
 
 
-class Angles:
+class KeptErrors:
     """Those of pieces, by the numbers of the pieces, in any order; `most` of them together."""
 
     def __init__(self, most: int) -> None:
@@ -27,30 +27,30 @@ class Angles:
         self._runs: dict[int, tuple[int, int]] = {}
         self._end = 0
 
-    def put(self, number: int, angles: np.ndarray) -> None:
+    def put(self, number: int, errors: np.ndarray) -> None:
         """Keep those of a piece."""
-        self._table.write(self._end, angles)
-        self._runs[number] = self._end, len(angles)
-        self._end += len(angles)
+        self._table.write(self._end, errors)
+        self._runs[number] = self._end, len(errors)
+        self._end += len(errors)
 
-    def of(self, numbers: Iterable[int]) -> KeptAngles:
+    def of(self, numbers: Iterable[int]) -> SomeErrors:
         """Those of some pieces, one after the other."""
-        return KeptAngles(self._table, tuple(self._runs[number] for number in numbers))
+        return SomeErrors(self._table, tuple(self._runs[number] for number in numbers))
 
 
 @dataclass(frozen=True)
-class KeptAngles:
-    """Angles from 0 on. `runs`: the first row and the number of rows of each piece."""
+class SomeErrors:
+    """KeptErrors from 0 on. `runs`: the first row and the number of rows of each piece."""
 
     table: Table
     runs: Sequence[tuple[int, int]]
 
     def __len__(self) -> int:
-        """The number of angles."""
+        """The number of errors."""
         return sum(count for _, count in self.runs)
 
     def pieces(self) -> Iterator[np.ndarray]:
-        """The angles of each piece."""
+        """The errors of each piece."""
         for start, count in self.runs:
             yield self.table.read(start, start + count)
 
@@ -59,7 +59,7 @@ class KeptAngles:
         return np.cumsum([count for _, count in self.runs], dtype=np.int64)
 
     def _read(self, start: int, stop: int) -> np.ndarray:
-        """By their places among all angles."""
+        """By their places among all errors."""
         found = []
         for i in range(int(np.searchsorted(self._ends, start, side="right")), len(self.runs)):
             first, count = self.runs[i]
@@ -90,11 +90,13 @@ class KeptAngles:
         return self._sum(start, half) + self._sum(start + half, count - half)
 
     def quantile(self, share: float) -> float:
-        """Linear between two angles; NaN where one is NaN, or where there is none."""
+        """Linear between two errors; NaN where one is NaN, or where there is none."""
         if math.isnan(self.largest):
             return np.nan
         place = (len(self) - 1) * share
         low, high = (_at(self.pieces, min(math.floor(place) + i, len(self) - 1)) for i in (0, 1))
+        if low == high:  # infinite, it may be
+            return low
         t = place - math.floor(place)
         return low + (high - low) * t if t < 0.5 else high - (high - low) * (1 - t)
 

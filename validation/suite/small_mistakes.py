@@ -1,0 +1,148 @@
+"""Small mistakes: what the error bound of a textbook's formula lets pass, and whether backward errors see it.
+
+The textbook's formula answers rays of the regime in which a mistake matters, once as it is and once with the mistake. An
+answer within the bound passes as "as good as a textbook's formula"; it is right if it is the exact refraction of inputs
+within 4 roundings of those given. The formula itself is right in all of these regimes, and no mistake may be so.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mi_refract.formulas import FORMULAS
+from mi_refract.ray_sets import ray_set
+from mi_refract.ray_sets.judged_answers import RIGHT, JudgedAnswers, judge_answers
+from mi_refract.ray_sets.ray_set import RaySet
+from mi_refract.ray_sets.tir_signal import LOOSEST
+from mi_refract.report.row import Row
+from validation import repeated
+from validation.run import seeds
+from validation.run.context import Context
+from validation.study import Study, Task, about
+
+NAME = "small mistakes"
+SEED, COUNT = 2041, 2000
+TERMS = {
+    "passed before": "share of the answers that are within the error bound",
+    "seen": f"share of the answers whose backward error is above {RIGHT:g} u",
+    "m, median": "of the backward errors, in u",
+    "m, worst": "the largest of them",
+    "m, worst, without": "the largest one without the mistake",
+    "not seen": "1 where every answer is right",
+}
+Vectors = np.ndarray
+Answer = Callable[[Vectors, Vectors, Vectors], Vectors]  # a, n (N, 3) and k (N, 1) of one precision to b
+
+
+def textbook(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
+    """b = k a − (k c + √(1 − k² (1 − c²))) n with c = n·a < 0; zero under total internal reflection."""
+    c = _dot(n, a)
+    radicand = 1 - k * k * (1 - c * c)
+    return np.where(radicand < 0, 0, k * a - (k * c + np.sqrt(np.maximum(radicand, 0))) * n)
+
+
+def half_precision(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
+    """k through a 16-bit float."""
+    return textbook(a, n, k.astype(np.float16).astype(k.dtype))
+
+
+def tilted(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
+    """n off by 1e-6 rad, within the plane of incidence."""
+    t = a - _dot(n, a) * n
+    n = n + n.dtype.type(1e-6) * t / np.sqrt(_dot(t, t))
+    return textbook(a, n / np.sqrt(_dot(n, n)), k)
+
+
+def by_angles(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
+    """The angles of incidence and refraction, through acos and asin in float32."""
+    incident = np.arccos(np.minimum(-_dot(n, a), 1).astype(np.float32))
+    sine = k * np.sin(incident).astype(k.dtype)
+    refracted = np.arcsin(np.minimum(sine, 1).astype(np.float32)).astype(k.dtype)
+    t = a - _dot(n, a) * n
+    return np.where(sine > 1, 0, np.sin(refracted) * t / np.sqrt(_dot(t, t)) - np.cos(refracted) * n)
+
+
+def not_unit(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
+    """n shorter by 1e-6, as interpolation leaves it, and not made unit."""
+    return textbook(a, n * n.dtype.type(1 - 1e-6), k)
+
+
+def rounded_contrast(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
+    """κ = k² − 1 in float32, in b = k (a − c n) − √(c² − κ (1 − c²)) n."""
+    single, c = k.astype(np.float32), _dot(n, a)
+    contrast = (single * single - 1).astype(k.dtype)
+    across = np.cross(n, a)
+    radicand = c * c - contrast * _dot(across, across)
+    return np.where(radicand < 0, 0, k * (a - c * n) - np.sqrt(np.maximum(radicand, 0)) * n)
+
+
+def _dot(x: Vectors, y: Vectors) -> Vectors:
+    return (x * y).sum(1, keepdims=True)
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """`regime`: where it matters. `harmless`: in this precision no error beyond rounding, and why."""
+
+    answer: Answer
+    regime: str
+    harmless: tuple[str, str] = ("", "")
+
+
+MISTAKES = {
+    "eta rounded to half precision": Mistake(half_precision, "generic"),
+    "normal off by 1e-6 rad": Mistake(tilted, "generic"),
+    "angles by acos in float32": Mistake(by_angles, "near-normal"),
+    "normal not made unit": Mistake(not_unit, "critical"),
+    "k² − 1 in float32": Mistake(
+        rounded_contrast,
+        "matched",
+        ("f32", "no error of k: fl(k²) − 1 is the exact k² − 1 of a k less than 1 u off"),
+    ),
+}
+
+
+def tasks(context: Context) -> list[Task]:
+    """One per mistake and precision."""
+    return [
+        Task(f"{NAME}: {name}, {precision}", functools.partial(rows, name, precision))
+        for name in MISTAKES
+        for precision in ray_set.PRECISIONS
+    ]
+
+
+def rows(name: str, precision: str) -> list[Row]:
+    """One."""
+    mistake = MISTAKES[name]
+    rays = ray_set.make([mistake.regime], COUNT, precision, seeds.current(SEED))
+    with_it, without = (judged(answer, rays) for answer in (mistake.answer, textbook))
+    seen = float((with_it.backward > RIGHT).mean())
+    values = {
+        "passed before": float(1 - with_it.verdict.wrong.mean()),
+        "seen": seen,
+        "m, median": float(np.median(with_it.backward)),
+        "m, worst": float(with_it.backward.max()),
+        "m, worst, without": float(without.backward.max()),
+        "not seen": float(seen == 0),
+    }
+    harmless = mistake.harmless[1] if precision == mistake.harmless[0] else ""
+    budgets = {"m, worst, without": RIGHT} | ({} if harmless else {"not seen": 0.0})
+    replay = {"regime": mistake.regime, "count": COUNT, "seed": seeds.current(SEED)}
+    return [Row(NAME, name, mistake.regime, precision, values, budgets, reason=harmless, replay=replay)]
+
+
+def judged(answer: Answer, rays: RaySet) -> JudgedAnswers:
+    """The answers to a set in its precision."""
+    given = rays.rays
+    with np.errstate(all="ignore"):
+        b = answer(given.a, given.n, given.k[:, None])
+    if b.dtype != given.a.dtype:
+        raise TypeError(f"{answer.__name__}: answers in {b.dtype}; accepted: {given.a.dtype}")
+    return judge_answers(b.astype(np.float64), None, given, rays.precision, FORMULAS[LOOSEST].budget, "zero")
+
+
+STUDY = Study(NAME, "Small mistakes", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))
