@@ -5,13 +5,14 @@ n × w by
 
     k n×δa + γ δn×n + δk k n×a     to first order, |δa|, |δn|, |δk| ≤ ε
 
-Lengths do not count, so δa is across a: n×δa fills an ellipse, ε cos θ_i long on the line of n×a and ε across it. In the
-direction at the angle φ from that line the change is at most ε h,
+Lengths do not count, so δa is across a: n×δa fills an ellipse, ε cos θ_i long on the line of n×a and ε across it. In
+the direction at the angle φ from that line the change is at most ε h,
 
     h = k √(cos² θ_i cos² φ + sin² φ) + |γ| + k sin θ_i |cos φ|
 
-The backward error, the least ε that takes n × w to 0, is the largest of |n × w|·φ / h over all φ. Near the critical angle
-it is small where the angle to the exact direction is not: there the last digit of an input moves the direction as far.
+The backward error, the least ε that takes n × w to 0, is the largest component of n × w in such a direction, over h.
+Near the critical angle it is small where the angle to the exact direction is not: there the last digit of an input
+moves the direction as far.
 
 A decision on total internal reflection is exact for inputs on the other side of the critical angle: with e = k sin θ_i
 
@@ -30,7 +31,6 @@ from numpy.typing import NDArray
 from mi_refract.regimes import Array, Rays
 
 from .direction_errors import absolute_radicand, lengths
-
 
 _TURNS = np.linspace(0, np.pi / 2, 33)  # of φ: the largest is found to 1 part in 1000
 
@@ -67,7 +67,8 @@ def of_decisions(rays: Rays) -> Array:
     e = k * sine
     step = absolute_radicand(rays) / (2 * e * (2 * k * cosine + e))
     turn = np.abs(np.arcsin(1 / k) - np.arctan2(sine, cosine)) / 2  # NaN where k < 1
-    return np.asarray(np.fmin(step, turn).astype(float))
+    nearest: Array = np.fmin(step, turn).astype(float)
+    return nearest
 
 
 def _unit(v: Array) -> Array:

@@ -207,9 +207,7 @@ class CheckOptions:
         bound = self.formula or check_answers.LOOSEST
         with self._judge() as judge:
             most = self.backward or math.inf
-            found = check_answers.check(
-                rays, answers, tir=self.tir, error_bound=bound, most_backward=most, judge=judge
-            )
+            found = check_answers.check(rays, answers, tir=self.tir, error_bound=bound, most_backward=most, judge=judge)
         # On a terminal, too: a wrapped line is easier to read than a squeezed column.
         Console(width=UNWRAPPED).print(reports.table(found), highlight=False)
         if self.report:

@@ -164,8 +164,8 @@ def check(
     `tir`: how the answers signal total internal reflection, one of TIR; detected where it is AUTO. `error_bound`: the
     formula of FORMULAS whose a-priori bound the errors must keep. `most_backward`: the largest backward error, in u, of
     an answer that is not wrong. `judge`: who judges pieces of the set; the findings do not depend on it, nor on whether
-    rays and answers are arrays or stored: both are the same. ValueError for an unknown name or a `most_backward` that is
-    not positive, for tir = FLAG without the column `transmitted`, or for answers whose header is that of other rays.
+    rays and answers are arrays or stored: both are the same. ValueError for an unknown name, a `most_backward` not
+    above 0, tir = FLAG without the column `transmitted`, or answers whose header is that of other rays.
     """
     _check_name("tir", tir, (AUTO, *TIR))
     _check_name("error_bound", error_bound, FORMULAS)

@@ -87,8 +87,8 @@ def judge_answers(
     """Compare `b` (N, 3) with the certified answers, within `budget`.
 
     `flag`: the column `transmitted` (N,), if there is one. `precision`: f32 or f64. `tir`: one of TIR, or AUTO.
-    `counted`: count the rays of each signal. `most_backward`: the largest backward error, in u, of an answer that is not
-    wrong.
+    `counted`: count the rays of each signal. `most_backward`: in u, the largest backward error of an answer that is
+    not wrong.
     """
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
     bounds = RayBounds(rays, exact, budget, float(np.finfo(PRECISIONS[precision]).eps) / 2, normalised=True)

@@ -1,4 +1,4 @@
-"""Answers that pass as "as good as a textbook's formula", and are not right: those of inputs farther off than rounding."""
+"""Answers that pass as "as good as a textbook's formula", and are exact only for inputs farther off than rounding."""
 
 import numpy as np
 import pytest

@@ -1,15 +1,15 @@
 """Per ray: the refraction of other programs, each in a process of its own, against the certified answer.
 
 A program reads rays as CSV and answers with directions; `mi-refract rays run` does and checks the same. Each answer
-should be the exact refraction of inputs within 4 roundings of those given (a goal), and must be within the bound of the
-textbook formula, in the program's precision, for that ray. The worst errors of each
-program were recorded earlier on rays of the same kinds (the rays themselves were not kept); another goal is to be within
-a factor of 3 of these. Goals are shown where they are missed and fail no run: the worst of some thousand rays
-depends on which they are. The set "random" is the first one, as it was before any result. After the first results its
-rays near the critical angle were left out, for chance decides how near they come, and it was made twice as large: that
-is the set "random, apart". The goal is the same for both. The set "near-critical" was never changed. A program fails
-that is installed and crashes, hangs, or answers rays that it was not given. One that is not installed, or says that it
-cannot run on this machine, is not run.
+should be the exact refraction of inputs within 4 roundings of those given (a goal), and must be within the bound of
+the textbook formula, in the program's precision, for that ray. The worst errors of each program were recorded earlier
+on rays of the same kinds (the rays themselves were not kept); another goal is to be within a factor of 3 of these.
+Goals are shown where they are missed and fail no run: the worst of some thousand rays depends on which they are. The
+set "random" is the first one, as it was before any result. After the first results its rays near the critical angle
+were left out, for chance decides how near they come, and it was made twice as large: that is the set "random, apart".
+The goal is the same for both. The set "near-critical" was never changed. A program fails that is installed and
+crashes, hangs, or answers rays that it was not given. One that is not installed, or says that it cannot run on this
+machine, is not run.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ TERMS = {name: f"{rays.count} rays: {rays.text}" for name, rays in SETS.items()}
     RECORDED: "the largest such angle recorded earlier for this system",
     OFF_RECORDED: "the ratio of the two, taken above 1; 1 inside a recorded range",
     ERROR_OVER_BOUND: "the largest error of a ray over its a-priori bound, that of the textbook formula",
-    BACKWARD: "the largest of all answers: each is the exact refraction of inputs within so many roundings of those given",
+    BACKWARD: "the largest one: each answer is the exact refraction of inputs within so many roundings of those given",
     "median backward error / u": "the median of them",
     "p99 backward error / u": "exceeded by one answer in 100",
     MISCLASSIFIED: "rays whose total internal reflection was misclassified",

@@ -1,8 +1,9 @@
 """Small mistakes: what the error bound of a textbook's formula lets pass, and whether backward errors see it.
 
-The textbook's formula answers rays of the regime in which a mistake matters, once as it is and once with the mistake. An
-answer within the bound passes as "as good as a textbook's formula"; it is right if it is the exact refraction of inputs
-within 4 roundings of those given. The formula itself is right in all of these regimes, and no mistake may be so.
+The textbook's formula answers rays of the regime in which a mistake matters, once as it is and once with the mistake.
+An answer within the bound passes as "as good as a textbook's formula"; it is right if it is the exact refraction of
+inputs within 4 roundings of those given. The formula itself is right in all of these regimes, and no mistake may be
+so.
 """
 
 from __future__ import annotations
