@@ -74,4 +74,5 @@ def of_decisions(rays: Rays) -> Array:
 def _unit(v: Array) -> Array:
     wide = v.astype(np.longdouble)
     wide = wide / np.abs(wide).max(1, keepdims=True, initial=0)  # squares of the least numbers would be 0
-    return wide / lengths(wide)[:, None]
+    unit: Array = wide / lengths(wide)[:, None]
+    return unit
