@@ -10,6 +10,7 @@ __all__ = [
     "files",
     "judged_parts",
     "ray_set",
+    "renderer_file",
     "reports",
     "run_program",
     "spread_check",

@@ -20,7 +20,17 @@ from validation import __main__ as command
 from validation import limits
 from validation.suite import per_ray
 from validation.suite.renderers import SYSTEMS, environments
-from validation.suite.renderers.system import RECORDED_F64, SCRIPTS, LARGE, TOTAL, Apt, Npm, Pip, RefractFunction, System
+from validation.suite.renderers.system import (
+    LARGE,
+    RECORDED_F64,
+    SCRIPTS,
+    TOTAL,
+    Apt,
+    Npm,
+    Pip,
+    RefractFunction,
+    System,
+)
 
 STANDARD, FULL = (SimpleNamespace(profile=SimpleNamespace(name=name)) for name in ("standard", "full"))
 # What every program below does right unless `{defect}` says otherwise.

@@ -1,0 +1,235 @@
+"""Options of `mi-refract rays export|check|run`: which rays, and how their answers are checked and reported."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib.util
+import math
+import shlex
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypedDict
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from mi_refract.cluster.connection import HERE, Elsewhere
+from mi_refract.io.atomic import writable
+from mi_refract.io.outside_text import printable
+from mi_refract.io.provenance import provenance
+from mi_refract.ray_sets import ray_set
+from mi_refract.ray_sets.ray_set import Answers, RaySet
+from mi_refract.ray_sets.stored_answers import StoredAnswers
+from mi_refract.ray_sets.stored_rays import StoredRays
+from mi_refract.regimes import REGIMES
+
+if TYPE_CHECKING:  # they need python-flint
+    from mi_refract.ray_sets.check_answers import Judge
+    from mi_refract.ray_sets.judged_parts import JudgedPart, Piece, Question
+
+OUTPUTS = ((".html", ".htm"), (".xml",), (".json",))  # of --report, --junit, --json
+UNWRAPPED = 10_000  # columns: wider than any line
+
+
+def _print_regimes(asked: bool) -> None:
+    if asked:
+        table = Table("regime", "rays", "", box=None, pad_edge=False)
+        for name, regime in REGIMES.items():
+            table.add_row(name, regime.text, "" if name in ray_set.DEFAULT else "only with --regime")
+        Console(width=None if sys.stdout.isatty() else UNWRAPPED).print(table, highlight=False)
+        raise typer.Exit
+
+
+Regime = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME", help="A regime of rays, see --regimes; by default all with unit vectors."),
+]
+Count = Annotated[int, typer.Option(min=1, help="Number of rays per regime.")]
+Precision = Annotated[str, typer.Option(help="f32 or f64.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the ray generator.")]
+TwoSided = Annotated[
+    bool, typer.Option("--two-sided", help="Put normals on either side; by default they face the ray.")
+]
+Medium = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="SPEC",
+        help="A medium that rays pass into and out of, from and to air, such as SCHOTT:N-BK7; may be repeated.",
+    ),
+]
+Wavelengths = Annotated[str | None, typer.Option(metavar="NM,…", help="Wavelengths in nm, of the media.")]
+Regimes = Annotated[bool, typer.Option("--regimes", is_eager=True, callback=_print_regimes, help="List the regimes.")]
+File = Annotated[Path | None, typer.Option("--rays", metavar="FILE", help="The file of rays, as exported.")]
+Tir = Annotated[
+    str,
+    typer.Option(help="How answers signal total internal reflection: auto, zero, nan, reflected, tangent or flag."),
+]
+Formula = Annotated[
+    str | None,
+    typer.Option(
+        "--error-bound", metavar="FORMULA", help="The formula whose error bound applies; by default the loosest."
+    ),
+]
+Backward = Annotated[
+    float | None,
+    typer.Option(
+        "--backward-error",
+        metavar="M",
+        help="An answer is wrong unless it is exact for inputs within M roundings of those given (a sound program: 4); "
+        "by default it need only be within the error bound.",
+    ),
+]
+OldFormula = Annotated[str | None, typer.Option("--as-good-as", hidden=True)]  # as --error-bound was called
+Report = Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML page.")]
+Junit = Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")]
+Json = Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")]
+
+
+@dataclass(frozen=True)
+class MadeRays:
+    """The options that choose rays, as they were typed."""
+
+    regime: list[str] | None
+    count: int
+    precision: str
+    seed: int
+    two_sided: bool
+    medium: list[str] | None
+    wavelengths: str | None
+
+    @property
+    def arguments(self) -> MadeArguments:
+        """Those of `ray_set.make`. ">>" and "<<" may be typed for ≫ and ≪. ValueError for wrong wavelengths."""
+        names = [name.replace(">>", "≫").replace("<<", "≪") for name in self.regime or []]
+        return {
+            "names": names or None,
+            "count": self.count,
+            "precision": self.precision,
+            "seed": self.seed,
+            "two_sided": self.two_sided,
+            "media": self.medium or (),
+            "wavelengths": _wavelengths(self.wavelengths),
+        }
+
+    @property
+    def words(self) -> list[str]:
+        """The options that choose these rays, without those that have their default."""
+        words = [word for name in self.regime or [] for word in ("--regime", name)]
+        for option, value, default in (
+            ("--count", self.count, ray_set.COUNT),
+            ("--precision", self.precision, ray_set.PRECISION),
+            ("--seed", self.seed, 0),
+            ("--wavelengths", self.wavelengths, None),
+        ):
+            words += [option, str(value)] if value != default else []
+        words += [word for spec in self.medium or [] for word in ("--medium", spec)]
+        return words + ["--two-sided"] * self.two_sided
+
+
+class MadeArguments(TypedDict):
+    """What `ray_set.make` takes."""
+
+    names: list[str] | None
+    count: int
+    precision: str
+    seed: int
+    two_sided: bool
+    media: Sequence[str]
+    wavelengths: Sequence[float]
+
+
+@dataclass(frozen=True)
+class CheckOptions:
+    """How answers are checked, and which files are written."""
+
+    tir: str
+    formula: str | None
+    backward: float | None
+    report: Path | None
+    junit: Path | None
+    json: Path | None
+    elsewhere: Elsewhere = HERE
+
+    def __post_init__(self) -> None:
+        """ValueError or OSError, before anything runs, for an option that cannot be met."""
+        needed = ("flint", "jinja2") if self.report else ("flint",)
+        if not all(map(importlib.util.find_spec, needed)):
+            raise ValueError("checking rays needs the extra `validation`: pip install 'mi-refract[validation]'")
+        from mi_refract.formulas import FORMULAS
+        from mi_refract.ray_sets.tir_signal import AUTO, TIR
+
+        if self.tir not in (AUTO, *TIR):
+            raise ValueError(f"--tir {self.tir}: unknown; accepted: {', '.join((AUTO, *TIR))}")
+        if self.formula not in (None, *FORMULAS):
+            raise ValueError(f"--error-bound {self.formula}: unknown; accepted: {', '.join(FORMULAS)}")
+        if self.backward is not None and not self.backward > 0:
+            raise ValueError(f"--backward-error {self.backward:g}: accepted: a positive number of roundings")
+        self.elsewhere.check()
+        for path, suffixes in zip((self.report, self.junit, self.json), OUTPUTS, strict=True):
+            if path:
+                writable(path, suffixes)
+
+    @property
+    def words(self) -> list[str]:
+        """The options of the check that are not the default."""
+        chosen = ["--tir", self.tir] if self.tir != "auto" else []
+        chosen += ["--error-bound", self.formula] if self.formula else []
+        return chosen + (["--backward-error", f"{self.backward:g}"] if self.backward else [])
+
+    @contextlib.contextmanager
+    def _judge(self) -> Iterator[Judge]:
+        """Who judges pieces of the set, with a bar on a terminal."""
+        from mi_refract.ray_sets import judged_parts, spread_check
+
+        with contextlib.ExitStack() as stack:
+            judge: Judge = judged_parts.here
+            if self.elsewhere.given:
+                judge = stack.enter_context(spread_check.judging(self.elsewhere, _say))
+            yield functools.partial(_watched, judge)
+
+    def check(self, rays: RaySet | StoredRays, answers: Answers | StoredAnswers, name: str, replay: list[str]) -> int:
+        """Check the answers, print and write the reports; the exit code. `replay`: the words of the command."""
+        from mi_refract.ray_sets import check_answers, reports
+
+        bound = self.formula or check_answers.LOOSEST
+        with self._judge() as judge:
+            most = self.backward or math.inf
+            found = check_answers.check(rays, answers, tir=self.tir, error_bound=bound, most_backward=most, judge=judge)
+        # On a terminal, too: a wrapped line is easier to read than a squeezed column.
+        Console(width=UNWRAPPED).print(reports.table(found), highlight=False)
+        if self.report:
+            about = {"answers": name} | {key: rays.header[key] for key in ("seed", "checksum")} | provenance()
+            reports.write_html(self.report, found, about, shlex.join(["mi-refract", "rays", *replay]))
+        if self.junit:
+            reports.write_junit(self.junit, found, name)
+        if self.json:
+            reports.write_json(self.json, found)
+        return found.exit_code
+
+
+def _watched(judge: Judge, calls: Iterable[tuple[Piece, Question]]) -> Iterator[tuple[int, JudgedPart]]:
+    """As `judge`, with the number of rays so far on a terminal's stderr."""
+    console, rays = Console(stderr=True), 0
+    status = console.status("certified: 0 rays") if console.is_terminal else None
+    with status or contextlib.nullcontext():
+        for number, part in judge(calls):
+            rays += part.rays
+            if status:
+                status.update(f"certified: {rays} rays")
+            yield number, part
+
+
+def _say(text: str) -> None:
+    print(printable(f"mi-refract: {text}"), file=sys.stderr, flush=True)
+
+
+def _wavelengths(text: str | None) -> tuple[float, ...]:
+    """The numbers of --wavelengths; none without. ValueError for anything else."""
+    try:
+        return tuple(map(float, text.split(","))) if text is not None else ()
+    except ValueError:
+        raise ValueError(f"--wavelengths {text}: accepted: numbers in nm, such as 486.1327,587.5618") from None
