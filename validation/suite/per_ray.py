@@ -202,6 +202,9 @@ def rows(call: RefractFunction, rays: RaySet, answers: Answers) -> list[Row]:
             "seed": seeds.current(SEED),
             "script": " ".join((call.script, *call.arguments)),
             "worst": figures.replay if figures else None,
+            "version": str(answers.header.get("system", "")),
+            "total internal reflection": findings.tir,
+            "remark": call.remark,
         }
         made.append(Row(NAME, call.title, name, call.precision, values, budgets, goals, about, replay))
     return made

@@ -1,4 +1,4 @@
-"""`python -m validation renderers [--list | --install NAME,…]`: lists and installs the other renderers.
+"""`python -m validation renderers [--list | --install NAME,… | --page OUT.html]`: the other renderers.
 
 Exit code 0; 1 where an installation failed, with a line on stderr for each; 2 for misuse.
 """
@@ -6,10 +6,12 @@ Exit code 0; 1 where an installation failed, with a line on stderr for each; 2 f
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from mi_refract.io.atomic import writable
 from validation.run import command_line
 
 from . import environments
@@ -31,8 +33,15 @@ def _command(
         bool, typer.Option("--list", help="Print what there is, and whether it is installed (default).")
     ] = False,
     install: Annotated[str, typer.Option(metavar="NAME,…", help=f"Install some of {', '.join(SYSTEMS)}.")] = "",
+    page: Annotated[
+        Path | None, typer.Option(metavar="OUT.html", help="Write how they did as a page, from the last validation.")
+    ] = None,
+    data: Annotated[Path | None, typer.Option("--json", metavar="OUT.json", help="Write the same as JSON.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of that validation's report.")] = Path("out"),
 ) -> int:
-    """List or install the other renderers and libraries that can be run here."""
+    """List or install the other renderers and libraries that can be run here, or write a page of how they did."""
+    if page or data:
+        return _write(page, data, out)
     wanted = [name.strip() for name in install.split(",") if name.strip()]
     if unknown := [name for name in wanted if name not in SYSTEMS]:
         return command_line.misuse(NAME, f"unknown system {unknown[0]!r}; accepted: {', '.join(SYSTEMS)}")
@@ -41,6 +50,23 @@ def _command(
     if not wanted:
         print("\n".join(_line(system) for system in SYSTEMS.values()))
     return max([_install(SYSTEMS[name]) for name in wanted], default=0)
+
+
+def _write(page: Path | None, data: Path | None, out: Path) -> int:
+    from validation.suite import matrix_page
+
+    try:
+        for path, suffixes in ((page, (".html", ".htm")), (data, (".json",))):
+            if path:
+                writable(path, suffixes)
+        found = matrix_page.read(out)
+        if page:
+            matrix_page.write_html(page, found)
+        if data:
+            matrix_page.write_json(data, found)
+    except (ValueError, OSError) as error:
+        return command_line.misuse(NAME, str(error))
+    return 0
 
 
 def _install(system: System) -> int:
