@@ -153,6 +153,16 @@ def test_frames_are_rotations_onto_the_normal(monkeypatch):
     np.testing.assert_allclose(np.linalg.det(frames), 1, atol=1e-15)
 
 
+def test_things_apart_are_in_no_row(monkeypatch):
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    import table
+
+    places = table.apart(range(200))
+    assert all(len(np.unique(places[:, axis])) == len(places) for axis in range(3))
+    gaps = np.linalg.norm(places[:, None] - places, axis=2)[~np.eye(len(places), dtype=bool)]
+    assert gaps.min() > 0.5 - 1e-9
+
+
 # Where they cannot run -------------------------------------------------------------------------------------------
 
 
@@ -171,6 +181,8 @@ def test_a_script_for_node_is_told_its_folder_and_cannot_run_without_node(monkey
     ("name", "hidden", "said"),
     [
         ("wgsl", {"VK_DRIVER_FILES": "/nowhere", "VK_ICD_FILENAMES": "/nowhere"}, "mesa-vulkan-drivers libvulkan1"),
+        ("glsl", {"__EGL_VENDOR_LIBRARY_DIRS": "/nowhere"}, "libegl1 libgl1-mesa-dri"),
+        ("materialx", {"__EGL_VENDOR_LIBRARY_DIRS": "/nowhere"}, "libegl1 libgl1-mesa-dri"),
         ("slang", {"PATH": "/nowhere"}, "Debian: g++"),
         ("thi_ng", {"PATH": "/nowhere"}, "no node in PATH"),
     ],

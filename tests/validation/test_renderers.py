@@ -57,6 +57,7 @@ DEFECTS = {
     "bytes": ("os.write(1, bytes([0xff, 0xfe, 0x00])); os._exit(0)", "", "unanswered"),
     "cut short": ("", "print('id,bx,by,bz'); print('0,0.5,0.'); sys.exit(0)", "unanswered"),
 }
+BY_A_DRIVER = ("glsl", "materialx", "wgsl")
 REASONS = {
     "exception": "ended with status 1: RuntimeError: out of glass",
     "killed": "was killed by SIGKILL",
@@ -158,18 +159,7 @@ def test_small_systems_that_are_installed_are_right(name, few):
     if reason := environments.absent(SYSTEMS[name]):
         pytest.skip(reason)
     rows = [row for call in SYSTEMS[name].calls for row in per_ray.call_rows(SYSTEMS[name], call, STANDARD)]
-    by_a_driver = name in ("glsl", "materialx", "wgsl")
-    assert {row.verdict for row in rows} <= ({"pass", "not run"} if by_a_driver else {"pass"})
-
-
-def test_things_apart_are_in_no_row(monkeypatch):
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    import table
-
-    places = table.apart(range(200))
-    assert all(len(np.unique(places[:, axis])) == len(places) for axis in range(3))
-    gaps = np.linalg.norm(places[:, None] - places, axis=2)[~np.eye(len(places), dtype=bool)]
-    assert gaps.min() > 0.5 - 1e-9
+    assert {row.verdict for row in rows} <= ({"pass", "not run"} if name in BY_A_DRIVER else {"pass"})
 
 
 # Environments --------------------------------------------------------------------------------------------------
@@ -219,8 +209,7 @@ def test_every_system_has_a_place_a_licence_and_scripts():
     assert all(system.licence and system.title and (system.calls or system.draws) for system in SYSTEMS.values())
     assert all((SCRIPTS / call.script).is_file() for system in SYSTEMS.values() for call in system.calls)
     needs = [system.needs for system in SYSTEMS.values() if isinstance(system.needs, Pip)]
-    assert all("==" in each.requirements[0] for each in needs)
-    assert all(each.requirements[0].startswith(f"{each.built}==") for each in needs if each.built)
+    assert all(re.match(f"{each.built or '.+'}==", each.requirements[0]) for each in needs)
 
 
 def test_every_package_is_pinned_by_hashes_and_no_script_of_one_runs():

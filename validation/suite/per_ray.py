@@ -2,13 +2,14 @@
 
 A program reads rays as CSV and answers with directions; `mi-refract rays run` does and checks the same. Each answer
 must be within the bound of the textbook formula, in the program's precision, for that ray. The worst errors of each
-program were recorded earlier on rays of the same kinds (the rays themselves were not kept); a goal, not a budget, is to
-be within a factor of 3 of these. The goal is shown where it is missed and fails no run: the worst of some thousand rays
-depends on which they are. The set "random" is the first one, as it was before any result. After the first results its
-rays near the critical angle were left out, for chance decides how near they come, and it was made twice as large: that
-is the set "random, apart". The goal is the same for both. The set "near-critical" was never changed. A program fails
-that is installed and crashes, hangs, or answers rays that it was not given. One that is not installed, or says that it
-cannot run on this machine, is not run.
+program were recorded earlier on rays of the same kinds (the rays themselves were not kept); those of WGSL, Slang,
+MaterialX, Skia, Taichi, raylib, @thi.ng/vectors, batoid, pyoptools and prysm on these very rays, at the default seed. A
+goal, not a budget, is to be within a factor of 3 of these. The goal is shown where it is missed and fails no run: the
+worst of some thousand rays depends on which they are. The set "random" is the first one, as it was before any result.
+After the first results its rays near the critical angle were left out, for chance decides how near they come, and it
+was made twice as large: that is the set "random, apart". The goal is the same for both. The set "near-critical" was
+never changed. A program fails that is installed and crashes, hangs, or answers rays that it was not given. One that is
+not installed, or says that it cannot run on this machine, is not run.
 """
 
 from __future__ import annotations
