@@ -3,13 +3,13 @@
 A program reads rays as CSV and answers with directions; `mi-refract rays run` does and checks the same. Each answer
 should be the exact refraction of inputs within 4 roundings of those given (a goal), and must be within the bound of
 the textbook formula, in the program's precision, for that ray. The worst errors of each program were recorded earlier
-on rays of the same kinds (the rays themselves were not kept); another goal is to be within a factor of 3 of these.
-Goals are shown where they are missed and fail no run: the worst of some thousand rays depends on which they are. The
-set "random" is the first one, as it was before any result. After the first results its rays near the critical angle
-were left out, for chance decides how near they come, and it was made twice as large: that is the set "random, apart".
-The goal is the same for both. The set "near-critical" was never changed. A program fails that is installed and
-crashes, hangs, or answers rays that it was not given. One that is not installed, or says that it cannot run on this
-machine, is not run.
+on rays of the same kinds (the rays themselves were not kept), of the programs that came later on these very rays, at
+the default seed; another goal is to be within a factor of 3 of these. Goals are shown where they are missed and fail no
+run: the worst of some thousand rays depends on which they are. The set "random" is the first one, as it was before any
+result. After the first results its rays near the critical angle were left out, for chance decides how near they come,
+and it was made twice as large: that is the set "random, apart". The goal is the same for both. The set "near-critical"
+was never changed. A program fails that is installed and crashes, hangs, or answers rays that it was not given. One that
+is not installed, or says that it cannot run on this machine, is not run.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from validation.suite.renderers.system import (
     CRITICAL,
     GRAZING,
     LARGE,
+    LENGTHS,
     MATCHED,
     RANDOM,
     TOTAL,
@@ -190,7 +191,8 @@ def rows(call: RefractFunction, rays: RaySet, answers: Answers) -> list[Row]:
     """One per set."""
     left_out = absolute_radicand(rays.rays) < call.gives_up
     findings = check_answers.check(_only(rays, ~left_out), _without(answers, rays.ids[left_out]))
-    about = _remark(findings, str(answers.header.get("system", "")), call.remark)
+    known = "; ".join(filter(None, (LENGTHS[call.lengths], call.remark)))
+    about = _remark(findings, str(answers.header.get("system", "")), known)
     made = []
     for name in SETS:
         figures = next((each for each in findings.regimes if each.regime == name), None)
