@@ -88,6 +88,7 @@ class System:
     small: bool = False
     calls: tuple[RefractFunction, ...] = field(default=())
     draws: bool = False  # whether it renders images
+    lens: str = ""  # the script of scripts/ that traces a lens with it
 
     @property
     def source(self) -> str:

@@ -62,13 +62,14 @@ _SYSTEMS = (
         small=True,
         calls=_as_in_glsl("GLSL", "glsl_rays.py"),
     ),
-    System(  # a ray tracer for lens design; the function that bends a ray needs none of its windows and plots
+    System(  # a ray tracer for lens design, with its glasses; the trace needs none of its windows and plots
         "rayoptics",
         "rayoptics",
-        "BSD-3-Clause",
-        Pip(("rayoptics==0.9.8", "numpy")),
-        megabytes=140,
+        "BSD-3-Clause (rayoptics, opticalglass)",
+        Pip(("rayoptics==0.9.8", "opticalglass==1.1.1", "numpy")),
+        megabytes=260,
         small=True,
+        lens="rayoptics_lens.py",
         calls=(
             RefractFunction(
                 "rayoptics, bend", "f64", "rayoptics_rays.py", recorded_error(7e-15, 1.9e-12, 2e-16, 1e-15), "nan"
@@ -81,6 +82,7 @@ _SYSTEMS = (
         "MIT",
         Pip(("optiland==0.6.3",)),
         megabytes=1300,
+        lens="optiland_lens.py",
         calls=(
             RefractFunction(
                 "optiland, RealRays.refract",
