@@ -181,8 +181,9 @@ UNEXPLAINED = limit(0.05, "of the mutants of our code: no test notices them, and
 
 RECORDED = limit(3.0, "factor between the worst error and the recorded one: the numbers of those rays were not kept")
 LENS_TRACE = limit(1.0, "the bound adds up every rounding at its worst, see `validation/suite/lenses.py`")
-# A term B λ²/(λ² − C) up to 6u, with C in another unit; three of them with 1, 3u more, halved by the root, and 1u.
-SAME_FORMULA = limit(16 * 2.0**-53, "relative: Sellmeier's formula with the same coefficients: 6u of n on either side")
+OTHER_INDEX = limit(
+    1.02, "factor between the largest difference of an index and the recorded one, of three digits; the data are locked"
+)
 SUITE_ERROR = limit(1e-4, "probability of any alarm in a pair of equal images")
 
 

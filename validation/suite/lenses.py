@@ -129,7 +129,7 @@ def answered(title: str, answer: Answer) -> list[Row]:
             values = {FOCUS_OFF: float(np.abs(found / own - 1).max()), SHIFT_OFF: _shift_off(found, own)}
             budgets = {}
             if case == OWN:
-                values[INDEX_OFF], budgets[INDEX_OFF] = index_off, limits.SAME_FORMULA
+                values[INDEX_OFF], budgets[INDEX_OFF] = index_off, limits.CATALOG_FORMULA
             values, budgets = row.values | values, row.budgets | budgets
             rows.append(replace(row, values=values, budgets=budgets, reason=answer.system))
     return rows
