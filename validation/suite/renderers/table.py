@@ -98,6 +98,7 @@ _SYSTEMS = (
         Pip(("raysect==0.9.0", "numpy")),
         megabytes=190,
         small=True,
+        draws=True,
         calls=(
             RefractFunction(
                 "raysect, Dielectric",
