@@ -250,7 +250,7 @@ def test_scripts_import_nothing_of_ours_and_we_nothing_of_theirs():
         return {name.partition(".")[0] for name in names}
 
     root = SCRIPTS.parents[3]
-    theirs = {"bpy", "glm", "moderngl", "optiland", "pyluxcore", "pyradiance", "rayoptics"}
+    theirs = {"bpy", "glm", "moderngl", "optiland", "pyluxcore", "pyradiance", "rayoptics", "raysect"}
     scripts = {*SCRIPTS.glob("*.py"), *(root / "mi_refract" / "scene_export" / "targets").glob("render_*.py")}
     assert len(scripts) > 9
     for path in scripts:

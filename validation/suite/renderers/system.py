@@ -15,7 +15,9 @@ MATCHED, TOTAL = "η ≈ 1", "total reflection"
 RecordedError = Mapping[str, tuple[float, float]]  # worst angle in radians by set, from … to
 
 
-def recorded_error(random: float, critical: float, grazing: float | tuple, matched: float | tuple) -> RecordedError:
+def recorded_error(
+    random: float | tuple, critical: float | tuple, grazing: float | tuple, matched: float | tuple
+) -> RecordedError:
     """Worst angles in radians by set of rays, a number or a range (from, to); of random rays one for both sets."""
     sets = (RANDOM, APART, CRITICAL, GRAZING, MATCHED)
     figures = zip(sets, (random, random, critical, grazing, matched), strict=True)

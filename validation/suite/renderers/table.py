@@ -126,6 +126,25 @@ _SYSTEMS = (
             ),
         ),
     ),
+    System(  # a spectral ray tracer in Python and Cython, for plasma diagnostics; its cameras want matplotlib
+        "raysect",
+        "raysect",
+        "BSD-3-Clause",
+        Pip(("raysect==0.9.0", "numpy")),
+        megabytes=190,
+        small=True,
+        draws=True,
+        calls=(
+            RefractFunction(
+                "raysect, Dielectric",
+                "f64",
+                "raysect_rays.py",
+                recorded_error((5.1e-15, 2.5e-14), (1.6e-12, 2.5e-12), (2.3e-16, 2.9e-16), (5.4e-16, 6.5e-16)),
+                "reflected",
+                remark="normalises the ray and the normal; takes a ray at the critical angle for total reflection",
+            ),
+        ),
+    ),
     System(  # by the programs in pyradiance's wheel
         "radiance",
         "Radiance",
