@@ -218,7 +218,6 @@ def test_every_system_has_a_place_a_licence_and_scripts():
     assert all(system.licence and system.title and (system.calls or system.draws) for system in SYSTEMS.values())
     assert all((SCRIPTS / call.script).is_file() for system in SYSTEMS.values() for call in system.calls)
     assert all((SCRIPTS / system.lens).is_file() for system in SYSTEMS.values() if system.lens)
-    assert all((SCRIPTS / system.glasses.script).is_file() for system in SYSTEMS.values() if system.glasses)
     needs = [system.needs for system in SYSTEMS.values() if isinstance(system.needs, Pip)]
     assert all("==" in each.requirements[0] for each in needs)
 

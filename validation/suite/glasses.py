@@ -29,25 +29,11 @@ from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED, WORST_ANGLE
 from validation.study import Study, Task, about
 
 from .renderers import SYSTEMS, System, environments
-from .renderers.system import GlassCatalogue
+from .renderers.glass_catalogues import CATALOGUES, GlassCatalogue
 
 NAME = "glasses by others"
 SEED, COUNT = 2041, 660  # rays of each regime
 REGIMES = ("generic", "near-normal", "grazing", "critical", "Brewster")
-# One of each maker, three of Schott's, and some whose index is known to depend on the edition of the catalogue.
-GLASSES = (
-    "SCHOTT:N-BK7",
-    "SCHOTT:N-SF11",
-    "SCHOTT:F2",
-    "OHARA:S-FPL51",
-    "HOYA:FCD1",
-    "HIKARI:J-BK7A",
-    "SUMITA:K-BK7",
-    "SUMITA:K-GIR79",
-    "SUMITA:K-SFLDn3",
-    "CDGM:H-K9L",
-    "CDGM:H-LaF4",
-)
 WAVELENGTHS = (435.8343, 486.1327, 546.074, 587.5618, 656.2725, 706.5188)  # nm
 INDEX_OFF, RECORDED, OFF_RECORDED = "index off", "recorded", "off the recorded"
 TERMS = {
@@ -67,9 +53,8 @@ TERMS = {
 def tasks(context: Context) -> list[Task]:
     """One per system that has glasses."""
     return [
-        Task(f"glasses: {system.title}", functools.partial(system_rows, system, system.glasses, context))
-        for system in SYSTEMS.values()
-        if system.glasses
+        Task(f"glasses: {SYSTEMS[name].title}", functools.partial(system_rows, SYSTEMS[name], catalogue, context))
+        for name, catalogue in CATALOGUES.items()
     ]
 
 
@@ -77,7 +62,7 @@ def system_rows(system: System, catalogue: GlassCatalogue, context: Context) -> 
     """A row per regime and one per glass, or one that says why there are none."""
     if reason := _why_not(system, context):
         return [Row(NAME, system.title, "every glass", "f64", reason=reason)]
-    rays = given(catalogue.makers)
+    rays = given(catalogue.glasses)
     try:
         text = environments.run(environments.script(system, catalogue.script), as_csv(rays))
         answers = parse_answers(text, system.title)
@@ -99,13 +84,9 @@ def _why_not(system: System, context: Context) -> str:
 
 
 @seeds.cached
-def given(makers: tuple[str, ...]) -> RaySet:
-    """The rays for a system that has glasses of these makers."""
-    return ray_set.make(REGIMES, COUNT, "f64", seeds.current(SEED), media=_of(makers), wavelengths=WAVELENGTHS)
-
-
-def _of(makers: tuple[str, ...]) -> list[str]:
-    return [glass for glass in GLASSES if glass.partition(":")[0] in makers]
+def given(glasses: tuple[str, ...]) -> RaySet:
+    """The rays for a system that has these glasses."""
+    return ray_set.make(REGIMES, COUNT, "f64", seeds.current(SEED), media=glasses, wavelengths=WAVELENGTHS)
 
 
 def rows(title: str, catalogue: GlassCatalogue, rays: RaySet, answers: Answers) -> list[Row]:
@@ -117,7 +98,7 @@ def rows(title: str, catalogue: GlassCatalogue, rays: RaySet, answers: Answers) 
     used = _in_order(rays, answers)
     wavelength, pair = media_rays.columns(rays.header, rays.ids).T
     off = np.abs(used / rays.rays.k - 1)
-    for i, glass in enumerate(_of(catalogue.makers)):
+    for i, glass in enumerate(catalogue.glasses):
         of_glass = np.flatnonzero(pair // 2 == i)
         # argmax takes the first NaN for the largest.
         worst = of_glass[np.argmax(off[of_glass])]

@@ -76,27 +76,6 @@ class RefractFunction:
 
 
 @dataclass(frozen=True)
-class OtherIndex:
-    """What is known of a glass that has another index in a system's catalogue than in `mi_refract.media`."""
-
-    recorded: float  # the largest relative difference at the wavelengths of `validation.suite.glasses`, three digits
-    cause: str
-
-
-@dataclass(frozen=True)
-class GlassCatalogue:
-    """Glasses of a system: `script` of scripts/ reads rays with media and wavelengths, and answers with `n_ratio`.
-
-    `makers`: whose glasses. `told`: the signal of total internal reflection. `others`: those with another index there.
-    """
-
-    script: str
-    makers: tuple[str, ...]
-    told: str
-    others: Mapping[str, OtherIndex] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class System:
     """Another renderer or library. `needs` is None where this package's own environment has it.
 
@@ -112,7 +91,6 @@ class System:
     calls: tuple[RefractFunction, ...] = field(default=())
     draws: bool = False  # whether it renders images
     lens: str = ""  # the script of scripts/ that traces a lens with it
-    glasses: GlassCatalogue | None = None
 
     @property
     def source(self) -> str:

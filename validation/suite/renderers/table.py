@@ -4,20 +4,7 @@ A new renderer is one entry here. A function of refraction also needs a script i
 in `image_renderers`. Programs under the GPL are run, never imported nor redistributed.
 """
 
-from .system import (
-    RECORDED_F32,
-    RECORDED_F64,
-    Apt,
-    GlassCatalogue,
-    Npm,
-    OtherIndex,
-    Pip,
-    RefractFunction,
-    System,
-    recorded_error,
-)
-
-_MAKERS = ("CDGM", "HIKARI", "HOYA", "OHARA", "SCHOTT", "SUMITA")
+from .system import RECORDED_F32, RECORDED_F64, Apt, Npm, Pip, RefractFunction, System, recorded_error
 
 
 def _as_in_glsl(title: str, script: str) -> tuple[RefractFunction, ...]:
@@ -27,24 +14,6 @@ def _as_in_glsl(title: str, script: str) -> tuple[RefractFunction, ...]:
         RefractFunction(f"{title}, dvec3", "f64", script, RECORDED_F64, "zero", ("float64",)),
     )
 
-
-# Of optiland's copy of refractiveindex.info, which has the makers' catalogues for Zemax of other years.
-_OTHER_INDICES = {
-    "CDGM:H-K9L": OtherIndex(
-        1.19e-5,
-        "CDGM's catalogue for Zemax of 2022: Sellmeier's formula, n_g = 1.52669; its spreadsheet prints 1.52667",
-    ),
-    "CDGM:H-LaF4": OtherIndex(
-        6.32e-5,
-        "CDGM's catalogue for Zemax of 2022: Sellmeier's formula, n_g = 1.77728; its spreadsheet prints 1.77717",
-    ),
-    "SUMITA:K-GIR79": OtherIndex(
-        1.83e-3, "Sumita's catalogue of 2017 had n_d = 1.85588; since then the glass of that name has 1.85920"
-    ),
-    "SUMITA:K-SFLDn3": OtherIndex(
-        4.89e-5, "Sumita's catalogue of 2017 had n_d = 1.84666, V_d = 23.9; since then 1.84670, 23.8"
-    ),
-}
 
 _SYSTEMS = (
     System(
@@ -101,7 +70,6 @@ _SYSTEMS = (
         megabytes=260,
         small=True,
         lens="rayoptics_lens.py",
-        glasses=GlassCatalogue("rayoptics_glasses.py", _MAKERS, "nan"),
         calls=(
             RefractFunction(
                 "rayoptics, bend", "f64", "rayoptics_rays.py", recorded_error(7e-15, 1.9e-12, 2e-16, 1e-15), "nan"
@@ -115,7 +83,6 @@ _SYSTEMS = (
         Pip(("optiland==0.6.3",)),
         megabytes=1300,
         lens="optiland_lens.py",
-        glasses=GlassCatalogue("optiland_glasses.py", _MAKERS, "nan", _OTHER_INDICES),
         calls=(
             RefractFunction(
                 "optiland, RealRays.refract",
