@@ -35,6 +35,7 @@ from validation.suite.renderers.system import (
     APART,
     CRITICAL,
     GRAZING,
+    LENGTHS,
     MATCHED,
     RANDOM,
     TOTAL,
@@ -177,7 +178,8 @@ def rows(call: RefractFunction, rays: RaySet, answers: Answers) -> list[Row]:
     """One per set."""
     left_out = absolute_radicand(rays.rays) < call.gives_up
     findings = check_answers.check(_only(rays, ~left_out), _without(answers, rays.ids[left_out]))
-    about = _remark(findings, str(answers.header.get("system", "")), call.remark)
+    known = "; ".join(filter(None, (LENGTHS[call.lengths], call.remark)))
+    about = _remark(findings, str(answers.header.get("system", "")), known)
     made = []
     for name in SETS:
         figures = next((each for each in findings.regimes if each.regime == name), None)

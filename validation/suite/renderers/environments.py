@@ -77,13 +77,20 @@ def _marker(system: System) -> Path:
 
 def _mark(system: System) -> list[str]:
     """What is installed: another version of the table or of the lock is another mark."""
-    lock = locked(system) / "package-lock.json" if isinstance(system.needs, Npm) else locked(system)
-    return [repr(system.needs), hashlib.sha256(lock.read_bytes()).hexdigest()]
+    locks = [locked(system) / "package-lock.json" if isinstance(system.needs, Npm) else locked(system)]
+    if isinstance(system.needs, Pip) and system.needs.built:
+        locks.append(locked_source(system))
+    return [repr(system.needs), *(hashlib.sha256(lock.read_bytes()).hexdigest() for lock in locks)]
 
 
 def locked(system: System) -> Path:
     """The packages with their hashes, of all that may be installed: a file for pip, a folder for npm."""
     return LOCKS / (system.name if isinstance(system.needs, Npm) else f"{system.name}.txt")
+
+
+def locked_source(system: System) -> Path:
+    """The source of the one package that there is no wheel of, with its hash."""
+    return LOCKS / f"{system.name}.source.txt"
 
 
 def python(system: System) -> str:
@@ -121,9 +128,12 @@ def install(system: System) -> None:
         _do(system, [_interpreter(system, needs.python), "-m", "venv", "--without-pip", str(folder(system))])
         pip = [sys.executable, "-m", "pip", "--python", python(system), "install"]
         options = ["--quiet", "--disable-pip-version-check", "--no-input", "--no-compile", "--no-deps"]
-        # To build a package would run, and fetch, code without a hash.
+        # To build a package would run, and fetch, code without a hash; not so without isolation, by locked tools.
         safe = ["--require-hashes", "--only-binary", ":all:"]
         _do(system, [*pip, *options, *safe, "--requirement", str(locked(system))])
+        if needs.built:
+            safe = ["--require-hashes", "--no-binary", ":all:", "--no-build-isolation"]
+            _do(system, [*pip, *options, *safe, "--requirement", str(locked_source(system))])
     write_atomically(_marker(system), json.dumps(_mark(system)))
 
 
@@ -158,7 +168,11 @@ def _do(system: System, command: Sequence[str]) -> None:
 
 
 def script(system: System, name: str, *arguments: str) -> list[str]:
-    """The command that runs a script of scripts/ in the system's environment."""
+    """The command that runs a script of scripts/ in the system's environment; one for node is told where that is."""
+    if name.endswith(".mjs"):
+        if not (node := shutil.which("node")):
+            raise Unable("no node in PATH")
+        return [node, str(SCRIPTS / name), str(folder(system)), *arguments]
     return [python(system), str(SCRIPTS / name), *arguments]
 
 

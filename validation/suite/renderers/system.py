@@ -24,6 +24,14 @@ def recorded_error(
     return {name: x if isinstance(x, tuple) else (x, x) for name, x in figures}
 
 
+# What a function does with vectors that are not of unit length.
+LENGTHS = {
+    "": "",  # nobody looked
+    "used": "takes vectors of any length as they are",
+    "ray scaled": "scales the ray to unit length",
+    "speed": "takes the index that a ray leaves from its speed 1/n, not from the medium",
+}
+
 # Everyone who writes down GLSL's formula in that precision.
 RECORDED_F32 = recorded_error(3e-6, 6e-4, (1e-7, 3e-7), (5e-7, 1e-6))
 RECORDED_F64 = recorded_error(9e-15, 1.9e-12, 2e-16, 1e-15)
@@ -35,6 +43,8 @@ class Pip:
 
     requirements: tuple[str, ...]
     python: str = ""  # the one version that there are wheels for, as "3.11"
+    # The one of them that has no wheel: built from NAME.source.txt, by tools that are in the lock.
+    built: str = field(default="", repr=False)  # its lock is in the mark of what is installed
 
 
 @dataclass(frozen=True)
@@ -62,7 +72,7 @@ class RefractFunction:
 
     `told`: the signal of total internal reflection, one of `mi_refract.ray_sets.tir_signal.TIR`. `gives_up`: the
     cos²θ_t below which it treats a ray as totally reflected, by its documentation. `remark`: known
-    differences.
+    differences. `lengths`: one of LENGTHS.
     """
 
     title: str
@@ -73,6 +83,7 @@ class RefractFunction:
     arguments: tuple[str, ...] = ()
     gives_up: float = 0.0
     remark: str = ""
+    lengths: str = ""
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,16 @@ def apart(rays):
     return grid + np.random.default_rng(0).uniform(-0.25, 0.25, grid.shape)
 
 
+def frames(n):
+    """(N, 3, 3): rotations that take (0, 0, 1) to n, to rounding; by Duff et al. 2017, as in Mitsuba."""
+    x, y, z = n.T
+    sign = np.copysign(1.0, z)
+    over = -1 / (sign + z)
+    first = np.stack([1 + sign * x * x * over, sign * x * y * over, -sign * x], axis=1)
+    second = np.stack([x * y * over, sign + y * y * over, -y], axis=1)
+    return np.stack([first, second, n], axis=2)
+
+
 def write(rays, b, system, transmitted=None):
     """Answers to stdout, to the last bit. `system`: the name and version of what computed them.
 

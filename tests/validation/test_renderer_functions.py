@@ -1,0 +1,207 @@
+"""Functions of refraction of other systems: what they do with vectors of other lengths, and where they cannot run."""
+
+import dataclasses
+import sys
+
+import numpy as np
+import pytest
+
+from mi_refract.ray_sets.files import parse_answers
+from validation.suite import per_ray
+from validation.suite.renderers import SYSTEMS, environments
+from validation.suite.renderers.system import LENGTHS, RECORDED_F64, SCRIPTS, Npm, Pip, RefractFunction, System
+
+COUNT = 60
+CALLS = {
+    f"{name} {call.precision}": (system, call)
+    for name, system in SYSTEMS.items()
+    for call in system.calls
+    if call.lengths
+}
+HEADER = "id,ax,ay,az,nx,ny,nz,n_from,n_to"
+# A plane of batoid between media of index 1.5 and 1, and a ray of speed 1: as from index 1.
+SPEED = "import batoid; ray = batoid.RayVector(0, 0, -1, 0.6, 0, 0.8); media = map(batoid.ConstMedium, (1.5, 1))"
+
+
+@pytest.fixture(scope="module")
+def vectors():
+    """(a, n, n_from, n_to), of unit length: into a denser and a thinner medium, half of these totally reflected."""
+    rng = np.random.default_rng(7)
+    a, n = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in rng.normal(size=(2, COUNT, 3)))
+    n = np.where((a * n).sum(1, keepdims=True) > 0, -n, n)
+    n_from = np.where(np.arange(COUNT) % 2, 1.5, 1.0)
+    return a, n, n_from, 2.5 - n_from
+
+
+def textbook(a, n, k):
+    """k a − (k c + √(1 − k²(1 − c²))) n of vectors of any length; NaN where the radicand is negative."""
+    k, c = k[:, None], (a * n).sum(1, keepdims=True)
+    radicand = 1 - k * k * (1 - c * c)
+    return k * a - (k * c + np.sqrt(np.where(radicand < 0, np.nan, radicand))) * n
+
+
+def scaled(v):
+    return v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+# What a system does by LENGTHS, of the ray a, the normal n and the two indices.
+MEANINGS = {
+    "used": lambda a, n, n_from, n_to: textbook(a, n, n_from / n_to),
+    "ray scaled": lambda a, n, n_from, n_to: textbook(scaled(a), n, n_from / n_to),
+    "speed": lambda a, n, n_from, n_to: textbook(scaled(a), n, n_from / np.linalg.norm(a, axis=1) / n_to),
+}
+
+
+def as_rows(a, n, n_from, n_to):
+    return "\n".join(
+        [HEADER, *(",".join(map(repr, (i, *row))) for i, row in enumerate(np.c_[a, n, n_from, n_to].tolist()))]
+    )
+
+
+def means(system, call, vectors):
+    """The meanings of LENGTHS that agree with every answer to rays twice as long, and to normals where these count."""
+    a, n, n_from, n_to = vectors
+    found = set(MEANINGS)
+    for a_by, n_by in ((1, 1), (2, 1), (1, 2) if call.lengths == "used" else (0.5, 1)):
+        given = a_by * a, n_by * n, n_from, n_to
+        command = environments.script(system, call.script, *call.arguments)
+        b = parse_answers(environments.run(command, as_rows(*given)), call.title).b
+        for name in sorted(found):
+            expected = MEANINGS[name](*given)
+            through = np.isfinite(expected[:, 0])
+            if a_by == n_by == 1:
+                assert 0 < through.sum() < COUNT, "some are totally reflected, not all"
+            if not np.allclose(b[through], expected[through], atol=1e-4 if call.precision == "f32" else 1e-12):
+                found.discard(name)
+    return found
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_vectors_of_other_lengths_are_treated_as_the_table_says(name, vectors):
+    system, call = CALLS[name]
+    if reason := environments.absent(system):
+        pytest.skip(reason)
+    try:
+        assert means(system, call, vectors) == {call.lengths}
+    except environments.Unable as reason_here:
+        pytest.skip(f"cannot run here: {reason_here}")
+
+
+@pytest.mark.parametrize(
+    ("before", "meaning"),
+    [
+        ("", "used"),
+        ("a = a / np.linalg.norm(a, axis=1, keepdims=True)", "ray scaled"),
+        ("s = np.linalg.norm(a, axis=1, keepdims=True); a, k = a / s, k / s", "speed"),
+        ("n = n / np.linalg.norm(n, axis=1, keepdims=True)", None),
+    ],
+)
+def test_each_treatment_is_told_from_the_others(before, meaning, vectors, tmp_path):
+    path = tmp_path / "program.py"
+    path.write_text(
+        f"import sys; sys.path.insert(0, {str(SCRIPTS)!r})\nimport numpy as np, table\nrays = table.Rays('float64')\n"
+        f"a, n, k = rays.a, rays.n, rays.k[:, None]\n{before}\nc = (a * n).sum(1, keepdims=True)\n"
+        "d = 1 - k * k * (1 - c * c)\nb = np.where(d < 0, 0, k * a - (k * c + np.sqrt(np.abs(d))) * n)\n"
+        "table.write(rays, b, 'a program')\n"
+    )
+    for claimed in MEANINGS:
+        call = RefractFunction("a program", "f64", str(path), RECORDED_F64, "zero", lengths=claimed)
+        found = means(System("a", "A", "none", None, 0), call, vectors)
+        assert (found == {claimed}) == (claimed == meaning), claimed
+
+
+def test_every_treatment_of_lengths_has_a_meaning_and_is_said():
+    assert set(MEANINGS) == set(LENGTHS) - {""} and all(LENGTHS[name] for name in MEANINGS)
+    assert {call.lengths for _, call in CALLS.values()} == set(MEANINGS)
+    rays = per_ray.given("f64")
+    for lengths, said in LENGTHS.items():
+        call = RefractFunction("a", "f64", "", RECORDED_F64, "zero", lengths=lengths, remark="known")
+        answers = parse_answers("\n".join(["id,bx,by,bz", *(f"{i},0,0,0" for i in rays.ids.tolist())]), "a")
+        reason = per_ray.rows(call, rays, answers)[0].reason
+        assert "known" in reason and said in reason and "; ;" not in reason
+
+
+def test_batoid_takes_the_first_index_from_the_speed_and_not_from_the_medium():
+    if reason := environments.absent(SYSTEMS["batoid"]):
+        pytest.skip(reason)
+    asked = f"{SPEED}; batoid.Plane().refract(ray, *media); print(*ray.v[0].tolist())"
+    direction = environments.run([environments.python(SYSTEMS["batoid"]), "-c", asked]).split()
+    np.testing.assert_allclose([float(x) for x in direction], [0.6, 0, 0.8], atol=1e-15)
+
+
+def test_prysm_takes_a_normal_on_the_far_side_only():
+    if reason := environments.absent(SYSTEMS["prysm"]):
+        pytest.skip(reason)
+    asked = (
+        "import numpy as np; from prysm.experimental.raytracing.spencer_and_murty import refract; "
+        "[print(*refract(1, 1.5, np.array([[0.6, 0, 0.8]]), np.array([[0, 0, z]]))[0].tolist()) for z in (1.0, -1.0)]"
+    )
+    far, near = environments.run([environments.python(SYSTEMS["prysm"]), "-c", asked]).splitlines()
+    np.testing.assert_allclose(np.array(far.split(), float), [0.4, 0, np.sqrt(1 - 0.4**2)], atol=1e-15)
+    np.testing.assert_allclose(np.array(near.split(), float), [0.4, 0, -np.sqrt(1 - 0.4**2)], atol=1e-15)
+
+
+def test_frames_are_rotations_onto_the_normal(monkeypatch):
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    import table
+
+    axes = np.vstack([np.eye(3), -np.eye(3)])
+    n = np.vstack([scaled(np.random.default_rng(3).normal(size=(1000, 3))), axes, scaled(axes - 1e-9)])
+    frames = table.frames(n)
+    np.testing.assert_array_equal(frames[:, :, 2], n)
+    np.testing.assert_allclose(np.swapaxes(frames, 1, 2) @ frames, np.broadcast_to(np.eye(3), frames.shape), atol=1e-15)
+    np.testing.assert_allclose(np.linalg.det(frames), 1, atol=1e-15)
+
+
+# Where they cannot run -------------------------------------------------------------------------------------------
+
+
+def test_a_script_for_node_is_told_its_folder_and_cannot_run_without_node(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    system = System("thing", "Thing", "none", Npm(("a@1",)), 0)
+    monkeypatch.setattr("shutil.which", lambda program: f"/bin/{program}")
+    command = environments.script(system, "thing.mjs", "more")
+    assert command == ["/bin/node", str(SCRIPTS / "thing.mjs"), str(environments.folder(system)), "more"]
+    monkeypatch.setattr("shutil.which", lambda program: None)
+    with pytest.raises(environments.Unable, match="no node in PATH"):
+        environments.script(system, "thing.mjs")
+
+
+@pytest.mark.parametrize(
+    ("name", "hidden", "said"),
+    [
+        ("wgsl", {"VK_DRIVER_FILES": "/nowhere", "VK_ICD_FILENAMES": "/nowhere"}, "mesa-vulkan-drivers libvulkan1"),
+        ("slang", {"PATH": "/nowhere"}, "Debian: g++"),
+        ("thi_ng", {"PATH": "/nowhere"}, "no node in PATH"),
+    ],
+)
+def test_without_its_driver_or_compiler_a_system_is_not_run_and_says_what_is_missing(name, hidden, said, monkeypatch):
+    system = dataclasses.replace(SYSTEMS[name], small=True)
+    if reason := environments.absent(system):
+        pytest.skip(reason)
+    for variable, value in hidden.items():
+        monkeypatch.setenv(variable, value)
+    for call in system.calls:
+        (row,) = per_ray.call_rows(system, call, None)
+        assert row.verdict == "not run" and row.reason.startswith("cannot run here: ") and said in row.reason
+
+
+# Built from source -----------------------------------------------------------------------------------------------
+
+
+def test_a_package_without_a_wheel_is_built_by_locked_tools_after_them(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(environments, "LOCKS", tmp_path)
+    for name in ("thing.txt", "thing.source.txt"):
+        (tmp_path / name).write_text(name)
+    done = []
+    monkeypatch.setattr(environments, "_do", lambda system, given: done.append(given))
+    system = System("thing", "Thing", "none", Pip(("a==1", "setuptools"), built="a"), 0)
+    environments.install(system)
+    _, wheels, source = done
+    assert {"--require-hashes", "--only-binary", "--no-deps"} < {*wheels} and wheels[-1].endswith("thing.txt")
+    assert {"--require-hashes", "--no-build-isolation", "--no-binary", "--no-deps"} < {*source}
+    assert source[-1] == str(environments.locked_source(system)) and sys.executable == source[0]
+    assert not environments.absent(system)
+    (tmp_path / "thing.source.txt").write_text("another source")
+    assert environments.absent(system)

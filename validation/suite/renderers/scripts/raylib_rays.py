@@ -1,0 +1,14 @@
+"""`Vector3Refract` of raylib's raymath, in float32, by the bindings for Python."""
+
+from importlib.metadata import version
+
+import numpy as np
+import raylib
+import table
+
+rays = table.Rays("float32")
+b = np.empty_like(rays.a)
+for i, (a, n, k) in enumerate(zip(rays.a.tolist(), rays.n.tolist(), rays.k.tolist(), strict=True)):
+    found = raylib.Vector3Refract(a, n, k)
+    b[i] = found.x, found.y, found.z
+table.write(rays, b, f"raylib {version('raylib')}")
