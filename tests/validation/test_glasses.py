@@ -221,3 +221,17 @@ def test_sumita_has_changed_two_glasses(glass, powers, n_d):
     off = max(abs(there(w) / media.index(glass, w) - 1) for w in glasses.WAVELENGTHS)
     assert round(there(media.LINES["d"]), 5) == n_d
     assert off == pytest.approx(CATALOGUES["optiland"].others[glass].recorded, rel=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("glass", "formula"),
+    [
+        ("SCHOTT:LLF1", "sellmeier(1.23326922, 0.116923839, 0.862645379, 8853.9681, 43687.5155, 104992168)"),
+        ("SCHOTT:N-BK7", "sellmeier(1.03961212, 0.231792344, 1.01046945, 6000.6987, 20017.9144, 103560653)"),
+    ],
+)
+def test_schott_has_changed_one_glass_and_raysect_rounds_the_others(glass, formula):
+    """Coefficients of Schott's catalogue of 2000, as raysect has them; of N-BK7 only C1 = 6000.69867 nm² is another."""
+    off = max(abs(media.index(formula, w) / media.index(glass, w) - 1) for w in glasses.WAVELENGTHS)
+    assert off == pytest.approx(CATALOGUES["raysect"].others[glass].recorded, rel=5e-3)
+    assert round(media.index("SCHOTT:LLF1", G), 5) == 1.56333

@@ -7,7 +7,8 @@ bound of the textbook formula for the ray; indices are compared with those of `m
 evaluates the same formula with the same coefficients differs by rounding. Where a system has another edition or
 another fit of a maker's catalogue, the row says so: the difference was recorded, and more than 1e-5, which is what
 makers print, misses a goal. rayoptics reads the same tables of the makers as this package, through opticalglass, and
-shows that the formulas are evaluated alike; optiland and raysect have tables of their own.
+shows that the formulas are evaluated alike; optiland and raysect have tables of their own. batoid has no catalogue, but
+a telescope with two glasses by name.
 """
 
 from __future__ import annotations

@@ -64,8 +64,20 @@ _OPTILAND = {
 }
 
 
+_ROUNDED = "raysect keeps 10 decimals of C1, in µm²"
+_RAYSECT = {
+    "SCHOTT:N-BK7": OtherIndex(3.76e-11, _ROUNDED),
+    "SCHOTT:F2": OtherIndex(1.46e-11, _ROUNDED),
+    "SCHOTT:N-LAK10": OtherIndex(8.29e-11, _ROUNDED),
+    "SCHOTT:LLF1": OtherIndex(
+        2.97e-5, "Schott's catalogue of 2000 had other coefficients, n_g = 1.56328; today's print 1.56333"
+    ),
+}
 # By the name of a system in `table`.
 CATALOGUES = {
     "rayoptics": GlassCatalogue("rayoptics_glasses.py", GLASSES, "nan"),
     "optiland": GlassCatalogue("optiland_glasses.py", GLASSES, "nan", _OPTILAND),
+    "raysect": GlassCatalogue("raysect_glasses.py", tuple(_RAYSECT), "reflected", _RAYSECT),
+    # No catalogue: two glasses that a telescope of its data calls by Schott's names.
+    "batoid": GlassCatalogue("batoid_glasses.py", ("SCHOTT:N-BK7", "SCHOTT:N-LAK10"), "nan"),
 }

@@ -14,7 +14,10 @@ import table
 
 
 class Rays(table.Rays):
-    """As of `table`, with `n_from`, `n_to` and `k` by `index(catalogue, name, wavelength)`; air has the index 1."""
+    """As of `table`, with `n_from`, `n_to` and `k` by `index(catalogue, name, wavelength)`; air has the index 1.
+
+    `wavelength` (N,) in nm; `left` and `entered`: the names of the media.
+    """
 
     def __init__(self, index):
         text = sys.stdin.read()
@@ -25,7 +28,8 @@ class Rays(table.Rays):
         at, medium = names.index("wavelength"), names.index("medium")
         asked = [(float(row[at]), *media[int(row[medium])]) for row in rows]
         known = {(w, name): _index(index, name, w) for w, *pair in asked for name in pair}
-        self.wavelength = np.array([w for w, _, _ in asked])
+        wavelength, self.left, self.entered = zip(*asked, strict=True)
+        self.wavelength = np.array(wavelength)
         self.n_from = np.array([known[w, left] for w, left, _ in asked])
         self.n_to = np.array([known[w, entered] for w, _, entered in asked])
         self.k = self.n_from / self.n_to
