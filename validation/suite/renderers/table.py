@@ -20,8 +20,8 @@ from .system import (
 def _as_in_glsl(title: str, script: str) -> tuple[RefractFunction, ...]:
     """`refract` of vec3 and of dvec3, which answer total internal reflection with the null vector."""
     return (
-        RefractFunction(f"{title}, vec3", "f32", script, RECORDED_F32, "zero", ("float32",)),
-        RefractFunction(f"{title}, dvec3", "f64", script, RECORDED_F64, "zero", ("float64",)),
+        RefractFunction(f"{title}, vec3", "f32", script, RECORDED_F32, "zero", ("float32",), lengths="used"),
+        RefractFunction(f"{title}, dvec3", "f64", script, RECORDED_F64, "zero", ("float64",), lengths="used"),
     )
 
 
