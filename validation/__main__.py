@@ -35,7 +35,10 @@ ROOMS = {
     "diff": ("diff", ("planted_defects", "visible_changes", "times")),
     "ground-truth": ("ground_truth", ("traced_bodies",)),
     "robustness": ("robustness", ("mutated_inputs", "killed_commands", "code_mutants")),
-    "suite": ("suite", ("matrix", "per_ray", "small_mistakes", "rendered_images", "dispersion", "exports")),
+    "suite": (
+        "suite",
+        ("matrix", "per_ray", "small_mistakes", "rendered_images", "dispersion", "lenses", "glasses", "exports"),
+    ),
 }
 # What the profile `quick` runs where no study is named.
 QUICK = (

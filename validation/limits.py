@@ -180,6 +180,10 @@ UNEXPLAINED = limit(0.05, "of the mutants of our code: no test notices them, and
 # Other renderers -----------------------------------------------------------------------------------------------
 
 RECORDED = limit(3.0, "factor between the worst error and the recorded one: the numbers of those rays were not kept")
+LENS_TRACE = limit(1.0, "the bound adds up every rounding at its worst, see `validation/suite/lenses.py`")
+OTHER_INDEX = limit(
+    1.02, "factor between the largest difference of an index and the recorded one, of three digits; the data are locked"
+)
 SUITE_ERROR = limit(1e-4, "probability of any alarm in a pair of equal images")
 
 

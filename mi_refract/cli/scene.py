@@ -27,7 +27,7 @@ def _scene() -> None:
 @app.command()
 def export(
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="A Mitsuba scene, or the name of one in scenes/.")],
-    to: Annotated[str, typer.Option(metavar="TARGET", help="cycles|luxcore|radiance|povray|mitsuba|obj+json")],
+    to: Annotated[str, typer.Option(metavar="TARGET", help="cycles|luxcore|radiance|raysect|povray|mitsuba|obj+json")],
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="FOLDER", help="A new or empty folder; NAME-TARGET by default."),

@@ -9,13 +9,14 @@ from pathlib import Path
 from mi_refract.io import atomic
 
 from .plain_scene import PlainScene
-from .targets import cycles, luxcore, mitsuba, obj, povray, radiance
+from .targets import cycles, luxcore, mitsuba, obj, povray, radiance, raysect
 from .targets.shared_files import Files
 
 TARGETS: dict[str, Callable[[PlainScene], Files]] = {
     "cycles": cycles.files,
     "luxcore": luxcore.files,
     "radiance": radiance.files,
+    "raysect": raysect.files,
     "povray": povray.files,
     "mitsuba": mitsuba.files,
     "obj+json": obj.files,

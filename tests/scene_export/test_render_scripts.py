@@ -1,13 +1,16 @@
 """What the scripts of exports ask of their renderers: each seed once, and a plain path tracer."""
 
+import json
 import runpy
 import sys
 import types
 from unittest import mock
 
+import numpy as np
 import pytest
-from support import fake_bpy
+from support import fake_bpy, fake_raysect
 
+from mi_refract.io import image_file
 from mi_refract.scene_export import tessellation, write_files
 from mi_refract.scene_export.plain_scene import Camera, Diffuse, Glass, Light, Mesh, PlainScene
 
@@ -126,3 +129,31 @@ def test_luxcore_renders_each_seed_into_a_file_of_its_own(words, seeds, threads,
         assert session.calls == ["Start", *["HasDone", "UpdateStats"] * 2, "HasDone", "Stop", "Save"]
     assert lux.Scene.return_value.Parse.call_args.args == ({"name": "scene.scn"},)
     assert 0 < max(waits) < 1
+
+
+def test_raysect_writes_rows_from_the_lowest_and_weighs_no_ray(tmp_path, monkeypatch):
+    _, script = fake_raysect.run(written("raysect", tmp_path / "new"), monkeypatch)
+    pixels = np.arange(2 * 3 * 3, dtype=np.float32).reshape(2, 3, 3)
+    (tmp_path / "image.pfm").write_bytes(script["pfm"](pixels))
+    assert (image_file.read(tmp_path / "image.pfm").pixels == pixels).all()
+    assert script["Camera"]((2, 1))._generate_rays(0, 0) == [("ray", 1.0)]
+
+
+def test_raysect_lamps_are_black_from_behind(tmp_path, monkeypatch):
+    _, script = fake_raysect.run(written("raysect", tmp_path / "new"), monkeypatch)
+    lamp, ray = script["Light"]("bright"), types.SimpleNamespace(new_spectrum=lambda: "black")
+    seen = [lamp.evaluate_surface("world", ray, "lamp", "place", exiting, "more") for exiting in (False, True)]
+    assert seen == ["bright", "black"]
+
+
+def test_raysect_takes_a_band_and_a_dispersion(tmp_path, monkeypatch):
+    folder = written("raysect", tmp_path / "new")
+    _, script = fake_raysect.run(folder, monkeypatch)
+    plain = json.loads((folder / "scene.json").read_text())
+    for band, bins in ((None, 3), ([656.0, 656.5], 1)):
+        made = script["camera"]("world", plain, types.SimpleNamespace(spp=5, band=band), "pipeline")
+        assert (made.spectral_rays, made.spectral_bins, made.pixel_samples) == (1, bins, 5)
+        assert [made.min_wavelength, made.max_wavelength] == (band or [400, 700])
+    entry = {"int_ior": 1.5, "ext_ior": 1.25}
+    assert script["glass"](entry) == ("glass", 1.5, 1, 1.25)
+    assert script["glass"](entry | {"sellmeier": [1, 2, 3, 4, 5, 6]})[1] == (1, 2, 3, 4, 5, 6)

@@ -102,7 +102,8 @@ def test_nothing_stays_of_half_an_export(small, tmp_path, monkeypatch):
 
 def test_unknown_target(small, tmp_path):
     with pytest.raises(
-        ValueError, match=r"'blender': unknown; accepted: cycles, luxcore, radiance, povray, mitsuba, obj\+json"
+        ValueError,
+        match=r"'blender': unknown; accepted: cycles, luxcore, radiance, raysect, povray, mitsuba, obj\+json",
     ):
         write_files.write(small, "blender", tmp_path / "new")
 

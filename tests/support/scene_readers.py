@@ -6,11 +6,12 @@ place in the image, from (0, 0) at its upper left corner to (1, 1). `Scene.sky(d
 
 import json
 import re
+import types
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from support import fake_bpy
+from support import fake_bpy, fake_raysect
 
 from mi_refract.io.image_file import read_exr
 
@@ -284,6 +285,62 @@ def _cycles_light(tree, mix):
     return np.array(front.inputs["Color"].default_value[:3]) * front.inputs["Strength"].default_value
 
 
+# raysect ----------------------------------------------------------------------------------------------------------
+
+
+def raysect(folder, monkeypatch):
+    """What the script makes of raysect. A camera looks along +z, and +x is left in its image; lengths are scaled."""
+    made, script = fake_raysect.run(folder, monkeypatch)
+    plain = json.loads((folder / "scene.json").read_text())
+    script["build"](plain, folder)
+    unit = script["scale"](plain, folder)
+    options = types.SimpleNamespace(spp=3, band=None)
+    camera = script["camera"]("world", plain, options, "pipeline")
+    assert camera.ray_extinction_prob == 0 and camera.ray_importance_sampling is False
+    width, height = camera.pixels
+    half = np.tan(np.radians(camera.fov) / 2) / max(width, height)
+    place = np.asarray(camera.transform)
+
+    def ray(x, y):
+        local = np.array([(1 - 2 * x) * half * width, (1 - 2 * y) * half * height, 1])
+        return place[:3, 3] / unit, place[:3, :3] @ local
+
+    found = Scene((width, height), camera.ray_max_depth, ray, None)
+    found.sky = _raysect_sky(made.sky, script)
+    for name, mesh in made.meshes.items():
+        found.triangles[name] = mesh.triangles / unit
+        if isinstance(mesh.material, fake_raysect.Emitter):
+            found.lights[name] = _bins(mesh.material.spectrum)
+        elif mesh.material[0] == "glass":
+            _, inside, transmission, outside = mesh.material
+            assert transmission == 1
+            found.indices[name] = inside / outside
+        else:
+            found.colours[name] = _bins(mesh.material[1])
+    return found
+
+
+def _bins(spectrum):
+    """Red, green and blue, each constant between two places."""
+    values = list(spectrum.values())
+    assert values[::2] == values[1::2] and min(np.diff(list(spectrum))) > 0
+    return values[::2]
+
+
+def _raysect_sky(sky, script):
+    if not isinstance(sky, script["Map"]):
+        return plain_sky(_bins(sky.spectrum))
+
+    def seen(direction):
+        vector = types.SimpleNamespace(**dict(zip("xyz", direction, strict=True)))
+        vector.normalise = lambda: vector
+        spectrum = types.SimpleNamespace(samples=np.zeros(3))
+        ray = types.SimpleNamespace(direction=vector, new_spectrum=lambda: spectrum)
+        return sky.evaluate_surface("world", ray).samples
+
+    return lambda directions: np.array([seen(direction) for direction in directions])
+
+
 # A program of one's own -------------------------------------------------------------------------------------------
 
 
@@ -334,4 +391,11 @@ def _mtl(path):
     return found
 
 
-READERS = {"radiance": radiance, "luxcore": luxcore, "povray": povray, "cycles": cycles, "obj+json": obj}
+READERS = {
+    "radiance": radiance,
+    "luxcore": luxcore,
+    "povray": povray,
+    "cycles": cycles,
+    "raysect": raysect,
+    "obj+json": obj,
+}

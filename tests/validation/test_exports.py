@@ -86,6 +86,18 @@ DEFECTS = {
     ),
     "no diffuse light": ("Radiance", lambda: edited("radiance", "README.txt", r"-ab \d+", "-ab 0")),
     "sky of Radiance": ("Radiance", lambda: edited("radiance", "sky.cal", r"Acos\(y\)", "Acos(-y)")),
+    "rays of raysect's camera weighed": (
+        "raysect",
+        lambda: edited("raysect", "render.py", r"\(ray, 1\.0\) for ray, _", "(ray, w) for ray, w"),
+    ),
+    "scene of raysect too large": (
+        "raysect",
+        lambda: edited("raysect", "render.py", r"SIZE, FAR = 0\.5", "SIZE, FAR = 500"),
+    ),
+    "indices of raysect": (
+        "raysect",
+        lambda: edited("raysect", "render.py", r'\(entry\["int_ior"\]', '(entry["ext_ior"]'),
+    ),
     "sky of LuxCore": ("LuxCore", lambda: under_the_ground("luxcore")),
     "sky of Cycles": ("Cycles", lambda: under_the_ground("cycles")),
     "sky of POV-Ray": ("POV-Ray", lambda: under_the_ground("povray")),

@@ -226,6 +226,7 @@ def test_every_system_has_a_place_a_licence_and_scripts():
     assert all(name == system.name and name.isidentifier() for name, system in SYSTEMS.items())
     assert all(system.licence and system.title and (system.calls or system.draws) for system in SYSTEMS.values())
     assert all((SCRIPTS / call.script).is_file() for system in SYSTEMS.values() for call in system.calls)
+    assert all((SCRIPTS / system.lens).is_file() for system in SYSTEMS.values() if system.lens)
     needs = [system.needs for system in SYSTEMS.values() if isinstance(system.needs, Pip)]
     assert all(re.match(f"{each.built or '.+'}==", each.requirements[0]) for each in needs)
 
@@ -258,7 +259,7 @@ def test_scripts_import_nothing_of_ours_and_we_nothing_of_theirs():
         return {name.partition(".")[0] for name in names}
 
     root = SCRIPTS.parents[3]
-    theirs = {"bpy", "glm", "moderngl", "optiland", "pyluxcore", "pyradiance", "rayoptics"}
+    theirs = {"bpy", "glm", "moderngl", "optiland", "pyluxcore", "pyradiance", "rayoptics", "raysect"}
     theirs |= {"MaterialX", "batoid", "prysm", "pyoptools", "raylib", "skia", "slangpy", "taichi", "wgpu"}
     scripts = {*SCRIPTS.glob("*.py"), *(root / "mi_refract" / "scene_export" / "targets").glob("render_*.py")}
     assert len(scripts) > 9

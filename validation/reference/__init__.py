@@ -3,4 +3,12 @@
 In: rays, scenes or parameters. Out: directions, paths and powers to compare with.
 """
 
-__all__ = ["closed_forms", "diffuse_fresnel", "fast_reference", "layered_scenes", "optical_systems", "planar_retrace"]
+__all__ = [
+    "closed_forms",
+    "diffuse_fresnel",
+    "exact_lens",
+    "fast_reference",
+    "layered_scenes",
+    "optical_systems",
+    "planar_retrace",
+]

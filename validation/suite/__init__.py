@@ -3,4 +3,14 @@
 In: rays and plain scenes, given to the programs of `renderers/`. Out: rows per system and check, and a matrix of them.
 """
 
-__all__ = ["dispersion", "exports", "matrix", "per_ray", "rendered_images", "small_mistakes"]
+__all__ = [
+    "dispersion",
+    "exports",
+    "glasses",
+    "lenses",
+    "matrix",
+    "matrix_page",
+    "per_ray",
+    "rendered_images",
+    "small_mistakes",
+]

@@ -3,4 +3,4 @@
 `COMMANDS` is the text that says how to render; `ASSUMPTIONS` says where the renderer's model differs from Mitsuba's.
 """
 
-__all__ = ["cycles", "luxcore", "mitsuba", "obj", "povray", "radiance", "scene_json"]
+__all__ = ["cycles", "luxcore", "mitsuba", "obj", "povray", "radiance", "raysect", "scene_json"]

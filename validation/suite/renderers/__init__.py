@@ -7,4 +7,4 @@ nothing of this project; a script that cannot run on this machine says why in a 
 from .system import System
 from .table import SYSTEMS
 
-__all__ = ["SYSTEMS", "System", "command", "environments", "image_renderers"]
+__all__ = ["SYSTEMS", "System", "command", "environments", "glass_catalogues", "image_renderers"]

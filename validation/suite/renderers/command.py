@@ -80,6 +80,8 @@ def _install(system: System) -> int:
 
 
 def _line(system: System) -> str:
-    does = " and ".join(word for word, able in (("rays", system.calls), ("images", system.draws)) if able)
+    does = " and ".join(
+        word for word, able in (("rays", system.calls), ("images", system.draws), ("lenses", system.lens)) if able
+    )
     state = "absent" if environments.absent(system) else "here"
-    return f"{system.name:10} {state:7} {does:18} {system.megabytes:5} MB  {system.source}  [{system.licence}]"
+    return f"{system.name:10} {state:7} {does:16} {system.megabytes:5} MB  {system.source}  [{system.licence}]"

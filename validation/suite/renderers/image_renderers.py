@@ -18,7 +18,7 @@ from mi_refract.io import image_file
 from mi_refract.io.image_file import Image
 from mi_refract.scene_export import write_files
 from mi_refract.scene_export.plain_scene import PlainScene
-from mi_refract.scene_export.targets import cycles, luxcore, povray, radiance, scene_json
+from mi_refract.scene_export.targets import cycles, luxcore, povray, radiance, raysect, scene_json
 
 from . import environments
 from .table import SYSTEMS
@@ -41,7 +41,7 @@ class ImageRenderer:
     assumed: Sequence[str]
 
 
-def _by_script(target: str) -> Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]:
+def _by_script(target: str, ending: str = "exr") -> Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]:
     """By the script that is exported with the scene, after `edit(folder)` of its files."""
 
     def draw(
@@ -52,7 +52,7 @@ def _by_script(target: str) -> Callable[[PlainScene, Path, int, Sequence[int]], 
             edit(folder / "scene")
         program = [environments.python(SYSTEMS[target]), "render.py", "--spp", str(spp), "--out", str(folder)]
         environments.run([*program, "--seeds", *map(str, seeds)], timeout=HOURS, where=folder / "scene")
-        return [_rgb(image_file.read(folder / f"seed{seed}.exr")) for seed in seeds]
+        return [_rgb(image_file.read(folder / f"seed{seed}.{ending}")) for seed in seeds]
 
     return draw
 
@@ -138,10 +138,12 @@ def _spp(sphere: int, prism: int, environment: int) -> dict[str, int]:
     return {"sphere": sphere, "prism": prism, "environment": environment}
 
 
+RAYSECT_SPP = _spp(2048, 768, 256) | {"furnace": 128}  # which samples no lamp
 POVRAY = ("Each pixel is the mean of a grid of 4 × 4 samples, without noise.", *povray.ASSUMPTIONS)
 IMAGE_RENDERERS: dict[str, ImageRenderer] = {
     "Radiance": ImageRenderer("radiance", _radiance, _spp(160, 112, 4), radiance.ASSUMPTIONS),
     "Cycles": ImageRenderer("cycles", _by_script("cycles"), _spp(128, 128, 32), cycles.ASSUMPTIONS),
+    "raysect": ImageRenderer("raysect", _by_script("raysect", "pfm"), RAYSECT_SPP, raysect.ASSUMPTIONS),
     "LuxCore": ImageRenderer("luxcore", _by_script("luxcore"), _spp(320, 400, 288), luxcore.ASSUMPTIONS),
     "POV-Ray": ImageRenderer("povray", _povray, _spp(16, 16, 16), POVRAY),
     "three-gpu-pathtracer": ImageRenderer("three", _three("1"), {"prism": 8, "furnace": 8}, THREE),

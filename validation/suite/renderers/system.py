@@ -16,7 +16,7 @@ RecordedError = Mapping[str, tuple[float, float]]  # worst angle in radians by s
 
 
 def recorded_error(
-    random: float | tuple, critical: float, grazing: float | tuple, matched: float | tuple
+    random: float | tuple, critical: float | tuple, grazing: float | tuple, matched: float | tuple
 ) -> RecordedError:
     """Worst angles in radians by set of rays, a number or a range (from, to); of random rays one for both sets."""
     sets = (RANDOM, APART, CRITICAL, GRAZING, MATCHED)
@@ -101,6 +101,7 @@ class System:
     small: bool = False
     calls: tuple[RefractFunction, ...] = field(default=())
     draws: bool = False  # whether it renders images
+    lens: str = ""  # the script of scripts/ that traces a lens with it
 
     @property
     def source(self) -> str:

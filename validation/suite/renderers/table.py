@@ -87,13 +87,14 @@ _SYSTEMS = (
         small=True,
         calls=_as_in_glsl("GLSL", "glsl_rays.py"),
     ),
-    System(  # a ray tracer for lens design; the function that bends a ray needs none of its windows and plots
+    System(  # a ray tracer for lens design, with its glasses; the trace needs none of its windows and plots
         "rayoptics",
         "rayoptics",
-        "BSD-3-Clause",
-        Pip(("rayoptics==0.9.8", "numpy")),
-        megabytes=140,
+        "BSD-3-Clause (rayoptics, opticalglass)",
+        Pip(("rayoptics==0.9.8", "opticalglass==1.1.1", "numpy")),
+        megabytes=260,
         small=True,
+        lens="rayoptics_lens.py",
         calls=(
             RefractFunction(
                 "rayoptics, bend", "f64", "rayoptics_rays.py", recorded_error(7e-15, 1.9e-12, 2e-16, 1e-15), "nan"
@@ -106,6 +107,7 @@ _SYSTEMS = (
         "MIT",
         Pip(("optiland==0.6.3",)),
         megabytes=1300,
+        lens="optiland_lens.py",
         calls=(
             RefractFunction(
                 "optiland, RealRays.refract",
@@ -113,6 +115,25 @@ _SYSTEMS = (
                 "optiland_rays.py",
                 recorded_error(9e-15, 1.9e-12, 3e-16, 1e-15),
                 "nan",
+            ),
+        ),
+    ),
+    System(  # a spectral ray tracer in Python and Cython, for plasma diagnostics; its cameras want matplotlib
+        "raysect",
+        "raysect",
+        "BSD-3-Clause",
+        Pip(("raysect==0.9.0", "numpy")),
+        megabytes=190,
+        small=True,
+        draws=True,
+        calls=(
+            RefractFunction(
+                "raysect, Dielectric",
+                "f64",
+                "raysect_rays.py",
+                recorded_error((5.1e-15, 2.5e-14), (1.6e-12, 2.5e-12), (2.3e-16, 2.9e-16), (5.4e-16, 6.5e-16)),
+                "reflected",
+                remark="normalises the ray and the normal; takes a ray at the critical angle for total reflection",
             ),
         ),
     ),

@@ -1,0 +1,176 @@
+"""Render `scene.json` by raysect: `python render.py --spp 256 --seeds 1 2 3 4 --out .`
+
+It writes one `seedN.pfm` per seed. A Python with raysect runs this script; mi_refract never imports it. A ray of
+raysect carries a spectrum, here of three bins: red, green and blue. Glass has one index for all of them, so that a path
+is the same for the three. With `--band FROM TO` (nm) a ray has one bin, and a glass with an entry "sellmeier" in
+`scene.json` (B1, B2, B3, C1, C2, C3 as raysect takes them, in µm²) has the index of that band; the image shows that bin
+three times.
+"""
+
+import argparse
+import json
+import math
+import multiprocessing
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+from raysect.core import Vector3D, rotate_basis, translate
+from raysect.core.math import random
+from raysect.core.workflow import SerialEngine
+from raysect.optical import ConstantSF, InterpolatedSF, World
+from raysect.optical.material import Dielectric, Lambert, Sellmeier, UniformSurfaceEmitter
+from raysect.optical.observer import FullFrameSampler2D, PinholeCamera, SpectralRadiancePipeline2D
+from raysect.primitive import Mesh, Sphere
+
+# raysect meets triangles in float32 and starts the next ray 1e-6 beside them: a scene must not be much larger than 1.
+SIZE, FAR = 0.5, 10.0  # the largest coordinate after scaling, and the radius of the sky
+BINS, STEP = (400.0, 500.0, 600.0, 700.0), 1e-6  # of red, green and blue: no colour is meant
+
+
+def main():
+    """Render once per seed, each in a process of its own."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--spp", type=int, default=256)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
+    parser.add_argument("--threads", type=int, default=0, help="processes; 0 for all")
+    parser.add_argument("--band", type=float, nargs=2, help="wavelengths in nm")
+    parser.add_argument("--out", type=Path, default=Path())
+    options = parser.parse_args()
+    tasks = [(options, seed) for seed in options.seeds]
+    with multiprocessing.get_context("fork").Pool(options.threads or os.cpu_count()) as pool:
+        for path in pool.imap(image, tasks, chunksize=1):
+            print(path, flush=True)
+
+
+def image(task):
+    """Render one image; its path."""
+    options, seed = task
+    folder = Path(__file__).resolve().parent
+    plain = json.loads((folder / "scene.json").read_text())
+    world = build(plain, folder)
+    random.seed(seed)
+    pipeline = SpectralRadiancePipeline2D()
+    camera(world, plain, options, pipeline).observe()
+    mean = np.asarray(pipeline.frame.mean).transpose(1, 0, 2)  # rows from the top
+    path = options.out.resolve() / f"seed{seed}.pfm"
+    path.write_bytes(pfm(np.broadcast_to(mean, (*mean.shape[:2], 3))))
+    return path
+
+
+def pfm(pixels):
+    """A portable float map, whose first row is the lowest."""
+    height, width, _ = pixels.shape
+    return f"PF\n{width} {height}\n-1.0\n".encode() + pixels[::-1].astype("<f4").tobytes()
+
+
+def build(plain, folder):
+    """The world of `scene.json` and the files beside it."""
+    world, unit = World(), scale(plain, folder)
+    materials = {name: MATERIALS[entry["type"]](entry) for name, entry in plain["materials"].items()}
+    for name, entry in plain["meshes"].items():
+        vertices, faces = triangles(folder / entry["file"])
+        # Open, although it may be closed: whether a place is inside is asked for absorption only.
+        mesh = Mesh(vertices * unit, faces, smoothing=False, closed=False, parent=world, name=name)
+        mesh.material = materials[entry["material"]]
+    sky = plain["sky"]
+    material = Map(sky, folder) if "environment" in sky else UniformSurfaceEmitter(per_bin(sky["radiance"]))
+    Sphere(FAR, parent=world, material=material)
+    return world
+
+
+def scale(plain, folder):
+    """What makes the largest coordinate of the scene SIZE."""
+    parts = [triangles(folder / entry["file"])[0] for entry in plain["meshes"].values()]
+    return SIZE / np.abs(np.concatenate([[plain["camera"]["origin"]], *parts])).max()
+
+
+def triangles(path):
+    """Vertices and faces of a binary PLY file of float32 positions and triangles."""
+    header, _, data = path.read_bytes().partition(b"end_header\n")
+    vertices, faces = (int(count) for count in re.findall(rb"element \w+ (\d+)", header))
+    corners = np.frombuffer(data, [("count", "u1"), ("index", "<i4", 3)], faces, vertices * 12)
+    return np.frombuffer(data, "<f4", vertices * 3).reshape(-1, 3).astype(float), corners["index"].copy()
+
+
+def per_bin(colour):
+    """A spectrum that is constant within each bin."""
+    places = [BINS[0], *(edge + side for edge in BINS[1:-1] for side in (-STEP, STEP)), BINS[-1]]
+    return InterpolatedSF(places, np.repeat(colour, 2))
+
+
+class Light(UniformSurfaceEmitter):
+    """Emits on the side of its normals, and is black from behind."""
+
+    def evaluate_surface(self, world, ray, primitive, hit_point, exiting, *others):
+        """As the base class asks it."""
+        if exiting:
+            return ray.new_spectrum()
+        return super().evaluate_surface(world, ray, primitive, hit_point, exiting, *others)
+
+
+class Map(UniformSurfaceEmitter):
+    """A sky by direction, linear between the pixels of the map."""
+
+    def __init__(self, sky, folder):
+        """The map of `scene.json`."""
+        super().__init__(ConstantSF(1))
+        self.pixels = np.load(folder / sky["environment"]).astype(float)
+
+    def evaluate_surface(self, world, ray, *others):
+        """As the base class asks it."""
+        d, spectrum = ray.direction.normalise(), ray.new_spectrum()
+        rows, columns = self.pixels.shape[:2]
+        row = max(0.0, min(rows - 1.0, math.acos(max(-1.0, min(1.0, d.y))) / math.pi * rows - 0.5))
+        column = math.atan2(d.x, -d.z) / (2 * math.pi) * columns - 0.5
+        top, left = int(row), math.floor(column)
+        a, b, sides = row - top, column - left, (left % columns, (left + 1) % columns)
+        upper, lower = self.pixels[top], self.pixels[min(top + 1, rows - 1)]
+        for weight, line in ((1 - a, upper), (a, lower)):
+            spectrum.samples[:] += weight * ((1 - b) * line[sides[0]] + b * line[sides[1]])
+        return spectrum
+
+
+def glass(entry):
+    """A smooth boundary that absorbs nothing."""
+    index = Sellmeier(*entry["sellmeier"]) if "sellmeier" in entry else ConstantSF(entry["int_ior"])
+    return Dielectric(index, ConstantSF(1), ConstantSF(entry["ext_ior"]))
+
+
+MATERIALS = {
+    "glass": glass,
+    "diffuse": lambda entry: Lambert(per_bin(entry["reflectance"])),
+    "light": lambda entry: Light(per_bin(entry["radiance"])),
+}
+
+
+class Camera(PinholeCamera):
+    """A pinhole camera whose rays count the same; raysect's weighs them by the cosine to where it looks."""
+
+    def _generate_rays(self, *place):
+        return [(ray, 1.0) for ray, _ in super()._generate_rays(*place)]
+
+
+def camera(world, plain, options, pipeline):
+    """A pinhole; without roulette and importance sampling, raysect is a plain path tracer."""
+    entry = plain["camera"]
+    width, height = entry["width"], entry["height"]
+    wide = math.tan(math.radians(entry["fov_x_degrees"]) / 2)
+    made = Camera((width, height), parent=world, pipelines=[pipeline], frame_sampler=FullFrameSampler2D())
+    made.fov = math.degrees(2 * math.atan(wide * max(1, height / width)))  # of the longer side
+    origin, target = (np.array(entry[key]) for key in ("origin", "target"))
+    place = origin * scale(plain, Path(__file__).resolve().parent)
+    made.transform = translate(*place) * rotate_basis(Vector3D(*(target - origin)), Vector3D(*entry["up"]))
+    made.pixel_samples, made.quiet, made.render_engine = options.spp, True, SerialEngine()
+    band = options.band or (BINS[0], BINS[-1])
+    made.min_wavelength, made.max_wavelength = 1.0, band[1]
+    made.min_wavelength = band[0]
+    made.spectral_rays, made.spectral_bins = 1, 1 if options.band else len(BINS) - 1
+    made.ray_extinction_prob, made.ray_importance_sampling = 0.0, False
+    made.ray_extinction_min_depth, made.ray_max_depth = 1, plain["max_depth"]
+    return made
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""Glasses by name and wavelength, asked of lens designers' ray tracers: another index is told from another direction.
+
+Rays pass between glasses and air, each at one of six wavelengths: the set that `mi-refract rays export --medium …
+--wavelengths …` writes. A program looks up its own index for each medium and wavelength, bends the ray, and answers
+with the direction and with the ratio of indices that it used. Directions are judged for that ratio, by the a-priori
+bound of the textbook formula for the ray; indices are compared with those of `mi_refract.media`, glass by glass. What
+evaluates the same formula with the same coefficients differs by rounding. Where a system has another edition or
+another fit of a maker's catalogue, the row says so: the difference was recorded, and more than 1e-5, which is what
+makers print, misses a goal. rayoptics reads the same tables of the makers as this package, through opticalglass, and
+shows that the formulas are evaluated alike; optiland and raysect have tables of their own. batoid has no catalogue, but
+a telescope with two glasses by name.
+"""
+
+from __future__ import annotations
+
+import functools
+from importlib.util import find_spec
+
+import numpy as np
+
+from mi_refract.ray_sets import check_answers, media_rays, ray_set
+from mi_refract.ray_sets.check_answers import PROBLEMS, Findings, RegimeErrors
+from mi_refract.ray_sets.files import as_csv, parse_answers
+from mi_refract.ray_sets.ray_set import Answers, RaySet
+from mi_refract.report.row import Row
+from validation import limits, repeated
+from validation.run import seeds
+from validation.run.context import Context
+from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED, WORST_ANGLE
+from validation.study import Study, Task, about
+
+from .renderers import SYSTEMS, System, environments
+from .renderers.glass_catalogues import CATALOGUES, GlassCatalogue
+
+NAME = "glasses by others"
+SEED, COUNT = 2041, 660  # rays of each regime
+REGIMES = ("generic", "near-normal", "grazing", "critical", "Brewster")
+WAVELENGTHS = (435.8343, 486.1327, 546.074, 587.5618, 656.2725, 706.5188)  # nm
+INDEX_OFF, RECORDED, OFF_RECORDED = "index off", "recorded", "off the recorded"
+TERMS = {
+    INDEX_OFF: "the largest relative difference between the ratio of indices used and that of the media",
+    RECORDED: "that difference as it was recorded for a system with other data",
+    OFF_RECORDED: "the ratio of the two, taken above 1",
+    WORST_ANGLE: "the largest angle to the certified direction for the ratio used, without misclassified rays",
+    ERROR_OVER_BOUND: "the largest error of a ray over its a-priori bound, that of the textbook formula",
+    MISCLASSIFIED: "rays whose total internal reflection was misclassified",
+    "wrong": "rays beyond the bound, misclassified although the bound decides them, or without a direction",
+    "unfit": "answers that are missing, duplicate, or to rays that were not given",
+    "told otherwise": "1 where the program signals total internal reflection in another way than was recorded",
+    "unanswered": "rays without an answer, because the program crashed, hung, or did not say its indices",
+}
+
+
+def tasks(context: Context) -> list[Task]:
+    """One per system that has glasses."""
+    return [
+        Task(f"glasses: {SYSTEMS[name].title}", functools.partial(system_rows, SYSTEMS[name], catalogue, context))
+        for name, catalogue in CATALOGUES.items()
+    ]
+
+
+def system_rows(system: System, catalogue: GlassCatalogue, context: Context) -> list[Row]:
+    """A row per regime and one per glass, or one that says why there are none."""
+    if reason := _why_not(system, context):
+        return [Row(NAME, system.title, "every glass", "f64", reason=reason)]
+    rays = given(catalogue.glasses)
+    try:
+        text = environments.run(environments.script(system, catalogue.script), as_csv(rays))
+        answers = parse_answers(text, system.title)
+        if answers.n_ratio is None:
+            raise ValueError("no column n_ratio; accepted: the ratio of indices that was used")
+    except environments.Unable as why:
+        return [Row(NAME, system.title, "every glass", "f64", reason=f"cannot run here: {why}")]
+    except (environments.Broken, ValueError) as defect:
+        values, text = {"unanswered": float(len(rays))}, " ".join(str(defect).split())
+        return [Row(NAME, system.title, "every glass", "f64", values, {"unanswered": 0.0}, reason=text)]
+    return rows(system.title, catalogue, rays, answers)
+
+
+def _why_not(system: System, context: Context) -> str:
+    if find_spec("opticalglass") is None:
+        return "opticalglass is not installed: pip install 'mi-refract[glass]'"
+    large = not system.small and context.profile.name != "full"
+    return environments.absent(system) or (f"{system.megabytes} MB: in the full profile only" if large else "")
+
+
+@seeds.cached
+def given(glasses: tuple[str, ...]) -> RaySet:
+    """The rays for a system that has these glasses."""
+    return ray_set.make(REGIMES, COUNT, "f64", seeds.current(SEED), media=glasses, wavelengths=WAVELENGTHS)
+
+
+def rows(title: str, catalogue: GlassCatalogue, rays: RaySet, answers: Answers) -> list[Row]:
+    """Directions by regime, then indices by glass."""
+    findings = check_answers.check(rays, answers)
+    system = str(answers.header.get("system", ""))
+    found = {each.regime: each for each in findings.regimes}
+    made = [_direction_row(title, name, found.get(name), findings, catalogue.told, system) for name in REGIMES]
+    used = _in_order(rays, answers)
+    wavelength, pair = media_rays.columns(rays.header, rays.ids).T
+    off = np.abs(used / rays.rays.k - 1)
+    for i, glass in enumerate(catalogue.glasses):
+        of_glass = np.flatnonzero(pair // 2 == i)
+        # argmax takes the first NaN for the largest.
+        worst = of_glass[np.argmax(off[of_glass])]
+        made.append(_index_row(title, glass, float(off[worst]), float(wavelength[worst]), catalogue, system))
+    return made
+
+
+def _in_order(rays: RaySet, answers: Answers) -> np.ndarray:
+    """(N,) the ratio used for each ray; NaN where it was not answered."""
+    assert answers.n_ratio is not None
+    said = dict(zip(answers.ids.tolist(), answers.n_ratio.tolist(), strict=True))
+    return np.array([said.get(id_, np.nan) for id_ in rays.ids.tolist()])
+
+
+def _direction_row(
+    title: str, regime: str, errors: RegimeErrors | None, findings: Findings, told: str, system: str
+) -> Row:
+    values = {"unfit": float(sum(each.count for each in findings.problems if PROBLEMS[each.kind]))}
+    budgets = {"unfit": 0.0, "wrong": 0.0}
+    if errors is None:
+        return Row(NAME, title, regime, "f64", values | {"wrong": np.nan}, budgets, reason=system)
+    values |= {WORST_ANGLE: errors.worst, "p99 rad": errors.p99, ERROR_OVER_BOUND: errors.error_over_bound}
+    values |= {MISCLASSIFIED: float(errors.tir_misclassified), "wrong": float(errors.wrong)}
+    budgets |= {ERROR_OVER_BOUND: 1.0}
+    if regime == "critical":
+        values["told otherwise"], budgets["told otherwise"] = float(findings.tir != told), 0.0
+    text = f"{system}; total internal reflection: {findings.tir}"
+    return Row(NAME, title, regime, "f64", values, budgets, reason=text, replay={"worst": errors.replay})
+
+
+def _index_row(title: str, glass: str, off: float, wavelength: float, catalogue: GlassCatalogue, system: str) -> Row:
+    known = catalogue.others.get(glass)
+    replay = {"wavelength": wavelength, "glass": glass}
+    if not known:
+        budgets = {INDEX_OFF: limits.CATALOG_FORMULA}
+        return Row(NAME, title, glass, "f64", {INDEX_OFF: off}, budgets, reason=system, replay=replay)
+    factor = max(off / known.recorded, known.recorded / off) if off > 0 else float(np.where(off == 0, np.inf, np.nan))
+    values = {INDEX_OFF: off, RECORDED: known.recorded, OFF_RECORDED: factor}
+    budgets, goals = {OFF_RECORDED: limits.OTHER_INDEX}, {INDEX_OFF: media_rays.SAME}
+    return Row(NAME, title, glass, "f64", values, budgets, goals, f"{system}; {known.cause}", replay)
+
+
+STUDY = Study(NAME, "Glasses by others", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))

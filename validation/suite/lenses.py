@@ -1,0 +1,239 @@
+"""The focal shift of an achromat by lens designers' ray tracers, with the same indices and with those of their glasses.
+
+The achromat of `scenes/planar/achromat.toml`, of N-BK7 and F2, at its six wavelengths: where rays close to the axis and
+at the edge cross the axis, by rayoptics' and optiland's sequential traces, in float64, and by the planar trace of this
+package. Each is compared with a trace in 80 decimals for the very indices that it used, so that an error of the trace
+is told from another index. Given the same indices, what is left is rounding; its bound is that of first order, with
+every rounding at its worst. Then each system takes the glasses by name from its own catalogue, and the indices are
+compared as well.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from decimal import Decimal
+
+import numpy as np
+
+from mi_refract.media import LINES
+from mi_refract.planar import scene_file
+from mi_refract.planar.path_tree import follow_scene
+from mi_refract.report.row import Row
+from validation import limits
+from validation.reference.exact_lens import Crossing, Lens, crossing
+from validation.run.context import SCENES, Context
+from validation.run.metrics import ERROR_OVER_BOUND
+from validation.study import Study, Task, about
+
+from .renderers import SYSTEMS, System, environments
+
+NAME = "achromat by others"
+FILE = SCENES / "planar" / "achromat.toml"
+LENS = Lens((0.02154, -0.02322, -0.00199), (6.0, 2.5))
+GLASSES = ("SCHOTT", "N-BK7"), ("SCHOTT", "F2")
+START, RADIUS = -20.0, 12.5  # where rays begin, and the rim of the lens in the file
+HEIGHTS = (1e-3, 10.0)  # close to the axis, and at the edge
+GIVEN, OWN = "same indices", "own glasses"
+U = 2.0**-53
+OFF, INDEX_OFF, FOCUS_OFF, SHIFT_OFF = "relative error", "index off", "focus off", "shift off"
+TERMS = {
+    OFF: "of the distance from the first vertex to the crossing, from the exact trace for its indices; the largest",
+    ERROR_OVER_BOUND: "the largest error over the bound of its ray",
+    INDEX_OFF: "the largest relative difference between the system's index of a glass and that of the file",
+    FOCUS_OFF: "by how much the system's crossing differs from that of the planar trace, relative, the largest",
+    SHIFT_OFF: "by how much its focal shifts differ from those of the planar trace, over the largest shift",
+    "unanswered": "1 where the program crashed, hung or gave no numbers",
+    GIVEN: "all systems have the indices that `mi_refract.media` gives the file",
+    OWN: "each system looks the glasses up by their names",
+}
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """How far a way to trace may round, in u. `sine`, `normal`: of a direction, times these of the ray and the normal.
+
+    `turn`: of a direction, whatever it is. `bend`: of each curvature, relative.
+    """
+
+    sine: float
+    normal: float
+    turn: float
+    bend: Sequence[float]
+
+
+# The sine after a surface is k sin + γ sin_n: γ = k cos − cos_t is off by up to 7u and a normal's sine by 1u of itself.
+THEIRS = Rounding(8.0, 8.0, 0.0, (1.0, 1.0, 1.0))
+
+
+def _ours() -> Rounding:
+    """An arc is kept by its ends and its control point, each of them rounded: a curvature as its sag is.
+
+    The gradient of its conic has the axis where rounding puts it, so a normal may turn by a few u on the axis, too.
+    """
+    sags = [abs(c) * RADIUS**2 / 2 for c in LENS.curvatures]
+    return Rounding(0.0, 0.0, 16.0, [4 * (v + sag) / sag for v, sag in zip(LENS.vertices, sags, strict=True)])
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Indices by glass and wavelength; rays [z, y, dz, dy] after the lens by wavelength and height, for each case."""
+
+    system: str
+    indices: np.ndarray
+    rays: dict[str, np.ndarray]
+
+
+def tasks(context: Context) -> list[Task]:
+    """One for the planar trace, and one per system that traces lenses."""
+    others = [system for system in SYSTEMS.values() if system.lens]
+    own = Task("achromat: the planar trace", planar_rows)
+    return [own, *(Task(f"achromat: {s.title}", functools.partial(system_rows, s, context)) for s in others)]
+
+
+def planar_rows() -> list[Row]:
+    """How far this package's own trace is from the exact one."""
+    rays, indices = planar()
+    return [_row("planar trace", GIVEN, i, rays, indices, _ours()) for i in range(len(HEIGHTS))]
+
+
+def system_rows(system: System, context: Context) -> list[Row]:
+    """Two rows per case, or one that says why there are none."""
+    reason = environments.absent(system)
+    if not reason and not system.small and context.profile.name != "full":
+        reason = f"{system.megabytes} MB: in the full profile only"
+    if reason:
+        return [Row(NAME, system.title, "every ray", "float64", reason=reason)]
+    try:
+        answer = parsed(environments.run(environments.script(system, system.lens), json.dumps(question())))
+    except environments.Unable as why:
+        return [Row(NAME, system.title, "every ray", "float64", reason=f"cannot run here: {why}")]
+    except (environments.Broken, ValueError) as defect:
+        values, text = {"unanswered": 1.0}, " ".join(str(defect).split())
+        return [Row(NAME, system.title, "every ray", "float64", values, {"unanswered": 0.0}, reason=text)]
+    return answered(system.title, answer)
+
+
+def answered(title: str, answer: Answer) -> list[Row]:
+    """The rows of an answer."""
+    ours, indices = planar()
+    index_off = float(np.abs(answer.indices / indices - 1).max())
+    rows = []
+    for i in range(len(HEIGHTS)):
+        for case in (GIVEN, OWN):
+            used = indices if case == GIVEN else answer.indices
+            found, own = _axis(answer.rays[case][:, i]), _axis(ours[:, i])
+            row = _row(title, case, i, answer.rays[case], used, THEIRS)
+            values = {FOCUS_OFF: float(np.abs(found / own - 1).max()), SHIFT_OFF: _shift_off(found, own)}
+            budgets = {}
+            if case == OWN:
+                values[INDEX_OFF], budgets[INDEX_OFF] = index_off, limits.CATALOG_FORMULA
+            values, budgets = row.values | values, row.budgets | budgets
+            rows.append(replace(row, values=values, budgets=budgets, reason=answer.system))
+    return rows
+
+
+def _row(title: str, case: str, i: int, rays: np.ndarray, indices: np.ndarray, rounding: Rounding) -> Row:
+    """Rays at the height number `i` against the exact trace for these indices; the focal shifts of each wavelength."""
+    height, found = HEIGHTS[i], _axis(rays[:, i])
+    exact = [crossing(LENS, (1.0, *n, 1.0), height, START) for n in indices.T.tolist()]
+    off = [float(abs(Decimal(x) - e.place)) for x, e in zip(found.tolist(), exact, strict=True)]
+    at = dict(zip(wavelengths(), found.tolist(), strict=True))
+    values = {
+        OFF: max(x / float(e.place) for x, e in zip(off, exact, strict=True)),
+        ERROR_OVER_BOUND: max(x / bound(e, rounding) for x, e in zip(off, exact, strict=True)),
+        f"at {LINES['d']:g} nm": at[LINES["d"]],
+    }
+    values |= {f"shift at {w:g} nm": x - at[LINES["d"]] for w, x in at.items() if w != LINES["d"]}
+    replay = {"height": height, "glasses": [":".join(glass) for glass in GLASSES], "indices": indices.tolist()}
+    budgets = {ERROR_OVER_BOUND: limits.LENS_TRACE}
+    return Row(NAME, title, f"{case}, height {height:g}", "float64", values, budgets, replay=replay)
+
+
+def bound(exact: Crossing, rounding: Rounding) -> float:
+    """Of the error of a crossing: each error at its worst, times how far it moves the crossing, and the last formula.
+
+    A distance to a sphere is off by 8u of what it is computed from, up to the radius; coordinates by 2u of themselves.
+    """
+    total = 4.0 * abs(float(exact.place))
+    reach = max(-START, *LENS.vertices)
+    for i, (met, curvature) in enumerate(zip(exact.meetings, LENS.curvatures, strict=True)):
+        worst = {
+            "turn": rounding.turn + rounding.sine * abs(met.sine) + rounding.normal * abs(met.normal),
+            "slide": 8 * max(1 / abs(curvature), reach),
+            "height": 2 * abs(met.y),
+            "depth": 2 * reach,
+            "bend": rounding.bend[i],
+        }
+        total += sum(exact.moves[kind][i] * size for kind, size in worst.items())
+    return total * U
+
+
+@functools.cache
+def planar() -> tuple[np.ndarray, np.ndarray]:
+    """Rays (wavelengths, heights, 4) by the planar trace, as of `Answer`, and indices (glasses, wavelengths)."""
+    scene = scene_file.load(FILE)
+    rays = []
+    for segments in scene.segments:
+        origins = np.array([[START, height] for height in HEIGHTS])
+        directions = np.tile([1.0, 0.0], (len(HEIGHTS), 1))
+        asked = replace(
+            scene, segments=(segments,), origins=origins, directions=directions, beams=np.zeros(len(HEIGHTS), int)
+        )
+        (found,) = follow_scene(asked)
+        order = np.argsort(found.rays)
+        rays.append(np.concatenate([found.tips, found.paths.directions], axis=1)[order])
+    return np.array(rays), np.array([region.indices for region in scene.regions])
+
+
+def wavelengths() -> tuple[float, ...]:
+    """Those of the file, in nm."""
+    return scene_file.load(FILE).light.wavelengths
+
+
+def question() -> dict[str, object]:
+    """What a script of a system reads."""
+    return {
+        "curvatures": LENS.curvatures,
+        "thicknesses": LENS.thicknesses,
+        "start": START,
+        "heights": HEIGHTS,
+        "wavelengths": wavelengths(),
+        "glasses": GLASSES,
+        "indices": planar()[1].tolist(),
+    }
+
+
+def parsed(text: str) -> Answer:
+    """What a script wrote. ValueError, one line, for anything else than finite numbers of the right count."""
+    rays_shape, indices_shape = (len(wavelengths()), len(HEIGHTS), 4), (len(GLASSES), len(wavelengths()))
+    try:
+        data = json.loads(text)
+        indices = np.array(data["indices"], float)
+        rays = {case: np.array(data["rays"][key], float) for case, key in ((GIVEN, "given"), (OWN, "own"))}
+        system = str(data["system"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"no answer: {error!r}; accepted: system, indices and rays in JSON") from None
+    shapes = [indices.shape, *(each.shape for each in rays.values())]
+    if shapes != [indices_shape, rays_shape, rays_shape]:
+        raise ValueError(f"numbers of shape {shapes}; accepted: {indices_shape}, and {rays_shape} twice")
+    if not all(np.isfinite(each).all() for each in (indices, *rays.values())):
+        raise ValueError("a number that is not finite; accepted: the rays after the lens")
+    return Answer(system, indices, rays)
+
+
+def _axis(rays: np.ndarray) -> np.ndarray:
+    """z where the rays (N, 4) cross the axis."""
+    z, y, dz, dy = rays.T
+    return np.asarray(z - y * dz / dy)
+
+
+def _shift_off(found: np.ndarray, own: np.ndarray) -> float:
+    middle = wavelengths().index(LINES["d"])
+    shifts, expected = found - found[middle], own - own[middle]
+    return float(np.abs(shifts - expected).max() / np.abs(expected).max())
+
+
+STUDY = Study(NAME, "An achromat by others", about(__doc__), TERMS, tasks)
