@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,7 @@ RENDERER = {
     "licence": Key(TEXT, "its licence", None),
     "rays": Key(TABLES, "[[rays]]: functions that answer rays", None),
     "images": Key(ANY, "[images]: how it renders a scene", None),
+    "lens": Key(TEXTS, "a command that traces a lens, for the study `lenses`", None),
     "install": Key(ANY, "[install]: what brings it; of the renderers of this project only", None),
 }
 RAYS = {
@@ -80,12 +81,12 @@ class RaysCommand:
     title: str
     precision: str
     command: tuple[str, ...]
-    tir: str
-    gives_up: float
-    lengths: str
-    remark: str
-    recorded: Mapping[str, tuple[float, float]]
-    deviations: Mapping[str, str]
+    tir: str = AUTO
+    gives_up: float = 0.0
+    lengths: str = ""
+    remark: str = ""
+    recorded: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    deviations: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,7 @@ class RendererFile:
     licence: str
     rays: tuple[RaysCommand, ...]
     images: ImagesCommand | None
+    lens: tuple[str, ...]
     install: Table | None
 
     @property
@@ -129,11 +131,11 @@ def load(folder: str | Path) -> RendererFile:
 
 
 def filled(command: tuple[str, ...], **values: object) -> list[str]:
-    """A command with its placeholders filled in; {python} is this interpreter unless it is given.
+    """A command with its placeholders filled in; {python} is this interpreter and {environment} "." unless given.
 
     ValueError for a placeholder that is unknown.
     """
-    known = {"python": sys.executable} | values
+    known = {"python": sys.executable, "environment": "."} | values
     try:
         return [word.format_map({name: str(value) for name, value in known.items()}) for word in command]
     except (KeyError, IndexError, ValueError, AttributeError) as error:
@@ -150,11 +152,14 @@ def reference() -> str:
 def _renderer(folder: Path, values: Table) -> RendererFile:
     rays = tuple(_rays(each, f"rays[{i}].") for i, each in enumerate(values["rays"] or []))
     images = _images(values["images"]) if values["images"] is not None else None
-    if not rays and images is None:
+    if not rays and images is None and values["install"] is None:  # of some, scripts render the images
         raise ValueError("rays: missing; accepted: [[rays]], [images] or both")
-    if repeated := {each.title for each in rays if [x.title for x in rays].count(each.title) > 1}:
+    titles = [f"{each.title}, {each.precision}" for each in rays]
+    if repeated := {title for title in titles if titles.count(title) > 1}:
         raise ValueError(f"rays: {repeated.pop()!r} is there twice; accepted: a title for each function")
-    return RendererFile(folder, values["title"], values["licence"] or "", rays, images, values["install"])
+    return RendererFile(
+        folder, values["title"], values["licence"] or "", rays, images, tuple(values["lens"] or ()), values["install"]
+    )
 
 
 def _rays(given: Table, where: str) -> RaysCommand:

@@ -81,7 +81,7 @@ deviation = {{ prism = "no dispersion" }}
         ('title = "T"\n', "rays: missing; accepted: [[rays]], [images] or both"),
         (f'title = "T"\n{RAYS}speed = 3\n', "rays[0].speed: unknown; accepted: title, precision"),
         (f'title = "T"\n{RAYS.replace("f32", "f16")}', "rays[0].precision: 'f16'; accepted: f32 or f64"),
-        (f'title = "T"\n{RAYS}{RAYS}', "rays: 'r' is there twice"),
+        (f'title = "T"\n{RAYS}{RAYS}', "rays: 'r, f32' is there twice"),
         (f'title = "T"\n{RAYS.replace("./r", "{rays}")}', "command: {rays}: 'rays'; accepted: {python}"),
         (f'title = "T"\n{RAYS}gives_up = -1\n', "rays[0].gives_up: -1; accepted: a number from 0"),
         (

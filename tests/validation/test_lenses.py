@@ -96,7 +96,7 @@ def test_another_index_is_no_other_trace(monkeypatch):
 def program(tmp_path, body):
     path = tmp_path / "program.py"
     path.write_text(f"import json, sys\nlens = json.load(sys.stdin)\n{body}\n")
-    return System("a", "A", "none", None, 0, small=True, lens=str(path))
+    return System("a", "A", "none", None, 0, small=True, lens=("{python}", str(path)))
 
 
 @pytest.mark.parametrize(

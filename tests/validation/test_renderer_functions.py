@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from mi_refract.ray_sets.files import parse_answers
+from mi_refract.ray_sets.renderer_file import RaysCommand
 from validation.suite import per_ray
 from validation.suite.renderers import SYSTEMS, environments
-from validation.suite.renderers.system import LENGTHS, RECORDED_F64, SCRIPTS, Npm, Pip, RefractFunction, System
+from validation.suite.renderers.system import SCRIPTS, Npm, Pip, System
 
 COUNT = 60
 CALLS = {
@@ -44,11 +45,14 @@ def scaled(v):
     return v / np.linalg.norm(v, axis=1, keepdims=True)
 
 
-# What a system does by LENGTHS, of the ray a, the normal n and the two indices.
+USED = "takes vectors of any length as they are"
+SCALED = "scales the ray to unit length"
+BY_SPEED = "takes the index that a ray leaves from its speed 1/n, not from the medium"
+# What a system does, by what is said of it, of the ray a, the normal n and the two indices.
 MEANINGS = {
-    "used": lambda a, n, n_from, n_to: textbook(a, n, n_from / n_to),
-    "ray scaled": lambda a, n, n_from, n_to: textbook(scaled(a), n, n_from / n_to),
-    "speed": lambda a, n, n_from, n_to: textbook(scaled(a), n, n_from / np.linalg.norm(a, axis=1) / n_to),
+    USED: lambda a, n, n_from, n_to: textbook(a, n, n_from / n_to),
+    SCALED: lambda a, n, n_from, n_to: textbook(scaled(a), n, n_from / n_to),
+    BY_SPEED: lambda a, n, n_from, n_to: textbook(scaled(a), n, n_from / np.linalg.norm(a, axis=1) / n_to),
 }
 
 
@@ -59,13 +63,12 @@ def as_rows(a, n, n_from, n_to):
 
 
 def means(system, call, vectors):
-    """The meanings of LENGTHS that agree with every answer to rays twice as long, and to normals where these count."""
+    """The meanings that agree with every answer to rays twice as long, and to normals where these count."""
     a, n, n_from, n_to = vectors
     found = set(MEANINGS)
-    for a_by, n_by in ((1, 1), (2, 1), (1, 2) if call.lengths == "used" else (0.5, 1)):
+    for a_by, n_by in ((1, 1), (2, 1), (1, 2) if call.lengths == USED else (0.5, 1)):
         given = a_by * a, n_by * n, n_from, n_to
-        command = environments.script(system, call.script, *call.arguments)
-        b = parse_answers(environments.run(command, as_rows(*given)), call.title).b
+        b = parse_answers(environments.ask(system, call.command, as_rows(*given)), call.title).b
         for name in sorted(found):
             expected = MEANINGS[name](*given)
             through = np.isfinite(expected[:, 0])
@@ -90,9 +93,9 @@ def test_vectors_of_other_lengths_are_treated_as_the_table_says(name, vectors):
 @pytest.mark.parametrize(
     ("before", "meaning"),
     [
-        ("", "used"),
-        ("a = a / np.linalg.norm(a, axis=1, keepdims=True)", "ray scaled"),
-        ("s = np.linalg.norm(a, axis=1, keepdims=True); a, k = a / s, k / s", "speed"),
+        ("", USED),
+        ("a = a / np.linalg.norm(a, axis=1, keepdims=True)", SCALED),
+        ("s = np.linalg.norm(a, axis=1, keepdims=True); a, k = a / s, k / s", BY_SPEED),
         ("n = n / np.linalg.norm(n, axis=1, keepdims=True)", None),
     ],
 )
@@ -105,20 +108,19 @@ def test_each_treatment_is_told_from_the_others(before, meaning, vectors, tmp_pa
         "table.write(rays, b, 'a program')\n"
     )
     for claimed in MEANINGS:
-        call = RefractFunction("a program", "f64", str(path), RECORDED_F64, "zero", lengths=claimed)
+        call = RaysCommand("a program", "f64", ("{python}", str(path)), "zero", lengths=claimed)
         found = means(System("a", "A", "none", None, 0), call, vectors)
         assert (found == {claimed}) == (claimed == meaning), claimed
 
 
 def test_every_treatment_of_lengths_has_a_meaning_and_is_said():
-    assert set(MEANINGS) == set(LENGTHS) - {""} and all(LENGTHS[name] for name in MEANINGS)
     assert {call.lengths for _, call in CALLS.values()} == set(MEANINGS)
     rays = per_ray.given("f64")
-    for lengths, said in LENGTHS.items():
-        call = RefractFunction("a", "f64", "", RECORDED_F64, "zero", lengths=lengths, remark="known")
+    for lengths in ("", *MEANINGS):
+        call = RaysCommand("a", "f64", (), "zero", lengths=lengths, remark="known")
         answers = parse_answers("\n".join(["id,bx,by,bz", *(f"{i},0,0,0" for i in rays.ids.tolist())]), "a")
         reason = per_ray.rows(call, rays, answers)[0].reason
-        assert "known" in reason and said in reason and "; ;" not in reason
+        assert "known" in reason and lengths in reason and "; ;" not in reason
 
 
 def test_batoid_takes_the_first_index_from_the_speed_and_not_from_the_medium():
@@ -170,11 +172,14 @@ def test_a_script_for_node_is_told_its_folder_and_cannot_run_without_node(monkey
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     system = System("thing", "Thing", "none", Npm(("a@1",)), 0)
     monkeypatch.setattr("shutil.which", lambda program: f"/bin/{program}")
-    command = environments.script(system, "thing.mjs", "more")
-    assert command == ["/bin/node", str(SCRIPTS / "thing.mjs"), str(environments.folder(system)), "more"]
+    asked = []
+    monkeypatch.setattr(environments, "run", lambda *words, **named: asked.append(words))
+    command = ("node", "thing.mjs", "{environment}")
+    environments.ask(system, command, "rays")
+    assert asked == [(["node", "thing.mjs", str(environments.folder(system))], "rays")]
     monkeypatch.setattr("shutil.which", lambda program: None)
     with pytest.raises(environments.Unable, match="no node in PATH"):
-        environments.script(system, "thing.mjs")
+        environments.ask(system, command, "rays")
 
 
 @pytest.mark.parametrize(

@@ -16,22 +16,25 @@ import pytest
 
 from mi_refract import oracle
 from mi_refract.ray_sets import ray_set
+from mi_refract.ray_sets.renderer_file import RaysCommand
 from validation import __main__ as command
 from validation import limits
 from validation.suite import per_ray
 from validation.suite.renderers import SYSTEMS, environments
+from validation.suite.renderers import table as TABLE
+from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 from validation.suite.renderers.system import (
     LARGE,
-    RECORDED_F64,
     SCRIPTS,
     TOTAL,
     Apt,
     Npm,
     Pip,
-    RefractFunction,
     System,
 )
 
+# The figures of those who write down GLSL's formula.
+RECORDED_F64 = next(call.recorded for call in SYSTEMS["pyglm"].calls if call.precision == "f64")
 STANDARD, FULL = (SimpleNamespace(profile=SimpleNamespace(name=name)) for name in ("standard", "full"))
 # What every program below does right unless `{defect}` says otherwise.
 PROGRAM = f"""
@@ -94,7 +97,7 @@ def rows_of(few, tmp_path):
     def run(before="", after="", recorded_error=RECORDED_F64, gives_up=0.0):
         path = tmp_path / "program.py"
         path.write_text(PROGRAM.format(before=before, after=after))
-        call = RefractFunction("a program", "f64", str(path), recorded_error, "zero", gives_up=gives_up)
+        call = RaysCommand("a program", "f64", ("{python}", str(path)), "zero", gives_up, recorded=recorded_error)
         return per_ray.call_rows(System("a", "A", "none", None, 0, small=True), call, STANDARD)
 
     return run
@@ -224,9 +227,11 @@ def test_large_systems_wait_for_the_full_profile(monkeypatch):
 
 def test_every_system_has_a_place_a_licence_and_scripts():
     assert all(name == system.name and name.isidentifier() for name, system in SYSTEMS.items())
-    assert all(system.licence and system.title and (system.calls or system.draws) for system in SYSTEMS.values())
-    assert all((SCRIPTS / call.script).is_file() for system in SYSTEMS.values() for call in system.calls)
-    assert all((SCRIPTS / system.lens).is_file() for system in SYSTEMS.values() if system.lens)
+    drawing = {renderer.system for renderer in IMAGE_RENDERERS.values()}
+    assert all(system.calls or name in drawing for name, system in SYSTEMS.items())
+    assert all(system.licence and system.title for system in SYSTEMS.values())
+    commands = [command for system in SYSTEMS.values() for command in (*(c.command for c in system.calls), system.lens)]
+    assert all((TABLE.SYSTEMS_FOLDER / "any" / word).resolve().is_file() for c in commands for word in c[1:2])
     needs = [system.needs for system in SYSTEMS.values() if isinstance(system.needs, Pip)]
     assert all(re.match(f"{each.built or '.+'}==", each.requirements[0]) for each in needs)
 

@@ -107,7 +107,7 @@ def system_rows(system: System, context: Context) -> list[Row]:
     if reason:
         return [Row(NAME, system.title, "every ray", "float64", reason=reason)]
     try:
-        answer = parsed(environments.run(environments.script(system, system.lens), json.dumps(question())))
+        answer = parsed(environments.ask(system, system.lens, json.dumps(question())))
     except environments.Unable as why:
         return [Row(NAME, system.title, "every ray", "float64", reason=f"cannot run here: {why}")]
     except (environments.Broken, ValueError) as defect:

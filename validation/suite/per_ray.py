@@ -27,6 +27,7 @@ from mi_refract.ray_sets.check_answers import PROBLEMS, Findings, RegimeErrors
 from mi_refract.ray_sets.files import as_csv, parse_answers
 from mi_refract.ray_sets.judged_answers import RIGHT
 from mi_refract.ray_sets.ray_set import Answers, RaySet
+from mi_refract.ray_sets.renderer_file import RaysCommand
 from mi_refract.report.row import Row
 from validation import limits, repeated
 from validation.run import seeds
@@ -38,11 +39,9 @@ from validation.suite.renderers.system import (
     CRITICAL,
     GRAZING,
     LARGE,
-    LENGTHS,
     MATCHED,
     RANDOM,
     TOTAL,
-    RefractFunction,
     System,
 )
 
@@ -140,7 +139,7 @@ def tasks(context: Context) -> list[Task]:
     ]
 
 
-def call_rows(system: System, call: RefractFunction, context: Context) -> list[Row]:
+def call_rows(system: System, call: RaysCommand, context: Context) -> list[Row]:
     """A row per set of rays, or one that says why there is none."""
     if reason := environments.absent(system):
         return [_unmeasured(call, reason)]
@@ -148,7 +147,7 @@ def call_rows(system: System, call: RefractFunction, context: Context) -> list[R
         return [_unmeasured(call, f"{system.megabytes} MB: in the full profile only")]
     rays = given(call.precision)
     try:
-        text = environments.run(environments.script(system, call.script, *call.arguments), as_csv(rays))
+        text = environments.ask(system, call.command, as_csv(rays))
         answers = parse_answers(text, call.title)
     except environments.Unable as reason_here:
         return [_unmeasured(call, f"cannot run here: {reason_here}")]
@@ -158,7 +157,7 @@ def call_rows(system: System, call: RefractFunction, context: Context) -> list[R
     return rows(call, rays, answers)
 
 
-def _unmeasured(call: RefractFunction, reason: str) -> Row:
+def _unmeasured(call: RaysCommand, reason: str) -> Row:
     return Row(NAME, call.title, "every set", call.precision, reason=reason)
 
 
@@ -187,11 +186,11 @@ def _gathered(parts: dict[str, regimes.Rays], precision: str) -> RaySet:
 # Judged ------------------------------------------------------------------------------------------------------------
 
 
-def rows(call: RefractFunction, rays: RaySet, answers: Answers) -> list[Row]:
+def rows(call: RaysCommand, rays: RaySet, answers: Answers) -> list[Row]:
     """One per set."""
     left_out = absolute_radicand(rays.rays) < call.gives_up
     findings = check_answers.check(_only(rays, ~left_out), _without(answers, rays.ids[left_out]))
-    known = "; ".join(filter(None, (LENGTHS[call.lengths], call.remark)))
+    known = "; ".join(filter(None, (call.lengths, call.remark)))
     about = _remark(findings, str(answers.header.get("system", "")), known)
     made = []
     for name in SETS:
@@ -202,7 +201,7 @@ def rows(call: RefractFunction, rays: RaySet, answers: Answers) -> list[Row]:
         replay = {
             "set": SETS[name].text,
             "seed": seeds.current(SEED),
-            "script": " ".join((call.script, *call.arguments)),
+            "command": " ".join(call.command),
             "worst": figures.replay if figures else None,
             "version": str(answers.header.get("system", "")),
             "total internal reflection": findings.tir,
@@ -230,7 +229,7 @@ def _remark(findings: Findings, system: str, known: str) -> str:
 
 
 def _measured(
-    name: str, call: RefractFunction, findings: Findings, figures: RegimeErrors | None
+    name: str, call: RaysCommand, findings: Findings, figures: RegimeErrors | None
 ) -> tuple[Numbers, Numbers, Numbers]:
     """Values, budgets and goals. Where no ray of the set was answered, all that can be said is that it was not."""
     values = {"unfit": float(sum(each.count for each in findings.problems if PROBLEMS[each.kind]))}
@@ -253,11 +252,11 @@ def _measured(
     goals[BACKWARD] = RIGHT
     budgets[ERROR_OVER_BOUND] = 1.0
     if name == TOTAL:
-        values["told otherwise"], budgets["told otherwise"] = float(findings.tir != call.told), 0.0
-    if name in call.recorded_error:
+        values["told otherwise"], budgets["told otherwise"] = float(findings.tir != call.tir), 0.0
+    if name in call.recorded:
         values |= {
-            RECORDED: call.recorded_error[name][1],
-            OFF_RECORDED: off(figures.worst, *call.recorded_error[name]),
+            RECORDED: call.recorded[name][1],
+            OFF_RECORDED: off(figures.worst, *call.recorded[name]),
         }
         goals[OFF_RECORDED] = limits.RECORDED
     return values, budgets, goals

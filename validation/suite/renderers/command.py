@@ -15,6 +15,7 @@ from mi_refract.io.atomic import writable
 from validation.run import command_line
 
 from . import environments
+from .image_renderers import IMAGE_RENDERERS
 from .system import System
 from .table import SYSTEMS
 
@@ -80,8 +81,8 @@ def _install(system: System) -> int:
 
 
 def _line(system: System) -> str:
-    does = " and ".join(
-        word for word, able in (("rays", system.calls), ("images", system.draws), ("lenses", system.lens)) if able
-    )
+    draws = any(renderer.system == system.name for renderer in IMAGE_RENDERERS.values())
+    able = {"rays": system.calls, "images": draws, "lenses": system.lens}
+    does = " and ".join(word for word, can in able.items() if can)
     state = "absent" if environments.absent(system) else "here"
     return f"{system.name:10} {state:7} {does:16} {system.megabytes:5} MB  {system.source}  [{system.licence}]"

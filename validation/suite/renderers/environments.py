@@ -13,6 +13,7 @@ from pathlib import Path
 
 from mi_refract.io import process_group
 from mi_refract.io.atomic import write_atomically
+from mi_refract.ray_sets import renderer_file
 
 from .system import LOCKS, SCRIPTS, Apt, Npm, Pip, System
 
@@ -168,12 +169,19 @@ def _do(system: System, command: Sequence[str]) -> None:
 
 
 def script(system: System, name: str, *arguments: str) -> list[str]:
-    """The command that runs a script of scripts/ in the system's environment; one for node is told where that is."""
-    if name.endswith(".mjs"):
-        if not (node := shutil.which("node")):
-            raise Unable("no node in PATH")
-        return [node, str(SCRIPTS / name), str(folder(system)), *arguments]
+    """The command that runs a script of scripts/ in the system's environment."""
     return [python(system), str(SCRIPTS / name), *arguments]
+
+
+def ask(system: System, command: tuple[str, ...], given: str) -> str:
+    """What a command of the system's file answers to `given` on its stdin. Errors as of `run`.
+
+    Unable also where its program is none of this machine.
+    """
+    words = renderer_file.filled(command, python=python(system), environment=folder(system))
+    if os.sep not in words[0] and not shutil.which(words[0]):
+        raise Unable(f"no {words[0]} in PATH")
+    return run(words, given, where=system.folder)
 
 
 def run(command: Sequence[str], given: str = "", timeout: float | None = None, where: Path | None = None) -> str:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from mi_refract.io.toml_schema import TEXT, TEXTS, Key, Table, read, whole
+from mi_refract.ray_sets.renderer_file import FLAG, ImagesCommand, RaysCommand, RendererFile
 
 SCRIPTS = Path(__file__).parent / "scripts"
 LOCKS = Path(__file__).parent / "locks"
@@ -12,29 +14,6 @@ LOCKS = Path(__file__).parent / "locks"
 # The sets of rays of `validation.suite.per_ray`, by name.
 RANDOM, APART, CRITICAL, GRAZING = "random", "random, apart", "near-critical", "grazing"
 MATCHED, TOTAL, LARGE = "η ≈ 1", "total reflection", "k ≫ 1"
-RecordedError = Mapping[str, tuple[float, float]]  # worst angle in radians by set, from … to
-
-
-def recorded_error(
-    random: float | tuple, critical: float | tuple, grazing: float | tuple, matched: float | tuple
-) -> RecordedError:
-    """Worst angles in radians by set of rays, a number or a range (from, to); of random rays one for both sets."""
-    sets = (RANDOM, APART, CRITICAL, GRAZING, MATCHED)
-    figures = zip(sets, (random, random, critical, grazing, matched), strict=True)
-    return {name: x if isinstance(x, tuple) else (x, x) for name, x in figures}
-
-
-# What a function does with vectors that are not of unit length.
-LENGTHS = {
-    "": "",  # nobody looked
-    "used": "takes vectors of any length as they are",
-    "ray scaled": "scales the ray to unit length",
-    "speed": "takes the index that a ray leaves from its speed 1/n, not from the medium",
-}
-
-# Everyone who writes down GLSL's formula in that precision.
-RECORDED_F32 = recorded_error(3e-6, 6e-4, (1e-7, 3e-7), (5e-7, 1e-6))
-RECORDED_F64 = recorded_error(9e-15, 1.9e-12, 2e-16, 1e-15)
 
 
 @dataclass(frozen=True)
@@ -67,30 +46,11 @@ class Apt:
 
 
 @dataclass(frozen=True)
-class RefractFunction:
-    """A function of refraction in one precision: `script` of scripts/ reads rays and writes answers, both as CSV.
-
-    `told`: the signal of total internal reflection, one of `mi_refract.ray_sets.tir_signal.TIR`. `gives_up`: the
-    cos²θ_t below which it treats a ray as totally reflected, by its documentation. `remark`: known
-    differences. `lengths`: one of LENGTHS.
-    """
-
-    title: str
-    precision: str  # "f32" or "f64"
-    script: str
-    recorded_error: RecordedError
-    told: str
-    arguments: tuple[str, ...] = ()
-    gives_up: float = 0.0
-    remark: str = ""
-    lengths: str = ""
-
-
-@dataclass(frozen=True)
 class System:
-    """Another renderer or library. `needs` is None where this package's own environment has it.
+    """Another renderer or library. `needs` is None where nothing must be installed.
 
-    `small`: fit for every run. A program under the GPL is run, never imported nor passed on.
+    `folder`: where its commands run. `small`: fit for every run. `calls`: its functions of refraction. `images`: how it
+    renders, where a command does. `lens`: the command that traces a lens with it.
     """
 
     name: str
@@ -99,9 +59,10 @@ class System:
     needs: Pip | Npm | Apt | None
     megabytes: int  # on disk
     small: bool = False
-    calls: tuple[RefractFunction, ...] = field(default=())
-    draws: bool = False  # whether it renders images
-    lens: str = ""  # the script of scripts/ that traces a lens with it
+    calls: tuple[RaysCommand, ...] = ()
+    lens: tuple[str, ...] = ()
+    images: ImagesCommand | None = None
+    folder: Path | None = None
 
     @property
     def source(self) -> str:
@@ -113,4 +74,42 @@ class System:
                 return f"npm install {' '.join(given)}"
             case Apt(packages=given):
                 return f"apt-get install {' '.join(given)}"
-        return "with this package"
+        return "with this package" if self.folder is None or self.folder.parent.name == "systems" else str(self.folder)
+
+
+INSTALL = {
+    "pip": Key(TEXTS, "packages of PyPI, in an environment of their own", None),
+    "python": Key(TEXT, "the one version of Python that they are for", None),
+    "built": Key(TEXT, "the one of them that has no wheel", None),
+    "npm": Key(TEXTS, "packages of npm, in a folder of their own", None),
+    "apt": Key(TEXTS, "packages of the distribution, as PACKAGE=VERSION", None),
+    "program": Key(TEXT, "of apt: the program that is found in PATH", None),
+    "version": Key(TEXT, "of apt: what the program says of itself", ""),
+    "megabytes": Key(whole(1, 100_000), "on disk"),
+    "small": Key(FLAG, "whether it is fit for every run", False),
+}
+
+
+def from_file(known: RendererFile) -> System:
+    """The system that a file tells of. ValueError for an unknown key of [install]."""
+    given = None if known.install is None else read(known.install, INSTALL, f"{known.folder}: install.")
+    return System(
+        known.name,
+        known.title,
+        known.licence,
+        None if given is None else _needs(given),
+        megabytes=0 if given is None else given["megabytes"],
+        small=given is None or given["small"],
+        calls=known.rays,
+        lens=known.lens,
+        images=known.images,
+        folder=known.folder,
+    )
+
+
+def _needs(given: Table) -> Pip | Npm | Apt:
+    if given["npm"]:
+        return Npm(tuple(given["npm"]))
+    if given["apt"]:
+        return Apt(given["program"], tuple(given["apt"]), given["version"])
+    return Pip(tuple(given["pip"]), given["python"] or "", given["built"] or "")
