@@ -35,7 +35,7 @@ ROOMS = {
     "diff": ("diff", ("planted_defects", "visible_changes", "times")),
     "ground-truth": ("ground_truth", ("traced_bodies",)),
     "robustness": ("robustness", ("mutated_inputs", "killed_commands", "code_mutants")),
-    "suite": ("suite", ("matrix", "per_ray", "rendered_images", "dispersion", "exports")),
+    "suite": ("suite", ("matrix", "per_ray", "rendered_images", "dispersion", "spectral_lines", "exports")),
 }
 # What the profile `quick` runs where no study is named.
 QUICK = (

@@ -181,6 +181,7 @@ UNEXPLAINED = limit(0.05, "of the mutants of our code: no test notices them, and
 
 RECORDED = limit(3.0, "factor between the worst error and the recorded one: the numbers of those rays were not kept")
 SUITE_ERROR = limit(1e-4, "probability of any alarm in a pair of equal images")
+LINE_DETECTABLE = limit(0.01, "of the image's mean: with more noise a dispersive image could be wrong and pass")
 
 
 def table() -> dict[str, Limit]:

@@ -3,4 +3,4 @@
 In: rays and plain scenes, given to the programs of `renderers/`. Out: rows per system and check, and a matrix of them.
 """
 
-__all__ = ["dispersion", "exports", "matrix", "per_ray", "rendered_images"]
+__all__ = ["dispersion", "exports", "matrix", "per_ray", "rendered_images", "spectral_lines"]

@@ -38,11 +38,14 @@ from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 from .renderers import SYSTEMS, System, environments
 
 NAME = "images"
+DETECTABLE_IMAGE = "detectable difference, image"
+INCONCLUSIVE = "inconclusive"
 TERMS = {
     "tests that differ": "of tiles of 16² pixels by channel, blocks of tiles, and the whole image; of pairs that are "
     "equal, one in 10,000 has any",
     "tiles that differ without noise": "of those where neither side has noise",
     DETECTABLE: "relative to the tile's mean, median over the tiles; of the image: of its mean",
+    INCONCLUSIVE: "1 where no difference is seen, but noise would hide one that is wanted to be seen",
     MEAN_DIFFERENCE: "of the image's mean, relative: what the other renderer has more",
     "RMSE / noise": "of the two means by pixel, over what the spread between renders predicts: 1 for equal images "
     "whose noise is all in that spread, which it is not for a fixed grid of samples",
@@ -64,7 +67,7 @@ class Size:
     wanted: float
 
 
-SIZES = {"quick": Size(64, 64, 32, 0.1), "standard": Size(64, 64, 32, 0.1), "full": Size(128, 512, 1, 0.01)}
+SIZES = {"quick": Size(64, 64, 32, 0.1), "standard": Size(64, 64, 32, 0.1), "full": Size(128, 2048, 1, 0.01)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,14 +178,14 @@ def _row(context: Context, title: str, scene: str, ours: Sequence[Image], theirs
     size = SIZES[context.profile.name]
     # Not their pixels: some of the renderers sample every pixel on one grid, whatever the seed.
     found = compare("welch", ours, theirs, family_error=limits.SUITE_ERROR, resolution=size.wanted, pixels="no")
-    values = _values(found, *(np.stack([image.pixels for image in side]) for side in (ours, theirs)))
+    values = measured(found, *(np.stack([image.pixels for image in side]) for side in (ours, theirs)))
     known = title in SCENES[scene].known
     if known:
         values["not seen to differ"] = float(found.verdict is not Verdict.DIFFERENT)
     budgets = {"not seen to differ": 0.0} if known else {}
     if title not in WHY:
         budgets = {"tests that differ": 0.0, "tiles that differ without noise": 0.0}
-    goals = {DETECTABLE: size.wanted} if title not in WHY else {}
+    goals = {INCONCLUSIVE: 0.0} | ({DETECTABLE: size.wanted} if title not in WHY else {})
     reason = f"{found.verdict}: {found.reason}"
     if title in WHY and found.verdict is Verdict.DIFFERENT:
         reason += f"; {WHY[title]}"
@@ -192,7 +195,7 @@ def _row(context: Context, title: str, scene: str, ours: Sequence[Image], theirs
     return Row(NAME, title, scene, f"{size.resolution}²", values, budgets, goals, reason, replay, images)
 
 
-def _values(found: Comparison, ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
+def measured(found: Comparison, ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
     """The numbers of a pair; `ours` and `theirs` are renders × height × width × 3."""
     metrics = {metric.name: metric.value for metric in found.metrics}
     noise = sum(side.var(0, ddof=1).mean() / len(side) for side in (ours.astype(float), theirs.astype(float)))
@@ -201,7 +204,8 @@ def _values(found: Comparison, ours: np.ndarray, theirs: np.ndarray) -> dict[str
         "tests that differ": metrics.get("tests of tiles and channels that differ", np.nan),
         "tiles that differ without noise": metrics.get("tiles without noise that differ", np.nan),
         DETECTABLE: found.minimum_detectable,
-        "detectable difference, image": metrics.get("minimum detectable difference of the whole image", np.nan),
+        DETECTABLE_IMAGE: metrics.get("minimum detectable difference of the whole image", np.nan),
+        INCONCLUSIVE: float(found.verdict is Verdict.INCONCLUSIVE),
         MEAN_DIFFERENCE: float(theirs.mean() / ours.mean() - 1),
     }
     return values | ({"RMSE / noise": float(rmse / np.sqrt(noise))} if noise > 0 else {})

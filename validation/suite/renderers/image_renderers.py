@@ -42,16 +42,21 @@ class ImageRenderer:
 
 
 def _by_script(target: str, ending: str = "exr") -> Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]:
-    """By the script that is exported with the scene, after `edit(folder)` of its files."""
+    """By the script that is exported with the scene, after `edit(folder)` of its files, with `more` options."""
 
     def draw(
-        plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int], edit: Callable[[Path], None] | None = None
+        plain: PlainScene,
+        folder: Path,
+        spp: int,
+        seeds: Sequence[int],
+        edit: Callable[[Path], None] | None = None,
+        more: Sequence[str] = (),
     ) -> list[Image]:
         write_files.write(plain, target, folder / "scene")
         if edit:
             edit(folder / "scene")
         program = [environments.python(SYSTEMS[target]), "render.py", "--spp", str(spp), "--out", str(folder)]
-        environments.run([*program, "--seeds", *map(str, seeds)], timeout=HOURS, where=folder / "scene")
+        environments.run([*program, *more, "--seeds", *map(str, seeds)], timeout=HOURS, where=folder / "scene")
         return [_rgb(image_file.read(folder / f"seed{seed}.{ending}")) for seed in seeds]
 
     return draw
