@@ -109,7 +109,7 @@ def test_the_caustic_is_seen_without_glass(tmp_path):
     rays, _ = scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(x.ravel(), y.ravel()), mi.Point2f(0.5))
     found = scene.ray_intersect(rays)
     assert np.array(found.is_valid()).all() and np.abs(np.array(found.p)[1]).max() < 1e-2
-    size = rendered_images.Size(16, 64, 1, 0.3)
+    size = rendered_images.Size(16, 32, 1, 0.3)
     bright = np.mean([image.pixels for image in rendered_images.reference("caustic", size)], axis=0)
     (tmp_path / "bare").mkdir()
     [dark] = by_the_builtin(matched, given, tmp_path / "bare", 256, [1])

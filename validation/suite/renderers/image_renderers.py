@@ -172,7 +172,7 @@ PTRACER = (
     "Paths begin at lamps, and their last vertex is joined with the camera: what is seen in or through smooth glass "
     "stays black. A caustic on a diffuse surface that is seen directly is there.",
 )
-MITSUBA_SPP = _spp(1024, 768, 256) | {"furnace": 128, "caustic": 16384}
+MITSUBA_SPP = _spp(1024, 768, 256) | {"furnace": 128, "caustic": 32768}
 POVRAY = ("Each pixel is the mean of a grid of 4 × 4 samples, without noise.", *povray.ASSUMPTIONS)
 IMAGE_RENDERERS: dict[str, ImageRenderer] = {
     "Mitsuba, volpath": ImageRenderer("mitsuba", _mitsuba("volpath"), MITSUBA_SPP, MITSUBA),
