@@ -37,7 +37,17 @@ ROOMS = {
     "robustness": ("robustness", ("mutated_inputs", "killed_commands", "code_mutants")),
     "suite": (
         "suite",
-        ("matrix", "per_ray", "small_mistakes", "rendered_images", "dispersion", "lenses", "glasses", "exports"),
+        (
+            "matrix",
+            "per_ray",
+            "small_mistakes",
+            "rendered_images",
+            "spectral_lines",
+            "dispersion",
+            "lenses",
+            "glasses",
+            "exports",
+        ),
     ),
 }
 # What the profile `quick` runs where no study is named.

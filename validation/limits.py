@@ -185,6 +185,7 @@ OTHER_INDEX = limit(
     1.02, "factor between the largest difference of an index and the recorded one, of three digits; the data are locked"
 )
 SUITE_ERROR = limit(1e-4, "probability of any alarm in a pair of equal images")
+LINE_DETECTABLE = limit(0.01, "of the image's mean: with more noise a dispersive image could be wrong and pass")
 
 
 def table() -> dict[str, Limit]:

@@ -352,6 +352,7 @@ def _off(row: Row | None) -> str:
     if matrix.OFF not in row.values:
         return "✗" if row.broken else "✓"
     word = " **different**" if row.values.get("differs") else ""
+    word += " **inconclusive**" if row.values.get(matrix.INCONCLUSIVE) else ""
     if per_ray.OFF_RECORDED in row.missed:
         factor = compact(row.values[per_ray.OFF_RECORDED])
         less = row.values[matrix.OFF] < row.values.get(per_ray.RECORDED, 0)

@@ -29,6 +29,7 @@ BORROWED = 0.1
 POOLED = 30  # blocks of tiles from which the correlation of pixels is estimated again, at least
 MISSED = 0.01  # the minimum detectable difference is missed with this probability
 FAR = 10.0  # times the margin: a pixel without noise that is so far off is evidence, see `with_silent_pixels`
+UNSEEN = 1e-3  # of the margin: a tile with less noise than this decides nothing, see `Side.inflation`
 WORKERS = 2
 
 CORRECTIONS = ("sidak", "holm")
@@ -80,9 +81,14 @@ class Side:
         squares = self.squares * inflation.factor**2 / self.area**4 / freedom
         return variance, squares + variance**2 / inflation.freedom
 
-    def inflation(self) -> Inflation:
-        """The inflation of all tiles of the image; 1 where it is not known, or without noise."""
-        noisy = self.variance > 0
+    def inflation(self, margin: float = 0.0) -> Inflation:
+        """The inflation of all tiles of the image; 1 where it is not known, or without noise.
+
+        `margin`: the equivalence margin. Where noise is below UNSEEN of it, as that of a plain sky, it may be the
+        rounding of a sum, the same in all pixels of a render. Such a tile differs beyond the margin by 1000 σ of
+        independent pixels or not at all, and says nothing of how the pixels of other tiles correlate.
+        """
+        noisy = self.variance > np.square(UNSEEN * margin * self.mean)
         if self.renders is None or not noisy.any():
             return self.correlated
         between = self.renders.var(0, ddof=1)[noisy] / len(self.renders)
@@ -166,7 +172,7 @@ class Level:
 
 def levels(reference: Side, test: Side, equivalence_margin: float, pixels: PixelSums | None = None) -> Iterator[Level]:
     """The test of single tiles, then of blocks GROWTH times as wide, and so on to the whole image."""
-    inflations = reference.inflation(), test.inflation()
+    inflations = reference.inflation(equivalence_margin), test.inflation(equivalence_margin)
     while True:
         level = compare_tiles(reference, test, equivalence_margin, inflations)
         yield level if pixels is None else _with_pixels(level, pixels, reference.area, max(inflations))
@@ -175,7 +181,8 @@ def levels(reference: Side, test: Side, equivalence_margin: float, pixels: Pixel
         reference, test = reference.coarser(), test.coarser()
         pixels = pixels and pixels.coarser(GROWTH)
         if reference.area.size >= POOLED:
-            inflations = max(inflations[0], reference.inflation()), max(inflations[1], test.inflation())
+            coarse = reference.inflation(equivalence_margin), test.inflation(equivalence_margin)
+            inflations = max(inflations[0], coarse[0]), max(inflations[1], coarse[1])
 
 
 def compare_tiles(

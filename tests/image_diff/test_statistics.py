@@ -58,6 +58,19 @@ def test_correlation_that_only_coarser_tiles_show_is_estimated_again():
     assert np.square(coarse.error).mean() == pytest.approx(per_block / 4, rel=0.1)
 
 
+def test_rounding_of_a_plain_sky_says_nothing_of_the_noise_elsewhere():
+    """A sum of equal samples, rounded the same in all pixels of a render: fully correlated, and 1e-7."""
+    rng = np.random.default_rng(6)
+    renders = 0.6 + 0.05 * rng.normal(size=(4, 64, 64, 1))
+    renders[:, :16] = 0.6 + 1e-7 * rng.normal(size=(4, 1, 1, 1)) + 1e-8 * rng.normal(size=(4, 16, 64, 1))
+    side = from_renders(list(renders), 16)
+    assert side.inflation().factor > 10
+    assert side.inflation(1e-3).factor == pytest.approx(1, abs=0.6)
+    # Noise that could matter counts, correlated as it is.
+    renders[:, :16] = 0.6 + 1e-3 * rng.normal(size=(4, 1, 1, 1)) + 1e-4 * rng.normal(size=(4, 16, 64, 1))
+    assert from_renders(list(renders), 16).inflation(1e-3).factor > 10
+
+
 @pytest.mark.parametrize("spp", [2, 5])
 def test_second_moments_are_those_of_so_many_samples(spp):
     """`m2` is the mean of the squares: the variance of the samples is (m2 − mean²) · spp / (spp − 1)."""

@@ -74,10 +74,10 @@ def run(folder, monkeypatch, *words):
             "InterpolatedSF": lambda x, y: dict(zip(x, y, strict=True)),
             "World": mock.Mock(),
         },
+        "optical.library": {"schott": lambda name: types.SimpleNamespace(index=f"of {name}")},
         "optical.material": {
             "Dielectric": lambda index, transmission, outside: ("glass", index, transmission, outside),
             "Lambert": lambda colour: ("diffuse", colour),
-            "Sellmeier": lambda *coefficients: coefficients,
             "UniformSurfaceEmitter": Emitter,
         },
         "optical.observer": {

@@ -14,9 +14,10 @@ from mi_refract.scene_export import write_files
 from mi_refract.scene_export.plain_scene import Glass
 from mi_refract.scene_export.targets import cycles, environment_map, luxcore
 from mi_refract.scene_export.targets.environment_map import longitude_latitude, radiance
+from validation import readme_tables
 from validation.run.context import PROFILES, Context
 from validation.run.render_methods import Camera
-from validation.suite import rendered_images
+from validation.suite import matrix, rendered_images
 from validation.suite.renderers import environments, image_renderers
 from validation.suite.renderers.image_renderers import ImageRenderer
 
@@ -47,12 +48,18 @@ def by_the_builtin(change, plain, folder, spp, seeds):
     return [image_file.named(f"seed {seed}", camera(spp, seed)[0].astype(np.float32)) for seed in seeds]
 
 
-def denser(plain):
+def denser(plain, index=2.0):
     def glass(mesh):
         changed = isinstance(mesh.material, Glass)
-        return dataclasses.replace(mesh, material=Glass(2.0, mesh.material.ext_ior)) if changed else mesh
+        return dataclasses.replace(mesh, material=Glass(index, mesh.material.ext_ior)) if changed else mesh
 
     return dataclasses.replace(plain, meshes=tuple(map(glass, plain.meshes)))
+
+
+def matched(plain):
+    """As if no glass were there."""
+    [outside] = {mesh.material.ext_ior for mesh in plain.meshes if isinstance(mesh.material, Glass)}
+    return denser(plain, outside)
 
 
 def wider(plain):
@@ -71,6 +78,42 @@ def test_another_image_fails(judged, change):
     row = judged(functools.partial(by_the_builtin, change))
     assert row.verdict == "fail" and row.replay["verdict"] == "different"
     assert row.values["tests that differ"] > 0
+
+
+def test_a_pair_whose_noise_hides_what_is_wanted_is_no_pass(judged, monkeypatch):
+    """In the row, in the matrix, and in the table of the README; whatever its mean says."""
+    monkeypatch.setitem(rendered_images.SIZES, "full", dataclasses.replace(SMALL, wanted=1e-3))
+    row = judged(functools.partial(by_the_builtin, lambda plain: plain))
+    assert row.replay["verdict"] == "inconclusive" and row.missed[rendered_images.INCONCLUSIVE] == 0
+    [cell] = matrix.summary([row])
+    assert rendered_images.INCONCLUSIVE in cell.missed and "inconclusive" in cell.reason
+    assert "**inconclusive**" in readme_tables.suite([cell])
+    clear = judged(functools.partial(by_the_builtin, denser))
+    assert rendered_images.INCONCLUSIVE not in clear.missed
+
+
+def test_mitsubas_own_integrators_agree_where_they_can(judged):
+    for title in ("Mitsuba, volpath", "Mitsuba, prb"):
+        row = judged(rendered_images.IMAGE_RENDERERS[title].draw, title)
+        assert row.verdict == "pass" and row.replay["verdict"] == "equal"
+    blind = judged(rendered_images.IMAGE_RENDERERS[rendered_images.PTRACER].draw)
+    assert blind.verdict == "fail", "light tracing sees nothing through the prism"
+
+
+def test_the_caustic_is_seen_without_glass(tmp_path):
+    """Every ray of the camera meets the floor; and without the ball the image is another one."""
+    given = rendered_images.SCENES["caustic"].load(16)
+    write_files.write(given, "mitsuba", tmp_path / "scene")
+    scene = scene_files.load_scene(tmp_path / "scene" / "scene.xml", {"bsdf": "dielectric"})
+    x, y = np.meshgrid(*[np.linspace(0, 1, 65)] * 2)
+    rays, _ = scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(x.ravel(), y.ravel()), mi.Point2f(0.5))
+    found = scene.ray_intersect(rays)
+    assert np.array(found.is_valid()).all() and np.abs(np.array(found.p)[1]).max() < 1e-2
+    size = rendered_images.Size(16, 32, 1, 0.3)
+    bright = np.mean([image.pixels for image in rendered_images.reference("caustic", size)], axis=0)
+    (tmp_path / "bare").mkdir()
+    [dark] = by_the_builtin(matched, given, tmp_path / "bare", 256, [1])
+    assert bright.max() > 1.2 * dark.pixels.max()
 
 
 def test_who_is_known_to_differ_must_be_seen_to(judged):

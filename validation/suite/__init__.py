@@ -13,4 +13,5 @@ __all__ = [
     "per_ray",
     "rendered_images",
     "small_mistakes",
+    "spectral_lines",
 ]

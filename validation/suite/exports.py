@@ -42,7 +42,9 @@ TERMS = {
     NOISE: "the predicted noise of the difference of the two means",
 }
 LEVEL = 2  # of the spheres
-LEFT_OUT = {THREE: "it counts the light of the sky twice, see the study of images; without MIS it is here"}
+LEFT_OUT = {THREE: "it counts the light of the sky twice, see the study of images; without MIS it is here"} | {
+    title: "it is the reference" for title, renderer in IMAGE_RENDERERS.items() if renderer.system == "mitsuba"
+}
 THEIRS = {"POV-Ray": 256, "Cycles": 512, "LuxCore": 1024, "Radiance": 512}  # samples a pixel and render
 
 

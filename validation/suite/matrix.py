@@ -15,6 +15,7 @@ from validation.run.metrics import MEAN_DIFFERENCE, WORST_ANGLE
 from validation.study import Study, Task, about
 
 from . import per_ray, rendered_images
+from .rendered_images import INCONCLUSIVE
 
 NAME = "matrix"
 OFF = "off by"
@@ -24,6 +25,7 @@ TERMS = {
     "disagrees": "1 where a budget is broken in the row that this comes from",
     per_ray.RECORDED: per_ray.TERMS[per_ray.RECORDED],
     per_ray.OFF_RECORDED: "how many times the error recorded earlier, or that over it; a goal, which fails no run",
+    INCONCLUSIVE: "1 where noise hides what the images are compared for: no pass, whatever the mean says",
     "differs": "1 where the images are different and this is known of the system; see its remark",
 }
 CHECKS = {per_ray.NAME: tuple(per_ray.SETS), rendered_images.NAME: tuple(rendered_images.SCENES)}
@@ -54,6 +56,7 @@ def _cells(row: Row) -> list[Row]:
         goals[per_ray.OFF_RECORDED] = row.goals[per_ray.OFF_RECORDED]
     if row.study == rendered_images.NAME:
         values["differs"], goals["differs"] = float(differs), 0.0
+        values[INCONCLUSIVE], goals[INCONCLUSIVE] = float(row.replay.get("verdict") == INCONCLUSIVE), 0.0
     said = "; ".join(filter(None, (row.replay.get("renderer", ""), row.reason)))
     return [Row(NAME, _system(row), case, "", values, {"disagrees": 0.0}, goals, said) for case in cases]
 

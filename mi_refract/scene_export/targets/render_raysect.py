@@ -2,9 +2,8 @@
 
 It writes one `seedN.pfm` per seed. A Python with raysect runs this script; mi_refract never imports it. A ray of
 raysect carries a spectrum, here of three bins: red, green and blue. Glass has one index for all of them, so that a path
-is the same for the three. With `--band FROM TO` (nm) a ray has one bin, and a glass with an entry "sellmeier" in
-`scene.json` (B1, B2, B3, C1, C2, C3 as raysect takes them, in µm²) has the index of that band; the image shows that bin
-three times.
+is the same for the three. With `--band FROM TO` (nm) a ray has one bin, which the image shows three times, and a glass
+that has an entry "schott" in `scene.json` is that of raysect's library, with its index in the band.
 """
 
 import argparse
@@ -20,7 +19,8 @@ from raysect.core import Vector3D, rotate_basis, translate
 from raysect.core.math import random
 from raysect.core.workflow import SerialEngine
 from raysect.optical import ConstantSF, InterpolatedSF, World
-from raysect.optical.material import Dielectric, Lambert, Sellmeier, UniformSurfaceEmitter
+from raysect.optical.library import schott
+from raysect.optical.material import Dielectric, Lambert, UniformSurfaceEmitter
 from raysect.optical.observer import FullFrameSampler2D, PinholeCamera, SpectralRadiancePipeline2D
 from raysect.primitive import Mesh, Sphere
 
@@ -134,7 +134,7 @@ class Map(UniformSurfaceEmitter):
 
 def glass(entry):
     """A smooth boundary that absorbs nothing."""
-    index = Sellmeier(*entry["sellmeier"]) if "sellmeier" in entry else ConstantSF(entry["int_ior"])
+    index = schott(entry["schott"]).index if "schott" in entry else ConstantSF(entry["int_ior"])
     return Dielectric(index, ConstantSF(1), ConstantSF(entry["ext_ior"]))
 
 

@@ -16,14 +16,17 @@ import numpy as np
 
 from mi_refract.io import image_file
 from mi_refract.io.image_file import Image
+from mi_refract.rendering import scene_files
 from mi_refract.scene_export import write_files
 from mi_refract.scene_export.plain_scene import PlainScene
 from mi_refract.scene_export.targets import cycles, luxcore, povray, radiance, raysect, scene_json
+from validation.run.render_methods import Camera
 
 from . import environments
 from .table import SYSTEMS
 
 HOURS = 4 * 3600.0  # after which a renderer hangs
+PASS = 2048  # samples a pixel
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -42,16 +45,21 @@ class ImageRenderer:
 
 
 def _by_script(target: str, ending: str = "exr") -> Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]:
-    """By the script that is exported with the scene, after `edit(folder)` of its files."""
+    """By the script that is exported with the scene, after `edit(folder)` of its files, with `more` options."""
 
     def draw(
-        plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int], edit: Callable[[Path], None] | None = None
+        plain: PlainScene,
+        folder: Path,
+        spp: int,
+        seeds: Sequence[int],
+        edit: Callable[[Path], None] | None = None,
+        more: Sequence[str] = (),
     ) -> list[Image]:
         write_files.write(plain, target, folder / "scene")
         if edit:
             edit(folder / "scene")
         program = [environments.python(SYSTEMS[target]), "render.py", "--spp", str(spp), "--out", str(folder)]
-        environments.run([*program, "--seeds", *map(str, seeds)], timeout=HOURS, where=folder / "scene")
+        environments.run([*program, *more, "--seeds", *map(str, seeds)], timeout=HOURS, where=folder / "scene")
         return [_rgb(image_file.read(folder / f"seed{seed}.{ending}")) for seed in seeds]
 
     return draw
@@ -123,6 +131,25 @@ def _rgb(image: Image) -> Image:
     return image_file.named(image.path.name, image.select(("R", "G", "B")))
 
 
+def _mitsuba(integrator: str) -> Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]:
+    """By another integrator of Mitsuba's, with Mitsuba's `dielectric`, in this process and the present variant."""
+
+    def draw(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+        write_files.write(plain, "mitsuba", folder / "scene")
+        parameters = {"bsdf": "dielectric", "integrator": integrator}
+        camera = Camera(scene_files.load_scene(folder / "scene" / "scene.xml", parameters))
+        return [image_file.named(f"seed {seed}", mean(camera, spp, seed)) for seed in seeds]
+
+    return draw
+
+
+def mean(camera: Camera, spp: int, seed: int) -> np.ndarray:
+    """An image of so many samples, at most PASS of them at a time: more would need gigabytes."""
+    passes = -(-spp // PASS)
+    images = [camera(-(-spp // passes), 1000 * seed + i)[0][..., :3] for i in range(passes)]
+    return np.mean(images, axis=0).astype(np.float32)
+
+
 THREE = (
     "A glass has one index, the quotient of the two; radiance is not scaled by the square of the index.",
     "The tent filter of its pixels is replaced by a box.",
@@ -139,12 +166,22 @@ def _spp(sphere: int, prism: int, environment: int) -> dict[str, int]:
 
 
 RAYSECT_SPP = _spp(2048, 768, 256) | {"furnace": 128}  # which samples no lamp
+MITSUBA = ("Mitsuba's `dielectric` in the same variant and scene file; no Russian roulette.",)
+PTRACER = (
+    *MITSUBA,
+    "Paths begin at lamps, and their last vertex is joined with the camera: what is seen in or through smooth glass "
+    "stays black. A caustic on a diffuse surface that is seen directly is there.",
+)
+MITSUBA_SPP = _spp(1024, 768, 256) | {"furnace": 128, "caustic": 32768}
 POVRAY = ("Each pixel is the mean of a grid of 4 × 4 samples, without noise.", *povray.ASSUMPTIONS)
 IMAGE_RENDERERS: dict[str, ImageRenderer] = {
+    "Mitsuba, volpath": ImageRenderer("mitsuba", _mitsuba("volpath"), MITSUBA_SPP, MITSUBA),
+    "Mitsuba, prb": ImageRenderer("mitsuba", _mitsuba("prb"), MITSUBA_SPP, MITSUBA),
+    "Mitsuba, ptracer": ImageRenderer("mitsuba", _mitsuba("ptracer"), {"caustic": 131072, "sphere": 512}, PTRACER),
     "Radiance": ImageRenderer("radiance", _radiance, _spp(160, 112, 4), radiance.ASSUMPTIONS),
     "Cycles": ImageRenderer("cycles", _by_script("cycles"), _spp(128, 128, 32), cycles.ASSUMPTIONS),
     "raysect": ImageRenderer("raysect", _by_script("raysect", "pfm"), RAYSECT_SPP, raysect.ASSUMPTIONS),
-    "LuxCore": ImageRenderer("luxcore", _by_script("luxcore"), _spp(320, 400, 288), luxcore.ASSUMPTIONS),
+    "LuxCore": ImageRenderer("luxcore", _by_script("luxcore"), _spp(1280, 1024, 288), luxcore.ASSUMPTIONS),
     "POV-Ray": ImageRenderer("povray", _povray, _spp(16, 16, 16), POVRAY),
     "three-gpu-pathtracer": ImageRenderer("three", _three("1"), {"prism": 8, "furnace": 8}, THREE),
     "three-gpu-pathtracer, no MIS": ImageRenderer("three", _three("0"), {"prism": 8, "furnace": 8}, THREE),

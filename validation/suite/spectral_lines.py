@@ -1,0 +1,195 @@
+"""A dispersive prism by raysect, line by line of the spectrum, against the same by `refract_path`.
+
+Both render `dispersive_prism` in SF11, in the light of the lines C, d and F alone: a lamp seen through a prism, at
+another place in each of them. Each computes the index itself: raysect by the Sellmeier formula of its own library of
+glasses, where a ray of one narrow bin has the index of that bin; here by `int_ior` = "sellmeier(…)" in a spectral
+variant, where the film sees the same band, 1 nm wide. Lamps, sky and table are grey. The images are compared by Welch's
+t-test, tiles and pixels. As a control, raysect's image at one line is compared with ours at another: that must be seen.
+The models differ in how they sample: `refract_path` samples the lamps and the sky, raysect meets them by chance; see
+the study of images for the rest. The index varies by 1e-4 in a band, evenly about its middle, in both.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import re
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mi_refract.image_diff.comparison import Verdict
+from mi_refract.image_diff.methods import compare
+from mi_refract.io import image_file
+from mi_refract.io.image_file import Image
+from mi_refract.media import LINES
+from mi_refract.rendering import scene_files
+from mi_refract.report.row import Row
+from mi_refract.scene_export import from_mitsuba, write_files
+from mi_refract.scene_export.plain_scene import Diffuse, Glass, Light, PlainScene
+from validation import limits
+from validation.run.context import SCENES as FOLDER
+from validation.run.context import Context
+from validation.run.metrics import DETECTABLE
+from validation.run.render_methods import Camera, under
+from validation.study import Study, Task, about
+
+from .rendered_images import DETECTABLE_IMAGE, INCONCLUSIVE, OURS, RENDERS, TERMS, Size, measured, why_not
+from .renderers import environments
+from .renderers.image_renderers import IMAGE_RENDERERS
+from .renderers.table import SYSTEMS
+
+NAME = "spectral lines"
+OTHER, SCENE, VARIANT = "raysect", "dispersive_prism.xml", "llvm_ad_spectral"
+GLASS = "SF11"  # of Schott's catalogue of 2000: B1, B2, B3, then C1, C2, C3 in nm²
+INDEX = "sellmeier(1.73848403, 0.311168974, 1.17490871, 13606.8604, 61596.0463, 121922711)"
+WANTED = "C", "d", "F"
+HALF, EDGE = 0.5, 0.01  # nm: half of the band, and how far its response falls to 0
+SIZES = {"quick": Size(64, 128, 4, 0.1), "standard": Size(64, 128, 4, 0.1), "full": Size(128, 2048, 1, 0.01)}
+THEIR_SPP = 1024  # divided by a size's `less`; with 768 noise hid 1 % in 6 to 9 % of the tiles, and 10 % is too much
+PIXELS = "yes"  # those of both are independent
+DIMMED = 0.1  # lamps: what raysect finds of them by chance on the table is noise
+MIXED = "lines mixed up"
+NOT_SEEN, DIFFERENT = "not seen to differ", "different"
+SHOWN = {name: TERMS[name] for name in ("tests that differ", "tiles that differ without noise", DETECTABLE)} | {
+    DIFFERENT: "1 where tiles or their pixels differ",
+    NOT_SEEN: "1 where the wrong line passes",
+}
+
+
+def tasks(context: Context) -> list[Task]:
+    """One per line, and the control."""
+    found = [Task(f"{NAME}: {line}", functools.partial(line_rows, context, line)) for line in WANTED]
+    return [*found, Task(f"{NAME}: {MIXED}", functools.partial(mixed_rows, context))]
+
+
+def _reason(context: Context) -> str:
+    return context.variants.get(VARIANT, "not in this wheel") or why_not(SYSTEMS["raysect"], context)
+
+
+def line_rows(context: Context, line: str) -> list[Row]:
+    """Equal within the noise, which hides at most 1 % of the image's mean."""
+    size = SIZES[context.profile.name]
+    setting = f"{size.resolution}²"
+    if reason := _reason(context):
+        return [Row(NAME, OTHER, line, setting, reason=reason)]
+    try:
+        sides = ours(line, size), theirs(line, size)
+    except environments.Unable as why:
+        return [Row(NAME, OTHER, line, setting, reason=" ".join(str(why).split()))]
+    except (environments.Broken, OSError) as defect:
+        values = {"not rendered": float(RENDERS)}
+        return [Row(NAME, OTHER, line, setting, values, {"not rendered": 0.0}, reason=str(defect))]
+    found, values = _compared(*sides, size)
+    values[DIFFERENT] = float(found.verdict is Verdict.DIFFERENT)
+    budgets = {DIFFERENT: 0.0, "tests that differ": 0.0, "tiles that differ without noise": 0.0}
+    budgets |= {DETECTABLE_IMAGE: float(limits.LINE_DETECTABLE)}
+    goals = {INCONCLUSIVE: 0.0, DETECTABLE: size.wanted}
+    replay = {"verdict": str(found.verdict), "nm": LINES[line], "reference spp": size.spp, "spp": _spp(size)}
+    return [Row(NAME, OTHER, line, setting, values, budgets, goals, f"{found.verdict}: {found.reason}", replay)]
+
+
+def mixed_rows(context: Context) -> list[Row]:
+    """Raysect's image at a line against ours at the next one."""
+    size = SIZES[context.profile.name]
+    setting = f"{size.resolution}²"
+    if reason := _reason(context):
+        return [Row(NAME, MIXED, "every line", setting, reason=reason)]
+    rows = []
+    for line, other in (("C", "d"), ("F", "d")):
+        try:
+            found, _ = _compared(ours(other, size), theirs(line, size), size)
+        except (environments.Unable, environments.Broken, OSError) as why:
+            rows.append(Row(NAME, MIXED, line, setting, reason=" ".join(str(why).split())))
+            continue
+        values = {NOT_SEEN: float(found.verdict is not Verdict.DIFFERENT)}
+        rows.append(Row(NAME, MIXED, f"{line} for {other}", setting, values, {NOT_SEEN: 0.0}, reason=found.reason))
+    return rows
+
+
+def _compared(one: list[Image], two: list[Image], size: Size) -> Any:
+    found = compare("welch", one, two, family_error=limits.SUITE_ERROR, resolution=size.wanted, pixels=PIXELS)
+    return found, measured(found, *(np.stack([image.pixels for image in side]) for side in (one, two)))
+
+
+def _spp(size: Size) -> int:
+    return THEIR_SPP // size.less
+
+
+# The two renderers -------------------------------------------------------------------------------------------------
+
+
+def plain(resolution: int) -> PlainScene:
+    """The scene without colours, in the vacuum, with dimmer lamps. The prism's index is set by each renderer."""
+
+    def grey(material: Any) -> Any:
+        match material:
+            case Glass():
+                return dataclasses.replace(material, ext_ior=1.0)
+            case Diffuse(reflectance=colour):
+                return Diffuse((colour[1],) * 3)
+            case Light(radiance=colour):
+                return Light((DIMMED * colour[1],) * 3)
+
+    text = (FOLDER / SCENE).read_text().replace('"meshes/', f'"{FOLDER}/meshes/')
+    text = re.sub(r'<string name="int_ior" [^>]*/>', '<float name="int_ior" value="1.5"/>', text)
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / SCENE).write_text(text)
+        given = from_mitsuba.load(Path(folder) / SCENE, res=str(resolution))
+    meshes = tuple(dataclasses.replace(mesh, material=grey(mesh.material)) for mesh in given.meshes)
+    assert isinstance(given.sky, tuple)
+    return dataclasses.replace(given, meshes=meshes, sky=(given.sky[1],) * 3)
+
+
+@functools.cache
+def theirs(line: str, size: Size) -> list[Image]:
+    """Raysect's renders at a line."""
+
+    def dispersive(folder: Path) -> None:
+        file = folder / "scene.json"
+        document = json.loads(file.read_text())
+        (glass,) = [entry for entry in document["materials"].values() if entry["type"] == "glass"]
+        glass["schott"] = GLASS
+        file.write_text(json.dumps(document))
+
+    band = ["--band", *(str(LINES[line] + side) for side in (-HALF, HALF))]
+    with tempfile.TemporaryDirectory() as folder:
+        draw, seeds = IMAGE_RENDERERS[OTHER].draw, range(1, RENDERS + 1)
+        images = draw(plain(size.resolution), Path(folder), _spp(size), seeds, edit=dispersive, more=band)
+    return [image_file.named(image.path.name, image.pixels[..., :1]) for image in images]
+
+
+@functools.cache
+def ours(line: str, size: Size) -> list[Image]:
+    """Renders by `refract_path` at a line."""
+    with tempfile.TemporaryDirectory() as folder, under(VARIANT):
+        write_files.write(plain(size.resolution), "mitsuba", Path(folder) / "scene")
+        file = Path(folder) / "scene" / "scene.xml"
+        file.write_text(spectral(file.read_text(), LINES[line]))
+        camera = Camera(scene_files.load_scene(file, {"bsdf": "refract"}))
+        # The film adds up what it sees over its band.
+        images = [camera(size.spp, OURS + seed)[0][..., :1] / (2 * HALF + EDGE) for seed in range(RENDERS)]
+    return [image_file.named(f"{line} {i}", image.astype(np.float32)) for i, image in enumerate(images)]
+
+
+def spectral(text: str, wavelength: float) -> str:
+    """The scene's XML with our integrator, the dispersive glass, grey light and a film that sees one band."""
+    knots = zip((-HALF - EDGE, -HALF, HALF, HALF + EDGE), (0, 1, 1, 0), strict=True)
+    band = ", ".join(f"{wavelength + side:.8g}:{value}" for side, value in knots)
+    for pattern, by, times in (
+        (r'<integrator type="[^"]*"', '<integrator type="refract_path"', 1),
+        (r'<float name="int_ior" value="[^"]*"\s*/>', f'<string name="int_ior" value="{INDEX}"/>', 1),
+        (r'<film type="hdrfilm">', f'<film type="specfilm"><spectrum name="band" value="{band}"/>', 1),
+        (r'<string name="pixel_format" value="rgb"/>', "", 1),
+        (r'<rgb name="(\w+)" value="([^,"]*), [^"]*"/>', r'<spectrum name="\1" value="\2"/>', 4),
+    ):
+        text, count = re.subn(pattern, by, text)
+        if count != times:
+            raise ValueError(f"{pattern!r} is there {count} times; accepted: {times}")
+    return text
+
+
+STUDY = Study(NAME, "Spectral lines", about(__doc__), SHOWN, tasks)
