@@ -22,7 +22,6 @@ from mi_refract.io.pixels import srgb_encode
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
-from validation import limits
 from validation.diff import visible_changes
 from validation.directions import per_formula
 from validation.efficiency import cluster_scale, error_against_time
@@ -51,7 +50,7 @@ from validation.run.metrics import (
     low,
 )
 from validation.stability import layered_paths
-from validation.suite import matrix, per_ray
+from validation.suite import matrix_table
 
 ROOT = SCENES.parent
 GALLERY = SCENES / "gallery.png"
@@ -330,34 +329,7 @@ def visible(rows: list[Row]) -> str:
 
 def suite(rows: list[Row]) -> str:
     """Markdown: how far every system is off at most, check by check."""
-    cells: dict[str, dict[str, Row]] = {}
-    for row in rows:
-        if row.study == matrix.NAME:
-            cells.setdefault(row.subject, {})[row.case] = row
-    if not any(row.values for each in cells.values() for row in each.values()):
-        raise ValueError("README: no other renderer was run; its table needs some")
-    checks = [check for each in matrix.CHECKS.values() for check in each]
-    lines = [[system, *(_off(found.get(check)) for check in checks)] for system, found in cells.items()]
-    text = (
-        "Rays: radians; images: share of the mean. ✓: every ray within its bound; ✗: a bound is broken, and the run "
-        f"fails.\nTo be within a factor of {limits.RECORDED:g} of the error recorded earlier is a goal: what misses it "
-        'says\n"× recorded", or "recorded /" where the error is smaller, and fails nothing.'
-    )
-    return _table(text, ["", *checks], lines)
-
-
-def _off(row: Row | None) -> str:
-    if row is None or not row.values:
-        return "not run" if row else ""
-    if matrix.OFF not in row.values:
-        return "✗" if row.broken else "✓"
-    word = " **different**" if row.values.get("differs") else ""
-    word += " **inconclusive**" if row.values.get(matrix.INCONCLUSIVE) else ""
-    if per_ray.OFF_RECORDED in row.missed:
-        factor = compact(row.values[per_ray.OFF_RECORDED])
-        less = row.values[matrix.OFF] < row.values.get(per_ray.RECORDED, 0)
-        word += f" (recorded / {factor})" if less else f" ({factor} × recorded)"
-    return compact(row.values[matrix.OFF]) + word + (" ✗" if row.broken else "")
+    return _table(*matrix_table.table(rows))
 
 
 def _percent(shares: list[float], digits: int = 0) -> str:

@@ -269,7 +269,7 @@ def test_the_exit_code_follows_the_budgets(tmp_path, monkeypatch, capsys, budget
         (["--out", __file__], "File exists; accepted: a writable folder"),
         (["--speed", "9"], "No such option: --speed"),
         (["--write-tables"], "--write-tables with the profile 'quick'; accepted: --profile standard, --profile full"),
-        (["renderers", "--install", "blender"], "unknown system 'blender'; accepted: mitsuba, pyglm"),
+        (["renderers", "--install", "blender"], "unknown system 'blender'; accepted: batoid, cycles"),
         (["renderers", "--list", "--install", "pyglm"], "accepted: one of them"),
         (["renderers", "pyglm"], "unexpected extra argument"),
     ],

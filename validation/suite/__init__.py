@@ -10,6 +10,7 @@ __all__ = [
     "lenses",
     "matrix",
     "matrix_page",
+    "matrix_table",
     "per_ray",
     "rendered_images",
     "small_mistakes",
