@@ -10,9 +10,9 @@ from validation import limits
 from . import matrix, per_ray
 
 TEXT = (
-    "Rays: the largest angle in radians, and the largest backward error in u: the answers are exact for inputs so many\n"
-    f"roundings off, and right up to {RIGHT:g}, a goal; what misses it is bold. Images: share of the mean. ✓: every ray\n"
-    "within its bound; ✗: a bound is broken, and the run fails. To be within a factor of "
+    "Rays: the largest angle in radians, and the largest backward error in u: the answers are exact for inputs so "
+    f"many\nroundings off, and right up to {RIGHT:g}, a goal; what misses it is bold. Images: share of the mean. "
+    "✓: every ray\nwithin its bound; ✗: a bound is broken, and the run fails. To be within a factor of "
     f"{limits.RECORDED:g} of the error recorded\nearlier is a goal: what misses it says "
     '"× recorded", or "recorded /" where the error is smaller, and fails nothing.'
 )
