@@ -135,7 +135,7 @@ SCENES = {
     "prism": Scene(functools.partial(_scene, "prism"), (THREE,)),
     "environment": Scene(environment),
     "furnace": Scene(furnace, (THREE,)),
-    "caustic": Scene(caustic, more=16),
+    "caustic": Scene(caustic, more=4),
 }
 # What makes a renderer disagree.
 WHY = {

@@ -172,12 +172,12 @@ PTRACER = (
     "Paths begin at lamps, and their last vertex is joined with the camera: what is seen in or through smooth glass "
     "stays black. A caustic on a diffuse surface that is seen directly is there.",
 )
-MITSUBA_SPP = _spp(1024, 768, 256) | {"furnace": 128, "caustic": 32768}
+MITSUBA_SPP = _spp(1024, 768, 256) | {"furnace": 128, "caustic": 8192}
 POVRAY = ("Each pixel is the mean of a grid of 4 × 4 samples, without noise.", *povray.ASSUMPTIONS)
 IMAGE_RENDERERS: dict[str, ImageRenderer] = {
     "Mitsuba, volpath": ImageRenderer("mitsuba", _mitsuba("volpath"), MITSUBA_SPP, MITSUBA),
     "Mitsuba, prb": ImageRenderer("mitsuba", _mitsuba("prb"), MITSUBA_SPP, MITSUBA),
-    "Mitsuba, ptracer": ImageRenderer("mitsuba", _mitsuba("ptracer"), {"caustic": 131072, "sphere": 512}, PTRACER),
+    "Mitsuba, ptracer": ImageRenderer("mitsuba", _mitsuba("ptracer"), {"caustic": 32768, "sphere": 512}, PTRACER),
     "Radiance": ImageRenderer("radiance", _radiance, _spp(160, 112, 4), radiance.ASSUMPTIONS),
     "Cycles": ImageRenderer("cycles", _by_script("cycles"), _spp(128, 128, 32), cycles.ASSUMPTIONS),
     "raysect": ImageRenderer("raysect", _by_script("raysect", "pfm"), RAYSECT_SPP, raysect.ASSUMPTIONS),
