@@ -98,10 +98,19 @@ def _command(
     tls_ca_file: TlsCaFile = None,
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
+    renderers: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--renderer",
+            metavar="FOLDER",
+            help="Take the renderer of FOLDER/mi-refract-renderer.toml into `suite`, too.",
+        ),
+    ] = None,
 ) -> int:
     """Measure the formulas and the plugin against certified answers, and write the report."""
     _check(studies or [], profile, out, write_tables)
     there = elsewhere(scheduler, workers, tls_ca_file, tls_cert, tls_key)
+    _join(renderers or [], studies or [], there)
     try:
         there.check()
     except (ValueError, OSError) as error:
@@ -131,6 +140,24 @@ def _check(studies: list[str], profile: str, out: Path, write_tables: bool) -> N
         raise Misuse(f"--out {out}: {error.strerror}; accepted: a writable folder") from None
     if not os.access(out, os.W_OK):
         raise Misuse(f"--out {out}: not writable; accepted: a writable folder")
+
+
+def _join(folders: list[Path], studies: list[str], there: Elsewhere) -> None:
+    """Take renderers into the table of `suite`."""
+    if not folders:
+        return
+    if studies and "suite" not in studies:
+        raise Misuse(f"--renderer {folders[0]} without suite; accepted: the study suite")
+    if there.given:
+        raise Misuse(f"--renderer {folders[0]} with workers, which know nothing of it; accepted: this process")
+    from validation.suite import rendered_images
+    from validation.suite.renderers import table
+
+    for folder in folders:
+        try:
+            rendered_images.join(table.join(folder))
+        except (ValueError, OSError) as error:
+            raise Misuse(str(error)) from None
 
 
 def modules(studies: list[str], profile: str) -> list[str]:

@@ -160,10 +160,10 @@ def of_regime(name: str, header: Header) -> Rays:
         rays = regimes.make_given(name, k, precision, seed)
     else:
         rays = regimes.make(name, header["count"], precision, seed)
-    return rays if header["two_sided"] else _facing(rays)
+    return rays if header["two_sided"] else facing(rays)
 
 
-def _facing(rays: Rays) -> Rays:
+def facing(rays: Rays) -> Rays:
     """The same rays, each with its normal on the side that it comes from."""
     c = float_expansions.dot(rays.n.T.astype(np.float64), rays.a.T.astype(np.float64))[0]
     return Rays(rays.a, np.where(c[:, None] > 0, -rays.n, rays.n), rays.k)

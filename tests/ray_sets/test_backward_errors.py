@@ -33,6 +33,23 @@ def test_the_textbook_is_right_but_where_k_is_large(precision):
     assert {each.regime for each in strict.regimes if each.wrong} == LARGE
 
 
+def test_where_k_is_large_the_sine_is_lost_in_1_minus_c_squared():
+    """sin²θ_i from 1 − c² is off by u, and the radicand by k² u; from |n × a|² by u sin²θ_i. That is all of it."""
+    rays = ray_set.make(["k ≫ 1"], 500, "f32", 3)
+
+    def by(sine_squared):
+        def answer(a, n, k):
+            c = (n * a).sum(1, keepdims=True)
+            radicand = 1 - k * k * sine_squared(a, n, c)
+            return np.where(radicand < 0, 0, k * (a - c * n) - np.sqrt(np.maximum(radicand, 0)) * n)
+
+        return check(rays, answered(rays, answer))
+
+    lost, kept = by(lambda a, n, c: 1 - c * c), by(lambda a, n, c: (np.cross(n, a) ** 2).sum(1, keepdims=True))
+    assert lost.right < 0.6 * lost.answered and lost.regimes[0].backward_worst > 100
+    assert kept.right == kept.answered and kept.regimes[0].backward_worst < 1
+
+
 def test_a_normal_off_by_a_millionth_hid_and_is_seen():
     rays = ray_set.make(["generic"], 500, "f32", 3)
     found = check(rays, answered(rays, tilted))

@@ -176,7 +176,7 @@ def test_a_script_for_node_is_told_its_folder_and_cannot_run_without_node(monkey
     monkeypatch.setattr(environments, "run", lambda *words, **named: asked.append(words))
     command = ("node", "thing.mjs", "{environment}")
     environments.ask(system, command, "rays")
-    assert asked == [(["node", "thing.mjs", str(environments.folder(system))], "rays")]
+    assert asked[0][:2] == (["node", "thing.mjs", str(environments.folder(system))], "rays")
     monkeypatch.setattr("shutil.which", lambda program: None)
     with pytest.raises(environments.Unable, match="no node in PATH"):
         environments.ask(system, command, "rays")

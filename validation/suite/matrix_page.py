@@ -35,6 +35,10 @@ TERMS = {
     "in a tile",
     "not run": "the system was not installed where this page was made; the command installs it",
 } | {name: rays.text for name, rays in per_ray.SETS.items()}
+TERMS[LARGE] += (
+    ". A formula with 1 − k² (1 − c²) is not right here: near the normal the difference 1 − c² has few digits left of "
+    "sin²θ_i, and its error counts k² times; |n × a|² keeps them"
+)
 
 
 def read(folder: Path) -> Stored:
@@ -149,9 +153,10 @@ def write_json(path: Path, found: Stored) -> None:
 def write_html(path: Path, found: Stored) -> None:
     """One page that needs no network. OSError."""
     right = sum(not each["wrong"] for each in found["rays"])
+    drawn = f", {len(found['images'])} renderers by images" if found["images"] else ""
     content = {
         "title": "Refraction by other systems",
-        "sentence": f"Who refracts right: {len(found['rays'])} functions ray by ray, {len(found['images'])} renderers",
+        "sentence": f"Who refracts right: {len(found['rays'])} functions ray by ray{drawn}",
         "counts": [
             ("pass", "functions without a wrong answer", right),
             ("fail", "with wrong answers", len(found["rays"]) - right),
@@ -160,7 +165,7 @@ def write_html(path: Path, found: Stored) -> None:
         "sets": list(per_ray.SETS),
         "rays": [each | {"cells": [_cell(each["sets"].get(name)) for name in per_ray.SETS]} for each in found["rays"]],
         "scenes": list(rendered_images.SCENES),
-        "images": [
+        "renderers": [
             each | {"cells": [_picture(each["scenes"].get(name)) for name in rendered_images.SCENES]}
             for each in found["images"]
         ],
@@ -175,7 +180,7 @@ def _cell(found: Stored | None) -> tuple[str, str]:
     """The text of a cell and its class."""
     if not found:
         return "–", ""
-    states = {"right": "pass", "within bound": "info", "wrong": "fail"}
+    states = {"right": "pass", "within bound": "missed", "wrong": "fail"}
     wrong = "wrong, " if found["verdict"] == "wrong" else ""
     return wrong + _shown(found["backward_error"]), states[found["verdict"]]
 
@@ -183,7 +188,7 @@ def _cell(found: Stored | None) -> tuple[str, str]:
 def _picture(found: Stored | None) -> tuple[str, str]:
     if not found:
         return "–", ""
-    state = {"equal": "pass", "different": "fail"}.get(found["verdict"], "info")
+    state = {"equal": "pass", "different": "fail"}.get(found["verdict"], "missed")
     if not isinstance(found["mean_difference"], (int, float)):
         return found["verdict"], state
     seen = f", seen from {found['detectable']:.2%}" if isinstance(found["detectable"], (int, float)) else ""

@@ -124,6 +124,7 @@ TERMS = {name: f"{rays.count} rays: {rays.text}" for name, rays in SETS.items()}
     MISCLASSIFIED: "rays whose total internal reflection was misclassified",
     "wrong": "rays beyond the bound, misclassified although the bound decides them, or without a direction",
     "given up": "rays left out: so near to the critical angle that the system treats them as totally reflected",
+    "not seen to deviate": "1 where every answer is right and the system is known to be wrong there",
     "unfit": "answers that are missing, duplicate, or to rays that were not given",
     "told otherwise": "1 where the program signals total internal reflection in another way than was recorded",
     "unanswered": "rays without an answer, because the program crashed, hung or printed none",
@@ -172,7 +173,8 @@ def _made(kind: Set, precision: type) -> regimes.Rays:
     rng = np.random.default_rng([seeds.current(SEED), kind.stream])
     normal: np.ndarray = regimes.normalised(rng.normal(size=(kind.count, 3))).astype(precision)
     a, n, k = regimes.rays_at(kind.draw, rng, normal)
-    return regimes.Rays(a.astype(precision), n.astype(precision), k.astype(precision))
+    # As `mi-refract rays export` writes them: a program need not know rays from behind.
+    return ray_set.facing(regimes.Rays(a.astype(precision), n.astype(precision), k.astype(precision)))
 
 
 def _gathered(parts: dict[str, regimes.Rays], precision: str) -> RaySet:
@@ -196,6 +198,7 @@ def rows(call: RaysCommand, rays: RaySet, answers: Answers) -> list[Row]:
     for name in SETS:
         figures = next((each for each in findings.regimes if each.regime == name), None)
         values, budgets, goals = _measured(name, call, findings, figures)
+        deviates = f"; known to deviate: {call.deviations[name]}" if name in call.deviations else ""
         if call.gives_up:
             values["given up"] = float(left_out[rays.regime == name].sum())
         replay = {
@@ -207,7 +210,7 @@ def rows(call: RaysCommand, rays: RaySet, answers: Answers) -> list[Row]:
             "total internal reflection": findings.tir,
             "remark": call.remark,
         }
-        made.append(Row(NAME, call.title, name, call.precision, values, budgets, goals, about, replay))
+        made.append(Row(NAME, call.title, name, call.precision, values, budgets, goals, about + deviates, replay))
     return made
 
 
@@ -259,6 +262,9 @@ def _measured(
             OFF_RECORDED: off(figures.worst, *call.recorded[name]),
         }
         goals[OFF_RECORDED] = limits.RECORDED
+    if name in call.deviations:
+        values["not seen to deviate"] = float(figures.wrong == 0)
+        budgets = {"unfit": 0.0, "not seen to deviate": 0.0}
     return values, budgets, goals
 
 

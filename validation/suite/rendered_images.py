@@ -35,7 +35,7 @@ from validation.run.context import Context
 from validation.run.metrics import DETECTABLE, MEAN_DIFFERENCE
 from validation.run.render_methods import Camera
 from validation.study import Study, Task, about
-from validation.suite.renderers.image_renderers import IMAGE_RENDERERS, mean
+from validation.suite.renderers.image_renderers import IMAGE_RENDERERS, ImageRenderer, by_command, mean
 
 from .renderers import SYSTEMS, System, environments
 
@@ -145,6 +145,29 @@ WHY = {
 }
 
 
+def join(system: System) -> None:
+    """Take a system that renders by a command into the study. ValueError for an unknown export or scene."""
+    images, where = system.images, f"{system.folder}: images."
+    if images is None:
+        return
+    if images.export not in write_files.TARGETS:
+        raise ValueError(f"{where}export: {images.export!r}; accepted: {', '.join(write_files.TARGETS)}")
+    for scene in (*images.spp, *images.deviations):
+        if scene not in SCENES:
+            raise ValueError(f"{where}spp, images.deviation: {scene!r}; accepted: {', '.join(SCENES)}")
+    if system.title in IMAGE_RENDERERS:
+        raise ValueError(f"{system.folder}: title: {system.title!r} is another's; accepted: a new one")
+    assumed = images.assumed or ("not said.",)
+    IMAGE_RENDERERS[system.title] = ImageRenderer(system.name, by_command(system), images.spp, assumed)
+    TERMS[f"{system.title}, assumed"] = " ".join(assumed)
+
+
+def known_to_differ(title: str, scene: str) -> str:
+    """Why a renderer disagrees on a scene; "" where it is not known to."""
+    images = SYSTEMS[IMAGE_RENDERERS[title].system].images
+    return WHY[title] if title in SCENES[scene].known else images.deviations.get(scene, "") if images else ""
+
+
 def tasks(context: Context) -> list[Task]:
     """One per renderer and scene."""
     return [
@@ -198,7 +221,7 @@ def _row(context: Context, title: str, scene: str, ours: Sequence[Image], theirs
     # Not their pixels: some of the renderers sample every pixel on one grid, whatever the seed.
     found = compare("welch", ours, theirs, family_error=limits.SUITE_ERROR, resolution=size.wanted, pixels="no")
     values = measured(found, *(np.stack([image.pixels for image in side]) for side in (ours, theirs)))
-    known = title in SCENES[scene].known
+    known = known_to_differ(title, scene)
     if known:
         values["not seen to differ"] = float(found.verdict is not Verdict.DIFFERENT)
     budgets = {"not seen to differ": 0.0}
@@ -207,7 +230,7 @@ def _row(context: Context, title: str, scene: str, ours: Sequence[Image], theirs
     goals = {INCONCLUSIVE: 0.0} | ({DETECTABLE: size.wanted} if not known else {})
     reason = f"{found.verdict}: {found.reason}"
     if known and found.verdict is Verdict.DIFFERENT:
-        reason += f"; {WHY[title]}"
+        reason += f"; {known}"
     replay = {
         "verdict": str(found.verdict),
         "scene": scene,

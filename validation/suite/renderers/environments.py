@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from mi_refract.io import process_group
@@ -173,15 +173,21 @@ def script(system: System, name: str, *arguments: str) -> list[str]:
     return [python(system), str(SCRIPTS / name), *arguments]
 
 
-def ask(system: System, command: tuple[str, ...], given: str) -> str:
-    """What a command of the system's file answers to `given` on its stdin. Errors as of `run`.
+def ask(
+    system: System,
+    command: tuple[str, ...],
+    given: str = "",
+    timeout: float | None = None,
+    values: Mapping[str, object] | None = None,
+) -> str:
+    """What a command of the system's file, filled in with `values`, answers to `given` on its stdin.
 
-    Unable also where its program is none of this machine.
+    Errors as of `run`. Unable also where its program is none of this machine.
     """
-    words = renderer_file.filled(command, python=python(system), environment=folder(system))
+    words = renderer_file.filled(command, python=python(system), environment=folder(system), **(values or {}))
     if os.sep not in words[0] and not shutil.which(words[0]):
         raise Unable(f"no {words[0]} in PATH")
-    return run(words, given, where=system.folder)
+    return run(words, given, timeout, system.folder)
 
 
 def run(command: Sequence[str], given: str = "", timeout: float | None = None, where: Path | None = None) -> str:

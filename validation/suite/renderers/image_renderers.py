@@ -23,6 +23,7 @@ from mi_refract.scene_export.targets import cycles, luxcore, povray, radiance, r
 from validation.run.render_methods import Camera
 
 from . import environments
+from .system import System
 from .table import SYSTEMS
 
 HOURS = 4 * 3600.0  # after which a renderer hangs
@@ -129,6 +130,22 @@ def _raw(path: Path, plain: PlainScene) -> Image:
 
 def _rgb(image: Image) -> Image:
     return image_file.named(image.path.name, image.select(("R", "G", "B")))
+
+
+def by_command(system: System) -> Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]:
+    """By the command of the system's own file."""
+    images = system.images
+    if images is None:
+        raise ValueError(f"{system.name}: no [images]; accepted: a system that renders by a command")
+
+    def draw(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
+        write_files.write(plain, images.export, folder / "scene")
+        for seed in seeds:
+            at = {"scene": folder / "scene", "image": folder / f"seed{seed}.exr", "spp": spp, "seed": seed}
+            environments.ask(system, images.command, timeout=HOURS, values=at)
+        return [_rgb(image_file.read(folder / f"seed{seed}.exr")) for seed in seeds]
+
+    return draw
 
 
 def _mitsuba(integrator: str) -> Callable[[PlainScene, Path, int, Sequence[int]], list[Image]]:
