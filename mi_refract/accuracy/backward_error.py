@@ -49,14 +49,21 @@ def of_directions(b: Array, rays: Rays, reflected: NDArray[np.bool_] | None = No
     sine = lengths(axis)
     along = np.where(sine > 0, np.abs((residual * axis).sum(1)) / sine, 0)
     across = np.sqrt(np.maximum((residual * residual).sum(1) - along * along, 0))
-    found = np.zeros(len(rays))
+    found = _least(along, across, (k * cosine, k, (n * w).sum(1), np.where(reflected, 0, k * sine)))
+    onward = (n * b).sum(1) * np.sign(cosine) * np.where(reflected, -1, 1)
+    found = np.maximum(found, -onward.astype(float))  # on the wrong side: n must turn by so much
+    return np.where(np.isfinite(b).all(1), found, np.inf)
+
+
+def _least(along: Array, across: Array, axes: tuple[Array, Array, Array, Array]) -> Array:
+    """The least ε for a residual with these components. `axes`: k cos θ_i, k, γ and k sin θ_i; all (N,)."""
+    x, y, ellipse_x, ellipse_y, disc, segment = (np.abs(v).astype(float) for v in (along, across, *axes))
+    found = np.zeros(len(x))
     for turn in _TURNS:
         c, s = np.cos(turn), np.sin(turn)
-        h = k * np.hypot(cosine * c, s) + np.abs((n * w).sum(1)) + np.where(reflected, 0, k * sine * c)
-        found = np.fmax(found, (along * c + across * s) / h)
-    onward = (n * b).sum(1) * np.sign(cosine) * np.where(reflected, -1, 1)
-    found = np.maximum(found, -onward)  # on the wrong side: n must turn by so much
-    return np.where(np.isfinite(b).all(1), found, np.inf).astype(float)
+        h = np.sqrt((ellipse_x * c) ** 2 + (ellipse_y * s) ** 2) + disc + segment * c
+        np.fmax(found, (x * c + y * s) / h, out=found)
+    return found
 
 
 @np.errstate(divide="ignore", over="ignore", invalid="ignore")
