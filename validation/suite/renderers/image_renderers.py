@@ -190,16 +190,16 @@ PTRACER = (
     "stays black. A caustic on a diffuse surface that is seen directly is there.",
 )
 MITSUBA_SPP = _spp(1024, 768, 256) | {"furnace": 128, "caustic": 8192}
-POVRAY = ("Each pixel is the mean of a grid of 4 × 4 samples, without noise.", *povray.ASSUMPTIONS)
+POVRAY = ("Each pixel is the mean of a grid of 8 × 8 samples, without noise.", *povray.ASSUMPTIONS)
 IMAGE_RENDERERS: dict[str, ImageRenderer] = {
     "Mitsuba, volpath": ImageRenderer("mitsuba", _mitsuba("volpath"), MITSUBA_SPP, MITSUBA),
     "Mitsuba, prb": ImageRenderer("mitsuba", _mitsuba("prb"), MITSUBA_SPP, MITSUBA),
     "Mitsuba, ptracer": ImageRenderer("mitsuba", _mitsuba("ptracer"), {"caustic": 32768, "sphere": 512}, PTRACER),
-    "Radiance": ImageRenderer("radiance", _radiance, _spp(160, 112, 4), radiance.ASSUMPTIONS),
-    "Cycles": ImageRenderer("cycles", _by_script("cycles"), _spp(128, 128, 32), cycles.ASSUMPTIONS),
+    "Radiance": ImageRenderer("radiance", _radiance, _spp(960, 448, 24), radiance.ASSUMPTIONS),
+    "Cycles": ImageRenderer("cycles", _by_script("cycles"), _spp(512, 128, 32), cycles.ASSUMPTIONS),
     "raysect": ImageRenderer("raysect", _by_script("raysect", "pfm"), RAYSECT_SPP, raysect.ASSUMPTIONS),
-    "LuxCore": ImageRenderer("luxcore", _by_script("luxcore"), _spp(1280, 1024, 288), luxcore.ASSUMPTIONS),
-    "POV-Ray": ImageRenderer("povray", _povray, _spp(16, 16, 16), POVRAY),
+    "LuxCore": ImageRenderer("luxcore", _by_script("luxcore"), _spp(1280, 1024, 576), luxcore.ASSUMPTIONS),
+    "POV-Ray": ImageRenderer("povray", _povray, _spp(64, 64, 64), POVRAY),
     "three-gpu-pathtracer": ImageRenderer("three", _three("1"), {"prism": 8, "furnace": 8}, THREE),
     "three-gpu-pathtracer, no MIS": ImageRenderer("three", _three("0"), {"prism": 8, "furnace": 8}, THREE),
 }
