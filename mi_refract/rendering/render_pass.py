@@ -144,14 +144,14 @@ def _rendered(scene: Any, spp: int, seed: int) -> tuple[Doubles, Doubles | None]
     threads = dr.thread_count()
     one = dr.is_jit_v(mi.Float) or not box
     if one:
-        dr.set_thread_count(1)
+        _set_threads(1)
     try:
         mi.render(scene, spp=spp, seed=seed)
         if scene.integrator().should_stop():  # by its `timeout`, or a signal that Mitsuba has taken
             raise InterruptedError("the rendering was stopped before its last sample")
     finally:
         if one:
-            dr.set_thread_count(threads)
+            _set_threads(threads)
     mean = np.array(film.bitmap(), np.float64)  # what `aov` returns has fewer channels
     mean = mean.reshape(*mean.shape[:2], -1)
     raw = film.bitmap(raw=True)
@@ -160,6 +160,13 @@ def _rendered(scene: Any, spp: int, seed: int) -> tuple[Doubles, Doubles | None]
         return mean * spp, None
     weights = np.array(raw, np.float64)[..., names.index("W"), None]
     return mean * weights, weights
+
+
+def _set_threads(count: int) -> None:
+    """When no kernel runs: a kernel is run by the threads that are there when its turn comes."""
+    if dr.is_jit_v(mi.Float):
+        dr.sync_thread()
+    dr.set_thread_count(count)
 
 
 # Samples ------------------------------------------------------------------------------------------------------------
