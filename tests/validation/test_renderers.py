@@ -175,6 +175,14 @@ def test_the_built_in_runs_and_is_right(few):
         assert [row.verdict for row in rows] == ["pass"] * len(per_ray.SETS), call.title
 
 
+def test_this_package_is_right_in_every_set(few, needs_variant):
+    needs_variant("llvm_ad_rgb")
+    for call in SYSTEMS["mi_refract"].calls:
+        rows = per_ray.call_rows(SYSTEMS["mi_refract"], call, STANDARD)
+        assert [(row.case, row.verdict, row.missed) for row in rows] == [(name, "pass", {}) for name in per_ray.SETS]
+        assert max(row.values[per_ray.BACKWARD] for row in rows) < 1
+
+
 @pytest.mark.parametrize("name", [name for name, system in SYSTEMS.items() if system.small and system.needs])
 def test_small_systems_that_are_installed_are_right(name, few):
     if reason := environments.absent(SYSTEMS[name]):
