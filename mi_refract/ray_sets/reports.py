@@ -62,6 +62,7 @@ TERMS = {
     "exact": "answers that are the certified direction, rounded: no formula can do better",
     "wrong": "answers whose error is beyond the bound, whose TIR is misclassified beyond it, or that are no direction",
 }
+MEANING = f"right: the exact answer for inputs within {RIGHT:g} roundings, m u, of those given"
 SIGNALS = {
     "zero": "total internal reflection is signalled by the zero vector",
     "nan": "total internal reflection is signalled by NaN",
@@ -109,9 +110,9 @@ def _directions(found: Findings) -> str:
     wide = found.total("undecidable")
     open_ = f"; {wide} of them are to rays whose bound is above 0.1 rad, which shows little" if wide else ""
     if found.right == found.answered:
-        return f"{answers}, all right: exact for inputs within {RIGHT:g} roundings of those given; {worst}"
-    some = f"{found.right} of {answers} are right: exact for inputs within {RIGHT:g} roundings of those given"
-    return f"{some}; all are within the error bound of the formula {found.error_bound}; {worst}{open_}"
+        return f"{answers}, all right; {worst}"
+    others = f"the others are within the error bound of the formula {found.error_bound}"
+    return f"{found.right} of {answers} are right, {others}; {worst}{open_}"
 
 
 def problem_text(problem: Problem) -> str:
@@ -178,6 +179,7 @@ def table(found: Findings) -> RenderableType:
             *_cells(each, found.ulp).values(),
         )
     notes = [*map(problem_text, found.problems), *ratio(found), signal(found), *explained(found)]
+    notes += [MEANING] if found.right > 0 and not found.wrong else []
     return Group(*([rows] if found.regimes else []), *(Text(printable(line)) for line in (*notes, sentence(found))))
 
 
