@@ -54,7 +54,7 @@ from validation.suite import matrix_table
 
 ROOT = SCENES.parent
 GALLERY = SCENES / "gallery.png"
-GALLERY_COLUMNS = 5
+GALLERY_COLUMNS = 8
 
 
 @dataclass(frozen=True)
