@@ -128,8 +128,9 @@ def test_all_are_killed(client, scene, variant):
 
     expected = local(scene, 40)
     same(remote(client, scene, variant, 40, watch, passes), expected)
-    assert len(victims) == 2 and not {*victims} & {*passes.workers.accepted}
-    until(lambda: len(client.nthreads()) == 2)
+    assert len(victims) == 2
+    # A dead worker may be in the scheduler's list for a while, also when those that came instead have done its work.
+    until(lambda: len(client.nthreads()) == 2 and not {*victims} & {*client.nthreads()})
 
 
 EIGHT = """
