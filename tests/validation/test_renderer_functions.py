@@ -6,11 +6,12 @@ import sys
 import numpy as np
 import pytest
 
+from mi_refract.accuracy import backward_error
 from mi_refract.ray_sets.files import parse_answers
 from mi_refract.ray_sets.renderer_file import RaysCommand
 from validation.suite import per_ray
 from validation.suite.renderers import SYSTEMS, environments
-from validation.suite.renderers.system import SCRIPTS, Npm, Pip, System
+from validation.suite.renderers.system import CRITICAL, SCRIPTS, Npm, Pip, System
 
 COUNT = 60
 CALLS = {
@@ -129,6 +130,19 @@ def test_batoid_takes_the_first_index_from_the_speed_and_not_from_the_medium():
     asked = f"{SPEED}; batoid.Plane().refract(ray, *media); print(*ray.v[0].tolist())"
     direction = environments.run([environments.python(SYSTEMS["batoid"]), "-c", asked]).split()
     np.testing.assert_allclose([float(x) for x in direction], [0.6, 0, 0.8], atol=1e-15)
+
+
+def test_raysect_s_reciprocals_of_lengths_count_near_the_critical_angle():
+    """Without them the formula leaves 1.5 u on these rays; with them 4.26 u, as raysect does."""
+    rays = per_ray.given("f64")
+    rays = rays.rays[rays.regime == CRITICAL]
+
+    def worst(a, n):
+        b = textbook(a, n, rays.k)
+        return backward_error.of_directions(b[np.isfinite(b[:, 0])], rays[np.isfinite(b[:, 0])]).max() / 2**-53
+
+    assert worst(rays.a, rays.n) < 2
+    assert 4 < worst(*(v * (1 / np.sqrt((v * v).sum(1, keepdims=True))) for v in (rays.a, rays.n))) < 5
 
 
 def test_prysm_takes_a_normal_on_the_far_side_only():
