@@ -17,6 +17,7 @@ ALONE = 120.0  # seconds until new workers must have come where all have gone
 # As text: a worker that cannot import a function which it is sent ends, and its nanny starts it again, without end.
 _QUESTION = "__import__({!r}, fromlist=['facts']).facts({!r})"
 _POLL, _BETWEEN_LOOKS = 0.05, 2.0  # seconds
+_FETCHING = 10.0  # seconds in which a worker that has answered hands its answer over: it may have gone since
 
 
 class Workers:
@@ -122,7 +123,10 @@ class Workers:
             error = answer.exception() if answer.status == "error" else None
             different, there = [f"{type(error).__name__}: {error}" if error else answer.status], {}
         else:
-            there = answer.result()
+            try:
+                there = answer.result(timeout=_FETCHING)
+            except TimeoutError:  # the worker has gone with its answer; where it has not, it is asked again
+                return
             different = worker_facts.differences(there, self.expected, self.tolerated)
         if not different:
             self.accepted[address] = threads

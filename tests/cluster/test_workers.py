@@ -7,7 +7,7 @@ import re
 import time
 
 import pytest
-from support.dask_workers import accepted
+from support.dask_workers import accepted, until
 
 from mi_refract.cluster import worker_facts, workers
 from mi_refract.cluster.connection import LostSchedulerError, connected
@@ -92,6 +92,26 @@ def test_a_worker_without_the_package_is_refused(client, variant):
         client.run(exec, f"import sys; {there} = kept", workers=[liar])
     assert list(found.accepted) == [honest]
     assert "ModuleNotFoundError: import of mi_refract.cluster.worker_facts halted" in found.refused[liar]
+
+
+def test_a_worker_that_goes_with_its_answer_is_asked_again(client, monkeypatch, variant):
+    """Dask calls the answer finished, and waits without end for a worker that is not there."""
+
+    class Lost:
+        status = "finished"
+
+        def done(self):
+            return True
+
+        def result(self, timeout=None):
+            assert timeout, "would wait without end"
+            raise TimeoutError
+
+    submit, lost = client.submit, []
+    monkeypatch.setattr(client, "submit", lambda *a, **k: submit(*a, **k) if lost else lost.append(Lost()) or lost[0])
+    found = accepted(client, variant)
+    until(lambda: found.look(at_once=True) or len(found.accepted) == 2)
+    assert lost and not found.refused
 
 
 def test_no_workers_at_all(client, monkeypatch, variant):
