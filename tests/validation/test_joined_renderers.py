@@ -1,6 +1,5 @@
 """`--renderer FOLDER`: a stranger's renderer in the study, ray by ray and by its images."""
 
-import dataclasses
 import shutil
 
 import pytest
@@ -64,15 +63,6 @@ def joined(tmp_path):
 @pytest.fixture
 def context(tmp_path):
     return Context(PROFILES["quick"], tmp_path, "llvm_ad_rgb", ("llvm", ""), {})
-
-
-@pytest.fixture
-def few(monkeypatch):
-    smaller = {name: dataclasses.replace(kind, count=40) for name, kind in per_ray.SETS.items()}
-    monkeypatch.setattr(per_ray, "SETS", smaller)
-    per_ray.given.cache_clear()
-    yield
-    per_ray.given.cache_clear()
 
 
 def test_its_rays_are_judged_as_everyone_s(joined, few, context):

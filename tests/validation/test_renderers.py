@@ -1,7 +1,6 @@
 """Other systems: what is wrong with one of them never passes, and what is absent says what would bring it."""
 
 import ast
-import dataclasses
 import hashlib
 import json
 import re
@@ -78,16 +77,6 @@ REASONS = {
     "an id missing": "id 0",
     "hangs": "no end within 2 s",
 }
-
-
-@pytest.fixture
-def few(monkeypatch):
-    """Sets of forty rays."""
-    smaller = {name: dataclasses.replace(kind, count=40) for name, kind in per_ray.SETS.items()}
-    monkeypatch.setattr(per_ray, "SETS", smaller)
-    per_ray.given.cache_clear()
-    yield
-    per_ray.given.cache_clear()
 
 
 @pytest.fixture
