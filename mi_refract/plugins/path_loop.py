@@ -17,6 +17,7 @@ import mitsuba as mi
 from .absorption import absorbed
 from .emitter_sampling import NonConstantEmitters, SceneEmitters
 from .keyed_sampler import ONE
+from .scene_features import BOUNDARIES, all_shapes, bsdf_name
 from .who_asks import DISPERSED, context
 
 # Samples near 0 and near 1 pick the one lobe and the other; a lobe with a smaller power than these is not followed.
@@ -42,7 +43,8 @@ class PathFeatures:
     second_number: bool  # a BSDF sample takes `sample2`, two numbers; delta lobes need none
     all_of_hit: bool  # a hit needs more than its shading frame
     dispersion: bool  # some boundary bends light by its wavelength
-    absorption: bool  # some boundary has a medium that absorbs
+    absorption: bool  # some medium absorbs
+    null: bool  # a BSDF may have a null lobe
 
     @property
     def roulette(self) -> bool:
@@ -138,18 +140,22 @@ class Trace:
         self.context = context()
         self.emitters = (NonConstantEmitters if plan.lamps_only else SceneEmitters)(v, scene)
         self.flags = +(mi.RayFlags.All if plan.all_of_hit else mi.RayFlags.ShadingFrame)
+        if plan.split_depth and self.vectorised:
+            self.boundaries = self._boundaries()
 
     def run(self, ray: Any, sampler: Any, active: Any) -> LoopState:
         """Follow `ray` and all that it splits into; the state at the end, whose `result` is the radiance."""
+        way = self.media.way if self.plan.absorption else 0
         if self.plan.hide_emitters and self.plan.area:
-            ray = self._past_emitters(ray, active)
-        start = self._start(ray, sampler, active)
+            camera, ray = ray, self._past_emitters(ray, active)
+            way += dr.dot(ray.o - camera.o, ray.d)
+        start = self._start(ray, way, sampler, active)
         (end,) = dr.while_loop((start,), lambda s: s.active, self._step, label="refract_path")
         if self.plan.once:
             self._add_environment(end)
         return end
 
-    def _start(self, ray: Any, sampler: Any, active: Any) -> LoopState:
+    def _start(self, ray: Any, way: Any, sampler: Any, active: Any) -> LoopState:
         v, plan = self.v, self.plan
         valid = v.Bool(plan.environment and not plan.hide_emitters)
         s = LoopState(ray, v.Spectrum(1), v.Spectrum(0), v.UInt32(0), active, valid, sampler, v.Float(1))
@@ -165,7 +171,7 @@ class Trace:
         if plan.dispersion:
             s.carried = v.Float(dr.size_v(v.UnpolarizedSpectrum))
         if plan.absorption:
-            s.sigma, s.skipped = v.UnpolarizedSpectrum(self.media.start), v.Float(0)
+            s.sigma, s.skipped = v.UnpolarizedSpectrum(self.media.start), v.Float(way)
         return s
 
     def _past_emitters(self, ray: Any, active: Any) -> Any:
@@ -193,7 +199,8 @@ class Trace:
         onward = hit & (s.depth + 1 < self.plan.max_depth)
         if self.plan.deterministic:
             self._truncate(s, hit & (onward ^ True), 1)
-        if self.vectorised or onward:
+        # Where the last vertex is transparent the pixel is: `path` asks there, too.
+        if self.vectorised or onward or (hit and self.plan.null):
             onward = self._scatter(s, si, si.bsdf(), hit, onward)
         else:
             s.valid = s.valid or hit
@@ -211,7 +218,7 @@ class Trace:
         first = self.numbers.one(s.sampler, key + 1) if plan.first_number else None
         second = self.numbers.two(s.sampler, key + 2) if plan.second_number else self.v.Point2f(0.5)
         first = second.x if first is None else first
-        bs, weight = bsdf.sample(self.context, si, first, second, onward)
+        bs, weight = bsdf.sample(self.context, si, first, second, hit if plan.null else onward)
         ray, throughput, inside = self._next(s, si, bsdf, bs, weight, onward)
         s.valid = s.valid | (hit & (mi.has_flag(bs.sampled_type, LOBES.Null) ^ True))
         s.depth = s.depth + 1
@@ -231,6 +238,9 @@ class Trace:
         """The ray after a sample of the BSDF, its throughput, and what else of the state the sample changes."""
         if self.v.is_polarized:
             weight = si.to_world_mueller(weight, -bs.wo, si.wi)
+        ray = si.spawn_ray(si.to_world(bs.wo))
+        if dr.grad_enabled(weight, ray.d):
+            weight, ray.d, bs.pdf = self._at_fixed_direction(si, bsdf, bs, weight, ray.d, active)
         throughput, changed = self._times(s.throughput, weight), {}
         if self.plan.dispersion:
             # The first wavelength stands for all that end here. Each is the first as often as any other.
@@ -238,11 +248,26 @@ class Trace:
             throughput = throughput * dr.select(dispersed, s.carried, 1)
             changed["carried"] = dr.select(dispersed, 1, s.carried)
         if self.plan.absorption:
-            changed["sigma"] = self.media.cross(s, si, bs, bsdf, active)
-        ray = si.spawn_ray(si.to_world(bs.wo))
-        if self.plan.absorption:
+            changed["sigma"] = self.media.cross(s, si, bs, bsdf, ray, active)
             changed["skipped"] = dr.dot(ray.o - si.p, ray.d)
         return ray, throughput, changed
+
+    def _at_fixed_direction(
+        self, si: Any, bsdf: Any, bs: Any, weight: Any, d: Any, active: Any
+    ) -> tuple[Any, Any, Any]:
+        """Weight, direction and density of a sample, as they are differentiated.
+
+        The direction of a delta lobe moves with the parameters. Any other is a fixed place of the integrand:
+        d/dx ∫ f dω = ∫ f'(ω)/p(ω) p(ω) dω, where neither ω nor the p that it was drawn with is differentiated.
+        """
+        smooth = active & mi.has_flag(bs.sampled_type, LOBES.Smooth)
+        wo = si.to_local(dr.detach(d))
+        value, pdf = bsdf.eval_pdf(self.context, si, wo, smooth)
+        if self.v.is_polarized:
+            value = si.to_world_mueller(value, -wo, si.wi)
+        smooth &= pdf > 0
+        value = value / dr.detach(dr.select(smooth, pdf, 1))
+        return dr.select(smooth, value, weight), dr.select(smooth, dr.detach(d), d), dr.select(smooth, pdf, bs.pdf)
 
     def _roulette(self, s: LoopState, onward: Any, key: Any) -> Any:
         brightest = dr.max(self.v.unpolarized_spectrum(s.throughput))
@@ -301,8 +326,9 @@ class Trace:
         ds, radiance = self.emitters.sample(si, self.numbers.two(s.sampler, key), smooth)
         wo = si.to_local(ds.d)
         value, pdf = bsdf.eval_pdf(self.context, si, wo, smooth)
-        # What reflects nothing needs no shadow ray.
-        lit = smooth & (ds.pdf != 0) & (dr.max(dr.abs(self.v.unpolarized_spectrum(value))) > 0)
+        lit = smooth & (ds.pdf != 0)
+        if not dr.grad_enabled(value):  # what reflects nothing needs no shadow ray, but may have a derivative
+            lit &= dr.max(dr.abs(self.v.unpolarized_spectrum(value))) > 0
         lit = lit & (self.scene.ray_test(si.spawn_ray_to(ds.p), lit) ^ True)
         if self.v.is_polarized:
             value = si.to_world_mueller(value, -wo, si.wi)
@@ -318,7 +344,7 @@ class Trace:
     def _split(self, s: LoopState, si: Any, bsdf: Any, bs: Any, second: Any, throughput: Any, onward: Any) -> Any:
         """Push the other lobe where both are worth following; the throughput of the lobe that was sampled."""
         plan, p = self.plan, dr.detach(bs.pdf)
-        pair = onward & s.seen & self._is_pair(bsdf.flags())
+        pair = onward & s.seen & self._is_boundary(bsdf)
         s.seen = s.seen & mi.has_flag(bs.sampled_type, LOBES.Delta)
         both = pair & (s.depth <= plan.split_depth) & (s.share * dr.minimum(p, 1 - p) > plan.split_weight)
         if self.vectorised or both:
@@ -334,11 +360,29 @@ class Trace:
         lost = dr.max(self.v.unpolarized_spectrum(s.throughput)) * dr.square(s.eta) * share
         s.truncated = dr.select(where, s.truncated + lost, s.truncated)
 
-    @staticmethod
-    def _is_pair(flags: Any) -> Any:
-        """Whether a BSDF has a reflected and a transmitted direction, and no others."""
-        pair = mi.has_flag(flags, LOBES.DeltaReflection) & mi.has_flag(flags, LOBES.DeltaTransmission)
-        return pair & ((mi.has_flag(flags, LOBES.Smooth) | mi.has_flag(flags, LOBES.Null)) ^ True)
+    def _boundaries(self) -> list[tuple[Any, Any]]:
+        """The numbers of the BSDFs that are `BOUNDARIES`, as ranges: from, up to and without.
+
+        Mitsuba numbers BSDFs as they are loaded. Opaque: another scene is other data, not another kernel.
+        """
+        v, ranges = self.v, list[list[int]]()
+        bsdfs = [bsdf for shape in all_shapes(self.scene) if (bsdf := shape.bsdf()) is not None]
+        pointers = [v.BSDFPtr(bsdf) for bsdf in bsdfs if bsdf_name(bsdf) in BOUNDARIES]
+        for number in sorted({int(dr.reinterpret_array(v.UInt32, pointer)[0]) for pointer in pointers}):
+            if ranges and ranges[-1][1] == number:
+                ranges[-1][1] += 1
+            else:
+                ranges.append([number, number + 1])
+        return [(dr.opaque(v.UInt32, first), dr.opaque(v.UInt32, last)) for first, last in ranges]
+
+    def _is_boundary(self, bsdf: Any) -> Any:
+        """Whether a BSDF is known to have one reflected and one refracted direction, and no others."""
+        if not self.vectorised:
+            return bsdf_name(bsdf) in BOUNDARIES
+        number, found = dr.reinterpret_array(self.v.UInt32, bsdf), self.v.Bool(False)
+        for first, last in self.boundaries:
+            found |= (number >= first) & (number < last)
+        return found
 
     def _push(self, s: LoopState, si: Any, bsdf: Any, bs: Any, second: Any, both: Any) -> Any:
         reflected = mi.has_flag(bs.sampled_type, LOBES.DeltaReflection)

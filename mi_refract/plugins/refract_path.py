@@ -20,9 +20,10 @@ import mitsuba as mi
 
 from .absorption import read_absorption
 from .keyed_sampler import KeyedMultijitter, Sampled
-from .medium_tracking import Crossings, MediumTracker, check_wrappers
+from .medium_tracking import Crossings, MediumTracker, ShapeMedia, absorbs_only, check_media, check_wrappers, extinction
 from .path_loop import PathFeatures, Trace
 from .scene_features import SceneFeatures, inspect
+from .who_asks import warn_once
 
 INTEGRATOR = "refract_path"
 MOST_PATHS = 4096  # that one sample may split into
@@ -63,6 +64,11 @@ def read_split(props: Any, deterministic: bool) -> tuple[int, float]:
     return depth, float(weight)
 
 
+def _camera(v: Any, sensor: Any) -> Any:
+    """From the world to the camera, in whose space rays leave the plane z = 0; None where they start at the sensor."""
+    return sensor.world_transform().inverse() if isinstance(sensor, v.ProjectiveCamera) else None
+
+
 def integrator_class(v: Any) -> type:
     """The class of the integrator for one variant, given its module."""
     vectorised = dr.is_jit_v(v.Float)
@@ -78,23 +84,33 @@ def integrator_class(v: Any) -> type:
             self.deterministic = read_flag(props, "deterministic")
             self.split_depth, self.split_weight = read_split(props, self.deterministic)
             self.camera = read_absorption(INTEGRATOR, props, "camera")
-            self.seed: Any = 0
-            # With the identity of the scene. Not the scene, which holds its integrator: a circle cannot be frozen.
-            self.seen: tuple[int, SceneFeatures] | None = None
+            self.samples_per_pass = props.get("samples_per_pass", UNLIMITED)
+            # Not the scene, which holds its integrator: a circle cannot be frozen.
+            self.needs: SceneFeatures | None = None  # of the scene rendered last
+            self.rendering = False  # between `begin_render` and `end_render`
+            self.near: Any = None  # the near plane of the sensor of this render, by its transformation
             self.crossings: list[Crossings] = []  # one a pass; in scalar variants one in all
 
-        def begin_render(self, seed: Any) -> None:
-            """To be called before `sample`, where no `render` is. `seed`: of the sampler."""
-            self.seed, self.seen, self.crossings = seed, None, []
+        def begin_render(self, sensor: Any) -> None:
+            """To be called before `sample` where no `render` is; else each sample looks the scene up anew."""
+            self.needs, self.rendering, self.crossings = None, True, []
+            self.near = _camera(v, sensor)
 
         def end_render(self) -> None:
             """To be called after what `sample` gave was evaluated. ValueError where absorption was contradictory."""
+            self.rendering = False
+            self._refuse()
+
+        def _refuse(self) -> None:
             for crossings in self.crossings:
                 crossings.refuse()
 
-        def render(self, scene: Any, sensor: Any = 0, seed: Any = 0, *more: Any, **named: Any) -> Any:
-            self.begin_render(seed)
-            image = super().render(scene, sensor, seed, *more, **named)
+        def render(self, scene: Any, sensor: Any = 0, *more: Any, **named: Any) -> Any:
+            self.begin_render(scene.sensors()[sensor] if isinstance(sensor, int) else sensor)
+            try:
+                image = super().render(scene, sensor, *more, **named)
+            finally:
+                self.rendering = False
             self.end_render()
             return image
 
@@ -107,10 +123,35 @@ def integrator_class(v: Any) -> type:
             if self.max_depth == 0:
                 return v.Spectrum(0), v.Bool(False), [v.Float(0)] * len(self.aov_names())
             plan = self.plan(scene)
-            numbers = KeyedMultijitter(v, sampler, self.seed) if vectorised and plan.split_depth else Sampled()
-            media = MediumTracker(v, self._sigma(ray, medium), self._crossings(scene)) if plan.absorption else None
+            count = min(self.samples_per_pass, sampler.sample_count()) if vectorised else 1
+            numbers = KeyedMultijitter(v, sampler, count) if vectorised and plan.split_depth else Sampled()
+            media = self._media(scene, ray, medium) if plan.absorption else None
             end = Trace(v, scene, plan, numbers, media).run(v.Ray3f(ray), sampler, v.Bool(active))
+            if plan.absorption and not self.rendering:  # another integrator evaluates the image, and asks no more
+                dr.eval(end.result)
+                self._refuse()
+                self.crossings = []
             return dr.select(end.valid, end.result, 0), end.valid, [end.truncated] if self.deterministic else []
+
+        def _media(self, scene: Any, ray: Any, medium: Any) -> MediumTracker | ShapeMedia:
+            sigma = self._sigma(ray, medium)
+            way = self._before(scene, ray) if medium is not None or self.camera else v.Float(0)
+            if self._needs(scene).shape_media:
+                return ShapeMedia(v, sigma, way)
+            return MediumTracker(v, scene, sigma, way, self._crossings(scene))
+
+        def _before(self, scene: Any, ray: Any) -> Any:
+            """The way from the camera to the origin of the ray, on the near plane.
+
+            Another integrator does not say which sensor it renders: the scene must have one.
+            """
+            sensors = scene.sensors()
+            if not self.rendering and len(sensors) != 1:
+                raise ValueError(f"{INTEGRATOR}: a camera in an absorbing medium; expected one sensor in the scene")
+            to_camera = self.near if self.rendering else _camera(v, sensors[0])
+            if to_camera is None:
+                return v.Float(0)
+            return (to_camera @ ray.o).z / (to_camera @ ray.d).z
 
         def _crossings(self, scene: Any) -> Crossings:
             if vectorised or not self.crossings:
@@ -125,22 +166,22 @@ def integrator_class(v: Any) -> type:
                 return self.camera.eval(si, v.Bool(True))
             if medium is None:
                 return 0
-            mei = dr.zeros(v.MediumInteraction3f)
-            mei.wavelengths = ray.wavelengths
-            scattered, _, extinction = medium.get_scattering_coefficients(mei, v.Bool(True))
-            if not medium.is_homogeneous() or dr.any(scattered != 0, axis=None):
-                raise ValueError(f"{INTEGRATOR}: the sensor's medium: accepted: a homogeneous one with an albedo of 0")
-            return extinction
+            return extinction(v, medium, ray.wavelengths, v.Bool(True))
 
         def plan(self, scene: Any) -> PathFeatures:
             """The features that are traced for a scene. ValueError where `deterministic` is set and impossible."""
             needs = self._needs(scene)
             # Local memory has no derivatives, and the evaluated loops that derivatives need have no local memory.
             symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
-            if self.deterministic and (needs.both_numbers or needs.null or not needs.only_glass):
+            if self.deterministic and not needs.deterministic:
                 raise ValueError(f"{INTEGRATOR}: deterministic: accepted: scenes of smooth dielectrics and conductors")
             if self.deterministic and not symbolic:
                 raise ValueError(f"{INTEGRATOR}: deterministic: accepted: renders that are not differentiated")
+            if not symbolic and needs.refracting and needs.smooth and needs.area:
+                warn_once(
+                    f"{INTEGRATOR}: derivatives leave out edges of area lights that move, seen through a boundary from "
+                    "a surface that is not smooth"
+                )
             return PathFeatures(
                 self.max_depth,
                 self.rr_depth,
@@ -156,23 +197,38 @@ def integrator_class(v: Any) -> type:
                 second_number=needs.smooth,
                 all_of_hit=needs.smooth or needs.textured,
                 dispersion=needs.dispersive,
-                absorption=needs.absorbing or self.camera is not None,
+                absorption=needs.absorbing or needs.media or self.camera is not None,
+                null=needs.null,
             )
 
         def _needs(self, scene: Any) -> SceneFeatures:
-            """Looked up once a render, as an edit of the scene can change them."""
-            if self.seen is None or self.seen[0] != id(scene):
-                self.seen = id(scene), inspect(scene)
-                if self.seen[1].absorbing:
+            """Looked up once a render, as an edit of the scene can change them.
+
+            Another integrator that calls `sample` does not say when a render begins: then they are looked up anew.
+            """
+            if self.needs is None or not self.rendering:
+                self.needs = inspect(scene)
+                if self.needs.absorbing:
                     check_wrappers(scene)
+                if self.needs.media:
+                    self._check_media(scene)
                 mi.Log(mi.LogLevel.Info, f"{INTEGRATOR}: left out: {self.left_out()}")  # type: ignore[operator]
-            return self.seen[1]
+            return self.needs
+
+        def _check_media(self, scene: Any) -> None:
+            for sensor in scene.sensors():
+                if (medium := sensor.get_medium()) is not None and not absorbs_only(v, medium):
+                    raise ValueError(
+                        f"{INTEGRATOR}: the sensor's medium scatters or varies; expected a homogeneous medium with an "
+                        "albedo of 0"
+                    )
+            check_media(v, scene)
 
         def left_out(self) -> str:
             """What was left out of the scene rendered last, each feature with the reason."""
-            if self.seen is None:
+            if self.needs is None:
                 return "no scene seen yet"
-            return "; ".join(f"{feature} ({reason})" for feature, reason in self.seen[1].left_out.items()) or "nothing"
+            return "; ".join(f"{feature} ({reason})" for feature, reason in self.needs.left_out.items()) or "nothing"
 
         def to_string(self) -> str:
             depth = -1 if self.max_depth == UNLIMITED else self.max_depth

@@ -1,8 +1,8 @@
 """What a loaded Mitsuba scene needs of an integrator, and what an integrator can leave out. For every variant.
 
 A black surface needs nothing: that is a `diffuse` whose reflectance is the number 0, as an area light without a BSDF
-has it. In spectral variants `<rgb value="0"/>` is a spectrum of about 3e-8, which is not black. A plugin that is not
-known here, and an instance, whose shapes Mitsuba does not show, count as needing everything.
+has it. In spectral variants `<rgb value="0"/>` is a spectrum of about 3e-8, which is not black. A part is left out only
+for plugins on the lists below, which are known not to need it. Any other plugin, and an instance, needs everything.
 """
 
 from __future__ import annotations
@@ -38,6 +38,40 @@ POLARISING = {
     "SmoothDielectric",
 }
 KNOWN = WRAPPERS | DEPOLARISING | POLARISING
+KNOWN_SHAPES = {
+    "BSplineCurve",
+    "BlenderMesh",
+    "Cube",
+    "Cylinder",
+    "Disk",
+    "Ellipsoids",
+    "EllipsoidsMesh",
+    "LinearCurve",
+    "Mesh",
+    "OBJMesh",
+    "PLYMesh",
+    "Rectangle",
+    "SDFGrid",
+    "SerializedMesh",
+    "Sphere",
+}
+# One reflected and one refracted direction, each sampled by a side of one threshold of `sample1`: what can be split.
+BOUNDARIES = {"Refract", "SmoothDielectric"}
+# No choice is left to chance where the lobes of `BOUNDARIES` are both followed.
+DETERMINISTIC = BOUNDARIES | {"SmoothConductor", "TwoSidedBRDF"}
+# Of a hit these need the shading normal only, which is all that `RayFlags.ShadingFrame` gives: no tangent, no (u, v).
+WITHOUT_TANGENT = DETERMINISTIC | {"BlendBSDF", "MaskBSDF", "Null", "ThinDielectric"}
+PLAIN_LAMPS = {"AreaLight", "DirectionalArea"}
+CONSTANT_TEXTURES = {
+    "BlackBodySpectrum",
+    "D65Spectrum",
+    "IrregularSpectrum",
+    "RawConstantTexture",
+    "RawConstantTextureImpl",
+    "RegularSpectrum",
+    "SRGBReflectanceSpectrum",
+    "UniformSpectrum",
+}
 # Plugins that sample with `sample1` or with `sample2`, and never with both.
 EITHER = {
     "Null",
@@ -64,12 +98,15 @@ class SceneFeatures:
     delta_emitters: bool  # some emitter can be found only by sampling it
     both_numbers: bool  # some BSDF samples with `sample1` and with `sample2`, too
     only_glass: bool  # every BSDF has delta lobes only
-    textured: bool  # something of a BSDF or of a light varies over its surface
+    textured: bool  # a BSDF or a light may vary over its surface, or with its tangent
     null: bool  # some BSDF has a null lobe
     polarising: bool  # some BSDF acts on the state of polarisation
     dispersive: bool  # some BSDF bends light by its wavelength
     absorbing: bool  # some BSDF has an absorbing medium on one side
-    media: bool
+    media: bool  # some shape, sensor or emitter has a medium of Mitsuba's
+    shape_media: bool  # some shape has one
+    refracting: bool  # some BSDF has a refracted direction
+    deterministic: bool  # every BSDF is of `DETERMINISTIC`
     unknown: tuple[str, ...] = ()
 
     @property
@@ -101,10 +138,10 @@ def inspect(scene: Any) -> SceneFeatures:
     """What a Mitsuba scene needs as it is now; an edit of its parameters can change that."""
     import mitsuba as mi
 
-    shapes, emitters, sky = scene.shapes(), scene.emitters(), scene.environment()
-    opaque = [shape.class_name() for shape in shapes if shape.class_name() == "Instance"]
-    bsdfs = [bsdf for shape in shapes if not _black(outer := shape.bsdf()) for bsdf in nested(outer)]
-    names = [_name(bsdf) for bsdf in bsdfs]
+    shapes, emitters, sky = all_shapes(scene), scene.emitters(), scene.environment()
+    opaque = [shape.class_name() for shape in shapes if shape.class_name() not in KNOWN_SHAPES]
+    bsdfs = [bsdf for shape in shapes if (outer := shape.bsdf()) and not _black(outer) for bsdf in nested(outer)]
+    names = [bsdf_name(bsdf) for bsdf in bsdfs]
     unknown = tuple(sorted({name for name in names if name not in KNOWN} | set(opaque)))
     everything = bool(unknown)
     flags = 0
@@ -112,8 +149,8 @@ def inspect(scene: Any) -> SceneFeatures:
         flags |= bsdf.flags()
     lobes, sampled = mi.BSDFFlags, [emitter.flags() for emitter in emitters]
     lamps = [shape.emitter() for shape in shapes if shape.is_emitter()]
-    media = [medium for shape in shapes for medium in (shape.interior_medium(), shape.exterior_medium())]
-    media += [end.get_medium() for end in (*emitters, *scene.sensors())]
+    shape_media = any(shape.interior_medium() or shape.exterior_medium() for shape in shapes)
+    end_media = any(end.get_medium() for end in (*emitters, *scene.sensors()))
     return SceneFeatures(
         smooth=everything or bool(flags & +lobes.Smooth),
         sampleable=bool(emitters),  # Mitsuba refuses a scene all of whose emitters have the weight 0
@@ -125,17 +162,30 @@ def inspect(scene: Any) -> SceneFeatures:
         # An emitter that declares nothing may be anything.
         delta_emitters=any(not flag or flag & +mi.EmitterFlags.Delta for flag in sampled),
         only_glass=not (everything or flags & +(lobes.Smooth | lobes.Delta1D)),
-        textured=everything or any(_textured(node) for node in (*bsdfs, *lamps)),
+        textured=everything
+        or any(_textured(node) for node in (*bsdfs, *lamps))
+        or not {name for name, bsdf in zip(names, bsdfs, strict=True) if not bsdf.flags() & +lobes.Smooth}
+        <= WITHOUT_TANGENT
+        or not {lamp.class_name() for lamp in lamps} <= PLAIN_LAMPS,
         null=everything or bool(flags & +lobes.Null),
         polarising=any(name not in WRAPPERS | DEPOLARISING for name in names) or everything,
         dispersive=everything or any(getattr(bsdf, "dispersive", False) for bsdf in bsdfs),  # no plugin of Mitsuba's is
         absorbing=everything or any(getattr(bsdf, "absorbing", False) for bsdf in bsdfs),
-        media=bool(opaque) or any(medium is not None for medium in media),
+        media=shape_media or end_media,
+        shape_media=shape_media,
+        refracting=everything or bool(flags & +lobes.Transmission),
+        deterministic=not everything and set(names) <= DETERMINISTIC,
         unknown=unknown,
     )
 
 
-def _name(bsdf: Any) -> str:
+def all_shapes(scene: Any) -> list[Any]:
+    """The shapes of a scene, and those within its shape groups, which `scene.shapes()` leaves out."""
+    groups = [child for child in _children(scene) if child.class_name() == "ShapeGroupPlugin"]
+    return [*scene.shapes(), *(part for group in groups for part in _children(group) if hasattr(part, "bsdf"))]
+
+
+def bsdf_name(bsdf: Any) -> str:
     """The C++ class; of a Python plugin, which Mitsuba calls "BSDF", its own, with its module unless it is ours."""
     name, kind = bsdf.class_name(), type(bsdf)
     if name != "BSDF" and kind.__module__.startswith("mitsuba"):
@@ -152,16 +202,25 @@ def nested(bsdf: Any) -> Iterator[Any]:
 
 
 def _textured(node: Any) -> bool:
-    return any(hasattr(child, "is_spatially_varying") and child.is_spatially_varying() for child in _children(node))
+    return any(
+        hasattr(child, "is_spatially_varying")
+        and (child.is_spatially_varying() or child.class_name() not in CONSTANT_TEXTURES)
+        for child in _children(node)
+    )
 
 
 def _black(bsdf: Any) -> bool:
     # A frozen function is recorded for every value that will come.
-    if _name(bsdf) != "SmoothDiffuse" or dr.flag(dr.JitFlag.FreezingScope):
+    if bsdf_name(bsdf) != "SmoothDiffuse" or dr.flag(dr.JitFlag.FreezingScope):
         return False
     (reflectance,) = _children(bsdf)
     exact = reflectance.class_name() == "UniformSpectrum" or "spectral" not in bsdf.variant_name()
-    return bool(exact and not reflectance.is_spatially_varying() and reflectance.max() == 0)
+    if not exact or reflectance.is_spatially_varying() or reflectance.max() != 0:
+        return False
+    import mitsuba as mi
+
+    # The derivative of an image in a reflectance of 0 is not 0.
+    return not any(dr.grad_enabled(value) for _, value in mi.traverse(bsdf))
 
 
 def _children(node: Any) -> list[Any]:

@@ -195,7 +195,7 @@ def _samples(scene: Any, channels: tuple[str, ...], spp: int, seed: int) -> tupl
 
     sensor, integrator = scene.sensors()[0], scene.integrator()
     if hasattr(integrator, "begin_render"):
-        integrator.begin_render(seed)
+        integrator.begin_render(sensor)
     sampler, spp = ADIntegrator.prepare(None, sensor, seed, spp, integrator.aov_names())
     ray, weight, place = ADIntegrator.sample_rays(None, scene, sensor, sampler)
     ray.scale_differential(1 / math.sqrt(spp))

@@ -189,7 +189,7 @@ def test_strata_are_those_of_correlated_multi_jitter(llvm_variant):
     """Of 12 samples of each of 5 pixels every stratum holds one, of rows, columns and cells; keys are independent."""
     sampler = mi.load_dict({"type": "independent", "sample_count": 12})
     sampler.seed(3, 60)
-    numbers = keyed_sampler.KeyedMultijitter(mi, sampler, 3)
+    numbers = keyed_sampler.KeyedMultijitter(mi, sampler, 12)
     one = np.array(numbers.one(sampler, mi.UInt32(7))).reshape(5, 12)
     x, y = np.array(numbers.two(sampler, mi.UInt32(8))).reshape(2, 5, 12)
     for strata_of, count in ((one, 12), (x, 12), (y, 12)):
@@ -205,7 +205,7 @@ def test_rows_and_columns_are_permuted_within_their_cells(llvm_variant):
     """Of 3 rows all 6 orders, of 4 columns the 8 that Kensler's function has; other ones for another key."""
     sampler = mi.load_dict({"type": "independent", "sample_count": 12})
     sampler.seed(3, 12 * 400)
-    numbers = keyed_sampler.KeyedMultijitter(mi, sampler, 3)
+    numbers = keyed_sampler.KeyedMultijitter(mi, sampler, 12)
     seen = []
     for key in (8, 9):
         x, y = np.array(numbers.two(sampler, mi.UInt32(key))).reshape(2, 400, 12)
