@@ -271,12 +271,16 @@ class Trace:
 
     def _roulette(self, s: LoopState, onward: Any, key: Any) -> Any:
         brightest = dr.max(self.v.unpolarized_spectrum(s.throughput))
-        onward = onward & (brightest != 0)
+        differentiated = dr.grad_enabled(s.throughput)
+        if not differentiated:  # a throughput of 0 may have a derivative
+            onward = onward & (brightest != 0)
         if not self.plan.roulette:
             return onward
         # A branch is not to be ended for being one of several: as if there had been no split.
         whole = brightest / s.share if self.plan.split_depth else brightest
         survival = dr.detach(dr.minimum(whole * dr.square(s.eta), 0.95))
+        if differentiated:
+            survival = dr.select(survival > 0, survival, 0.5)
         late = onward & (s.depth >= self.plan.rr_depth)
         ends = late & (self.numbers.one(s.sampler, key + 3) >= survival)
         s.throughput = dr.select(late, s.throughput * dr.rcp(survival), s.throughput)

@@ -230,3 +230,145 @@ def test_the_image_has_a_derivative_in_sigma(needs_variant):
     parameters.update()
     dr.backward(dr.mean(mi.render(made, parameters, spp=4), axis=None))
     assert float(dr.grad(parameters[key]).array[0]) == pytest.approx(-THICKNESS * math.exp(-0.3 * THICKNESS), rel=1e-4)
+
+
+# Ways and media that were left out ------------------------------------------------------------------------------
+
+CHANCE = {"deterministic": False, "split_weight": 1e-2}
+CLEAR = {"type": "homogeneous", "albedo": 0.0, "sigma_t": 0.7}
+
+
+@pytest.mark.parametrize("height", [0.5, 1, 2.5, 4])
+def test_the_way_to_a_hidden_lamp_is_absorbed_too(height, rgb_variant):
+    """From z = 5 in a medium that ends at a boundary at 0.4, past a lamp that lets light through, to the sky."""
+    lamp = sheet({"type": "null"}, 5 - height) | {"emitter": {"type": "area"}}
+    end = sheet(matched(ext_absorption=1.0), 0.4)
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))}
+    for hide in (False, True):
+        method = CHANCE | {"camera_absorption": 1.0, "hide_emitters": hide}
+        found = radiance(lamp=lamp, end=end, light=sky, integrator=method, spp=4)
+        assert found == pytest.approx(math.exp(-4.6) + (not hide) * math.exp(-height), rel=1e-3)
+
+
+def near_plane(kind, near, **parts):
+    """A camera in a medium of σ = 0.7 with a near plane, one unit before the end of the medium."""
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    view = PLACE().look_at([0.1, 0.2, 2], [0.1, 0.2, 1], [0, 1, 0]).scale([0.01, 0.01, 1])
+    sensor = {"type": kind, "near_clip": near, "film": film, "to_world": view} | parts
+    return radiance(sensor=sensor, slab=box(matched(int_absorption=0.7), 6.0), integrator={"camera_absorption": 0.7})
+
+
+@pytest.mark.parametrize("near", [1e-3, 0.3, 0.9])
+@pytest.mark.parametrize("kind", ["orthographic", "perspective"])
+def test_the_way_to_the_near_plane_is_absorbed_too(kind, near, rgb_variant):
+    lens = {"fov": 0.01, "to_world": PLACE().look_at([0.1, 0.2, 2], [0.1, 0.2, 1], [0, 1, 0])}
+    found = near_plane(kind, near, **(lens if kind == "perspective" else {}))
+    assert found == pytest.approx(math.exp(-0.7 * 5), rel=1e-4)
+
+
+def test_a_medium_of_a_shape_is_absorption(rgb_variant):
+    """Tinted glass as other scenes have it: a boundary with a medium that does not scatter, and one of `null`."""
+    expected = math.exp(-0.7 * THICKNESS)
+    assert radiance(slab=box(matched(), interior=CLEAR)) == pytest.approx(expected, rel=1e-5)
+    assert radiance(slab=box({"type": "null"}, interior=CLEAR), integrator=CHANCE) == pytest.approx(expected, rel=1e-5)
+    ball = box(matched(), 0.5)  # of glass that says nothing, in the medium: as for `volpath` it is filled with it
+    assert radiance(slab=box(matched(), interior=CLEAR), ball=ball) == pytest.approx(expected, rel=1e-5)
+    inside = radiance(0.5, {"medium": CLEAR}, slab=box(matched(), interior=CLEAR))
+    assert inside == pytest.approx(math.exp(-0.7 * 1.5), rel=1e-5)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_spectral_polarized"])
+def test_tinted_glass_is_that_of_volpath(variant, needs_variant):
+    """By independent renders, within 6 standard errors: one false alarm in 10,000 with 7 degrees of freedom each."""
+    needs_variant(variant)
+    switch(variant)
+    tint = {"type": "homogeneous", "albedo": 0.0, "sigma_t": {"type": "rgb", "value": [0.2, 0.5, 1.0]}}
+    made = scene(slab=box(glass(), interior=tint), integrator=CHANCE)
+    renders = []
+    for seed, method in enumerate(({"type": "refract_path", "split_depth": 2}, {"type": "volpath", "max_depth": 64})):
+        integrator = mi.load_dict(method)
+        shots = [mi.render(made, integrator=integrator, spp=4096, seed=8 * seed + i) for i in range(8)]
+        renders.append(np.array([np.array(shot).ravel()[:3] for shot in shots], dtype=float))
+    apart = np.abs(renders[0].mean(axis=0) - renders[1].mean(axis=0))
+    assert (apart < 6 * np.sqrt(sum(x.var(axis=0, ddof=1) / 8 for x in renders)) + 1e-6).all()
+    assert renders[1].max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("medium", "bsdf", "said"),
+    [
+        (CLEAR | {"albedo": 0.5}, matched(), "the interior medium of 'slab' scatters or varies"),
+        (
+            {"type": "heterogeneous", "albedo": 0.0, "sigma_t": {"type": "constvolume", "value": 1.0}},
+            matched(),
+            "varies",
+        ),
+        (CLEAR, matched(int_absorption=0.7), "'slab' has an interior medium in a scene whose BSDFs absorb"),
+    ],
+)
+def test_a_medium_that_is_not_followed_is_refused_by_name(medium, bsdf, said, rgb_variant):
+    found = refusal(slab=box(bsdf, interior=medium, id="slab"), integrator=CHANCE)
+    assert said in found
+    group = {"type": "shapegroup", "id": "g", "slab": box(bsdf, interior=medium, id="slab")}
+    instance = {"type": "instance", "group": {"type": "ref", "id": "g"}}
+    assert said in refusal(group=group, instance=instance, integrator=CHANCE)
+
+
+def test_absorption_within_a_wrapper_of_a_group_is_refused(rgb_variant):
+    mask = {"type": "mask", "opacity": 1.0, "bsdf": matched(int_absorption=0.5)}
+    group = {"type": "shapegroup", "id": "g", "slab": box(mask, id="masked")}
+    instance = {"type": "instance", "group": {"type": "ref", "id": "g"}}
+    assert "'masked' has an absorbing BSDF within a MaskBSDF" in refusal(
+        group=group, instance=instance, integrator=CHANCE
+    )
+
+
+@pytest.mark.parametrize(
+    ("at", "thickness", "refused"), [(12, 1e-3, True), (50, 4e-3, True), (12, 4e-3, False), (0, 1e-3, False)]
+)
+def test_a_sheet_that_rays_step_over_is_refused(at, thickness, refused, rgb_variant):
+    """Mitsuba starts a ray 9e-5 of (1 + the largest coordinate) beside the surface that it left."""
+    pane = box(matched(int_absorption=100.0), thickness, at, id="pane")
+    if refused:
+        assert "'pane' absorbs, and is so thin that rays step over it" in refusal(camera=at + 5.0, pane=pane)
+    else:
+        assert radiance(at + 5.0, pane=pane) == pytest.approx(math.exp(-100 * thickness), rel=2e-2)
+
+
+@pytest.mark.parametrize("order", [("inner", "outer", "far"), ("far", "inner", "outer"), ("outer", "far", "inner")])
+def test_shapes_without_names_are_told_apart(order, rgb_variant):
+    """Glass of water whose inner wall does not say what the outer one says; a ball far away is no witness."""
+    parts = {"inner": (0.5, ""), "outer": (1.0, 'int_absorption"'), "far": (0.5, "")}
+    shapes = ""
+    for name in order:
+        radius, absorbs = parts[name]
+        place = (
+            f'<float name="radius" value="{radius}"/><point name="center" x="{9 if name == "far" else 0}" y="0" z="0"/>'
+        )
+        sigma = f'<float name="{absorbs} value="1.0"/>' if absorbs else ""
+        shapes += f'<shape type="sphere">{place}<bsdf type="refract">{sigma}</bsdf></shape>'
+    film = '<film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/></film>'
+    look = '<transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform>'
+    made = mi.load_string(
+        f'<scene version="3.0.0"><integrator type="refract_path"/><sensor type="perspective">{film}{look}</sensor>'
+        f'{shapes}<emitter type="constant"/></scene>'
+    )
+    with pytest.raises((ValueError, RuntimeError)) as caught:
+        mi.render(made, spp=16)
+    error = caught.value
+    while error.__cause__ is not None:
+        error = error.__cause__
+    assert "(Sphere) through another absorption" in str(error)
+
+
+@pytest.mark.parametrize("around", [{"type": "moment"}, {"type": "aov", "aovs": "d:depth"}], ids=str)
+def test_contradictions_are_refused_within_another_integrator(around, rgb_variant):
+    slab = box(matched(int_absorption=0.7), id="aquarium")
+    made = scene(0.5, slab=slab)
+    method = mi.load_dict(around | {"inner": {"type": "refract_path"}})
+    with pytest.raises((ValueError, RuntimeError)) as caught:
+        mi.render(made, integrator=method, spp=4)
+    error = caught.value
+    while error.__cause__ is not None:
+        error = error.__cause__
+    assert "light comes to 'aquarium' through another" in str(error)

@@ -8,6 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.stats import t
+from support.variants import switch
 
 from mi_refract.image_diff import pixelwise, tile_statistics
 from mi_refract.plugins import keyed_sampler, path_loop, refract_path, scene_features
@@ -424,3 +426,189 @@ def test_parameters_and_their_defaults_are_written_out(parameters, written, scal
 def test_an_unknown_parameter_is_refused():
     with pytest.raises(RuntimeError, match="unreferenced"):
         mi.load_dict({"type": "refract_path", "max_dept": 3})
+
+
+# Where flags, tangents and seeds were taken for granted ---------------------------------------------------------
+
+GLASS = {"type": "refract", "int_ior": 1.5, "ext_ior": 1.0}
+TILT = np.array([0.5 + 0.5 * np.sin(np.radians(20)), 0.5, 0.5 + 0.5 * np.cos(np.radians(20))])
+NORMAL_MAP = {"type": "bitmap", "bitmap": mi.Bitmap(TILT.reshape(1, 1, 3).astype(np.float32)), "raw": True}
+STEPS = {"type": "bitmap", "bitmap": mi.Bitmap(np.linspace(0, 1, 16, dtype=np.float32).reshape(4, 4, 1)), "raw": True}
+POLARIZER = {"type": "polarizer", "theta": 20.0}
+NOT_BOUNDARIES = {
+    "two glasses": {"type": "blendbsdf", "weight": 0.3, "a": GLASS, "b": GLASS | {"int_ior": 1.8}},
+    "glass and mirror": {"type": "blendbsdf", "weight": 0.3, "a": GLASS, "b": {"type": "conductor"}},
+    "normal map": {"type": "normalmap", "normalmap": NORMAL_MAP, "b": GLASS},
+    "normal map of dielectric": {"type": "normalmap", "normalmap": NORMAL_MAP, "b": {"type": "dielectric"}},
+    "bump map": {"type": "bumpmap", "arbitrary": STEPS, "scale": 20.0, "b": GLASS},
+    "mask": {"type": "mask", "opacity": 0.5, "b": GLASS},
+}
+
+
+def equal_means(theirs, ours, alpha=1e-4):
+    """Whether means of independent renders are within chance; `alpha` is the rate of false alarms."""
+    theirs, ours = (np.array(x).reshape(len(x), -1).mean(axis=1) for x in (theirs, ours))
+    deviation = np.sqrt(theirs.var(ddof=1) / len(theirs) + ours.var(ddof=1) / len(ours))
+    return abs(theirs.mean() - ours.mean()) <= t.ppf(1 - alpha / 2, len(ours) - 1) * deviation + 1e-6 * theirs.mean()
+
+
+@pytest.mark.parametrize("split_depth", [0, 1, 3])
+@pytest.mark.parametrize("name", NOT_BOUNDARIES)
+def test_glass_in_a_wrapper_is_that_of_path(name, split_depth, llvm_variant):
+    """Where a wrapper chooses between two glasses, or refuses a lobe. One false alarm in 10,000 for each."""
+    oblique = mi.ScalarTransform4f().rotate([0, 1, 0], 70).scale(9)  # the camera sees the sheet from 20° above it
+    scene = glass_ball(sky=sky(), ball={"type": "rectangle", "to_world": oblique, "bsdf": NOT_BOUNDARIES[name]})
+    theirs = [by_path(scene, 64, seed, rr_depth=100) for seed in range(8)]
+    ours = [render(scene, 64, 100 + seed, rr_depth=100, split_depth=split_depth) for seed in range(8)]
+    assert equal_means(theirs, ours)
+
+
+@pytest.mark.parametrize(
+    ("variant", "shape", "bsdf"),
+    [
+        ("llvm_ad_rgb", "disk", {"type": "normalmap", "normalmap": NORMAL_MAP, "b": {"type": "conductor"}}),
+        ("llvm_ad_rgb", "sphere", {"type": "normalmap", "normalmap": NORMAL_MAP, "b": {"type": "conductor"}}),
+        ("llvm_ad_spectral_polarized", "disk", POLARIZER),
+        ("llvm_ad_spectral_polarized", "cube", POLARIZER),
+    ],
+)
+def test_what_needs_a_tangent_has_it_in_a_scene_of_glass_only(variant, shape, bsdf, needs_variant):
+    """A matt ball out of sight changes nothing: with it a hit has all its parts."""
+    needs_variant(variant)
+    switch(variant)
+    turned = mi.ScalarTransform4f().rotate([1, 2, 0], 30)
+    part = {"type": shape, "to_world": turned, "bsdf": bsdf}
+    front = {"type": "sphere", "center": [0, 0, 2], "radius": 0.8, "bsdf": GLASS | {"int_ior": 1.01}}
+    behind = {"type": "sphere", "center": [0, 0, 90], "bsdf": {"type": "diffuse"}}
+    lamp = {"type": "envmap", "bitmap": mi.Bitmap(SKY)}
+    if bsdf is POLARIZER:  # light that is polarised by another one behind it
+        other = mi.ScalarTransform4f().translate([0, 0, -3]).scale(3)
+        second = {"type": "rectangle", "to_world": other, "bsdf": POLARIZER | {"theta": 70.0}}
+    else:
+        second = {"type": "sphere", "center": [0, 0, -3], "bsdf": GLASS}
+    parts = {"ball": part, "front": front, "second": second, "sky": lamp}
+    alone, beside = (
+        [render(glass_ball(**parts, **more), 64, seed) for seed in range(6)] for more in ({}, {"far": behind})
+    )
+    assert equal_means(beside, alone)
+
+
+@pytest.mark.parametrize("around", ["moment", "aov", "alone"])
+def test_other_seeds_have_other_numbers_whatever_calls(around, llvm_variant):
+    """The mean of 16 images has 1/16 of the squared error of one; numbers that repeat leave most of it."""
+    scene = load("balls", 24)
+    inner = {"type": "refract_path", "max_depth": 8, "split_depth": 1}
+    more = {"moment": {}, "aov": {"aovs": "d:depth"}, "alone": {}}[around]
+    method = mi.load_dict(inner if around == "alone" else {"type": around, "inner": inner} | more)
+    images = np.array([np.array(mi.render(scene, integrator=method, spp=4, seed=s))[..., :3] for s in range(16)])
+    whole = np.mean([render(scene, 1024, 100 + seed, max_depth=8, split_depth=1) for seed in range(2)], axis=0)
+    assert np.square(images.mean(axis=0) - whole).mean() < np.square(images - whole).mean() / 8
+
+
+@pytest.mark.parametrize("samples_per_pass", [4, 16])
+def test_passes_of_the_film_have_other_numbers(samples_per_pass, llvm_variant):
+    """64 samples in passes have the noise of 64 at once within a factor of 4; 16 passes that repeat have 16 times."""
+    scene = load("balls", 24)
+    noise = [
+        np.var([render(scene, 64, seed, split_depth=1, max_depth=8, **more) for seed in range(6)], axis=0).mean()
+        for more in ({}, {"samples_per_pass": samples_per_pass})
+    ]
+    assert noise[1] < 4 * noise[0]
+
+
+@pytest.mark.parametrize("spp", [4, 16, 64])
+@pytest.mark.parametrize("split_depth", [0, 1, 2])
+def test_a_lamp_behind_a_grille_is_as_bright_as_by_path(spp, split_depth, llvm_variant):
+    """Numbers that leave out a part of the square leave out lamps. One false alarm in 10,000 for each case."""
+    place = mi.ScalarTransform4f
+    lattice = {"type": "bitmap", "bitmap": mi.Bitmap(np.kron(np.eye(2, dtype=np.float32), np.ones((1, 1)))[..., None])}
+    lattice |= {"raw": True, "filter_type": "nearest", "to_uv": place().scale([8, 8, 1])}
+    grille = {"type": "mask", "opacity": lattice, "b": {"type": "diffuse", "reflectance": 0.0}}
+    parts = {
+        "floor": {"type": "rectangle", "to_world": place().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(6)},
+        "grille": {"type": "rectangle", "to_world": place().translate([0, 2, 0]).rotate([1, 0, 0], 90), "bsdf": grille},
+        "lamp": {
+            "type": "rectangle",
+            "to_world": place().translate([0, 2.2, 0]).rotate([1, 0, 0], 90),
+            "emitter": {"type": "area", "radiance": 5.0},
+        },
+    }
+    scene = glass_ball(**parts)
+    theirs = [by_path(scene, 256, seed) for seed in range(8)]
+    ours = [render(scene, spp, 100 + seed, split_depth=split_depth) for seed in range(max(8, 512 // spp))]
+    assert equal_means(theirs, ours)
+
+
+@pytest.mark.parametrize("around", ["moment", "aov", "alone"])
+def test_an_edit_is_seen_whatever_calls(around, llvm_variant):
+    """A black floor that turns grey."""
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(9), "bsdf": BLACK}
+    scene = glass_ball(floor=floor, spot={"type": "point", "position": [0, 4, 4], "intensity": 30.0})
+    inner, more = {"type": "refract_path", "max_depth": 5}, {"aovs": "d:depth"} if around == "aov" else {}
+    method = mi.load_dict(inner if around == "alone" else {"type": around, "inner": inner} | more)
+    params = mi.traverse(scene)
+    means = []
+    for grey in (0.0, 0.5):
+        params[next(key for key in [*params.keys()] if "reflectance" in key)] = grey
+        params.update()
+        means.append(np.array(mi.render(scene, integrator=method, spp=16))[..., :3].mean())
+    assert means[0] == 0
+    assert means[1] == pytest.approx(by_path(scene, 64, max_depth=5).mean(), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    "bsdf", [{"type": "mask", "opacity": 0.2, "b": {"type": "diffuse"}}, {"type": "null"}], ids=str
+)
+def test_at_the_last_vertex_what_is_transparent_is_so(bsdf, rgb_variant):
+    """Alpha with a `max_depth` of 1 is the opacity: 16 σ of the samples."""
+    vectorised = dr.is_jit_v(mi.Float)
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgba", "rfilter": BOX}
+    place = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    sheet = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(9), "bsdf": bsdf}
+    scene = mi.load_dict(
+        {"type": "scene", "sensor": {"type": "perspective", "to_world": place, "film": film}, "sheet": sheet}
+    )
+    spp = 64 if vectorised else 8
+    alpha = render(scene, spp, max_depth=1, hide_emitters=True)[..., 3].mean()
+    opacity = bsdf.get("opacity", 0.0)
+    assert alpha == pytest.approx(opacity, abs=16 * np.sqrt(opacity * (1 - opacity) / 64 / spp))
+
+
+ROUGH = {
+    "rough metal": ({"type": "roughconductor", "alpha": 0.15}, "alpha.value", 0.15),
+    "rougher metal": ({"type": "roughconductor", "alpha": 0.3}, "alpha.value", 0.3),
+    "rough glass": ({"type": "roughdielectric", "alpha": 0.3}, "alpha.value", 0.3),
+    "grey": ({"type": "diffuse", "reflectance": 0.0}, "reflectance.value", 0.0),
+}
+
+
+@pytest.mark.parametrize("name", ROUGH)
+def test_derivatives_off_the_glass_are_those_of_finite_differences(name, needs_variant):
+    """A sheet between two lamps with edges, by 8 seeds; t-test, one false alarm in 10,000 for each case."""
+    needs_variant("llvm_ad_rgb")
+    switch("llvm_ad_rgb")
+    bsdf, end, value = ROUGH[name]
+    sheet = {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -30).scale(3), "bsdf": bsdf}
+    place = mi.ScalarTransform4f
+    above = place().look_at([0, 3.5, 2], [0, 0, 0], [1, 0, 0]).scale(0.8)
+    below = place().look_at([0, 0.5, -4], [0, 0, 0], [1, 0, 0]).scale(0.8)
+    light = {"type": "rectangle", "emitter": {"type": "area", "radiance": 5.0}}
+    scene = glass_ball(16, ball=sheet, above=light | {"to_world": above}, below=light | {"to_world": below})
+    method = mi.load_dict({"type": "refract_path", "max_depth": 4, "rr_depth": 100})
+    params = mi.traverse(scene)
+    key = f"ball.bsdf.{end}"
+    kind, step, found, expected = type(params[key]), 0.02, [], []
+    for seed in range(8):
+        images = []
+        for x in (value - step * (value > 0), value + step):
+            params[key] = kind(x)
+            params.update()
+            images.append(render(scene, 1024, seed, max_depth=4, rr_depth=100).mean())
+        expected.append((images[1] - images[0]) / (step * (1 + (value > 0))))
+        params[key] = kind(value)
+        dr.enable_grad(params[key])
+        params.update()
+        dr.backward(dr.mean(mi.render(scene, params, integrator=method, spp=256, seed=50 + seed), axis=None))
+        found.append(dr.mean(dr.grad(params[key]), axis=None))
+    assert abs(np.mean(expected)) > 1e-3
+    assert equal_means(expected, np.array(found).ravel())
