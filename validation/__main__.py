@@ -28,7 +28,10 @@ if TYPE_CHECKING:
 ROOMS = {
     "directions": ("directions", ("per_formula", "planted_defects", "bsdf_samples", "sweep", "search")),
     "stability": ("stability", ("optical_chains", "energy", "derivatives", "layered_paths")),
-    "renders": ("renders", ("scene_needs", "against_dielectric", "colours", "unused_features", "rendering_passes")),
+    "renders": (
+        "renders",
+        ("scene_needs", "against_dielectric", "colours", "unused_features", "invisible_changes", "rendering_passes"),
+    ),
     "efficiency": ("efficiency", ("error_against_time", "scaling", "cluster_scale")),
     "media": ("media", ("catalogs", "ray_directions", "closed_forms", "renders", "hero_wavelength")),
     "planar": ("planar", ("against_retrace", "closed_paths", "extruded_scenes", "times")),
