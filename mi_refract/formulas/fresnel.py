@@ -209,12 +209,18 @@ def mueller_transmission(cos_i: Number, cos_t: Number, transmitted: Mask, k: Num
 
     From the transmitted powers of both waves and their interference. Arguments as for `powers`.
     """
+    t_s, t_p, cross = transmitted_powers(cos_i, cos_t, transmitted, k)
+    return _mueller(t_s, t_p, (cross, 0))
+
+
+def transmitted_powers(cos_i: Number, cos_t: Number, transmitted: Mask, k: Number) -> tuple[Any, Any, Any]:
+    """(T_s, T_p, √(T_s T_p)) of the transmitted waves; 0 where not transmitted. Arguments as for `powers`."""
     c, y, ratio, number = _wide(cos_i), _wide(cos_t), _wide(k), type(cos_i)
     d_s, d_p = (dr.select(transmitted, d, 1) for d in (dr.fma(ratio, c, y), dr.fma(ratio, y, c)))
     power = 4 * ratio * (c * y)
     pairs = (d_s, d_s), (d_p, d_p), (d_s, d_p)
     t_s, t_p, cross = (dr.select(transmitted, number(power / (x * y)), 0) for x, y in pairs)
-    return _mueller(t_s, t_p, (cross, 0))
+    return t_s, t_p, cross
 
 
 def _differences(cos_i: Number, k: Number, contrast: Number) -> tuple[DoubleWord, Any]:

@@ -23,14 +23,14 @@ Refraction = Callable[[Vector2, Vector2, Number], tuple[Vector2, Mask]]  # (d, l
 
 @dataclass
 class PathState:
-    """State of a ray: where it is, the index of its medium (NaN: unknown), its share of the power, boundaries met.
+    """State of a ray: where it is, the index of its medium (NaN: unknown), shares of the s and p waves, boundaries met.
 
     search: how far it has been searched for the next boundary.
     """
 
     ray: Ray
     index: Number
-    power: Number
+    power: Vector2
     depth: Index
     search: SearchState
     active: Mask
@@ -102,8 +102,10 @@ class PathLoop:
             "hits": arrays.buffer(arrays.signed, -1, (max_depth, count)),
             "events": arrays.buffer(arrays.byte, int(Event.NONE), (legs, count)),
         }
-        names = ("indices", "weights") if weights else ()
-        return buffers | {name: arrays.buffer(arrays.number, np.nan, (legs, count)) for name in names}
+        if weights:
+            buffers["indices"] = arrays.buffer(arrays.number, np.nan, (legs, count))
+            buffers["polarised"] = arrays.buffer(arrays.number, np.nan, (legs, count, 2))
+        return buffers
 
     def _start(self, p: Vector2, d: Vector2, index: Number) -> PathState:
         arrays, d = self.arrays, _unit(d)
@@ -111,7 +113,7 @@ class PathLoop:
         slack = 4 * arrays.roundoff * (dr.abs(p.x) + dr.abs(p.y))
         half = arrays.number(0.5)
         ray = Ray(p, d, arrays.index(NOWHERE), half, half, arrays.mask(False), slack)
-        return PathState(ray, index, arrays.number(1), arrays.index(0), self._search(-BACK), arrays.mask(True))
+        return PathState(ray, index, arrays.vector(1, 1), arrays.index(0), self._search(-BACK), arrays.mask(True))
 
     def _box_entry(self, p: Vector2, d: Vector2) -> Vector2:
         """The origin, or where a ray from outside enters the box around all boundaries.
@@ -152,7 +154,7 @@ class PathLoop:
         run.scatter("events", state.depth, event, active)
         if run.weights:
             run.scatter("indices", state.depth, index, active)
-            run.scatter("weights", state.depth, state.power, active)
+            run.scatter("polarised", state.depth, state.power, active)
 
     def _cross(self, state: PathState, hit: Hit, run: Run) -> PathState:
         """The state after the boundary that is met."""
@@ -171,7 +173,7 @@ class PathLoop:
         run.scatter("hits", j, hit.segment, met)
         on = met & (near == index)
         ray = Ray(p, dr.select(on, b, d), hit.segment, hit.s, hit.r, hit.to_left == through, arrays.number(0))
-        power = state.power * _share(d, line, k, through) if run.weights else state.power
+        power = state.power * _shares(d, line, k, through) if run.weights else state.power
         return PathState(ray, dr.select(through, far, index), power, j + 1, self._search(0), on)
 
     def _turn(
@@ -224,12 +226,19 @@ def _mirrored(d: Vector2, line: Vector2) -> Vector2:
     return type(d)(d.x + c * line.y, d.y - c * line.x)
 
 
-def _share(d: Vector2, line: Vector2, k: Number, through: Mask) -> Number:
-    """The share of the power that goes the way that the ray takes: Fresnel's T where it goes through, R otherwise."""
+def _shares(d: Vector2, line: Vector2, k: Number, through: Mask) -> Vector2:
+    """The shares of the s and the p wave that go the way of the ray: Fresnel's T where it goes through, R otherwise.
+
+    In a plane neither wave becomes the other, at any boundary.
+    """
     cos_i = dr.minimum(dr.abs(cross(line, d)), 1)
     cos_t, transmitted = fresnel.refracted_cosine(cos_i, k)
-    r, t = fresnel.powers(cos_i, cos_t, transmitted, k)
-    return dr.select(through, t, r)
+    t_s, t_p, _ = fresnel.transmitted_powers(cos_i, cos_t, transmitted, k)
+    r_s, r_p = fresnel.amplitudes(cos_i, k)
+    return type(d)(
+        dr.select(through, t_s, dr.squared_norm(r_s)),
+        dr.select(through, t_p, dr.squared_norm(r_p)),
+    )
 
 
 def _refraction(arrays: ArrayBackend, formula: str | None) -> Refraction:

@@ -130,6 +130,10 @@ def with_rays(scene: PlanarScene, count: int) -> PlanarScene:
         have = np.arange(len(origins))
         want = np.linspace(0, have[-1], count) if len(have) > 1 else have
         angle = np.interp(want, have, np.unwrap(np.arctan2(directions[:, 1], directions[:, 0])))
+        if scene.fans and (fan := scene.fans[beam]) and len(have) > 1:
+            angle = np.radians(
+                np.linspace(fan[0], fan[1], len(want))
+            )  # steps of 180° and more say nothing of the way round
         places = np.column_stack([np.interp(want, have, x) for x in origins.T])
         parts.append((places, np.column_stack([np.cos(angle), np.sin(angle)]), np.full(len(want), beam)))
     origins, directions, beams = (np.concatenate(columns) for columns in zip(*parts, strict=True))
@@ -204,7 +208,8 @@ def as_data(scene: PlanarScene, traced: Sequence[Branches]) -> dict[str, Any]:
 
 def _paths(scene: PlanarScene, branches: Branches) -> Iterator[dict[str, Any]]:
     paths, weights, indices = branches.paths, branches.weights, branches.paths.indices
-    assert indices is not None
+    polarised = paths.polarised
+    assert indices is not None and polarised is not None
     for i, last in enumerate(branches.last):
         ray, points = int(branches.rays[i]), paths.points[i]
         yield {
@@ -217,6 +222,7 @@ def _paths(scene: PlanarScene, branches: Branches) -> Iterator[dict[str, Any]]:
             "events": [Event(event).name.lower() for event in paths.events[i, : last + 1]],
             "indices": _nullable(indices[i, : last + 1]),
             "weights": _nullable(weights[i, : last + 1]),
+            "polarised": {wave: _nullable(polarised[i, : last + 1, j]) for j, wave in enumerate(("s", "p"))},
         }
 
 

@@ -33,8 +33,9 @@ class Paths:
     hits: N × D, the number of each segment met, then −1.
     events: N × (D+1), `Event` at each boundary, then how the path ended, then NONE.
     indices: N × (D+1), refractive index of the medium of each leg; NaN after the end and where it is not known.
-    weights: N × (D+1), share of the ray's power that each leg carries (Fresnel, unpolarised light).
-    `indices` and `weights` are None where weights were not asked for.
+    polarised: N × (D+1) × 2, shares of the ray's s and p waves that each leg carries (Fresnel). s is perpendicular to
+    the plane. Neither wave becomes the other at a boundary.
+    `indices` and `polarised` are None where weights were not asked for.
     """
 
     points: Array
@@ -42,4 +43,9 @@ class Paths:
     hits: NDArray[np.int32]
     events: NDArray[np.uint8]
     indices: Array | None = None
-    weights: Array | None = None
+    polarised: Array | None = None
+
+    @property
+    def weights(self) -> Array | None:
+        """N × (D+1), share of the power of unpolarised light that each leg carries: the mean of both waves."""
+        return None if self.polarised is None else self.polarised.mean(axis=-1)

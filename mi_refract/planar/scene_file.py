@@ -43,7 +43,8 @@ class PlanarScene:
     `segments`: one per colour, the same geometry with other indices. `regions`: in drawing order, inner ones last.
     `index`: of the medium around everything, per colour. `origins`, `directions`: N × 2, directions of length 1;
     `beams`: N, the number of the `[[beam]]` (from 0) that a ray belongs to. `branches`: the most partial reflections
-    on a path; 0: rays are refracted wherever possible. `view`: x0, x1, y0, y1; None: all shapes.
+    on a path; 0: rays are refracted wherever possible. `view`: x0, x1, y0, y1; None: all shapes. `fans`: by beam, the
+    angles in degrees of the first and of the last ray of a fan.
     """
 
     path: Path
@@ -58,6 +59,7 @@ class PlanarScene:
     max_depth: int
     branches: int
     view: tuple[float, float, float, float] | None
+    fans: tuple[tuple[float, float] | None, ...] = ()
 
     @property
     def colours(self) -> tuple[str, ...]:
@@ -121,6 +123,7 @@ def _scene(path: Path, table: dict[str, Any], wavelengths: Sequence[float] | int
         values["max_depth"],
         values["branches"],
         tuple(values["view"]) if values["view"] else None,
+        tuple(tuple(table["angles"]) if table.get("kind") == "fan" else None for table in values["beam"]),
     )
 
 

@@ -164,9 +164,9 @@ def absorbs_only(v: Any, medium: Any) -> bool:
     if dr.flag(dr.JitFlag.FreezingScope):  # what a frozen function computes nobody reads
         return True
     mei = dr.zeros(v.MediumInteraction3f)
-    lines = [mi.MI_CIE_MIN + (mi.MI_CIE_MAX - mi.MI_CIE_MIN) * i / 64 for i in range(65)] if v.is_spectral else []
-    for line in lines or [()]:
-        mei.wavelengths = type(mei.wavelengths)(line)
+    visible = [(mi.MI_CIE_MIN + (mi.MI_CIE_MAX - mi.MI_CIE_MIN) * i / 64,) for i in range(65)]
+    for line in visible if v.is_spectral else [()]:
+        mei.wavelengths = type(mei.wavelengths)(*line)
         if dr.any(medium.get_scattering_coefficients(mei, True)[0] != 0, axis=None):
             return False
     return True

@@ -371,8 +371,10 @@ class Trace:
         """
         v, ranges = self.v, list[list[int]]()
         bsdfs = [bsdf for shape in all_shapes(self.scene) if (bsdf := shape.bsdf()) is not None]
-        pointers = [v.BSDFPtr(bsdf) for bsdf in bsdfs if bsdf_name(bsdf) in BOUNDARIES]
-        for number in sorted({int(dr.reinterpret_array(v.UInt32, pointer)[0]) for pointer in pointers}):
+        pointers: list[Any] = [
+            dr.reinterpret_array(v.UInt32, v.BSDFPtr(b)) for b in bsdfs if bsdf_name(b) in BOUNDARIES
+        ]
+        for number in sorted({int(pointer[0]) for pointer in pointers}):
             if ranges and ranges[-1][1] == number:
                 ranges[-1][1] += 1
             else:

@@ -14,6 +14,7 @@ from mi_refract.backend import detect
 from mi_refract.planar import Event, Segments, path_tree, trace
 from mi_refract.planar.path_tree import as_data, count, follow, follow_scene, summary, with_rays
 from mi_refract.planar.paths import REFLECT_BITS
+from mi_refract.planar.scene_file import load
 
 OBLIQUE = math.cos(0.6), math.sin(0.6)
 
@@ -30,9 +31,9 @@ def final_weights(found):
 def test_the_power_is_all_there(most):
     """R outside, T² Rᵏ after k reflections inside: 1 − T Rᵏ⁺¹ altogether, for at most k of them; T² for none."""
     found = through_slab(most, least=0.0)
-    t = found.paths.weights[0, 1]
-    assert 0.9 < t < 0.99
-    expected = t**2 if most == 0 else 1 - t * (1 - t) ** (most + 1)
+    t = found.paths.polarised[0, 1]  # of the s and of the p wave
+    assert 0.9 < t.mean() < 0.99
+    expected = np.mean(t**2 if most == 0 else 1 - t * (1 - t) ** (most + 1))
     assert final_weights(found).sum() == pytest.approx(expected, abs=1e-14)
     inside = [(1 << k + 1) - 2 for k in range(1, most + 1)]
     assert sorted(found.reflect.tolist()) == [0, 1, *inside][: most + 2 if most else 1]
@@ -53,8 +54,8 @@ def test_the_primary_rainbow_is_bit_one():
     i, r = math.asin(height), math.asin(height / n)
     turned = -(math.pi + 2 * i - 4 * r)  # clockwise, for it meets the upper half
     np.testing.assert_allclose(found.paths.directions[primary], [math.cos(turned), math.sin(turned)], atol=1e-14)
-    transmitted = found.paths.weights[primary, 1]
-    assert final_weights(found)[primary] == pytest.approx(transmitted**2 * (1 - transmitted), rel=1e-12)
+    t = found.paths.polarised[primary, 1]
+    assert final_weights(found)[primary] == pytest.approx(np.mean(t**2 * (1 - t)), rel=1e-12)
 
 
 def test_the_tree_holds_every_path_once():
@@ -196,3 +197,44 @@ def test_the_last_bit_is_that_of_one_boundary(backend):
     assert np.flatnonzero(paths.events[1] == Event.REFLECTED).tolist() == [REFLECT_BITS - 1]
     assert (paths.events[1] == Event.REFRACTED).sum() == 2 * (REFLECT_BITS - 1)
     assert (paths.events == Event.ESCAPED).sum(1).tolist() == [1, 1]
+
+
+def beams(tmp_path, angles, count):
+    path = tmp_path / "fan.toml"
+    path.write_text(f"""
+        [[shape]]
+        kind = "circle"
+        radius = 1.0
+        n = 1.5
+        [[beam]]
+        kind = "fan"
+        at = [0.0, 0.0]
+        angles = {list(angles)}
+        count = {count}
+    """)
+    return load(path)
+
+
+@pytest.mark.parametrize("angles", [(-170.0, 170.0), (0.0, 360.0), (170.0, -170.0), (10.0, 20.0)])
+@pytest.mark.parametrize("count", [2, 3, 9])
+def test_more_rays_of_a_fan_go_the_same_way_round(angles, count, tmp_path):
+    """Whatever number of rays the file has: steps of 180° and more."""
+    found = with_rays(beams(tmp_path, angles, count), 7).directions
+    expected = np.radians(np.linspace(*angles, 7))
+    assert found == pytest.approx(np.column_stack([np.cos(expected), np.sin(expected)]), abs=1e-12)
+
+
+def test_s_and_p_never_mix():
+    """Ten plates at Brewster's angle: p goes through whole, s loses R_s at each of 20 boundaries."""
+    n, y = 1.5, np.repeat(np.arange(10.0), 2) + np.tile([0.0, 0.5], 10)
+    far = 1e3
+    starts = np.column_stack([np.full(20, -far), -y])
+    ends = np.column_stack([np.full(20, far), -y])
+    left, right = np.tile([1.0, n], 10), np.tile([n, 1.0], 10)
+    brewster = np.arctan(n)
+    paths = trace(
+        Segments(starts, ends, left, right), [[0.0, 1.0]], [[np.sin(brewster), -np.cos(brewster)]], 20, weights=True
+    )
+    r_s = ((n * n - 1) / (n * n + 1)) ** 2
+    assert paths.polarised[0, 20] == pytest.approx([(1 - r_s) ** 20, 1.0], rel=1e-6)
+    assert paths.weights[0, 20] == pytest.approx(((1 - r_s) ** 20 + 1) / 2, rel=1e-6)

@@ -128,7 +128,12 @@ BEHIND = [0, 0, 90]
 CHANGES: dict[str, Change] = {
     "matt ball far away": _add(far={"type": "sphere", "center": BEHIND}),
     "dark lamp": _add(
-        far={"type": "sphere", "center": BEHIND, "bsdf": {"type": "null"}, "emitter": {"type": "area", "radiance": 1e-20}}
+        far={
+            "type": "sphere",
+            "center": BEHIND,
+            "bsdf": {"type": "null"},
+            "emitter": {"type": "area", "radiance": 1e-20},
+        }
     ),
     "dark point lamp": _add(far={"type": "point", "position": BEHIND, "intensity": 1e-20}),
     "instance": _instance,
@@ -159,6 +164,8 @@ def changed(scene: str, name: str) -> bool:
         return False
     if scene == "normal map" and name in ("texture as tint", "texture as index", "absorption 1e-30", "flat bump map"):
         return False
+    if mi.is_spectral and name == "texture as tint":  # a raw bitmap has no spectrum
+        return False
     return not (scene == "dispersive" and name == "texture as index")
 
 
@@ -188,7 +195,7 @@ def images(scene: Any, around: Nodes | None, depth: int, spp: int, seed: int, **
 
 def rows(variant: str, name: str, depth: int) -> list[Row]:
     """One row a change of one scene."""
-    before = mi.variant()
+    before: Any = mi.variant()
     mi.set_variant(variant)
     try:
         seed, parts = current(SEED), scenes("spectral" in variant)[name]
@@ -199,7 +206,7 @@ def rows(variant: str, name: str, depth: int) -> list[Row]:
         for change in (*CHANGES, *WAYS):
             if not changed(name, change):
                 continue
-            scene, around, parameters = unchanged, None, {}
+            scene, around, parameters = unchanged, None, dict[str, Any]()
             if change in CHANGES:
                 other = scenes("spectral" in variant)[name]
                 CHANGES[change](other)
