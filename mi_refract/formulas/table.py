@@ -15,8 +15,8 @@ from .documented import refract_cross, refract_decomposed, refract_rotated, refr
 from .well_conditioned import LocalCosines, Refracted, refract_compensated, refract_promoted
 
 # Which k every formula takes; both directions of a boundary, so one is the inverse of the other. In float32
-#   promoted     k a + n (n·b − k n·a)/n² cancels: with a roundoff v = 2⁻⁵³, n·a is off by 2v, the difference by v, n² by
-#                1.5v, the quotient by v, so b by 5.5 k v at most: 0.011u for k = 2²⁰, 0.9u for 8.5e7. ROUNDING leaves
+#   promoted     k a + n (n·b − k n·a)/n² cancels: with v = 2⁻⁵³, n·a is off by 2v, the difference by v, n² by 1.5v,
+#                the quotient by v, so b by 5.5 k v at most: 0.011u for k = 2²⁰, 0.9u for 8.5e7. ROUNDING leaves
 #                0.0064u, less than all of these together; of 2·10⁷ rays with k ≈ 2²⁰ aimed at the worst rounding none
 #                is off by more than 0.863u in all.
 #   decomposed   k n·a − s √… loses the root where it is below ulp(k)/2: b may be 0 at normal incidence from 2²⁴ on.
