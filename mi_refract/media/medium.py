@@ -50,8 +50,8 @@ class Medium:
                 text = f"{self.name}: no index at {at:g} nm"
                 raise ValueError(f"{text}; accepted: a wavelength from {low:g} to {high:g} nm")
             low, high = self.fitted
-            beyond = [w for w in np.atleast_1d(wavelength).ravel() if not low <= w <= high]
-            if beyond:
+            asked = np.atleast_1d(wavelength)
+            if (beyond := asked[(asked < low) | (asked > high)]).size:
                 text = f"{self.name}: the index at {beyond[0]:g} nm is an extrapolation"
                 warnings.warn(f"{text}; its formula is fitted from {low:g} to {high:g} nm", stacklevel=2)
         return found
