@@ -12,7 +12,7 @@ Conventions, everywhere in this package:
   `b` keeps the length of `a`.
 - Exactly at the critical angle the ray is transmitted, along the surface. A tangential ray (n·a = 0) neither
   enters nor leaves: `transmitted` is False and b = a.
-- NaN in gives NaN out and `transmitted = False`; so does a zero vector, or a k outside 1e-9 … 1e9.
+- NaN in gives NaN out and `transmitted = False`; so does a zero vector, or a k outside 2⁻²⁰ … 2²⁰.
 - `contrast` is κ = k² − 1, for those who know it better than float32 `k` does.
 """
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import warnings
 from typing import Annotated, Any, NamedTuple
 
 try:
@@ -21,6 +22,7 @@ except ModuleNotFoundError as missing:
 
 from mi_refract import __version__
 from mi_refract.io.exit_code import exit_code
+from mi_refract.io.outside_text import printable
 
 from .plain_values import PlainValues
 
@@ -93,5 +95,7 @@ def _root(
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line, or `arguments`; the exit code."""
-    return exit_code("mi-refract", lambda: app(arguments, prog_name="mi-refract", standalone_mode=False))
+    """Run the command line, or `arguments`; the exit code. Warnings are one line on stderr, as errors are."""
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_: print(printable(f"mi-refract: {message}"), file=sys.stderr)
+        return exit_code("mi-refract", lambda: app(arguments, prog_name="mi-refract", standalone_mode=False))

@@ -5,7 +5,7 @@ the surface, `n` is a normal on either side, k = n_from / n_to, and `b` leaves t
 Where `transmitted` is False (total internal reflection, or a tangential ray) `b` is the mirror direction.
 
 The entries of FORMULAS are total functions without branches on data: input that is not a refraction (a zero or
-non-finite vector, a ratio outside 1e-9 … 1e9) gives NaN and False. The functions themselves leave
+non-finite vector, a ratio outside 2⁻²⁰ … 2²⁰) gives NaN and False. The functions themselves leave
 that check out (NaN still gives NaN), for callers that have made it, as the plugin has. `a` and `n` are 3-vectors of
 any Dr.Jit backend and precision, `k` a number or an array of that precision; a wider `k` is rounded to it, once.
 The documented formulas take unit `a` and `n`; what those are off by, the result is off by.

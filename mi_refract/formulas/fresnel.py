@@ -12,8 +12,8 @@ of the incident vector cancels. Signs follow Verdet's convention, as in Mitsuba.
 Optics, 1.5; R : T, from cos(θᵢ ± θₜ) = P ∓ Q and r_p/r_s = −(P − Q)/(P + Q): this project.
 
 float32 is computed in float64 and rounded once; float64 in double words. Arguments are Dr.Jit numbers of one precision
-and any backend, or Python floats, which are float64. NaN in gives NaN out. Precondition: k from 1e-9
-to 1e9; in float64 cosines above 1e-150, or 0.
+and any backend, or Python floats, which are float64. NaN in gives NaN out. Precondition: k from 2⁻²⁰
+to 2²⁰; in float64 cosines above 1e-150, or 0.
 """
 
 from __future__ import annotations

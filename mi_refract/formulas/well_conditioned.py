@@ -106,7 +106,7 @@ def refract_promoted(
     itself still scales the tangent. `local`: `local_cosines`, where `n` is an axis and they are known already.
     Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted (). `a`, `n` of any length from 1e-18 to 1e18.
     Source: this project.
-    Weak nowhere for k ≤ 1e6; slow where float64 is (consumer GPUs).
+    Weak nowhere for k ≤ 2²⁰; slow where float64 is (consumer GPUs).
     """
     if dr.type_v(a) != dr.VarType.Float32:
         return refract_compensated(a, n, k, contrast)
@@ -126,7 +126,7 @@ def refract_promoted(
     transmitted = (radicand >= 0) & (c != 0)
     along, scale = dr.select(transmitted, dr.mulsign(dr.safe_sqrt(radicand), c), -c), dr.select(transmitted, k2, 1)
     # κ = 0 leaves b = a to the last bit: √(c²) is |c| exactly, so the factor of n is 0. So it is for c = 0.
-    # Else k a + n (…) cancels to 4k·2⁻⁵³ |a|, which is u/128 for k = 1e6.
+    # Else k a + n (…) cancels to 5.5k·2⁻⁵³ |a|, which is 0.011u for k = 2²⁰ (LARGEST_RATIO).
     return type(a)(dr.fma(m, ieee_divide(dr.fma(-scale, c, along), dr.dot(m, m)), d * scale)), transmitted
 
 
@@ -161,7 +161,7 @@ def refract_compensated(a: Vector3, n: Vector3, k: Number, contrast: Number = No
     A plain evaluation b₀ (a few u off) is corrected by its exact defect in the two equations that define b, so the
     sum b₀ + δ is rounded once. `contrast`: κ where it is known better than k, for the radicand; `k` itself still
     scales the tangent. Shapes: `a`, `n` (3,), `k` () to b (3,), transmitted (). Source: this project.
-    Weak nowhere for k ≤ 1e6.
+    Weak nowhere.
     Precondition in float32: lengths of 1e-3 to 1e3, so that no product of four over- or underflows
     (`numerics.scale_to_unit` sees to it, in the entries of FORMULAS).
     """

@@ -6,8 +6,9 @@ Dr.Jit arrays. Out: indices in double precision, and their derivatives. Nothing 
 
 from . import glass_catalogs
 from .dispersion import LINES
+from .materials import LABORATORY_AIR
 from .medium import Medium
 from .ratio import relative_index
 from .specification import index, parse
 
-__all__ = ["LINES", "Medium", "glass_catalogs", "index", "parse", "relative_index"]
+__all__ = ["LABORATORY_AIR", "LINES", "Medium", "glass_catalogs", "index", "parse", "relative_index"]

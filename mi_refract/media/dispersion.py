@@ -159,8 +159,9 @@ class Table:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the coefficients: `n_587_6` is n at 587.6 nm."""
-        return tuple("n_" + f"{knot:.9g}".replace(".", "_") for knot in self.knots)
+        """Names of the coefficients: `n_587_6` is n at 587.6 nm; of nine digits, or 17 where knots agree to nine."""
+        digits = 9 if len({f"{knot:.9g}" for knot in self.knots}) == len(self.knots) else 17
+        return tuple("n_" + f"{knot:.{digits}g}".replace(".", "_") for knot in self.knots)
 
     def _weights(self, wavelength: Number) -> list[Number]:
         """For each knot, by how much its value counts; they are 0 beyond the first knot and the last."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 
 import drjit as dr
@@ -25,6 +26,7 @@ class Medium:
     valid: tuple[float, float] = ANY  # nm; outside there is no index
     relative_to: str = ""  # "air" (20 °C, 101325 Pa, dry) or "vacuum"; "" where it is not said
     is_air: bool = False
+    fitted: tuple[float, float] = ANY  # nm; outside, but within `valid`, the formula extrapolates
 
     @property
     def dispersive(self) -> bool:
@@ -36,7 +38,7 @@ class Medium:
 
         wavelength: float, numpy array of any shape, or Dr.Jit array. coefficients: other values of some of the medium's
         own, for derivatives. Outside `valid`, or where n is not a positive number: NaN in Dr.Jit arrays, ValueError for
-        the others.
+        the others. Outside `fitted`: a warning, but for Dr.Jit arrays.
         """
         found = self.index_or_nan(wavelength, coefficients)
         if not dr.is_array_v(wavelength):
@@ -47,6 +49,11 @@ class Medium:
                 at = np.atleast_1d(wavelength)[np.isnan(np.atleast_1d(found))][0]
                 text = f"{self.name}: no index at {at:g} nm"
                 raise ValueError(f"{text}; accepted: a wavelength from {low:g} to {high:g} nm")
+            low, high = self.fitted
+            asked = np.atleast_1d(wavelength)
+            if (beyond := asked[(asked < low) | (asked > high)]).size:
+                text = f"{self.name}: the index at {beyond[0]:g} nm is an extrapolation"
+                warnings.warn(f"{text}; its formula is fitted from {low:g} to {high:g} nm", stacklevel=2)
         return found
 
     def index_or_nan(self, wavelength: Number, coefficients: Coefficients | None = None) -> Number:

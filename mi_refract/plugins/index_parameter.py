@@ -44,7 +44,7 @@ def read_index(v: Any, props: Any, name: str, default: str) -> Any:
         raise ValueError(f"{label} = {value!r}: accepted: {ACCEPTED}")
     if not knots.wavelengths:
         return media.parse(knots.values[0], name=label)
-    table = "table(" + ", ".join(f"{w:.9g}: {n:.9g}" for w, n in zip(*knots, strict=True)) + ")"
+    table = "table(" + ", ".join(f"{w!r}: {n!r}" for w, n in zip(*knots, strict=True)) + ")"
     if not v.is_spectral:
         raise ValueError(f"{label}: a spectrum has become a colour here; accepted: {name} = {table!r}, a string")
     return media.parse(table, name=label)

@@ -82,6 +82,7 @@ def numbers_of(ids: np.ndarray, rays: Rays, header: Header) -> np.ndarray:
 class Answers:
     """A program's answers: ids (N,), b (N, 3) float64, the column `transmitted` (N,) if there is one, the header.
 
+    `transmitted`: of True and False, or of 1 and 0.
     `n_ratio`: (N,) the n_from / n_to that the program used, if it says so.
     """
 
@@ -92,10 +93,14 @@ class Answers:
     n_ratio: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        """ValueError where the shapes do not match."""
+        """ValueError where the shapes do not match, and for a `transmitted` that is neither 0 nor 1."""
         more = [each.shape for each in (self.transmitted, self.n_ratio) if each is not None]
         if self.b.shape != (len(self.ids), 3) or any(shape != self.ids.shape for shape in more):
             raise ValueError(f"answers: b is {self.b.shape} for {len(self.ids)} ids; accepted: a direction for each id")
+        if self.transmitted is not None:
+            if (wrong := self.transmitted[~np.isin(self.transmitted, (0, 1))]).size:
+                raise ValueError(f"answers: transmitted is {wrong[0]}; expected 0 or 1")
+            object.__setattr__(self, "transmitted", self.transmitted.astype(bool))  # `~` of an integer is another one
 
 
 def default(media: Sequence[str] = ()) -> tuple[str, ...]:

@@ -5,6 +5,10 @@
 s² is the mean of m independent contrasts between passes (`PassSums.contrasts`), and the squared error of this image is
 one more quantity of their distribution. So with 95 % probability it lies within  s² ± t s_c √(1 + 1/m),  s_c their
 standard deviation, as far as passes are normally distributed: what no sample has met yet is in no estimate.
+
+Of a single pass there is no contrast, and s² is that of its samples, as if they were independent. Where the sampler
+stratifies them their mean varies less, Var(x̄) ≤ s²/n for strata of equal probability (Cochran, Sampling Techniques,
+1977, 5.6), so this is an upper bound.
 """
 
 from __future__ import annotations
@@ -27,11 +31,15 @@ DARK = 0.01  # of the image's mean: a darker tile is judged as if it were so bri
 
 @dataclass(frozen=True)
 class RelativeError:
-    """The estimate, and where the error of this image lies with probability LEVEL; NaN where too little is known."""
+    """The estimate, and where the error of this image lies with probability LEVEL; NaN where too little is known.
+
+    `at_most`: it is that of independent samples, an upper bound for stratified ones.
+    """
 
     value: float
     low: float = math.nan
     high: float = math.nan
+    at_most: bool = False
 
 
 def relative_error(sums: PassSums) -> RelativeError:
@@ -43,15 +51,13 @@ def relative_error(sums: PassSums) -> RelativeError:
     if not mean > 0 or not sums.freedom:
         return RelativeError(math.nan)
     squared, spread = float(found.mean()) if found.size else math.nan, math.nan
-    if sums.within is not None:  # what samples say of it is more than what so few passes say
-        variance = sums.variance
-        assert variance is not None
+    if at_most := not found.size and (variance := sums.variance) is not None:
         known = np.isfinite(variance := variance[..., : sums.colours])
         squared = float(variance[known].mean())
     if found.size > 1:
         spread = _quantile(found.size - 1) * float(found.std(ddof=1)) * math.sqrt(1 + 1 / found.size)
     value, low, high = (math.sqrt(max(x, 0) / sums.spp) / mean for x in (squared, squared - spread, squared + spread))
-    return RelativeError(value, low, high)
+    return RelativeError(value, low, high, at_most)
 
 
 def without_noise(sums: PassSums) -> bool:

@@ -17,6 +17,7 @@ from .pass_plan import FEW
 from .pass_sums import PassSums
 
 VARIANCE = "{}.variance"
+SAMPLES = "samples: an upper bound where the sampler stratifies them"
 _KEPT = ("spp", "passes", "identity", "contrasts", "variance_from", "machines", "render_seconds", "ended_by")
 
 
@@ -49,7 +50,7 @@ def write(output: Path, channels: tuple[str, ...], sums: PassSums, header: Metad
 
 def _source(sums: PassSums) -> str:
     """What the variance was estimated from."""
-    return "nothing" if not sums.freedom else "passes" if sums.within is None else "samples"
+    return "nothing" if not sums.freedom else "passes" if sums.within is None else SAMPLES
 
 
 def nonfinite_pixels(sums: PassSums) -> int:
@@ -76,7 +77,7 @@ def read(output: Path, channels: tuple[str, ...], identity: dict[str, Any]) -> P
         return None
     variance = np.broadcast_to(variance.astype(np.float64), mean.shape)
     # Their sum over freedom is the variance that the file holds; under a wide filter a pixel has the expected weight.
-    within = variance * (spp - passes) if said["variance_from"] == "samples" and passes < FEW else None
+    within = variance * (spp - passes) if said["variance_from"] == SAMPLES and passes < FEW else None
     sums = PassSums(spp, passes, mean * spp, variance * (passes - 1), within)
     sums.contrasts, sums.colours = contrasts, int(identity["colours"])
     machines = [name for name in str(said["machines"]).split(", ") if name]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mi_refract import oracle
+from mi_refract import oracle, regimes
 from mi_refract.accuracy import backward_error
 from mi_refract.regimes import Rays
 
@@ -97,6 +97,33 @@ def test_mirror_directions():
     off = backward_error.of_directions(turned(mirror, rays.a, EPSILON), rays, every)
     assert off == pytest.approx(np.full(len(rays), EPSILON / 3), rel=1e-4)  # a alone turns b once, n twice
     assert (backward_error.of_directions(mirror, rays) > 0.01).all()
+
+
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+@pytest.mark.parametrize("name", regimes.REGIMES)
+def test_a_rounded_exact_answer_is_off_by_no_more_than_its_rounding(name, precision):
+    """Rounding moves b by up to u |b|, and no input of h ≥ 1 need move farther than b does."""
+    rays = regimes.make(name, 400, precision, seed=5)
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    found = backward_error.of_directions(exact.direction.astype(precision), rays, ~exact.transmitted)
+    assert found.max() <= np.finfo(precision).eps / 2
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1e-14, 1e-9, 1e-3, 1.0])
+def test_mirror_directions_off_by_any_share_along_and_across(alpha):
+    """Next to the surface, `alpha` above it, b off by x in the plane of incidence and by y across it.
+
+    δa moves b by 1, δn by 2 along and 2 sin alpha across: there is a disc and an ellipse, of which 20001 tangents are
+    searched for the farthest.
+    """
+    sin, cos, turns = np.sin(alpha), np.cos(alpha), np.linspace(0, np.pi / 2, 20001)
+    rays = Rays(np.array([[cos, 0.0, -sin]]), np.array([[0.0, 0.0, 1.0]]), np.ones(1))
+    mirror, plane, across = np.array([[cos, 0, sin], [-sin, 0, cos], [0, 1, 0]])
+    for x, y in ((3, 0), (3, 1), (2, 2), (0.5, 1), (0, 1)):
+        b = (mirror + EPSILON * (x * plane + y * across))[None]
+        h = 1 + 2 * np.hypot(np.cos(turns), sin * np.sin(turns))
+        least = EPSILON * ((x * np.cos(turns) + y * np.sin(turns)) / h).max()
+        assert backward_error.of_directions(b, rays, np.ones(1, bool))[0] == pytest.approx(least, rel=2e-3)
 
 
 @pytest.mark.parametrize("distance", [1e-12, 1e-9, 1e-6, 1e-3])

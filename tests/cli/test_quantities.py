@@ -36,3 +36,4 @@ def test_what_is_no_time(text):
 def test_an_error_has_its_interval_where_there_is_one():
     assert shown_error(RelativeError(0.0042, 0.004, 0.0044)) == "0.42 % (0.4 to 0.44 %)"
     assert shown_error(RelativeError(0.0042)) == "0.42 %"
+    assert shown_error(RelativeError(0.0042, at_most=True)) == "at most 0.42 %"

@@ -144,6 +144,14 @@ def test_an_unknown_glass_has_nearest_names(call):
     assert "unknown glass" in err and "nearest: SCHOTT:N-BK7, " in err
 
 
+@pytest.mark.filterwarnings("default")
+def test_an_index_beyond_the_makers_fit_is_a_warning_in_one_line(call):
+    pytest.importorskip("opticalglass")
+    code, _, err = call("export", "--medium", "CDGM:D-ZF93", "--wavelengths", "2325", "-o", "r.csv")
+    assert (code, err.count("\n")) == (0, 1)
+    assert err.startswith("mi-refract: CDGM:D-ZF93: the index at 2325 nm is an extrapolation; ")
+
+
 def test_rays_and_media_do_not_choose_the_rays_both(call):
     code, _, err = call("check", "answers.csv", "--rays", "rays.csv", *OPTIONS)
     assert (code, "--rays rays.csv and --wavelengths: both choose the rays" in err) == (2, True)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mi_refract import oracle, regimes
-from mi_refract.accuracy import RayBounds, judge, judge_formula
-from mi_refract.formulas import FORMULAS, ROUNDING, Budget, cancelling, radicand_for
+from mi_refract.accuracy import RayBounds, evaluate, judge, judge_formula
+from mi_refract.formulas import FORMULAS, LARGEST_RATIO, ROUNDING, SMALLEST_RATIO, Budget, cancelling, radicand_for
 from mi_refract.formulas.bounds import root
 
 U = 2.0**-53
@@ -47,6 +47,26 @@ def test_a_side_that_is_not_known_may_be_either():
     open_side, known = Budget(10, side=4), Budget(10)
     assert open_side.chord(U, 0.5, 0.8, cos_i=4 * U) == 10 * U + 1.6
     assert open_side.chord(U, 0.5, 0.8, cos_i=5 * U) == known.chord(U, 0.5, 0.8, cos_i=0.0) == 10 * U
+
+
+@pytest.mark.parametrize("end", [SMALLEST_RATIO, LARGEST_RATIO])
+@pytest.mark.parametrize("name", FORMULAS)
+def test_bounds_hold_up_to_the_least_and_the_largest_ratio_and_there_is_no_answer_beyond(name, end, setting):
+    """A factor of two up to either end, the refracted angle uniform in its sine."""
+    rng, count = np.random.default_rng(6), 40 if setting.backend == "scalar" else 4000
+    n, k = rng.normal(size=(count, 3)), end * rng.uniform(*((0.5, 1) if end > 1 else (1, 2)), count)
+    k[0], n = end, n / np.linalg.norm(n, axis=1, keepdims=True)
+    t = np.cross(n, rng.normal(size=(count, 3)))
+    sine = rng.uniform(0, 1, (count, 1)) / np.maximum(k, 1)[:, None]
+    a = sine * t / np.linalg.norm(t, axis=1, keepdims=True) - np.sqrt(1 - sine * sine) * n
+    rays = regimes.Rays(*(x.astype(setting.precision) for x in (a, n, k)))
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    formula = FORMULAS[name]
+    found = judge_formula(formula, rays, exact, setting.vector, formula.budget)
+    assert not found.wrong.any() and exact.transmitted.sum() > count / 2
+    beyond = regimes.Rays(rays.a, rays.n, rays.k * setting.precision(2 if end > 1 else 0.5))
+    b, transmitted = evaluate(formula, beyond, setting.vector)
+    assert np.isnan(b[0]).all() and not transmitted[0]
 
 
 @pytest.fixture(scope="module")

@@ -104,6 +104,13 @@ def test_of_a_table_each_knot_is_its_own_value():
     assert found.coefficient_slopes(500.0) == {"n_400": 0, "n_500": 1, "n_900": 0}
 
 
+def test_knots_that_agree_to_nine_digits_have_values_of_their_own():
+    close = math.nextafter(500.0, 600)
+    found = media.parse(f"table(400: 1.5, 500: 1.5, {close!r}: 1.6, 600: 1.7)")
+    assert [found.index(w) for w in (400.0, 450.0, 500.0, close, 600.0)] == [1.5, 1.5, 1.5, 1.6, 1.7]
+    assert len(found.coefficients) == 4
+
+
 def test_abbe_goes_through_both_of_its_numbers():
     found = media.parse("abbe(1.5168, 64.17)")
     n_d, n_f, n_c = (found.index(LINES[line]) for line in "dFC")

@@ -75,9 +75,31 @@ def test_a_glass_has_an_index_where_its_maker_prints_numbers():
 
 
 @READS
-def test_glasses_are_relative_to_air_and_named_in_any_case():
+@pytest.mark.parametrize(
+    ("glass", "valid", "fitted", "beyond"),
+    [
+        ("CDGM:D-ZF93", (400, 2400), (404, 1014), 2325.0),  # where its index is 1.9250 and the formula gives 1.9150
+        ("HOYA:BSC7", (280, 1550), (365, 1014), 1530.0),
+        ("SCHOTT:N-BK7", (290, 2500), (365, 2326), 334.1),
+        ("OHARA:S-BSL 7", (290, 2400), (365, 2325), 2400.0),
+    ],
+)
+def test_beyond_the_makers_fit_an_index_is_a_warning(glass, valid, fitted, beyond):
+    medium = media.parse(glass)
+    assert (medium.valid, medium.fitted) == (valid, fitted)
+    for inside in fitted:
+        medium.index(inside)
+    said = f"{glass}: the index at {beyond:g} nm is an extrapolation; .* {fitted[0]} to {fitted[1]} nm"
+    for asked in (beyond, [fitted[0], beyond]):
+        with pytest.warns(UserWarning, match=said):
+            medium.index(asked)
+
+
+@READS
+def test_glasses_are_relative_to_air_and_named_in_any_case_with_or_without_spaces():
     assert media.parse("schott:n-bk7").relative_to == "air"
     assert media.parse("schott:n-bk7").name == "SCHOTT:N-BK7"
+    assert media.parse("OHARA:S-BSL7").name == media.parse("ohara: s-bsl 7").name == "OHARA:S-BSL 7"
 
 
 @READS

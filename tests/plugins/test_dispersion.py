@@ -132,6 +132,14 @@ def test_light_outside_the_range_of_a_medium_is_lost(spectral_variant):
         assert weight[0] > 0 and weight[1] == 0 and np.isfinite(weight).all()
 
 
+def test_a_spectrum_may_jump_between_knots_that_agree_to_nine_digits(spectral_variant):
+    text = '<bsdf type="refract" version="3.0.0"><spectrum name="int_ior" value="{}"/><float name="ext_ior" value="1"/>'
+    bsdf = mi.load_string(text.format("360:1.5, 600:1.5, 600.00000001:1.6, 830:1.6") + "</bsdf>")
+    for wavelength, index in ((500.0, 1.5), (700.0, 1.6)):
+        bs, _ = sample(bsdf, tilted(0.5), REFRACTED, wavelengths=(wavelength, 500.0, 600.0, 700.0))
+        assert vector(bs.wo)[0] == pytest.approx(-math.sin(0.5) / index, rel=1e-6)
+
+
 def test_a_medium_whose_range_leaves_out_colour_is_refused(spectral_variant):
     with pytest.raises(RuntimeError, match=r"int_ior: .* from 420 to 830 nm: outside it is .* accepted: a medium with"):
         load("table(420: 1.5, 830: 1.4)")

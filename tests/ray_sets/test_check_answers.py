@@ -82,6 +82,10 @@ def test_the_exact_answers_are_exact(precision, names):
         assert max(each.worst for each in found.regimes) <= found.ulp
     flagged = check(to, Answers(to.ids, answers.b, certified.transmitted))
     assert (flagged.exit_code, flagged.tir) == (0, "flag")
+    for kind in (int, np.uint8, float):
+        assert check(to, Answers(to.ids, answers.b, certified.transmitted.astype(kind))).total("wrong") == 0
+    with pytest.raises(ValueError, match=r"^answers: transmitted is 2; expected 0 or 1$"):
+        Answers(to.ids, answers.b, np.full(len(to), 2))
 
 
 def test_the_shortest_decimals_of_float32_will_do():

@@ -56,6 +56,26 @@ def test_the_estimate_is_right_on_average(kind):
     assert estimated == pytest.approx(true, rel=0.08)
 
 
+@pytest.mark.parametrize(("passes", "at_most"), [(1, True), (2, False), (4, False)])
+def test_of_stratified_samples_the_estimate_is_right_or_said_to_be_a_bound(passes, at_most):
+    """Samples in n strata have the variance σ² (1 − 1/n³) n/(n − 1): n² + n + 1 times that of their mean is stated.
+
+    Of 60 renders each, over 432 values: standard errors of 1.3 %, so a tolerance of 8 % fails once in 10⁹ times.
+    """
+    n, truth, squares = 4, RNG.uniform(0.2, 2, SIZE), []
+    for _ in range(60):
+        tree = PassTree()
+        for _ in range(passes):
+            values = truth * (0.5 + (np.arange(n)[:, None, None, None] + RNG.random((n, *SIZE))) / n)
+            within = values.var(0) * n
+            tree.add(PassSums(n, 1, values.sum(0), np.zeros(SIZE), within))
+        found = relative_error(tree.sums())
+        squares.append((found.value**2, true_error(tree.sums(), truth) ** 2))
+        assert found.at_most == at_most
+    estimated, true = np.mean(squares, 0)
+    assert estimated == pytest.approx(true * (n * n + n + 1 if at_most else 1), rel=0.08)
+
+
 def count_beyond(kind, judge):
     """Of 500 renders that end where `judge(sums)` says: how many have an error above the one asked for.
 

@@ -43,9 +43,7 @@ def test_a_formula_with_another_unit_is_found(catalog, monkeypatch):
 @READS
 def test_a_glass_with_the_numbers_of_another_is_found(monkeypatch):
     glasses = dict(glass_catalogs.read("SCHOTT"))
-    glasses["N-BK7"] = glasses["N-BK7HT"].__class__(
-        glasses["N-BK7"].coefficients, glasses["F2"].printed, glasses["F2"].v_d, glasses["F2"].range
-    )
+    glasses["N-BK7"] = replace(glasses["N-BK7"], printed=glasses["F2"].printed, v_d=glasses["F2"].v_d)
     monkeypatch.setattr(glass_catalogs, "read", lambda catalog: glasses)
     assert set(catalogs._row("SCHOTT").broken) == {"largest miss"}
 
