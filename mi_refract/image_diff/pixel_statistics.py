@@ -9,6 +9,10 @@ Where renders are equal u is skewed to the right at every pixel: as a form Σ a�
 has one positive eigenvalue among many negative ones, and Σ aⱼₖ³ ≥ 0. That makes large S rarer: a long right tail is
 in Σu² twice. Where pixels correlate, Σu² is too small by at most the inflation F of tile means, since ρ² ≤ |ρ|; with F
 estimated at f degrees of freedom the expectation of the bound over that estimate is (1 + s²/f)^(−f/2).
+
+Rare light is skewed to the left where the sides have n₁ > n₂ samples: the small side has none in most pixels, there v₂
+is 0, and u = m₁² > 0. Equal images have one variance of a sample. With the estimates exchanged, v₁ n₁/n₂ + v₂ n₂/n₁,
+such a pixel has u < 0, and single events of the small side are a tail on the right. A tile must differ by both.
 """
 
 from __future__ import annotations
@@ -27,7 +31,10 @@ ROUNDING = 1e-12  # of m²: more than that of u in float64, which is some 1e-16 
 
 @dataclass(frozen=True)
 class PixelSums:
-    """Sums of u and of its square over the pixels of each tile and channel: tiles × tiles × C."""
+    """Sums of u and of its square over the pixels of each tile and channel: 1 or 2 × tiles × tiles × C.
+
+    The second with the estimates of the variances exchanged, where the sides have different numbers of samples.
+    """
 
     total: Array
     squares: Array
@@ -48,29 +55,38 @@ class PixelSums:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             s2 = np.where(total <= 0, 0.0, np.square(total) / (factor * squares))
         exponent = s2 if np.isinf(freedom) else freedom * np.log1p(s2 / freedom)
-        bound: Array = np.exp(-exponent / 2)
+        bound: Array = np.exp(-exponent / 2).max(0)
         return bound
 
 
-def sums(m1: Array, v1: Array, m2: Array, v2: Array, tile: int) -> PixelSums:
-    """Of the means of both sides and the variances of these means, float64, H × W × C."""
+def sums(m1: Array, v1: Array, m2: Array, v2: Array, tile: int, ratio: Array | float = 1.0) -> PixelSums:
+    """Of the means of both sides and the variances of these means, float64, H × W × C.
+
+    `ratio`: samples of the first side over those of the second, of all channels or of each.
+    """
     # Light that one render found alone has u = 0: its rounding, the same everywhere, must not add up.
-    excess = np.square(m2 - m1) - v1 - v2 - ROUNDING * (np.square(m1) + np.square(m2))
-    return PixelSums(block_sum(excess, tile), block_sum(np.square(excess), tile))
+    squared = np.square(m2 - m1) - ROUNDING * (np.square(m1) + np.square(m2))
+    noise = [v1 + v2] if np.all(ratio == 1) else [v1 + v2, ratio * v1 + v2 / ratio]
+    found = [squared - each for each in noise]
+    return PixelSums(*(np.stack([block_sum(x, tile) for x in each]) for each in (found, map(np.square, found))))
 
 
-def sums_of_renders(reference: Sequence[Array], test: Sequence[Array], tile: int) -> PixelSums:
-    """Of two sets of independent renders, each H × W × C, at least 2 a side; needs memory for rows of tiles only."""
+def sums_of_renders(reference: Sequence[Array], test: Sequence[Array], tile: int, ratio: float = 0.0) -> PixelSums:
+    """Of two sets of independent renders, each H × W × C, at least 2 a side; needs memory for rows of tiles only.
+
+    `ratio`: as in `sums`; 0: that of their numbers.
+    """
+    ratio = ratio or len(reference) / len(test)
 
     def band(top: int) -> PixelSums:
         one, two = (_mean_and_variance([each[top : top + tile] for each in side]) for side in (reference, test))
-        return sums(*one, *two, tile)
+        return sums(*one, *two, tile, ratio)
 
     from concurrent.futures import ThreadPoolExecutor
 
     with ThreadPoolExecutor(WORKERS) as pool:
         bands = list(pool.map(band, range(0, reference[0].shape[0], tile)))
-    return PixelSums(*(np.concatenate(each) for each in ([b.total for b in bands], [b.squares for b in bands])))
+    return PixelSums(*(np.concatenate(each, -3) for each in ([b.total for b in bands], [b.squares for b in bands])))
 
 
 def _mean_and_variance(renders: Sequence[Array]) -> tuple[Array, Array]:

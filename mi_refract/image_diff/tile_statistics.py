@@ -4,6 +4,16 @@ Per tile and channel the means m₁, m₂ are compared by t = (m₁ − m₂)/�
 sum of its pixels' variances over the renders, and its degrees of freedom follow Satterthwaite: a tile of 16² pixels
 knows its noise much better than the few renders do. (Welch 1947; Satterthwaite 1946; for renderers Jung, Hanika and
 Dachsbacher, "Detecting Bias in Monte Carlo Renderers using Welch's t-test", JCGT 2020.)
+
+Where one side has fewer samples than the other, n₂ < n₁, and light is rare, it may have none of that light in a tile,
+and a variance near 0. Equal images have the same variance σ² of a sample, so the estimates s₁², s₂² may be exchanged:
+the variance of m₁ − m₂ is the larger of s₁²/n₁ + s₂²/n₂ and s₁²/n₂ + s₂²/n₁. The second is the pooled estimate times
+(1/n₁ + 1/n₂), and with n₁ = n₂ the first. With that, for light of equal events at a rate λ on the small side:
+
+- too few of them: no events are −√λ standard deviations, and P(t ≤ −x) ≤ exp(−x²/2) as for every mean of values of at
+  least 0 (Maurer 2003): no tile with fewer than x² expected events is an alarm at −x;
+- too many: k of them are x ≤ (k − λ)/√k by their own variance, and P ≤ exp(−(k ln(k/λ) − k + λ)) ≤ exp(−x²/2)
+  (Chernoff; with r = λ/k, −ln r − 1 + r ≥ (1 − r)²/2).
 """
 
 from __future__ import annotations
@@ -52,9 +62,10 @@ class Inflation:
 class Side:
     """Totals per tile and channel: `mean`, `variance` of the means and its square, over pixels; `renders` one by one.
 
-    `freedom`: degrees of freedom of a pixel's variance. Without `renders` pixels are taken for independent. `borrowed`:
-    the channels whose noise only the other side knows; its `variance` is that of both. `correlated`: its `inflation`,
-    where that is known without `renders`.
+    `freedom`: degrees of freedom of a pixel's variance. `count`: samples behind a pixel, in the unit of the other side;
+    of all channels or of each. Without `renders` pixels are taken for independent. `borrowed`: the channels whose noise
+    only the other side knows; its `variance` is that of both. `correlated`: its `inflation`, where that is known
+    without `renders`.
     """
 
     area: Array
@@ -62,6 +73,7 @@ class Side:
     variance: Array
     squares: Array
     freedom: float
+    count: Array | float = 1.0
     renders: Array | None = None
     borrowed: Flags | None = None
     correlated: Inflation = field(default_factory=Inflation)
@@ -97,8 +109,11 @@ class Side:
         return Inflation(max(1.0, float((between / self.variance[noisy]).mean())), freedom)
 
 
-def from_renders(renders: Sequence[Array], tile: int) -> Side:
-    """One side from independent renders, each H × W × C; needs memory for a row of tiles only."""
+def from_renders(renders: Sequence[Array], tile: int, count: float = 0.0) -> Side:
+    """One side from independent renders, each H × W × C; needs memory for a row of tiles only.
+
+    `count`: samples per pixel of all of them, if the other side's are known, too; 0: as many as there are renders.
+    """
     height, width = renders[0].shape[:2]
     columns = np.arange(0, width, tile)
 
@@ -117,14 +132,18 @@ def from_renders(renders: Sequence[Array], tile: int) -> Side:
 
     with ThreadPoolExecutor(WORKERS) as pool:
         each, noise = (np.stack(x, -3) for x in zip(*pool.map(band, range(0, height, tile)), strict=True))
-    return Side(block_area(height, width, tile), each.mean(0), noise[0], noise[1], len(renders) - 1.0, each)
+    area, freedom = block_area(height, width, tile), len(renders) - 1.0
+    return Side(area, each.mean(0), noise[0], noise[1], freedom, count or len(renders), each)
 
 
-def from_variances(mean: Array, variance: Array, freedom: float, tile: int) -> Side:
-    """One side from an image and the variance of its pixels, both H × W × C; `freedom`: of that variance."""
+def from_variances(mean: Array, variance: Array, freedom: float, tile: int, count: Array | float = 1.0) -> Side:
+    """One side from an image and the variance of its pixels, both H × W × C; `freedom`: of that variance.
+
+    `count`: samples per pixel.
+    """
     area = block_area(mean.shape[0], mean.shape[1], tile)
     squares = np.square(variance, dtype=np.float64)
-    return Side(area, block_sum(mean, tile), block_sum(variance, tile), block_sum(squares, tile), freedom)
+    return Side(area, block_sum(mean, tile), block_sum(variance, tile), block_sum(squares, tile), freedom, count)
 
 
 @dataclass(frozen=True)
@@ -160,14 +179,18 @@ class Level:
 
         A difference δ is seen where δ ≥ margin + (t(1 − p/2) + t(1 − MISSED)) · error.
         """
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return (self.reach(threshold) + self.allowed) / self.mean
+
+    def reach(self, threshold: float) -> Array:
+        """By how much the differences that are seen exceed the margin; NaN without light or noise."""
         from scipy import special
 
         asked = ~self.silent & self.lit
         freedom = self.freedom[asked]
-        reach = -special.stdtrit(freedom, threshold / 2) - special.stdtrit(freedom, MISSED)
         found = np.full(self.mean.shape, np.nan)
-        found[asked] = (reach * self.error[asked] + self.allowed[asked]) / self.mean[asked]
-        return found
+        found[asked] = -special.stdtrit(freedom, threshold / 2) - special.stdtrit(freedom, MISSED)
+        return found * self.error
 
 
 def levels(reference: Side, test: Side, equivalence_margin: float, pixels: PixelSums | None = None) -> Iterator[Level]:
@@ -191,27 +214,43 @@ def compare_tiles(
     equivalence_margin: float,
     inflations: tuple[Inflation, Inflation] = (Inflation(), Inflation()),
 ) -> Level:
-    """Welch's t-test of every tile; differences up to `equivalence_margin` × the tile's mean count as none."""
+    """Welch's t-test of every tile; differences up to `equivalence_margin` × the tile's mean count as none.
+
+    That mean is the one of the side with more samples.
+    """
     from scipy import special
 
     with np.errstate(divide="ignore", invalid="ignore"):
         m1, m2 = one.mean / one.area, two.mean / two.area
-        v1, d1 = one.spread(inflations[0])
-        v2, d2 = two.spread(inflations[1])
-        variance = v1 + v2
-        allowed = equivalence_margin * np.maximum(np.abs(m1), DARK * median_nonblack(np.abs(m1)))
+        ratio = one.count / two.count
+        own, exchanged = (_noise(one, two, inflations, each) for each in (1.0, ratio))
+        larger = exchanged[0] > own[0]
+        variance, squares, few = (np.where(larger, y, x) for x, y in zip(own, exchanged, strict=True))
+        mean = np.abs(np.where(ratio >= 1, m1, m2))
+        allowed = equivalence_margin * np.maximum(mean, DARK * median_nonblack(mean))
         silent, error, difference = variance == 0, np.sqrt(variance), m2 - m1
-        freedom = np.where(silent, 1.0, variance**2 / (d1 + d2))
+        freedom = np.where(silent, 1.0, variance**2 / squares)
         t = np.where(silent, 0.0, difference / error)
         beyond = np.where(silent, 0.0, np.maximum(np.abs(difference) - allowed, 0) / error)
-        few = (one.variance + two.variance) ** 2 < HEAVY * (one.squares + two.squares)
         for side in (one, two):
             if side.borrowed is not None:
                 few |= side.borrowed & (error > BORROWED * np.maximum(np.abs(m1), np.abs(m2)))
         off = silent & (np.abs(difference) > allowed)
     # NaN becomes 0: what is not finite equals nothing.
     p, p_beyond = (np.nan_to_num(2 * special.stdtr(freedom, -np.abs(x)), nan=0.0) for x in (t, beyond))
-    return Level(t, p, p_beyond, silent, off, few & ~silent, np.abs(m1), allowed, error, freedom)
+    return Level(t, p, p_beyond, silent, off, few & ~silent, mean, allowed, error, freedom)
+
+
+def _noise(
+    one: Side, two: Side, inflations: tuple[Inflation, Inflation], ratio: Array | float
+) -> tuple[Array, Array, Flags]:
+    """The variance of m₁ − m₂, s₁²/n₂ + s₂²/n₁ where `ratio` is n₁/n₂, s₁²/n₁ + s₂²/n₂ where it is 1.
+
+    Its square over its degrees of freedom; and whether it comes from few pixels.
+    """
+    (v1, d1), (v2, d2) = one.spread(inflations[0]), two.spread(inflations[1])
+    few = (ratio * one.variance + two.variance / ratio) ** 2 < HEAVY * (ratio**2 * one.squares + two.squares / ratio**2)
+    return ratio * v1 + v2 / ratio, ratio**2 * d1 + d2 / ratio**2, few
 
 
 def _with_pixels(level: Level, pixels: PixelSums, area: Array, inflation: Inflation) -> Level:
@@ -337,6 +376,20 @@ class TileTests:
         finest = self.levels[0]
         hidden = (finest.detectable(self.threshold) > resolution).sum((0, 1)).max()
         return float(hidden / max(finest.lit.any(-1).sum(), 1))
+
+    def quieter(self, resolution: float, hidden: float) -> float:
+        """The factor by which the noise's variance must fall for `resolution` to be seen in all but `hidden` tiles.
+
+        And in the median tile; at most 1, NaN without light or noise, 0 where no noise is low enough.
+        """
+        finest = self.levels[0]
+        room = np.maximum(resolution * finest.mean - finest.allowed, 0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            enough = np.sort(np.square(room / finest.reach(self.threshold)).reshape(-1, finest.mean.shape[-1]), 0)
+        allowed = int(hidden * max(finest.lit.any(-1).sum(), 1))  # NaN, of other tiles, is sorted last
+        if not np.isfinite(enough).any():
+            return np.nan
+        return float(np.nanmin([1.0, np.nanmedian(enough), *enough[min(allowed, len(enough) - 1)]]))
 
     def _seen(self, level: Level) -> Flags:
         return (level.beyond <= self.threshold) & ~level.silent

@@ -111,7 +111,7 @@ def untested(reference: Image, test: Image) -> list[Image]:
 
 
 def _estimate(image: Image, side: str, given: int, allow_nonfinite: bool) -> Estimate:
-    names, pairs, spp = means(image.channels), spreads(image.channels), _spp(image, side, given)
+    names, pairs, spp = means(image.channels), spreads(image.channels), samples(image, side, given)
     mean = image.select(names).astype(np.float64)
     variance = np.full(mean.shape, np.nan)
     for i, name in enumerate(names):
@@ -135,12 +135,15 @@ def _estimate(image: Image, side: str, given: int, allow_nonfinite: bool) -> Est
     return Estimate(bare, variance, spp, freedom, _is_filtered(image, freedom < spp - 1))
 
 
-def _spp(image: Image, side: str, given: int) -> int:
-    """The samples per pixel that are given, or else those of the header, which may hold anything."""
+def samples(image: Image, side: str, given: int, least: int = 2) -> int:
+    """The samples per pixel that are given, or else those of the header, which may hold anything.
+
+    ValueError, which names the option of that `side`, for fewer than `least` and for what is no such number.
+    """
     found = given or image.metadata.get(SPP, "no samples per pixel")
-    if not re.fullmatch(r"[0-9]{1,15}(\.0)?", text := str(found)) or float(text) < 2:
+    if not re.fullmatch(r"[0-9]{1,15}(\.0)?", text := str(found)) or float(text) < least:
         where = "samples per pixel:" if given else "its header names"
-        raise ValueError(f"{image.path}: {where} {shown(found)}; accepted: `spp` or `spp_{side}`, 2 to 10¹⁵")
+        raise ValueError(f"{image.path}: {where} {shown(found)}; accepted: `spp` or `spp_{side}`, {least} to 10¹⁵")
     return int(float(text))
 
 

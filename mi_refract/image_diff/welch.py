@@ -26,8 +26,10 @@ from .tile_statistics import (
     levels,
     with_silent_pixels,
 )
-from .variances import Estimate, estimates, has_variance, same_noise
+from .variances import SPP, Estimate, estimates, has_variance, same_noise, samples
 
+SAMPLES = "samples per pixel"
+SIDES = ("reference", "new image")
 IDENTICAL = Metric("values that differ", 0.0, 0.0)
 
 
@@ -43,7 +45,7 @@ def compare_renders(
     resolution: Annotated[float, "relative difference that must be visible in a tile, or it is inconclusive"] = 0.05,
     hidden: Annotated[float, "share of the tiles, in any channel, whose noise may hide that difference"] = 0.1,
     pixels: Annotated[str, "test them, too: yes, or no for renders that share a fixed grid of samples"] = "yes",
-    spp: Annotated[int, "samples per pixel of images whose variance is known; 0: as their headers say"] = 0,
+    spp: Annotated[int, "samples per pixel of each image; 0: as their headers say"] = 0,
     spp_reference: Annotated[int, "the reference's, where the sides differ; 0: `spp`"] = 0,
     spp_test: Annotated[int, "the new image's, where the sides differ; 0: `spp`"] = 0,
 ) -> Comparison:
@@ -58,17 +60,22 @@ def compare_renders(
     Where the variance of one side alone is known, that of a sample is taken to be the same on the other (a z-test, for
     many samples). A renderer that samples worse than the reference did is different, then, however right its mean is.
 
+    A side with fewer samples than the other one is not taken to have less noise per sample than that one: it may have
+    missed rare light. Renders count alike, unless all of them say their samples per pixel.
+
     EQUAL, however noisy, where both hold the variance themselves and are the same in every value of every channel.
     INCONCLUSIVE where only tiles differ of which a t-test knows little (with the noise of a few pixels, or without
-    noise and by little or in a few pixels), and where the noise hides differences of `resolution`. ValueError for fewer
-    renders, the same render twice, options out of range, images that cannot be compared.
+    noise, and by little or in a few pixels), and where the noise hides differences of `resolution`, with the number of
+    samples that would show them. ValueError for fewer renders, the same render twice, options out of range, images that
+    cannot be compared.
     """
     _check(tile, family_error, correction, equivalence_margin, resolution, hidden)
     if pixels not in ("yes", "no"):
         raise ValueError(f"pixels = {pixels!r}: accepted: yes, no")
     known, whole = None, (reference[0], test[0])
+    given = spp_reference or spp, spp_test or spp
     if len(reference) == len(test) == 1 and (has_variance(reference[0]) or has_variance(test[0])):
-        known = estimates(reference[0], test[0], (spp_reference or spp, spp_test or spp), allow_nonfinite)
+        known = estimates(reference[0], test[0], given, allow_nonfinite)
         reference, test = [known[0].image], [known[1].image]
     for image in (*reference[1:], *test):
         if reason := preconditions(reference[0], image, allow_nonfinite):
@@ -76,12 +83,12 @@ def compare_renders(
     if known and same_noise(*whole):
         return Comparison("welch", Verdict.EQUAL, "the same in every value, noise and all", (IDENTICAL,))
     tile = min(tile, max(reference[0].pixels.shape[:2]))
-    sides = _of_estimates(*known, tile) if known else _of_renders(reference, test, tile)
+    sides = _of_estimates(*known, tile) if known else _of_renders(reference, test, tile, given)
     found = list(levels(sides.one, sides.two, equivalence_margin, sides.pixels if pixels == "yes" else None))
     a, b = (_finite(side[0].select(sides.channels)) for side in (reference, test))
     found[0] = with_silent_pixels(found[0], a, b, equivalence_margin, tile, sides.odds)
     tests = TileTests(found, family_error, correction)
-    verdict, reason = _verdict(tests, resolution, hidden)
+    verdict, reason = _verdict(tests, resolution, hidden, sides)
     maps = _maps(found[0], tile, reference[0].pixels.shape)
     return Comparison("welch", verdict, reason, _metrics(tests, resolution, hidden), tests.minimum_detectable(), maps)
 
@@ -103,16 +110,36 @@ def _check(tile: int, family_error: float, correction: str, margin: float, resol
 
 @dataclass(frozen=True)
 class _Sides:
-    """Both sides, the sums over their pixels, the channels that are tested, and the `odds` of `with_silent_pixels`."""
+    """Both sides, the sums over their pixels, the channels that are tested, and the `odds` of `with_silent_pixels`.
+
+    `counts`: the samples per pixel of both sides, or the renders: what `unit` says.
+    """
 
     one: Side
     two: Side
     pixels: PixelSums
     channels: Sequence[str]
+    counts: tuple[int, int]
+    unit: str
     odds: Pixels | float = 7.0
 
+    def deciding(self, quieter: float) -> str:
+        """How many samples or renders divide the noise's variance by 1/`quieter`; "" where no number does.
 
-def _of_renders(reference: Sequence[Image], test: Sequence[Image], tile: int) -> _Sides:
+        More on the side with fewer, up to the other's number; beyond that as many on both.
+        """
+        if not quieter > 0:
+            return ""
+        needed, most = quieter * (1 / self.counts[0] + 1 / self.counts[1]), max(self.counts)
+        rest = needed - 1 / most
+        alone = rest * most >= 1 and self.counts[0] != self.counts[1]
+        count, whose = (
+            (1 / rest, f"of the {SIDES[self.counts[0] > self.counts[1]]}") if alone else (2 / needed, "a side")
+        )
+        return f"; about {float(f'{count:.1e}'):,.0f} {self.unit} {whose} would decide"
+
+
+def _of_renders(reference: Sequence[Image], test: Sequence[Image], tile: int, given: tuple[int, int]) -> _Sides:
     if min(len(reference), len(test)) < 2:
         raise ValueError(
             f"welch: {len(reference)} and {len(test)} renders; accepted: at least 2 a side, or one a side with its "
@@ -121,7 +148,14 @@ def _of_renders(reference: Sequence[Image], test: Sequence[Image], tile: int) ->
     for side in (reference, test):
         _distinct(side)
     a, b = ([_finite(aligned(reference[0], image)[1]) for image in side] for side in (reference, test))
-    return _Sides(from_renders(a, tile), from_renders(b, tile), sums_of_renders(a, b, tile), reference[0].channels)
+    counts, unit = (len(reference), len(test)), "renders"
+    named = list(zip(("reference", "test"), given, (reference, test), strict=True))
+    if all(spp or SPP in each.metadata for _, spp, side in named for each in side):
+        n1, n2 = (sum(samples(each, name, spp, least=1) for each in side) for name, spp, side in named)
+        counts, unit = (n1, n2), SAMPLES
+    one, two = (from_renders(x, tile, count) for x, count in zip((a, b), counts, strict=True))
+    pixels = sums_of_renders(a, b, tile, counts[0] / counts[1])
+    return _Sides(one, two, pixels, reference[0].channels, counts, unit)
 
 
 def _of_estimates(a: Estimate, b: Estimate, tile: int) -> _Sides:
@@ -141,19 +175,20 @@ def _of_estimates(a: Estimate, b: Estimate, tile: int) -> _Sides:
     # pⁿ⁺ᵐ + odds pⁿ(1 − pᵐ) ≤ p over all values is at most 1, as that of 7 in `with_silent_pixels` is.
     odds = np.where(only_one, 1 + (a.spp - 1) / b.spp, np.where(only_two, 1 + (b.spp - 1) / a.spp, 7.0))
     # A variance that carries both means' is as well known as the side that knows it does; the other one's is 0 there.
-    one, two = from_variances(m1, w1, a.freedom, tile), from_variances(m2, w2, b.freedom, tile)
+    n1, n2 = (np.where(only_one | only_two, 1, each.spp) for each in (a, b))
+    one, two = from_variances(m1, w1, a.freedom, tile, n1), from_variances(m2, w2, b.freedom, tile, n2)
     found = inflation(m2 - m1, w1 + w2, tile) if a.filtered or b.filtered else Inflation()
     one = replace(one, borrowed=only_two, correlated=found if a.filtered else Inflation())
     two = replace(two, borrowed=only_one, correlated=found if b.filtered else Inflation())
-    return _Sides(one, two, sums(m1, w1, m2, w2, tile), names, odds)
+    return _Sides(one, two, sums(m1, w1, m2, w2, tile, n1 / n2), names, (a.spp, b.spp), SAMPLES, odds)
 
 
 def _distinct(side: Sequence[Image]) -> None:
-    """The same seed twice would halve the noise that is seen. Images without noise may be the same."""
+    """The same seed twice would halve the noise that is seen. Images without noise or without light may be the same."""
     if all(_identical(side[0], image) for image in side):
         return
     for a, b in itertools.combinations(side, 2):
-        if _identical(a, b):
+        if _identical(a, b) and (a.pixels != a.pixels[0, 0]).any():
             raise ValueError(f"{b.path}: the same image as {a.path}; accepted: independent renders, of other seeds")
 
 
@@ -166,7 +201,7 @@ def _finite(pixels: Pixels) -> Pixels:
     return pixels if np.isfinite(pixels).all() else np.where(np.isfinite(pixels), pixels, 0)
 
 
-def _verdict(tests: TileTests, resolution: float, hidden: float) -> tuple[Verdict, str]:
+def _verdict(tests: TileTests, resolution: float, hidden: float, sides: _Sides) -> tuple[Verdict, str]:
     counts = {
         "tests of tiles and channels": tests.differing,
         "of their pixels": tests.pixels_differing,
@@ -182,7 +217,8 @@ def _verdict(tests: TileTests, resolution: float, hidden: float) -> tuple[Verdic
         return Verdict.EQUAL, "no noise, and no tile differs beyond the margin"
     if not visible <= resolution or share > hidden:
         where = f"one of {visible:.2g} in the median tile, and one of {resolution:.2g} in {share:.3g} of the tiles"
-        return Verdict.INCONCLUSIVE, f"no difference is seen, but noise hides {where}"
+        more = sides.deciding(tests.quieter(resolution, hidden))
+        return Verdict.INCONCLUSIVE, f"no difference is seen, but noise hides {where}{more}"
     where = f"in a tile of median noise, and noise hides one of {resolution:.2g} in {share:.3g} of the tiles"
     return Verdict.EQUAL, f"no difference; one of {visible:.2g} would have been seen {where}"
 

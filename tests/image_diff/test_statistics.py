@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,8 @@ from mi_refract.io.image_file import Image
 SEEDS = range(10)
 
 
-def image(pixels, channels=("Y",)):
-    return Image(Path("a.exr"), np.asarray(pixels, np.float32), channels)
+def image(pixels, channels=("Y",), **rest):
+    return Image(Path("a.exr"), np.asarray(pixels, np.float32), channels, **rest)
 
 
 # Tiles -----------------------------------------------------------------------------------------------------------
@@ -154,9 +155,11 @@ def test_the_sums_of_the_pixels_are_their_own():
     found = pixel_statistics.sums_of_renders([*one], [*two], 8)
     v = one.var(0, ddof=1) / 3 + two.var(0, ddof=1) / 5
     u = np.square(one.mean(0) - two.mean(0)) - v
-    assert found.total.shape == (3, 3, 2)
-    np.testing.assert_allclose(found.total[1, 2], u[8:16, 16:24].sum((0, 1)))
-    np.testing.assert_allclose(found.squares[2, 0], np.square(u[16:20, :8]).sum((0, 1)))
+    exchanged = np.square(one.mean(0) - two.mean(0)) - one.var(0, ddof=1) / 5 - two.var(0, ddof=1) / 3
+    assert found.total.shape == (2, 3, 3, 2)
+    for i, each in enumerate((u, exchanged)):
+        np.testing.assert_allclose(found.total[i, 1, 2], each[8:16, 16:24].sum((0, 1)))
+        np.testing.assert_allclose(found.squares[i, 2, 0], np.square(each[16:20, :8]).sum((0, 1)))
 
 
 @pytest.mark.parametrize("value", [1.0, 0.7, 1e-5])
@@ -177,6 +180,75 @@ def test_what_is_not_finite_is_an_alarm():
     pixels = pixel_statistics.sums(*[broken] * 4, 16)
     (found,) = levels(*sides, 0.0, pixels)
     assert TileTests([found], 0.001).pixels_differing == 1
+
+
+# Sides of different numbers of samples --------------------------------------------------------------------------------
+
+
+def lit(rng, samples, base, probability, gain=1.0):
+    """A film of samples of Γ(4) noise around `base`, to which one in 1/`probability` adds 200; with its variance."""
+    shape = (64, 64, 1)
+    hits = rng.binomial(samples, probability, shape)
+    plain = base * rng.gamma(4 * samples, 1 / (4 * samples), shape)
+    spread = base**2 / 4 * rng.chisquare(samples - 1, shape) / (samples - 1)
+    spread += 200**2 * hits * (1 - hits / samples) / (samples - 1)
+    pixels = np.dstack([gain * (plain + 200 * hits / samples), gain**2 * spread])
+    return image(pixels, ("Y", "Y.variance"), metadata={"mi_refract:spp": samples})
+
+
+def lit_renders(rng, count, samples, base, probability):
+    found = [lit(rng, samples, base, probability) for _ in range(count)]
+    return [image(each.pixels[..., :1], metadata=each.metadata) for each in found]
+
+
+RARE = {"fireflies": (1.0, 3e-4), "a small lamp": (0.0, 1e-3), "a smaller one": (0.0, 1e-4)}
+SIDES = {
+    "films": (lambda rng, *light: (lit(rng, 1024, *light), lit(rng, 16, *light))),
+    "renders": (lambda rng, *light: (lit_renders(rng, 64, 4, *light), lit_renders(rng, 4, 4, *light))),
+    "renders of other counts": (lambda rng, *light: (lit_renders(rng, 8, 256, *light), lit_renders(rng, 8, 4, *light))),
+}
+
+
+@pytest.mark.parametrize("light", RARE)
+@pytest.mark.parametrize("form", SIDES)
+@pytest.mark.parametrize("first", [0, 1])
+def test_rare_light_that_the_smaller_side_missed_is_no_difference(light, form, first):
+    """At 0.1 % two or more alarms of 10 pairs have probability 4.5e-5, of any of these cases below 1e-3."""
+    alarms = 0
+    for seed in SEEDS:
+        sides = SIDES[form](np.random.default_rng(seed), *RARE[light])
+        found = compare("auto", sides[first], sides[1 - first])
+        alarms += found.verdict is Verdict.DIFFERENT
+        assert found.verdict is not Verdict.EQUAL
+        assert found.verdict is Verdict.DIFFERENT or found.reason.endswith("a side would decide")
+    assert alarms <= 1
+
+
+def test_normal_noise_keeps_its_power_between_4096_and_64_samples():
+    """3 % are more than what an equal pair says is missed in 1 % of the cases: more than 2 of 10 are below 2e-4."""
+    missed = 0
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        reference = lit(rng, 4096, 1.0, 0.0)
+        assert compare("auto", reference, lit(rng, 64, 1.0, 0.0)).minimum_detectable < 0.03
+        missed += compare("auto", reference, lit(rng, 64, 1.0, 0.0, 1.03)).verdict is not Verdict.DIFFERENT
+    assert missed <= 2
+
+
+@pytest.mark.parametrize(
+    "counts, whose", [((65536, 16), "of the new image"), ((64, 64), "a side"), ((32, 64), "a side")]
+)
+def test_as_many_samples_as_it_says_decide(counts, whose):
+    """Twice the number shows 5 % in so many tiles; half of it does not."""
+    rng, light = np.random.default_rng(4), (1.0, 0.0)
+    options = {"tile": 4, "hidden": 0.0}
+    found = compare("auto", *(lit(rng, count, *light) for count in counts), **options)
+    words = re.search(r"; about ([0-9,]+) samples per pixel (.*) would decide$", found.reason)
+    assert (found.verdict, words[2]) == (Verdict.INCONCLUSIVE, whose)
+    said = int(words[1].replace(",", ""))
+    for factor, verdict in ((0.5, Verdict.INCONCLUSIVE), (2, Verdict.EQUAL)):
+        asked = [counts[0] if whose != "a side" else int(factor * said), int(factor * said)]
+        assert compare("auto", *(lit(rng, count, *light) for count in asked), **options).verdict is verdict
 
 
 # Without noise -------------------------------------------------------------------------------------------------------
