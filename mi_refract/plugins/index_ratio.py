@@ -14,6 +14,7 @@ import mitsuba as mi
 from mi_refract import media
 from mi_refract.formulas import LARGEST_RATIO, SMALLEST_RATIO
 from mi_refract.media import Medium
+from mi_refract.numerics import differentiated, replace_grad
 
 from .index_parameter import PLUGIN, read_index
 from .who_asks import warn_once
@@ -49,9 +50,19 @@ class DispersiveRatio:
     def at(self, wavelength: Any) -> Any:
         """The ratio at a wavelength in nm, in float64; NaN outside the range of either medium."""
         inside, outside = (
-            {key[len(side) + 1 :]: x for key, x in self.exact.items() if key.startswith(side)} for side in SIDES
+            {key[len(side) + 1 :]: self._attached(key) for key in self.exact if key.startswith(side)} for side in SIDES
         )
         return media.relative_index(self.inside, self.outside, wavelength, inside, outside)
+
+    def _attached(self, key: str) -> Any:
+        """A coefficient in double precision, with a derivative in the number that is shown, formed in each render."""
+        shown, exact = self.shown[key], self.exact[key]
+        return replace_grad(exact, self.wide(shown)) if differentiated(shown) else exact
+
+    @property
+    def differentiated(self) -> bool:
+        """Whether a coefficient carries a derivative."""
+        return any(map(differentiated, self.shown.values()))
 
     def traverse(self, cb: Any) -> None:
         """Show the coefficients. No dot in a name: Mitsuba would call what was set by what follows the last one."""
@@ -62,13 +73,11 @@ class DispersiveRatio:
         """Take over coefficients that were set; those that were not keep their double precision."""
         for key in keys or self.shown:
             if key in self.shown:
-                if len(self.shown[key]) != 1:
-                    raise ValueError(f"{PLUGIN}: {key} has {len(self.shown[key])} entries; accepted: one number")
-                self.exact[key] = self._exact(self.shown[key])
+                shown = self.shown[key]
+                if len(shown) != 1:
+                    raise ValueError(f"{PLUGIN}: {key} has {len(shown)} entries; accepted: one number")
+                self.exact[key] = self.wide(dr.detach(shown)) if dr.is_jit_v(shown) else self.wide(shown[0])
         self._hide()
-
-    def _exact(self, shown: Any) -> Any:
-        return self.wide(shown) if dr.is_jit_v(shown) else self.wide(shown[0])
 
     def names(self) -> str:
         """The media, for a message."""
@@ -89,6 +98,7 @@ class TexturedRatio:
     """n_int/n_ext where one of them, or both, is a texture of numbers."""
 
     DRJIT_STRUCT: ClassVar = {"sides": dict}  # for frozen functions
+    differentiated = False  # of numbers: a texture's values carry their own
 
     def __init__(self, v: Any, sides: Mapping[str, Any]) -> None:
         """`v`: the variant's module. `sides`: a texture or a number of `int_ior` and of `ext_ior`."""

@@ -178,7 +178,7 @@ def test_contrast_is_formed_in_double_and_rounded_once(typical_variant):
     assert expected / exact > 2 * c  # so the contrast does count
 
 
-def test_eta_can_be_read_edited_and_is_an_attribute(typical_variant):
+def test_eta_can_be_read_and_edited(typical_variant):
     bsdf = load(int_ior=1.5, ext_ior=1)
     params = mi.traverse(bsdf)
     assert number(params["eta"]) == 1.5
@@ -186,10 +186,7 @@ def test_eta_can_be_read_edited_and_is_an_attribute(typical_variant):
     params.update()
     bs, _ = sample(bsdf, (0.6, 0, 0.8), 0.9)
     assert vector(bs.wo) == pytest.approx([-0.48, 0, -math.sqrt(1 - 0.48**2)], abs=1e-6)
-    assert np.array(bsdf.has_attribute("eta")).all()
-    assert not np.array(bsdf.has_attribute("roughness")).any()
     assert number(bsdf.eval_attribute_1("eta", interaction((0, 0, 1)))) == 1.25
-    assert vector(bsdf.eval_attribute_3("eta", interaction((0, 0, 1)))) == pytest.approx([1.25] * 3)
 
 
 def test_textures_are_traversed_and_tint_their_lobe_only(typical_variant):
@@ -203,15 +200,40 @@ def test_textures_are_traversed_and_tint_their_lobe_only(typical_variant):
     assert transmitted == pytest.approx(1)
 
 
-def test_attributes_of_a_texture_are_its_colour(scalar_variant):
-    colour = [0.2, 0.5, 0.8]
-    bsdf, si = load(specular_reflectance={"type": "rgb", "value": colour}), interaction((0, 0, 1))
-    assert vector(bsdf.eval_attribute_3("specular_reflectance", si)) == pytest.approx(colour)
-    assert vector(bsdf.eval_attribute("specular_reflectance", si)) == pytest.approx(colour)
-    assert number(load(specular_reflectance=0.4).eval_attribute_1("specular_reflectance", si)) == pytest.approx(0.4)
-    for evaluate in (bsdf.eval_attribute, bsdf.eval_attribute_1, bsdf.eval_attribute_3):
-        with pytest.raises(RuntimeError, match=r"no attribute 'roughness'; it has eta, specular_reflectance"):
-            evaluate("roughness", si)
+TINTS = {"specular_reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.8]}, "specular_transmittance": 0.4}
+
+
+@pytest.mark.parametrize("tints", [{}, TINTS], ids=["plain", "tinted"])
+@pytest.mark.parametrize("name", ["eta", *TINTS, "int_ior", "roughness"])
+def test_attributes_are_those_of_rough_glass(typical_variant, name, tints):
+    """In compiled variants what is absent is 0; in scalar ones both raise. (Smooth glass gives 0 for its eta.)"""
+    si, bsdfs = interaction((0, 0, 1)), (load(**tints), mi.load_dict({"type": "roughdielectric"} | tints))
+
+    def answers(bsdf):
+        found = [vector(bsdf.has_attribute(name)).any()]
+        for evaluate in (bsdf.eval_attribute, bsdf.eval_attribute_1, bsdf.eval_attribute_3):
+            try:
+                found.append(vector(evaluate(name, si)).tolist())
+            except RuntimeError:
+                found.append("raised")
+        return found
+
+    assert answers(bsdfs[0]) == answers(bsdfs[1])
+
+
+def test_an_attribute_is_asked_of_all_bsdfs_of_a_scene(jit):
+    """As scripts that write feature buffers do: of glass that lacks it, beside a plaster that has it."""
+    parts = {"glass": {"type": "sphere", "bsdf": {"type": "refract"}}}
+    plaster = {"type": "plastic", "specular_reflectance": 0.5}
+    parts["wall"] = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3), "bsdf": plaster}
+    scene = mi.load_dict({"type": "scene"} | parts)
+    x = mi.Float(0, 2)
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, 0, 5), mi.Vector3f(0, 0, -1)))
+    bsdf = si.bsdf()
+    has = bsdf.has_attribute("specular_reflectance")
+    assert vector(has).tolist() == [0, 1]
+    found = bsdf.eval_attribute_3("specular_reflectance", si, active=has)
+    assert np.array(found).T.tolist() == [[0] * 3, [0.5] * 3]
 
 
 @pytest.mark.parametrize(("keys", "eta"), [([], 1.25), (["eta"], 1.25), (["specular_reflectance"], 1.5)])
