@@ -16,7 +16,6 @@ from .segments import Array
 VISIBLE = 380.0, 730.0  # nm: where a number of wavelengths is spread over
 MOST = 256  # wavelengths
 POWERS = ("flat", "D65")
-AIR = media.parse("AIR:ciddor")
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class Light:
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
         if medium.relative_to == "vacuum":
-            n = n / AIR.index(wavelengths)
+            n = np.ones_like(n) if medium.is_air else n / media.LABORATORY_AIR.index(wavelengths)
         return tuple(float(x) for x in n)
 
 

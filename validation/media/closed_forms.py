@@ -60,7 +60,7 @@ def bow_row(reflections: int) -> Row:
     errors = []
     for wavelength in BOWS:
         scene = scene_file.load(FOLDER / "double_rainbow.toml", [wavelength])
-        n = media.index("MATERIAL:water", wavelength) / media.index("AIR:ciddor", wavelength)
+        n = media.index("MATERIAL:water", wavelength) / media.LABORATORY_AIR.index(wavelength)
         theta = math.acos(math.sqrt((n * n - 1) / (reflections * (reflections + 2))))
         inside = math.asin(math.sin(theta) / n)
         turn = 2 * (theta - inside) + reflections * (math.pi - 2 * inside)  # clockwise, of a ray above the axis
