@@ -18,6 +18,7 @@ from . import black, channels, flip, pixelwise, tolerance, variances, welch
 from .comparison import Comparison, Verdict, aligned, not_compared, shared_channels
 
 AUTO = "auto"
+DECIDING = {"hard_fail", "allow_failures"}  # options that say by how much a single pixel may differ
 
 Side = Image | Sequence[Image]
 
@@ -92,7 +93,8 @@ def compare(
 ) -> Comparison:
     """Compare two images, or two sequences of renders of one image, by a method of the table.
 
-    "auto" is `welch` where it can be, else `tolerance`; options of the other one are accepted and not used. Channels
+    "auto" is `welch` where it can be, else `tolerance`; options of the other one are accepted and not used. There one
+    outrageous pixel is a difference, too, unless `hard_fail` or `allow_failures` say what a pixel may do. Channels
     NAME.variance are what `welch` reads of single images, and otherwise left out, but for those that are `named`.
 
     INCONCLUSIVE where a method calls the images equal but would call a black one equal, too, or one with some of its
@@ -106,7 +108,18 @@ def compare(
     if method == AUTO:
         method, why = choice(*sides, spp=any(options.get(name) for name in ("spp", "spp_reference", "spp_test")))
         options = {name: value for name, value in options.items() if name in METHODS[method].options or _unknown(name)}
-        return replace(_compare(method, sides, allow_nonfinite, named, options), chosen=why)
+        found = replace(_compare(method, sides, allow_nonfinite, named, options), chosen=why)
+        failing = found.verdict is Verdict.EQUAL and found.metrics[0].value > 0
+        if method == "tolerance" and failing and not options.keys() & DECIDING:
+            a, b = (channels.without_variances(side[0], named) for side in sides)
+            one, two = (replace(a, pixels=_finite(x)) for x in aligned(a, b))
+            if far := tolerance.outrageous(
+                one, replace(two, path=b.path), options.get("fail", METHODS[method].options["fail"].default)
+            ):
+                return replace(
+                    found, verdict=Verdict.DIFFERENT, reason=f"one pixel is outrageous: {far}; {found.reason}"
+                )
+        return found
     return _compare(method, sides, allow_nonfinite, named, options)
 
 

@@ -37,6 +37,7 @@ HEAVY = 4.0  # a tile whose noise comes from fewer pixels than this is heavy-tai
 # of 100 rare events, ten times as frequent beyond 5 σ as normal noise: such a tile is heavy-tailed, too.
 BORROWED = 0.1
 POOLED = 30  # blocks of tiles from which the correlation of pixels is estimated again, at least
+FEW_STEPS = 8  # of a fixed point, each of which halves its error at least
 MISSED = 0.01  # the minimum detectable difference is missed with this probability
 FAR = 10.0  # times the margin: a pixel without noise that is so far off is evidence, see `with_silent_pixels`
 UNSEEN = 1e-3  # of the margin: a tile with less noise than this decides nothing, see `Side.inflation`
@@ -384,8 +385,12 @@ class TileTests:
         """
         finest = self.levels[0]
         room = np.maximum(resolution * finest.mean - finest.allowed, 0)
+        factor = np.ones_like(room)
         with np.errstate(invalid="ignore", divide="ignore"):
-            enough = np.sort(np.square(room / finest.reach(self.threshold)).reshape(-1, finest.mean.shape[-1]), 0)
+            for _ in range(FEW_STEPS):  # more samples are more degrees of freedom, too
+                reach = replace(finest, freedom=finest.freedom / factor).reach(self.threshold)
+                factor = np.sqrt(factor * np.minimum(np.square(room / reach), 1))
+        enough = np.sort(factor.reshape(-1, finest.mean.shape[-1]), 0)
         allowed = int(hidden * max(finest.lit.any(-1).sum(), 1))  # NaN, of other tiles, is sorted last
         if not np.isfinite(enough).any():
             return np.nan

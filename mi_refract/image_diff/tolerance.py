@@ -4,7 +4,8 @@ A pixel differs where one of its channels does: by more than `fail`, and by more
 both magnitudes. The bounds are asked in `idiff`'s order: up to `allow_failures` such pixels pass, whatever the others
 say; then `fail_percent` and `hard_fail` decide, and after them the same bounds for warnings.
 
-`tolerance_passes_black` says whether an all-black test image would pass with the same options,
+`outrageous` finds what `fail_percent` should not let pass: a pixel that is far brighter than all around it in the other
+image. `tolerance_passes_black` says whether an all-black test image would pass with the same options,
 `tolerance_accepts_black` in which pixels: there the method sees no difference.
 """
 
@@ -24,6 +25,9 @@ from .comparison import Comparison, Metric, Verdict, checked_pixels, counted, ve
 from .pixelwise import require_nonnegative
 
 BLOCK = 2**16  # pixels whose ratios are formed at once, in float64
+# A pixel is outrageous above both of these: a detail that moves by NEAR pixels is not, nor is any code value of a
+# display where the mean is more than a hundredth of white.
+TIMES_AROUND, TIMES_MEAN, NEAR = 10.0, 100.0, 2
 
 
 def tolerance(
@@ -72,6 +76,28 @@ def tolerance(
     quiet = verdict is not Verdict.EQUAL or failed <= allow_failures
     warning = "" if quiet else _warning(warned, largest, pixels, options, difference.dtype)
     return Comparison("tolerance", verdict, reason, metrics, maps=maps, warning=warning)
+
+
+def outrageous(reference: Image, test: Image, fail: float) -> str:
+    """Where one image is TIMES_AROUND as bright as the other is within NEAR pixels, and TIMES_MEAN its mean; or "".
+
+    Differences up to `fail` are none. Both images are finite and have the same channels in the same order.
+    """
+    names = (test, reference.pixels, test.pixels), (reference, test.pixels, reference.pixels)
+    for image, dim, bright in names:
+        size = np.abs(dim)
+        found = np.abs(bright) > np.maximum(TIMES_MEAN * size.mean((0, 1), dtype=np.float64), size + fail)
+        if found.any():
+            from scipy.ndimage import maximum_filter
+
+            around = maximum_filter(size, (2 * NEAR + 1, 2 * NEAR + 1, 1), mode="nearest")
+            excess = np.where(found & (np.abs(bright) > TIMES_AROUND * around), np.abs(bright), 0)
+            if excess.any():
+                y, x, _ = np.unravel_index(int(excess.argmax()), excess.shape)
+                most = f"{compact(float(excess.max()))}{_place(excess, reference)}, of {image.path}"
+                beside = f"{compact(float(around[y, x].max()))} in the other image within {NEAR} pixels"
+                return f"{most} for at most {beside}"
+    return ""
 
 
 def tolerance_passes_black(reference: Image, options: Mapping[str, Any]) -> bool:

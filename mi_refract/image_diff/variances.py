@@ -3,7 +3,8 @@
 A variance is that of one sample per pixel, as Mitsuba's test data and its `moment` integrator have it; that of the
 image follows by dividing by the samples per pixel. Its degrees of freedom are the samples per pixel − 1, unless the
 header says otherwise: where it was estimated from the spread between a few passes they are passes − 1. Samples are
-independent, but pixels of a file of `mi-refract render` are not, under a filter wider than a box.
+independent, but pixels of a file of `mi-refract render` are not, under a filter wider than a box: the means of its
+tiles vary (∫∫w)²/∫∫w² times as much as those of independent pixels, for weights w of at least 0 (2 radius)² at most.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from mi_refract.io.pixels import Pixels
 from mi_refract.io.toml_schema import shown
 
 from .channels import ROUNDED, XYZ, matched, means, selected, spreads
+from .pixel_correlation import RADIUS
 
 # m2 − m² below 0 by its rounding, in half floats 2⁻¹¹ of m2 and twice that of m²: no error. In Mitsuba's test data
 # 0.0022 is the most as X, Y, Z; as R, G, B 100 of its 111 files of colour are further below.
@@ -28,20 +30,22 @@ NEGATIVE = 4 * ROUNDED
 SPP = "mi_refract:spp"  # of a header
 FREEDOM = "mi_refract:variance_freedom"  # of a header
 FILTER = "mi_refract:filter_radius"  # of a header, in pixels: then variances are those of filtered pixels
+AREA = "mi_refract:filter_area"  # of a header, in pixels: (∫∫w)²/∫∫w² of the filter w
 
 
 @dataclass(frozen=True)
 class Estimate:
     """An image without channels of variance, and `variance`: H × W × C of one sample per pixel; NaN where unknown.
 
-    `freedom`: degrees of freedom of these variances. `filtered`: whether they are those of pixels that share samples.
+    `freedom`: degrees of freedom of these variances. `shared`: how many times as much the means of tiles vary as those
+    of independent pixels, as pixels share samples; None where that is to be estimated.
     """
 
     image: Image
     variance: Pixels
     spp: int
     freedom: int
-    filtered: bool
+    shared: float | None
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -76,7 +80,7 @@ def with_file(image: Image, path: Path, most: int = MAX_VALUES) -> Image:
         (height, width), wrong = image.pixels.shape[:2], found.pixels.shape[:2]
         raise ValueError(f"{path}: {wrong[1]} × {wrong[0]}; accepted: a variance of {width} × {height}")
     if FREEDOM in found.metadata:
-        said = {FREEDOM: _freedom(found), FILTER: found.metadata.get(FILTER, "")}
+        said = {FREEDOM: _freedom(found), **{name: found.metadata.get(name, "") for name in (FILTER, AREA)}}
         image = replace(image, metadata=image.metadata | said)
     if len(found.channels) == len(image.channels) == 1:
         return replace(image, variances={image.channels[0]: found.pixels[..., 0]})
@@ -132,7 +136,7 @@ def _estimate(image: Image, side: str, given: int, allow_nonfinite: bool) -> Est
             variance[..., i] = np.maximum(mean[..., i] * (1 - mean[..., i]), 0) * spp / (spp - 1)
     bare = replace(image, pixels=image.select(names), channels=tuple(names), variances={})
     freedom = _freedom(image) if FREEDOM in image.metadata and (image.variances or pairs) else spp - 1
-    return Estimate(bare, variance, spp, freedom, _is_filtered(image, freedom < spp - 1))
+    return Estimate(bare, variance, spp, freedom, _shared(image, freedom < spp - 1))
 
 
 def samples(image: Image, side: str, given: int, least: int = 2) -> int:
@@ -155,10 +159,19 @@ def _freedom(image: Image) -> int:
     return int(float(text))
 
 
-def _is_filtered(image: Image, of_passes: bool) -> bool:
-    """Whether neighbours share samples, as the header says; where it does not they may, if passes were compared."""
-    found = str(image.metadata.get(FILTER, ""))
-    return float(found) > 0.5 if re.fullmatch(r"[0-9]{1,6}(\.[0-9]{1,15})?", found) else of_passes
+def _shared(image: Image, of_passes: bool) -> float | None:
+    """`Estimate.shared` as the header says; where it does not pixels may share samples, if passes were compared."""
+    radius, area = (
+        float(found)
+        if re.fullmatch(r"[0-9]{1,6}(\.[0-9]{1,20})?", found := str(image.metadata.get(name, "")))
+        else None
+        for name in (FILTER, AREA)
+    )
+    if area is not None:
+        return max(area, 1.0)
+    if radius is None or RADIUS >= radius > 0.5:
+        return None if of_passes or radius else 1.0
+    return 1.0 if radius <= 0.5 else (2 * radius) ** 2
 
 
 def _not_negative(image: Image, name: str) -> Pixels:

@@ -53,9 +53,9 @@ def compare_renders(
 
     Two or more renders a side, or one a side whose variance is known (module `variances`): then pixels are taken for
     independent, as under a box filter. A wider filter leaves the means of tiles as they are, and hides differences of
-    pixels. Where the variance is that of filtered pixels, from a few passes, `pixel_correlation` is asked. Tests the
-    mean of single tiles, of blocks of them, and of the whole image; and whether their pixels scatter more than their
-    noise explains.
+    pixels. Where the variance is that of filtered pixels, the header says how wide the filter is, or
+    `pixel_correlation` estimates it. Tests the mean of single tiles, of blocks of them, and of the whole image; and
+    whether their pixels scatter more than their noise explains.
 
     Where the variance of one side alone is known, that of a sample is taken to be the same on the other (a z-test, for
     many samples). A renderer that samples worse than the reference did is different, then, however right its mean is.
@@ -177,9 +177,11 @@ def _of_estimates(a: Estimate, b: Estimate, tile: int) -> _Sides:
     # A variance that carries both means' is as well known as the side that knows it does; the other one's is 0 there.
     n1, n2 = (np.where(only_one | only_two, 1, each.spp) for each in (a, b))
     one, two = from_variances(m1, w1, a.freedom, tile, n1), from_variances(m2, w2, b.freedom, tile, n2)
-    found = inflation(m2 - m1, w1 + w2, tile) if a.filtered or b.filtered else Inflation()
-    one = replace(one, borrowed=only_two, correlated=found if a.filtered else Inflation())
-    two = replace(two, borrowed=only_one, correlated=found if b.filtered else Inflation())
+    found = inflation(m2 - m1, w1 + w2, tile) if None in (a.shared, b.shared) else Inflation()
+    one, two = (
+        replace(side, borrowed=borrowed, correlated=found if each.shared is None else Inflation(each.shared))
+        for side, borrowed, each in ((one, only_two, a), (two, only_one, b))
+    )
     return _Sides(one, two, sums(m1, w1, m2, w2, tile, n1 / n2), names, (a.spp, b.spp), SAMPLES, odds)
 
 

@@ -306,7 +306,7 @@ class LongRender:
         metadata = _metadata(self.job, ", ".join(formulas_in(self.scene)) or "none")
         sums = self.progress.sums()
         assert sums is not None
-        header = rendered_file.header(self.progress, sums, metadata, self.ended_by, self.renderer.filter_radius)
+        header = rendered_file.header(self.progress, sums, metadata | self.renderer.filter_header, self.ended_by)
         if not unchanged:
             rendered_file.write(self.output, self.renderer.channels, sums, header)
         self.checkpoint.unlink(missing_ok=True)

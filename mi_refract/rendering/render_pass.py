@@ -19,12 +19,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refract.io.image_file import Metadata
+
 from .pass_plan import FEW, scalar_seed_of, seed_of
 from .pass_sums import Doubles, PassSums
 from .sample_sums import Film, image_sums
 
 # One thread would be the caller's own, which keeps denormals: the others take them for 0, and bits would differ.
 LEAST_THREADS = 2
+STEP = 1 / 256  # of a pixel, at which filters are integrated
 COLOURS = ("R", "G", "B", "X", "Y", "Z")
 
 
@@ -45,10 +48,18 @@ class PassRenderer:
         return int(width), int(height)
 
     @property
-    def filter_radius(self) -> float:
-        """In pixels: what is more than 0.5 has neighbours share samples."""
+    def filter_header(self) -> Metadata:
+        """What a file says of the film's filter w: its radius in pixels, and its area (∫∫w)²/∫∫w².
+
+        The noise of a tile's mean has as many times the variance that it would have if pixels were independent. More
+        than 0.5, and 1, have neighbours share samples.
+        """
         rfilter = self.scene.sensors()[0].film().rfilter()
-        return 0.5 if rfilter.is_box_filter() else float(rfilter.radius())
+        if rfilter.is_box_filter():
+            return {"mi_refract:filter_radius": 0.5, "mi_refract:filter_area": 1.0}
+        weights = _weights(rfilter)
+        area = float((np.square(weights.sum()) / np.square(weights).sum() * STEP) ** 2)  # w is a product of two
+        return {"mi_refract:filter_radius": float(rfilter.radius()), "mi_refract:filter_area": area}
 
     @property
     def colours(self) -> int:
@@ -101,12 +112,9 @@ def _expected_weights(film: Any) -> Doubles | None:
     rfilter = film.rfilter()
     if rfilter.is_box_filter():
         return None
-    step = 1 / 256  # of a pixel
-    half = math.ceil(rfilter.radius() / step)
-    places = (np.arange(-half, half) + 0.5) * step
-    found = rfilter.eval(mi.Float(places)) if dr.is_jit_v(mi.Float) else [rfilter.eval(place) for place in places]
-    weights = np.where(np.abs(places) <= rfilter.radius(), np.array(found, np.float64), 0)
-    ends, sums = np.arange(-half, half + 1) * step, np.cumsum([0, *weights]) * step
+    weights = _weights(rfilter)
+    half = len(weights) // 2
+    ends, sums = np.arange(-half, half + 1) * STEP, np.cumsum([0, *weights]) * STEP
 
     def along(pixels: int) -> Doubles:
         middle = np.arange(pixels) + 0.5
@@ -115,6 +123,14 @@ def _expected_weights(film: Any) -> Doubles | None:
 
     width, height = (int(n) for n in film.crop_size())
     return np.asarray(along(height)[:, None, None] * along(width)[:, None])
+
+
+def _weights(rfilter: Any) -> Doubles:
+    """The weights in one dimension, at STEPs from −radius to radius."""
+    half = math.ceil(rfilter.radius() / STEP)
+    places = (np.arange(-half, half) + 0.5) * STEP
+    found = rfilter.eval(mi.Float(places)) if dr.is_jit_v(mi.Float) else [rfilter.eval(place) for place in places]
+    return np.where(np.abs(places) <= rfilter.radius(), np.array(found, np.float64), 0)
 
 
 def _keeps_samples(scene: Any) -> bool:

@@ -21,14 +21,13 @@ SAMPLES = "samples: an upper bound where the sampler stratifies them"
 _KEPT = ("spp", "passes", "identity", "contrasts", "variance_from", "machines", "render_seconds", "ended_by")
 
 
-def header(progress: Progress, sums: PassSums, metadata: Metadata, ended_by: str, filter_radius: float) -> Metadata:
+def header(progress: Progress, sums: PassSums, metadata: Metadata, ended_by: str) -> Metadata:
     """`metadata`, and what is known of the passes, whose sums are `sums`."""
     return metadata | {
         "mi_refract:spp": sums.spp,
         "mi_refract:passes": sums.passes,
         "mi_refract:variance_freedom": sums.freedom,
         "mi_refract:variance_from": _source(sums),
-        "mi_refract:filter_radius": filter_radius,
         "mi_refract:nonfinite_pixels": nonfinite_pixels(sums),
         "mi_refract:identity": json.dumps(progress.identity, sort_keys=True),
         "mi_refract:contrasts": json.dumps([float(f"{each:.9g}") for each in sums.contrasts]),

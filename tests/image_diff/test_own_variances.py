@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.ndimage import gaussian_filter
 
 from mi_refract.image_diff import accept, folders, panes, report_folder, self_test, settings_file, text_reports
 from mi_refract.image_diff.comparison import Verdict
@@ -20,8 +21,8 @@ from mi_refract.image_diff.methods import METHODS, choice, compare
 from mi_refract.image_diff.pixel_correlation import inflation
 from mi_refract.image_diff.results import Status
 from mi_refract.image_diff.settings import How, Settings
+from mi_refract.image_diff.variances import AREA, FREEDOM
 from mi_refract.image_diff.variances import FILTER as RADIUS
-from mi_refract.image_diff.variances import FREEDOM
 from mi_refract.image_diff.welch import compare_renders
 from mi_refract.io.image_file import Image, read, write_exr
 
@@ -197,6 +198,31 @@ def test_the_filter_says_whether_pixels_share_samples():
     of_samples, unnamed = {FREEDOM: PASSES * PER_PASS - 1}, promised()
     assert promised(**{RADIUS: 2.0}) == unnamed > 1.3 * promised(**{RADIUS: 0.5})
     assert promised(**{RADIUS: 2.0}, **of_samples) > 1.3 * promised(**{RADIUS: 0.5}, **of_samples)
+
+
+def wide(rng, deviation, gain=1.0, **header):
+    """Exponential samples under a Gaussian filter."""
+    light = gaussian_filter(
+        rng.gamma(PER_PASS, 1 / PER_PASS, (8, 64, 64, 3)), (0, deviation, deviation, 0), mode="wrap"
+    )
+    return replace(found := film(gain * light), metadata=found.metadata | header)
+
+
+@pytest.mark.parametrize("deviation", [2.0, 3.0])
+@pytest.mark.parametrize("named", ["radius", "area"])
+def test_wide_filters_make_no_false_alarms(deviation, named):
+    """Two or more alarms of 15 at 0.1 % have probability 1e-4; 1.05 times what is promised is missed in 1 % at most."""
+    header = {RADIUS: 4 * deviation} | ({AREA: 4 * np.pi * deviation**2} if named == "area" else {})
+    alarms = missed = 0
+    for seed in range(15):
+        rng = np.random.default_rng(seed)
+        reference = wide(rng, deviation, **header)
+        found = compare("auto", reference, wide(rng, deviation, **header))
+        alarms += found.verdict is Verdict.DIFFERENT
+        brighter = wide(rng, deviation, 1 + 1.05 * found.minimum_detectable, **header)
+        missed += compare("auto", reference, brighter).verdict is not Verdict.DIFFERENT
+    assert max(alarms, missed) <= 1
+    assert named == "radius" or found.minimum_detectable < 0.25  # of 0.1 under a box
 
 
 # The method that is chosen -----------------------------------------------------------------------------------------

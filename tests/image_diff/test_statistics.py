@@ -197,7 +197,8 @@ def lit(rng, samples, base, probability, gain=1.0):
 
 
 def lit_renders(rng, count, samples, base, probability):
-    found = [lit(rng, samples, base, probability) for _ in range(count)]
+    # Two that hold one hit each, in the same pixel, would be the same image, as no real ones are.
+    found = [lit(rng, samples, base, probability, 1 + 1e-6 * i) for i in range(count)]
     return [image(each.pixels[..., :1], metadata=each.metadata) for each in found]
 
 
@@ -220,7 +221,7 @@ def test_rare_light_that_the_smaller_side_missed_is_no_difference(light, form, f
         found = compare("auto", sides[first], sides[1 - first])
         alarms += found.verdict is Verdict.DIFFERENT
         assert found.verdict is not Verdict.EQUAL
-        assert found.verdict is Verdict.DIFFERENT or found.reason.endswith("a side would decide")
+        assert found.verdict is Verdict.DIFFERENT or found.reason.endswith("would decide")
     assert alarms <= 1
 
 

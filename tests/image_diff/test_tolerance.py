@@ -200,3 +200,44 @@ def test_other_channels_are_named_too():
         assert (found.verdict, found.reason.partition(";")[0]) == (DIFFERENT, f"channels added: {words}")
     seen = compare("tolerance", with_channel("A", 1), image(SIX))
     assert "the others: 1 % of the pixels (6 of 600)" in seen.reason
+
+
+# One outrageous pixel ----------------------------------------------------------------------------------------------
+
+
+def lit(size, dot=1000.0, at=(7, 9), width=1, channel=slice(None)):
+    """A smooth image of mean 1 and its like with a firefly of `dot` times the mean."""
+    plain = np.ones((size, size, 3)) + 0.5 * np.sin(np.arange(size) / 9)[:, None, None]
+    spoilt = plain.copy()
+    spoilt[at[0] : at[0] + width, at[1] : at[1] + width, channel] = dot
+    return image(plain), image(spoilt)
+
+
+@pytest.mark.parametrize("size", [64, 71, 128, 256, 1024])
+@pytest.mark.parametrize("dot, channel", [(1000.0, slice(None)), (500.0, 1), (-500.0, 1)])
+def test_auto_sees_one_outrageous_pixel_at_any_size(size, dot, channel):
+    """`tolerance` itself lets 0.02 % of the pixels be anything: from 71² on that is one."""
+    plain, spoilt = lit(size, dot, channel=channel)
+    for sides in ((plain, spoilt), (spoilt, plain)):
+        assert compare("tolerance", *sides).verdict is (EQUAL if size > 64 else DIFFERENT)
+        found = compare("auto", *sides)
+        assert found.verdict is DIFFERENT
+        assert size == 64 or "at x = 9, y = 7" in found.reason
+
+
+@pytest.mark.parametrize("options", [{"hard_fail": 2000.0}, {"allow_failures": 1}])
+def test_options_that_say_what_a_pixel_may_do_decide(options):
+    assert compare("auto", *lit(128), **options).verdict is EQUAL
+
+
+def test_what_a_small_change_makes_is_not_outrageous():
+    """A highlight of one pixel that moves by two, the edge of a lamp, and white on a gray display."""
+    white = np.full((128, 128, 3), 0.02)
+    white[60, 60] = 1.0
+    for sides in (
+        (lit(128, at=(20, 20))[1], lit(128, at=(21, 22))[1]),
+        (lit(256, width=3)[1], lit(256, width=3, at=(8, 9))[1]),
+        (image(np.full((128, 128, 3), 0.02)), image(white)),
+        (lit(128, 0.3)),
+    ):
+        assert compare("auto", *sides).verdict is EQUAL

@@ -53,6 +53,22 @@ def test_so_it_is_for_other_filters_and_films(tmp_path, llvm, rfilter, pixel_for
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "scalar_rgb"])
+@pytest.mark.parametrize(
+    ("rfilter", "radius", "area"),
+    [({"type": "box"}, 0.5, 1.0), ({"type": "tent", "radius": 3.0}, 3.0, (3 * 1.5) ** 2)]
+    + [({"type": "gaussian", "stddev": x}, 4 * x, 4 * np.pi * x**2) for x in (1.0, 3.0)],
+)
+def test_the_file_says_how_wide_the_filter_is(llvm, rfilter, radius, area):
+    """(∫∫w)²/∫∫w²; of a Gaussian that ends nowhere, and Mitsuba's ends at four standard deviations."""
+    film = {"type": "hdrfilm", "width": 4, "height": 4, "filter": rfilter}
+    scene = mi.load_dict(
+        {"type": "scene", "integrator": {"type": "path"}, "sensor": {"type": "perspective", "film": film}}
+    )
+    found = pass_renderer(scene, 0).filter_header
+    assert found["mi_refract:filter_radius"] == radius
+    assert found["mi_refract:filter_area"] == pytest.approx(area, rel=0.01)
+
+
 @pytest.mark.parametrize("rfilter", ["gaussian", "lanczos"])
 def test_a_wide_filters_sums_are_those_of_mitsubas_film(tmp_path, needs_variant, variant, rfilter):
     """Totals and weights apart: a mean over passes of their quotients would be biased."""
