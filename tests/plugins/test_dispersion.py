@@ -1,5 +1,6 @@
 """A boundary whose index depends on the wavelength, asked as a BSDF."""
 
+import itertools
 import math
 
 import drjit as dr
@@ -7,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_refract import media
 from mi_refract.plugins import who_asks
 
 GLASS = "cauchy(1.5, 20000)"  # n from 1.53 at 830 nm to 1.65 at 360 nm
@@ -62,11 +64,13 @@ def is_dispersed(bs):
 @pytest.mark.parametrize("side", [1, -1])
 def test_refracted_light_is_of_the_first_wavelength_in_its_direction(spectral_variant, side):
     eta = n(WAVELENGTHS[0]) ** side
+    powers = [reflectance(math.sin(0.5), n(x) ** side) for x in WAVELENGTHS]
+    total = np.mean(powers) + 1 - powers[0]  # of both lobes, R̄ + T
     bs, weight = sample(load(), tilted(0.5, side), REFRACTED)
     assert vector(bs.wo)[0] == pytest.approx(-math.sin(0.5) / eta, rel=1e-6)
     assert vector(bs.eta)[0] == pytest.approx(eta, rel=1e-6)
-    assert weight == pytest.approx([eta**-2, 0, 0, 0], rel=1e-6)
-    assert vector(bs.pdf)[0] == pytest.approx(1 - reflectance(math.sin(0.5), eta), rel=1e-5)
+    assert weight == pytest.approx([total * eta**-2, 0, 0, 0], rel=1e-5)
+    assert vector(bs.pdf)[0] == pytest.approx((1 - powers[0]) / total, rel=1e-5)
     assert is_dispersed(bs)
 
 
@@ -74,8 +78,9 @@ def test_refracted_light_is_of_the_first_wavelength_in_its_direction(spectral_va
 def test_reflected_light_keeps_all_wavelengths_each_with_its_power(spectral_variant, angle):
     powers = np.array([reflectance(math.sin(angle), n(x)) for x in WAVELENGTHS])
     bs, weight = sample(load(), tilted(angle), REFLECTED)
-    assert vector(bs.pdf)[0] == pytest.approx(powers[0], rel=1e-5)
-    assert weight == pytest.approx(powers / powers[0], rel=1e-4)
+    chosen = powers.mean() / (powers.mean() + 1 - powers[0])
+    assert vector(bs.pdf)[0] == pytest.approx(chosen, rel=1e-5)
+    assert weight == pytest.approx(powers / chosen, rel=1e-4)
     assert len(set(powers.round(3))) > 1
     assert not is_dispersed(bs)
 
@@ -88,6 +93,60 @@ def test_where_one_wavelength_is_totally_reflected_the_others_keep_what_they_hav
     bs, weight = sample(load(), tilted(math.asin(sin_i * (1 + 1e-6)), -1), 0.5)
     assert vector(bs.sampled_component)[0] == 0
     assert weight == pytest.approx(powers, rel=2e-3)
+
+
+OIL = "table(360: 1.52, 500: 1.5, 600: 1.5, 830: 1.49)"  # a plateau at the index of the glass beside it
+PAIRS = {
+    "equal": ("cauchy(1.5, 4000)", "cauchy(1.5, 4000)"),
+    "a plateau at the index outside": (OIL, 1.5),
+    "1e-4 beside it": (OIL, 1.4999),
+    "a plateau inside, seen from it": (1.5, OIL),
+    "crossing": ("table(360: 1.6, 830: 1.4)", "table(360: 1.4, 830: 1.6)"),
+    "glasses that cross at 580 nm": ("SCHOTT:N-SK16", "SCHOTT:N-F2"),
+    "glasses that cross at 700 nm": ("SCHOTT:N-BAF10", "SCHOTT:N-SF5"),
+    "an end of the range": ("table(385: 1.6, 800: 1.45)", 1.5),
+}
+WHOLE, BENT = len(WAVELENGTHS) + 1, 2  # the bounds of a weight, reflected and refracted
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_weights_are_bounded_and_each_wavelength_has_its_powers(pair, spectral_variant):
+    """Every wavelength in turn is the hero: P w_i = R_i for all, (1 − P) w = T for the hero, and weights are bounded.
+
+    Of R the float32 cosine leaves (cos θ)⁻¹ u times a few, of κ near 0 what float64 leaves: 1e-4 and 1e-12 are wide.
+    """
+    inside, outside = PAIRS[pair]
+    bsdf, waves = load(inside, outside), (380.0, 550.0, 579.7, 699.0)
+    pair_ = [media.parse(x, name="pair") for x in (inside, outside)]
+
+    def ratio(wavelength):
+        valid = all(m.valid[0] <= wavelength <= m.valid[1] for m in pair_ if m.dispersive)
+        return float(media.relative_index(*pair_, wavelength)) if valid else None
+
+    for turn, side, angle in itertools.product(range(4), (1, -1), (0.0, 0.7, 1.2, 1.5)):
+        wavelengths = waves[turn:] + waves[:turn]
+        etas = [ratio(x) for x in wavelengths]
+        powers = np.array([0.0 if eta is None else reflectance(math.sin(angle), eta**side) for eta in etas])
+        for number in (REFLECTED, REFRACTED):
+            bs, weight = sample(bsdf, tilted(angle, side), number, wavelengths=wavelengths)
+            if etas[0] is None:
+                assert (weight == 0).all()
+                continue
+            p = vector(bs.pdf)[0]
+            if vector(bs.sampled_component)[0] == 0:
+                assert p * weight == pytest.approx(powers, rel=1e-4, abs=1e-12)
+                assert weight.max() <= WHOLE * (1 + 1e-6)
+            else:
+                weight[0] *= etas[0] ** (2 * side)
+                assert p * weight == pytest.approx([1 - powers[0], 0, 0, 0], rel=1e-4, abs=1e-6)
+                assert weight.max() <= BENT * (1 + 1e-6)
+
+
+def test_at_the_plateau_the_light_of_the_others_is_reflected_by_chance(spectral_variant):
+    """The hero has the index outside, so R = 0, and the others have not."""
+    bs, weight = sample(load(OIL, 1.5), tilted(1.2), REFLECTED, wavelengths=(550.0, 380.0, 450.0, 700.0))
+    assert vector(bs.sampled_component)[0] == 0 and vector(bs.pdf)[0] > 0
+    assert weight[0] == 0 and (weight[1:] > 0).all()
 
 
 def test_an_index_within_1e_7_of_the_surroundings_is_not_rounded(spectral_variant):
