@@ -2,10 +2,10 @@
 
 | parameter | type | meaning and default | exposed | differentiable |
 |---|---|---|---|---|
-| `int_ior`, `ext_ior` | number, string, texture | index inside (`bk7`) and outside (`air`): `index_parameter` | if it varies | yes |
+| `int_ior`, `ext_ior` | number, string, texture | index inside (`bk7`), outside (`air`) | if it varies | yes |
 | `eta` | number | int_ior / ext_ior, where neither varies by wavelength or point | yes | yes |
-| `specular_reflectance`, `specular_transmittance` | number, texture | tint of the lobe (1) | yes | yes |
-| `int_absorption`, `ext_absorption` and others | number, spectrum | absorption of a side (none): `absorption` | yes | yes |
+| `specular_reflectance`, `…_transmittance` | number, texture | tint of the lobe (1) | yes | yes |
+| `int_absorption`, `ext_absorption`, … | number, spectrum | absorption of a side (none) | yes | yes |
 | `formula` | string | a key of FORMULAS, or `auto` (default) | no | no |
 
 A plugin class belongs to one variant: `plugin_class` makes it of the functions below, `register` makes it known. In
@@ -18,10 +18,10 @@ wavelength i, R̄ their mean (0 for a wavelength without an index) and T the her
     P = R̄ / (R̄ + T),    1 − P = T / (R̄ + T);    weights R_i / P reflected,  T / (1 − P) = R̄ + T for the refracted hero
 
 so each wavelength has the right mean. No weight exceeds N + 1 reflected, as R_i / P = R_i + R_i T / R̄ and R_i ≤ N R̄,
-nor 2 refracted. (Chosen by the hero's R alone, R_i / R_hero has no bound: R_hero = 0 where the indices are equal. Chosen
-by R̄, a refracted weight reaches N, and N² with the factor below.) Where R_i is the same for all, P = R and the weights
-are 1. What the hero weighs more for the others' having ended, a factor up to N, is the integrator's to multiply with
-(`DISPERSED` in `sampled_type`). For other integrators the index is that of the d line.
+nor 2 refracted. (Chosen by the hero's R alone, R_i / R_hero has no bound: R_hero = 0 where the indices are equal.
+Chosen by R̄, a refracted weight reaches N, and N² with the factor below.) Where R_i is the same for all, P = R and the
+weights are 1. What the hero weighs more for the others' having ended, a factor up to N, is the integrator's to multiply
+with (`DISPERSED` in `sampled_type`). For other integrators the index is that of the d line.
 """
 
 from __future__ import annotations
@@ -128,6 +128,7 @@ def set_ratio(self: Any, eta: Any) -> None:
 
 
 def traverse(self: Any, cb: Any) -> None:
+    """Show the parameters."""
     if self.varying:
         self.varying.traverse(cb)
     else:
@@ -139,6 +140,7 @@ def traverse(self: Any, cb: Any) -> None:
 
 
 def parameters_changed(self: Any, keys: Any) -> None:
+    """Take over what was set. ValueError for an index that is none."""
     if self.varying:
         self.varying.changed(keys)
         if isinstance(self.varying, DispersiveRatio):
@@ -152,7 +154,8 @@ def parameters_changed(self: Any, keys: Any) -> None:
             set_ratio(self, dr.select((eta >= SMALLEST_RATIO) & (eta <= LARGEST_RATIO), eta, dr.nan))
             return
         # A number is read back, so that an edit compiles nothing. What was not edited keeps its double precision.
-        number, kept = float(self.eta[0]), float(dr.slice(self.k_inner))
+        inner: Any = dr.slice(self.k_inner)
+        number, kept = float(self.eta[0]), float(inner)
         set_ratio(self, kept if dr.scalar.Array1f(kept)[0] == number else checked("eta", number))
 
 
@@ -184,6 +187,7 @@ def is_differentiated(self: Any) -> bool:
 
 
 def sample(self: Any, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+    """One of the two lobes, by `sample1`; see the module docstring."""
     v = self.v
     has_r, has_t = ctx.is_enabled(FLAGS.DeltaReflection, 0), ctx.is_enabled(FLAGS.DeltaTransmission, 1)
     if not (has_r or has_t):
@@ -321,7 +325,7 @@ def perpendicular(v: Any, direction: Any) -> Any:
 
 
 def evaluate(self: Any, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-    """0: a pair of delta lobes has no density anywhere. For `prb` and its kin, while they differentiate, more than that.
+    """0: a pair of delta lobes has no density anywhere. For `prb` and its kin, while they differentiate, more than 0.
 
     They sample without derivatives, in a symbolic loop, and differentiate log eval at the direction that was sampled;
     they read no derivative from 0. So where `wo` is the direction of a lobe, the value is its tint times a constant,
@@ -337,7 +341,9 @@ def evaluate(self: Any, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
     if not (differentiated(value) or differentiated(index)):
         return v.Spectrum(0)
     if differentiated(index):
-        warn_once(f"{PLUGIN}: the derivative in the index is infinite: {FIXED_DIRECTIONS}; expected {MOVING_DIRECTIONS}")
+        warn_once(
+            f"{PLUGIN}: the derivative in the index is infinite: {FIXED_DIRECTIONS}; expected {MOVING_DIRECTIONS}"
+        )
         value *= replace_grad(v.Float(1), v.Float(index) * dr.inf)
     ray = refract(self, si, False, active)
     lobe = dr.select(reflected, v.Vector3f(ray.a.x, ray.a.y, si.wi.z), ray.wo)
@@ -347,22 +353,26 @@ def evaluate(self: Any, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
 
 
 def pdf(self: Any, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+    """0: a delta lobe has no density."""
     return self.v.Float(0)
 
 
 def eval_pdf(self: Any, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+    """0 and 0, as `pdf`; what `evaluate` is for `prb` alone."""
     return self.v.Spectrum(0), self.v.Float(0)
 
 
-# Attributes: Mitsuba finds what `traverse` shows, and gives 0 for what it does not find (an error in scalar variants) --
+# Attributes: Mitsuba finds what `traverse` shows, and gives 0 for what it does not find (an error in scalars) --------
 
 
 def has_attribute(self: Any, name: str, active: Any = True) -> Any:
+    """Those that `traverse` shows, and absorption where there is any."""
     v = self.v
     return v.Bool(self.absorbing) if name in (HERE, BEYOND) else v.BSDF.has_attribute(self, name, active)
 
 
 def eval_attribute(self: Any, name: str, si: Any, active: Any = True) -> Any:
+    """As `has_attribute`; 0 for any other, in vectorised variants."""
     v = self.v
     if name not in (HERE, BEYOND):
         return v.BSDF.eval_attribute(self, name, si, active)
@@ -371,12 +381,14 @@ def eval_attribute(self: Any, name: str, si: Any, active: Any = True) -> Any:
 
 
 def eval_attribute_1(self: Any, name: str, si: Any, active: Any = True) -> Any:
+    """As `eval_attribute`."""
     if name == "eta" and not self.varying and not dr.is_jit_v(self.v.Float):
         return self.eta[0]  # Mitsuba finds no number in an array
     return self.v.BSDF.eval_attribute_1(self, name, si, active)
 
 
 def to_string(self: Any) -> str:
+    """The parameters, one a line."""
     chosen = f"{self.formula_name} (auto)" if self.requested == "auto" else self.formula_name
     lines = self.varying.lines() if self.varying else [f"eta = {self.eta[0]}"]
     lines += [f"formula = {chosen}", *(f"{name} = {texture}" for name, texture in self.textures.items())]
