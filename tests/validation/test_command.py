@@ -157,6 +157,8 @@ def test_scenes_say_what_they_need_and_what_is_left_out(context):
         "only glass",
         "textured",
         "polarising",
+        "refracting",
+        "deterministic",
     }
     assert row.reason == "left out: emitter sampling, a random number, media, null lobes, dispersion, absorption"
     assert row.replay["left out"]["dispersion"] == "no BSDF bends light by its wavelength"

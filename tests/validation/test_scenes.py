@@ -458,7 +458,7 @@ def test_the_rainbow_is_red_at_its_borders_and_blue_between(needs_variant):
 def test_each_colour_has_its_place_on_the_screen(variant, needs_variant):
     needs_variant(variant)
     mi.set_variant(variant)
-    band = spectral("spectrum_on_screen", res=64, spp=1024)[12:34, 8:56].sum(0)
+    band = spectral("spectrum_on_screen", res=64, spp=8192)[12:34, 8:56].sum(0)
     red, green, blue = np.average(np.mgrid[8:56, 0:3][0], axis=0, weights=np.clip(band - np.median(band, 0), 0, None))
     if variant.endswith("rgb"):
         assert red == pytest.approx(green, abs=0.5) and blue == pytest.approx(green, abs=0.5)

@@ -22,6 +22,7 @@ import numpy as np
 from mi_refract.image_diff import tile_statistics
 from mi_refract.report.row import Row
 from validation import limits
+from validation.repeated import by_tasks
 from validation.run.context import Context
 from validation.run.seeds import current
 from validation.study import Study, Task, about
@@ -178,7 +179,7 @@ def tasks(context: Context) -> list[Task]:
     others = [] if context.profile.quick else [f"{family}spectral", f"{family}spectral_polarized"]
     usable = [v for v in (context.variant, *others) if context.variants.get(v) is None]
     return [
-        Task(f"{NAME}: {variant} {scene}", functools.partial(rows, variant, scene, depth))
+        Task(f"{NAME}: {variant} {scene}, split {depth}", functools.partial(rows, variant, scene, depth))
         for variant in usable
         for scene in ("glass", "matt", "absorbing", "normal map", *(["dispersive"] if "spectral" in variant else []))
         for depth in ((0, 2) if scene in ("glass", "matt") or not context.profile.quick else (2,))
@@ -242,4 +243,4 @@ def compared(expected: Any, render: Callable[[int], Any], seed: int) -> dict[str
 
 
 SEED = 2031
-STUDY = Study(NAME, "Changes that must not be seen", about(__doc__), TERMS, tasks)
+STUDY = Study(NAME, "Changes that must not be seen", about(__doc__), TERMS, tasks, again=by_tasks(tasks))
