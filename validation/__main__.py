@@ -30,7 +30,15 @@ ROOMS = {
     "stability": ("stability", ("optical_chains", "energy", "derivatives", "layered_paths")),
     "renders": (
         "renders",
-        ("scene_needs", "against_dielectric", "colours", "unused_features", "invisible_changes", "rendering_passes"),
+        (
+            "scene_needs",
+            "against_dielectric",
+            "colours",
+            "unused_features",
+            "invisible_changes",
+            "random_numbers",
+            "rendering_passes",
+        ),
     ),
     "efficiency": ("efficiency", ("error_against_time", "scaling", "cluster_scale")),
     "media": ("media", ("catalogs", "ray_directions", "closed_forms", "renders", "hero_wavelength")),

@@ -221,3 +221,5 @@ EXPORT_SIGMAS = limit(2.0, "RMSE over predicted noise; the mean of squares of 14
 INVISIBLE_ALARM = limit(1e-6, "probability of any false alarm of a test: 1e-3 in a run of 500 rows with two tests each")
 INVISIBLE = limit(0.05, "relative: differences of the mean that each row must be able to see")
 INVISIBLE_NOISE = limit(2.0, "numbers that repeat in passes of 4 samples leave 4 times the noise; the ratio has 3 %")
+
+NUMBERS_ALARM = limit(1e-4, "probability of any false alarm of the chi-square tests of random numbers, all counts")

@@ -4,4 +4,12 @@ In: the scenes of `scenes/`, with either plugin. Out: rows with differences, sig
 the images as EXR files.
 """
 
-__all__ = ["against_dielectric", "colours", "invisible_changes", "rendering_passes", "scene_needs", "unused_features"]
+__all__ = [
+    "against_dielectric",
+    "colours",
+    "invisible_changes",
+    "random_numbers",
+    "rendering_passes",
+    "scene_needs",
+    "unused_features",
+]
