@@ -140,6 +140,9 @@ class Trace:
         self.context = context()
         self.emitters = (NonConstantEmitters if plan.lamps_only else SceneEmitters)(v, scene)
         self.flags = +(mi.RayFlags.All if plan.all_of_hit else mi.RayFlags.ShadingFrame)
+        # Derivatives need loops that are evaluated. The kernels of their reverse sweep may run after the scene is gone,
+        # so these must not trace rays: what rays meet is evaluated at once.
+        self.evaluated = self.vectorised and not dr.flag(dr.JitFlag.SymbolicLoops)
         if plan.split_depth and self.vectorised:
             self.boundaries = self._boundaries()
 
@@ -191,7 +194,7 @@ class Trace:
     # One vertex ----------------------------------------------------------------------------------------------------
 
     def _step(self, s: LoopState) -> tuple[LoopState]:
-        si = self.scene.ray_intersect(s.ray, self.flags, s.depth == 0)
+        si = self._intersect(s)
         hit = si.is_valid()
         if self.plan.absorption:
             s.throughput = self._times(s.throughput, self._left(s.sigma, si.t + s.skipped))
@@ -208,6 +211,13 @@ class Trace:
             onward = self._pop(s, onward)
         s.active = onward
         return (s,)
+
+    def _intersect(self, s: LoopState) -> Any:
+        if not self.evaluated:
+            return self.scene.ray_intersect(s.ray, self.flags, s.depth == 0)
+        found = self.scene.ray_intersect_preliminary(s.ray, s.depth == 0, s.active)
+        dr.eval(found)
+        return found.compute_surface_interaction(s.ray, self.flags, s.active)
 
     def _scatter(self, s: LoopState, si: Any, bsdf: Any, hit: Any, onward: Any) -> Any:
         """Emitter sampling, the next ray, and whether there is one."""
@@ -334,6 +344,8 @@ class Trace:
         if not dr.grad_enabled(value):  # what reflects nothing needs no shadow ray, but may have a derivative
             lit &= dr.max(dr.abs(self.v.unpolarized_spectrum(value))) > 0
         lit = lit & (self.scene.ray_test(si.spawn_ray_to(ds.p), lit) ^ True)
+        if self.evaluated:
+            dr.eval(lit)
         if self.v.is_polarized:
             value = si.to_world_mueller(value, -wo, si.wi)
         if self.plan.absorption:

@@ -102,9 +102,7 @@ def test_every_view_has_its_gradient(variant, integrator, glass, name, forward, 
 
 
 def test_a_scene_that_was_differentiated_leaves_no_damage(needs_variant):
-    """A second `backward` through a graph that the first has freed leaves its side effects for later, unseen by who
-    reads the gradient. They trace rays; where the scene has gone by then, Mitsuba ends the process.
-    """
+    """`backward` leaves kernels for later. Where they trace rays and the scene has gone by then, the process ends."""
     needs_variant("llvm_ad_rgb")
     program = f"""
 import faulthandler, sys
@@ -113,7 +111,7 @@ sys.path[:0] = {sys.path!r}
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 from test_gradients import *
-for integrator in ("refract_path", "volpath", "refract_path", "path"):
+for integrator in ("refract_path", "volpath", "path", *["refract_path"] * 6):
     scene = load(integrator, **NUMBER)
     params = mi.traverse(scene)
     moment = mi.load_dict({{"type": "moment", "inner": {{"type": integrator}}}})
@@ -124,7 +122,8 @@ for integrator in ("refract_path", "volpath", "refract_path", "path"):
     params.update()
     for view in (0, 1, 2):
         dr.backward(loss(scene, params, view, 4))
-        numbers(dr.grad(params[parameter(params, "eta")]))
+        if integrator != "refract_path":  # Mitsuba's own trace rays in the dropped scene where nobody reads this
+            numbers(dr.grad(params[parameter(params, "eta")]))
     del scene, params
 """
     command = [sys.executable, "-c", f"import sys; sys.path.insert(0, {__file__.rpartition('/')[0]!r}){program}"]
