@@ -119,9 +119,9 @@ def activate(preferred: str | None = None, *, may_restart: bool = False) -> str:
     if preferred is None:
         preferred = "llvm_ad_rgb" if here.usable else "scalar_rgb"
     elif preferred not in mi.variants():
-        raise ValueError(f"variant {preferred!r}: unknown; accepted: {', '.join(_running())}")
+        raise ValueError(f"variant {preferred!r}: unknown; expected {', '.join(_running())}")
     elif not preferred.startswith("scalar_") and (reason := usable_variants()[preferred]):
-        raise ValueError(f"variant {preferred!r} cannot run here: {reason}; accepted: {', '.join(_running())}")
+        raise ValueError(f"variant {preferred!r} cannot run here: {reason}; expected {', '.join(_running())}")
     _own_plugins_first(mi)
     mi.set_variant(preferred)
     return preferred
@@ -239,7 +239,7 @@ def _loaded() -> set[str] | None:
 
 def _remedy(chosen: str | None) -> str:
     install = "apt-get install libllvm19" if shutil.which("apt-get") else "install LLVM 17 or newer"
-    return f"accepted: the file of a libLLVM 17 or newer ({install})" if chosen else install
+    return f"expected the file of a libLLVM 17 or newer ({install})" if chosen else install
 
 
 def _announce(backend: Backend) -> None:

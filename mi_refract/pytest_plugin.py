@@ -83,7 +83,7 @@ def _assert_unbiased(
 ) -> Comparison:
     __tracebackhide__ = True
     if runs < 2:
-        raise ValueError(f"runs = {runs}: accepted: at least 2, or the noise is not known")
+        raise ValueError(f"runs = {runs}; expected at least 2, or the noise is not known")
 
     from mi_refract.image_diff.folders import read_renders
 

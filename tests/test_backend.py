@@ -228,7 +228,7 @@ def test_the_users_choice_is_the_only_candidate(counted, monkeypatch):
     here = backend.llvm()
     assert probes == [library]
     assert not here.usable
-    assert here.reason.startswith(f"{backend.CHOICE}={library}: is made up; accepted: ")
+    assert here.reason.startswith(f"{backend.CHOICE}={library}: is made up; expected ")
     assert [entry.path for entry in backend.libraries()] == [library]
 
 
@@ -271,11 +271,11 @@ def test_every_variant_has_an_answer(usable_variants, monkeypatch):
 
 def test_activate_a_variant_that_is_unknown_or_cannot_run(monkeypatch):
     for variant in ("llvm_ad_rbg", "", "scalar_rgb_double"):
-        with pytest.raises(ValueError, match=r"unknown; accepted: scalar_rgb, ") as error:
+        with pytest.raises(ValueError, match=r"unknown; expected scalar_rgb, ") as error:
             backend.activate(variant)
         assert one_line(str(error.value))
     monkeypatch.setattr(backend, "cuda", lambda: backend.Backend("cuda", False, "no GPU"))
-    with pytest.raises(ValueError, match=r"'cuda_ad_rgb' cannot run here: no GPU; accepted: scalar_rgb, .*\w$"):
+    with pytest.raises(ValueError, match=r"'cuda_ad_rgb' cannot run here: no GPU; expected scalar_rgb, .*\w$"):
         backend.activate("cuda_ad_rgb")
 
 

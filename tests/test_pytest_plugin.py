@@ -41,7 +41,7 @@ def test_what_is_equal_passes(assert_image_equal, assert_image_unbiased, tmp_pat
         (IMAGE[:-1], "auto", {}, "could not compare: "),
         ("missing.exr", "auto", {}, "could not compare: .*missing.exr"),
         (["no numbers"], "auto", {}, "could not compare: "),
-        (IMAGE, "telepathy", {}, "could not compare: method 'telepathy': accepted: "),
+        (IMAGE, "telepathy", {}, "could not compare: method 'telepathy'; expected "),
         (IMAGE, "exact", {"threshold": 1}, "could not compare: "),
     ],
 )
@@ -66,7 +66,7 @@ def test_bias_fails_and_so_does_what_cannot_be_told(assert_image_unbiased, tmp_p
     for folder in (tmp_path, tmp_path / "none"):
         with pytest.raises(pytest.fail.Exception, match="could not compare: "):
             assert_image_unbiased(render, folder)
-    with pytest.raises(ValueError, match="runs = 1: accepted: at least 2"):
+    with pytest.raises(ValueError, match="runs = 1; expected at least 2"):
         assert_image_unbiased(render, render, runs=1)
 
 

@@ -104,7 +104,8 @@ def _command(
         str | None, typer.Option(metavar="ADDRESS", help="Run what times nothing on this Dask scheduler's workers.")
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, max=1024, help="Run what times nothing in so many processes, by Dask.")
+        int | None,
+        typer.Option(min=1, max=1024, help="Number of worker processes (Dask) for tasks that measure no times."),
     ] = None,
     tls_ca_file: TlsCaFile = None,
     tls_cert: TlsCert = None,
@@ -130,7 +131,7 @@ def _command(
         with lock.held(out / LOCK, "a validation"):
             return _run(studies or [], profile, out, write_tables, goals, there)
     except KeyboardInterrupt:
-        print("validation: interrupted; the same command goes on from here", file=sys.stderr)
+        print("validation: interrupted; run the same command again to resume", file=sys.stderr)
         raise
 
 
@@ -140,17 +141,17 @@ class Misuse(ValueError):
 
 def _check(studies: list[str], profile: str, out: Path, write_tables: bool) -> None:
     if unknown := [name for name in studies if name not in ROOMS]:
-        raise Misuse(f"unknown study {unknown[0]!r}; accepted: {', '.join(ROOMS)}")
+        raise Misuse(f"unknown study {unknown[0]!r}; expected {', '.join(ROOMS)}")
     if profile not in PROFILES:
-        raise Misuse(f"unknown profile {profile!r}; accepted: {', '.join(PROFILES)}")
+        raise Misuse(f"unknown profile {profile!r}; expected {', '.join(PROFILES)}")
     if write_tables and profile == "quick":
-        raise Misuse("--write-tables with the profile 'quick'; accepted: --profile standard, --profile full")
+        raise Misuse("--write-tables with the profile 'quick'; expected --profile standard, --profile full")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise Misuse(f"--out {out}: {error.strerror}; accepted: a writable folder") from None
+        raise Misuse(f"--out {out}: {error.strerror}; expected a writable folder") from None
     if not os.access(out, os.W_OK):
-        raise Misuse(f"--out {out}: not writable; accepted: a writable folder")
+        raise Misuse(f"--out {out}: not writable; expected a writable folder")
 
 
 def _join(folders: list[Path], studies: list[str], there: Elsewhere) -> None:
@@ -158,9 +159,9 @@ def _join(folders: list[Path], studies: list[str], there: Elsewhere) -> None:
     if not folders:
         return
     if studies and "suite" not in studies:
-        raise Misuse(f"--renderer {folders[0]} without suite; accepted: the study suite")
+        raise Misuse(f"--renderer {folders[0]} without suite; expected the study suite")
     if there.given:
-        raise Misuse(f"--renderer {folders[0]} with workers, which know nothing of it; accepted: this process")
+        raise Misuse(f"--renderer {folders[0]} with workers, which know nothing of it; expected this process")
     from validation.suite import rendered_images
     from validation.suite.renderers import table
 

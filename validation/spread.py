@@ -69,7 +69,7 @@ class Elsewhere:
         """
         names = [name for _, name in work]
         if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"two tasks are called {twice[0]!r}; accepted: a name for each, by which workers find it")
+            raise ValueError(f"two tasks are called {twice[0]!r}; expected a name for each, by which workers find it")
         with self.there.connected() as client:
             expected = facts(self.asked.variant)
             workers = Workers(client, self.asked.variant, expected, warn=_say, facts=__name__)

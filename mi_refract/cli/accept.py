@@ -72,10 +72,10 @@ def accept(
         if (reference is None) != (test is None):
             raise ValueError(f"{reference}: one path; accepted with --from: both folders before any names, or none")
         if options or allow_nonfinite or method != AUTO or idiff is not None or variance or channels:
-            raise ValueError("--from takes what was compared; accepted: no option that says how")
+            raise ValueError("--from takes what was compared; expected no option that says how")
         found = _read_results(source, reference, test, names or [], settings, max_values)
     elif reference is None or test is None:
-        raise ValueError("two paths are needed; accepted: mi-refract accept REFERENCE TEST, or --from OUT.json")
+        raise ValueError("two paths are needed; expected mi-refract accept REFERENCE TEST, or --from OUT.json")
     else:
         chosen = settings_of(
             reference, method, options, idiff, settings, allow_nonfinite, max_values, variance, channels
@@ -122,5 +122,5 @@ def _changes(found: Results, variant: str) -> list[accepting.Copy]:
 
 def _agreed(count: int) -> bool:
     if not sys.stdin.isatty():
-        raise ValueError("accept asks on a terminal only; accepted elsewhere: --yes")
+        raise ValueError("accept asks on a terminal only; elsewhere expected --yes")
     return typer.confirm(f"Accept {count} as the reference{'' if count == 1 else 's'}?")

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 Names = Annotated[
     list[str] | None, typer.Argument(metavar="[NAME]...", help="Only these images: paths in the folders, * and ?.")
 ]
-Method = Annotated[str, typer.Option(help=f"How: {'|'.join(settings_file.ACCEPTED)}; see --methods.")]
+Method = Annotated[str, typer.Option(help=f"Comparison method: {'|'.join(settings_file.ACCEPTED)}; see --methods.")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="An option of the method.")]
 Idiff = Annotated[
     str | None,
@@ -48,7 +48,7 @@ Variance = Annotated[
     str, typer.Option(metavar="TEMPLATE", help='Images of the variance of a sample beside both: "{stem}_var.exr".')
 ]
 Channels = Annotated[
-    str, typer.Option(metavar="NAMES", help='Those that are compared: "X,Y,Z"; "nested.X=X" if names differ.')
+    str, typer.Option(metavar="NAMES", help='Channels to compare: "X,Y,Z"; "nested.X=X" if names differ.')
 ]
 MaxValues = Annotated[
     int, typer.Option("--max-values", metavar="N", min=1, help="Width × height × channels of an image, at most.")

@@ -102,13 +102,15 @@ CheckSettings = Annotated[
 SelfTest = Annotated[
     bool,
     typer.Option(
-        "--self-test", help="Plant defects in REFERENCE (an image, a folder of renders, a scene); which are seen?"
+        "--self-test",
+        help="Inject synthetic defects into REFERENCE (an image, a folder of renders, a scene); report which methods "
+        "detect them.",
     ),
 ]
 
 AllowPlugins = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME", help="Run this plugin, which the scene of --self-test brings, too."),
+    typer.Option(metavar="NAME", help="Also allow this plugin, which ships with the scene of --self-test."),
 ]
 
 
@@ -141,7 +143,7 @@ def diff(
     require_extra("scipy", *(("jinja2", "matplotlib") if report else ()))
     renders = renders or samples
     if allow_plugins and not (self_test and reference and reference.suffix == SCENE):
-        raise ValueError("--allow-plugins: only a scene brings plugins; accepted: with --self-test SCENE.xml")
+        raise ValueError("--allow-plugins: only a scene brings plugins; expected with --self-test SCENE.xml")
     if self_test:
         others = (
             options,
@@ -159,10 +161,10 @@ def diff(
         )
         if any(others) or method != AUTO:
             accepted = "no other option but --max-values, --allow-plugins"
-            raise ValueError(f"--self-test asks every method and prints; accepted: {accepted}")
+            raise ValueError(f"--self-test asks every method and prints; expected {accepted}")
         raise typer.Exit(_self_test(reference, test, max_values, allow_plugins or []))
     if reference is None or (test is None and not check_settings):
-        raise ValueError("two paths are needed; accepted: mi-refract diff REFERENCE TEST")
+        raise ValueError("two paths are needed; expected mi-refract diff REFERENCE TEST")
     chosen = settings_of(reference, method, options, idiff, settings, allow_nonfinite, max_values, variance, channels)
     if check_settings or test is None:
         raise typer.Exit(_check_settings(reference, test, names or [], chosen))
@@ -251,7 +253,7 @@ def _self_test(path: Path | None, other: Path | None, max_values: int, allow_plu
     from . import self_test_scenes
 
     if other:
-        raise ValueError(f"{other}: --self-test takes one path; accepted: an image, a folder of renders, a scene")
+        raise ValueError(f"{other}: --self-test takes one path; expected an image, a folder of renders, a scene")
     if path is None:
         renders = self_test_scenes.glass_ball()
     elif path.suffix == SCENE:

@@ -20,7 +20,7 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] 
     facts = diagnose()
     print(json_text(facts, indent=2) if as_json else printable_lines(_as_text(facts)))
     if None not in facts["variants"].values():
-        raise ValueError("no variant of Mitsuba runs here; accepted: at least one")
+        raise ValueError("no Mitsuba variant can run on this machine")
 
 
 def diagnose() -> dict[str, Any]:

@@ -20,7 +20,7 @@ def parse_share(text: str, option: str) -> float:
         value = 0.0
     if not 0 < value <= (1 if percent else PLAIN):
         raise ValueError(
-            f"{option} {text}: accepted: more than 0 %, up to 100 %, such as 1% or 0.01 (up to {PLAIN} without %)"
+            f"{option} {text}; expected more than 0 %, up to 100 %, such as 1% or 0.01 (up to {PLAIN} without %)"
         )
     return value
 
@@ -34,7 +34,7 @@ def parse_seconds(text: str, option: str) -> float:
     given = zip(parts.groups(), _SECONDS.values(), strict=True) if parts else ()
     seconds = sum(float(number) * unit for number, unit in given if number)
     if not seconds > 0:
-        raise ValueError(f"{option} {text}: accepted: a time of more than 0, such as 90s, 10m or 1h30m")
+        raise ValueError(f"{option} {text}; expected a time of more than 0, such as 90s, 10m or 1h30m")
     return seconds
 
 

@@ -37,30 +37,37 @@ def render(
         int | None, typer.Option(min=1, max=2**32 - 1, help="Samples per pixel; without it what the scene says.")
     ] = None,
     until: Annotated[
-        str | None, typer.Option(metavar="SHARE", help="Stop at this error: RMSE over mean, such as 1%.")
+        str | None, typer.Option(metavar="SHARE", help="Stop when the relative RMSE falls below this, e.g. 1%.")
     ] = None,
     until_tile: Annotated[
-        str | None, typer.Option(metavar="SHARE", help="Stop at this error of the worst 16 × 16 tile but 1 % of them.")
+        str | None,
+        typer.Option(
+            metavar="SHARE", help="Stop when the 99th-percentile relative error over 16 × 16 tiles is below this."
+        ),
     ] = None,
     duration: Annotated[
-        str | None, typer.Option("--time", metavar="TIME", help="Stop after it: 90s, 10m, 1h30m.")
+        str | None, typer.Option("--time", metavar="TIME", help="Stop after this time, e.g. 90s, 10m, 1h30m.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the sampler.")] = 0,
     pass_spp: Annotated[
         int | None, typer.Option(min=1, max=2**32 - 1, help="Samples per pixel of a pass, which bound the memory.")
     ] = None,
-    restart: Annotated[bool, typer.Option("--restart", help="Begin anew, whatever there is already.")] = False,
-    preview: Annotated[Path | None, typer.Option(metavar="X.png", help="Write the image so far, now and then.")] = None,
+    restart: Annotated[
+        bool, typer.Option("--restart", help="Start over; ignore any checkpoint or existing image.")
+    ] = False,
+    preview: Annotated[
+        Path | None, typer.Option(metavar="X.png", help="Write a preview of the current image every 10 seconds.")
+    ] = None,
     allow_plugins: Annotated[
         list[str] | None,
-        typer.Option("--allow-plugins", metavar="NAME", help="Run this plugin, which the scene brings, too."),
+        typer.Option("--allow-plugins", metavar="NAME", help="Also allow this plugin, which ships with the scene."),
     ] = None,
     scheduler: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS", help="Render on the workers of this Dask scheduler: tcp://host:8786."),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, max=1024, help="Render in so many processes of one thread each, by Dask.")
+        int | None, typer.Option(min=1, max=1024, help="Number of single-threaded worker processes (Dask).")
     ] = None,
     tls_ca_file: TlsCaFile = None,
     tls_cert: TlsCert = None,
@@ -75,10 +82,10 @@ def render(
         ),
     ] = False,
 ) -> None:
-    """Render a Mitsuba scene into an EXR file that holds its own noise, and says how it was made.
+    """Render a Mitsuba scene into an EXR file with per-channel variance and provenance metadata.
 
-    The render goes on where it was left: from a checkpoint after it was ended, from a finished image that has fewer
-    samples. The scene may use the plugins `refract` and `refract_path`, which Mitsuba's own executable does not know.
+    An interrupted render resumes from its checkpoint; a finished image with fewer samples is refined. The scene may
+    use the plugins `refract` and `refract_path`, which Mitsuba's own executable does not know.
     """
     from mi_refract.io.atomic import writable
 
@@ -102,7 +109,7 @@ def render(
     with _spinner(console, f"{scene.name}, {chosen}"):
         rendering = LongRender(job, output, limits, restart=restart)
     if rendering.progress.passes:
-        print(printable(f"{output}: goes on from {rendering.progress.done} spp"), file=sys.stderr)
+        print(printable(f"{output}: resuming from {rendering.progress.done} spp"), file=sys.stderr)
     with (
         cluster_passes(cluster, rendering, str(chosen)) as passes,
         interrupts.last_act(rendering.give_up),

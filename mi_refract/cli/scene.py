@@ -58,4 +58,4 @@ def _scene_path(scene: str) -> Path:
         if path.is_file():
             return path
     names = sorted(path.stem for path in SCENES.glob("*.xml"))
-    raise FileNotFoundError(f"{scene}: no such scene; accepted: {', '.join(['a file', *names])}")
+    raise FileNotFoundError(f"{scene}: no such scene; expected {', '.join(['a file', *names])}")

@@ -124,5 +124,5 @@ def resolve(name: str, backend: dr.JitBackend) -> tuple[str, Formula]:
     """The key and entry behind `name`, a key of FORMULAS or "auto". ValueError otherwise."""
     key = automatic(backend) if name == "auto" else name
     if key not in FORMULAS:
-        raise ValueError(f"formula = {name!r}: unknown; accepted: auto, {', '.join(FORMULAS)}")
+        raise ValueError(f"formula = {name!r}: unknown; expected auto, {', '.join(FORMULAS)}")
     return key, FORMULAS[key]

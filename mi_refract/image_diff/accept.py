@@ -46,18 +46,18 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
             if result.error:
                 raise ValueError(result.error)
             if result.test:
-                raise ValueError(f"{result.test}: compared without digests; accepted: results of diff(to_accept=True)")
+                raise ValueError(f"{result.test}: compared without digests; expected results of diff(to_accept=True)")
             continue
         target = _target(result, results, variant)
         if target in taken or (variant and target.exists() and target not in result.variants):
-            raise ValueError(f"{target}: the reference of another image, too; accepted: one new image for each")
+            raise ValueError(f"{target}: the reference of another image, too; expected one new image for each")
         taken.add(target)
         images = image_file.read_parts(result.test, result.how.max_values)
         finite = all(np.isfinite(image.pixels).all() for image in images)
         if not result.how.options.get("allow_nonfinite") and not finite:
             raise ValueError(f"{result.test}: values that are not finite; accepted with --allow-nonfinite")
         if target.suffix.lower() != result.test.suffix.lower():
-            raise ValueError(f"{target}: accepted: a name that ends in {result.test.suffix}, as {result.test} does")
+            raise ValueError(f"{target}; expected a name that ends in {result.test.suffix}, as {result.test} does")
         yield Copy(result.test, target, result.digests[result.test], result.digests.get(target, ""))
         yield from _of_variance(result.test, target, results, result)
 
@@ -72,7 +72,9 @@ def _of_variance(new: Path, target: Path, results: Results, result: Result) -> I
     if source.exists():
         yield Copy(source, to, digests.get(source, ""), digests.get(to, ""))
     elif to.exists():
-        raise ValueError(f"{source}: no such file, and {to} is of another render; accepted: a variance of {new}")
+        raise ValueError(
+            f"{source}: no such file, and {to} belongs to a different render; expected a variance of {new}"
+        )
 
 
 def _target(result: Result, results: Results, variant: str) -> Path:
@@ -80,7 +82,7 @@ def _target(result: Result, results: Results, variant: str) -> Path:
     if not variant:
         return target
     if result.reference is None:
-        raise ValueError(f"{result.test}: has no reference yet; accepted: without --as-variant")
+        raise ValueError(f"{result.test}: has no reference yet; expected without --as-variant")
     return pairing.variant(target, result.how, variant)
 
 
@@ -107,7 +109,7 @@ def _require_unchanged(copies: Sequence[Copy]) -> None:
 
 
 def _changed(path: Path) -> OSError:
-    return OSError(f"{path}: changed since it was compared; accepted: what was shown")
+    return OSError(f"{path}: changed since it was compared; expected what was shown")
 
 
 def _copied(source: Path, to: Path) -> str:

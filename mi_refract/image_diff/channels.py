@@ -74,7 +74,7 @@ def selected(image: Image, names: Mapping[str, str]) -> Image:
     missing = [name for name in names if name not in image.channels]
     if missing:
         accepted = ", ".join(means(image.channels))
-        raise ValueError(f"{image.path}: no channel {missing[0]!r}; accepted in `channels`: {accepted}")
+        raise ValueError(f"{image.path}: no channel {missing[0]!r}; in `channels` expected {accepted}")
     kept = dict(names)
     for old, new in names.items():
         if old in pairs:

@@ -98,7 +98,7 @@ def aligned(reference: Image, test: Image) -> tuple[Pixels, Pixels]:
     for name, of in HEADER.items():
         if of(reference) != of(test):
             hint = "; or `channels`: those to compare" if name == "channels" else ""
-            raise ValueError(f"{test.path}: {name} {of(test)}; accepted: {of(reference)}, as in {reference.path}{hint}")
+            raise ValueError(f"{test.path}: {name} {of(test)}; expected {of(reference)}, as in {reference.path}{hint}")
     same_order = reference.channels == test.channels
     return reference.pixels, test.pixels if same_order else test.select(reference.channels)
 

@@ -56,9 +56,9 @@ def flip(
     """
     require_nonnegative(locals())
     if hdr not in ("auto", "yes", "no"):
-        raise ValueError(f"hdr = {hdr!r}: accepted: auto, yes, no")
+        raise ValueError(f"hdr = {hdr!r}; expected auto, yes, no")
     if not 1 <= ppd <= 1000:  # below, its filters see nothing; above, they are larger than any image
-        raise ValueError(f"ppd = {ppd}: accepted: 1 to 1000")
+        raise ValueError(f"ppd = {ppd}; expected 1 to 1000")
     _, _, found = checked_pixels("flip", reference, test, allow_nonfinite)
     if found:
         return found
@@ -177,10 +177,10 @@ def _linear(image: Image) -> Pixels:
     """Linear H × W × 3 float32; values that are not finite become 0."""
     names = _colours(image)
     if names != RGB and len(names) != 1:
-        raise ValueError(f"{image.path}: channels {', '.join(names)}; accepted by FLIP: R, G, B, or one")
+        raise ValueError(f"{image.path}: channels {', '.join(names)}; expected by FLIP: R, G, B, or one")
     pixels = np.nan_to_num(image.select(names), nan=0.0, posinf=0.0, neginf=0.0)
     if np.abs(pixels).max() > np.finfo(np.float32).max:
-        raise ValueError(f"{image.path}: values beyond those of float32; accepted by FLIP: up to 3.4e38")
+        raise ValueError(f"{image.path}: values beyond those of float32; expected by FLIP: up to 3.4e38")
     pixels = pixels.astype(np.float32, copy=False)
     if encoding(image) == "sRGB":
         pixels = srgb_decode(pixels).astype(np.float32)

@@ -84,7 +84,7 @@ def _pairs(reference: Path, test: Path, settings: Settings, renders: bool) -> li
     if not renders:
         return pairing.pairs(reference, test, settings)
     if not (reference.is_dir() and test.is_dir()):
-        raise NotADirectoryError(f"{test if reference.is_dir() else reference}: accepted with --renders: a folder")
+        raise NotADirectoryError(f"{test if reference.is_dir() else reference}; expected with --renders: a folder")
     name = reference.resolve().name
     return [Pair(name, reference, test, reference, settings.of(name))]
 
@@ -163,7 +163,7 @@ def _judged(result: Result, asked: _Asked) -> Result:
     for path in (result.reference, *result.variants):
         try:
             if path.samefile(new):
-                raise ValueError(f"{new}: the same file as the reference {path}; accepted: two")
+                raise ValueError(f"{new}: the same file as the reference {path}; expected two")
             one = _against(path, read(path), test(), result, asked.roots)
         except (ValueError, OSError, MemoryError) as error:
             failed = failed or error  # unless another reference is equal
@@ -200,10 +200,10 @@ def _against(path: Path, reference: list[Image], test: list[Image], result: Resu
         for side, (images, root) in enumerate(zip((reference, test), roots, strict=True))
     )
     if how.reads_variance and not (len(reference) > 1 or variances.has_variance(reference[0])):
-        raise FileNotFoundError(f"{pairing.beside(how.variance, path, roots[0])}: no such file; accepted: a variance")
+        raise FileNotFoundError(f"{pairing.beside(how.variance, path, roots[0])}: no such file; expected a variance")
     file = pairing.beside(how.mask, result.target or path, roots[0]) if how.mask else None
     if (file or how.ignore) and reference[-1].place:
-        raise ValueError(f"{path}: several parts or MIP levels; accepted with a mask: one image")
+        raise ValueError(f"{path}: several parts or MIP levels; expected with a mask one image")
     mask = masks.made(reference[0], file, how.ignore, how.max_values)
     reference, test = ([masks.applied(image, mask) for image in side] for side in (reference, test))
     if path.is_dir():
@@ -223,7 +223,7 @@ def _with_variance(images: list[Image], root: Path, how: How) -> list[Image]:
         return images
     file = pairing.beside(how.variance, images[0].path, root)
     if file == images[0].path:
-        raise ValueError(f"variance = {how.variance!r}: is {file} itself; accepted: the name of another image")
+        raise ValueError(f"variance = {how.variance!r}: is {file} itself; expected the name of another image")
     return [variances.with_file(images[0], file, how.max_values)] if file.exists() else images
 
 
@@ -253,7 +253,7 @@ def opened(path: Path) -> BufferedReader:
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         return file
     file.close()
-    raise ValueError(f"{path}: accepted: a regular file")
+    raise ValueError(f"{path}; expected a regular file")
 
 
 def read_renders(folder: Path, max_values: int = MAX_VALUES) -> list[Image]:
@@ -262,14 +262,14 @@ def read_renders(folder: Path, max_values: int = MAX_VALUES) -> list[Image]:
     if failed:
         raise OSError(failed[0][1])
     if not found:
-        raise ValueError(f"{folder}: holds no image; accepted: several renders of one")
+        raise ValueError(f"{folder}: holds no image; expected several renders of one")
     read = functools.partial(image_file.read, max_values=max_values)
     images = list(bounded_map(read, found.values(), lambda path: 0, max_values, WORKERS))  # all are needed at once
     sums: dict[float, Image] = {}
     for image in images:
         other = sums.setdefault(float(image.pixels.sum(dtype=np.float64)), image)
         if other is not image and np.array_equal(image.pixels, other.pixels):
-            raise ValueError(f"{image.path}: the same pixels as {other.path}; accepted: renders of different seeds")
+            raise ValueError(f"{image.path}: the same pixels as {other.path}; expected renders of different seeds")
     return images
 
 

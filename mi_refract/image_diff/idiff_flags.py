@@ -51,7 +51,7 @@ def parse(text: str) -> Flags:
     try:
         words = shlex.split(text)
     except ValueError as error:
-        raise ValueError(f"{text!r}: {error}; accepted: flags of idiff") from None
+        raise ValueError(f"{text!r}: {error}; expected flags of idiff") from None
     options: dict[str, Any] = dict(THRESHOLDS.values())
     every, ignored = False, []
     while words:
@@ -71,7 +71,7 @@ def parse(text: str) -> Flags:
 
 def _next(flag: str, words: list[str]) -> str:
     if not words:
-        raise ValueError(f"{flag}: nothing follows; accepted: {flag} VALUE")
+        raise ValueError(f"{flag}: nothing follows; expected {flag} VALUE")
     return words.pop(0)
 
 
@@ -82,13 +82,13 @@ def _number(flag: str, text: str, whole: bool) -> float:
     except ValueError:
         value = math.nan
     if not value >= 0 or (whole and not value.is_integer()):
-        raise ValueError(f"{flag} {text}: accepted: a {'whole ' * whole}number of at least 0")
+        raise ValueError(f"{flag} {text}; expected a {'whole ' * whole}number of at least 0")
     return int(value) if whole else value
 
 
 def _refused(word: str, flag: str) -> str:
     if flag == "-p":
-        return "-p: idiff's perceptual test; accepted: --method flip, which replaces it"
+        return "-p: idiff's perceptual test; expected --method flip, which replaces it"
     if not flag.startswith("-"):
-        return f"{word}: no flag; accepted: the flags alone, without idiff and the images"
-    return f"{word}: no flag of idiff; accepted: {ACCEPTED}"
+        return f"{word}: no flag; expected the flags alone, without idiff and the images"
+    return f"{word}: no flag of idiff; expected {ACCEPTED}"

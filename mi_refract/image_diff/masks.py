@@ -33,10 +33,10 @@ def made(reference: Image, path: Path | None, rectangles: Sequence[Rectangle], m
     for rectangle in rectangles:
         part = counts[_slices(reference, rectangle)]
         if not part.size:
-            raise ValueError(f"ignore = {list(rectangle)}: accepted: a rectangle that holds pixels of {reference.path}")
+            raise ValueError(f"ignore = {list(rectangle)}; expected a rectangle that holds pixels of {reference.path}")
         part[:] = False
     if not counts.any():
-        raise ValueError(f"{path or 'ignore'}: leaves no pixel of {reference.path}; accepted: at least one")
+        raise ValueError(f"{path or 'ignore'}: leaves no pixel of {reference.path}; expected at least one")
     return counts
 
 
@@ -62,11 +62,11 @@ def _read(path: Path, reference: Image, most: int) -> Mask:
     if found.pixels.shape[:2] != reference.pixels.shape[:2]:
         height, width = reference.pixels.shape[:2]
         raise ValueError(
-            f"{path}: {found.pixels.shape[1]} × {found.pixels.shape[0]}; accepted: a mask of {width} × {height}"
+            f"{path}: {found.pixels.shape[1]} × {found.pixels.shape[0]}; expected a mask of {width} × {height}"
         )
     colours = found.select([name for name in found.channels if name != "A"] or found.channels)
     if not np.isfinite(colours).all():
-        raise ValueError(f"{path}: values that are not finite; accepted: a mask from 0 to 1")
+        raise ValueError(f"{path}: values that are not finite; expected a mask from 0 to 1")
     counts: Mask = colours.max(-1) >= WHITE
     return counts
 

@@ -66,10 +66,10 @@ class Method:
     def checked(self, method: str, name: str, value: Any) -> Any:
         """The value of an option; ValueError for an unknown name or a value of another type."""
         if name not in self.options:
-            raise ValueError(f"{method} has no option {name!r}; accepted: {', '.join(self.options) or 'none'}")
+            raise ValueError(f"{method} has no option {name!r}; expected {', '.join(self.options) or 'none'}")
         kind = self.options[name].type
         if isinstance(value, bool) or not isinstance(value, (int, float) if kind is float else kind):
-            raise ValueError(f"{method}: {name} = {value!r}: accepted: a value of type {kind.__name__}")
+            raise ValueError(f"{method}: {name} = {value!r}; expected a value of type {kind.__name__}")
         return kind(value)
 
 
@@ -131,18 +131,18 @@ def _compare(
     options: Mapping[str, Any],
 ) -> Comparison:
     if method not in METHODS:
-        raise ValueError(f"method {method!r}: accepted: {AUTO}, {', '.join(METHODS)}")
+        raise ValueError(f"method {method!r}; expected {AUTO}, {', '.join(METHODS)}")
     chosen = METHODS[method]
     checked = {name: chosen.checked(method, name, value) for name, value in options.items()}
     if not all(sides):
-        raise ValueError(f"{method}: no image on one side; accepted: at least one")
+        raise ValueError(f"{method}: no image on one side; expected at least one")
     one, two = bare = [[channels.without_variances(image, named) for image in side] for side in sides]
     single = len(one) == len(two) == 1
     if chosen.takes_renders:
         one, two = sides if single else bare
         found = chosen.function(one, two, allow_nonfinite=allow_nonfinite, **checked)
     elif not single:
-        raise ValueError(f"{method}: {len(one)} and {len(two)} images; accepted: one a side")
+        raise ValueError(f"{method}: {len(one)} and {len(two)} images; expected one a side")
     else:
         a, b, other = shared_channels(one[0], two[0])
         found = chosen.function(a, b, allow_nonfinite=allow_nonfinite, **checked)

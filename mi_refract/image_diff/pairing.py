@@ -45,32 +45,32 @@ def require_apart(reference: Path, test: Path, maps: Sequence[Map] = (), new: bo
     """
     for role, path in {"test": test, **({} if new else {"reference": reference})}.items():
         if not path.exists():
-            raise FileNotFoundError(f"{path}: no such {role} file or folder; accepted: one that is there")
+            raise FileNotFoundError(f"{path}: no such {role} file or folder; expected one that is there")
     if maps and test.is_dir():
         return
     if reference.exists() and reference.samefile(test):
-        raise ValueError(f"{test}: the same as the reference {reference}; accepted: two")
+        raise ValueError(f"{test}: the same as the reference {reference}; expected two")
     inner, outer = reference.resolve(), test.resolve()
     if inner.is_relative_to(outer) or outer.is_relative_to(inner):
-        raise ValueError(f"{test}: one within the other, {reference}; accepted: two apart")
+        raise ValueError(f"{test}: one path contains the other, {reference}; use separate folders")
 
 
 def pairs(reference: Path, test: Path, settings: Settings) -> list[Pair]:
     """The images of both sides by name, each with how it is compared. ValueError where a folder holds no image."""
     known = reference.exists()
     if known and reference.is_dir() != test.is_dir():
-        raise ValueError(f"{reference}, {test}: a folder and a file; accepted: two of a kind")
+        raise ValueError(f"{reference}, {test}: cannot compare a folder with a file")
     if not test.is_dir():
         return [_single(reference, test, settings)]
     (old, lost), (new, missed) = images_in(reference) if known else ({}, []), images_in(test)
     for folder, nothing in ((reference, known and not old and not lost), (test, not new and not missed)):
         if nothing:
-            raise ValueError(f"{folder}: holds no image; accepted: at least one")
+            raise ValueError(f"{folder}: holds no image; expected at least one")
     found = _mapped(old, new, settings.maps) if settings.maps else _of_one_name(old, new)
     found = [replace(pair, target=reference / pair.target, how=settings.of(pair.name)) for pair in found]
     found = _without_variants(*_without_own_files(found, old, (reference, test)))
     if not found and not lost and not missed:
-        raise ValueError(f"defaults.map fits no image in {reference} and {test}; accepted: templates of their paths")
+        raise ValueError(f"defaults.map fits no image in {reference} and {test}; expected templates of their paths")
     return [*found, *(Pair(name, None, None, reference / name, error=error) for name, error in lost + missed)]
 
 
@@ -93,7 +93,7 @@ def named(pairs: Sequence[Each], names: Sequence[str]) -> list[Each]:
     """
     for name in names:
         if not any(name_patterns.matches(name, pair.name) for pair in pairs):
-            raise ValueError(f"{name}: matches no image; accepted: the path of an image in its folder, * and ?")
+            raise ValueError(f"{name}: matches no image; expected the path of an image in its folder, * and ?")
     return [pair for pair in pairs if not names or any(name_patterns.matches(name, pair.name) for name in names)]
 
 
@@ -117,7 +117,7 @@ def wrong_entries(settings: Settings, pairs: Sequence[Pair]) -> list[Pair]:
 def error_of(pair: Pair, reference: Path) -> str:
     """Why the pair cannot be compared, as far as that is known before it is; "" for nothing."""
     file = _mask(pair, reference if reference.is_dir() else reference.parent)
-    missing = f"{file}: no such file; accepted: a mask" if file and pair.reference and not file.exists() else ""
+    missing = f"{file}: no such file; expected a mask" if file and pair.reference and not file.exists() else ""
     return pair.error or pair.how.error or missing
 
 
@@ -138,7 +138,7 @@ def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> 
         name = name_patterns.filled(each.test, values)
         before = found.setdefault(name, Pair(name, file, new.get(name), Path(path)))
         if before.reference != file:
-            error = f"{file}: a second reference, beside {before.reference}; accepted: one for {name}"
+            error = f"{file}: a second reference, beside {before.reference}; expected one for {name}"
             found[name] = replace(before, error=error)
     references = {pair.reference.resolve() for pair in found.values() if pair.reference}
     for name, file in new.items():
@@ -191,7 +191,7 @@ def _with_variants(pair: Pair, others: Sequence[Path]) -> Pair:
     matched: dict[str, Path] = {}
     for template in pair.how.accept:
         if name_patterns.expanded(template, values, [own]):
-            error = f"accept = {template!r} matches the reference {pair.target} itself; accepted: names of others"
+            error = f"accept = {template!r} matches the reference {pair.target} itself; expected names of others"
             return replace(pair, error=error)
         matched |= {name: names[name] for name in name_patterns.expanded(template, values, sorted(names))}
     return replace(pair, variants=tuple(matched.values()))
@@ -203,14 +203,14 @@ def variant(target: Path, how: How, name: str) -> Path:
     ValueError where there is none, or for a name that would not match it.
     """
     if not name.strip() or name.startswith(".") or set(name) & set("/\\*?\0"):
-        raise ValueError(f"--as-variant {name!r}: accepted: a part of a file name, as macos")
+        raise ValueError(f"--as-variant {name!r}; expected a part of a file name, as macos")
     plain = [each for each in how.accept if not set(each) & set("*?")]
     if named := [each for each in plain if name in each]:
         return target.parent / name_patterns.filled(named[0], name_patterns.fields(target.name))
     fitting = [each for each in how.accept if each.count("*") == 1 and "?" not in each]
     if not fitting:
         raise ValueError(
-            f"{target}: its settings have no `accept` with {name} or one *; accepted: in mi-refract.toml, below "
+            f"{target}: its settings have no `accept` with {name} or one *; expected in mi-refract.toml, below "
             f'[defaults], accept = ["{{stem}}-{name}{{suffix}}"]'
         )
     filled = name_patterns.filled(fitting[0].replace("*", "{*}"), name_patterns.fields(target.name) | {"*": name})
@@ -241,7 +241,7 @@ def images_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for path in (Path(parent, name) for name in folders):
             if path.is_symlink():
-                failed.append((path.relative_to(folder).as_posix(), f"{path}: a link to a folder; accepted: a folder"))
+                failed.append((path.relative_to(folder).as_posix(), f"{path}: a link to a folder; expected a folder"))
         for name in names:
             path = Path(parent, name)
             if path.suffix[1:].lower() in endings() and not name.startswith("."):

@@ -130,4 +130,4 @@ def require_nonnegative(options: Mapping[str, Any]) -> None:
     """ValueError for a number among the options that is negative or NaN."""
     for name, value in options.items():
         if isinstance(value, float | int) and not value >= 0:
-            raise ValueError(f"{name} = {value}: accepted: a number of at least 0")
+            raise ValueError(f"{name} = {value}; expected a number of at least 0")

@@ -31,7 +31,7 @@ def read(path: str | Path, reference: Path | None = None, test: Path | None = No
     """
     found = _document(path)
     if found.get("renders"):
-        raise ValueError(f"{path}: of --renders; accepted: of a comparison of single images")
+        raise ValueError(f"{path}: of --renders; expected of a comparison of single images")
     one, two = _path(path, found, "reference"), _path(path, found, "test")
     if one is None or two is None:
         raise _not_ours(path, "reference, test")
@@ -52,24 +52,24 @@ def with_settings(found: Results, settings: Settings) -> Results:
     """
     for each in found.results:
         if each.status in FAILED and (each.how.variance or settings.of(each.name).reads_variance):
-            raise ValueError(f"{each.name}: has a variance in a file of its own; accepted: accept without --from")
+            raise ValueError(f"{each.name}: has a variance in a file of its own; expected accept without --from")
     kept = [replace(settings.of(each.name), options=each.how.options) for each in found.results]
     return replace(found, results=tuple(replace(each, how=how) for each, how in zip(found.results, kept, strict=True)))
 
 
 def _not_ours(path: str | Path, what: str) -> ValueError:
-    return ValueError(f"{path}: {what}: accepted: a file that mi-refract diff --json wrote")
+    return ValueError(f"{path}: {what}; expected a file that mi-refract diff --json wrote")
 
 
 def _document(path: str | Path) -> dict[str, Any]:
     try:
         found = json.loads(regular_file.read_bytes(path, MOST))
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: no JSON ({error}); accepted: a file that mi-refract diff --json wrote") from None
+        raise ValueError(f"{path}: no JSON ({error}); expected a file that mi-refract diff --json wrote") from None
     if not isinstance(found, dict) or not isinstance(found.get("results"), list):
         raise _not_ours(path, "no results")
     if found.get("schema") != SCHEMA:
-        raise ValueError(f"{path}: schema {found.get('schema')!r}; accepted: {SCHEMA}")
+        raise ValueError(f"{path}: schema {found.get('schema')!r}; expected {SCHEMA}")
     return found
 
 
@@ -116,7 +116,7 @@ def _moved(where: str, path: Path | None, key: str, before: Path, now: Path) -> 
     inside = path.relative_to(before) if path.is_relative_to(before) else None
     moved = now / inside if inside is not None else None
     if moved is None or not (moved == now or moved.parent.resolve().is_relative_to(now.resolve())):
-        raise ValueError(f"{where}.{key}: {path}: accepted: a path in {before}")
+        raise ValueError(f"{where}.{key}: {path}; expected a path in {before}")
     return moved
 
 

@@ -204,7 +204,7 @@ def _method(layers: Sequence[tuple[str, Mapping[str, Any]]]) -> tuple[str, dict[
     for name in options:
         if name not in options_of(method):
             accepted = ", ".join(sorted(options_of(method) - {"allow_nonfinite"})) or "none"
-            raise ValueError(f"{given_by[name]}.{name}: not an option of {method}; accepted: {accepted}")
+            raise ValueError(f"{given_by[name]}.{name}: not an option of {method}; expected {accepted}")
     return method, options
 
 
@@ -229,6 +229,6 @@ def _fight(entries: Sequence[Entry]) -> str:
                 if one.values[key] != other.values[key]:
                     return (
                         f"{other.where}.{key}: {other.values[key]!r}, but {one.values[key]!r} in {one.where} for the "
-                        f"same name {one.pattern!r}; accepted: one of them"
+                        f"same name {one.pattern!r}; expected one of them"
                     )
     return ""

@@ -130,7 +130,7 @@ def load(path: str | Path, default: How = How(), allow_nonfinite: Sequence[str] 
         defaults, maps = _defaults(top["defaults"])
         rules = tuple(_entry(each, f"image[{i}]", str(path)) for i, each in enumerate(top["image"]))
     except (ValueError, RecursionError) as error:
-        said = str(error) if isinstance(error, ValueError) else "brackets nested too deeply; accepted: TOML"
+        said = str(error) if isinstance(error, ValueError) else "brackets nested too deeply; expected TOML"
         raise ValueError(" ".join(f"{path}: {said}".split())) from None
     return Settings(default, rules, tuple(allow_nonfinite), defaults, maps)
 
@@ -145,7 +145,7 @@ def _map(given: dict[str, Any]) -> Map:
     values = read(given, {side: Key(TEMPLATE, "") for side in ("reference", "test")}, "defaults.map.")
     one, two = (name_patterns.fields_of(values[side]) for side in ("reference", "test"))
     if one != two or not one or "*" in values["reference"] + values["test"]:
-        raise ValueError("defaults.map: accepted: the same fields in `reference` and `test`, and no `*`")
+        raise ValueError("defaults.map; expected the same fields in `reference` and `test`, and no `*`")
     return Map(**values)
 
 
@@ -195,21 +195,21 @@ def channels_from(words: str) -> Names:
         (one.strip(), two.strip() if equals else one.strip()) for one, equals, two in (p.partition("=") for p in parts)
     ]
     if (found := channels_of(dict(pairs))) is None or len(found) != len(pairs):
-        raise ValueError(f"--channels {words}: accepted: distinct names, or REFERENCE=TEST, between commas")
+        raise ValueError(f"--channels {words}; expected distinct names, or REFERENCE=TEST, between commas")
     return found
 
 
 def variance_from(words: str) -> str:
     """The template of the command line's `--variance`. ValueError for what is none."""
     if MASK.parse(words) is None:
-        raise ValueError(f"--variance {words}: accepted: {MASK.accepted}")
+        raise ValueError(f"--variance {words}; expected {MASK.accepted}")
     return words
 
 
 def from_words(method: str, words: Sequence[str], idiff: str | None = None) -> How:
     """The method and its options from the command line's `NAME=VALUE` and `--idiff`. ValueError for anything else."""
     if method not in ACCEPTED:
-        raise ValueError(f"--method {method}: accepted: {METHOD.accepted}")
+        raise ValueError(f"--method {method}; expected {METHOD.accepted}")
     if idiff is not None:
         return _from_idiff(method, words, idiff)
     keys = keys_of(method)
@@ -217,7 +217,7 @@ def from_words(method: str, words: Sequence[str], idiff: str | None = None) -> H
     for word in words:
         name, equals, value = word.partition("=")
         if not equals or name in given:
-            raise ValueError(f"--set {word}: accepted: NAME=VALUE, each name once")
+            raise ValueError(f"--set {word}; expected NAME=VALUE, each name once")
         given[name] = _value(value, keys[name].type) if name in keys else value
     values = read(given, keys, "--set ")
     return How(method, {name: values[name] for name in given})

@@ -78,7 +78,7 @@ def with_file(image: Image, path: Path, most: int = MAX_VALUES) -> Image:
     found = image_file.read(path, most)
     if found.pixels.shape[:2] != image.pixels.shape[:2]:
         (height, width), wrong = image.pixels.shape[:2], found.pixels.shape[:2]
-        raise ValueError(f"{path}: {wrong[1]} × {wrong[0]}; accepted: a variance of {width} × {height}")
+        raise ValueError(f"{path}: {wrong[1]} × {wrong[0]}; expected a variance of {width} × {height}")
     if FREEDOM in found.metadata:
         said = {FREEDOM: _freedom(found), **{name: found.metadata.get(name, "") for name in (FILTER, AREA)}}
         image = replace(image, metadata=image.metadata | said)
@@ -88,7 +88,7 @@ def with_file(image: Image, path: Path, most: int = MAX_VALUES) -> Image:
     colours = list(XYZ) if set(XYZ) <= set(found.channels) and not set(XYZ) & set(image.channels) else []
     if not both + colours:
         has, needed = ", ".join(found.channels), ", ".join(image.channels)
-        raise ValueError(f"{path}: variances of {has}; accepted: of channels of {image.path}, {needed}")
+        raise ValueError(f"{path}: variances of {has}; expected of channels of {image.path}, {needed}")
     variances = {name: found.pixels[..., found.channels.index(name)] for name in both + colours}
     return replace(image, variances=variances)
 
@@ -147,7 +147,7 @@ def samples(image: Image, side: str, given: int, least: int = 2) -> int:
     found = given or image.metadata.get(SPP, "no samples per pixel")
     if not re.fullmatch(r"[0-9]{1,15}(\.0)?", text := str(found)) or float(text) < least:
         where = "samples per pixel:" if given else "its header names"
-        raise ValueError(f"{image.path}: {where} {shown(found)}; accepted: `spp` or `spp_{side}`, {least} to 10¹⁵")
+        raise ValueError(f"{image.path}: {where} {shown(found)}; expected `spp` or `spp_{side}`, {least} to 10¹⁵")
     return int(float(text))
 
 
@@ -155,7 +155,7 @@ def _freedom(image: Image) -> int:
     """The degrees of freedom that the header names, which may hold anything."""
     found = image.metadata[FREEDOM]
     if not re.fullmatch(r"[0-9]{1,15}(\.0)?", text := str(found)) or float(text) < 1:
-        raise ValueError(f"{image.path}: {FREEDOM} = {shown(found)}; accepted: a whole number, 1 to 10¹⁵")
+        raise ValueError(f"{image.path}: {FREEDOM} = {shown(found)}; expected a whole number, 1 to 10¹⁵")
     return int(float(text))
 
 
@@ -187,7 +187,7 @@ def _not_negative(image: Image, name: str) -> Pixels:
         )
         raise ValueError(
             f"{image.path}: its variance of {name} is negative in {below.sum()} pixels, the first at x = "
-            f"{x + image.origin[0]}, y = {y + image.origin[1]}; accepted: at least 0{hint}"
+            f"{x + image.origin[0]}, y = {y + image.origin[1]}; expected at least 0{hint}"
         )
     return np.maximum(found, 0)
 
@@ -198,7 +198,7 @@ def _finite(image: Image, name: str, mean: Pixels, variance: Pixels, allow: bool
     if (wrong := unknown & np.isfinite(mean)).any() and not allow:
         y, x = np.unravel_index(int(wrong.argmax()), wrong.shape)
         where = f"x = {x + image.origin[0]}, y = {y + image.origin[1]}"
-        raise ValueError(f"{image.path}: its variance of {name} is not finite at {where}; accepted: finite ones")
+        raise ValueError(f"{image.path}: its variance of {name} is not finite at {where}; expected finite ones")
     return np.where(unknown, 0, variance)
 
 

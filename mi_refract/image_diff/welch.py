@@ -71,7 +71,7 @@ def compare_renders(
     """
     _check(tile, family_error, correction, equivalence_margin, resolution, hidden)
     if pixels not in ("yes", "no"):
-        raise ValueError(f"pixels = {pixels!r}: accepted: yes, no")
+        raise ValueError(f"pixels = {pixels!r}; expected yes, no")
     known, whole = None, (reference[0], test[0])
     given = spp_reference or spp, spp_test or spp
     if len(reference) == len(test) == 1 and (has_variance(reference[0]) or has_variance(test[0])):
@@ -95,17 +95,17 @@ def compare_renders(
 
 def _check(tile: int, family_error: float, correction: str, margin: float, resolution: float, hidden: float) -> None:
     if tile < 1:
-        raise ValueError(f"tile = {tile}: accepted: a positive whole number")
+        raise ValueError(f"tile = {tile}; expected a positive whole number")
     if not 0 < family_error < 1:
-        raise ValueError(f"family_error = {family_error}: accepted: more than 0, less than 1")
+        raise ValueError(f"family_error = {family_error}; expected more than 0, less than 1")
     if correction not in CORRECTIONS:
-        raise ValueError(f"correction = {correction!r}: accepted: {', '.join(CORRECTIONS)}")
+        raise ValueError(f"correction = {correction!r}; expected {', '.join(CORRECTIONS)}")
     if not margin >= 0:
-        raise ValueError(f"equivalence_margin = {margin}: accepted: at least 0")
+        raise ValueError(f"equivalence_margin = {margin}; expected at least 0")
     if not resolution > 0:
-        raise ValueError(f"resolution = {resolution}: accepted: more than 0")
+        raise ValueError(f"resolution = {resolution}; expected more than 0")
     if not 0 <= hidden <= 1:
-        raise ValueError(f"hidden = {hidden}: accepted: 0 to 1")
+        raise ValueError(f"hidden = {hidden}; expected 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class _Sides:
 def _of_renders(reference: Sequence[Image], test: Sequence[Image], tile: int, given: tuple[int, int]) -> _Sides:
     if min(len(reference), len(test)) < 2:
         raise ValueError(
-            f"welch: {len(reference)} and {len(test)} renders; accepted: at least 2 a side, or one a side with its "
+            f"welch: {len(reference)} and {len(test)} renders; expected at least 2 a side, or one a side with its "
             "variance, in channels as m2_R, R.variance or in a file (`variance`)"
         )
     for side in (reference, test):
@@ -163,9 +163,7 @@ def _of_estimates(a: Estimate, b: Estimate, tile: int) -> _Sides:
     b = replace(b, variance=b.variance[..., [b.image.channels.index(name) for name in a.image.channels]])
     known = a.known | b.known
     if not known.any():
-        raise ValueError(
-            f"{b.image.path}: no variance of a channel of {a.image.path}; accepted: `channels`, `variance`"
-        )
+        raise ValueError(f"{b.image.path}: no variance of a channel of {a.image.path}; expected `channels`, `variance`")
     names = [name for name, each in zip(a.image.channels, known, strict=True) if each]
     (m1, v1), (m2, v2) = ((_finite(x.image.select(names)).astype(np.float64), x.variance[..., known]) for x in (a, b))
     only_one, only_two = ~b.known[known], ~a.known[known]
@@ -191,7 +189,7 @@ def _distinct(side: Sequence[Image]) -> None:
         return
     for a, b in itertools.combinations(side, 2):
         if _identical(a, b) and (a.pixels != a.pixels[0, 0]).any():
-            raise ValueError(f"{b.path}: the same image as {a.path}; accepted: independent renders, of other seeds")
+            raise ValueError(f"{b.path}: the same image as {a.path}; expected independent renders, of other seeds")
 
 
 def _identical(a: Image, b: Image) -> bool:

@@ -39,7 +39,7 @@ def writable(path: str | os.PathLike[str], suffixes: Sequence[str]) -> Path:
     """
     path = Path(path)
     if path.suffix.lower() not in suffixes:
-        raise ValueError(f"{path}: accepted: a file name that ends in {' or '.join(suffixes)}")
+        raise ValueError(f"{path}; expected a file name that ends in {' or '.join(suffixes)}")
     _require_file(path)
     check_parent(path)
     return path
@@ -49,20 +49,20 @@ def _require_file(path: Path) -> None:
     """OSError where `path` exists and is no file: a new file cannot take its place, or others would lose it."""
     names = [path, path.parent / path.readlink()] if path.is_symlink() else [path]
     if any(name.parent.resolve().is_relative_to("/proc") for name in names):  # /dev/stdout, /dev/fd/3: may be of a file
-        raise OSError(f"{path}: is a stream of a process; accepted: the name of a file")
+        raise OSError(f"{path}: is a stream of a process; expected the name of a file")
     kind = stat.S_IFMT(path.stat().st_mode) if path.exists() else stat.S_IFREG
     if kind == stat.S_IFDIR:
-        raise IsADirectoryError(f"{path}: is a folder; accepted: the name of a file")
+        raise IsADirectoryError(f"{path}: is a folder; expected the name of a file")
     if kind != stat.S_IFREG:
-        raise OSError(f"{path}: is {_KINDS.get(kind, 'a device')}; accepted: the name of a file")
+        raise OSError(f"{path}: is {_KINDS.get(kind, 'a device')}; expected the name of a file")
 
 
 def check_parent(path: Path) -> None:
     """OSError where the folder that `path` is to be made in is missing, or not writable."""
     if not path.parent.is_dir():
-        raise NotADirectoryError(f"{path}: {path.parent} is not a folder; accepted: an existing one")
+        raise NotADirectoryError(f"{path}: {path.parent} is not a folder; expected an existing one")
     if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise PermissionError(f"{path}: {path.parent} is not writable; accepted: a writable folder")
+        raise PermissionError(f"{path}: {path.parent} is not writable; expected a writable folder")
 
 
 @contextlib.contextmanager

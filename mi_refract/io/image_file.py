@@ -45,9 +45,9 @@ def write_exr(
     path = atomic.writable(path, SUFFIXES)
     pixels = np.ascontiguousarray(pixels, dtype=np.float32)
     if pixels.ndim != 3 or pixels.size == 0 or pixels.shape[2] != len(channels):
-        raise ValueError(f"{path}: pixels of shape {pixels.shape}; accepted: H × W × {len(channels)} {tuple(channels)}")
+        raise ValueError(f"{path}: pixels of shape {pixels.shape}; expected H × W × {len(channels)} {tuple(channels)}")
     if len(set(channels)) != len(channels):
-        raise ValueError(f"{path}: channels {tuple(channels)}: accepted: distinct names")
+        raise ValueError(f"{path}: channels {tuple(channels)}; expected distinct names")
     attributes = _attributes(path, metadata or {})
     try:
         with atomic.replacing(path, suffix=".exr") as temporary:  # OpenImageIO tells the format by the name
@@ -82,7 +82,7 @@ def _write(path: Path, pixels: NDArray[np.float32], channels: Sequence[str], att
 def _attributes(path: Path, metadata: Mapping[str, str | int | float]) -> Metadata:
     for name, value in metadata.items():
         if not isinstance(value, (str, int, float)):
-            raise ValueError(f"{path}: attribute {name} = {value!r}: accepted: str, int, float")
+            raise ValueError(f"{path}: attribute {name} = {value!r}; expected str, int, float")
     return {n: str(v) if isinstance(v, int) and not -(2**31) <= v < 2**31 else v for n, v in metadata.items()}
 
 
@@ -114,7 +114,7 @@ class Image:
     def select(self, channels: Sequence[str]) -> NDArray[np.floating[Any]]:
         """The pixels of these channels, in this order: H × W × len(channels). ValueError for a name not there."""
         if missing := [name for name in channels if name not in self.channels]:
-            raise ValueError(f"{self.path}: no channel {missing[0]!r}; accepted: {', '.join(self.channels)}")
+            raise ValueError(f"{self.path}: no channel {missing[0]!r}; expected {', '.join(self.channels)}")
         return self.pixels[..., [self.channels.index(name) for name in channels]]
 
 
@@ -125,7 +125,7 @@ def read(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> Image:
     """
     image = read_parts(path, max_values, first_only=True)[0]
     if image.place:
-        raise ValueError(f"{path}: several parts or MIP levels in one file; accepted: one image")
+        raise ValueError(f"{path}: several parts or MIP levels in one file; expected one image")
     return image
 
 
@@ -145,7 +145,7 @@ def read_parts(
     try:
         return _images(path, source, kind, max_values, first_only, as_idiff)
     except MemoryError:
-        raise ValueError(f"{path}: more pixels than there is memory for; accepted: a smaller image") from None
+        raise ValueError(f"{path}: more pixels than fit in memory") from None
     finally:
         source.close()
 
@@ -166,9 +166,9 @@ def _checked(path: Path, max_values: int, multiplied: bool) -> tuple[Any, str]:
     try:
         str(path).encode()
     except UnicodeEncodeError:
-        raise ValueError(f"{path}: accepted: a name in UTF-8") from None
+        raise ValueError(f"{path}; expected a name in UTF-8") from None
     if path.exists() and not (path.is_file() or path.is_dir()):  # reading a pipe might never end
-        raise ValueError(f"{path}: accepted: a regular file")
+        raise ValueError(f"{path}; expected a regular file")
     with path.open("rb") as file:  # the operating system's own words for what is missing or forbidden
         begin = file.read(len(LFS_POINTER))
     if not begin:
@@ -215,7 +215,7 @@ def _check_attributes(path: Path) -> None:
             if file.tell() + length > size:
                 raise ValueError(f"{path}: corrupt EXR file: an attribute of {length} bytes")
             file.seek(length, os.SEEK_CUR)
-    raise ValueError(f"{path}: over {ATTRIBUTES} attributes; accepted: up to that")
+    raise ValueError(f"{path}: more than {ATTRIBUTES} attributes")
 
 
 def _text(file: BinaryIO) -> bytes:
@@ -248,7 +248,7 @@ def _opened(
     if source is None:
         message = _without(path, oiio.geterror())
         if "MB limit" in message:
-            raise ValueError(f"{path}: {message}; accepted: up to {max_values} values{option}")
+            raise ValueError(f"{path}: {message}; expected up to {max_values} values{option}")
         raise ValueError(f"{path}: corrupt {kind} file: {message}")
     return source
 
@@ -261,7 +261,7 @@ def named(name: str, pixels: Any) -> Image:
     """
     pixels = np.asarray(pixels)
     if pixels.ndim not in (2, 3) or not pixels.size or pixels.dtype.kind not in "fiu":
-        raise ValueError(f"{name}: {pixels.dtype} {pixels.shape}; accepted: numbers, height × width × channels")
+        raise ValueError(f"{name}: {pixels.dtype} {pixels.shape}; expected numbers, height × width × channels")
     pixels = pixels.reshape(*pixels.shape[:2], -1).astype(np.result_type(pixels.dtype, np.float32))
     count = pixels.shape[2]
     channels = tuple("RGBA"[:count]) if 3 <= count <= 4 else tuple(f"channel{i}" for i in range(count))
@@ -312,7 +312,7 @@ def _check_size(path: Path, spec: Any, max_values: int, taken: int = 0, option: 
     if spec.width * spec.height * spec.nchannels > max_values - taken:
         beside = f" beside {taken} of other parts and MIP levels" if taken else ""
         size = f"{spec.width} × {spec.height} × {spec.nchannels} values{beside}"
-        raise ValueError(f"{path}: {size}; accepted: up to {max_values} values{option}")
+        raise ValueError(f"{path}: {size}; expected up to {max_values} values{option}")
 
 
 def _image(path: Path, source: Any, kind: str, values: tuple[int, int], as_idiff: bool) -> Image:
@@ -320,17 +320,17 @@ def _image(path: Path, source: Any, kind: str, values: tuple[int, int], as_idiff
     spec = source.spec()
     found = source.format_name()
     if path.suffix[1:].lower() not in _endings(found) or found == "null":  # which is black, whatever the file holds
-        raise ValueError(f"{path}: holds an image of format {found}; accepted: the format that the name says")
+        raise ValueError(f"{path}: holds an image of format {found}; expected the format that the name says")
     if spec.deep:
-        raise ValueError(f"{path}: accepted: an image without deep samples")
+        raise ValueError(f"{path}; expected an image without deep samples")
     if min(spec.width, spec.height, spec.nchannels) < 1 or spec.depth > 1:
-        raise ValueError(f"{path}: {spec.width} × {spec.height} × {spec.depth} pixels; accepted: a plane with pixels")
+        raise ValueError(f"{path}: {spec.width} × {spec.height} × {spec.depth} pixels; expected a plane with pixels")
     _check_size(path, spec, *values)
     formats = {str(each) for each in (spec.channelformats or [spec.format])}
     if formats & {"uint64", "int64"}:
-        raise ValueError(f"{path}: integers of 64 bits; accepted: up to 32")
+        raise ValueError(f"{path}: integers of 64 bits; expected up to 32")
     if found == "tiff" and "double" in formats and spec.height == 1:  # OpenImageIO 2.4 to 3.2 reads what lay in memory
-        raise ValueError(f"{path}: one row of 64-bit numbers in a TIFF file; accepted: several rows, or 32 bits")
+        raise ValueError(f"{path}: one row of 64-bit numbers in a TIFF file; expected several rows, or 32 bits")
     wide = not as_idiff and formats & {"double", "uint32", "int32", "uint", "int"}
     at = source.current_subimage(), source.current_miplevel()
     pixels = source.read_image(*at, 0, spec.nchannels, "double" if wide else "float")

@@ -30,7 +30,7 @@ def held(path: Path, what: str, place: Path | None = None, accepted: str = "anot
     file = _locked(path)
     if file is None:
         where = path.parent if place is None else place
-        raise BlockingIOError(f"{where}: {what} runs there already, {_holder(path)}; accepted: {accepted}")
+        raise BlockingIOError(f"{where}: {what} runs there already, {_holder(path)}; expected {accepted}")
     try:
         import socket  # the others who import this module do without
 

@@ -67,7 +67,7 @@ def run(
     prints more than `most` bytes: it is killed then. ValueError for a `timeout` that is no time.
     """
     if not 0 <= timeout <= LONGEST:
-        raise ValueError(f"timeout {timeout:g} s; accepted: 0 … {LONGEST:g} s")
+        raise ValueError(f"timeout {timeout:g} s; expected 0 … {LONGEST:g} s")
     pipe, errors = subprocess.PIPE, subprocess.PIPE if keep_stderr else None
     with _signals_noted() as noted, _adopting(adopt):
         process = subprocess.Popen(

@@ -21,9 +21,9 @@ def opened(path: str | os.PathLike[str], most: int) -> Iterator[BinaryIO]:
     with open(path, "rb", opener=_without_waiting) as file:
         found = os.fstat(file.fileno())
         if not stat.S_ISREG(found.st_mode):
-            raise ValueError(f"{path}: is a pipe or a device; accepted: a file")
+            raise ValueError(f"{path}: not a regular file")
         if found.st_size > most:
-            raise ValueError(f"{path}: {found.st_size} bytes; accepted: up to {most}")
+            raise ValueError(f"{path}: {found.st_size} bytes; expected up to {most}")
         yield file
 
 
@@ -41,5 +41,5 @@ def read_bytes(path: str | os.PathLike[str], most: int) -> bytes:
         while size < len(content) <= most and (more := file.read(_PIECE)):  # it grew meanwhile
             content += more
     if len(content) > most:
-        raise ValueError(f"{path}: more than {most} bytes; accepted: up to {most}")
+        raise ValueError(f"{path}: more than {most} bytes")
     return content

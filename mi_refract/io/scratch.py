@@ -97,5 +97,5 @@ def _temporary(size: int) -> BinaryIO:
     except OSError as error:
         file.close()
         why = f"{tempfile.gettempdir()}: no room for {size} bytes: {error.strerror}"
-        raise OSError(f"{why}; accepted: a folder for temporary files that has it, in TMPDIR") from None
+        raise OSError(f"{why}; expected a folder for temporary files that has it, in TMPDIR") from None
     return file

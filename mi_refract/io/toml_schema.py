@@ -109,7 +109,7 @@ def read(table: Table, keys: dict[str, Key], where: str = "") -> Table:
     """The values of `keys`, parsed. ValueError names `where` and the key that is unknown, missing or not accepted."""
     for name in table:
         if name not in keys:
-            raise ValueError(f"{where}{_shown_key(name)}: unknown; accepted: {', '.join(keys)}")
+            raise ValueError(f"{where}{_shown_key(name)}: unknown; expected {', '.join(keys)}")
     return {name: _value(table, name, key, where) for name, key in keys.items()}
 
 
@@ -119,7 +119,7 @@ def _value(table: Table, name: str, key: Key, where: str) -> Any:
     value = key.type.parse(table[name]) if name in table else None
     if value is None:
         found = shown(table[name]) if name in table else "missing"
-        raise ValueError(f"{where}{name}: {found}; accepted: {key.type.accepted}")
+        raise ValueError(f"{where}{name}: {found}; expected {key.type.accepted}")
     return value
 
 

@@ -62,14 +62,14 @@ def load(catalog: str, glass: str, label: str) -> Medium:
         glasses = read(catalog)
     except ModuleNotFoundError as error:
         text = f"{label}: {error.name} is not installed"
-        raise ValueError(f"{text}; accepted: pip install 'mi-refract[glass]' first") from None
+        raise ValueError(f"{text}; expected pip install 'mi-refract[glass]' first") from None
     known = {_plain(name): name for name in glasses}
     if _plain(glass) not in known:
         near = ", ".join(f"{catalog}:{known[each]}" for each in difflib.get_close_matches(_plain(glass), known, 3, 0.0))
-        raise ValueError(f"{label}: unknown glass; accepted: one of the catalogue's {len(glasses)}; nearest: {near}")
+        raise ValueError(f"{label}: unknown glass; expected one of the catalogue's {len(glasses)}; nearest: {near}")
     name = known[_plain(glass)]
     if not glasses[name].coefficients:
-        raise ValueError(f"{label}: its catalogue prints no formula of this glass; accepted: another, or table(…)")
+        raise ValueError(f"{label}: its catalogue prints no formula of this glass; expected another, or table(…)")
     form, coefficients = _in_nanometres(catalog, glasses[name].coefficients)
     found = glasses[name]
     return Medium(f"{catalog}:{name}", form, coefficients, found.range, "air", fitted=found.fitted)

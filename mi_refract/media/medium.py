@@ -48,7 +48,7 @@ class Medium:
                 low, high = self.valid
                 at = np.atleast_1d(wavelength)[np.isnan(np.atleast_1d(found))][0]
                 text = f"{self.name}: no index at {at:g} nm"
-                raise ValueError(f"{text}; accepted: a wavelength from {low:g} to {high:g} nm")
+                raise ValueError(f"{text}; expected a wavelength from {low:g} to {high:g} nm")
             low, high = self.fitted
             asked = np.atleast_1d(wavelength)
             if (beyond := asked[(asked < low) | (asked > high)]).size:

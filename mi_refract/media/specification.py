@@ -44,10 +44,10 @@ def parse(spec: float | str, name: str = "") -> Medium:
     label = f"{name} = {spec!r}" if name else repr(spec)
     if isinstance(spec, (int, float)) and not isinstance(spec, bool):
         if not 0 < spec < math.inf:
-            raise ValueError(f"{label}: accepted: a positive finite number, or a material's name")
+            raise ValueError(f"{label}; expected a positive finite number, or a material's name")
         return Medium(str(spec), CONSTANT, {"n": float(spec)})
     if not isinstance(spec, str):
-        raise ValueError(f"{label}: accepted: a positive finite number, or a material's name")
+        raise ValueError(f"{label}; expected a positive finite number, or a material's name")
     text = spec.strip()
     if ":" in text.partition("(")[0]:
         return _catalogued(text, label)
@@ -59,7 +59,7 @@ def parse(spec: float | str, name: str = "") -> Medium:
 def _formula(text: str, label: str) -> Medium:
     call = re.fullmatch(r"(\w+)\s*\((.*)\)", text)
     if not call or call[1] not in FORMULAS_OF_N:
-        raise ValueError(f"{label}: accepted: {', '.join(f'{known}(…)' for known in FORMULAS_OF_N)}")
+        raise ValueError(f"{label}; expected {', '.join(f'{known}(…)' for known in FORMULAS_OF_N)}")
     form, coefficients, valid = FORMULAS_OF_N[call[1]](call[2], label)
     medium = _between_poles(Medium(text, form, coefficients, valid), label)
     _check_visible(medium, label)
@@ -72,7 +72,7 @@ def _numbers(arguments: str, label: str, counts: Sequence[int], says: str) -> li
     except ValueError:
         values = []
     if len(values) not in counts or not all(map(math.isfinite, values)):
-        raise ValueError(f"{label}: accepted: {says}, finite numbers")
+        raise ValueError(f"{label}; expected {says}, finite numbers")
     return values
 
 
@@ -85,7 +85,7 @@ def _sellmeier(arguments: str, label: str) -> Formula:
     values = _numbers(arguments, label, range(2, 14, 2), "sellmeier(B1, …, C1, …), as many C in nm² as B, up to 6")
     for i, c in enumerate(values[len(values) // 2 :], 1):
         if 0 < abs(c) < MICROMETRES:
-            raise ValueError(f"{label}: C{i} = {c:g}: accepted: nm²; from µm² multiply by 1e6")
+            raise ValueError(f"{label}: C{i} = {c:g}; expected nm²; from µm² multiply by 1e6")
     return *dispersion.sellmeier(values), ANY
 
 
@@ -93,19 +93,19 @@ def _sellmeier_nm(arguments: str, label: str) -> Formula:
     values = _numbers(arguments, label, range(2, 14, 2), "sellmeier_nm(B1, …, L1, …), as many L in nm as B, up to 6")
     for i, wavelength in enumerate(values[len(values) // 2 :], 1):
         if wavelength < 0 or 0 < wavelength < MICROMETRES:
-            raise ValueError(f"{label}: L{i} = {wavelength:g}: accepted: nm; from µm multiply by 1e3")
+            raise ValueError(f"{label}: L{i} = {wavelength:g}; expected nm; from µm multiply by 1e3")
     return *dispersion.sellmeier(values, squared=True), ANY
 
 
 def _abbe(arguments: str, label: str) -> Formula:
     n_d, v_d = _numbers(arguments, label, [2], "abbe(n_d, V_d)")
     if v_d == 0:
-        raise ValueError(f"{label}: V_d = 0: accepted: (n_d − 1)/(n_F − n_C), which is not 0")
+        raise ValueError(f"{label}: V_d = 0; expected (n_d − 1)/(n_F − n_C), which is not 0")
     return Abbe(), {"n_d": n_d, "V_d": v_d}, ANY
 
 
 def _table(arguments: str, label: str) -> Formula:
-    accepted = "accepted: table(400: 1.53, 500: 1.52, …), two or more, wavelengths in nm, increasing"
+    accepted = "expected table(400: 1.53, 500: 1.52, …), two or more, wavelengths in nm, increasing"
     try:
         knots = [(float(w), float(n)) for w, n in (pair.split(":") for pair in arguments.split(","))]
     except ValueError:
@@ -115,7 +115,7 @@ def _table(arguments: str, label: str) -> Formula:
     if len(knots) < 2 or not increasing or not 0 < wavelengths[0] < wavelengths[-1] < math.inf:
         raise ValueError(f"{label}: {accepted}")
     if bad := [f"{n:g} at {w:g} nm" for w, n in knots if not 0 < n < math.inf]:
-        raise ValueError(f"{label}: n = {bad[0]}: accepted: a positive finite index")
+        raise ValueError(f"{label}: n = {bad[0]}; expected a positive finite index")
     form = Table(wavelengths)
     return form, dict(zip(form.names, (n for _, n in knots), strict=True)), (wavelengths[0], wavelengths[-1])
 
@@ -134,7 +134,7 @@ def _between_poles(medium: Medium, label: str) -> Medium:
     low, high = medium.valid
     for name, pole in medium.dispersion.poles(medium.coefficients).items():
         if VISIBLE[0] <= pole <= VISIBLE[1]:
-            raise ValueError(f"{label}: {name}: n is infinite at {pole:.6g} nm; accepted: no such pole in 360 … 830 nm")
+            raise ValueError(f"{label}: {name}: n is infinite at {pole:.6g} nm; expected no such pole in 360 … 830 nm")
         low, high = (max(low, pole), high) if pole < VISIBLE[0] else (low, min(high, pole))
     return Medium(medium.name, medium.dispersion, medium.coefficients, (low, high))
 
@@ -148,7 +148,7 @@ def _check_visible(medium: Medium, label: str) -> None:
     n = medium.index_or_nan(wavelengths)
     if low <= high and np.isnan(n).any():
         at = wavelengths[np.isnan(n)][0]
-        raise ValueError(f"{label}: n is no positive number at {at:.6g} nm; accepted: one at all of 360 … 830 nm")
+        raise ValueError(f"{label}: n is no positive number at {at:.6g} nm; expected one at all of 360 … 830 nm")
 
 
 def _catalogued(text: str, label: str) -> Medium:
@@ -160,7 +160,7 @@ def _catalogued(text: str, label: str) -> Medium:
         return glass_catalogs.load(catalog.upper(), glass, label)
     near = difflib.get_close_matches(text, MATERIALS, 3, 0.0)
     catalogs = ", ".join(f"{name}:…" for name in glass_catalogs.CATALOGS)
-    raise ValueError(f"{label}: unknown material; nearest: {', '.join(near)}; accepted: these, or {catalogs}")
+    raise ValueError(f"{label}: unknown material; nearest: {', '.join(near)}; expected these, or {catalogs}")
 
 
 def _of_mitsuba(material: str, label: str) -> Medium:
@@ -177,6 +177,6 @@ def _of_mitsuba(material: str, label: str) -> Medium:
         single = variant.lookup_ior(query, "ior", material)
     except RuntimeError as error:
         known = str(error).partition("choices are:")[2] or "the names of Mitsuba's table"
-        raise ValueError(f"{label}: unknown material; accepted: {known.strip()}") from None
+        raise ValueError(f"{label}: unknown material; expected {known.strip()}") from None
     absolute = "vacuum" if material in ("air", "vacuum") else ""
     return Medium(material, CONSTANT, {"n": float(f"{single:.7g}")}, relative_to=absolute, is_air=material == "air")

@@ -27,7 +27,7 @@ def floats(name: str, x: Any, *shapes: tuple) -> np.ndarray:
     fits = any(len(s) == x.ndim and all(map(lambda w, m: w in ("N", m), s, x.shape)) for s in shapes)
     if x.dtype not in (np.float32, np.float64) or not fits:
         accepted = " or ".join(f"({', '.join(map(str, s))})" if s else "a number" for s in shapes)
-        raise ValueError(f"oracle: {name} is {x.dtype} {x.shape}; accepted: float32 or float64, {accepted}")
+        raise ValueError(f"oracle: {name} is {x.dtype} {x.shape}; expected float32 or float64, {accepted}")
     return x.astype(np.float64)
 
 

@@ -34,7 +34,7 @@ def residual(a: Any, n: Any, k: Any, certified: Certified, *, contrast: Any = No
     """
     a, n, k, contrast, valid = checked(a, n, k, contrast)
     if len(certified) != len(a):
-        raise ValueError(f"oracle: certified holds {len(certified)} rays; accepted: {len(a)}, as many as a")
+        raise ValueError(f"oracle: certified holds {len(certified)} rays; expected {len(a)}, as many as a")
     holds = np.isnan(certified.direction).all(axis=1) & ~certified.transmitted
     width = np.zeros(len(a))
     index = np.flatnonzero(valid)

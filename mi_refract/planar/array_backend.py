@@ -148,12 +148,12 @@ def choose_backend(name: str | None, precision: str) -> ArrayBackend:
     which computes in double.
     """
     if precision not in PRECISIONS:
-        raise ValueError(f"precision = {precision!r}; accepted: {', '.join(PRECISIONS)}")
+        raise ValueError(f"precision = {precision!r}; expected {', '.join(PRECISIONS)}")
     found = detect()
     llvm = found["llvm"]
     name = name or ("llvm" if llvm.usable else "scalar")
     if name not in found:
-        raise ValueError(f"backend = {name!r}; accepted: {', '.join(found)}")
+        raise ValueError(f"backend = {name!r}; expected {', '.join(found)}")
     if not found[name].usable:
         raise ValueError(f"backend = {name!r} cannot run here: {found[name].reason}")
     if name != "scalar":
@@ -161,7 +161,7 @@ def choose_backend(name: str | None, precision: str) -> ArrayBackend:
     if precision == "float32":
         accepted = "float64, or a compiled backend (llvm, cuda)"
         missing = "" if llvm.usable else f"; llvm cannot run here: {llvm.reason}"
-        raise ValueError(f"precision = 'float32': scalar arrays compute in double; accepted: {accepted}{missing}")
+        raise ValueError(f"precision = 'float32': scalar arrays compute in double; expected {accepted}{missing}")
     return ScalarBackend()
 
 

@@ -67,7 +67,7 @@ class Curve:
         matrix, at = np.asarray(matrix, float), np.asarray(at, float)
         determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
         if not (math.isfinite(determinant) and determinant and np.isfinite(at).all()):
-            raise ValueError(f"matrix = {matrix.tolist()}, at = {at.tolist()}; accepted: finite, determinant not 0")
+            raise ValueError(f"matrix = {matrix.tolist()}, at = {at.tolist()}; expected finite, determinant not 0")
         # Column by column: products with 0 and 1 are exact, whatever order of summation a matrix product has.
         x, y = matrix.T
         vertices, control = (p[:, :1] * x + p[:, 1:] * y + at for p in (self.vertices, self.control))
@@ -82,7 +82,7 @@ class Curve:
         """
         arcs = np.flatnonzero(~self.straight)
         if not 0 < len(arcs) <= facets:
-            raise ValueError(f"facets: {facets}, for {len(arcs)} arcs; accepted: an arc at least, and a facet for each")
+            raise ValueError(f"facets: {facets}, for {len(arcs)} arcs; expected an arc at least, and a facet for each")
         steps = np.ones(len(self), int)
         steps[arcs] = np.diff(np.arange(len(arcs) + 1) * facets // len(arcs))
         chords = [self._piece(j).outline(int(n))[:-1] for j, n in enumerate(steps)]

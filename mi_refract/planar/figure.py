@@ -233,7 +233,7 @@ def _rgb(scene: PlanarScene, name: str) -> Any:
     try:
         return np.array(to_rgb(name))
     except ValueError:
-        raise ValueError(f"{scene.path}: colours: {name!r}; accepted: a colour that matplotlib knows") from None
+        raise ValueError(f"{scene.path}: colours: {name!r}; expected a colour that matplotlib knows") from None
 
 
 def _stroke(panel: Axes, lines: Legs, colours: dict[int, Any], room: float) -> None:

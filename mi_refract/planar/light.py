@@ -66,7 +66,7 @@ def of_wavelengths(asked: Sequence[float] | int, power: str = "flat") -> Light:
 
 def parsed(text: str) -> list[float] | int:
     """Wavelengths in nm with commas between them, or how many. ValueError for anything else."""
-    accepted = f"accepted: wavelengths in nm as 486.1,587.6, or a number of them from 2 to {MOST}"
+    accepted = f"expected wavelengths in nm as 486.1,587.6, or a number of them from 2 to {MOST}"
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:

@@ -251,7 +251,7 @@ def _refraction(arrays: ArrayBackend, formula: str | None) -> Refraction:
 
         return planar
     if formula not in FORMULAS:
-        raise ValueError(f"formula = {formula!r}: unknown; accepted: {', '.join(FORMULAS)}")
+        raise ValueError(f"formula = {formula!r}: unknown; expected {', '.join(FORMULAS)}")
 
     def spatial(d: Vector2, line: Vector2, k: Number) -> tuple[Vector2, Mask]:
         zero = 0 * d.x

@@ -83,7 +83,7 @@ def follow(
     (None: MOST).
     """
     if branches < 0:
-        raise ValueError(f"branches = {branches}: accepted: a whole number from 0")
+        raise ValueError(f"branches = {branches}; expected a whole number from 0")
     trace = Tracer(segments, **how)
     rays, reflect = np.arange(len(origins)), np.zeros(len(origins), np.uint32)
     orders: list[Branches] = []
@@ -103,7 +103,7 @@ def _check_size(paths: int, max_depth: int, reflections: int, most: int) -> None
     if paths * (max_depth + 1) > most:
         size = f"{paths} paths of up to {max_depth} boundaries with up to {reflections} partial reflections"
         rest = "" if most == MOST else f", of which other colours take {MOST - most}"
-        raise ValueError(f"{size}; accepted: fewer rays, branches or boundaries, {MOST} legs altogether{rest}")
+        raise ValueError(f"{size}; expected fewer rays, branches or boundaries, {MOST} legs altogether{rest}")
 
 
 def follow_scene(scene: PlanarScene, **how: Any) -> tuple[Branches, ...]:

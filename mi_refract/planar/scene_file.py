@@ -75,7 +75,7 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
     """
     path = Path(path)
     if path.is_dir():
-        raise IsADirectoryError(f"{path}: is a folder; accepted: a scene file")
+        raise IsADirectoryError(f"{path}: is a folder; expected a scene file")
     content = regular_file.read_bytes(path, SIZE)
     try:
         return _scene(path, _parsed(content), wavelengths)
@@ -87,11 +87,11 @@ def _parsed(content: bytes) -> dict[str, Any]:
     try:
         return tomllib.loads(content.decode())
     except UnicodeDecodeError as error:
-        raise ValueError(f"byte {error.start} is not UTF-8; accepted: TOML") from None
+        raise ValueError(f"byte {error.start} is not UTF-8; expected TOML") from None
     except RecursionError:
-        raise ValueError("brackets nested too deeply; accepted: TOML") from None
+        raise ValueError("brackets nested too deeply; expected TOML") from None
     except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{error}; accepted: TOML") from None
+        raise ValueError(f"{error}; expected TOML") from None
 
 
 def _light(values: dict[str, Any], wavelengths: Sequence[float] | int | None) -> Light:
@@ -99,7 +99,7 @@ def _light(values: dict[str, Any], wavelengths: Sequence[float] | int | None) ->
     if asked is None:
         return of_names(values["colours"])
     if values["colours"]:
-        raise ValueError("colours: beside wavelengths; accepted: one of them")
+        raise ValueError("colours: beside wavelengths; expected one of them")
     return of_wavelengths(asked, values["light"])
 
 
@@ -140,15 +140,13 @@ def _parts(tables: list[dict[str, Any]], ambient: Indices, light: Light) -> list
         kind, values = read_kind(table, SHAPES, f"{where}.", light)
         values["outside"] = _outside(values, media, where) or ambient
         if values.get("name") in media:
-            raise ValueError(f"{where}.name: {shown(values['name'])} is another shape's; accepted: a new one")
+            raise ValueError(f"{where}.name: {shown(values['name'])} is another shape's; expected a new one")
         if values.get("name"):
             media[values["name"]] = values["n"]
         each = max(values.get("facets") or 4, len(values.get("points", ())))
         pieces += values.get("layers", 1) * each * len(light)
         if pieces > PIECES:
-            raise ValueError(
-                f"{where}: {pieces} pieces and more; accepted: {PIECES}, colours times those of all shapes"
-            )
+            raise ValueError(f"{where}: {pieces} pieces and more; expected {PIECES}, colours times those of all shapes")
         try:
             with np.errstate(all="ignore"):
                 placed = _placed(kind.build(values), values)
@@ -165,10 +163,10 @@ def _outside(values: dict[str, Any], media: dict[str, Indices], where: str) -> I
     if name is None:
         return values.get("outside")
     if values["outside"]:
-        raise ValueError(f"{where}.within: {shown(name)}, beside `outside`; accepted: one of them")
+        raise ValueError(f"{where}.within: {shown(name)}, beside `outside`; expected one of them")
     if name not in media:
         known = ", ".join(map(shown, media)) or "none so far"
-        raise ValueError(f"{where}.within: {shown(name)}; accepted: the name of a shape above: {known}")
+        raise ValueError(f"{where}.within: {shown(name)}; expected the name of a shape above: {known}")
     return media[name]
 
 
@@ -184,7 +182,7 @@ def _placed(parts: list[Part], values: dict[str, Any]) -> list[Part]:
 
 def _check_range(where: str, *points: Array) -> None:
     if not all(np.abs(p).max() <= FARTHEST for p in points):
-        raise ValueError(f"{where}: coordinates beyond {FARTHEST:g}; accepted: up to that")
+        raise ValueError(f"{where}: coordinates beyond {FARTHEST:g}")
 
 
 def _rays(tables: list[dict[str, Any]]) -> tuple[Array, Array, NDArray[np.intp]]:
@@ -194,7 +192,7 @@ def _rays(tables: list[dict[str, Any]]) -> tuple[Array, Array, NDArray[np.intp]]
         kind, values = read_kind(table, BEAMS, f"beam[{j}].", Light())
         count += values.get("count", 1)
         if count > RAYS:
-            raise ValueError(f"beam[{j}].count: {count} rays with the beams before; accepted: up to {RAYS}")
+            raise ValueError(f"beam[{j}].count: {count} rays with the beams before; expected up to {RAYS}")
         try:
             rays.append(kind.build(values))
         except ValueError as error:

@@ -203,7 +203,7 @@ def _fan(v: Table) -> tuple[Array, Array]:
 
 def _rays(v: Table) -> tuple[Array, Array]:
     if len(v["origins"]) != len(v["directions"]):
-        raise ValueError(f"directions: {len(v['directions'])}, for {len(v['origins'])} origins; accepted: as many")
+        raise ValueError(f"directions: {len(v['directions'])}, for {len(v['origins'])} origins; expected as many")
     return np.array(v["origins"]), np.array(v["directions"])
 
 

@@ -89,7 +89,7 @@ def read_kind(table: Table, kinds: dict[str, Kind], where: str, light: Light) ->
     name = table.get("kind")
     if not isinstance(name, str) or name not in kinds:
         found = shown(name) if "kind" in table else "missing"
-        raise ValueError(f"{where}kind: {found}; accepted: {', '.join(kinds)}")
+        raise ValueError(f"{where}kind: {found}; expected {', '.join(kinds)}")
     keys = kinds[name].keys
     values = read({key: value for key, value in table.items() if key != "kind"}, keys, where)
     return kinds[name], per_colour(values, keys, where, light)
@@ -106,7 +106,7 @@ def per_colour(values: Table, keys: dict[str, Key], where: str, light: Light) ->
         if isinstance(indices, str):
             found[name] = light.indices(indices, f"{where}{name}")
         elif len(indices) not in (1, colours):
-            raise ValueError(f"{where}{name}: {len(indices)} numbers; accepted: 1 for all or each of {colours} colours")
+            raise ValueError(f"{where}{name}: {len(indices)} numbers; expected 1 for all or each of {colours} colours")
     return values | {name: tuple(n) * (colours // len(n)) for name, n in found.items()}
 
 

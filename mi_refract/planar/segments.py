@@ -27,12 +27,12 @@ def finite_array(name: str, values: Any, shape: tuple[int, ...]) -> Array:
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{name}: accepted: numbers of shape {shape}") from None
+        raise ValueError(f"{name}; expected numbers of shape {shape}") from None
     if array.shape != shape:
-        raise ValueError(f"{name}: shape {array.shape}; accepted: {shape}")
+        raise ValueError(f"{name}: shape {array.shape}; expected {shape}")
     if array.size and not (np.isfinite(array.min()) and np.isfinite(array.max())):
         place = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise ValueError(f"{name}{list(place)} = {array[place]}: accepted: finite numbers")
+        raise ValueError(f"{name}{list(place)} = {array[place]}; expected finite numbers")
     return array
 
 
@@ -61,7 +61,7 @@ class Segments:
     def __post_init__(self) -> None:
         """Convert all fields to float64 and check them."""
         if len(self.start) == 0:
-            raise ValueError("segments: none; accepted: at least one")
+            raise ValueError("segments: none; expected at least one")
         for name, shape in SHAPES.items():
             values = getattr(self, name)
             if values is None and name in ARC_FIELDS:
@@ -69,12 +69,12 @@ class Segments:
             values = finite_array(f"segments.{name}", values, (len(self.start), *shape))
             object.__setattr__(self, name, values)
         if (self.control is None) != (self.weight is None):
-            raise ValueError("segments: control and weight: accepted: both or neither")
+            raise ValueError("segments: control and weight; expected both or neither")
         for name in ("n_left", "n_right", "weight"):
             values = getattr(self, name)
             if values is not None and not (values > 0).all():
                 i = int(np.argmin(values > 0))
-                raise ValueError(f"segments.{name}[{i}] = {values[i]}: accepted: more than 0")
+                raise ValueError(f"segments.{name}[{i}] = {values[i]}; expected more than 0")
         self._check_distinct()
 
     def __len__(self) -> int:
@@ -104,4 +104,4 @@ class Segments:
         same = (np.diff(key[order].astype(np.int64), axis=0) == 0).all(1) & (ends[order[1:], 0] != ends[order[1:], 1])
         if same.any():
             i, j = sorted(order[int(np.argmax(same)) :][:2].tolist())
-            raise ValueError(f"segments {i} and {j} coincide; accepted: one, with the media on either side of both")
+            raise ValueError(f"segments {i} and {j} coincide; expected one, with the media on either side of both")

@@ -34,7 +34,7 @@ def polygon(points: Any, arcs: Sequence[float] | None = None) -> Curve:
     curve = _chain(points, arcs, closed=True)
     size = area(curve)
     if abs(size) <= 1e-12 * np.ptp(curve.vertices, 0).max() ** 2:
-        raise ValueError("points: they enclose no area; accepted: three that are not on a line, or an arc")
+        raise ValueError("points: they enclose no area; expected three that are not on a line, or an arc")
     return curve if size > 0 else curve.reversed()
 
 
@@ -43,9 +43,9 @@ def _chain(points: Any, arcs: Sequence[float] | None, closed: bool) -> Curve:
     pieces = len(corners) - (not closed)
     turns = [0.0] * pieces if arcs is None else [float(turn) for turn in arcs]
     if len(corners) < 2:
-        raise ValueError(f"points: {len(corners)}; accepted: at least 2")
+        raise ValueError(f"points: {len(corners)}; expected at least 2")
     if len(turns) != pieces or not all(abs(turn) < 360 for turn in turns):
-        raise ValueError(f"arcs: {len(turns)} for {pieces} pieces; accepted: one a piece, above -360 and below 360")
+        raise ValueError(f"arcs: {len(turns)} for {pieces} pieces; expected one a piece, above -360 and below 360")
     if not any(turns):
         return polygonal(corners, closed)
     vertices, control, weight = [corners[0]], [], []
@@ -141,10 +141,10 @@ def lens(
         rims = [vertex + depths[0], vertex + thickness + depths[1]]
     if math.isnan(rims[0] + rims[1]):
         ends = (1 / (abs(c) * math.sqrt(1 + k)) for c, k in zip(curvature, conic, strict=True) if c and k > -1)
-        raise ValueError(f"radius = {radius:g}: a surface ends before; accepted: at most {min(ends, default=0):g}")
+        raise ValueError(f"radius = {radius:g}: a surface ends before; expected at most {min(ends, default=0):g}")
     if rims[1] < rims[0]:
         meet = _tip(curvature, thickness, conic)[1]
-        raise ValueError(f"radius = {radius:g}: the surfaces meet before; accepted: at most {meet:g}, or no radius")
+        raise ValueError(f"radius = {radius:g}: the surfaces meet before; expected at most {meet:g}, or no radius")
     front = _surface(vertex, rims[0], radius, curvature[0], conic[0])
     back = _surface(vertex + thickness, rims[1], radius, curvature[1], conic[1])
     return joined(front, back.reversed())
@@ -169,7 +169,7 @@ def _tip(curvature: Sequence[float], thickness: float, conic: Sequence[float]) -
         if square > 0 and 1 - c1 * k1 * z >= -FLAT and 1 - c2 * k2 * (z - t) >= -FLAT:
             tips.append((math.sqrt(square), z))
     if not tips:
-        raise ValueError(f"curvature = {list(curvature)}: the surfaces never meet; accepted: only with a radius")
+        raise ValueError(f"curvature = {list(curvature)}: the surfaces never meet; expected only with a radius")
     radius, z = min(tips)
     return z, radius
 
@@ -181,7 +181,7 @@ def ellipse_lens(n: float, focal_length: float, thickness: float, radius: float)
     the rays meet at right angles. ValueError for n ≤ 1, a thickness not below the focal length, and as for `lens`.
     """
     if not n > 1 or not 0 < thickness < focal_length:
-        raise ValueError(f"n = {n:g}, thickness = {thickness:g}; accepted: n > 1, 0 < thickness < {focal_length:g}")
+        raise ValueError(f"n = {n:g}, thickness = {thickness:g}; expected n > 1, 0 < thickness < {focal_length:g}")
     eccentricity = 1 / n
     curvature = 1 / (focal_length * (1 - eccentricity)), 1 / (focal_length - thickness)
     return lens(curvature, thickness, radius=radius, conic=(-(eccentricity**2), 0.0), vertex=-focal_length)
@@ -200,7 +200,7 @@ def document_lens(resolution: float | None = None) -> Curve:
     ValueError for a resolution that is not above 0.
     """
     if resolution is not None and not resolution > 0:
-        raise ValueError(f"resolution = {resolution}; accepted: above 0")
+        raise ValueError(f"resolution = {resolution}; expected above 0")
     c, k, conic = LENS_CURVATURE, LENS_HALF_WIDTH, LENS_CONIC
     whole = lens((-c, c), 2 * k, conic=(conic, conic), vertex=-k)
     whole = whole.mapped(affine(90, (1.0, LENS_STRETCH)))

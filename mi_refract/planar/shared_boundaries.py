@@ -50,16 +50,16 @@ def _present(parts: list[Named], pieces: NDArray[Any], largest: float) -> None:
     """ValueError for a part of which merging leaves no piece."""
     for (name, _), left in zip(parts, pieces, strict=True):
         if not left:
-            raise ValueError(f"{name}: a point, beside coordinates of {largest:g}; accepted: above {NEAR:.0e} of that")
+            raise ValueError(f"{name}: a point, beside coordinates of {largest:g}; expected above {NEAR:.0e} of that")
 
 
 def _filled(there: Array, earlier: str, later: str, part: Part) -> Any:
     """The index on the side of an earlier part's edge along which `part` runs: that of its inside."""
     if not part.curve.closed:
-        raise ValueError(f"{later}: it runs along {earlier}; accepted: a boundary of its own")
+        raise ValueError(f"{later}: it runs along {earlier}; expected a boundary of its own")
     if tuple(there) != part.right:
         found, outside = _indices(there), _indices(part.right)
-        raise ValueError(f"{later}: along {earlier} there is index {found}; accepted: {outside}, what it lies in")
+        raise ValueError(f"{later}: along {earlier} there is index {found}; expected {outside}, what it lies in")
     return part.left
 
 

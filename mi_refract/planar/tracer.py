@@ -121,9 +121,9 @@ class Tracer:
 
 def _check_depth(max_depth: Any, rays: int) -> None:
     if isinstance(max_depth, bool) or not isinstance(max_depth, int | np.integer) or max_depth < 1:
-        raise ValueError(f"max_depth = {max_depth!r}: accepted: a whole number, 1 or more")
+        raise ValueError(f"max_depth = {max_depth!r}; expected a whole number, 1 or more")
     if rays * (max_depth + 1) >= 2**32:
-        raise ValueError(f"{rays} rays, max_depth = {max_depth}: accepted: a product below 2³²")
+        raise ValueError(f"{rays} rays, max_depth = {max_depth}; expected a product below 2³²")
 
 
 def _scaled(directions: Array) -> Array:
@@ -134,14 +134,14 @@ def _scaled(directions: Array) -> Array:
         return directions
     size = np.maximum(*np.abs(directions).T)
     if not size.all():
-        raise ValueError(f"directions[{int(np.argmin(size))}] = (0, 0): accepted: a direction")
+        raise ValueError(f"directions[{int(np.argmin(size))}] = (0, 0); expected a direction")
     return np.ldexp(directions, 1 - np.frexp(size)[1][:, None])
 
 
 def _check_range(name: str, values: Array, largest: float) -> None:
     """ValueError for numbers of which a product of two would overflow."""
     if values.size and not (values.max() <= largest and values.min() >= -largest):
-        raise ValueError(f"{name}: a number beyond ±{largest:g}; accepted: up to that")
+        raise ValueError(f"{name}: a number beyond ±{largest:g}")
 
 
 def _middle(segments: Segments) -> Array:
@@ -173,14 +173,14 @@ def _each(name: str, values: Any, count: int, kinds: str, kind: Any) -> Any:
     fits = array.dtype.kind in kinds and array.shape in ((), (count,))
     if not fits or not (((array >= 0) & (array < 2**32)) if whole else ((array > 0) & np.isfinite(array))).all():
         accepted = "a whole number, 0 or more and below 2³²" if whole else "a number above 0"
-        raise ValueError(f"{name}: accepted: {accepted}, or {count} of them")
+        raise ValueError(f"{name}; expected {accepted}, or {count} of them")
     return np.ascontiguousarray(np.broadcast_to(array.astype(kind), count))
 
 
 def _mesh(arrays: ArrayBackend, segments: Segments, method: str) -> MeshAcceleration | None:
     """The mesh that finds the next boundary; None where all segments are tried: faster, asked for, or the only way."""
     if method not in METHODS:
-        raise ValueError(f"method = {method!r}; accepted: {', '.join(METHODS)}")
+        raise ValueError(f"method = {method!r}; expected {', '.join(METHODS)}")
     if method == "brute" or (method == "auto" and len(segments) <= FEW):
         return None
     length = np.hypot(*(segments.end - segments.start).T)
@@ -196,5 +196,5 @@ def _mesh(arrays: ArrayBackend, segments: Segments, method: str) -> MeshAccelera
         reason = "segments {} and {}".format(*mesh.crowded)
     if method == "mesh":
         limit = f"longer and farther apart than {SHORTEST:.1e} of half the extent"
-        raise ValueError(f"method = 'mesh': {reason}; accepted: straight segments, {limit}")
+        raise ValueError(f"method = 'mesh': {reason}; expected straight segments, {limit}")
     return None

@@ -57,16 +57,16 @@ def read_absorption(plugin: str, props: Any, side: str) -> Absorption | None:
     sigma, colour, distance = f"{side}_absorption", f"{side}_colour", f"{side}_colour_distance"
     if sigma in props:
         if colour in props or distance in props:
-            raise ValueError(f"{plugin}: {sigma} beside {colour}: accepted: one of the two")
+            raise ValueError(f"{plugin}: {sigma} beside {colour}; expected one of the two")
         return _read(plugin, props, sigma, 0.0)
     if (colour in props) != (distance in props):
         missing = distance if colour in props else colour
-        raise ValueError(f"{plugin}: {colour} and {distance}: {missing} is not given; accepted: both, or neither")
+        raise ValueError(f"{plugin}: {colour} and {distance}: {missing} is not given; expected both, or neither")
     if colour not in props:
         return None
     length = props[distance]
     if isinstance(length, bool) or not isinstance(length, (int, float)) or not 0 < length < math.inf:
-        raise ValueError(f"{plugin}: {distance} = {length!r}: accepted: a positive finite length")
+        raise ValueError(f"{plugin}: {distance} = {length!r}; expected a positive finite length")
     return _read(plugin, props, colour, float(length))
 
 
@@ -74,10 +74,10 @@ def _read(plugin: str, props: Any, name: str, distance: float) -> Absorption:
     values = _values(props[name])
     accepted = "a number or a spectrum " + ("above 0 and up to 1" if distance else "≥ 0, and finite")
     if values is None:
-        raise ValueError(f"{plugin}: {name} = {_brief(props[name])}: accepted: {accepted}; no texture")
+        raise ValueError(f"{plugin}: {name} = {_brief(props[name])}; expected {accepted}; no texture")
     fits = all(0 < x <= 1 if distance else 0 <= x < math.inf for x in values)
     if not fits:
-        raise ValueError(f"{plugin}: {name} = {_brief(props[name])}: accepted: {accepted}")
+        raise ValueError(f"{plugin}: {name} = {_brief(props[name])}; expected {accepted}")
     # Mitsuba makes a spectrum of an RGB colour up to 1 only, and a smooth one of 1/2; of the others, in proportion.
     coloured = type(props[name]).__name__.endswith("Color3d") and not distance
     factor = 2 * max(values) if coloured and any(values) else 1.0

@@ -25,7 +25,7 @@ def read_ior(props: Any, name: str, default: str) -> float:
     index = read_index(mi, props, name, default)
     if isinstance(index, Medium) and not index.dispersive:
         return float(index.index(media.LINES["d"]))
-    raise ValueError(f"{PLUGIN}: {name} = {props[name]}: accepted here: one index for all wavelengths, everywhere")
+    raise ValueError(f"{PLUGIN}: {name} = {props[name]}; expected here one index for all wavelengths, everywhere")
 
 
 def read_index(v: Any, props: Any, name: str, default: str) -> Any:
@@ -41,10 +41,10 @@ def read_index(v: Any, props: Any, name: str, default: str) -> Any:
     if knots is None:
         if isinstance(value, mi.Object) and hasattr(value, "is_spatially_varying"):
             return value
-        raise ValueError(f"{label} = {value!r}: accepted: {ACCEPTED}")
+        raise ValueError(f"{label} = {value!r}; expected {ACCEPTED}")
     if not knots.wavelengths:
         return media.parse(knots.values[0], name=label)
     table = "table(" + ", ".join(f"{w!r}: {n!r}" for w, n in zip(*knots, strict=True)) + ")"
     if not v.is_spectral:
-        raise ValueError(f"{label}: a spectrum has become a colour here; accepted: {name} = {table!r}, a string")
+        raise ValueError(f"{label}: a spectrum has become a colour here; expected {name} = {table!r}, a string")
     return media.parse(table, name=label)

@@ -75,7 +75,7 @@ class DispersiveRatio:
             if key in self.shown:
                 shown = self.shown[key]
                 if len(shown) != 1:
-                    raise ValueError(f"{PLUGIN}: {key} has {len(shown)} entries; accepted: one number")
+                    raise ValueError(f"{PLUGIN}: {key} has {len(shown)} entries; expected one number")
                 self.exact[key] = self.wide(dr.detach(shown)) if dr.is_jit_v(shown) else self.wide(shown[0])
         self._hide()
 
@@ -134,7 +134,7 @@ def read_ratio(v: Any, props: Any) -> tuple[DispersiveRatio | TexturedRatio | No
     dispersive = [name for name, index in indices.items() if isinstance(index, Medium) and index.dispersive]
     if not all(isinstance(index, Medium) for index in indices.values()):
         if dispersive:
-            raise ValueError(f"{PLUGIN}: {dispersive[0]}: accepted beside a texture: one index for all wavelengths")
+            raise ValueError(f"{PLUGIN}: {dispersive[0]}; expected beside a texture one index for all wavelengths")
         line = media.LINES["d"]
         return TexturedRatio(v, {k: x.index(line) if isinstance(x, Medium) else x for k, x in indices.items()}), 1.0
     inside, outside = indices.values()
@@ -161,7 +161,7 @@ def _check_range(label: str, medium: Medium) -> str:
         return ""
     text = f"{label}: {medium.name} has an index from {medium.valid[0]:g} to {medium.valid[1]:g} nm"
     if lost > LOST:
-        raise ValueError(f"{text}: outside it is {lost:.1%} of the colour; accepted: a medium with at most {LOST:.1%}")
+        raise ValueError(f"{text}: outside it is {lost:.1%} of the colour; expected a medium with at most {LOST:.1%}")
     return f"{text}; other light ({lost:.1e} of the colour) is lost there"
 
 

@@ -196,7 +196,7 @@ def check_integrator(scene: Any) -> None:
         return
     for bsdf in (each for shape in all_shapes(scene) if (outer := shape.bsdf()) for each in nested(outer)):
         if name := absorbing_parameter(bsdf):
-            raise ValueError(f"refract: {name}: accepted: the integrator refract_path, or no absorption")
+            raise ValueError(f"refract: {name}; expected the integrator refract_path, or no absorption")
 
 
 def check_wrappers(scene: Any) -> None:
@@ -207,11 +207,11 @@ def check_wrappers(scene: Any) -> None:
         within = outer is not None and any(getattr(bsdf, "absorbing", False) for bsdf in nested(outer))
         if within and not dr.all(outer.has_attribute(BEYOND)):
             text = f"{shape_name(shapes, i)} has an absorbing BSDF within a {outer.class_name()}"
-            raise ValueError(f"refract_path: {text}: accepted: absorption of the shape's own BSDF")
+            raise ValueError(f"refract_path: {text}; expected absorption of the shape's own BSDF")
 
 
 def _message(shape: str, at_camera: bool) -> str:
     camera = "camera_absorption, or the sensor's medium, as the camera's surroundings absorb"
     outside = "ext_absorption (or ext_colour) as the medium around it absorbs"
     accepted = f"{camera}; {outside}" if at_camera else f"{outside}; {camera}"
-    return f"refract_path: light comes to {shape} through another absorption than its BSDF says: accepted: {accepted}"
+    return f"refract_path: light comes to {shape} through another absorption than its BSDF says; expected {accepted}"

@@ -86,7 +86,7 @@ def read_parameters(self: Any, props: Any, formula: str = "auto") -> None:
     v.BSDF.__init__(self, props)
     self.varying, eta = read_ratio(v, props)  # `varying`: a ratio that is not one number, or None
     if formula != "auto" and "formula" in props:
-        raise ValueError(f"{PLUGIN}_{formula}: formula = {props['formula']!r}: accepted: nothing here")
+        raise ValueError(f"{PLUGIN}_{formula}: `formula` cannot be set on {PLUGIN}_{formula}")
     self.requested = props.get("formula", formula)
     try:
         self.formula_name, self.formula = resolve(self.requested, dr.backend_v(v.Float))
@@ -109,7 +109,7 @@ def read_parameters(self: Any, props: Any, formula: str = "auto") -> None:
 def checked(name: str, eta: float) -> float:
     """`eta`; ValueError where it is no ratio of indices."""
     if not SMALLEST_RATIO <= eta <= LARGEST_RATIO:
-        raise ValueError(f"{PLUGIN}: {name} = {eta!r}: accepted: a ratio from {SMALLEST_RATIO} to {LARGEST_RATIO}")
+        raise ValueError(f"{PLUGIN}: {name} = {eta!r}; expected a ratio from {SMALLEST_RATIO} to {LARGEST_RATIO}")
     return eta
 
 
@@ -147,7 +147,7 @@ def parameters_changed(self: Any, keys: Any) -> None:
             set_ratio(self, self.varying.at(self.wide(LINES["d"])))
     elif not keys or "eta" in keys:
         if len(self.eta) != 1:
-            raise ValueError(f"{PLUGIN}: eta has {len(self.eta)} entries; accepted: one number")
+            raise ValueError(f"{PLUGIN}: eta has {len(self.eta)} entries; expected one number")
         if dr.is_jit_v(self.eta) and dr.flag(dr.JitFlag.FreezingScope):
             # A number cannot be read while a function is recorded. An index that is none loses its light.
             eta = self.wide(dr.detach(self.eta))
@@ -252,7 +252,7 @@ def refuse_others(self: Any) -> Any:
     Dr.Jit asks the BSDFs of all scenes in memory, also where no light meets them: an error would be one of scenes that
     do not absorb. (Some integrators leave out a sample that is NaN.)
     """
-    text = f"{PLUGIN}: {absorbing_parameter(self)}: accepted: the integrator refract_path, or no absorption"
+    text = f"{PLUGIN}: {absorbing_parameter(self)}; expected the integrator refract_path, or no absorption"
     if not dr.is_jit_v(self.v.Float):
         raise RuntimeError(text)
     warn_once(f"{text}; where light meets it, the image is infinite")

@@ -36,7 +36,7 @@ def read_count(props: Any, name: str, default: int, least: int) -> int:
     value = props.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         what = "-1 (no limit) or an integer ≥ 0" if least < 0 else f"an integer ≥ {least}"
-        raise ValueError(f"{INTEGRATOR}: {name} = {value!r}: accepted: {what}")
+        raise ValueError(f"{INTEGRATOR}: {name} = {value!r}; expected {what}")
     return value
 
 
@@ -44,7 +44,7 @@ def read_flag(props: Any, name: str) -> bool:
     """A Boolean parameter, False where it is not given. ValueError with its name and what is accepted."""
     value = props.get(name, False)
     if not isinstance(value, bool):
-        raise ValueError(f"{INTEGRATOR}: {name} = {value!r}: accepted: true or false")
+        raise ValueError(f"{INTEGRATOR}: {name} = {value!r}; expected true or false")
     return value
 
 
@@ -53,13 +53,13 @@ def read_split(props: Any, deterministic: bool) -> tuple[int, float]:
     depth = read_count(props, "split_depth", DEEPEST if deterministic else 0, 0)
     weight = props.get("split_weight", 1e-3 if deterministic else 1e-2)
     if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not 0 <= weight <= 1:
-        raise ValueError(f"{INTEGRATOR}: split_weight = {weight!r}: accepted: a number from 0 to 1")
+        raise ValueError(f"{INTEGRATOR}: split_weight = {weight!r}; expected a number from 0 to 1")
     # Every path has a share above the weight, and all of them together have 1.
     paths = min(2.0**depth, 1 / weight if weight else math.inf)
     if depth > DEEPEST or paths > MOST_PATHS:
         raise ValueError(
             f"{INTEGRATOR}: split_depth = {depth}, split_weight = {weight}: one sample could split into {paths:.3g} "
-            f"paths; accepted: 2^split_depth or 1/split_weight up to {MOST_PATHS}, and split_depth up to {DEEPEST}"
+            f"paths; expected 2^split_depth or 1/split_weight up to {MOST_PATHS}, and split_depth up to {DEEPEST}"
         )
     return depth, float(weight)
 
@@ -174,9 +174,9 @@ def integrator_class(v: Any) -> type:
             # Local memory has no derivatives, and the evaluated loops that derivatives need have no local memory.
             symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
             if self.deterministic and not needs.deterministic:
-                raise ValueError(f"{INTEGRATOR}: deterministic: accepted: scenes of smooth dielectrics and conductors")
+                raise ValueError(f"{INTEGRATOR}: deterministic; expected scenes of smooth dielectrics and conductors")
             if self.deterministic and not symbolic:
-                raise ValueError(f"{INTEGRATOR}: deterministic: accepted: renders that are not differentiated")
+                raise ValueError(f"{INTEGRATOR}: deterministic; expected renders that are not differentiated")
             if not symbolic and needs.refracting and needs.smooth and needs.area:
                 warn_once(
                     f"{INTEGRATOR}: derivatives leave out edges of area lights that move, seen through a boundary from "

@@ -65,13 +65,13 @@ def check_files(path: Path, folders: Iterable[Path], defines: Mapping[str, str])
     _walk_file(path, list(folders), walk, 0)
     longest = max(map(len, walk.parameters.values()), default=0)
     if walk.dollars * max(longest, len(walk.parameters)) > SIZE:  # Mitsuba tries each parameter at each place
-        raise ValueError(f"{path}: parameters expand to over {SIZE} bytes; accepted: up to that")
+        raise ValueError(f"{path}: parameters expand to more than {SIZE} bytes")
     return walk
 
 
 def _refuse_more(path: Path, count: int, limit: int, what: str) -> None:
     if count > limit:
-        raise ValueError(f"{path}: more than {limit} {what}; accepted: up to that")
+        raise ValueError(f"{path}: more than {limit} {what}")
 
 
 def _walk_file(path: Path, folders: list[Path], walk: Walk, depth: int) -> None:
@@ -79,12 +79,12 @@ def _walk_file(path: Path, folders: list[Path], walk: Walk, depth: int) -> None:
     walk.xml.append(path)
     _refuse_more(path, walk.files, FILES, "files included")
     if path.is_dir():
-        raise IsADirectoryError(f"{path}: is a folder; accepted: a scene file")
+        raise IsADirectoryError(f"{path}: is a folder; expected a scene file")
     content = regular_file.read_bytes(path, SIZE - walk.size)
     walk.size += len(content)
     walk.dollars += content.count(b"$")
     if b"\0" in content:
-        raise ValueError(f"{path}: zero bytes; accepted: XML in UTF-8")
+        raise ValueError(f"{path}: zero bytes; expected XML in UTF-8")
     for name, text in _elements(path, content):
         walk.elements += 1
         _refuse_more(path, walk.elements, ELEMENTS, "XML elements")
@@ -97,7 +97,7 @@ def _follow(name: bytes, values: Mapping[str, str], path: Path, folders: list[Pa
     if name == b"default":
         value = values.get("value", "")
         if len(value) > VALUE:
-            raise ValueError(f"{path}: <default>: a value of {len(value)} characters; accepted: up to {VALUE}")
+            raise ValueError(f"{path}: <default>: a value of {len(value)} characters; expected up to {VALUE}")
         walk.parameters.setdefault(values.get("name", ""), value)
         _refuse_more(path, len(walk.parameters), PARAMETERS, "parameters")
     elif name == b"path":
@@ -107,7 +107,7 @@ def _follow(name: bytes, values: Mapping[str, str], path: Path, folders: list[Pa
         folders.insert(0, walk.searched[-1])
     elif name == b"spectrum" and re.fullmatch(r"[^\s,:]+:[^\s,:]+", values.get("value", "").strip()):
         accepted = "a number, or two pairs and more of a wavelength in nm and a value"
-        raise ValueError(f"{path}: {values.get('name')} = {values['value']!r}: accepted: {accepted}")
+        raise ValueError(f"{path}: {values.get('name')} = {values['value']!r}; expected {accepted}")
     elif values.get("filename"):
         found = resolved(values["filename"], [path.parent, *folders])
         refuse_special(found)
@@ -153,7 +153,7 @@ def _elements(path: Path, content: bytes) -> Iterator[tuple[bytes, bytes]]:
     depth, place = 0, content.find(b"<")
     while place >= 0:
         if content.startswith(b"<!DOCTYPE", place):
-            raise ValueError(f"{path}: a document type; accepted: a scene without")
+            raise ValueError(f"{path}: DOCTYPE declarations are not allowed")
         begin = next((begin for begin in _SKIPPED if content.startswith(begin, place)), None)
         if begin:
             end = content.find(_SKIPPED[begin], place + len(begin))
@@ -170,5 +170,5 @@ def _elements(path: Path, content: bytes) -> Iterator[tuple[bytes, bytes]]:
                 yield tag[2], tag[3]
                 depth += not tag[3].endswith(b"/")
             if depth > DEPTH:
-                raise ValueError(f"{path}: elements nested more than {DEPTH} deep; accepted: up to that")
+                raise ValueError(f"{path}: elements nested more than {DEPTH} deep")
         place = content.find(b"<", end)

@@ -168,23 +168,21 @@ def check_faces(path: Path) -> None:
         return
     faces, count = np.array(mesh.faces_buffer()), mesh.vertex_count()
     if faces.size and faces.max() >= count:
-        raise ValueError(
-            f"{path}: vertex {faces.max()} of a face; accepted: 0 to {count - 1}, the vertices of the file"
-        )
+        raise ValueError(f"{path}: vertex {faces.max()} of a face; expected 0 to {count - 1}, the vertices of the file")
 
 
 def check_plugins(path: Path, names: Any, allowed: Collection[str]) -> None:
     """ValueError for a plugin that is neither Mitsuba's nor ours nor in `allowed`."""
     if unknown := sorted({*names} - known_plugins() - {*allowed}):
-        accepted = f"those; code that a scene brings: where it is rendered, by --allow-plugins {unknown[0]}"
-        raise ValueError(f"{path}: plugin {unknown[0]!r}: neither Mitsuba's nor mi_refract's; accepted: {accepted}")
+        accepted = f"those; to load native code shipped with a scene, pass --allow-plugins {unknown[0]}"
+        raise ValueError(f"{path}: plugin {unknown[0]!r}: neither Mitsuba's nor mi_refract's; expected {accepted}")
 
 
 def _check_needed(path: Path, every: Iterable[Any]) -> None:
     for props in every:
         name = NEEDED.get(plugin := props.plugin_name())
         if name and name not in props:
-            raise ValueError(f"{path}: plugin {plugin!r} without {name!r}; accepted: one with it")
+            raise ValueError(f"{path}: plugin {plugin!r} without {name!r}; expected one with it")
 
 
 def _children(props: Any, by_id: Mapping[str, int]) -> list[int]:
@@ -209,7 +207,7 @@ def _check_nesting(path: Path, kinds: list[str], children: list[list[int]]) -> N
         lobes[i] = 1 + 2 * sum(lobes[child] for child in children[i]) if kinds[i] == "BSDF" else 0
         if depth[i] > DEPTH or lobes[i] > LOBES:
             what = f"up to {DEPTH}, and {LOBES} lobes of a BSDF"
-            raise ValueError(f"{path}: plugins nested {depth[i]} deep, of {lobes[i]} lobes; accepted: {what}")
+            raise ValueError(f"{path}: plugins nested {depth[i]} deep, of {lobes[i]} lobes; expected {what}")
 
 
 def _children_first(path: Path, children: list[list[int]]) -> Iterator[int]:
@@ -228,5 +226,5 @@ def _children_first(path: Path, children: list[list[int]]) -> Iterator[int]:
             begun.add(node)
             for child in children[node]:
                 if child in begun and child not in done:
-                    raise ValueError(f"{path}: plugins refer to each other in a circle; accepted: a scene without")
+                    raise ValueError(f"{path}: circular reference between plugins")
                 stack.append(child)

@@ -116,9 +116,9 @@ def make_given(name: str, ratios: ArrayLike, precision: DTypeLike, seed: int = 0
     regime, k = REGIMES[name], rounded(np.asarray(ratios, float), precision)
     if not regime.takes_k:
         taking = ", ".join(repr(each) for each in REGIMES if REGIMES[each].takes_k)
-        raise ValueError(f"regime {name!r}: its ratios of indices are its own; accepted: {taking}")
+        raise ValueError(f"regime {name!r}: its ratios of indices are its own; expected {taking}")
     if (k < regime.least_k).any():
-        raise ValueError(f"regime {name!r}: k = {k.min():.6g}; accepted: {regime.least_k:g} or more")
+        raise ValueError(f"regime {name!r}: k = {k.min():.6g}; expected {regime.least_k:g} or more")
     if not regime.angle:
         rays = make(name, len(k), precision, seed)
         return Rays(rays.a, rays.n, k.astype(precision))

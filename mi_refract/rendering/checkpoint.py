@@ -123,9 +123,7 @@ def read(path: Path, identity: dict[str, Any]) -> Progress:
             )
     except _DAMAGE as error:
         what = f"{path}: is no complete checkpoint ({type(error).__name__})"
-        raise ValueError(f"{what}; accepted: one that is, or --restart, which begins anew") from None
+        raise ValueError(f"{what}; expected one that is, or --restart to start over") from None
     if different:
-        raise ValueError(
-            f"{path}: of another render: {different}; accepted: the same render, or --restart, which begins anew"
-        )
+        raise ValueError(f"{path}: belongs to a different render: {different}; pass --restart to start over")
     return found

@@ -74,7 +74,7 @@ def without_noise(sums: PassSums) -> bool:
 def require_interval() -> None:
     """ImportError, in one line, where the interval cannot be had."""
     if importlib.util.find_spec("scipy") is None:
-        raise ImportError("--until needs SciPy; accepted: pip install 'mi-refract[diff]', or --until-tile")
+        raise ImportError("--until needs SciPy; expected pip install 'mi-refract[diff]', or --until-tile")
 
 
 def _quantile(freedom: int) -> float:

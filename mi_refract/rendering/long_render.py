@@ -68,12 +68,12 @@ class Limits:
         """ValueError for what is out of range."""
         for name in ("spp", "pass_spp"):
             if (value := getattr(self, name)) is not None and not 1 <= value < 2**32:
-                raise ValueError(f"{name} = {value}: accepted: a whole number from 1 to 2³² − 1")
+                raise ValueError(f"{name} = {value}; expected a whole number from 1 to 2³² − 1")
         for name in ("until", "until_tile"):
             if (value := getattr(self, name)) is not None and not 0 < value <= 1:
-                raise ValueError(f"{name} = {value:g}: accepted: more than 0 %, up to 100 %")
+                raise ValueError(f"{name} = {value:g}; expected more than 0 %, up to 100 %")
         if self.seconds is not None and not 0 < self.seconds < float("inf"):
-            raise ValueError(f"time = {self.seconds:g} s: accepted: more than 0")
+            raise ValueError(f"time = {self.seconds:g} s; expected more than 0")
 
     @property
     def open_ended(self) -> bool:
@@ -120,7 +120,7 @@ class LongRender:
         """
         self.job, self.limits, self.output = job, limits, writable(output, SUFFIXES)
         if not 0 <= job.seed < 2**32:
-            raise ValueError(f"seed = {job.seed}: accepted: a whole number from 0 to 2³² − 1")
+            raise ValueError(f"seed = {job.seed}; expected a whole number from 0 to 2³² − 1")
         if limits.until is not None:
             error_estimate.require_interval()
         self.checkpoint = checkpoint.path_of(self.output)
@@ -150,7 +150,7 @@ class LongRender:
         if self.checkpoint.exists():
             found = checkpoint.read(self.checkpoint, identity)
             if self.spp is not None and found.done > self.spp:
-                raise ValueError(f"{self.checkpoint}: holds {found.done} spp; accepted: at least so many, or --restart")
+                raise ValueError(f"{self.checkpoint}: holds {found.done} spp; expected at least so many, or --restart")
             return found
         image = rendered_file.read(self.output, self.renderer.channels, identity)
         enough = image is not None and (self.spp is None or image.done <= (self._planned(None).total or 0))
@@ -168,9 +168,7 @@ class LongRender:
         if self.progress.rest is not None and self.progress.done != self.spp:
             self.progress.rest = None  # it was the last of fewer samples: a whole pass takes its place
         if self.progress.tree.passes and asked not in (None, recorded):
-            raise ValueError(
-                f"{self.checkpoint}: passes of {recorded} samples per pixel; accepted: those, or --restart"
-            )
+            raise ValueError(f"{self.checkpoint}: passes of {recorded} samples per pixel; expected those, or --restart")
         begun = recorded if self.progress.tree.passes else None
         return self._planned(begun or asked, self.progress.base.spp if self.progress.base else 0)
 
@@ -183,7 +181,7 @@ class LongRender:
         """
         with lock.held(lock_of(self.output), "a render", self.output, "another file"):
             if _stamps(self.output, self.checkpoint) != self._seen:
-                raise BlockingIOError(f"{self.output}: another render was there meanwhile; accepted: to try again")
+                raise BlockingIOError(f"{self.output}: another render was there meanwhile; expected to try again")
             self._holds_lock = True
             try:
                 return self._run(passes or ThisProcess(self.renderer), watch)
@@ -264,7 +262,7 @@ class LongRender:
         if error_estimate.without_noise(sums):
             return NO_NOISE
         if self.spp is None and not np.any(sums.total[..., : sums.colours] > 0):
-            self._warn_once(f"{self.output}: is black so far: it has no relative error that could end it")
+            self._warn_once(f"{self.output}: the image is still black; --until cannot be evaluated")
         if self.progress.passes < FEW:
             return ""
         if self.limits.until and (error := error_estimate.relative_error(sums)).high <= self.limits.until:
@@ -332,7 +330,7 @@ class LongRender:
             self.keep()
             said = self.warnings[before:]
             if not said and self.checkpoint.exists():
-                said = [f"{self.checkpoint}: {self.progress.done} spp; the same command goes on from them"]
+                said = [f"{self.checkpoint}: {self.progress.done} spp; run the same command again to resume"]
             for text in said:
                 os.write(2, f"\nmi-refract: {printable(text)}\n".encode(errors="replace"))
             lock_of(self.output).unlink(missing_ok=True)

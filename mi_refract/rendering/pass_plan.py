@@ -32,9 +32,7 @@ def seed_of(seed: int, number: int) -> int:
 def scalar_seed_of(seed: int, number: int, pixels: int) -> int:
     """The same in scalar variants, for a film of so many pixels. ValueError where passes would repeat."""
     if number >= (most := (MASK + 1) // pixels):
-        raise ValueError(
-            f"pass {number} of {pixels} pixels: accepted in scalar variants: up to {most} passes; more --pass-spp"
-        )
+        raise ValueError(f"pass {number} of {pixels} pixels; scalar variants take up to {most} passes; more --pass-spp")
     return (_mix(seed) + number) % most
 
 
@@ -92,11 +90,9 @@ def plan_passes(
     """
     spp = asked or usual_spp(pixels, total)
     if min(spp, total or spp) * pixels > MASK:
-        raise ValueError(
-            f"{spp} samples per pixel in a pass of {pixels} pixels; accepted: up to 2³² − 1 samples in all"
-        )
+        raise ValueError(f"{spp} samples per pixel in a pass of {pixels} pixels; expected up to 2³² − 1 samples in all")
     if asked and accepted(asked) != asked:
-        raise ValueError(f"{asked} samples per pixel in a pass; accepted by the sampler: {accepted(asked)}")
+        raise ValueError(f"{asked} samples per pixel in a pass; the sampler takes {accepted(asked)}")
     if total and not asked:
         spp = spp if moments else min(spp, max(1, total // FEW))
     while spp > 1 and accepted(spp) != spp:

@@ -141,7 +141,7 @@ class PassTree:
     def add(self, node: PassSums, level: int = 0) -> None:
         """Add a node of ARITY**level passes, which begins where the last one ended. The tree owns it from here on."""
         if any(self.counts[:level]) or node.passes != ARITY**level:
-            raise ValueError(f"{node.passes} passes after {self.passes}: accepted: {ARITY**level}, where they begin")
+            raise ValueError(f"{node.passes} passes after {self.passes}; expected {ARITY**level}, where they begin")
         self.passes += node.passes
         while True:
             while len(self.levels) <= level:

@@ -221,7 +221,7 @@ def _samples(scene: Any, channels: tuple[str, ...], spp: int, seed: int) -> tupl
         values.append(dr.select(valid, mi.Float(1), mi.Float(0)))
     values += list(others)
     if len(values) != len(channels):
-        raise ValueError(f"{len(values)} values in a sample; accepted: {len(channels)}, those of the film")
+        raise ValueError(f"{len(values)} values in a sample; expected {len(channels)}, those of the film")
     return values, mi.Point2f(place) - mi.Point2f(sensor.film().crop_offset())
 
 

@@ -71,7 +71,7 @@ def _absolute(path: Path) -> str:
     normal = os.path.abspath(path)  # noqa: PTH100 (`Path.absolute` leaves "..")
     if not Path(normal).exists() or not os.path.samefile(path, normal):  # noqa: PTH121
         raise ValueError(
-            f"{path}: is {normal} only by a symbolic link; accepted with a cluster: a name without '..' after it"
+            f"{path}: is {normal} only by a symbolic link; expected with a cluster a name without '..' after it"
         )
     return normal
 
@@ -82,7 +82,7 @@ def _check_size(scene: Path, paths: list[str], limit: int) -> None:
         largest = max(paths, key=sizes.__getitem__)
         told = f"{size / MEBIBYTE:.1f} MiB of files, the largest {largest} ({sizes[largest] / MEBIBYTE:.1f} MiB)"
         more = f"--bundle-limit {-(-size // MEBIBYTE)}, if all workers have the memory"
-        raise ValueError(f"{scene}: {told}; accepted with a cluster: {limit} MiB, or {more}")
+        raise ValueError(f"{scene}: {told}; expected with a cluster {limit} MiB, or {more}")
 
 
 def _search_folders(scene: Path) -> list[Path]:
@@ -109,7 +109,7 @@ def _check_places(bundle: SceneBundle, xml: list[str], defines: Mapping[str, str
 
 
 _ONLY_HERE = (
-    "by an absolute name or from the working folder; accepted with a cluster: a name relative to the scene's folder"
+    "by an absolute name or from the working folder; expected with a cluster a name relative to the scene's folder"
 )
 
 

@@ -21,9 +21,9 @@ def parse_defines(items: Sequence[str]) -> dict[str, str]:
     for item in items:
         name, equals, value = item.partition("=")
         if not equals or not re.fullmatch(r"[A-Za-z_]\w*", name):
-            raise ValueError(f"-D {item}: accepted: NAME=VALUE")
+            raise ValueError(f"-D {item}; expected NAME=VALUE")
         if name in defines:
-            raise ValueError(f"-D {item}: {name} is given twice; accepted: once")
+            raise ValueError(f"-D {item}: {name} is given twice; expected once")
         defines[name] = value
     return defines
 
@@ -49,7 +49,7 @@ def load_scene(
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such scene file")
     if taken := [name for name in TAKEN if name in defines]:
-        raise ValueError(f"define {taken[0]!r}: taken by Mitsuba's parser; accepted: any name but {TAKEN}")
+        raise ValueError(f"define {taken[0]!r}: taken by Mitsuba's parser; expected any name but {TAKEN}")
     try:
         scene = scene_parser.load(path, defines, allow_plugins, moved)
     except OSError:
@@ -57,16 +57,16 @@ def load_scene(
     except Exception as error:  # RuntimeError from the parser; whatever a Python plugin raises
         raise ValueError(naming(path, error)) from None
     if not isinstance(scene, mi.Scene):
-        raise ValueError(f"{path}: holds a {type(scene).__name__}; accepted: a <scene>")
+        raise ValueError(f"{path}: holds a {type(scene).__name__}; expected a <scene>")
     if not scene.sensors():
-        raise ValueError(f"{path}: a scene without a sensor; accepted: at least one")
+        raise ValueError(f"{path}: a scene without a sensor; expected at least one")
     try:
         check_integrator(scene)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     width, height = scene.sensors()[0].film().crop_size()
     if width * height > PIXELS:
-        raise ValueError(f"{path}: a film of {width} × {height} pixels; accepted: up to {PIXELS}")
+        raise ValueError(f"{path}: a film of {width} × {height} pixels; expected up to {PIXELS}")
     return scene
 
 

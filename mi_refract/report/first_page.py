@@ -70,7 +70,7 @@ def prepare(rows: Sequence[Row], page: FirstPage, keys: Mapping[str, str], image
     """
     for answer in page["answers"]:
         if answer["state"] not in STATES:
-            raise ValueError(f"first page: state {answer['state']!r}; accepted: {', '.join(STATES)}")
+            raise ValueError(f"first page: state {answer['state']!r}; expected {', '.join(STATES)}")
     return {
         "lead": page.get("lead", ""),
         "answers": [{**answer, "link": keys.get(answer["study"], "")} for answer in page["answers"]],

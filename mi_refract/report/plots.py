@@ -62,7 +62,7 @@ class Axes:
     def __post_init__(self) -> None:
         """Check the scales. Errors: ValueError."""
         if not {self.x_scale, self.y_scale} <= {"log", "linear"}:
-            raise ValueError(f"axes: scales {self.x_scale!r}, {self.y_scale!r}; accepted: 'log', 'linear'")
+            raise ValueError(f"axes: scales {self.x_scale!r}, {self.y_scale!r}; expected 'log', 'linear'")
         if self.slope is not None and self.logarithmic != "xy":
             raise ValueError("axes: a slope needs both scales logarithmic")
 

@@ -52,7 +52,7 @@ def read_json(path: str | Path) -> tuple[list[Row], dict[str, Any]]:
         rows = [_row(number, data) for number, data in enumerate(document["rows"])]
         return rows, dict(document["context"])
     except RecursionError:
-        raise ValueError(f"{path}: brackets nested too deeply; accepted: JSON as `write_json` writes it") from None
+        raise ValueError(f"{path}: brackets nested too deeply; expected JSON as `write_json` writes it") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         what = f"missing {error}" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"{path}: {' '.join(what.split())}") from error

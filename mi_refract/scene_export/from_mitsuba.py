@@ -30,7 +30,7 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) ->
     """
     path = Path(path)
     if level not in LEVELS:
-        raise ValueError(f"level = {level}: accepted: a whole number from {LEVELS[0]} to {LEVELS[-1]}")
+        raise ValueError(f"level = {level}; expected a whole number from {LEVELS[0]} to {LEVELS[-1]}")
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such scene file")
     root = SceneFile(path, defines).node(0)
@@ -47,7 +47,7 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) ->
     root.finish()
     for kind in ("Sensor", "Integrator"):
         if kind not in found:
-            raise ValueError(f"{path}: no {kind.lower()}; accepted: a scene with one")
+            raise ValueError(f"{path}: no {kind.lower()}; expected a scene with one")
     sky = found.get("Emitter", (0.0, 0.0, 0.0))
     return PlainScene(path.stem, with_unique_names(shapes), sky, found["Sensor"], found["Integrator"])
 

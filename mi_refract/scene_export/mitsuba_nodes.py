@@ -62,7 +62,7 @@ class Node:
 
     def error(self, what: str, accepted: str) -> ValueError:
         """The error that names the file and the plugin, what is wrong, and what would be accepted."""
-        return ValueError(" ".join(f"{self.scene.path}: {self}: {what}; accepted: {accepted}".split()))
+        return ValueError(" ".join(f"{self.scene.path}: {self}: {what}; expected {accepted}".split()))
 
     def value(self, kind: type[Kind], name: str, default: Kind | None = None) -> Kind:
         """A number, a text or a truth value. ValueError where it is of another type, missing, or not finite."""

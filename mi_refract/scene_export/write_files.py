@@ -30,7 +30,7 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
     files, or cannot be written.
     """
     if target not in TARGETS:
-        raise ValueError(f"target {target!r}: unknown; accepted: {', '.join(TARGETS)}")
+        raise ValueError(f"target {target!r}: unknown; expected {', '.join(TARGETS)}")
     place = _new_or_empty(folder)
     files = TARGETS[target](plain)
     with atomic.replacing(place, folder=True) as temporary:
@@ -44,8 +44,8 @@ def _new_or_empty(folder: str | os.PathLike[str]) -> Path:
     place = Path(folder).resolve()
     if place.is_dir():
         if any(place.iterdir()):
-            raise FileExistsError(f"{folder}: holds files already; accepted: a new folder or an empty one")
+            raise FileExistsError(f"{folder}: holds files already; expected a new folder or an empty one")
     elif place.exists():
-        raise NotADirectoryError(f"{folder}: is not a folder; accepted: a new folder or an empty one")
+        raise NotADirectoryError(f"{folder}: is not a folder; expected a new folder or an empty one")
     atomic.check_parent(place)
     return place

@@ -204,7 +204,7 @@ def test_images_larger_than_allowed(run, pair):
     for words in (["diff", *names], ["accept", *names, "--yes"], ["diff", "--self-test", names[0]]):
         code, out, err = run(*words, "--max-values", 100)
         assert (code, out) == (2, "")
-        assert err.endswith("louder.exr: 48 × 32 × 3 values; accepted: up to 100 values (max-values)\n")
+        assert err.endswith("louder.exr: 48 × 32 × 3 values; expected up to 100 values (max-values)\n")
     assert run("diff", *names, "--max-values", 2**62)[0] == 1
     assert run("diff", *names, "--max-values", 0)[0] == 2
 
@@ -217,22 +217,22 @@ BAD = {
     "twice the folder": (["{}/old", "{}/old"], "the same as the reference"),
     "twice the file": (["{}/old/equal.exr", "{}/old/../old/equal.exr"], "the same as the reference"),
     "within": (["{}", "{}/new"], "one within the other"),
-    "samples of files": (["{}/old/equal.exr", "{}/new/equal.exr", "--renders"], "accepted with --renders: a folder"),
-    "method": (["{}/old", "{}/new", "--method", "idiff"], "--method idiff: accepted: auto, exact"),
+    "samples of files": (["{}/old/equal.exr", "{}/new/equal.exr", "--renders"], "expected with --renders: a folder"),
+    "method": (["{}/old", "{}/new", "--method", "idiff"], "--method idiff; expected auto, exact"),
     "option": (["{}/old", "{}/new", "--method", "exact", "--set", "fail=1"], "--set fail: unknown"),
-    "option of neither": (["{}/old", "{}/new", "--set", "threshold=1"], "--set threshold: unknown; accepted: tile"),
+    "option of neither": (["{}/old", "{}/new", "--set", "threshold=1"], "--set threshold: unknown; expected tile"),
     "inconclusive": (["{}/old", "{}/new", "--inconclusive", "maybe"], "maybe"),
     "no settings": (["{}/old", "{}/new", "--settings", "{}/none.toml"], "none.toml"),
     "bad settings": (["{}/old", "{}/new", "--settings", "{}/bad.toml"], "bad.toml: defaults.fale: unknown"),
-    "report's name": (["{}/old", "{}/new", "--report", "{}/out.exr"], "accepted: a file name that ends in .html"),
+    "report's name": (["{}/old", "{}/new", "--report", "{}/out.exr"], "expected a file name that ends in .html"),
     "report's folder": (["{}/old", "{}/new", "--report", "{}/none/out.html"], "is not a folder"),
     "report in nothing": (["{}/old", "{}/new", "--report", "{}/none/report/"], "is not a folder"),
     "report a file": (["{}/old", "{}/new", "--report", "{}/bad.toml/"], "a file name that ends in .html, or a folder"),
-    "report among others": (["{}/old", "{}/new", "--report", "{}"], "no report of ours; accepted: a new or empty"),
+    "report among others": (["{}/old", "{}/new", "--report", "{}"], "no report of ours; expected a new or empty"),
     "report among images": (["{}/old", "{}/new", "--report", "{}/new/report/"], "where it would be compared"),
     "report over images": (["{}/old", "{}/new", "--report", "{}/old"], "where it would be compared"),
-    "junit's name": (["{}/old", "{}/new", "--junit", "{}/out.json"], "accepted: a file name that ends in .xml"),
-    "json's name": (["{}/old", "{}/new", "--json", "{}/old/equal.exr"], "accepted: a file name that ends in .json"),
+    "junit's name": (["{}/old", "{}/new", "--junit", "{}/out.json"], "expected a file name that ends in .xml"),
+    "json's name": (["{}/old", "{}/new", "--json", "{}/old/equal.exr"], "expected a file name that ends in .json"),
     "one path": (["{}/old"], "TEST"),
     "no path": ([], "REFERENCE"),
     "unknown option": (["{}/old", "{}/new", "--nonesuch"], "--nonesuch"),
@@ -320,8 +320,8 @@ def test_bad_self_tests(run, pair, tmp_path):
     image(tmp_path / "nan.exr", value=np.nan)
     for words, message in [
         (pair, "--self-test takes one path"),
-        ([pair[0] / "equal.exr", "--report", tmp_path / "a.html"], "accepted: no other option"),
-        ([pair[0] / "equal.exr", "--method", "flip"], "accepted: no other option"),
+        ([pair[0] / "equal.exr", "--report", tmp_path / "a.html"], "expected no other option"),
+        ([pair[0] / "equal.exr", "--method", "flip"], "expected no other option"),
         ([tmp_path / "none.exr"], "none.exr"),
         ([tmp_path / "none.xml"], "none.xml"),
         ([tmp_path / "mixed"], "size or channels differ from"),
@@ -371,7 +371,7 @@ def test_spp_with_auto(run, noisy):
     assert run("diff", *noisy, *words, "--set", "spp=200")[0] == 1
     code, _, err = run("diff", *noisy, *words)
     assert (code, len(err.splitlines())) == (2, 2)
-    assert "accepted: `spp` or `spp_test`" in err
+    assert "expected `spp` or `spp_test`" in err
     assert run("diff", *noisy, *words, "--set", "spp_test=1")[0] == 2
 
 
@@ -393,7 +393,7 @@ def test_channels(run, noisy):
     assert run("diff", old, new, *words, "--channels", "R,R") == (
         2,
         "",
-        "mi-refract: --channels R,R: accepted: distinct names, or REFERENCE=TEST, between commas\n",
+        "mi-refract: --channels R,R; expected distinct names, or REFERENCE=TEST, between commas\n",
     )
 
 

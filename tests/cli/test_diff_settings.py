@@ -56,7 +56,7 @@ def test_an_entry_that_is_wrong_stops_no_other_image(run, pair):
     for words in ([], ["--check-settings"]):
         code, out, err = run("diff", *pair, *words)
         assert (code, err.count("\n")) == (2, 1)
-        assert "image[0].fale: unknown; accepted: name" in err
+        assert "image[0].fale: unknown; expected name" in err
         assert "equal.exr" in out
 
 

@@ -15,7 +15,7 @@ def test_shares(text, value):
 
 @pytest.mark.parametrize("text", ["0", "0%", "-1%", "100.1%", "1.5", "nan", "inf", "%", "", "1 %%", "1", "0.5"])
 def test_what_is_no_share(text):
-    with pytest.raises(ValueError, match=r"^--until .*: accepted: more than 0 %, up to 100 %"):
+    with pytest.raises(ValueError, match=r"^--until .*; expected more than 0 %, up to 100 %"):
         parse_share(text, "--until")
 
 
@@ -29,7 +29,7 @@ def test_times(text, value):
 
 @pytest.mark.parametrize("text", ["0", "0s", "-1", "1x", "", "m", "1m1h", "1e9", "nan", "inf", "10 m", "9" * 12])
 def test_what_is_no_time(text):
-    with pytest.raises(ValueError, match=r"^--time .*: accepted: a time of more than 0"):
+    with pytest.raises(ValueError, match=r"^--time .*; expected a time of more than 0"):
         parse_seconds(text, "--time")
 
 

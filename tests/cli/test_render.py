@@ -125,12 +125,12 @@ def test_the_best_variant_is_the_default(render, scene, monkeypatch, needs_varia
 
 BAD = {
     "no scene": ({"scene": "none.xml"}, (), "none.xml: no such scene file"),
-    "no variant": ({"variant": "llvm_rgb"}, (), "variant 'llvm_rgb': unknown; accepted: scalar_rgb"),
+    "no variant": ({"variant": "llvm_rgb"}, (), "variant 'llvm_rgb': unknown; expected scalar_rgb"),
     "no folder": ({"output": "none/out.exr"}, (), "is not a folder"),
-    "a device": ({"output": "device.exr"}, (), "device.exr: is a device; accepted: the name of a file"),
-    "no EXR": ({"output": "out.png"}, (), "accepted: a file name that ends in .exr"),
-    "define without a value": ({}, ("-D", "bsdf"), "-D bsdf: accepted: NAME=VALUE"),
-    "define without a name": ({}, ("-D", "=dielectric"), "-D =dielectric: accepted: NAME=VALUE"),
+    "a device": ({"output": "device.exr"}, (), "device.exr: is a device; expected the name of a file"),
+    "no EXR": ({"output": "out.png"}, (), "expected a file name that ends in .exr"),
+    "define without a value": ({}, ("-D", "bsdf"), "-D bsdf; expected NAME=VALUE"),
+    "define without a name": ({}, ("-D", "=dielectric"), "-D =dielectric; expected NAME=VALUE"),
     "define twice": ({}, ("-D", "bsdf=a", "-D", "bsdf=b"), "bsdf is given twice"),
     "define of nothing": ({}, ("-D", "bdsf=dielectric"), "bdsf"),
     "define of the parser": ({}, ("-D", "config=x"), "taken by Mitsuba's parser"),
@@ -161,7 +161,7 @@ def test_bad_input(render, scene, paths, options, message):
     [
         (SCENE.replace("</shape>", ""), "mismatch"),
         (SCENE.replace("max_depth", "max_dept"), "max_dept"),
-        ('<bsdf version="3.0.0" type="dielectric"/>', "holds a BSDF; accepted: a <scene>"),
+        ('<bsdf version="3.0.0" type="dielectric"/>', "holds a BSDF; expected a <scene>"),
         ('<scene version="3.0.0"/>', "without a sensor"),
         ("", "scene.xml"),
     ],
@@ -182,7 +182,7 @@ def test_a_plugin_of_the_scenes_own_runs_only_where_it_is_allowed(render, scene)
     (scene.parent / "plugins" / "evil.so").write_text("native code")
     code, _, err = render("-D", "bsdf=evil")
     assert (
-        code == 2 and "accepted: those; code that a scene brings: where it is rendered, by --allow-plugins evil" in err
+        code == 2 and "expected those; code that a scene brings: where it is rendered, by --allow-plugins evil" in err
     )
     code, _, err = render("-D", "bsdf=evil", "--allow-plugins", "other", "--allow-plugins", "evil")
     assert (code, err.count("\n")) == (2, 1) and "Error while loading plugin" in err and "plugins/evil.so" in err
@@ -192,7 +192,7 @@ def test_a_pipe_is_no_scene(render, scene):
     scene.unlink()
     os.mkfifo(scene)
     code, _, err = render()
-    assert (code, err) == (2, f"mi-refract: {scene}: is a pipe or a device; accepted: a file\n")
+    assert (code, err) == (2, f"mi-refract: {scene}: not a regular file\n")
 
 
 def test_a_failed_rendering_keeps_the_old_image(render, scene):

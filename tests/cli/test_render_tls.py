@@ -87,7 +87,7 @@ def test_the_bits_are_those_of_a_render_here(render, scheduler, own, tmp_path):
     [
         ("of another authority", r"no Dask scheduler answers: TLS certificate does not match"),
         ("by another authority", r"no Dask scheduler answers: .*: it may be without TLS, or of another authority;"),
-        ("without a certificate", r"no --tls-ca-file or no --tls-cert; accepted: both, and --tls-key"),
+        ("without a certificate", r"no --tls-ca-file or no --tls-cert; expected both, and --tls-key"),
         ("without TLS", r"no Dask scheduler answers: ConnectionResetError: .*: it may ask for TLS;"),
     ],
 )

@@ -39,13 +39,13 @@ def test_level_0_is_not_the_default(export):
 @pytest.mark.parametrize(
     "words, says",
     [
-        (["nowhere", "--to", "cycles"], "no such scene; accepted: a file, balls, "),
-        (["prism", "--to", "blender"], "accepted: cycles, luxcore, radiance"),
+        (["nowhere", "--to", "cycles"], "no such scene; expected a file, balls, "),
+        (["prism", "--to", "blender"], "expected cycles, luxcore, radiance"),
         (["prism", "--to", "povray"], "a diffuse surface"),
         (["prism", "--to", "cycles", "-o", "no/where"], "not a folder"),
         (["prism", "--to", "cycles", "-o", "full"], "holds files already"),
         (["prism", "--to", "cycles", "-D", "nothing=1"], "nothing"),
-        (["prism", "--to", "cycles", "--level", "20"], "accepted: a whole number from 0 to 8"),
+        (["prism", "--to", "cycles", "--level", "20"], "expected a whole number from 0 to 8"),
         (["prism"], "--to"),
         (["full/scene.xml", "--to", "cycles"], "full/scene.xml"),
     ],

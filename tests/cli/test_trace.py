@@ -153,7 +153,7 @@ def test_scalar_arrays_have_no_float32(trace, ball):
     output = ball.with_name("image.svg")
     code, out, err = trace("--backend", "scalar", "--precision", "float32", "-o", output)
     assert (code, out, err.count("\n")) == (2, "", 1)
-    assert err.startswith("mi-refract: precision = 'float32': scalar arrays compute in double; accepted: float64")
+    assert err.startswith("mi-refract: precision = 'float32': scalar arrays compute in double; expected float64")
     assert not output.exists()
     assert trace("--backend", "scalar", "--precision", "float64")[0] == 0
 
@@ -180,22 +180,22 @@ def test_a_backend(trace):
 
 
 BAD = {
-    "suffix": (("-o", "{}/image.gif"), "accepted: a file name that ends in .svg or .png or .pdf"),
-    "no suffix": (("-o", "{}/image"), "accepted: a file name that ends in"),
+    "suffix": (("-o", "{}/image.gif"), "expected a file name that ends in .svg or .png or .pdf"),
+    "no suffix": (("-o", "{}/image"), "expected a file name that ends in"),
     "no folder": (("-o", "{}/none/image.svg"), "is not a folder"),
     "folder": (("-o", "{}/folder.svg"), "is a folder"),
     "branches": (("--branches", "-1"), "--branches"),
     "branches, no number": (("--branches", "some"), "--branches"),
     "no rays": (("--rays", "0"), "--rays"),
     "no depth": (("--max-depth", "0"), "--max-depth"),
-    "precision": (("--precision", "half"), "precision = 'half'; accepted: float32, float64"),
-    "formula": (("--formula", "snell"), "formula = 'snell': unknown; accepted: wedge"),
-    "backend": (("--backend", "metal"), "backend = 'metal'; accepted: scalar"),
+    "precision": (("--precision", "half"), "precision = 'half'; expected float32, float64"),
+    "formula": (("--formula", "snell"), "formula = 'snell': unknown; expected wedge"),
+    "backend": (("--backend", "metal"), "backend = 'metal'; expected scalar"),
     "option": (("--nonesuch",), "--nonesuch"),
-    "too much": (("--rays", "4000000"), "accepted: fewer rays"),
-    "far too much": (("--rays", "1000000000000"), "accepted: fewer rays"),
-    "beyond numbers": (("--rays", f"1{'0' * 30}"), "accepted: fewer rays"),
-    "too deep": (("--max-depth", f"1{'0' * 30}"), "accepted: fewer rays"),
+    "too much": (("--rays", "4000000"), "expected fewer rays"),
+    "far too much": (("--rays", "1000000000000"), "expected fewer rays"),
+    "beyond numbers": (("--rays", f"1{'0' * 30}"), "expected fewer rays"),
+    "too deep": (("--max-depth", f"1{'0' * 30}"), "expected fewer rays"),
 }
 
 

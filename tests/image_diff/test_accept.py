@@ -71,7 +71,7 @@ def test_a_bad_added_image_becomes_no_reference(folders):
 
 @pytest.mark.parametrize("name", ["ref.png", "folder"])
 def test_a_reference_is_of_the_format_that_its_name_says(folders, tmp_path, name):
-    with pytest.raises(ValueError, match=r"accepted: a name that ends in \.exr"):
+    with pytest.raises(ValueError, match=r"expected a name that ends in \.exr"):
         to_accept(tmp_path / name, folders[1] / "same.exr")
 
 
@@ -179,7 +179,7 @@ def test_no_pipe_or_device_is_read(tmp_path):
     os.mkfifo(tmp_path / "a.exr")
     (tmp_path / "b.exr").symlink_to("/dev/null")
     for path in (tmp_path / "a.exr", tmp_path / "b.exr"):
-        with pytest.raises(ValueError, match=r"\.exr: accepted: a regular file"):
+        with pytest.raises(ValueError, match=r"\.exr; expected a regular file"):
             diff.digest(path)
 
 
@@ -283,7 +283,7 @@ def test_accept_takes_nothing_that_changed_since(run, pair, monkeypatch):
     code, out, err = run("accept", *pair)
     assert code == 2
     assert "accepted\n" not in out
-    assert "louder.exr: changed since it was compared; accepted: what was shown\n" in err
+    assert "louder.exr: changed since it was compared; expected what was shown\n" in err
     assert tree(pair[0]) == before
 
 
@@ -304,7 +304,7 @@ def test_accept_does_not_ask_a_script(run, pair, monkeypatch):
     before = tree(pair[0])
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
     code, out, err = run("accept", *pair)
-    assert (code, err) == (2, "mi-refract: accept asks on a terminal only; accepted elsewhere: --yes\n")
+    assert (code, err) == (2, "mi-refract: accept asks on a terminal only; elsewhere expected --yes\n")
     assert "louder.exr" in out
     assert tree(pair[0]) == before
 

@@ -61,7 +61,7 @@ def test_of_the_json_those_that_are_named(run, compared):
     assert tree(old) == before | {"inner/added.exr": tree(new)["inner/added.exr"]}
     assert run("accept", old, new, "equal.exr", "--from", out)[:2] == (0, "nothing to accept\n")
     code, said, err = run("accept", old, new, "none*", "--from", out)
-    assert (code, said) == (2, "") and err.startswith("mi-refract: none*: matches no image; accepted: ")
+    assert (code, said) == (2, "") and err.startswith("mi-refract: none*: matches no image; expected ")
 
 
 def test_the_json_of_another_machine_fits_the_same_bytes_elsewhere(run, compared, tmp_path):
@@ -89,7 +89,7 @@ def test_what_changed_since_the_json_is_refused(run, compared, side):
     os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
     before = tree(compared[0])
     code, _, err = run("accept", "--from", compared[2], "--yes")
-    assert code == 2 and err == f"mi-refract: {path}: changed since it was compared; accepted: what was shown\n"
+    assert code == 2 and err == f"mi-refract: {path}: changed since it was compared; expected what was shown\n"
     assert tree(compared[0]) == before
 
 
@@ -110,26 +110,26 @@ def test_nan_is_accepted_where_the_comparison_allowed_it(run, pair, tmp_path):
         assert run("accept", "--from", out, "--yes")[0] == code
 
 
-OUTSIDE = "accepted: a path in "
+OUTSIDE = "expected a path in "
 SPOILED = {
     "no JSON": (lambda text: "{", "no JSON (", None),
-    "too deep": (lambda text: "[" * 100_000, "accepted: a file that mi-refract diff --json wrote", None),
-    "a list": (lambda text: "[]", "no results: accepted: a file that mi-refract diff --json wrote", None),
+    "too deep": (lambda text: "[" * 100_000, "expected a file that mi-refract diff --json wrote", None),
+    "a list": (lambda text: "[]", "no results; expected a file that mi-refract diff --json wrote", None),
     "no UTF-8": (lambda text: b"\xff\xfe{", "no JSON (", None),
-    "another": (lambda text: '{"schema": 1, "results": [3]}', "reference, test: accepted: a file", None),
-    "schema": (None, "schema 99; accepted: 1", lambda d: d.update(schema=99)),
-    "no results": (None, "no results: accepted", lambda d: d.update(results={})),
-    "result": (None, "results[0]: status: accepted", lambda d: d["results"].insert(0, 3)),
-    "status": (None, "status: accepted", lambda d: entry(d, "louder.exr").update(status="fine")),
-    "status of a type": (None, "status: accepted", lambda d: entry(d, "louder.exr").update(status=[])),
-    "name": (None, "name, error: accepted", lambda d: entry(d, "louder.exr").update(name=None)),
-    "renders": (None, "of --renders; accepted: ", lambda d: d.update(renders=True)),
-    "path": (None, "test: accepted: a file", lambda d: entry(d, "louder.exr").update(test=7)),
-    "NUL": (None, "test: accepted: a file", lambda d: entry(d, "louder.exr").update(test="a\0b")),
+    "another": (lambda text: '{"schema": 1, "results": [3]}', "reference, test; expected a file", None),
+    "schema": (None, "schema 99; expected 1", lambda d: d.update(schema=99)),
+    "no results": (None, "no results; expected", lambda d: d.update(results={})),
+    "result": (None, "results[0]: status; expected", lambda d: d["results"].insert(0, 3)),
+    "status": (None, "status; expected", lambda d: entry(d, "louder.exr").update(status="fine")),
+    "status of a type": (None, "status; expected", lambda d: entry(d, "louder.exr").update(status=[])),
+    "name": (None, "name, error; expected", lambda d: entry(d, "louder.exr").update(name=None)),
+    "renders": (None, "of --renders; expected ", lambda d: d.update(renders=True)),
+    "path": (None, "test; expected a file", lambda d: entry(d, "louder.exr").update(test=7)),
+    "NUL": (None, "test; expected a file", lambda d: entry(d, "louder.exr").update(test="a\0b")),
     "outside": (None, OUTSIDE, lambda d: entry(d, "louder.exr").update(target="/etc/x.exr")),
     "no digests": (None, "compared without digests", lambda d: entry(d, "louder.exr").update(digests=None)),
-    "digests": (None, "digests: accepted", lambda d: entry(d, "louder.exr").update(digests={"test": "a"})),
-    "digest": (None, "digests: accepted", lambda d: entry(d, "louder.exr")["digests"].update(test="g" * 64)),
+    "digests": (None, "digests; expected", lambda d: entry(d, "louder.exr").update(digests={"test": "a"})),
+    "digest": (None, "digests; expected", lambda d: entry(d, "louder.exr")["digests"].update(test="g" * 64)),
 }
 
 
@@ -158,7 +158,7 @@ def test_no_path_of_the_json_leads_out_of_its_folder(run, compared, tmp_path, ke
     for path in (root / ".." / "elsewhere" / "louder.exr", root / "link" / "louder.exr"):
         edited(out, lambda data, path=path: entry(data, "louder.exr").update({key: str(path)}))
         code, said, err = run("accept", "--from", out, "--yes")
-        assert (code, said) == (2, "") and f"].{key}: {path}: accepted: a path in {root}\n" in err
+        assert (code, said) == (2, "") and f"].{key}: {path}; expected a path in {root}\n" in err
     assert {k: v for k, v in tree(tmp_path).items() if k != "out.json"} == {
         k: v for k, v in before.items() if k != "out.json"
     }
@@ -223,15 +223,15 @@ def test_a_variant_of_the_json(run, pair, tmp_path):
         (
             "",
             "macos",
-            "settings have no `accept` with macos or one *; accepted: in mi-refract.toml, below [defaults]",
+            "settings have no `accept` with macos or one *; expected in mi-refract.toml, below [defaults]",
         ),
         ('[defaults]\naccept = ["{stem}-*-*.exr"]', "macos", "settings have no `accept` with macos or one *"),
-        (SETTINGS, "a/b", "--as-variant 'a/b': accepted: a part of a file name"),
-        (SETTINGS, "*", "--as-variant '*': accepted"),
-        (SETTINGS, " ", "--as-variant ' ': accepted"),
-        (SETTINGS, "..", "--as-variant '..': accepted"),
+        (SETTINGS, "a/b", "--as-variant 'a/b'; expected a part of a file name"),
+        (SETTINGS, "*", "--as-variant '*'; expected"),
+        (SETTINGS, " ", "--as-variant ' '; expected"),
+        (SETTINGS, "..", "--as-variant '..'; expected"),
         ('[defaults]\naccept = ["equal-*.exr"]', "one", "equal-one.exr: the reference of another image"),
-        ('[defaults]\naccept = ["{stem}-*.png"]', "one", "accepted: a name that ends in .exr"),
+        ('[defaults]\naccept = ["{stem}-*.png"]', "one", "expected a name that ends in .exr"),
     ],
 )
 def test_no_variant_where_its_name_says_nothing(run, pair, settings, name, message):
@@ -250,5 +250,5 @@ def test_an_image_without_a_reference_is_no_variant(run, compared):
     (old / "mi-refract.toml").write_text(SETTINGS)
     before = tree(old)
     code, _, err = run("accept", old, new, "--as-variant", "macos", "--yes")
-    assert code == 2 and "inner/added.exr: has no reference yet; accepted: without --as-variant" in err
+    assert code == 2 and "inner/added.exr: has no reference yet; expected without --as-variant" in err
     assert tree(old) == before

@@ -104,7 +104,7 @@ def test_allowed_values_must_be_the_same_ones(method):
 )
 def test_what_cannot_be_compared_is_an_error(method, other, what):
     for pair in ((image(SMOOTH), other), (other, image(SMOOTH))):
-        with pytest.raises(ValueError, match=f"{what} .*; accepted: ") as error:
+        with pytest.raises(ValueError, match=f"{what} .*; expected ") as error:
             judge(method, *pair)
         assert "\n" not in str(error.value)
 
@@ -136,10 +136,10 @@ def test_the_header_of_a_file_is_asked(tmp_path, name):
         assert output.open(str(path), spec) and output.write_image(SMOOTH) and output.close()
     one, same, aspect, display = (image_file.read(tmp_path / str(i) / name) for i in range(4))
     assert preconditions(one, same) is None
-    with pytest.raises(ValueError, match=r"pixel aspect ratio 2\.0; accepted: 1\.0"):
+    with pytest.raises(ValueError, match=r"pixel aspect ratio 2\.0; expected 1\.0"):
         preconditions(one, aspect)
     if name != "a.png":  # which holds none
-        with pytest.raises(ValueError, match="display window 99 × 40 from x = 0, y = 0; accepted: 48 × 40"):
+        with pytest.raises(ValueError, match="display window 99 × 40 from x = 0, y = 0; expected 48 × 40"):
             preconditions(one, display)
 
 
@@ -327,7 +327,7 @@ def test_a_tile_with_the_noise_of_one_pixel_is_flagged():
 
 def test_the_same_seed_twice_is_an_error():
     side = renders(3)
-    with pytest.raises(ValueError, match="accepted: independent renders"):
+    with pytest.raises(ValueError, match="expected independent renders"):
         judge("welch", [*side, replace(side[0], path=Path("b.exr"))], renders(4))
 
 
@@ -408,7 +408,7 @@ def test_a_method_runs_once(method, monkeypatch):
 @pytest.mark.parametrize(
     "method, options, match",
     [
-        ("psnr", {}, "accepted: auto, exact"),
+        ("psnr", {}, "expected auto, exact"),
         ("exact", {"fail": 1.0}, "has no option 'fail'"),
         ("tolerance", {"fail": "1"}, "type float"),
         ("tolerance", {"fail": float("nan")}, "at least 0"),

@@ -94,7 +94,7 @@ def test_a_change_against_black_is_a_change_at_any_brightness():
 
 @pytest.mark.parametrize("ppd", [0.0, 1e-9, np.inf])
 def test_flip_is_not_asked_from_where_nothing_is_seen(ppd):
-    with pytest.raises(ValueError, match="accepted: 1 to 1000"):
+    with pytest.raises(ValueError, match="expected 1 to 1000"):
         compare("flip", image(SMOOTH), image(1 - SMOOTH), ppd=ppd)
 
 

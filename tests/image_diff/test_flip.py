@@ -287,7 +287,7 @@ def test_what_it_does_not_look_at():
     four = linear(np.dstack([SMOOTH, SMOOTH[..., :1]]), ("R", "G", "B", "A"))
     assert compare("flip", four, four).reason.endswith("not looked at, but the same: A")
     xyz = linear(SMOOTH, ("X", "Y", "Z"))
-    with pytest.raises(ValueError, match="accepted by FLIP"):
+    with pytest.raises(ValueError, match="expected by FLIP"):
         compare("flip", xyz, xyz)
 
 

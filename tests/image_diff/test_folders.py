@@ -131,7 +131,7 @@ def test_images_larger_than_allowed_are_not_compared(folders):
     assert not diff.diff(*folders, Settings(How(max_values=most))).of(Status.ERROR)
     results = diff.diff(*folders, Settings(How(max_values=most - 1)))
     assert [r.name for r in results.of(Status.ERROR)] == ["inner/changed.exr", "same.exr"]
-    ending = f"changed.exr: 48 × 32 × 3 values; accepted: up to {most - 1} values (max-values)"
+    ending = f"changed.exr: 48 × 32 × 3 values; expected up to {most - 1} values (max-values)"
     assert results.of(Status.ERROR)[0].error.endswith(ending)
     assert results.reproduce(results.results[0]).endswith(f"changed.exr --max-values {most - 1}")
     with pytest.raises(ValueError, match="max-values"):
@@ -286,7 +286,7 @@ def test_bad_samples(tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     for folder, message in [
-        (twice, r"the same pixels as .*; accepted: renders of different seeds"),
+        (twice, r"the same pixels as .*; expected renders of different seeds"),
         (samples(tmp_path / "one", 1, 200), "one"),
         (empty, "empty: holds no image"),
     ]:
@@ -294,7 +294,7 @@ def test_bad_samples(tmp_path):
         assert results.exit_code == 2
         with pytest.raises(ValueError, match=message):
             raise ValueError(results.results[0].error)
-    with pytest.raises(NotADirectoryError, match=r"0\.exr: accepted with --renders: a folder"):
+    with pytest.raises(NotADirectoryError, match=r"0\.exr; expected with --renders: a folder"):
         diff.diff(good, twice / "0.exr", renders=True)
 
 

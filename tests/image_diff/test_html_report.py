@@ -84,7 +84,7 @@ def test_an_image_that_is_larger_than_allowed_is_not_read_for_the_page(tmp_path)
         image(tmp_path / side / "added.exr", 0.5)
     (tmp_path / "old" / "added.exr").unlink()
     found = folders.diff(tmp_path / "old", tmp_path / "new", Settings(How(max_values=71)))
-    assert "accepted: up to 71 values (max-values)" in html(tmp_path, found)
+    assert "expected up to 71 values (max-values)" in html(tmp_path, found)
 
 
 # The text

@@ -78,7 +78,7 @@ def test_a_data_window_that_does_not_begin_at_zero(pair):
 
 
 BAD = {
-    "size": ({"mask": "small.exr"}, "small.exr: 7 × 8; accepted: a mask of 48 × 32"),
+    "size": ({"mask": "small.exr"}, "small.exr: 7 × 8; expected a mask of 48 × 32"),
     "missing": ({"mask": "none.exr"}, "none.exr: No such file"),
     "nan": ({"mask": "nan.exr"}, "values that are not finite"),
     "nothing left": ({"ignore": ((0, 0, 48, 32),)}, "leaves no pixel"),
@@ -124,7 +124,7 @@ def test_a_new_image_of_another_size_is_not_spread_over_the_mask(pair, shape):
     image(pair[1], shape=shape, gain=0.0)
     (found,) = diff.diff(*pair, settings(method="exact", ignore=((0, 0, 2, 2),))).results
     assert found.status == "error"
-    assert f"size {shape[1]} × {shape[0]}; accepted: 48 × 32" in found.error
+    assert f"size {shape[1]} × {shape[0]}; expected 48 × 32" in found.error
 
 
 @pytest.mark.parametrize("rectangle", [(0, -50, 48, 10), (-50, 0, 10, 32), (-50, -50, 10, 10)])

@@ -116,7 +116,7 @@ def test_what_is_no_number_of_them_is_one_line(pair, named):
     results = folders.diff(old, new)
     (error,) = (each.error for each in results.results if each.name == "same.exr")
     assert error.startswith(f"{path}: {FREEDOM} = ")
-    assert error.endswith("; accepted: a whole number, 1 to 10¹⁵")
+    assert error.endswith("; expected a whole number, 1 to 10¹⁵")
     assert "\n" not in error
     assert statuses(results)["off.exr"] is Status.DIFFERENT
 

@@ -68,7 +68,7 @@ def test_every_part_and_level_is_read(tmp_path, name):
     assert all(np.array_equal(image.pixels, pixels) for image, pixels in zip(found, PYRAMID, strict=True))
     (first,) = read_parts(tmp_path / name, first_only=True)
     assert (first.place, first.part) == ("MIP level 0", (0, 0))
-    with pytest.raises(ValueError, match=r"several parts or MIP levels in one file; accepted: one image"):
+    with pytest.raises(ValueError, match=r"several parts or MIP levels in one file; expected one image"):
         read(tmp_path / name)
 
 
@@ -76,7 +76,7 @@ def test_the_limit_holds_for_all_together(tmp_path):
     path = parts(tmp_path / "a.exr", SMALL)
     size = 8 * 8 * 3
     assert len(read_parts(path, 3 * size)) == 3
-    with pytest.raises(ValueError, match=r"8 × 8 × 3 values beside 384 .*; accepted: up to 575 values \(max-values\)"):
+    with pytest.raises(ValueError, match=r"8 × 8 × 3 values beside 384 .*; expected up to 575 values \(max-values\)"):
         read_parts(path, 3 * size - 1)
     assert len(read_parts(path, size, first_only=True)) == 1
 
@@ -146,7 +146,7 @@ def test_what_cannot_be_compared_is_named_with_its_place(tmp_path):
     other = parts(tmp_path / "other.tif", [SMALL[0], SMALL[1][:4]])
     found = compared(parts(tmp_path / "one.tif", SMALL[:2]), other)
     assert str(found.status) == "error"
-    assert "size 8 × 4; accepted: 8 × 8" in found.error and found.error.endswith("(part 1)")
+    assert "size 8 × 4; expected 8 × 8" in found.error and found.error.endswith("(part 1)")
 
 
 def test_a_file_of_several_parts_can_be_accepted(tmp_path):

@@ -171,7 +171,7 @@ def test_where_black_is_accepted_is_where_it_passes_alone():
 
 @pytest.mark.parametrize("bad", [{"allow_failures": -1}, {"fail_percent": -1.0}, {"hard_fail": float("nan")}])
 def test_bounds_below_zero_are_refused(bad):
-    with pytest.raises(ValueError, match="accepted: a number of at least 0"):
+    with pytest.raises(ValueError, match="expected a number of at least 0"):
         compare("tolerance", image(FLAT), image(SIX), **bad)
 
 

@@ -167,7 +167,9 @@ def test_a_variance_is_accepted_with_its_image(pair):
     drawn = samples(3, 16, gain=1.2)
     write_exr(new / "a.exr", drawn.mean(0))
     found = folders.diff(old, new, settings(**BESIDE), to_accept=True)
-    with pytest.raises(ValueError, match=r"new/a_var.exr: no such file, and .*old/a_var.exr is of another render"):
+    with pytest.raises(
+        ValueError, match=r"new/a_var.exr: no such file, and .*old/a_var.exr belongs to a different render"
+    ):
         list(accept.changes(found))
     write_exr(new / "a_var.exr", drawn.var(0, ddof=1))
     with pytest.raises(OSError, match=r"new/a_var\.exr: changed since it was compared"):  # nobody has compared it
@@ -189,19 +191,19 @@ BAD = {
     "missing": (lambda old: (old / "a_var.exr").unlink(), {}, "a_var.exr: no such file"),
     "negative": (_write("_var", -np.ones(SHAPE)), {}, "negative in 1536 pixels, the first at x = 0, y = 0"),
     "negative, as a colour": (_write("_var", -np.ones(SHAPE)), {}, "channels = ['X', 'Y', 'Z']"),
-    "other size": (_write("_var", np.ones((8, 9, 3))), {}, "9 × 8; accepted: a variance of 48 × 32"),
+    "other size": (_write("_var", np.ones((8, 9, 3))), {}, "9 × 8; expected a variance of 48 × 32"),
     "NaN": (_write("_var", HOLE), {}, "its variance of R is not finite at x = 7, y = 0"),
-    "other channels": (_write("_var", np.ones(SHAPE), ("U", "V", "W")), {}, "variances of U, V, W; accepted: of chann"),
+    "other channels": (_write("_var", np.ones(SHAPE), ("U", "V", "W")), {}, "variances of U, V, W; expected of chann"),
     "no image": (lambda old: (old / "a_var.exr").write_bytes(b"xy"), {}, "a_var.exr: corrupt EXR file"),
-    "itself": (lambda old: None, {"variance": "{name}"}, "itself; accepted: the name of another image"),
-    "1 sample": (lambda old: None, {"spp_test": 1}, "samples per pixel: 1; accepted: `spp` or `spp_test`, 2 to 10¹⁵"),
+    "itself": (lambda old: None, {"variance": "{name}"}, "itself; expected the name of another image"),
+    "1 sample": (lambda old: None, {"spp_test": 1}, "samples per pixel: 1; expected `spp` or `spp_test`, 2 to 10¹⁵"),
     "-3 samples": (
         lambda old: None,
         {"spp_reference": -3},
-        "samples per pixel: -3; accepted: `spp` or `spp_reference`",
+        "samples per pixel: -3; expected `spp` or `spp_reference`",
     ),
-    "no samples": (lambda old: None, {"spp_test": 0}, "names 'no samples per pixel'; accepted: `spp` or `spp_test`"),
-    "no such channel": (lambda old: None, {"channels": (("Q", "Q"),)}, "no channel 'Q'; accepted in `channels`: R, G"),
+    "no samples": (lambda old: None, {"spp_test": 0}, "names 'no samples per pixel'; expected `spp` or `spp_test`"),
+    "no such channel": (lambda old: None, {"channels": (("Q", "Q"),)}, "no channel 'Q'; in `channels` expected R, G"),
 }
 
 
@@ -416,7 +418,7 @@ def test_channels_as_words(text):
 
 @pytest.mark.parametrize("text", ["", "X,", "X,X", "a=X,b=X", "=X", "X=", " , "])
 def test_words_that_are_no_channels(text):
-    with pytest.raises(ValueError, match="accepted: distinct names"):
+    with pytest.raises(ValueError, match="expected distinct names"):
         settings_file.channels_from(text)
 
 
@@ -424,13 +426,13 @@ def test_words_that_are_no_channels(text):
 def test_values_that_are_no_channels(tmp_path, value):
     path = tmp_path / "mi-refract.toml"
     path.write_text(f"[defaults]\nchannels = {value}\n")
-    with pytest.raises(ValueError, match=r"defaults\.channels: .* accepted: a list of channels, or a table"):
+    with pytest.raises(ValueError, match=r"defaults\.channels: .* expected a list of channels, or a table"):
         settings_file.load(path)
 
 
 @pytest.mark.parametrize("text", ["../a.exr", "/a.exr", "{nothing}.exr", " "])
 def test_templates_that_are_none(text):
-    with pytest.raises(ValueError, match=r"--variance .* accepted: a path that may hold"):
+    with pytest.raises(ValueError, match=r"--variance .* expected a path that may hold"):
         settings_file.variance_from(text)
 
 

@@ -70,7 +70,7 @@ def test_what_is_no_file_is_not_replaced(no_file, tmp_path):
     path, kind = no_file
     before = {each: each.lstat() for each in tmp_path.iterdir()}
     for write in (lambda: atomic.writable(path, (path.suffix,)), lambda: write_atomically(path, "new")):
-        with pytest.raises(OSError, match=rf"{path}: is a {kind}.*; accepted: the name of a file"):
+        with pytest.raises(OSError, match=rf"{path}: is a {kind}.*; expected the name of a file"):
             write()
     assert {each: each.lstat() for each in tmp_path.iterdir()} == before
 
@@ -237,7 +237,7 @@ def test_a_lock_says_who_holds_it_and_ends_with_its_process(tmp_path):
         assert text.startswith(
             f"{tmp_path}: a run runs there already, process {os.getpid()} on {socket.gethostname()} "
         )
-        assert text.endswith("; accepted: another folder") and "\n" not in text
+        assert text.endswith("; expected another folder") and "\n" not in text
         path.write_text("{")
         with pytest.raises(BlockingIOError, match="has not said"), lock.held(path, "a run"):
             pass

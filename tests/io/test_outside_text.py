@@ -66,11 +66,11 @@ def test_what_is_printed_twice_is_the_same():
 
 def test_errors_are_printed_by_it(capsys):
     def fails():
-        raise ValueError(f"{NAME}: accepted: another name")
+        raise ValueError(f"{NAME}; expected another name")
 
     assert exit_code.exit_code("it", fails) == 2
     said = capsys.readouterr().err
-    assert said.count("\n") == 1 and said.endswith(": accepted: another name\n")
+    assert said.count("\n") == 1 and said.endswith("; expected another name\n")
     assert not shows_more_than_text(said)
 
 

@@ -69,7 +69,7 @@ def test_a_glass_has_an_index_where_its_maker_prints_numbers():
     """From 290 nm, where 10 mm of it pass some light, to 2500 nm."""
     assert media.parse("SCHOTT:N-BK7").valid == (290.0, 2500.0)
     with pytest.raises(
-        ValueError, match="SCHOTT:N-BK7: no index at 3000 nm; accepted: a wavelength from 290 to 2500 nm"
+        ValueError, match="SCHOTT:N-BK7: no index at 3000 nm; expected a wavelength from 290 to 2500 nm"
     ):
         media.index("SCHOTT:N-BK7", 3000.0)
 
@@ -107,12 +107,12 @@ def test_an_unknown_glass_is_told_the_nearest_three():
     text = "nearest: SCHOTT:N-BK7, SCHOTT:[^,]+, SCHOTT:[^,]+$"
     with pytest.raises(ValueError, match=text) as error:
         media.parse("SCHOTT:N-BK8", "refract: int_ior")
-    assert str(error.value).startswith("refract: int_ior = 'SCHOTT:N-BK8': unknown glass; accepted: one of the ")
+    assert str(error.value).startswith("refract: int_ior = 'SCHOTT:N-BK8': unknown glass; expected one of the ")
 
 
 @READS
 def test_a_glass_that_is_printed_without_a_formula_is_refused():
-    with pytest.raises(ValueError, match="its catalogue prints no formula of this glass; accepted: another, or table"):
+    with pytest.raises(ValueError, match="its catalogue prints no formula of this glass; expected another, or table"):
         media.parse("HIKARI:J-PSKH8")
 
 

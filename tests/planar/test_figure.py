@@ -119,7 +119,7 @@ def test_colours_part_at_the_first_boundary(drawn):
 
 def test_a_colour_that_is_none(drawn):
     given = replace(SLANTED, light=Light(("ultraviolent",)))
-    with pytest.raises(ValueError, match=r"test\.toml: colours: 'ultraviolent'; accepted: a colour"):
+    with pytest.raises(ValueError, match=r"test\.toml: colours: 'ultraviolent'; expected a colour"):
         drawn(given)
 
 

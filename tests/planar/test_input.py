@@ -16,14 +16,14 @@ GOOD = {"start": [(0.0, 0.0)], "end": [(1.0, 0.0)], "n_left": [1.5], "n_right": 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"n_left": [0.0]}, "n_left[0] = 0.0: accepted: more than 0"),
-        ({"n_right": [math.nan]}, "n_right[0] = nan: accepted: finite"),
-        ({"end": [(1.0, math.inf)]}, "end[0, 1] = inf: accepted: finite"),
-        ({"end": [(1.0, 0.0), (2.0, 0.0)]}, "end: shape (2, 2); accepted: (1, 2)"),
-        ({"start": "here"}, "start: accepted: numbers"),
-        ({"start": [], "end": [], "n_left": [], "n_right": []}, "none; accepted: at least one"),
-        ({"control": [(0.0, 1.0)]}, "control and weight: accepted: both or neither"),
-        ({"control": [(0.0, 1.0)], "weight": [-1.0]}, "weight[0] = -1.0: accepted: more than 0"),
+        ({"n_left": [0.0]}, "n_left[0] = 0.0; expected more than 0"),
+        ({"n_right": [math.nan]}, "n_right[0] = nan; expected finite"),
+        ({"end": [(1.0, math.inf)]}, "end[0, 1] = inf; expected finite"),
+        ({"end": [(1.0, 0.0), (2.0, 0.0)]}, "end: shape (2, 2); expected (1, 2)"),
+        ({"start": "here"}, "start; expected numbers"),
+        ({"start": [], "end": [], "n_left": [], "n_right": []}, "none; expected at least one"),
+        ({"control": [(0.0, 1.0)]}, "control and weight; expected both or neither"),
+        ({"control": [(0.0, 1.0)], "weight": [-1.0]}, "weight[0] = -1.0; expected more than 0"),
     ],
 )
 def test_bad_segments_are_named_in_one_line(change, message):
@@ -46,25 +46,25 @@ def test_segments_that_coincide_are_refused():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"max_depth": 0}, "max_depth = 0: accepted: a whole number, 1 or more"),
-        ({"max_depth": 2.5}, "max_depth = 2.5: accepted"),
-        ({"origins": [(0.0, math.nan)]}, "origins[0, 1] = nan: accepted: finite"),
-        ({"directions": [(0.0, 0.0)]}, "directions[0] = (0, 0): accepted: a direction"),
-        ({"directions": [(0.0, 1.0)] * 2}, "directions: shape (2, 2); accepted: (1, 2)"),
-        ({"formula": "sellmeier"}, "formula = 'sellmeier': unknown; accepted: wedge"),
-        ({"precision": "float16"}, "precision = 'float16'; accepted: float32, float64"),
-        ({"backend": "metal"}, "backend = 'metal'; accepted: scalar, llvm, cuda"),
-        ({"method": "bvh"}, "method = 'bvh'; accepted: auto, brute, mesh"),
-        ({"reflect": -1}, "reflect: accepted: a whole number"),
-        ({"reflect": 0.5}, "reflect: accepted: a whole number"),
-        ({"reflect": 2**32}, "reflect: accepted: a whole number, 0 or more and below 2³²"),
-        ({"max_depth": True}, "max_depth = True: accepted: a whole number, 1 or more"),
-        ({"n_start": math.inf}, "n_start: accepted: a number"),
-        ({"n_start": "air"}, "n_start: accepted: a number"),
-        ({"n_start": 0}, "n_start: accepted: a number"),
-        ({"origins": [(0.0, 1e101)]}, "origins: a number beyond ±1e+100; accepted: up to that"),
-        ({"max_depth": 2**32}, "1 rays, max_depth = 4294967296: accepted: a product below 2³²"),
-        ({"n_start": math.nan}, "n_start: accepted: a number"),
+        ({"max_depth": 0}, "max_depth = 0; expected a whole number, 1 or more"),
+        ({"max_depth": 2.5}, "max_depth = 2.5; expected"),
+        ({"origins": [(0.0, math.nan)]}, "origins[0, 1] = nan; expected finite"),
+        ({"directions": [(0.0, 0.0)]}, "directions[0] = (0, 0); expected a direction"),
+        ({"directions": [(0.0, 1.0)] * 2}, "directions: shape (2, 2); expected (1, 2)"),
+        ({"formula": "sellmeier"}, "formula = 'sellmeier': unknown; expected wedge"),
+        ({"precision": "float16"}, "precision = 'float16'; expected float32, float64"),
+        ({"backend": "metal"}, "backend = 'metal'; expected scalar, llvm, cuda"),
+        ({"method": "bvh"}, "method = 'bvh'; expected auto, brute, mesh"),
+        ({"reflect": -1}, "reflect; expected a whole number"),
+        ({"reflect": 0.5}, "reflect; expected a whole number"),
+        ({"reflect": 2**32}, "reflect; expected a whole number, 0 or more and below 2³²"),
+        ({"max_depth": True}, "max_depth = True; expected a whole number, 1 or more"),
+        ({"n_start": math.inf}, "n_start; expected a number"),
+        ({"n_start": "air"}, "n_start; expected a number"),
+        ({"n_start": 0}, "n_start; expected a number"),
+        ({"origins": [(0.0, 1e101)]}, "origins: a number beyond ±1e+100"),
+        ({"max_depth": 2**32}, "1 rays, max_depth = 4294967296; expected a product below 2³²"),
+        ({"n_start": math.nan}, "n_start; expected a number"),
     ],
 )
 def test_bad_arguments_are_named_in_one_line(change, message):
@@ -77,7 +77,7 @@ def test_bad_arguments_are_named_in_one_line(change, message):
 
 def test_float32_has_a_range_of_its_own(needs_variant):
     needs_variant("llvm_ad_rgb")
-    with pytest.raises(ValueError, match=r"origins: a number beyond ±1e\+15; accepted: up to that"):
+    with pytest.raises(ValueError, match=r"origins: a number beyond ±1e\+15"):
         trace(Segments(**GOOD), [(0.0, -1e16)], [(0.0, 1.0)], 2, precision="float32", backend="llvm")
 
 
@@ -95,7 +95,7 @@ def test_scalar_arrays_refuse_float32_because_they_compute_in_double(monkeypatch
     monkeypatch.setattr(array_backend, "detect", lambda: {name: Backend(name, u, "why") for name, u in usable.items()})
     with pytest.raises(ValueError) as error:
         array_backend.choose_backend(asked, "float32")
-    message = "precision = 'float32': scalar arrays compute in double; accepted: float64, or a compiled backend (llvm, "
+    message = "precision = 'float32': scalar arrays compute in double; expected float64, or a compiled backend (llvm, "
     assert str(error.value) == f"{message}cuda){end}"
     assert array_backend.choose_backend("scalar", "float64").number is float
 

@@ -68,18 +68,18 @@ def test_what_is_measured_against_vacuum_is_made_relative_to_air():
 
 
 BAD = {
-    "unknown": ('"cauchy(1.5, 4000)"', '"glas"', "shape[0].n = 'glas': unknown material; accepted: vacuum"),
-    "formula": ('"cauchy(1.5, 4000)"', '"cauchy(1.5"', "shape[0].n = 'cauchy(1.5': accepted: cauchy(…)"),
+    "unknown": ('"cauchy(1.5, 4000)"', '"glas"', "shape[0].n = 'glas': unknown material; expected vacuum"),
+    "formula": ('"cauchy(1.5, 4000)"', '"cauchy(1.5"', "shape[0].n = 'cauchy(1.5'; expected cauchy(…)"),
     "range": (
         '"cauchy(1.5, 4000)"',
         '"table(500: 1.5, 900: 1.4)"',
         "shape[0].n: table(500: 1.5, 900: 1.4): no index at",
     ),
-    "one": ("[486.1327, 587.5618]", "1", "wavelengths: 1; accepted: a number from 2 to 256, or a list"),
-    "negative": ("[486.1327, 587.5618]", "[-500]", "wavelengths: [-500]; accepted: a number from 2 to 256"),
-    "many": ("[486.1327, 587.5618]", "257", "wavelengths: 257; accepted"),
-    "both": ("wavelengths =", 'colours = ["red", "blue"]\nwavelengths =', "colours: beside wavelengths; accepted: one"),
-    "light": ("wavelengths =", 'light = "A"\nwavelengths =', 'light: \'A\'; accepted: "flat" or "D65"'),
+    "one": ("[486.1327, 587.5618]", "1", "wavelengths: 1; expected a number from 2 to 256, or a list"),
+    "negative": ("[486.1327, 587.5618]", "[-500]", "wavelengths: [-500]; expected a number from 2 to 256"),
+    "many": ("[486.1327, 587.5618]", "257", "wavelengths: 257; expected"),
+    "both": ("wavelengths =", 'colours = ["red", "blue"]\nwavelengths =', "colours: beside wavelengths; expected one"),
+    "light": ("wavelengths =", 'light = "A"\nwavelengths =', 'light: \'A\'; expected "flat" or "D65"'),
 }
 
 
@@ -92,7 +92,7 @@ def test_what_is_refused_is_one_line(old, new, said, tmp_path):
 
 @pytest.mark.parametrize("text", ["", "red", "1", "nan", "450,", "-450", "inf"])
 def test_words_that_are_no_wavelengths(text):
-    with pytest.raises(ValueError, match="accepted: wavelengths in nm as"):
+    with pytest.raises(ValueError, match="expected wavelengths in nm as"):
         light.parsed(text)
 
 

@@ -103,10 +103,10 @@ def test_paths_end_in_every_way():
 
 
 def test_too_many_branches_are_refused(monkeypatch):
-    with pytest.raises(ValueError, match="branches = -1: accepted"):
+    with pytest.raises(ValueError, match="branches = -1; expected"):
         through_slab(-1)
     monkeypatch.setattr(path_tree, "MOST", 30)
-    with pytest.raises(ValueError, match="3 paths of up to 20 boundaries with up to 1 partial reflections; accepted: "):
+    with pytest.raises(ValueError, match="3 paths of up to 20 boundaries with up to 1 partial reflections; expected "):
         through_slab(1)
 
 

@@ -20,7 +20,7 @@ def written(tmp_path, text):
 
 
 MANY = [
-    ('kind = "circle"\nradius = 1\nn = 1.5\nfacets = 1000000', 5, r"shape\[4\]: 5000000 pieces and more; accepted: ")
+    ('kind = "circle"\nradius = 1\nn = 1.5\nfacets = 1000000', 5, r"shape\[4\]: 5000000 pieces and more; expected ")
 ]
 MANY += [('kind = "luneburg"\nradius = 1\nlayers = 10000\nfacets = 1000000', 1, r"shape\[0\]: 10000000000 pieces")]
 
@@ -38,15 +38,15 @@ def test_pieces_are_counted_before_they_are_made(tmp_path, monkeypatch, shape, c
 
 def test_rays_are_counted_before_they_are_made(tmp_path, monkeypatch):
     monkeypatch.setattr(scene_file, "RAYS", 7)
-    with pytest.raises(ValueError, match=r"beam\[2\]\.count: 8 rays with the beams before; accepted: up to 7"):
+    with pytest.raises(ValueError, match=r"beam\[2\]\.count: 8 rays with the beams before; expected up to 7"):
         load(written(tmp_path, BEAMS))
 
 
 def test_a_file_that_is_none_or_too_large(tmp_path, monkeypatch):
     os.mkfifo(tmp_path / "pipe.toml")
     for path in (tmp_path / "pipe.toml", Path("/dev/zero")):
-        with pytest.raises(ValueError, match=f"^{path}: is a pipe or a device; accepted: a file$"):
+        with pytest.raises(ValueError, match=f"^{path}: not a regular file$"):
             load(path)
     monkeypatch.setattr(scene_file, "SIZE", 1000)
-    with pytest.raises(ValueError, match=r"scene\.toml: 1001 bytes; accepted: up to 1000"):
+    with pytest.raises(ValueError, match=r"scene\.toml: 1001 bytes; expected up to 1000"):
         load(written(tmp_path, " " * 1001))

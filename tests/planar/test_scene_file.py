@@ -232,47 +232,47 @@ def test_a_file_without_a_title_has_its_own_name(tmp_path):
 
 
 BAD = {  # what is replaced, by what: the key, what was found, what is accepted
-    "unknown key": ("max_depth = 5", "max_depths = 5", "max_depths: unknown; accepted: title, index"),
-    "unknown key of a shape": ("facets = 20", "radius = 3", "shape[2].radius: unknown; accepted: radii"),
+    "unknown key": ("max_depth = 5", "max_depths = 5", "max_depths: unknown; expected title, index"),
+    "unknown key of a shape": ("facets = 20", "radius = 3", "shape[2].radius: unknown; expected radii"),
     "strange key": ("max_depth = 5", '"a\\nb" = 5', r"'a\nb': unknown"),
-    "missing key": ("radius = 0.2", "", "shape[1].radius: missing; accepted: a number above 0"),
-    "missing index": ("n = [1.5, 1.6]", "", "shape[0].n: missing; accepted: a number above 0, a list"),
-    "wrong type": ("radius = 2\n", 'radius = "2"\n', "shape[0].radius: '2'; accepted: a number above 0"),
-    "bool": ("radius = 2\n", "radius = true\n", "shape[0].radius: true; accepted: a number"),
-    "NaN": ("radius = 2\n", "radius = nan\n", "shape[0].radius: nan; accepted: a number"),
-    "infinity": ("at = [9, 0]", "at = [inf, 0]", "shape[2].at: [inf, 0]; accepted: [x, y]"),
+    "missing key": ("radius = 0.2", "", "shape[1].radius: missing; expected a number above 0"),
+    "missing index": ("n = [1.5, 1.6]", "", "shape[0].n: missing; expected a number above 0, a list"),
+    "wrong type": ("radius = 2\n", 'radius = "2"\n', "shape[0].radius: '2'; expected a number above 0"),
+    "bool": ("radius = 2\n", "radius = true\n", "shape[0].radius: true; expected a number"),
+    "NaN": ("radius = 2\n", "radius = nan\n", "shape[0].radius: nan; expected a number"),
+    "infinity": ("at = [9, 0]", "at = [inf, 0]", "shape[2].at: [inf, 0]; expected [x, y]"),
     "no float": ("rotate = 30", f"rotate = 1{'0' * 400}", "shape[0].rotate: 1000"),
-    "date": ("rotate = 30", "rotate = 1999-12-31", "shape[0].rotate: datetime.date(1999, 12, 31); accepted: a number"),
-    "index 0": ("n = 1.3", "n = 0", "shape[2].n: 0; accepted: a number above 0"),
-    "negative index": ("index = [1, 1.1]", "index = [1, -1.1]", "index: [1, -1.1]; accepted: a number above 0"),
-    "index of a third colour": ("n = 1.3", "n = [1, 2, 3]", "shape[2].n: 3 numbers; accepted: 1 for all or each of 2"),
-    "colours missing": ('colours = ["red", "blue"]', "", "index: 2 numbers; accepted: 1 for all or each of 1"),
-    "no colours": ('["red", "blue"]', "[]", "colours: []; accepted: a list of texts"),
-    "max_depth 0": ("max_depth = 5", "max_depth = 0", "max_depth: 0; accepted: a whole number, 1 to"),
-    "max_depth 1.5": ("max_depth = 5", "max_depth = 1.5", "max_depth: 1.5; accepted: a whole number"),
-    "branches": ("branches = 1", "branches = -1", "branches: -1; accepted: a whole number, 0 to"),
-    "view": ("view = [-2, 2,", "view = [2, -2,", "view: [2, -2, -1.5, 1.5]; accepted: [x0, x1, y0, y1]"),
-    "unknown kind": ('"ellipse"', '"elipse"', "shape[2].kind: 'elipse'; accepted: polygon, rectangle, prism"),
-    "kind missing": ('kind = "ellipse"', "", "shape[2].kind: missing; accepted: polygon"),
-    "kind of beam": ('"fan"', '"torch"', "beam[1].kind: 'torch'; accepted: parallel, fan, rays"),
-    "kind as a list": ('kind = "fan"', "kind = []", "beam[1].kind: []; accepted: parallel"),
+    "date": ("rotate = 30", "rotate = 1999-12-31", "shape[0].rotate: datetime.date(1999, 12, 31); expected a number"),
+    "index 0": ("n = 1.3", "n = 0", "shape[2].n: 0; expected a number above 0"),
+    "negative index": ("index = [1, 1.1]", "index = [1, -1.1]", "index: [1, -1.1]; expected a number above 0"),
+    "index of a third colour": ("n = 1.3", "n = [1, 2, 3]", "shape[2].n: 3 numbers; expected 1 for all or each of 2"),
+    "colours missing": ('colours = ["red", "blue"]', "", "index: 2 numbers; expected 1 for all or each of 1"),
+    "no colours": ('["red", "blue"]', "[]", "colours: []; expected a list of texts"),
+    "max_depth 0": ("max_depth = 5", "max_depth = 0", "max_depth: 0; expected a whole number, 1 to"),
+    "max_depth 1.5": ("max_depth = 5", "max_depth = 1.5", "max_depth: 1.5; expected a whole number"),
+    "branches": ("branches = 1", "branches = -1", "branches: -1; expected a whole number, 0 to"),
+    "view": ("view = [-2, 2,", "view = [2, -2,", "view: [2, -2, -1.5, 1.5]; expected [x0, x1, y0, y1]"),
+    "unknown kind": ('"ellipse"', '"elipse"', "shape[2].kind: 'elipse'; expected polygon, rectangle, prism"),
+    "kind missing": ('kind = "ellipse"', "", "shape[2].kind: missing; expected polygon"),
+    "kind of beam": ('"fan"', '"torch"', "beam[1].kind: 'torch'; expected parallel, fan, rays"),
+    "kind as a list": ('kind = "fan"', "kind = []", "beam[1].kind: []; expected parallel"),
     "name taken": ("radii = [1, 2]", 'radii = [1, 2]\nname = "disc"', "shape[2].name: 'disc' is another shape's"),
-    "within nothing": ('"disc"\nat', '"dish"\nat', "shape[1].within: 'dish'; accepted: the name of a shape above"),
+    "within nothing": ('"disc"\nat', '"dish"\nat', "shape[1].within: 'dish'; expected the name of a shape above"),
     "within and outside": ('"disc"\nat', '"disc"\noutside = 1\nat', "shape[1].within: 'disc', beside `outside`"),
-    "scale 0": ("scale = [1, 0.5]", "scale = [1, 0]", "shape[0].scale: [1, 0]; accepted: a number of size"),
+    "scale 0": ("scale = [1, 0.5]", "scale = [1, 0]", "shape[0].scale: [1, 0]; expected a number of size"),
     "out of range": ("radii = [1, 2]\n", "radii = [1, 1e99]\nscale = 99\n", "shape[2]: coordinates beyond 1e+100"),
-    "lost": ("radii = [1, 2]", "radii = [1e-20, 2e-20]", "shape[2]: a point, beside coordinates of 9; accepted: above"),
+    "lost": ("radii = [1, 2]", "radii = [1e-20, 2e-20]", "shape[2]: a point, beside coordinates of 9; expected above"),
     "facets": ("facets = 20", "facets = 3", "shape[2].facets: 3, for 4 arcs"),
-    "no rays": ("count = 3", "count = 0", "beam[1].count: 0; accepted: a whole number, 1 to"),
-    "no direction": ("direction = [3, 4]", "direction = [0, 0]", "beam[0].direction: [0, 0]; accepted: degrees, or"),
-    "three coordinates": ("at = [-5, 0]", "at = [-5, 0, 1]", "beam[1].at: [-5, 0, 1]; accepted: [x, y]"),
+    "no rays": ("count = 3", "count = 0", "beam[1].count: 0; expected a whole number, 1 to"),
+    "no direction": ("direction = [3, 4]", "direction = [0, 0]", "beam[0].direction: [0, 0]; expected degrees, or"),
+    "three coordinates": ("at = [-5, 0]", "at = [-5, 0, 1]", "beam[1].at: [-5, 0, 1]; expected [x, y]"),
     "far away": ("origins = [[0, 1]", "origins = [[0, 1e101]", "beam[2]: coordinates beyond 1e+100"),
     "too few directions": ("[180, [0, -1e300]]", "[180]", "beam[2].directions: 1, for 2 origins"),
-    "no list": ("origins = [[0, 1], [2, 3]]", "origins = 3", "beam[2].origins: 3; accepted: a list of [x, y]"),
-    "one table": ("[[shape]]", "[shape]", "accepted: TOML"),
-    "syntax": ("max_depth = 5", "max_depth = = 5", "(at line 5, column 13); accepted: TOML"),
-    "twice": ("max_depth = 5", "max_depth = 5\nmax_depth = 5", "accepted: TOML"),
-    "nesting": ("max_depth = 5", f"max_depth = {'[' * 5000}", "accepted: TOML"),
+    "no list": ("origins = [[0, 1], [2, 3]]", "origins = 3", "beam[2].origins: 3; expected a list of [x, y]"),
+    "one table": ("[[shape]]", "[shape]", "expected TOML"),
+    "syntax": ("max_depth = 5", "max_depth = = 5", "(at line 5, column 13); expected TOML"),
+    "twice": ("max_depth = 5", "max_depth = 5\nmax_depth = 5", "expected TOML"),
+    "nesting": ("max_depth = 5", f"max_depth = {'[' * 5000}", "expected TOML"),
 }
 
 
@@ -298,11 +298,11 @@ def without(table):
 @pytest.mark.parametrize(
     "text, expected",
     [
-        ("", "shape: missing; accepted: a table or more"),
+        ("", "shape: missing; expected a table or more"),
         (without("shape"), "shape: missing"),
         (without("beam"), "beam: missing"),
-        (without("beam") + "\n[beam]\ncount = 1", "beam: {'count': 1}; accepted: a table or more, in double brackets"),
-        ("shape = []\n" + without("shape"), "shape: []; accepted: a table or more"),
+        (without("beam") + "\n[beam]\ncount = 1", "beam: {'count': 1}; expected a table or more, in double brackets"),
+        ("shape = []\n" + without("shape"), "shape: []; expected a table or more"),
     ],
 )
 def test_an_empty_scene_is_none(tmp_path, text, expected):
@@ -314,7 +314,7 @@ def test_an_empty_scene_is_none(tmp_path, text, expected):
 def test_what_is_no_text_is_no_scene(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_bytes(b"title = '\xff'")
-    with pytest.raises(ValueError, match=r"scene\.toml: byte 9 is not UTF-8; accepted: TOML"):
+    with pytest.raises(ValueError, match=r"scene\.toml: byte 9 is not UTF-8; expected TOML"):
         load(path)
     with pytest.raises(FileNotFoundError, match=r"^[^\n]*none\.toml[^\n]*$"):
         load(tmp_path / "none.toml")
@@ -329,9 +329,9 @@ def test_what_is_no_text_is_no_scene(tmp_path):
         ('kind = "lens"\ncurvature = [1, -1]\nthickness = 1\nradius = 2', "shape[0].radius = 2: a surface ends"),
         ('kind = "ellipse_lens"\nfocal_length = 1\nthickness = 2\nradius = 1', "shape[0].n = 1.5, thickness = 2;"),
         ('kind = "polygon"\npoints = [[0, 0], [1, 1]]', "shape[0].points: they enclose no area"),
-        ('kind = "polygon"\npoints = [[0, 0]]', "shape[0].points: 1; accepted: at least 2"),
+        ('kind = "polygon"\npoints = [[0, 0]]', "shape[0].points: 1; expected at least 2"),
         ('kind = "polygon"\npoints = [[0, 0], [1, 1], [0, 1]]\narcs = [9]', "shape[0].arcs: 1 for 3 pieces"),
-        ('kind = "prism"\nside = 1\napex = 180', "shape[0].apex: 180; accepted: degrees, above 0 and below 180"),
+        ('kind = "prism"\nside = 1\napex = 180', "shape[0].apex: 180; expected degrees, above 0 and below 180"),
     ],
 )
 def test_what_a_shape_cannot_be_names_its_key(tmp_path, shape, expected):
@@ -386,7 +386,7 @@ def test_whatever_the_values_a_file_is_a_scene_or_one_line(tmp_path):
         try:
             scene = load(path)
         except ValueError as error:
-            line = rf"{re.escape(str(path))}: shape\[0\](\.\w+)?( = |: )[^\n]+; accepted: [^\n]+"
+            line = rf"{re.escape(str(path))}: shape\[0\](\.\w+)?( = |: )[^\n]+; expected [^\n]+"
             assert re.fullmatch(line, str(error)), error
         else:
             read += 1

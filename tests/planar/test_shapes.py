@@ -223,7 +223,7 @@ def test_the_documents_polyline_has_the_originals_vertices_and_closes_at_its_tip
 
 @pytest.mark.parametrize("resolution", [0.0, -0.05, math.nan])
 def test_a_polyline_needs_a_resolution(resolution):
-    with pytest.raises(ValueError, match="accepted: above 0"):
+    with pytest.raises(ValueError, match="expected above 0"):
         shapes.document_lens(resolution)
 
 
@@ -270,8 +270,8 @@ def test_a_surface_reaches_as_far_as_it_exists():
         (((0.02, 0.03), 1.0, None), "curvature.*never meet"),
         (((0.0, 0.0), 1.0, None), "curvature.*never meet"),
         (((0.1, -0.5), 20.5, None), "curvature.*never meet"),  # but their far halves do
-        (((0.02, -0.02), 1.0, 60.0), "radius = 60: a surface ends before; accepted: at most 50"),
-        (((0.02, -0.02), 1.0, 20.0), "radius = 20: the surfaces meet before; accepted: at most 7.05"),
+        (((0.02, -0.02), 1.0, 60.0), "radius = 60: a surface ends before; expected at most 50"),
+        (((0.02, -0.02), 1.0, 20.0), "radius = 20: the surfaces meet before; expected at most 7.05"),
     ],
 )
 def test_impossible_lenses_are_refused(arguments, found):
@@ -288,7 +288,7 @@ def test_the_ellipse_lens_has_one_optical_path_to_its_focus():
     assert np.ptp(front[:, 0] + n * np.hypot(*front.T)) <= 8 * ULP * 4
     assert np.ptp(np.hypot(*back.T)) <= 4 * ULP * 4
     for bad in ((1.0, 4, 1.5, 1), (1.5, 4, 4, 1)):
-        with pytest.raises(ValueError, match="accepted: n > 1, 0 < thickness < 4"):
+        with pytest.raises(ValueError, match="expected n > 1, 0 < thickness < 4"):
             shapes.ellipse_lens(*bad)
 
 

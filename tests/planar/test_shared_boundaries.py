@@ -75,13 +75,13 @@ def test_a_shape_may_touch_what_it_lies_in_and_what_that_is_cemented_to(tmp_path
     segments = two(tmp_path, more=INNER).segments[0]
     around = [(1.3, 1.1), (1.3, 1.5), (1.3, 1.7), (1.5, 1.1), (1.5, 1.1)]
     assert media(segments) == [*around, (1.7, 1.1), (1.7, 1.1), (1.7, 1.1)]
-    with pytest.raises(ValueError, match=r"shape\[2\]: along shape\[0\] there is index 1.5; accepted: 1.1"):
+    with pytest.raises(ValueError, match=r"shape\[2\]: along shape\[0\] there is index 1.5; expected 1.1"):
         two(tmp_path, more=INNER.replace('within = "left"', ""))
 
 
 def test_the_same_shape_twice_is_none(tmp_path):
     again = '[[shape]]\nkind = "rectangle"\nwidth = 2\nheight = 2\nn = 1.6\nat = [0.3, 0.1]\n'
-    with pytest.raises(ValueError, match=r"shape\[2\]: along shape\[0\] there is index 1.5; accepted: 1.1"):
+    with pytest.raises(ValueError, match=r"shape\[2\]: along shape\[0\] there is index 1.5; expected 1.1"):
         two(tmp_path, more=again)
 
 

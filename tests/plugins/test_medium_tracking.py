@@ -166,7 +166,7 @@ def refusal(**parts):
 def test_a_camera_inside_that_says_nothing_is_refused(rgb_variant):
     said = refusal(camera=0.5, slab=box(matched(int_absorption=0.7), id="aquarium"))
     assert "refract_path: light comes to 'aquarium' through another absorption than its BSDF says" in said
-    assert said.endswith("accepted: camera_absorption, or the sensor's medium, as the camera's surroundings absorb; "
+    assert said.endswith("expected camera_absorption, or the sensor's medium, as the camera's surroundings absorb; "
                          "ext_absorption (or ext_colour) as the medium around it absorbs")  # fmt: skip
 
 
@@ -174,7 +174,7 @@ def test_a_neighbour_that_says_something_else_is_refused_by_name(rgb_variant):
     parts = {"outer": box(matched(int_absorption=0.2), id="outer"), "inner": box(matched(), 0.5, id="inner")}
     said = refusal(**parts)
     assert "light comes to 'inner' through another" in said
-    assert "accepted: ext_absorption (or ext_colour) as the medium around it absorbs" in said
+    assert "expected ext_absorption (or ext_colour) as the medium around it absorbs" in said
 
 
 def test_within_a_wrapper_absorption_is_refused(rgb_variant):
@@ -184,7 +184,7 @@ def test_within_a_wrapper_absorption_is_refused(rgb_variant):
     mask = {"type": "mask", "opacity": 0.5, "bsdf": matched(int_absorption=0.2)}
     said = refusal(slab=box(mask, id="masked"), integrator=method)
     assert "refract_path: 'masked' has an absorbing BSDF within a MaskBSDF" in said
-    assert said.endswith("accepted: absorption of the shape's own BSDF")
+    assert said.endswith("expected absorption of the shape's own BSDF")
 
 
 @pytest.mark.parametrize(

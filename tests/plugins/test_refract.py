@@ -284,14 +284,14 @@ def test_a_direction_that_is_none_stays_none(typical_variant):
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
-        ({"int_ior": 0}, "int_ior = 0: accepted"),
-        ({"int_ior": -1.5}, "int_ior = -1.5: accepted"),
-        ({"ext_ior": math.nan}, "ext_ior = nan: accepted"),
-        ({"ext_ior": math.inf}, "ext_ior = inf: accepted"),
-        ({"int_ior": True}, "int_ior = True: accepted"),
-        ({"int_ior": "unobtainium"}, "int_ior = 'unobtainium': unknown material; accepted: vacuum"),
-        ({"formula": "snell"}, "formula = 'snell': unknown; accepted: auto, wedge"),
-        ({"formula": 3}, "formula = 3: unknown; accepted: auto"),
+        ({"int_ior": 0}, "int_ior = 0; expected"),
+        ({"int_ior": -1.5}, "int_ior = -1.5; expected"),
+        ({"ext_ior": math.nan}, "ext_ior = nan; expected"),
+        ({"ext_ior": math.inf}, "ext_ior = inf; expected"),
+        ({"int_ior": True}, "int_ior = True; expected"),
+        ({"int_ior": "unobtainium"}, "int_ior = 'unobtainium': unknown material; expected vacuum"),
+        ({"formula": "snell"}, "formula = 'snell': unknown; expected auto, wedge"),
+        ({"formula": 3}, "formula = 3: unknown; expected auto"),
         ({"roughness": 0.1}, "roughness"),
     ],
 )
@@ -303,7 +303,7 @@ def test_bad_parameters_are_named_with_what_is_accepted(typical_variant, paramet
 
 @pytest.mark.parametrize(("int_ior", "ext_ior"), [(1e300, 1), (1e-50, 1), (1e200, 1e-200), (1e-320, 1)])
 def test_indices_whose_ratio_is_beyond_float32_are_refused(typical_variant, int_ior, ext_ior):
-    with pytest.raises(RuntimeError, match=r"int_ior / ext_ior = .*: accepted: a ratio from"):
+    with pytest.raises(RuntimeError, match=r"int_ior / ext_ior = .*; expected a ratio from"):
         load(int_ior=int_ior, ext_ior=ext_ior)
 
 

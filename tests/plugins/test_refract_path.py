@@ -259,9 +259,9 @@ def test_a_white_sky_shows_what_was_truncated(llvm_variant):
 def test_what_would_be_left_to_chance_is_refused(bsdf, llvm_variant):
     with pytest.raises(RuntimeError) as caught:
         render(glass_ball(sky=sky(), other={"type": "sphere", "bsdf": bsdf}), 1, deterministic=True)
-    assert "accepted: scenes of smooth dielectrics and conductors" in str(caught.value.__cause__)
+    assert "expected scenes of smooth dielectrics and conductors" in str(caught.value.__cause__)
     method = mi.load_dict({"type": "refract_path", "max_depth": 5, "deterministic": True})
-    with pytest.raises(ValueError, match="accepted: renders that are not differentiated"):
+    with pytest.raises(ValueError, match="expected renders that are not differentiated"):
         derivative(glass_ball(sky=sky()), method, "backward")
 
 
@@ -379,22 +379,22 @@ def test_a_frozen_render_follows_the_index_and_a_lamp_that_turns_grey(split_dept
 @pytest.mark.parametrize(
     ("parameters", "said"),
     [
-        ({"max_depth": -2}, "max_depth = -2: accepted: -1 (no limit) or an integer ≥ 0"),
+        ({"max_depth": -2}, "max_depth = -2; expected -1 (no limit) or an integer ≥ 0"),
         ({"max_depth": 2.5}, "max_depth = 2.5"),
         ({"max_depth": True}, "max_depth = True"),
         ({"max_depth": "deep"}, "max_depth = 'deep'"),
-        ({"rr_depth": 0}, "rr_depth = 0: accepted: an integer ≥ 1"),
-        ({"split_depth": -1}, "split_depth = -1: accepted: an integer ≥ 0"),
+        ({"rr_depth": 0}, "rr_depth = 0; expected an integer ≥ 1"),
+        ({"split_depth": -1}, "split_depth = -1; expected an integer ≥ 0"),
         (
             {"split_depth": 13, "split_weight": 0.0},
-            "split into 8.19e+03 paths; accepted: 2^split_depth or 1/split_weight up to 4096",
+            "split into 8.19e+03 paths; expected 2^split_depth or 1/split_weight up to 4096",
         ),
         ({"split_depth": 65}, "and split_depth up to 64"),
-        ({"split_weight": 1.5}, "split_weight = 1.5: accepted: a number from 0 to 1"),
+        ({"split_weight": 1.5}, "split_weight = 1.5; expected a number from 0 to 1"),
         ({"split_weight": float("nan")}, "split_weight = nan"),
         ({"split_weight": True}, "split_weight = True"),
         ({"split_weight": "half"}, "split_weight = 'half'"),
-        ({"deterministic": 1}, "deterministic = 1: accepted: true or false"),
+        ({"deterministic": 1}, "deterministic = 1; expected true or false"),
     ],
     ids=str,
 )

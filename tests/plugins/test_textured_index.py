@@ -58,7 +58,7 @@ def test_the_texture_is_a_parameter(typical_variant):
 
 
 def test_beside_a_texture_an_index_is_the_same_for_all_wavelengths(typical_variant):
-    with pytest.raises(RuntimeError, match=r"refract: ext_ior: accepted beside a texture: one index for all"):
+    with pytest.raises(RuntimeError, match=r"refract: ext_ior; expected beside a texture one index for all"):
         load(ext_ior="cauchy(1.5, 4000)")
 
 

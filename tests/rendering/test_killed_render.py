@@ -69,7 +69,7 @@ def test_a_signal_keeps_what_is_done(tmp_path, llvm, number):
     output = tmp_path / "a.exr"
     code, _, err = ended_by(number, output)
     assert code == 128 + number, err
-    assert "spp; the same command goes on from them" in err
+    assert "spp; run the same command again to resume" in err
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr.checkpoint"]
     render = LongRender(Job(BALL, {"res": "32"}), output, Limits(spp=4800, pass_spp=4))
     assert render.progress.passes > 0

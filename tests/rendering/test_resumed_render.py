@@ -170,7 +170,7 @@ def test_a_sampler_that_rounds_up_has_nothing_left(tmp_path, llvm):
 def test_a_checkpoint_of_more_samples_is_refused(tmp_path, llvm):
     output = tmp_path / "a.exr"
     stopped_after(rendering(output, spp=64, pass_spp=4), 5)
-    with pytest.raises(ValueError, match="holds 20 spp; accepted: at least so many, or --restart"):
+    with pytest.raises(ValueError, match="holds 20 spp; expected at least so many, or --restart"):
         rendering(output, spp=16, pass_spp=4)
 
 
@@ -193,7 +193,7 @@ def test_a_black_image_is_warned_of(tmp_path, llvm):
     (tmp_path / "dark.xml").write_text(sky)
     render = LongRender(Job(tmp_path / "dark.xml"), tmp_path / "a.exr", Limits(until=0.1, pass_spp=1))
     stopped_after(render, 9)
-    assert "is black so far" in render.warnings[0]
+    assert "the image is still black" in render.warnings[0]
 
 
 def test_the_time_of_an_integrator_is_none_of_ours(tmp_path, llvm):
@@ -339,5 +339,5 @@ def test_a_full_disk_at_a_checkpoint_is_a_warning(tmp_path, llvm, monkeypatch):
 
 def test_an_output_that_cannot_be_written_is_found_before(tmp_path, monkeypatch):
     monkeypatch.setattr(long_render, "load_scene", lambda *arguments: pytest.fail("loaded"))
-    with pytest.raises(NotADirectoryError, match="accepted"):
+    with pytest.raises(NotADirectoryError, match="expected"):
         rendering(tmp_path / "none" / "a.exr", spp=1)

@@ -112,7 +112,7 @@ def test_too_large(folder):
 
 
 ONLY_HERE = (
-    "by an absolute name or from the working folder; accepted with a cluster: a name relative to the scene's folder"
+    "by an absolute name or from the working folder; expected with a cluster a name relative to the scene's folder"
 )
 
 
@@ -149,7 +149,7 @@ def test_parents_behind_a_link(folder):
     """`link/..` is another folder than the text says."""
     (folder / "scenes" / "link").symlink_to(folder / "far")
     text = refusal(written(folder, "link/../common/bright.exr"))
-    assert "by a symbolic link; accepted" in text
+    assert "by a symbolic link; expected" in text
 
 
 def test_errors_name_the_files_as_they_are_here(folder):

@@ -24,7 +24,7 @@ def test_the_formulas_of_a_scene(bsdf, formulas):
 
 
 def test_a_film_is_measured_before_the_rendering():
-    with pytest.raises(ValueError, match=r"nested\.xml: a film of 8193 × 8193 pixels; accepted: up to 67108864"):
+    with pytest.raises(ValueError, match=r"nested\.xml: a film of 8193 × 8193 pixels; expected up to 67108864"):
         scene_files.load_scene(SCENE, {"res": "8193"})
 
 
@@ -39,7 +39,7 @@ def test_absorption_with_an_integrator_that_knows_none_is_refused_by_name(tmp_pa
     with pytest.raises(ValueError) as error:
         scene_files.load_scene(path)
     assert (
-        str(error.value) == f"{path}: refract: int_absorption: accepted: the integrator refract_path, or no absorption"
+        str(error.value) == f"{path}: refract: int_absorption; expected the integrator refract_path, or no absorption"
     )
     scene_files.load_scene(path, {"integrator": "refract_path"})
 
@@ -50,5 +50,5 @@ def test_a_spectrum_of_one_pair_is_refused_by_the_name_of_its_parameter(tmp_path
     path.write_text(text.replace("<default", '<default name="pairs" value="400:1.5"/><default', 1))
     with pytest.raises(ValueError) as error:
         scene_files.load_scene(path)
-    said = "int_ior = '400:1.5': accepted: a number, or two pairs and more of a wavelength in nm and a value"
+    said = "int_ior = '400:1.5'; expected a number, or two pairs and more of a wavelength in nm and a value"
     assert str(error.value) == f"{path}: {said}"

@@ -55,7 +55,7 @@ def test_what_is_broken_comes_before_the_answers(tmp_path):
 @pytest.mark.parametrize(
     ("page", "complaint"),
     [
-        ({"answers": [{**ANSWER, "state": "maybe"}]}, "state 'maybe'; accepted: yes, no, plain, not measured"),
+        ({"answers": [{**ANSWER, "state": "maybe"}]}, "state 'maybe'; expected yes, no, plain, not measured"),
         ({"answers": [], "plot": {**PAGE["plot"], "row": "none"}}, "there is no row 'none'"),
     ],
 )

@@ -103,7 +103,7 @@ def test_nothing_stays_of_half_an_export(small, tmp_path, monkeypatch):
 def test_unknown_target(small, tmp_path):
     with pytest.raises(
         ValueError,
-        match=r"'blender': unknown; accepted: cycles, luxcore, radiance, raysect, povray, mitsuba, obj\+json",
+        match=r"'blender': unknown; expected cycles, luxcore, radiance, raysect, povray, mitsuba, obj\+json",
     ):
         write_files.write(small, "blender", tmp_path / "new")
 

@@ -39,7 +39,7 @@ def run_action(folder: Path, inputs: dict[str, str], workspace: Path, temporary:
     action = plain_yaml.loads((folder / "action.yml").read_text("utf-8"))
     declared = action["inputs"]
     if unknown := inputs.keys() - declared.keys():
-        raise ValueError(f"inputs {sorted(unknown)}: accepted: {', '.join(declared)}")
+        raise ValueError(f"inputs {sorted(unknown)}; expected {', '.join(declared)}")
     if missing := {name for name, each in declared.items() if each.get("required") == "true"} - inputs.keys():
         raise ValueError(f"inputs {sorted(missing)}: missing")
     values = {f"inputs.{name}": inputs.get(name, each.get("default", "")) for name, each in declared.items()}

@@ -29,7 +29,7 @@ def test_what_cannot_be_counted_is_not_enough(text, tmp_path, capsys):
         report.write_text(text)
     assert MINIMUM([str(report), "0"]) == 2
     assert MINIMUM([]) == MINIMUM([str(report), "many"]) == 2
-    assert "accepted: FILE.xml CASES" in capsys.readouterr().err
+    assert "expected FILE.xml CASES" in capsys.readouterr().err
 
 
 def test_no_step_of_ci_goes_on_after_a_failure():

@@ -266,13 +266,13 @@ def test_the_exit_code_follows_the_budgets(tmp_path, monkeypatch, capsys, budget
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["refractions"], "unknown study 'refractions'; accepted: directions, stability, renders, efficiency, media"),
-        (["--profile", "slow"], "unknown profile 'slow'; accepted: quick, standard, full"),
-        (["--out", __file__], "File exists; accepted: a writable folder"),
+        (["refractions"], "unknown study 'refractions'; expected directions, stability, renders, efficiency, media"),
+        (["--profile", "slow"], "unknown profile 'slow'; expected quick, standard, full"),
+        (["--out", __file__], "File exists; expected a writable folder"),
         (["--speed", "9"], "No such option: --speed"),
-        (["--write-tables"], "--write-tables with the profile 'quick'; accepted: --profile standard, --profile full"),
-        (["renderers", "--install", "blender"], "unknown system 'blender'; accepted: batoid, cycles"),
-        (["renderers", "--list", "--install", "pyglm"], "accepted: one of them"),
+        (["--write-tables"], "--write-tables with the profile 'quick'; expected --profile standard, --profile full"),
+        (["renderers", "--install", "blender"], "unknown system 'blender'; expected batoid, cycles"),
+        (["renderers", "--list", "--install", "pyglm"], "expected one of them"),
         (["renderers", "pyglm"], "unexpected extra argument"),
     ],
 )
@@ -290,7 +290,7 @@ def test_an_interruption_is_exit_code_130_and_says_how_to_go_on(tmp_path, monkey
 
     monkeypatch.setattr(command, "_run", interrupted)
     assert command.main(["--out", str(tmp_path)]) == 130
-    assert "the same command goes on from here" in capsys.readouterr().err
+    assert "run the same command again to resume" in capsys.readouterr().err
 
 
 def test_two_validations_do_not_share_a_folder(tmp_path, monkeypatch, capsys):
@@ -449,5 +449,5 @@ def test_a_scene_is_loaded_in_the_same_order_every_time(context):
 def test_keeping_the_worst_rays_refuses_what_is_no_formula(capsys):
     assert keep_worst.main(["promoted", "nope"]) == 2
     error = capsys.readouterr().err
-    assert error.startswith("validation.directions.keep_worst: unknown formula 'nope'; accepted: ")
+    assert error.startswith("validation.directions.keep_worst: unknown formula 'nope'; expected ")
     assert len(error.splitlines()) == 1

@@ -42,5 +42,5 @@ def test_where_nothing_changes_there_is_no_figure():
 def test_what_is_replaced_is_there_once():
     assert dispersion._once("a", "b", "cac") == "cbc"
     for text in ("cc", "aa"):
-        with pytest.raises(ValueError, match="accepted: once"):
+        with pytest.raises(ValueError, match="expected once"):
             dispersion._once("a", "b", text)

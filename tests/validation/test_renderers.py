@@ -302,7 +302,7 @@ def test_the_list_says_what_is_there(elsewhere, capsys, monkeypatch):
     ("needs", "said"),
     [
         (Pip(("mi-refract-no-such-thing==1",)), "mi-refract-no-such-thing==1"),
-        (Pip(("numpy",), python="2.7"), "needs Python 2.7; accepted: a python2.7 in PATH"),
+        (Pip(("numpy",), python="2.7"), "needs Python 2.7; expected a python2.7 in PATH"),
         (Npm(("mi-refract-no-such-thing@1",)), "npm"),
         (Apt("no-such-program", ("mi-refract-no-such-thing",)), "apt-get"),
     ],

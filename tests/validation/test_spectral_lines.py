@@ -113,5 +113,5 @@ def test_the_film_sees_what_shines_and_another_index_is_seen(needs_variant, monk
         assert images[0].pixels[0, 0, 0] == pytest.approx(sky, rel=1e-3)
     found, _ = spectral_lines._compared(one["C"], one["F"], Size(32, 256, 1, 0.3))
     assert found.verdict is Verdict.DIFFERENT
-    with pytest.raises(ValueError, match="accepted: 1"):
+    with pytest.raises(ValueError, match="expected 1"):
         spectral_lines.spectral("<scene/>", 500.0)

@@ -115,20 +115,20 @@ def test_a_worker_sends_files_and_errors_as_they_are(monkeypatch, scalar_variant
         return [row(images={"test": "images/a.exr"})]
 
     def fails(context):
-        raise ValueError("a scene is wrong; accepted: others")
+        raise ValueError("a scene is wrong; expected others")
 
     study = Study("s", "", "", {}, lambda c: [Task(f.__name__, functools.partial(f, c)) for f in (writes, fails)])
     planted(monkeypatch)
     monkeypatch.setattr(spread, "import_module", lambda name: types.SimpleNamespace(STUDY=study))
     outcome = spread.run_here(spread.Asked(("one",), "quick", "scalar_rgb"), "writes")
     assert outcome.files == {"images/a.exr": b"pixels"} and outcome.finished[0][0].images == {"test": "images/a.exr"}
-    with pytest.raises(ValueError, match="a scene is wrong; accepted: others"):
+    with pytest.raises(ValueError, match="a scene is wrong; expected others"):
         spread.run_here(spread.Asked(("one",), "quick", "scalar_rgb"), "fails")
 
 
 def test_two_tasks_of_one_name_are_refused(context):
     elsewhere = spread.Elsewhere(ASKED, Elsewhere("tcp://127.0.0.1:9"))
-    with pytest.raises(ValueError, match="two tasks are called 'a'; accepted: a name for each"):
+    with pytest.raises(ValueError, match="two tasks are called 'a'; expected a name for each"):
         runner.run([Task("a", list), Task("a", list)], context, elsewhere)
 
 
@@ -152,7 +152,7 @@ def test_workers_with_other_sources_are_refused_by_name():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--scheduler", "tcp://h:1", "--workers", "2"], "--scheduler and --workers; accepted: one of them"),
+        (["--scheduler", "tcp://h:1", "--workers", "2"], "--scheduler and --workers; expected one of them"),
         (["--tls-key", "key.pem"], "--tls-ca-file, --tls-cert, --tls-key: accepted with --scheduler tls://HOST:PORT"),
         (["--scheduler", "tls://h:1", "--tls-cert", "none.pem"], "--tls-cert none.pem: no such file; accepted"),
         (["--workers", "0"], "Invalid value for '--workers': Input should be greater than or equal to 1"),

@@ -37,7 +37,7 @@ def _command(
 ) -> int:
     """Search for the rays with the largest errors of each formula, and add them to the rays that the tests replay."""
     if unknown := [name for name in formulas or () if name not in FORMULAS]:
-        return command_line.misuse(NAME, f"unknown formula {unknown[0]!r}; accepted: {', '.join(FORMULAS)}")
+        return command_line.misuse(NAME, f"unknown formula {unknown[0]!r}; expected {', '.join(FORMULAS)}")
     variant = backend.activate(may_restart=True)
     context = Context(PROFILES["full"], Path(), variant, backend.detect(), backend.usable_variants())
     for setting in settings(context):

@@ -63,7 +63,7 @@ class Found:
         precision, formula, regime, objective, score, a, n, k = line.split(_SEPARATOR)
         numbers = (*a.split(), *n.split(), k)
         if len(numbers) != 7 or not np.isfinite([float.fromhex(x) for x in numbers]).all():
-            raise ValueError(f"not a ray: {line!r}; accepted: three numbers for a, three for n, one for k")
+            raise ValueError(f"not a ray: {line!r}; expected three numbers for a, three for n, one for k")
         return cls(precision, formula, regime, objective, float(score), numbers)
 
 

@@ -133,7 +133,7 @@ def _once(pattern: str, by: str, text: str) -> str:
     """ValueError unless there is one such place."""
     found, count = re.subn(pattern, by, text)
     if count != 1:
-        raise ValueError(f"{pattern!r} is there {count} times; accepted: once")
+        raise ValueError(f"{pattern!r} is there {count} times; expected once")
     return found
 
 

@@ -68,7 +68,7 @@ def system_rows(system: System, catalogue: GlassCatalogue, context: Context) -> 
         text = environments.run(environments.script(system, catalogue.script), as_csv(rays))
         answers = parse_answers(text, system.title)
         if answers.n_ratio is None:
-            raise ValueError("no column n_ratio; accepted: the ratio of indices that was used")
+            raise ValueError("no column n_ratio; expected the ratio of indices that was used")
     except environments.Unable as why:
         return [Row(NAME, system.title, "every glass", "f64", reason=f"cannot run here: {why}")]
     except (environments.Broken, ValueError) as defect:

@@ -215,12 +215,12 @@ def parsed(text: str) -> Answer:
         rays = {case: np.array(data["rays"][key], float) for case, key in ((GIVEN, "given"), (OWN, "own"))}
         system = str(data["system"])
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"no answer: {error!r}; accepted: system, indices and rays in JSON") from None
+        raise ValueError(f"no answer: {error!r}; expected system, indices and rays in JSON") from None
     shapes = [indices.shape, *(each.shape for each in rays.values())]
     if shapes != [indices_shape, rays_shape, rays_shape]:
-        raise ValueError(f"numbers of shape {shapes}; accepted: {indices_shape}, and {rays_shape} twice")
+        raise ValueError(f"numbers of shape {shapes}; expected {indices_shape}, and {rays_shape} twice")
     if not all(np.isfinite(each).all() for each in (indices, *rays.values())):
-        raise ValueError("a number that is not finite; accepted: the rays after the lens")
+        raise ValueError("a number that is not finite; expected the rays after the lens")
     return Answer(system, indices, rays)
 
 

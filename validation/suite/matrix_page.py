@@ -44,7 +44,7 @@ TERMS[LARGE] += (
 def read(folder: Path) -> Stored:
     """The matrix of the validation whose report is in a folder. ValueError or OSError where there is none."""
     path = folder / ROWS
-    accepted = f"accepted: the folder of {MADE_BY} --out {folder}"
+    accepted = f"expected the folder of {MADE_BY} --out {folder}"
     try:
         document = json.loads(path.read_text("utf-8"))
         rows = [row for row in document["rows"] if row["study"] in (per_ray.NAME, rendered_images.NAME)]

@@ -151,12 +151,12 @@ def join(system: System) -> None:
     if images is None:
         return
     if images.export not in write_files.TARGETS:
-        raise ValueError(f"{where}export: {images.export!r}; accepted: {', '.join(write_files.TARGETS)}")
+        raise ValueError(f"{where}export: {images.export!r}; expected {', '.join(write_files.TARGETS)}")
     for scene in (*images.spp, *images.deviations):
         if scene not in SCENES:
-            raise ValueError(f"{where}spp, images.deviation: {scene!r}; accepted: {', '.join(SCENES)}")
+            raise ValueError(f"{where}spp, images.deviation: {scene!r}; expected {', '.join(SCENES)}")
     if system.title in IMAGE_RENDERERS:
-        raise ValueError(f"{system.folder}: title: {system.title!r} is another's; accepted: a new one")
+        raise ValueError(f"{system.folder}: title: {system.title!r} is another's; expected a new one")
     assumed = images.assumed or ("not said.",)
     IMAGE_RENDERERS[system.title] = ImageRenderer(system.name, by_command(system), images.spp, assumed)
     TERMS[f"{system.title}, assumed"] = " ".join(assumed)

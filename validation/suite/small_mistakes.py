@@ -144,7 +144,7 @@ def judged(answer: Answer, rays: RaySet) -> JudgedAnswers:
     with np.errstate(all="ignore"):
         b = answer(given.a, given.n, given.k[:, None])
     if b.dtype != given.a.dtype:
-        raise TypeError(f"{answer.__name__}: answers in {b.dtype}; accepted: {given.a.dtype}")
+        raise TypeError(f"{answer.__name__}: answers in {b.dtype}; expected {given.a.dtype}")
     return judge_answers(b.astype(np.float64), None, given, rays.precision, FORMULAS[LOOSEST].budget, "zero")
 
 

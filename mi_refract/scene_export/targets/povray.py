@@ -44,9 +44,9 @@ def files(plain: PlainScene) -> Files:
     for mesh in plain.meshes:
         place = f"{plain.name}: {mesh.name}"
         if isinstance(mesh.material, Glass) and not is_closed(mesh.faces):
-            raise ValueError(f"{place}: glass with an open surface; accepted for POV-Ray: a closed surface")
+            raise ValueError(f"{place}: glass with an open surface; for POV-Ray expected a closed surface")
         if isinstance(mesh.material, Diffuse) and any(mesh.material.reflectance):
-            raise ValueError(f"{place}: a diffuse surface; accepted for POV-Ray: glass and lights")
+            raise ValueError(f"{place}: a diffuse surface; for POV-Ray expected glass and lights")
     camera = plain.camera
     outside = _outside(plain)
     parts = [_settings(plain), _camera(camera), _sky(plain.sky), *(_mesh(mesh, outside) for mesh in plain.meshes)]

@@ -45,9 +45,9 @@ def _command(
         return _write(page, data, out)
     wanted = [name.strip() for name in install.split(",") if name.strip()]
     if unknown := [name for name in wanted if name not in SYSTEMS]:
-        return command_line.misuse(NAME, f"unknown system {unknown[0]!r}; accepted: {', '.join(SYSTEMS)}")
+        return command_line.misuse(NAME, f"unknown system {unknown[0]!r}; expected {', '.join(SYSTEMS)}")
     if listed and wanted:
-        return command_line.misuse(NAME, "--list with --install; accepted: one of them")
+        return command_line.misuse(NAME, "--list with --install; expected one of them")
     if not wanted:
         print("\n".join(_line(system) for system in SYSTEMS.values()))
     return max([_install(SYSTEMS[name]) for name in wanted], default=0)

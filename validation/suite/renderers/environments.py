@@ -116,7 +116,7 @@ def install(system: System) -> None:
         _said_version.cache_clear()
         return
     if not locked(system).exists():
-        raise OSError(f"{system.name}: no lock of its packages; accepted: {locked(system)}")
+        raise OSError(f"{system.name}: no lock of its packages; expected {locked(system)}")
     shutil.rmtree(folder(system), ignore_errors=True)
     folder(system).mkdir(parents=True)
     if isinstance(needs, Npm):
@@ -155,7 +155,7 @@ def _interpreter(system: System, version: str) -> str:
         return sys.executable
     if found := shutil.which(f"python{version}"):
         return found
-    raise OSError(f"{system.name}: needs Python {version}; accepted: a python{version} in PATH")
+    raise OSError(f"{system.name}: needs Python {version}; expected a python{version} in PATH")
 
 
 def _do(system: System, command: Sequence[str]) -> None:

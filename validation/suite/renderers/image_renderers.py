@@ -136,7 +136,7 @@ def by_command(system: System) -> Callable[[PlainScene, Path, int, Sequence[int]
     """By the command of the system's own file."""
     images = system.images
     if images is None:
-        raise ValueError(f"{system.name}: no [images]; accepted: a system that renders by a command")
+        raise ValueError(f"{system.name}: no [images]; expected a system that renders by a command")
 
     def draw(plain: PlainScene, folder: Path, spp: int, seeds: Sequence[int]) -> list[Image]:
         write_files.write(plain, images.export, folder / "scene")

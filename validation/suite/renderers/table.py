@@ -25,6 +25,6 @@ def join(folder: Path) -> System:
     """Take the renderer of a folder into the table. ValueError where one has its name; errors as of `load`."""
     system = from_file(renderer_file.load(folder))
     if system.name in SYSTEMS:
-        raise ValueError(f"{folder}: {system.name!r} is in the table; accepted: a folder of another name")
+        raise ValueError(f"{folder}: {system.name!r} is in the table; expected a folder of another name")
     SYSTEMS[system.name] = system
     return system
