@@ -383,3 +383,18 @@ def test_straight_segments_among_arcs_decide_as_alone_do(follow):
 def test_a_straight_piece_may_run_along_itself_at_any_pace(follow, setting, control, weight):
     piece = Segments([(0, 0)], [(1, 0)], [1.5], [1.0], [control], [weight])
     assert follow(piece, (0.2, 1), (0, -1)).points[0, 1] == pytest.approx([0.2, 0], abs=4 * setting.roundoff)
+
+
+def test_a_ray_along_a_side_goes_on_on_the_side_that_it_is_on(follow):
+    """Rounding hides the sign of its cosine: such rays were within by their medium and outside by their direction."""
+    square = np.array(SQUARE, float) - 0.5
+    for turn in np.radians(np.arange(0, 90, 1.1)):
+        c, s = math.cos(turn), math.sin(turn)
+        figure = polygon(square @ np.array([(c, s), (-s, c)]), 1.25)
+        along = figure.end - figure.start
+        along = np.concatenate([along, -along])
+        paths = follow(figure, np.concatenate([figure.start, figure.end]) - along, along, max_depth=1, n_start=1.0)
+        met = paths.events[:, 0] == REFRACTED
+        side = (figure.end - figure.start)[paths.hits[met, 0]]
+        d = paths.directions[met]
+        assert (side[:, 0] * d[:, 1] - side[:, 1] * d[:, 0] > 0).all()
