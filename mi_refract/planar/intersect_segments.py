@@ -80,7 +80,7 @@ class Hit:
     left, right: numbers of the vertices on the left and on the right of the ray.
     along: the segment's direction, from its left vertex to its right one; of an arc at its left vertex.
     into: of an arc, the same at its right vertex.
-    bend: of an arc, the curvature at a vertex times the cube of |along| or |into|, positive to the left.
+    bend: of an arc, twice the curvature at a vertex times the cube of |along| or |into|, positive to the left.
     """
 
     distance: Number
