@@ -71,12 +71,16 @@ class Axis:
         return None if abs(turn) <= LOST * (self.size @ np.abs(pencil))[1] else self._back(-height / turn)
 
     def _front(self, way: float) -> Point:
-        x, y = self.places[0] + way * self.directions[0]
-        return float(x), float(y)
+        return _along(self.places[0], self.directions[0], way)
 
     def _back(self, way: float) -> Point:
-        x, y = self.places[-1] + way * self.directions[-1]
-        return float(x), float(y)
+        return _along(self.places[-1], self.directions[-1], way)
+
+
+def _along(place: Array, direction: Array, way: float) -> Point:
+    """A place on the axis; a coordinate that is 0 but for rounding is 0."""
+    x, y = np.where(np.abs(found := place + way * direction) > LOST * (np.abs(place).max() + abs(way)), found, 0.0)
+    return float(x), float(y)
 
 
 def axis(segments: Segments, paths: Paths, i: int) -> Axis | None:
