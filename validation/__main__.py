@@ -42,7 +42,7 @@ ROOMS = {
     ),
     "efficiency": ("efficiency", ("error_against_time", "scaling", "cluster_scale")),
     "media": ("media", ("catalogs", "ray_directions", "closed_forms", "renders", "hero_wavelength")),
-    "planar": ("planar", ("against_retrace", "closed_paths", "extruded_scenes", "times")),
+    "planar": ("planar", ("against_retrace", "closed_paths", "joints", "extruded_scenes", "times")),
     "diff": ("diff", ("planted_defects", "visible_changes", "times")),
     "ground-truth": ("ground_truth", ("traced_bodies",)),
     "robustness": ("robustness", ("mutated_inputs", "killed_commands", "code_mutants")),

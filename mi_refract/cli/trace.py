@@ -31,6 +31,9 @@ def trace(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the paths as JSON.")] = False,
     table: Annotated[bool, typer.Option("--table", help="Print focal points and spot sizes.")] = False,
+    plane: Annotated[
+        str | None, typer.Option(metavar="X,Y[,DEGREES]", help="Add spots on the plane there, across +x or DEGREES.")
+    ] = None,
     branches: Annotated[
         int | None, typer.Option(min=0, help="Largest number of partial reflections on a path.")
     ] = None,
@@ -52,6 +55,7 @@ def trace(
         atomic.writable(output, figure.FORMATS)
         figure.require_matplotlib()
     given: dict[str, Any] = {"branches": branches, "max_depth": max_depth}
+    screen = focal_points.plane(plane) if plane else None
     asked = light.parsed(wavelengths) if wavelengths else None
     read = scene_file.load(scene, asked)
     loaded = replace(read, **{name: value for name, value in given.items() if value is not None})
@@ -60,9 +64,9 @@ def trace(
     traced = follow_scene(loaded, formula=formula, precision=precision, backend=arrays)
     if output:
         figure.save(output, loaded, traced)
-    found = focal_points.groups(loaded, traced) if table else []
+    found = focal_points.groups(loaded, traced, screen) if table or screen else []
     if as_json:
-        focal = {"foci": [asdict(group) for group in found]} if table else {}
+        focal = {"foci": [asdict(group) for group in found]} if table or screen else {}
         print(json_text(as_data(loaded, traced) | focal))
     else:
         print(printable(f"{scene.name}: {summary(loaded, traced)}"))

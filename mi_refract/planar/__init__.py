@@ -1,7 +1,8 @@
 """Rays in two dimensions: boundaries between media, the paths of rays through them, scene files, figures.
 
 In: directed boundaries with a refractive index on either side, straight or arcs of conics, as arrays (`Segments`), as
-`shapes` or as a scene file (TOML). Out: `Paths` (points, boundaries met, events, power), focal points, an image.
+`shapes` or as a scene file (TOML). Out: `Paths` (points, boundaries met, events, power), focal points, focal lengths,
+an image.
 
 `Event`, `Paths`, `Segments`, `Tracer` and `trace` are loaded when they are first used: geometry needs no ray tracing.
 """
@@ -25,6 +26,7 @@ __all__ = [
     "figure",
     "focal_points",
     "light",
+    "paraxial",
     "path_tree",
     "paths",
     "scene_file",

@@ -1,24 +1,55 @@
-"""Focal points and spot sizes of the rays that leave a planar scene."""
+"""Focal points, cardinal points and spot sizes of the rays that leave a planar scene."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .curves import unit
+from .paraxial import LOST, Cardinal, axis
 from .path_tree import Branches
 from .paths import REFLECT_BITS, Event
 from .scene_file import PlanarScene
 from .segments import Array
+from .tracer import trace
 
 Point = tuple[float, float]
 PARALLEL = 1e-9  # sine of the angle between two lines that count as parallel
 SYMMETRIC = 1e-3  # sine of the angle by which two rays may differ from mirror images of each other
 STEEPEST = math.radians(89)  # largest angle to the mean direction for which there is a spot
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane through `point`; `degrees`: the direction that is perpendicular to it, 0 along +x."""
+
+    point: Point
+    degrees: float = 0.0
+
+
+def plane(text: str) -> Plane:
+    """The plane that the option --plane names: X,Y or X,Y,DEGREES. ValueError for anything else."""
+    try:
+        x, y, degrees = map(float, f"{text},0".split(",")[: max(3, text.count(",") + 1)])
+    except ValueError:
+        x = y = degrees = math.nan
+    if not all(map(math.isfinite, (x, y, degrees))):
+        raise ValueError(f"--plane {text}; expected X,Y or X,Y,DEGREES, finite numbers")
+    return Plane((x, y), degrees)
+
+
+@dataclass(frozen=True)
+class Spot:
+    """Where the lines of rays meet a plane: their mean, their RMS distance from it, and from the first to the last."""
+
+    centre: Point
+    rms: float
+    extent: float
 
 
 @dataclass(frozen=True)
@@ -28,7 +59,9 @@ class Spread:
     `focus`: the point of least RMS distance from all the rays' lines, `virtual` where it lies behind most of them.
     `spot`: where the rays' mean meets the plane across it in which their RMS distance from their centre, `rms`, is
     smallest; `largest` is the largest such distance. None where a ray is more than 89° off the mean direction.
-    `marginal`, `paraxial`: where the outermost and the innermost pair of rays cross that are mirror images.
+    `marginal`: where the outermost pair of rays crosses whose paths are mirror images. `paraxial`: where rays of this
+    beam would meet that are ever nearer to the axis between these; `cardinal`: the points of the system along it.
+    `on_plane`: on a chosen plane; None where there is none, or a ray is more than 89° off its normal.
     """
 
     rays: int
@@ -39,6 +72,8 @@ class Spread:
     largest: float | None = None
     marginal: Point | None = None
     paraxial: Point | None = None
+    cardinal: Cardinal | None = None
+    on_plane: Spot | None = None
 
 
 def spread(origins: Array, directions: Array) -> Spread:
@@ -72,6 +107,18 @@ def crossing(origin: Array, direction: Array, other: Array, along: Array) -> Poi
     if abs(sine) <= PARALLEL:
         return None
     return _point(origin + direction * (_cross(other - origin, along) / sine))
+
+
+def spot(origins: Array, directions: Array, plane: Plane) -> Spot | None:
+    """Where lines through `origins` along unit `directions` (N × 2) meet a plane; None for one 89° off its normal."""
+    normal = np.array(unit(plane.degrees))
+    forward = directions @ normal
+    if np.abs(forward).min() < math.cos(STEEPEST):
+        return None
+    places = origins + directions * ((plane.point - origins) @ normal / forward)[:, None]
+    heights = (places - plane.point) @ _turned(normal)
+    x, y = places.mean(axis=0).tolist()
+    return Spot((x, y), float(heights.std()), float(np.ptp(heights)))
 
 
 def _spot(origins: Array, directions: Array) -> tuple[Array, Array] | None:
@@ -111,11 +158,11 @@ class Group:
     spread: Spread
 
 
-def groups(scene: PlanarScene, traced: Sequence[Branches]) -> list[Group]:
+def groups(scene: PlanarScene, traced: Sequence[Branches], plane: Plane | None = None) -> list[Group]:
     """The escaped rays, grouped by colour, beam and partial reflections, on whatever side of a shape they leave."""
     return [
-        Group(colour, beam, reflect, _of_group(scene, branches, np.flatnonzero(inside)))
-        for colour, branches in zip(scene.colours, traced, strict=True)
+        Group(scene.colours[colour], beam, reflect, _of_group(scene, colour, branches, np.flatnonzero(inside), plane))
+        for colour, branches in enumerate(traced)
         for beam in range(int(scene.beams.max()) + 1)
         for reflect in np.unique(branches.reflect).tolist()
         if (inside := _members(scene, branches, beam, reflect)).any()
@@ -127,15 +174,39 @@ def _members(scene: PlanarScene, branches: Branches, beam: int, reflect: int) ->
     return escaped & (scene.beams[branches.rays] == beam) & (branches.reflect == reflect)
 
 
-def _of_group(scene: PlanarScene, branches: Branches, members: NDArray[np.intp]) -> Spread:
+def _of_group(
+    scene: PlanarScene, colour: int, branches: Branches, members: NDArray[np.intp], plane: Plane | None
+) -> Spread:
     origins, directions = branches.tips[members], branches.paths.directions[members]
     directions = directions / np.hypot(*directions.T)[:, None]  # float32 is not unit to the last bit
     found = spread(origins, directions)
+    if plane is not None:
+        found = replace(found, on_plane=spot(origins, directions, plane))
     pairs = list(_pairs(scene, branches.rays[members], directions))
     if not pairs:
         return found
-    outer, inner = (crossing(origins[i], directions[i], origins[j], directions[j]) for i, j in (pairs[0], pairs[-1]))
-    return replace(found, marginal=outer, paraxial=inner)
+    i, j = pairs[0]
+    outer = crossing(origins[i], directions[i], origins[j], directions[j])
+    return replace(found, marginal=outer, **_along_axis(scene, colour, branches, *members[list(pairs[-1])]))
+
+
+def _along_axis(scene: PlanarScene, colour: int, branches: Branches, one: int, other: int) -> dict[str, Any]:
+    """The paraxial image and the cardinal points of the axis midway between two paths, if its events are theirs."""
+    pair = branches.rays[[one, other]]
+    origin, way = scene.origins[pair].mean(axis=0), scene.directions[pair].mean(axis=0)
+    if not way.any():
+        return {}
+    reflect = int(branches.reflect[one])
+    paths = trace(scene.segments[colour], [origin], [way], scene.max_depth, reflect=reflect, weights=True)
+    along = axis(scene.segments[colour], paths, 0)
+    if along is None or (paths.events[0] != branches.paths.events[one]).any():
+        return {}
+    d, (x, y) = scene.directions[pair[0]], scene.origins[pair[0]] - along.places[0]
+    u = along.directions[0]
+    slope = _cross(u, d) / (u @ d)
+    slope = slope if abs(slope) > LOST else 0.0
+    height = _cross(u, np.array([x, y])) - slope * (u @ [x, y])
+    return {"paraxial": along.image(height, slope), "cardinal": along.cardinal()}
 
 
 def _pairs(scene: PlanarScene, rays: NDArray[np.intp], directions: Array) -> Iterator[tuple[int, int]]:
@@ -151,19 +222,44 @@ def _pairs(scene: PlanarScene, rays: NDArray[np.intp], directions: Array) -> Ite
 
 
 def table(found: Sequence[Group]) -> str:
-    """A table in plain text, one line per group."""
-    heads = ("colour", "beam", "reflected at", "rays", "focus", "spot at", "rms", "largest", "marginal", "paraxial")
-    lines = [heads, *(_cells(group) for group in found)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(heads))]
+    """Tables in plain text, one line per group: focal points, and where there are any cardinal points and spots."""
+    heads = "focus", "spot at", "rms", "largest", "marginal", "paraxial"
+    parts = [_aligned(found, ("rays", *heads), _foci)]
+    if any(group.spread.cardinal for group in found):
+        lengths = "focal length", "back focal length", "front focal length"
+        parts.append(_aligned(found, (*lengths, "front principal point", "back one"), _cardinal))
+    if any(group.spread.on_plane for group in found):
+        parts.append(_aligned(found, ("on the plane at", "rms", "extent"), _on_plane))
+    return "\n".join(parts)
+
+
+def _aligned(found: Sequence[Group], heads: Sequence[str], cells: Callable[[Spread], Sequence[str]]) -> str:
+    lines = [("colour", "beam", "reflected at", *heads), *((*_names(group), *cells(group.spread)) for group in found)]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     return "\n".join("  ".join(f"{c:{w}}" for c, w in zip(line, widths, strict=True)).rstrip() for line in lines)
 
 
-def _cells(group: Group) -> tuple[str, ...]:
-    s = group.spread
+def _names(group: Group) -> tuple[str, str, str]:
     bits = ", ".join(str(j) for j in range(REFLECT_BITS) if group.reflect >> j & 1)
-    names = group.colour or "–", str(group.beam), bits or "–", str(s.rays)
+    return group.colour or "–", str(group.beam), bits or "–"
+
+
+def _foci(s: Spread) -> tuple[str, ...]:
     focus = _text(s.focus) + (" (virtual)" if s.virtual else "")
-    return *names, focus, _text(s.spot), _text(s.rms), _text(s.largest), _text(s.marginal), _text(s.paraxial)
+    return str(s.rays), focus, *map(_text, (s.spot, s.rms, s.largest, s.marginal, s.paraxial))
+
+
+def _cardinal(s: Spread) -> tuple[str, ...]:
+    c = s.cardinal
+    if c is None or c.principal is None:
+        return "infinite" if c else "–", *"––––"
+    lengths = c.focal_length, c.back_focal_length, c.front_focal_length
+    return *map(_text, lengths), *map(_text, c.principal)
+
+
+def _on_plane(s: Spread) -> tuple[str, ...]:
+    spot = s.on_plane
+    return (_text(spot.centre), _text(spot.rms), _text(spot.extent)) if spot else ("–",) * 3
 
 
 def _text(value: Point | float | None) -> str:

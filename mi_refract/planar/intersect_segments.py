@@ -24,9 +24,8 @@ from .array_backend import ArrayBackend, Index, Vector2, Vertices
 from .segments import Array
 
 NOWHERE = 0xFFFFFFFF  # the number of no segment
-# Bounds for a start on its own segment. Only signs are taken from these numbers.
-LEAST = 1e-14  # distance from either end, as a share of the segment
-SIGN = 1e-22  # distance of the ends from the ray, in units of the segment's length
+# Of a start on its own segment: the least distance of its ends from the ray, in units of the segment's length.
+SIGN = 1e-22
 
 
 def cross(a: Vector2, b: Vector2) -> Number:
@@ -56,14 +55,21 @@ class Ray:
 class Start:
     """The segment that a ray starts on: numbers of its vertices, the ways from p to them, their sides of the ray.
 
-    Of an arc also the way to its control point, and its `turn` (0 where it is straight).
+    Of an arc also the way to its control point, s and r (up to a common factor) of where the ray's line meets it once
+    more, whether that is ahead, between the arc's ends, and as of a `Hit` the directions and `bend` from its vertices.
     """
 
     vertices: Vertices
     ways: tuple[Vector2, Vector2]
     sides: tuple[Number, Number]
     middle: Vector2 = None
-    turn: Number = None
+    other: tuple[Number, Number] = None, None
+    again: Mask = False
+    aways: tuple[Vector2, Vector2] = None, None
+    bends: tuple[Number, Number] = None, None
+
+
+Seen = tuple[Vector2, Number]  # the way from the ray's start to a vertex, and f of it
 
 
 @dataclass
@@ -74,7 +80,7 @@ class Hit:
     left, right: numbers of the vertices on the left and on the right of the ray.
     along: the segment's direction, from its left vertex to its right one; of an arc at its left vertex.
     into: of an arc, the same at its right vertex.
-    bend: of an arc, the curvature at a vertex times the cube of |along| or |into|, positive to the left.
+    bend: of an arc, twice the curvature at a vertex times the cube of |along| or |into|, positive to the left.
     """
 
     distance: Number
@@ -97,11 +103,6 @@ def bounding_box(*points: Array) -> tuple[list[float], list[float]]:
     return (low - margin).tolist(), (high + margin).tolist()
 
 
-def start_shares(ray: Ray) -> tuple[Number, Number]:
-    """s and r of the ray's start, kept off both ends of the segment."""
-    return dr.maximum(ray.s, LEAST), dr.maximum(ray.r, LEAST)
-
-
 class LineSegments:
     """M straight segments from `start` to `end` (M × 2); `vertices` (M × 2) are equal numbers for equal ends."""
 
@@ -122,8 +123,13 @@ class LineSegments:
     def start(self, ray: Ray) -> Start:
         """Quantities of the ray's start, computed once per ray, not per segment."""
         a, b, vertices = self._of(ray.own, ray.own != NOWHERE)
-        s, r, e = *start_shares(ray), b - a
+        (s, r), e = self._shares(ray), b - a
         return Start(self._own(ray, vertices), (-e * r, e * s), self._sides(ray, e, s, r))
+
+    def _shares(self, ray: Ray) -> tuple[Number, Number]:
+        """s and r of the ray's start, kept off both ends of the segment by u² of it: signs stay, no number changes."""
+        least = self.arrays.roundoff**2
+        return dr.maximum(ray.s, least), dr.maximum(ray.r, least)
 
     def _own(self, ray: Ray, vertices: Vertices) -> Vertices:
         return type(vertices)(*(dr.select(ray.own != NOWHERE, v, NOWHERE) for v in vertices))
@@ -140,7 +146,7 @@ class LineSegments:
         nowhere = index(NOWHERE)
         return Hit(number(dr.inf), nowhere, number(0), number(0), self.arrays.mask(False), nowhere, nowhere, zero)
 
-    def _seen(self, ray: Ray, start: Start, vertex: Index, place: Vector2) -> tuple[Vector2, Number]:
+    def _seen(self, ray: Ray, start: Start, vertex: Index, place: Vector2) -> Seen:
         """The way from the ray's start to a vertex, and f of it."""
         way = place - ray.p
         side = cross(ray.d, way)
@@ -152,8 +158,19 @@ class LineSegments:
     def nearer(self, best: Hit, ray: Ray, start: Start, i: Index, active: Mask = True) -> Hit:
         """The crossing of segment i, if it comes before `best`."""
         a, b, vertices = self._of(i, active)
-        e = b - a
-        (to_a, f_a), (to_b, f_b) = (self._seen(ray, start, v, x) for v, x in ((vertices[0], a), (vertices[1], b)))
+        seen = self._seen(ray, start, vertices[0], a), self._seen(ray, start, vertices[1], b)
+        found, ahead = self._crossing(ray, start, i, b - a, vertices, seen)
+        # Of two segments that share a vertex, the turn between them says which comes first, whatever λ rounds to.
+        turn = cross(found.along, best.along)
+        first = dr.select(found.right == best.right, turn < 0, found.distance < best.distance)
+        first = ahead & active & dr.select(found.left == best.left, turn > 0, first)
+        return dr.select(first, found, best)
+
+    def _crossing(
+        self, ray: Ray, start: Start, i: Index, e: Vector2, vertices: Vertices, seen: tuple[Seen, Seen]
+    ) -> tuple[Hit, Mask]:
+        """The crossing of segment i, which goes along e, and whether it is ahead."""
+        (to_a, f_a), (to_b, f_b) = seen
         a_left, b_left = f_a >= 0, f_b >= 0
         way = dr.select((vertices[1] == start.vertices[0]) | (vertices[1] == start.vertices[1]), to_b, to_a)
         # |d × e| = |f_a| + |f_b| without cancellation. `reach` is λ times that: its sign is right where λ's is lost.
@@ -163,18 +180,12 @@ class LineSegments:
         # along the segment, where the sign of `reach` is noise.
         t_a, t_b = dr.dot(to_a, ray.d), dr.dot(to_b, ray.d)
         beyond = (dr.maximum(t_a, t_b) > 0) & (reach > ray.slack * (dr.abs(e.x) + dr.abs(e.y)))
-        ahead = (a_left != b_left) & ((dr.minimum(t_a, t_b) > ray.slack) | beyond) & (i != ray.own) & active
+        ahead = (a_left != b_left) & ((dr.minimum(t_a, t_b) > ray.slack) | beyond) & (i != ray.own)
         near = ieee_divide(dr.minimum(dr.abs(f_a), dr.abs(f_b)), scale)
         s, r = (dr.select(0.5 * scale > dr.abs(f), near, 1 - near) for f in (f_b, f_a))
         distance = dr.dot(dr.fma(e, r, to_a), ray.d)  # λ; reach/scale is noise at grazing incidence
         left, right = (dr.select(a_left, vertices[j], vertices[1 - j]) for j in (0, 1))
-        along = dr.select(a_left, e, -e)
-        # Of two segments that share a vertex, the turn between them says which comes first, whatever λ rounds to.
-        turn = cross(along, best.along)
-        first = dr.select(right == best.right, turn < 0, distance < best.distance)
-        first = ahead & dr.select(left == best.left, turn > 0, first)
-        found = Hit(distance, i, s, r, a_left, left, right, along)
-        return dr.select(first, found, best)
+        return Hit(distance, i, s, r, a_left, left, right, dr.select(a_left, e, -e)), ahead
 
     def place(self, hit: Hit) -> tuple[Vector2, Vector2]:
         """The point of a hit, from the nearer end, and the segment's direction there."""

@@ -165,6 +165,9 @@ class PathLoop:
         index = dr.select(dr.isnan(state.index), near, state.index)
         p, line = self.boundaries.place(hit)
         b, through = self._turn(d, line, k, j, run.mirrored)
+        to_left = hit.to_left == through
+        # Of a ray along the boundary rounding hides from which side it comes; that was decided by the boundary's ends.
+        b = dr.select((cross(line, b) > 0) == to_left, b, _mirrored(b, line))
         event = dr.select(through, int(Event.REFRACTED), int(Event.REFLECTED))
         event = dr.select(near == index, event, int(Event.MEDIUM_MISMATCH))
         met = j < run.max_depth
@@ -172,7 +175,7 @@ class PathLoop:
         run.scatter("points", j + 1, p, met)
         run.scatter("hits", j, hit.segment, met)
         on = met & (near == index)
-        ray = Ray(p, dr.select(on, b, d), hit.segment, hit.s, hit.r, hit.to_left == through, arrays.number(0))
+        ray = Ray(p, dr.select(on, b, d), hit.segment, hit.s, hit.r, to_left, arrays.number(0))
         power = state.power * _shares(d, line, k, through) if run.weights else state.power
         return PathState(ray, dr.select(through, far, index), power, j + 1, self._search(0), on)
 

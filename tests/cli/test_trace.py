@@ -120,11 +120,27 @@ def test_the_table(trace):
     lines = out.splitlines()
     assert lines[0] == "ball.toml: 7 rays, 14 hits, 7 escaped"
     assert lines[1].split()[-4:] == ["rms", "largest", "marginal", "paraxial"]
-    assert len(lines) == 3
+    assert len(lines) == 5
+    assert lines[4].split()[3:6] == ["1.5", "0.5", "-0.5"]
     assert "1.10445, 0" in lines[2]  # sin i / sin 2(i − r) for sin i = 0.9, sin r = 0.6
     data = json.loads(trace("--table", "--json")[1])
     assert data["foci"][0]["spread"]["marginal"][0] == pytest.approx(1.1044455683692647, abs=1e-12)
+    assert data["foci"][0]["spread"]["paraxial"] == pytest.approx([1.5, 0], abs=1e-14)
+    assert data["foci"][0]["spread"]["cardinal"]["focal_length"] == pytest.approx(1.5, rel=1e-14)
     assert "foci" not in json.loads(trace("--json")[1])
+
+
+def test_a_spot_on_a_plane(trace):
+    code, out, err = trace("--plane", "-2,0")
+    assert (code, err) == (0, "")
+    assert len(out.splitlines()) == 7
+    one, other = (
+        json.loads(trace("--json", "--plane", at)[1])["foci"][0]["spread"]["on_plane"] for at in ("3,0", "3,5,180")
+    )
+    assert one.keys() == {"centre", "rms", "extent"}
+    assert one["centre"] == pytest.approx([3, 0], abs=1e-12)
+    for name, value in one.items():
+        assert other[name] == pytest.approx(value, abs=1e-12)
 
 
 def test_branches_override_the_file(trace, ball):
@@ -180,6 +196,9 @@ def test_a_backend(trace):
 
 
 BAD = {
+    "no plane": (("--plane", "here"), "--plane here; expected X,Y or X,Y,DEGREES, finite numbers"),
+    "a number too many": (("--plane", "1,2,3,4"), "--plane 1,2,3,4; expected X,Y or X,Y,DEGREES"),
+    "a plane at infinity": (("--plane", "inf,0"), "--plane inf,0; expected"),
     "suffix": (("-o", "{}/image.gif"), "expected a file name that ends in .svg or .png or .pdf"),
     "no suffix": (("-o", "{}/image"), "expected a file name that ends in"),
     "no folder": (("-o", "{}/none/image.svg"), "is not a folder"),

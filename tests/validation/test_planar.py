@@ -10,7 +10,8 @@ import pytest
 from mi_refract.backend import detect
 from mi_refract.planar import Event, Paths, Segments, path_loop, shapes
 from mi_refract.planar import tracer as tracer
-from validation.planar import against_retrace, closed_paths, extruded_scenes, times, wall_scene
+from mi_refract.planar.intersect_arcs import ConicArcs
+from validation.planar import against_retrace, closed_paths, extruded_scenes, joints, times, wall_scene
 from validation.planar.error_growth import _transfer
 from validation.reference.planar_retrace import retrace
 from validation.run.array_settings import settings
@@ -266,6 +267,23 @@ def put(hits, ray, segment):
     return hits
 
 
+def test_the_wrong_root_behind_a_joint_is_seen(scalar, monkeypatch):
+    """Sides of the ends from shares that are kept off the joint by 1e-14, the other root from those that are not."""
+    aimed = "joints", scalar, (20.0,), (0,)
+    monkeypatch.setattr(joints, "SCALAR_SHARE", 10)
+    assert joints.row(*aimed).verdict == "pass"
+    plain = ConicArcs.start
+
+    def clamped(self, ray):
+        start = plain(self, ray)
+        start.other = abs(start.sides[1]) * ray.r, abs(start.sides[0]) * ray.s
+        return start
+
+    monkeypatch.setattr(ConicArcs, "_shares", lambda self, ray: (max(ray.s, 1e-14), max(ray.r, 1e-14)))
+    monkeypatch.setattr(ConicArcs, "start", clamped)
+    assert WRONG_PATH_FAR in joints.row(*aimed).broken
+
+
 # Extruded ------------------------------------------------------------------------------------------------------
 
 
@@ -343,7 +361,7 @@ def test_a_field_of_lenses_is_met_twice_by_every_ray(size, side):
 # The study -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("study", [against_retrace, closed_paths, extruded_scenes, times])
+@pytest.mark.parametrize("study", [against_retrace, closed_paths, extruded_scenes, joints, times])
 def test_what_cannot_run_has_a_reason(study, scalar_context):
     context = dataclasses.replace(
         scalar_context(), backends={n: dataclasses.replace(b, usable=False, reason="off") for n, b in detect().items()}

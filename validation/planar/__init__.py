@@ -4,4 +4,4 @@ In: planar scene files, and random scenes. Out: rows with distances from an inde
 answers and from Mitsuba's paths through the extruded scenes, each divided by a bound on rounding errors; and times.
 """
 
-__all__ = ["against_retrace", "closed_paths", "extruded_scenes", "times"]
+__all__ = ["against_retrace", "closed_paths", "extruded_scenes", "joints", "times"]
