@@ -36,6 +36,7 @@ ROOMS = {
             "colours",
             "unused_features",
             "invisible_changes",
+            "neighbours",
             "random_numbers",
             "rendering_passes",
         ),

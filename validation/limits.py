@@ -223,3 +223,7 @@ INVISIBLE = limit(0.05, "relative: differences of the mean that each row must be
 INVISIBLE_NOISE = limit(2.0, "numbers that repeat in passes of 4 samples leave 4 times the noise; the ratio has 3 %")
 
 NUMBERS_ALARM = limit(1e-4, "probability of any false alarm of the chi-square tests of random numbers, all counts")
+
+# Neighbours of glass
+NEIGHBOUR_ALARM = limit(1e-8, "probability of a false alarm of a test: 5e-5 in a run of 5000 tests")
+NEIGHBOUR = limit(0.01, "relative: differences of the mean that each row must be able to see")

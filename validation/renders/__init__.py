@@ -8,6 +8,7 @@ __all__ = [
     "against_dielectric",
     "colours",
     "invisible_changes",
+    "neighbours",
     "random_numbers",
     "rendering_passes",
     "scene_needs",

@@ -1,0 +1,187 @@
+"""Every BSDF of Mitsuba beside, around and within glass: does `refract_path` render what `path` renders?
+
+Each BSDF is taken alone and in every wrapper that Mitsuba lets it into. What `refract_path` leaves out is decided by
+the features of a scene, so BSDFs share an image only where each of them alone has the same features: none hides what
+another one lacks. The mean of many independent pixels with few samples each is compared with one well sampled image by
+`path`: a bias at a count of samples stays, however many pixels there are. Tested are the mean of each BSDF over all
+settings, that of each setting over all BSDFs, and every one of both. Random numbers depend on the count and the split
+depth, lobes on the BSDF: two BSDFs are rendered with every count, the others with one for each split depth. Spectral
+and polarised wrappers take `diffuse` and the BSDFs of delta lobes, which alone are split. `path` renders null lobes as
+`volpath` does, so it is the reference for all.
+
+`python -m validation renders`
+"""
+
+from __future__ import annotations
+
+import functools
+import gc
+import itertools
+import statistics
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from mi_refract.formulas import FORMULAS
+from mi_refract.plugins import inspect
+from mi_refract.report.row import Row
+from validation import limits
+from validation.repeated import by_tasks
+from validation.run.context import Context
+from validation.run.seeds import current
+from validation.study import Study, Task, about
+
+from .glass_cells import CELLS, WIDE, scene, uneven
+from .invisible_changes import GLASS, Nodes, texture
+
+TERMS = {
+    "alarms": "means that differ by more than noise does but once in 10⁸ tests: of all, of one setting, of one cell",
+    "difference": "of the mean over all settings, or over all BSDFs, relative to that of `path`",
+    "detectable": "relative difference of that mean that its test finds with probability 1/2",
+    "detectable, each": "the same, the worst, of one BSDF in one setting",
+}
+NAME = "neighbours"
+SEED = 2041
+SIGMAS = statistics.NormalDist().inv_cdf(1 - limits.NEIGHBOUR_ALARM / 2)
+ROUNDING = 1e-5  # relative, of the mean of a float32 image: where nothing is left to chance there is no other error
+TURN, ROUGH, MIXED = {"theta": 30.0}, {"alpha": 0.3}, {"roughness": 0.4, "spec_trans": 0.5}
+DELTA: dict[str, Nodes] = {name: {} for name in ("dielectric", "thindielectric", "null", "circular")}
+DELTA |= {"conductor": {"specular_reflectance": 0.8}, "polarizer": TURN, "retarder": TURN, "refract": GLASS}
+SMOOTH: dict[str, Nodes] = {name: {} for name in ("diffuse", "plastic", "hair", "measured", "measured_polarized")}
+SMOOTH |= {f"rough{name}": ROUGH for name in ("dielectric", "conductor", "plastic")} | {"pplastic": ROUGH}
+SMOOTH |= {"principled": MIXED | {"clearcoat": 0.5, "sheen": 0.5}, "principledthin": MIXED | {"diff_trans": 0.8}}
+BSDFS = DELTA | SMOOTH | {f"refract_{formula}": GLASS for formula in FORMULAS}
+TURNED = [0.5 + 0.5 * np.sin(0.35), 0.5, 0.5 + 0.5 * np.cos(0.35)]  # by 20 degrees
+WRAPPERS: dict[str, Callable[[Nodes], Nodes]] = {
+    "alone": lambda bsdf: bsdf,
+    "mask": lambda bsdf: {"type": "mask", "opacity": 0.6, "b": bsdf},
+    "blendbsdf": lambda bsdf: {"type": "blendbsdf", "weight": 0.3, "a": bsdf, "b": GLASS},
+    "twosided": lambda bsdf: {"type": "twosided", "b": bsdf},
+    "bumpmap": lambda bsdf: {"type": "bumpmap", "arbitrary": uneven((8, 8), 0.0, 0.1), "b": bsdf},
+    "normalmap": lambda bsdf: {"type": "normalmap", "normalmap": texture(TURNED), "b": bsdf},
+}
+Settings = tuple[tuple[int, int], ...]  # split depth, samples per pixel
+SETTINGS: dict[str, Settings] = {
+    "alone": ((0, 8), (1, 4), (3, 16)),
+    "mask": ((0, 2), (1, 16), (3, 25)),
+    "blendbsdf": ((0, 16), (1, 4), (3, 2)),
+    "twosided": ((0, 64), (1, 64), (3, 8)),
+    "bumpmap": ((0, 32), (1, 25), (3, 4)),
+    "normalmap": ((0, 4), (1, 2), (3, 32)),
+}
+COUNTS = (2, 4, 8, 16, 32, 64, 25)
+# Parameters, and samples of a cell by `path`, as many as in all settings together by `refract_path`. Alpha is compared
+# where emitters are hidden, else colours.
+LONG, SHORT = {"max_depth": 6, "rr_depth": 3}, {"max_depth": 2, "hide_emitters": True}
+WAYS = {"": (LONG, 160_000), "every count": (LONG, 4_000_000), "alpha": (SHORT, 160_000)}
+# Of the profile `quick`, with 4 samples and one split.
+QUICK = {"alone": ("diffuse", "dielectric"), "blendbsdf": ("dielectric",), "normalmap": ("refract",)}
+
+
+def measured(view: Any, bsdfs: int, method: Nodes, spp: int, samples: float, seed: int) -> Any:
+    """By BSDF and cell, the mean and its squared standard error, of two renders with as many pixels as needed."""
+    tall, pixels = -(-bsdfs * len(CELLS) // WIDE), max(8, round((samples / 2 / spp) ** 0.5))
+    film = {"type": "hdrfilm", "width": WIDE * pixels, "height": tall * pixels, "rfilter": {"type": "box"}}
+    place = mi.ScalarTransform4f().look_at([WIDE / 2, tall / 2, 3], [WIDE / 2, tall / 2, 0], [0, 1, 0])
+    sensor = {"type": "orthographic", "film": film | {"pixel_format": "rgba"}, "sampler": {"type": "independent"}}
+    camera = mi.load_dict(sensor | {"to_world": place.scale([WIDE / 2, WIDE / 2, 1])})
+    integrator = mi.load_dict(method)
+    pair = [np.array(mi.render(view, sensor=camera, integrator=integrator, spp=spp, seed=seed + i)) for i in (0, 1)]
+    channels = np.s_[..., 3:] if "hide_emitters" in method else np.s_[..., :3]
+    cells = np.array(pair, float)[channels].mean(-1)[:, ::-1].reshape(2, tall, pixels, WIDE, pixels)
+    noise = np.square(cells[0] - cells[1]).sum((1, 3)) / 4 / pixels**4
+    found = np.stack([cells.mean((0, 2, 4)), noise]).reshape(2, -1)[:, : bsdfs * len(CELLS)]
+    return found.reshape(2, bsdfs, len(CELLS))
+
+
+def tasks(context: Context) -> list[Task]:
+    """One per variant and wrapper; the profile `quick` renders a few BSDFs in the variant of the run."""
+    if context.scalar:
+        reason = "scalar variants would render for hours"
+        return [Task(NAME, lambda: [Row(NAME, "refract_path", "every BSDF", context.variant, reason=reason)])]
+    rgb, family = context.variant, context.variant.removesuffix("rgb")
+    cases: list[Any] = [(rgb, wrapper, names, ((1, 4),), "") for wrapper, names in QUICK.items()]
+    if not context.profile.quick:
+        every, few = (*DELTA, *SMOOTH), (*DELTA, "diffuse")
+        cases = [
+            (variant, wrapper, tuple(BSDFS) if wrapper == "alone" else every if variant == rgb else few, settings, "")
+            for variant in (rgb, f"{family}spectral", f"{family}spectral_polarized")
+            for wrapper, settings in SETTINGS.items()
+        ]
+        counts = (0, 4), (0, 25), *itertools.product((1, 3), COUNTS)
+        cases.append((rgb, "alone", ("diffuse", "plastic"), counts, "every count"))
+        cases += [(rgb, x, ("null", "dielectric", "diffuse"), ((0, 4), (1, 4)), "alpha") for x in ("alone", "mask")]
+    usable = [case for case in cases if context.variants.get(case[0]) is None]
+    return [Task(f"{NAME}: {case[0]} {titled(*case[1::3])}", functools.partial(rows, *case)) for case in usable]
+
+
+def titled(wrapper: str, way: str) -> str:
+    """A wrapper and a way, as rows are called."""
+    return f"{wrapper}, {way}" if way else wrapper
+
+
+def groups(variant: str, wrapper: str, names: Iterable[str]) -> tuple[list[dict[str, Nodes]], dict[str, str]]:
+    """The BSDFs whose scenes have the same features, in groups; by name, why Mitsuba does not load the others."""
+    found: dict[Any, dict[str, Nodes]] = {}
+    refused = {}
+    for name in names:
+        bsdf = WRAPPERS[wrapper](BSDFS[name] | {"type": name})
+        try:
+            found.setdefault(inspect(scene([bsdf], variant)), {})[name] = bsdf
+        except RuntimeError as error:
+            refused[name] = str(error).rpartition("[")[2].partition("] ")[2].partition("\n")[0]
+    return list(found.values()), refused
+
+
+def rows(variant: str, wrapper: str, names: tuple[str, ...], settings: Settings, way: str = "") -> list[Row]:
+    """A row for each BSDF, and one for each setting; those that Mitsuba refuses in its own words."""
+    before: Any = mi.variant()
+    mi.set_variant(variant)
+    try:
+        together, refused = groups(variant, wrapper, names)
+        parts = zip(*(images(list(each.values()), variant, settings, way) for each in together), strict=True)
+        test, noise, expected, uncertain = (np.concatenate(part, -2) for part in parts)
+    finally:
+        mi.set_variant(before)
+    cases: dict[str, Any] = {name: np.s_[:, [i]] for i, name in enumerate(itertools.chain(*together))}
+    cases |= {f"split {depth}, {spp} spp": np.s_[[i], :] for i, (depth, spp) in enumerate(settings)}
+    budgets, replay = {"alarms": 0.0, "detectable": limits.NEIGHBOUR}, {"seed": current(SEED), "samples": WAYS[way][1]}
+    title, found = titled(wrapper, way), []
+    for case, part in cases.items():
+        values = judged(test[part], noise[part], expected[part[1]], uncertain[part[1]])
+        found.append(Row(NAME, "refract_path", f"{title}: {case}", variant, values, budgets, replay=replay))
+    for name, reason in refused.items():
+        found.append(Row(NAME, "refract_path", f"{title}: {name}", variant, reason=f"Mitsuba: {reason}"))
+    return found
+
+
+def images(bsdfs: list[Nodes], variant: str, settings: Settings, way: str) -> tuple[Any, Any, Any, Any]:
+    """Means and squared standard errors of all cells: in each setting by `refract_path`, then by `path`."""
+    gc.collect()  # Dr.Jit compiles every BSDF that is alive
+    seed, (parameters, samples) = current(SEED), WAYS[way]
+    measure = functools.partial(measured, scene(bsdfs, variant), len(bsdfs))
+    expected, uncertain = measure({"type": "path"} | parameters, 64, samples, seed + 5000)
+    ours, found = {"type": "refract_path"} | parameters, []
+    for i, (depth, spp) in enumerate(settings):
+        found.append(measure(ours | {"split_depth": depth}, spp, samples / len(settings), seed + 2 * i))
+    test, noise = np.stack(found, 1)
+    return test, noise, expected, uncertain
+
+
+def judged(test: Any, noise: Any, expected: Any, uncertain: Any) -> dict[str, float]:
+    """The values of a row, of the means and squared standard errors by setting, BSDF and cell."""
+    cells = test - expected, noise + uncertain, expected + 0 * test
+    each = tuple(x.sum(-1) for x in cells)
+    whole = cells[0].mean(0).sum(), noise.sum() / len(test) ** 2 + uncertain.sum(), expected.sum()
+    alarms, detectable = 0, []
+    for difference, variance, mean in (cells, each, whole):
+        error = np.sqrt(variance + np.square(ROUNDING * mean))
+        alarms += int(np.count_nonzero(~(np.abs(difference) <= SIGMAS * error)))
+        detectable.append(float((SIGMAS * error / mean).max()))
+    values = {"alarms": float(alarms), "difference": float(abs(whole[0]) / whole[2])}
+    return values | {"detectable": detectable[2], "detectable, each": detectable[1]}
+
+
+STUDY = Study(NAME, "Glass and its neighbours", about(__doc__), TERMS, tasks, again=by_tasks(tasks))
