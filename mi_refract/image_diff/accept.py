@@ -57,7 +57,7 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
         if not result.how.options.get("allow_nonfinite") and not finite:
             raise ValueError(f"{result.test}: values that are not finite; accepted with --allow-nonfinite")
         if target.suffix.lower() != result.test.suffix.lower():
-            raise ValueError(f"{target}; expected a name that ends in {result.test.suffix}, as {result.test} does")
+            raise ValueError(f"{target}: expected a name that ends in {result.test.suffix}, as {result.test} does")
         yield Copy(result.test, target, result.digests[result.test], result.digests.get(target, ""))
         yield from _of_variance(result.test, target, results, result)
 

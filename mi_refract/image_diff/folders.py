@@ -253,7 +253,7 @@ def opened(path: Path) -> BufferedReader:
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         return file
     file.close()
-    raise ValueError(f"{path}; expected a regular file")
+    raise ValueError(f"{path}: expected a regular file")
 
 
 def read_renders(folder: Path, max_values: int = MAX_VALUES) -> list[Image]:

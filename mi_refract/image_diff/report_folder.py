@@ -85,7 +85,7 @@ def require_free(path: Path, *sides: Path) -> None:
             raise ValueError(f"{path}: in {side}, where it would be compared; expected a folder outside")
     if not path.is_dir():
         if path.exists():
-            raise NotADirectoryError(f"{path}; expected a file name that ends in .html, or a folder")
+            raise NotADirectoryError(f"{path}: expected a file name that ends in .html, or a folder")
         return atomic.check_parent(path.resolve())
     if foreign := _foreign(path):
         raise ValueError(f"{path}: holds {foreign}, no report of ours; expected a new or empty folder, or a report")

@@ -39,7 +39,7 @@ def writable(path: str | os.PathLike[str], suffixes: Sequence[str]) -> Path:
     """
     path = Path(path)
     if path.suffix.lower() not in suffixes:
-        raise ValueError(f"{path}; expected a file name that ends in {' or '.join(suffixes)}")
+        raise ValueError(f"{path}: expected a file name that ends in {' or '.join(suffixes)}")
     _require_file(path)
     check_parent(path)
     return path

@@ -166,9 +166,9 @@ def _checked(path: Path, max_values: int, multiplied: bool) -> tuple[Any, str]:
     try:
         str(path).encode()
     except UnicodeEncodeError:
-        raise ValueError(f"{path}; expected a name in UTF-8") from None
+        raise ValueError(f"{path}: expected a name in UTF-8") from None
     if path.exists() and not (path.is_file() or path.is_dir()):  # reading a pipe might never end
-        raise ValueError(f"{path}; expected a regular file")
+        raise ValueError(f"{path}: expected a regular file")
     with path.open("rb") as file:  # the operating system's own words for what is missing or forbidden
         begin = file.read(len(LFS_POINTER))
     if not begin:
@@ -322,7 +322,7 @@ def _image(path: Path, source: Any, kind: str, values: tuple[int, int], as_idiff
     if path.suffix[1:].lower() not in _endings(found) or found == "null":  # which is black, whatever the file holds
         raise ValueError(f"{path}: holds an image of format {found}; expected the format that the name says")
     if spec.deep:
-        raise ValueError(f"{path}; expected an image without deep samples")
+        raise ValueError(f"{path}: expected an image without deep samples")
     if min(spec.width, spec.height, spec.nchannels) < 1 or spec.depth > 1:
         raise ValueError(f"{path}: {spec.width} × {spec.height} × {spec.depth} pixels; expected a plane with pixels")
     _check_size(path, spec, *values)

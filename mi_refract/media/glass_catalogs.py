@@ -62,7 +62,7 @@ def load(catalog: str, glass: str, label: str) -> Medium:
         glasses = read(catalog)
     except ModuleNotFoundError as error:
         text = f"{label}: {error.name} is not installed"
-        raise ValueError(f"{text}; expected pip install 'mi-refract[glass]' first") from None
+        raise ValueError(f"{text}; to read it: pip install 'mi-refract[glass]'") from None
     known = {_plain(name): name for name in glasses}
     if _plain(glass) not in known:
         near = ", ".join(f"{catalog}:{known[each]}" for each in difflib.get_close_matches(_plain(glass), known, 3, 0.0))

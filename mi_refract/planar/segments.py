@@ -27,7 +27,7 @@ def finite_array(name: str, values: Any, shape: tuple[int, ...]) -> Array:
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{name}; expected numbers of shape {shape}") from None
+        raise ValueError(f"{name}: expected numbers of shape {shape}") from None
     if array.shape != shape:
         raise ValueError(f"{name}: shape {array.shape}; expected {shape}")
     if array.size and not (np.isfinite(array.min()) and np.isfinite(array.max())):

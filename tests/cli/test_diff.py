@@ -211,12 +211,12 @@ def test_images_larger_than_allowed(run, pair):
 
 BAD = {
     "no file": (["{}/old", "{}/none"], "none"),
-    "file and folder": (["{}/old", "{}/new/equal.exr"], "a folder and a file"),
+    "file and folder": (["{}/old", "{}/new/equal.exr"], "cannot compare a folder with a file"),
     "nothing in it": (["{}/old", "{}/empty"], "empty: holds no image"),
     "nothing to refer to": (["{}/empty", "{}/new"], "empty: holds no image"),
     "twice the folder": (["{}/old", "{}/old"], "the same as the reference"),
     "twice the file": (["{}/old/equal.exr", "{}/old/../old/equal.exr"], "the same as the reference"),
-    "within": (["{}", "{}/new"], "one within the other"),
+    "within": (["{}", "{}/new"], "one path contains the other"),
     "samples of files": (["{}/old/equal.exr", "{}/new/equal.exr", "--renders"], "expected with --renders: a folder"),
     "method": (["{}/old", "{}/new", "--method", "idiff"], "--method idiff; expected auto, exact"),
     "option": (["{}/old", "{}/new", "--method", "exact", "--set", "fail=1"], "--set fail: unknown"),

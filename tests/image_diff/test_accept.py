@@ -179,7 +179,7 @@ def test_no_pipe_or_device_is_read(tmp_path):
     os.mkfifo(tmp_path / "a.exr")
     (tmp_path / "b.exr").symlink_to("/dev/null")
     for path in (tmp_path / "a.exr", tmp_path / "b.exr"):
-        with pytest.raises(ValueError, match=r"\.exr; expected a regular file"):
+        with pytest.raises(ValueError, match=r"\.exr: expected a regular file"):
             diff.digest(path)
 
 

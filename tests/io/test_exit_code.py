@@ -39,7 +39,7 @@ def deep():
 @pytest.mark.parametrize(
     ("body", "said"),
     [
-        (raises(ValueError("size = 0:\n  expected 1 or more")), "it: size = 0; expected 1 or more"),
+        (raises(ValueError("size = 0;\n  expected 1 or more")), "it: size = 0; expected 1 or more"),
         (raises(OSError("folder: not writable")), "it: folder: not writable"),
         (raises(FileNotFoundError(2, "No such file or directory", "a.exr")), "it: a.exr: No such file or directory"),
         (raises(OSError(28, "No space left on device")), "it: No space left on device"),

@@ -36,7 +36,7 @@ def test_a_file_that_grows_meanwhile_is_read_up_to_the_limit(size, tmp_path, mon
     small = path.stat()
     monkeypatch.setattr(regular_file.os, "fstat", grow)
     assert regular_file.read_bytes(path, 2**23).rstrip(b"x") == bytes(size)
-    with pytest.raises(ValueError, match=f"{path}: more than {size + 5} bytes; expected up to {size + 5}"):
+    with pytest.raises(ValueError, match=f"{path}: more than {size + 5} bytes"):
         regular_file.read_bytes(path, size + 5)
 
 

@@ -20,7 +20,7 @@ GOOD = {"start": [(0.0, 0.0)], "end": [(1.0, 0.0)], "n_left": [1.5], "n_right": 
         ({"n_right": [math.nan]}, "n_right[0] = nan; expected finite"),
         ({"end": [(1.0, math.inf)]}, "end[0, 1] = inf; expected finite"),
         ({"end": [(1.0, 0.0), (2.0, 0.0)]}, "end: shape (2, 2); expected (1, 2)"),
-        ({"start": "here"}, "start; expected numbers"),
+        ({"start": "here"}, "start: expected numbers"),
         ({"start": [], "end": [], "n_left": [], "n_right": []}, "none; expected at least one"),
         ({"control": [(0.0, 1.0)]}, "control and weight; expected both or neither"),
         ({"control": [(0.0, 1.0)], "weight": [-1.0]}, "weight[0] = -1.0; expected more than 0"),
