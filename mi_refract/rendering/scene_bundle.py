@@ -82,7 +82,7 @@ def _check_size(scene: Path, paths: list[str], limit: int) -> None:
         largest = max(paths, key=sizes.__getitem__)
         told = f"{size / MEBIBYTE:.1f} MiB of files, the largest {largest} ({sizes[largest] / MEBIBYTE:.1f} MiB)"
         more = f"--bundle-limit {-(-size // MEBIBYTE)}, if all workers have the memory"
-        raise ValueError(f"{scene}: {told}; expected with a cluster {limit} MiB, or {more}")
+        raise ValueError(f"{scene}: {told}; expected with a cluster: {limit} MiB, or {more}")
 
 
 def _search_folders(scene: Path) -> list[Path]:

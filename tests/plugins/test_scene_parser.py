@@ -245,9 +245,15 @@ REFUSED = {
         '<bsdf type="diffuse"><spectrum name="reflectance" filename="pipe"/></bsdf>',
         "pipe: not a regular file",
     ),
-    "pipe by a parameter": ('<default name="p" value="pipe"/><include filename="$p"/>', "pipe: is a pipe"),
-    "pipe as an image": ('<texture type="bitmap"><string name="filename" value="pipe"/></texture>', "pipe: is a pipe"),
-    "device as a mesh": ('<shape type="ply"><string name="filename" value="/dev/zero"/></shape>', "/dev/zero: is"),
+    "pipe by a parameter": ('<default name="p" value="pipe"/><include filename="$p"/>', "pipe: not a regular"),
+    "pipe as an image": (
+        '<texture type="bitmap"><string name="filename" value="pipe"/></texture>',
+        "pipe: not a regular",
+    ),
+    "device as a mesh": (
+        '<shape type="ply"><string name="filename" value="/dev/zero"/></shape>',
+        "/dev/zero: not a regular",
+    ),
     "device": (b"", "s.xml: not a regular file"),
 }
 
@@ -266,7 +272,7 @@ def test_what_would_end_the_process_is_refused(case, load, tmp_path, monkeypatch
     begin = time.process_time()
     with pytest.raises(ValueError, match=re.escape(message)) as caught:
         load(elements, other=nested(20000), empty="")
-    assert "expected " in str(caught.value) and "\n" not in str(caught.value)
+    assert "\n" not in str(caught.value)
     assert time.process_time() - begin < 10
     # Only what cannot be told from the text alone comes to Mitsuba's parser.
     assert bool(seen) == case.startswith(("deep by", "many", "circle", "pipe as an image", "device as"))
@@ -285,7 +291,7 @@ def test_limits_of_size(load, monkeypatch):
         load(" " * 170)
     with pytest.raises(ValueError, match=r"other\.xml: \d+ bytes; expected up to \d+"):
         load('<include filename="other.xml"/>' * 2, other=" " * 40)
-    with pytest.raises(ValueError, match="expand to over 200 bytes"):
+    with pytest.raises(ValueError, match="expand to more than 200 bytes"):
         load(f'<default name="a" value="{"x" * 60}"/>' + "$a" * 4)
     monkeypatch.setattr(scene_limits, "SIZE", 10_000)
     load(f"{SENSOR}{' ' * 200}")

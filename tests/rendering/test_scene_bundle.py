@@ -108,7 +108,7 @@ def test_too_large(folder):
     mi.Bitmap(np.random.default_rng(0).random((400, 400, 3), np.float32)).write(str(folder / "common" / "bright.exr"))
     text = refusal(scene, 1)
     assert f"{scene}: 1." in text and f"the largest {folder}/common/bright.exr" in text
-    assert text.endswith("accepted with a cluster: 1 MiB, or --bundle-limit 2, if all workers have the memory")
+    assert text.endswith("expected with a cluster: 1 MiB, or --bundle-limit 2, if all workers have the memory")
 
 
 ONLY_HERE = (
