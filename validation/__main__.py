@@ -46,7 +46,7 @@ ROOMS = {
     "planar": ("planar", ("against_retrace", "closed_paths", "joints", "extruded_scenes", "times")),
     "diff": ("diff", ("planted_defects", "visible_changes", "times")),
     "ground-truth": ("ground_truth", ("traced_bodies",)),
-    "robustness": ("robustness", ("mutated_inputs", "killed_commands", "code_mutants")),
+    "robustness": ("robustness", ("code_mutants",)),
     "suite": (
         "suite",
         (

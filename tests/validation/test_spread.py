@@ -179,7 +179,7 @@ def test_who_works_is_what_the_options_say(tmp_path, monkeypatch):
 CLOCKS = {"kernel_timing.interval", "scaling.run"}
 READ = {"perf_counter", "process_time"}  # functions that name one of them are clocks, too
 # Theirs are told beside a row, or are limits.
-NOT_JUDGED = {"render_methods.Camera.__call__", "killed_commands.examine"}
+NOT_JUDGED = {"render_methods.Camera.__call__"}
 
 
 def reached(start):
