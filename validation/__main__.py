@@ -41,7 +41,7 @@ ROOMS = {
             "rendering_passes",
         ),
     ),
-    "efficiency": ("efficiency", ("error_against_time", "scaling", "cluster_scale")),
+    "efficiency": ("efficiency", ("error_against_time", "scaling")),
     "media": ("media", ("catalogs", "ray_directions", "closed_forms", "renders", "hero_wavelength")),
     "planar": ("planar", ("against_retrace", "closed_paths", "joints", "extruded_scenes", "times")),
     "diff": ("diff", ("planted_defects", "visible_changes", "times")),

@@ -54,7 +54,8 @@ PIXELS = 64  # of a film that is rendered
 
 INTEGERS = (0, 1, 2, 127, 128, 255, 32767, 65535, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)
 WORDS = [*(value.to_bytes(size, "little") for size in (2, 4, 8) for value in INTEGERS if value < 256**size)]
-WORDS += [b"[" * 5000, b"{" * 3000, b'{"a":' * 2000, b"9" * 400, b"1" * 5000, b"\xff\xfe", b"\r", b"\n"]
+DEEP = [b"[" * 5000, b"{" * 3000, b'{"a":' * 2000, b"9" * 400, b"1" * 5000]
+WORDS += [*DEEP, b"\xff\xfe", b"\r", b"\n"]
 WORDS += b"""\xed\xb2\x80 nan inf -inf NaN(ind) nan( 1e999 -0 0 1e-320 18446744073709551616 -1 0x1p-1074 true null [] {}
 "" [[]] 1_000 \x00 \xe2\x80\xae \x1b[31m ##[error] ::error:: [/red] # , " ' = ../../x 2147483648 4294967295""".split()
 XML_WORDS = [b"", b"$" * 3000, b"x" * 5000, b"1, nan, 0"]
@@ -67,6 +68,7 @@ ELEMENTS = (
     b"<!DOCTYPE a>%s",
 )  # fmt: skip
 TOKEN = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?|[A-Za-z_][\w.]*|\"[^\"\n]*\"|^.*\n", re.MULTILINE)
+VALUE = re.compile(rb"(?<=[=:] )[^\n,]+|(?<=,)[^\n,]+")
 ATTRIBUTE, ELEMENT = re.compile(rb'(?<==")[^"]*(?=")'), re.compile(rb"<(?=[a-z])")
 
 
@@ -85,6 +87,14 @@ def mutated(draw, good, head=None, tokens=TOKEN, words=WORDS):
         new = draw(st.sampled_from(words) | st.binary(max_size=8) | st.just(b"") | st.just(data[copied] * times))
         data = data[:start] + new + data[stop:]
     return data
+
+
+@st.composite
+def deep(draw, good):
+    """A value is brackets without end, or digits."""
+    data = draw(st.sampled_from(good))
+    start, stop = draw(st.sampled_from([found.span() for found in VALUE.finditer(data)] or [(0, len(data))]))
+    return data[:start] + draw(st.sampled_from(DEEP)) + data[stop:]
 
 
 @st.composite
@@ -133,7 +143,9 @@ class Parser:
         plain = mutated(self.good, self.head)
         if self.suffix == ".xml":
             return st.one_of(plain, mutated_xml(self.good), mutated_xml(self.good))
-        return plain | mutated_member(*self.good) if self.suffix == ".npz" else plain
+        if self.suffix == ".npz":
+            return plain | mutated_member(*self.good)
+        return plain if self.head else plain | deep(self.good)
 
 
 SETTINGS = b"""[[image]]
