@@ -13,6 +13,7 @@ import pytest
 from support.dask_workers import until
 from support.processes import ENVIRONMENT
 
+from mi_refract.cluster import worker_facts
 from mi_refract.io.image_file import read_exr
 
 SCENE = """<scene version="3.0.0">
@@ -98,6 +99,14 @@ def test_too_large_for_a_cluster(render, scene):
     code, _, err = render("--workers", 1, "--bundle-limit", 1)
     assert (code, err.count("\n")) == (2, 1)
     assert f"{scene}: 1.0 MiB of files" in err and "accepted with a cluster: 1 MiB, or --bundle-limit 2" in err
+
+
+def test_another_libllvm_is_refused_unless_mixed_workers_are_accepted(render, monkeypatch):
+    own = worker_facts.facts
+    monkeypatch.setattr(worker_facts, "facts", lambda variant: own(variant) | {worker_facts.LLVM: "99.0"})
+    code, _, err = render("--workers", 1)
+    assert code == 2 and "is refused: libLLVM unknown, here 99.0" in err
+    assert render("--workers", 1, "--mixed-workers")[0] == 0
 
 
 def test_without_dask(render, monkeypatch):
