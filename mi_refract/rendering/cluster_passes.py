@@ -251,7 +251,7 @@ class ClusterPasses:
         except KilledWorker as error:
             raise ConnectionError(
                 f"passes {node.first} to {node.stop - 1}: {error.allowed_failures + 1} workers were lost that rendered "
-                f"them, the last {error.last_worker.address}; accepted: workers with enough memory"
+                f"them, the last {error.last_worker.address}; expected workers with enough memory"
             ) from None
 
     def _note(self, node: _Node, part: Part) -> None:
