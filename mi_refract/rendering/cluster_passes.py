@@ -315,8 +315,8 @@ class ClusterPasses:
             return None
         (offset, spp), bundle, client, scene = self._series, self._bundle(allowed), self.workers.client, self.scene
         options: dict[str, Any] = {"retries": RETRIES, "pure": False, "priority": -next(self._count)}
-        if listed or not scene or scene.expected is None or not self.workers.all_accepted:
-            options["workers"], scene = sorted(allowed), scene and replace(scene, expected=None)
+        if listed or not self.workers.all_accepted:
+            options["workers"], scene = sorted(allowed), replace(scene, expected=None)
         size = ARITY**task
         parts = tasks = [
             client.submit(render_node, bundle, scene, task, offset + number, spp, **options)
