@@ -98,7 +98,7 @@ def test_too_large_for_a_cluster(render, scene):
     scene.write_text(SCENE + f"<!-- {'x' * 2**20} -->")
     code, _, err = render("--workers", 1, "--bundle-limit", 1)
     assert (code, err.count("\n")) == (2, 1)
-    assert f"{scene}: 1.0 MiB of files" in err and "accepted with a cluster: 1 MiB, or --bundle-limit 2" in err
+    assert f"{scene}: 1.0 MiB of files" in err and "expected with a cluster 1 MiB, or --bundle-limit 2" in err
 
 
 def test_another_libllvm_is_refused_unless_mixed_workers_are_accepted(render, monkeypatch):
@@ -164,7 +164,7 @@ def goes_on(render, scene):
         done = checkpoint.json.loads(bytes(file["header"]))["passes"]
     spp = done + 3
     code, _, err = render("--spp", spp, "--pass-spp", 1)
-    assert code == 0 and f"goes on from {done} spp" in err
+    assert code == 0 and f"resuming from {done} spp" in err
     assert render("--spp", spp, "--pass-spp", 1, output="local.exr")[0] == 0
     (found, header), (expected, _) = (read_exr(scene.with_name(name)) for name in ("out.exr", "local.exr"))
     np.testing.assert_array_equal(found, expected)
