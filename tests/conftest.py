@@ -7,12 +7,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import hypothesis
 import pytest
 
 from mi_refract import backend
 
 VARIANT = backend.activate()
 USABLE: dict[str, str | None] = backend.usable_variants()
+# `--hypothesis-profile=long` draws other examples every time, and more.
+CHECKS = {"deadline": None, "suppress_health_check": list(hypothesis.HealthCheck)}
+hypothesis.settings.register_profile("short", max_examples=50, derandomize=True, database=None, **CHECKS)
+hypothesis.settings.register_profile("long", max_examples=1000, **CHECKS)
+hypothesis.settings.load_profile("short")
 
 
 def pytest_report_header() -> str:

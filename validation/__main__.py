@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mi_refract.cli.cluster_options import TlsCaFile, TlsCert, TlsKey, elsewhere
-from mi_refract.cluster.connection import HERE, Elsewhere
+from mi_refract.cluster.connection import LOCAL, ClusterTarget
 from mi_refract.io import lock
 from mi_refract.io.outside_text import printable
 from validation.run import command_line
@@ -41,12 +40,12 @@ ROOMS = {
             "rendering_passes",
         ),
     ),
-    "efficiency": ("efficiency", ("error_against_time", "scaling", "cluster_scale")),
+    "efficiency": ("efficiency", ("error_against_time", "scaling")),
     "media": ("media", ("catalogs", "ray_directions", "closed_forms", "renders", "hero_wavelength")),
     "planar": ("planar", ("against_retrace", "closed_paths", "joints", "extruded_scenes", "times")),
     "diff": ("diff", ("planted_defects", "visible_changes", "times")),
     "ground-truth": ("ground_truth", ("traced_bodies",)),
-    "robustness": ("robustness", ("mutated_inputs", "killed_commands", "code_mutants")),
+    "robustness": ("robustness", ("code_mutants",)),
     "suite": (
         "suite",
         (
@@ -108,9 +107,6 @@ def _command(
         int | None,
         typer.Option(min=1, max=1024, help="Number of worker processes (Dask) for tasks that measure no times."),
     ] = None,
-    tls_ca_file: TlsCaFile = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
     renderers: Annotated[
         list[Path] | None,
         typer.Option(
@@ -122,15 +118,15 @@ def _command(
 ) -> int:
     """Measure the formulas and the plugin against certified answers, and write the report."""
     _check(studies or [], profile, out, write_tables)
-    there = elsewhere(scheduler, workers, tls_ca_file, tls_cert, tls_key)
-    _join(renderers or [], studies or [], there)
+    target = ClusterTarget(scheduler, workers)
+    _join(renderers or [], studies or [], target)
     try:
-        there.check()
+        target.check()
     except (ValueError, OSError) as error:
         raise Misuse(str(error)) from None
     try:
         with lock.held(out / LOCK, "a validation"):
-            return _run(studies or [], profile, out, write_tables, goals, there)
+            return _run(studies or [], profile, out, write_tables, goals, target)
     except KeyboardInterrupt:
         print("validation: interrupted; run the same command again to resume", file=sys.stderr)
         raise
@@ -155,13 +151,13 @@ def _check(studies: list[str], profile: str, out: Path, write_tables: bool) -> N
         raise Misuse(f"--out {out}: not writable; expected a writable folder")
 
 
-def _join(folders: list[Path], studies: list[str], there: Elsewhere) -> None:
+def _join(folders: list[Path], studies: list[str], target: ClusterTarget) -> None:
     """Take renderers into the table of `suite`."""
     if not folders:
         return
     if studies and "suite" not in studies:
         raise Misuse(f"--renderer {folders[0]} without suite; expected the study suite")
-    if there.given:
+    if target.given:
         raise Misuse(f"--renderer {folders[0]} with workers, which know nothing of it; expected this process")
     from validation.suite import rendered_images
     from validation.suite.renderers import table
@@ -181,7 +177,9 @@ def modules(studies: list[str], profile: str) -> list[str]:
     return list(dict.fromkeys(f"{room}.{module}" for room, members in chosen for module in members))
 
 
-def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: bool, there: Elsewhere = HERE) -> int:
+def _run(
+    names: list[str], profile: str, out: Path, write_tables: bool, goals: bool, target: ClusterTarget = LOCAL
+) -> int:
     from mi_refract import backend
     from mi_refract.report import run_report
     from validation.run.context import Context, profiles
@@ -197,8 +195,8 @@ def _run(names: list[str], profile: str, out: Path, write_tables: bool, goals: b
     context = Context(chosen, out, variant, backend.detect(), backend.usable_variants())
     studies: list[Study] = [import_module(f"validation.{name}").STUDY for name in modules(names, profile)]
     asked = spread.Asked(tuple(modules(names, profile)), profile, variant)
-    elsewhere = spread.Elsewhere(asked, there) if there.given else None
-    rows, spent = runner.run(spread.tasks(studies, context), context, elsewhere)
+    cluster = spread.OnCluster(asked, target) if target.given else None
+    rows, spent = runner.run(spread.tasks(studies, context), context, cluster)
     for study in studies:
         rows = study.summarise(rows)
     if not chosen.quick:  # whose few cases need not come near any bound

@@ -135,8 +135,6 @@ SCALING = {
     ("glasses", 64): {"first image / built-in": FIRST_IMAGE[64], "after an edit / built-in": EDIT},
     ("glasses", 1000): {"first image / built-in": FIRST_IMAGE[1000]},
 }
-CLUSTER_LOST = limit(0.1, "of the time of 1000 workers, in simulation, 1080p × 65,536 spp: what the cluster is for")
-CLUSTER_PREDICTED = limit(0.1, "absolute, of the efficiency: a record, as processes and scheduler share two cores here")
 
 # Planar --------------------------------------------------------------------------------------------------------
 

@@ -24,7 +24,7 @@ from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
 from validation.diff import visible_changes
 from validation.directions import per_formula
-from validation.efficiency import cluster_scale, error_against_time
+from validation.efficiency import error_against_time
 from validation.planar import against_retrace
 from validation.planar import times as planar_times
 from validation.reference.layered_scenes import MIRAGE
@@ -208,11 +208,6 @@ def efficiency(rows: list[Row]) -> str:
     return _table(size, ["scene", "method", "sampler", *EFFICIENCY.values()], cells)
 
 
-def cluster(rows: list[Row]) -> str:
-    """Markdown: the model's efficiency by scene and workers, as the package is and as proposed."""
-    return _table(*cluster_scale.table(rows))
-
-
 def planar(rows: list[Row]) -> str:
     """Markdown: by scene the distance of paths from the retrace, and the time per path by the number of segments."""
     retraced, timed = _planar_errors(rows), _planar_times(rows)
@@ -343,7 +338,6 @@ TABLES = {
     "renders": Table("validation/README.md", "renders", renders),
     "paths": Table("validation/README.md", "stability", paths),
     "efficiency": Table("mi_refract/plugins/README.md", "efficiency", efficiency),
-    "cluster": Table("mi_refract/rendering/README.md", "efficiency", cluster),
     "planar": Table("mi_refract/planar/README.md", "planar", planar),
     "defects": Table("mi_refract/image_diff/README.md", "diff", seen),
     "visible": Table("mi_refract/image_diff/README.md", "diff", visible),

@@ -56,11 +56,11 @@ def tasks(studies: Sequence[Study], context: Context) -> list[Task]:
 
 
 @dataclass(frozen=True)
-class Elsewhere:
+class OnCluster:
     """A `runner.Elsewhere`: workers of a scheduler, or so many processes of one thread each on this machine."""
 
     asked: Asked
-    there: connection.Elsewhere
+    target: connection.ClusterTarget
 
     def run(self, work: Sequence[tuple[int, str]], context: Context) -> Iterator[tuple[int, runner.Finished]]:
         """As `runner.Elsewhere.run`. ConnectionError, one line, where nobody is there who may run tasks.
@@ -70,7 +70,7 @@ class Elsewhere:
         names = [name for _, name in work]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"two tasks are called {twice[0]!r}; expected a name for each, by which workers find it")
-        with self.there.connected() as client:
+        with connection.connected(self.target.scheduler, self.target.workers) as client:
             expected = facts(self.asked.variant)
             workers = Workers(client, self.asked.variant, expected, warn=_say, facts=__name__)
             workers.wait()

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mi_refract.cluster.connection import ClusterTarget
 from mi_refract.io.atomic import writable
 from mi_refract.io.outside_text import printable
 from mi_refract.ray_sets import files, ray_set, run_program, stored_rays
 from mi_refract.ray_sets.ray_set import RaySet
 from mi_refract.ray_sets.stored_rays import StoredRays
 
-from .cluster_options import TlsCaFile, TlsCert, TlsKey, elsewhere
 from .interrupts import as_exceptions
 from .rays_options import (
     Backward,
@@ -94,17 +94,14 @@ def check(
     workers: Annotated[
         int | None, typer.Option(min=1, max=1024, help="Certify and judge in so many processes, by Dask.")
     ] = None,
-    tls_ca_file: TlsCaFile = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
 ) -> None:
     """Check answers against certified ones. Exit code 0: right, 1: wrong, 2: the answers do not match the rays.
 
     The rays are those of --rays, or those that `export` makes with the same options as here, or without any. The
     answers do not choose them.
     """
-    there = elsewhere(scheduler, workers, tls_ca_file, tls_cert, tls_key)
-    options = CheckOptions(tir, formula or old_formula, backward, report, junit, json, there)
+    target = ClusterTarget(scheduler, workers)
+    options = CheckOptions(tir, formula or old_formula, backward, report, junit, json, target)
     made = MadeRays(regime, count, precision, seed, two_sided, medium, wavelengths)
     chosen = _chosen(file, made.words)
     rays = files.read_stored(file) if file else stored_rays.make(**made.arguments)

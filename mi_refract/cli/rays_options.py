@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from mi_refract.cluster.connection import HERE, Elsewhere
+from mi_refract.cluster.connection import LOCAL, ClusterTarget
 from mi_refract.io.atomic import writable
 from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import provenance
@@ -152,7 +152,7 @@ class CheckOptions:
     report: Path | None
     junit: Path | None
     json: Path | None
-    elsewhere: Elsewhere = HERE
+    target: ClusterTarget = LOCAL
 
     def __post_init__(self) -> None:
         """ValueError or OSError, before anything runs, for an option that cannot be met."""
@@ -168,7 +168,7 @@ class CheckOptions:
             raise ValueError(f"--error-bound {self.formula}: unknown; accepted: {', '.join(FORMULAS)}")
         if self.backward is not None and not self.backward > 0:
             raise ValueError(f"--backward-error {self.backward:g}: accepted: a positive number of roundings")
-        self.elsewhere.check()
+        self.target.check()
         for path, suffixes in zip((self.report, self.junit, self.json), OUTPUTS, strict=True):
             if path:
                 writable(path, suffixes)
@@ -187,8 +187,8 @@ class CheckOptions:
 
         with contextlib.ExitStack() as stack:
             judge: Judge = judged_parts.here
-            if self.elsewhere.given:
-                judge = stack.enter_context(spread_check.judging(self.elsewhere, _say))
+            if self.target.given:
+                judge = stack.enter_context(spread_check.judging(self.target, _say))
             yield functools.partial(_watched, judge)
 
     def check(self, rays: RaySet | StoredRays, answers: Answers | StoredAnswers, name: str, replay: list[str]) -> int:

@@ -13,11 +13,11 @@ from rich.console import Console
 from rich.text import Text
 
 from mi_refract import backend
+from mi_refract.cluster.connection import ClusterTarget
 from mi_refract.io.outside_text import printable
 from mi_refract.rendering import scene_files
 
 from . import interrupts, variants
-from .cluster_options import TlsCaFile, TlsCert, TlsKey, elsewhere
 from .quantities import parse_seconds, parse_share, shown_error
 from .render_cluster import ClusterOptions, cluster_passes
 from .render_progress import shown
@@ -69,9 +69,6 @@ def render(
     workers: Annotated[
         int | None, typer.Option(min=1, max=1024, help="Number of single-threaded worker processes (Dask).")
     ] = None,
-    tls_ca_file: TlsCaFile = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
     bundle_limit: Annotated[
         int, typer.Option(min=1, metavar="MIB", help="MiB of a scene's files that may be sent to workers.")
     ] = 256,
@@ -90,8 +87,7 @@ def render(
     from mi_refract.io.atomic import writable
 
     defines = scene_files.parse_defines(define or [])
-    there = elsewhere(scheduler, workers, tls_ca_file, tls_cert, tls_key)
-    cluster = ClusterOptions(there, bundle_limit, mixed_workers=mixed_workers)
+    cluster = ClusterOptions(ClusterTarget(scheduler, workers), bundle_limit, mixed_workers=mixed_workers)
     cluster.check(allow_plugins or ())
     shares = [
         None if text is None else parse_share(text, option)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from mi_refract.cluster import worker_facts
-from mi_refract.cluster.connection import HERE, Elsewhere
+from mi_refract.cluster.connection import LOCAL, ClusterTarget, connected
 from mi_refract.cluster.workers import Workers
 from mi_refract.io.outside_text import printable
 
@@ -21,24 +21,19 @@ if TYPE_CHECKING:  # they import Mitsuba
 class ClusterOptions:
     """Who renders. `bundle_limit` in MiB."""
 
-    elsewhere: Elsewhere = HERE
+    target: ClusterTarget = LOCAL
     bundle_limit: int = 256
     mixed_workers: bool = False
 
-    @property
-    def given(self) -> bool:
-        """Whether other processes render."""
-        return self.elsewhere.given
-
     def check(self, plugins: Collection[str]) -> None:
         """ValueError for options that exclude each other, ImportError without Dask. `plugins`: the scene's own."""
-        if not self.given and (self.elsewhere.tls.given or self.mixed_workers):
-            raise ValueError("--tls-ca-file, --tls-cert, --tls-key, --mixed-workers: accepted with --scheduler ADDRESS")
-        self.elsewhere.check()
-        if self.given and plugins:
+        if self.mixed_workers and not self.target.given:
+            raise ValueError("--mixed-workers; expected --scheduler ADDRESS or --workers N with it")
+        self.target.check()
+        if self.target.given and plugins:
             raise ValueError(
                 f"--allow-plugins {min(plugins)}: native code, which is not sent to workers; "
-                "accepted: without --scheduler and --workers"
+                "expected no --scheduler and no --workers"
             )
 
 
@@ -48,7 +43,7 @@ def cluster_passes(options: ClusterOptions, rendering: LongRender, variant: str)
 
     ValueError for a scene that cannot be sent; ConnectionError where no scheduler answers or no worker may render.
     """
-    if not options.given or rendering.is_done:
+    if not options.target.given or rendering.is_done:
         yield None
         return
     from mi_refract.rendering import scene_bundle
@@ -56,7 +51,7 @@ def cluster_passes(options: ClusterOptions, rendering: LongRender, variant: str)
 
     job = rendering.job
     bundle = scene_bundle.pack(job.scene, job.defines, options.bundle_limit)
-    with options.elsewhere.connected() as client:
+    with connected(options.target.scheduler, options.target.workers) as client:
         tolerated: frozenset[str] = worker_facts.MIXED if options.mixed_workers else frozenset()
         expected = worker_facts.facts(variant)
         workers = Workers(client, variant, expected, tolerated, _say, task="render")

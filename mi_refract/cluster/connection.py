@@ -8,20 +8,21 @@ import logging
 import re
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent import futures
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from . import local_process
-from .tls import ACCEPTED as TLS_ACCEPTED
-from .tls import ENCRYPTED, NO_TLS, Tls
+from . import local_cluster
 
 Result = TypeVar("Result")
 PATIENCE = 6.0  # seconds until a scheduler must have answered
 _CLOSING = 2.0  # seconds
 _LOGGERS = ("distributed", "tornado", "asyncio")
-_ACCEPTED = "accepted: the address of a Dask scheduler, such as tcp://host:8786 or tls://host:8786"
+_EXPECTED = (
+    "expected the address of a Dask scheduler, such as tcp://host:8786, or tls://host:8786 and the files of "
+    "`distributed.comm.tls` in Dask's configuration"
+)
 
 
 class LostSchedulerError(ConnectionError):
@@ -29,12 +30,11 @@ class LostSchedulerError(ConnectionError):
 
 
 @dataclass(frozen=True)
-class Elsewhere:
-    """Who works, as the options of a command say: this process where neither `scheduler` nor `workers` is given."""
+class ClusterTarget:
+    """Which processes work, as the options of a command say: this one where neither is given."""
 
     scheduler: str | None = None
     workers: int | None = None
-    tls: Tls = NO_TLS
 
     @property
     def given(self) -> bool:
@@ -42,26 +42,17 @@ class Elsewhere:
         return self.scheduler is not None or self.workers is not None
 
     def check(self) -> None:
-        """ValueError for options that exclude each other, those of `Tls.security`, ImportError without Dask."""
+        """ValueError for options that exclude each other, ImportError without Dask."""
         if self.scheduler is not None and self.workers is not None:
-            raise ValueError("--scheduler and --workers; accepted: one of them")
-        if self.tls.given and self.scheduler is None:
-            raise ValueError(TLS_ACCEPTED)
+            raise ValueError("--scheduler and --workers; expected one of them")
         if self.given:
-            require_dask()
-        if self.scheduler is not None and self.tls.given:
-            self.tls.security(self.scheduler)
-
-    def connected(self) -> contextlib.AbstractContextManager[Any]:
-        """As the function `connected`."""
-        return connected(self.scheduler, self.workers, self.tls)
+            _require_dask()
 
 
-HERE = Elsewhere()
+LOCAL = ClusterTarget()
 
 
-def require_dask() -> None:
-    """ImportError, one line, where Dask's `distributed` is missing."""
+def _require_dask() -> None:
     try:
         import distributed  # noqa: F401
     except ModuleNotFoundError as error:
@@ -71,23 +62,26 @@ def require_dask() -> None:
 
 
 @contextlib.contextmanager
-def connected(scheduler: str | None = None, workers: int | None = None, tls: Tls = NO_TLS) -> Iterator[Any]:
+def connected(scheduler: str | None = None, workers: int | None = None) -> Iterator[Any]:
     """A `distributed.Client` of the scheduler at an address, or of so many processes of one thread each, started here.
 
-    ConnectionError, one line, after PATIENCE where no scheduler answers; ImportError without Dask; ValueError unless
-    exactly one of the two is given.
+    The processes speak TLS. A client of a `tls://` scheduler takes certificates from Dask's configuration, and refuses
+    every connection that is not encrypted. ConnectionError, one line, after PATIENCE where no scheduler answers;
+    ImportError without Dask; ValueError unless exactly one of the two is given.
     """
     if (scheduler is None) == (workers is None):
-        raise ValueError("accepted: either --scheduler ADDRESS or --workers N")
-    if tls.given and scheduler is None:
-        raise ValueError(TLS_ACCEPTED)
-    require_dask()
+        raise ValueError("expected either --scheduler ADDRESS or --workers N")
+    _require_dask()
+    from distributed.security import Security
+
     with _silent(), contextlib.ExitStack() as stack:
         if workers is not None:
-            local = stack.enter_context(local_process.started(workers))
-            client = _client(local.address, local.security())
+            address, security = stack.enter_context(local_cluster.started(workers))
         else:
-            client = _client(str(scheduler), tls.security(str(scheduler)))
+            address = str(scheduler)
+            # None: as Dask's configuration says.
+            security = Security(require_encryption=address.startswith("tls://") or None)
+        client = _client(address, security)
         try:
             yield client
         finally:
@@ -100,7 +94,7 @@ def _client(address: str, security: Any) -> Any:
 
     try:
         # First, as a client that found nobody would take 16 s to give up.
-        kind = asyncio.run(_kind(address, security.get_connection_args("client")))
+        kind = asyncio.run(_kind(address, security))
         if kind != "Scheduler":
             raise ValueError(f"a {kind} answers")
         # Results come from the workers themselves where these can be reached, else through the scheduler.
@@ -108,16 +102,14 @@ def _client(address: str, security: Any) -> Any:
     except Exception as error:
         said = [" ".join(str(each).split()) for each in (error.__cause__, error) if each is not None]
         text = re.sub(r"in <[^>]*>: ", "", next(filter(None, said), f"not within {PATIENCE:.0f} s"))
-        if "SSL" in text or "reset by peer" in text:
-            encrypted = address.startswith(ENCRYPTED)
-            text += f": it may {'be without TLS, or of another authority' if encrypted else 'ask for TLS'}"
-        raise ConnectionError(f"--scheduler {address}: no Dask scheduler answers: {text[:200]}; {_ACCEPTED}") from None
+        raise ConnectionError(f"--scheduler {address}: no Dask scheduler answers: {text[:200]}; {_EXPECTED}") from None
 
 
-async def _kind(address: str, arguments: Mapping[str, Any]) -> str:
+async def _kind(address: str, security: Any) -> str:
     """What answers at an address, as it says."""
     from distributed import rpc
 
+    arguments = security.get_connection_args("client")
     async with asyncio.timeout(PATIENCE), rpc(address, timeout=PATIENCE / 2, connection_args=arguments) as there:
         return str((await there.identity()).get("type"))
 
@@ -147,7 +139,7 @@ def scheduler_needed(client: Any) -> Iterator[None]:
 
     address = getattr(client.scheduler, "address", "") or "--scheduler"
     lost = (
-        f"{address}: the Dask scheduler is gone, or has given up its tasks; accepted: one that runs, or none: then here"
+        f"{address}: the Dask scheduler is gone, or has given up its tasks; expected one that runs, or none: then here"
     )
     try:
         if client.status != "running":

@@ -62,18 +62,15 @@ class Workers:
         while True:
             self.look(at_once=True)
             waited = time.monotonic() - began
-            if self.accepted and not self._asked:
-                return
-            if self._seen and not self._asked and (self.refused or waited > _NOBODY):
-                break
-            if waited > PATIENCE:
-                if self.accepted:
-                    return
+            answered = self._seen and not self._asked
+            if waited > PATIENCE or (answered and (self.accepted or self.refused or waited > _NOBODY)):
                 break
             time.sleep(_POLL)
+        if self.accepted:
+            return
         found = "; ".join(self.refused.values()) or ("workers do not answer" if self._asked else "no workers")
         raise ConnectionError(
-            f"{self._address}: no worker that may {self._task}: {found}; accepted: at least one like this process"
+            f"{self._address}: no worker that may {self._task}: {found}; expected at least one like this process"
         )
 
     @property
@@ -94,7 +91,7 @@ class Workers:
                 self._seen = True
         if self._coming is not None and time.monotonic() - self._looked > SILENT:
             raise LostSchedulerError(
-                f"{self._address}: the Dask scheduler has not answered for {SILENT:.0f} s; accepted: one that does"
+                f"{self._address}: the Dask scheduler has not answered for {SILENT:.0f} s; expected one that does"
             )
         self._require_some()
 
@@ -116,7 +113,7 @@ class Workers:
         elif self._alone_since is None:
             self._alone_since = time.monotonic()
         elif time.monotonic() - self._alone_since > ALONE:
-            raise ConnectionError(f"{self._address}: all workers have gone; accepted: new ones within {ALONE:.0f} s")
+            raise ConnectionError(f"{self._address}: all workers have gone; expected new ones within {ALONE:.0f} s")
 
     def _judge(self, address: str, threads: int, answer: Any) -> None:
         if answer.status != "finished":

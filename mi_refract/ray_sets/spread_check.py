@@ -7,7 +7,7 @@ import functools
 from collections.abc import Callable, Iterable, Iterator
 
 from mi_refract.cluster import on_worker, spread, worker_facts
-from mi_refract.cluster.connection import Elsewhere
+from mi_refract.cluster.connection import ClusterTarget, connected
 from mi_refract.cluster.workers import Workers
 from mi_refract.io.provenance import installed_version
 
@@ -24,13 +24,13 @@ def facts(variant: str) -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def judging(elsewhere: Elsewhere, warn: Callable[[str], None]) -> Iterator[Judge]:
+def judging(target: ClusterTarget, warn: Callable[[str], None]) -> Iterator[Judge]:
     """A judge for `check_answers.check`: workers of a scheduler, or so many processes on this machine.
 
     `warn` is told of every worker that is refused. ConnectionError, ImportError or ValueError, one line, where there is
     nobody who may judge.
     """
-    with elsewhere.connected() as client:
+    with connected(target.scheduler, target.workers) as client:
         there = Workers(client, VARIANT, facts(VARIANT), warn=warn, facts=__name__)
         there.wait()
 

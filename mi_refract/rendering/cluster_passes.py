@@ -251,7 +251,7 @@ class ClusterPasses:
         except KilledWorker as error:
             raise ConnectionError(
                 f"passes {node.first} to {node.stop - 1}: {error.allowed_failures + 1} workers were lost that rendered "
-                f"them, the last {error.last_worker.address}; accepted: workers with enough memory"
+                f"them, the last {error.last_worker.address}; expected workers with enough memory"
             ) from None
 
     def _note(self, node: _Node, part: Part) -> None:
@@ -315,8 +315,8 @@ class ClusterPasses:
             return None
         (offset, spp), bundle, client, scene = self._series, self._bundle(allowed), self.workers.client, self.scene
         options: dict[str, Any] = {"retries": RETRIES, "pure": False, "priority": -next(self._count)}
-        if listed or not scene or scene.expected is None or not self.workers.all_accepted:
-            options["workers"], scene = sorted(allowed), scene and replace(scene, expected=None)
+        if listed or not self.workers.all_accepted:
+            options["workers"], scene = sorted(allowed), replace(scene, expected=None)
         size = ARITY**task
         parts = tasks = [
             client.submit(render_node, bundle, scene, task, offset + number, spp, **options)

@@ -13,6 +13,7 @@ import pytest
 from support.dask_workers import until
 from support.processes import ENVIRONMENT
 
+from mi_refract.cluster import worker_facts
 from mi_refract.io.image_file import read_exr
 
 SCENE = """<scene version="3.0.0">
@@ -65,10 +66,9 @@ def started(scene):
 @pytest.mark.parametrize(
     "options, message",
     [
-        (("--scheduler", "tcp://h:1", "--workers", 2), "--scheduler and --workers; accepted: one of them"),
+        (("--scheduler", "tcp://h:1", "--workers", 2), "--scheduler and --workers; expected one of them"),
         (("--workers", 0), "--workers"),
-        (("--tls-key", "key.pem"), "accepted with --scheduler ADDRESS"),
-        (("--mixed-workers",), "accepted with --scheduler ADDRESS"),
+        (("--mixed-workers",), "expected --scheduler ADDRESS or --workers N with it"),
         (
             ("--workers", 1, "--allow-plugins", "evil"),
             "--allow-plugins evil: native code, which is not sent to workers",
@@ -90,7 +90,7 @@ def test_no_scheduler(started, scene):
     out, err = process.communicate()
     assert time.monotonic() - began < 10
     assert (process.returncode, out, err.count("\n")) == (2, "", 1)
-    assert "--scheduler tcp://127.0.0.1:9: no Dask scheduler answers: " in err and "; accepted: the address of" in err
+    assert "--scheduler tcp://127.0.0.1:9: no Dask scheduler answers: " in err and "; expected the address of" in err
     assert list(scene.parent.iterdir()) == [scene]
 
 
@@ -99,6 +99,14 @@ def test_too_large_for_a_cluster(render, scene):
     code, _, err = render("--workers", 1, "--bundle-limit", 1)
     assert (code, err.count("\n")) == (2, 1)
     assert f"{scene}: 1.0 MiB of files" in err and "expected with a cluster: 1 MiB, or --bundle-limit 2" in err
+
+
+def test_another_libllvm_is_refused_unless_mixed_workers_are_accepted(render, monkeypatch):
+    own = worker_facts.facts
+    monkeypatch.setattr(worker_facts, "facts", lambda variant: own(variant) | {worker_facts.LLVM: "99.0"})
+    code, _, err = render("--workers", 1)
+    assert code == 2 and "is refused: libLLVM unknown, here 99.0" in err
+    assert render("--workers", 1, "--mixed-workers")[0] == 0
 
 
 def test_without_dask(render, monkeypatch):
@@ -142,7 +150,7 @@ def test_the_scheduler_ends_and_the_render_goes_on_here(started, render, scene, 
     assert process.returncode == (130 if ended_by == signal.SIGINT else 2)
     if ended_by == signal.SIGKILL:
         assert (
-            err.count("\n") == 1 and "the Dask scheduler is gone, or has given up its tasks; accepted: one that" in err
+            err.count("\n") == 1 and "the Dask scheduler is gone, or has given up its tasks; expected one that" in err
         )
     assert scene.with_name("out.exr.checkpoint").exists()
     goes_on(render, scene)

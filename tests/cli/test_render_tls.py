@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import re
-import subprocess
-import sys
 import time
 
+import dask
 import numpy as np
 import pytest
-from support.certificates import authority
-from support.dask_workers import until
-from support.processes import ENVIRONMENT
+from distributed import Security
+from support.dask_workers import program, tls_settings, until
 
 from mi_refract.io.image_file import read_exr
 
@@ -28,37 +24,21 @@ SCENE = """<scene version="3.0.0">
 </scene>"""
 
 
-@pytest.fixture(scope="module")
-def own(tmp_path_factory):
-    return authority(tmp_path_factory.mktemp("tls") / "own")
+OWN, OTHER = Security.temporary(), Security.temporary()
+MIXED = Security.temporary()
+MIXED.tls_ca_file = OWN.tls_ca_file  # trusts the scheduler, which does not trust it
+DOUBTING = Security(**{f"tls_client_{part}": getattr(OWN, f"tls_client_{part}") for part in ("cert", "key")})
+DOUBTING.tls_ca_file = OTHER.tls_ca_file
 
 
 @pytest.fixture(scope="module")
-def other(tmp_path_factory):
-    return authority(tmp_path_factory.mktemp("tls") / "other")
-
-
-def options(folder, authority=None):
-    certificate, key = folder / "cert.pem", folder / "key.pem"
-    return ("--tls-ca-file", (authority or folder) / "cert.pem", "--tls-cert", certificate, "--tls-key", key)
-
-
-@pytest.fixture(scope="module")
-def scheduler(own):
+def scheduler(tmp_path_factory):
     """The address of one that asks for TLS; a worker joins it."""
-    file = own / "scheduler.json"
-    common = ["--no-dashboard", "--scheduler-file", file, *options(own)]
-    with contextlib.ExitStack() as stack:
-        for words in (
-            ["scheduler", "--host", "127.0.0.1", "--port", "0"],
-            ["worker", "--nthreads", "1", "--no-nanny", "--host", "127.0.0.1", "--local-directory", own],
-        ):
-            command = [sys.executable, "-m", "dask", *words, *common]
-            process = subprocess.Popen(
-                list(map(str, command)), env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-            )
-            stack.callback(process.wait)
-            stack.callback(process.kill)
+    folder = tmp_path_factory.mktemp("tls")
+    file = folder / "scheduler.json"
+    common = ("--scheduler-file", str(file), "--host", "127.0.0.1", "--protocol", "tls")
+    worker = ("worker", "--nthreads", "1", "--no-nanny", "--local-directory", str(folder))
+    with program("scheduler", "--port", "0", *common, security=OWN), program(*worker, *common, security=OWN):
         until(file.exists)
         yield json.loads(file.read_text())["address"]
 
@@ -75,33 +55,22 @@ def render(tmp_path, run):
     return call
 
 
-def test_the_bits_are_those_of_a_render_here(render, scheduler, own, tmp_path):
+def test_the_bits_are_those_of_a_render_here(render, scheduler, tmp_path):
     assert scheduler.startswith("tls://")
-    assert render("there.exr", "--scheduler", scheduler, *options(own))[0] == render("here.exr")[0] == 0
+    with dask.config.set(tls_settings(OWN)):
+        assert render("there.exr", "--scheduler", scheduler)[0] == render("here.exr")[0] == 0
     found, expected = (read_exr(tmp_path / name)[0] for name in ("there.exr", "here.exr"))
     np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize(
-    "case, message",
-    [
-        ("of another authority", r"no Dask scheduler answers: TLS certificate does not match"),
-        ("by another authority", r"no Dask scheduler answers: .*: it may be without TLS, or of another authority;"),
-        ("without a certificate", r"no --tls-ca-file or no --tls-cert; expected both, and --tls-key"),
-        ("without TLS", r"no Dask scheduler answers: ConnectionResetError: .*: it may ask for TLS;"),
-    ],
-)
-def test_refused(render, scheduler, own, other, tmp_path, case, message):
+@pytest.mark.parametrize("security, protocol", [(MIXED, "tls"), (DOUBTING, "tls"), (Security(), "tls"), (OWN, "tcp")])
+def test_refused(render, scheduler, tmp_path, security, protocol):
     """In one line, at once."""
-    words = {
-        "of another authority": (scheduler, *options(own, other)),
-        "by another authority": (scheduler, *options(other, own)),
-        "without a certificate": (scheduler,),
-        "without TLS": (scheduler.replace("tls", "tcp"),),
-    }[case]
-    began = time.monotonic()
-    code, out, err = render("no.exr", "--scheduler", *words)
+    address, began = scheduler.replace("tls", protocol), time.monotonic()
+    with dask.config.set(tls_settings(security)):
+        code, out, err = render("no.exr", "--scheduler", address)
     assert (code, out, err.count("\n")) == (2, "", 1)
-    assert re.search(f"--scheduler {words[0]}: {message}", err)
+    assert f"--scheduler {address}: no Dask scheduler answers: " in err
+    assert "and the files of `distributed.comm.tls` in Dask's configuration" in err
     assert time.monotonic() - began < 10
     assert not list(tmp_path.glob("*no.exr*"))

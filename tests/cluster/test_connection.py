@@ -9,15 +9,15 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import dask
 import pytest
 from distributed import CancelledError
-from distributed.comm import CommClosedError
-from support.dask_workers import until
+from distributed.comm import CommClosedError, connect
+from support.dask_workers import tls_settings, until
 from support.processes import python
 
-from mi_refract.cluster import local_process
+from mi_refract.cluster import local_cluster
 from mi_refract.cluster.connection import LostSchedulerError, connected, scheduler_needed
-from mi_refract.cluster.tls import Tls
 
 
 def refusal(**options):
@@ -33,28 +33,42 @@ def test_no_scheduler():
     assert time.monotonic() - began < 10
     assert text.startswith("--scheduler tcp://127.0.0.1:9: no Dask scheduler answers: ")
     assert "refused" in text or "Timed out trying to connect" in text  # the last attempt may be cut short
-    assert "accepted: the address of a Dask scheduler" in text
+    assert "expected the address of a Dask scheduler" in text
 
 
 @pytest.mark.parametrize(
     "options, message",
     [
         ({"scheduler": "nonsense"}, "--scheduler nonsense: no Dask scheduler answers: missing port"),
-        ({"scheduler": "tcp://h:1", "workers": 1}, "accepted: either --scheduler ADDRESS or --workers N"),
-        ({"workers": 0}, "--workers 0: accepted: a whole number from 1 to 1024"),
-        ({"workers": 1, "tls": Tls(key="x")}, "accepted with --scheduler tls://HOST:PORT"),
-        ({"scheduler": "tls://h:1"}, "--scheduler tls://h:1: no --tls-ca-file or no --tls-cert; accepted: both"),
+        ({"scheduler": "tcp://h:1", "workers": 1}, "expected either --scheduler ADDRESS or --workers N"),
+        ({"workers": 0}, "--workers 0; expected a whole number from 1 to 1024"),
+        ({"scheduler": "tls://h:1"}, "and the files of `distributed.comm.tls` in Dask's configuration"),
     ],
 )
 def test_misuse(options, message):
     assert message in refusal(**options)
 
 
-def test_encryption_is_not_given_up():
-    """Where TLS is asked for, a connection without is refused."""
-    for address in ("tcp://127.0.0.1:9", "127.0.0.1:9"):
-        said = refusal(scheduler=address, tls=Tls(ca_file=Path("ca.pem")))
-        assert f"--scheduler {address}: is not encrypted; --tls-ca-file, --tls-cert, --tls-key: accepted with" in said
+def test_a_connection_that_is_not_encrypted_is_refused():
+    """Of local workers, and where the scheduler speaks TLS: Dask would take a worker's results over any connection."""
+
+    def refuses(client):
+        with pytest.raises(RuntimeError, match="encryption required"):
+            client.sync(connect, "tcp://127.0.0.1:9", **client.connection_args)
+
+    with connected(workers=1) as local:
+        refuses(local)
+        assert local.run_on_scheduler(lambda dask_scheduler: dask_scheduler.security.require_encryption)
+        with dask.config.set(tls_settings(local.security)), connected(local.scheduler.address) as client:
+            refuses(client)
+
+
+def test_a_module_of_the_working_folder_is_not_taken_for_one_of_ours(tmp_path, monkeypatch):
+    for name in ("dask", "distributed", "mi_refract", "pickle"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit")
+    monkeypatch.chdir(tmp_path)
+    with connected(workers=1) as client:
+        assert client.submit(os.getpid).result() != os.getpid()
 
 
 def test_without_dask(monkeypatch):
@@ -77,7 +91,7 @@ def test_a_lost_scheduler_is_one_line(status, raised, lost):
     with pytest.raises(LostSchedulerError if lost else type(raised)) as caught, scheduler_needed(client):
         raise raised
     text = (
-        "tcp://h:1: the Dask scheduler is gone, or has given up its tasks; accepted: one that runs, or none: then here"
+        "tcp://h:1: the Dask scheduler is gone, or has given up its tasks; expected one that runs, or none: then here"
     )
     assert str(caught.value) == (text if lost else "of the scene")
 
@@ -115,15 +129,15 @@ def group(leader):
 def test_local_workers_end_with_a_killed_process():
     code = """import signal, subprocess, sys, time
 signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
-from mi_refract.cluster import local_process
+from mi_refract.cluster import local_cluster
 popen = subprocess.Popen
 def told(*arguments, **options):
     process = popen(*arguments, **options)
     print(process.pid, flush=True)
     return process
 subprocess.Popen = told
-with local_process.started(1) as local:
-    print(local.address, flush=True)
+with local_cluster.started(1) as (address, _):
+    print(address, flush=True)
     time.sleep(600)"""
     with python(code) as process:
         leader, address = int(process.stdout.readline()), process.stdout.readline()
@@ -142,5 +156,5 @@ with local_process.started(1) as local:
 
 
 def test_a_cluster_that_cannot_start(monkeypatch):
-    monkeypatch.setattr(local_process, "MODULE", "mi_refract.cluster.none")
-    assert refusal(workers=1) == "--workers 1: no local cluster: ended with status 1; accepted: fewer, or none"
+    monkeypatch.setattr(local_cluster, "MODULE", "mi_refract.cluster.none")
+    assert refusal(workers=1) == "--workers 1: no local cluster: ended with status 1; expected fewer, or none"

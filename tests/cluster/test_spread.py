@@ -50,6 +50,28 @@ def test_an_error_of_a_call_is_its_own(workers):
     assert len(list(spread.results(workers, half, [(1,)]))) == 1  # the workers are as before
 
 
+def late():
+    raise TimeoutError("of the call")
+
+
+def test_an_error_that_dask_raises_too_is_that_of_the_call(workers):
+    with pytest.raises(TimeoutError, match="of the call"):
+        list(spread.results(workers, late, [()]))
+
+
+def test_who_is_refused_gets_no_call(workers):
+    refused = sorted(workers.accepted)[0]
+    threads = workers.accepted.pop(refused)
+    workers.refused[refused] = "made up"
+    own = workers.client.run(os.getpid, workers=[refused])[refused]
+    try:
+        found = list(spread.results(workers, process_of, [(0.1,)] * 6))
+    finally:
+        del workers.refused[refused]
+        workers.accepted[refused] = threads
+    assert len(found) == 6 and own not in [pid for _, pid, _ in found]
+
+
 def test_a_call_of_a_lost_worker_is_made_again(workers):
     results = spread.results(workers, process_of, [(1.0,)] * 4)
     first, _, _ = next(results)

@@ -250,6 +250,7 @@ def test_what_was_begun_ahead_serves_the_next_call(client, scene, variant):
 
 def test_who_is_refused_gets_no_task(client, scene, variant):
     passes = source(client, scene, variant)
+    passes.scene = replace(passes.scene, expected=facts(variant))  # by which the refused one would take a task
     finished(passes)
     honest, liar = sorted(passes.workers.accepted)
     del passes.workers.accepted[liar]

@@ -7,16 +7,12 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
-from support.certificates import tls_files
 from support.processes import ENVIRONMENT
 
-from mi_refract.cluster.local import PEM
 from mi_refract.cluster.worker_facts import facts
 from mi_refract.cluster.workers import Workers
 
@@ -39,17 +35,39 @@ def kill(client: Any, address: str) -> None:
 @contextlib.contextmanager
 def joined(client: Any) -> Iterator[subprocess.Popen[bytes]]:
     """One more worker of one thread, without a nanny, for the scheduler of a client of `connected(workers=…)`."""
-    command = [sys.executable, "-m", "distributed.cli.dask_worker", client.scheduler.address]
-    with tempfile.TemporaryDirectory() as folder:
-        files = tls_files({name: getattr(client.security, name) for name in PEM}, Path(folder))
-        command += ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--tls-ca-file", str(files.ca_file)]
-        command += ["--tls-cert", str(files.cert), "--tls-key", str(files.key)]
-        process = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        try:
-            yield process
-        finally:
-            process.kill()
-            process.wait()
+    with program(
+        "worker", client.scheduler.address, "--nthreads", "1", "--no-nanny", security=client.security
+    ) as process:
+        yield process
+
+
+def tls_settings(security: Any) -> dict[str, str]:
+    """Of Dask's configuration: authority, certificates and keys, as text or files."""
+    found = {"distributed.comm.tls.ca-file": security.tls_ca_file}
+    for role in ("client", "scheduler", "worker"):
+        for part in ("cert", "key"):
+            found[f"distributed.comm.tls.{role}.{part}"] = getattr(security, f"tls_{role}_{part}")
+    return found
+
+
+@contextlib.contextmanager
+def program(*words: str, security: Any) -> Iterator[subprocess.Popen[bytes]]:
+    """`dask WORDS`, which takes its TLS settings from the environment; killed at the end."""
+    variables = {
+        "DASK_" + name.upper().replace(".", "__").replace("-", "_"): value
+        for name, value in tls_settings(security).items()
+    }
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dask", *words, "--no-dashboard"],
+        env=ENVIRONMENT | variables,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
 
 
 def until(reached: Callable[[], Any], seconds: float = 60.0) -> None:

@@ -24,7 +24,6 @@ from validation import __main__ as command
 from validation import limits, readme_tables, runner
 from validation.diff import planted_defects, visible_changes
 from validation.directions import bsdf_samples, keep_worst, per_formula
-from validation.efficiency import cluster_scale
 from validation.renders import against_dielectric, colours
 from validation.renders import scene_needs as scenes
 from validation.run import array_settings as settings
@@ -378,7 +377,6 @@ NOTHING_MEASURED = {
     "renders": "no scene was rendered",
     "paths": "no paths were traced",
     "efficiency": "no efficiency was measured",
-    "cluster": "no scale was modelled",
     "planar": "no planar paths were traced",
     "seen": "no defects were planted",
     "visible": "no visible changes were planted",
@@ -401,7 +399,6 @@ def test_the_readmes_hold_their_tables():
         "renders": scenes,
         "paths": layered_paths.plugins(),
         "efficiency": ways,
-        "cluster": [f"{scene}, {n} workers" for scene in cluster_scale.SCENES for n in cluster_scale.SHOWN],
         "planar": [path.stem for path in SCENES.glob("planar/*.toml")],
         "defects": [*planted_defects.GLASSES, *DEFECTS, *METHODS],
         "visible": [*visible_changes.KINDS, *map(str, visible_changes.SQUARES)],

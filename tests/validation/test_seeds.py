@@ -31,9 +31,7 @@ OTHERWISE = {
     "suite.dispersion": "four seeds a side, whose noise is taken out; no figure has a bound",
     "media.hero_wavelength": "times and variances; no figure has a bound",
     "media.renders": "sixteen seeds a side in the furnace, eight by Welch's test; the rest is times and closed forms",
-    "robustness.mutated_inputs": "no figure: each input is a case of its own, and the study is longer in full",
     "robustness.code_mutants": "each mutant is a case of its own, and the study is longer in full",
-    "robustness.killed_commands": "the moments of the signals are random; no figure has a bound",
     "ground_truth.traced_bodies": "bodies are fixed; the rainbow's seeds are its sample",
 }
 DRAWS = "default_rng", "regimes.make(", "seed="

@@ -9,13 +9,13 @@ import os
 import time
 import types
 
+import dask
 import pytest
-from support.certificates import authority, tls_files
+from support.dask_workers import tls_settings
 
 from mi_refract import backend
 from mi_refract.cluster import worker_facts
-from mi_refract.cluster.connection import Elsewhere
-from mi_refract.cluster.tls import Tls
+from mi_refract.cluster.connection import ClusterTarget, connected
 from mi_refract.report.row import Row
 from validation import __main__ as command
 from validation import runner, spread
@@ -28,11 +28,9 @@ ASKED = spread.Asked(MODULES, "quick", "scalar_rgb")
 
 
 @pytest.fixture(scope="module")
-def scheduler(tmp_path_factory):
-    from mi_refract.cluster import local_process
-
-    with local_process.started(2) as local:
-        yield Elsewhere(local.address, tls=tls_files(local.pem, tmp_path_factory.mktemp("tls")))
+def scheduler():
+    with connected(workers=2) as client, dask.config.set(tls_settings(client.security)):
+        yield ClusterTarget(client.scheduler.address)
 
 
 @pytest.fixture
@@ -47,11 +45,11 @@ def studies():
 def test_the_rows_are_those_of_a_run_here(scheduler, context, tmp_path):
     work = spread.tasks(studies(), context)
     alone, _ = runner.run(work, dataclasses.replace(context, out=tmp_path / "alone"))
-    rows, spent = runner.run(work, context, spread.Elsewhere(ASKED, scheduler))
+    rows, spent = runner.run(work, context, spread.OnCluster(ASKED, scheduler))
     assert rows == alone and len(rows) > 10
     assert [each["task"] for each in spent] == [task.name for task in work]
     assert all(each["machine"] == os.uname().nodename for each in spent)
-    unreachable = spread.Elsewhere(ASKED, Elsewhere("tcp://127.0.0.1:9"))
+    unreachable = spread.OnCluster(ASKED, ClusterTarget("tcp://127.0.0.1:9"))
     kept, _ = runner.run(work, context, unreachable)
     assert [json.dumps(each.as_dict()) for each in kept] == [json.dumps(each.as_dict()) for each in alone]
 
@@ -127,7 +125,7 @@ def test_a_worker_sends_files_and_errors_as_they_are(monkeypatch, scalar_variant
 
 
 def test_two_tasks_of_one_name_are_refused(context):
-    elsewhere = spread.Elsewhere(ASKED, Elsewhere("tcp://127.0.0.1:9"))
+    elsewhere = spread.OnCluster(ASKED, ClusterTarget("tcp://127.0.0.1:9"))
     with pytest.raises(ValueError, match="two tasks are called 'a'; expected a name for each"):
         runner.run([Task("a", list), Task("a", list)], context, elsewhere)
 
@@ -153,8 +151,6 @@ def test_workers_with_other_sources_are_refused_by_name():
     ("arguments", "words"),
     [
         (["--scheduler", "tcp://h:1", "--workers", "2"], "--scheduler and --workers; expected one of them"),
-        (["--tls-key", "key.pem"], "--tls-ca-file, --tls-cert, --tls-key: accepted with --scheduler tls://HOST:PORT"),
-        (["--scheduler", "tls://h:1", "--tls-cert", "none.pem"], "--tls-cert none.pem: no such file; accepted"),
         (["--workers", "0"], "Invalid value for '--workers': Input should be greater than or equal to 1"),
     ],
 )
@@ -165,12 +161,10 @@ def test_misuse_is_one_line(arguments, words, capsys, tmp_path):
 
 
 def test_who_works_is_what_the_options_say(tmp_path, monkeypatch):
-    folder, given = authority(tmp_path / "tls"), []
-    files = [folder / name for name in ("cert.pem", "cert.pem", "key.pem")]
+    given = []
     monkeypatch.setattr(command, "_run", lambda *arguments: given.append(arguments[-1]) or 0)
-    options = zip(("--tls-ca-file", "--tls-cert", "--tls-key"), map(str, files), strict=True)
-    assert command.main(["--scheduler", "tls://h:1", *sum(options, ()), "--out", str(tmp_path / "out")]) == 0
-    assert given == [Elsewhere("tls://h:1", None, Tls(*files))]
+    assert command.main(["--scheduler", "tls://h:1", "--out", str(tmp_path / "out")]) == 0
+    assert given == [ClusterTarget("tls://h:1")]
 
 
 # Which tasks time something -------------------------------------------------------------------------------------------
@@ -179,7 +173,7 @@ def test_who_works_is_what_the_options_say(tmp_path, monkeypatch):
 CLOCKS = {"kernel_timing.interval", "scaling.run"}
 READ = {"perf_counter", "process_time"}  # functions that name one of them are clocks, too
 # Theirs are told beside a row, or are limits.
-NOT_JUDGED = {"render_methods.Camera.__call__", "killed_commands.examine"}
+NOT_JUDGED = {"render_methods.Camera.__call__"}
 
 
 def reached(start):

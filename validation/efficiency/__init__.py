@@ -1,7 +1,6 @@
-"""How large is the error of an image after a given time, how does the time grow with the scene, and on how many workers
-does it fall?
+"""How large is the error of an image after a given time, and how does the time grow with the scene?
 
 In: integrators, BSDFs and samplers. Out: rows with errors, times and memory, and curves of them.
 """
 
-__all__ = ["cluster_scale", "error_against_time", "scaling"]
+__all__ = ["error_against_time", "scaling"]

@@ -1,6 +1,6 @@
-"""What commands do with inputs that are garbage, when they are killed, and what tests do when our code is mutated.
+"""What tests do when our code is mutated. Garbage inputs and killed commands are tests (`tests/robustness`).
 
-In: seeds and numbers of inputs. Out: rows; every finding names the seed and the index that make the input again.
+In: a seed and a number of mutants. Out: rows, which name each mutant that no test notices.
 """
 
-__all__ = ["code_mutants", "killed_commands", "mutated_inputs"]
+__all__ = ["code_mutants"]

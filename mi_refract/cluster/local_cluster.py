@@ -1,0 +1,105 @@
+"""A Dask scheduler and workers of one thread each in a process of its own, which ends with ours, however that ends.
+
+No signal that is blocked here is blocked in the workers. Certificate and key are made for this once: without them every
+user of this machine could have the workers run code. The process, `python -m mi_refract.cluster.local_cluster`, reads
+the number of workers and Dask's `Security` from its stdin, prints the scheduler's address, and ends when stdin closes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from typing import Any
+
+MOST = 1024  # workers
+# Dask watches itself: its profiler and monitors would take 5 % of the workers' time from kernels.
+SETTINGS = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.system-monitor.interval": "10s",
+    "distributed.admin.tick.interval": "1s",
+}
+MODULE = "mi_refract.cluster.local_cluster"
+_FAILED = "failed: "
+_ENDING = 10.0  # seconds
+
+
+@contextlib.contextmanager
+def started(workers: int) -> Iterator[tuple[str, Any]]:
+    """The address of a scheduler with so many workers, and the `Security` of its clients. They end at the end.
+
+    ConnectionError, one line, where they cannot be started.
+    """
+    from distributed.security import Security
+
+    if not 1 <= workers <= MOST:
+        raise ValueError(f"--workers {workers}; expected a whole number from 1 to {MOST}")
+    security = Security.temporary()
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-m", MODULE],  # -P: no module of the working folder takes the place of one of ours
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=None if os.environ.get("MI_REFRACT_TRACEBACK") == "1" else subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    assert process.stdin and process.stdout
+    try:
+        with contextlib.suppress(BrokenPipeError):
+            pickle.dump((workers, security), process.stdin)
+            process.stdin.flush()
+        said = process.stdout.readline().decode().strip()
+        if not said or said.startswith(_FAILED):
+            reason = said.removeprefix(_FAILED) or f"ended with status {process.wait()}"
+            raise ConnectionError(f"--workers {workers}: no local cluster: {reason}; expected fewer, or none")
+        yield said, security
+    finally:
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_ENDING)
+        process.stdout.close()
+
+
+def main() -> None:
+    """Start, print the address, wait, and end with all workers."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, signal.valid_signals())
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C is for who started us
+    folder = tempfile.mkdtemp(prefix="mi_refract-workers-")
+    try:
+        import dask
+        from distributed import LocalCluster
+
+        workers, security = pickle.load(sys.stdin.buffer)
+        dask.config.set(SETTINGS)
+        cluster = LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            host="127.0.0.1",
+            protocol="tls://",
+            security=security,
+            dashboard_address=None,
+            local_directory=folder,
+            silence_logs=logging.CRITICAL,
+        )
+        print(cluster.scheduler_address, flush=True)
+        sys.stdin.buffer.read()
+    except Exception as error:
+        print(f"{_FAILED}{type(error).__name__}: {' '.join(str(error).split())}", flush=True)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        if os.getpgrp() == os.getpid():  # workers are of our group: at once, whatever they render
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(os.getpid(), signal.SIGKILL)
+        os._exit(1)
+
+
+if __name__ == "__main__":
+    main()
