@@ -13,12 +13,19 @@ estimated at f degrees of freedom the expectation of the bound over that estimat
 Rare light is skewed to the left where the sides have n₁ > n₂ samples: the small side has none in most pixels, there v₂
 is 0, and u = m₁² > 0. Equal images have one variance of a sample. With the estimates exchanged, v₁ n₁/n₂ + v₂ n₂/n₁,
 such a pixel has u < 0, and single events of the small side are a tail on the right. A tile must differ by both.
+
+Where the noise of one side alone is known, from n samples, and the other has m, the difference d = ±(m₂ − m₁), positive
+where the other is brighter, is tested in the same way: S = Σd / √(Σd²). Light of rare events has d > 0 where the other
+side found it alone, which is no evidence of a difference, but for its number. All of k events are in the m samples with
+probability (1 + n/m)⁻ᵏ; they show S² = k in d, and in u where n < m. So both have P(S ≥ s) ≤ exp(−g s²) with
+g = min(½, ln(1 + n/m)) instead of ½.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,32 +41,40 @@ class PixelSums:
     """Sums of u and of its square over the pixels of each tile and channel: 1 or 2 × tiles × tiles × C.
 
     The second with the estimates of the variances exchanged, where the sides have different numbers of samples.
+    `exponent`: g of P(S ≥ s) ≤ exp(−g s²), of all channels or of each.
     """
 
     total: Array
     squares: Array
+    exponent: Array | float = 0.5
 
     def coarser(self, growth: int) -> PixelSums:
         """The same in tiles `growth` times as wide."""
-        return PixelSums(block_sum(self.total, growth), block_sum(self.squares, growth))
+        return replace(self, total=block_sum(self.total, growth), squares=block_sum(self.squares, growth))
 
-    def p(self, area: Array, allowed: Array, factor: float, freedom: float) -> Array:
-        """Upper bounds of the p of no pixel beyond `allowed`, which is that of a tile; NaN for what is not finite.
+    def p(self, area: Array, least: Array, factor: float, freedom: float) -> Array:
+        """Upper bounds of the p of no pixel's u beyond `least`, which is that of a tile; NaN for what is not finite.
 
         `area`: pixels of a tile. `factor`, `freedom`: by how much tile means vary more than with independent pixels,
         and the degrees of freedom of that estimate.
         """
-        least = np.square(allowed)
         total = self.total - area * least
         squares = self.squares - 2 * least * self.total + area * np.square(least)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            s2 = np.where(total <= 0, 0.0, np.square(total) / (factor * squares))
+            s2 = np.where(total <= 0, 0.0, 2 * self.exponent * np.square(total) / (factor * squares))
         exponent = s2 if np.isinf(freedom) else freedom * np.log1p(s2 / freedom)
         bound: Array = np.exp(-exponent / 2).max(0)
         return bound
 
 
-def sums(m1: Array, v1: Array, m2: Array, v2: Array, tile: int, ratio: Array | float = 1.0) -> PixelSums:
+def exponent(known: float, other: float) -> float:
+    """g, where the noise of a side of `known` samples is all that is known, and the other side has `other` samples."""
+    return min(0.5, math.log1p(known / other))
+
+
+def sums(
+    m1: Array, v1: Array, m2: Array, v2: Array, tile: int, ratio: Array | float = 1.0, exponent: Array | float = 0.5
+) -> PixelSums:
     """Of the means of both sides and the variances of these means, float64, H × W × C.
 
     `ratio`: samples of the first side over those of the second, of all channels or of each.
@@ -68,7 +83,8 @@ def sums(m1: Array, v1: Array, m2: Array, v2: Array, tile: int, ratio: Array | f
     squared = np.square(m2 - m1) - ROUNDING * (np.square(m1) + np.square(m2))
     noise = [v1 + v2] if np.all(ratio == 1) else [v1 + v2, ratio * v1 + v2 / ratio]
     found = [squared - each for each in noise]
-    return PixelSums(*(np.stack([block_sum(x, tile) for x in each]) for each in (found, map(np.square, found))))
+    total, squares = (np.stack([block_sum(x, tile) for x in each]) for each in (found, map(np.square, found)))
+    return PixelSums(total, squares, exponent)
 
 
 def sums_of_renders(reference: Sequence[Array], test: Sequence[Array], tile: int, ratio: float = 0.0) -> PixelSums:

@@ -26,16 +26,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.io.pixels import Pixels as Array
-from mi_refract.io.pixels import block_area, block_sum
+from mi_refract.io.pixels import block_area, block_max, block_sum
 
 from .pixel_statistics import PixelSums
 
 DARK = 1e-3  # a tile darker than this share of its channel's `median_nonblack` counts as that bright in ratios
 GROWTH = 4  # from one level of tiles to the next
 HEAVY = 4.0  # a tile whose noise comes from fewer pixels than this is heavy-tailed: its t is not a Student's
-# Where the variance comes from the other side, a mean does not vary with its own noise. Noise of 0.1 of it may be that
-# of 100 rare events, ten times as frequent beyond 5 σ as normal noise: such a tile is heavy-tailed, too.
-BORROWED = 0.1
+SINGLE = 0.3  # of a tile's standard error: a pixel that moves its mean by more may be of light that is rare
 POOLED = 30  # blocks of tiles from which the correlation of pixels is estimated again, at least
 FEW_STEPS = 8  # of a fixed point, each of which halves its error at least
 MISSED = 0.01  # the minimum detectable difference is missed with this probability
@@ -64,9 +62,8 @@ class Side:
     """Totals per tile and channel: `mean`, `variance` of the means and its square, over pixels; `renders` one by one.
 
     `freedom`: degrees of freedom of a pixel's variance. `count`: samples behind a pixel, in the unit of the other side;
-    of all channels or of each. Without `renders` pixels are taken for independent. `borrowed`: the channels whose noise
-    only the other side knows; its `variance` is that of both. `correlated`: its `inflation`, where that is known
-    without `renders`.
+    of all channels or of each. Without `renders` pixels are taken for independent. `correlated`: its `inflation`, where
+    that is known without `renders`.
     """
 
     area: Array
@@ -76,7 +73,6 @@ class Side:
     freedom: float
     count: Array | float = 1.0
     renders: Array | None = None
-    borrowed: Flags | None = None
     correlated: Inflation = field(default_factory=Inflation)
 
     def coarser(self) -> Side:
@@ -153,8 +149,9 @@ class Level:
 
     `t`: positive where the test is brighter. `p`: of no difference; `beyond`: of none beyond the margin; both 0 where a
     value is not finite. `silent`: no noise on either side, of which a t-test knows nothing: p is 1 there, and `off`
-    where the means differ beyond the margin. `heavy`: noise from a few pixels only. `of_pixels`: p of no pixel beyond
-    the margin; `of_silent`: the same of tiles without noise; None where that is not tested.
+    where the means differ beyond the margin. `heavy`: noise from a few pixels only. `shown`: p of none beyond the margin
+    by the noise that the pixels show; 0 where that is not asked. `of_pixels`: p of no pixel beyond the margin;
+    `of_silent`: the same of tiles without noise; None where that is not tested.
     """
 
     t: Array
@@ -167,6 +164,7 @@ class Level:
     allowed: Array
     error: Array
     freedom: Array
+    shown: Array | float = 0.0
     of_pixels: Array | None = None
     of_silent: Array | None = None
 
@@ -194,16 +192,46 @@ class Level:
         return found * self.error
 
 
-def levels(reference: Side, test: Side, equivalence_margin: float, pixels: PixelSums | None = None) -> Iterator[Level]:
+@dataclass(frozen=True)
+class OneSided:
+    """What the pixels show where the noise of one side alone is known: d of `pixel_statistics`, 0 in other channels.
+
+    `largest`: that of each tile; infinite where that is no matter. `correlated`: by how much pixels are.
+    """
+
+    sums: PixelSums
+    largest: Array
+    correlated: Inflation
+
+    def coarser(self) -> OneSided:
+        """The same in tiles GROWTH times as wide."""
+        return replace(self, sums=self.sums.coarser(GROWTH), largest=block_max(self.largest, GROWTH))
+
+    def p(self, area: Array, level: Level) -> Array:
+        """Of no difference beyond the margin; 0 where no pixel decides it, and where the other side is not brighter."""
+        asked = (self.sums.total[0] > 0) & (self.largest > SINGLE * level.error * area)
+        p = self.sums.p(area, level.allowed, self.correlated.factor, self.correlated.freedom)
+        return np.where(asked, np.nan_to_num(2 * p, nan=0.0), 0.0)
+
+
+def levels(
+    reference: Side,
+    test: Side,
+    equivalence_margin: float,
+    pixels: PixelSums | None = None,
+    shown: OneSided | None = None,
+) -> Iterator[Level]:
     """The test of single tiles, then of blocks GROWTH times as wide, and so on to the whole image."""
     inflations = reference.inflation(equivalence_margin), test.inflation(equivalence_margin)
     while True:
         level = compare_tiles(reference, test, equivalence_margin, inflations)
+        level = level if shown is None else replace(level, shown=shown.p(reference.area, level))
         yield level if pixels is None else _with_pixels(level, pixels, reference.area, max(inflations))
         if reference.area.size == 1:
             return
         reference, test = reference.coarser(), test.coarser()
         pixels = pixels and pixels.coarser(GROWTH)
+        shown = shown and shown.coarser()
         if reference.area.size >= POOLED:
             coarse = reference.inflation(equivalence_margin), test.inflation(equivalence_margin)
             inflations = max(inflations[0], coarse[0]), max(inflations[1], coarse[1])
@@ -233,9 +261,6 @@ def compare_tiles(
         freedom = np.where(silent, 1.0, variance**2 / squares)
         t = np.where(silent, 0.0, difference / error)
         beyond = np.where(silent, 0.0, np.maximum(np.abs(difference) - allowed, 0) / error)
-        for side in (one, two):
-            if side.borrowed is not None:
-                few |= side.borrowed & (error > BORROWED * np.maximum(np.abs(m1), np.abs(m2)))
         off = silent & (np.abs(difference) > allowed)
     # NaN becomes 0: what is not finite equals nothing.
     p, p_beyond = (np.nan_to_num(2 * special.stdtr(freedom, -np.abs(x)), nan=0.0) for x in (t, beyond))
@@ -250,12 +275,13 @@ def _noise(
     Its square over its degrees of freedom; and whether it comes from few pixels.
     """
     (v1, d1), (v2, d2) = one.spread(inflations[0]), two.spread(inflations[1])
-    few = (ratio * one.variance + two.variance / ratio) ** 2 < HEAVY * (ratio**2 * one.squares + two.squares / ratio**2)
+    pixels = HEAVY * max(inflations).factor  # that share samples
+    few = (ratio * one.variance + two.variance / ratio) ** 2 < pixels * (ratio**2 * one.squares + two.squares / ratio**2)
     return ratio * v1 + v2 / ratio, ratio**2 * d1 + d2 / ratio**2, few
 
 
 def _with_pixels(level: Level, pixels: PixelSums, area: Array, inflation: Inflation) -> Level:
-    p = pixels.p(area, level.allowed, inflation.factor, inflation.freedom)
+    p = pixels.p(area, np.square(level.allowed), inflation.factor, inflation.freedom)
     return replace(level, of_pixels=np.where(level.silent, 1.0, np.nan_to_num(p, nan=0.0)))
 
 
@@ -335,12 +361,12 @@ class TileTests:
     @property
     def differing(self) -> int:
         """The number of tests of tiles that are alarms; heavy-tailed tiles are not among them."""
-        return sum(int((self._seen(level) & ~level.heavy).sum()) for level in self.levels)
+        return sum(int((self._seen(level) & ~self._doubtful(level)).sum()) for level in self.levels)
 
     @property
     def heavy_differing(self) -> int:
         """The number of tests of heavy-tailed tiles that would be alarms."""
-        return sum(int((self._seen(level) & level.heavy).sum()) for level in self.levels)
+        return sum(int((self._seen(level) & self._doubtful(level)).sum()) for level in self.levels)
 
     @property
     def pixels_differing(self) -> int:
@@ -398,6 +424,9 @@ class TileTests:
 
     def _seen(self, level: Level) -> Flags:
         return (level.beyond <= self.threshold) & ~level.silent
+
+    def _doubtful(self, level: Level) -> Flags:
+        return level.heavy | (level.shown > self.threshold)
 
 
 def compare_stacks(

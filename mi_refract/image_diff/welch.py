@@ -10,15 +10,16 @@ from typing import Annotated
 import numpy as np
 
 from mi_refract.io.image_file import Image
-from mi_refract.io.pixels import Pixels
+from mi_refract.io.pixels import Pixels, block_max, block_sum
 
 from .comparison import Comparison, Maps, Metric, Verdict, aligned, nonfinite_result, preconditions
 from .pixel_correlation import inflation
-from .pixel_statistics import PixelSums, sums, sums_of_renders
+from .pixel_statistics import PixelSums, exponent, sums, sums_of_renders
 from .tile_statistics import (
     CORRECTIONS,
     Inflation,
     Level,
+    OneSided,
     Side,
     TileTests,
     from_renders,
@@ -30,6 +31,7 @@ from .variances import SPP, Estimate, estimates, has_variance, same_noise, sampl
 
 SAMPLES = "samples per pixel"
 SIDES = ("reference", "new image")
+WELL_KNOWN = 16  # times as many samples: a variance of 11 of their rare events is known to 1/√(16 · 11), 8 %
 IDENTICAL = Metric("values that differ", 0.0, 0.0)
 
 
@@ -84,7 +86,9 @@ def compare_renders(
         return Comparison("welch", Verdict.EQUAL, "the same in every value, noise and all", (IDENTICAL,))
     tile = min(tile, max(reference[0].pixels.shape[:2]))
     sides = _of_estimates(*known, tile) if known else _of_renders(reference, test, tile, given)
-    found = list(levels(sides.one, sides.two, equivalence_margin, sides.pixels if pixels == "yes" else None))
+    found = list(
+        levels(sides.one, sides.two, equivalence_margin, sides.pixels if pixels == "yes" else None, sides.shown)
+    )
     a, b = (_finite(side[0].select(sides.channels)) for side in (reference, test))
     found[0] = with_silent_pixels(found[0], a, b, equivalence_margin, tile, sides.odds)
     tests = TileTests(found, family_error, correction)
@@ -122,6 +126,7 @@ class _Sides:
     counts: tuple[int, int]
     unit: str
     odds: Pixels | float = 7.0
+    shown: OneSided | None = None
 
     def deciding(self, quieter: float) -> str:
         """How many samples or renders divide the noise's variance by 1/`quieter`; "" where no number does.
@@ -175,12 +180,22 @@ def _of_estimates(a: Estimate, b: Estimate, tile: int) -> _Sides:
     # A variance that carries both means' is as well known as the side that knows it does; the other one's is 0 there.
     n1, n2 = (np.where(only_one | only_two, 1, each.spp) for each in (a, b))
     one, two = from_variances(m1, w1, a.freedom, tile, n1), from_variances(m2, w2, b.freedom, tile, n2)
-    found = inflation(m2 - m1, w1 + w2, tile) if None in (a.shared, b.shared) else Inflation()
+    alone = bool((only_one | only_two).any())
+    found = inflation(m2 - m1, w1 + w2, tile) if alone or None in (a.shared, b.shared) else Inflation()
     one, two = (
-        replace(side, borrowed=borrowed, correlated=found if each.shared is None else Inflation(each.shared))
-        for side, borrowed, each in ((one, only_two, a), (two, only_one, b))
+        replace(side, correlated=found if each.shared is None else Inflation(each.shared))
+        for side, each in ((one, a), (two, b))
     )
-    return _Sides(one, two, sums(m1, w1, m2, w2, tile, n1 / n2), names, (a.spp, b.spp), SAMPLES, odds)
+    rarer = np.where(only_one, exponent(a.spp, b.spp), np.where(only_two, exponent(b.spp, a.spp), 0.5))
+    pixels = sums(m1, w1, m2, w2, tile, n1 / n2, rarer)
+    shown = None
+    if alone:
+        brighter = (m2 - m1) * (1.0 * only_one - only_two)
+        known = np.where(only_one, a.spp / b.spp, b.spp / a.spp) >= WELL_KNOWN
+        largest = block_max(np.where(known, brighter, np.inf), tile)
+        total, squares = block_sum(brighter, tile), block_sum(np.square(brighter), tile)
+        shown = OneSided(PixelSums(total[None], squares[None], rarer), largest, max(found, one.correlated, two.correlated))
+    return _Sides(one, two, pixels, names, (a.spp, b.spp), SAMPLES, odds, shown)
 
 
 def _distinct(side: Sequence[Image]) -> None:

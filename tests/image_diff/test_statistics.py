@@ -115,8 +115,8 @@ def test_the_bound_of_the_pixels_is_the_one_derived():
     assert found.p(area, none, 1.0, np.inf).item() == pytest.approx(np.exp(-(32**2 / 256) / 2))
     assert found.p(area, none, 2.0, np.inf).item() == pytest.approx(np.exp(-(32**2 / 512) / 2))
     assert found.p(area, none, 2.0, 6.0).item() == pytest.approx((1 + 2 / 6) ** -3)
-    assert found.p(area, none + 2.0, 1.0, np.inf).item() == pytest.approx(np.exp(-(16**2 / 64) / 2))
-    assert found.p(area, none + 3.0, 1.0, np.inf).item() == 1  # 9 − 1 is less than 3²
+    assert found.p(area, none + 4.0, 1.0, np.inf).item() == pytest.approx(np.exp(-(16**2 / 64) / 2))
+    assert found.p(area, none + 9.0, 1.0, np.inf).item() == 1  # 9 − 1 is less than 9
 
 
 def skewed(rng, shape):
