@@ -43,7 +43,7 @@ ROOMS = {
     "efficiency": ("efficiency", ("error_against_time", "scaling")),
     "media": ("media", ("catalogs", "ray_directions", "closed_forms", "renders", "hero_wavelength")),
     "planar": ("planar", ("against_retrace", "closed_paths", "joints", "extruded_scenes", "times")),
-    "diff": ("diff", ("planted_defects", "visible_changes", "times")),
+    "diff": ("diff", ("planted_defects", "visible_changes", "welch_nulls", "times")),
     "ground-truth": ("ground_truth", ("traced_bodies",)),
     "robustness": ("robustness", ("code_mutants",)),
     "suite": (

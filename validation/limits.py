@@ -160,6 +160,7 @@ DIFF_SECONDS = {
 }
 PAGE_MEGABYTES = limit(15.0, "MB: a page that can be sent by mail")
 MEMORY_MEGABYTES = limit(1024.0 * 2**20 / 1e6, "MB, 1 GiB: what the smallest machines of a CI have to spare")
+NULL_ALARM = limit(1e-7, "probability that chance breaks a bound: 1e-4 in 1000 of them, other seeds included")
 
 # Ground truth --------------------------------------------------------------------------------------------------
 

@@ -276,7 +276,9 @@ def _noise(
     """
     (v1, d1), (v2, d2) = one.spread(inflations[0]), two.spread(inflations[1])
     pixels = HEAVY * max(inflations).factor  # that share samples
-    few = (ratio * one.variance + two.variance / ratio) ** 2 < pixels * (ratio**2 * one.squares + two.squares / ratio**2)
+    few = (ratio * one.variance + two.variance / ratio) ** 2 < pixels * (
+        ratio**2 * one.squares + two.squares / ratio**2
+    )
     return ratio * v1 + v2 / ratio, ratio**2 * d1 + d2 / ratio**2, few
 
 

@@ -194,7 +194,9 @@ def _of_estimates(a: Estimate, b: Estimate, tile: int) -> _Sides:
         known = np.where(only_one, a.spp / b.spp, b.spp / a.spp) >= WELL_KNOWN
         largest = block_max(np.where(known, brighter, np.inf), tile)
         total, squares = block_sum(brighter, tile), block_sum(np.square(brighter), tile)
-        shown = OneSided(PixelSums(total[None], squares[None], rarer), largest, max(found, one.correlated, two.correlated))
+        shown = OneSided(
+            PixelSums(total[None], squares[None], rarer), largest, max(found, one.correlated, two.correlated)
+        )
     return _Sides(one, two, pixels, names, (a.spp, b.spp), SAMPLES, odds, shown)
 
 

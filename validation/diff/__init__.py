@@ -4,4 +4,4 @@ In: renders of two scenes, with and without planted defects. Out: rows with the 
 seen, false alarms, times and sizes.
 """
 
-__all__ = ["planted_defects", "times", "visible_changes"]
+__all__ = ["planted_defects", "times", "visible_changes", "welch_nulls"]
