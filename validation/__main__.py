@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 # By name on the command line: the room, and the modules in it whose STUDY is run, in the order of the report.
 ROOMS = {
     "directions": ("directions", ("per_formula", "planted_defects", "bsdf_samples", "sweep", "search")),
-    "stability": ("stability", ("optical_chains", "energy", "derivatives", "layered_paths")),
+    "stability": ("stability", ("optical_chains", "energy", "derivatives", "gradients", "layered_paths")),
     "renders": (
         "renders",
         ("scene_needs", "against_dielectric", "colours", "unused_features", "invisible_changes", "rendering_passes"),

@@ -221,3 +221,9 @@ EXPORT_SIGMAS = limit(2.0, "RMSE over predicted noise; the mean of squares of 14
 INVISIBLE_ALARM = limit(1e-6, "probability of any false alarm of a test: 1e-3 in a run of 500 rows with two tests each")
 INVISIBLE = limit(0.05, "relative: differences of the mean that each row must be able to see")
 INVISIBLE_NOISE = limit(2.0, "numbers that repeat in passes of 4 samples leave 4 times the noise; the ratio has 3 %")
+
+# Gradients of images
+GRADIENT_ALARM = limit(4.42, "standard errors: a false alarm once in 10⁵ rows, 5e-4 in a run of 50")
+GRADIENT = limit(0.05, "relative: the error of a derivative that each row must be able to see")
+TRUNCATION = limit(0.02, "relative, of D(h), e = (fh)²/6 at the frequency f: D is off by (fh)⁴/30 = 1.2 e², 5e-4")
+BACKWARD_MODE = limit(0.05, "of the standard error: both modes draw the same numbers, and add them in another order")
