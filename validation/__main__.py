@@ -32,7 +32,7 @@ ROOMS = {
         "renders",
         ("scene_needs", "against_dielectric", "colours", "unused_features", "invisible_changes", "rendering_passes"),
     ),
-    "efficiency": ("efficiency", ("error_against_time", "scaling", "cluster_scale")),
+    "efficiency": ("efficiency", ("error_against_time", "scaling", "changing_indices", "cluster_scale")),
     "media": ("media", ("catalogs", "ray_directions", "closed_forms", "renders", "hero_wavelength")),
     "planar": ("planar", ("against_retrace", "closed_paths", "extruded_scenes", "times")),
     "diff": ("diff", ("planted_defects", "visible_changes", "times")),

@@ -4,4 +4,4 @@ does it fall?
 In: integrators, BSDFs and samplers. Out: rows with errors, times and memory, and curves of them.
 """
 
-__all__ = ["cluster_scale", "error_against_time", "scaling"]
+__all__ = ["changing_indices", "cluster_scale", "error_against_time", "scaling"]
