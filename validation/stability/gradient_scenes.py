@@ -14,7 +14,7 @@ Nodes = dict[str, Any]
 SIZE = 16
 GLASS = {"type": "refract", "int_ior": 1.5, "ext_ior": 1.0}
 MATT = {"type": "diffuse", "reflectance": 0.6}
-ROUGH, ROUGH_GLASS = {"type": "roughconductor", "alpha": 0.2}, {"type": "roughdielectric", "alpha": 0.2}
+ROUGH, ROUGH_GLASS = {"type": "roughconductor", "alpha": 0.2}, {"type": "roughdielectric", "alpha": 0.5, "int_ior": 2.2}
 PRINCIPLED = {"type": "principled", "metallic": 1.0, "roughness": 0.4}
 CONSTANT, POINT = {"type": "constant"}, {"type": "point", "position": [1, 2, 1]}
 CAUCHY = "cauchy(1.5, 10000)"
@@ -56,10 +56,10 @@ def core(bsdf: Nodes, glass: Nodes = GLASS, **more: Any) -> Nodes:
     return scene(8, ball={"type": "sphere", "bsdf": glass}, core=inner, **{"light": sky()} | more)
 
 
-def plane(bsdf: Nodes) -> Nodes:
+def plane(bsdf: Nodes, light: Nodes | None = None) -> Nodes:
     """It fills the view."""
     wide = mi.ScalarTransform4f().rotate([1, 0, 0], -30).scale(9)
-    return scene(20, plane={"type": "rectangle", "to_world": wide, "bsdf": bsdf}, light=sky())
+    return scene(20, plane={"type": "rectangle", "to_world": wide, "bsdf": bsdf}, light=light or sky())
 
 
 def mesh(bsdf: Nodes) -> Nodes:
@@ -166,17 +166,18 @@ CASES = {
     "radiance of a `constant`": Case(lambda: room(light=CONSTANT), "radiance.value", 1, 0.1),
     "intensity of a `point`": Case(lambda: room(light=POINT), "intensity.value", 1, 0.1),
     "`specular_reflectance`": Case(
-        lambda: room(specular_reflectance=0.7), "specular_reflectance.value", 0.7, 0.03, spp=512),
+        lambda: room(specular_reflectance=0.7), "specular_reflectance.value", 0.7, 0.03, spp=1024),
     "`specular_transmittance`": Case(
         lambda: room(specular_transmittance=0.7), "specular_transmittance.value", 0.7, 0.03, others=ALL),
     "`int_absorption`": Case(lambda: room(int_absorption=0.5), "int_absorption.value", 0.5, 0.03, others=()),
-    "`alpha` of `roughconductor`": Case(lambda: plane(ROUGH), "alpha.value", 0.2, 0.01, others=ALL, spp=512),
-    "`alpha` of `roughconductor`, in glass": Case(lambda: core(ROUGH), "alpha.value", 0.2, 0.01),
+    "`alpha` of `roughconductor`": Case(
+        lambda: plane(ROUGH, lamp(0, 2.4, 1.8, size=0.8)), "alpha.value", 0.2, 0.01, others=ALL, spp=512),
+    "`alpha` of `roughconductor`, in glass": Case(lambda: core(ROUGH), "alpha.value", 0.2, 0.01, spp=512),
     "`alpha` of `roughdielectric`": Case(
-        lambda: plane(ROUGH_GLASS), "alpha.value", 0.2, 0.01, others=ALL, spp=512),
-    "`roughness` of `principled`": Case(lambda: plane(PRINCIPLED), "roughness.value", 0.4, 0.02),
+        lambda: plane(ROUGH_GLASS), "alpha.value", 0.5, 0.02, others=ALL, spp=512),
+    "`roughness` of `principled`": Case(lambda: plane(PRINCIPLED), "roughness.value", 0.4, 0.02, spp=512),
     "`eta`": Case(ball, "eta", 1.5, 0.01, others=ALL),
-    "`eta`, a matt ball within": Case(lambda: core(MATT), "ball.bsdf.eta", 1.5, 0.02, others=ALL, spp=1024),
+    "`eta`, a matt ball within": Case(lambda: core(MATT), "ball.bsdf.eta", 1.5, 0.04, others=ALL, spp=2048),
     "`int_ior`, textured": Case(
         lambda: ball(int_ior=bitmap(1.4, 1.6, 1)), "int_ior.data", 1, 0.005, times, others=ALL),
     "`int_ior_A`": Case(lambda: ball(int_ior=CAUCHY), "int_ior_A", 1.5, 0.01, others=(), spp=512, spectral=True),
@@ -192,11 +193,12 @@ CASES = {
         lambda: room(blend(MATT)), "weight.value", 0.4, 0.03, others=ALL),
     "`weight` of a `blendbsdf`, matt and glass": Case(
         lambda: core(MATT, blend(GLASS)), "weight.value", 0.4, 0.03, others=ALL, excluded=DELTA),
-    "`eta`, a checkerboard behind": Case(tiles, "eta", 1.5, 0.01, others=ALL, excluded=PIXEL),
+    "`eta`, a checkerboard behind": Case(tiles, "eta", 1.5, 0.03, others=ALL, spp=1024, excluded=PIXEL),
     "translation of glass, its outline in view": Case(
         lambda: ball(40), "ball.to_world", 0, 0.004, moved, others=ALL, excluded=PIXEL),
     "`eta`, a matt ball within, a lamp": Case(
-        lambda: core(MATT, light=lamp(2, 2, 3, size=0.8)), "ball.bsdf.eta", 1.5, 0.02, others=ALL, excluded=VERTEX),
+        lambda: core(MATT, light=lamp(2, 2, 3, size=0.8)), "ball.bsdf.eta", 1.5, 0.04, others=ALL, spp=1024,
+        excluded=VERTEX),
 }
 # fmt: on
 QUICK = ("`alpha` of `roughconductor`", "`eta`")
