@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 # By name on the command line: the room, and the modules in it whose STUDY is run, in the order of the report.
 ROOMS = {
     "directions": ("directions", ("per_formula", "planted_defects", "bsdf_samples", "sweep", "search")),
-    "stability": ("stability", ("optical_chains", "energy", "derivatives", "layered_paths")),
+    "stability": ("stability", ("optical_chains", "energy", "derivatives", "gradients", "layered_paths")),
     "renders": (
         "renders",
         (
@@ -40,7 +40,7 @@ ROOMS = {
             "rendering_passes",
         ),
     ),
-    "efficiency": ("efficiency", ("error_against_time", "scaling")),
+    "efficiency": ("efficiency", ("error_against_time", "scaling", "changing_indices")),
     "media": ("media", ("catalogs", "ray_directions", "closed_forms", "renders", "hero_wavelength")),
     "planar": ("planar", ("against_retrace", "closed_paths", "joints", "extruded_scenes", "times")),
     "diff": ("diff", ("planted_defects", "visible_changes", "welch_nulls", "times")),

@@ -135,6 +135,13 @@ SCALING = {
     ("glasses", 64): {"first image / built-in": FIRST_IMAGE[64], "after an edit / built-in": EDIT},
     ("glasses", 1000): {"first image / built-in": FIRST_IMAGE[1000]},
 }
+CHANGING = {
+    "a new scene for each image": limit(
+        0.2, "of the built-in's: a record of 0.06, with Mitsuba's loading three times it"
+    ),
+    "an edit among 300 glasses": limit(0.3, "of the built-in's: a record of 0.13; tracing 300 plugins is the same"),
+    "a sweep of 12 indices": limit(0.4, "of the built-in's: a record of 0.26, of images that take 10 ms"),
+}
 
 # Planar --------------------------------------------------------------------------------------------------------
 
@@ -226,3 +233,8 @@ NUMBERS_ALARM = limit(1e-4, "probability of any false alarm of the chi-square te
 # Neighbours of glass
 NEIGHBOUR_ALARM = limit(1e-8, "probability of a false alarm of a test: 5e-5 in a run of 5000 tests")
 NEIGHBOUR = limit(0.01, "relative: differences of the mean that each row must be able to see")
+# Gradients of images
+GRADIENT_ALARM = limit(4.42, "standard errors: a false alarm once in 10⁵ rows, 5e-4 in a run of 50")
+GRADIENT = limit(0.05, "relative: the error of a derivative that each row must be able to see")
+TRUNCATION = limit(0.02, "relative, of D(h), e = (fh)²/6 at the frequency f: D is off by (fh)⁴/30 = 1.2 e², 5e-4")
+BACKWARD_MODE = limit(0.05, "of the standard error: both modes draw the same numbers, and add them in another order")

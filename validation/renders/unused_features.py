@@ -23,11 +23,10 @@ from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing
 from validation.run.context import SCENES, Context
+from validation.run.glass_balls import RESOLUTION, Balls, alone, compiled, seconds_of, size_of
 from validation.run.kernel_timing import kernels
 from validation.run.render_methods import opened, under
 from validation.study import Study, Task, about
-
-from .glass_balls import RESOLUTION, Balls, alone, compiled, seconds_of, size_of
 
 TERMS = {
     "operations": "Dr.Jit's count for the whole kernel; of `sample` alone, or of a render",

@@ -9,6 +9,7 @@ __all__ = [
     "bsdf_sampling",
     "command_line",
     "context",
+    "glass_balls",
     "headline",
     "kernel_timing",
     "metrics",

@@ -23,8 +23,10 @@ class Balls:
     Without a `max_depth` it is one that no path reaches, and that no cache has seen.
     """
 
-    def __init__(self, plugin: str, count: int, integrator: str = "path", max_depth: int = 0) -> None:
-        """Load it, for an integrator to a depth."""
+    def __init__(
+        self, plugin: str, count: int, integrator: str = "path", max_depth: int = 0, least: float = 1.3
+    ) -> None:
+        """Load it, for an integrator to a depth. `least`: the smallest index, which is the first ball's."""
         import mitsuba as mi
 
         side = int(np.ceil(np.sqrt(count)))
@@ -40,7 +42,7 @@ class Balls:
         }
         for i in range(count):
             place = [2 * (i % side) - side + 1, 2 * (i // side) - side + 1, 0]
-            glass = {"type": plugin, "int_ior": 1.3 + 0.5 * i / count, "ext_ior": 1.0}
+            glass = {"type": plugin, "int_ior": least + 0.5 * i / count, "ext_ior": 1.0}
             scene[f"ball{i:04}"] = {"type": "sphere", "radius": 0.9, "center": place, "bsdf": glass}
         self.scene = mi.load_dict(scene)
         self.params = mi.traverse(self.scene)
