@@ -149,8 +149,8 @@ class Level:
 
     `t`: positive where the test is brighter. `p`: of no difference; `beyond`: of none beyond the margin; both 0 where a
     value is not finite. `silent`: no noise on either side, of which a t-test knows nothing: p is 1 there, and `off`
-    where the means differ beyond the margin. `heavy`: noise from a few pixels only. `shown`: p of none beyond the margin
-    by the noise that the pixels show; 0 where that is not asked. `of_pixels`: p of no pixel beyond the margin;
+    where the means differ beyond the margin. `heavy`: noise from a few pixels only. `shown`: p of none beyond the
+    margin by the noise that the pixels show; 0 where that is not asked. `of_pixels`: p of no pixel beyond the margin;
     `of_silent`: the same of tiles without noise; None where that is not tested.
     """
 

@@ -1,12 +1,13 @@
 """Pairs that differ by noise only, by `welch`: how often it calls them different, and what it sees beside them.
 
 Light is normal, lognormal, of Pareto's law, or a base to which rare samples add 200 times as much (fireflies), or of
-rare samples alone (a lamp). The sides have equal numbers of samples or up to 1000 times as many, either side the more.
-Their noise is known on both sides or on one, from samples, from passes under filters of up to 3 pixels, or from several
-renders. Pairs of renders of a scene have a ball of glass and a small lamp, whose light comes through the glass by chance.
+rare samples alone (a lamp). The sides have equal numbers of samples, or either side has up to 1000 times as many. Their
+noise is known on both sides or on one, from samples, from passes under filters of up to 3 pixels, or from several
+renders. Pairs of renders of a scene have a ball of glass and a small lamp, whose light comes through the glass by
+chance.
 
-`welch` states a false alarm in 0.1 % of the pairs, and a difference that a tile shows with a probability of 99 %. Of the
-latter, and of the one of 50 %, as many are planted.
+`welch` states a false alarm in 0.1 % of the pairs, and the difference of a tile that it sees with a probability of 99 %.
+Such differences are planted, and those that it sees with 50 %.
 
 `python -m validation diff --profile standard`
 """
@@ -181,7 +182,7 @@ POWER = {
 
 
 def scene() -> dict[str, Any]:
-    """A ball of glass on a floor below a small lamp, which paths meet by chance only where they pass through the ball."""
+    """A ball of glass on a floor below a small lamp, which paths through the ball meet by chance only."""
     import mitsuba as mi
 
     place = mi.ScalarTransform4f

@@ -17,6 +17,7 @@ MATT = {"type": "diffuse", "reflectance": 0.6}
 ROUGH, ROUGH_GLASS = {"type": "roughconductor", "alpha": 0.2}, {"type": "roughdielectric", "alpha": 0.5, "int_ior": 2.2}
 PRINCIPLED = {"type": "principled", "metallic": 1.0, "roughness": 0.4}
 CONSTANT, POINT = {"type": "constant"}, {"type": "point", "position": [1, 2, 1]}
+LENS = {"type": "sphere", "center": [0, 1.5, 1], "radius": 0.5, "bsdf": GLASS}
 CAUCHY = "cauchy(1.5, 10000)"
 
 
@@ -56,10 +57,10 @@ def core(bsdf: Nodes, glass: Nodes = GLASS, **more: Any) -> Nodes:
     return scene(8, ball={"type": "sphere", "bsdf": glass}, core=inner, **{"light": sky()} | more)
 
 
-def plane(bsdf: Nodes, light: Nodes | None = None) -> Nodes:
+def plane(bsdf: Nodes, light: Nodes | None = None, **more: Nodes) -> Nodes:
     """It fills the view."""
     wide = mi.ScalarTransform4f().rotate([1, 0, 0], -30).scale(9)
-    return scene(20, plane={"type": "rectangle", "to_world": wide, "bsdf": bsdf}, light=light or sky())
+    return scene(20, plane={"type": "rectangle", "to_world": wide, "bsdf": bsdf}, light=light or sky(), **more)
 
 
 def mesh(bsdf: Nodes) -> Nodes:
@@ -194,11 +195,14 @@ CASES = {
     "`weight` of a `blendbsdf`, matt and glass": Case(
         lambda: core(MATT, blend(GLASS)), "weight.value", 0.4, 0.03, others=ALL, excluded=DELTA),
     "`eta`, a checkerboard behind": Case(tiles, "eta", 1.5, 0.03, others=ALL, spp=1024, excluded=PIXEL),
-    "translation of glass, its outline in view": Case(
-        lambda: ball(40), "ball.to_world", 0, 0.004, moved, others=ALL, excluded=PIXEL),
-    "`eta`, a matt ball within, a lamp": Case(
-        lambda: core(MATT, light=lamp(2, 2, 3, size=0.8)), "ball.bsdf.eta", 1.5, 0.04, others=ALL, spp=1024,
+    "translation of a matt ball, its outline in view": Case(
+        lambda: scene(40, ball={"type": "sphere", "bsdf": MATT}, light=sky()), "ball.to_world", 0, 0.004, moved,
+        others=ALL, excluded=PIXEL),
+    "`eta` of a ball between a lamp and a matt plane": Case(
+        lambda: plane(MATT, lamp(0, 2.6, 1.73, size=0.3), ball=LENS), "ball.bsdf.eta", 1.5, 0.02, others=ALL, spp=1024,
         excluded=VERTEX),
+    "translation of glass, its outline in view": Case(
+        lambda: ball(40), "ball.to_world", 0, 0.004, moved, others=ALL, spp=2048),
 }
 # fmt: on
 QUICK = ("`alpha` of `roughconductor`", "`eta`")
