@@ -70,7 +70,7 @@ SIGNALS = {
     "tangent": "total internal reflection is signalled by a vector along the surface",
     "flag": "total internal reflection is signalled by transmitted = 0",
     NONE: "no ray is totally reflected",
-    UNCLEAR: "total internal reflection is signalled in no known way; accepted: the zero vector, NaN, the mirror "
+    UNCLEAR: "total internal reflection is signalled in no known way; expected the zero vector, NaN, the mirror "
     "direction, a vector along the surface, or a column `transmitted`",
 }
 PROBLEM_TEXTS = {

@@ -185,9 +185,9 @@ def test_every_explanation_is_of_a_line_that_there_is():
 def test_tests_that_guard_a_package_are_there_and_the_modules_own_come_first():
     assert code_mutants.missing() in ("", "cosmic_ray not installed: pip install -e '.[dev]'")
     assert [*code_mutants.GUARDS] == [*mutants.ROOMS]
-    mutant = Mutant("mi_refract/ray_sets/certain_parts.py", "AddNot", 0, 1, "", "")
+    mutant = Mutant("mi_refract/ray_sets/possible_directions.py", "AddNot", 0, 1, "", "")
     order = code_mutants.guards(mutant_runs.ROOT, mutant)
-    assert order[0] == "tests/ray_sets/test_certain_parts.py"
+    assert order[0] == "tests/ray_sets/test_possible_directions.py"
     assert "tests/cli/test_rays.py" in order
     for room in mutants.ROOMS:
         assert all(path.is_file() for path in code_mutants._test_files(mutant_runs.ROOT, room))

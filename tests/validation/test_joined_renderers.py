@@ -104,7 +104,7 @@ def test_its_images_are_compared(joined, context, monkeypatch, needs_variant):
     [
         (TOML + IMAGES.replace("mitsuba", "vray"), "images.export: 'vray'; accepted: "),
         (TOML + IMAGES.replace("sphere", "teapot"), "images.spp, images.deviation: 'teapot'; accepted: sphere"),
-        (TOML.replace("program.py", "{nothing}"), "command: {python} {nothing}: 'nothing'; accepted: {python}"),
+        (TOML.replace("program.py", "{nothing}"), "command: {python} {nothing}: 'nothing'; expected {python}"),
         (TOML + "[install]\ncargo = ['x']\n", "install.cargo: unknown; accepted: pip"),
     ],
 )
