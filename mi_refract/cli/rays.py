@@ -86,10 +86,10 @@ def check(
     junit: Junit = None,
     json: Json = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Certify and judge on the workers of this Dask scheduler.")
+        str | None, typer.Option(metavar="ADDRESS", help="Certify on the workers of this Dask scheduler.")
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, max=1024, help="Certify and judge in so many processes, by Dask.")
+        int | None, typer.Option(min=1, max=1024, help="Number of worker processes that certify (Dask).")
     ] = None,
     tls_ca_file: TlsCaFile = None,
     tls_cert: TlsCert = None,
@@ -97,8 +97,7 @@ def check(
 ) -> None:
     """Check answers against certified ones. Exit code 0: right, 1: wrong, 2: the answers do not match the rays.
 
-    The rays are those of --rays, or those that `export` makes with the same options as here, or without any. The
-    answers do not choose them.
+    Without --rays: the rays that `export` generates with the same options. The answers file never selects the rays.
     """
     there = elsewhere(scheduler, workers, tls_ca_file, tls_cert, tls_key)
     options = CheckOptions(tir, formula, backward, report, junit, json, there)
@@ -142,8 +141,8 @@ def run(
 ) -> None:
     """Run a command on rays and check its answers: rays go to its stdin, answers come from its stdout.
 
-    Exit code 0: right, 1: wrong, 2: the answers do not match the rays, or the command fails or takes too long. Of
-    several functions of a renderer the largest.
+    Exit code 0: right, 1: wrong, 2: the answers do not match the rays, or the command fails or takes too long. With
+    --renderer, the largest exit code of its functions.
     """
     options = CheckOptions(tir, formula, backward, report, junit, json)
     made = MadeRays(regime, count, precision or ray_set.PRECISION, seed, two_sided, medium, wavelengths)

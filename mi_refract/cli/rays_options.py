@@ -56,7 +56,7 @@ Medium = Annotated[
     list[str] | None,
     typer.Option(
         metavar="SPEC",
-        help="A medium that rays pass into and out of, from and to air, such as SCHOTT:N-BK7; may be repeated.",
+        help="Material of one side, such as SCHOTT:N-BK7; the other side is air; may be repeated.",
     ),
 ]
 Wavelengths = Annotated[str | None, typer.Option(metavar="NM,…", help="Wavelengths in nm, of the media.")]

@@ -27,7 +27,7 @@ from .header import FORMAT, PRECISIONS, Header, Ids
 # Their vectors are unit up to the rounding of each component, as the documented formulas require.
 DEFAULT = tuple(name for name, regime in regimes.REGIMES.items() if regime.unit and not regime.rests_on_denormals)
 COUNT, PRECISION = 1000, "f32"
-_ROWS = 2**16  # that are in float64 at once, which takes several times what the rays do
+ROWS = 2**16  # that are in float64 at once, which takes several times what the rays do
 CONVENTIONS = {
     "a": "incident direction, pointing toward the surface",
     "n": "normal, on the side that the ray comes from: n.a <= 0",
@@ -80,9 +80,9 @@ class RaySet:
         return np.concatenate(list(self.numbers_in_pieces()))
 
     def numbers_in_pieces(self) -> Iterator[Array]:
-        """`numbers`, some rows at a time."""
-        for i in range(0, len(self), _ROWS):
-            ids, rays = self.ids[i : i + _ROWS], self.rays[i : i + _ROWS]
+        """`numbers`, ROWS at a time."""
+        for i in range(0, len(self), ROWS):
+            ids, rays = self.ids[i : i + ROWS], self.rays[i : i + ROWS]
             columns = [ids, rays.a, rays.n, *indices(rays.k), *media_rays.columns(self.header, ids).T]
             yield np.column_stack(columns).astype(np.float64)
 

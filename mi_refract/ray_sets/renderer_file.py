@@ -50,7 +50,7 @@ RAYS = {
     "precision": Key(Type("f32 or f64", lambda x: x if x in PRECISIONS else None), "the precision that it claims"),
     "command": Key(TEXTS, "reads rays on stdin and writes answers to stdout, as CSV; runs in the file's folder"),
     "total_internal_reflection": Key(
-        Type(", ".join((AUTO, *TIR)), lambda x: x if x in (AUTO, *TIR) else None), "how it is told", AUTO
+        Type(", ".join((AUTO, *TIR)), lambda x: x if x in (AUTO, *TIR) else None), "how the function signals total internal reflection", AUTO
     ),
     "gives_up": Key(
         Type("a number from 0", only_if(lambda x: x >= 0, number)),

@@ -71,7 +71,7 @@ def test_export_and_check(call):
     code, out, err = call("check", "answers.csv", "--rays", "rays.csv")
     assert (code, err) == (0, "")
     assert "120 answers, all right; the largest error is" in out
-    assert "right: the exact answer for inputs within 4 roundings, m u, of those given" in out
+    assert "right: backward error m ≤ 4 u (exact for inputs perturbed by at most 4 roundings)" in out
     assert "signalled by the zero vector (detected)" in out
 
 

@@ -110,7 +110,7 @@ def test_undecidable_rays_are_counted():
     assert (generic.undecidable, generic.judged) == (0, generic.compared)
     assert lost.sum() <= steep_.undecidable < steep_.rays
     assert steep_.judged + steep_.undecidable <= steep_.rays
-    assert f"; {steep_.undecidable} of them are to rays whose bound is above 0.1 rad" in reports.sentence(found)
+    assert f"; {steep_.undecidable} rays are undecidable (error bound above 0.1 rad)" in reports.sentence(found)
     assert reports.as_data(found)["regimes"][0]["undecidable"] == steep_.undecidable
 
 
