@@ -12,9 +12,8 @@ import typer
 from mi_refract.cluster.connection import ClusterTarget
 from mi_refract.io.atomic import writable
 from mi_refract.io.outside_text import printable
-from mi_refract.ray_sets import files, ray_set, run_program, stored_rays
+from mi_refract.ray_sets import files, ray_set, run_program
 from mi_refract.ray_sets.ray_set import RaySet
-from mi_refract.ray_sets.stored_rays import StoredRays
 
 from .interrupts import as_exceptions
 from .rays_options import (
@@ -27,7 +26,6 @@ from .rays_options import (
     Junit,
     MadeRays,
     Medium,
-    OldFormula,
     Precision,
     Regime,
     Regimes,
@@ -77,7 +75,6 @@ def check(
     tir: Tir = "auto",
     formula: Formula = None,
     backward: Backward = None,
-    old_formula: OldFormula = None,
     regime: Regime = None,
     count: Count = ray_set.COUNT,
     precision: Precision = ray_set.PRECISION,
@@ -89,23 +86,22 @@ def check(
     junit: Junit = None,
     json: Json = None,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Certify and judge on the workers of this Dask scheduler.")
+        str | None, typer.Option(metavar="ADDRESS", help="Certify on the workers of this Dask scheduler.")
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, max=1024, help="Certify and judge in so many processes, by Dask.")
+        int | None, typer.Option(min=1, max=1024, help="Number of worker processes that certify (Dask).")
     ] = None,
 ) -> None:
     """Check answers against certified ones. Exit code 0: right, 1: wrong, 2: the answers do not match the rays.
 
-    The rays are those of --rays, or those that `export` makes with the same options as here, or without any. The
-    answers do not choose them.
+    Without --rays: the rays that `export` generates with the same options. The answers file never selects the rays.
     """
     target = ClusterTarget(scheduler, workers)
-    options = CheckOptions(tir, formula or old_formula, backward, report, junit, json, target)
+    options = CheckOptions(tir, formula, backward, report, junit, json, target)
     made = MadeRays(regime, count, precision, seed, two_sided, medium, wavelengths)
     chosen = _chosen(file, made.words)
-    rays = files.read_stored(file) if file else stored_rays.make(**made.arguments)
-    given = files.read_stored_answers(answers, rays)
+    rays = files.read(file) if file else ray_set.make(**made.arguments)
+    given = files.read_answers(answers, most=files.most_answers(rays))
     origin = "" if chosen else ", as of `export` without options; others: --rays FILE"
     print(printable(f"{answers}: {_summary(rays)}{origin}"))
     raise typer.Exit(options.check(rays, given, str(answers), ["check", str(answers), *chosen, *options.words]))
@@ -133,7 +129,6 @@ def run(
     tir: Tir = "auto",
     formula: Formula = None,
     backward: Backward = None,
-    old_formula: OldFormula = None,
     timeout: Annotated[
         float, typer.Option(min=0, metavar="SECONDS", help="Time limit of the command, up to a week.")
     ] = run_program.TIMEOUT,
@@ -143,10 +138,10 @@ def run(
 ) -> None:
     """Run a command on rays and check its answers: rays go to its stdin, answers come from its stdout.
 
-    Exit code 0: right, 1: wrong, 2: the answers do not match the rays, or the command fails or takes too long. Of
-    several functions of a renderer the largest.
+    Exit code 0: right, 1: wrong, 2: the answers do not match the rays, or the command fails or takes too long. With
+    --renderer, the largest exit code of its functions.
     """
-    options = CheckOptions(tir, formula or old_formula, backward, report, junit, json)
+    options = CheckOptions(tir, formula, backward, report, junit, json)
     made = MadeRays(regime, count, precision or ray_set.PRECISION, seed, two_sided, medium, wavelengths)
     if renderer:
         raise typer.Exit(_run_renderer(renderer, command, file, made, precision, options, timeout))
@@ -172,13 +167,13 @@ def _run_renderer(
     from mi_refract.ray_sets import renderer_file
 
     if command:
-        raise ValueError(f"--renderer {folder} and {command[0]}: accepted: one of them")
+        raise ValueError(f"--renderer {folder} and {command[0]}; expected one of them")
     known = renderer_file.load(folder)
     calls = [call for call in known.rays if precision in (None, call.precision)]
     if not calls:
-        raise ValueError(f"{folder}: no function{f' in {precision}' if precision else ''}; accepted: [[rays]]")
+        raise ValueError(f"{folder}: no function{f' in {precision}' if precision else ''}; expected [[rays]]")
     if len(calls) > 1 and (options.report or options.junit or options.json):
-        raise ValueError(f"{folder}: {len(calls)} functions, and one report; accepted: --precision of one of them")
+        raise ValueError(f"{folder}: {len(calls)} functions, and one report; expected --precision of one of them")
     return max(_run_function(known, call, file, made, options, timeout) for call in calls)
 
 
@@ -204,17 +199,17 @@ def _run_function(
 def _chosen(file: Path | None, made: list[str]) -> list[str]:
     """The options that choose the rays, none for those of `export` without options. `made`: those of `export`."""
     if file and made:
-        raise ValueError(f"--rays {file} and {made[0]}: both choose the rays; accepted: one of them")
+        raise ValueError(f"--rays {file} and {made[0]}: both choose the rays; expected one of them")
     return ["--rays", str(file)] if file else made
 
 
-def _summary(rays: RaySet | StoredRays) -> str:
+def _summary(rays: RaySet) -> str:
     number = len(rays.header["regimes"])
     regimes = f"{number} regime{'' if number == 1 else 's'}"
     return f"{len(rays)} rays, {regimes}, {rays.precision}, seed {rays.header['seed']}{_media(rays)}"
 
 
-def _media(rays: RaySet | StoredRays) -> str:
+def _media(rays: RaySet) -> str:
     """How many media and wavelengths there are; "" without media."""
     if not (pairs := rays.header.get("media")):
         return ""

@@ -23,13 +23,11 @@ from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import provenance
 from mi_refract.ray_sets import ray_set
 from mi_refract.ray_sets.ray_set import Answers, RaySet
-from mi_refract.ray_sets.stored_answers import StoredAnswers
-from mi_refract.ray_sets.stored_rays import StoredRays
-from mi_refract.regimes import REGIMES
+from mi_refract.regimes import REGIMES, Rays
 
 if TYPE_CHECKING:  # they need python-flint
-    from mi_refract.ray_sets.check_answers import Judge
-    from mi_refract.ray_sets.judged_parts import JudgedPart, Piece, Question
+    from mi_refract.oracle import Certified
+    from mi_refract.ray_sets.check_answers import Certify
 
 OUTPUTS = ((".html", ".htm"), (".xml",), (".json",))  # of --report, --junit, --json
 UNWRAPPED = 10_000  # columns: wider than any line
@@ -58,7 +56,7 @@ Medium = Annotated[
     list[str] | None,
     typer.Option(
         metavar="SPEC",
-        help="A medium that rays pass into and out of, from and to air, such as SCHOTT:N-BK7; may be repeated.",
+        help="Material of one side, such as SCHOTT:N-BK7; the other side is air; may be repeated.",
     ),
 ]
 Wavelengths = Annotated[str | None, typer.Option(metavar="NM,…", help="Wavelengths in nm, of the media.")]
@@ -83,7 +81,6 @@ Backward = Annotated[
         "by default it need only be within the error bound.",
     ),
 ]
-OldFormula = Annotated[str | None, typer.Option("--as-good-as", hidden=True)]  # as --error-bound was called
 Report = Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML page.")]
 Junit = Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")]
 Json = Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")]
@@ -163,11 +160,11 @@ class CheckOptions:
         from mi_refract.ray_sets.tir_signal import AUTO, TIR
 
         if self.tir not in (AUTO, *TIR):
-            raise ValueError(f"--tir {self.tir}: unknown; accepted: {', '.join((AUTO, *TIR))}")
+            raise ValueError(f"--tir {self.tir}: unknown; expected {', '.join((AUTO, *TIR))}")
         if self.formula not in (None, *FORMULAS):
-            raise ValueError(f"--error-bound {self.formula}: unknown; accepted: {', '.join(FORMULAS)}")
+            raise ValueError(f"--error-bound {self.formula}: unknown; expected {', '.join(FORMULAS)}")
         if self.backward is not None and not self.backward > 0:
-            raise ValueError(f"--backward-error {self.backward:g}: accepted: a positive number of roundings")
+            raise ValueError(f"--backward-error {self.backward:g}; expected a positive number of roundings")
         self.target.check()
         for path, suffixes in zip((self.report, self.junit, self.json), OUTPUTS, strict=True):
             if path:
@@ -180,25 +177,23 @@ class CheckOptions:
         chosen += ["--error-bound", self.formula] if self.formula else []
         return chosen + (["--backward-error", f"{self.backward:g}"] if self.backward else [])
 
-    @contextlib.contextmanager
-    def _judge(self) -> Iterator[Judge]:
-        """Who judges pieces of the set, with a bar on a terminal."""
-        from mi_refract.ray_sets import judged_parts, spread_check
+    def check(self, rays: RaySet, answers: Answers, name: str, replay: list[str]) -> int:
+        """Check the answers, print and write the reports; the exit code. `replay`: the words of the command."""
+        from mi_refract.ray_sets import check_answers, reports, spread_check
+        from mi_refract.ray_sets.tir_signal import LOOSEST
 
         with contextlib.ExitStack() as stack:
-            judge: Judge = judged_parts.here
+            certify: Certify = check_answers.certify_here
             if self.target.given:
-                judge = stack.enter_context(spread_check.judging(self.target, _say))
-            yield functools.partial(_watched, judge)
-
-    def check(self, rays: RaySet | StoredRays, answers: Answers | StoredAnswers, name: str, replay: list[str]) -> int:
-        """Check the answers, print and write the reports; the exit code. `replay`: the words of the command."""
-        from mi_refract.ray_sets import check_answers, reports
-
-        bound = self.formula or check_answers.LOOSEST
-        with self._judge() as judge:
-            most = self.backward or math.inf
-            found = check_answers.check(rays, answers, tir=self.tir, error_bound=bound, most_backward=most, judge=judge)
+                certify = stack.enter_context(spread_check.certifying(self.target, _say))
+            found = check_answers.check(
+                rays,
+                answers,
+                tir=self.tir,
+                error_bound=self.formula or LOOSEST,
+                most_backward=self.backward or math.inf,
+                certify=functools.partial(_watched, certify, len(rays)),
+            )
         # On a terminal, too: a wrapped line is easier to read than a squeezed column.
         Console(width=UNWRAPPED).print(reports.table(found), highlight=False)
         if self.report:
@@ -211,16 +206,16 @@ class CheckOptions:
         return found.exit_code
 
 
-def _watched(judge: Judge, calls: Iterable[tuple[Piece, Question]]) -> Iterator[tuple[int, JudgedPart]]:
-    """As `judge`, with the number of rays so far on a terminal's stderr."""
-    console, rays = Console(stderr=True), 0
-    status = console.status("certified: 0 rays") if console.is_terminal else None
+def _watched(certify: Certify, total: int, pieces: Iterable[Rays]) -> Iterator[tuple[int, Certified]]:
+    """As `certify`, with the number of rays so far on a terminal's stderr."""
+    console, count = Console(stderr=True), 0
+    status = console.status(f"certified 0 of {total} rays") if console.is_terminal else None
     with status or contextlib.nullcontext():
-        for number, part in judge(calls):
-            rays += part.rays
+        for number, exact in certify(pieces):
+            count += len(exact)
             if status:
-                status.update(f"certified: {rays} rays")
-            yield number, part
+                status.update(f"certified {count} of {total} rays")
+            yield number, exact
 
 
 def _say(text: str) -> None:
@@ -232,4 +227,4 @@ def _wavelengths(text: str | None) -> tuple[float, ...]:
     try:
         return tuple(map(float, text.split(","))) if text is not None else ()
     except ValueError:
-        raise ValueError(f"--wavelengths {text}: accepted: numbers in nm, such as 486.1327,587.5618") from None
+        raise ValueError(f"--wavelengths {text}; expected numbers in nm, such as 486.1327,587.5618") from None

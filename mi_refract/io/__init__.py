@@ -15,6 +15,5 @@ __all__ = [
     "process_group",
     "provenance",
     "regular_file",
-    "scratch",
     "toml_schema",
 ]

@@ -8,13 +8,10 @@ that explains wrong answers; as text, JSON, JUnit XML or an HTML page. The comma
 __all__ = [
     "check_answers",
     "files",
-    "judged_parts",
     "ray_set",
     "renderer_file",
     "reports",
     "run_program",
     "spread_check",
-    "stored_answers",
-    "stored_rays",
     "tir_signal",
 ]

@@ -4,33 +4,33 @@ The oracle certifies every ray. An answer is right where its error is within the
 for that very ray. Errors are angles, over the rays whose total internal reflection was classified correctly; the error
 of the length is reported separately. Where answers say which ratio of indices the program used, directions are compared
 with the certified ones for that ratio, and the ratio with that of the ray.
+
+All rays, their answers and certified answers are arrays. Whatever takes more memory than these is done in pieces.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import dataclass, replace
+import functools
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from mi_refract.accuracy import lengths
-from mi_refract.formulas import FORMULAS
+from mi_refract import oracle
+from mi_refract.formulas import FORMULAS, Budget
+from mi_refract.regimes import Array, Rays
 
-from . import diagnosis, judged_parts, media_rays, tir_signal
+from . import diagnosis, matched_answers, media_rays, tir_signal
 from .diagnosis import Explanation
-from .evidence import AllEvidence
-from .header import PRECISIONS, Header, shown
-from .judged_answers import judge_answers
-from .judged_parts import JudgedPart, Piece, Question
-from .kept_errors import KeptErrors, SomeErrors
-from .pieces import ArrayPieces, Pieces, StoredPieces
-from .ray_set import Answers, RaySet
-from .stored_answers import LISTED_IDS, StoredAnswers
-from .stored_rays import StoredRays
-from .tir_signal import AUTO, FLAG, LOOSEST, NONE, TIR, UNCLEAR
+from .header import PRECISIONS, Header, Ids, shown
+from .judged_answers import Flags, JudgedAnswers, Table, certified, judge_answers, see
+from .matched_answers import MatchedAnswers, Piece
+from .ray_set import Answers, RaySet, in_regime
+from .tir_signal import AUTO, FLAG, LOOSEST, TIR, UNCLEAR
 
-SEEN, GUESSED = 2**16, 2**9  # rays that are looked at, and judged, to guess the signal of total internal reflection
+LISTED_IDS = 5
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,8 @@ PROBLEMS = {
     "impossible": False,
     "index": False,
 }
+# Of RegimeErrors, those that are sums over the rays.
+COUNTS = ("tir_misclassified", "tir_beyond_bound", "undecidable", "judged", "wrong", "right", "exact")
 SAME_ULPS = 4  # the largest relative difference of a ratio of indices that is none, where the file holds the indices
 
 
@@ -147,195 +149,172 @@ class Findings:
         return int(self.wrong > 0 or self.tir == UNCLEAR or bool(self.problems) or not self.total("judged"))
 
 
-Judge = Callable[[Iterable[tuple[Piece, Question]]], Iterator[tuple[int, JudgedPart]]]
+# The certified answers to pieces of the set, by the numbers of the pieces.
+Certify = Callable[[Iterable[Rays]], Iterable[tuple[int, oracle.Certified]]]
+Judge = Callable[..., JudgedAnswers]  # of a Piece, with `exact=` its certified answers where they are known
+
+
+def certify_here(pieces: Iterable[Rays]) -> Iterator[tuple[int, oracle.Certified]]:
+    """In this process, one piece after the other."""
+    for number, rays in enumerate(pieces):
+        yield number, certified(rays)
 
 
 def check(
-    rays: RaySet | StoredRays,
-    answers: Answers | StoredAnswers,
+    rays: RaySet,
+    answers: Answers,
     *,
     tir: str = AUTO,
     error_bound: str = LOOSEST,
     most_backward: float = np.inf,
-    judge: Judge = judged_parts.here,
+    certify: Certify = certify_here,
 ) -> Findings:
     """Compare every answer with the certified direction.
 
     `tir`: how the answers signal total internal reflection, one of TIR; detected where it is AUTO. `error_bound`: the
     formula of FORMULAS whose a-priori bound the errors must keep. `most_backward`: the largest backward error, in u, of
-    an answer that is not wrong. `judge`: who judges pieces of the set; the findings do not depend on it, nor on whether
-    rays and answers are arrays or stored: both are the same. ValueError for an unknown name, a `most_backward` not
-    above 0, tir = FLAG without the column `transmitted`, or answers whose header is that of other rays.
+    an answer that is not wrong. `certify`: who certifies pieces of the set. ValueError for an unknown name, a
+    `most_backward` not above 0, tir = FLAG without the column `transmitted`, or answers whose header is that of other
+    rays.
     """
     _check_name("tir", tir, (AUTO, *TIR))
     _check_name("error_bound", error_bound, FORMULAS)
-    _check_header(rays, answers, tir)
-    pieces, mismatches = _matched(rays, answers)
-    ulp = float(np.finfo(PRECISIONS[rays.precision]).eps)
     if not most_backward > 0:
-        raise ValueError(f"most_backward = {most_backward}: accepted: a positive number of roundings")
-    same = _same_ratio(rays.header, ulp)
-    question = Question(rays.precision, error_bound, tir, most_backward=most_backward, same_ratio=same)
-    signal, parts, angles, backward = _parts(pieces, question, judge)
+        raise ValueError(f"most_backward = {most_backward}; expected a positive number of roundings")
+    if tir == FLAG and answers.transmitted is None:
+        raise ValueError("tir = 'flag': there is no column `transmitted`; expected answers with one")
+    if (given := answers.header.get("checksum")) not in (None, rays.header["checksum"]):
+        expected = f"{rays.header['checksum']}, or other rays with --rays FILE"
+        raise ValueError(f"the answers are to rays with the checksum {shown(given)}; expected {expected}")
+    matched, mismatches = matched_answers.match(rays, answers)
+    exact = dict(certify(piece.used for piece in matched.pieces()))
+    signal = tir if tir != AUTO else _signal(matched, exact)
+    judge = functools.partial(_judged, rays.precision, FORMULAS[error_bound].budget, signal, most_backward)
+    table, losses = _all_judged(matched, exact, judge)
+    ulp = float(np.finfo(PRECISIONS[rays.precision]).eps)
+    ratio, other_ratios = _ratio_difference(matched, ulp)
+    masks = {kind: table[kind] for kind in ("non-finite", "zero", "impossible")} | {"index": other_ratios}
+    unfit = {kind: matched.ids[mask] for kind, mask in masks.items()}
     return Findings(
         precision=rays.precision,
         ulp=ulp,
         error_bound=error_bound,
         tir=signal,
         tir_given=tir != AUTO,
-        regimes=tuple(_by_regime(rays.header, parts, angles, backward)),
-        problems=(*(_listed(kind, *each) for kind, each in mismatches.items()), *_not_directions(parts)),
-        explanations=_explanations(pieces, parts, angles, replace(question, tir=signal)),
+        regimes=tuple(_by_regime(matched, table)),
+        problems=tuple(_listed(kind, ids) for kind, ids in (mismatches | unfit).items() if len(ids)),
+        explanations=tuple(_explanations(matched, table, losses, judge)),
         header=rays.header,
-        ratio=_ratio_difference(rays.header, answers, parts, question.same_ratio),
+        ratio=ratio,
     )
 
 
-def _same_ratio(header: Header, ulp: float) -> float:
-    return media_rays.SAME if media_rays.has_media(header) else SAME_ULPS * ulp
+def _check_name(name: str, value: str, expected: Collection[str]) -> None:
+    if value not in expected:
+        raise ValueError(f"{name} = {value!r}: unknown; expected {', '.join(expected)}")
 
 
-def _ratio_difference(
-    header: Header, answers: Answers | StoredAnswers, parts: list[JudgedPart], same: float
-) -> RatioDifference | None:
-    given = answers.ratios if isinstance(answers, StoredAnswers) else answers.n_ratio
-    if given is None or not parts:
-        return None
-    largest, id_ = max((part.ratio for part in parts), key=lambda found: found[0])
-    return RatioDifference(largest, id_, media_rays.described(header, id_), same)
+def _signal(matched: MatchedAnswers, exact: Mapping[int, oracle.Certified]) -> str:
+    """How the answers signal total internal reflection."""
+    if matched.answers.transmitted is not None:
+        return FLAG
+    precision = matched.rays.precision
+    return tir_signal.detect(see(x.b, x.used, precision, exact[number]) for number, x in enumerate(matched.pieces()))
 
 
-def _check_header(rays: RaySet | StoredRays, answers: Answers | StoredAnswers, tir: str) -> None:
-    flagged = answers.flagged if isinstance(answers, StoredAnswers) else answers.transmitted is not None
-    if tir == FLAG and not flagged:
-        raise ValueError("tir = 'flag': there is no column `transmitted`; accepted: answers with one")
-    if (given := answers.header.get("checksum")) not in (None, rays.header["checksum"]):
-        accepted = f"{rays.header['checksum']}, or other rays with --rays FILE"
-        raise ValueError(f"the answers are to rays with the checksum {shown(given)}; accepted: {accepted}")
+def _judged(
+    precision: str, budget: Budget, tir: str, most_backward: float, piece: Piece, exact: oracle.Certified | None = None
+) -> JudgedAnswers:
+    return judge_answers(
+        *(piece.b, piece.transmitted, piece.used, precision, budget, tir), exact=exact, most_backward=most_backward
+    )
 
 
-def _matched(
-    rays: RaySet | StoredRays, answers: Answers | StoredAnswers
-) -> tuple[Pieces, dict[str, tuple[int, list[int]]]]:
-    """The rays with their answers; and of each kind of mismatch how many ids have it, and the first of them."""
-    if isinstance(rays, StoredRays) and isinstance(answers, StoredAnswers):
-        return StoredPieces(rays, answers), answers.mismatches
-    if isinstance(rays, RaySet) and isinstance(answers, Answers):
-        mismatches, order = _match_ids(rays, answers)
-        return ArrayPieces(rays, answers, order), mismatches
-    raise TypeError("rays and answers; accepted: both stored, or neither")
+def _all_judged(
+    matched: MatchedAnswers, exact: dict[int, oracle.Certified], judge: Judge
+) -> tuple[Table, Mapping[str, int]]:
+    """The table of all answers, and how many of them `diagnosis.losses` account for. Takes pieces out of `exact`."""
+    tables, losses = [judge(matched.take(slice(0))).table], Counter[str]()
+    for number, piece in enumerate(matched.pieces()):
+        judged = judge(piece, exact.pop(number))
+        tables.append(judged.table)
+        losses.update(diagnosis.losses(judged.verdict))
+    return np.concatenate(tables), losses
 
 
-def _parts(pieces: Pieces, question: Question, judge: Judge) -> tuple[str, list[JudgedPart], KeptErrors, KeptErrors]:
-    """The signal of total internal reflection, and the parts judged by it, whose errors are kept apart.
-
-    The signal is known after all rays are: that of a sample is taken first, and all are judged again if it was wrong.
-    """
-    detected = question.tir == AUTO and not pieces.flagged
-    tir = FLAG if question.tir == AUTO else question.tir
-    if detected:
-        tir = _guess(pieces, question)
-    while True:
-        asked, found = replace(question, tir=tir, counted=detected), {}
-        angles, backward = KeptErrors(pieces.total), KeptErrors(pieces.total)
-        for number, part in judge((piece, asked) for piece in pieces):
-            angles.put(number, part.angles)
-            backward.put(number, part.backward)
-            found[number] = part.without_errors()
-        parts = [found[number] for number in range(len(found))]
-        signal = tir_signal.joined([part.signals for part in parts if part.signals]).signal if detected else tir
-        if signal == tir:
-            return tir, parts, angles, backward
-        tir, detected = signal, False
+def _ratio_difference(matched: MatchedAnswers, ulp: float) -> tuple[RatioDifference | None, Flags]:
+    """The largest, and (N,) where it is more than that of one glass written in two ways; nothing if none is said."""
+    if matched.answers.n_ratio is None or not len(matched.rows):
+        return None, np.zeros(len(matched.rows), bool)
+    header, differences = matched.rays.header, matched.ratio_differences()
+    same = media_rays.SAME if media_rays.has_media(header) else SAME_ULPS * ulp
+    row = int(np.argmax(differences))
+    id_ = int(matched.ids[row])
+    return RatioDifference(float(differences[row]), id_, media_rays.described(header, id_), same), differences > same
 
 
-def _guess(pieces: Pieces, question: Question) -> str:
-    """The signal of a few rays, evenly over the set; of those that seem totally reflected, where there are any."""
-    some = pieces.sampled(np.arange(0, pieces.total, max(1, pieces.total // SEEN)))
-    rays = some.used
-    across = np.cross(rays.n.astype(float), rays.a.astype(float))
-    with np.errstate(all="ignore"):
-        sine = rays.k * (lengths(across) / (lengths(rays.a) * lengths(rays.n)))
-    which = np.flatnonzero(sine > 1)
-    which = which[:: max(1, len(which) // GUESSED)]
-    if not len(which):
-        return NONE
-    flag = None if some.flag is None else some.flag[which]
-    budget = FORMULAS[question.error_bound].budget
-    return judge_answers(some.b[which], flag, rays[which], question.precision, budget).tir
+def _listed(kind: str, ids: Ids) -> Problem:
+    first, more = ", ".join(map(str, ids[:LISTED_IDS])), ", …" if len(ids) > LISTED_IDS else ""
+    return Problem(kind, len(ids), f"id{'' if len(ids) == 1 else 's'} {first}{more}")
 
 
 def _explanations(
-    pieces: Pieces, parts: list[JudgedPart], angles: KeptErrors, question: Question
-) -> tuple[Explanation, ...]:
-    if not any(part.evidence.wrong_count for part in parts):
-        return ()
-    found = AllEvidence([part.evidence for part in parts], angles.of(range(len(parts))))
-    some, printed = (pieces.sampled(of(found)) for of in (diagnosis.sample, diagnosis.printed_sample))
-    budget = FORMULAS[question.error_bound].budget
-    judged = judge_answers(some.b, some.flag, some.used, question.precision, budget, question.tir)
-    return tuple(diagnosis.explain(judged, found, printed.b))
-
-
-def _check_name(name: str, value: str, accepted: Collection[str]) -> None:
-    if value not in accepted:
-        raise ValueError(f"{name} = {value!r}: unknown; accepted: {', '.join(accepted)}")
-
-
-def _match_ids(rays: RaySet, answers: Answers) -> tuple[dict[str, tuple[int, list[int]]], np.ndarray]:
-    """The mismatches of the ids, as of `_matched`; and (N,) for each ray the row of its first answer, or −1."""
-    ids, first, counts = np.unique(answers.ids, return_index=True, return_counts=True)
-    found = {
-        "missing": np.setdiff1d(rays.ids, ids),
-        "duplicate": ids[counts > 1],
-        "unknown": np.setdiff1d(ids, rays.ids),
-    }
-    place = np.searchsorted(ids, rays.ids).clip(max=max(len(ids) - 1, 0))
-    order = np.where(ids[place] == rays.ids, first[place], -1) if len(ids) else np.full(len(rays), -1)
-    return {kind: (len(which), which[:LISTED_IDS].tolist()) for kind, which in found.items() if len(which)}, order
-
-
-def _listed(kind: str, count: int, first: list[int]) -> Problem:
-    some = ", ".join(map(str, first[:LISTED_IDS]))
-    plural, more = "" if count == 1 else "s", ", …" if count > LISTED_IDS else ""
-    return Problem(kind, count, f"id{plural} {some}{more}")
-
-
-def _not_directions(parts: list[JudgedPart]) -> Iterator[Problem]:
-    """Answers that are neither a direction nor the signal of total internal reflection, or an impossible one."""
-    for kind in parts[0].listed if parts else ():
-        counts, ids = zip(*(part.listed[kind] for part in parts), strict=True)
-        if sum(counts):
-            yield _listed(kind, sum(counts), [id_ for some in ids for id_ in some])
+    matched: MatchedAnswers, table: Table, losses: Mapping[str, int], judge: Judge
+) -> Iterable[Explanation]:
+    if not table["beyond_bound"].any():
+        return []
+    evidence = diagnosis.Evidence(table, losses)
+    return diagnosis.explain(judge(matched.take(evidence.sample)), evidence, matched.take(evidence.printed).b)
 
 
 # By regime ---------------------------------------------------------------------------------------------------------
 
 
-def _by_regime(
-    header: Header, parts: list[JudgedPart], angles: KeptErrors, backward: KeptErrors
-) -> Iterator[RegimeErrors]:
-    for name in header["regimes"]:
-        if numbers := [number for number, part in enumerate(parts) if part.regime == name]:
-            of_regime = [parts[number] for number in numbers]
-            yield _regime_errors(name, of_regime, angles.of(numbers), backward.of(numbers))
+def _by_regime(matched: MatchedAnswers, table: Table) -> Iterator[RegimeErrors]:
+    for name in matched.rays.header["regimes"]:
+        rows = np.flatnonzero(in_regime(matched.rays.header, name, matched.ids))
+        if len(rows):
+            found = table[rows]
+            worst = np.lexsort([found[key] for key in ("share", "impossible", "tir_beyond_bound", "blank")])[-1]
+            yield _regime_errors(name, found, _replay(matched.take(rows[worst : worst + 1])))
 
 
-def _regime_errors(name: str, parts: list[JudgedPart], angles: SomeErrors, backward: SomeErrors) -> RegimeErrors:
-    lengths_ = [part.length_error for part in parts if part.compared]
-    worst = judged_parts.last_of_largest([part.worst.rank for part in parts])
+def _regime_errors(name: str, found: Table, replay: dict[str, Any]) -> RegimeErrors:
+    compared = found[found["compared"]]
+    angles, backward = compared["angle"], found["backward"]
     return RegimeErrors(
         name,
-        rays=sum(part.rays for part in parts),
-        compared=len(angles),
-        worst=angles.largest,
-        p99=angles.quantile(0.99),
-        mean=angles.mean,
-        length_error=float(np.max(lengths_)) if lengths_ else np.nan,
-        error_over_bound=float(np.max([part.error_over_bound for part in parts])),
-        backward_median=backward.quantile(0.5),
-        backward_p99=backward.quantile(0.99),
-        backward_worst=backward.largest,
-        replay=parts[worst].worst.replay,
-        **{count: sum(part.counts[count] for part in parts) for count in judged_parts.COUNTS},
+        rays=len(found),
+        compared=len(compared),
+        worst=_quantile(angles, 1),
+        p99=_quantile(angles, 0.99),
+        mean=float(angles.mean()) if len(angles) else np.nan,
+        length_error=float(compared["drift"].max()) if len(angles) else np.nan,
+        error_over_bound=float(found["share"].max()),
+        backward_median=_quantile(backward, 0.5),
+        backward_p99=_quantile(backward, 0.99),
+        backward_worst=_quantile(backward, 1),
+        replay=replay,
+        **{count: int(found[count].sum()) for count in COUNTS},
     )
+
+
+def _quantile(errors: Array, share: float) -> float:
+    """NaN where there is none. Between a finite and an infinite error: the infinite one."""
+    if not len(errors):
+        return np.nan
+    with np.errstate(invalid="ignore"):
+        found = float(np.quantile(errors, share))
+    return float(np.quantile(errors, share, method="higher")) if np.isnan(found) else found
+
+
+def _replay(one: Piece) -> dict[str, Any]:
+    """A ray with its answer in hexadecimal floats."""
+    exact = certified(one.used)
+    return {
+        "id": int(one.ids[0]),
+        **one.used.hexed(0),
+        "answer": [float(x).hex() for x in one.b[0]],
+        "exact": [float(x).hex() for x in exact.direction[0]],
+        "transmitted": bool(exact.transmitted[0]),
+    }

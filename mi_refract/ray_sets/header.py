@@ -8,7 +8,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+Ids = NDArray[np.int64]
 Header = dict[str, Any]  # the `# key: value` lines of a file
 
 FORMAT = "mi_refract rays 1"
@@ -25,7 +27,7 @@ def as_json(text: str) -> Any:
     try:
         return json.loads(text)
     except RecursionError:
-        raise ValueError("nested too deep; accepted: JSON") from None
+        raise ValueError("nested too deep; expected JSON") from None
 
 
 def _is_text(value: Any) -> bool:
@@ -94,15 +96,15 @@ def check_media(header: Mapping[str, Any], precision: str) -> None:
         rounded = np.array(header["wavelengths"]).astype(PRECISIONS[precision])
     if len(np.unique(rounded)) < len(rounded) or not rounded.all():
         found = f"the wavelengths {shown(header['wavelengths'])} are not all different in {precision}"
-        raise ValueError(f"{found}; accepted: each once")
+        raise ValueError(f"{found}; expected each once")
 
 
 def _check_rules(header: Mapping[str, Any], rules: Mapping[str, Rule]) -> None:
     for key, (accepts, words) in rules.items():
         if key not in header:
-            raise ValueError(f"the header has no {key}; accepted: {words}")
+            raise ValueError(f"the header has no {key}; expected {words}")
         if not accepts(header[key]):
-            raise ValueError(f"the header's {key} is {shown(header[key])}; accepted: {words}")
+            raise ValueError(f"the header's {key} is {shown(header[key])}; expected {words}")
 
 
 def check(header: Mapping[str, Any], rays: int) -> None:
@@ -111,18 +113,18 @@ def check(header: Mapping[str, Any], rays: int) -> None:
     Each regime has `count` rays, one after the other: no ray is without a regime, and none is in two.
     """
     if unknown := sorted(header.keys() - SCHEMA.keys() - MEDIA.keys()):
-        raise ValueError(f"the header has {shown(unknown[0])}; accepted: {', '.join((*SCHEMA, *MEDIA))}")
+        raise ValueError(f"the header has {shown(unknown[0])}; expected {', '.join((*SCHEMA, *MEDIA))}")
     _check_rules(header, SCHEMA)
     if header.keys() & MEDIA.keys():
         check_media(header, header["precision"])
     count, regimes = header["count"], header["regimes"]
     if count * len(regimes) != rays or not rays:
         found = f"the header is of {len(regimes)} × {count} rays, the file has {rays}"
-        raise ValueError(f"{found}; accepted: `count` rays of each regime")
+        raise ValueError(f"{found}; expected `count` rays of each regime")
     for i, (name, ends) in enumerate(regimes.items()):
         if ends != [i * count, (i + 1) * count - 1]:
             found = f"the header's regime {shown(name)} has the ids {shown(ends)}"
-            raise ValueError(f"{found}; accepted: {[i * count, (i + 1) * count - 1]}")
+            raise ValueError(f"{found}; expected {[i * count, (i + 1) * count - 1]}")
 
 
 def shown(value: Any) -> str:

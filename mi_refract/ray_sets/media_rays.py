@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from mi_refract import media
-from mi_refract.regimes import REGIMES
+from mi_refract.regimes import REGIMES, Array
 
-from .header import AIR, LARGEST_WAVELENGTH, MOST_MEDIA, PRECISIONS, Header, check_media, shown
+from .header import AIR, LARGEST_WAVELENGTH, MOST_MEDIA, PRECISIONS, Header, Ids, check_media, shown
 
 COLUMNS = ("wavelength", "medium")
 WHOLE = ("medium",)  # those that hold whole numbers
@@ -46,15 +46,15 @@ def header_of(specs: Sequence[str], wavelengths: Sequence[float], precision: str
     """
     if not len(specs) or not len(wavelengths):
         found = f"{len(specs)} media and {len(wavelengths)} wavelengths"
-        raise ValueError(f"{found}; accepted: neither, or at least one of each")
+        raise ValueError(f"{found}; expected neither, or at least one of each")
     if max(len(specs), len(wavelengths)) > MOST_MEDIA:
         found = f"{len(specs)} media and {len(wavelengths)} wavelengths"
-        raise ValueError(f"{found}; accepted: up to {MOST_MEDIA} of each")
+        raise ValueError(f"{found}; expected up to {MOST_MEDIA} of each")
     if wrong := [each for each in wavelengths if not 0 < each < LARGEST_WAVELENGTH]:
-        raise ValueError(f"wavelength {wrong[0]:g}: accepted: nm, above 0")
+        raise ValueError(f"wavelength {wrong[0]:g}; expected nm, above 0")
     names = [_parsed(spec).name for spec in specs]
     if twice := [name for name in names if names.count(name) > 1]:
-        raise ValueError(f"medium {shown(twice[0])}: {names.count(twice[0])} times; accepted: each once")
+        raise ValueError(f"medium {shown(twice[0])}: {names.count(twice[0])} times; expected each once")
     pairs = [pair for name in names for pair in ([name, AIR], [AIR, name])]
     header = {"wavelength, medium": CONVENTION, "media": pairs, "wavelengths": [float(each) for each in wavelengths]}
     check_media(header, precision)
@@ -68,21 +68,21 @@ def check(header: Header) -> None:
         names = [pair[0] for pair in header["media"][::2]]
         made = header_of(names, header["wavelengths"], header["precision"])
         if header["media"] != made["media"]:
-            raise ValueError(f"the header's media is {shown(header['media'])}; accepted: {shown(made['media'])}")
+            raise ValueError(f"the header's media is {shown(header['media'])}; expected {shown(made['media'])}")
         check_regimes(header)
 
 
 def check_regimes(header: Header) -> None:
     """ValueError, one line, for a regime whose ratios are its own, or for fewer rays than there are combinations."""
     if refused := [name for name in header["regimes"] if name in REGIMES and name not in NAMES]:
-        accepted = ", ".join(map(repr, NAMES))
-        raise ValueError(f"regime {refused[0]!r}: its ratios of indices are its own; accepted with media: {accepted}")
+        found = f"regime {refused[0]!r} has ratios of indices of its own"
+        raise ValueError(f"{found}; expected with media: {', '.join(map(repr, NAMES))}")
     if header["count"] < (least := len(header["media"]) * len(header["wavelengths"])):
         found = f"{header['count']} rays of each regime"
-        raise ValueError(f"{found}; accepted: {least} or more, one for each medium, wavelength and side of the surface")
+        raise ValueError(f"{found}; expected {least} or more, one for each medium, wavelength and side of the surface")
 
 
-def columns(header: Header, ids: np.ndarray) -> np.ndarray:
+def columns(header: Header, ids: Ids) -> Array:
     """(N, 2) float64 of the rays with these ids (N,): wavelength in nm, number of the pair; (N, 0) without media."""
     if not has_media(header):
         return np.empty((len(ids), 0))
@@ -90,7 +90,7 @@ def columns(header: Header, ids: np.ndarray) -> np.ndarray:
     return np.column_stack([_rounded(header["wavelengths"], header["precision"])[at], pair])
 
 
-def ratios(header: Header, ids: np.ndarray) -> np.ndarray:
+def ratios(header: Header, ids: Ids) -> Array:
     """(N,) n_from / n_to of the rays with these ids, in the set's precision, as float64. Precondition: `has_media`."""
     return _table(header)[_combination(header, ids)]
 
@@ -104,19 +104,17 @@ def described(header: Header, id_: int) -> str:
     return f"{left} to {entered} at {wavelength:.9g} nm"
 
 
-def first_other_ratio(header: Header, k: np.ndarray, first: int = 0) -> str:
-    """Of rays from the id `first` on the first whose `k` (n,) is not the ratio of its media; "" where there is none."""
-    if not has_media(header):
-        return ""
-    expected = ratios(header, np.arange(first, first + len(k)))
-    other = np.flatnonzero(~(np.abs(k.astype(np.float64) - expected) <= SAME * expected))
-    if not len(other):
-        return ""
-    id_, found = first + int(other[0]), float(k[other[0]])
-    return f"ray {id_} has n_from / n_to = {found:.9g}; accepted: {expected[other[0]]:.9g}, {described(header, id_)}"
+def check_ratios(header: Header, k: Array) -> None:
+    """ValueError, one line, where `k` (N,) of all rays is not the ratio of their media."""
+    if has_media(header):
+        expected = ratios(header, np.arange(len(k)))
+        other = np.flatnonzero(~(np.abs(k.astype(np.float64) - expected) <= SAME * expected))
+        if len(other):
+            found = f"ray {other[0]} has n_from / n_to = {float(k[other[0]]):.9g}"
+            raise ValueError(f"{found}; expected {expected[other[0]]:.9g}, {described(header, int(other[0]))}")
 
 
-def _combination(header: Header, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _combination(header: Header, ids: Ids) -> tuple[Ids, Ids]:
     """The number of the pair and that of the wavelength of each ray, (N,) both."""
     count, total = header["count"], len(header["media"]) // 2
     place = ids % count
@@ -127,13 +125,13 @@ def _combination(header: Header, ids: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return 2 * medium + turned, at
 
 
-def _table(header: Header) -> np.ndarray:
+def _table(header: Header) -> Array:
     names = tuple(pair[0] for pair in header["media"][::2])
     return _ratios(names, tuple(header["wavelengths"]), header["precision"])
 
 
 @functools.lru_cache(maxsize=8)
-def _ratios(names: tuple[str, ...], wavelengths: tuple[float, ...], precision: str) -> np.ndarray:
+def _ratios(names: tuple[str, ...], wavelengths: tuple[float, ...], precision: str) -> Array:
     """(pairs, wavelengths) n_from / n_to in the set's precision, as float64."""
     at, found = _rounded(wavelengths, precision), []
     for medium in map(_parsed, names):
@@ -144,7 +142,7 @@ def _ratios(names: tuple[str, ...], wavelengths: tuple[float, ...], precision: s
     if not ((k >= SMALLEST) & (k <= LARGEST)).all():
         pair, i = np.argwhere(~((k >= SMALLEST) & (k <= LARGEST)))[0]
         text = f"{names[pair // 2]}: n = {float(found[pair - pair % 2][i]):.6g} beside air at {at[i]:.9g} nm"
-        raise ValueError(f"{text}; accepted: {SMALLEST:g} … {LARGEST:g}")
+        raise ValueError(f"{text}; expected {SMALLEST:g} … {LARGEST:g}")
     return k
 
 
@@ -155,11 +153,11 @@ def _parsed(spec: str) -> media.Medium:
     except ValueError:
         pass
     if ":" not in spec and "(" not in spec:
-        accepted = "a number, cauchy(A, B, …) or another formula, SCHOTT:N-BK7 or another glass"
-        raise ValueError(f"medium {shown(spec)}: accepted: {accepted}")
+        expected = "a number, cauchy(A, B, …) or another formula, SCHOTT:N-BK7 or another glass"
+        raise ValueError(f"medium {shown(spec)}; expected {expected}")
     return media.parse(spec, "medium")
 
 
-def _rounded(numbers: Iterable[float] | np.ndarray, precision: str) -> np.ndarray:
+def _rounded(numbers: Iterable[float] | Array, precision: str) -> Array:
     with np.errstate(over="ignore"):
         return np.asarray(numbers, np.float64).astype(PRECISIONS[precision]).astype(np.float64)

@@ -8,24 +8,26 @@ With media and wavelengths (see `media_rays`), their ratios take the place of th
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mi_refract import regimes
 from mi_refract.numerics import float_expansions
-from mi_refract.regimes import Rays
+from mi_refract.regimes import Array, Rays
 
 from . import media_rays
-from .header import FORMAT, PRECISIONS, Header
+from .header import FORMAT, PRECISIONS, Header, Ids
 
 # Their vectors are unit up to the rounding of each component, as the documented formulas require.
 DEFAULT = tuple(name for name, regime in regimes.REGIMES.items() if regime.unit and not regime.rests_on_denormals)
 COUNT, PRECISION = 1000, "f32"
-_HASHED = 2**16  # rays at a time
+ROWS = 2**16  # that are in float64 at once, which takes several times what the rays do
 CONVENTIONS = {
     "a": "incident direction, pointing toward the surface",
     "n": "normal, on the side that the ray comes from: n.a <= 0",
@@ -35,7 +37,7 @@ CONVENTIONS = {
 }
 
 
-def indices(k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def indices(k: Array) -> tuple[Array, Array]:
     """(n_from, n_to), each (N,) and at least 1. Their ratio is k, exactly."""
     _, exponent = np.frexp(k)
     n_to = np.ldexp(np.ones_like(k), np.maximum(1 - exponent, 0))
@@ -44,11 +46,10 @@ def indices(k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class RaySet:
-    """Rays (N), their ids (N,), the name of each ray's regime (N,), and the header of the file."""
+    """Rays (N), their ids (N,), and the header of the file, whose ranges of ids name the regimes."""
 
     rays: Rays
-    ids: np.ndarray
-    regime: np.ndarray
+    ids: Ids
     header: Header
 
     def __len__(self) -> int:
@@ -65,17 +66,32 @@ class RaySet:
         """Half an ulp of 1 in the set's precision."""
         return float(np.finfo(PRECISIONS[self.precision]).eps) / 2
 
+    @functools.cached_property
+    def regime(self) -> NDArray[np.object_]:
+        """(N,): the name of each ray's regime."""
+        names = np.full(len(self), "", dtype=object)
+        for name in self.header["regimes"]:
+            names[in_regime(self.header, name, self.ids)] = name
+        return names
+
     @property
-    def numbers(self) -> np.ndarray:
+    def numbers(self) -> Array:
         """(N, 9) float64: id, a, n, n_from, n_to; with media (N, 11): wavelength, medium."""
-        return numbers_of(self.ids, self.rays, self.header)
+        return np.concatenate(list(self.numbers_in_pieces()))
+
+    def numbers_in_pieces(self) -> Iterator[Array]:
+        """`numbers`, ROWS at a time."""
+        for i in range(0, len(self), ROWS):
+            ids, rays = self.ids[i : i + ROWS], self.rays[i : i + ROWS]
+            columns = [ids, rays.a, rays.n, *indices(rays.k), *media_rays.columns(self.header, ids).T]
+            yield np.column_stack(columns).astype(np.float64)
 
 
-def numbers_of(ids: np.ndarray, rays: Rays, header: Header) -> np.ndarray:
-    """(N, 9) float64: id, a, n, n_from, n_to; with media (N, 11): wavelength, medium."""
-    return np.column_stack(
-        [ids, rays.a, rays.n, *indices(rays.k), *media_rays.columns(header, ids).T],
-    ).astype(np.float64)
+def in_regime(header: Header, name: str, ids: Ids) -> NDArray[np.bool_]:
+    """(N,) which of the ids are in the range of a regime."""
+    first, last = header["regimes"][name]
+    inside: NDArray[np.bool_] = (ids >= first) & (ids <= last)
+    return inside
 
 
 @dataclass(frozen=True)
@@ -86,17 +102,17 @@ class Answers:
     `n_ratio`: (N,) the n_from / n_to that the program used, if it says so.
     """
 
-    ids: np.ndarray
-    b: np.ndarray
-    transmitted: np.ndarray | None = None
+    ids: Ids
+    b: Array
+    transmitted: NDArray[np.bool_] | None = None
     header: Header = field(default_factory=dict)
-    n_ratio: np.ndarray | None = None
+    n_ratio: Array | None = None
 
     def __post_init__(self) -> None:
         """ValueError where the shapes do not match, and for a `transmitted` that is neither 0 nor 1."""
-        more = [each.shape for each in (self.transmitted, self.n_ratio) if each is not None]
-        if self.b.shape != (len(self.ids), 3) or any(shape != self.ids.shape for shape in more):
-            raise ValueError(f"answers: b is {self.b.shape} for {len(self.ids)} ids; accepted: a direction for each id")
+        columns = [column for column in (self.transmitted, self.n_ratio) if column is not None]
+        if self.b.shape != (len(self.ids), 3) or any(column.shape != self.ids.shape for column in columns):
+            raise ValueError(f"answers: b is {self.b.shape} for {len(self.ids)} ids; expected a direction for each id")
         if self.transmitted is not None:
             if (wrong := self.transmitted[~np.isin(self.transmitted, (0, 1))]).size:
                 raise ValueError(f"answers: transmitted is {wrong[0]}; expected 0 or 1")
@@ -125,7 +141,8 @@ def make(
     """
     header = header_of(names, count, precision, seed, two_sided, media, wavelengths)
     rays = Rays.joined([of_regime(name, header) for name in header["regimes"]])
-    return _with_checksum(RaySet(rays, np.arange(len(rays)), regime_names(header, len(rays)), header))
+    made = RaySet(rays, np.arange(len(rays)), header)
+    return replace(made, header=header | {"checksum": checksum(made)})
 
 
 def header_of(
@@ -142,14 +159,26 @@ def header_of(
     ValueError for an unknown regime or precision, a regime given twice, or no ray at all; of media see
     `media_rays.header_of` and `media_rays.check_regimes`.
     """
+    from mi_refract import __version__
+
     names = default(media) if names is None else tuple(names)
     if unknown := [name for name in names if name not in regimes.REGIMES]:
-        raise ValueError(f"regime {unknown[0]!r}: unknown; accepted: {', '.join(map(repr, regimes.REGIMES))}")
+        raise ValueError(f"regime {unknown[0]!r}: unknown; expected {', '.join(map(repr, regimes.REGIMES))}")
     if precision not in PRECISIONS:
-        raise ValueError(f"precision {precision!r}: unknown; accepted: {', '.join(PRECISIONS)}")
+        raise ValueError(f"precision {precision!r}: unknown; expected {', '.join(PRECISIONS)}")
     if not names or len(set(names)) < len(names) or count < 1 or seed < 0:
-        raise ValueError(f"{count} rays of {list(names)}, seed {seed}: accepted: at least one ray, each regime once")
-    header = _header(names, count, precision, seed, two_sided)
+        raise ValueError(f"{count} rays of {list(names)}, seed {seed}; expected at least one ray, each regime once")
+    header: Header = {
+        "format": FORMAT,
+        "version": __version__,
+        "precision": precision,
+        "seed": seed,
+        "count": count,
+        "two_sided": two_sided,
+        **{key: text for key, text in CONVENTIONS.items() if key not in ("n", "n, two-sided")},
+        "n": CONVENTIONS["n, two-sided" if two_sided else "n"],
+        "regimes": {name: [i * count, (i + 1) * count - 1] for i, name in enumerate(names)},
+    }
     if len(media) or len(wavelengths):
         header |= media_rays.header_of(media, wavelengths, precision)
         media_rays.check_regimes(header)
@@ -174,57 +203,10 @@ def facing(rays: Rays) -> Rays:
     return Rays(rays.a, np.where(c[:, None] > 0, -rays.n, rays.n), rays.k)
 
 
-def _header(names: Sequence[str], count: int, precision: str, seed: int, two_sided: bool) -> Header:
-    from mi_refract import __version__
-
-    conventions = {key: text for key, text in CONVENTIONS.items() if key not in ("n", "n, two-sided")}
-    conventions["n"] = CONVENTIONS["n, two-sided" if two_sided else "n"]
-    ids = {name: [i * count, (i + 1) * count - 1] for i, name in enumerate(names)}
-    return {
-        "format": FORMAT,
-        "version": __version__,
-        "precision": precision,
-        "seed": seed,
-        "count": count,
-        "two_sided": two_sided,
-        **conventions,
-        "regimes": ids,
-    }
-
-
-def regime_names(header: Header, count: int) -> np.ndarray:
-    """(count,): the regime of each ray, by the ranges of ids in the header."""
-    names = np.full(count, "", dtype=object)
-    for name, (first, last) in header["regimes"].items():
-        names[first : last + 1] = name
-    return names
-
-
-def _with_checksum(rays: RaySet) -> RaySet:
-    return RaySet(rays.rays, rays.ids, rays.regime, rays.header | {"checksum": checksum(rays)})
-
-
 def checksum(rays: RaySet) -> str:
     """SHA-256 of the header without its own line, and of the numbers. It does not depend on the file format."""
-    digest = Checksum(rays.header)
-    for i in range(0, len(rays), _HASHED):  # all numbers in float64 take several times what the rays do
-        digest.add_numbers(numbers_of(rays.ids[i : i + _HASHED], rays.rays[i : i + _HASHED], rays.header))
-    return digest.text
-
-
-class Checksum:
-    """As `checksum`, of rays that come in pieces."""
-
-    def __init__(self, header: Header) -> None:
-        """`header`: with or without the line of the checksum."""
-        hashed = {key: value for key, value in header.items() if key != "checksum"}
-        self._digest = hashlib.sha256(json.dumps(hashed, sort_keys=True).encode())
-
-    def add_numbers(self, numbers: np.ndarray) -> None:
-        """The next rows of the set's numbers."""
-        self._digest.update(numbers.astype("<f8").tobytes())
-
-    @property
-    def text(self) -> str:
-        """What the header says."""
-        return f"sha256:{self._digest.hexdigest()}"
+    hashed = {key: value for key, value in rays.header.items() if key != "checksum"}
+    digest = hashlib.sha256(json.dumps(hashed, sort_keys=True).encode())
+    for numbers in rays.numbers_in_pieces():
+        digest.update(numbers.astype("<f8").tobytes())
+    return f"sha256:{digest.hexdigest()}"

@@ -50,7 +50,9 @@ RAYS = {
     "precision": Key(Type("f32 or f64", lambda x: x if x in PRECISIONS else None), "the precision that it claims"),
     "command": Key(TEXTS, "reads rays on stdin and writes answers to stdout, as CSV; runs in the file's folder"),
     "total_internal_reflection": Key(
-        Type(", ".join((AUTO, *TIR)), lambda x: x if x in (AUTO, *TIR) else None), "how it is told", AUTO
+        Type(", ".join((AUTO, *TIR)), lambda x: x if x in (AUTO, *TIR) else None),
+        "how the function signals total internal reflection",
+        AUTO,
     ),
     "gives_up": Key(
         Type("a number from 0", only_if(lambda x: x >= 0, number)),
@@ -125,7 +127,7 @@ def load(folder: str | Path) -> RendererFile:
     try:
         return _renderer(Path(folder), read(tomllib.loads(content.decode()), RENDERER))
     except RecursionError:
-        raise ValueError(f"{path}: brackets nested too deeply; accepted: TOML") from None
+        raise ValueError(f"{path}: brackets nested too deeply; expected TOML") from None
     except ValueError as error:  # also of TOML and UTF-8
         raise ValueError(" ".join(f"{path}: {error}".split())) from None
 
@@ -140,7 +142,7 @@ def filled(command: tuple[str, ...], **values: object) -> list[str]:
         return [word.format_map({name: str(value) for name, value in known.items()}) for word in command]
     except (KeyError, IndexError, ValueError, AttributeError) as error:
         accepted = ", ".join(f"{{{name}}}" for name in known)
-        raise ValueError(f"command: {' '.join(command)}: {error}; accepted: {accepted}") from None
+        raise ValueError(f"command: {' '.join(command)}: {error}; expected {accepted}") from None
 
 
 def reference() -> str:
@@ -153,10 +155,10 @@ def _renderer(folder: Path, values: Table) -> RendererFile:
     rays = tuple(_rays(each, f"rays[{i}].") for i, each in enumerate(values["rays"] or []))
     images = _images(values["images"]) if values["images"] is not None else None
     if not rays and images is None and values["install"] is None:  # of some, scripts render the images
-        raise ValueError("rays: missing; accepted: [[rays]], [images] or both")
+        raise ValueError("rays: missing; expected [[rays]], [images] or both")
     titles = [f"{each.title}, {each.precision}" for each in rays]
     if repeated := {title for title in titles if titles.count(title) > 1}:
-        raise ValueError(f"rays: {repeated.pop()!r} is there twice; accepted: a title for each function")
+        raise ValueError(f"rays: {repeated.pop()!r} is there twice; expected a title for each function")
     return RendererFile(
         folder, values["title"], values["licence"] or "", rays, images, tuple(values["lens"] or ()), values["install"]
     )
@@ -182,7 +184,7 @@ def _rays(given: Table, where: str) -> RaysCommand:
 def _range(value: Any, where: str) -> tuple[float, float]:
     pair = list_of(positive, 2, 2)(value if isinstance(value, list) else [value, value])
     if pair is None or pair[0] > pair[1]:
-        raise ValueError(f"{where}: {shown(value)}; accepted: a number above 0, or [from, to]")
+        raise ValueError(f"{where}: {shown(value)}; expected a number above 0, or [from, to]")
     return pair[0], pair[1]
 
 
@@ -190,11 +192,11 @@ def _images(given: Table) -> ImagesCommand:
     values = read(given, IMAGES, "images.")
     for scene, spp in values["spp"].items():
         if type(spp) is not int or spp < 1:
-            raise ValueError(f"images.spp.{scene}: {shown(spp)}; accepted: a whole number above 0")
+            raise ValueError(f"images.spp.{scene}: {shown(spp)}; expected a whole number above 0")
     deviations = values["deviation"] or {}
     for scene, reason in deviations.items():
         if TEXT.parse(reason) is None:
-            raise ValueError(f"images.deviation.{scene}: {shown(reason)}; accepted: the reason, a text")
+            raise ValueError(f"images.deviation.{scene}: {shown(reason)}; expected the reason, a text")
     filled(tuple(values["command"]), scene="", spp=0, seed=0, image="")
     return ImagesCommand(
         values["export"],

@@ -62,7 +62,7 @@ TERMS = {
     "exact": "answers that are the certified direction, rounded: no formula can do better",
     "wrong": "answers whose error is beyond the bound, whose TIR is misclassified beyond it, or that are no direction",
 }
-MEANING = f"right: the exact answer for inputs within {RIGHT:g} roundings, m u, of those given"
+MEANING = f"right: backward error m ≤ {RIGHT:g} u (exact for inputs perturbed by at most {RIGHT:g} roundings)"
 SIGNALS = {
     "zero": "total internal reflection is signalled by the zero vector",
     "nan": "total internal reflection is signalled by NaN",
@@ -70,7 +70,7 @@ SIGNALS = {
     "tangent": "total internal reflection is signalled by a vector along the surface",
     "flag": "total internal reflection is signalled by transmitted = 0",
     NONE: "no ray is totally reflected",
-    UNCLEAR: "total internal reflection is signalled in no known way; accepted: the zero vector, NaN, the mirror "
+    UNCLEAR: "total internal reflection is signalled in no known way; expected the zero vector, NaN, the mirror "
     "direction, a vector along the surface, or a column `transmitted`",
 }
 PROBLEM_TEXTS = {
@@ -108,7 +108,7 @@ def _directions(found: Findings) -> str:
         return f"{answers}, all exact up to rounding"
     worst = f"the largest error is {compact(found.farthest.worst)} rad ({found.farthest.regime})"
     wide = found.total("undecidable")
-    open_ = f"; {wide} of them are to rays whose bound is above 0.1 rad, which shows little" if wide else ""
+    open_ = f"; {wide} rays are undecidable (error bound above 0.1 rad)" if wide else ""
     if found.right == found.answered:
         return f"{answers}, all right; {worst}"
     others = f"the others are within the error bound of the formula {found.error_bound}"

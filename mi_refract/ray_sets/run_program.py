@@ -31,19 +31,19 @@ def answers_of(
     cannot be started.
     """
     if not command:
-        raise ValueError("no command; accepted: mi-refract rays run [OPTIONS] -- COMMAND")
+        raise ValueError("no command; expected mi-refract rays run [OPTIONS] -- COMMAND")
     name = shlex.join(command)
     if not 0 <= timeout <= process_group.LONGEST:
-        raise ValueError(f"--timeout {timeout:g}: accepted: 0 … {process_group.LONGEST:g} seconds")
+        raise ValueError(f"--timeout {timeout:g}; expected 0 … {process_group.LONGEST:g} seconds")
     most = csv_bytes(most_answers(rays))
     try:
         ended = process_group.run(command, as_csv(rays).encode(), timeout, cwd=cwd, env=env, most=most, adopt=adopt)
     except process_group.TooMuchOutputError as error:
-        raise ValueError(f"{name}: {error}; accepted: one answer a ray") from None
+        raise ValueError(f"{name}: {error}; expected one answer a ray") from None
     except TimeoutError:
-        raise ValueError(f"{name}: no answer within {timeout:g} s; accepted: a longer --timeout") from None
+        raise ValueError(f"{name}: no answer within {timeout:g} s; expected a longer --timeout") from None
     except OSError as error:
         raise type(error)(f"{name}: cannot be started: {error.strerror or error}") from None
     if ended.status:
-        raise ValueError(f"{name}: {ended.how}; accepted: status 0")
+        raise ValueError(f"{name}: {ended.how}; expected status 0")
     return parse_answers(ended.out, name)

@@ -1,21 +1,40 @@
-"""Files of rays and of answers: nothing is lost, and a file that was edited is an error."""
+"""Files of rays and of answers: nothing is lost, and what was edited, damaged or forged is one line of error."""
 
 from __future__ import annotations
 
+import io
+import json
+import os
+import subprocess
+import sys
+import time
+import tracemalloc
 import zipfile
 
 import numpy as np
 import pytest
+from rich.console import Console
+from support.processes import ENVIRONMENT
 
 from mi_refract.io import image_file
-from mi_refract.ray_sets import files, ray_set
+from mi_refract.ray_sets import check_answers, files, ray_set, reports
+from mi_refract.ray_sets.ray_set import Answers, RaySet
+from mi_refract.regimes import Rays
 
 FORMATS = [("f32", "csv"), ("f32", "npz"), ("f32", "exr"), ("f64", "csv"), ("f64", "npz")]
 SMALL = {"names": ("generic", "k ≪ 1", "k ≫ 1", "denormal"), "count": 300, "seed": 5}
+IDS = np.arange(2)
 
 
-def bits(found):
-    return [getattr(found.rays, name).tobytes() for name in "ank"]
+def refused(path, message, read=files.read):
+    """Assert that the error is one line that names the file."""
+    with pytest.raises(ValueError) as caught, np.errstate(all="ignore"):
+        read(path)
+    text = str(caught.value)
+    assert text.startswith(f"{path}: ") and message in text and "\n" not in text and len(text) < 600
+
+
+# Rays
 
 
 @pytest.mark.parametrize("precision, ending", FORMATS)
@@ -23,24 +42,19 @@ def test_every_bit_returns(tmp_path, precision, ending):
     made = ray_set.make(**SMALL, precision=precision)
     path = files.write(tmp_path / f"rays.{ending}", made)
     found = files.read(path)
-    assert bits(found) == bits(made)
-    assert found.rays.a.dtype == ray_set.PRECISIONS[precision]
-    assert (found.header, list(found.regime)) == (made.header, list(made.regime))
-    np.testing.assert_array_equal(found.ids, made.ids)
+    for name in "ank":
+        one, other = getattr(found.rays, name), getattr(made.rays, name)
+        assert (one.tobytes(), one.dtype) == (other.tobytes(), other.dtype)
+    assert (found.header, list(found.regime), found.ids.tolist()) == (made.header, list(made.regime), list(range(1200)))
     denormal = made.rays.n[made.regime == "denormal"]
     assert (np.signbit(denormal) & (denormal == 0)).any()
     assert ((denormal != 0) & (np.abs(denormal) < np.finfo(denormal.dtype).tiny)).any()
+    again, other = (ray_set.make(**SMALL | {"seed": seed}, precision=precision) for seed in (5, 6))
+    assert files.write(tmp_path / f"again.{ending}", again).read_bytes() == path.read_bytes()
+    assert files.write(tmp_path / f"other.{ending}", other).read_bytes() != path.read_bytes()
 
 
-@pytest.mark.parametrize("precision, ending", FORMATS)
-def test_the_same_options_give_the_same_file(tmp_path, precision, ending):
-    written = [files.write(tmp_path / f"{i}.{ending}", ray_set.make(**SMALL, precision=precision)) for i in range(2)]
-    assert written[0].read_bytes() == written[1].read_bytes()
-    other = files.write(tmp_path / f"3.{ending}", ray_set.make(**SMALL | {"seed": 6}, precision=precision))
-    assert other.read_bytes() != written[0].read_bytes()
-
-
-@pytest.mark.parametrize("precision", ray_set.PRECISIONS)
+@pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_numbers_read_in_either_precision_are_the_rays(precision):
     """A reader in float64 and one in float32 both have the very number; no reader loses anything of k."""
     made = ray_set.make(**SMALL, precision=precision)
@@ -55,59 +69,59 @@ def test_numbers_read_in_either_precision_are_the_rays(precision):
     assert min(n_from.min(), n_to.min()) >= 1
 
 
-@pytest.mark.parametrize("name", ["rays.txt", "rays", "none/rays.csv"])
-def test_invalid_paths(tmp_path, name):
-    with pytest.raises((ValueError, OSError), match="accepted"):
-        files.write(tmp_path / name, ray_set.make(count=2))
+def test_paths_and_sets_that_cannot_be_written(tmp_path, monkeypatch):
+    two = ray_set.make(("generic",), 2)
+    for name in ("rays.txt", "rays", "none/rays.csv"):
+        with pytest.raises((ValueError, OSError)):
+            files.write(tmp_path / name, two)
+    with pytest.raises(ValueError, match=r"2 rays in f64; expected in EXR: f32, up to 16777216$"):
+        files.write(tmp_path / "rays.exr", ray_set.make(("generic",), 2, "f64"))
+    monkeypatch.setattr(files, "_EXR_IDS", 1)
+    with pytest.raises(ValueError, match=r"2 rays in f32; expected in EXR: f32, up to 1$"):
+        files.write(tmp_path / "rays.exr", two)
     assert not list(tmp_path.iterdir())
 
 
-def test_exr_holds_single_precision_only(tmp_path):
-    with pytest.raises(ValueError, match=r"f64; accepted in EXR: f32"):
-        files.write(tmp_path / "rays.exr", ray_set.make(count=2, precision="f64"))
-
-
-# Files that somebody touched
-
-
 EDITS = {
-    "a digit": lambda text: text.replace("0.3", "0.4", 1),
-    "an index": lambda text: text.replace(",1.5,1.0", ",1.5,2.0", 1),
-    "a row less": lambda text: text.rstrip("\n").rpartition("\n")[0] + "\n",
-    "two rows swapped": lambda text: text.replace("\n3,", "\n99,").replace("\n4,", "\n3,").replace("\n99,", "\n4,"),
-    "a regime's ids": lambda text: text.replace("[0, 49]", "[0, 59]"),
-    "another seed": lambda text: text.replace("# seed: 0", "# seed: 1"),
-    "the precision": lambda text: text.replace("# precision: f64", "# precision: f32"),
-    "no checksum": lambda text: "\n".join(line for line in text.split("\n") if "checksum" not in line),
-    "half a row": lambda text: text[: len(text) // 2],
-    "no header": lambda text: "\n".join(line for line in text.split("\n") if not line.startswith("#")),
-    "other columns": lambda text: text.replace("n_from,n_to", "n_to,n_from"),
-    "a word": lambda text: text.replace("\n7,", "\n7,x"),
-    "ids that are none": lambda text: text.replace("\n7,", "\nnan,"),
-    "a gap in the ranges": lambda text: text.replace('{"generic": [0, 49]', '{"generic": "?"'),
-    "nothing left": lambda text: "",
+    "a digit": (lambda text: text.replace("0.3", "0.4", 1), "the checksum does not match"),
+    "an index": (lambda text: text.replace(",1.5,1.0", ",1.5,2.0", 1), "the checksum does not match"),
+    "a row less": (lambda text: text.rstrip("\n").rpartition("\n")[0] + "\n", "the file has 99"),
+    "two rows swapped": (
+        lambda text: text.replace("\n3,", "\n99,").replace("\n4,", "\n3,").replace("\n99,", "\n4,"),
+        "the checksum does not match",
+    ),
+    "a regime's ids": (lambda text: text.replace("[0, 49]", "[0, 59]"), "regime 'generic' has the ids [0, 59]"),
+    "another seed": (lambda text: text.replace("# seed: 0", "# seed: 1"), "the checksum does not match"),
+    "the precision": (lambda text: text.replace("precision: f64", "precision: f32"), "the checksum does not match"),
+    "no checksum": (
+        lambda text: "\n".join(line for line in text.split("\n") if "checksum" not in line),
+        "the header has no checksum",
+    ),
+    "half a row": (lambda text: text[: len(text) // 2], "expected"),
+    "no header": (
+        lambda text: "\n".join(line for line in text.split("\n") if not line.startswith("#")),
+        "not a file of rays",
+    ),
+    "other columns": (lambda text: text.replace("n_from,n_to", "n_to,n_from"), "the first row is 'id,ax"),
+    "a word": (lambda text: text.replace("\n7,", "\n7,x"), "expected 9 numbers"),
+    "no number": (lambda text: text.replace("\n7,", "\nnan,"), "the checksum does not match"),
+    "nothing left": (lambda text: "", "the table is empty"),
 }
 
 
-@pytest.mark.parametrize("edit", EDITS.values(), ids=EDITS)
-def test_an_edited_file_is_refused(tmp_path, edit):
+@pytest.mark.parametrize("edit, message", EDITS.values(), ids=EDITS)
+def test_an_edited_file_is_refused(tmp_path, edit, message):
     text = files.as_csv(ray_set.make(["generic", "critical"], 50, "f64"))
-    path = tmp_path / "rays.csv"
-    path.write_text(text)
-    files.read(path)
     assert edit(text) != text
-    path.write_text(edit(text))
-    with pytest.raises(ValueError, match=r"^.*rays\.csv: .*accepted") as caught:
-        files.read(path)
-    assert "\n" not in str(caught.value)
+    (tmp_path / "rays.csv").write_text(edit(text))
+    refused(tmp_path / "rays.csv", message)
 
 
 @pytest.mark.parametrize("ending", ["csv", "npz", "exr"])
 @pytest.mark.parametrize("keep", [0, 0.3, 0.9])
 def test_a_truncated_file_is_refused(tmp_path, ending, keep):
     path = files.write(tmp_path / f"rays.{ending}", ray_set.make(count=200))
-    data = path.read_bytes()
-    path.write_bytes(data[: int(keep * len(data))])
+    path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
     with pytest.raises((ValueError, OSError), match=path.name) as caught:
         files.read(path)
     assert "\n" not in str(caught.value)
@@ -115,78 +129,171 @@ def test_a_truncated_file_is_refused(tmp_path, ending, keep):
 
 def test_another_image_is_refused(tmp_path):
     image_file.write_exr(tmp_path / "a.exr", np.zeros((2, 2, 3)))
-    with pytest.raises(ValueError, match=r"a\.exr: no channel 'id'"):
-        files.read(tmp_path / "a.exr")
+    refused(tmp_path / "a.exr", "no channel 'id'")
     image_file.write_exr(tmp_path / "a.exr", np.zeros((2, 2, 9)), files.COLUMNS)
-    with pytest.raises(ValueError, match="not a file of rays"):
-        files.read(tmp_path / "a.exr")
+    refused(tmp_path / "a.exr", "not a file of rays")
 
 
-def test_exr_holds_ids_up_to_those_of_float32(tmp_path, monkeypatch):
-    made = ray_set.make(("generic",), 4)
-    with pytest.raises(ValueError, match=r"4 rays in f64; accepted in EXR: f32, up to 16777216$"):
-        files.write(tmp_path / "rays.exr", ray_set.make(("generic",), 4, "f64"))
-    monkeypatch.setattr(files, "_EXR_IDS", 3)
-    with pytest.raises(ValueError, match=r"4 rays in f32; accepted in EXR: f32, up to 3$"):
-        files.write(tmp_path / "rays.exr", made)
-    monkeypatch.setattr(files, "_EXR_IDS", 4)
-    assert len(files.read(files.write(tmp_path / "rays.exr", made))) == 4
+# Headers and rays that somebody forged, with a checksum that fits
+
+
+@pytest.fixture(scope="module")
+def four():
+    return ray_set.make(["generic", "critical"], 2)
+
+
+def forged(rays, **changes):
+    """The set with another header, without what is None there, and with a checksum that fits."""
+    bare = {key: value for key, value in rays.header.items() if key != "checksum"}
+    header = {key: value for key, value in (bare | changes).items() if value is not None}
+    made = RaySet(rays.rays, rays.ids, header)
+    return RaySet(rays.rays, rays.ids, {"checksum": ray_set.checksum(made)} | header)
+
+
+def text_of(rays):
+    """As `files.as_csv`, of any header."""
+    lines = [f"# {key}: {json.dumps(value)}" for key, value in rays.header.items() if value is not None]
+    return "\n".join([*lines, files.as_csv(rays).partition(f"{rays.header['checksum']}\n")[2]])
+
+
+HEADERS = {
+    "three rays unjudged": ({"regimes": {"generic": [0, 0]}, "count": 1}, "is of 1 × 1 rays, the file has 4"),
+    "a gap": ({"regimes": {"generic": [0, 0], "critical": [2, 3]}}, "'generic' has the ids [0, 0]; expected [0, 1]"),
+    "two at once": ({"regimes": {"generic": [0, 1], "critical": [1, 2]}}, "regime 'critical' has the ids [1, 2]"),
+    "backward": ({"regimes": {"generic": [2, 3], "critical": [0, 1]}}, "regime 'generic' has the ids [2, 3]"),
+    "negative": ({"regimes": {"generic": [0, 1], "critical": [-2, -1]}}, "the header's regimes is"),
+    "no regime": ({"regimes": {}}, "the header is of 0 × 2 rays"),
+    "a list": ({"regimes": [["generic", [0, 3]]]}, "the header's regimes is"),
+    "numbers as text": ({"regimes": {"generic": ["0", "1"]}}, "the header's regimes is"),
+    "a long name": ({"regimes": {"x" * 10_000: [0, 1], "critical": [2, 3]}}, "the header's regimes is"),
+    "a count that is too large": ({"count": 10**12}, "the header is of 2 × 1000000000000 rays, the file has 4"),
+    "a count without an end": ({"count": 10**400}, "the header's count is 1000"),
+    "a count that is true": ({"count": True}, "the header's count is True"),
+    "no seed": ({"seed": None}, "the header has no seed"),
+    "a seed that is text": ({"seed": "0"}, "the header's seed is '0'"),
+    "no precision": ({"precision": None}, "the header has no precision"),
+    "a precision that is a list": ({"precision": ["f32"]}, "the header's precision is ['f32']"),
+    "another precision": ({"precision": "f16"}, "the header's precision is 'f16'"),
+    "NaN": ({"two_sided": float("nan")}, "the header's two_sided is nan"),
+    "a checksum that is a number": ({"checksum": 7}, "the header's checksum is 7"),
+    "more": ({"another": 1}, "the header has 'another'"),
+    "a long text": ({"version": "x" * 201}, "the header's version is 'xxx"),
+}
+
+
+@pytest.mark.parametrize("changes, message", HEADERS.values(), ids=HEADERS)
+def test_a_header_that_is_not_ours_is_refused(tmp_path, four, changes, message):
+    path = tmp_path / "rays.csv"
+    path.write_text(text_of(forged(four, seed=9)))
+    assert files.read(path).header["seed"] == 9  # so the others are refused for what they say
+    path.write_text(text_of(forged(four, **changes)))
+    refused(path, message)
+
+
+@pytest.mark.parametrize("ending", ["csv", "npz", "exr"])
+@pytest.mark.parametrize("text", ["[" * 100_000, "1" * 10_000, '{"format": NaN}', "7", "null"])
+def test_json_of_any_depth(tmp_path, four, ending, text):
+    path, columns = tmp_path / f"rays.{ending}", four.numbers
+    if ending == "csv":
+        path.write_text(files.as_csv(four).replace('{"generic"', text + '{"generic"'))
+    elif ending == "npz":
+        arrays = dict(zip(("id", "a", "n", "n_from", "n_to"), np.split(columns, [1, 4, 7, 8], 1), strict=True))
+        np.savez(path, **arrays, header=np.array(text))
+    else:
+        image_file.write_exr(path, columns[None], files.COLUMNS, {"mi_refract:rays": text})
+    refused(path, "the header's regimes is" if ending == "csv" else "not a file of rays")
+
+
+@pytest.mark.parametrize("name, value", [(name, x) for name in "ank" for x in (np.nan, np.inf, 0.0, -1.5)])
+def test_rays_without_refraction_are_refused(tmp_path, four, name, value):
+    columns = {name: getattr(four.rays, name).copy() for name in "ank"}
+    columns[name][2] = value
+    if name != "k" and value == -1.5:  # a vector of any length is one
+        columns[name][2] = [0, value, 0]
+    path = tmp_path / "rays.npz"
+    with np.errstate(all="ignore"):
+        files.write(path, forged(RaySet(Rays(*columns.values()), four.ids, four.header)))
+    if name != "k" and value == -1.5:
+        assert len(files.read(path)) == 4
+    else:  # NaN is equal to nothing
+        invalid = "ray 2 is invalid: zero or non-finite vector, or index ≤ 0"
+        refused(path, "checksum does not match" if np.isnan(value) else invalid)
+
+
+def test_markup_and_escapes_in_a_regime_stay_text(tmp_path):
+    """Rich would read [bold] and fail on [/]; a terminal would obey an escape."""
+    name = "[/] [bold]x[link=http://a] \x1b[2J\u202e"
+    one = ray_set.make(["generic"], 20)
+    files.write(tmp_path / "rays.npz", forged(one, regimes={name: [0, 19]}))
+    found = check_answers.check(files.read(tmp_path / "rays.npz"), Answers(one.ids, one.rays.a.astype(float)))
+    stream = io.StringIO()
+    Console(file=stream, width=1000, force_terminal=True, color_system=None).print(reports.table(found))
+    assert "[/] [bold]x[link=http://a]" in stream.getvalue()
+    assert "\x1b[2J" not in stream.getvalue() and "\u202e" not in stream.getvalue()
 
 
 # Answers
 
 
-def answers(text):
-    return files.parse_answers(text, "answers.csv")
-
-
 def test_answers_as_people_write_them():
     text = "\ufeff# seed: 3\r\n# by: us\r\n\r\nid, bx, by, bz, transmitted\r\n# a remark\r\n4, 1, 2.5e-3, -0, 1\r\n"
-    text += "2,nan,-nan(ind),NaN,0\r\n\r\n0 ,inf,-INF,+1.5,1\r\n"
-    for found in (answers(text[1:]), answers(text.encode())):
+    text += "2,nan,-nan(ind),-NaN(0x7ff),0\r\n  \n\r\n0 ,inf,-INF,+1.5,1 # right\r\n"
+    for found in (files.parse_answers(text[1:]), files.parse_answers(text.encode())):
         assert found.header == {"seed": 3, "by": "us"}
         assert found.ids.tolist() == [4, 2, 0]
         np.testing.assert_array_equal(found.b, [[1, 2.5e-3, 0], [np.nan] * 3, [np.inf, -np.inf, 1.5]])
         assert found.transmitted.tolist() == [True, False, True]
-    assert answers("id,bx,by,bz\n1,2,3,4").transmitted is None
-    assert len(answers("id,bx,by,bz\n").ids) == 0
+    assert files.parse_answers("id,bx,by,bz\n1,2,3,4").transmitted is None
+    assert files.parse_answers("id,bx,by,bz\n").b.shape == (0, 3)
 
 
-@pytest.mark.parametrize(
-    "text, message",
-    [
-        ("", "the table is empty; accepted, in this order: id,bx,by,bz or id,bx,by,bz,transmitted"),
-        ("1,2,3,4\n", "the first row is '1,2,3,4'"),
-        ("bx,by,bz\n", "the first row is 'bx,by,bz'"),
-        ("id,by,bx,bz\n", "the first row is 'id,by,bx,bz'"),
-        ("id,bx,by,bz\n1,2,3,4\n2,3,4\n3,x,1,2\n", "2 wrong rows, the first is line 3, '2,3,4'; accepted: 4 numbers"),
-        ("id,bx,by,bz\n1,2,3,4,1\n", "1 wrong rows, the first is line 2"),
-        ("id,bx,by,bz\n1,,,\n", "1 wrong rows"),
-        ("id,bx,by,bz\n1.5,2,3,4\n", "1 ids are not whole numbers below 2^53, the first is 1.5"),
-        (
-            "id,bx,by,bz\nnan,2,3,4\ninf,2,3,4\n1e300,2,3,4\n",
-            "3 ids are not whole numbers below 2^53, the first is nan",
-        ),
-        ("id,bx,by,bz,transmitted\n1,2,3,4,2\n2,2,3,4,nan\n", "transmitted is 2.0 for 2 rays; accepted: 0 or 1"),
-        (b"\xff\xfe\x00id", "not text; accepted: CSV in UTF-8"),
-    ],
-)
-def test_invalid_csv(text, message):
+TOP = "id,bx,by,bz\n"
+TABLES = {
+    "nothing": ("", "the table is empty; expected, in this order: id,bx,by,bz or id,bx,by,bz,transmitted or "),
+    "no names": ("1,2,3,4\n", "the first row is '1,2,3,4'"),
+    "no id": ("bx,by,bz\n", "the first row is 'bx,by,bz'"),
+    "another order": ("id,by,bx,bz\n", "the first row is 'id,by,bx,bz'"),
+    "a short row": (f"# x\n{TOP}\n1,2,3,4\n2,3,4\n3,x,1,2\n", "line 5 is '2,3,4'; expected 4 numbers"),
+    "long rows": (TOP + "1,2,3,4,1\n", "line 2 is '1,2,3,4,1'; expected 4 numbers"),
+    "no numbers": (TOP + "1,,,\n", "line 2 is '1,,,'"),
+    "numbers of Python": (TOP + "1,1_0,2,3\n", "line 2 is '1,1_0,2,3'"),
+    "other digits": (TOP + "1,١,2,3\n", "line 2 is '1,١,2,3'"),
+    "hexadecimal": (TOP + "1,0x1p0,2,3\n", "line 2 is '1,0x1p0,2,3'"),
+    "a fraction": (TOP + "1.5,2,3,4\n", "1 ids are not whole numbers below 2^53, the first is 1.5"),
+    "ids": (TOP + "nan,2,3,4\ninf,2,3,4\n1e300,2,3,4\n", "3 ids are not whole numbers below 2^53, the first is nan"),
+    "flags": ("id,bx,by,bz,transmitted\n1,2,3,4,2\n2,2,3,4,nan\n", "transmitted is 2.0 for 2 rays; expected 0 or 1"),
+    "no text": (b"\xff\xfe\x00id", "not text; expected CSV in UTF-8"),
+    "no text below": (TOP.encode() + b"1,2,3,4\n\xff,2,3,4\n", "not text; expected CSV in UTF-8"),
+    "a line without end": (TOP + "1" * 2_000_000, "line 2 is longer than 1048576 characters"),
+}
+
+
+@pytest.mark.parametrize("text, message", TABLES.values(), ids=TABLES)
+def test_tables_that_are_refused(tmp_path, text, message):
     with pytest.raises(ValueError) as caught:
-        answers(text)
-    assert str(caught.value).startswith("answers.csv: ")
-    assert message in str(caught.value)
+        files.parse_answers(text, "answers.csv")
+    assert str(caught.value).startswith("answers.csv: ") and message in str(caught.value)
+    (tmp_path / "a.csv").write_bytes(text if isinstance(text, bytes) else text.encode())
+    refused(tmp_path / "a.csv", message, files.read_answers)
+
+
+def test_a_line_of_nan_takes_no_time():
+    start = time.process_time()
+    with pytest.raises(ValueError, match="line 2 is '1,nan"):
+        files.parse_answers(TOP + "1," + "nan(" * 200_000 + "\n")
+    assert time.process_time() - start < 2  # a quadratic search takes minutes
 
 
 def test_answers_in_any_format(tmp_path):
     ids, b, flags = np.arange(5), np.arange(15.0).reshape(5, 3), np.array([1, 0, 1, 1, 0])
-    np.savez(tmp_path / "a.npz", id=ids, b=b, transmitted=flags)
+    np.savez(tmp_path / "a.npz", id=ids, b=np.asfortranarray(b), transmitted=flags)
+    np.savez_compressed(tmp_path / "c.npz", id=ids[:, None], b=b.astype(np.longdouble), transmitted=flags == 1)
     pixels = np.zeros((2, 4, 5), np.float32)
     pixels[..., 0] = -1
     pixels.reshape(8, 5)[:5] = np.column_stack([ids, b, flags])
     image_file.write_exr(tmp_path / "a.exr", pixels, (*files.ANSWER_COLUMNS, files.TRANSMITTED))
-    for ending in ("npz", "exr"):
-        found = files.read_answers(tmp_path / f"a.{ending}")
+    for name in ("a.npz", "c.npz", "a.exr"):
+        found = files.read_answers(tmp_path / name)
         np.testing.assert_array_equal(found.ids, ids)
         np.testing.assert_array_equal(found.b, b)
         np.testing.assert_array_equal(found.transmitted, flags == 1)
@@ -202,49 +309,169 @@ def test_an_image_leaves_out_only_pixels_that_are_marked_empty(tmp_path):
     assert files.read_answers(tmp_path / "a.exr").ids.tolist() == [0, -2, 2]
     pixels[0, 1, 0] = np.nan
     image_file.write_exr(tmp_path / "a.exr", pixels, files.ANSWER_COLUMNS)
-    with pytest.raises(ValueError, match=r"a\.exr: "):
-        files.read_answers(tmp_path / "a.exr")
+    refused(tmp_path / "a.exr", "1 ids are not whole numbers", files.read_answers)
 
 
-IDS = np.arange(2)
+@pytest.mark.parametrize("ending", ["csv", "npz", "exr"])
+def test_more_answers_than_rays_need(tmp_path, ending):
+    path, numbers = tmp_path / f"a.{ending}", np.tile([1.0, 2, 3, 4], (11, 1))
+    if ending == "csv":
+        path.write_text(TOP + "# no row\n" + "1,2,3,4\n" * 11)
+    elif ending == "npz":
+        np.savez(path, id=numbers[:, 0], b=numbers[:, 1:])
+    else:
+        image_file.write_exr(path, numbers[None].astype(np.float32), files.ANSWER_COLUMNS)
+    assert len(files.read_answers(path, most=11).ids) == 11
+    refused(path, "10", lambda path: files.read_answers(path, most=10))
+    os.truncate(path, 2**40)
+    if ending != "exr":
+        refused(path, "1099511627776 bytes", files.read_answers)
 
 
-@pytest.mark.parametrize("arrays", [{"id": IDS}, {"b": np.zeros((2, 3))}, {"id": IDS, "b": np.zeros(3)}])
-def test_invalid_npz(tmp_path, arrays):
-    np.savez(tmp_path / "a.npz", **arrays)
-    with pytest.raises(ValueError, match=r"a\.npz: .*accepted: an \.npz file with id, b"):
-        files.read_answers(tmp_path / "a.npz")
+def test_what_is_not_a_file(tmp_path):
+    (tmp_path / "a.csv").mkdir()
+    for name in ("a.csv", "b.npz"):
+        with pytest.raises(OSError) as caught:
+            files.read_answers(tmp_path / name)
+        assert str(caught.value.filename) == str(tmp_path / name)
+    os.mkfifo(tmp_path / "c.csv")
+    (tmp_path / "d.npz").symlink_to("/dev/zero")
+    for name in ("c.csv", "d.npz"):
+        refused(tmp_path / name, "not a regular file", files.read_answers)
+    refused(tmp_path / "e.txt", "expected a file name that ends in .csv or .npz or .exr", files.read_answers)
+
+
+def test_rays_are_read_without_the_oracle():
+    code = "import sys; sys.modules['flint'] = None; import mi_refract.ray_sets.files"
+    subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, check=True)
+
+
+# NumPy's archives
+
+
+def rewritten(path, change, method=zipfile.ZIP_DEFLATED):
+    """The archive with `change(name, bytes of the member)`."""
+    with zipfile.ZipFile(path) as old:
+        members = {info.filename: old.read(info) for info in old.infolist()}
+    with zipfile.ZipFile(path, "w", method) as new:
+        for name, content in members.items():
+            new.writestr(name, change(name, content))
+
+
+def npy(shape, dtype="<f8", content=b""):
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": dtype, "fortran_order": False, "shape": shape})
+    return stream.getvalue() + content
+
+
+ARRAYS = {
+    "no b": ({"b": None}, "there is no b; expected an .npz file with id, b"),
+    "no id": ({"id": None}, "there is no id"),
+    "complex": ({"b": np.zeros((2, 3), complex)}, "b holds complex128, not real numbers"),
+    "text": ({"b": np.full((2, 3), "1")}, "b holds <U1, not real numbers"),
+    "dates": ({"b": np.zeros((2, 3), "datetime64[s]")}, "not real numbers"),
+    "records": ({"b": np.zeros((2, 3), [("x", float)])}, "not real numbers"),
+    "objects": ({"b": np.array([print, None], dtype=object)}, "Object arrays cannot be loaded"),
+    "a row more": ({"b": np.zeros((3, 3))}, "id has 2 rows, b has 3 rows, which differ"),
+    "flat": ({"b": np.zeros(6)}, "b has the shape (6,)"),
+    "wide": ({"b": np.zeros((2, 4))}, "b has the shape (2, 4)"),
+    "a scalar": ({"b": np.zeros(())}, "b has the shape ()"),
+    "a long header": ({"header": np.array("x" * 2**19)}, "header has 2097280 bytes"),
+    "a header of numbers": ({"header": np.zeros(3)}, "header is float64"),
+}
+
+
+@pytest.mark.parametrize("changes, message", ARRAYS.values(), ids=ARRAYS)
+def test_arrays_that_are_no_answers(tmp_path, changes, message):
+    arrays = {"id": IDS, "b": np.zeros((2, 3))} | changes
+    np.savez(tmp_path / "a.npz", **{name: array for name, array in arrays.items() if array is not None})
+    refused(tmp_path / "a.npz", message, files.read_answers)
+
+
+MEMBERS = {
+    "more than it has": npy((10**12, 3)),
+    "a negative length": npy((-2, 3), content=bytes(48)),
+    "two negative lengths": npy((-2, -3), content=bytes(48)),
+    "less than it has": npy((2, 3), content=bytes(4800)),
+    "no array": b"hello",
+    "nothing": b"",
+    "a later version": b"\x93NUMPY\x09\x00" + bytes(100),
+    "a header of gigabytes": b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + b"(" * 20_000_000,
+    "a deep header": b"\x93NUMPY\x01\x00\x00\x20" + b"(" * 0x2000,
+    "a pickle": npy((2, 3), "|O", b"cos\nsystem\n(S'true'\ntR."),
+}
+
+
+@pytest.mark.parametrize("content", MEMBERS.values(), ids=MEMBERS)
+def test_members_that_do_not_hold_what_they_say(tmp_path, content):
+    np.savez(tmp_path / "a.npz", id=IDS, b=np.zeros((2, 3)))
+    rewritten(tmp_path / "a.npz", lambda name, old: content if name == "b.npy" else old)
+    refused(tmp_path / "a.npz", "an .npz file with id, b", files.read_answers)
+
+
+def test_archives_that_are_encrypted_or_compressed_otherwise(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, id=IDS, b=np.zeros((2, 3)))
+    rewritten(path, lambda name, old: old, zipfile.ZIP_BZIP2)
+    refused(path, "id is compressed by method 12", files.read_answers)
+    np.savez(path, id=IDS, b=np.zeros((2, 3)))
+    data = bytearray(path.read_bytes())
+    for signature, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        at = -1
+        while (at := data.find(signature, at + 1)) >= 0:
+            data[at + offset] |= 1
+    path.write_bytes(data)
+    refused(path, "is encrypted", files.read_answers)
+
+
+def test_a_bomb_is_not_unpacked(tmp_path):
+    """40 million rows of zeros in less than 1 MB, in an array that is asked for and in one that is not."""
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as new:
+        for name in ("id", "else"):
+            with new.open(f"{name}.npy", "w") as stream:
+                stream.write(npy((40_000_000,), "|u1"))
+                for _ in range(40):
+                    stream.write(bytes(1_000_000))
+        new.writestr("b.npy", npy((2, 3), content=bytes(48)))
+    tracemalloc.start()
+    refused(path, "id has 40000128 bytes, more than", lambda path: files.read_answers(path, most=1000))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4e6
+
+
+def test_a_damaged_archive_is_one_line(tmp_path):
+    """Every third byte changed in turn, of a small archive: an answer or one line, never another exception."""
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, id=IDS, b=np.zeros((2, 3)))
+    data, refusals = path.read_bytes(), 0
+    for at in range(0, len(data), 3):
+        path.write_bytes(data[:at] + bytes([data[at] ^ 0xFF]) + data[at + 1 :])
+        try:
+            files.read_answers(path)
+        except (ValueError, OSError) as error:
+            refusals += 1
+            assert "\n" not in str(error)
+    assert refusals > len(data) / 6
+
+
+def test_the_last_bit_of_an_array_is_checked(tmp_path):
+    path = files.write(tmp_path / "rays.npz", ray_set.make(("generic",), 3000))
+    with zipfile.ZipFile(path) as archive:
+        info = archive.getinfo("n_to.npy")
+    data = bytearray(path.read_bytes())
+    data[data.find(b"\x93NUMPY", info.header_offset) + info.file_size - 1] ^= 1
+    path.write_bytes(data)
+    refused(path, "Bad CRC-32 for file 'n_to.npy'")
 
 
 @pytest.mark.parametrize(("megabytes", "accepted"), [(12, True), (20, False)])
 def test_what_else_is_in_an_npz_may_have_16_megabytes(tmp_path, megabytes, accepted):
     """Beside twice the bytes of the numbers: the file is not read where it is larger."""
-    np.savez(tmp_path / "a.npz", id=IDS, b=np.zeros((2, 3)), more=np.zeros(megabytes << 20, np.uint8))
+    path = tmp_path / "a.npz"
+    np.savez(path, id=IDS, b=np.zeros((2, 3)), more=np.zeros(megabytes << 20, np.uint8))
     if accepted:
-        assert len(files.read_answers(tmp_path / "a.npz", most=2).ids) == 2
+        assert len(files.read_answers(path, most=2).ids) == 2
     else:
-        with pytest.raises(ValueError, match=r"a\.npz: .* bytes; accepted"):
-            files.read_answers(tmp_path / "a.npz", most=2)
-
-
-@pytest.mark.parametrize(("version", "accepted"), [((1, 0), True), ((2, 0), True), ((3, 0), False)])
-def test_versions_of_numpys_format(tmp_path, version, accepted):
-    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
-        for name, array in (("id", IDS), ("b", np.ones((2, 3)))):
-            with archive.open(f"{name}.npy", "w") as file:
-                np.lib.format.write_array(file, array, version)
-    if accepted:
-        np.testing.assert_array_equal(files.read_answers(tmp_path / "a.npz").b, np.ones((2, 3)))
-    else:
-        with pytest.raises(ValueError, match=r"id is in version \(3, 0\) of NumPy's format; accepted"):
-            files.read_answers(tmp_path / "a.npz")
-
-
-def test_the_numbers_of_the_largest_set_take_2_gib():
-    assert files.MOST_RAYS * len(files.COLUMNS) * 8 <= 2**31 < (files.MOST_RAYS + 1) * len(files.COLUMNS) * 8
-
-
-def test_a_pickle_is_not_opened(tmp_path):
-    np.savez(tmp_path / "a.npz", id=np.arange(2), b=np.array([print, None], dtype=object))
-    with pytest.raises(ValueError, match=r"a\.npz: .*accepted"):
-        files.read_answers(tmp_path / "a.npz")
+        refused(path, "bytes", lambda path: files.read_answers(path, most=2))

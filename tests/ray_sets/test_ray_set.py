@@ -37,8 +37,8 @@ def test_normals_face_the_ray(precision):
 @pytest.mark.parametrize(
     "given, message",
     [
-        ({"names": ["generc"]}, "regime 'generc': unknown; accepted: 'generic'"),
-        ({"precision": "f16"}, "precision 'f16': unknown; accepted: f32, f64"),
+        ({"names": ["generc"]}, "regime 'generc': unknown; expected 'generic'"),
+        ({"precision": "f16"}, "precision 'f16': unknown; expected f32, f64"),
         ({"count": 0}, "at least one ray"),
         ({"names": []}, "at least one ray"),
         ({"names": ["generic", "generic"]}, "each regime once"),

@@ -44,7 +44,7 @@ TWO = regime(), regime("critical", 3e-7)
         (
             found(regime(undecidable=2), TWO[1]),
             0,
-            f"16 {SOME_RIGHT}; 2 of them are to rays whose bound is above 0.1 rad, which shows little",
+            f"16 {SOME_RIGHT}; 2 rays are undecidable (error bound above 0.1 rad)",
         ),
         (found(regime(exact=10)), 0, "10 answers, all exact up to rounding"),
         (found(regime(wrong=2)), 1, "2 of 10 answers are wrong"),

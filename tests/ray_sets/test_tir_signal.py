@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from mi_refract import oracle
-from mi_refract.formulas import FORMULAS
 from mi_refract.ray_sets import tir_signal
-from mi_refract.ray_sets.judged_answers import judge_answers
-from mi_refract.ray_sets.tir_signal import LOOSEST, SeenAnswers
+from mi_refract.ray_sets.tir_signal import SeenAnswers
 from mi_refract.regimes import Rays
 
 U = 2.0**-53
@@ -26,28 +25,24 @@ def seen(given, b):
     return SeenAnswers(b, given, oracle.refract(given.a, given.n, given.k, fresnel=False, progress=False), U)
 
 
-def test_rays_far_beyond_the_critical_angle_decide():
-    """Four of ten say zero; the others are within 1e-4 of the critical angle, and answer along the surface."""
-    given = rays([-0.5] * 4 + [-1e-4] * 6)
-    b = np.array([[0.0, 0, 0]] * 4 + [[1.0, 0, 0]] * 6)
-    found = tir_signal.count(seen(given, b))
-    assert (found.total, found.certain, found.of_certain["zero"]) == (10, 4, 4)
-    assert found.signal == "zero"
+ZERO, ALONG = [0.0, 0, 0], [1.0, 0, 0]
 
 
-def test_where_none_is_far_beyond_it_all_decide():
-    given = rays([-1e-4] * 10)
-    found = tir_signal.count(seen(given, np.zeros((10, 3))))
-    assert (found.total, found.certain, found.signal) == (10, 0, "zero")
-
-
-def test_signals_are_counted_where_they_are_asked_for():
-    given, budget = rays([-0.5] * 4), FORMULAS[LOOSEST].budget
-    told = judge_answers(np.zeros((4, 3)), None, given, "f64", budget, "zero")
-    assert told.signals is None
-    asked = judge_answers(np.zeros((4, 3)), None, given, "f64", budget, "zero", counted=True)
-    assert asked.signals.of_total["zero"] == 4
-    assert judge_answers(np.zeros((4, 3)), None, given, "f64", budget).tir == "zero"
+@pytest.mark.parametrize(
+    ("radicands", "b", "signal"),
+    [
+        ([-0.5] * 4 + [-1e-4] * 6, [ZERO] * 4 + [ALONG] * 6, "zero"),  # far from the critical angle, four decide
+        ([-1e-4] * 10, [ZERO] * 10, "zero"),  # where none is far, all decide
+        ([-0.5] * 10, [ZERO] * 9 + [ALONG], "zero"),
+        ([-0.5] * 10, [ZERO] * 8 + [ALONG] * 2, tir_signal.UNCLEAR),
+        ([0.5] * 10, [ZERO] * 10, tir_signal.NONE),
+    ],
+)
+@pytest.mark.parametrize("size", [3, 10])
+def test_the_signal_that_most_rays_agree_on(radicands, b, signal, size):
+    given = rays(radicands)
+    pieces = [seen(given[i : i + size], np.array(b)[i : i + size]) for i in range(0, 10, size)]
+    assert tir_signal.detect(pieces) == signal
 
 
 def test_a_mirror_direction_is_one_at_any_length():

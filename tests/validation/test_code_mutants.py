@@ -183,9 +183,9 @@ def test_every_explanation_is_of_a_line_that_there_is():
 
 
 def test_tests_that_guard_a_package_are_there_and_the_modules_own_come_first():
-    mutant = Mutant("mi_refract/ray_sets/diagnosis.py", "AddNot", 0, 1, "", "")
+    mutant = Mutant("mi_refract/ray_sets/possible_directions.py", "AddNot", 0, 1, "", "")
     order = code_mutants.guards(code_mutants.ROOT, mutant)
-    assert order[0] == "tests/ray_sets/test_diagnosis.py"
+    assert order[0] == "tests/ray_sets/test_possible_directions.py"
     assert "tests/cli/test_rays.py" in order
     for room in code_mutants.GUARDS:
         assert all((code_mutants.ROOT / path).is_file() for path in code_mutants.test_files(code_mutants.ROOT, room))

@@ -57,7 +57,7 @@ def test_what_a_scene_must_not_do_is_refused_and_would_be_seen(case, tmp_path, m
     path = tmp_path / f"mutated{parser.suffix}"
     assert parser.good[-1].count(old) == 1
     path.write_bytes(parser.good[-1].replace(old, new))
-    with pytest.raises(ValueError, match="accepted: "):
+    with pytest.raises(ValueError, match="expected "):
         parser.read(path)
     monkeypatch.setattr(module, check, lambda *arguments: None)
     assert message in parser.read(path)

@@ -6,7 +6,7 @@ noise is known on both sides or on one, from samples, from passes under filters 
 renders. Pairs of renders of a scene have a ball of glass and a small lamp, whose light comes through the glass by
 chance.
 
-`welch` states a false alarm in 0.1 % of the pairs, and the difference of a tile that it sees with a probability of 99 %.
+`welch` states a false alarm in 0.1 % of pairs, and the difference of a tile that it sees with a probability of 99 %.
 Such differences are planted, and those that it sees with 50 %.
 
 `python -m validation diff --profile standard`

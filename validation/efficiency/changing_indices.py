@@ -42,7 +42,7 @@ def tasks(context: Context) -> list[Task]:
     if context.scalar:
         return [Task(NAME, lambda: [Row(NAME, OURS, "every way", context.variant, reason="nothing is compiled")])]
     many = MANY[context.profile.name]
-    ways = {
+    ways: dict[str, Callable[[Callable[[], float], str], float]] = {
         "a new scene for each image": new_scene,
         f"an edit among {many} glasses": functools.partial(edits, many, 1),
         f"a sweep of {SWEEP} indices": functools.partial(edits, 1, SWEEP),

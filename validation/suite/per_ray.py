@@ -15,6 +15,7 @@ is not installed, or says that it cannot run on this machine, is not run.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -25,6 +26,7 @@ from mi_refract.accuracy import absolute_radicand
 from mi_refract.ray_sets import check_answers, ray_set
 from mi_refract.ray_sets.check_answers import PROBLEMS, Findings, RegimeErrors
 from mi_refract.ray_sets.files import as_csv, parse_answers
+from mi_refract.ray_sets.header import PRECISIONS
 from mi_refract.ray_sets.judged_answers import RIGHT
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.ray_sets.renderer_file import RaysCommand
@@ -165,7 +167,7 @@ def _unmeasured(call: RaysCommand, reason: str) -> Row:
 @seeds.cached
 def given(precision: str) -> RaySet:
     """All sets, one after the other."""
-    parts = {name: _made(kind, ray_set.PRECISIONS[precision]) for name, kind in SETS.items()}
+    parts = {name: _made(kind, PRECISIONS[precision]) for name, kind in SETS.items()}
     return _gathered(parts, precision)
 
 
@@ -178,10 +180,11 @@ def _made(kind: Set, precision: type) -> regimes.Rays:
 
 
 def _gathered(parts: dict[str, regimes.Rays], precision: str) -> RaySet:
-    regime = np.concatenate([np.full(len(part), name, dtype=object) for name, part in parts.items()])
-    ends = {name: np.flatnonzero(regime == name)[[0, -1]].tolist() for name in parts}
-    header = {"precision": precision, "seed": seeds.current(SEED), "regimes": ends}
-    rays = RaySet(regimes.Rays.joined(list(parts.values())), np.arange(len(regime)), regime, header)
+    ends = itertools.accumulate(map(len, parts.values()))
+    ids = {name: [end - len(part), end - 1] for (name, part), end in zip(parts.items(), ends, strict=True)}
+    header = {"precision": precision, "seed": seeds.current(SEED), "regimes": ids}
+    joined = regimes.Rays.joined(list(parts.values()))
+    rays = RaySet(joined, np.arange(len(joined)), header)
     return replace(rays, header=header | {"checksum": ray_set.checksum(rays)})
 
 
@@ -215,7 +218,7 @@ def rows(call: RaysCommand, rays: RaySet, answers: Answers) -> list[Row]:
 
 
 def _only(rays: RaySet, mask: np.ndarray) -> RaySet:
-    return replace(rays, rays=rays.rays[mask], ids=rays.ids[mask], regime=rays.regime[mask])
+    return replace(rays, rays=rays.rays[mask], ids=rays.ids[mask])
 
 
 def _without(answers: Answers, ids: np.ndarray) -> Answers:

@@ -16,6 +16,7 @@ import numpy as np
 
 from mi_refract.formulas import FORMULAS
 from mi_refract.ray_sets import ray_set
+from mi_refract.ray_sets.header import PRECISIONS
 from mi_refract.ray_sets.judged_answers import RIGHT, JudgedAnswers, judge_answers
 from mi_refract.ray_sets.ray_set import RaySet
 from mi_refract.ray_sets.tir_signal import LOOSEST
@@ -112,7 +113,7 @@ def tasks(context: Context) -> list[Task]:
     return [
         Task(f"{NAME}: {name}, {precision}", functools.partial(rows, name, precision))
         for name in MISTAKES
-        for precision in ray_set.PRECISIONS
+        for precision in PRECISIONS
     ]
 
 

@@ -15,25 +15,30 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mi_refract.accuracy import RayBounds, lengths
+from mi_refract.regimes import Array
+
+Index = NDArray[np.intp]
+Flags = NDArray[np.bool_]
 
 UNDECIDABLE = 0.1  # radians: a direction is not judged where its bound is larger
 
 
 @dataclass(frozen=True)
-class Parts:
+class Components:
     """Directions (M, 3) as parts along t, along m, and across both: (M,) each, of a unit vector."""
 
-    along: np.ndarray
-    onward: np.ndarray
-    across: np.ndarray
+    along: Array
+    onward: Array
+    across: Array
 
 
-def possible(b: np.ndarray, bounds: RayBounds, some: np.ndarray) -> np.ndarray:
+def possible(b: Array, bounds: RayBounds, some: Index) -> Flags:
     """(M,) the answers of `b` (N, 3) to the rays `some` (M indices) that a transmitted direction may be."""
     u, k, exact = bounds.u[some], bounds.k[some], bounds.exact
-    given, incident = _parts(b, bounds, some)
+    given, incident = _components(b, bounds, some)
     e = k * incident.along
     root2 = np.where(exact.transmitted[some], exact.cos_t[some] ** 2, 1 - e * e)
     x = bounds.budget.radicand_error_bound(u, k)
@@ -47,34 +52,34 @@ def possible(b: np.ndarray, bounds: RayBounds, some: np.ndarray) -> np.ndarray:
     return _within(off, e * given.along + nearest * onward, np.hypot(e, nearest), _slack(bounds, some))
 
 
-def possible_tangent(b: np.ndarray, bounds: RayBounds, some: np.ndarray) -> np.ndarray:
+def possible_tangent(b: Array, bounds: RayBounds, some: Index) -> Flags:
     """(M,) as `possible`, of vectors along the surface."""
-    given, incident = _parts(b, bounds, some)
+    given, incident = _components(b, bounds, some)
     e, length = bounds.k[some] * incident.along, np.hypot(given.along, given.across)
     with np.errstate(invalid="ignore", divide="ignore"):
         return _within(e * given.across / length, given.along, e, _slack(bounds, some))
 
 
-def possible_mirror(b: np.ndarray, bounds: RayBounds, some: np.ndarray) -> np.ndarray:
+def possible_mirror(b: Array, bounds: RayBounds, some: Index) -> Flags:
     """(M,) as `possible`, of mirror directions."""
-    given, incident = _parts(b, bounds, some)
+    given, incident = _components(b, bounds, some)
     e, back = incident.along, -incident.onward
     off = np.sqrt(given.across**2 + (e * given.onward - back * given.along) ** 2)
     return _within(off, e * given.along + back * given.onward, np.ones(len(some)), _slack(bounds, some, 1.0))
 
 
-def _within(off: np.ndarray, forward: np.ndarray, size: np.ndarray, slack: np.ndarray) -> np.ndarray:
+def _within(off: Array, forward: Array, size: Array, slack: Array) -> Flags:
     """Whether a vector of this size is within `slack` of the line of b, and b does not point away from it."""
     return (size <= slack) | (off <= slack) & (forward > 0)
 
 
-def _slack(bounds: RayBounds, some: np.ndarray, largest: float = np.inf) -> np.ndarray:
+def _slack(bounds: RayBounds, some: Index, largest: float = np.inf) -> Array:
     """(M,): L, with K = k where k > 1, up to `largest`."""
     k = np.minimum(bounds.k[some], largest)
     return np.asarray(bounds.budget.of_terms(bounds.u[some], k))
 
 
-def _parts(b: np.ndarray, bounds: RayBounds, some: np.ndarray) -> tuple[Parts, Parts]:
+def _components(b: Array, bounds: RayBounds, some: Index) -> tuple[Components, Components]:
     """The parts of b and of `a`, in extended precision."""
     a, n = (_unit(v[some]) for v in (bounds.rays.a, bounds.rays.n))
     c = (a * n).sum(1, keepdims=True)
@@ -87,11 +92,11 @@ def _parts(b: np.ndarray, bounds: RayBounds, some: np.ndarray) -> tuple[Parts, P
     rest = b - onward[:, None] * m  # first: next to the normal, t is not orthogonal to m to the last digit
     along = (rest * t).sum(1)
     across = lengths(rest - along[:, None] * t)
-    return Parts(along, onward, across), Parts(length, np.abs(c[:, 0]), np.zeros(len(some)))
+    return Components(along, onward, across), Components(length, np.abs(c[:, 0]), np.zeros(len(some)))
 
 
-def _unit(v: np.ndarray) -> np.ndarray:
+def _unit(v: Array) -> Array:
     """Any vectors (M, 3), made unit in extended precision. Precondition: finite, not zero."""
-    wide = v.astype(np.longdouble)
+    wide: Array = v.astype(np.longdouble)
     wide = wide / np.abs(wide).max(1, keepdims=True, initial=0)  # squares of the least numbers would be 0
-    return wide / lengths(wide)[:, None]
+    return np.asarray(wide / lengths(wide)[:, None])
