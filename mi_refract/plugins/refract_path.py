@@ -6,8 +6,8 @@ counted from the camera, both lobes of glass are followed, each with its power, 
 chance, and lobes with a smaller share are dropped; the channel `truncated` holds what was dropped, and times the
 largest radiance it is a bound of the error.
 
-Derivatives are attached: rays move with the index. Edges that move across a pixel are not in them. A render that is
-differentiated does not split.
+Derivatives are attached: rays move with the index. Edges that move across a pixel, or in the view of a surface that is
+not smooth, are not in them. A render that is differentiated does not split.
 """
 
 from __future__ import annotations

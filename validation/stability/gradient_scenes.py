@@ -175,7 +175,7 @@ CASES = {
         lambda: plane(ROUGH, lamp(0, 2.4, 1.8, size=0.8)), "alpha.value", 0.2, 0.01, others=ALL, spp=512),
     "`alpha` of `roughconductor`, in glass": Case(lambda: core(ROUGH), "alpha.value", 0.2, 0.01, spp=512),
     "`alpha` of `roughdielectric`": Case(
-        lambda: plane(ROUGH_GLASS), "alpha.value", 0.5, 0.02, others=ALL, spp=512),
+        lambda: plane(ROUGH_GLASS), "alpha.value", 0.5, 0.02, others=ALL, spp=1024),
     "`roughness` of `principled`": Case(lambda: plane(PRINCIPLED), "roughness.value", 0.4, 0.02, spp=512),
     "`eta`": Case(ball, "eta", 1.5, 0.01, others=ALL),
     "`eta`, a matt ball within": Case(lambda: core(MATT), "ball.bsdf.eta", 1.5, 0.04, others=ALL, spp=2048),
@@ -202,7 +202,7 @@ CASES = {
         lambda: plane(MATT, lamp(0, 2.6, 1.73, size=0.3), ball=LENS), "ball.bsdf.eta", 1.5, 0.02, others=ALL, spp=1024,
         excluded=VERTEX),
     "translation of glass, its outline in view": Case(
-        lambda: ball(40), "ball.to_world", 0, 0.004, moved, others=ALL, spp=2048),
+        lambda: ball(40), "ball.to_world", 0, 0.004, moved, others=ALL, spp=4096),
 }
 # fmt: on
 QUICK = ("`alpha` of `roughconductor`", "`eta`")
