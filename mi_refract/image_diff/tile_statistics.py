@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mi_refract.io.pixels import Pixels as Array
-from mi_refract.io.pixels import block_area, block_max, block_sum
+from mi_refract.io.pixels import block_area, block_sum
 
 from .pixel_statistics import PixelSums
 
@@ -196,22 +196,39 @@ class Level:
 class OneSided:
     """What the pixels show where the noise of one side alone is known: d of `pixel_statistics`, 0 in other channels.
 
-    `largest`: that of each tile; infinite where that is no matter. `correlated`: by how much pixels are.
+    `sums`: of d, over tiles of side `tile`. `brighter`: d of every pixel, H × W × C. `well_known`: the channels whose
+    noise is known from so many samples that rare light of the other side is in it. `correlated`: by how much pixels are.
     """
 
     sums: PixelSums
-    largest: Array
+    tile: int
+    brighter: Array
+    well_known: Flags
     correlated: Inflation
 
     def coarser(self) -> OneSided:
         """The same in tiles GROWTH times as wide."""
-        return replace(self, sums=self.sums.coarser(GROWTH), largest=block_max(self.largest, GROWTH))
+        return replace(self, sums=self.sums.coarser(GROWTH), tile=GROWTH * self.tile)
 
     def p(self, area: Array, level: Level) -> Array:
-        """Of no difference beyond the margin; 0 where no pixel decides it, and where the other side is not brighter."""
-        asked = (self.sums.total[0] > 0) & (self.largest > SINGLE * level.error * area)
-        p = self.sums.p(area, level.allowed, self.correlated.factor, self.correlated.freedom)
-        return np.where(asked, np.nan_to_num(2 * p, nan=0.0), 0.0)
+        """Of no difference beyond the margin; 0 where the other side is not brighter.
+
+        Where noise is well known no pixel may move the mean of a tile by more than SINGLE of its standard error: what a
+        few bright pixels add beyond that may be light that is rare. Light of single events, each of more than that, has
+        fewer than 1/SINGLE² = 11 of them in a tile; so clipped, k of λ events are SINGLE k − √λ standard deviations at
+        most, where t is (k − λ)/√λ. Elsewhere the pixels alone say how large the noise is.
+        """
+        from scipy import special
+
+        most = (SINGLE * level.error * area).repeat(self.tile, 0).repeat(self.tile, 1)
+        height, width = self.brighter.shape[:2]
+        clipped = block_sum(np.minimum(self.brighter, most[:height, :width]), self.tile)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (clipped / area - level.allowed) / level.error
+        p = special.stdtr(level.freedom, -t)
+        by_pixels = self.sums.p(area, level.allowed, self.correlated.factor, self.correlated.freedom)
+        asked = self.sums.total[0] > 0
+        return np.where(asked, np.nan_to_num(2 * np.where(self.well_known, p, by_pixels), nan=0.0), 0.0)
 
 
 def levels(

@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from mi_refract.io.image_file import Image
-from mi_refract.io.pixels import Pixels, block_max, block_sum
+from mi_refract.io.pixels import Pixels, block_sum
 
 from .comparison import Comparison, Maps, Metric, Verdict, aligned, nonfinite_result, preconditions
 from .pixel_correlation import inflation
@@ -86,9 +86,8 @@ def compare_renders(
         return Comparison("welch", Verdict.EQUAL, "the same in every value, noise and all", (IDENTICAL,))
     tile = min(tile, max(reference[0].pixels.shape[:2]))
     sides = _of_estimates(*known, tile) if known else _of_renders(reference, test, tile, given)
-    found = list(
-        levels(sides.one, sides.two, equivalence_margin, sides.pixels if pixels == "yes" else None, sides.shown)
-    )
+    pixel_sums = sides.pixels if pixels == "yes" else None
+    found = list(levels(sides.one, sides.two, equivalence_margin, pixel_sums, sides.shown))
     a, b = (_finite(side[0].select(sides.channels)) for side in (reference, test))
     found[0] = with_silent_pixels(found[0], a, b, equivalence_margin, tile, sides.odds)
     tests = TileTests(found, family_error, correction)
@@ -191,11 +190,14 @@ def _of_estimates(a: Estimate, b: Estimate, tile: int) -> _Sides:
     shown = None
     if alone:
         brighter = (m2 - m1) * (1.0 * only_one - only_two)
-        known = np.where(only_one, a.spp / b.spp, b.spp / a.spp) >= WELL_KNOWN
-        largest = block_max(np.where(known, brighter, np.inf), tile)
+        well_known = np.where(only_one, a.spp / b.spp, b.spp / a.spp) >= WELL_KNOWN
         total, squares = block_sum(brighter, tile), block_sum(np.square(brighter), tile)
         shown = OneSided(
-            PixelSums(total[None], squares[None], rarer), largest, max(found, one.correlated, two.correlated)
+            PixelSums(total[None], squares[None], rarer),
+            tile,
+            brighter,
+            well_known,
+            max(found, one.correlated, two.correlated),
         )
     return _Sides(one, two, pixels, names, (a.spp, b.spp), SAMPLES, odds, shown)
 

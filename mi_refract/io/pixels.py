@@ -39,13 +39,6 @@ def block_sum(pixels: Pixels, side: int) -> Pixels:
     return sums
 
 
-def block_max(pixels: Pixels, side: int) -> Pixels:
-    """The largest values of the blocks of `block_sum`."""
-    rows, columns = np.arange(0, pixels.shape[-3], side), np.arange(0, pixels.shape[-2], side)
-    largest: Pixels = np.maximum.reduceat(np.maximum.reduceat(pixels, rows, -3), columns, -2)
-    return largest
-
-
 def block_area(height: int, width: int, side: int) -> Pixels:
     """The number of pixels in each block of `block_sum`, with a last axis of length 1."""
     rows, columns = (np.diff(np.arange(0, size, side), append=size) for size in (height, width))

@@ -146,11 +146,22 @@ def test_what_no_sample_of_the_reference_found_is_evidence_by_how_many_it_had():
         assert found.verdict is not Verdict.EQUAL
 
 
-def test_rare_events_are_no_evidence_against_a_side_that_does_not_know_its_noise():
-    """A tile of 5.5 σ where σ is a quarter of the mean: so are a few paths that find a lamp."""
-    mean, far, variance = (np.full((16, 16, 1), x) for x in (1.0, 2.375, 256 * 1000 * 0.25**2))
+@pytest.mark.parametrize(
+    ("lit", "verdict"),
+    [(1, Verdict.INCONCLUSIVE), (8, Verdict.INCONCLUSIVE), (64, Verdict.DIFFERENT), (256, Verdict.DIFFERENT)],
+)
+def test_rare_events_are_no_evidence_against_a_side_that_does_not_know_its_noise(lit, verdict):
+    """A tile of 5.5 σ where σ is a quarter of the mean: so are a few paths that find a lamp, but not 64 of them.
+
+    The other side is as dark as the reference but in `lit` pixels. Of rare light whose σ is a quarter of the mean, equal
+    images have 16 events in the tile, and 64 with a probability of 1e-18.
+    """
+    mean, variance = (np.full((16, 16, 1), x) for x in (1.0, 256 * 1000 * 0.25**2))
+    far = mean.copy()
+    far.flat[:: 256 // lit] += 1.375 * 256 / lit
     known, other = image(mean, variance, ("Y",)), image(far, channels=("Y",))
     found = compare("welch", known, other, spp_reference=10**9, spp_test=1000)
-    assert (found.verdict, "heavy-tailed" in found.reason) == (Verdict.INCONCLUSIVE, True)
+    assert found.verdict is verdict
+    assert ("heavy-tailed" in found.reason) == (verdict is Verdict.INCONCLUSIVE)
     both = image(far, np.full_like(mean, 1e-9), ("Y",)), image(mean, variance, ("Y",))
     assert compare("welch", *both, spp_reference=10**9, spp_test=1000).verdict is Verdict.DIFFERENT

@@ -23,6 +23,7 @@ OTHERWISE = {
     "renders.colours": "images are shown; no figure has a bound",
     "renders.unused_features": "times and equality to the last bit",
     "efficiency.error_against_time": "several seeds a method, with intervals",
+    "efficiency.changing_indices": "times",
     "efficiency.scaling": "times",
     "planar.times": "times",
     "diff.planted_defects": "trials with seeds of their own",
