@@ -24,7 +24,7 @@ from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
 from validation.diff import visible_changes
 from validation.directions import per_formula
-from validation.efficiency import error_against_time
+from validation.efficiency import changing_indices, error_against_time
 from validation.planar import against_retrace
 from validation.planar import times as planar_times
 from validation.reference.layered_scenes import MIRAGE
@@ -208,6 +208,16 @@ def efficiency(rows: list[Row]) -> str:
     return _table(size, ["scene", "method", "sampler", *EFFICIENCY.values()], cells)
 
 
+def changing(rows: list[Row]) -> str:
+    """Markdown: what it costs to change an index, over the built-in."""
+    found = [row for row in rows if row.study == changing_indices.NAME and row.values]
+    if not found:
+        raise ValueError("README: no changes of indices were timed; their table needs a compiled variant")
+    cells = [[row.case, _with_interval(row, TIME_OVER_BUILTIN)] for row in found]
+    text = f"Median of {found[0].replay['rounds']} rounds, {found[0].setting}, two sides in turn."
+    return _table(text, ["", "time over the built-in's"], cells)
+
+
 def planar(rows: list[Row]) -> str:
     """Markdown: by scene the distance of paths from the retrace, and the time per path by the number of segments."""
     retraced, timed = _planar_errors(rows), _planar_times(rows)
@@ -338,6 +348,7 @@ TABLES = {
     "renders": Table("validation/README.md", "renders", renders),
     "paths": Table("validation/README.md", "stability", paths),
     "efficiency": Table("mi_refract/plugins/README.md", "efficiency", efficiency),
+    "changing": Table("mi_refract/plugins/README.md", "efficiency", changing),
     "planar": Table("mi_refract/planar/README.md", "planar", planar),
     "defects": Table("mi_refract/image_diff/README.md", "diff", seen),
     "visible": Table("mi_refract/image_diff/README.md", "diff", visible),
