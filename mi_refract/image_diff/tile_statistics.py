@@ -197,7 +197,8 @@ class OneSided:
     """What the pixels show where the noise of one side alone is known: d of `pixel_statistics`, 0 in other channels.
 
     `sums`: of d, over tiles of side `tile`. `brighter`: d of every pixel, H × W × C. `well_known`: the channels whose
-    noise is known from so many samples that rare light of the other side is in it. `correlated`: by how much pixels are.
+    noise is known from so many samples that it holds the rare light of the other side. `correlated`: the `Inflation` of
+    tile means.
     """
 
     sums: PixelSums
@@ -213,10 +214,10 @@ class OneSided:
     def p(self, area: Array, level: Level) -> Array:
         """Of no difference beyond the margin; 0 where the other side is not brighter.
 
-        Where noise is well known no pixel may move the mean of a tile by more than SINGLE of its standard error: what a
-        few bright pixels add beyond that may be light that is rare. Light of single events, each of more than that, has
-        fewer than 1/SINGLE² = 11 of them in a tile; so clipped, k of λ events are SINGLE k − √λ standard deviations at
-        most, where t is (k − λ)/√λ. Elsewhere the pixels alone say how large the noise is.
+        Where the noise is well known, a pixel may move the mean of a tile by SINGLE of its standard error at most: what
+        bright pixels add beyond that may be rare light. If an event moves the mean by more than that, equal images have
+        λ < 1/SINGLE² = 11 of them in a tile. Then k events, clipped, are SINGLE k − √λ < (k − λ)/√λ standard deviations.
+        Elsewhere the pixels alone say how large the noise is.
         """
         from scipy import special
 

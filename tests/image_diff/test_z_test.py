@@ -153,8 +153,7 @@ def test_what_no_sample_of_the_reference_found_is_evidence_by_how_many_it_had():
 def test_rare_events_are_no_evidence_against_a_side_that_does_not_know_its_noise(lit, verdict):
     """A tile of 5.5 σ where σ is a quarter of the mean: so are a few paths that find a lamp, but not 64 of them.
 
-    The other side is as dark as the reference but in `lit` pixels. Of rare light whose σ is a quarter of the mean, equal
-    images have 16 events in the tile, and 64 with a probability of 1e-18.
+    The other side is brighter in `lit` pixels alone, by 5.5/`lit` σ of the tile each.
     """
     mean, variance = (np.full((16, 16, 1), x) for x in (1.0, 256 * 1000 * 0.25**2))
     far = mean.copy()
