@@ -216,7 +216,7 @@ class OneSided:
 
         Where the noise is well known, a pixel may move the mean of a tile by SINGLE of its standard error at most: what
         bright pixels add beyond that may be rare light. If an event moves the mean by more than that, equal images have
-        λ < 1/SINGLE² = 11 of them in a tile. Then k events, clipped, are SINGLE k − √λ < (k − λ)/√λ standard deviations.
+        λ < 1/SINGLE² = 11 of them in a tile. So clipped, k of them are SINGLE k − √λ < (k − λ)/√λ σ.
         Elsewhere the pixels alone say how large the noise is.
         """
         from scipy import special
