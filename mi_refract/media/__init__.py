@@ -1,7 +1,7 @@
 """Refractive indices of materials by wavelength. Wavelengths are in nanometres, in air or in vacuum as the source says.
 
 In: what a scene says of a material, a number or a string (see `parse`), and wavelengths as floats, numpy arrays or
-Dr.Jit arrays. Out: indices in double precision, and their derivatives. Nothing here refracts.
+Dr.Jit arrays. Out: indices in double precision; Dr.Jit differentiates those of its arrays. Nothing here refracts.
 """
 
 from . import glass_catalogs

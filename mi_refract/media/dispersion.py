@@ -1,6 +1,6 @@
-"""Formulas of dispersion: n as a function of the wavelength λ in nm and of coefficients, and its derivatives.
+"""Formulas of dispersion: n as a function of the wavelength λ in nm and of coefficients.
 
-A formula takes floats, numpy arrays or Dr.Jit arrays alike, in double precision.
+A formula takes floats, numpy arrays or Dr.Jit arrays alike, in double precision; Dr.Jit differentiates it.
 """
 
 from __future__ import annotations
@@ -40,12 +40,6 @@ class Dispersion(Protocol):
     def index(self, wavelength: Number, c: Coefficients) -> Number:
         """N, dimensionless."""
 
-    def slope(self, wavelength: Number, c: Coefficients) -> Number:
-        """dn/dλ per nm."""
-
-    def coefficient_slopes(self, wavelength: Number, c: Coefficients) -> dict[str, Number]:
-        """dn/dc for each coefficient c."""
-
     def poles(self, c: Coefficients) -> dict[str, float]:
         """Wavelengths at which n is infinite, in nm, by the coefficient that puts them there."""
 
@@ -77,32 +71,6 @@ class Terms:
         for b, r in self.resonances:
             total = total + c[b] * (square / (square - self._pole(c[r])))
         return total
-
-    def slope(self, wavelength: Number, c: Coefficients) -> Number:
-        """See `Dispersion`. d/dλ a λ^p = p a λ^p/λ; d/dλ B λ²/(λ² − C) = −2 B C λ/(λ² − C)²."""
-        square = wavelength * wavelength
-        total = 0 * wavelength
-        for name, p in self.powers:
-            total = total + c[name] * p * _to_power(square, p // 2) / wavelength
-        for b, r in self.resonances:
-            pole = self._pole(c[r])
-            apart = square - pole
-            total = total - c[b] * (2 * pole * wavelength / (apart * apart))
-        return self._of_n(total, wavelength, c)
-
-    def coefficient_slopes(self, wavelength: Number, c: Coefficients) -> dict[str, Number]:
-        """See `Dispersion`. d/dC B λ²/(λ² − C) = B λ²/(λ² − C)²."""
-        square = wavelength * wavelength
-        slopes = {name: _to_power(square, p // 2) for name, p in self.powers}
-        for b, r in self.resonances:
-            apart = square - self._pole(c[r])
-            slopes[b] = square / apart
-            slopes[r] = c[b] * square / (apart * apart) * (2 * c[r] if self.squared else 1)
-        return {name: self._of_n(slope, wavelength, c) for name, slope in slopes.items()}
-
-    def _of_n(self, slope: Number, wavelength: Number, c: Coefficients) -> Number:
-        """The derivative of n, from that of the sum."""
-        return slope if self.power == 1 else slope / (2 * self.index(wavelength, c))
 
     def _pole(self, r: Number) -> Number:
         return r * r if self.squared else r
@@ -136,16 +104,6 @@ class Abbe:
         """See `Dispersion`."""
         return c["n_d"] + (c["n_d"] - 1) / c["V_d"] * self._g(wavelength)
 
-    def slope(self, wavelength: Number, c: Coefficients) -> Number:
-        """See `Dispersion`."""
-        span = LINES["F"] ** -2 - LINES["C"] ** -2
-        return -2 * (c["n_d"] - 1) / c["V_d"] / (span * wavelength * wavelength * wavelength)
-
-    def coefficient_slopes(self, wavelength: Number, c: Coefficients) -> dict[str, Number]:
-        """See `Dispersion`."""
-        g = self._g(wavelength)
-        return {"n_d": 1 + g / c["V_d"], "V_d": -(c["n_d"] - 1) * g / (c["V_d"] * c["V_d"])}
-
     def poles(self, c: Coefficients) -> dict[str, float]:
         """None: n is infinite at λ = 0 only."""
         return {}
@@ -163,37 +121,16 @@ class Table:
         digits = 9 if len({f"{knot:.9g}" for knot in self.knots}) == len(self.knots) else 17
         return tuple("n_" + f"{knot:.{digits}g}".replace(".", "_") for knot in self.knots)
 
-    def _weights(self, wavelength: Number) -> list[Number]:
-        """For each knot, by how much its value counts; they are 0 beyond the first knot and the last."""
-        rising: list[tuple[Number, Number]] = []  # from 0 at a knot to 1 at the next; only between the two
-        for i, (start, end) in enumerate(itertools.pairwise(self.knots)):
-            share = (wavelength - start) / (end - start)
-            after = wavelength >= start if i == 0 else wavelength > start
-            inside = after & (wavelength <= end)
-            rising.append((inside, share))
-        weights = []
-        for i in range(len(self.knots)):
-            up = where(rising[i - 1][0], rising[i - 1][1], 0) if i else 0
-            down = where(rising[i][0], 1 - rising[i][1], 0) if i < len(rising) else 0
-            weights.append(up + down)
-        return weights
-
     def index(self, wavelength: Number, c: Coefficients) -> Number:
-        """See `Dispersion`."""
-        return sum(c[name] * weight for name, weight in zip(self.names, self._weights(wavelength), strict=True))
-
-    def slope(self, wavelength: Number, c: Coefficients) -> Number:
-        """See `Dispersion`; at a knot, that of the interval which ends there."""
+        """See `Dispersion`; 0 beyond the first knot and the last."""
         total = 0 * wavelength
         values = [c[name] for name in self.names]
         for i, (start, end) in enumerate(itertools.pairwise(self.knots)):
             after = wavelength >= start if i == 0 else wavelength > start
-            total = total + where(after & (wavelength <= end), (values[i + 1] - values[i]) / (end - start), 0)
+            share = (wavelength - start) / (end - start)  # 0 at `start`, 1 at `end`: there the value is the knot's own
+            between = values[i] * (1 - share) + values[i + 1] * share
+            total = total + where(after & (wavelength <= end), between, 0)
         return total
-
-    def coefficient_slopes(self, wavelength: Number, c: Coefficients) -> dict[str, Number]:
-        """See `Dispersion`."""
-        return dict(zip(self.names, self._weights(wavelength), strict=True))
 
     def poles(self, c: Coefficients) -> dict[str, float]:
         """None."""
@@ -207,14 +144,6 @@ class Constant:
     def index(self, wavelength: Number, c: Coefficients) -> Number:
         """See `Dispersion`."""
         return c["n"] + 0 * wavelength
-
-    def slope(self, wavelength: Number, c: Coefficients) -> Number:
-        """0."""
-        return 0 * wavelength
-
-    def coefficient_slopes(self, wavelength: Number, c: Coefficients) -> dict[str, Number]:
-        """See `Dispersion`."""
-        return {"n": 1 + 0 * wavelength}
 
     def poles(self, c: Coefficients) -> dict[str, float]:
         """None."""

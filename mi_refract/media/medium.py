@@ -63,16 +63,5 @@ class Medium:
         n = self.dispersion.index(nan_unless(inside, x), self._all(coefficients))
         return like(nan_unless((n > 0) & (n < math.inf), n), wavelength)
 
-    def slope(self, wavelength: Number, coefficients: Coefficients | None = None) -> Number:
-        """dn/dλ per nm; errors and NaN as of `index`."""
-        n = self.index(wavelength, coefficients)
-        return like(nan_unless(n > 0, self.dispersion.slope(wide(wavelength), self._all(coefficients))), wavelength)
-
-    def coefficient_slopes(self, wavelength: Number, coefficients: Coefficients | None = None) -> dict[str, Number]:
-        """dn/dc for each coefficient c, in its own unit; errors and NaN as of `index`."""
-        n = self.index(wavelength, coefficients)
-        slopes = self.dispersion.coefficient_slopes(wide(wavelength), self._all(coefficients))
-        return {name: like(nan_unless(n > 0, slope), wavelength) for name, slope in slopes.items()}
-
     def _all(self, coefficients: Coefficients | None) -> Coefficients:
         return {**self.coefficients, **(coefficients or {})}
