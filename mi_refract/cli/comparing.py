@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 Names = Annotated[
-    list[str] | None, typer.Argument(metavar="[NAME]...", help="Only these images: paths in the folders, * and ?.")
+    list[str] | None, typer.Argument(metavar="NAME", help="Only these images: paths in the folders, * and ?.")
 ]
 Method = Annotated[str, typer.Option(help=f"Comparison method: {'|'.join(settings_file.ACCEPTED)}; see --methods.")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="An option of the method.")]

@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     from mi_refract.image_diff.html_report import Page
     from mi_refract.image_diff.report_folder import Folder as ReportFolder
 
-NotAlways = Annotated[
-    Path | None, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them; optional with --self-test.")
+Reference = Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")]
+Test = Annotated[
+    Path | None,
+    typer.Argument(metavar="TEST", help="The image or folder to compare with it; optional with --check-settings."),
 ]
-NotWithSelfTest = Annotated[Path | None, typer.Argument(metavar="TEST", help="The image or folder to compare with it.")]
-SCENE = ".xml"
 OUTPUTS = ((".xml",), (".json",))  # of --junit, --json
 PAGES = (".html", ".htm")
 
@@ -72,7 +72,6 @@ def _print_methods(asked: bool) -> None:
 
 
 Renders = Annotated[bool, typer.Option("--renders", help="Each folder holds several renders of one image.")]
-OldRenders = Annotated[bool, typer.Option("--samples", hidden=True)]
 CountsAs = Annotated[
     Inconclusive | None, typer.Option(help="What an inconclusive image counts as; exit code 3 by default.")
 ]
@@ -99,29 +98,15 @@ Methods = Annotated[
 CheckSettings = Annotated[
     bool, typer.Option("--check-settings", help="Print how each image would be compared, and which settings say so.")
 ]
-SelfTest = Annotated[
-    bool,
-    typer.Option(
-        "--self-test",
-        help="Inject synthetic defects into REFERENCE (an image, a folder of renders, a scene); report which methods "
-        "detect them.",
-    ),
-]
-
-AllowPlugins = Annotated[
-    list[str] | None,
-    typer.Option(metavar="NAME", help="Also allow this plugin, which ships with the scene of --self-test."),
-]
 
 
 def diff(
-    reference: NotAlways = None,
-    test: NotWithSelfTest = None,
+    reference: Reference,
+    test: Test = None,
     names: Names = None,
     method: Method = AUTO,
     options: Set = None,
     renders: Renders = False,
-    samples: OldRenders = False,
     idiff: Idiff = None,
     settings: File = None,
     allow_nonfinite: Nonfinite = None,
@@ -135,35 +120,11 @@ def diff(
     json: Json = None,
     github: GitHub = False,
     methods: Methods = False,
-    self_test: SelfTest = False,
-    allow_plugins: AllowPlugins = None,
     check_settings: CheckSettings = False,
 ) -> None:
     """Compare images with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
     require_extra("scipy", *(("jinja2", "matplotlib") if report else ()))
-    renders = renders or samples
-    if allow_plugins and not (self_test and reference and reference.suffix == SCENE):
-        raise ValueError("--allow-plugins: only a scene brings plugins; expected with --self-test SCENE.xml")
-    if self_test:
-        others = (
-            options,
-            idiff is not None,
-            renders,
-            settings,
-            allow_nonfinite,
-            inconclusive,
-            report,
-            junit,
-            json,
-            github,
-            variance,
-            channels,
-        )
-        if any(others) or method != AUTO:
-            accepted = "no other option but --max-values, --allow-plugins"
-            raise ValueError(f"--self-test asks every method and prints; expected {accepted}")
-        raise typer.Exit(_self_test(reference, test, max_values, allow_plugins or []))
-    if reference is None or (test is None and not check_settings):
+    if test is None and not check_settings:
         raise ValueError("two paths are needed; expected mi-refract diff REFERENCE TEST")
     chosen = settings_of(reference, method, options, idiff, settings, allow_nonfinite, max_values, variance, channels)
     if check_settings or test is None:
@@ -244,25 +205,6 @@ def _replay(found: Results, names: Sequence[str]) -> str:
     """The command that repeats the whole comparison."""
     sides = (as_word(path) for path in (found.reference, found.test))
     return shlex.join(["mi-refract", "diff", *sides, *names, *found.flags, *["--renders"] * found.renders])
-
-
-def _self_test(path: Path | None, other: Path | None, max_values: int, allow_plugins: Sequence[str]) -> int:
-    """Print which defects are seen; 1 where one that was due is not."""
-    from mi_refract.image_diff import self_test as self_tests
-
-    from . import self_test_scenes
-
-    if other:
-        raise ValueError(f"{other}: --self-test takes one path; expected an image, a folder of renders, a scene")
-    if path is None:
-        renders = self_test_scenes.glass_ball()
-    elif path.suffix == SCENE:
-        renders = self_test_scenes.of_file(path, allow_plugins)
-    else:
-        renders = self_tests.read_images(path, max_values)
-    rows = self_tests.examine(renders, str(path or "a glass ball"))
-    print_table(self_tests.table(rows))
-    return int(self_tests.failed(rows))
 
 
 def _check_settings(reference: Path, test: Path | None, names: Sequence[str], chosen: Settings) -> int:

@@ -1,20 +1,55 @@
-"""The images for `mi-refract diff --self-test`: renders of a scene file, or of a built-in scene with a glass ball."""
+"""The command `mi-refract self-test`: which defects would the comparison of images see?"""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
+from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.pixels import Pixels
-from mi_refract.rendering.scene_files import load_scene
 
 from . import variants
+from .comparing import MaxValues, print_table, require_extra
 
 RENDERS, SPP = 16, 16
 RESOLUTION = 64
+SCENE = ".xml"
+
+Images = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="REFERENCE", help="An image, a folder of renders of one image, or a scene; by default a glass ball."
+    ),
+]
+AllowPlugins = Annotated[
+    list[str] | None, typer.Option(metavar="NAME", help="Also allow this plugin, which ships with the scene.")
+]
+
+
+def self_test(reference: Images = None, max_values: MaxValues = MAX_VALUES, allow_plugins: AllowPlugins = None) -> None:
+    """Inject synthetic defects into REFERENCE and report which methods detect them.
+
+    Exit code 0: every defect that had to be detected was, 1: one was missed, or equal images were called different, 2:
+    REFERENCE cannot be read.
+    """
+    from mi_refract.image_diff import self_test as self_tests
+
+    require_extra("scipy")
+    if allow_plugins and (reference is None or reference.suffix != SCENE):
+        raise ValueError("--allow-plugins: only a scene brings plugins; expected with SCENE.xml")
+    if reference is None:
+        renders = glass_ball()
+    elif reference.suffix == SCENE:
+        renders = of_file(reference, allow_plugins or ())
+    else:
+        renders = self_tests.read_images(reference, max_values)
+    rows = self_tests.examine(renders, str(reference or "a glass ball"))
+    print_table(self_tests.table(rows))
+    raise typer.Exit(int(self_tests.failed(rows)))
 
 
 def of_file(path: Path, allow_plugins: Collection[str] = ()) -> Pixels:
@@ -22,6 +57,8 @@ def of_file(path: Path, allow_plugins: Collection[str] = ()) -> Pixels:
 
     `allow_plugins`: names of plugins that the scene may bring, which are code. Errors: those of `load_scene`.
     """
+    from mi_refract.rendering.scene_files import load_scene
+
     variants.activate()
     return _rendered(load_scene(path, allow_plugins=allow_plugins))
 

@@ -8,16 +8,13 @@ import json
 import os
 import shlex
 import sys
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from support.diff_images import BROKEN, image, samples, tree
 
-from mi_refract import backend
-from mi_refract.cli import app, self_test_scenes
-from mi_refract.image_diff import methods, self_test
+from mi_refract.image_diff import methods
 from mi_refract.io import exit_code
 from mi_refract.io.image_file import read, write_exr
 
@@ -76,14 +73,8 @@ def test_renders_that_hold_their_variance_are_compared_by_welch(run, tmp_path):
         assert out.splitlines()[1].startswith(word)
         assert " welch (the variance of both is known) " in out
     assert run("diff", old, new, "--method", "tolerance", "--set", "fail=0.1", "--set", "fail_relative=0.1")[0] == 0
-    code, out, err = run("diff", "--self-test", old)
+    code, out, err = run("self-test", old)
     assert (code, err) == (0, "")
-
-
-def test_the_old_word_for_renders_still_works(run, tmp_path):
-    old, new = samples(tmp_path / "old"), samples(tmp_path / "new", first=100, gain=1.3)
-    assert run("diff", old, new, "--samples") == run("diff", old, new, "--renders")
-    assert "--samples" not in run("diff", "--help")[1]
 
 
 @pytest.mark.parametrize("method", methods.METHODS)
@@ -201,7 +192,7 @@ def test_whatever_one_image_does_the_report_is_written(run, pair, tmp_path, monk
 
 def test_images_larger_than_allowed(run, pair):
     names = [pair[0] / "louder.exr", pair[1] / "louder.exr"]
-    for words in (["diff", *names], ["accept", *names, "--yes"], ["diff", "--self-test", names[0]]):
+    for words in (["diff", *names], ["accept", *names, "--yes"], ["self-test", names[0]]):
         code, out, err = run(*words, "--max-values", 100)
         assert (code, out) == (2, "")
         assert err.endswith("louder.exr: 48 × 32 × 3 values; expected up to 100 values (max-values)\n")
@@ -276,60 +267,7 @@ def test_nothing_is_created_or_overwritten(run, pair, tmp_path):
     assert tree(tmp_path) == before
 
 
-# Self-test, report ------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def quick(monkeypatch):
-    """A self-test of few trials."""
-    full = self_test.examine
-    monkeypatch.setattr(self_test, "examine", lambda renders, case: full(renders, case, trials=2, null_pairs=4))
-
-
-def test_self_test_of_renders_and_of_one_image(run, tmp_path, quick):
-    folder = samples(tmp_path / "renders", 8, noise=0.001)
-    for path, number in ((folder, "null pairs 4"), (folder / "0.exr", "null pairs 1")):
-        code, out, err = run("diff", "--self-test", path)
-        assert err == ""
-        assert code == int("failed: " in out)
-        assert {"NaN", "blur"} <= {line.split()[0] for line in out.splitlines()}
-        assert number in out
-
-
-def test_self_test_renders_a_scene(run, tmp_path, quick, monkeypatch):
-    text = (Path(app.__file__).parents[2] / "scenes" / "sphere.xml").read_text()
-    scene = tmp_path / "sphere.xml"
-    scene.write_text(text.replace('name="res" value="128"', 'name="res" value="24"'))
-    monkeypatch.setattr(self_test_scenes, "SPP", 2)
-    monkeypatch.setattr(backend, "activate", lambda *chosen: None)
-    code, out, err = run("diff", "--self-test", scene)
-    assert (code in (0, 1), err) == (True, "")
-    assert "renders: noise " in out
-
-
-def test_a_self_test_that_misses_something_says_so(run, pair, quick, monkeypatch):
-    monkeypatch.setattr(self_test.Row, "verdict", "fail")
-    assert run("diff", "--self-test", pair[0] / "equal.exr")[0] == 1
-    monkeypatch.setattr(self_test.Row, "verdict", "pass")
-    assert run("diff", "--self-test", pair[0] / "equal.exr")[0] == 0
-
-
-def test_bad_self_tests(run, pair, tmp_path):
-    image(tmp_path / "mixed" / "a.exr")
-    image(tmp_path / "mixed" / "b.exr", shape=(8, 8, 3))
-    image(tmp_path / "nan.exr", value=np.nan)
-    for words, message in [
-        (pair, "--self-test takes one path"),
-        ([pair[0] / "equal.exr", "--report", tmp_path / "a.html"], "expected no other option"),
-        ([pair[0] / "equal.exr", "--method", "flip"], "expected no other option"),
-        ([tmp_path / "none.exr"], "none.exr"),
-        ([tmp_path / "none.xml"], "none.xml"),
-        ([tmp_path / "mixed"], "size or channels differ from"),
-        ([tmp_path / "nan.exr"], "every value of them finite"),
-    ]:
-        code, out, err = run("diff", "--self-test", *words)
-        assert (code, out, err.count("\n")) == (2, "", 1)
-        assert message in err
+# Report -------------------------------------------------------------------------------------------------------------
 
 
 def test_report(run, pair, tmp_path):

@@ -1,8 +1,67 @@
-"""`mi-refract diff --self-test SCENE.xml`: a scene of others runs no code of its own, and ends no process."""
+"""`mi-refract self-test`: of images, of renders, of scenes. A scene of others runs no code and ends no process."""
 
 import os
+from pathlib import Path
 
+import numpy as np
 import pytest
+from support.diff_images import image, samples
+
+from mi_refract import backend
+from mi_refract.cli import self_test as command
+from mi_refract.image_diff import self_test
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """A self-test of few trials."""
+    full = self_test.examine
+    monkeypatch.setattr(self_test, "examine", lambda renders, case: full(renders, case, trials=2, null_pairs=4))
+
+
+def test_self_test_of_renders_and_of_one_image(run, tmp_path, quick):
+    folder = samples(tmp_path / "renders", 8, noise=0.001)
+    for path, number in ((folder, "null pairs 4"), (folder / "0.exr", "null pairs 1")):
+        code, out, err = run("self-test", path)
+        assert err == ""
+        assert code == int("failed: " in out)
+        assert {"NaN", "blur"} <= {line.split()[0] for line in out.splitlines()}
+        assert number in out
+
+
+def test_self_test_renders_a_scene(run, tmp_path, quick, monkeypatch):
+    text = (Path(command.__file__).parents[2] / "scenes" / "sphere.xml").read_text()
+    scene = tmp_path / "sphere.xml"
+    scene.write_text(text.replace('name="res" value="128"', 'name="res" value="24"'))
+    monkeypatch.setattr(command, "SPP", 2)
+    monkeypatch.setattr(backend, "activate", lambda *chosen: None)
+    code, out, err = run("self-test", scene)
+    assert (code in (0, 1), err) == (True, "")
+    assert "renders: noise " in out
+
+
+def test_a_self_test_that_misses_something_says_so(run, pair, quick, monkeypatch):
+    monkeypatch.setattr(self_test.Row, "verdict", "fail")
+    assert run("self-test", pair[0] / "equal.exr")[0] == 1
+    monkeypatch.setattr(self_test.Row, "verdict", "pass")
+    assert run("self-test", pair[0] / "equal.exr")[0] == 0
+
+
+def test_bad_self_tests(run, pair, tmp_path):
+    image(tmp_path / "mixed" / "a.exr")
+    image(tmp_path / "mixed" / "b.exr", shape=(8, 8, 3))
+    image(tmp_path / "nan.exr", value=np.nan)
+    for words, message in [
+        (pair, "Got unexpected extra argument"),
+        ([pair[0] / "equal.exr", "--method", "flip"], "No such option"),
+        ([tmp_path / "none.exr"], "none.exr"),
+        ([tmp_path / "none.xml"], "none.xml"),
+        ([tmp_path / "mixed"], "size or channels differ from"),
+        ([tmp_path / "nan.exr"], "every value of them finite"),
+    ]:
+        code, out, err = run("self-test", *words)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert message in err
 
 
 @pytest.mark.parametrize(
@@ -23,7 +82,7 @@ def test_refused_in_one_line(elements, says, run, tmp_path):
         (tmp_path / "s.xml").write_text(f'<scene version="3.0.0">{elements}</scene>')
     else:
         os.mkfifo(tmp_path / "s.xml")
-    code, out, err = run("diff", "--self-test", tmp_path / "s.xml")
+    code, out, err = run("self-test", tmp_path / "s.xml")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert err.startswith("mi-refract: ") and says in err
 
@@ -34,13 +93,13 @@ def test_a_plugin_of_the_scenes_own_runs_only_where_it_is_allowed(run, tmp_path)
     (tmp_path / "plugins" / "evil.so").write_text("native code")
     scene = tmp_path / "s.xml"
     scene.write_text('<scene version="3.0.0"><bsdf type="evil"/></scene>')
-    code, _, err = run("diff", "--self-test", scene, "--allow-plugins", "other")
+    code, _, err = run("self-test", scene, "--allow-plugins", "other")
     assert code == 2 and "plugin 'evil': neither Mitsuba's nor mi_refract's" in err
-    code, _, err = run("diff", "--self-test", scene, "--allow-plugins", "other", "--allow-plugins", "evil")
+    code, _, err = run("self-test", scene, "--allow-plugins", "other", "--allow-plugins", "evil")
     assert (code, err.count("\n")) == (2, 1) and "Error while loading plugin" in err and "plugins/evil.so" in err
 
 
 def test_only_a_scene_brings_plugins(run, pair):
-    for words in ((*pair,), ("--self-test",), ("--self-test", pair[0])):
-        code, _, err = run("diff", *words, "--allow-plugins", "evil")
-        assert (code, err.count("\n")) == (2, 1) and "expected with --self-test SCENE.xml" in err
+    for words in ((), (pair[0],)):
+        code, _, err = run("self-test", *words, "--allow-plugins", "evil")
+        assert (code, err.count("\n")) == (2, 1) and "expected with SCENE.xml" in err
