@@ -13,7 +13,7 @@ from typing import Annotated, Any, NamedTuple
 
 try:
     import typer
-    from typer.core import TyperCommand, TyperGroup
+    from typer.core import TyperGroup
 except ModuleNotFoundError as missing:
     if missing.name not in ("typer", "rich"):
         raise
@@ -23,8 +23,6 @@ except ModuleNotFoundError as missing:
 from mi_refract import __version__
 from mi_refract.io.exit_code import exit_code
 from mi_refract.io.outside_text import printable
-
-from .plain_values import PlainValues
 
 
 class Command(NamedTuple):
@@ -47,11 +45,7 @@ COMMANDS = {
 }
 
 
-class PlainCommand(PlainValues, TyperCommand):
-    """A command that starts quickly."""
-
-
-class Commands(PlainValues, TyperGroup):
+class Commands(TyperGroup):
     """The commands of COMMANDS, each imported when it is called."""
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -66,7 +60,7 @@ class Commands(PlainValues, TyperGroup):
         command = getattr(importlib.import_module(f".{found.module}", __package__), found.attribute)
         if not isinstance(command, typer.Typer):
             single = typer.Typer(add_completion=False, rich_markup_mode=None)
-            single.command(cmd_name, cls=PlainCommand)(command)
+            single.command(cmd_name)(command)
             command = single
         return typer.main.get_command(command)
 

@@ -76,7 +76,7 @@ def test_the_help_has_a_line_for_each_command_and_each_command_its_own(name, cap
 
 
 # What a comparison of two images needs none of, but for its report, a terminal, or another method.
-UNUSED = ("mitsuba", "drjit", "scipy", "matplotlib", "jinja2", "rich", "pydantic", "xml", "email", "asyncio")
+UNUSED = ("mitsuba", "drjit", "scipy", "matplotlib", "jinja2", "rich", "xml", "asyncio")
 
 
 @pytest.mark.parametrize("options", [[], ["--method", "tolerance", "--set", "fail=0.5", "--json", "out.json"]])
