@@ -17,7 +17,7 @@ import typer
 
 from mi_refract.cluster.connection import LOCAL, ClusterTarget
 from mi_refract.io import lock
-from mi_refract.io.outside_text import printable
+from mi_refract.io.sanitise import printable
 from validation.run import command_line
 
 if TYPE_CHECKING:

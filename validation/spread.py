@@ -17,8 +17,8 @@ from mi_refract.cluster import connection, on_worker, worker_facts
 from mi_refract.cluster import spread as calls
 from mi_refract.cluster.workers import Workers
 from mi_refract.io.atomic import write_atomically
-from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import installed_version
+from mi_refract.io.sanitise import printable
 from validation.run.context import Context, profiles
 
 from . import repeated, runner

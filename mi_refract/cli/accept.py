@@ -16,7 +16,7 @@ from mi_refract.image_diff.methods import AUTO
 from mi_refract.image_diff.results import Results, Status
 from mi_refract.io.exit_code import MISUSE, describe
 from mi_refract.io.image_file import MAX_VALUES
-from mi_refract.io.outside_text import printable
+from mi_refract.io.sanitise import printable
 
 from .comparing import (
     Channels,

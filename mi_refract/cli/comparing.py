@@ -19,7 +19,7 @@ import typer
 from mi_refract.image_diff import settings_file, text_reports
 from mi_refract.image_diff.results import Results, Status
 from mi_refract.image_diff.settings import Settings
-from mi_refract.io.outside_text import printable
+from mi_refract.io.sanitise import printable
 from mi_refract.report.text_table import Plain
 
 if TYPE_CHECKING:

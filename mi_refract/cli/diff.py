@@ -19,7 +19,7 @@ from mi_refract.image_diff.results import Results, as_word
 from mi_refract.image_diff.settings import Settings
 from mi_refract.io.atomic import writable
 from mi_refract.io.image_file import MAX_VALUES
-from mi_refract.io.outside_text import printable
+from mi_refract.io.sanitise import printable
 
 from .comparing import (
     Channels,

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from mi_refract import __version__, backend
-from mi_refract.io.outside_text import json_text, printable_lines
 from mi_refract.io.provenance import installed_version
+from mi_refract.io.sanitise import json_text, printable_lines
 
 from . import variants
 

@@ -11,7 +11,7 @@ import typer
 
 from mi_refract.cluster.connection import ClusterTarget
 from mi_refract.io.atomic import writable
-from mi_refract.io.outside_text import printable
+from mi_refract.io.sanitise import printable
 from mi_refract.ray_sets import files, ray_set, run_program
 from mi_refract.ray_sets.ray_set import RaySet
 

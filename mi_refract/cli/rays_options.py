@@ -19,8 +19,8 @@ from rich.table import Table
 
 from mi_refract.cluster.connection import LOCAL, ClusterTarget
 from mi_refract.io.atomic import writable
-from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import provenance
+from mi_refract.io.sanitise import printable
 from mi_refract.ray_sets import ray_set
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.regimes import REGIMES, Rays

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from mi_refract import backend
 from mi_refract.cluster.connection import ClusterTarget
-from mi_refract.io.outside_text import printable
+from mi_refract.io.sanitise import printable
 from mi_refract.rendering import scene_files
 
 from . import interrupts, variants

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from mi_refract.cluster import worker_facts
 from mi_refract.cluster.connection import LOCAL, ClusterTarget, connected
 from mi_refract.cluster.workers import Workers
-from mi_refract.io.outside_text import printable
+from mi_refract.io.sanitise import printable
 
 if TYPE_CHECKING:  # they import Mitsuba
     from mi_refract.rendering.long_render import LongRender, Passes

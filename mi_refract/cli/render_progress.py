@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from mi_refract.io.atomic import write_atomically
-from mi_refract.io.outside_text import printable
 from mi_refract.io.pixels import srgb_encode
+from mi_refract.io.sanitise import printable
 from mi_refract.report.thumbnails import png
 
 from .quantities import shown_error

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from mi_refract.io import atomic
-from mi_refract.io.outside_text import json_text, printable
+from mi_refract.io.sanitise import json_text, printable
 from mi_refract.planar import figure, focal_points, light, scene_file, scene_schema
 from mi_refract.planar.path_tree import as_data, follow_scene, summary, with_rays
 

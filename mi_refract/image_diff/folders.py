@@ -25,7 +25,7 @@ from . import channels, masks, methods, pairing, parts, variances
 from .comparison import Comparison, Verdict
 from .pairing import Pair
 from .results import FAILED, STATUSES, Result, Results, Status
-from .settings import How, Settings
+from .settings import ComparisonSpec, Settings
 
 AS_ASKED = Settings()
 WORKERS = min(os.cpu_count() or 1, 8)
@@ -217,7 +217,7 @@ def _against(path: Path, reference: list[Image], test: list[Image], result: Resu
     return _Judged(images, found, masks.warning(mask))
 
 
-def _with_variance(images: list[Image], root: Path, how: How) -> list[Image]:
+def _with_variance(images: list[Image], root: Path, how: ComparisonSpec) -> list[Image]:
     """A single image with the variance that lies beside it, where the settings name one and it is there."""
     if not how.reads_variance or len(images) > 1:
         return images

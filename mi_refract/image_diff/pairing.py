@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 from . import name_patterns
-from .settings import How, Map, Settings
+from .settings import ComparisonSpec, Map, Settings
 
 ROOT = "{root}/"  # before a template of a path that is not beside the reference
 
@@ -32,7 +32,7 @@ class Pair:
     reference: Path | None
     test: Path | None
     target: Path
-    how: How = field(default_factory=How)
+    how: ComparisonSpec = field(default_factory=ComparisonSpec)
     variants: tuple[Path, ...] = ()
     error: str = ""
 
@@ -197,7 +197,7 @@ def _with_variants(pair: Pair, others: Sequence[Path]) -> Pair:
     return replace(pair, variants=tuple(matched.values()))
 
 
-def variant(target: Path, how: How, name: str) -> Path:
+def variant(target: Path, how: ComparisonSpec, name: str) -> Path:
     """Where a variant of the reference `target` lies: by the first template of `accept` with the name or one `*`.
 
     ValueError where there is none, or for a name that would not match it.

@@ -15,13 +15,13 @@ from mi_refract.io.image_file import Image
 
 from . import idiff_flags, methods
 from .comparison import Comparison, Verdict
-from .settings import How
+from .settings import ComparisonSpec
 
 WORST = (Verdict.DIFFERENT, Verdict.INCONCLUSIVE, Verdict.EQUAL)
 Part = tuple[int, int]
 
 
-def read(path: Path, how: How) -> list[Image]:
+def read(path: Path, how: ComparisonSpec) -> list[Image]:
     """Every image of a file; with flags of `idiff` in the numbers that it compares, and without -a the first alone.
 
     Raises what `image_file.read_parts` raises.
@@ -32,7 +32,9 @@ def read(path: Path, how: How) -> list[Image]:
     return image_file.read_parts(path, how.max_values, first_only=first_only, as_idiff=True)
 
 
-def compare(how: How, reference: Sequence[Image], test: Sequence[Image]) -> tuple[Comparison, tuple[Image, Image]]:
+def compare(
+    how: ComparisonSpec, reference: Sequence[Image], test: Sequence[Image]
+) -> tuple[Comparison, tuple[Image, Image]]:
     """The comparison of two files that were read whole, and the two images that it is about.
 
     ValueError as `methods.compare`, with the place of the image.
@@ -50,7 +52,7 @@ def compare(how: How, reference: Sequence[Image], test: Sequence[Image]) -> tupl
     return replace(chosen, warning=_warning(found, places)), images
 
 
-def _of_one(how: How, one: Image, two: Image, place: str) -> Comparison:
+def _of_one(how: ComparisonSpec, one: Image, two: Image, place: str) -> Comparison:
     try:
         named = [name for name, _ in how.channels]
         return methods.compare(how.method, [one], [two], named=named, **how.options)

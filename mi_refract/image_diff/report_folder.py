@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_refract.io import atomic
-from mi_refract.io.outside_text import printable
+from mi_refract.io.sanitise import printable
 from mi_refract.report.embedded_images import EmbeddedImages
 from mi_refract.report.html_page import rendered, write_beside
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from mi_refract.io.image_file import Image
 
 from .comparison import Comparison, Verdict
-from .settings import How
+from .settings import ComparisonSpec
 
 
 class Status(enum.StrEnum):
@@ -55,7 +55,7 @@ class Result:
     status: Status
     reference: Path | None
     test: Path | None
-    how: How = field(default_factory=How)
+    how: ComparisonSpec = field(default_factory=ComparisonSpec)
     comparison: Comparison | None = None
     error: str = ""
     images: tuple[Image, ...] = ()

@@ -15,7 +15,7 @@ from typing import Any
 from mi_refract.io import regular_file
 
 from .results import FAILED, Result, Results, Status
-from .settings import How, Settings
+from .settings import ComparisonSpec, Settings
 from .text_reports import SCHEMA
 
 MOST = 2**28  # bytes of a file
@@ -94,10 +94,10 @@ def _result(where: str, entry: Table, roots: Mapping[str, tuple[Path, Path]]) ->
     return replace(result, target=target, variants=tuple(variants), digests=digests)
 
 
-def _how(entry: Table) -> How:
+def _how(entry: Table) -> ComparisonSpec:
     options = entry.get("options")
     nonfinite = isinstance(options, dict) and options.get("allow_nonfinite") is True
-    return How(options={"allow_nonfinite": nonfinite}, variance=str(entry.get("variance") or ""))
+    return ComparisonSpec(options={"allow_nonfinite": nonfinite}, variance=str(entry.get("variance") or ""))
 
 
 def _variants(where: str, entry: Table, before: Path, now: Path) -> list[Path]:

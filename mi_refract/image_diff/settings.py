@@ -25,12 +25,12 @@ from .name_patterns import fields_of, matches
 SYSTEMS = {"linux": "linux", "darwin": "macos", "win32": "windows"}  # by sys.platform
 PROCESSORS = {"x86_64": "x86_64", "amd64": "x86_64", "arm64": "arm64", "aarch64": "arm64"}  # by platform.machine()
 TOLERANCE = "tolerance"  # the method that the flags of idiff are for
-FILE_ONLY = ("accept", "mask", "ignore")  # keys of `How` that no option of the command line says
+FILE_ONLY = ("accept", "mask", "ignore")  # keys of `ComparisonSpec` that no option of the command line says
 OF_BOTH = ("variance", "channels")  # those that one of the file's tables and an option of its own say
 
 
 @dataclass(frozen=True)
-class How:
+class ComparisonSpec:
     """A method, those of its options that are given, and the `reason` from a settings file.
 
     `max_values`: width × height × channels of an image, at most. `skip`: not compared at all. `accept`: templates of
@@ -120,14 +120,14 @@ class Settings:
     `defaults`: what the settings file says of all images; `default`, the command line's, goes before it.
     """
 
-    default: How = How()
+    default: ComparisonSpec = ComparisonSpec()
     rules: tuple[Entry, ...] = ()
     allow_nonfinite: tuple[str, ...] = ()
     defaults: Entry = Entry("*", {}, "defaults")
     maps: tuple[Map, ...] = ()
     path: str = ""
 
-    def of(self, name: str) -> How:
+    def of(self, name: str) -> ComparisonSpec:
         """How the image of this name is compared. Entries that cannot be followed are the `error` of what is found."""
         entries = [each for each in self.rules if each.here and matches(each.pattern, name)]
         reasons = [str(each.values["reason"]) for each in entries if "reason" in each.values]
@@ -137,7 +137,7 @@ class Settings:
             entries=tuple(each.where for each in (self.defaults, *entries) if each.values or each.error),
             reason="; ".join(dict.fromkeys(reasons)),
         )
-        if error := next((each.error for each in entries if each.error), "") or _fight(entries):
+        if error := next((each.error for each in entries if each.error), "") or _conflict(entries):
             return replace(how, error=error)
         try:
             method, options = _method(
@@ -220,7 +220,7 @@ def options_of(method: str) -> frozenset[str]:
     return frozenset(names) | {"allow_nonfinite"}
 
 
-def _fight(entries: Sequence[Entry]) -> str:
+def _conflict(entries: Sequence[Entry]) -> str:
     """Two entries of the same pattern that give the same key other values; "" where there are none."""
     for i, one in enumerate(entries):
         for other in entries[i + 1 :]:

@@ -21,7 +21,7 @@ from mi_refract.io.toml_schema import TABLES, TEXT, Key, Type, first_of, key_tab
 from . import idiff_flags, name_patterns
 from .channels import Names
 from .methods import AUTO, METHODS, options_of_auto
-from .settings import PROCESSORS, SYSTEMS, TOLERANCE, Entry, How, Map, Settings, all_options
+from .settings import PROCESSORS, SYSTEMS, TOLERANCE, ComparisonSpec, Entry, Map, Settings, all_options
 
 FILE = "mi-refract.toml"
 ACCEPTED = (AUTO, *METHODS)
@@ -115,7 +115,7 @@ TYPES: dict[type, Type] = {
 }
 
 
-def load(path: str | Path, default: How = How(), allow_nonfinite: Sequence[str] = ()) -> Settings:  # noqa: B008
+def load(path: str | Path, default: ComparisonSpec = ComparisonSpec(), allow_nonfinite: Sequence[str] = ()) -> Settings:  # noqa: B008
     """The settings of a file, with `default` and `allow_nonfinite` from the command line.
 
     An entry with a name that is wrong in anything else is kept with its error: its images cannot be compared, the
@@ -206,7 +206,7 @@ def variance_from(words: str) -> str:
     return words
 
 
-def from_words(method: str, words: Sequence[str], idiff: str | None = None) -> How:
+def from_words(method: str, words: Sequence[str], idiff: str | None = None) -> ComparisonSpec:
     """The method and its options from the command line's `NAME=VALUE` and `--idiff`. ValueError for anything else."""
     if method not in ACCEPTED:
         raise ValueError(f"--method {method}; expected {METHOD.accepted}")
@@ -220,17 +220,17 @@ def from_words(method: str, words: Sequence[str], idiff: str | None = None) -> H
             raise ValueError(f"--set {word}; expected NAME=VALUE, each name once")
         given[name] = _value(value, keys[name].type) if name in keys else value
     values = read(given, keys, "--set ")
-    return How(method, {name: values[name] for name in given})
+    return ComparisonSpec(method, {name: values[name] for name in given})
 
 
-def _from_idiff(method: str, words: Sequence[str], flags: str) -> How:
+def _from_idiff(method: str, words: Sequence[str], flags: str) -> ComparisonSpec:
     if method not in (AUTO, TOLERANCE):
         raise ValueError(f"--idiff with --method {method}; accepted with --method {TOLERANCE}, or alone")
     try:
         given = idiff_flags.parse(flags).options
     except ValueError as error:
         raise ValueError(f"--idiff: {error}") from None
-    return How(TOLERANCE, {**given, **from_words(TOLERANCE, words).options}, idiff=flags)
+    return ComparisonSpec(TOLERANCE, {**given, **from_words(TOLERANCE, words).options}, idiff=flags)
 
 
 def _value(value: str, kind: Type) -> Any:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import quote
 
 from mi_refract.io.atomic import write_atomically
-from mi_refract.io.outside_text import printable
+from mi_refract.io.sanitise import printable
 from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.row import strict
 from mi_refract.report.text_table import Group, Table, Text
@@ -26,7 +26,7 @@ from . import idiff_flags
 from .comparison import Metric
 from .pairing import Pair
 from .results import FAILED, Result, Results, Status
-from .settings import How, written
+from .settings import ComparisonSpec, written
 
 if TYPE_CHECKING:
     from mi_refract.report import junit
@@ -88,7 +88,7 @@ def settings_table(pairs: Sequence[Pair]) -> Table:
     return rows
 
 
-def _pixels(how: How) -> list[str]:
+def _pixels(how: ComparisonSpec) -> list[str]:
     given = {"mask": how.mask, "variance": how.variance, "channels": written(how.channels)}
     return [
         *(f"{name} {each}" for name, each in given.items() if each),

@@ -10,10 +10,10 @@ __all__ = [
     "exit_code",
     "image_file",
     "lock",
-    "outside_text",
     "pixels",
     "process_group",
     "provenance",
     "regular_file",
+    "sanitise",
     "toml_schema",
 ]

@@ -8,7 +8,7 @@ import sys
 import traceback
 from collections.abc import Callable
 
-from .outside_text import printable
+from .sanitise import printable
 
 MISUSE, INTERRUPTED = 2, 130
 TRACEBACK = "MI_REFRACT_TRACEBACK"  # environment variable: with "1" the traceback is printed as well

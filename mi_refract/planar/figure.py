@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mi_refract.io.atomic import write_atomically
-from mi_refract.io.outside_text import printable
 from mi_refract.io.pixels import srgb_encode
+from mi_refract.io.sanitise import printable
 
 from .figure_geometry import SHARED, Legs, View, around, curves, density, legs
 from .light import Light, linear_srgb

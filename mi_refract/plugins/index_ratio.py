@@ -17,7 +17,7 @@ from mi_refract.media import Medium
 from mi_refract.numerics import differentiated, replace_grad
 
 from .index_parameter import PLUGIN, read_index
-from .who_asks import warn_once
+from .integrator_context import warn_once
 
 DEFAULTS = {"int_ior": "bk7", "ext_ior": "air"}
 SIDES = tuple(DEFAULTS)

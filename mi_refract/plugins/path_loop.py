@@ -16,9 +16,9 @@ import mitsuba as mi
 
 from .absorption import absorbed
 from .emitter_sampling import NonConstantEmitters, SceneEmitters
+from .integrator_context import DISPERSED, context
 from .keyed_sampler import ONE
 from .scene_features import BOUNDARIES, all_shapes, bsdf_name
-from .who_asks import DISPERSED, context
 
 # Samples near 0 and near 1 pick the one lobe and the other; a lobe with a smaller power than these is not followed.
 FIRST, LAST = 2.0**-25, ONE
@@ -52,7 +52,7 @@ class PathFeatures:
         return self.rr_depth < self.max_depth and not self.deterministic
 
     @property
-    def once(self) -> bool:
+    def environment_after_loop(self) -> bool:
         """Whether the environment is looked up once, after the loop: a lane has one path only."""
         return self.environment and not self.split_depth
 
@@ -73,13 +73,13 @@ class LoopState:
     previous: Any = None  # the interaction at the vertex before,
     pdf: Any = None  # the density of its BSDF sample,
     delta: Any = None  # and whether that was of a delta lobe
-    seen: Any = None  # the path from the camera has had delta lobes only; after another lobe it is not split
+    specular_so_far: Any = None  # the path from the camera has had delta lobes only; after another lobe it is not split
     share: Any = None  # the share of the pixel's light: the product of the powers of the lobes that were split
     node: Any = None  # the number of this branch in the tree: 2 n and 2 n + 1 are the branches of n
     waiting: Any = None  # how many branches are on the stack
     stack: Any = None
     truncated: Any = None
-    carried: Any = None  # how many wavelengths the path carries: all, or one since a dispersive boundary
+    wavelength_count: Any = None  # how many wavelengths the path carries: all, or one since a dispersive boundary
     sigma: Any = None  # absorption of the medium that the path is in
     skipped: Any = None  # from the last vertex to the origin of the ray, which is beside the surface
 
@@ -95,7 +95,7 @@ def branch_class(v: Any, plan: PathFeatures) -> type:
         "share": v.Float,
         "node": v.UInt32,
     }
-    fields |= {"carried": v.Float} if plan.dispersion else {}
+    fields |= {"wavelength_count": v.Float} if plan.dispersion else {}
     fields |= {"sigma": v.UnpolarizedSpectrum, "skipped": v.Float} if plan.absorption else {}
     return make_dataclass("Branch", fields.items())
 
@@ -154,7 +154,7 @@ class Trace:
             way += dr.dot(ray.o - camera.o, ray.d)
         start = self._start(ray, way, sampler, active)
         (end,) = dr.while_loop((start,), lambda s: s.active, self._step, label="refract_path")
-        if self.plan.once:
+        if self.plan.environment_after_loop:
             self._add_environment(end)
         return end
 
@@ -162,17 +162,17 @@ class Trace:
         v, plan = self.v, self.plan
         valid = v.Bool(plan.environment and not plan.hide_emitters)
         s = LoopState(ray, v.Spectrum(1), v.Spectrum(0), v.UInt32(0), active, valid, sampler, v.Float(1))
-        if plan.once:
+        if plan.environment_after_loop:
             s.escaped = v.Bool(False)
         if plan.emitter_sampling:
             s.previous, s.pdf, s.delta = dr.zeros(v.Interaction3f), v.Float(1), v.Bool(True)
         if plan.split_depth:
-            s.share, s.node, s.waiting, s.seen = v.Float(1), v.UInt32(1), v.UInt32(0), v.Bool(True)
+            s.share, s.node, s.waiting, s.specular_so_far = v.Float(1), v.UInt32(1), v.UInt32(0), v.Bool(True)
             s.stack = dr.alloc_local(self.branch, plan.split_depth) if self.vectorised else ScalarStack()
         if plan.deterministic:
             s.truncated = v.Float(0)
         if plan.dispersion:
-            s.carried = v.Float(dr.size_v(v.UnpolarizedSpectrum))
+            s.wavelength_count = v.Float(dr.size_v(v.UnpolarizedSpectrum))
         if plan.absorption:
             s.sigma, s.skipped = v.UnpolarizedSpectrum(self.media.start), v.Float(way)
         return s
@@ -255,8 +255,8 @@ class Trace:
         if self.plan.dispersion:
             # The first wavelength stands for all that end here. Each is the first as often as any other.
             dispersed = (bs.sampled_type & DISPERSED) != 0
-            throughput = throughput * dr.select(dispersed, s.carried, 1)
-            changed["carried"] = dr.select(dispersed, 1, s.carried)
+            throughput = throughput * dr.select(dispersed, s.wavelength_count, 1)
+            changed["wavelength_count"] = dr.select(dispersed, 1, s.wavelength_count)
         if self.plan.absorption:
             changed["sigma"] = self.media.cross(s, si, bs, bsdf, ray, active)
             changed["skipped"] = dr.dot(ray.o - si.p, ray.d)
@@ -308,9 +308,9 @@ class Trace:
 
     def _add_emission(self, s: LoopState, si: Any, hit: Any) -> None:
         plan = self.plan
-        if plan.once:
+        if plan.environment_after_loop:
             s.escaped = hit ^ True
-        if plan.environment and not plan.once:
+        if plan.environment and not plan.environment_after_loop:
             emitter, met = si.emitter(self.scene), self.v.Bool(True)
         elif plan.area and (self.vectorised or hit):
             emitter, met = si.shape.emitter(), hit
@@ -360,8 +360,8 @@ class Trace:
     def _split(self, s: LoopState, si: Any, bsdf: Any, bs: Any, second: Any, throughput: Any, onward: Any) -> Any:
         """Push the other lobe where both are worth following; the throughput of the lobe that was sampled."""
         plan, p = self.plan, dr.detach(bs.pdf)
-        pair = onward & s.seen & self._is_boundary(bsdf)
-        s.seen = s.seen & mi.has_flag(bs.sampled_type, LOBES.Delta)
+        pair = onward & s.specular_so_far & self._is_boundary(bsdf)
+        s.specular_so_far = s.specular_so_far & mi.has_flag(bs.sampled_type, LOBES.Delta)
         both = pair & (s.depth <= plan.split_depth) & (s.share * dr.minimum(p, 1 - p) > plan.split_weight)
         if self.vectorised or both:
             both = self._push(s, si, bsdf, bs, second, both)
@@ -431,5 +431,5 @@ class Trace:
             setattr(s, name, dr.select(found, getattr(branch, name), getattr(s, name)))
         if self.plan.emitter_sampling:
             s.pdf, s.delta = dr.select(found, 1, s.pdf), s.delta | found
-        s.seen = s.seen | found
+        s.specular_so_far = s.specular_so_far | found
         return onward | found

@@ -39,7 +39,7 @@ from mi_refract.numerics import differentiated, ieee_divide, replace_grad
 from .absorption import BEYOND, HERE, absorbing_parameter, read_absorption
 from .index_parameter import PLUGIN
 from .index_ratio import DispersiveRatio, TexturedRatio, read_ratio
-from .who_asks import DISPERSED, is_followed, warn_once
+from .integrator_context import DISPERSED, is_followed, warn_once
 
 LOBES = ("specular_reflectance", "specular_transmittance")  # tint of the reflected and of the transmitted lobe
 FLAGS = mi.BSDFFlags

@@ -19,11 +19,11 @@ import drjit as dr
 import mitsuba as mi
 
 from .absorption import read_absorption
+from .integrator_context import warn_once
 from .keyed_sampler import KeyedMultijitter, Sampled
 from .medium_tracking import Crossings, MediumTracker, ShapeMedia, absorbs_only, check_media, check_wrappers, extinction
 from .path_loop import PathFeatures, Trace
 from .scene_features import SceneFeatures, inspect
-from .who_asks import warn_once
 
 INTEGRATOR = "refract_path"
 MOST_PATHS = 4096  # that one sample may split into

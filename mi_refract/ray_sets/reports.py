@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refract.io.atomic import write_atomically
-from mi_refract.io.outside_text import printable
+from mi_refract.io.sanitise import printable
 from mi_refract.regimes import REGIMES
 from mi_refract.report import junit
 from mi_refract.report.embedded_images import EmbeddedImages

@@ -20,8 +20,8 @@ import numpy as np
 from mi_refract.io import lock
 from mi_refract.io.atomic import writable
 from mi_refract.io.image_file import SUFFIXES, Metadata
-from mi_refract.io.outside_text import printable
 from mi_refract.io.provenance import provenance
+from mi_refract.io.sanitise import printable
 
 from . import checkpoint, error_estimate, rendered_file
 from .checkpoint import Progress

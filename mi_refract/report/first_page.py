@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
 
-from mi_refract.io.outside_text import printable_lines
+from mi_refract.io.sanitise import printable_lines
 
 from .embedded_images import EmbeddedImages
 from .plots import Axes, curves_svg

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refract.io.atomic import write_atomically
-from mi_refract.io.outside_text import printable_lines
+from mi_refract.io.sanitise import printable_lines
 
 from .embedded_images import EmbeddedImages
 from .first_page import code

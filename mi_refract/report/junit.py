@@ -10,7 +10,7 @@ from typing import Literal
 from xml.etree import ElementTree as xml
 
 from mi_refract.io.atomic import write_atomically
-from mi_refract.io.outside_text import printable
+from mi_refract.io.sanitise import printable
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from mi_refract.io.outside_text import printable_lines
+from mi_refract.io.sanitise import printable_lines
 
 from .number_text import compact
 

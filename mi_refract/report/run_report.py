@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mi_refract.io.atomic import write_atomically
-from mi_refract.io.outside_text import printable
+from mi_refract.io.sanitise import printable
 
 from . import first_page, junit, study_page
 from .embedded_images import EmbeddedImages

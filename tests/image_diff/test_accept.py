@@ -16,7 +16,7 @@ from mi_refract.cli import accept as cli_accept
 from mi_refract.image_diff import accept
 from mi_refract.image_diff import folders as diff
 from mi_refract.image_diff.results import Category
-from mi_refract.image_diff.settings import How, Settings
+from mi_refract.image_diff.settings import ComparisonSpec, Settings
 
 
 def to_accept(old, new, *settings):
@@ -110,7 +110,7 @@ def test_a_name_with_a_dash_is_no_option_of_the_command(tmp_path, monkeypatch):
 
 def test_the_commands_do_what_they_say(folders):
     old, new = folders
-    results = diff.diff(old, new, Settings(How("tolerance", {"fail": 0.01})))
+    results = diff.diff(old, new, Settings(ComparisonSpec("tolerance", {"fail": 0.01})))
     by_name = {result.name: result for result in results.results}
     pair = f"{old}/inner/changed.exr {new}/inner/changed.exr --method tolerance --set fail=0.01"
     assert results.reproduce(by_name["inner/changed.exr"]) == f"mi-refract diff {pair}"

@@ -15,7 +15,7 @@ from support.diff_images import BROKEN, found, image, samples
 from mi_refract.image_diff import folders as diff
 from mi_refract.image_diff import methods
 from mi_refract.image_diff.results import Result, Results, Status
-from mi_refract.image_diff.settings import Entry, How, Settings
+from mi_refract.image_diff.settings import ComparisonSpec, Entry, Settings
 from mi_refract.io import image_file
 
 
@@ -128,15 +128,15 @@ def test_a_header_may_say_anything_of_its_samples(tmp_path, spp):
 
 def test_images_larger_than_allowed_are_not_compared(folders):
     most = 32 * 48 * 3
-    assert not diff.diff(*folders, Settings(How(max_values=most))).of(Status.ERROR)
-    results = diff.diff(*folders, Settings(How(max_values=most - 1)))
+    assert not diff.diff(*folders, Settings(ComparisonSpec(max_values=most))).of(Status.ERROR)
+    results = diff.diff(*folders, Settings(ComparisonSpec(max_values=most - 1)))
     assert [r.name for r in results.of(Status.ERROR)] == ["inner/changed.exr", "same.exr"]
     ending = f"changed.exr: 48 × 32 × 3 values; expected up to {most - 1} values (max-values)"
     assert results.of(Status.ERROR)[0].error.endswith(ending)
     assert results.reproduce(results.results[0]).endswith(f"changed.exr --max-values {most - 1}")
     with pytest.raises(ValueError, match="max-values"):
         diff.read_renders(folders[0], most - 1)
-    ruled = Settings(How(max_values=most - 1), rules=(Entry("same.exr", {"method": "exact"}),))
+    ruled = Settings(ComparisonSpec(max_values=most - 1), rules=(Entry("same.exr", {"method": "exact"}),))
     assert found(diff.diff(*folders, ruled))["same.exr"] == ("error", "unknown")
 
 
@@ -164,7 +164,7 @@ def test_pairs_that_are_compared_at_once_have_no_more_values_than_one_may(tmp_pa
     pair = 2 * 8 * 8 * 3
     for limit, least, largest in ((8 * 32 * 3, 2 * pair, 4 * pair), (10**6, 5 * pair, 11 * pair)):
         most[0] = 0
-        results = diff.diff(tmp_path / "old", tmp_path / "new", Settings(How(max_values=limit)))
+        results = diff.diff(tmp_path / "old", tmp_path / "new", Settings(ComparisonSpec(max_values=limit)))
         assert [r.name for r in results.results] == [
             "broken.exr",
             *sorted([f"{i}.exr" for i in range(12)]),

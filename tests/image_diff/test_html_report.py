@@ -14,7 +14,7 @@ from support.browser import browse, needs_chromium, seen
 from mi_refract.image_diff import flip, folders, html_report, panes
 from mi_refract.image_diff.comparison import Comparison, Metric, Verdict
 from mi_refract.image_diff.results import Result, Results, Status
-from mi_refract.image_diff.settings import How, Settings
+from mi_refract.image_diff.settings import ComparisonSpec, Settings
 from mi_refract.io import image_file
 from mi_refract.io.image_file import write_exr
 from mi_refract.report.embedded_images import ROUNDED, EmbeddedImages, encoded, strongest
@@ -83,7 +83,7 @@ def test_an_image_that_is_larger_than_allowed_is_not_read_for_the_page(tmp_path)
     for side in ("old", "new"):
         image(tmp_path / side / "added.exr", 0.5)
     (tmp_path / "old" / "added.exr").unlink()
-    found = folders.diff(tmp_path / "old", tmp_path / "new", Settings(How(max_values=71)))
+    found = folders.diff(tmp_path / "old", tmp_path / "new", Settings(ComparisonSpec(max_values=71)))
     assert "expected up to 71 values (max-values)" in html(tmp_path, found)
 
 
@@ -155,7 +155,7 @@ def test_every_file_is_read_once_and_flip_runs_once_for_verdict_and_page(tmp_pat
     read, flip_map = image_file.read_parts, flip.flip_map
     monkeypatch.setattr(image_file, "read_parts", lambda path, *most: reads.append(path) or read(path, *most))
     monkeypatch.setattr(flip, "flip_map", lambda *sides: runs.append(sides) or flip_map(*sides))
-    settings = Settings(How(method))
+    settings = Settings(ComparisonSpec(method))
     whole = html(tmp_path, folders.diff(*sides, settings, maps=True))
     assert sorted(reads) == sorted(sides) and len(runs) == 1 and "flip" in dict(roles(whole))
     page = html_report.Page(tmp_path / "viewed.html")

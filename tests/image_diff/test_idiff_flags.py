@@ -14,7 +14,7 @@ from mi_refract.image_diff import folders
 from mi_refract.image_diff import settings_file as diff_settings
 from mi_refract.image_diff.idiff_flags import THRESHOLDS, parse
 from mi_refract.image_diff.methods import METHODS
-from mi_refract.image_diff.settings import How, Settings
+from mi_refract.image_diff.settings import ComparisonSpec, Settings
 
 OSL = "-a -fail 0.004 -failpercent 0.02 -hardfail 0.01 -warn 0.008 -warnpercent 0.02 -failrelative 0.001"
 
@@ -111,7 +111,9 @@ def test_a_rule_without_flags_inherits_those_of_the_command_line(rules):
     how = Settings(default, rules('method = "tolerance"\nfail_percent = 3')).of("x")
     assert (how.options["fail"], how.options["fail_percent"], how.idiff) == (0.5, 3.0, "-a -fail .5")
     assert diff_settings.from_words("auto", ["fail_percent=3"], "-a -fail .5").options == how.options
-    assert Settings(default, rules('method = "exact"')).of("x") == How("exact", {}, "r", entries=("image[0]",))
+    assert Settings(default, rules('method = "exact"')).of("x") == ComparisonSpec(
+        "exact", {}, "r", entries=("image[0]",)
+    )
     own = Settings(default, rules('idiff = "-fail .25"')).of("x")
     assert (own.options["fail"], own.idiff) == (0.25, "-fail .25")
 

@@ -20,7 +20,7 @@ from mi_refract.image_diff.comparison import Verdict
 from mi_refract.image_diff.methods import METHODS, choice, compare
 from mi_refract.image_diff.pixel_correlation import inflation
 from mi_refract.image_diff.results import Status
-from mi_refract.image_diff.settings import How, Settings
+from mi_refract.image_diff.settings import ComparisonSpec, Settings
 from mi_refract.image_diff.variances import AREA, FREEDOM
 from mi_refract.image_diff.variances import FILTER as RADIUS
 from mi_refract.image_diff.welch import compare_renders
@@ -126,7 +126,7 @@ def test_of_a_variance_in_a_file_its_own_header_says_them(tmp_path, named, freed
     for side, value in (("old", 1.0), ("new", 3.0)):
         written(tmp_path / side / "a.exr", one_pixel(value, variance_freedom=7))
         written(tmp_path / side / "a_var.exr", one_pixel(250.0, **named))
-    how = How(variance="{stem}_var.exr", options={"equivalence_margin": 0.0})
+    how = ComparisonSpec(variance="{stem}_var.exr", options={"equivalence_margin": 0.0})
     (found,) = folders.diff(tmp_path / "old", tmp_path / "new", Settings(how), maps=True).results
     p = 2 * stats.t.sf(2 / np.sqrt(0.5), 2 * freedom)
     assert found.comparison.maps["p"].item() == pytest.approx(p, rel=1e-5)

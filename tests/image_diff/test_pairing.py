@@ -9,7 +9,7 @@ from support.diff_images import found, image
 
 from mi_refract.image_diff import folders as diff
 from mi_refract.image_diff import name_patterns, pairing, text_reports
-from mi_refract.image_diff.settings import Entry, How, Map, Settings
+from mi_refract.image_diff.settings import ComparisonSpec, Entry, Map, Settings
 
 OSL = Settings(maps=(Map("{dir}/ref/{name}", "{dir}/{name}"),))
 VARIANTS = Settings(defaults=Entry("*", {"accept": ("{stem}-*{suffix}",)}))
@@ -165,7 +165,7 @@ def test_files_beside_a_reference(tmp_path):
 
 
 def test_what_the_file_alone_says_is_repeated_by_name(variants):
-    settings = Settings(How("tolerance"), rules=(Entry("a/*", {"ignore": ((0, 0, 1, 1),)}),))
+    settings = Settings(ComparisonSpec("tolerance"), rules=(Entry("a/*", {"ignore": ((0, 0, 1, 1),)}),))
     image(variants[1] / "a/ball.exr", gain=1.3)
     results = diff.diff(*variants, settings)
     (ball,) = [result for result in results.results if result.name == "a/ball.exr"]
@@ -179,7 +179,7 @@ def test_what_the_file_alone_says_is_repeated_by_name(variants):
 def test_a_new_image_is_never_its_own_reference(tmp_path):
     image(tmp_path / "ball.exr")
     image(tmp_path / "ball-new.exr", gain=1.5)
-    settings = replace(VARIANTS, default=How("exact"))
+    settings = replace(VARIANTS, default=ComparisonSpec("exact"))
     assert found(diff.diff(tmp_path / "ball.exr", tmp_path / "ball-new.exr", settings))["ball.exr"][0] == "different"
     mapped = replace(settings, maps=(Map("{stem}.exr", "{stem}-new.exr"),))
     assert found(diff.diff(tmp_path, tmp_path, mapped))["ball-new.exr"] == ("different", "changed")
@@ -210,8 +210,8 @@ def test_variants_in_folders_below_of_two_files(tmp_path):
 
 
 def test_a_variant_by_a_template_that_holds_its_name(tmp_path):
-    how = How(accept=("{stem}-arm64{suffix}", "{stem}-macos{suffix}", "{stem}-*{suffix}"))
+    how = ComparisonSpec(accept=("{stem}-arm64{suffix}", "{stem}-macos{suffix}", "{stem}-*{suffix}"))
     for name in ("macos", "arm64", "icx"):
         assert pairing.variant(tmp_path / "a/ball.exr", how, name) == tmp_path / f"a/ball-{name}.exr"
     with pytest.raises(ValueError, match=r"no `accept` with icx or one \*; expected .*-icx\{suffix\}"):
-        pairing.variant(tmp_path / "ball.exr", How(accept=("{stem}-macos{suffix}",)), "icx")
+        pairing.variant(tmp_path / "ball.exr", ComparisonSpec(accept=("{stem}-macos{suffix}",)), "icx")

@@ -9,7 +9,7 @@ from support.diff_images import image as smooth
 
 from mi_refract.image_diff import accept, folders
 from mi_refract.image_diff.methods import METHODS
-from mi_refract.image_diff.settings import How, Settings
+from mi_refract.image_diff.settings import ComparisonSpec, Settings
 from mi_refract.image_diff.settings_file import from_words
 from mi_refract.io import image_file
 from mi_refract.io.image_file import read, read_parts
@@ -52,7 +52,7 @@ def with_change(images, number, by=0.5):
     return [pixels + by if i == number else pixels for i, pixels in enumerate(images)]
 
 
-def compared(one, two, how=How()):  # noqa: B008
+def compared(one, two, how=ComparisonSpec()):  # noqa: B008
     (result,) = folders.diff(one, two, Settings(how), maps=True).results
     return result
 
@@ -85,9 +85,9 @@ def test_the_limit_holds_for_all_together(tmp_path):
 @pytest.mark.parametrize("write, images, place", [(parts, SMALL, "part 2"), (levels, PYRAMID, "MIP level 2")])
 def test_a_change_in_any_of_them_is_different_and_placed(tmp_path, method, write, images, place):
     one = write(tmp_path / "a.exr", images)
-    same = compared(one, write(tmp_path / "b.exr", images), How(method))
+    same = compared(one, write(tmp_path / "b.exr", images), ComparisonSpec(method))
     assert str(same.status) == "equal"
-    found = compared(one, write(tmp_path / "c.exr", with_change(images, 2)), How(method))
+    found = compared(one, write(tmp_path / "c.exr", with_change(images, 2)), ComparisonSpec(method))
     assert str(found.status) == "different"
     assert found.reason.startswith(f"{place}: ")
     assert found.reason.endswith(f"; different: 1 of {len(images)} parts and MIP levels")

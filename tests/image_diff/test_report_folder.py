@@ -15,7 +15,7 @@ from support.diff_images import BROKEN, image, tree
 from mi_refract.image_diff import folders, panes, report_folder, report_rows
 from mi_refract.image_diff import text_reports as text
 from mi_refract.image_diff.results import Result, Status
-from mi_refract.image_diff.settings import Entry, How, Settings
+from mi_refract.image_diff.settings import ComparisonSpec, Entry, Settings
 
 EVIL = 'a"b<script>alert(1)<∕script>.exr'
 SKIPPED = Entry("skipped.exr", {"skip": True, "reason": "needs <i>a</i> GPU"})
@@ -60,7 +60,7 @@ def sides(tmp_path):
 
 
 def written(sides, place, **how):
-    settings = Settings(How("tolerance"), rules=(SKIPPED,))
+    settings = Settings(ComparisonSpec("tolerance"), rules=(SKIPPED,))
     with report_folder.writing(place) as report:
         found = folders.diff(*sides, settings, view=report.view)
         report.write(found, {"version": "1 & 2"}, "mi-refract diff old new", **how)

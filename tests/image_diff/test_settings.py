@@ -12,7 +12,7 @@ from support.diff_images import found, image
 from mi_refract.image_diff import folders as diff
 from mi_refract.image_diff import methods, settings, settings_file
 from mi_refract.image_diff.results import Status
-from mi_refract.image_diff.settings import Entry, How, Settings
+from mi_refract.image_diff.settings import ComparisonSpec, Entry, Settings
 from mi_refract.io import image_file
 
 RULES = """
@@ -45,21 +45,21 @@ def test_later_entries_replace_what_they_give(rules):
     chosen = Settings(rules=rules(RULES))
     both, first = ("image[0]", "image[1]"), ("image[0]",)
     options = {"fail": 0.2, "fail_relative": 0.0}
-    assert chosen.of("inner/changed.exr") == How("tolerance", options, "glass; more glass", entries=both)
-    assert chosen.of("inner/deep/other.exr") == How("tolerance", {"fail": 1.0}, "glass", entries=first)
-    assert chosen.of("changed.exr") == How()
-    assert Settings(rules=rules("")).of("changed.exr") == How()
+    assert chosen.of("inner/changed.exr") == ComparisonSpec("tolerance", options, "glass; more glass", entries=both)
+    assert chosen.of("inner/deep/other.exr") == ComparisonSpec("tolerance", {"fail": 1.0}, "glass", entries=first)
+    assert chosen.of("changed.exr") == ComparisonSpec()
+    assert Settings(rules=rules("")).of("changed.exr") == ComparisonSpec()
 
 
 def test_a_rule_goes_before_the_command_line(rules):
-    chosen = Settings(How("tolerance", {"fail": 0.5, "hard_fail": 0.6}), rules(RULES))
+    chosen = Settings(ComparisonSpec("tolerance", {"fail": 0.5, "hard_fail": 0.6}), rules(RULES))
     assert chosen.of("inner/changed.exr").options == {"fail": 0.2, "fail_relative": 0.0, "hard_fail": 0.6}
     assert chosen.of("other.exr").options == {"fail": 0.5, "hard_fail": 0.6}
-    exact = Settings(How("exact"), rules(RULES))
+    exact = Settings(ComparisonSpec("exact"), rules(RULES))
     assert exact.of("inner/changed.exr").method == "tolerance"
-    assert exact.of("other.exr") == How("exact")
-    silent = Settings(How("exact"), rules('[[image]]\nname = "a"\nreason = "NaN"\nallow_nonfinite = true'))
-    assert silent.of("a") == How("exact", {"allow_nonfinite": True}, "NaN", entries=("image[0]",))
+    assert exact.of("other.exr") == ComparisonSpec("exact")
+    silent = Settings(ComparisonSpec("exact"), rules('[[image]]\nname = "a"\nreason = "NaN"\nallow_nonfinite = true'))
+    assert silent.of("a") == ComparisonSpec("exact", {"allow_nonfinite": True}, "NaN", entries=("image[0]",))
 
 
 def test_a_rule_that_allows_no_nan_holds_and_its_command_says_the_same(rules):
@@ -172,9 +172,9 @@ def test_settings_that_are_no_text(tmp_path):
 
 
 def test_options_in_words():
-    assert settings_file.from_words("auto", []) == How()
+    assert settings_file.from_words("auto", []) == ComparisonSpec()
     how = settings_file.from_words("welch", ["tile=8", "equivalence_margin=1", "correction=holm"])
-    assert how == How("welch", {"tile": 8, "equivalence_margin": 1.0, "correction": "holm"})
+    assert how == ComparisonSpec("welch", {"tile": 8, "equivalence_margin": 1.0, "correction": "holm"})
     assert type(how.options["equivalence_margin"]) is float
     assert settings_file.from_words("tolerance", ["fail=inf"]).options == {"fail": np.inf}
 
@@ -182,7 +182,7 @@ def test_options_in_words():
 @pytest.mark.parametrize("method", methods.METHODS)
 def test_every_option_of_every_method_in_words_and_back(method):
     defaults = {name: option.default for name, option in methods.METHODS[method].options.items()}
-    flags = How(method, defaults).flags
+    flags = ComparisonSpec(method, defaults).flags
     assert flags[:2] == ["--method", method]
     assert settings_file.from_words(method, flags[3::2]).options == defaults
 
@@ -208,7 +208,7 @@ def test_bad_options_in_words(method, words, message):
 
 
 def test_an_option_out_of_its_range_is_no_verdict(folders):
-    results = diff.diff(*folders, Settings(How("tolerance", {"fail": -1.0})))
+    results = diff.diff(*folders, Settings(ComparisonSpec("tolerance", {"fail": -1.0})))
     assert {result.status for result in results.results if None not in (result.reference, result.test)} == {"error"}
 
 
@@ -218,14 +218,14 @@ def test_an_option_out_of_its_range_is_no_verdict(folders):
 def load(tmp_path, text, default=None):
     path = tmp_path / "rules.toml"
     path.write_text(text)
-    return settings_file.load(path, default or How())
+    return settings_file.load(path, default or ComparisonSpec())
 
 
 def test_defaults_come_before_the_command_line_and_that_before_entries(tmp_path):
     text = '[defaults]\nmethod = "tolerance"\nfail = 0.1\nfail_percent = 1\n' + A + "fail = 0.3"
     assert load(tmp_path, text).of("b").options == {"fail": 0.1, "fail_percent": 1.0}
     assert load(tmp_path, text).of("a").options == {"fail": 0.3, "fail_percent": 1.0}
-    asked = load(tmp_path, text, How("tolerance", {"fail": 0.2}))
+    asked = load(tmp_path, text, ComparisonSpec("tolerance", {"fail": 0.2}))
     assert asked.of("b").options == {"fail": 0.2, "fail_percent": 1.0}
     assert asked.of("a").options == {"fail": 0.3, "fail_percent": 1.0}
 
@@ -233,7 +233,7 @@ def test_defaults_come_before_the_command_line_and_that_before_entries(tmp_path)
 def test_another_method_drops_the_options_of_the_one_before(tmp_path):
     text = '[defaults]\nmethod = "tolerance"\nfail = 0.1\n' + A + 'method = "paired"\nlargest = 3'
     assert load(tmp_path, text).of("a").options == {"largest": 3.0}
-    assert load(tmp_path, text, How("exact")).of("b") == How("exact", entries=("defaults",))
+    assert load(tmp_path, text, ComparisonSpec("exact")).of("b") == ComparisonSpec("exact", entries=("defaults",))
 
 
 def test_options_without_a_method_are_those_that_auto_may_use(tmp_path):

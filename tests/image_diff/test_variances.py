@@ -12,7 +12,7 @@ from mi_refract.image_diff import accept, channels, folders, pairing, settings_f
 from mi_refract.image_diff.comparison import Verdict
 from mi_refract.image_diff.methods import automatic, compare
 from mi_refract.image_diff.results import Category, Status
-from mi_refract.image_diff.settings import Entry, How, Settings, written
+from mi_refract.image_diff.settings import ComparisonSpec, Entry, Settings, written
 from mi_refract.io.image_file import Image, read, write_exr
 
 RGB, XYZ = channels.RGB, channels.XYZ
@@ -130,7 +130,7 @@ def test_files_elsewhere_and_maps(tmp_path, pair):
     (old / "a_var.exr").rename(old / "noise/a.exr")
     given = BESIDE | {"variance": "{root}/noise/{name}"}
     assert one(folders.diff(old, new, settings(**given))).status is Status.EQUAL
-    default = How(variance=given["variance"], options={"spp": 16})
+    default = ComparisonSpec(variance=given["variance"], options={"spp": 16})
     results = folders.diff(old, new, Settings(default))
     words = f"mi-refract diff {old} {new} a.exr --set spp=16 --variance '{given['variance']}'"
     assert results.reproduce(one(results)) == words  # of two files, {root} would be another folder
@@ -399,7 +399,10 @@ def test_the_file_and_the_command_line(tmp_path):
         '[defaults]\nvariance = "d.exr"\nchannels = ["R"]\n[[image]]\nname = "b"\nreason = "r"\n'
         'variance = "{root}/{stem}.exr"\nchannels = { "nested.X" = "X" }\n'
     )
-    plain, given = (settings_file.load(path, how) for how in (How(), How(variance="c.exr", channels=(("G", "B"),))))
+    plain, given = (
+        settings_file.load(path, how)
+        for how in (ComparisonSpec(), ComparisonSpec(variance="c.exr", channels=(("G", "B"),)))
+    )
     assert [(each.of("a").variance, each.of("a").channels) for each in (plain, given)] == [
         ("d.exr", (("R", "R"),)),
         ("c.exr", (("G", "B"),)),

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_refract.plugins import who_asks
+from mi_refract.plugins import integrator_context
 from mi_refract.plugins.absorption import BEYOND, HERE
 
 SPECTRUM = {"type": "irregular", "wavelengths": "360, 830", "values": "0.36, 0.83"}
@@ -131,13 +131,13 @@ def test_an_integrator_that_does_not_track_media_is_refused(each_variant, monkey
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi = mi.Vector3f(0, 0, 1)
     bsdf = load(ext_colour=0.5, ext_colour_distance=1.0)
-    _, weight = bsdf.sample(who_asks.context(), si, 0.5, [0.5, 0.5])
+    _, weight = bsdf.sample(integrator_context.context(), si, 0.5, [0.5, 0.5])
     assert np.isfinite(np.array(weight)).all()
     if not dr.is_jit_v(mi.Float):
         with pytest.raises(RuntimeError, match=r"refract: ext_colour; expected the integrator refract_path"):
             bsdf.sample(mi.BSDFContext(), si, 0.5, [0.5, 0.5])
         return
-    monkeypatch.setattr(who_asks, "_said", said := set())
+    monkeypatch.setattr(integrator_context, "_said", said := set())
     _, weight = bsdf.sample(mi.BSDFContext(), si, 0.5, [0.5, 0.5])
     assert np.isinf(np.array(mi.unpolarized_spectrum(weight))).all()
     (text,) = said
@@ -146,7 +146,7 @@ def test_an_integrator_that_does_not_track_media_is_refused(each_variant, monkey
 
 def test_with_path_light_that_meets_absorption_is_infinite_and_no_other_scene(llvm_variant, monkeypatch):
     """Also while the absorbing scene is in memory."""
-    monkeypatch.setattr(who_asks, "_said", set())
+    monkeypatch.setattr(integrator_context, "_said", set())
     eye = {"type": "perspective", "fov": 60, "film": {"type": "hdrfilm", "width": 8, "height": 8}}
     eye["to_world"] = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
     whole = {"type": "scene", "sensor": eye, "light": {"type": "constant"}, "integrator": {"type": "path"}}

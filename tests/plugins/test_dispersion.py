@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mi_refract import media
-from mi_refract.plugins import who_asks
+from mi_refract.plugins import integrator_context
 
 GLASS = "cauchy(1.5, 20000)"  # n from 1.53 at 830 nm to 1.65 at 360 nm
 WAVELENGTHS = 450.0, 700.0, 550.0, 600.0
@@ -34,7 +34,7 @@ def interaction(wi, wavelengths=WAVELENGTHS):
 
 
 def sample(bsdf, wi, sample1, **more):
-    bs, weight = bsdf.sample(who_asks.context(), interaction(wi, **more), sample1, [0.5, 0.5])
+    bs, weight = bsdf.sample(integrator_context.context(), interaction(wi, **more), sample1, [0.5, 0.5])
     return bs, np.array(mi.unpolarized_spectrum(weight), dtype=float).ravel()
 
 
@@ -58,7 +58,7 @@ def reflectance(sin_i, eta):
 
 
 def is_dispersed(bs):
-    return bool((vector(bs.sampled_type).astype(int) & who_asks.DISPERSED).any())
+    return bool((vector(bs.sampled_type).astype(int) & integrator_context.DISPERSED).any())
 
 
 @pytest.mark.parametrize("side", [1, -1])

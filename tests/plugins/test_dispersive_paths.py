@@ -10,7 +10,7 @@ from support.variants import switch
 
 from mi_refract import media
 from mi_refract.image_diff import pixelwise
-from mi_refract.plugins import who_asks
+from mi_refract.plugins import integrator_context
 
 GLASS = "cauchy(1.5, 20000)"
 PLACE = mi.ScalarTransform4f
@@ -69,7 +69,7 @@ def count(made, spp=4):
 
     def recorded(self, *arguments):
         ends.append(run(self, *arguments))
-        dr.eval(ends[-1].result, ends[-1].depth, ends[-1].carried)
+        dr.eval(ends[-1].result, ends[-1].depth, ends[-1].wavelength_count)
         return ends[-1]
 
     path_loop.Trace.run = recorded
@@ -89,7 +89,7 @@ def test_light_that_is_only_reflected_keeps_all_of_its_wavelengths(needs_variant
     llvm_spectral(needs_variant)
     ball = {"type": "sphere", "bsdf": glass(specular_transmittance=0.0)}
     (end,) = count(scene(ball=ball))
-    carried, depth = np.array(end.carried), np.array(end.depth)
+    carried, depth = np.array(end.wavelength_count), np.array(end.depth)
     assert (depth == 2).any() and (carried[depth == 2] == 4).all()  # reflected, and then in the sky
     assert 1 in carried[depth == 1]  # refracted, and black
 
@@ -97,7 +97,7 @@ def test_light_that_is_only_reflected_keeps_all_of_its_wavelengths(needs_variant
 def test_through_glass_one_wavelength_is_left(needs_variant):
     llvm_spectral(needs_variant)
     (end,) = count(scene())
-    carried, depth = np.array(end.carried), np.array(end.depth)
+    carried, depth = np.array(end.wavelength_count), np.array(end.depth)
     assert set(carried[depth >= 3].tolist()) == {1.0}  # into the ball, out of it, and in the sky
     assert set(carried[depth == 2].tolist()) == {4.0}  # reflected
 
@@ -107,7 +107,7 @@ def test_what_is_behind_glass_that_is_not_dispersive_keeps_them(needs_variant):
     ball = {"type": "sphere", "bsdf": glass(int_ior=1.5)}
     far = {"type": "sphere", "to_world": PLACE().translate([0, 0, 99]), "bsdf": glass()}
     (end,) = count(scene(ball=ball, far=far))
-    assert (np.array(end.carried)[np.array(end.depth) >= 1] == 4).all()
+    assert (np.array(end.wavelength_count)[np.array(end.depth) >= 1] == 4).all()
 
 
 def test_the_image_is_that_of_one_render_per_wavelength(needs_variant):
@@ -132,7 +132,7 @@ def test_the_image_is_that_of_one_render_per_wavelength(needs_variant):
 def test_path_has_the_d_line_and_is_warned_once(needs_variant, monkeypatch):
     llvm_spectral(needs_variant)
     said = []
-    monkeypatch.setattr(who_asks, "_said", set())
+    monkeypatch.setattr(integrator_context, "_said", set())
     monkeypatch.setattr(mi, "Log", lambda level, text: said.append(text))
     ball = {"type": "sphere", "bsdf": glass()}
     made = scene(light={"type": "envmap", "bitmap": mi.Bitmap(SKY)}, ball=ball)
@@ -186,5 +186,5 @@ def test_the_derivative_of_an_image_is_that_of_differences(key, needs_variant):
 def test_scenes_without_dispersion_or_absorption_have_no_state_of_them(needs_variant):
     llvm_spectral(needs_variant)
     (end,) = count(scene(ball={"type": "sphere", "bsdf": glass(int_ior=1.5)}))
-    assert {field.name for field in dataclasses.fields(end)} >= {"carried", "sigma", "skipped"}
-    assert end.carried is None and end.sigma is None and end.skipped is None
+    assert {field.name for field in dataclasses.fields(end)} >= {"wavelength_count", "sigma", "skipped"}
+    assert end.wavelength_count is None and end.sigma is None and end.skipped is None

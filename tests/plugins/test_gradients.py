@@ -10,7 +10,7 @@ import pytest
 from support.variants import switch
 
 import mi_refract  # noqa: F401  (registers the plugins)
-from mi_refract.plugins import who_asks
+from mi_refract.plugins import integrator_context
 
 AROUND = 0.6 + 0.4 * np.sin(np.arange(64) * 2 * np.pi / 64 + 0.3)
 SKY = (AROUND[None, :, None] + np.linspace(0, 0.7, 32)[:, None, None]).astype(np.float32) * np.ones(3, np.float32)
@@ -22,7 +22,7 @@ DISPERSIVE = {"int_ior": "cauchy(1.5, 4000)"}
 
 @pytest.fixture(autouse=True)
 def _said(monkeypatch):
-    monkeypatch.setattr(who_asks, "_said", set())
+    monkeypatch.setattr(integrator_context, "_said", set())
 
 
 def load(integrator="refract_path", **glass):

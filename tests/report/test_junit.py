@@ -2,7 +2,7 @@
 
 from xml.etree import ElementTree
 
-from mi_refract.io.outside_text import printable
+from mi_refract.io.sanitise import printable
 from mi_refract.report.junit import Case, write_junit
 
 EVIL = "a\nb\x1b[31m\udcff\uffff\u2028\u202e<>&\x85"

@@ -399,6 +399,7 @@ def test_the_readmes_hold_their_tables():
         "renders": scenes,
         "paths": layered_paths.plugins(),
         "efficiency": ways,
+        "changing": ["a new scene for each image", "an edit among 300 glasses", "a sweep of 12 indices"],
         "planar": [path.stem for path in SCENES.glob("planar/*.toml")],
         "defects": [*planted_defects.GLASSES, *DEFECTS, *METHODS],
         "visible": [*visible_changes.KINDS, *map(str, visible_changes.SQUARES)],

@@ -35,7 +35,7 @@ TERMS = {
 }
 NAME = "invisible changes"
 SIZE, RENDERS = 16, 8
-SPP = {"matt": 256}  # its caustics are noise; 16 for the others
+SPP = {"matt": 256, "dispersive": 64}  # caustics and colours are noise; 16 for the others
 TILE = 8
 Nodes = dict[str, Any]
 Change = Callable[[Nodes], None]

@@ -75,7 +75,7 @@ COUNTS = (2, 4, 8, 16, 32, 64, 25)
 # Parameters, and samples of a cell by `path`, as many as in all settings together by `refract_path`. Alpha is compared
 # where emitters are hidden, else colours.
 LONG, SHORT = {"max_depth": 6, "rr_depth": 3}, {"max_depth": 2, "hide_emitters": True}
-WAYS = {"": (LONG, 160_000), "every count": (LONG, 4_000_000), "alpha": (SHORT, 160_000)}
+WAYS = {"": (LONG, 320_000), "every count": (LONG, 4_000_000), "alpha": (SHORT, 320_000)}
 # Of the profile `quick`, with 4 samples and one split.
 QUICK = {"alone": ("diffuse", "dielectric"), "blendbsdf": ("dielectric",), "normalmap": ("refract",)}
 

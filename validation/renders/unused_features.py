@@ -17,7 +17,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.formulas import FORMULAS
-from mi_refract.plugins import who_asks
+from mi_refract.plugins import integrator_context
 from mi_refract.plugins.refract import LOBES, PLUGIN
 from mi_refract.report.row import Row
 from validation import limits
@@ -97,7 +97,7 @@ def operations(
         params = mi.traverse(bsdf)
         dr.enable_grad(params["eta"])
         params.update()
-    asked = who_asks.context() if followed else mi.BSDFContext()
+    asked = integrator_context.context() if followed else mi.BSDFContext()
     asked.mode = mi.TransportMode.Importance if importance else mi.TransportMode.Radiance
     if component is not None:
         asked.component = component

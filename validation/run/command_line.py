@@ -7,7 +7,7 @@ import sys
 import typer
 
 from mi_refract.io import exit_code as exits
-from mi_refract.io.outside_text import printable
+from mi_refract.io.sanitise import printable
 
 
 def application() -> typer.Typer:

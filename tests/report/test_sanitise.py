@@ -11,7 +11,7 @@ from support.hostile import NAME, shows_more_than_text
 from mi_refract.image_diff import html_report, text_reports
 from mi_refract.image_diff.comparison import Comparison, Metric, Verdict
 from mi_refract.image_diff.results import Result, Results, Status
-from mi_refract.image_diff.settings import How
+from mi_refract.image_diff.settings import ComparisonSpec
 from mi_refract.planar import figure, path_tree, scene_file
 from mi_refract.ray_sets import check_answers, reports
 from mi_refract.ray_sets.diagnosis import Explanation
@@ -30,7 +30,7 @@ def printed(table):
 
 @pytest.fixture
 def results(tmp_path):
-    how = How("exact", {}, NAME)
+    how = ComparisonSpec("exact", {}, NAME)
     said = Comparison("exact", Verdict.DIFFERENT, NAME, (Metric(NAME, 2.0, 1.0),))
     found = [Result(NAME, Status.ERROR, tmp_path, tmp_path, how, error=NAME)]
     found += [Result(NAME, Status.DIFFERENT, None, tmp_path, how)]

@@ -9,7 +9,7 @@ from support.hostile import BIDI, CONTROLS, NAME, shows_more_than_text
 
 from mi_refract import cli
 from mi_refract.io import exit_code
-from mi_refract.io.outside_text import MARK, json_text, printable, printable_lines
+from mi_refract.io.sanitise import MARK, json_text, printable, printable_lines
 
 EVIL = "a\nb\x1b[31m\udcff\uffff\u2028\u202e<>&\x85"
 
