@@ -124,7 +124,7 @@ def test_a_weight_that_is_taken_twice_colours_the_furnace(needs_variant, monkeyp
 
     def twice(self, s, si, bsdf, bs, weight, active):
         ray, throughput, changed = step(self, s, si, bsdf, bs, weight, active)
-        return ray, throughput, changed | ({"carried": self.v.Float(1.1)} if self.plan.dispersion else {})
+        return ray, throughput, changed | ({"wavelength_count": self.v.Float(1.1)} if self.plan.dispersion else {})
 
     monkeypatch.setattr(path_loop.Trace, "_next", twice)
     (row,) = renders.furnace_rows(HERE, "llvm_ad_spectral", "by chance", {})
