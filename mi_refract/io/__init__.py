@@ -16,4 +16,5 @@ __all__ = [
     "regular_file",
     "sanitise",
     "toml_schema",
+    "typed_table",
 ]

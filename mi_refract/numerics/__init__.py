@@ -11,14 +11,42 @@ from . import error_free, float_expansions
 from .drjit_arrays import aligned, as_component, differentiated, from_numpy, ieee_divide, replace_grad, scale_to_unit
 from .error_free import DoubleWord, TripleWord, two_prod, two_sum
 from .float_expansions import FloatExpansion
-from .types import ArrayType, Mask, Number, Variant, Vector3
+from .types import (
+    BSDF,
+    ArrayType,
+    BSDFSample,
+    Emitter,
+    Interaction,
+    Mask,
+    Number,
+    Properties,
+    Ray,
+    Sampler,
+    Scene,
+    Sensor,
+    Shape,
+    Spectrum,
+    Variant,
+    Vector3,
+)
 
 __all__ = [
+    "BSDF",
     "ArrayType",
+    "BSDFSample",
     "DoubleWord",
+    "Emitter",
     "FloatExpansion",
+    "Interaction",
     "Mask",
     "Number",
+    "Properties",
+    "Ray",
+    "Sampler",
+    "Scene",
+    "Sensor",
+    "Shape",
+    "Spectrum",
     "TripleWord",
     "Variant",
     "Vector3",

@@ -17,3 +17,18 @@ Mask: TypeAlias = Any
 ArrayType: TypeAlias = Any
 # One variant of Mitsuba as a module, as `import mitsuba` gives it after `set_variant`, or `mitsuba.llvm_ad_rgb`.
 Variant: TypeAlias = Any
+
+# Objects of a variant of Mitsuba, of the classes of the same name.
+Scene: TypeAlias = Any
+Shape: TypeAlias = Any
+Emitter: TypeAlias = Any
+Sensor: TypeAlias = Any
+Sampler: TypeAlias = Any
+BSDF: TypeAlias = Any
+Properties: TypeAlias = Any
+# Arrays of a variant: `mi.Ray3f`, `mi.SurfaceInteraction3f`, `mi.BSDFSample3f`, and `mi.Spectrum` or, in polarised
+# variants, a Mueller matrix of it.
+Ray: TypeAlias = Any
+Interaction: TypeAlias = Any
+BSDFSample: TypeAlias = Any
+Spectrum: TypeAlias = Any

@@ -1,0 +1,82 @@
+"""Tables that users write, TOML or JSON, as `msgspec.Struct`s: unknown keys, types and limits are checked on the way.
+
+A field of a struct is a key: its annotation is the type, `Annotated[float, Meta(gt=0, description="…")]` adds limits
+and what the key means, its default makes it optional. The READMEs' tables of keys come from the same structs.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from typing import Any, TypeVar
+
+import msgspec
+
+T = TypeVar("T")
+
+
+def parse_toml(text: str | bytes, kind: type[T], where: str) -> T:
+    """The value of type `kind` that the TOML holds. ValueError as of `convert`, or for what is not TOML."""
+    try:
+        document = tomllib.loads(text if isinstance(text, str) else text.decode())
+    except RecursionError:
+        raise ValueError(f"{where}: brackets nested too deeply; expected TOML") from None
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}; expected TOML") from None
+    return convert(document, kind, where)
+
+
+def convert(value: Any, kind: type[T], where: str) -> T:
+    """A tree of dicts and lists as a value of type `kind`.
+
+    ValueError is one line: `where`, the path of the key, what it is, what was expected. NaN and infinity are refused.
+    """
+    try:
+        _check_finite(value, "$")
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        message, _, path = str(error).partition(" - at `")
+        key = re.sub(r"^\$\.?", "", path.removesuffix("`"))
+        message = f"{message[0].lower()}{message[1:]}"
+        raise ValueError(" ".join(f"{where}: {f'{key}: ' if key else ''}{message}".split())) from None
+
+
+def _check_finite(value: Any, path: str) -> None:
+    if isinstance(value, float) and not math.isfinite(value):
+        raise msgspec.ValidationError(f"Expected a finite number, got {value} - at `{path}`")
+    if isinstance(value, dict | list):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, item in items:
+            _check_finite(item, f"{path}[{key}]" if isinstance(value, list) else f"{path}.{key}")
+
+
+def key_table(title: str, kind: type[msgspec.Struct]) -> str:
+    """A Markdown table of the keys of a struct: name, type with its limits, meaning, default."""
+    rows = []
+    for field in msgspec.inspect.type_info(kind).fields:  # type: ignore[union-attr]
+        described = isinstance(field.type, msgspec.inspect.Metadata)
+        schema = field.type.extra_json_schema or {} if described else {}
+        bare = field.type.type if described else field.type
+        default = "" if field.required or field.default in (None, msgspec.NODEFAULT) else f"; default {field.default!r}"
+        rows.append(f"| `{field.encode_name}` | {_type_text(bare)} | {schema.get('description', '')}{default} |")
+    return "\n".join([f"| {title} | type | meaning |", "|---|---|---|", *rows])
+
+
+_WORDS = {"Str": "text", "Float": "number", "Int": "whole number", "Bool": "true or false", "Dict": "table"}
+_LIMITS = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
+
+
+def _type_text(kind: Any) -> str:
+    """A type as a reader of the table understands it, e.g. `number > 0` or `list of texts`."""
+    name = type(kind).__name__.removesuffix("Type")
+    if name == "Union":
+        return " or ".join(_type_text(each) for each in kind.types if not isinstance(each, msgspec.inspect.NoneType))
+    if name == "Literal":
+        return ", ".join(f"`{value}`" for value in kind.values)
+    if name in ("List", "VarTuple"):
+        return f"list of {_type_text(kind.item_type)}"
+    if name == "Tuple":
+        return f"[{', '.join(_type_text(each) for each in kind.item_types)}]"
+    limits = [f"{sign} {value:g}" for key, sign in _LIMITS.items() if (value := getattr(kind, key, None)) is not None]
+    return " ".join([_WORDS.get(name, "table"), ", ".join(limits)]).strip()
