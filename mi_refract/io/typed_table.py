@@ -54,7 +54,7 @@ def _check_finite(value: Any, path: str) -> None:
 def key_table(title: str, kind: type[msgspec.Struct]) -> str:
     """A Markdown table of the keys of a struct: name, type with its limits, meaning, default."""
     rows = []
-    for field in msgspec.inspect.type_info(kind).fields:  # type: ignore[union-attr]
+    for field in msgspec.inspect.type_info(kind).fields:  # type: ignore[attr-defined]
         described = isinstance(field.type, msgspec.inspect.Metadata)
         schema = field.type.extra_json_schema or {} if described else {}
         bare = field.type.type if described else field.type
