@@ -13,6 +13,8 @@ from concurrent import futures
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from mi_refract.io.errors import LostSchedulerError, MissingExtraError, UsageError
+
 from . import local_cluster
 
 Result = TypeVar("Result")
@@ -23,10 +25,6 @@ _EXPECTED = (
     "expected the address of a Dask scheduler, such as tcp://host:8786, or tls://host:8786 and the files of "
     "`distributed.comm.tls` in Dask's configuration"
 )
-
-
-class LostSchedulerError(ConnectionError):
-    """The scheduler has ended, or cannot be reached any more."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class ClusterTarget:
     def check(self) -> None:
         """ValueError for options that exclude each other, ImportError without Dask."""
         if self.scheduler is not None and self.workers is not None:
-            raise ValueError("--scheduler and --workers; expected one of them")
+            raise UsageError("--scheduler and --workers; expected one of them")
         if self.given:
             _require_dask()
 
@@ -56,7 +54,7 @@ def _require_dask() -> None:
     try:
         import distributed  # noqa: F401
     except ModuleNotFoundError as error:
-        raise ImportError(
+        raise MissingExtraError(
             f"--scheduler and --workers need Dask ({error.name} is missing): pip install 'mi-refract[cluster]'"
         ) from None
 
@@ -70,7 +68,7 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
     ImportError without Dask; ValueError unless exactly one of the two is given.
     """
     if (scheduler is None) == (workers is None):
-        raise ValueError("expected either --scheduler ADDRESS or --workers N")
+        raise UsageError("expected either --scheduler ADDRESS or --workers N")
     _require_dask()
     from distributed.security import Security
 

@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
+from mi_refract.io.errors import NoWorkersError
+
 from . import on_worker
 from .connection import scheduler_needed
 from .workers import Workers
@@ -61,7 +63,7 @@ def results(
                     with scheduler_needed(client):
                         address, result = future.result(timeout=_FETCHED)
                 except KilledWorker as error:
-                    raise ConnectionError(
+                    raise NoWorkersError(
                         f"task {number}: {error.allowed_failures + 1} workers were lost that ran it, the last "
                         f"{error.last_worker.address}; expected workers with enough memory"
                     ) from None

@@ -7,8 +7,10 @@ from collections.abc import Callable, Collection, Mapping
 from concurrent import futures
 from typing import Any
 
+from mi_refract.io.errors import LostSchedulerError, NoWorkersError
+
 from . import worker_facts
-from .connection import LostSchedulerError, in_thread, scheduler_needed
+from .connection import in_thread, scheduler_needed
 
 PATIENCE = 120.0  # seconds until the first workers must have said what they are: they import Mitsuba, and try libLLVM
 _NOBODY = 30.0  # seconds until a scheduler must have a worker at all
@@ -69,7 +71,7 @@ class Workers:
         if self.accepted:
             return
         found = "; ".join(self.refused.values()) or ("workers do not answer" if self._asked else "no workers")
-        raise ConnectionError(
+        raise NoWorkersError(
             f"{self._address}: no worker that may {self._task}: {found}; expected at least one like this process"
         )
 
@@ -113,7 +115,7 @@ class Workers:
         elif self._alone_since is None:
             self._alone_since = time.monotonic()
         elif time.monotonic() - self._alone_since > ALONE:
-            raise ConnectionError(f"{self._address}: all workers have gone; expected new ones within {ALONE:.0f} s")
+            raise NoWorkersError(f"{self._address}: all workers have gone; expected new ones within {ALONE:.0f} s")
 
     def _judge(self, address: str, threads: int, answer: Any) -> None:
         if answer.status != "finished":

@@ -20,15 +20,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from .errors import TooMuchOutputError
+
 LONGEST = 7 * 86_400.0  # seconds that a program may have
 _PIECE = 2**16  # bytes
 _POLL = 0.02  # seconds
 _ADOPTING = 36  # PR_SET_CHILD_SUBREAPER of <linux/prctl.h>
 _ENDING = 5.0  # seconds until a killed process must have ended
-
-
-class TooMuchOutputError(ValueError):
-    """A program printed more than it may."""
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from mi_refract.io.atomic import replacing
+from mi_refract.io.errors import CheckpointError
 
 from .identity import apart_from_passes, changed
 from .pass_sums import ARRAYS, PassSums, PassTree
@@ -123,7 +124,7 @@ def read(path: Path, identity: dict[str, Any]) -> Progress:
             )
     except _DAMAGE as error:
         what = f"{path}: is no complete checkpoint ({type(error).__name__})"
-        raise ValueError(f"{what}; expected one that is, or --restart to start over") from None
+        raise CheckpointError(f"{what}; expected one that is, or --restart to start over") from None
     if different:
-        raise ValueError(f"{path}: belongs to a different render: {different}; pass --restart to start over")
+        raise CheckpointError(f"{path}: belongs to a different render: {different}; pass --restart to start over")
     return found

@@ -20,6 +20,7 @@ from mi_refract import backend
 from mi_refract.cluster import on_worker, worker_facts
 from mi_refract.cluster.connection import in_thread, scheduler_needed
 from mi_refract.cluster.workers import Workers
+from mi_refract.io.errors import NoWorkersError, RefusedWorkerError
 
 from . import scene_bundle
 from .pass_plan import next_stop
@@ -63,10 +64,6 @@ class RenderedScene:
     seed: int
     expected: Mapping[str, str] | None = None
     tolerated: frozenset[str] = frozenset()
-
-
-class RefusedWorkerError(RuntimeError):
-    """A worker that has just come was given a task before it was asked for its facts, and must not have it."""
 
 
 # On a worker ----------------------------------------------------------------------------------------------------------
@@ -249,7 +246,7 @@ class ClusterPasses:
         try:
             return coming.result()
         except KilledWorker as error:
-            raise ConnectionError(
+            raise NoWorkersError(
                 f"passes {node.first} to {node.stop - 1}: {error.allowed_failures + 1} workers were lost that rendered "
                 f"them, the last {error.last_worker.address}; expected workers with enough memory"
             ) from None

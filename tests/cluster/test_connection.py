@@ -17,7 +17,8 @@ from support.dask_workers import tls_settings, until
 from support.processes import python
 
 from mi_refract.cluster import local_cluster
-from mi_refract.cluster.connection import LostSchedulerError, connected, scheduler_needed
+from mi_refract.cluster.connection import connected, scheduler_needed
+from mi_refract.io.errors import LostSchedulerError
 
 
 def refusal(**options):

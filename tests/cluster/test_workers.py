@@ -10,9 +10,10 @@ import pytest
 from support.dask_workers import accepted, until
 
 from mi_refract.cluster import worker_facts, workers
-from mi_refract.cluster.connection import LostSchedulerError, connected
+from mi_refract.cluster.connection import connected
 from mi_refract.cluster.worker_facts import HOST, LLVM, MIXED, UNUSABLE, WIDTH, differences, machine
 from mi_refract.cluster.workers import Workers
+from mi_refract.io.errors import LostSchedulerError
 
 HERE = {"mitsuba": "3.9.1", LLVM: "19.1", WIDTH: "8", UNUSABLE: "", HOST: "here"}
 
