@@ -43,14 +43,6 @@ def test_formats(tmp_path, name, kind, error):
     assert image_file.count_values(tmp_path / name) == PIXELS.size
 
 
-def test_several_at_once_keep_their_order_and_their_errors(tmp_path):
-    paths = [save(tmp_path / f"{i}.exr", PIXELS + i) for i in range(5)]
-    assert [image.path for image in image_file.read_all(paths)] == paths
-    paths[3].write_bytes(b"")
-    with pytest.raises(ValueError, match=r"3\.exr: corrupt"):
-        image_file.read_all(paths)
-
-
 def test_channels_window_and_header(tmp_path):
     image = read(save(tmp_path / "a.exr", PIXELS, x=-3, y=5, channelnames=("B", "Z", "a.X")))
     assert image.origin == (-3, 5)

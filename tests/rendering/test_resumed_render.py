@@ -292,7 +292,7 @@ def test_two_renders_into_one_file(tmp_path, llvm):
     said = []
 
     def watch(_):
-        with pytest.raises(BlockingIOError, match=r"a\.exr: a render runs there already, process \d+ .* another file"):
+        with pytest.raises(BlockingIOError, match=r"a\.exr: a render is already running in process \d+ .* file"):
             second.run()
         said.append(True)
 
