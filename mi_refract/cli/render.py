@@ -97,13 +97,14 @@ def render(
     if preview is not None:
         writable(preview, (".png",))
     chosen = variants.activate(variant)
-    from mi_refract.rendering.long_render import Job, Limits, LongRender
+    from mi_refract.rendering.end_conditions import Limits
+    from mi_refract.rendering.long_render import Job, resume
 
     limits = Limits(spp, shares[0], shares[1], seconds, pass_spp)
     job = Job(scene, defines, seed, tuple(allow_plugins or ()))
     console = Console(stderr=True)
     with _spinner(console, f"{scene.name}, {chosen}"):
-        rendering = LongRender(job, output, limits, restart=restart)
+        rendering = resume(job, output, limits, restart=restart)
     if rendering.progress.passes:
         print(printable(f"{output}: resuming from {rendering.progress.done} spp"), file=sys.stderr)
     with (

@@ -43,7 +43,7 @@ def cluster_passes(options: ClusterOptions, rendering: LongRender, variant: str)
 
     ValueError for a scene that cannot be sent; ConnectionError where no scheduler answers or no worker may render.
     """
-    if not options.target.given or rendering.is_done:
+    if not options.target.given or rendering.end():
         yield None
         return
     from mi_refract.rendering import scene_bundle

@@ -21,7 +21,8 @@ from mi_refract.cluster.connection import connected
 from mi_refract.cluster.worker_facts import facts
 from mi_refract.rendering import cluster_passes, scene_bundle
 from mi_refract.rendering.cluster_passes import ClusterPasses, Part, RenderedScene
-from mi_refract.rendering.long_render import Job, Limits, LongRender
+from mi_refract.rendering.end_conditions import Limits
+from mi_refract.rendering.long_render import Job, resume
 from mi_refract.rendering.pass_sums import PassSums
 
 SCENE = """<scene version="3.0.0">
@@ -58,7 +59,7 @@ def small_tasks(monkeypatch):
 
 
 def rendering(scene, output, spp, **limits):
-    return LongRender(Job(scene), output, Limits(spp=spp, pass_spp=1, **limits))
+    return resume(Job(scene), output, Limits(spp=spp, pass_spp=1, **limits))
 
 
 def source(client, scene, variant, warn=lambda text: None, **options):
