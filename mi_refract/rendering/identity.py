@@ -27,9 +27,9 @@ def identity_of(
     """
     import mitsuba as mi
 
-    files = scene_parser.files_of(scene, defines, allow_plugins)
+    parsed = scene_parser.parse(scene, defines)
     digest = hashlib.sha256()
-    for name, path in [("", each) for each in files.xml] + list(files.others.items()):
+    for name, path in [*(("", xml) for xml in parsed.xml), *parsed.files(allow_plugins).items()]:
         digest.update(json.dumps([name, hashlib.sha256(path.read_bytes()).hexdigest()]).encode())
     width, height = renderer.size
     llvm = "llvm" in str(mi.variant())

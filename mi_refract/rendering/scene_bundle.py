@@ -45,12 +45,13 @@ def pack(scene: Path, defines: Mapping[str, str], limit: int = LIMIT) -> SceneBu
 
     ValueError, one line, for a scene that is larger, or that reaches XML in a way that only works here.
     """
-    found = scene_parser.files_of(scene, defines)
-    paths = dict.fromkeys(map(_absolute, (*found.xml, *found.others.values())))
+    parsed = scene_parser.parse(scene, defines)
+    others = parsed.files()
+    paths = dict.fromkeys(map(_absolute, (*parsed.xml, *others.values())))
     _check_size(scene, list(paths), limit)
     files = {path: Path(path).read_bytes() for path in paths}
     parent = Path(_absolute(scene)).parent
-    named = {name: _absolute(path) for name, path in found.others.items()}
+    named = {name: _absolute(path) for name, path in others.items()}
     moved = {
         name: path
         for name, path in named.items()
@@ -58,11 +59,10 @@ def pack(scene: Path, defines: Mapping[str, str], limit: int = LIMIT) -> SceneBu
     }
     contents = [[path, hashlib.sha256(content).hexdigest()] for path, content in sorted(files.items())]
     digest = hashlib.sha256(json.dumps([_absolute(scene), contents, moved]).encode()).hexdigest()
-    searched = scene_limits.check_files(scene, _search_folders(scene), defines).searched
-    named_folders = {each.parent for each in (*found.xml, *found.others.values())} | set(searched)
+    named_folders = {file.parent for file in (*parsed.xml, *others.values())} | set(parsed.searched)
     folders = tuple(sorted(os.path.join(Path.cwd(), each) for each in named_folders))  # noqa: PTH118
     bundle = SceneBundle(digest, _absolute(scene), files, folders, moved)
-    _check_places(bundle, [_absolute(path) for path in found.xml], defines)
+    _check_places(bundle, [_absolute(path) for path in parsed.xml], defines)
     return bundle
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from mi_refract.io.image_file import one_line
 
 TAKEN = ("config", "filename")  # names that mi.parser.parse_file would take for its own
-REPRODUCIBLE: Any = {"parallel": False, "optimize": False}  # for mi.load_file, as scene_parser.load does
+REPRODUCIBLE: Any = {"parallel": False, "optimize": False}  # for mi.load_file, as `ParsedScene.load` does
 PIXELS = 2**26  # of an image; four channels of them are 1 GiB
 
 
@@ -51,7 +51,7 @@ def load_scene(
     if taken := [name for name in TAKEN if name in defines]:
         raise ValueError(f"define {taken[0]!r}: taken by Mitsuba's parser; expected any name but {TAKEN}")
     try:
-        scene = scene_parser.load(path, defines, allow_plugins, moved)
+        scene = scene_parser.parse(path, defines).load(allow_plugins, moved)
     except OSError:
         raise
     except Exception as error:  # RuntimeError from the parser; whatever a Python plugin raises
