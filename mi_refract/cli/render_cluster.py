@@ -50,13 +50,13 @@ def cluster_passes(options: ClusterOptions, rendering: LongRender, variant: str)
     from mi_refract.rendering.cluster_passes import ClusterPasses, RenderedScene
 
     job = rendering.job
-    bundle = scene_bundle.pack(job.scene, job.defines, options.bundle_limit)
+    bundle = scene_bundle.pack(rendering.parsed, job.defines, options.bundle_limit)
     with connected(options.target.scheduler, options.target.workers) as client:
         tolerated: frozenset[str] = worker_facts.MIXED if options.mixed_workers else frozenset()
         expected = worker_facts.facts(variant)
         workers = Workers(client, variant, expected, tolerated, _say, task="render")
         workers.wait()
-        scene = RenderedScene(variant, dict(job.defines), job.seed, expected, tolerated)
+        scene = RenderedScene(variant, job.seed, expected, tolerated)
         passes = ClusterPasses(workers, bundle, scene, rendering.warnings.append)
         try:
             yield passes

@@ -54,13 +54,12 @@ class Part:
 
 @dataclass(frozen=True)
 class RenderedScene:
-    """What a worker must know beside the bundle: the variant, the `<default>`s, the seed of the render.
+    """What a worker must know beside the bundle: the variant, and the seed of the render.
 
     `expected`: facts that a worker must have, but for `tolerated`, where any may be given a task; None: none is asked.
     """
 
     variant: str
-    defines: Mapping[str, str]
     seed: int
     expected: Mapping[str, str] | None = None
     tolerated: frozenset[str] = frozenset()
@@ -109,7 +108,7 @@ def _rendered(
     """The sums of a node (level, first pass, samples of a pass), and the most pixels of a pass that are not finite."""
     from .render_pass import pass_renderer
 
-    loaded, root = scene_bundle.load(bundle, scene.variant, scene.defines, folder)
+    loaded, root = scene_bundle.load(bundle, scene.variant, folder)
     renderer, spp, bad = pass_renderer(loaded, scene.seed), node[2], [0]
 
     def made(level: int, first: int) -> PassSums:

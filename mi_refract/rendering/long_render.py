@@ -27,7 +27,7 @@ from mi_refract.io.image_file import SUFFIXES, Metadata
 from mi_refract.io.provenance import installed_version, provenance
 from mi_refract.io.sanitise import printable
 from mi_refract.numerics import Scene
-from mi_refract.plugins import scene_parser
+from mi_refract.plugins.scene_parser import ParsedScene
 
 from . import checkpoint, error_estimate, rendered_file
 from .checkpoint import PASS, CheckpointWriter, Progress
@@ -35,7 +35,7 @@ from .end_conditions import NO_NOISE, Limits, reached
 from .pass_plan import PassPlan, next_stop, plan_passes
 from .pass_sums import PassSums
 from .render_pass import PassRenderer, pass_renderer
-from .scene_files import formulas_in, load_scene, naming
+from .scene_files import formulas_in, load_parsed, naming, parse_scene
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,8 @@ def resume(
         raise ValueError(f"seed = {job.seed}; expected a whole number from 0 to 2³² − 1")
     if limits.until is not None:
         error_estimate.require_interval()
-    scene = load_scene(job.scene, job.defines, job.allow_plugins)
+    parsed = parse_scene(job.scene, job.defines)
+    scene = load_parsed(parsed, job.allow_plugins)
     renderer = pass_renderer(scene, job.seed)
     spp = limits.spp
     if spp is None and not limits.open_ended:
@@ -98,7 +99,7 @@ def resume(
         left = None if spp is None else max(0, spp - done)
         return plan_passes(width * height, left, pass_spp, renderer.accepted, moments=renderer.moments)
 
-    progress, saved = Progress(_identity(job, renderer)), checkpoint.path_of(path)
+    progress, saved = Progress(_identity(job, parsed, renderer)), checkpoint.path_of(path)
     if saved.exists() and not restart:
         progress = checkpoint.read(saved, progress.identity)
         if spp is not None and progress.done > spp:
@@ -114,14 +115,13 @@ def resume(
         raise ValueError(f"{saved}: passes of {begun} samples per pixel; expected --pass-spp {begun}, or --restart")
     chosen = plan(begun or limits.pass_spp, progress.base.spp if progress.base else 0)
     progress.identity[PASS] = chosen.spp
-    return LongRender(job, path, limits, scene, renderer, spp, chosen, progress)
+    return LongRender(job, path, limits, parsed, scene, renderer, spp, chosen, progress)
 
 
-def _identity(job: Job, renderer: PassRenderer) -> dict[str, Any]:
+def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> dict[str, Any]:
     """Everything that the bits of a render depend on, by names for messages; but for PASS, which its plan says."""
-    files = scene_parser.files_of(job.scene, job.defines, job.allow_plugins)
     digest = hashlib.sha256()
-    for name, path in [("", path) for path in files.xml] + list(files.others.items()):
+    for name, path in [*(("", xml) for xml in parsed.xml), *parsed.files(job.allow_plugins).items()]:
         digest.update(json.dumps([name, hashlib.sha256(path.read_bytes()).hexdigest()]).encode())
     width, height = renderer.size
     llvm = "llvm" in str(mi.variant())
@@ -150,6 +150,7 @@ class LongRender:
     job: Job
     output: Path
     limits: Limits
+    parsed: ParsedScene
     scene: Scene
     renderer: PassRenderer
     spp: int | None
