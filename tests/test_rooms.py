@@ -69,11 +69,11 @@ FILLED = {
     "PathState",
     "Progress",
     "Ray",
+    "SceneText",
     "Scatter",
     "SearchState",
     "Start",
     "Tally",
-    "Walk",
 }
 
 

@@ -41,7 +41,3 @@ class LostSchedulerError(MiRefractError, ConnectionError):
 
 class NoWorkersError(MiRefractError, ConnectionError):
     """No worker of the scheduler may be given work, or none is left."""
-
-
-class RefusedWorkerError(MiRefractError, RuntimeError):
-    """A worker that must not have a task was given one before it was asked for its facts."""
