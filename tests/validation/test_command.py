@@ -303,8 +303,8 @@ def test_two_validations_do_not_share_a_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(command, "import_module", lambda name: types.SimpleNamespace(STUDY=holding))
     assert command.main(["directions", "--out", str(tmp_path)]) == 0
     assert inside == [2]
-    said = [line for line in capsys.readouterr().err.splitlines() if "runs there already" in line]
-    assert len(said) == 1 and f"{tmp_path}: a validation runs there already, process {os.getpid()} on " in said[0]
+    said = [line for line in capsys.readouterr().err.splitlines() if "is already running" in line]
+    assert len(said) == 1 and f"{tmp_path}: a validation is already running in process {os.getpid()} on " in said[0]
     assert {path.name for path in tmp_path.iterdir()} == {"rows.json", "junit.xml", "report.html"}
 
 

@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from mi_refract.io import process_group
+from mi_refract.io.errors import TooMuchOutputError
 from mi_refract.report.row import Row
 from validation.limits import UNEXPLAINED
 from validation.run.context import Context
@@ -251,14 +252,14 @@ def _test(tests: Tests) -> tuple[bool, str, float]:
         if mutant:
             (_COPY / mutant.path).write_text(_mutated(source, mutant.operator, mutant.occurrence), "utf-8")
         ended = process_group.run(command, b"", timeout, cwd=_COPY, env=kept | own, keep_stderr=True)
-    except (TimeoutError, process_group.TooMuchOutputError) as error:
+    except (TimeoutError, TooMuchOutputError) as error:
         return False, str(error), time.monotonic() - began
     finally:
         if mutant:
             (_COPY / mutant.path).write_text(source, "utf-8")
     said = [line for line in ended.out.decode(errors="replace").splitlines() if line.strip()]
     if ended.status > FAILED and not mutant:
-        raise ValueError(f"{ended.how}: {' '.join(files)[:200]}")
+        raise ValueError(f"{ended.describe}: {' '.join(files)[:200]}")
     failed = [line for line in said if line.startswith(("FAILED ", "ERROR "))]
     return ended.status == PASSED, (failed or said or [""])[-1][:300], time.monotonic() - began
 
