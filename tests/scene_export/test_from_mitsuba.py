@@ -14,7 +14,7 @@ import pytest
 from mi_refract.io import image_file
 from mi_refract.scene_export import from_mitsuba, meshes_from_shapes, write_files
 from mi_refract.scene_export.plain_scene import Diffuse, Environment, Glass, Light
-from mi_refract.scene_export.targets.environment_map import radiance
+from mi_refract.scene_export.targets.shared_files import radiance
 
 SCENES = Path(__file__).parents[2] / "scenes"
 NAMES = sorted(path.stem for path in SCENES.glob("*.xml"))

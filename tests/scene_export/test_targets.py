@@ -14,7 +14,7 @@ from mi_refract.image_diff.comparison import Verdict
 from mi_refract.io import image_file
 from mi_refract.scene_export import from_mitsuba, tessellation, write_files
 from mi_refract.scene_export.plain_scene import Camera, Diffuse, Environment, Glass, Light, Mesh, PlainScene
-from mi_refract.scene_export.targets import cycles, environment_map, luxcore, obj, povray
+from mi_refract.scene_export.targets import luxcore, povray, scene_json, shared_files
 
 SCENES = Path(__file__).parents[2] / "scenes"
 CAMERA = Camera((0.0, 0.0, 9.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, 8, 4)
@@ -187,7 +187,7 @@ def test_radiance_sky_is_read_as_it_is_meant(small, sky, tmp_path):
         a, b = names["row"] - i, names["column"] - j
         value = (1 - a) * ((1 - b) * table[i, j] + b * table[i, j + 1])
         value += a * ((1 - b) * table[i + 1, j] + b * table[i + 1, j + 1])
-        assert value == pytest.approx(environment_map.radiance(sky, direction[None])[0, 1], abs=1e-6)
+        assert value == pytest.approx(shared_files.radiance(sky, direction[None])[0, 1], abs=1e-6)
 
 
 # --- LuxCore ---------------------------------------------------------------------------------------------
@@ -262,20 +262,29 @@ def test_the_map_has_no_date(small, sky, tmp_path):
     assert image_file.read(tmp_path / "new" / "sky.exr").metadata["DateTime"] == "1970:01:01 00:00:00"
 
 
-@pytest.mark.parametrize("module", [cycles, luxcore, povray, obj], ids=lambda module: module.__name__.split(".")[-1])
-def test_maps_are_looked_up_by_unit_directions(module, sky):
+LOOKUPS = {
+    "cycles": scene_json.cycles_direction_at,
+    "luxcore": luxcore.direction_at,
+    "povray": povray.direction_at,
+    "own program": scene_json.own_direction_at,
+}
+
+
+@pytest.mark.parametrize("target", LOOKUPS)
+def test_maps_are_looked_up_by_unit_directions(target, sky):
     """Every direction is somewhere on the map, and a resampled map shows in each what the sky shows there."""
     u, v = np.random.default_rng(6).random((2, 400))
-    directions = module.direction_at(u, v)
+    direction_at = LOOKUPS[target]
+    directions = direction_at(u, v)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1)
-    image = environment_map.longitude_latitude(sky, module.direction_at)
+    image = shared_files.longitude_latitude(sky, direction_at)
     height, width = image.shape[:2]
     nearest = image[(v * height).astype(int), (u * width).astype(int)]
-    np.testing.assert_allclose(nearest, environment_map.radiance(sky, directions), atol=0.15)
+    np.testing.assert_allclose(nearest, shared_files.radiance(sky, directions), atol=0.15)
     weights = np.sin(np.pi * (np.arange(height) + 0.5) / height)[:, None, None] * np.ones_like(image)
     sphere = np.random.default_rng(7).normal(size=(20000, 3))
     np.testing.assert_allclose(
-        np.average(image, axis=(0, 1), weights=weights), environment_map.radiance(sky, sphere).mean(0), atol=0.01
+        np.average(image, axis=(0, 1), weights=weights), shared_files.radiance(sky, sphere).mean(0), atol=0.01
     )
 
 

@@ -12,8 +12,8 @@ from mi_refract.io import image_file
 from mi_refract.rendering import scene_files
 from mi_refract.scene_export import write_files
 from mi_refract.scene_export.plain_scene import Glass
-from mi_refract.scene_export.targets import cycles, environment_map, luxcore
-from mi_refract.scene_export.targets.environment_map import longitude_latitude, radiance
+from mi_refract.scene_export.targets import luxcore, scene_json, shared_files
+from mi_refract.scene_export.targets.shared_files import longitude_latitude, radiance
 from validation import readme_tables
 from validation.run.context import PROFILES, Context
 from validation.run.render_methods import Camera
@@ -178,7 +178,7 @@ def test_an_environment_is_what_mitsuba_makes_of_it():
 
 # Where each renderer looks a direction up: u to the right, v from the top of the image.
 LOOKED_UP = {
-    cycles.direction_at: lambda x, y, z: (0.5 - np.arctan2(y, x) / (2 * np.pi), np.arccos(z) / np.pi),
+    scene_json.cycles_direction_at: lambda x, y, z: (0.5 - np.arctan2(y, x) / (2 * np.pi), np.arccos(z) / np.pi),
     luxcore.direction_at: lambda x, y, z: (np.arctan2(y, x) / (2 * np.pi) % 1, np.arccos(z) / np.pi),
     image_renderers.equirectangular: lambda x, y, z: (0.5 + np.arctan2(z, x) / (2 * np.pi), np.arccos(y) / np.pi),
 }
@@ -186,7 +186,7 @@ LOOKED_UP = {
 
 @pytest.mark.parametrize("renderer", LOOKED_UP)
 def test_a_renderer_finds_the_sky_where_it_looks(renderer, monkeypatch):
-    monkeypatch.setattr(environment_map, "FINER", 8)
+    monkeypatch.setattr(shared_files, "FINER", 8)
     sky, seen = rendered_images.askew(), directions()
     image = longitude_latitude(sky, renderer)
     u, v = LOOKED_UP[renderer](*seen.T)
