@@ -26,7 +26,7 @@ import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 CHOICE = "DRJIT_LIBLLVM_PATH"  # where Dr.Jit looks first
 OWN_CHOICE = "MI_REFRACT_LIBLLVM"  # set to the same value where the choice was ours, not the user's
@@ -127,9 +127,9 @@ def activate(preferred: str | None = None, *, may_restart: bool = False) -> str:
     return preferred
 
 
-def _own_plugins_first(mi: Any) -> None:
+def _own_plugins_first(mi: ModuleType) -> None:
     """Have Mitsuba look for plugins in its own folder first: it would run `plugins/sphere.so` of the working folder."""
-    own = str(Path(mi.__file__).parent)
+    own = str(Path(str(mi.__file__)).parent)
     if str(next(iter(mi.file_resolver()))) != own:
         mi.file_resolver().prepend(own)
 
