@@ -104,16 +104,6 @@ def local_odds(ray: LocalCosines, transmitted: Mask, k: Number, contrast: Number
     return dr.fma(kappa * kappa, dr.fma(q, q, p * p), mirror), power * dr.fma(d_s, d_s, d_p * d_p)
 
 
-def reflectance(cos_i: Number, cos_t: Number, transmitted: Mask, k: Number, contrast: Number = None) -> Any:
-    """Unpolarised reflectance R = (r_s² + r_p²)/2; see `powers`."""
-    return powers(cos_i, cos_t, transmitted, k, contrast)[0]
-
-
-def transmittance(cos_i: Number, cos_t: Number, transmitted: Mask, k: Number, contrast: Number = None) -> Any:
-    """Unpolarised transmittance T = 1 − R, formed without that subtraction; see `powers`."""
-    return powers(cos_i, cos_t, transmitted, k, contrast)[1]
-
-
 def _through(lift: Callable[[Number], Number], transmitted: Mask, cos_t: Number) -> tuple[Any, Any]:
     """(cos_t or 0, about 0 or 1) where light is transmitted or not. NaN stays.
 
