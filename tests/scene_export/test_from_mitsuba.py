@@ -14,8 +14,7 @@ import pytest
 from mi_refract.io import image_file
 from mi_refract.scene_export import from_mitsuba, meshes_from_shapes, write_files
 from mi_refract.scene_export.mitsuba_nodes import SceneFile
-from mi_refract.scene_export.plain_scene import Diffuse, Environment, Glass, Light
-from mi_refract.scene_export.targets.shared_files import radiance
+from mi_refract.scene_export.plain_scene import Diffuse, Glass, Light
 
 SCENES = Path(__file__).parents[2] / "scenes"
 NAMES = sorted(path.stem for path in SCENES.glob("*.xml"))
@@ -202,26 +201,6 @@ def test_a_difference_is_seen(old, new, tmp_path):
     (tmp_path / "prism.xml").write_text(text.replace(old, new))
     other = again(from_mitsuba.load(tmp_path / "prism.xml"), tmp_path / "plain")
     assert disagreements(original(SCENES / "prism.xml"), other) > 0.004
-
-
-def test_turned_environment(scene, tmp_path):
-    (tmp_path / "lamps.exr").write_bytes((SCENES / "lamps.exr").read_bytes())
-    turn = '<transform name="to_world"><rotate x="0.6" y="0.8" angle="70"/></transform>'
-    path = scene(
-        '<emitter type="constant"><rgb name="radiance" value="0.5, 0.25, 1"/></emitter>',
-        f'<emitter type="envmap"><string name="filename" value="lamps.exr"/><float name="scale" value="3"/>{turn}'
-        "</emitter>",
-    )
-    sky, emitter = from_mitsuba.load(path).sky, original(path).environment()
-    assert isinstance(sky, Environment)
-    directions = np.random.default_rng(2).normal(size=(500, 3))
-    expected = []
-    for direction in directions:
-        si = mi.SurfaceInteraction3f()
-        si.wi = -mi.Vector3f(direction / np.linalg.norm(direction))
-        expected.append(list(emitter.eval(si)))
-    np.testing.assert_allclose(radiance(sky, directions), expected, rtol=1e-3, atol=1e-3)
-    assert not np.allclose(radiance(sky, directions * [1, 1, -1]), expected, rtol=0.1, atol=0.1)
 
 
 CONSTANT = '<emitter type="constant"><rgb name="radiance" value="0.5, 0.25, 1"/></emitter>'
