@@ -63,7 +63,7 @@ def product(x: FloatExpansion, y: FloatExpansion, words: int = 3) -> FloatExpans
     return distil(terms, words)
 
 
-def negated(x: FloatExpansion) -> FloatExpansion:
+def negated(x: Sequence[Number]) -> FloatExpansion:
     """−x of an expansion."""
     return [-x_i for x_i in x]
 

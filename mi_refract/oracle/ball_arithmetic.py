@@ -64,19 +64,19 @@ class Certified:
     A ray with a or n zero or not finite, or k not finite and positive, has NaN numbers and both masks False.
     """
 
-    direction: Array  # (N, 3)
-    direction_low: Array  # (N, 3)
-    radius: Array  # (N,)
-    transmitted: NDArray[np.bool_]  # (N,)
-    undecided: NDArray[np.bool_]  # (N,): no precision sufficed, all numbers NaN; impossible for doubles
-    cos_i: Array  # (N,)
-    cos_t: Array  # (N,)
-    reflectance: Array  # (N,), as all below NaN without `fresnel`
-    reflectance_low: Array
-    transmittance: Array
-    transmittance_low: Array
-    amplitude_s: NDArray[np.complex128]  # (N,), to 1e-16
-    amplitude_p: NDArray[np.complex128]
+    direction: np.ndarray  # (N, 3)
+    direction_low: np.ndarray  # (N, 3)
+    radius: np.ndarray  # (N,)
+    transmitted: np.ndarray  # (N,) bool
+    undecided: np.ndarray  # (N,) bool: no precision sufficed, all numbers NaN; impossible for doubles
+    cos_i: np.ndarray  # (N,)
+    cos_t: np.ndarray  # (N,)
+    reflectance: np.ndarray  # (N,), as all below NaN without `fresnel`
+    reflectance_low: np.ndarray
+    transmittance: np.ndarray
+    transmittance_low: np.ndarray
+    amplitude_s: np.ndarray  # (N,) complex, to 1e-16
+    amplitude_p: np.ndarray
 
     def __len__(self) -> int:
         """The number of rays."""

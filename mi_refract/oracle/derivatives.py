@@ -14,8 +14,6 @@ import numpy as np
 from flint import arb, arb_series, ctx
 from numpy.typing import ArrayLike
 
-from .ball_arithmetic import Array
-
 Series: TypeAlias = Any  # a `flint.arb_series`, or a ball
 
 # As many bits as the widest radicand of float32 inputs needs to be exact, and enough for float64 unless it cancels
@@ -24,7 +22,7 @@ BITS = 1200
 MAX_RADIUS = 1e-25
 
 
-def derivative(a: ArrayLike, n: ArrayLike, k: ArrayLike, along_a: ArrayLike, along_k: ArrayLike) -> Array:
+def derivative(a: ArrayLike, n: ArrayLike, k: ArrayLike, along_a: ArrayLike, along_k: ArrayLike) -> np.ndarray:
     """(N, 3): d/dε of b for a + ε along_a and k + ε along_k, where b keeps the length of `a`.
 
     a, n, along_a: (N, 3) of any lengths; k, along_k: (N,) or numbers. At n·a = 0 and D = 0 there is none: NaN.
@@ -33,7 +31,7 @@ def derivative(a: ArrayLike, n: ArrayLike, k: ArrayLike, along_a: ArrayLike, alo
     return _by_series(_direction, 3, a, n, k, along_a, along_k)
 
 
-def derivative_of_powers(cos_i: ArrayLike, k: ArrayLike, along_cos: ArrayLike, along_k: ArrayLike) -> Array:
+def derivative_of_powers(cos_i: ArrayLike, k: ArrayLike, along_cos: ArrayLike, along_k: ArrayLike) -> np.ndarray:
     """(N,): d/dε of the unpolarised reflectance R, and so of −T, for cos_i + ε along_cos and k + ε along_k."""
     zeros = np.zeros((len(np.asarray(cos_i)), 3))
     a, along_a = (zeros + np.reshape(x, (-1, 1)) for x in (cos_i, along_cos))
@@ -48,7 +46,7 @@ def _by_series(
     k: ArrayLike,
     along_a: ArrayLike,
     along_k: ArrayLike,
-) -> Array:
+) -> np.ndarray:
     """(N, width): `solve` of each ray, as the coefficients of ε; NaN where a ball is too wide."""
     a, n, along_a = (np.asarray(x, np.float64) for x in (a, n, along_a))
     k, along_k = (np.broadcast_to(np.asarray(x, np.float64), len(a)) for x in (k, along_k))
