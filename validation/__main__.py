@@ -54,7 +54,6 @@ ROOMS = {
             "small_mistakes",
             "rendered_images",
             "spectral_lines",
-            "dispersion",
             "lenses",
             "glasses",
             "exports",

@@ -65,7 +65,7 @@ def system_rows(system: System, catalogue: GlassCatalogue, context: Context) -> 
         return [Row(NAME, system.title, "every glass", "f64", reason=reason)]
     rays = given(catalogue.glasses)
     try:
-        text = environments.run(environments.script(system, catalogue.script), as_csv(rays))
+        text = environments.run(environments.script(system, catalogue.script, "glasses"), as_csv(rays))
         answers = parse_answers(text, system.title)
         if answers.n_ratio is None:
             raise ValueError("no column n_ratio; expected the ratio of indices that was used")
