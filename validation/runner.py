@@ -120,7 +120,7 @@ def sources() -> str:
     """A digest of all that rows are made from: the package, the validation, scenes and tests."""
     digest = hashlib.sha256()
     ours, here = Path(mi_refract.__file__).parent, Path(__file__).parent
-    sources = [ours.rglob("*.py"), here.rglob("*.py"), here.rglob("*.json"), SCENES.rglob("*")]
+    sources = [ours.rglob("*.py"), here.rglob("*.py"), here.rglob("*.json"), here.rglob("*.j2"), SCENES.rglob("*")]
     sources.append(here.with_name("tests").rglob("*.py"))  # which mutants of our code must not pass
     for path in sorted(path for group in sources for path in group if path.is_file()):
         digest.update(path.read_bytes())

@@ -214,8 +214,8 @@ def resolved(a: np.ndarray, k: np.ndarray, exact: oracle.Certified, u: float) ->
 
 def relative(x: np.ndarray, exact: np.ndarray, low: np.ndarray, setting: Setting) -> np.ndarray:
     """|x/exact − 1|; below the smallest normal number, |x − exact| over that number."""
-    error = np.abs((x - exact) - low) / np.maximum(np.abs(exact), np.finfo(setting.precision).tiny)
-    return np.nan_to_num(error.astype(float), nan=np.inf)
+    error: np.ndarray = np.abs((x - exact) - low) / np.maximum(np.abs(exact), np.finfo(setting.precision).tiny)
+    return error
 
 
 def worst(x: np.ndarray) -> float:
