@@ -93,11 +93,12 @@ def mutated_xml(draw, good):
         inserted = draw(st.integers(0, 4)) == 0
         spans = [found.span() for found in (ELEMENT if inserted else ATTRIBUTE).finditer(data)]
         start, stop = draw(st.sampled_from(spans or [(0, 0)]))
-        begin, end = draw(st.sampled_from(ELEMENTS)).split(b"%s")
-        count = draw(st.sampled_from([1, 2, 40, 20_000]))
-        data = (
-            data[:start] + (begin * count + end * count if inserted else draw(st.sampled_from(XML_WORDS))) + data[stop:]
-        )
+        new = draw(st.sampled_from(XML_WORDS))
+        if inserted:
+            begin, end = draw(st.sampled_from(ELEMENTS)).split(b"%s")
+            count = draw(st.sampled_from([1, 2, 40, 20_000]))
+            new = begin * count + end * count
+        data = data[:start] + new + data[stop:]
     return data
 
 
@@ -117,9 +118,9 @@ def mutated_member(draw, good):
 def inputs(suffix, good):
     """Garbage like the good contents of files with this suffix."""
     plain = mutated(good, HEADER if suffix == ".exr" else None)
-    return {".xml": plain | mutated_xml(good) | mutated_xml(good), ".npz": plain | mutated_member(good[0])}.get(
-        suffix, plain
-    )
+    if suffix == ".xml":
+        return plain | mutated_xml(good) | mutated_xml(good)
+    return plain | mutated_member(good[0]) if suffix == ".npz" else plain
 
 
 # Parsers: suffix, good contents, and a function that raises one line, or returns what is wrong with accepting the file
