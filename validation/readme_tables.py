@@ -232,8 +232,8 @@ def planar(rows: list[Row]) -> str:
             boundaries = f"{exact.values[study.BOUNDARIES]:.0f}"
             retraced.append([f"`{case}`", str(exact.replay["rays"]), boundaries, *errors, *nearest])
     text = (
-        "Largest distance from an independent retrace, over the scene's extent, on LLVM; and in float32 the error that\n"
-        "comes nearest to its bound, at one point of one path, with the bound there."
+        "Largest distance from an independent retrace, over the scene's extent, on LLVM; and in float32 the error "
+        "that\ncomes nearest to its bound, at one point of one path, with the bound there."
     )
     heading = ["scene", "rays", "boundaries", "float64: error", "float32: error", "nearest its bound", "bound", "ratio"]
     first = _table(text, heading, retraced, missing)

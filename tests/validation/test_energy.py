@@ -272,7 +272,7 @@ def test_the_derivative_of_the_reflectance_keeps_its_digits_near_the_critical_an
     cos_i, ratio = np.sqrt((1 - sine) * (1 + sine)), np.full(40, k)
     exact = oracle_derivative.derivative_of_powers(cos_i, ratio, 0.0, ratio)
     certified = oracle.fresnel(cos_i, ratio)
-    number = dr.value_t(derivatives.differentiable(setting))
+    number = dr.value_t(dr.diff_array_t(setting.vector))
 
     def reflectance(k):
         cos_t, transmitted = fresnel.refracted_cosine(number(cos_i), k)
