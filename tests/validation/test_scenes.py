@@ -382,7 +382,8 @@ def test_the_rainbow_is_red_at_its_borders_and_blue_between(needs_variant):
 
 
 def test_each_colour_has_its_place_on_the_screen(colours):
-    band = spectral("spectrum_on_screen", res=64, spp=8192)[12:34, 8:56].sum(0)
+    """Red minus green is −3.5 ± 0.35 columns, blue minus green 5.9 ± 0.4: both bounds are four deviations away."""
+    band = spectral("spectrum_on_screen", res=64, spp=2048)[12:34, 8:56].sum(0)
     red, green, blue = np.average(np.mgrid[8:56, 0:3][0], axis=0, weights=np.clip(band - np.median(band, 0), 0, None))
     if colours:
         assert red + 2 < green < blue - 2
@@ -390,8 +391,10 @@ def test_each_colour_has_its_place_on_the_screen(colours):
         assert red == pytest.approx(green, abs=0.5) and blue == pytest.approx(green, abs=0.5)
 
 
-def test_thick_glass_is_darker():
+def test_thick_glass_is_darker(needs_variant):
     """The stopper is solid, the wall of the neck below it is thin; both are seen before the sky."""
+    needs_variant("llvm_ad_rgb")
+    mi.set_variant("llvm_ad_rgb")
     image = np.array(mi.render(load(SCENES / "green_bottle.xml", res=64, spp=16), seed=1))
     stopper, neck = image[3:7, 29:36].mean((0, 1)), image[10:15, 29:36].mean((0, 1))
     assert (stopper < neck).all() and stopper[0] < 0.5 * neck[0]

@@ -74,7 +74,8 @@ def carry(subject: Subject, chain: Chain, a: Array, stop: Array, setting: Settin
     """Rays `a` (N, 3) from the top to boundary `stop` (N,), or back out of the top, by one formula; one launch."""
     if dr.is_jit_v(setting.vector):
         return _compiled(subject, chain, a, stop, setting)
-    k, normals = chain.k.astype(setting.precision).tolist(), np.asarray(chain.normals, setting.precision)
+    normals: Array = np.asarray(chain.normals, setting.precision)
+    k = chain.k.astype(setting.precision).tolist()
     contrasts = None if chain.contrasts is None else chain.contrasts.astype(np.float64).tolist()
 
     def boundary(mine: list[Any], place: int, way: int) -> tuple:
