@@ -6,10 +6,8 @@ module is imported, not after the run.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -22,6 +20,7 @@ from mi_refract.io.pixels import srgb_encode
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
+from mi_refract.report.thumbnails import png
 from validation.diff import visible_changes
 from validation.directions import per_formula
 from validation.efficiency import changing_indices, error_against_time
@@ -340,22 +339,13 @@ def gallery(rows: list[Row], context: Context) -> bytes:
 
     Scenes with dispersion or absorption come last, from a spectral variant.
     """
-    import OpenImageIO as oiio
-
     drawn = [row for row in rows if row.subject == PLUGIN and row.images]
     paths = [r.images["test"] for study in (against_dielectric, colours) for r in drawn if r.study == study.NAME]
     tiles = [tile for path in paths if (tile := image_file.read_exr(context.out / path)[0]).std() > 1e-3]
-    gap = np.ones((tiles[0].shape[0], 4, 3), np.float32)
-    strips = []
-    for start in range(0, len(tiles), GALLERY_COLUMNS):
-        row = tiles[start : start + GALLERY_COLUMNS]
-        row += [np.ones_like(tiles[0])] * (GALLERY_COLUMNS - len(row))
-        strip = [x for tile in row for x in (tile, gap)][:-1]
-        strips += [np.concatenate(strip, axis=1), np.ones((4, sum(x.shape[1] for x in strip), 3), np.float32)]
-    encoded = srgb_encode(np.concatenate(strips[:-1]).clip(0, 1)).astype(np.float32)
-    image = oiio.ImageBuf(np.ascontiguousarray(encoded))
-    with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder) / "gallery.png"
-        if not image.write(str(target), "uint8"):
-            raise OSError(f"{target}: {image.geterror()}")
-        return target.read_bytes()
+    side, gap = tiles[0].shape[0], 4
+    lines = -(-len(tiles) // GALLERY_COLUMNS)
+    sheet = np.ones((lines * (side + gap) - gap, GALLERY_COLUMNS * (side + gap) - gap, 3), np.float32)
+    for i, tile in enumerate(tiles):
+        y, x = (place * (side + gap) for place in divmod(i, GALLERY_COLUMNS))
+        sheet[y : y + side, x : x + side] = srgb_encode(tile.clip(0, 1))
+    return png(np.rint(255 * sheet).astype(np.uint8))
