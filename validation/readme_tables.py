@@ -50,7 +50,7 @@ from validation.run.metrics import (
     low,
 )
 from validation.stability import layered_paths
-from validation.suite import matrix_table
+from validation.suite import matrix
 
 ROOT = SCENES.parent
 GALLERY = SCENES / "gallery.png"
@@ -334,7 +334,7 @@ def visible(rows: list[Row]) -> str:
 
 def suite(rows: list[Row]) -> str:
     """Markdown: how far every system is off at most, check by check."""
-    return _table(*matrix_table.table(rows))
+    return _table(*matrix.table(rows))
 
 
 def _percent(shares: list[float], digits: int = 0) -> str:

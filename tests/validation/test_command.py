@@ -23,7 +23,7 @@ from mi_refract.report.run_report import read_json
 from validation import __main__ as command
 from validation import limits, readme_tables, runner
 from validation.diff import planted_defects, visible_changes
-from validation.directions import bsdf_samples, keep_worst, per_formula
+from validation.directions import bsdf_samples, per_formula
 from validation.renders import against_dielectric, colours
 from validation.renders import scene_needs as scenes
 from validation.run import array_settings as settings
@@ -442,10 +442,3 @@ def test_a_scene_is_loaded_in_the_same_order_every_time(context):
     scenes = [render_methods.opened(SCENES / "diamond.xml", "dielectric", 8) for _ in range(12)]
     images = [render_methods.Camera(scene)(1, seed=0)[0] for scene in scenes]
     assert all((image == images[0]).all() for image in images)
-
-
-def test_keeping_the_worst_rays_refuses_what_is_no_formula(capsys):
-    assert keep_worst.main(["promoted", "nope"]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("validation.directions.keep_worst: unknown formula 'nope'; expected ")
-    assert len(error.splitlines()) == 1
