@@ -30,7 +30,6 @@ __all__ = [
     "path_tree",
     "paths",
     "scene_file",
-    "scene_schema",
     "segments",
     "shapes",
     "trace",
