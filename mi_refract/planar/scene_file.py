@@ -32,7 +32,7 @@ RAYS = 2**24  # of all beams
 FARTHEST = 1e100  # of all coordinates: products of two do not overflow
 
 Positive = Annotated[float, Meta(gt=0)]
-Text = Annotated[str, Meta(pattern=r"\S")]
+Text = Annotated[str, Meta(min_length=1)]
 Names = Annotated[list[Text], Meta(min_length=1)]
 Point = tuple[float, float]
 Points = Annotated[list[Point], Meta(min_length=1)]
@@ -169,8 +169,9 @@ def _curves(shape: AnyShape, n: dict[str, Indices]) -> list[tuple[Curve, Indices
         case Ellipse():
             curve = shapes.ellipse(*shape.radii)
         case Lens():
-            options = {"radius": shape.radius, "conic": shape.conic, "vertex": shape.vertex}
-            curve = shapes.lens(shape.curvature, shape.thickness, **options)
+            curve = shapes.lens(
+                shape.curvature, shape.thickness, radius=shape.radius, conic=shape.conic, vertex=shape.vertex
+            )
         case EllipseLens():
             curve = shapes.ellipse_lens(n["n"][0] / outside[0], shape.focal_length, shape.thickness, shape.radius)
     return [(curve, n["n"], outside)]
@@ -391,15 +392,16 @@ def _parts(tables: Sequence[AnyShape], ambient: Indices, light: Light) -> list[P
         pieces += curves * max(shape.facets or 4, len(getattr(shape, "points", ()))) * len(light)
         if pieces > PIECES:
             raise ValueError(f"{where}: {pieces} pieces and more; expected {PIECES}, colours times those of all shapes")
+        first = len(parts)
         try:
             with np.errstate(all="ignore"):
                 for curve, left, right in _curves(shape, n):
                     chords = curve.faceted(shape.facets) if shape.facets else curve
-                    placed = chords.mapped(affine(shape.rotate, shape.scale), shape.at)
-                    parts.append(Part(where, placed, left, right))
-                    _check_range("", placed.vertices, placed.control)
+                    parts.append(Part(where, chords.mapped(affine(shape.rotate, shape.scale), shape.at), left, right))
         except ValueError as error:
             raise ValueError(f"{where}.{error}") from None
+        for part in parts[first:]:
+            _check_range(where, part.curve.vertices, part.curve.control)
     return parts
 
 

@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mi_refract.planar.paths import REFLECT_BITS
 from support.planar_scenes import SLAB, ball, beam, polygon, scene
 
 from mi_refract.backend import detect
 from mi_refract.planar import Event, Segments, path_tree, trace
 from mi_refract.planar.path_tree import as_data, count, follow, follow_scene, summary, with_rays
-from mi_refract.planar.paths import REFLECT_BITS
 from mi_refract.planar.scene_file import load
 
 OBLIQUE = math.cos(0.6), math.sin(0.6)

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_refract.planar import Paths, Segments, Tracer, shapes
+from mi_refract.planar.curves import affine
 from mi_refract.planar.segments import Array
 from mi_refract.report.row import Row
 from validation import limits
@@ -40,7 +41,7 @@ TERMS = {
 AXES = {"x": "segments", "y": PER_PATH, "x_scale": "log", "y_scale": "log", "slope": None}
 NAME = "planar_times"
 SEED = 2033
-ORIGINAL = 0.05  # its resolution, 1172 segments
+ORIGINAL = 1172  # chords of the original program
 SIZES = (10, 100, 1000, 10_000, 100_000, 1_000_000)
 BRUTE_SIZES = (0, 10, 100, 1000)
 ROUNDS = {"quick": 6, "standard": 7, "full": 21}
@@ -85,13 +86,14 @@ class Field:
 
 @functools.cache
 def field(size: int) -> Field:
-    """About `size` segments, on lenses of a thousand; 0: the one lens, as the original cuts it."""
+    """About `size` segments, on lenses of a thousand; 0: the one lens, of as many chords as the original."""
     side = max(1, round(math.sqrt(size / 1000)))
-    curve = shapes.document_lens().faceted(size // side**2) if size else shapes.document_lens(ORIGINAL)
+    lens = shapes.lens((0.04, -0.04), 16.4, conic=(1.9, 1.9), vertex=-8.2).mapped(affine(90, (1, 4)))
+    curve = lens.faceted(size // side**2 if size else ORIGINAL)
     pitch = 1.2 * np.ptp(curve.vertices, axis=0)
     places = pitch * np.stack(np.meshgrid(*[np.arange(side)] * 2), 2).reshape(-1, 1, 2)
     start, end = ((places + x).reshape(-1, 2) for x in (curve.start, curve.end))
-    media = np.full(len(start), shapes.LENS_INDEX), np.ones(len(start))
+    media = np.full(len(start), 4.4), np.ones(len(start))
     return Field(Segments(start, end, *media), side, pitch)
 
 
