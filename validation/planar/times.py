@@ -23,9 +23,11 @@ from mi_refract.planar.segments import Array
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing
-from validation.run.array_settings import Setting, settings
+from validation.run.array_settings import Setting
 from validation.run.context import Context
 from validation.study import Study, Task, about
+
+from .against_retrace import by_setting
 
 PER_PATH = "µs per path"
 TERMS = {
@@ -53,15 +55,10 @@ BOUNDARIES = 2
 
 def tasks(context: Context) -> list[Task]:
     """One task per backend and precision."""
-    return [
-        Task(f"planar, times: {s.label}", functools.partial(_setting_rows, context, s), timed=True)
-        for s in settings(context)
-    ]
+    return by_setting(context, NAME, "planar, times", "every size", _setting_rows, timed=True)
 
 
 def _setting_rows(context: Context, setting: Setting) -> list[Row]:
-    if setting.vector is None:
-        return [Row(NAME, "trace", "every size", setting.label, reason=setting.reason)]
     sizes = SIZES[:3] if context.profile.quick else SIZES
     return measure(context, setting, SIZES[:1] if setting.is_scalar else sizes)
 
