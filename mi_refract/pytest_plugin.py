@@ -85,7 +85,7 @@ def _assert_unbiased(
     if runs < 2:
         raise ValueError(f"runs = {runs}; expected at least 2, or the noise is not known")
 
-    from mi_refract.image_diff.folders import read_renders
+    from mi_refract.image_diff.file_pair import read_renders
 
     first = seed + REFERENCE_SEED
     known = [reference(i) for i in range(first, first + runs)] if callable(reference) else Path(reference)

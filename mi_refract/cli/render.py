@@ -17,7 +17,8 @@ from mi_refract.cluster.connection import ClusterTarget
 from mi_refract.io.sanitise import printable
 from mi_refract.rendering import scene_files
 
-from . import interrupts, variants
+from . import interrupts
+from .doctor import activate
 from .quantities import parse_seconds, parse_share, shown_error
 from .render_cluster import ClusterOptions, cluster_passes
 from .render_progress import shown
@@ -96,7 +97,7 @@ def render(
     seconds = None if duration is None else parse_seconds(duration, "--time")
     if preview is not None:
         writable(preview, (".png",))
-    chosen = variants.activate(variant)
+    chosen = activate(variant)
     from mi_refract.rendering.long_render import Job, Limits, LongRender
 
     limits = Limits(spp, shares[0], shares[1], seconds, pass_spp)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mi_refract.image_diff import folders
-from mi_refract.image_diff.settings import ComparisonSpec, Settings
+from mi_refract.image_diff.settings import Settings
 from validation import limits
 from validation.diff import times
 
@@ -22,11 +22,11 @@ def root(tmp_path_factory):
 def test_what_is_timed_is_told_apart(root):
     """An image that differs is what the page shows; the folder's images are equal for all that `auto` asks."""
     one, other = root / "a" / "0.exr", root / "b" / "0.exr"
-    assert folders.diff(one, other, Settings(ComparisonSpec("tolerance"))).exit_code == 1
+    assert folders.diff(one, other, Settings.for_all(method="tolerance")).exit_code == 1
     assert folders.diff(root / "a", root / "b", renders=True).exit_code == 1
     folder = folders.diff(root / "many_a", root / "many_b")
     assert (folder.exit_code, len(folder.results)) == (0, SMALL.pairs)
-    assert folders.diff(root / "many_a", root / "many_b", Settings(ComparisonSpec("exact"))).exit_code == 1
+    assert folders.diff(root / "many_a", root / "many_b", Settings.for_all(method="exact")).exit_code == 1
 
 
 def test_rows():

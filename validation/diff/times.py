@@ -23,7 +23,7 @@ import numpy as np
 
 from mi_refract.image_diff import folders, html_report
 from mi_refract.image_diff.methods import AUTO, METHODS
-from mi_refract.image_diff.settings import ComparisonSpec, Settings
+from mi_refract.image_diff.settings import Settings
 from mi_refract.io import image_file
 from mi_refract.report.row import Row
 from validation import limits
@@ -134,13 +134,13 @@ def _subjects(root: Path, page: Path) -> dict[str, Callable[[], object]]:
         name: functools.partial(
             folders.diff,
             *((a, b) if method.takes_renders else (a / "0.exr", b / "0.exr")),
-            Settings(ComparisonSpec(name)),
+            Settings.for_all(method=name),
             renders=method.takes_renders,
         )
         for name, method in METHODS.items()
     }
     many = functools.partial(folders.diff, root / "many_a", root / "many_b")
-    judged = folders.diff(a / "0.exr", b / "0.exr", Settings(ComparisonSpec("tolerance")), maps=True)
+    judged = folders.diff(a / "0.exr", b / "0.exr", Settings.for_all(method="tolerance"), maps=True)
     small = [str(root / side / "0000.exr") for side in ("many_a", "many_b")]
     shell = functools.partial(_process, "-m", "mi_refract.cli", "diff", *small)
     return found | {AUTO: many, SHELL: shell, "page": functools.partial(html_report.write, page, judged)}
