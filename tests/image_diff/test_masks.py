@@ -126,7 +126,7 @@ def test_a_new_image_of_another_size_is_not_spread_over_the_mask(pair, shape):
     assert f"size {shape[1]} × {shape[0]}; expected 48 × 32" in found.error
 
 
-@pytest.mark.parametrize("rectangle", [(0, -50, 48, 10), (-50, 0, 10, 32), (-50, -50, 10, 10)])
+@pytest.mark.parametrize("rectangle", [(0, -10, 48, 5), (-9, 0, 4, 32), (-50, -50, 10, 10), (0, 32, 9, 9)])
 def test_a_rectangle_outside_the_image_holds_none_of_its_pixels(pair, rectangle):
-    rows, columns = masks._slices(image_file.read(pair[0]), rectangle)
-    assert np.zeros(SIZE)[rows, columns].size == 0
+    with pytest.raises(ValueError, match="expected a rectangle that holds pixels of"):
+        masks.made(image_file.read(pair[0]), None, [rectangle])
