@@ -19,17 +19,14 @@ import typer
 
 from mi_refract.image_diff import folders, pairing, text_reports
 from mi_refract.image_diff.methods import AUTO, METHODS
-from mi_refract.image_diff.results import Results, Status
+from mi_refract.image_diff.results import Status
 from mi_refract.image_diff.settings import FILE, Settings
 from mi_refract.io.atomic import writable
 from mi_refract.io.exit_code import MISUSE
 from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.sanitise import printable
-from mi_refract.report.text_table import Plain
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
     from mi_refract.image_diff.html_report import Page
     from mi_refract.image_diff.report_folder import Folder
 
@@ -136,7 +133,11 @@ def diff(
     for path, suffix in ((junit, ".xml"), (json, ".json")):
         if path:
             writable(path, (suffix,))
-    with _report(report, reference, test) as page:
+    if _is_folder(report):
+        from mi_refract.image_diff import report_folder
+
+        report_folder.require_free(Path(report), reference, test)
+    with _report(report) as page:
         with _progress() as progress:
             found = folders.diff(
                 reference,
@@ -149,7 +150,7 @@ def diff(
                 digests=bool(json),
                 progress=progress,
             )
-        _print_results(found)
+        text_reports.print_results(found)
         if page:
             from mi_refract.io.provenance import provenance
 
@@ -205,14 +206,14 @@ def accept(
         found = results_file.read(source, reference, test)
         found = replace(found, results=tuple(pairing.named(found.results, names or [])))
         found = results_file.with_settings(found, _settings(found.reference, AUTO, [], None, settings, max_values))
-        _print_errors(found)
+        text_reports.print_errors(found)
     elif reference is None or test is None:
         raise ValueError("two paths are needed; expected mi-refract accept REFERENCE TEST, or --from OUT.json")
     else:
         chosen = _settings(reference, method, options or [], idiff, settings, max_values)
         with _progress() as progress:
             found = folders.diff(reference, test, chosen, names=names or [], to_accept=True, progress=progress)
-        _print_results(found)
+        text_reports.print_results(found)
     try:
         copies = list(accepting.changes(found, as_variant))
     except accepting.UnreadableImage as error:
@@ -266,39 +267,39 @@ def _check_settings(reference: Path, test: Path, names: Sequence[str], chosen: S
     """Print how each image would be compared, and which entries say so; 2 where that is wrong for one."""
     every = pairing.pairs(reference, test, chosen)
     pairs = pairing.named(every, names)
-    print_table(text_reports.settings_table(pairs))
-    for pattern in chosen.unused([pair.name for pair in pairs]):
-        print(f"mi-refract: {printable(pattern)}: matches no image", file=sys.stderr)
-    errors = {pair.name: pairing.error_of(pair, reference) for pair in (*pairs, *pairing.wrong_entries(chosen, every))}
-    for name, error in errors.items():
-        if error:
-            print(f"mi-refract: {printable(name)}: {printable(error)}", file=sys.stderr)
-    return MISUSE if any(errors.values()) else 0
+    lines = [f"{pattern}: matches no image" for pattern in chosen.unused([pair.name for pair in pairs])]
+    checked = ((pair, pairing.error_of(pair, reference)) for pair in (*pairs, *pairing.wrong_entries(chosen, every)))
+    errors = [f"{pair.name}: {error}" for pair, error in checked if error]
+    text_reports.print_table(text_reports.settings_table(pairs))
+    for line in lines + errors:
+        print(f"mi-refract: {printable(line)}", file=sys.stderr)
+    return MISUSE if errors else 0
 
 
 # Output -------------------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
-def _report(report: str, *sides: Path) -> Iterator[Page | Folder | None]:
+def _report(report: str) -> Iterator[Page | Folder | None]:
     """The writer of the report, if any. ValueError or OSError where it cannot be written."""
-    if not report:
-        yield None
-        return
-    from mi_refract.image_diff import html_report, report_folder
-
     if _is_folder(report):
-        report_folder.require_free(Path(report), *sides)
+        from mi_refract.image_diff import report_folder
+
         with report_folder.writing(Path(report)) as folder:
             yield folder
-    else:
+    elif report:
+        from mi_refract.image_diff import html_report
+
         yield html_report.Page(writable(report, HTML))
+    else:
+        yield None
 
 
 def _is_folder(report: str) -> bool:
     """Whether the report is a folder: it ends in /, has no ending, or is one already."""
     path = Path(report)
-    return report.endswith(("/", os.sep)) or (path.suffix.lower() not in HTML and (not path.suffix or path.is_dir()))
+    named_so = report.endswith(("/", os.sep)) or not path.suffix
+    return bool(report) and (named_so or (path.suffix.lower() not in HTML and path.is_dir()))
 
 
 def _pages(report: str, url: str) -> text_reports.Pages:
@@ -319,31 +320,3 @@ def _progress() -> Iterator[Callable[[int, int], None]]:
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("comparing", total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
-def _print_errors(found: Results) -> None:
-    for result in found.of(Status.ERROR):
-        print(f"mi-refract: {printable(result.error)}", file=sys.stderr)
-
-
-def _print_results(found: Results) -> None:
-    """The table on stdout, what could not be compared on stderr, a line each."""
-    _print_errors(found)
-    for flags in text_reports.without_effect(found):
-        print(f"mi-refract: {printable(flags)}", file=sys.stderr)
-    for pattern in found.unused:
-        print(f"mi-refract: {printable(pattern)}: matches no image", file=sys.stderr)
-    if len(found.results) > len(found.of(Status.ERROR)):
-        print_table(text_reports.table(found))
-
-
-def print_table(table: Plain | RenderableType) -> None:
-    """Print it on stdout, as plain text where that is no terminal."""
-    if isinstance(table, Plain) and not (sys.stdout.isatty() or os.environ.get("FORCE_COLOR")):
-        print(table)
-        return
-    from rich.console import Console
-
-    # In a file it is as wide as it must be: no line of a log is a wrapped one.
-    console = Console() if sys.stdout.isatty() else Console(width=10_000)
-    console.print(table, highlight=False)

@@ -8,9 +8,10 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from mi_refract.image_diff.text_reports import print_table
 from mi_refract.io.image_file import MAX_VALUES
 
-from .diff import MaxValues, print_table, require_extra
+from .diff import MaxValues, require_extra
 from .doctor import activate
 
 RENDERS, SPP = 16, 16

@@ -1,4 +1,4 @@
-"""The results of `diff` as text: for a terminal, for scripts (JSON), test runners (JUnit) and GitHub.
+"""The results of `diff` as text: printed, for scripts (JSON), test runners (JUnit) and GitHub.
 
 Names of files and messages of errors may hold any character: each format escapes what would be read as more than text.
 """
@@ -9,23 +9,27 @@ import json
 import math
 import os
 import re
+import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import quote
 
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.sanitise import printable
 from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.row import strict
-from mi_refract.report.text_table import Group, Table, Text
+from mi_refract.report.text_table import Group, Plain, Table, Text
 
 from . import idiff_flags
 from .pairing import Pair
 from .results import FAILED, Result, Results, Status
 from .settings import written
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
 
 SCHEMA = 1
 FEW = 20  # equal images that are listed one by one
@@ -47,6 +51,34 @@ STYLES = {
 
 
 # Terminal -----------------------------------------------------------------------------------------------------------
+
+
+def print_results(results: Results) -> None:
+    """Print the table on stdout, and on stderr a line for each image that could not be compared, and for warnings."""
+    print_errors(results)
+    lines = without_effect(results) + [f"{pattern}: matches no image" for pattern in results.unused]
+    for line in lines:
+        print(f"mi-refract: {printable(line)}", file=sys.stderr)
+    if len(results.results) > len(results.of(Status.ERROR)):
+        print_table(table(results))
+
+
+def print_errors(results: Results) -> None:
+    """Print a line on stderr for each image that could not be compared."""
+    for result in results.of(Status.ERROR):
+        print(f"mi-refract: {printable(result.error)}", file=sys.stderr)
+
+
+def print_table(table: Plain | RenderableType) -> None:
+    """Print it on stdout, as plain text where that is no terminal."""
+    if isinstance(table, Plain) and not (sys.stdout.isatty() or os.environ.get("FORCE_COLOR")):
+        print(table)
+        return
+    from rich.console import Console
+
+    # In a file it is as wide as it must be: no line of a log is a wrapped one.
+    console = Console() if sys.stdout.isatty() else Console(width=10_000)
+    console.print(table, highlight=False)
 
 
 def sentence(results: Results) -> str:
@@ -120,7 +152,9 @@ def _method(result: Result, *, in_words: bool = False) -> str:
 
 def write_json(path: str | Path, results: Results) -> None:
     """Write `as_data` as strict JSON: NaN and the infinities become words. OSError."""
-    write_atomically(path, json.dumps(strict(as_data(results)), indent=1, allow_nan=False) + "\n")
+    data = as_data(results)
+    text = json.dumps(strict(data), indent=1, allow_nan=False)
+    write_atomically(path, text + "\n")
 
 
 def as_data(results: Results) -> dict[str, Any]:
