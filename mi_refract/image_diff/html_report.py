@@ -151,7 +151,7 @@ def item(
     result: Result, results: Results, shown: Shown | None = None, images: EmbeddedImages | None = None
 ) -> dict[str, Any]:
     """What a page says of an image; with `shown`, whose panes go to `images`, all of it."""
-    found, why = result.comparison, cause(result)
+    found, why, href = result.comparison, cause(result), page_of(result)
     times, worst = excess(result)
     folder = PurePosixPath(result.name).parent.as_posix()
     words = (result.name, result.status, result.category, why)
@@ -166,7 +166,7 @@ def item(
         "metrics": [_metric(metric) for metric in found.metrics] if found else [],
         "text": " ".join(words).lower(),
         "word": word(result),
-        "href": page_of(result),
+        "href": href,
         "folder": "" if folder == "." else folder,
         "excess": "" if worst is None else f"{times:.9g}" if math.isfinite(times) else "Infinity",
         "excess_text": "" if worst is None else f"{compact(times)} ×" if math.isfinite(times) else "∞",

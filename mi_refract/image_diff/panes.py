@@ -68,7 +68,8 @@ def _shown(result: Result, image_bytes: float, map_bytes: float, thumbs: bool) -
     small = {}
     if thumbs and sides:
         role, image = list(sides.items())[-1]
-        small[role] = thumbnails.of_image(image.pixels, _paint(image) == "code")
+        coded = _paint(image) == "code"
+        small[role] = thumbnails.of_image(image.pixels, coded)
     one, two = sides.get("reference"), sides.get("test")
     if one and two and one.pixels.shape == two.pixels.shape:
         with np.errstate(invalid="ignore"):

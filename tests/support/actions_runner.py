@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from support import plain_yaml
+import yaml
 
 BASH = ["bash", "--noprofile", "--norc", "-e", "-o", "pipefail"]  # what `shell: bash` is on a runner
 
@@ -36,7 +36,7 @@ def run_action(folder: Path, inputs: dict[str, str], workspace: Path, temporary:
 
     ValueError for an input that the action does not have, or one that is required and missing.
     """
-    action = plain_yaml.loads((folder / "action.yml").read_text("utf-8"))
+    action = yaml.load((folder / "action.yml").read_text("utf-8"), yaml.BaseLoader)
     declared = action["inputs"]
     if unknown := inputs.keys() - declared.keys():
         raise ValueError(f"inputs {sorted(unknown)}; expected {', '.join(declared)}")
