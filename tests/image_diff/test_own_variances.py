@@ -18,7 +18,7 @@ from mi_refract.image_diff import accept, folders, panes, report_folder, self_te
 from mi_refract.image_diff.comparison import Verdict
 from mi_refract.image_diff.methods import METHODS, choice, compare
 from mi_refract.image_diff.results import Status
-from mi_refract.image_diff.settings import ComparisonSpec, Settings
+from mi_refract.image_diff.settings import Settings
 from mi_refract.image_diff.variances import FREEDOM
 from mi_refract.image_diff.welch import compare_renders
 from mi_refract.io.image_file import Image, read, write_exr
@@ -105,8 +105,8 @@ def test_of_a_variance_in_a_file_its_own_header_says_them(tmp_path, named, freed
     for side, value in (("old", 1.0), ("new", 3.0)):
         written(tmp_path / side / "a.exr", one_pixel(value, variance_freedom=7))
         written(tmp_path / side / "a_var.exr", one_pixel(250.0, **named))
-    how = ComparisonSpec(variance="{stem}_var.exr", options={"equivalence_margin": 0.0})
-    (found,) = folders.diff(tmp_path / "old", tmp_path / "new", Settings(how), maps=True).results
+    settings = Settings.for_all(variance="{stem}_var.exr", equivalence_margin=0.0)
+    (found,) = folders.diff(tmp_path / "old", tmp_path / "new", settings, maps=True).results
     p = 2 * stats.t.sf(2 / np.sqrt(0.5), 2 * freedom)
     assert found.comparison.maps["p"].item() == pytest.approx(p, rel=1e-5)
 
@@ -149,8 +149,8 @@ def test_without_variances_it_is_tolerance_as_ever():
 
 def test_a_method_that_was_asked_for_is_used(pair, tmp_path):
     """By the command line for all, by a settings file for one; nothing explains it."""
-    how = settings_file.from_words("flip", [], None)
-    assert {each.comparison.method_in_words for each in folders.diff(*pair, Settings(how)).results} == {"flip"}
+    flip = Settings.for_all(method="flip")
+    assert {each.comparison.method_in_words for each in folders.diff(*pair, flip).results} == {"flip"}
     path = tmp_path / "a.toml"
     path.write_text('[[image]]\nname = "off.exr"\nmethod = "exact"\nreason = "r"\n')
     found = {each.name: each.comparison for each in folders.diff(*pair, settings_file.load(path)).results}
@@ -219,8 +219,8 @@ def test_one_that_is_named_is_compared(pair, method):
     other.pixels[..., other.channels.index("R.variance")] *= 2
     written(new / "off.exr", other)
     for names, status in ((("R", "G"), Status.EQUAL), (("R", "R.variance"), Status.DIFFERENT)):
-        how = replace(settings_file.from_words(method, [], None), channels=tuple((name, name) for name in names))
-        (found,) = folders.diff(old / "off.exr", new / "off.exr", Settings(how)).results
+        settings = Settings.for_all(method=method, channels=tuple((name, name) for name in names))
+        (found,) = folders.diff(old / "off.exr", new / "off.exr", settings).results
         assert found.status is status
         left = {"R", "G", "B"} - set(names)
         assert found.reason.endswith(f"; not compared: {', '.join(sorted(left, key='RGB'.index))}")
@@ -260,7 +260,7 @@ def test_panes_show_the_image(tmp_path, names):
         light = gain * rng.gamma(PER_PASS, 1 / PER_PASS, (PASSES, 32, 32, len(names)))
         written(tmp_path / side / "a.exr", film(light, names))
     (found,) = folders.diff(tmp_path / "old", tmp_path / "new", maps=True).results
-    shown = panes.of_result(found, panes.Most(1e6, 1e6, thumbnails=True))
+    shown = panes.of_result(found, 1e6, 1e6, thumbs=True)
     assert [pane["role"] for pane in shown.panes][:4] == ["reference", "test", "difference", "flip"]
     assert (shown.note, set(shown.thumbnails)) == ("", {"test", "difference"})
     assert "variance" not in json.dumps(shown.panes)

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_refract.image_diff import accept, channels, folders, pairing, settings_file, text_reports
+from mi_refract.image_diff import accept, channels, folders, pairing, text_reports
 from mi_refract.image_diff.comparison import Verdict
 from mi_refract.image_diff.methods import choice, compare
 from mi_refract.image_diff.results import Category, Status
-from mi_refract.image_diff.settings import ComparisonSpec, Entry, Settings, written
+from mi_refract.image_diff.settings import Entry, Settings
 from mi_refract.io.image_file import Image, read, write_exr
 
 RGB, XYZ = channels.RGB, channels.XYZ
@@ -130,10 +130,8 @@ def test_files_elsewhere_and_maps(tmp_path, pair):
     (old / "a_var.exr").rename(old / "noise/a.exr")
     given = BESIDE | {"variance": "{root}/noise/{name}"}
     assert one(folders.diff(old, new, settings(**given))).status is Status.EQUAL
-    default = ComparisonSpec(variance=given["variance"], options={"spp": 16})
-    results = folders.diff(old, new, Settings(default))
-    words = f"mi-refract diff {old} {new} a.exr --set spp=16 --variance '{given['variance']}'"
-    assert results.reproduce(one(results)) == words  # of two files, {root} would be another folder
+    results = folders.diff(old, new, Settings.for_all(variance=given["variance"], spp=16))
+    assert results.reproduce(one(results)) == f"mi-refract diff {old} {new} a.exr"  # of two files, {root} is another
 
 
 def test_a_variance_counts_for_welch_alone(pair):
@@ -390,53 +388,6 @@ def test_channels_of_every_method(pair):
 
 
 # Settings ---------------------------------------------------------------------------------------------------------
-
-
-def test_the_file_and_the_command_line(tmp_path):
-    """The file's defaults, then the command line, then its rules."""
-    path = tmp_path / "mi-refract.toml"
-    path.write_text(
-        '[defaults]\nvariance = "d.exr"\nchannels = ["R"]\n[[image]]\nname = "b"\nreason = "r"\n'
-        'variance = "{root}/{stem}.exr"\nchannels = { "nested.X" = "X" }\n'
-    )
-    plain, given = (
-        settings_file.load(path, how)
-        for how in (ComparisonSpec(), ComparisonSpec(variance="c.exr", channels=(("G", "B"),)))
-    )
-    assert [(each.of("a").variance, each.of("a").channels) for each in (plain, given)] == [
-        ("d.exr", (("R", "R"),)),
-        ("c.exr", (("G", "B"),)),
-    ]
-    for each in (plain, given):
-        assert (each.of("b").variance, each.of("b").channels) == ("{root}/{stem}.exr", (("nested.X", "X"),))
-    assert given.of("a").flags == ["--variance", "c.exr", "--channels", "G=B"]
-    assert not given.of("a").needs_file
-
-
-@pytest.mark.parametrize("text", ["X,Y,Z", "nested.X=X,Y", "a b = c,d"])
-def test_channels_as_words(text):
-    found = settings_file.channels_from(text)
-    assert settings_file.channels_from(written(found)) == found
-
-
-@pytest.mark.parametrize("text", ["", "X,", "X,X", "a=X,b=X", "=X", "X=", " , "])
-def test_words_that_are_no_channels(text):
-    with pytest.raises(ValueError, match="expected distinct names"):
-        settings_file.channels_from(text)
-
-
-@pytest.mark.parametrize("value", ['""', "[]", '["X", "X"]', "{}", '{ a = "X", b = "X" }', "[1]", "{ a = 1 }", "3"])
-def test_values_that_are_no_channels(tmp_path, value):
-    path = tmp_path / "mi-refract.toml"
-    path.write_text(f"[defaults]\nchannels = {value}\n")
-    with pytest.raises(ValueError, match=r"defaults\.channels: .* expected a list of channels, or a table"):
-        settings_file.load(path)
-
-
-@pytest.mark.parametrize("text", ["../a.exr", "/a.exr", "{nothing}.exr", " "])
-def test_templates_that_are_none(text):
-    with pytest.raises(ValueError, match=r"--variance .* expected a path that may hold"):
-        settings_file.variance_from(text)
 
 
 def test_check_settings_shows_them(pair):

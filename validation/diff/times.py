@@ -24,7 +24,7 @@ import numpy as np
 
 from mi_refract.image_diff import folders, html_report
 from mi_refract.image_diff.methods import AUTO, METHODS
-from mi_refract.image_diff.settings import ComparisonSpec, Settings
+from mi_refract.image_diff.settings import Settings
 from mi_refract.io import image_file
 from mi_refract.report.row import Row
 from validation import limits
@@ -161,7 +161,7 @@ def subjects_of(root: Path, size: Size) -> dict[str, Subject]:
 
 def settings(method: str) -> Settings:
     """Settings that compare by one method."""
-    return Settings(ComparisonSpec(method))
+    return Settings.for_all(method=method)
 
 
 def python(*words: str) -> str:
