@@ -97,7 +97,7 @@ def _read(path: Path, folders: list[Path], text: SceneText, depth: int) -> None:
             folders.insert(0, text.searched[-1])
             _limit(path, len(text.searched), FOLDERS, "<path> elements")
         elif element == b"spectrum" and re.fullmatch(r"[^\s,:]+:[^\s,:]+", values.get("value", "").strip()):
-            expected = "a number, or at least two pairs of a wavelength in nm and a value"
+            expected = "a number, or two pairs and more of a wavelength in nm and a value"
             raise ValueError(f"{path}: {values.get('name')} = {values['value']!r}; expected {expected}")
         elif name := values.get("filename"):
             # Mitsuba looks for an included file beside the file that includes it, for a spectrum in <path>s first.
@@ -133,8 +133,8 @@ def _attributes(text: bytes, parameters: Mapping[str, str]) -> dict[str, str]:
         name = next((name for name in names if name in parameters), None)
         return match[0] if name is None else parameters[name] + match[1][len(name) :]
 
-    pairs = ((name.decode(), unescape(value[1:-1].decode(errors="replace"))) for name, value in _ATTRIBUTE.findall(text))
-    return {name: _PARAMETER.sub(replace, value).replace("\\$", "$") for name, value in pairs}
+    pairs = {name: unescape(value[1:-1].decode(errors="replace")) for name, value in _ATTRIBUTE.findall(text)}
+    return {name.decode(): _PARAMETER.sub(replace, value).replace("\\$", "$") for name, value in pairs.items()}
 
 
 def _elements(path: Path, content: bytes) -> Iterator[tuple[bytes, bytes]]:

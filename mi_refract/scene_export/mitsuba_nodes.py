@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
