@@ -35,6 +35,7 @@ from mi_refract.numerics import (
     Scene,
     Spectrum,
     Variant,
+    Vector3,
 )
 
 from .absorption import absorbed
@@ -135,6 +136,24 @@ def power_heuristic(a: Number, b: Number) -> Number:
     a, b = dr.square(a), dr.square(b)
     some = (a + b > 0) & dr.isfinite(a)
     return dr.select(some, a / dr.select(some, a + b, 1), 0)
+
+
+def at_fixed_direction(
+    v: Variant, context: Any, si: Interaction, bsdf: BSDF, bs: BSDFSample, weight: Spectrum, d: Vector3, active: Mask
+) -> tuple[Spectrum, Vector3, Number]:
+    """Weight, world direction and density of a sample, as they are differentiated.
+
+    The direction of a delta lobe moves with the parameters. Any other direction is a fixed point of the integrand:
+    d/dx ∫ f dω = ∫ f'(ω)/p(ω) p(ω) dω, in which neither ω nor p is differentiated.
+    """
+    smooth = active & mi.has_flag(bs.sampled_type, LOBES.Smooth)
+    wo = si.to_local(dr.detach(d))
+    value, pdf = bsdf.eval_pdf(context, si, wo, smooth)
+    if v.is_polarized:
+        value = si.to_world_mueller(value, -wo, si.wi)
+    smooth &= pdf > 0
+    value = value / dr.detach(dr.select(smooth, pdf, 1))
+    return dr.select(smooth, value, weight), dr.select(smooth, dr.detach(d), d), dr.select(smooth, pdf, bs.pdf)
 
 
 class PathLoop:
@@ -322,25 +341,13 @@ class PathLoop:
     def _next(
         self, s: LoopState, si: Interaction, bsdf: BSDF, bs: BSDFSample, weight: Spectrum, active: Mask
     ) -> tuple[Ray, Spectrum, dict[str, Any]]:
-        """The ray after a sample of the BSDF, its throughput, and the state of optional parts that the sample changes.
-
-        Where derivatives are wanted: the direction of a delta lobe moves with the parameters. Any other direction is a
-        fixed point of the integrand: d/dx ∫ f dω = ∫ f'(ω)/p(ω) p(ω) dω, in which neither ω nor p is differentiated.
-        """
+        """The ray after a sample of the BSDF, its throughput, and the state of optional parts that it changes."""
         v = self.v
         if v.is_polarized:
             weight = si.to_world_mueller(weight, -bs.wo, si.wi)
         ray = si.spawn_ray(si.to_world(bs.wo))
         if dr.grad_enabled(weight, ray.d):
-            smooth = active & mi.has_flag(bs.sampled_type, LOBES.Smooth)
-            wo = si.to_local(dr.detach(ray.d))
-            value, pdf = bsdf.eval_pdf(self.context, si, wo, smooth)
-            if v.is_polarized:
-                value = si.to_world_mueller(value, -wo, si.wi)
-            smooth &= pdf > 0
-            weight = dr.select(smooth, value / dr.detach(dr.select(smooth, pdf, 1)), weight)
-            ray.d = dr.select(smooth, dr.detach(ray.d), ray.d)
-            bs.pdf = dr.select(smooth, pdf, bs.pdf)
+            weight, ray.d, bs.pdf = at_fixed_direction(v, self.context, si, bsdf, bs, weight, ray.d, active)
         throughput, optional = self._times(s.throughput, weight), dict[str, Any]()
         if self.features.dispersion:
             # The first wavelength stands for all that end here; each is the first equally often.

@@ -12,7 +12,7 @@ from scipy.stats import t
 from support.variants import switch
 
 from mi_refract.image_diff import pixelwise, tile_statistics
-from mi_refract.plugins import keyed_sampler, path_loop, refract_path, scene_features
+from mi_refract.plugins import path_loop, refract_path, sampling, scene_features
 from mi_refract.rendering import scene_files
 from validation.run.context import SCENES
 
@@ -191,26 +191,26 @@ def test_strata_are_those_of_correlated_multi_jitter(llvm_variant):
     """Of 12 samples of each of 5 pixels every stratum holds one, of rows, columns and cells; keys are independent."""
     sampler = mi.load_dict({"type": "independent", "sample_count": 12})
     sampler.seed(3, 60)
-    numbers = keyed_sampler.KeyedMultijitter(mi, sampler, 12)
-    one = np.array(numbers.one(sampler, mi.UInt32(7))).reshape(5, 12)
-    x, y = np.array(numbers.two(sampler, mi.UInt32(8))).reshape(2, 5, 12)
+    numbers = sampling.KeyedMultijitter(mi, sampler, 12)
+    one = np.array(numbers.next_1d(sampler, mi.UInt32(7))).reshape(5, 12)
+    x, y = np.array(numbers.next_2d(sampler, mi.UInt32(8))).reshape(2, 5, 12)
     for strata_of, count in ((one, 12), (x, 12), (y, 12)):
         assert (np.sort(np.floor(strata_of * count), axis=1) == np.arange(count)).all()
     assert (np.sort(np.floor(x * 4) * 3 + np.floor(y * 3), axis=1) == np.arange(12)).all()
-    other = np.array(numbers.one(sampler, mi.UInt32(9))).reshape(5, 12)
+    other = np.array(numbers.next_1d(sampler, mi.UInt32(9))).reshape(5, 12)
     assert (np.argsort(one, axis=1) != np.argsort(other, axis=1)).any(axis=1).all()
     assert (np.argsort(one[0]) != np.argsort(one[1])).any()
-    assert (np.array(numbers.one(sampler, mi.UInt32(7))).reshape(5, 12) == one).all()  # whatever was drawn before
+    assert (np.array(numbers.next_1d(sampler, mi.UInt32(7))).reshape(5, 12) == one).all()  # whatever was drawn before
 
 
 def test_rows_and_columns_are_permuted_within_their_cells(llvm_variant):
     """Of 3 rows all 6 orders, of 4 columns the 8 that Kensler's function has; other ones for another key."""
     sampler = mi.load_dict({"type": "independent", "sample_count": 12})
     sampler.seed(3, 12 * 400)
-    numbers = keyed_sampler.KeyedMultijitter(mi, sampler, 12)
+    numbers = sampling.KeyedMultijitter(mi, sampler, 12)
     seen = []
     for key in (8, 9):
-        x, y = np.array(numbers.two(sampler, mi.UInt32(key))).reshape(2, 400, 12)
+        x, y = np.array(numbers.next_2d(sampler, mi.UInt32(key))).reshape(2, 400, 12)
         column, row = np.floor(x * 4).astype(int), np.floor(y * 3).astype(int)
         inner_row, inner_column = np.floor(x * 12).astype(int) % 3, np.floor(y * 12).astype(int) % 4
         orders = [

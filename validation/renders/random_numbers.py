@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refract.plugins.keyed_sampler import KeyedMultijitter
+from mi_refract.plugins.sampling import KeyedMultijitter
 from mi_refract.report.row import Row
 from validation import limits
 from validation.repeated import by_tasks
@@ -95,7 +95,7 @@ def histograms(make: Any, count: int, seed: int) -> Iterator[tuple[str, Any, int
             pick = np.arange(pixels), random.integers(0, count, pixels)
         keys = mi.UInt32(2 * key), mi.UInt32(2 * key + 1)
         dr.make_opaque(keys)  # the next key is new data, not a new kernel
-        numbers = source.one(sampler, keys[0]), source.two(sampler, keys[1])
+        numbers = source.next_1d(sampler, keys[0]), source.next_2d(sampler, keys[1])
         dr.eval(numbers)
         z = np.array(numbers[0], float).reshape(pixels, count)
         x, y = np.array(numbers[1], float).reshape(2, pixels, count)
