@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 # By name on the command line: the room, and the modules in it whose STUDY is run, in the order of the report.
 ROOMS = {
     "directions": ("directions", ("per_formula", "planted_defects", "bsdf_samples", "sweep", "search")),
-    "stability": ("stability", ("optical_chains", "energy", "derivatives", "gradients", "layered_paths")),
+    "stability": ("stability", ("optical_chains", "energy", "derivatives", "layered_paths")),
     "renders": (
         "renders",
         (
@@ -37,6 +37,7 @@ ROOMS = {
             "invisible_changes",
             "neighbours",
             "random_numbers",
+            "gradients",
             "rendering_passes",
         ),
     ),

@@ -5,7 +5,7 @@ import pytest
 from mi_refract import backend
 from mi_refract.plugins import path_loop
 from validation.run.context import PROFILES, Context
-from validation.stability import gradients
+from validation.renders import gradients
 
 
 @pytest.fixture
