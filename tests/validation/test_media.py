@@ -25,11 +25,13 @@ READS = pytest.mark.skipif(
 
 
 @READS
-def test_indices_are_those_of_the_catalogue():
-    row = catalogs._row("SCHOTT")
+@pytest.mark.parametrize("catalog", glass_catalogs.CATALOGS)
+def test_indices_are_those_of_the_catalogue(catalog):
+    """At all printed lines the index that `opticalglass` computes; of some makers also the printed one."""
+    row = catalogs._row(catalog)
     assert row.verdict == "pass"
     assert row.values["glasses"] > 100
-    assert row.values["missing"] == 0
+    assert catalog not in catalogs.CONSISTENT or row.values["missing"] == 0
 
 
 @READS
