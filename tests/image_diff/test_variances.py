@@ -542,7 +542,7 @@ def test_panes_show_the_image(tmp_path, names):
     for side, gain in (("old", 1.0), ("new", 1.5)):
         written(tmp_path / side / "a.exr", film(70, names=names, gain=gain))
     found = one(folders.diff(tmp_path / "old", tmp_path / "new", maps=True))
-    shown = panes.of_result(found, panes.Most(1e6, 1e6, thumbnails=True))
+    shown = panes.of_result(found, 1e6, 1e6, thumbs=True)
     assert [pane["role"] for pane in shown.panes][:4] == ["reference", "test", "difference", "flip"]
     assert (shown.note, set(shown.thumbnails)) == ("", {"test", "difference"})
     assert "variance" not in json.dumps(shown.panes)

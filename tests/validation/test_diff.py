@@ -188,5 +188,5 @@ def test_rows_of_times():
 
 
 def test_a_process_that_fails_is_no_measurement(tmp_path):
-    with pytest.raises(OSError, match="diff, times: mi-refract: .*no such"):
+    with pytest.raises(OSError, match=r"diff, times: mi-refract: .*no such"):
         times.python("-m", "mi_refract.cli", "diff", str(tmp_path / "none.exr"), str(tmp_path / "a.exr"))

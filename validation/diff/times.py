@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +24,7 @@ import numpy as np
 
 from mi_refract.image_diff import folders, html_report
 from mi_refract.image_diff.methods import AUTO, METHODS
-from mi_refract.image_diff.settings import ComparisonSpec, Settings
+from mi_refract.image_diff.settings import Settings
 from mi_refract.io import image_file
 from mi_refract.report.row import Row
 from validation import limits
@@ -134,8 +135,9 @@ def subjects_of(root: Path, size: Size) -> dict[str, Subject]:
     files = [[sorted((root / f"{kind}{side}").iterdir()) for side in "ab"] for kind in ("", "many_")]
 
     def read(sides: list[list[Path]]) -> None:
-        for pair in zip(*sides, strict=True):
-            image_file.read_all(pair)
+        with ThreadPoolExecutor(2) as pool:
+            for pair in zip(*sides, strict=True):
+                list(pool.map(image_file.read, pair))
 
     found = {
         "read the pair": Subject(one, functools.partial(read, [side[:1] for side in files[0]])),
@@ -159,7 +161,7 @@ def subjects_of(root: Path, size: Size) -> dict[str, Subject]:
 
 def settings(method: str) -> Settings:
     """Settings that compare by one method."""
-    return Settings(ComparisonSpec(method))
+    return Settings.for_all(method=method)
 
 
 def python(*words: str) -> str:
