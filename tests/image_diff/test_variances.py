@@ -484,7 +484,7 @@ def test_the_method_that_auto_chooses():
 def test_the_same_image_is_equal_however_noisy():
     noisy = film(50, passes=2, shape=4.0)
     found = compare("auto", noisy, noisy)
-    assert (found.verdict, found.reason) == (EQUAL, "the same in every value, noise and all")
+    assert (found.verdict, found.reason) == (EQUAL, "identical in every value, variances included")
     assert all(metric.holds for metric in found.metrics)
     order = [3, 4, 5, 2, 1, 0]
     mixed = replace(noisy, pixels=noisy.pixels[..., order], channels=tuple(noisy.channels[i] for i in order))
@@ -496,7 +496,7 @@ def test_the_same_image_is_equal_however_noisy():
     noisy.pixels[3, 4, 0] = np.nan  # is no more equal to itself than elsewhere
     assert compare("auto", noisy, noisy).verdict is DIFFERENT
     found = compare("auto", noisy, noisy, allow_nonfinite=True)
-    assert found.reason == "the same in every value, noise and all; not compared: 1 of 4608 values, not finite"
+    assert found.reason == "identical in every value, variances included; not compared: 1 of 4608 values, not finite"
 
 
 def test_the_same_image_without_variances_of_its_own_is_no_such_case():
