@@ -228,8 +228,8 @@ def test_two_validations_do_not_share_a_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(command, "import_module", lambda name: study(second))
     assert command.main(["ground-truth", "--out", str(tmp_path)]) == 0
     assert inside == [2]
-    said = [line for line in capsys.readouterr().err.splitlines() if f"process {os.getpid()} on " in line]
-    assert len(said) == 1 and said[0].startswith(f"validation: {tmp_path}: ")
+    said = [line for line in capsys.readouterr().err.splitlines() if "is already running" in line]
+    assert len(said) == 1 and f"{tmp_path}: a validation is already running in process {os.getpid()} on " in said[0]
     assert {path.name for path in tmp_path.iterdir()} == {"rows.json", "junit.xml", "report.html"}
 
 

@@ -213,8 +213,8 @@ def reciprocity_row(setting: Setting, count: int) -> Row:
 
     def both(cos_i: Any, k: Any) -> tuple:
         cos_t, transmitted = fresnel.refracted_cosine(cos_i, k)
-        back = fresnel.transmittance(cos_t, cos_i, transmitted, 1 / k)
-        return fresnel.transmittance(cos_i, cos_t, transmitted, k), back, transmitted
+        _, back = fresnel.powers(cos_t, cos_i, transmitted, 1 / k)
+        return fresnel.powers(cos_i, cos_t, transmitted, k)[1], back, transmitted
 
     for regime in CASES:
         cos_i, k, exact = given(regime, count, setting.precision)
