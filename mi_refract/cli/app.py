@@ -38,7 +38,7 @@ COMMANDS = {
     "render": Command("render", "render", "Render a Mitsuba scene, with our plugins, into an EXR file."),
     "trace": Command("trace", "trace", "Trace rays through a planar scene; draw them, print focal points."),
     "diff": Command("diff", "diff", "Compare images with their references: equal or different?"),
-    "accept": Command("accept", "accept", "Make the images that differ the new references."),
+    "accept": Command("diff", "accept", "Make the images that differ the new references."),
     "self-test": Command("self_test", "self_test", "Show which defects a comparison of images would detect."),
     "rays": Command("rays", "app", "Check another program's refraction, ray by ray."),
     "scene": Command("scene", "app", "Export a Mitsuba scene for another renderer."),

@@ -130,11 +130,6 @@ def test_scalar_variants_are_not_run(scalar_context):
     assert {row.verdict for row in found} == {"not run"}
 
 
-def test_a_wrong_parameter_is_no_missing_integrator(scalar_variant):
-    with pytest.raises(RuntimeError, match="split_depth"):
-        _ = Method("wrong", "path", "refract", {"split_depth": 1}).missing
-
-
 def test_a_method_renders_to_the_depth_of_the_scene_or_to_another(scalar_variant):
     path = SCENES / "nested.xml"
     assert "max_depth = 48" in str(render_methods.camera(path, BUILTIN, 4).integrator)

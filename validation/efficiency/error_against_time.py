@@ -19,7 +19,7 @@ import numpy as np
 
 from mi_refract.image_diff import tile_statistics
 from mi_refract.plugins import scene_features
-from mi_refract.report.row import Row
+from mi_refract.report.row import Reason, Row
 from validation import limits
 from validation.run import kernel_timing
 from validation.run.context import NO_REFERENCE, SCENES, Context, beyond_builtin
@@ -120,7 +120,8 @@ def scene_rows(context: Context, path: Path, methods: tuple[Method, ...] = METHO
     if context.variant.startswith("scalar"):
         reason = SCALAR
     elif extent.scenes and path.stem not in extent.scenes:
-        reason = f"left out: the profile {context.profile.name} measures {', '.join(extent.scenes)}"
+        text = f"left out: the profile {context.profile.name} measures {', '.join(extent.scenes)}"
+        reason = Reason(text, "`--profile full`")
     elif path.stem in NO_REFERENCE:
         reason = f"left out: {NO_REFERENCE[path.stem]}"
     else:

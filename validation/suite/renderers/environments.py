@@ -15,6 +15,7 @@ from mi_refract.io import process_group
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.errors import TooMuchOutputError
 from mi_refract.ray_sets import renderer_file
+from mi_refract.report.row import Reason
 
 from .system import LOCKS, SCRIPTS, Apt, Npm, Pip, System
 
@@ -44,7 +45,9 @@ def folder(system: System) -> Path:
 
 def absent(system: System) -> str:
     """ "" where the system is installed in its pinned version; otherwise the command that brings it."""
-    return "" if _present(system) else f"{COMMAND} {system.name}"
+    return (
+        "" if _present(system) else Reason(f"{COMMAND} {system.name}", f"other renderers, by `{COMMAND} {system.name}`")
+    )
 
 
 def _present(system: System) -> bool:
