@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
-import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
@@ -115,11 +114,9 @@ class SceneFile:
 
         ValueError, one line, where Mitsuba cannot parse it, and beyond the limits of `plugins.scene_limits`.
         """
-        self.path, config = path, mi.parser.ParserConfig("scalar_rgb")
-        config.merge_equivalent = config.merge_meshes = config.parallel = False
+        self.path = path
         try:
-            with scene_parser.folders(path.parent):
-                self.state = scene_parser.parse(path, config, defines)
+            self.state = scene_parser.parse(path, defines, "scalar_rgb").state
         except OSError:
             raise
         except Exception as error:

@@ -26,7 +26,7 @@ from mi_refract.io import image_file
 from mi_refract.io.image_file import Image
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.rendering import scene_files
-from mi_refract.report.row import Row
+from mi_refract.report.row import Reason, Row
 from mi_refract.scene_export import from_mitsuba, write_files
 from mi_refract.scene_export.plain_scene import Diffuse, Environment, Glass, Light, Mesh, PlainScene
 from validation import limits
@@ -182,7 +182,7 @@ def why_not(system: System, context: Context) -> str:
     if reason := environments.absent(system):
         return reason
     if not system.small and context.profile.name != "full":
-        return f"{system.megabytes} MB: in the full profile only"
+        return Reason(f"{system.megabytes} MB: in the full profile only", "`--profile full`")
     return COMPILED if context.variant.startswith("scalar") else ""
 
 
