@@ -2,7 +2,7 @@
 
 A field of a struct is a key: its annotation is the type, `Annotated[float, Meta(gt=0, description="…")]` adds limits
 and what the key means, its default makes it optional. The READMEs' tables of keys come from the same structs.
-Do not put a `pattern` for texts into a union with a list: msgspec 0.22 then frees the wrong pointer at exit and crashes.
+Do not put a `pattern` for texts into a union with a list: msgspec 0.22 then frees a wrong pointer and crashes at exit.
 """
 
 from __future__ import annotations
