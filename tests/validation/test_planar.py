@@ -78,13 +78,13 @@ def test_the_transfer_is_the_derivative():
 
 
 def test_the_bound_of_a_direction_behind_a_plane_is_the_sum_of_what_was_added():
-    """At 60°, in units of 2u: φ' = g φ + 1 + |g| + 1/|d'_n| + |1 − g| S/ℓ, with φ = 1, ℓ = 4 and S the largest coordinate."""
+    """At 60°, in units of 2u: φ' = g φ + 1 + |g| + 1/|d'_n| + |1 − g| S/ℓ, φ = 1, ℓ = 4, S = 2 the segment's end."""
     plane = Segments([[0.0, -2]], [[0.0, 2]], [1.0], [1.5])
     angle = np.radians(60)
-    path = retrace(plane, [[-3.0, 0.5]], [[0.5, np.sin(angle)]], 1)
+    path = retrace(plane, [[-1.0, -1.0]], [[0.5, np.sin(angle)]], 1)
     behind = np.sqrt(1 - (np.sin(angle) / 1.5) ** 2)
     g = 0.5 / (1.5 * behind)
-    expected = 2 * (g + 1 + g + 1 / behind + (1 - g) * float(np.abs(path.points).max()) / 4)
+    expected = 2 * (g + 1 + g + 1 / behind + (1 - g) * 2 / 4)
     assert growth(path, plane)[1][0] == pytest.approx([2, expected])
 
 
