@@ -180,7 +180,7 @@ INVALID = {
     "few rays": ({"count": 11}, "11 rays of each regime; expected 12 or more, one for each medium"),
     **{
         name: ({"names": ("generic", name)}, f"regime {name!r} has ratios of indices of its own; expected with media: ")
-        for name in set(regimes.REGIMES) - set(media_rays.NAMES)
+        for name in sorted(set(regimes.REGIMES) - set(media_rays.NAMES))
     },
 }  # fmt: skip
 
