@@ -183,7 +183,7 @@ def run(
     def answered(words: list[str], title: str, precision: str, tir: str = "auto") -> int:
         rays = files.read(file) if file else _made(regime, count, precision, seed, two_sided, medium, wavelengths)
         with as_exceptions():
-            answers = run_program.answers_of(words, rays, timeout=timeout, cwd=renderer, adopt=True)
+            answers = run_program.answers_of(words, rays, timeout=timeout, cwd=renderer)
         return checked(rays, answers, title, tir)
 
     if not renderer:
