@@ -148,7 +148,7 @@ def run(
     chosen = _chosen(file, made.words)
     rays = files.read(file) if file else ray_set.make(**made.arguments)
     with as_exceptions():
-        given = run_program.answers_of(command or [], rays, timeout=timeout, adopt=True)
+        given = run_program.answers_of(command or [], rays, timeout=timeout)
     name = shlex.join(command or [])
     print(printable(f"{name}: {_summary(rays)}"))
     raise typer.Exit(options.check(rays, given, name, ["run", *chosen, *options.words, "--", *(command or [])]))
@@ -187,7 +187,7 @@ def _run_function(
     rays = files.read(file) if file else ray_set.make(**made.arguments)
     command = filled(call.command)
     with as_exceptions():
-        given = run_program.answers_of(command, rays, timeout=timeout, cwd=known.folder, adopt=True)
+        given = run_program.answers_of(command, rays, timeout=timeout, cwd=known.folder)
     print(printable(f"{call.title}: {_summary(rays)}"))
     asked = replace(options, tir=call.tir) if options.tir == "auto" else options
     code = asked.check(rays, given, call.title, ["run", "--renderer", str(known.folder), *chosen, *options.words])

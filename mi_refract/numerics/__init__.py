@@ -26,6 +26,7 @@ from .types import (
     Sensor,
     Shape,
     Spectrum,
+    Values,
     Variant,
     Vector3,
 )
@@ -48,6 +49,7 @@ __all__ = [
     "Shape",
     "Spectrum",
     "TripleWord",
+    "Values",
     "Variant",
     "Vector3",
     "aligned",

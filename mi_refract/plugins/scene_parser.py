@@ -1,34 +1,41 @@
-"""Mitsuba scene files, parsed, with their limits and their plugins checked before anything in them runs.
+"""Mitsuba scene files, parsed once, with their limits and their plugins checked before anything in them runs.
 
 A scene is code: Mitsuba looks for `plugins/NAME.so` in the folder of the scene, in a `<path>`, and in the working
-folder before it takes its own plugin of that name. Here its own come first, and a name that is neither its own nor ours
-is an error, unless it is allowed by name.
+folder before it takes its own plugin of that name. Here its own come first, and a plugin that is neither Mitsuba's nor
+ours is an error unless it is allowed by name.
 """
 
 from __future__ import annotations
 
 import contextlib
 import glob
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import mitsuba as mi
 import numpy as np
 
 from mi_refract.formulas import FORMULAS
 from mi_refract.io import image_file
+from mi_refract.numerics import Properties, Scene
 
-from .refract import PLUGIN
+from .index_parameter import PLUGIN
 from .refract_path import INTEGRATOR
-from .scene_limits import DENSEST, DEPTH, FEW_VALUES, LOBES, VALUES, check_files, refuse_special, resolved
+from .scene_limits import DEPTH, check_files, refuse_special, resolved
 
+ParserState: TypeAlias = Any  # an `mi.parser.ParserState`
 OURS = (PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS), INTEGRATOR)
 # Registered by Mitsuba's own Python modules, or known to its parser.
 PYTHON = ("direct_projective", "flat_sensor", "prb", "prb_basic", "prb_projective", "prbvolpath", "volprim_rf_basic")
 BUILT_IN = ("scene",)  # its "rgb" and "spectrum" as a type end the process
 NEEDED = {"bitmap": "filename", "blendbsdf": "weight"}  # without it Mitsuba reads memory that is not there
+LOBES = 2**16  # of a BSDF if every BSDF in it were two-sided: each of two references to a BSDF doubles them
+VALUES = 2**29  # of an image that a scene names: 16384 × 8192 × 4
+# More values than these and DENSEST for each byte of the file are no picture: deflate packs up to 1032 bytes into one.
+FEW_VALUES, DENSEST = 2**24, 1032
 _untyped: Any = mi  # its stubs have no types for file resolvers
 
 
@@ -57,104 +64,120 @@ def folders(*first: Path) -> Iterator[Any]:
         _untyped.set_file_resolver(before)
 
 
-def parse(path: Path, config: Any, defines: Mapping[str, str]) -> Any:
-    """What Mitsuba's parser makes of a scene file, references resolved; nothing of it runs. Call it within `folders`.
-
-    `config`: an `mi.parser.ParserConfig`. ValueError for a scene beyond the limits, or that names pipes or devices;
-    whatever Mitsuba raises where it cannot parse the file.
-    """
-    check_files(path, map(Path, map(str, _untyped.file_resolver())), defines)
-    state = mi.parser.parse_file(config, str(path), **defines)
-    seen = mi.parser.ParserState(state)  # a copy: to look at a parameter marks it as used
-    nodes, by_id = list(seen.nodes), dict(seen.id_to_index)
-    children = [_children(node.props, by_id) for node in nodes]
-    _check_nesting(path, [node.type.name for node in nodes], children)
-    places = [Path(str(folder)) for folder in _untyped.file_resolver()]
-    for node in nodes:
-        for value in _texts(node.props):
-            refuse_special(resolved(value, places))
-    mi.parser.transform_all(config, state)
-    return state
-
-
 @dataclass(frozen=True)
-class SceneFiles:
-    """The files that a scene consists of: `xml`, its own first, and the others by their names in it."""
+class ParsedScene:
+    """A scene file that Mitsuba's parser has read. Nothing of it has run."""
 
-    xml: tuple[Path, ...]
-    others: dict[str, Path]
+    path: Path
+    config: Any  # the `mi.parser.ParserConfig` that it was parsed with
+    state: ParserState  # references resolved
+    folders: tuple[Path, ...]  # where Mitsuba looks for its files
+    xml: tuple[Path, ...]  # its own file first, and those that it includes
+    named: dict[str, Path]  # other files that it names, by their names in it; they need not exist
+    searched: tuple[Path, ...]  # the folders of its <path> elements
+
+    def files(self, allowed: Collection[str] = ()) -> dict[str, Path]:
+        """The files beside `xml` that the scene consists of, by their names in it; with those of `allowed` plugins."""
+        code = {
+            f"plugins/{file.name}": file
+            for place in reversed(self.folders)  # Mitsuba takes the first that it finds
+            for name in allowed
+            for file in (place / "plugins").glob(f"{glob.escape(name)}.*")
+        }
+        return {name: file for name, file in sorted((self.named | code).items()) if name and file.is_file()}
+
+    def load(self, allowed: Collection[str] = (), moved: Mapping[str, str] | None = None) -> Scene:
+        """The scene itself, in the variant that it was parsed for; once, as Mitsuba takes the state apart.
+
+        Args:
+            allowed: names of plugins that may run beside Mitsuba's and ours.
+            moved: where files are now, by their names in the scene.
+
+        Raises:
+            ValueError: for other plugins, and for files and parameters that would end the process.
+            RuntimeError: of Mitsuba, where it cannot make a plugin.
+        """
+        path, nodes = self.path, self.state.nodes
+        if unknown := sorted({node.props.plugin_name() for node in nodes} - known_plugins() - {*allowed}):
+            expected = f"those; to load native code shipped with a scene, pass --allow-plugins {unknown[0]}"
+            raise ValueError(f"{path}: plugin {unknown[0]!r}: neither Mitsuba's nor mi_refract's; expected {expected}")
+        images, meshes = set[str](), set[str]()
+        seen = mi.parser.ParserState(self.state)  # a copy: reading a parameter marks it as used
+        for props, read in ((node.props, copy.props) for node, copy in zip(nodes, seen.nodes, strict=True)):
+            plugin = props.plugin_name()
+            if (name := NEEDED.get(plugin)) and name not in props:
+                raise ValueError(f"{path}: plugin {plugin!r} without {name!r}; expected one with it")
+            for name, value in _texts(read):
+                if moved and value in moved:
+                    props[name] = value = moved[value]
+                if name == "filename" and plugin in ("ply", "bitmap", "envmap"):
+                    (meshes if plugin == "ply" else images).add(value)
+        with folders(own_folder(), *self.folders):  # Mitsuba's own folder before every <path>
+            for file in meshes:
+                check_faces(resolved(file, self.folders))
+            for image in (resolved(file, self.folders) for file in images):
+                if image.is_file():  # Mitsuba believes a header that is damaged, or asks for too much memory
+                    image_file.check_header(image, min(VALUES, FEW_VALUES + DENSEST * image.stat().st_size))
+            return mi.parser.instantiate(self.config, self.state)
 
 
-def files_of(path: Path, defines: Mapping[str, str], allowed: Collection[str] = ()) -> SceneFiles:
-    """The files that a scene names and that are there, in the present variant; and those of `allowed` plugins.
+def parse(path: Path, defines: Mapping[str, str] | None = None, variant: str = "") -> ParsedScene:
+    """Parse a scene file.
 
-    Errors: those of `parse`.
+    Args:
+        path: the file.
+        defines: values that replace those of `<default>` elements.
+        variant: of Mitsuba; default: the present one.
+
+    Raises:
+        ValueError: for a scene beyond the limits of `scene_limits`, with circular references, or that names pipes.
+        OSError: for a file that cannot be read.
+        Exception: whatever Mitsuba raises where it cannot parse the file.
     """
-    config = mi.parser.ParserConfig(str(mi.variant()))
-    with folders(path.parent) as inside:
-        walk = check_files(path, map(Path, map(str, inside)), defines)
-        state = parse(path, config, defines)
-        places = [path.parent, *(Path(str(folder)) for folder in inside)]
-        named = {name: resolved(name, places) for node in state.nodes for name in _texts(node.props)}
-    code = {
-        f"plugins/{file.name}": file
-        for place in reversed(places)  # Mitsuba takes the first that it finds
-        for name in allowed
-        for file in (place / "plugins").glob(f"{glob.escape(name)}.*")
-    }
-    others = {name: file for name, file in (walk.opened | named | code).items() if name and file.is_file()}
-    return SceneFiles(tuple(dict.fromkeys(walk.xml)), dict(sorted(others.items())))
-
-
-def _texts(props: Any) -> Iterator[str]:
-    """The values of a plugin's parameters that are strings."""
-    for name in props.keys():  # noqa: SIM118 (no dict)
-        if isinstance(value := props[name], str):
-            yield value
-
-
-def load(
-    path: Path, defines: Mapping[str, str], allowed: Collection[str] = (), moved: Mapping[str, str] | None = None
-) -> Any:
-    """Load a scene file in the present variant, so that the same seed gives the same image.
-
-    `defines` replace its `<default>`s; `allowed`: names of plugins beside Mitsuba's and ours, which are found where
-    Mitsuba looks, in the folder of the scene among others; `moved`: where files are now, by their names in the scene.
-    Errors: those of `parse`, and ValueError for other plugins.
-    """
-    config = mi.parser.ParserConfig(str(mi.variant()))
+    config = mi.parser.ParserConfig(variant or str(mi.variant()))
     # Mitsuba orders merged meshes by address, and what it loads in parallel by thread. Emitters are in the same order,
-    # so that the same seed would give different images.
+    # so the same seed would give different images.
     config.parallel = config.merge_equivalent = config.merge_meshes = False
     with folders(path.parent) as inside:
-        state = parse(path, config, defines)
-        check_plugins(path, (node.props.plugin_name() for node in state.nodes), allowed)
-        _check_needed(path, (node.props for node in state.nodes))
-        _move(state, moved or {})
-        inside.prepend(str(own_folder()))  # before every <path>
-        places = [path.parent, *(Path(str(folder)) for folder in inside)]
-        for check, plugins in ((check_faces, ("ply",)), (_check_image, ("bitmap", "envmap"))):
-            for file in {node.props["filename"] for node in state.nodes if _names_file(node.props, plugins)}:
-                check(resolved(file, places))
-        return mi.parser.instantiate(config, state)
+        text = check_files(path, [Path(str(folder)) for folder in inside], defines or {})
+        state = mi.parser.parse_file(config, str(path), **defines or {})
+        seen = mi.parser.ParserState(state)  # a copy: reading a parameter marks it as used
+        _check_nesting(path, seen)
+        places = tuple(Path(str(folder)) for folder in inside)  # those of <path> elements first
+        named = {value: resolved(value, places) for node in seen.nodes for _, value in _texts(node.props)}
+        for file in named.values():
+            refuse_special(file)
+        mi.parser.transform_all(config, state)
+    xml, searched = tuple(dict.fromkeys(text.xml)), tuple(text.searched)
+    return ParsedScene(path, config, state, places, xml, text.opened | named, searched)
 
 
-def _move(state: Any, moved: Mapping[str, str]) -> None:
-    """Put new names of files where a scene has old ones."""
-    for node in state.nodes if moved else ():
-        for name in node.props.keys():  # noqa: SIM118 (no dict)
-            if isinstance(value := node.props[name], str) and value in moved:
-                node.props[name] = moved[value]
+def _texts(props: Properties) -> list[tuple[str, str]]:
+    """The parameters of a plugin that are strings."""
+    pairs = [(name, props[name]) for name in props.keys()]  # noqa: SIM118 (no dict)
+    return [(name, value) for name, value in pairs if isinstance(value, str)]
 
 
-def _names_file(props: Any, plugins: Collection[str]) -> bool:
-    return props.plugin_name() in plugins and isinstance(props.get("filename", None), str)
-
-
-def _check_image(path: Path) -> None:
-    """ValueError for an image whose header is damaged or asks for too much memory: Mitsuba believes it."""
-    if path.is_file():
-        image_file.check_header(path, min(VALUES, FEW_VALUES + DENSEST * path.stat().st_size))
+def _check_nesting(path: Path, state: ParserState) -> None:
+    """ValueError where nodes refer to each other in a circle, too deeply, or make a BSDF of too many lobes."""
+    nodes, by_id = list(state.nodes), dict(state.id_to_index)
+    children: dict[int, list[int]] = {}
+    for i, node in enumerate(nodes):
+        values = [node.props[name] for name in node.props.keys()]  # noqa: SIM118 (no dict)
+        kinds = [(type(value).__name__, value) for value in values]  # Mitsuba does not export the classes
+        children[i] = [value.index() for kind, value in kinds if kind == "ResolvedReference"]
+        children[i] += [by_id[x.id()] for kind, x in kinds if kind == "Reference" and x.id() in by_id]
+    depth: dict[int, int] = {}
+    lobes: dict[int, int] = {}
+    try:
+        for i in TopologicalSorter(children).static_order():  # children first
+            depth[i] = 1 + max((depth[child] for child in children[i]), default=0)
+            lobes[i] = 1 + 2 * sum(lobes[child] for child in children[i]) if nodes[i].type.name == "BSDF" else 0
+            if depth[i] > DEPTH or lobes[i] > LOBES:
+                expected = f"up to {DEPTH} deep, and up to {LOBES} lobes of a BSDF"
+                raise ValueError(f"{path}: plugins nested {depth[i]} deep, of {lobes[i]} lobes; expected {expected}")
+    except CycleError:
+        raise ValueError(f"{path}: circular reference between plugins") from None
 
 
 def check_faces(path: Path) -> None:
@@ -169,62 +192,3 @@ def check_faces(path: Path) -> None:
     faces, count = np.array(mesh.faces_buffer()), mesh.vertex_count()
     if faces.size and faces.max() >= count:
         raise ValueError(f"{path}: vertex {faces.max()} of a face; expected 0 to {count - 1}, the vertices of the file")
-
-
-def check_plugins(path: Path, names: Any, allowed: Collection[str]) -> None:
-    """ValueError for a plugin that is neither Mitsuba's nor ours nor in `allowed`."""
-    if unknown := sorted({*names} - known_plugins() - {*allowed}):
-        accepted = f"those; to load native code shipped with a scene, pass --allow-plugins {unknown[0]}"
-        raise ValueError(f"{path}: plugin {unknown[0]!r}: neither Mitsuba's nor mi_refract's; expected {accepted}")
-
-
-def _check_needed(path: Path, every: Iterable[Any]) -> None:
-    for props in every:
-        name = NEEDED.get(plugin := props.plugin_name())
-        if name and name not in props:
-            raise ValueError(f"{path}: plugin {plugin!r} without {name!r}; expected one with it")
-
-
-def _children(props: Any, by_id: Mapping[str, int]) -> list[int]:
-    """The nodes inside a node and those that it refers to."""
-    found = []
-    for name in props.keys():  # noqa: SIM118 (no dict)
-        value = props[name]
-        kind = type(value).__name__  # Mitsuba does not export the classes
-        if kind == "ResolvedReference":
-            found.append(value.index())
-        elif kind == "Reference" and value.id() in by_id:
-            found.append(by_id[value.id()])
-    return found
-
-
-def _check_nesting(path: Path, kinds: list[str], children: list[list[int]]) -> None:
-    """ValueError where nodes refer to each other in a circle, too deeply, or make a BSDF of too many lobes."""
-    depth: dict[int, int] = {}
-    lobes: dict[int, int] = {}
-    for i in _children_first(path, children):
-        depth[i] = 1 + max((depth[child] for child in children[i]), default=0)
-        lobes[i] = 1 + 2 * sum(lobes[child] for child in children[i]) if kinds[i] == "BSDF" else 0
-        if depth[i] > DEPTH or lobes[i] > LOBES:
-            what = f"up to {DEPTH}, and {LOBES} lobes of a BSDF"
-            raise ValueError(f"{path}: plugins nested {depth[i]} deep, of {lobes[i]} lobes; expected {what}")
-
-
-def _children_first(path: Path, children: list[list[int]]) -> Iterator[int]:
-    """The numbers of all nodes, each after its children. It does not call itself: chains may be long."""
-    begun, done = set[int](), set[int]()
-    for root in range(len(children)):
-        stack = [root]
-        while stack:
-            node = stack[-1]
-            if node in done or node in begun:
-                stack.pop()
-                if node not in done:
-                    done.add(node)
-                    yield node
-                continue
-            begun.add(node)
-            for child in children[node]:
-                if child in begun and child not in done:
-                    raise ValueError(f"{path}: circular reference between plugins")
-                stack.append(child)

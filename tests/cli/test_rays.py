@@ -340,15 +340,6 @@ def test_what_a_program_leaves_behind_is_ended(tmp_path):
     assert_ended(tmp_path / "child")
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux lets us adopt orphans")
-def test_what_left_its_group_is_ended_too(call, tmp_path):
-    rest = f"while not os.path.exists({str(tmp_path / 'child')!r}):\n    time.sleep(0.01)\nprint('id,bx,by,bz')"
-    command = parent(tmp_path / "child", rest, stdin="DEVNULL", stdout="DEVNULL")
-    command[-1] = command[-1].replace("stdin=", "start_new_session=True, stdin=")
-    assert call("run", *FEW, "--", *command)[0] == 2
-    assert not alive(int((tmp_path / "child").read_text()))
-
-
 def test_rays_and_answers_larger_than_a_pipe(tmp_path):
     """A program that answers before it has read everything; and one that reads nothing."""
     to = ray_set.make(["generic"], 3000)

@@ -10,12 +10,10 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import yaml
-from support.actions_runner import BASH, Job, run_action
+from support.actions_runner import BASH, Job, read_yaml, run_action
 from support.diff_images import image
 from support.processes import ENVIRONMENT
 from support.readme import blocks
@@ -37,11 +35,6 @@ case "$1 $2" in
   *) exec "{python}" "$@" ;;
 esac
 """
-
-
-def loads(text: str) -> dict[str, Any]:
-    """YAML whose values are all text, as a runner's inputs are."""
-    return yaml.load(text, yaml.BaseLoader)
 
 
 def program(path: Path, text: str) -> None:
@@ -208,7 +201,7 @@ def test_names_that_github_refuses_and_hostile_ones_are_left_out(tmp_path, capsy
 def test_the_action_is_one_that_a_runner_can_trust():
     """Other actions have a version, no expression stands in a script, and every step names its shell."""
     text = (ACTION / "action.yml").read_text("utf-8")
-    action = loads(text)
+    action = read_yaml(text)
     for step in action["runs"]["steps"]:
         assert "${{" not in step.get("run", "")
         assert re.fullmatch(r"[\w-]+/[\w-]+@v\d+", step["uses"]) if "uses" in step else step["shell"] == "bash"
@@ -221,12 +214,12 @@ def test_the_action_is_one_that_a_runner_can_trust():
 
 def test_the_readme_names_every_input_and_output():
     section = README.read_text("utf-8").partition("## In CI")[2].partition("\n## ")[0]
-    action = loads((ACTION / "action.yml").read_text("utf-8"))
+    action = read_yaml((ACTION / "action.yml").read_text("utf-8"))
     assert not [name for name in (*action["inputs"], *action["outputs"]) if f"`{name}`" not in section]
 
 
 def test_the_workflow_of_the_readme(act, project):
-    steps = loads(blocks(README, "yaml")[0])["jobs"]["images"]["steps"]
+    steps = read_yaml(blocks(README, "yaml")[0])["jobs"]["images"]["steps"]
     assert [step for step in steps if "run" in step] == [{"run": "./render_all new/"}]
     last = steps[-1]
     assert re.fullmatch(r"OWNER/mi_refract/(.*)@\w+", last["uses"])[1] == str(ACTION.relative_to(ROOT))
@@ -236,7 +229,7 @@ def test_the_workflow_of_the_readme(act, project):
 
 def test_the_job_of_this_project_that_uses_the_action(environment, tmp_path):
     text = (ROOT / ".github" / "workflows" / "ci.yml").read_text("utf-8")
-    prepare, use = loads(text)["jobs"]["action"]["steps"][1:]
+    prepare, use = read_yaml(text)["jobs"]["action"]["steps"][1:]
     assert ROOT / use["uses"] == ACTION
     (workspace := tmp_path / "workspace").mkdir()
     subprocess.run([*BASH, "-c", prepare["run"]], cwd=workspace, check=True)
@@ -249,7 +242,7 @@ def test_the_job_of_this_project_that_uses_the_action(environment, tmp_path):
 
 @pytest.mark.parametrize(("gain", "code"), [(1.0, 0), (1.1, 1), (np.nan, 1)])
 def test_the_gitlab_job_of_the_readme(project, environment, programs, gain, code):
-    job = loads(blocks(README, "yaml")[1])["images"]
+    job = read_yaml(blocks(README, "yaml")[1])["images"]
     set_gain(project, gain)
     done = subprocess.run(
         [*BASH, "-c", "\n".join(job["script"])],

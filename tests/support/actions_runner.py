@@ -14,6 +14,11 @@ import yaml
 BASH = ["bash", "--noprofile", "--norc", "-e", "-o", "pipefail"]  # what `shell: bash` is on a runner
 
 
+def read_yaml(text: str) -> Any:
+    """The document; every scalar is a text, as GitHub's expressions see it."""
+    return yaml.load(text, yaml.BaseLoader)
+
+
 @dataclass
 class Job:
     """What a job shows after the action has run."""
@@ -36,7 +41,7 @@ def run_action(folder: Path, inputs: dict[str, str], workspace: Path, temporary:
 
     ValueError for an input that the action does not have, or one that is required and missing.
     """
-    action = yaml.load((folder / "action.yml").read_text("utf-8"), yaml.BaseLoader)
+    action = read_yaml((folder / "action.yml").read_text("utf-8"))
     declared = action["inputs"]
     if unknown := inputs.keys() - declared.keys():
         raise ValueError(f"inputs {sorted(unknown)}; expected {', '.join(declared)}")

@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -118,8 +119,9 @@ def _readings(root: Path) -> dict[str, Callable[[], object]]:
     renders, many = ([sorted((root / f"{kind}{side}").iterdir()) for side in "ab"] for kind in ("", "many_"))
 
     def read(sides: list[list[Path]]) -> None:
-        for pair in zip(*sides, strict=True):
-            image_file.read_all(pair)
+        with ThreadPoolExecutor(2) as pool:
+            for pair in zip(*sides, strict=True):
+                list(pool.map(image_file.read, pair))
 
     pair = [side[:1] for side in renders]
     files = {"read the pair": pair, "read the renders": renders, "read the folder": many}

@@ -4,7 +4,6 @@ In: rays and plain scenes, given to the programs of `renderers/`. Out: rows per 
 """
 
 __all__ = [
-    "dispersion",
     "exports",
     "glasses",
     "lenses",

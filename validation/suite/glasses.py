@@ -22,7 +22,7 @@ from mi_refract.ray_sets import check_answers, media_rays, ray_set
 from mi_refract.ray_sets.check_answers import PROBLEMS, Findings, RegimeErrors
 from mi_refract.ray_sets.files import as_csv, parse_answers
 from mi_refract.ray_sets.ray_set import Answers, RaySet
-from mi_refract.report.row import Row
+from mi_refract.report.row import Reason, Row
 from validation import limits, repeated
 from validation.run import seeds
 from validation.run.context import Context
@@ -65,7 +65,7 @@ def system_rows(system: System, catalogue: GlassCatalogue, context: Context) -> 
         return [Row(NAME, system.title, "every glass", "f64", reason=reason)]
     rays = given(catalogue.glasses)
     try:
-        text = environments.run(environments.script(system, catalogue.script), as_csv(rays))
+        text = environments.run(environments.script(system, catalogue.script, "glasses"), as_csv(rays))
         answers = parse_answers(text, system.title)
         if answers.n_ratio is None:
             raise ValueError("no column n_ratio; expected the ratio of indices that was used")
@@ -81,7 +81,9 @@ def _why_not(system: System, context: Context) -> str:
     if find_spec("opticalglass") is None:
         return "opticalglass is not installed: pip install 'mi-refract[glass]'"
     large = not system.small and context.profile.name != "full"
-    return environments.absent(system) or (f"{system.megabytes} MB: in the full profile only" if large else "")
+    return environments.absent(system) or (
+        Reason(f"{system.megabytes} MB: in the full profile only", "`--profile full`") if large else ""
+    )
 
 
 @seeds.cached

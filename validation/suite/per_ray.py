@@ -30,7 +30,7 @@ from mi_refract.ray_sets.header import PRECISIONS
 from mi_refract.ray_sets.judged_answers import RIGHT
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.ray_sets.renderer_file import RaysCommand
-from mi_refract.report.row import Row
+from mi_refract.report.row import Reason, Row
 from validation import limits, repeated
 from validation.run import seeds
 from validation.run.context import Context
@@ -147,7 +147,7 @@ def call_rows(system: System, call: RaysCommand, context: Context) -> list[Row]:
     if reason := environments.absent(system):
         return [_unmeasured(call, reason)]
     if not system.small and context.profile.name != "full":
-        return [_unmeasured(call, f"{system.megabytes} MB: in the full profile only")]
+        return [_unmeasured(call, Reason(f"{system.megabytes} MB: in the full profile only", "`--profile full`"))]
     rays = given(call.precision)
     try:
         text = environments.ask(system, call.command, as_csv(rays))
