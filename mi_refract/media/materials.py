@@ -1,10 +1,12 @@
-"""Formulas of a few materials that no catalogue of glass has: air, water, fused silica, diamond."""
+"""Materials that no catalogue of glass has: air, water, fused silica, diamond; and the ratio of two indices."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from .dispersion import Terms, sellmeier
+from mi_refract.numerics import Number
+
+from .dispersion import Coefficients, Terms, sellmeier
 from .medium import Medium
 
 
@@ -53,11 +55,33 @@ def _edlen() -> Medium:
 MATERIALS = {medium.name: medium for medium in (_ciddor(), _edlen(), _diamond(), _fused_silica(), _water())}
 
 
-def _at_20_degrees(air: Medium) -> Medium:
-    """n − 1 is proportional to the density, here that of an ideal gas: within 2e-8 of Ciddor's own tables."""
-    colder = {name: x * (288.15 / 293.15 if name.startswith("B") else 1) for name, x in air.coefficients.items()}
-    return replace(air, name="air at 20 °C", coefficients=colder)
+_CIDDOR = MATERIALS["AIR:ciddor"]
+# What catalogues of glass have around their samples: 20 °C, 101325 Pa, dry. n − 1 is proportional to the density, here
+# that of an ideal gas: within 2e-8 of Ciddor's own tables.
+LABORATORY_AIR = replace(
+    _CIDDOR,
+    name="air at 20 °C",
+    coefficients={k: x * (288.15 / 293.15 if k.startswith("B") else 1) for k, x in _CIDDOR.coefficients.items()},
+)
 
 
-# What catalogues of glass have around their samples: 20 °C, 101325 Pa, dry.
-LABORATORY_AIR = _at_20_degrees(_ciddor())
+def relative_index(
+    inside: Medium,
+    outside: Medium,
+    wavelength: Number,
+    inside_coefficients: Coefficients | None = None,
+    outside_coefficients: Coefficients | None = None,
+) -> Number:
+    """n_inside / n_outside at a wavelength in nm; NaN, for floats as well, where one of them has no index.
+
+    Beside an index that is relative to air, air has the index 1. Where the other one is relative to vacuum, the former
+    is multiplied by the index of air at 20 °C and 101325 Pa.
+    """
+    n_inside = inside.index_or_nan(wavelength, inside_coefficients)
+    n_outside = outside.index_or_nan(wavelength, outside_coefficients)
+    if {inside.relative_to, outside.relative_to} != {"air", "vacuum"}:
+        return n_inside / n_outside
+    air = LABORATORY_AIR.index_or_nan(wavelength)
+    if outside.relative_to == "vacuum":
+        return n_inside + 0 * n_outside if outside.is_air else n_inside * air / n_outside
+    return 1 / n_outside + 0 * n_inside if inside.is_air else n_inside / (n_outside * air)

@@ -261,7 +261,7 @@ def test_light_that_one_render_found_alone_is_no_difference(value):
     black = np.zeros((16, 16, 1), np.float32)
     for count in range(2, 10):
         lit = [np.full_like(black, value), *[black] * (count - 1)]
-        for one, two in (([black] * 2, lit), (lit[::-1], [black] * 3)):
+        for one, two in (([black] * count, lit), (lit[::-1], [black] * count)):  # of equal counts: no other estimate
             assert from_renders(one, two, 16).pixels.p(area, 0 * area, Inflation()).item() == 1
 
 

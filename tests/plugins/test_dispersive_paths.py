@@ -65,18 +65,18 @@ def count(made, spp=4):
     from mi_refract.plugins import path_loop
 
     ends = []
-    run = path_loop.Trace.run
+    run = path_loop.PathLoop.run
 
     def recorded(self, *arguments):
         ends.append(run(self, *arguments))
         dr.eval(ends[-1].result, ends[-1].depth, ends[-1].wavelength_count)
         return ends[-1]
 
-    path_loop.Trace.run = recorded
+    path_loop.PathLoop.run = recorded
     try:
         dr.eval(mi.render(made, integrator=mi.load_dict({"type": "refract_path"}), spp=spp))
     finally:
-        path_loop.Trace.run = run
+        path_loop.PathLoop.run = run
     return ends
 
 

@@ -145,9 +145,21 @@ def test_on_the_way_to_a_lamp_inside_light_is_absorbed(rgb_variant):
     assert found == pytest.approx(0.5 / math.pi / height**2 * math.exp(-sigma * way), rel=1e-3)
 
 
-def test_light_from_without_end_leaves_an_absorbing_world(rgb_variant):
-    """Within a medium that has no end nothing comes from the sky."""
-    assert radiance(light={"type": "constant"}, integrator={"camera_absorption": 0.1}) == pytest.approx(0, abs=1e-30)
+@pytest.mark.parametrize(
+    "light",
+    [
+        {"type": "constant"},
+        {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))},
+        {"type": "directional", "direction": [0, 0, -1]},
+    ],
+    ids=lambda light: light["type"],
+)
+def test_light_from_without_end_leaves_an_absorbing_world(light, rgb_variant):
+    """Within a medium that has no end nothing comes from the sky: not along the ray, and not to a matt floor."""
+    assert radiance(light=light, integrator={"camera_absorption": 0.1}) == pytest.approx(0, abs=1e-30)
+    floor = sheet({"type": "diffuse"}, -1)
+    method = {"deterministic": False, "split_weight": 1e-2, "camera_absorption": 0.1}
+    assert radiance(light=light, floor=floor, integrator=method) == pytest.approx(0, abs=1e-30)
 
 
 # Contradictions -----------------------------------------------------------------------------------------------
@@ -191,8 +203,16 @@ def test_within_a_wrapper_absorption_is_refused(rgb_variant):
     ("crossed", "wrong", "refused"),
     [(1, 1, True), (2, 1, True), (9, 2, False), (9, 3, True), (10_000, 99, False), (10_000, 101, True), (5, 0, False)],
 )
-def test_few_rays_beside_an_edge_are_no_contradiction(crossed, wrong, refused):
-    assert medium_tracking._contradicts(crossed, wrong) == refused
+def test_few_rays_beside_an_edge_are_no_contradiction(crossed, wrong, refused, scalar_variant):
+    made = scene(slab=box(matched()))
+    crossings = medium_tracking.Crossings(mi.scalar_rgb, made)
+    for i in range(crossed):
+        crossings.add(made.shapes()[0], 1, True, i < wrong, False)
+    if refused:
+        with pytest.raises(ValueError, match="light comes to 'slab' through another absorption"):
+            crossings.refuse()
+    else:
+        crossings.refuse()
 
 
 def test_three_media_may_meet_at_an_edge(needs_variant):

@@ -9,6 +9,7 @@ the exact answers could cause it. Above 1 it is that of the formula. Mitsuba's f
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,6 +41,12 @@ CORE = 1.5  # the index of the light pipe
 PIPE_RAYS = 8
 PROBLEM = "the problem"
 
+
+def definition(make: Callable[[], optical_systems.System]) -> str:
+    """Of an optical system, in words."""
+    return " ".join((getattr(make, "func", make).__doc__ or "").split())
+
+
 TERMS = {
     "error / condition": "the worst error over condition · u of its ray",
     "error": "the worst error; of a mirage, relative, of the cosine where the ray ends; of directions, in radians",
@@ -54,7 +61,7 @@ TERMS = {
     **FEEDS,
     PROBLEM: f"condition · u of the ray that enters at {SEEN_AT}°, with the error of every formula layer by layer",
     "light pipe": f"total internal reflections in a square pipe of index {CORE}, askew; only signs should change",
-} | {name: " ".join((trace.__doc__ or "").split()) for name, trace in optical_systems.SYSTEMS.items()}
+} | {name: definition(make) for name, make in optical_systems.SYSTEMS.items()}
 
 
 @dataclass(frozen=True)
@@ -260,10 +267,10 @@ def system_rows(context: Context, setting: Setting) -> list[Row]:
 
 def system_row(name: str, subject: Subject, case: str, setting: Setting) -> Row:
     """The errors of a subject at the end of a system."""
-    trace, refractor = optical_systems.SYSTEMS[case], Refractor(subject, setting)
-    error = np.sqrt((trace(refractor) ** 2).sum(1))
+    system, refractor = optical_systems.SYSTEMS[case](), Refractor(subject, setting)
+    error = np.sqrt((system.errors(refractor) ** 2).sum(1))
     values = {
-        "error / condition": worst(error / (optical_systems.condition(trace) * setting.roundoff)),
+        "error / condition": worst(error / (system.condition * setting.roundoff)),
         "error": worst(error),
         MISCLASSIFIED: float(refractor.mirrored),
     }
@@ -274,7 +281,7 @@ def system_row(name: str, subject: Subject, case: str, setting: Setting) -> Row:
         values["over print"] = optical_systems.off_print(Refractor(subject, setting))
         # Angles stay below 45°, where a surface costs any formula 20u, and 11 · 20 · 2⁻⁵³ is far below the print.
         budgets |= {"over print": limits.PRINT} if setting.precision is np.float64 else {}
-    replay = {"definition": " ".join((trace.__doc__ or "").split()), "rays": len(error)}
+    replay = {"definition": definition(optical_systems.SYSTEMS[case]), "rays": len(error)}
     return Row(NAME, name, case, setting.label, values, budgets, replay=replay)
 
 
