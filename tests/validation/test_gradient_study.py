@@ -4,8 +4,8 @@ import pytest
 
 from mi_refract import backend
 from mi_refract.plugins import path_loop
-from validation.run.context import PROFILES, Context
 from validation.renders import gradients
+from validation.run.context import PROFILES, Context
 
 
 @pytest.fixture
