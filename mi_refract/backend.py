@@ -26,7 +26,6 @@ import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 CHOICE = "DRJIT_LIBLLVM_PATH"  # where Dr.Jit looks first
 OWN_CHOICE = "MI_REFRACT_LIBLLVM"  # set to the same value where the choice was ours, not the user's
@@ -98,8 +97,8 @@ def usable_variants() -> dict[str, str | None]:
     _announce(backends["llvm"])
     import mitsuba as mi
 
-    found = {variant: backends[variant.partition("_")[0]] for variant in mi.variants()}
-    return {variant: None if backend.usable else backend.reason for variant, backend in found.items()}
+    needed = {variant: backends[variant.partition("_")[0]] for variant in mi.variants()}
+    return {variant: None if backend.usable else backend.reason for variant, backend in needed.items()}
 
 
 def activate(preferred: str | None = None, *, may_restart: bool = False) -> str:
@@ -122,16 +121,12 @@ def activate(preferred: str | None = None, *, may_restart: bool = False) -> str:
         raise ValueError(f"variant {preferred!r}: unknown; expected {', '.join(_running())}")
     elif not preferred.startswith("scalar_") and (reason := usable_variants()[preferred]):
         raise ValueError(f"variant {preferred!r} cannot run here: {reason}; expected {', '.join(_running())}")
-    _own_plugins_first(mi)
+    # Mitsuba looks for plugins in its own folder first; else it would run `plugins/sphere.so` of the working folder.
+    own, resolver = str(Path(mi.__file__).parent), mi.file_resolver()  # type: ignore[operator]  # a class to its stubs
+    if str(next(iter(resolver))) != own:
+        resolver.prepend(own)
     mi.set_variant(preferred)
     return preferred
-
-
-def _own_plugins_first(mi: Any) -> None:
-    """Have Mitsuba look for plugins in its own folder first: it would run `plugins/sphere.so` of the working folder."""
-    own = str(Path(mi.__file__).parent)
-    if str(next(iter(mi.file_resolver()))) != own:
-        mi.file_resolver().prepend(own)
 
 
 def _running() -> list[str]:
@@ -161,9 +156,9 @@ def libraries() -> list[Library]:
 
 def candidates() -> list[str]:
     """Every libLLVM on this machine, the highest version first; before all others the one that is loaded, if any."""
-    found = {os.path.realpath(path) for path in _search()}
+    paths = {os.path.realpath(path) for path in _search()}
     loaded = _loaded() or set()
-    versioned = [(path in loaded, version, path) for path in found if (version := _version(path)) is not None]
+    versioned = [(path in loaded, version, path) for path in paths if (version := _version(path)) is not None]
     return [path for _, _, path in sorted(versioned, reverse=True)]
 
 
@@ -206,26 +201,18 @@ def llvm() -> Backend:
     for path in [chosen] if chosen else candidates():
         library = _try(path)
         if library.works:
-            return _if_loaded(path)
-        defects.append(f"{CHOICE}={path}: {library.defect}" if chosen else f"{_title(path)}: {library.defect}")
-    return Backend("llvm", False, f"{'; '.join(defects) or 'no libLLVM found'}; {_remedy(chosen)}")
-
-
-def _if_loaded(path: str) -> Backend:
-    """`path` works; but does Dr.Jit, if it is there already, have this library and no other?"""
-    if "drjit" in sys.modules:
-        loaded = _loaded()
-        there = any(_same(path, other) for other in loaded) if loaded is not None else True
-        if not there:
-            holds = ", ".join(sorted(map(_title, loaded or ()))) or "no libLLVM"
+            loaded = _loaded() if "drjit" in sys.modules else None
+            # A path without a folder is looked up by the dynamic linker, so only its name can be compared.
+            same = [os.path.realpath(path) == x if "/" in path else Path(x).name.startswith(path) for x in loaded or ()]
+            if loaded is None or any(same):
+                return Backend("llvm", True, _title(path), path)
+            holds = ", ".join(sorted(map(_title, loaded))) or "no libLLVM"
             reason = f"Dr.Jit was imported with {holds}; start Python with {CHOICE}={path}"
             return Backend("llvm", False, reason, path)
-    return Backend("llvm", True, _title(path), path)
-
-
-def _same(path: str, other: str) -> bool:
-    """A path without a folder is looked up by the dynamic linker, so only its name can be compared."""
-    return os.path.realpath(path) == other if "/" in path else Path(other).name.startswith(path)
+        defects.append(f"{CHOICE}={path}: {library.defect}" if chosen else f"{_title(path)}: {library.defect}")
+    install = "apt-get install libllvm19" if shutil.which("apt-get") else "install LLVM 17 or newer"
+    remedy = f"expected the file of a libLLVM 17 or newer ({install})" if chosen else install
+    return Backend("llvm", False, f"{'; '.join(defects) or 'no libLLVM found'}; {remedy}")
 
 
 def _loaded() -> set[str] | None:
@@ -235,11 +222,6 @@ def _loaded() -> set[str] | None:
     except OSError:
         return None
     return {os.path.realpath(path) for path in re.findall(r"(/\S*)$", maps, re.MULTILINE) if _version(path) is not None}
-
-
-def _remedy(chosen: str | None) -> str:
-    install = "apt-get install libllvm19" if shutil.which("apt-get") else "install LLVM 17 or newer"
-    return f"expected the file of a libLLVM 17 or newer ({install})" if chosen else install
 
 
 def _announce(backend: Backend) -> None:
@@ -288,7 +270,16 @@ def _try(path: str) -> Library:
         return Library(path, known[key])
     defect, lasting = _probe("llvm", {CHOICE: path})
     if key and lasting:
-        _remember(known | {key: defect})
+        known[key] = defect
+        # Replaced in one step. Where it cannot be written, the next process tries again.
+        with contextlib.suppress(OSError, RuntimeError):
+            _cache_file().parent.mkdir(parents=True, exist_ok=True)
+            temporary = _cache_file().with_name(f"backend.json.{os.getpid()}")
+            try:
+                temporary.write_text(json.dumps(dict(list(known.items())[-50:]), indent=1))
+                temporary.replace(_cache_file())
+            finally:
+                temporary.unlink(missing_ok=True)
     return Library(path, defect)
 
 
@@ -316,17 +307,11 @@ def _probe(name: str, environment: dict[str, str]) -> tuple[str, bool]:
             return f"no process could be started: {error.strerror}", False
     if done.returncode < 0:
         lasting = done.returncode not in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT)
-        return f"ends the process in Dr.Jit's kernels ({_signal(-done.returncode)})", lasting
+        name = {s.value: s.name for s in signal.Signals}.get(-done.returncode, f"signal {-done.returncode}")
+        return f"ends the process in Dr.Jit's kernels ({name})", lasting
     if done.returncode == 0 and done.stdout.endswith("works\n"):
         return "", True
     return _complaint(name, done.stderr), True
-
-
-def _signal(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
 
 
 def _complaint(name: str, stderr: str) -> str:
@@ -369,22 +354,5 @@ def _recall() -> dict[str | None, str]:
     try:
         known = json.loads(_cache_file().read_text())
     except (OSError, ValueError, RuntimeError):
-        return {}
-    if not isinstance(known, dict):
-        return {}
-    return {key: defect for key, defect in known.items() if isinstance(defect, str)}
-
-
-def _remember(known: dict[str | None, str]) -> None:
-    """Replace the memory in one step. Where it cannot be written, the next process tries again."""
-    temporary = None
-    try:
-        path = _cache_file()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f"{path.name}.{os.getpid()}")
-        temporary.write_text(json.dumps(dict(list(known.items())[-50:]), indent=1))
-        temporary.replace(path)
-    except (OSError, RuntimeError):
-        if temporary:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
+        known = None
+    return {key: x for key, x in known.items() if isinstance(x, str)} if isinstance(known, dict) else {}

@@ -10,8 +10,7 @@ import sys
 import time
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,43 +22,23 @@ from validation.run import command_line
 if TYPE_CHECKING:
     from validation.study import Study
 
-# By name on the command line: the room, and the modules in it whose STUDY is run, in the order of the report.
+# By name on the command line, which is that of the room: the modules whose STUDY is run, in the order of the report.
 ROOMS = {
-    "directions": ("directions", ("per_formula", "planted_defects", "bsdf_samples", "sweep", "search")),
-    "stability": ("stability", ("optical_chains", "energy", "derivatives", "layered_paths")),
+    "directions": ("per_formula", "planted_defects", "bsdf_samples", "sweep", "search"),
+    "stability": ("optical_chains", "energy", "derivatives", "layered_paths"),
     "renders": (
-        "renders",
-        (
-            "scene_needs",
-            "against_dielectric",
-            "colours",
-            "unused_features",
-            "invisible_changes",
-            "neighbours",
-            "random_numbers",
-            "gradients",
-            "rendering_passes",
-        ),
+        *("scene_needs", "against_dielectric", "colours", "unused_features", "invisible_changes"),
+        *("neighbours", "random_numbers", "gradients", "rendering_passes"),
     ),
-    "efficiency": ("efficiency", ("error_against_time", "scaling", "changing_indices")),
-    "media": ("media", ("catalogs", "ray_directions", "closed_forms", "renders", "hero_wavelength")),
-    "planar": ("planar", ("against_retrace", "closed_paths", "joints", "extruded_scenes", "times")),
-    "diff": ("diff", ("planted_defects", "visible_changes", "welch_nulls", "times")),
-    "ground-truth": ("ground_truth", ("traced_bodies",)),
-    "robustness": ("robustness", ("code_mutants",)),
+    "efficiency": ("error_against_time", "scaling", "changing_indices"),
+    "media": ("catalogs", "ray_directions", "closed_forms", "renders", "hero_wavelength"),
+    "planar": ("against_retrace", "closed_paths", "joints", "extruded_scenes", "times"),
+    "diff": ("planted_defects", "visible_changes", "welch_nulls", "times"),
+    "ground-truth": ("traced_bodies",),
+    "robustness": ("code_mutants",),
     "suite": (
-        "suite",
-        (
-            "matrix",
-            "per_ray",
-            "small_mistakes",
-            "rendered_images",
-            "spectral_lines",
-            "dispersion",
-            "lenses",
-            "glasses",
-            "exports",
-        ),
+        *("matrix", "per_ray", "small_mistakes", "rendered_images", "spectral_lines"),
+        *("lenses", "glasses", "exports"),
     ),
 }
 # What the profile `quick` runs where no study is named.
@@ -118,27 +97,8 @@ def _command(
     ] = None,
 ) -> int:
     """Measure the formulas and the plugin against certified answers, and write the report."""
-    _check(studies or [], profile, out, write_tables)
-    target = ClusterTarget(scheduler, workers)
-    _join(renderers or [], studies or [], target)
-    try:
-        target.check()
-    except (ValueError, OSError) as error:
-        raise Misuse(str(error)) from None
-    try:
-        with lock.held(out / LOCK, "a validation"):
-            return _run(studies or [], profile, out, write_tables, goals, target)
-    except KeyboardInterrupt:
-        print("validation: interrupted; run the same command again to resume", file=sys.stderr)
-        raise
-
-
-class Misuse(ValueError):
-    """Wrong arguments; one line."""
-
-
-def _check(studies: list[str], profile: str, out: Path, write_tables: bool) -> None:
-    if unknown := [name for name in studies if name not in ROOMS]:
+    names, target = studies or [], ClusterTarget(scheduler, workers)
+    if unknown := [name for name in names if name not in ROOMS]:
         raise Misuse(f"unknown study {unknown[0]!r}; expected {', '.join(ROOMS)}")
     if profile not in PROFILES:
         raise Misuse(f"unknown profile {profile!r}; expected {', '.join(PROFILES)}")
@@ -150,6 +110,21 @@ def _check(studies: list[str], profile: str, out: Path, write_tables: bool) -> N
         raise Misuse(f"--out {out}: {error.strerror}; expected a writable folder") from None
     if not os.access(out, os.W_OK):
         raise Misuse(f"--out {out}: not writable; expected a writable folder")
+    _join(renderers or [], names, target)
+    try:
+        target.check()
+    except (ValueError, OSError) as error:
+        raise Misuse(str(error)) from None
+    try:
+        with lock.held(out / LOCK, "a validation"):
+            return _run(names, profile, out, write_tables, goals, target)
+    except KeyboardInterrupt:
+        print("validation: interrupted; run the same command again to resume", file=sys.stderr)
+        raise
+
+
+class Misuse(ValueError):
+    """Wrong arguments; one line."""
 
 
 def _join(folders: list[Path], studies: list[str], target: ClusterTarget) -> None:
@@ -159,7 +134,7 @@ def _join(folders: list[Path], studies: list[str], target: ClusterTarget) -> Non
     if studies and "suite" not in studies:
         raise Misuse(f"--renderer {folders[0]} without suite; expected the study suite")
     if target.given:
-        raise Misuse(f"--renderer {folders[0]} with workers, which know nothing of it; expected this process")
+        raise Misuse(f"--renderer {folders[0]} with workers, which do not have it; expected no workers")
     from validation.suite import rendered_images
     from validation.suite.renderers import table
 
@@ -174,69 +149,61 @@ def modules(studies: list[str], profile: str) -> list[str]:
     """Names of the modules below `validation` whose studies are run."""
     if profile == "quick" and not studies:
         return list(QUICK)
-    chosen = [ROOMS[name] for name in studies or ROOMS]
-    return list(dict.fromkeys(f"{room}.{module}" for room, members in chosen for module in members))
+    rooms = dict.fromkeys(studies or ROOMS)
+    return [f"{room.replace('-', '_')}.{module}" for room in rooms for module in ROOMS[room]]
 
 
 def _run(
     names: list[str], profile: str, out: Path, write_tables: bool, goals: bool, target: ClusterTarget = LOCAL
 ) -> int:
+    from rich.console import Console
+
     from mi_refract import backend
     from mi_refract.report import run_report
     from validation.run.context import Context, profiles
 
-    from . import runner, spread
+    from . import runner
     from .run import headline, tightness
 
     start = time.perf_counter()
     variant = backend.activate(may_restart=True)
     print(printable(f"validation: {backend.summary()}"), file=sys.stderr)
-    tables = _tables(names) if write_tables else None
-    chosen = profiles(variant)[profile]
-    context = Context(chosen, out, variant, backend.detect(), backend.usable_variants())
-    studies: list[Study] = [import_module(f"validation.{name}").STUDY for name in modules(names, profile)]
-    asked = spread.Asked(tuple(modules(names, profile)), profile, variant)
-    cluster = spread.OnCluster(asked, target) if target.given else None
-    rows, spent = runner.run(spread.tasks(studies, context), context, cluster)
+    if write_tables:  # imported and checked before the run
+        from . import readme_tables
+
+        try:
+            readme_tables.check(names)
+        except ValueError as error:
+            raise Misuse(str(error)) from None
+    context = Context(profiles(variant)[profile], out, variant, backend.detect(), backend.usable_variants())
+    chosen = modules(names, profile)
+    studies: list[Study] = [import_module(f"validation.{name}").STUDY for name in chosen]
+    workers = runner.OnCluster(runner.TaskList(tuple(chosen), profile, variant), target) if target.given else None
+    rows, spent = runner.run(runner.tasks(studies, context), context, workers)
     for study in studies:
         rows = study.summarise(rows)
-    if not chosen.quick:  # whose few cases need not come near any bound
+    if not context.profile.quick:  # whose few cases need not come near any bound
         rows = [*rows, *tightness.rows(rows)]
     described = runner.describe(context, time.perf_counter() - start)
-    described["replay"] = " ".join(["python -m validation", *names, f"--profile {profile}"])
-    described["studies"] = {study.name: study.described for study in studies} | {tightness.NAME: tightness.ABOUT}
-    described["scatter"] = [scatter for study in studies for scatter in study.scatter]
-    described["tasks"] = spent
-    described["first_page"] = headline.first_page(rows, profile)
+    described |= {
+        "replay": " ".join(["python -m validation", *names, f"--profile {profile}"]),
+        "studies": {study.name: study.described for study in studies} | {tightness.NAME: tightness.ABOUT},
+        "scatter": [scatter for study in studies for scatter in study.scatter],
+        "tasks": spent,
+        "first_page": headline.first_page(rows, profile),
+    }
     run_report.write_json(out / "rows.json", rows, described)
     run_report.write_junit(out / "junit.xml", rows, described)
     run_report.write_html(out / "report.html", rows, described, out)
-    if tables:
-        tables.write(rows, context, names)
+    if write_tables:
+        readme_tables.write(rows, context, names)
     runner.forget(context)
-    parts = [run_report.summary(rows, described), *([run_report.goals_table(rows)] if goals else [])]
-    _print(parts, out / "report.html")
-    return 1 if any(row.verdict == "fail" for row in rows) else 0
-
-
-def _tables(names: list[str]) -> ModuleType:
-    """The module that writes them, imported and checked before the run."""
-    from . import readme_tables
-
-    try:
-        readme_tables.check(names)
-    except ValueError as error:
-        raise Misuse(str(error)) from None
-    return readme_tables
-
-
-def _print(parts: list[Any], page: Path) -> None:
-    from rich.console import Console
-
     console = Console()
-    for part in parts:
-        console.print(part)
-    console.print(printable(f"report: {page}"), highlight=False, markup=False)
+    console.print(run_report.summary(rows, described))
+    if goals:
+        console.print(run_report.goals_table(rows))
+    console.print(printable(f"report: {out / 'report.html'}"), highlight=False, markup=False)
+    return 1 if any(row.verdict == "fail" for row in rows) else 0
 
 
 if __name__ == "__main__":

@@ -1,15 +1,13 @@
 """The tables of the READMEs and the image gallery, all made from the rows of one run.
 
-Rows are found by the studies' own constants for names of studies and metrics. So a renamed label is an error when this
+Rows are selected by the studies' own constants for names of studies and metrics: a renamed label is an error when this
 module is imported, not after the run.
 """
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -22,6 +20,7 @@ from mi_refract.io.pixels import srgb_encode
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
+from mi_refract.report.thumbnails import png
 from validation.diff import visible_changes
 from validation.directions import per_formula
 from validation.efficiency import changing_indices, error_against_time
@@ -50,7 +49,7 @@ from validation.run.metrics import (
     low,
 )
 from validation.stability import layered_paths
-from validation.suite import matrix_table
+from validation.suite import matrix
 
 ROOT = SCENES.parent
 GALLERY = SCENES / "gallery.png"
@@ -59,7 +58,10 @@ GALLERY_COLUMNS = 8
 
 @dataclass(frozen=True)
 class Table:
-    """Where a table is written, between its markers; `study` is what must be run for it, by its command-line name."""
+    """Where a table is written, between its markers; `study` is what must be run for it, by its command-line name.
+
+    `make` gives the Markdown. ValueError, one line, where the rows do not hold what the table needs.
+    """
 
     path: str
     study: str
@@ -71,10 +73,9 @@ def check(studies: list[str]) -> None:
     for marker, table in chosen(studies).items():
         path = ROOT / table.path
         text = path.read_text() if path.is_file() else ""
-        if f"<!-- begin: {marker} -->" not in text or f"<!-- end: {marker} -->" not in text:
-            raise ValueError(
-                f"{path}: no markers '<!-- begin: {marker} -->' and '<!-- end: {marker} -->' for its table"
-            )
+        begin, end = f"<!-- begin: {marker} -->", f"<!-- end: {marker} -->"
+        if begin not in text or end not in text:
+            raise ValueError(f"{path}: no markers '{begin}' and '{end}' for its table")
 
 
 def chosen(studies: list[str]) -> dict[str, Table]:
@@ -93,40 +94,31 @@ def write(rows: list[Row], context: Context, studies: list[str]) -> None:
         write_atomically(GALLERY, gallery(rows, context))
 
 
-def accuracy(rows: list[Row]) -> str:
-    """Markdown: by formula the worst error over all regimes, misclassified rays and times, in float32 and float64."""
-    summaries = [r for r in rows if r.study == per_formula.NAME and r.case == per_formula.ALL]
-    found = {(r.subject, r.setting): r for r in summaries if WORST_CHORD in r.values}
-    subjects = list(dict.fromkeys(subject for subject, setting in found if setting in ACCURACY))
-    if not subjects:
-        raise ValueError("README: no directions were measured on LLVM; its accuracy table needs them")
-    rays = max(row.replay["rays"] for (_, setting), row in found.items() if setting in ACCURACY)
-    heading = ["formula", "source"]
-    for setting, metrics in ACCURACY.items():
-        heading += [(f"{setting.split()[1]}: " if i == 0 else "") + title for i, title in enumerate(metrics)]
-    text = (
-        f"Worst over {rays:,} rays in all regimes; u = 2⁻²⁴ or 2⁻⁵³; times are medians over copying the same bytes\n"
-        f"and over `{PLAIN}`, with their 95 % intervals."
-    )
-    lines = []
-    for subject in subjects:
-        cells = [f"`{subject}`", FORMULAS[subject].source if subject in FORMULAS else "Mitsuba 3"]
-        for setting, metrics in ACCURACY.items():
-            row = found.get((subject, setting))
-            cells += [_with_interval(row, metric) if row else "–" for metric in metrics.values()]
-        lines.append(cells)
-    return _table(text, heading, lines)
+def _measured(rows: list[Row], study: str, needs: Iterable[str] = (), subject: str = "") -> list[Row]:
+    """The rows of a study, and of a subject, that have all of these metrics."""
+    mine = [row for row in rows if row.study == study and row.values and subject in ("", row.subject)]
+    return [row for row in mine if row.values.keys() >= set(needs)]
 
 
-def _table(text: str, heading: list[str], rows: list[list[str]]) -> str:
-    """Markdown: a line of text, and a table."""
-    lines = [f"| {' | '.join(cells)} |" for cells in (heading, *rows)]
-    return "\n".join([text, "", lines[0], "|---" * len(heading) + "|", *lines[1:]])
+def _table(text: str, heading: Iterable[str], lines: list[list[str]], missing: str) -> str:
+    """Markdown: a line of text, and a table. ValueError where it has no lines: `missing` says what was not measured."""
+    if not lines:
+        raise ValueError(f"README: no {missing}; its table needs them")
+    heading = list(heading)
+    markdown = [f"| {' | '.join(cells)} |" for cells in (heading, *lines)]
+    return "\n".join([text, "", markdown[0], "|---" * len(heading) + "|", *markdown[1:]])
 
 
-def _with_interval(row: Row, metric: str) -> str:
+def _with_interval(row: Row | None, metric: str) -> str:
+    if row is None or metric not in row.values:
+        return "–"
     ends = [compact(row.values[end]) for end in (low(metric), high(metric)) if end in row.values]
     return compact(row.values[metric]) + (f" ({'–'.join(ends)})" if ends else "")
+
+
+def _replay(rows: list[Row], template: str) -> str:
+    """The template filled with what repeats the first row, and its `setting`."""
+    return template.format_map({**rows[0].replay, "setting": rows[0].setting}) if rows else ""
 
 
 ACCURACY = {
@@ -139,6 +131,29 @@ ACCURACY = {
     },
     "llvm float64": {"worst chord": WORST_CHORD, "in u": WORST_IN_U, "time / copy": TIME_OVER_COPY},
 }
+
+
+def accuracy(rows: list[Row]) -> str:
+    """By formula the worst error over all regimes, misclassified rays and times, in float32 and float64."""
+    summaries = [row for row in _measured(rows, per_formula.NAME, [WORST_CHORD]) if row.case == per_formula.ALL]
+    by_name = {(row.subject, row.setting): row for row in summaries if row.setting in ACCURACY}
+    rays = max((row.replay["rays"] for row in by_name.values()), default=0)
+    heading = ["formula", "source"]
+    for setting, metrics in ACCURACY.items():
+        heading += [(f"{setting.split()[1]}: " if i == 0 else "") + title for i, title in enumerate(metrics)]
+    text = (
+        f"Worst over {rays:,} rays in all regimes; u = 2⁻²⁴ or 2⁻⁵³; times are medians over copying the same bytes\n"
+        f"and over `{PLAIN}`, with their 95 % intervals."
+    )
+    lines = []
+    for subject in dict.fromkeys(subject for subject, _ in by_name):
+        cells = [f"`{subject}`", FORMULAS[subject].source if subject in FORMULAS else "Mitsuba 3"]
+        for setting, metrics in ACCURACY.items():
+            cells += [_with_interval(by_name.get((subject, setting)), metric) for metric in metrics.values()]
+        lines.append(cells)
+    return _table(text, heading, lines, "directions were measured on LLVM")
+
+
 RENDERS = {
     CHANGED_SHARE: "pixels changed",
     MEANS_DIFFER: "means differ by",
@@ -149,17 +164,14 @@ RENDERS = {
 
 
 def renders(rows: list[Row]) -> str:
-    """Markdown: `refract` against `dielectric`, scene by scene."""
-    found = [row for row in rows if row.study == against_dielectric.NAME and row.subject == PLUGIN and row.values]
-    if not found:
-        raise ValueError("README: no scene was rendered; its table needs them")
-    replay = found[0].replay
-    size = f"{replay['resolution']}² pixels, {replay['spp']} spp, {replay['seeds']} seeds, {replay['variant']}"
+    """`refract` against `dielectric`, scene by scene."""
+    mine = _measured(rows, against_dielectric.NAME, subject=PLUGIN)
+    text = _replay(mine, "{resolution}² pixels, {spp} spp, {seeds} seeds, {variant}.")
     cells = [
         [row.case, *(compact(row.values[metric]) if metric in row.values else "–" for metric in RENDERS)]
-        for row in found
+        for row in mine
     ]
-    return _table(f"{size}.", ["scene", *RENDERS.values()], cells)
+    return _table(text, ["scene", *RENDERS.values()], cells, "scenes were rendered")
 
 
 PATHS = {
@@ -171,19 +183,12 @@ PATHS = {
 
 
 def paths(rows: list[Row]) -> str:
-    """Markdown: the paths through the mirage, of every plugin and of exact arithmetic with rounded indices."""
-    found = [row for row in rows if row.study == layered_paths.NAME and row.values.keys() >= PATHS.keys()]
-    found = [row for row in found if row.replay["scene"] == f"{MIRAGE.scene}.xml"]
-    if not found:
-        raise ValueError("README: no paths were traced; its table needs a compiled variant")
-    cells = [
-        [
-            row.subject if row.subject.startswith("exact") else f"`{row.subject}`",
-            *(compact(row.values[metric]) for metric in PATHS),
-        ]
-        for row in found
-    ]
-    return _table(f"{found[0].replay['rays']} rays, {found[0].setting}.", ["", *PATHS.values()], cells)
+    """The paths through the mirage, of every plugin and of exact arithmetic with rounded indices."""
+    mine = _measured(rows, layered_paths.NAME, PATHS)
+    mine = [row for row in mine if row.replay["scene"] == f"{MIRAGE.scene}.xml"]
+    names = [row.subject if row.subject.startswith("exact") else f"`{row.subject}`" for row in mine]
+    cells = [[name, *(compact(row.values[m]) for m in PATHS)] for name, row in zip(names, mine, strict=True)]
+    return _table(_replay(mine, "{rays} rays, {setting}."), ["", *PATHS.values()], cells, "paths were traced")
 
 
 EFFICIENCY = {
@@ -194,95 +199,76 @@ EFFICIENCY = {
 
 
 def efficiency(rows: list[Row]) -> str:
-    """Markdown: every method on the scenes that were measured, over the built-in with the same sampler."""
-    found = [row for row in rows if row.study == error_against_time.NAME and row.values.keys() >= EFFICIENCY.keys()]
-    if not found:
-        raise ValueError("README: no efficiency was measured; its table needs a compiled variant")
-    replay = found[0].replay
-    size = f"{replay['resolution']}² pixels, {replay['spp']} spp, {replay['rounds']} rounds, {found[0].setting}."
+    """Every method on the scenes that were measured, over the built-in with the same sampler."""
+    mine = _measured(rows, error_against_time.NAME, EFFICIENCY)
     cells = []
-    for row in found:
+    for row in mine:
         name, default, _ = row.subject.partition(", independent")
         sampler = "independent" if default else row.replay["sampler"]
         cells.append([row.case, f"`{name}`", sampler, *(_with_interval(row, metric) for metric in EFFICIENCY)])
-    return _table(size, ["scene", "method", "sampler", *EFFICIENCY.values()], cells)
+    text = _replay(mine, "{resolution}² pixels, {spp} spp, {rounds} rounds, {setting}.")
+    return _table(text, ["scene", "method", "sampler", *EFFICIENCY.values()], cells, "efficiencies were measured")
 
 
 def changing(rows: list[Row]) -> str:
-    """Markdown: what it costs to change an index, over the built-in."""
-    found = [row for row in rows if row.study == changing_indices.NAME and row.values]
-    if not found:
-        raise ValueError("README: no changes of indices were timed; their table needs a compiled variant")
-    cells = [[row.case, _with_interval(row, TIME_OVER_BUILTIN)] for row in found]
-    text = f"Median of {found[0].replay['rounds']} rounds, {found[0].setting}, two sides in turn."
-    return _table(text, ["", "time over the built-in's"], cells)
+    """What it costs to change an index, over the built-in."""
+    mine = _measured(rows, changing_indices.NAME)
+    cells = [[row.case, _with_interval(row, TIME_OVER_BUILTIN)] for row in mine]
+    text = _replay(mine, "Median of {rounds} rounds, {setting}, two sides in turn.")
+    return _table(text, ["", "time over the built-in's"], cells, "changes of indices were timed")
 
 
 def planar(rows: list[Row]) -> str:
-    """Markdown: by scene the distance of paths from the retrace, and the time per path by the number of segments."""
-    retraced, timed = _planar_errors(rows), _planar_times(rows)
-    if not retraced or not timed:
-        raise ValueError("README: no planar paths were traced on LLVM; its tables need them")
-    columns = ["float32", "float64", "float32, rays shuffled", "float32, every segment tried"]
-    errors = ["scene", "rays", "boundaries", "float64: error", "float32: error", "nearest its bound", "bound", "ratio"]
-    return "\n\n".join(
-        [
-            _table(PLANAR_TEXT, errors, retraced),
-            _table("µs per path of two boundaries, with 95 % intervals.", ["segments", *columns], timed),
-        ]
-    )
-
-
-PLANAR_TEXT = (
-    "Largest distance from an independent retrace, over the scene's extent, on LLVM; and in float32 the error that\n"
-    "comes nearest to its bound, at one point of one path, with the bound there."
-)
-
-
-def _planar_errors(rows: list[Row]) -> list[list[str]]:
-    study = against_retrace
-    found = {(r.case, r.setting): r for r in rows if r.study == study.NAME and r.subject == study.TRACE and r.values}
-    lines = []
-    for case in dict.fromkeys(case for case, _ in found):
-        exact, narrow = (found.get((case, f"llvm {precision}")) for precision in ("float64", "float32"))
+    """By scene the distance of paths from the retrace, and the time per path by the number of segments."""
+    study, missing = against_retrace, "planar paths were traced on LLVM"
+    by_case = {(row.case, row.setting): row for row in _measured(rows, study.NAME, subject=study.TRACE)}
+    retraced = []
+    for case in dict.fromkeys(case for case, _ in by_case):
+        exact, narrow = (by_case.get((case, f"llvm {precision}")) for precision in ("float64", "float32"))
         if exact and narrow:
-            most, rays = f"{exact.values[study.BOUNDARIES]:.0f}", str(exact.replay["rays"])
             errors = [compact(row.values[study.DIFFERENCE]) for row in (exact, narrow)]
             nearest = [compact(narrow.values[m]) for m in (study.NEAREST, study.ITS_BOUND, ERROR_OVER_BOUND)]
-            lines.append([f"`{case}`", rays, most, *errors, *nearest])
-    return lines
-
-
-def _planar_times(rows: list[Row]) -> list[list[str]]:
-    study = planar_times
-    found = {(r.subject, r.case, r.setting): r for r in rows if r.study == study.NAME and r.values}
-    columns = [(study.MESH, "float32"), (study.MESH, "float64"), (study.SHUFFLED, "float32"), (study.BRUTE, "float32")]
-    lines = []
-    for subject, case, setting in found:
-        if (subject, setting) == (study.MESH, "llvm float32"):
-            timed = [found.get((name, case, f"llvm {precision}")) for name, precision in columns]
-            lines.append([case, *(_with_interval(row, study.PER_PATH) if row else "–" for row in timed)])
-    return lines
+            boundaries = f"{exact.values[study.BOUNDARIES]:.0f}"
+            retraced.append([f"`{case}`", str(exact.replay["rays"]), boundaries, *errors, *nearest])
+    text = (
+        "Largest distance from an independent retrace, over the scene's extent, on LLVM; and in float32 the error "
+        "that\ncomes nearest to its bound, at one point of one path, with the bound there."
+    )
+    heading = ["scene", "rays", "boundaries", "float64: error", "float32: error", "nearest its bound", "bound", "ratio"]
+    first = _table(text, heading, retraced, missing)
+    times = {(row.subject, row.case, row.setting): row for row in _measured(rows, planar_times.NAME)}
+    columns = {
+        "float32": (planar_times.MESH, "llvm float32"),
+        "float64": (planar_times.MESH, "llvm float64"),
+        "float32, rays shuffled": (planar_times.SHUFFLED, "llvm float32"),
+        "float32, every segment tried": (planar_times.BRUTE, "llvm float32"),
+    }
+    cells = [
+        [case, *(_with_interval(times.get((s, case, x)), planar_times.PER_PATH) for s, x in columns.values())]
+        for subject, case, setting in times
+        if (subject, setting) == columns["float32"]
+    ]
+    text = "µs per path of two boundaries, with 95 % intervals."
+    return "\n\n".join([first, _table(text, ["segments", *columns], cells, missing)])
 
 
 def seen(rows: list[Row]) -> str:
-    """Markdown: in how many trials each method of comparison saw each planted defect, and its false alarms."""
-    found = [row for row in rows if row.study == self_test.STUDY and row.values]
+    """In how many trials each method of comparison saw each planted defect, and its false alarms."""
+    mine, missing = _measured(rows, self_test.STUDY), "defects were planted"
     defects: dict[str, list[Row]] = {}
-    for row in found:
-        if "missed" in row.values:
-            defects.setdefault(row.subject, []).append(row)
-    alarms = {name: [row for row in found if row.subject == f"null pairs, {name}"] for name in METHODS}
-    if not defects or not all(alarms.values()):
-        raise ValueError("README: no defects were planted; its table needs a compiled variant")
+    for row in _measured(mine, self_test.STUDY, ["missed"]):
+        defects.setdefault(row.subject, []).append(row)
     cells = [[name, *(_shares(method, trials) for method in METHODS)] for name, trials in defects.items()]
-    cells.append(["nothing: other seeds, or other last bits", *map(_false_alarms, alarms.values())])
+    alarms = [_measured(mine, self_test.STUDY, subject=f"null pairs, {name}") for name in METHODS]
+    if not cells or not all(alarms):
+        return _table("", [], [], missing)
+    cells.append(["nothing: other seeds, or other last bits", *map(_false_alarms, alarms)])
     trials = next(iter(defects.values()))
     detectable = _percent([row.values[self_test.DETECTABLE] for row in trials], digits=1)
     replay, scenes = trials[0].replay, ", ".join(row.case for row in trials)
     text = f"{scenes}; {replay['trials']} trials each of {replay['renders a side']} renders a side. "
     text += f"Minimum detectable difference in a tile: {detectable}."
-    return _table(text, ["planted", *(f"`{name}`" for name in METHODS)], cells)
+    return _table(text, ["planted", *(f"`{name}`" for name in METHODS)], cells, missing)
 
 
 def _shares(method: str, trials: list[Row]) -> str:
@@ -299,48 +285,40 @@ def _false_alarms(rows: list[Row]) -> str:
     return f"{alarms:.0f} of {sum(pairs):.0f}"
 
 
-def visible(rows: list[Row]) -> str:
-    """Markdown: how large the errors of FLIP are in changes that nobody sees and that a person sees."""
-    study = visible_changes
-    own = (*study.KINDS, study.EDGE)  # not those of other seeds
-    found = [row for row in rows if row.study == study.NAME and (row.subject in own or row.case == study.LIMIT)]
-    kinds, limits_found = ([r for r in found if (r.case == study.LIMIT) is limit] for limit in (False, True))
-    if not kinds or not limits_found:
-        raise ValueError("README: no visible changes were planted; its table needs them")
-    metrics = (study.LOCAL, study.THROUGHOUT, study.ERROR)
-    cells = [
-        [
-            row.subject,
-            row.reason,
-            row.case,
-            *(compact(row.values[m]) for m in metrics),
-            f"{row.values[study.ALARMS]:.1%}",
-        ]
-        for row in kinds
-    ]
-    replay, bounds = kinds[0].replay, METHODS["flip"].options
-    heading = [
-        f"{name} (bound {compact(bounds[o].default)})" for name, o in zip(metrics, ("local", "patch"), strict=False)
-    ]
-    text = f"{replay['trials']} pairs of {replay['size']}² pixels each, {kinds[0].setting}."
-    first = _table(text, ["change", "", "by a person", *heading, study.ERROR, study.ALARMS], cells)
-    squares = [row for row in limits_found if study.CODES in row.values]
-    codes = [compact(row.values[study.CODES]) if row.values[study.CODES] < 255 else "never" for row in squares]
-    edge = next(compact(row.values[study.PIXELS]) for row in limits_found if row.subject == study.EDGE)
-    text = f"Smallest change of a gray square that is different; a black edge on white must move by {edge} pixels."
-    sides = [row.subject.split()[2] for row in squares]
-    return "\n\n".join([first, _table(text, ["pixels a side", *sides], [["codes of 255", *codes]])])
-
-
-def suite(rows: list[Row]) -> str:
-    """Markdown: how far every system is off at most, check by check."""
-    return _table(*matrix_table.table(rows))
-
-
 def _percent(shares: list[float], digits: int = 0) -> str:
     """Of several scenes: one number where they are the same, else the smallest and the largest."""
     ends = list(dict.fromkeys(f"{100 * x:.{digits}f}" for x in (min(shares), max(shares))))
     return "–".join(ends) + " %"
+
+
+def visible(rows: list[Row]) -> str:
+    """How large the errors of FLIP are in changes that nobody sees and that a person sees."""
+    study, missing = visible_changes, "visible changes were planted"
+    mine = _measured(rows, study.NAME)
+    kinds = [r for r in mine if r.case != study.LIMIT and r.subject in (*study.KINDS, study.EDGE)]  # not other seeds
+    metrics = (study.LOCAL, study.THROUGHOUT, study.ERROR)
+    cells = []
+    for row in kinds:
+        errors = (compact(row.values[metric]) for metric in metrics)
+        cells.append([row.subject, row.reason, row.case, *errors, f"{row.values[study.ALARMS]:.1%}"])
+    bounds = [
+        f"{m} (bound {compact(METHODS['flip'].options[o].default)})"
+        for m, o in zip(metrics, ("local", "patch"), strict=False)
+    ]
+    heading = ["change", "", "by a person", *bounds, study.ERROR, study.ALARMS]
+    first = _table(_replay(kinds, "{trials} pairs of {size}² pixels each, {setting}."), heading, cells, missing)
+    limits = [row for row in mine if row.case == study.LIMIT]
+    squares = [row for row in limits if study.CODES in row.values]
+    codes = [compact(row.values[study.CODES]) if row.values[study.CODES] < 255 else "never" for row in squares]
+    edge = next((compact(row.values[study.PIXELS]) for row in limits if row.subject == study.EDGE), "")
+    text = f"Smallest change of a gray square that is different; a black edge on white must move by {edge} pixels."
+    sides = ["pixels a side", *(row.subject.split()[2] for row in squares)]
+    return "\n\n".join([first, _table(text, sides, [["codes of 255", *codes]] if edge else [], missing)])
+
+
+def suite(rows: list[Row]) -> str:
+    """How far every system is off at most, check by check."""
+    return _table(*matrix.table(rows), "other renderers were run")
 
 
 TABLES = {
@@ -361,22 +339,13 @@ def gallery(rows: list[Row], context: Context) -> bytes:
 
     Scenes with dispersion or absorption come last, from a spectral variant.
     """
-    import OpenImageIO as oiio
-
     drawn = [row for row in rows if row.subject == PLUGIN and row.images]
     paths = [r.images["test"] for study in (against_dielectric, colours) for r in drawn if r.study == study.NAME]
     tiles = [tile for path in paths if (tile := image_file.read_exr(context.out / path)[0]).std() > 1e-3]
-    gap = np.ones((tiles[0].shape[0], 4, 3), np.float32)
-    strips = []
-    for start in range(0, len(tiles), GALLERY_COLUMNS):
-        row = tiles[start : start + GALLERY_COLUMNS]
-        row += [np.ones_like(tiles[0])] * (GALLERY_COLUMNS - len(row))
-        strip = [x for tile in row for x in (tile, gap)][:-1]
-        strips += [np.concatenate(strip, axis=1), np.ones((4, sum(x.shape[1] for x in strip), 3), np.float32)]
-    encoded = srgb_encode(np.concatenate(strips[:-1]).clip(0, 1)).astype(np.float32)
-    image = oiio.ImageBuf(np.ascontiguousarray(encoded))
-    with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder) / "gallery.png"
-        if not image.write(str(target), "uint8"):
-            raise OSError(f"{target}: {image.geterror()}")
-        return target.read_bytes()
+    side, gap = tiles[0].shape[0], 4
+    lines = -(-len(tiles) // GALLERY_COLUMNS)
+    sheet = np.ones((lines * (side + gap) - gap, GALLERY_COLUMNS * (side + gap) - gap, 3), np.float32)
+    for i, tile in enumerate(tiles):
+        y, x = (place * (side + gap) for place in divmod(i, GALLERY_COLUMNS))
+        sheet[y : y + side, x : x + side] = srgb_encode(tile.clip(0, 1))
+    return png(np.rint(255 * sheet).astype(np.uint8))

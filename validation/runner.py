@@ -1,4 +1,9 @@
-"""Runs tasks, saves the rows of each as soon as it is finished, and resumes after an interruption."""
+"""Runs tasks, saves the rows of each as soon as it is finished, and resumes after an interruption.
+
+Tasks that time nothing may run on the workers of a Dask cluster. A task holds closures, so it is not sent: a worker
+makes the same list of tasks and runs the one of that name. It must have the same sources, versions and other renderers.
+Images come back as files; rows are kept as they come.
+"""
 
 from __future__ import annotations
 
@@ -7,78 +12,108 @@ import json
 import os
 import platform
 import shutil
+import sys
+import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import mi_refract
+from mi_refract.cluster import connection, on_worker, worker_facts
+from mi_refract.cluster import spread as calls
 from mi_refract.io.atomic import write_atomically
+from mi_refract.io.provenance import installed_version
+from mi_refract.io.sanitise import printable
 from mi_refract.report.row import Row
-from validation.run.context import SCENES, Context
-from validation.study import Task
+from validation.run.context import SCENES, Context, profiles
 from validation.suite.renderers import SYSTEMS, environments
 
-Finished = tuple[list[Row], dict[str, Any]]  # of a task: its rows, and what it took
+from . import repeated
+from .study import Study, Task
+
+# What rows depend on, beside what any render depends on.
+PACKAGES = ("numpy", "scipy", "OpenImageIO", "python-flint", "jinja2")
+Finished = tuple[list[Row], dict[str, Any]]  # of a task: its rows, and its name and times
 
 
-class Elsewhere(Protocol):
-    """Other processes that run tasks."""
-
-    def run(self, work: Sequence[tuple[int, str]], context: Context) -> Iterator[tuple[int, Finished]]:
-        """Of every task (number, name) what it gave, in the order in which they end. A task's own errors pass."""
-        ...
+def tasks(studies: Sequence[Study], context: Context) -> list[Task]:
+    """All tasks of these studies, and those that repeat them with other seeds. ValueError where two have one name."""
+    made = [task for study in studies for task in (*study.tasks(context), *repeated.tasks(study, context))]
+    names = Counter(task.name for task in made)
+    if twice := [name for name, count in names.items() if count > 1]:
+        raise ValueError(f"two tasks are called {twice[0]!r}; expected different names, by which workers find them")
+    return made
 
 
 def run(
-    tasks: list[Task], context: Context, elsewhere: Elsewhere | None = None
+    tasks: Sequence[Task], context: Context, workers: OnCluster | None = None
 ) -> tuple[list[Row], list[dict[str, Any]]]:
-    """All rows, in the order of the tasks, and what each task took: its name, seconds, and seconds of all processors.
+    """All rows, in the order of the tasks; and of each task its name, seconds, and seconds of all processors.
 
-    `elsewhere` first runs those that are not timed. When it has ended the others run here, one after the other: what is
-    timed is alone. Errors and KeyboardInterrupt pass, with the finished tasks kept.
+    `workers` first run the tasks that are not timed; then the others run here, one after the other, so that what is
+    timed runs alone. Errors and KeyboardInterrupt pass, with the finished tasks kept.
     """
     store = context.out / "unfinished"
     store.mkdir(parents=True, exist_ok=True)
-    fingerprint = _fingerprint(context)
-    kept = [store / f"{hashlib.sha256((fingerprint + task.name).encode()).hexdigest()[:24]}.json" for task in tasks]
-    found: dict[int, Finished] = {}
+    about = repr((context.profile, context.variant, installed(), describe(context, 0))) + sources()
+    files = [store / f"{hashlib.sha256((about + task.name).encode()).hexdigest()[:24]}.json" for task in tasks]
+    finished: dict[int, Finished] = {}
+
+    def keep(number: int, result: Finished) -> None:
+        rows, spent = result
+        write_atomically(files[number], json.dumps({"spent": spent, "rows": [row.as_dict() for row in rows]}))
+        finished[number] = result
+
     with _progress(len(tasks)) as advance:
-        if elsewhere and (work := [(i, t.name) for i, t in enumerate(tasks) if not t.timed and not _recall(kept[i])]):
-            for i, finished in elsewhere.run(work, context):
+        work = [(i, task.name) for i, task in enumerate(tasks) if not task.timed and not _recall(files[i])]
+        if workers and work:
+            for i, result in workers.run(work, context):
                 advance(tasks[i].name)
-                found[i] = _keep(kept[i], finished)
+                keep(i, result)
         for i, task in enumerate(tasks):
-            if i not in found:
+            if i not in finished:
                 advance(task.name)
-                found[i] = _recall(kept[i]) or _keep(kept[i], timed(task))
-    order = [found[i] for i in range(len(tasks))]
+                keep(i, _recall(files[i]) or timed(task))
+    order = [finished[i] for i in range(len(tasks))]
     return [row for rows, _ in order for row in rows], [spent for _, spent in order]
 
 
-def _keep(kept: Path, finished: Finished) -> Finished:
-    rows, spent = finished
-    write_atomically(kept, json.dumps({"spent": spent, "rows": [row.as_dict() for row in rows]}))
-    return finished
-
-
 def timed(task: Task) -> Finished:
-    """Run a task; its rows and what it took."""
+    """Run a task; its rows, and what it took."""
     start, processors = time.perf_counter(), sum(os.times()[:4])
     rows = task.run()
     seconds, cpu = time.perf_counter() - start, sum(os.times()[:4]) - processors
     return rows, {"task": task.name, "seconds": round(seconds, 2), "CPU seconds": round(cpu, 2)}
 
 
+def _recall(file: Path) -> Finished | None:
+    """The rows of a finished task and its time; None if there are none or they cannot be read."""
+    try:
+        record = json.loads(file.read_text())
+        return [Row.from_dict(data) for data in record["rows"]], dict(record["spent"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
 def forget(context: Context) -> None:
-    """Drop the rows of single tasks: once the report is written, the next run starts anew."""
+    """Drop the rows of single tasks: once the report is written, the next run starts over."""
     shutil.rmtree(context.out / "unfinished", ignore_errors=True)
+
+
+# What rows depend on --------------------------------------------------------------------------------------------------
 
 
 def describe(context: Context, seconds: float) -> dict[str, Any]:
     """What all rows share."""
+    names = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    cores = [line.partition(":")[2].strip() for line in names if line.startswith("model name")]
+    processor = f"{len(cores)} × {cores[0]}" if cores else platform.machine()
     return {
         "profile": context.profile.name,
         "variant": context.variant,
@@ -86,29 +121,8 @@ def describe(context: Context, seconds: float) -> dict[str, Any]:
         "seconds": round(seconds, 1),
         "versions": {"mi_refract": mi_refract.__version__}
         | {name: version(name) for name in ("mitsuba", "drjit", "numpy", "OpenImageIO", "python-flint")},
-        "machine": {"processor": _processor(), "system": platform.platform(), "python": platform.python_version()},
+        "machine": {"processor": processor, "system": platform.platform(), "python": platform.python_version()},
     }
-
-
-def _processor() -> str:
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return f"{len(names)} × {names[0]}" if names else platform.machine()
-
-
-def _recall(kept: Path) -> Finished | None:
-    """The rows of a finished task and its time; None if there are none or they cannot be read."""
-    try:
-        record = json.loads(kept.read_text())
-        return [Row.from_dict(data) for data in record["rows"]], dict(record["spent"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
-def _fingerprint(context: Context) -> str:
-    """Rows are taken up again only for the same sources, scenes, profile, variant, versions and other renderers."""
-    about = (context.profile, context.variant, installed(), describe(context, 0))
-    return hashlib.sha256((repr(about) + sources()).encode()).hexdigest()
 
 
 def installed() -> list[str]:
@@ -119,12 +133,91 @@ def installed() -> list[str]:
 def sources() -> str:
     """A digest of all that rows are made from: the package, the validation, scenes and tests."""
     digest = hashlib.sha256()
-    ours, here = Path(mi_refract.__file__).parent, Path(__file__).parent
-    sources = [ours.rglob("*.py"), here.rglob("*.py"), here.rglob("*.json"), SCENES.rglob("*")]
-    sources.append(here.with_name("tests").rglob("*.py"))  # which mutants of our code must not pass
-    for path in sorted(path for group in sources for path in group if path.is_file()):
+    here = Path(__file__).parent
+    groups = [Path(mi_refract.__file__).parent.rglob("*.py"), SCENES.rglob("*")]
+    groups += [here.rglob(f"*.{kind}") for kind in ("py", "json", "toml", "j2")]
+    groups.append(here.with_name("tests").rglob("*.py"))  # which mutants of our code must not pass
+    for path in sorted(path for group in groups for path in group if path.is_file()):
         digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def facts(variant: str) -> dict[str, str]:
+    """What rows depend on, of this process, by name: `worker_facts.facts` and the sources of the validation."""
+    known = worker_facts.facts(variant) | {name: installed_version(name) for name in PACKAGES}
+    return known | {"validation": sources()[:8], "other renderers": ", ".join(installed()) or "none"}
+
+
+# On workers -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TaskList:
+    """What a list of tasks is made from. `modules`: names below `validation`, each with a STUDY."""
+
+    modules: tuple[str, ...]
+    profile: str
+    variant: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a worker sends back: a finished task, and its files by path below the output folder."""
+
+    finished: Finished
+    files: dict[str, bytes]
+
+
+@dataclass(frozen=True)
+class OnCluster:
+    """Workers of a scheduler, or worker processes of one thread each on this machine."""
+
+    tasks: TaskList
+    target: connection.ClusterTarget
+
+    def run(self, work: Sequence[tuple[int, str]], context: Context) -> Iterator[tuple[int, Finished]]:
+        """The result of every task (number, name), in the order in which they end. A task's own errors pass.
+
+        ConnectionError, one line, where no worker may run tasks; workers that are refused are named on stderr.
+        """
+        from mi_refract.cluster.workers import Workers
+
+        with connection.connected(self.target.scheduler, self.target.workers) as client:
+            expected = facts(self.tasks.variant)
+            workers = Workers(client, self.tasks.variant, expected, warn=_warn, facts=__name__)
+            workers.wait()
+            results = calls.results(workers, run_on_worker, [(self.tasks, name) for _, name in work])
+            for number, outcome, machine in results:
+                for path, content in outcome.files.items():
+                    (context.out / path).parent.mkdir(parents=True, exist_ok=True)
+                    write_atomically(context.out / path, content)
+                rows, spent = outcome.finished
+                yield work[number][0], (rows, spent | {"machine": machine})
+
+
+def _warn(text: str) -> None:
+    print(printable(f"validation: {text}"), file=sys.stderr, flush=True)
+
+
+def run_on_worker(asked: TaskList, name: str) -> Outcome:
+    """The task of that name, in a folder of its own. Its errors pass."""
+    threads, scratch = on_worker.threads(), on_worker.scratch_folder()
+    return on_worker.one_at_a_time(lambda: _run_task(asked, name, threads, scratch))
+
+
+def _run_task(asked: TaskList, name: str, threads: int, scratch: str) -> Outcome:
+    from mi_refract import backend
+
+    if on_worker.variant() != asked.variant:
+        backend.activate(asked.variant)
+    on_worker.limit_threads(threads)
+    profile = profiles(asked.variant)[asked.profile]
+    with tempfile.TemporaryDirectory(dir=scratch) as folder:
+        context = Context(profile, Path(folder), asked.variant, backend.detect(), backend.usable_variants())
+        studies = [import_module(f"validation.{module}").STUDY for module in asked.modules]
+        finished = timed(next(task for task in tasks(studies, context) if task.name == name))
+        files = {str(path.relative_to(folder)): path.read_bytes() for path in Path(folder).rglob("*") if path.is_file()}
+        return Outcome(finished, files)
 
 
 @contextmanager

@@ -4,7 +4,6 @@ In: the arguments of a command line. Out: text on stdout, the files asked for, a
 options, call the rooms below, and print; everything they do can be done from Python without this room.
 """
 
-import signal
 import sys
 
 __all__ = ["app", "main"]
@@ -19,8 +18,7 @@ def main(arguments: list[str] | None = None) -> int:
         arguments = sys.argv[1:]
         # Mitsuba heeds SIGINT also where it is ignored, so a rendering in the background ends, too.
         rendering = arguments[:1] == ["render"]
-        # A rendering that is ended by any of them keeps what it has.
-        end_at_once(even_if_ignored=rendering, also=(signal.SIGTERM, signal.SIGHUP) if rendering else ())
+        end_at_once(even_if_ignored=rendering)
     from mi_refract.io.exit_code import exit_code
 
     return exit_code("mi-refract", lambda: _run(arguments))

@@ -1,4 +1,4 @@
-"""Ctrl-C ends a command at once with exit code 130, whatever its threads do, and leaves nothing unfinished.
+"""Ctrl-C, SIGTERM and SIGHUP end a command at once with exit code 128 + signal, and leave no temporary file.
 
 While Mitsuba renders, a handler of its own takes SIGINT: it allocates memory, also where it has interrupted `malloc`,
 and then both wait for ever; or it makes the rendering return early. Python's own handler waits until Mitsuba or an
@@ -15,32 +15,28 @@ from collections.abc import Callable, Collection, Iterator
 from typing import NoReturn
 
 SHOW_CURSOR = b"\x1b[?25h"  # which a spinner hides
-_SIGINT = {signal.SIGINT}
-_signals = set(_SIGINT)  # that are blocked from `end_at_once` on
-_blocked = threading.Event()  # from `end_at_once` on
+_ENDING = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+_blocked: set[signal.Signals] = set()  # from `end_at_once` on
 _unblocked = threading.Event()  # within `as_exceptions`
-_last_acts: list[Callable[[], None]] = []  # of which the last one counts
+_last_acts: list[Callable[[], None]] = []
 
 
-def end_at_once(*, even_if_ignored: bool, also: Collection[signal.Signals] = ()) -> None:
-    """From here on, SIGINT and the signals in `also` end this process with 128 + their number; 130 for Ctrl-C.
+def end_at_once(*, even_if_ignored: bool) -> None:
+    """From here on, SIGINT, SIGTERM and SIGHUP end this process with 128 + their number; 130 for Ctrl-C.
 
     For the process's own command line, in its main thread. Call it before numpy, Mitsuba or Dr.Jit is imported: the
-    threads that they start block what their parent blocks. Where the shell has SIGINT ignored, in a background job, it
-    stays so, unless `even_if_ignored`; the others stay ignored where they are, as by `nohup`.
+    threads that they start block what their parent blocks. A signal that the caller has ignored, such as SIGINT of a
+    shell's background job or SIGHUP of `nohup`, stays ignored; SIGINT not with `even_if_ignored`.
     """
-    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    _signals.update(each for each in also if signal.getsignal(each) is not signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_BLOCK, _signals)
+    ignored = {number for number in _ENDING if signal.getsignal(number) is signal.SIG_IGN}
+    _blocked.update(_ENDING - ignored | {signal.SIGINT})  # Mitsuba's handler would take it even where it is ignored
+    signal.pthread_sigmask(signal.SIG_BLOCK, _blocked)
     from mi_refract.io import atomic  # it takes longer than all before it
 
-    _blocked.set()
-    waited = _signals - (_SIGINT if ignored and not even_if_ignored else set())
-    if not waited:
-        return
-    for each in waited:  # macOS does not queue what is ignored
-        signal.signal(each, signal.default_int_handler if each == signal.SIGINT else _exit)
-    threading.Thread(target=_watch, args=(atomic.end_process, waited), name="Ctrl-C", daemon=True).start()
+    if waited := _blocked - (set() if even_if_ignored else ignored):
+        for number in waited:  # macOS does not queue what is ignored
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else _exit)
+        threading.Thread(target=_watch, args=(atomic.end_process, waited), name="Ctrl-C", daemon=True).start()
 
 
 @contextlib.contextmanager
@@ -55,16 +51,16 @@ def last_act(act: Callable[[], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def as_exceptions() -> Iterator[None]:
-    """Within, SIGINT is a KeyboardInterrupt, as usual: for starting other programs, which inherit what is blocked.
+    """Within, SIGINT is a KeyboardInterrupt, and SIGTERM and SIGHUP a SystemExit.
 
-    The others that are blocked are so, too. Nothing that installs a handler of its own may be called. Without
-    `end_at_once` nothing changes.
+    For starting other programs, which inherit what is blocked; nothing that installs a handler of its own may be
+    called. Without `end_at_once` nothing changes.
     """
-    if not _blocked.is_set():
+    if not _blocked:
         yield
         return
     _unblocked.set()
-    before = signal.pthread_sigmask(signal.SIG_UNBLOCK, _signals)
+    before = signal.pthread_sigmask(signal.SIG_UNBLOCK, _blocked)
     try:
         yield
     finally:
@@ -73,7 +69,6 @@ def as_exceptions() -> Iterator[None]:
 
 
 def _exit(number: int, frame: object) -> NoReturn:
-    """For a thread that was there before, and has the signal unblocked."""
     raise SystemExit(128 + number)
 
 

@@ -6,7 +6,7 @@ import contextlib
 import math
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -17,7 +17,8 @@ from mi_refract.cluster.connection import ClusterTarget
 from mi_refract.io.sanitise import printable
 from mi_refract.rendering import scene_files
 
-from . import interrupts, variants
+from . import interrupts
+from .doctor import activate
 from .quantities import parse_seconds, parse_share, shown_error
 from .render_cluster import ClusterOptions, cluster_passes
 from .render_progress import shown
@@ -89,21 +90,21 @@ def render(
     defines = scene_files.parse_defines(define or [])
     cluster = ClusterOptions(ClusterTarget(scheduler, workers), bundle_limit, mixed_workers=mixed_workers)
     cluster.check(allow_plugins or ())
-    shares = [
-        None if text is None else parse_share(text, option)
-        for text, option in ((until, "--until"), (until_tile, "--until-tile"))
-    ]
-    seconds = None if duration is None else parse_seconds(duration, "--time")
+    share = parse_share(until, "--until") if until else None
+    tile_share = parse_share(until_tile, "--until-tile") if until_tile else None
+    seconds = parse_seconds(duration, "--time") if duration else None
     if preview is not None:
         writable(preview, (".png",))
-    chosen = variants.activate(variant)
-    from mi_refract.rendering.long_render import Job, Limits, LongRender
+    chosen = activate(variant)
+    from mi_refract.rendering.end_conditions import Limits
+    from mi_refract.rendering.long_render import Job, resume
 
-    limits = Limits(spp, shares[0], shares[1], seconds, pass_spp)
+    limits = Limits(spp, share, tile_share, seconds, pass_spp)
     job = Job(scene, defines, seed, tuple(allow_plugins or ()))
     console = Console(stderr=True)
-    with _spinner(console, f"{scene.name}, {chosen}"):
-        rendering = LongRender(job, output, limits, restart=restart)
+    spinner = console.status(Text(printable(f"{scene.name}, {chosen}"))) if console.is_terminal else None
+    with spinner or contextlib.nullcontext():
+        rendering = resume(job, output, limits, restart=restart)
     if rendering.progress.passes:
         print(printable(f"{output}: resuming from {rendering.progress.done} spp"), file=sys.stderr)
     with (
@@ -112,25 +113,13 @@ def render(
         shown(console, rendering, preview) as watch,
     ):
         header = rendering.run(watch, passes)
-    print(printable(f"{output}: {chosen}, {_summary(rendering, header)}"))
-    if count := header["mi_refract:nonfinite_pixels"]:
-        print(printable(f"mi-refract: {output}: {count} pixels are not finite"), file=sys.stderr)
-    if variant is None and not backend.llvm().usable:
-        print(printable(f"mi-refract: {chosen} is slow; {backend.summary()}"), file=sys.stderr)
-
-
-def _summary(rendering: Any, header: dict[str, Any]) -> str:
-    text = f"{header['mi_refract:spp']} spp in {_passes(rendering.progress.passes)}, "
-    text += f"{header['mi_refract:render_seconds']:.2f} s"
-    error = rendering.error()
+    count, error = rendering.progress.passes, rendering.error()
+    text = f"{output}: {chosen}, {header['mi_refract:spp']} spp in {count} pass{'es' if count != 1 else ''}"
+    text += f", {header['mi_refract:render_seconds']:.2f} s"
     if error is not None and math.isfinite(error.value):
         text += f", relative error {shown_error(error)}"
-    return text if rendering.has_all_samples else f"{text}; ended by {rendering.ended_by}"
-
-
-def _passes(count: int) -> str:
-    return f"{count} pass{'es' if count != 1 else ''}"
-
-
-def _spinner(console: Console, text: str) -> contextlib.AbstractContextManager[Any]:
-    return console.status(Text(printable(text))) if console.is_terminal else contextlib.nullcontext()
+    print(printable(text if rendering.has_all_samples else f"{text}; ended by {rendering.ended_by}"))
+    if bad := header["mi_refract:nonfinite_pixels"]:
+        print(printable(f"mi-refract: {output}: {bad} pixels are not finite"), file=sys.stderr)
+    if variant is None and not backend.llvm().usable:
+        print(printable(f"mi-refract: {chosen} is slow; {backend.summary()}"), file=sys.stderr)

@@ -10,7 +10,7 @@ import typer
 from mi_refract.io.sanitise import printable
 from mi_refract.rendering import scene_files
 
-from . import variants
+from .doctor import activate
 
 app = typer.Typer(
     help="Write scenes for other renderers.", no_args_is_help=True, add_completion=False, rich_markup_mode=None
@@ -39,23 +39,17 @@ def export(
 ) -> None:
     """Write a Mitsuba scene as triangles for another renderer, with a README.txt that says how to render it."""
     defines = scene_files.parse_defines(define or [])
-    variants.activate("scalar_rgb")
+    activate("scalar_rgb")
     from mi_refract.scene_export import from_mitsuba
     from mi_refract.scene_export.write_files import write
 
-    path = _scene_path(scene)
+    path = next((path for path in (Path(scene), SCENES / f"{scene}.xml") if path.is_file()), None)
+    if path is None:
+        names = sorted(path.stem for path in SCENES.glob("*.xml"))
+        raise FileNotFoundError(f"{scene}: no such scene; expected {', '.join(['a file', *names])}")
     folder = output or Path(f"{path.stem}-{to}")
     plain = from_mitsuba.load(path, level=from_mitsuba.LEVEL if level is None else level, **defines)
     written = write(plain, to, folder)
     triangles = sum(len(mesh.faces) for mesh in plain.meshes)
     done = f"{len(written)} files, {triangles} triangles; {folder / 'README.txt'} says how to render them"
     print(printable(f"{folder}: {done}"))
-
-
-def _scene_path(scene: str) -> Path:
-    """A file, or a scene of the checkout by its name. FileNotFoundError where it is neither."""
-    for path in (Path(scene), SCENES / f"{scene}.xml"):
-        if path.is_file():
-            return path
-    names = sorted(path.stem for path in SCENES.glob("*.xml"))
-    raise FileNotFoundError(f"{scene}: no such scene; expected {', '.join(['a file', *names])}")

@@ -1,4 +1,4 @@
-"""A connection to a Dask scheduler, whose failures are one line."""
+"""A Dask client: of a scheduler at an address, or of worker processes that are started here. Failures are one line."""
 
 from __future__ import annotations
 
@@ -6,27 +6,20 @@ import asyncio
 import contextlib
 import logging
 import re
-import threading
 import warnings
-from collections.abc import Callable, Iterator
-from concurrent import futures
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
+
+from mi_refract.io.errors import LostSchedulerError, MissingExtraError, NoWorkersError, UsageError
 
 from . import local_cluster
 
-Result = TypeVar("Result")
 PATIENCE = 6.0  # seconds until a scheduler must have answered
-_CLOSING = 2.0  # seconds
-_LOGGERS = ("distributed", "tornado", "asyncio")
 _EXPECTED = (
     "expected the address of a Dask scheduler, such as tcp://host:8786, or tls://host:8786 and the files of "
     "`distributed.comm.tls` in Dask's configuration"
 )
-
-
-class LostSchedulerError(ConnectionError):
-    """The scheduler has ended, or cannot be reached any more."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +35,9 @@ class ClusterTarget:
         return self.scheduler is not None or self.workers is not None
 
     def check(self) -> None:
-        """ValueError for options that exclude each other, ImportError without Dask."""
+        """UsageError for options that exclude each other, MissingExtraError without Dask."""
         if self.scheduler is not None and self.workers is not None:
-            raise ValueError("--scheduler and --workers; expected one of them")
+            raise UsageError("--scheduler and --workers; expected one of them")
         if self.given:
             _require_dask()
 
@@ -56,7 +49,7 @@ def _require_dask() -> None:
     try:
         import distributed  # noqa: F401
     except ModuleNotFoundError as error:
-        raise ImportError(
+        raise MissingExtraError(
             f"--scheduler and --workers need Dask ({error.name} is missing): pip install 'mi-refract[cluster]'"
         ) from None
 
@@ -67,14 +60,18 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
 
     The processes speak TLS. A client of a `tls://` scheduler takes certificates from Dask's configuration, and refuses
     every connection that is not encrypted. ConnectionError, one line, after PATIENCE where no scheduler answers;
-    ImportError without Dask; ValueError unless exactly one of the two is given.
+    MissingExtraError without Dask; UsageError unless exactly one of the two is given.
     """
     if (scheduler is None) == (workers is None):
-        raise ValueError("expected either --scheduler ADDRESS or --workers N")
+        raise UsageError("expected either --scheduler ADDRESS or --workers N")
     _require_dask()
     from distributed.security import Security
 
-    with _silent(), contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(warnings.catch_warnings())
+        warnings.simplefilter("ignore")  # of versions, large graphs: versions that matter are compared by `workers`
+        logging.disable(logging.CRITICAL)  # Dask's own messages: what matters of them is raised here
+        stack.callback(logging.disable, logging.NOTSET)
         if workers is not None:
             address, security = stack.enter_context(local_cluster.started(workers))
         else:
@@ -86,7 +83,7 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
             yield client
         finally:
             with contextlib.suppress(Exception):  # a scheduler that is gone
-                client.close(timeout=_CLOSING)
+                client.close(timeout=2.0)
 
 
 def _client(address: str, security: Any) -> Any:
@@ -100,8 +97,8 @@ def _client(address: str, security: Any) -> Any:
         # Results come from the workers themselves where these can be reached, else through the scheduler.
         return Client(address, security=security, timeout=PATIENCE, set_as_default=False, direct_to_workers=True)
     except Exception as error:
-        said = [" ".join(str(each).split()) for each in (error.__cause__, error) if each is not None]
-        text = re.sub(r"in <[^>]*>: ", "", next(filter(None, said), f"not within {PATIENCE:.0f} s"))
+        texts = [" ".join(str(cause).split()) for cause in (error.__cause__, error) if cause is not None]
+        text = re.sub(r"in <[^>]*>: ", "", next(filter(None, texts), f"not within {PATIENCE:.0f} s"))
         raise ConnectionError(f"--scheduler {address}: no Dask scheduler answers: {text[:200]}; {_EXPECTED}") from None
 
 
@@ -115,53 +112,26 @@ async def _kind(address: str, security: Any) -> str:
 
 
 @contextlib.contextmanager
-def _silent() -> Iterator[None]:
-    """Without Dask's own messages: what matters of them is raised or warned of here."""
-    loggers = [logging.getLogger(name) for name in _LOGGERS]
-    loggers += [logging.getLogger(name) for name in logging.root.manager.loggerDict if name.startswith("distributed.")]
-    before = [each.level for each in loggers]
-    for each in loggers:
-        each.setLevel(logging.CRITICAL + 1)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of versions, large graphs: versions that matter are compared by `workers`
-            yield
-    finally:
-        for each, level in zip(loggers, before, strict=True):
-            each.setLevel(level)
-
-
-@contextlib.contextmanager
-def scheduler_needed(client: Any) -> Iterator[None]:
-    """Within, whatever Dask raises where the scheduler of a client has gone is a LostSchedulerError, one line."""
-    from distributed import CancelledError
+def cluster_errors(client: Any) -> Iterator[None]:
+    """Within, Dask's errors are one line: LostSchedulerError where its scheduler has gone, NoWorkersError for a task
+    that has ended several workers.
+    """
+    from distributed import CancelledError, KilledWorker
     from distributed.comm import CommClosedError
 
     address = getattr(client.scheduler, "address", "") or "--scheduler"
-    lost = (
-        f"{address}: the Dask scheduler is gone, or has given up its tasks; expected one that runs, or none: then here"
-    )
+    lost = f"{address}: the Dask scheduler has ended or cancelled the tasks; run the same command again to resume"
     try:
         if client.status != "running":
             raise LostSchedulerError(lost)
         yield
+    except KilledWorker as error:
+        count, last = error.allowed_failures + 1, error.last_worker.address
+        text = f"{count} workers were lost that ran the same task, the last {last}"
+        raise NoWorkersError(f"{address}: {text}; expected workers with enough memory") from None
     except (CommClosedError, CancelledError):
         raise LostSchedulerError(lost) from None
     except (OSError, RuntimeError) as error:
         if client.status != "running" and not isinstance(error, LostSchedulerError):
             raise LostSchedulerError(lost) from None
         raise
-
-
-def in_thread(call: Callable[[], Result]) -> futures.Future[Result]:
-    """What `call` returns, some day: Dask waits for ever for a scheduler that hangs, or for data that is lost."""
-    found: futures.Future[Result] = futures.Future()
-
-    def run() -> None:
-        try:
-            found.set_result(call())
-        except BaseException as error:
-            found.set_exception(error)
-
-    threading.Thread(target=run, name="Dask", daemon=True).start()
-    return found

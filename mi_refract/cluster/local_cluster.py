@@ -1,4 +1,4 @@
-"""A Dask scheduler and workers of one thread each in a process of its own, which ends with ours, however that ends.
+"""A Dask scheduler and workers of one thread each, in a process of its own that ends with ours, however that ends.
 
 No signal that is blocked here is blocked in the workers. Certificate and key are made for this once: without them every
 user of this machine could have the workers run code. The process, `python -m mi_refract.cluster.local_cluster`, reads
@@ -19,6 +19,8 @@ import tempfile
 from collections.abc import Iterator
 from typing import Any
 
+from mi_refract.io.errors import NoWorkersError, UsageError
+
 MOST = 1024  # workers
 # Dask watches itself: its profiler and monitors would take 5 % of the workers' time from kernels.
 SETTINGS = {
@@ -26,24 +28,21 @@ SETTINGS = {
     "distributed.admin.system-monitor.interval": "10s",
     "distributed.admin.tick.interval": "1s",
 }
-MODULE = "mi_refract.cluster.local_cluster"
-_FAILED = "failed: "
-_ENDING = 10.0  # seconds
 
 
 @contextlib.contextmanager
 def started(workers: int) -> Iterator[tuple[str, Any]]:
     """The address of a scheduler with so many workers, and the `Security` of its clients. They end at the end.
 
-    ConnectionError, one line, where they cannot be started.
+    UsageError for a number out of range; NoWorkersError, one line, where they cannot be started.
     """
     from distributed.security import Security
 
     if not 1 <= workers <= MOST:
-        raise ValueError(f"--workers {workers}; expected a whole number from 1 to {MOST}")
+        raise UsageError(f"--workers {workers}; expected a whole number from 1 to {MOST}")
     security = Security.temporary()
     process = subprocess.Popen(
-        [sys.executable, "-P", "-m", MODULE],  # -P: no module of the working folder takes the place of one of ours
+        [sys.executable, "-P", "-m", __name__],  # -P: no module of the working folder takes the place of one of ours
         env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -53,18 +52,18 @@ def started(workers: int) -> Iterator[tuple[str, Any]]:
     assert process.stdin and process.stdout
     try:
         with contextlib.suppress(BrokenPipeError):
-            pickle.dump((workers, security), process.stdin)
+            process.stdin.write(pickle.dumps((workers, security)))
             process.stdin.flush()
-        said = process.stdout.readline().decode().strip()
-        if not said or said.startswith(_FAILED):
-            reason = said.removeprefix(_FAILED) or f"ended with status {process.wait()}"
-            raise ConnectionError(f"--workers {workers}: no local cluster: {reason}; expected fewer, or none")
-        yield said, security
+        answer = process.stdout.readline().decode().strip()
+        if not answer.startswith("tls://"):
+            reason = answer or f"ended with status {process.wait()}"
+            raise NoWorkersError(f"--workers {workers}: no local cluster: {reason}; expected fewer workers")
+        yield answer, security
     finally:
         with contextlib.suppress(BrokenPipeError):
             process.stdin.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(_ENDING)
+            process.wait(10.0)
         process.stdout.close()
 
 
@@ -92,7 +91,7 @@ def main() -> None:
         print(cluster.scheduler_address, flush=True)
         sys.stdin.buffer.read()
     except Exception as error:
-        print(f"{_FAILED}{type(error).__name__}: {' '.join(str(error).split())}", flush=True)
+        print(f"{type(error).__name__}: {' '.join(str(error).split())}", flush=True)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         if os.getpgrp() == os.getpid():  # workers are of our group: at once, whatever they render

@@ -5,15 +5,38 @@ from __future__ import annotations
 import contextlib
 import itertools
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from . import on_worker
-from .connection import scheduler_needed
+from .connection import cluster_errors
 from .workers import Workers
 
 AHEAD = 2  # calls for each thread of the workers
-_POLL, _FETCHED = 0.5, 20.0  # seconds
+_POLL, _FETCHED = 0.5, 30.0  # seconds
+
+
+def finished(client: Any, futures: Sequence[Any]) -> list[Any]:
+    """Those of the futures that are done, after waiting a little for one. Errors: those of `cluster_errors`."""
+    from distributed import wait
+
+    with contextlib.suppress(TimeoutError), cluster_errors(client), client.as_current():
+        wait(futures, timeout=_POLL, return_when="FIRST_COMPLETED")
+    return [future for future in futures if future.done()]
+
+
+def fetched(client: Any, future: Any) -> tuple[Any, ...]:
+    """(result,) of a future that is done; () where it was lost with its worker, and is being computed again.
+
+    The task's own error passes; errors of `cluster_errors`.
+    """
+    with cluster_errors(client):
+        try:
+            return (future.result(timeout=_FETCHED),)
+        except TimeoutError:
+            if future.status == "error":  # the task's own
+                raise
+            return ()
 
 
 def results(
@@ -25,8 +48,6 @@ def results(
     one. The errors of a call pass as they are; ConnectionError, one line, where the scheduler or all workers have gone,
     or where a call has ended several workers. What is begun and not finished is cancelled at the end.
     """
-    from distributed import KilledWorker, wait
-
     client, waiting = workers.client, enumerate(calls)
     begun: dict[Any, tuple[int, tuple[Any, ...], frozenset[str]]] = {}  # number, arguments, who may make the call
 
@@ -38,39 +59,25 @@ def results(
     try:
         while True:
             workers.look()
-            with scheduler_needed(client):
+            with cluster_errors(client):
                 for future, (number, arguments, allowed) in list(begun.items()):
                     # Dask would wait for these workers to come back.
                     if workers.accepted and allowed.isdisjoint(workers.accepted) and not future.done():
                         del begun[future]
                         client.cancel([future], force=True)
                         begin(number, arguments)
-            room = AHEAD * sum(workers.accepted.values()) - len(begun)
-            for number, arguments in itertools.islice(waiting, max(0, room)):
-                begin(number, arguments)
+                room = AHEAD * sum(workers.accepted.values()) - len(begun)
+                for number, arguments in itertools.islice(waiting, max(0, room)):
+                    begin(number, arguments)
             if not begun and workers.accepted:
                 return
             if not begun:
                 time.sleep(_POLL)
                 continue
-            with contextlib.suppress(TimeoutError), scheduler_needed(client), client.as_current():
-                wait(list(begun), timeout=_POLL, return_when="FIRST_COMPLETED")
-            for future in [each for each in begun if each.done()]:
-                number = begun[future][0]
-                try:
-                    with scheduler_needed(client):
-                        address, result = future.result(timeout=_FETCHED)
-                except KilledWorker as error:
-                    raise ConnectionError(
-                        f"task {number}: {error.allowed_failures + 1} workers were lost that ran it, the last "
-                        f"{error.last_worker.address}; expected workers with enough memory"
-                    ) from None
-                except TimeoutError:
-                    if future.status == "error":  # the call's own
-                        raise
-                    continue  # lost with the worker, and computed again
-                del begun[future]
-                yield number, result, workers.machines.get(address, address)
+            for future in finished(client, list(begun)):
+                for address, result in fetched(client, future):
+                    number = begun.pop(future)[0]
+                    yield number, result, workers.machines.get(address, address)
     finally:
         if begun and client.status == "running":
             client.cancel(list(begun), force=True)

@@ -13,11 +13,12 @@ The documented formulas take unit `a` and `n`; what those are off by, the result
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
 
-from mi_refract.numerics import Number, Vector3, as_component, ieee_divide
+from mi_refract.numerics import Mask, Number, Vector3, as_component, ieee_divide
 
 from .well_conditioned import Refracted
 
@@ -128,7 +129,11 @@ def refract_decomposed(a: Vector3, n: Vector3, k: Number) -> Refracted:
     return _conclude(a, n, c, radicand, b)
 
 
-def refract_2d(i: Any, l: Any, k: Number) -> tuple[list[Any], Any]:  # noqa: E741 (the document's names)
+def refract_2d(
+    i: Sequence[Number],
+    l: Sequence[Number],  # noqa: E741 (the document's names)
+    k: Number,
+) -> tuple[list[Number], Mask]:
     """Refract a 2D direction `i` at a boundary with direction `l`, by a change of basis.
 
     B = [[−l_y, l_x], [l_x, l_y]] turns `l` into (0, 1); B is its own inverse. With i_B = B i,

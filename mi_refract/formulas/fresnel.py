@@ -18,11 +18,13 @@ to 2²⁰; in float64 cosines above 1e-150, or 0.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
 
 from mi_refract.numerics import (
+    ArrayType,
     DoubleWord,
     Mask,
     Number,
@@ -102,17 +104,7 @@ def local_odds(ray: LocalCosines, transmitted: Mask, k: Number, contrast: Number
     return dr.fma(kappa * kappa, dr.fma(q, q, p * p), mirror), power * dr.fma(d_s, d_s, d_p * d_p)
 
 
-def reflectance(cos_i: Number, cos_t: Number, transmitted: Mask, k: Number, contrast: Number = None) -> Any:
-    """Unpolarised reflectance R = (r_s² + r_p²)/2; see `powers`."""
-    return powers(cos_i, cos_t, transmitted, k, contrast)[0]
-
-
-def transmittance(cos_i: Number, cos_t: Number, transmitted: Mask, k: Number, contrast: Number = None) -> Any:
-    """Unpolarised transmittance T = 1 − R, formed without that subtraction; see `powers`."""
-    return powers(cos_i, cos_t, transmitted, k, contrast)[1]
-
-
-def _through(lift: Any, transmitted: Mask, cos_t: Number) -> tuple[Any, Any]:
+def _through(lift: Callable[[Number], Number], transmitted: Mask, cos_t: Number) -> tuple[Any, Any]:
     """(cos_t or 0, about 0 or 1) where light is transmitted or not. NaN stays.
 
     Of float32 the 1e-300 leaves nothing: R ≤ 1e-300/16c⁴ at k = 1. It is there for a cos_t that underflowed to 0.
@@ -261,7 +253,7 @@ def _root(radicand: DoubleWord) -> Any:
     return dr.safe_sqrt(size.hi) if radicand.is_plain else size.sqrt().rounded()
 
 
-def _mueller(s2: Any, p2: Any, cross: Any) -> list[list[Any]]:
+def _mueller(s2: Number, p2: Number, cross: tuple[Number, Number]) -> list[list[Number]]:
     """From the powers of both waves and their interference a_p a_s*."""
     mean, half, re, im = 0.5 * (s2 + p2), 0.5 * (s2 - p2), cross[0], cross[1]
     return [[mean, half, 0, 0], [half, mean, 0, 0], [0, 0, re, -im], [0, 0, im, re]]
@@ -274,7 +266,7 @@ def _phase(x: Number, y: Number) -> tuple[Any, Any]:
     return (x - y) * (x + y), 2 * x * y
 
 
-def _complex_type(number: Any) -> Any:
+def _complex_type(number: Number) -> ArrayType:
     if isinstance(number, float):
         return dr.scalar.Complex2f64
     return dr.replace_shape_t(type(number), (2, -1), "complex")

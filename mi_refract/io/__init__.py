@@ -7,6 +7,7 @@ output of other programs, checked values; errors are one line that says what, wh
 __all__ = [
     "atomic",
     "bounded_map",
+    "errors",
     "exit_code",
     "image_file",
     "lock",

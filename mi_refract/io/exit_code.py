@@ -8,14 +8,19 @@ import sys
 import traceback
 from collections.abc import Callable
 
+from .errors import MiRefractError
 from .sanitise import printable
 
 MISUSE, INTERRUPTED = 2, 130
 TRACEBACK = "MI_REFRACT_TRACEBACK"  # environment variable: with "1" the traceback is printed as well
 
 
-def exit_code(name: str, body: Callable[[], int | None]) -> int:
-    """What `body()` returns, None as 0; 2 after any exception, and 130 after Ctrl-C.
+def exit_code(
+    name: str,
+    body: Callable[[], int | None],
+    interruptions: tuple[type[BaseException], ...] = (KeyboardInterrupt,),
+) -> int:
+    """What `body()` returns, None as 0; 2 after any exception, and 130 after Ctrl-C or one of `interruptions`.
 
     The exception is one line on stderr, `name: …`. What the body printed is on its way when this returns: a stdout
     that cannot be written is an exception as well. A standard stream that is closed is replaced by the null device, so
@@ -25,7 +30,7 @@ def exit_code(name: str, body: Callable[[], int | None]) -> int:
     try:
         code = body() or 0
         sys.stdout.flush()
-    except KeyboardInterrupt:
+    except interruptions:
         return INTERRUPTED
     except SystemExit as ended:
         if isinstance(ended.__context__, BrokenPipeError):  # rich ends the process with 1, as if that were a verdict
@@ -34,14 +39,15 @@ def exit_code(name: str, body: Callable[[], int | None]) -> int:
             return ended.code or 0
         return _failed(name, ValueError(ended.code))
     except Exception as error:
-        # Typer's parser raises errors of its own, in a module whose name depends on its version.
-        return INTERRUPTED if type(error).__name__ == "Abort" else _failed(name, error)
+        return _failed(name, error)
     return code
 
 
 def describe(error: BaseException) -> str:
     """An error in one line: its own words where it was raised for a reader, else its type as well."""
-    if hasattr(error, "format_message"):
+    if isinstance(error, MiRefractError):
+        text = str(error)
+    elif hasattr(error, "format_message"):  # typer's own errors, whose classes depend on its version
         text = error.format_message()
     elif isinstance(error, OSError) and error.errno and error.strerror:
         text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror

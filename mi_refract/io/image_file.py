@@ -9,7 +9,7 @@ import os
 import re
 import shlex
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import atomic
+from .errors import ImageError
 
 Metadata = dict[str, Any]
 SUFFIXES = (".exr",)
@@ -71,12 +72,9 @@ def _write(path: Path, pixels: NDArray[np.float32], channels: Sequence[str], att
     if not (output.close() and done):
         raise OSError(one_line(message or output.geterror()) or "OpenImageIO gives no reason")
     # On a full disk `close` is True all the same when the image was small enough for a buffer.
-    try:
-        complete = read_exr(path, pixels.size)[0].shape == pixels.shape
-    except ValueError:
-        complete = False
-    if not complete:
-        raise OSError("what was written cannot be read; is the disk full?")
+    source, rows = oiio.ImageInput.open(str(path)), pixels.shape[0]
+    if source is None or source.read_scanlines(0, 0, rows - 1, rows, 0, 0, pixels.shape[2], "float") is None:
+        raise OSError("the last row of pixels is missing; is the disk full?")
 
 
 def _attributes(path: Path, metadata: Mapping[str, str | int | float]) -> Metadata:
@@ -125,7 +123,7 @@ def read(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> Image:
     """
     image = read_parts(path, max_values, first_only=True)[0]
     if image.place:
-        raise ValueError(f"{path}: several parts or MIP levels in one file; expected one image")
+        raise ImageError(f"{path}: several parts or MIP levels in one file; expected one image")
     return image
 
 
@@ -145,7 +143,7 @@ def read_parts(
     try:
         return _images(path, source, kind, max_values, first_only, as_idiff)
     except MemoryError:
-        raise ValueError(f"{path}: more pixels than fit in memory") from None
+        raise ImageError(f"{path}: more pixels than fit in memory") from None
     finally:
         source.close()
 
@@ -166,15 +164,15 @@ def _checked(path: Path, max_values: int, multiplied: bool) -> tuple[Any, str]:
     try:
         str(path).encode()
     except UnicodeEncodeError:
-        raise ValueError(f"{path}: expected a name in UTF-8") from None
+        raise ImageError(f"{path}: expected a name in UTF-8") from None
     if path.exists() and not (path.is_file() or path.is_dir()):  # reading a pipe might never end
-        raise ValueError(f"{path}: expected a regular file")
+        raise ImageError(f"{path}: expected a regular file")
     with path.open("rb") as file:  # the operating system's own words for what is missing or forbidden
         begin = file.read(len(LFS_POINTER))
     if not begin:
-        raise ValueError(f"{path}: corrupt {kind} file: it is empty")
+        raise ImageError(f"{path}: corrupt {kind} file: it is empty")
     if begin == LFS_POINTER:
-        raise ValueError(f"{path}: a Git LFS pointer, not the image; `{_lfs_pull(path)}` brings it")
+        raise ImageError(f"{path}: a Git LFS pointer, not the image; `{_lfs_pull(path)}` brings it")
     # Others hold 8 bytes a value or fewer, and are asked below.
     return _opened(path, kind, max_values, max_values * (1 if begin.startswith(WHEN_OPENED) else 8), multiplied), kind
 
@@ -213,9 +211,9 @@ def _check_attributes(path: Path) -> None:
             _text(file)  # the type
             length = int.from_bytes(file.read(4), "little")
             if file.tell() + length > size:
-                raise ValueError(f"{path}: corrupt EXR file: an attribute of {length} bytes")
+                raise ImageError(f"{path}: corrupt EXR file: an attribute of {length} bytes")
             file.seek(length, os.SEEK_CUR)
-    raise ValueError(f"{path}: more than {ATTRIBUTES} attributes")
+    raise ImageError(f"{path}: more than {ATTRIBUTES} attributes")
 
 
 def _text(file: BinaryIO) -> bytes:
@@ -248,8 +246,8 @@ def _opened(
     if source is None:
         message = _without(path, oiio.geterror())
         if "MB limit" in message:
-            raise ValueError(f"{path}: {message}; expected up to {max_values} values{option}")
-        raise ValueError(f"{path}: corrupt {kind} file: {message}")
+            raise ImageError(f"{path}: {message}; expected up to {max_values} values{option}")
+        raise ImageError(f"{path}: corrupt {kind} file: {message}")
     return source
 
 
@@ -268,14 +266,6 @@ def named(name: str, pixels: Any) -> Image:
     return Image(Path(name), pixels, channels)
 
 
-def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Image]:
-    """Read several images, two at a time, as decompression takes most of the time. Raises what `read` raises."""
-    from concurrent.futures import ThreadPoolExecutor
-
-    with ThreadPoolExecutor(2) as pool:
-        return list(pool.map(read, paths))
-
-
 def _images(path: Path, source: Any, kind: str, most: int, first_only: bool, as_idiff: bool) -> list[Image]:
     """The images of an open file, in the order of parts and MIP levels, with their places."""
     found: list[Image] = []
@@ -285,7 +275,7 @@ def _images(path: Path, source: Any, kind: str, most: int, first_only: bool, as_
         if first_only:
             break
     if not found:
-        raise ValueError(f"{path}: corrupt {kind} file: {_without(path, source.geterror()) or 'no image'}")
+        raise ImageError(f"{path}: corrupt {kind} file: {_without(path, source.geterror()) or 'no image'}")
     several = found[-1].part[0] > 0 or (first_only and source.seek_subimage(1, 0))
     levelled = {image.part[0] for image in found if image.part[1]}
     levelled |= {0} if first_only and source.seek_subimage(0, 1) else set()
@@ -312,7 +302,7 @@ def _check_size(path: Path, spec: Any, max_values: int, taken: int = 0, option: 
     if spec.width * spec.height * spec.nchannels > max_values - taken:
         beside = f" beside {taken} of other parts and MIP levels" if taken else ""
         size = f"{spec.width} × {spec.height} × {spec.nchannels} values{beside}"
-        raise ValueError(f"{path}: {size}; expected up to {max_values} values{option}")
+        raise ImageError(f"{path}: {size}; expected up to {max_values} values{option}")
 
 
 def _image(path: Path, source: Any, kind: str, values: tuple[int, int], as_idiff: bool) -> Image:
@@ -320,22 +310,22 @@ def _image(path: Path, source: Any, kind: str, values: tuple[int, int], as_idiff
     spec = source.spec()
     found = source.format_name()
     if path.suffix[1:].lower() not in _endings(found) or found == "null":  # which is black, whatever the file holds
-        raise ValueError(f"{path}: holds an image of format {found}; expected the format that the name says")
+        raise ImageError(f"{path}: holds an image of format {found}; expected the format that the name says")
     if spec.deep:
-        raise ValueError(f"{path}: expected an image without deep samples")
+        raise ImageError(f"{path}: expected an image without deep samples")
     if min(spec.width, spec.height, spec.nchannels) < 1 or spec.depth > 1:
-        raise ValueError(f"{path}: {spec.width} × {spec.height} × {spec.depth} pixels; expected a plane with pixels")
+        raise ImageError(f"{path}: {spec.width} × {spec.height} × {spec.depth} pixels; expected a plane with pixels")
     _check_size(path, spec, *values)
     formats = {str(each) for each in (spec.channelformats or [spec.format])}
     if formats & {"uint64", "int64"}:
-        raise ValueError(f"{path}: integers of 64 bits; expected up to 32")
+        raise ImageError(f"{path}: integers of 64 bits; expected up to 32")
     if found == "tiff" and "double" in formats and spec.height == 1:  # OpenImageIO 2.4 to 3.2 reads what lay in memory
-        raise ValueError(f"{path}: one row of 64-bit numbers in a TIFF file; expected several rows, or 32 bits")
+        raise ImageError(f"{path}: one row of 64-bit numbers in a TIFF file; expected several rows, or 32 bits")
     wide = not as_idiff and formats & {"double", "uint32", "int32", "uint", "int"}
     at = source.current_subimage(), source.current_miplevel()
     pixels = source.read_image(*at, 0, spec.nchannels, "double" if wide else "float")
     if message := _without(path, source.geterror()) or ("" if pixels is not None else "no pixels"):
-        raise ValueError(f"{path}: corrupt {kind} file: {message}")
+        raise ImageError(f"{path}: corrupt {kind} file: {message}")
     pixels = np.asarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
     metadata = {attribute.name: attribute.value for attribute in spec.extra_attribs}
     display = (spec.full_x, spec.full_y, spec.full_width, spec.full_height)
@@ -364,7 +354,7 @@ def read_exr(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> tupl
     path = Path(path)
     with path.open("rb") as file:
         if file.read(4) != b"\x76\x2f\x31\x01":
-            raise ValueError(f"{path}: not an EXR file")
+            raise ImageError(f"{path}: not an EXR file")
     image = read(path, max_values)
     return image.pixels.astype(np.float32, copy=False), image.metadata | {"channels": image.channels}
 

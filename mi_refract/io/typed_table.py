@@ -2,6 +2,7 @@
 
 A field of a struct is a key: its annotation is the type, `Annotated[float, Meta(gt=0, description="…")]` adds limits
 and what the key means, its default makes it optional. The READMEs' tables of keys come from the same structs.
+Do not put a `pattern` for texts into a union with a list: msgspec 0.22 then frees a wrong pointer at exit.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import msgspec
@@ -16,7 +18,7 @@ import msgspec
 T = TypeVar("T")
 
 
-def parse_toml(text: str | bytes, kind: type[T], where: str) -> T:
+def parse_toml(text: str | bytes, kind: type[T], where: str, *, infinite: bool = False) -> T:
     """The value of type `kind` that the TOML holds. ValueError as of `convert`, or for what is not TOML."""
     try:
         document = tomllib.loads(text if isinstance(text, str) else text.decode())
@@ -24,43 +26,61 @@ def parse_toml(text: str | bytes, kind: type[T], where: str) -> T:
         raise ValueError(f"{where}: brackets nested too deeply; expected TOML") from None
     except ValueError as error:
         raise ValueError(f"{where}: {error}; expected TOML") from None
-    return convert(document, kind, where)
+    return convert(document, kind, where, infinite=infinite)
 
 
-def convert(value: Any, kind: type[T], where: str) -> T:
-    """A tree of dicts and lists as a value of type `kind`.
+def convert(value: Any, kind: type[T], where: str, *, infinite: bool = False) -> T:
+    """A tree of dicts and lists as a value of type `kind`; `infinite`: numbers may be.
 
-    ValueError is one line: `where`, the path of the key, what it is, what was expected. NaN and infinity are refused.
+    ValueError is one line: `where`, the path of the key, what it is, what was expected. NaN is refused.
     """
     try:
-        _check_finite(value, "$")
+        _check_finite(value, "$", infinite)
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
         message, _, path = str(error).partition(" - at `")
-        key = re.sub(r"^\$\.?", "", path.removesuffix("`"))
+        key = re.sub(r"^(key` in `)?\$\.?", "", path.removesuffix("`"))
         message = f"{message[0].lower()}{message[1:]}"
+        if message.startswith("object contains unknown field") and not key:
+            message = f"unknown key{message[29:]}; expected {', '.join(getattr(kind, '__struct_fields__', ()))}"
         raise ValueError(" ".join(f"{where}: {f'{key}: ' if key else ''}{message}".split())) from None
 
 
-def _check_finite(value: Any, path: str) -> None:
-    if isinstance(value, float) and not math.isfinite(value):
+def _check_finite(value: Any, path: str, infinite: bool) -> None:
+    if isinstance(value, float) and not math.isfinite(value) and not (infinite and math.isinf(value)):
         raise msgspec.ValidationError(f"Expected a finite number, got {value} - at `{path}`")
     if isinstance(value, dict | list):
         items = value.items() if isinstance(value, dict) else enumerate(value)
         for key, item in items:
-            _check_finite(item, f"{path}[{key}]" if isinstance(value, list) else f"{path}.{key}")
+            _check_finite(item, f"{path}[{key}]" if isinstance(value, list) else f"{path}.{key}", infinite)
 
 
 def key_table(title: str, kind: type[msgspec.Struct]) -> str:
     """A Markdown table of the keys of a struct: name, type with its limits, meaning, default."""
+    rows = [f"| `{name}` | {accepted} | {meaning} |" for name, accepted, meaning in _keys(kind)]
+    return "\n".join([f"| {title} | type | meaning |", "|---|---|---|", *rows])
+
+
+def kind_table(title: str, kinds: Iterable[type[msgspec.Struct]], shared: type[msgspec.Struct] = msgspec.Struct) -> str:
+    """A Markdown table of tagged structs: tag, first line of the docstring, and keys that `shared` lacks."""
     rows = []
+    for kind in kinds:
+        own = [f"`{key[0]}` ({key[1]}) {key[2]}" for key in _keys(kind) if key not in _keys(shared)]
+        meaning = (kind.__doc__ or "").partition("\n")[0].rstrip(".")
+        rows.append(f"| `{kind.__struct_config__.tag}` | {meaning} | {'; '.join(own)} |")
+    return "\n".join([f"| {title} | what it is | its keys |", "|---|---|---|", *rows])
+
+
+def _keys(kind: type[msgspec.Struct]) -> list[tuple[str, str, str]]:
+    """Name, type, and meaning with the default, of each key."""
+    keys = []
     for field in msgspec.inspect.type_info(kind).fields:  # type: ignore[attr-defined]
         described = isinstance(field.type, msgspec.inspect.Metadata)
         schema = field.type.extra_json_schema or {} if described else {}
         bare = field.type.type if described else field.type
         default = "" if field.required or field.default in (None, msgspec.NODEFAULT) else f"; default {field.default!r}"
-        rows.append(f"| `{field.encode_name}` | {_type_text(bare)} | {schema.get('description', '')}{default} |")
-    return "\n".join([f"| {title} | type | meaning |", "|---|---|---|", *rows])
+        keys.append((field.encode_name, _type_text(bare), f"{schema.get('description', '')}{default}"))
+    return keys
 
 
 _WORDS = {"Str": "text", "Float": "number", "Int": "whole number", "Bool": "true or false", "Dict": "table"}
@@ -71,7 +91,8 @@ def _type_text(kind: Any) -> str:
     """A type as a reader of the table understands it, e.g. `number > 0` or `list of texts`."""
     name = type(kind).__name__.removesuffix("Type")
     if name == "Union":
-        return " or ".join(_type_text(each) for each in kind.types if not isinstance(each, msgspec.inspect.NoneType))
+        texts = (_type_text(each) for each in kind.types if not isinstance(each, msgspec.inspect.NoneType))
+        return " or ".join(dict.fromkeys(texts))
     if name == "Literal":
         return ", ".join(f"`{value}`" for value in kind.values)
     if name in ("List", "VarTuple"):

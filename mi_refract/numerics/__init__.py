@@ -30,6 +30,7 @@ from .types import (
     Shape,
     Spectrum,
     Texture,
+    Values,
     Variant,
     Vector3,
 )
@@ -56,6 +57,7 @@ __all__ = [
     "Spectrum",
     "Texture",
     "TripleWord",
+    "Values",
     "Variant",
     "Vector3",
     "aligned",

@@ -67,7 +67,7 @@ def ieee_divide(x: Number, y: Number) -> Number:
     return x / y
 
 
-def differentiated(x: Any) -> bool:
+def differentiated(x: Number | Vector3) -> bool:
     """Whether `x` carries a derivative. The type is checked first, as asking Dr.Jit takes ten times as long."""
     return dr.is_diff_v(x) and dr.grad_enabled(x)
 

@@ -11,7 +11,6 @@ Sources: Knuth, TAOCP 2, 4.2.2 (two_sum); Ogita, Rump, Oishi 2005 (dot); Kahan, 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
@@ -61,11 +60,11 @@ class DoubleWord:
         return DoubleWord(*two_prod(x, y))
 
     @staticmethod
-    def of(x: Any) -> DoubleWord:
+    def of(x: DoubleWord | Number) -> DoubleWord:
         """`x` itself, or a plain number without a low part."""
         return x if isinstance(x, DoubleWord) else DoubleWord(x)
 
-    def __add__(self, other: Any) -> DoubleWord:
+    def __add__(self, other: DoubleWord | Number) -> DoubleWord:
         """AccurateDWPlusDW of Joldes, Muller, Popescu 2017; `other` may be a plain number."""
         # Right also where the high parts cancel.
         other = DoubleWord.of(other)
@@ -80,11 +79,11 @@ class DoubleWord:
         """−x, exactly."""
         return DoubleWord(-self.hi, -self.lo)
 
-    def __sub__(self, other: Any) -> DoubleWord:
+    def __sub__(self, other: DoubleWord | Number) -> DoubleWord:
         """x − y as x + (−y)."""
         return self + -DoubleWord.of(other)
 
-    def __mul__(self, other: Any) -> DoubleWord:
+    def __mul__(self, other: DoubleWord | Number) -> DoubleWord:
         """x y; `other` may be a plain number."""
         # lo · lo and the last normalisation are left out: |lo| ≤ 3u |hi| for normalised factors.
         other = DoubleWord.of(other)

@@ -9,29 +9,29 @@ Ogita, Rump, Oishi 2005 (repeated VecSum).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from .error_free import two_sum
+from .types import Number, Vector3
 
-FloatExpansion = list[Any]
+FloatExpansion = list[Number]
 # Splits the 53 bits of a float64 in two halves, whose products are exact.
 _SPLITTER = 2.0**27 + 1
 
 
-def two_prod(x: Any, y: Any) -> tuple[Any, Any]:
+def two_prod(x: Number, y: Number) -> tuple[Number, Number]:
     """p = fl(x y) and e with p + e = x y exactly. float64 only."""
     (x_hi, x_lo), (y_hi, y_lo) = _split(x), _split(y)
     p = x * y
     return p, ((x_hi * y_hi - p) + x_hi * y_lo + x_lo * y_hi) + x_lo * y_lo
 
 
-def _split(x: Any) -> tuple[Any, Any]:
+def _split(x: Number) -> tuple[Number, Number]:
     c = _SPLITTER * x
     hi = c - (c - x)
     return hi, x - hi
 
 
-def distil(terms: Sequence[Any], words: int = 3) -> FloatExpansion:
+def distil(terms: Sequence[Number], words: int = 3) -> FloatExpansion:
     """The sum of m `terms` in `words` floats: error ≤ (m u)^words Σ|terms|; exact where `words` floats can hold it.
 
     Every pass takes the float sum out and leaves its exact rounding errors behind.
@@ -53,9 +53,9 @@ def distil(terms: Sequence[Any], words: int = 3) -> FloatExpansion:
     return taken
 
 
-def product(x: Any, y: Any, words: int = 3) -> FloatExpansion:
+def product(x: FloatExpansion, y: FloatExpansion, words: int = 3) -> FloatExpansion:
     """x y of two expansions: relative error ≤ 16 u^words."""
-    terms: list[Any] = []
+    terms: FloatExpansion = []
     for i, x_i in enumerate(x):
         for j, y_j in enumerate(y):
             if i + j < words:
@@ -63,12 +63,12 @@ def product(x: Any, y: Any, words: int = 3) -> FloatExpansion:
     return distil(terms, words)
 
 
-def negated(x: Any) -> FloatExpansion:
+def negated(x: Sequence[Number]) -> FloatExpansion:
     """−x of an expansion."""
     return [-x_i for x_i in x]
 
 
-def quotient(x: Any, y: Any, words: int = 2) -> FloatExpansion:
+def quotient(x: FloatExpansion, y: FloatExpansion, words: int = 2) -> FloatExpansion:
     """x / y of two expansions, by long division: relative error ≤ 16 u^words."""
     digits, rest = [], list(x)
     for _ in range(words):
@@ -78,11 +78,11 @@ def quotient(x: Any, y: Any, words: int = 2) -> FloatExpansion:
     return distil(digits, words)
 
 
-def dot(x: Any, y: Any, words: int = 3) -> FloatExpansion:
+def dot(x: Vector3, y: Vector3, words: int = 3) -> FloatExpansion:
     """x · y of two vectors of floats, and 0 where it is 0. One word more than asked for is kept for what cancels."""
     return distil([part for x_i, y_i in zip(x, y, strict=True) for part in two_prod(x_i, y_i)], words + 1)[:words]
 
 
-def cross(x: Any, y: Any, words: int = 3) -> list[FloatExpansion]:
+def cross(x: Vector3, y: Vector3, words: int = 3) -> list[FloatExpansion]:
     """x × y of two 3-vectors of floats, each component as `dot` has it."""
     return [dot((x[i], x[j]), (y[j], -y[i]), words) for i, j in ((1, 2), (2, 0), (0, 1))]

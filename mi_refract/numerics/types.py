@@ -9,6 +9,8 @@ from typing import Any, TypeAlias
 
 # A Python float, or a Dr.Jit float array of N entries (scalar, LLVM, CUDA; float32 or float64; with or without AD).
 Number: TypeAlias = Any
+# A number, or a numpy array with an entry for each ray.
+Values: TypeAlias = Any
 # Three `Number`s of one type, as `mi.Vector3f` or `drjit.llvm.Array3f` holds them; v.x, v.y, v.z or v[0], v[1], v[2].
 Vector3: TypeAlias = Any
 # A Python bool, or a Dr.Jit array of N of them.

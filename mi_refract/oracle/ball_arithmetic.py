@@ -17,15 +17,19 @@ Arithmetic: F. Johansson, "Arb: efficient arbitrary-precision midpoint-radius in
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from flint import arb, ctx
+from numpy.typing import ArrayLike, NDArray
 
-from .arguments import checked, floats, rays
-from .progress import watched
+Array = NDArray[np.float64]
+Ball: TypeAlias = Any  # a `flint.arb`
+Ray = tuple[float, float, float, float, float, float, float, float | None]  # a, n, k, contrast
+Polynomials = tuple[Ball, ...]  # of the law, see `_exact`
 
 # The radicand of float64 inputs has its bits between 2^±12600: twice n·a (2 × 4200) and k² (4200).
 EXACT_BITS = 16384
@@ -34,6 +38,9 @@ PRECISIONS = (160, 320, 640)
 MAX_RADIUS = 1e-30
 # |x| ≤ 1 as a pair of doubles: |x − high| ≤ 2⁻⁵⁴, so |x − high − low| ≤ 2⁻¹⁰⁸. Two bits spare for the radius.
 PAIR_ERROR = 2.0**-106
+
+CHUNK = 256  # rays between two steps of the progress bar
+MANY = 100_000  # rays from which a progress bar is shown: about two seconds
 
 _COLUMNS = 18
 _FIRST_FRESNEL = 10
@@ -57,18 +64,18 @@ class Certified:
     A ray with a or n zero or not finite, or k not finite and positive, has NaN numbers and both masks False.
     """
 
-    direction: np.ndarray  # (N, 3) float64
-    direction_low: np.ndarray  # (N, 3) float64
-    radius: np.ndarray  # (N,) float64
+    direction: np.ndarray  # (N, 3)
+    direction_low: np.ndarray  # (N, 3)
+    radius: np.ndarray  # (N,)
     transmitted: np.ndarray  # (N,) bool
     undecided: np.ndarray  # (N,) bool: no precision sufficed, all numbers NaN; impossible for doubles
-    cos_i: np.ndarray  # (N,) float64
-    cos_t: np.ndarray  # (N,) float64
-    reflectance: np.ndarray  # (N,) float64, as all below NaN without `fresnel`
+    cos_i: np.ndarray  # (N,)
+    cos_t: np.ndarray  # (N,)
+    reflectance: np.ndarray  # (N,), as all below NaN without `fresnel`
     reflectance_low: np.ndarray
     transmittance: np.ndarray
     transmittance_low: np.ndarray
-    amplitude_s: np.ndarray  # (N,) complex128, to 1e-16
+    amplitude_s: np.ndarray  # (N,) complex, to 1e-16
     amplitude_p: np.ndarray
 
     def __len__(self) -> int:
@@ -76,31 +83,42 @@ class Certified:
         return len(self.radius)
 
 
-def refract(a: Any, n: Any, k: Any, *, contrast: Any = None, fresnel: bool = True, progress: bool = True) -> Certified:
+def refract(
+    a: ArrayLike,
+    n: ArrayLike,
+    k: ArrayLike,
+    *,
+    contrast: ArrayLike | None = None,
+    fresnel: bool = True,
+    progress: bool = True,
+) -> Certified:
     """Solve Snell's law, sin θt = k sin θi in the plane of a and n, for exactly these numbers.
 
     a: (N, 3) float32 or float64, incident, toward the surface, any length. n: (N, 3), normal on either side,
     any length. k: number or (N,), n_from/n_to. contrast: number or (N,), k² − 1 where it is known better than
     k knows it: the problem solved then has k = √(1 + contrast). `fresnel=False` leaves the Fresnel terms NaN.
-    `progress` shows a bar on a terminal's stderr once two seconds have passed.
+    `progress` shows a bar on a terminal's stderr for 100,000 rays or more.
 
     D = 0 is transmitted along the surface; n·a = 0 is tangential, not transmitted, b = a.
     Raises ValueError on a wrong shape or dtype; never on a value.
     """
     a, n, k, contrast, valid = checked(a, n, k, contrast)
     table = np.full((len(a), _COLUMNS), math.nan)
-    for chunk in watched(len(a), progress):
-        index = np.flatnonzero(valid[chunk]) + chunk.start
+    chunks: Iterable[int] = range(0, len(a), CHUNK)
+    if progress and len(a) >= MANY and sys.stderr.isatty():
+        chunks = _with_bar(chunks)
+    for first in chunks:
+        index = first + np.flatnonzero(valid[first : first + CHUNK])
         _fill(table, index, (_exact(*ray) for ray in rays(a, n, k, contrast, index)), fresnel)
     return _certified(table, valid)
 
 
-def fresnel(cos_i: Any, k: Any, *, contrast: Any = None) -> Certified:
+def fresnel(cos_i: ArrayLike, k: ArrayLike, *, contrast: ArrayLike | None = None) -> Certified:
     """As `refract`, of rays known by their cosine alone, for exactly these numbers; directions are NaN.
 
     cos_i: (N,) float32 or float64. Rays whose cosine is outside 0 … 1 are invalid. Raises as `refract` does.
     """
-    cos_i = floats("cos_i", cos_i, ("N",))
+    cos_i = _floats("cos_i", cos_i, ("N",))
     axis = np.tile([0.0, 0.0, 1.0], (len(cos_i), 1))
     _, _, k, contrast, valid = checked(axis, axis, k, contrast)
     valid &= (cos_i >= 0) & (cos_i <= 1)
@@ -111,7 +129,54 @@ def fresnel(cos_i: Any, k: Any, *, contrast: Any = None) -> Certified:
     return _certified(table, valid)
 
 
-def _fill(table: np.ndarray, index: np.ndarray, polynomials: Iterator[tuple], fresnel: bool) -> None:
+def _with_bar(chunks: Iterable[int]) -> Iterable[int]:
+    """The same, with a progress bar on stderr, where rich is installed."""
+    try:
+        from rich.console import Console
+        from rich.progress import track
+    except ImportError:
+        return chunks
+    return track(chunks, "oracle", console=Console(stderr=True), transient=True)
+
+
+# Arguments ---------------------------------------------------------------------------------------------------------
+
+
+def checked(
+    a: ArrayLike, n: ArrayLike, k: ArrayLike, contrast: ArrayLike | None
+) -> tuple[Array, Array, Array, Array | None, NDArray[np.bool_]]:
+    """Check shapes and dtypes; float64 arrays (it holds float32 exactly) and the mask of valid rays."""
+    a = _floats("a", a, ("N", 3))
+    count = len(a)
+    n, k = _floats("n", n, (count, 3)), np.broadcast_to(_floats("k", k, (), (count,)), (count,))
+    valid = np.isfinite(a).all(axis=1) & np.isfinite(n).all(axis=1) & a.any(axis=1) & n.any(axis=1)
+    valid &= np.isfinite(k) & (k > 0)
+    if contrast is not None:
+        contrast = np.broadcast_to(_floats("contrast", contrast, (), (count,)), (count,))
+        valid &= np.isfinite(contrast) & (contrast > -1)
+    return a, n, k, contrast, valid
+
+
+def _floats(name: str, x: ArrayLike, *shapes: tuple[int | str, ...]) -> Array:
+    """`x` as float64, exactly. One of `shapes`, where "N" is any length."""
+    x = np.asarray(float(x) if isinstance(x, int) else x)
+    fits = any(len(s) == x.ndim and all(map(lambda w, m: w in ("N", m), s, x.shape)) for s in shapes)
+    if x.dtype not in (np.float32, np.float64) or not fits:
+        expected = " or ".join(f"({', '.join(map(str, s))})" if s else "a number" for s in shapes)
+        raise ValueError(f"oracle: {name} is {x.dtype} {x.shape}; expected float32 or float64, {expected}")
+    return x.astype(np.float64)
+
+
+def rays(a: Array, n: Array, k: Array, contrast: Array | None, index: NDArray[np.intp]) -> Iterator[Ray]:
+    """The rays with these indices, as Python floats."""
+    columns = [x.tolist() for x in (*a[index].T, *n[index].T, k[index])]
+    return zip(*columns, [None] * len(index) if contrast is None else contrast[index].tolist(), strict=True)
+
+
+# The law -----------------------------------------------------------------------------------------------------------
+
+
+def _fill(table: Array, index: NDArray[np.intp], polynomials: Iterator[Polynomials], fresnel: bool) -> None:
     """Solve the rays of these polynomials, one precision after the other, into their rows of the table."""
     with ctx.workprec(EXACT_BITS):
         pending = list(zip(index, polynomials, strict=True))
@@ -125,7 +190,7 @@ def _fill(table: np.ndarray, index: np.ndarray, polynomials: Iterator[tuple], fr
     table[[i for i, _ in pending]] = math.nan
 
 
-def _certified(table: np.ndarray, valid: np.ndarray) -> Certified:
+def _certified(table: Array, valid: NDArray[np.bool_]) -> Certified:
     fresnel = table[:, _FIRST_FRESNEL:]
     return Certified(
         direction=table[:, 0:3].copy(),
@@ -144,7 +209,7 @@ def _certified(table: np.ndarray, valid: np.ndarray) -> Certified:
     )
 
 
-def _exact(ax: Any, ay: Any, az: Any, nx: Any, ny: Any, nz: Any, k: float, contrast: float | None) -> tuple:
+def _exact(ax: Ball, ay: Ball, az: Ball, nx: Ball, ny: Ball, nz: Ball, k: float, contrast: float | None) -> Polynomials:
     """The polynomials of the law, exact at EXACT_BITS: c, A, N, AN, c², |n×a|², k²−1, k², D, t, n."""
     ax, ay, az, nx, ny, nz = arb(ax), arb(ay), arb(az), arb(nx), arb(ny), arb(nz)
     if contrast is None:
@@ -164,7 +229,7 @@ def _exact(ax: Any, ay: Any, az: Any, nx: Any, ny: Any, nz: Any, k: float, contr
     return c, aa, nn, aann, c2, s2, e, k2, d, tx, ty, tz, nx, ny, nz
 
 
-def _exact_of_cosine(cos_i: float, k: float, contrast: float | None) -> tuple:
+def _exact_of_cosine(cos_i: float, k: float, contrast: float | None) -> Polynomials:
     """The same of unit vectors at this cosine; the direction is left out."""
     c = arb(cos_i)
     e = arb(k) * k - 1 if contrast is None else arb(contrast)
@@ -173,7 +238,7 @@ def _exact_of_cosine(cos_i: float, k: float, contrast: float | None) -> tuple:
     return c, arb(1), arb(1), arb(1), c2, s2, e, e + 1, c2 - e * s2, *[arb(0)] * 6
 
 
-def _solve(polynomials: tuple, fresnel: bool) -> tuple[float, ...]:
+def _solve(polynomials: Polynomials, fresnel: bool) -> tuple[float, ...]:
     """One ray at the working precision: a row of the table."""
     c, aa, nn, aann, _, _, _, k2, d, tx, ty, tz, nx, ny, nz = polynomials
     tangential, total = c == 0, d < 0
@@ -201,7 +266,7 @@ def _solve(polynomials: tuple, fresnel: bool) -> tuple[float, ...]:
     return x, y, z, *low, radius, float(transmitted), cos_i, cos_t, *terms
 
 
-def _fresnel(polynomials: tuple, k: Any, root: Any, tangential: bool) -> tuple[float, ...]:
+def _fresnel(polynomials: Polynomials, k: Ball, root: Ball, tangential: bool) -> tuple[float, ...]:
     """R, 1 − R as pairs, then a_s and a_p as real and imaginary part, with C = |c|, Q = √|D|.
 
     Nothing cancels that is not exact (k²C² − D = (k²−1)AN, C² − k²D = (k²−1)(|n×a|² − D)):
@@ -231,7 +296,7 @@ def _fresnel(polynomials: tuple, k: Any, root: Any, tangential: bool) -> tuple[f
     return r, float(reflectance - r), t, float(transmittance - t), float(a_s), 0.0, float(a_p), 0.0
 
 
-def relative_radicand(a: Any, n: Any, k: Any) -> np.ndarray:
+def relative_radicand(a: ArrayLike, n: ArrayLike, k: ArrayLike) -> Array:
     """(N,) how far each ray is from the critical angle: D / max(c², |k²−1| |n×a|²), from −1 to 1, to 2⁻⁵³ of itself.
 
     Exactly 0 at the critical angle, negative under total internal reflection; NaN where both terms are 0 or the ray

@@ -7,10 +7,14 @@ first term, whose coefficients are balls. √D, D > 0 the radicand of `oracle`, 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
 import numpy as np
 from flint import arb, arb_series, ctx
+from numpy.typing import ArrayLike
+
+Series: TypeAlias = Any  # a `flint.arb_series`, or a ball
 
 # As many bits as the widest radicand of float32 inputs needs to be exact, and enough for float64 unless it cancels
 # to less than 2⁻⁶⁰⁰ of its terms; what a ball cannot decide is NaN.
@@ -18,27 +22,35 @@ BITS = 1200
 MAX_RADIUS = 1e-25
 
 
-def derivative(a: Any, n: Any, k: Any, along_a: Any, along_k: Any) -> np.ndarray:
+def derivative(a: ArrayLike, n: ArrayLike, k: ArrayLike, along_a: ArrayLike, along_k: ArrayLike) -> np.ndarray:
     """(N, 3): d/dε of b for a + ε along_a and k + ε along_k, where b keeps the length of `a`.
 
     a, n, along_a: (N, 3) of any lengths; k, along_k: (N,) or numbers. At n·a = 0 and D = 0 there is none: NaN.
     Under total internal reflection it is that of the mirror direction.
     """
-    return _each(_direction, 3, a, n, k, along_a, along_k)
+    return _by_series(_direction, 3, a, n, k, along_a, along_k)
 
 
-def derivative_of_powers(cos_i: Any, k: Any, along_cos: Any, along_k: Any) -> np.ndarray:
+def derivative_of_powers(cos_i: ArrayLike, k: ArrayLike, along_cos: ArrayLike, along_k: ArrayLike) -> np.ndarray:
     """(N,): d/dε of the unpolarised reflectance R, and so of −T, for cos_i + ε along_cos and k + ε along_k."""
-    zeros = np.zeros((len(cos_i), 3))
-    return _each(
-        _reflectance, 1, zeros + np.reshape(cos_i, (-1, 1)), zeros, k, zeros + np.reshape(along_cos, (-1, 1)), along_k
-    )[:, 0]
+    zeros = np.zeros((len(np.asarray(cos_i)), 3))
+    a, along_a = (zeros + np.reshape(x, (-1, 1)) for x in (cos_i, along_cos))
+    return _by_series(_reflectance, 1, a, zeros, k, along_a, along_k)[:, 0]
 
 
-def _each(solve: Any, width: int, a: Any, n: Any, k: Any, along_a: Any, along_k: Any) -> np.ndarray:
+def _by_series(
+    solve: Callable[[list[Series], list[float], Series], list[Series]],
+    width: int,
+    a: ArrayLike,
+    n: ArrayLike,
+    k: ArrayLike,
+    along_a: ArrayLike,
+    along_k: ArrayLike,
+) -> np.ndarray:
+    """(N, width): `solve` of each ray, as the coefficients of ε; NaN where a ball is too wide."""
     a, n, along_a = (np.asarray(x, np.float64) for x in (a, n, along_a))
     k, along_k = (np.broadcast_to(np.asarray(x, np.float64), len(a)) for x in (k, along_k))
-    found = np.full((len(a), width), math.nan)
+    result = np.full((len(a), width), math.nan)
     before = ctx.cap
     ctx.cap = 2
     try:
@@ -47,17 +59,17 @@ def _each(solve: Any, width: int, a: Any, n: Any, k: Any, along_a: Any, along_k:
                 vector = [arb_series([row[j], row[3 + j]]) for j in range(3)]
                 balls = solve(vector, row[6:9], arb_series([row[9], row[10]]))
                 if all(float(x.rad()) <= MAX_RADIUS * max(1.0, abs(float(x))) for x in balls):
-                    found[i] = [float(x) for x in balls]
+                    result[i] = [float(x) for x in balls]
     finally:
         ctx.cap = before
-    return found
+    return result
 
 
-def _dot(x: list, y: list) -> Any:
+def _dot(x: list[Series], y: list[Series]) -> Series:
     return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
 
 
-def _direction(a: list, n: list, k: Any) -> list:
+def _direction(a: list[Series], n: list[Series], k: Series) -> list[Series]:
     """b = (k t + s √D n)/N, t = N a − c n; b = (t − c n)/N where nothing is transmitted."""
     n = [arb(x) for x in n]
     c, square = _dot(n, a), _dot(n, n)
@@ -73,7 +85,7 @@ def _direction(a: list, n: list, k: Any) -> list:
     return [x[1] for x in b]
 
 
-def _reflectance(cosine: list, _: list, k: Any) -> list:
+def _reflectance(cosine: list[Series], _: list[Series], k: Series) -> list[Series]:
     """(r_s² + r_p²)/2 from the amplitudes as printed: at BITS bits nothing needs saving."""
     c = cosine[0]
     d = k * k * c * c - (k * k - 1)

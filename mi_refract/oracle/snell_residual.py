@@ -4,26 +4,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from flint import arb, ctx
+from numpy.typing import ArrayLike, NDArray
 
-from .arguments import checked, rays
-from .ball_arithmetic import EXACT_BITS, PRECISIONS, Certified
+from .ball_arithmetic import EXACT_BITS, PRECISIONS, Array, Ball, Certified, Ray, checked, rays
 
 MAX_RESIDUAL = 1e-28
 
 
 @dataclass(frozen=True)
 class Residual:
-    """What Snell's law says of a certified answer: `holds` (N,) bool, `width` (N,) of its widest ball."""
+    """Whether certified answers satisfy Snell's law: `holds` (N,), and `width` (N,) of the widest ball."""
 
-    holds: np.ndarray
-    width: np.ndarray
+    holds: NDArray[np.bool_]
+    width: Array
 
 
-def residual(a: Any, n: Any, k: Any, certified: Certified, *, contrast: Any = None) -> Residual:
+def residual(
+    a: ArrayLike, n: ArrayLike, k: ArrayLike, certified: Certified, *, contrast: ArrayLike | None = None
+) -> Residual:
     """Put a certified answer back into the law; arguments as for `refract`.
 
     With u = n/|n|, i = a/|a| and ratio = k (transmitted) or 1, in balls around the answer:
@@ -46,7 +47,7 @@ def residual(a: Any, n: Any, k: Any, certified: Certified, *, contrast: Any = No
     return Residual(holds, width)
 
 
-def _law(ray: tuple, high: list, low: list, radius: float, transmitted: bool) -> list:
+def _law(ray: Ray, high: list[float], low: list[float], radius: float, transmitted: bool) -> list[Ball]:
     """The four balls of `residual`; none where the flag is wrong."""
     with ctx.workprec(EXACT_BITS):
         ax, ay, az, nx, ny, nz = (arb(x) for x in ray[:6])

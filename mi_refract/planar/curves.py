@@ -48,7 +48,7 @@ class Curve:
     @property
     def straight(self) -> NDArray[np.bool_]:
         """Which pieces are straight, M."""
-        return (self.weight == 1) & (self.control == (self.start + self.end) / 2).all(1)
+        return np.asarray((self.weight == 1) & (self.control == (self.start + self.end) / 2).all(1))
 
     def _piece(self, j: int) -> Curve:
         vertices = np.stack([self.start[j], self.end[j]])

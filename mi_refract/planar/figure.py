@@ -20,12 +20,11 @@ from mi_refract.io.atomic import write_atomically
 from mi_refract.io.pixels import srgb_encode
 from mi_refract.io.sanitise import printable
 
-from .figure_geometry import SHARED, Legs, View, around, curves, density, legs
-from .light import Light, linear_srgb
+from .figure_geometry import SHARED, Legs, around, curves, density, legs
+from .light import linear_srgb
 from .path_tree import Branches, count, summary
-from .paths import Event
 from .scene_file import PlanarScene
-from .segments import Segments
+from .segments import Event, Segments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -101,7 +100,10 @@ def build_figure(scene: PlanarScene, traced: Sequence[Branches], dpi: float) -> 
     from matplotlib.figure import Figure
 
     view = scene.view or around(scene, traced)
-    width, height = _size(view)
+    # Without its caption, in inches: of about the same area for every view.
+    ratio = min(max((view[1] - view[0]) / (view[3] - view[2]), 0.25), 4)
+    height = min(5.2 / ratio**0.5, 7.0)
+    width, height = max(height * ratio, 3.6) + 0.6, height + 0.95
     caption = _caption(scene, traced, int(14 * width))
     drawn = Figure((width, height + LINE * len(caption)), dpi, layout="constrained")
     panel = drawn.add_subplot(xlim=view[:2], ylim=view[2:], aspect="equal")
@@ -119,13 +121,6 @@ def require_matplotlib() -> None:
     """ValueError, which says what to install, where matplotlib is missing."""
     if importlib.util.find_spec("matplotlib") is None:
         raise ValueError("images need the extra `plot`: pip install 'mi-refract[plot]'")
-
-
-def _size(view: View) -> tuple[float, float]:
-    """Width and height of the figure without its caption, in inches: of about the same area for every view."""
-    aspect = min(max((view[1] - view[0]) / (view[3] - view[2]), 0.25), 4)
-    height = min(5.2 / aspect**0.5, 7.0)
-    return max(height * aspect, 3.6) + 0.6, height + 0.95
 
 
 def _settle(drawn: Figure) -> None:
@@ -150,8 +145,8 @@ def _media(panel: Axes, scene: PlanarScene) -> None:
     around = float(np.mean(scene.index))
     means = [float(np.mean(region.indices)) for region in scene.regions]
     most = max((abs(n - around) for n in means), default=0)
-    tint = _dark if scene.light.wavelengths else _tint
-    tints = {n: tint((n - around) / (most or 1)) for n in (around, *means)}
+    dark = bool(scene.light.wavelengths)
+    tints = {n: _tint((n - around) / (most or 1), dark) for n in (around, *means)}
     panel.set_facecolor(tints[around])
     for region, n in zip(scene.regions, means, strict=True):
         style: dict[str, Any] = {"facecolor": tints[n], "edgecolor": "none", "zorder": 0.5}
@@ -165,19 +160,19 @@ def _media(panel: Axes, scene: PlanarScene) -> None:
     panel.legend(handles=patches, ncols=len(patches), handlelength=1.2, columnspacing=1.2, **place)
 
 
-def _tint(contrast: float) -> tuple[float, float, float]:
-    """A medium's colour by its contrast to the outermost one, −1 … 1. Denser media are blue, thinner ones yellow."""
-    red, green, blue = DENSE if contrast > 0 else THIN
-    share = abs(contrast) and 0.15 + 0.85 * abs(contrast) ** 1.5
-    return 1 - share * (1 - red), 1 - share * (1 - green), 1 - share * (1 - blue)
+def _tint(contrast: float, dark: bool) -> tuple[float, float, float]:
+    """A medium's colour by its contrast to the outermost one, −1 … 1. Denser media are blue, thinner ones yellow.
 
-
-def _dark(contrast: float) -> tuple[float, float, float]:
-    """As `_tint`, behind rays that shine in their own colours."""
-    share = abs(contrast) and 0.3 + 0.7 * abs(contrast)
-    bright = DENSE if contrast > 0 else THIN
-    red, green, blue = (dark + 0.2 * share * light for dark, light in zip(NIGHT, bright, strict=True))
-    return red, green, blue
+    dark: behind rays that shine in their own colours.
+    """
+    hue = np.array(DENSE if contrast > 0 else THIN)
+    if dark:
+        share = abs(contrast) and 0.3 + 0.7 * abs(contrast)
+        red, green, blue = np.array(NIGHT) + 0.2 * share * hue
+    else:
+        share = abs(contrast) and 0.15 + 0.85 * abs(contrast) ** 1.5
+        red, green, blue = 1 - share * (1 - hue)
+    return float(red), float(green), float(blue)
 
 
 def _label(indices: Sequence[float]) -> str:
@@ -205,35 +200,23 @@ def strength(weight: Any) -> Any:
 
 
 def _rays(panel: Axes, scene: PlanarScene, lines: Legs) -> None:
+    from matplotlib.colors import to_rgb
+
     if scene.light.wavelengths:  # light adds up where lines would cover each other
-        _shade(panel, lines, _spectral(scene.light), _add_light)
+        _shade(panel, lines, {SHARED: np.ones(3)} | dict(enumerate(linear_srgb(scene.light))), _add_light)
         return
-    colours = _named(scene)
+    colours = {}
+    for number, name in [(SHARED, WHITE), *enumerate(scene.light.names)]:
+        try:
+            colours[number] = np.array(to_rgb(name or RAY))
+        except ValueError:
+            raise ValueError(f"{scene.path}: colours: {name!r}; expected a colour that matplotlib knows") from None
     x0, x1, y0, y1 = *panel.get_xlim(), *panel.get_ylim()
     crowd = np.hypot(*(lines.end - lines.start).T).sum() / math.hypot(x1 - x0, y1 - y0)
     if len(lines) > LINES or crowd > DIAGONALS:
         _shade(panel, lines, colours, _blend)
     elif len(lines):
         _stroke(panel, lines, colours, min(1.0, (40 / crowd) ** 0.5))
-
-
-def _named(scene: PlanarScene) -> dict[int, Any]:
-    names = {SHARED: WHITE} | {i: name or RAY for i, name in enumerate(scene.light.names)}
-    return {i: _rgb(scene, name) for i, name in names.items()}
-
-
-def _spectral(light: Light) -> dict[int, Any]:
-    """Linear colours by number, those of light; all together are white."""
-    return {SHARED: np.ones(3)} | dict(enumerate(linear_srgb(light)))
-
-
-def _rgb(scene: PlanarScene, name: str) -> Any:
-    from matplotlib.colors import to_rgb
-
-    try:
-        return np.array(to_rgb(name))
-    except ValueError:
-        raise ValueError(f"{scene.path}: colours: {name!r}; expected a colour that matplotlib knows") from None
 
 
 def _stroke(panel: Axes, lines: Legs, colours: dict[int, Any], room: float) -> None:

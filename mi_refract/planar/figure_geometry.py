@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from .curves import points
 from .path_tree import Branches
-from .paths import Event
 from .scene_file import PlanarScene
-from .segments import Array, Segments
+from .segments import Array, Event, Segments
 
 View = tuple[float, float, float, float]  # x0, x1, y0, y1
 MARGIN = 0.08  # around the scene, as a share of its larger side

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from .curves import unit
 from .paraxial import LOST, Cardinal, axis
 from .path_tree import Branches
-from .paths import REFLECT_BITS, Event
 from .scene_file import PlanarScene
-from .segments import Array
+from .segments import REFLECT_BITS, Array, Event
 from .tracer import trace
 
 Point = tuple[float, float]
+Cells = tuple[str, ...]
 PARALLEL = 1e-9  # sine of the angle between two lines that count as parallel
 SYMMETRIC = 1e-3  # sine of the angle by which two rays may differ from mirror images of each other
 STEEPEST = math.radians(89)  # largest angle to the mean direction for which there is a spot
@@ -98,15 +98,7 @@ def closest_point(origins: Array, directions: Array) -> Array | None:
     if np.linalg.svd(across, compute_uv=False)[-1] <= PARALLEL * math.sqrt(len(across)) or len(across) < 2:
         return None
     distances = ((origins - centre) * across).sum(axis=1)
-    return centre + np.linalg.lstsq(across, distances, rcond=None)[0]
-
-
-def crossing(origin: Array, direction: Array, other: Array, along: Array) -> Point | None:
-    """Where two lines cross; None where they are parallel."""
-    sine = _cross(direction, along)
-    if abs(sine) <= PARALLEL:
-        return None
-    return _point(origin + direction * (_cross(other - origin, along) / sine))
+    return np.asarray(centre + np.linalg.lstsq(across, distances, rcond=None)[0])
 
 
 def spot(origins: Array, directions: Array, plane: Plane) -> Spot | None:
@@ -131,17 +123,12 @@ def _spot(origins: Array, directions: Array) -> tuple[Array, Array] | None:
     slopes = directions @ across / forward
     lean = slopes - slopes.mean()
     centre = origins.mean(axis=0)
-
-    def heights() -> Array:
+    for last in (False, False, True):  # again from near the spot, where differences lose no digits
         arms = origins - centre
-        return arms @ across - slopes * (arms @ axis)
-
-    if np.ptp(slopes) > PARALLEL:
-        for _ in range(2):  # again from near the spot, where differences lose no digits
-            y = heights()
+        y = arms @ across - slopes * (arms @ axis)
+        if not last and np.ptp(slopes) > PARALLEL:
             # var(y + s slope) is least at s = −cov(y, slope)/var(slope)
             centre = centre + across * y.mean() - axis * (y @ lean / (lean @ lean))
-    y = heights()
     return centre + across * y.mean(), y - y.mean()
 
 
@@ -160,18 +147,16 @@ class Group:
 
 def groups(scene: PlanarScene, traced: Sequence[Branches], plane: Plane | None = None) -> list[Group]:
     """The escaped rays, grouped by colour, beam and partial reflections, on whatever side of a shape they leave."""
-    return [
-        Group(scene.colours[colour], beam, reflect, _of_group(scene, colour, branches, np.flatnonzero(inside), plane))
-        for colour, branches in enumerate(traced)
-        for beam in range(int(scene.beams.max()) + 1)
-        for reflect in np.unique(branches.reflect).tolist()
-        if (inside := _members(scene, branches, beam, reflect)).any()
-    ]
-
-
-def _members(scene: PlanarScene, branches: Branches, beam: int, reflect: int) -> NDArray[np.bool_]:
-    escaped = (branches.end == Event.ESCAPED) & (branches.last > 0)
-    return escaped & (scene.beams[branches.rays] == beam) & (branches.reflect == reflect)
+    found = []
+    for colour, branches in enumerate(traced):
+        escaped = (branches.end == Event.ESCAPED) & (branches.last > 0)
+        for beam in range(int(scene.beams.max()) + 1):
+            for reflect in np.unique(branches.reflect).tolist():
+                members = escaped & (scene.beams[branches.rays] == beam) & (branches.reflect == reflect)
+                if members.any():
+                    spread = _of_group(scene, colour, branches, np.flatnonzero(members), plane)
+                    found.append(Group(scene.colours[colour], beam, reflect, spread))
+    return found
 
 
 def _of_group(
@@ -179,15 +164,18 @@ def _of_group(
 ) -> Spread:
     origins, directions = branches.tips[members], branches.paths.directions[members]
     directions = directions / np.hypot(*directions.T)[:, None]  # float32 is not unit to the last bit
-    found = spread(origins, directions)
+    result = spread(origins, directions)
     if plane is not None:
-        found = replace(found, on_plane=spot(origins, directions, plane))
+        result = replace(result, on_plane=spot(origins, directions, plane))
     pairs = list(_pairs(scene, branches.rays[members], directions))
     if not pairs:
-        return found
+        return result
     i, j = pairs[0]
-    outer = crossing(origins[i], directions[i], origins[j], directions[j])
-    return replace(found, marginal=outer, **_along_axis(scene, colour, branches, *members[list(pairs[-1])]))
+    # Where the outermost pair crosses, if it does.
+    sine, marginal = _cross(directions[i], directions[j]), None
+    if abs(sine) > PARALLEL:
+        marginal = _point(origins[i] + directions[i] * (_cross(origins[j] - origins[i], directions[j]) / sine))
+    return replace(result, marginal=marginal, **_along_axis(scene, colour, branches, *members[list(pairs[-1])]))
 
 
 def _along_axis(scene: PlanarScene, colour: int, branches: Branches, one: int, other: int) -> dict[str, Any]:
@@ -221,45 +209,43 @@ def _pairs(scene: PlanarScene, rays: NDArray[np.intp], directions: Array) -> Ite
                 yield i, j
 
 
-def table(found: Sequence[Group]) -> str:
+def table(groups: Sequence[Group]) -> str:
     """Tables in plain text, one line per group: focal points, and where there are any cardinal points and spots."""
-    heads = "focus", "spot at", "rms", "largest", "marginal", "paraxial"
-    parts = [_aligned(found, ("rays", *heads), _foci)]
-    if any(group.spread.cardinal for group in found):
+    names = []
+    for group in groups:
+        bits = ", ".join(str(j) for j in range(REFLECT_BITS) if group.reflect >> j & 1)
+        names.append((group.colour or "–", str(group.beam), bits or "–"))
+    spreads = [group.spread for group in groups]
+    foci: list[Cells] = []
+    cardinals: list[Cells] = []
+    spots: list[Cells] = []
+    for s in spreads:
+        focus = _text(s.focus) + (" (virtual)" if s.virtual else "")
+        foci.append((str(s.rays), focus, *_texts(s.spot, s.rms, s.largest, s.marginal, s.paraxial)))
+        c, on_plane = s.cardinal, s.on_plane
+        if c is None or c.principal is None:
+            cardinals.append(("infinite" if c else "–", *"––––"))
+        else:
+            cardinals.append(_texts(c.focal_length, c.back_focal_length, c.front_focal_length, *c.principal))
+        spots.append(_texts(on_plane.centre, on_plane.rms, on_plane.extent) if on_plane else ("–",) * 3)
+    parts: list[tuple[Cells, list[Cells]]] = [
+        (("rays", "focus", "spot at", "rms", "largest", "marginal", "paraxial"), foci)
+    ]
+    if any(s.cardinal for s in spreads):
         lengths = "focal length", "back focal length", "front focal length"
-        parts.append(_aligned(found, (*lengths, "front principal point", "back one"), _cardinal))
-    if any(group.spread.on_plane for group in found):
-        parts.append(_aligned(found, ("on the plane at", "rms", "extent"), _on_plane))
-    return "\n".join(parts)
+        parts.append(((*lengths, "front principal point", "back one"), cardinals))
+    if any(s.on_plane for s in spreads):
+        parts.append((("on the plane at", "rms", "extent"), spots))
+    text = []
+    for heads, rows in parts:
+        lines = [("colour", "beam", "reflected at", *heads), *((*a, *b) for a, b in zip(names, rows, strict=True))]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        text += ["  ".join(f"{c:{w}}" for c, w in zip(line, widths, strict=True)).rstrip() for line in lines]
+    return "\n".join(text)
 
 
-def _aligned(found: Sequence[Group], heads: Sequence[str], cells: Callable[[Spread], Sequence[str]]) -> str:
-    lines = [("colour", "beam", "reflected at", *heads), *((*_names(group), *cells(group.spread)) for group in found)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    return "\n".join("  ".join(f"{c:{w}}" for c, w in zip(line, widths, strict=True)).rstrip() for line in lines)
-
-
-def _names(group: Group) -> tuple[str, str, str]:
-    bits = ", ".join(str(j) for j in range(REFLECT_BITS) if group.reflect >> j & 1)
-    return group.colour or "–", str(group.beam), bits or "–"
-
-
-def _foci(s: Spread) -> tuple[str, ...]:
-    focus = _text(s.focus) + (" (virtual)" if s.virtual else "")
-    return str(s.rays), focus, *map(_text, (s.spot, s.rms, s.largest, s.marginal, s.paraxial))
-
-
-def _cardinal(s: Spread) -> tuple[str, ...]:
-    c = s.cardinal
-    if c is None or c.principal is None:
-        return "infinite" if c else "–", *"––––"
-    lengths = c.focal_length, c.back_focal_length, c.front_focal_length
-    return *map(_text, lengths), *map(_text, c.principal)
-
-
-def _on_plane(s: Spread) -> tuple[str, ...]:
-    spot = s.on_plane
-    return (_text(spot.centre), _text(spot.rms), _text(spot.extent)) if spot else ("–",) * 3
+def _texts(*values: Point | float | None) -> Cells:
+    return tuple(map(_text, values))
 
 
 def _text(value: Point | float | None) -> str:

@@ -34,12 +34,17 @@ class Light:
         """The number of colours."""
         return len(self.names)
 
-    def indices(self, spec: str, where: str) -> tuple[float, ...]:
-        """The index of a material for each colour; of colours without wavelengths, that of the d line.
+    def indices(self, spec: str | float | Sequence[float], where: str) -> tuple[float, ...]:
+        """The index of a medium for each colour: one number for all, one for each, or a material.
 
-        Relative to air, where the material's own index is relative to vacuum. ValueError as of `media.parse`, and for a
-        wavelength outside the material's range.
+        A material's index is relative to air; it is that of the d line where colours have no wavelengths.
+        ValueError for another count of numbers, as of `media.parse`, and for a wavelength out of the material's range.
         """
+        if not isinstance(spec, str):
+            numbers = tuple(np.ravel(spec).tolist())
+            if len(numbers) not in (1, len(self)):
+                raise ValueError(f"{where}: {len(numbers)} numbers; expected 1 for all or each of {len(self)} colours")
+            return numbers * (len(self) // len(numbers))
         medium = media.parse(spec, where)
         wavelengths = np.array(self.wavelengths or (media.LINES["d"],) * len(self))
         try:

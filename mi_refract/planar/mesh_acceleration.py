@@ -209,7 +209,7 @@ def _wedge_shares(a: Array, b: Array, vertices: Any) -> Array:
     np.minimum.at(least, order[after], turn)
     with np.errstate(divide="ignore"):
         reach = 4 * MARGIN / np.sin(np.minimum(least, np.pi / 2))
-        return reach.reshape(-1, 2) / np.linalg.norm(b - a, axis=1, keepdims=True)
+        return np.asarray(reach.reshape(-1, 2) / np.linalg.norm(b - a, axis=1, keepdims=True))
 
 
 def _upright(of: str, a: Array, b: Array) -> Any:

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .paths import Event, Paths
-from .segments import Array, Segments
+from .segments import Array, Event, Paths, Segments
 
 Point = tuple[float, float]
 LOST = 2.0**-44  # share of its terms up to which a sum is 0 but for rounding, of some hundred roundings

@@ -15,8 +15,7 @@ from mi_refract.numerics import Mask, Number
 from .array_backend import ArrayBackend, Index, Scatter, Vector2, negated
 from .intersect_segments import NOWHERE, Hit, LineSegments, Ray, cross
 from .mesh_acceleration import BACK, MeshAcceleration, SearchState
-from .paths import REFLECT_BITS, Event
-from .segments import Array
+from .segments import REFLECT_BITS, Array, Event
 
 Refraction = Callable[[Vector2, Vector2, Number], tuple[Vector2, Mask]]  # (d, line, k) → direction, transmitted
 
@@ -61,7 +60,10 @@ class PathLoop:
         formula: str | None,
     ) -> None:
         """`mesh`: what finds the next boundary; None: try all. `formula`: as for `planar.trace`."""
-        self.arrays, self.boundaries, self.mesh, self.media = arrays, boundaries, mesh, arrays.table(_ratios(media))
+        self.arrays, self.boundaries, self.mesh = arrays, boundaries, mesh
+        left, right = media.T
+        # With k from left to right and from right to left: ratios in float64, before anything is rounded.
+        self.media = arrays.table(np.column_stack([left, right, left / right, right / left]))
         self.refract = _refraction(arrays, formula)
 
     def __call__(
@@ -77,7 +79,7 @@ class PathLoop:
 
         origins, directions: N × 2. index: N, of the medium in which rays start; None: unknown. mirrored: N, `reflect`.
         """
-        arrays = self.arrays
+        arrays, count, legs = self.arrays, len(origins), max_depth + 1
         if self.mesh:
             self.mesh.expect(origins, directions)
         rays = [arrays.table(x) for x in (origins, directions)]
@@ -89,13 +91,11 @@ class PathLoop:
             scatter("points", 0, p, True)
             state = self._start(p, d, arrays.number(dr.nan) if index is None else index)
             deepest = arrays.uniform(arrays.index, max_depth)
-            end = self._follow(state, Run(bits, deepest, scatter, weights))
+            run = Run(bits, deepest, scatter, weights)
+            step = lambda state: (self._step(state, run),)  # noqa: E731
+            (end,) = dr.while_loop((state,), lambda state: state.active, step, label="planar")
             scatter("directions", 0, _unit(end.ray.d), True)
 
-        return arrays.run(len(origins), self._buffers(len(origins), max_depth, weights), work)
-
-    def _buffers(self, count: int, max_depth: int, weights: bool) -> dict[str, Any]:
-        arrays, legs = self.arrays, max_depth + 1
         buffers = {
             "points": arrays.buffer(arrays.number, np.nan, (legs, count, 2)),
             "directions": arrays.buffer(arrays.number, np.nan, (1, count, 2)),
@@ -105,7 +105,7 @@ class PathLoop:
         if weights:
             buffers["indices"] = arrays.buffer(arrays.number, np.nan, (legs, count))
             buffers["polarised"] = arrays.buffer(arrays.number, np.nan, (legs, count, 2))
-        return buffers
+        return arrays.run(count, buffers, work)
 
     def _start(self, p: Vector2, d: Vector2, index: Number) -> PathState:
         arrays, d = self.arrays, _unit(d)
@@ -126,12 +126,6 @@ class PathLoop:
         enter, leave = dr.max(dr.minimum(a, b)), dr.min(dr.maximum(a, b))
         return dr.select((enter > 0) & (enter < leave), dr.fma(d, enter, p), p)
 
-    def _follow(self, state: PathState, run: Run) -> PathState:
-        def step(state: PathState) -> tuple[PathState]:
-            return (self._step(state, run),)
-
-        return dr.while_loop((state,), lambda state: state.active, step, label="planar")[0]
-
     def _step(self, state: PathState, run: Run) -> PathState:
         """Search once for the next boundary, and cross it if it is found."""
         hit, search, settled = self._nearest(state.ray, state.search, state.active)
@@ -140,14 +134,9 @@ class PathLoop:
         self._write_leg(run, state, int(Event.ESCAPED), state.index, active & negated(some))
         rest = PathState(state.ray, state.index, state.power, state.depth, search, state.active & negated(settled))
 
-        def across(state: PathState, hit: Hit, rest: PathState) -> PathState:
-            return self._cross(state, hit, run)
-
-        def on(state: PathState, hit: Hit, rest: PathState) -> PathState:
-            return rest
-
+        across = lambda state, hit, rest: self._cross(state, hit, run)  # noqa: E731
         # A branch, not a select: neighbouring rays mostly find their boundaries in the same step.
-        return dr.if_stmt((state, hit, rest), some, across, on, label="boundary")
+        return dr.if_stmt((state, hit, rest), some, across, lambda state, hit, rest: rest, label="boundary")
 
     def _write_leg(self, run: Run, state: PathState, event: Any, index: Number, active: Mask) -> None:
         """Write a leg and the event at its end."""
@@ -164,7 +153,11 @@ class PathLoop:
         k = dr.select(hit.to_left, to_left, to_right)
         index = dr.select(dr.isnan(state.index), near, state.index)
         p, line = self.boundaries.place(hit)
-        b, through = self._turn(d, line, k, j, run.mirrored)
+        b, through = self.refract(d, line, k)
+        if run.mirrored is not None:
+            bit = (run.mirrored >> dr.minimum(j, REFLECT_BITS - 1)) & 1
+            forced = through & (j < REFLECT_BITS) & (bit == 1)
+            b, through = dr.select(forced, _mirrored(d, line), b), through & negated(forced)
         to_left = hit.to_left == through
         # Of a ray along the boundary rounding hides from which side it comes; that was decided by the boundary's ends.
         b = dr.select((cross(line, b) > 0) == to_left, b, _mirrored(b, line))
@@ -178,21 +171,6 @@ class PathLoop:
         ray = Ray(p, dr.select(on, b, d), hit.segment, hit.s, hit.r, to_left, arrays.number(0))
         power = state.power * _shares(d, line, k, through) if run.weights else state.power
         return PathState(ray, dr.select(through, far, index), power, j + 1, self._search(0), on)
-
-    def _turn(
-        self,
-        d: Vector2,
-        line: Vector2,
-        k: Number,
-        j: Index,
-        mirrored: Index | None,
-    ) -> tuple[Vector2, Mask]:
-        """The direction after the j-th boundary, and whether the ray goes through it."""
-        b, through = self.refract(d, line, k)
-        if mirrored is None:
-            return b, through
-        forced = through & (j < REFLECT_BITS) & ((mirrored >> dr.minimum(j, REFLECT_BITS - 1)) & 1 == 1)
-        return dr.select(forced, _mirrored(d, line), b), through & negated(forced)
 
     def _search(self, gone: float) -> SearchState:
         return SearchState(self.arrays.number(gone), self.arrays.index(NOWHERE))
@@ -209,15 +187,6 @@ class PathLoop:
         first = self.arrays.index(0), self.boundaries.none()
         more = lambda i, best: active & (i < self.boundaries.count)  # noqa: E731
         return dr.while_loop(first, more, test, label="boundaries")[1], search, self.arrays.mask(True)
-
-
-def _ratios(media: Array) -> Array:
-    """M × 4: the indices on the left and on the right, k from left to right and from right to left.
-
-    The ratios are of the indices in float64, before they are rounded.
-    """
-    left, right = media.T
-    return np.column_stack([left, right, left / right, right / left])
 
 
 def _unit(v: Vector2) -> Vector2:

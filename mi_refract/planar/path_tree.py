@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .paths import REFLECT_BITS, Event, Paths
 from .scene_file import PlanarScene
-from .segments import Array, Segments
+from .segments import REFLECT_BITS, Array, Event, Paths, Segments
 from .tracer import Tracer
 
 LEAST = 1e-3  # share of a ray's power: partial reflections that carry no more are not followed
@@ -40,18 +39,18 @@ class Branches:
     @property
     def first(self) -> NDArray[np.intp]:
         """P: the number of the first leg that is the path's own; those before belong to another path of the ray."""
-        return np.frexp(self.reflect.astype(float))[1].astype(np.intp)
+        return np.asarray(np.frexp(self.reflect.astype(float))[1], np.intp)
 
     @property
     def own(self) -> NDArray[np.bool_]:
         """P × (D+1): whether there is a leg and it is the path's own, with the event at its end."""
         events = self.paths.events
-        return (events != Event.NONE) & (np.arange(events.shape[1]) >= self.first[:, None])
+        return np.asarray((events != Event.NONE) & (np.arange(events.shape[1]) >= self.first[:, None]))
 
     @property
     def last(self) -> NDArray[np.intp]:
         """P: the number of the last leg."""
-        return np.count_nonzero(self.paths.events, axis=1) - 1
+        return np.asarray(np.count_nonzero(self.paths.events, axis=1) - 1)
 
     @property
     def end(self) -> NDArray[np.uint8]:
@@ -62,7 +61,7 @@ class Branches:
     def tips(self) -> Array:
         """P × 2: where the path met its last boundary, or its origin."""
         places = np.isfinite(self.paths.points[..., 0]).sum(axis=1)
-        return self.paths.points[np.arange(len(self.rays)), places - 1]
+        return np.asarray(self.paths.points[np.arange(len(self.rays)), places - 1])
 
 
 def follow(
@@ -93,10 +92,17 @@ def follow(
         )
         paths = trace(origins[rays], directions[rays], max_depth, reflect=reflect, weights=True)
         orders.append(Branches(paths, rays, reflect))
-        parent, boundary = np.nonzero(_worth(orders[-1], least))
+        weights, events = orders[-1].weights, paths.events[:, :-1]
+        splits = orders[-1].own[:, :-1] & (events == Event.REFRACTED)
+        splits[:, REFLECT_BITS:] = False
+        with np.errstate(invalid="ignore"):
+            parent, boundary = np.nonzero(splits & (weights[:, :-1] - weights[:, 1:] > least))
         if len(orders) > branches or not parent.size:
-            return _joined(orders)
+            break
         rays, reflect = rays[parent], reflect[parent] | (np.uint32(1) << boundary.astype(np.uint32))
+    columns = {f.name: np.concatenate([getattr(o.paths, f.name) for o in orders]) for f in fields(Paths)}
+    rays, reflect = (np.concatenate([getattr(o, name) for o in orders]) for name in ("rays", "reflect"))
+    return Branches(Paths(**columns), rays, reflect)
 
 
 def _check_size(paths: int, max_depth: int, reflections: int, most: int) -> None:
@@ -138,23 +144,6 @@ def with_rays(scene: PlanarScene, count: int) -> PlanarScene:
         parts.append((places, np.column_stack([np.cos(angle), np.sin(angle)]), np.full(len(want), beam)))
     origins, directions, beams = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     return replace(scene, origins=origins, directions=directions, beams=beams)
-
-
-def _worth(branches: Branches, least: float) -> NDArray[np.bool_]:
-    """P × D: whether the path refracts at that boundary of its own and reflects more than `least` there."""
-    weights = branches.weights
-    refracted = branches.own[:, :-1] & (branches.paths.events[:, :-1] == Event.REFRACTED)
-    refracted[:, REFLECT_BITS:] = False
-    with np.errstate(invalid="ignore"):
-        return refracted & (weights[:, :-1] - weights[:, 1:] > least)
-
-
-def _joined(orders: Sequence[Branches]) -> Branches:
-    if len(orders) == 1:
-        return orders[0]
-    columns = {f.name: np.concatenate([getattr(o.paths, f.name) for o in orders]) for f in fields(Paths)}
-    rays, reflect = (np.concatenate([getattr(o, name) for o in orders]) for name in ("rays", "reflect"))
-    return Branches(Paths(**columns), rays, reflect)
 
 
 # Summaries -------------------------------------------------------------------------------------------------------

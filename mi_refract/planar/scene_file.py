@@ -1,30 +1,286 @@
-"""Reads planar scenes from TOML files: shapes, their media, and the rays to follow."""
+"""Planar scenes as TOML files: the keys that a file may hold, and the boundaries and rays that it describes.
+
+Each kind of `[[shape]]` and `[[beam]]` is a struct whose fields are the keys.
+"""
 
 from __future__ import annotations
 
-import tomllib
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal, get_args
 
 import numpy as np
+from msgspec import Meta, Struct, field
 from numpy.typing import NDArray
 
 from mi_refract.io import regular_file
-from mi_refract.io.toml_schema import read, shown
+from mi_refract.io.typed_table import key_table, kind_table, parse_toml
 
-from .curves import affine
-from .light import Light, of_names, of_wavelengths
-from .scene_schema import BEAMS, SCENE, SHAPES, Part
-from .scene_values import Indices, per_colour, read_kind
+from . import shapes
+from .curves import Curve, affine, unit
+from .light import MOST, Light, of_names, of_wavelengths
 from .segments import Array, Segments
-from .shared_boundaries import Named, boundaries
+from .shared_boundaries import Indices, Part, boundaries
 
-# Of what a file may ask for, checked before memory is allocated.
+# Limits of what a file may ask for, checked before memory is allocated.
 SIZE = 2**24  # bytes of the file
 PIECES = 2**22  # of all curves, once for each colour
 RAYS = 2**24  # of all beams
+FARTHEST = 1e100  # of all coordinates: products of two do not overflow
+
+Positive = Annotated[float, Meta(gt=0)]
+Text = Annotated[str, Meta(min_length=1)]
+Names = Annotated[list[Text], Meta(min_length=1)]
+Point = tuple[float, float]
+Points = Annotated[list[Point], Meta(min_length=1)]
+Box = tuple[float, float, float, float]
+Direction = float | Point
+Count = Annotated[int, Meta(ge=1, le=1_000_000)]
+Arcs = Annotated[list[float] | None, Meta(description="degrees by which each piece turns left, an arc; 0: straight")]
+Index = Positive | Annotated[list[Positive], Meta(min_length=1)] | Text
+
+
+def _doc(meaning: str) -> Meta:
+    return Meta(description=meaning)
+
+
+# Shapes -----------------------------------------------------------------------------------------------------------
+
+
+class Shape(Struct, forbid_unknown_fields=True, tag_field="kind"):
+    """What all shapes have."""
+
+    scale: Annotated[float | Point, _doc("stretches the shape; done first")] = 1.0
+    rotate: Annotated[float, _doc("then turns it counter-clockwise, in degrees")] = 0.0
+    at: Annotated[Point, _doc("then moves its origin there")] = (0.0, 0.0)
+    facets: Annotated[Count | None, _doc("number of chords that replace the arcs of a curve")] = None
+
+    def __post_init__(self) -> None:
+        """ValueError for a scale that is 0, or out of range."""
+        if not all(1e-100 <= abs(factor) <= 1e100 for factor in np.ravel(self.scale)):
+            raise ValueError(f"scale: {self.scale}; expected numbers of size 1e-100 to 1e100")
+
+
+class Inside(Shape):
+    """A shape that lies in a medium."""
+
+    outside: Annotated[Index | None, _doc("index around the shape; that of the whole scene by default")] = None
+    within: Annotated[Text | None, _doc("instead of `outside`: the name of an earlier shape around this one")] = None
+
+
+class Solid(Inside, kw_only=True):
+    """A closed curve around one medium."""
+
+    n: Annotated[Index, _doc('index inside: for all colours, for each, or of a material, as "SCHOTT:N-BK7"')]
+    name: Annotated[Text | None, _doc("a name that `within` of later shapes can use")] = None
+
+
+class Polygon(Solid, tag="polygon", kw_only=True):
+    """A closed chain of straight pieces and arcs of circles."""
+
+    points: Annotated[Points, _doc("its corners")]
+    arcs: Arcs = None
+
+
+class Rectangle(Solid, tag="rectangle", kw_only=True):
+    """A rectangle around its origin."""
+
+    width: Annotated[Positive, _doc("along x")]
+    height: Annotated[Positive, _doc("along y")]
+
+
+class Prism(Solid, tag="prism", kw_only=True):
+    """A triangle with two equal sides, its apex up, its centroid at the origin."""
+
+    side: Annotated[Positive, _doc("length of either side")]
+    apex: Annotated[float, Meta(gt=0, lt=180), _doc("the angle between them, in degrees")] = 60.0
+
+
+class Circle(Solid, tag="circle", kw_only=True):
+    """A circle around its origin."""
+
+    radius: Annotated[Positive, _doc("of the circle")]
+
+
+class Ellipse(Solid, tag="ellipse", kw_only=True):
+    """An ellipse around its origin."""
+
+    radii: Annotated[tuple[Positive, Positive], _doc("half axes along x and y")]
+
+
+class Lens(Solid, tag="lens", kw_only=True):
+    """Two conic surfaces z = c r² / (1 + √(1 − (1 + K) c² r²)) on the x axis, with a rim between them."""
+
+    curvature: Annotated[Point, _doc("c of the front and of the back, positive where the centre lies toward +x")]
+    conic: Annotated[Point, _doc("K of each")] = (0.0, 0.0)
+    thickness: Annotated[Positive, _doc("on the axis")]
+    radius: Annotated[Positive | None, _doc("half the aperture; up to where the surfaces meet by default")] = None
+    vertex: Annotated[float, _doc("where the front meets the axis")] = 0.0
+
+
+class EllipseLens(Solid, tag="ellipse_lens", kw_only=True):
+    """Focuses rays along x into its origin: an ellipse of eccentricity outside/n (first colour), and a circle."""
+
+    focal_length: Annotated[Positive, _doc("from the front to the focus")]
+    thickness: Annotated[Positive, _doc("on the axis")]
+    radius: Annotated[Positive, _doc("half the aperture")]
+
+
+class Luneburg(Inside, tag="luneburg", kw_only=True):
+    """A ball in concentric layers of index outside × √(2 − (r/radius)²)."""
+
+    radius: Annotated[Positive, _doc("radius of the outermost layer")]
+    layers: Annotated[int, Meta(ge=1, le=10_000), _doc("number of layers")]
+
+
+class Boundary(Shape, tag="boundary", kw_only=True):
+    """An open chain of straight pieces and arcs of circles between two media."""
+
+    points: Annotated[Points, _doc("its vertices")]
+    arcs: Arcs = None
+    n_left: Annotated[Index, _doc("index on the left, seen along it")]
+    n_right: Annotated[Index, _doc("index on the right")]
+
+
+def _curves(shape: AnyShape, n: dict[str, Indices]) -> list[tuple[Curve, Indices, Indices]]:
+    """Curves around the shape's origin, with the indices on their left and right; `n`: indices by key.
+
+    A closed curve runs counter-clockwise: its inside is on the left.
+    """
+    outside = n["outside"]
+    match shape:
+        case Boundary():
+            return [(shapes.polyline(shape.points, shape.arcs), n["n_left"], n["n_right"])]
+        case Luneburg():
+            layers = shapes.luneburg(shape.radius, shape.layers)
+            media = [outside, *(tuple(x * ratio for x in outside) for _, ratio in layers)]
+            return [(curve, media[j + 1], media[j]) for j, (curve, _) in enumerate(layers)]
+        case Polygon():
+            curve = shapes.polygon(shape.points, shape.arcs)
+        case Rectangle():
+            curve = shapes.rectangle(shape.width, shape.height)
+        case Prism():
+            curve = shapes.prism(shape.apex, shape.side)
+        case Circle():
+            curve = shapes.circle(shape.radius)
+        case Ellipse():
+            curve = shapes.ellipse(*shape.radii)
+        case Lens():
+            curve = shapes.lens(
+                shape.curvature, shape.thickness, radius=shape.radius, conic=shape.conic, vertex=shape.vertex
+            )
+        case EllipseLens():
+            curve = shapes.ellipse_lens(n["n"][0] / outside[0], shape.focal_length, shape.thickness, shape.radius)
+    return [(curve, n["n"], outside)]
+
+
+AnyShape = Polygon | Rectangle | Prism | Circle | Ellipse | Lens | EllipseLens | Luneburg | Boundary
+
+# Beams ------------------------------------------------------------------------------------------------------------
+
+
+class Beam(Struct, forbid_unknown_fields=True, tag_field="kind"):
+    """Rays that are described together."""
+
+
+class Parallel(Beam, tag="parallel", kw_only=True):
+    """Parallel rays from a line."""
+
+    start: Annotated[Point, _doc("start of the first ray")] = field(name="from")
+    to: Annotated[Point, _doc("start of the last ray")]
+    direction: Annotated[Direction, _doc("of all rays: degrees, or [x, y] that is not [0, 0]")]
+    count: Annotated[Count, _doc("number of rays; 1: from the middle")]
+
+
+class Fan(Beam, tag="fan", kw_only=True):
+    """Rays from a point."""
+
+    at: Annotated[Point, _doc("start of all rays")]
+    angles: Annotated[Point, _doc("directions of the first and of the last ray, in degrees")]
+    count: Annotated[Count, _doc("number of rays; 1: in the middle")]
+
+
+class Rays(Beam, tag="rays", kw_only=True):
+    """Rays one by one."""
+
+    origins: Annotated[Points, _doc("their starts")]
+    directions: Annotated[list[Direction], _doc("one for each start, as of `parallel`")]
+
+    def __post_init__(self) -> None:
+        """ValueError for another number of directions than of origins."""
+        if len(self.origins) != len(self.directions):
+            raise ValueError(f"directions: {len(self.directions)}, for {len(self.origins)} origins; expected as many")
+
+
+AnyBeam = Parallel | Fan | Rays
+
+
+def _rays_of(beam: AnyBeam) -> tuple[Array, Array]:
+    """Origins and directions of length 1, N × 2."""
+    match beam:
+        case Parallel():
+            origins = _spread(np.array(beam.start), np.array(beam.to), beam.count)
+            return origins, np.broadcast_to(_unit_vector("direction", beam.direction), origins.shape)
+        case Fan():
+            angles = _spread(*beam.angles, beam.count)
+            return np.broadcast_to(beam.at, (beam.count, 2)), np.array([unit(angle) for angle in angles])
+        case Rays():
+            return np.array(beam.origins), np.array([_unit_vector("directions", value) for value in beam.directions])
+
+
+def _spread(first: Array | float, last: Array | float, count: int) -> Array:
+    """`count` values evenly from the first to the last; a single one is in the middle. Whole numbers stay exact."""
+    if count == 1:
+        return np.array([(first + last) / 2])
+    steps = np.arange(count).reshape(-1, *[1] * np.ndim(first))
+    return np.concatenate([(first + (last - first) * steps / (count - 1))[:-1], [last]])
+
+
+def _unit_vector(key: str, value: Direction) -> tuple[float, float]:
+    """A vector of length 1 from degrees or [x, y]."""
+    if isinstance(value, float):
+        return unit(value)
+    size = max(map(abs, value))  # first by the larger component: a square may be out of range
+    if not size:
+        raise ValueError(f"{key}: [0, 0]; expected degrees, or [x, y] that is not [0, 0]")
+    x, y = value[0] / size, value[1] / size
+    length = math.hypot(x, y)
+    return x / length, y / length
+
+
+# Scenes -----------------------------------------------------------------------------------------------------------
+
+Wavelengths = Annotated[int, Meta(ge=2, le=MOST)] | Annotated[list[Positive], Meta(min_length=1, max_length=MOST)]
+
+
+class SceneTable(Struct, kw_only=True, forbid_unknown_fields=True):
+    """A scene file."""
+
+    title: Annotated[Text | None, _doc("title of the figure; the file's name by default")] = None
+    index: Annotated[Index, _doc("index of the medium around all shapes, as `n` of a shape")] = 1.0
+    colours: Annotated[Names | None, _doc("names, by matplotlib; one for each index")] = None
+    wavelengths: Annotated[Wavelengths | None, _doc("in nm, in place of `colours`; or how many, 380 to 730 nm")] = None
+    light: Annotated[Literal["flat", "D65"], _doc("powers of the wavelengths: equal, or of daylight")] = "flat"
+    max_depth: Annotated[int, Meta(ge=1, le=100_000), _doc("largest number of boundaries that a ray meets")] = 16
+    branches: Annotated[int, Meta(ge=0, le=8), _doc("largest number of partial reflections on a path")] = 0
+    view: Annotated[Box | None, _doc("x0, x1, y0, y1: the part that the figure shows; all shapes by default")] = None
+    shape: Annotated[list[AnyShape], Meta(min_length=1), _doc("[[shape]]: boundaries between media")]
+    beam: Annotated[list[AnyBeam], Meta(min_length=1), _doc("[[beam]]: rays to follow")]
+
+    def __post_init__(self) -> None:
+        """ValueError for an empty view."""
+        if self.view and not (self.view[0] < self.view[1] and self.view[2] < self.view[3]):
+            raise ValueError(f"view: {list(self.view)}; expected [x0, x1, y0, y1], x0 < x1, y0 < y1")
+
+
+def reference() -> str:
+    """All kinds and keys as tables in Markdown: what `mi-refract trace --keys` prints."""
+    tables = key_table("key of the scene", SceneTable), key_table("key of a shape", Solid)
+    kinds = kind_table("kind of shape", get_args(AnyShape), Solid), kind_table("kind of beam", get_args(AnyBeam))
+    return "\n\n".join([*tables, *kinds])
 
 
 @dataclass(frozen=True)
@@ -32,7 +288,7 @@ class Region:
     """A closed outline (K × 2, counter-clockwise, arcs as short chords) and the index inside, for drawing."""
 
     outline: Array
-    indices: tuple[float, ...]  # one per colour
+    indices: Indices
 
 
 @dataclass(frozen=True)
@@ -52,13 +308,13 @@ class PlanarScene:
     light: Light
     segments: tuple[Segments, ...]
     regions: tuple[Region, ...]
-    index: tuple[float, ...]
+    index: Indices
     origins: Array
     directions: Array
     beams: NDArray[np.intp]
     max_depth: int
     branches: int
-    view: tuple[float, float, float, float] | None
+    view: Box | None
     fans: tuple[tuple[float, float] | None, ...] = ()
 
     @property
@@ -76,108 +332,77 @@ def load(path: str | Path, wavelengths: Sequence[float] | int | None = None) -> 
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; expected a scene file")
-    content = regular_file.read_bytes(path, SIZE)
+    table = parse_toml(regular_file.read_bytes(path, SIZE), SceneTable, str(path))
     try:
-        return _scene(path, _parsed(content), wavelengths)
+        light = _light(table, wavelengths)
+        index = light.indices(table.index, "index")
+        parts = _parts(table.shape, index, light)
+        origins, directions, beams = _rays(table.beam)
+        segments = boundaries(parts)
     except ValueError as error:
         raise ValueError(" ".join(f"{path}: {error}".split())) from None
-
-
-def _parsed(content: bytes) -> dict[str, Any]:
-    try:
-        return tomllib.loads(content.decode())
-    except UnicodeDecodeError as error:
-        raise ValueError(f"byte {error.start} is not UTF-8; expected TOML") from None
-    except RecursionError:
-        raise ValueError("brackets nested too deeply; expected TOML") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{error}; expected TOML") from None
-
-
-def _light(values: dict[str, Any], wavelengths: Sequence[float] | int | None) -> Light:
-    asked = values["wavelengths"] if wavelengths is None else wavelengths
-    if asked is None:
-        return of_names(values["colours"])
-    if values["colours"]:
-        raise ValueError("colours: beside wavelengths; expected one of them")
-    return of_wavelengths(asked, values["light"])
-
-
-def _scene(path: Path, table: dict[str, Any], wavelengths: Sequence[float] | int | None) -> PlanarScene:
-    values = read(table, SCENE)
-    light = _light(values, wavelengths)
-    values = per_colour(values, SCENE, "", light)
-    parts = _parts(values["shape"], values["index"], light)
-    origins, directions, beams = _rays(values["beam"])
-    regions = tuple(Region(part.curve.outline(), part.left) for _, part in parts if part.curve.closed)
     return PlanarScene(
         path,
-        values["title"] or path.stem,
+        table.title or path.stem,
         light,
-        boundaries(parts),
-        regions,
-        values["index"],
+        segments,
+        tuple(Region(part.curve.outline(), part.left) for part in parts if part.curve.closed),
+        index,
         origins,
         directions,
         beams,
-        values["max_depth"],
-        values["branches"],
-        tuple(values["view"]) if values["view"] else None,
-        tuple(tuple(table["angles"]) if table.get("kind") == "fan" else None for table in values["beam"]),
+        table.max_depth,
+        table.branches,
+        table.view,
+        tuple(beam.angles if isinstance(beam, Fan) else None for beam in table.beam),
     )
 
 
-FARTHEST = 1e100  # of all coordinates: products of two do not overflow
+def _light(table: SceneTable, wavelengths: Sequence[float] | int | None) -> Light:
+    chosen = table.wavelengths if wavelengths is None else wavelengths
+    if chosen is None:
+        return of_names(table.colours)
+    if table.colours:
+        raise ValueError("colours: beside wavelengths; expected one of them")
+    return of_wavelengths(chosen, table.light)
 
 
-def _parts(tables: list[dict[str, Any]], ambient: Indices, light: Light) -> list[Named]:
-    """The shapes' parts in their places."""
-    parts: list[Named] = []
+def _parts(tables: Sequence[AnyShape], ambient: Indices, light: Light) -> list[Part]:
+    """The curves of all shapes, in their places."""
+    parts: list[Part] = []
     media: dict[str, Indices] = {}
     pieces = 0
-    for j, table in enumerate(tables):
+    for j, shape in enumerate(tables):
         where = f"shape[{j}]"
-        kind, values = read_kind(table, SHAPES, f"{where}.", light)
-        values["outside"] = _outside(values, media, where) or ambient
-        if values.get("name") in media:
-            raise ValueError(f"{where}.name: {shown(values['name'])} is another shape's; expected a new one")
-        if values.get("name"):
-            media[values["name"]] = values["n"]
-        each = max(values.get("facets") or 4, len(values.get("points", ())))
-        pieces += values.get("layers", 1) * each * len(light)
+        values = {key: getattr(shape, key, None) for key in ("n", "outside", "n_left", "n_right")}
+        n = {key: light.indices(x, f"{where}.{key}") for key, x in values.items() if x is not None}
+        if isinstance(shape, Inside) and shape.within is not None:
+            if shape.outside is not None:
+                raise ValueError(f"{where}.within: {shape.within!r}, beside `outside`; expected one of them")
+            if shape.within not in media:
+                known = ", ".join(map(repr, media)) or "none so far"
+                raise ValueError(f"{where}.within: {shape.within!r}; expected the name of a shape above: {known}")
+            n["outside"] = media[shape.within]
+        n.setdefault("outside", ambient)
+        if isinstance(shape, Solid) and shape.name:
+            if shape.name in media:
+                raise ValueError(f"{where}.name: {shape.name!r} is another shape's; expected a new one")
+            media[shape.name] = n["n"]
+        curves = shape.layers if isinstance(shape, Luneburg) else 1
+        pieces += curves * max(shape.facets or 4, len(getattr(shape, "points", ()))) * len(light)
         if pieces > PIECES:
             raise ValueError(f"{where}: {pieces} pieces and more; expected {PIECES}, colours times those of all shapes")
+        first = len(parts)
         try:
             with np.errstate(all="ignore"):
-                placed = _placed(kind.build(values), values)
+                for curve, left, right in _curves(shape, n):
+                    chords = curve.faceted(shape.facets) if shape.facets else curve
+                    parts.append(Part(where, chords.mapped(affine(shape.rotate, shape.scale), shape.at), left, right))
         except ValueError as error:
             raise ValueError(f"{where}.{error}") from None
-        for part in placed:
+        for part in parts[first:]:
             _check_range(where, part.curve.vertices, part.curve.control)
-            parts.append((where, part))
     return parts
-
-
-def _outside(values: dict[str, Any], media: dict[str, Indices], where: str) -> Indices | None:
-    name = values.get("within")
-    if name is None:
-        return values.get("outside")
-    if values["outside"]:
-        raise ValueError(f"{where}.within: {shown(name)}, beside `outside`; expected one of them")
-    if name not in media:
-        known = ", ".join(map(shown, media)) or "none so far"
-        raise ValueError(f"{where}.within: {shown(name)}; expected the name of a shape above: {known}")
-    return media[name]
-
-
-def _placed(parts: list[Part], values: dict[str, Any]) -> list[Part]:
-    matrix, facets = affine(values["rotate"], values["scale"]), values.get("facets")
-    placed = []
-    for part in parts:
-        curve = part.curve.faceted(facets) if facets else part.curve
-        curve = curve.mapped(matrix, values["at"])
-        placed.append(part._replace(curve=curve))
-    return placed
 
 
 def _check_range(where: str, *points: Array) -> None:
@@ -185,18 +410,17 @@ def _check_range(where: str, *points: Array) -> None:
         raise ValueError(f"{where}: coordinates beyond {FARTHEST:g}")
 
 
-def _rays(tables: list[dict[str, Any]]) -> tuple[Array, Array, NDArray[np.intp]]:
-    rays: list[tuple[Array, Array]] = []
-    count = 0
-    for j, table in enumerate(tables):
-        kind, values = read_kind(table, BEAMS, f"beam[{j}].", Light())
-        count += values.get("count", 1)
+def _rays(tables: Sequence[AnyBeam]) -> tuple[Array, Array, NDArray[np.intp]]:
+    sizes = list(itertools.accumulate(len(b.origins) if isinstance(b, Rays) else b.count for b in tables))
+    for j, count in enumerate(sizes):
         if count > RAYS:
             raise ValueError(f"beam[{j}].count: {count} rays with the beams before; expected up to {RAYS}")
+    rays = []
+    for j, beam in enumerate(tables):
         try:
-            rays.append(kind.build(values))
+            rays.append(_rays_of(beam))
         except ValueError as error:
             raise ValueError(f"beam[{j}].{error}") from None
         _check_range(f"beam[{j}]", rays[-1][0])
-    beams = np.repeat(np.arange(len(rays)), [len(origins) for origins, _ in rays])
+    beams = np.repeat(np.arange(len(rays)), np.diff(sizes, prepend=0))
     return np.concatenate([o for o, _ in rays]), np.concatenate([d for _, d in rays]), beams

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .curves import Curve, affine, area, joined, polygonal, unit
+from .curves import Curve, area, joined, polygonal, unit
 from .segments import Array
 
 # 1 − (1 + K) c² r² counts as 0 up to this: at the rim of a half sphere, whose curvature is 1/R rounded.
@@ -185,36 +185,6 @@ def ellipse_lens(n: float, focal_length: float, thickness: float, radius: float)
     eccentricity = 1 / n
     curvature = 1 / (focal_length * (1 - eccentricity)), 1 / (focal_length - thickness)
     return lens(curvature, thickness, radius=radius, conic=(-(eccentricity**2), 0.0), vertex=-focal_length)
-
-
-# Document 004's lens in the document's coordinates, moved to the origin: its axis is y, its tips lie on x.
-LENS_INDEX = 4.4
-LENS_CURVATURE, LENS_HALF_WIDTH, LENS_CONIC, LENS_STRETCH = -0.04, 8.2, 1.9, 4.0
-
-
-def document_lens(resolution: float | None = None) -> Curve:
-    """The lens of document 004: y = ±(k + sag(r)) with k = 8.2, c = −0.04, K = 1.9 and x = 4 r, around the origin.
-
-    The document draws 1172 chords with ends at r = 0, `resolution`, … (0.05) and leaves the outline open at the tips.
-    Here the last vertices are the tips, where the width is 0. Without a resolution: four exact arcs.
-    ValueError for a resolution that is not above 0.
-    """
-    if resolution is not None and not resolution > 0:
-        raise ValueError(f"resolution = {resolution}; expected above 0")
-    c, k, conic = LENS_CURVATURE, LENS_HALF_WIDTH, LENS_CONIC
-    whole = lens((-c, c), 2 * k, conic=(conic, conic), vertex=-k)
-    whole = whole.mapped(affine(90, (1.0, LENS_STRETCH)))
-    if resolution is None:
-        return whole
-    tip = float(np.abs(whole.vertices[:, 0]).max()) / LENS_STRETCH
-    # Summed as the document sums them.
-    r = np.cumsum([0.0, *[resolution] * math.ceil(tip / resolution)])
-    r = r[r < tip][:-1]
-    x, y = np.append(LENS_STRETCH * r, LENS_STRETCH * tip), np.append(k + sag(r, c, conic), 0.0)
-    quarter = np.stack([x, y], 1)[::-1]
-    quarters = [quarter * sign for sign in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
-    vertices = [q[:-1] if j % 2 == 0 else q[::-1][:-1] for j, q in enumerate(quarters)]
-    return polygonal(np.concatenate(vertices) + 0.0, closed=True)
 
 
 def luneburg(radius: float, layers: int) -> list[tuple[Curve, float]]:

@@ -25,8 +25,7 @@ from .intersect_arcs import ConicArcs
 from .intersect_segments import LineSegments
 from .mesh_acceleration import SHORTEST, MeshAcceleration
 from .path_loop import PathLoop
-from .paths import Paths
-from .segments import Array, Segments, finite_array
+from .segments import Array, Paths, Segments, finite_array
 
 METHODS = "auto", "brute", "mesh"
 FARTHEST = {"float32": 1e15, "float64": 1e100}  # of coordinates and indices: products of two do not overflow
@@ -83,8 +82,7 @@ class Tracer:
         self.farthest = FARTHEST[precision]
         for name in ("start", "end", "n_left", "n_right"):
             _check_range(f"segments.{name}", getattr(segments, name), self.farthest)
-        self.middle = _middle(segments)
-        segments = _moved(segments, -self.middle)
+        segments, self.middle = _centred(segments)
         ends = segments.start, segments.end, segments.vertices
         boundaries = LineSegments(arrays, *ends)
         if segments.control is not None and segments.weight is not None:
@@ -106,24 +104,20 @@ class Tracer:
         origins = finite_array("origins", origins, (len(origins), 2) if np.ndim(origins) else (0, 2))
         directions = _scaled(finite_array("directions", directions, origins.shape))
         count = len(origins)
-        _check_depth(max_depth, count)
+        if isinstance(max_depth, bool) or not isinstance(max_depth, int | np.integer) or max_depth < 1:
+            raise ValueError(f"max_depth = {max_depth!r}; expected a whole number, 1 or more")
+        if count * (max_depth + 1) >= 2**32:
+            raise ValueError(f"{count} rays, max_depth = {max_depth}; expected a product below 2³²")
         index = None if n_start is None else _each("n_start", n_start, count, "iuf", float)
         none = np.ndim(reflect) == 0 and reflect == 0
         mirrored = None if none else _each("reflect", reflect, count, "iu", np.uint32)
         _check_range("origins", origins, self.farthest)
-        found = self.loop(origins - self.middle, directions, index, mirrored, max_depth, weights)
+        fields = self.loop(origins - self.middle, directions, index, mirrored, max_depth, weights)
         if self.middle.any():
-            found["points"] = (found["points"] + self.middle).astype(found["points"].dtype)
-            found["points"][0] = origins
-        found["directions"] = found["directions"][0]
-        return Paths(**{name: x if name == "directions" else np.swapaxes(x, 0, 1) for name, x in found.items()})
-
-
-def _check_depth(max_depth: Any, rays: int) -> None:
-    if isinstance(max_depth, bool) or not isinstance(max_depth, int | np.integer) or max_depth < 1:
-        raise ValueError(f"max_depth = {max_depth!r}; expected a whole number, 1 or more")
-    if rays * (max_depth + 1) >= 2**32:
-        raise ValueError(f"{rays} rays, max_depth = {max_depth}; expected a product below 2³²")
+            fields["points"] = (fields["points"] + self.middle).astype(fields["points"].dtype)
+            fields["points"][0] = origins
+        directions = fields.pop("directions")[0]
+        return Paths(directions=directions, **{name: np.swapaxes(x, 0, 1) for name, x in fields.items()})
 
 
 def _scaled(directions: Array) -> Array:
@@ -135,7 +129,7 @@ def _scaled(directions: Array) -> Array:
     size = np.maximum(*np.abs(directions).T)
     if not size.all():
         raise ValueError(f"directions[{int(np.argmin(size))}] = (0, 0); expected a direction")
-    return np.ldexp(directions, 1 - np.frexp(size)[1][:, None])
+    return np.asarray(np.ldexp(directions, 1 - np.frexp(size)[1][:, None]))
 
 
 def _check_range(name: str, values: Array, largest: float) -> None:
@@ -144,8 +138,8 @@ def _check_range(name: str, values: Array, largest: float) -> None:
         raise ValueError(f"{name}: a number beyond ±{largest:g}")
 
 
-def _middle(segments: Segments) -> Array:
-    """The origin that coordinates are counted from: 0, or per axis the middle of boundaries that are far from 0.
+def _centred(segments: Segments) -> tuple[Segments, Array]:
+    """The segments as seen from a new origin, and that: 0, or per axis the middle of boundaries that are far from 0.
 
     Far is where |middle| exceeds twice the extent. Then |x − middle| < |middle|/2: the differences are exact, and
     float32 keeps all its digits for them.
@@ -153,17 +147,14 @@ def _middle(segments: Segments) -> Array:
     places = [segments.start, segments.end] + ([] if segments.control is None else [segments.control])
     low, high = (f([f(x, axis=0) for x in places], axis=0) for f in (np.min, np.max))
     middle = low / 2 + high / 2
-    return np.where(np.abs(middle) > 2 * (high - low).max(), middle, 0.0)
-
-
-def _moved(segments: Segments, by: Array) -> Segments:
-    if not by.any():
-        return segments
-    start, end, control = segments.start + by, segments.end + by, segments.control
+    middle = np.where(np.abs(middle) > 2 * (high - low).max(), middle, 0.0)
+    if not middle.any():
+        return segments, middle
+    start, end, control = segments.start - middle, segments.end - middle, segments.control
     if control is not None:  # a straight segment stays straight to the last bit
         straight = (control == (segments.start + segments.end) / 2).all(1)[:, None]
-        control = np.where(straight, (start + end) / 2, control + by)
-    return replace(segments, start=start, end=end, control=control)
+        control = np.where(straight, (start + end) / 2, control - middle)
+    return replace(segments, start=start, end=end, control=control), middle
 
 
 def _each(name: str, values: Any, count: int, kinds: str, kind: Any) -> Any:

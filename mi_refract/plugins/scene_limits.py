@@ -133,8 +133,10 @@ def _attributes(text: bytes, parameters: Mapping[str, str]) -> dict[str, str]:
         name = next((name for name in names if name in parameters), None)
         return match[0] if name is None else parameters[name] + match[1][len(name) :]
 
-    pairs = {name: unescape(value[1:-1].decode(errors="replace")) for name, value in _ATTRIBUTE.findall(text)}
-    return {name.decode(): _PARAMETER.sub(replace, value).replace("\\$", "$") for name, value in pairs.items()}
+    pairs = (
+        (name.decode(), unescape(value[1:-1].decode(errors="replace"))) for name, value in _ATTRIBUTE.findall(text)
+    )
+    return {name: _PARAMETER.sub(replace, value).replace("\\$", "$") for name, value in pairs}
 
 
 def _elements(path: Path, content: bytes) -> Iterator[tuple[bytes, bytes]]:

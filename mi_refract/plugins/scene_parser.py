@@ -102,12 +102,14 @@ class ParsedScene:
             expected = f"those; to load native code shipped with a scene, pass --allow-plugins {unknown[0]}"
             raise ValueError(f"{path}: plugin {unknown[0]!r}: neither Mitsuba's nor mi_refract's; expected {expected}")
         images, meshes = set[str](), set[str]()
-        for props in (node.props for node in nodes):
+        seen = mi.parser.ParserState(self.state)  # a copy: reading a parameter marks it as used
+        for props, read in ((node.props, copy.props) for node, copy in zip(nodes, seen.nodes, strict=True)):
             plugin = props.plugin_name()
             if (name := NEEDED.get(plugin)) and name not in props:
                 raise ValueError(f"{path}: plugin {plugin!r} without {name!r}; expected one with it")
-            for name, value in _texts(props):
-                props[name] = value = (moved or {}).get(value, value)
+            for name, value in _texts(read):
+                if moved and value in moved:
+                    props[name] = value = moved[value]
                 if name == "filename" and plugin in ("ply", "bitmap", "envmap"):
                     (meshes if plugin == "ply" else images).add(value)
         with folders(own_folder(), *self.folders):  # Mitsuba's own folder before every <path>

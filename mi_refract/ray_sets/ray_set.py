@@ -11,8 +11,9 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,6 @@ from .header import FORMAT, PRECISIONS, Header, Ids
 # Their vectors are unit up to the rounding of each component, as the documented formulas require.
 DEFAULT = tuple(name for name, regime in regimes.REGIMES.items() if regime.unit and not regime.rests_on_denormals)
 COUNT, PRECISION = 1000, "f32"
-ROWS = 2**16  # that are in float64 at once, which takes several times what the rays do
 CONVENTIONS = {
     "a": "incident direction, pointing toward the surface",
     "n": "normal, on the side that the ray comes from: n.a <= 0",
@@ -56,6 +56,10 @@ class RaySet:
         """The number of rays."""
         return len(self.ids)
 
+    def __getitem__(self, mask: NDArray[np.bool_]) -> RaySet:
+        """The rays of a mask (N,), under the same header."""
+        return RaySet(self.rays[mask], self.ids[mask], self.header)
+
     @property
     def precision(self) -> str:
         """ "f32" or "f64": the precision of the numbers, and the one that the answers claim."""
@@ -77,14 +81,8 @@ class RaySet:
     @property
     def numbers(self) -> Array:
         """(N, 9) float64: id, a, n, n_from, n_to; with media (N, 11): wavelength, medium."""
-        return np.concatenate(list(self.numbers_in_pieces()))
-
-    def numbers_in_pieces(self) -> Iterator[Array]:
-        """`numbers`, ROWS at a time."""
-        for i in range(0, len(self), ROWS):
-            ids, rays = self.ids[i : i + ROWS], self.rays[i : i + ROWS]
-            columns = [ids, rays.a, rays.n, *indices(rays.k), *media_rays.columns(self.header, ids).T]
-            yield np.column_stack(columns).astype(np.float64)
+        rays, of_media = self.rays, media_rays.columns(self.header, self.ids).T
+        return np.column_stack([self.ids, rays.a, rays.n, *indices(rays.k), *of_media]).astype(np.float64, copy=False)
 
 
 def in_regime(header: Header, name: str, ids: Ids) -> NDArray[np.bool_]:
@@ -104,7 +102,7 @@ class Answers:
 
     ids: Ids
     b: Array
-    transmitted: NDArray[np.bool_] | None = None
+    transmitted: NDArray[Any] | None = None
     header: Header = field(default_factory=dict)
     n_ratio: Array | None = None
 
@@ -117,6 +115,11 @@ class Answers:
             if (wrong := self.transmitted[~np.isin(self.transmitted, (0, 1))]).size:
                 raise ValueError(f"answers: transmitted is {wrong[0]}; expected 0 or 1")
             object.__setattr__(self, "transmitted", self.transmitted.astype(bool))  # `~` of an integer is another one
+
+    def __getitem__(self, mask: NDArray[np.bool_]) -> Answers:
+        """The answers of a mask (N,), under the same header."""
+        columns = [None if column is None else column[mask] for column in (self.transmitted, self.n_ratio)]
+        return Answers(self.ids[mask], self.b[mask], columns[0], self.header, columns[1])
 
 
 def default(media: Sequence[str] = ()) -> tuple[str, ...]:
@@ -140,9 +143,15 @@ def make(
     nm. Errors as of `header_of`.
     """
     header = header_of(names, count, precision, seed, two_sided, media, wavelengths)
-    rays = Rays.joined([of_regime(name, header) for name in header["regimes"]])
-    made = RaySet(rays, np.arange(len(rays)), header)
-    return replace(made, header=header | {"checksum": checksum(made)})
+    parts = []
+    for name, (first, last) in header["regimes"].items():
+        if media_rays.has_media(header):
+            k = media_rays.ratios(header, np.arange(first, last + 1))
+            parts.append(regimes.make_given(name, k, PRECISIONS[precision], seed))
+        else:
+            parts.append(regimes.make(name, count, PRECISIONS[precision], seed))
+    rays = Rays.joined(parts if two_sided else [facing(part) for part in parts])
+    return with_checksum(RaySet(rays, np.arange(len(rays)), header))
 
 
 def header_of(
@@ -185,28 +194,20 @@ def header_of(
     return header
 
 
-def of_regime(name: str, header: Header) -> Rays:
-    """The rays of one regime of the set with this header."""
-    precision, seed = PRECISIONS[header["precision"]], header["seed"]
-    if media_rays.has_media(header):
-        first, last = header["regimes"][name]
-        k = media_rays.ratios(header, np.arange(first, last + 1))
-        rays = regimes.make_given(name, k, precision, seed)
-    else:
-        rays = regimes.make(name, header["count"], precision, seed)
-    return rays if header["two_sided"] else facing(rays)
-
-
 def facing(rays: Rays) -> Rays:
     """The same rays, each with its normal on the side that it comes from."""
     c = float_expansions.dot(rays.n.T.astype(np.float64), rays.a.T.astype(np.float64))[0]
     return Rays(rays.a, np.where(c[:, None] > 0, -rays.n, rays.n), rays.k)
 
 
-def checksum(rays: RaySet) -> str:
-    """SHA-256 of the header without its own line, and of the numbers. It does not depend on the file format."""
-    hashed = {key: value for key, value in rays.header.items() if key != "checksum"}
+def checksum(header: Header, numbers: Array) -> str:
+    """SHA-256 of the header without its own line, and of `RaySet.numbers`. It does not depend on the file format."""
+    hashed = {key: value for key, value in header.items() if key != "checksum"}
     digest = hashlib.sha256(json.dumps(hashed, sort_keys=True).encode())
-    for numbers in rays.numbers_in_pieces():
-        digest.update(numbers.astype("<f8").tobytes())
+    digest.update(np.ascontiguousarray(numbers, "<f8").data)
     return f"sha256:{digest.hexdigest()}"
+
+
+def with_checksum(rays: RaySet) -> RaySet:
+    """The set, with its checksum in the header."""
+    return replace(rays, header=rays.header | {"checksum": checksum(rays.header, rays.numbers)})

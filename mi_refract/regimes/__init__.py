@@ -7,8 +7,7 @@ refraction.
 """
 
 from .angles import Draw, rays_at
-from .radicand import radicand, radicand_and_gradient
-from .rays import Array, Index, Rays, Triple, normalised
+from .rays import Array, Index, Rays, Triple, normalised, radicand, radicand_and_gradient
 from .table import REGIMES, Regime, make, make_given
 
 __all__ = [

@@ -1,12 +1,25 @@
-"""Families of rays given by lengths and components: far from unit, zeros of either sign, denormal numbers."""
+"""Families of rays given by lengths and components: far from unit, zeros, denormal, exactly or nearly critical."""
 
 from __future__ import annotations
+
+import functools
 
 import numpy as np
 from numpy.random import Generator
 
 from .angles import mixed, rays_at
-from .rays import Array, Triple, either, log_uniform, normalised
+from .rays import (
+    Array,
+    Index,
+    Triple,
+    either,
+    length,
+    log_uniform,
+    normalised,
+    power_of_two,
+    radicand_and_gradient,
+    rounded,
+)
 
 
 def lengths(rng: Generator, n: Array) -> Triple:
@@ -64,4 +77,104 @@ def tiny(rng: Generator, like: Array) -> Array:
     """Denormal numbers of either sign."""
     limits = np.finfo(like.dtype)
     whole = np.exp2(rng.uniform(0, limits.nmant, like.shape)).round()
-    return np.ldexp(whole, limits.minexp - limits.nmant) * rng.choice([-1.0, 1.0], like.shape)
+    return np.asarray(np.ldexp(whole, limits.minexp - limits.nmant) * rng.choice([-1.0, 1.0], like.shape))
+
+
+# What rounding does not spoil: exactly tangential, exactly critical ---------------------------------------------------
+
+
+def tangential(rng: Generator, n: Array) -> Triple:
+    """Half of them a = n × v in whole numbers, half (x, y, 0) and (−y, x, 0) in some order; times powers of two."""
+    count, bits = len(n), np.finfo(n.dtype).nmant // 2 - 1
+    whole, v = np.rint(rng.uniform(-(2**bits), 2**bits, (2, count, 3)))
+    product = np.cross(whole, v)
+    x, y = rounded(normalised(rng.normal(size=(count, 2))), n.dtype).T
+    turn, zero = rng.integers(0, 3, count), np.zeros(count)
+    flat_a, flat_n = (_turned(np.stack(c, axis=1), turn) for c in ((x, y, zero), (-y, x, zero)))
+    flat = (rng.random(count) < 0.5) | ~product.any(axis=1)
+    a, n = np.where(flat[:, None], flat_a, product), np.where(flat[:, None], flat_n, whole)
+    _, k = mixed(rng, count, float(np.finfo(n.dtype).eps))
+    return a * power_of_two(rng, count), n * power_of_two(rng, count), k
+
+
+def _turned(v: Array, turn: Index) -> Array:
+    """The components of every vector moved on cyclically by 0, 1 or 2."""
+    return np.take_along_axis(v, (np.arange(3) - turn[:, None]) % 3, axis=1)
+
+
+@functools.cache
+def _solutions() -> Array:
+    """Whole (x, y, z) and dyadic k with k² (x² + y²) = x² + y² + z²: a = (x, y, z) on n = (0, 0, 1) is critical."""
+    k = np.unique(np.concatenate([np.arange(2**m + 1, 2 ** (m + 2)) / 2**m for m in range(1, 7)]))
+    x, y = (v.ravel()[1:] for v in np.meshgrid(np.arange(129), np.arange(129)))
+    s = (x * x + y * y)[:, None]
+    # k² has 12 bits after the point: s (k² − 1) is exact, and so is the root where it is whole.
+    z = np.rint(np.sqrt(s * (k * k - 1)))
+    i, j = np.nonzero((z * z == s * (k * k - 1)) & (z > 0))
+    return np.stack([x[i], y[i], z[i, j], k[j]], axis=1)
+
+
+def exactly_critical(rng: Generator, n: Array) -> Triple:
+    """Whole solutions, turned by the whole matrix of a quaternion, which multiplies all lengths by its own square."""
+    count = len(n)
+    x, y, z, k = _solutions()[rng.integers(0, len(_solutions()), count)].T
+    small = rng.integers(-7, 8, (4, count)).astype(float)
+    small[0][~small.any(axis=0)] = 1
+    rotation = _rotation(*small)
+    local = np.stack([x * either(rng, count), y * either(rng, count), z * either(rng, count)], axis=1)
+    a = np.einsum("ijn,nj->ni", rotation, local)
+    return a * power_of_two(rng, count), rotation[:, 2].T * power_of_two(rng, count), k
+
+
+def _rotation(w: Array, x: Array, y: Array, z: Array) -> Array:
+    """(3, 3, N): the rotation of the quaternion times w² + x² + y² + z²."""
+    ww, xx, yy, zz = w * w, x * x, y * y, z * z
+    return np.array(
+        [
+            [ww + xx - yy - zz, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), ww - xx + yy - zz, 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), ww - xx - yy + zz],
+        ]
+    )
+
+
+# As near to the critical angle as the precision allows ----------------------------------------------------------------
+
+
+def to_the_ulp(least: float, most: float, rng: Generator, n: Array) -> Triple:
+    """Rays whose exact radicand is as near to 0 as one number among them can bring it, then up to two ulps aside.
+
+    k − 1 is log-uniform in `least` … `most`. For a third of them that number is k, for the rest the component of `a`
+    along the axis j that n is farthest from: it starts at 2u … 2⁻², and the smaller it is the finer are its ulps, down
+    to a radicand of u² of its terms.
+    """
+    count, precision, eps = len(n), n.dtype, float(np.finfo(n.dtype).eps)
+    wide, rows = n.astype(np.float64), np.arange(count)
+    j = np.argmin(np.abs(wide), axis=1)
+    k = rounded(1 + log_uniform(rng, least, most, count), precision)
+    start = log_uniform(rng, eps, 0.25, count) * either(rng, count)
+    a = rounded(_on_the_cone(rng, wide, j, k, start), precision)
+    by_k = (rng.random(count) < 1 / 3) | (np.abs(a[rows, j]) > 0.25)
+    for _ in range(2):
+        d, along = radicand_and_gradient(a, wide, k)
+        # A step that would leave |a| = 1 by more than u/4 is left to k.
+        step = d / along[rows, j]
+        by_k |= np.abs(step) * (np.abs(a[rows, j]) + np.abs(step)) > eps / 8
+        a[rows, j] -= np.where(by_k, 0, step)
+        a, k = rounded(a, precision), rounded(k - np.where(by_k, d / along[:, 6], 0), precision)
+    aside = rng.integers(-2, 3, count)
+    a[rows, j] += np.where(by_k, 0, aside) * np.spacing(np.abs(a[rows, j]).astype(precision))
+    return a, n, k + np.where(by_k, aside, 0) * np.spacing(k.astype(precision))
+
+
+def _on_the_cone(rng: Generator, n: Array, j: Index, k: Array, start: Array) -> Array:
+    """Unit a at the critical angle from ±n, whose component j is `start` as far as the cone reaches there."""
+    rows, sine, cosine = np.arange(len(n)), 1 / k, np.sqrt((k - 1) * (k + 1)) / k * either(rng, len(n))
+    n = n / length(n)[:, None]
+    p = -n[rows, j][:, None] * n
+    p[rows, j] += 1
+    p /= length(p)[:, None]
+    cos_turn = np.clip((start - cosine * n[rows, j]) / (sine * p[rows, j]), -1, 1)
+    sin_turn = np.sqrt(1 - cos_turn**2) * either(rng, len(n))
+    tangent = cos_turn[:, None] * p + sin_turn[:, None] * np.cross(n, p)
+    return normalised(cosine[:, None] * n + sine[:, None] * tangent)

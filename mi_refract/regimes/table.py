@@ -10,9 +10,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import ArrayLike, DTypeLike
 
-from . import angles, components, exact_cases
+from . import angles, components
 from .angles import AngleAt, aimed, at
-from .nearest_critical import to_the_ulp
 from .rays import Array, Build, Rays, Triple, normalised, rounded
 
 
@@ -53,12 +52,14 @@ REGIMES = {
         least_k=1.0,
     ),
     "critical, to the ulp": Regime(
-        functools.partial(to_the_ulp, 0.05, 1.5),
+        functools.partial(components.to_the_ulp, 0.05, 1.5),
         2.51,
         "k in 1.05 … 2.5, the radicand of the rounded numbers as near to 0 as two ulps of one of them, both sides",
     ),
     "critical, any k, to the ulp": Regime(
-        functools.partial(to_the_ulp, 1e-6, 9.9e5), 1e6, "the same for k − 1 in 1e-6 … 1e6: grazing to near-normal"
+        functools.partial(components.to_the_ulp, 1e-6, 9.9e5),
+        1e6,
+        "the same for k − 1 in 1e-6 … 1e6: grazing to near-normal",
     ),
     "matched": Regime(at(angles.matched), 1.01, "|k − 1| from an ulp to 1e-2, cosine uniform"),
     "matched, grazing": Regime(
@@ -100,10 +101,10 @@ REGIMES = {
         any_k=True,
     ),
     "tangential": Regime(
-        exact_cases.tangential, 1e6, "n·a = 0 exactly, lengths from 2⁻¹² up, ratios of all sets", False, any_k=True
+        components.tangential, 1e6, "n·a = 0 exactly, lengths from 2⁻¹² up, ratios of all sets", False, any_k=True
     ),
     "exactly critical": Regime(
-        exact_cases.exactly_critical, 4.0, "radicand exactly 0: whole a and n times powers of two", False
+        components.exactly_critical, 4.0, "radicand exactly 0: whole a and n times powers of two", False
     ),
 }
 
@@ -115,7 +116,7 @@ def make_given(name: str, ratios: ArrayLike, precision: DTypeLike, seed: int = 0
     """
     regime, k = REGIMES[name], rounded(np.asarray(ratios, float), precision)
     if not regime.takes_k:
-        taking = ", ".join(repr(each) for each in REGIMES if REGIMES[each].takes_k)
+        taking = ", ".join(repr(other) for other in REGIMES if REGIMES[other].takes_k)
         raise ValueError(f"regime {name!r}: its ratios of indices are its own; expected {taking}")
     if (k < regime.least_k).any():
         raise ValueError(f"regime {name!r}: k = {k.min():.6g}; expected {regime.least_k:g} or more")

@@ -7,7 +7,9 @@ workers that are alike.
 """
 
 __all__ = [
+    "checkpoint",
     "cluster_passes",
+    "end_conditions",
     "error_estimate",
     "long_render",
     "pass_plan",

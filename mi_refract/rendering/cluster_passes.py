@@ -1,7 +1,8 @@
 """Passes of a render on the workers of a cluster, summed there in the tree's own nodes before they come back.
 
 A task renders ARITY**k passes in a row, so that it takes seconds; other tasks fold ARITY nodes into one of the next
-level, so that a node comes back every few seconds. Sums are made in the order of `PassTree`: who made them is not seen.
+level, so that a node comes back every few seconds. Sums are made in the order of `PassTree`, so that the bits do not
+depend on who made them.
 """
 
 from __future__ import annotations
@@ -10,70 +11,47 @@ import contextlib
 import itertools
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from concurrent import futures
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
 from mi_refract import backend
-from mi_refract.cluster import on_worker, worker_facts
-from mi_refract.cluster.connection import in_thread, scheduler_needed
+from mi_refract.cluster import on_worker
+from mi_refract.cluster.connection import cluster_errors
+from mi_refract.cluster.spread import fetched, finished
 from mi_refract.cluster.workers import Workers
 
 from . import scene_bundle
 from .pass_plan import next_stop
 from .pass_sums import ARITY, PassSums, aligned_nodes
+from .render_pass import pass_renderer
 from .rendered_file import nonfinite_pixels
 from .scene_bundle import SceneBundle
 
 TASK_SECONDS = 3.0  # of a task that renders more than one pass, at most: nobody waits longer for a slow worker
-# Between two nodes, at most. What a kill may lose: BETWEEN_CHECKPOINTS, and what is not yet a whole node.
-NODE_SECONDS = 5.0
+NODE_SECONDS = 5.0  # between two nodes, at most: a kill loses what is not yet a whole node
 LEVELS = 4  # of a node, at most
 AHEAD = 3  # tasks for each thread of the workers
 NODES = 64  # that are begun at a time, at least; the workers keep what is finished of them
 RETRIES = 2
-_FIRST = 1000  # priority of what passes wait for
 _MEASURED = 16  # nodes whose time counts
-_POLL = 0.5  # seconds
 
 
 @dataclass(frozen=True)
 class Part:
-    """The sums of a node; the addresses of the workers that rendered it, and their pixels that are not finite.
-
-    `seconds`: of the workers, for all its passes.
-    """
+    """The sums of a node, of which workers rendered how many pixels that are not finite, and their seconds in all."""
 
     sums: PassSums
-    nonfinite: dict[str, int]
+    nonfinite: dict[str, int]  # the most of a pass, by the address of the worker
     seconds: float
-
-
-@dataclass(frozen=True)
-class RenderedScene:
-    """What a worker must know beside the bundle: the variant, the `<default>`s, the seed of the render.
-
-    `expected`: facts that a worker must have, but for `tolerated`, where any may be given a task; None: none is asked.
-    """
-
-    variant: str
-    defines: Mapping[str, str]
-    seed: int
-    expected: Mapping[str, str] | None = None
-    tolerated: frozenset[str] = frozenset()
-
-
-class RefusedWorkerError(RuntimeError):
-    """A worker that has just come was given a task before it was asked for its facts, and must not have it."""
 
 
 # On a worker ----------------------------------------------------------------------------------------------------------
 
 
 def keep(bundle: SceneBundle) -> SceneBundle:
-    """The task whose result the others ask for: so the bundle goes to each worker once, also from the others."""
+    """The task that the others depend on: so the bundle goes to each worker once, also from the others."""
     return bundle
 
 
@@ -83,51 +61,38 @@ def unpack(bundle: SceneBundle) -> None:
     on_worker.one_at_a_time(lambda: scene_bundle.unpack(bundle, folder))
 
 
-def render_node(bundle: SceneBundle, scene: RenderedScene, level: int, first: int, spp: int) -> Part:
+def render_node(bundle: SceneBundle, variant: str, seed: int, level: int, first: int, spp: int) -> Part:
     """Render ARITY**level passes of `spp` samples per pixel each, from number `first` on, and sum them.
 
-    Errors: those of `load_scene` and of the scene itself, with the paths of the machine that made the bundle;
-    RefusedWorkerError.
+    `seed`: of the render. Errors: those of `load_scene` and of the scene itself, with the paths of the machine that
+    made the bundle.
     """
-    if scene.expected is not None and worker_facts.differences(
-        worker_facts.facts(scene.variant), scene.expected, scene.tolerated
-    ):
-        raise RefusedWorkerError(on_worker.address())
     address, threads, folder = on_worker.address(), on_worker.threads(), on_worker.scratch_folder()
 
     def rendered() -> Part:
-        began = time.monotonic()
-        if on_worker.variant() != scene.variant:
-            backend.activate(scene.variant)
+        began, bad = time.monotonic(), [0]
+        if on_worker.variant() != variant:
+            backend.activate(variant)
         on_worker.limit_threads(threads)
-        sums, bad = _rendered(bundle, scene, folder, (level, first, spp))
-        return Part(sums, {address: bad}, time.monotonic() - began)
+        scene, root = scene_bundle.load(bundle, variant, folder)
+        renderer = pass_renderer(scene, seed)
+
+        def made(level: int, first: int) -> PassSums:
+            if level:
+                size = ARITY ** (level - 1)
+                sums = made(level - 1, first)
+                for i in range(1, ARITY):
+                    sums.add(made(level - 1, first + i * size))
+                return sums
+            sums = renderer.render(first, spp)
+            bad.append(nonfinite_pixels(sums))
+            return sums
+
+        with scene_bundle.original_paths(root):
+            sums = made(level, first)
+        return Part(sums, {address: max(bad)}, time.monotonic() - began)
 
     return on_worker.one_at_a_time(rendered)
-
-
-def _rendered(
-    bundle: SceneBundle, scene: RenderedScene, folder: str, node: tuple[int, int, int]
-) -> tuple[PassSums, int]:
-    """The sums of a node (level, first pass, samples of a pass), and the most pixels of a pass that are not finite."""
-    from .render_pass import pass_renderer
-
-    loaded, root = scene_bundle.load(bundle, scene.variant, scene.defines, folder)
-    renderer, spp, bad = pass_renderer(loaded, scene.seed), node[2], [0]
-
-    def made(level: int, first: int) -> PassSums:
-        if level:
-            size = ARITY ** (level - 1)
-            sums = made(level - 1, first)
-            for i in range(1, ARITY):
-                sums.add(made(level - 1, first + i * size))
-            return sums
-        sums = renderer.render(first, spp)
-        bad.append(nonfinite_pixels(sums))
-        return sums
-
-    with scene_bundle.original_paths(root):
-        return made(*node[:2]), max(bad)
 
 
 def fold(*parts: Part) -> Part:
@@ -147,7 +112,7 @@ def fold(*parts: Part) -> Part:
 
 @dataclass(frozen=True)
 class _Node:
-    """A node that was asked for. `needed`: one of these workers must be there; `tasks`: those that still render."""
+    """A node that is being rendered. `needed`: one of these workers must be there; `tasks`: those that still render."""
 
     level: int
     first: int
@@ -161,21 +126,22 @@ class _Node:
 
 
 class ClusterPasses:
-    """Renders passes on workers that were accepted. To be closed at the end, which cancels what is still asked for."""
+    """Renders passes on workers that were accepted. To be closed at the end, which cancels what is still begun."""
 
     def __init__(
         self,
         workers: Workers,
         bundle: SceneBundle,
-        scene: RenderedScene,
+        variant: str,
+        seed: int,
         warn: Callable[[str], None] = lambda text: None,
     ) -> None:
-        """`warn` is told of machines whose pixels are not finite."""
-        self.workers, self.bundle, self.scene, self.warn = workers, bundle, scene, warn
+        """`warn` is called with the machines whose pixels are not finite."""
+        self.workers, self.bundle, self.variant, self.seed, self.warn = workers, bundle, variant, seed, warn
         self._begun: deque[_Node] = deque()
         self._series = (0, 0)  # offset and samples of what is begun
         self._pass_seconds: deque[float] = deque(maxlen=_MEASURED)
-        self._handed: dict[str, Any] = {}  # who has unpacked the bundle, or will
+        self._handed: dict[str, Any] = {}  # which workers have unpacked the bundle, or will
         self._kept: tuple[Any, frozenset[str]] = (None, frozenset())  # the bundle there, and who may make it
         self._warned: set[str] = set()
         self._count = itertools.count()
@@ -192,13 +158,18 @@ class ClusterPasses:
             while first < stop:
                 if self._begun and self._begun[0].stop > stop:
                     self.close()
-                with scheduler_needed(self.workers.client):
-                    node, part = self._next(first, stop, last)
+                node, part = self._next(first, stop, last)
                 if node.first != first:
                     raise RuntimeError(f"pass {node.first} came in place of {first}")
                 first = node.stop
-                self._note(node, part)
-                yield node.level, part.sums.copy(), self._machines(part)  # a copy: what Dask gives may be read-only
+                self._pass_seconds.append(part.seconds / part.sums.passes)
+                machines = {a: self.workers.machines.get(a, a) for a in part.nonfinite}
+                for address, count in part.nonfinite.items():
+                    if count and machines[address] not in self._warned:
+                        self._warned.add(machines[address])
+                        self.warn(f"{machines[address]}: {count} pixels of a pass are not finite")
+                # A copy: what Dask gives may be read-only.
+                yield node.level, part.sums.copy(), ", ".join(sorted(set(machines.values())))
         except BaseException:
             self.close()
             raise
@@ -209,9 +180,9 @@ class ClusterPasses:
             self._give_up(self._begun.popleft())
 
     def _give_up(self, node: _Node) -> None:
-        """Ask for it no more: the scheduler forgets what nobody asks for, and all that only this needs.
+        """Release a node: the scheduler forgets what nobody waits for, and all that only this needs.
 
-        `client.cancel` is not for nodes: at a fold of folds, for which nobody asks, the scheduler fails an assertion
+        `client.cancel` is not for nodes: at a fold of folds, for which nobody waits, the scheduler fails an assertion
         and closes the connection (Dask 2026.8).
         """
         if self.workers.client.status == "running":
@@ -221,49 +192,18 @@ class ClusterPasses:
 
     def _next(self, first: int, stop: int, last: int) -> tuple[_Node, Part]:
         """The node that begins at `first`, when it is here; more are begun meanwhile."""
-        asked, coming = None, None
+        client = self.workers.client
         while True:
             self.workers.look()
-            self._hand_out()
-            self._begin_again()
-            self._begin(first, stop, last)
+            with cluster_errors(client):
+                self._hand_out()
+                self._begin_again()
+                self._begin(first, stop, last)
             if not self._begun:
-                time.sleep(_POLL)
-                continue
-            if coming is None or self._begun[0] is not asked:
-                asked, coming = self._begun[0], in_thread(self._begun[0].result.result)
-            if coming in futures.wait([coming], _POLL).done:
-                self._begun.popleft()
-                try:
-                    return asked, self._part(asked, coming)
-                except RefusedWorkerError:
-                    self.workers.look(at_once=True)
-                    if again := self._asked(asked.level, asked.first, 0, listed=True):
-                        self._begun.appendleft(again)
-                    else:
-                        self.close()  # nobody may have it now: all is begun anew, from it on
-
-    def _part(self, node: _Node, coming: futures.Future[Part]) -> Part:
-        from distributed import KilledWorker
-
-        try:
-            return coming.result()
-        except KilledWorker as error:
-            raise ConnectionError(
-                f"passes {node.first} to {node.stop - 1}: {error.allowed_failures + 1} workers were lost that rendered "
-                f"them, the last {error.last_worker.address}; expected workers with enough memory"
-            ) from None
-
-    def _note(self, node: _Node, part: Part) -> None:
-        self._pass_seconds.append(part.seconds / part.sums.passes)
-        for address, count in part.nonfinite.items():
-            machine = self.workers.machines.get(address, address)
-            if count and machine not in self._warned:
-                self._warned.add(machine)
-                self.warn(f"{machine}: {count} pixels of a pass are not finite")
-
-    def _machines(self, part: Part) -> str:
-        return ", ".join(sorted({self.workers.machines.get(address, address) for address in part.nonfinite}))
+                time.sleep(0.5)
+            elif finished(client, [self._begun[0].result]):
+                for part in fetched(client, self._begun[0].result):
+                    return self._begun.popleft(), part
 
     # What is begun ----------------------------------------------------------------------------------------------------
 
@@ -291,36 +231,27 @@ class ClusterPasses:
                 stop = min(next_stop(stop + self._series[0]) - self._series[0], last)
             task, largest = self.levels()
             level, begin = aligned_nodes(begin, stop, largest)[0]
-            if not (node := self._asked(level, begin, min(task, level))):
+            if not (node := self._submitted(level, begin, min(task, level))):
                 return
             self._begun.append(node)
 
     def _enough(self) -> bool:
         threads, tasks = sum(self.workers.accepted.values()), 0
         for node in self._begun:
-            node.tasks[:] = [
-                task for task in node.tasks if not task.done()
-            ]  # what is done need not be kept there for us
+            node.tasks[:] = [task for task in node.tasks if not task.done()]  # what is done need not be kept for us
             tasks += len(node.tasks)
         return tasks >= AHEAD * threads or len(self._begun) >= max(NODES, AHEAD * threads)
 
-    def _asked(self, level: int, first: int, task: int, *, listed: bool = False) -> _Node | None:
-        """A node, asked of the workers that are accepted now; None where there are none.
-
-        They are listed at each task, which costs the scheduler 5 µs for every one, or where all are accepted and not
-        `listed` each looks by itself whether it may have the task.
-        """
-        allowed = frozenset(self.workers.accepted)
-        if not allowed:
+    def _submitted(self, level: int, first: int, task: int) -> _Node | None:
+        """A node, submitted to the workers that are accepted now; None where there are none."""
+        if not (allowed := frozenset(self.workers.accepted)):
             return None
-        (offset, spp), bundle, client, scene = self._series, self._bundle(allowed), self.workers.client, self.scene
+        (offset, spp), bundle, client = self._series, self._bundle(allowed), self.workers.client
         options: dict[str, Any] = {"retries": RETRIES, "pure": False, "priority": -next(self._count)}
-        if listed or not self.workers.all_accepted:
-            options["workers"], scene = sorted(allowed), replace(scene, expected=None)
-        size = ARITY**task
+        options["workers"] = sorted(allowed)
         parts = tasks = [
-            client.submit(render_node, bundle, scene, task, offset + number, spp, **options)
-            for number in range(first, first + ARITY**level, size)
+            client.submit(render_node, bundle, self.variant, self.seed, task, offset + number, spp, **options)
+            for number in range(first, first + ARITY**level, ARITY**task)
         ]
         while len(parts) > 1:
             parts = [client.submit(fold, *parts[i : i + ARITY], **options) for i in range(0, len(parts), ARITY)]
@@ -328,30 +259,25 @@ class ClusterPasses:
 
     def _bundle(self, allowed: frozenset[str]) -> Any:
         """The bundle on the workers; sent again where all have gone that were allowed to have it."""
-        future, holders = self._kept
-        if not holders & allowed:
-            future, holders = (
-                self.workers.client.submit(keep, self.bundle, workers=sorted(allowed), pure=False),
-                allowed,
-            )
-            self._kept = future, holders
-        return future
+        if not self._kept[1] & allowed:
+            future = self.workers.client.submit(keep, self.bundle, workers=sorted(allowed), pure=False)
+            self._kept = future, allowed
+        return self._kept[0]
 
     def _hand_out(self) -> None:
-        """Have each worker unpack the bundle once. Of workers that are listed Dask chooses only who has it already."""
+        """Have each worker unpack the bundle once. Dask gives tasks to workers that have it already."""
         there = frozenset(self.workers.accepted)
         self._handed = {address: done for address, done in self._handed.items() if address in there}
         for address in there - self._handed.keys():
-            self._handed[address] = self.workers.client.submit(
-                unpack, self._bundle(there), workers=[address], pure=False, priority=_FIRST
-            )
+            options: dict[str, Any] = {"workers": [address], "pure": False, "priority": 1000}  # before all passes
+            self._handed[address] = self.workers.client.submit(unpack, self._bundle(there), **options)
 
     def _begin_again(self) -> None:
-        """Ask others for nodes whose workers have all gone: Dask would wait for these to come back."""
+        """Submit nodes whose workers have all gone to others: Dask would wait for these to come back."""
         there = self.workers.accepted.keys()
         for i, node in enumerate(self._begun):
             if there and node.needed.isdisjoint(there) and node.result.status != "error":
-                again = self._asked(node.level, node.first, 0)
-                if again is not None:
-                    self._give_up(node)
-                    self._begun[i] = again
+                self._give_up(node)
+                again = self._submitted(node.level, node.first, 0)
+                assert again is not None
+                self._begun[i] = again

@@ -1,4 +1,4 @@
-"""The image of a render as an EXR file: means, the variance of a sample beside each, and how it was made."""
+"""The image of a render as an EXR file: means, the variance of one sample beside each, and how it was made."""
 
 from __future__ import annotations
 
@@ -11,34 +11,33 @@ import numpy as np
 from mi_refract.io import image_file
 from mi_refract.io.image_file import Metadata, write_exr
 
-from .checkpoint import Progress
-from .identity import apart_from_passes, changed
+from .checkpoint import Progress, changes
 from .pass_plan import FEW
 from .pass_sums import PassSums
 
 VARIANCE = "{}.variance"
 SAMPLES = "samples: an upper bound where the sampler stratifies them"
-_KEPT = ("spp", "passes", "identity", "contrasts", "variance_from", "machines", "render_seconds", "ended_by")
 
 
 def header(progress: Progress, sums: PassSums, metadata: Metadata, ended_by: str) -> Metadata:
     """`metadata`, and what is known of the passes, whose sums are `sums`."""
+    source = "nothing" if not sums.freedom else "passes" if sums.within is None else SAMPLES
     return metadata | {
         "mi_refract:spp": sums.spp,
         "mi_refract:passes": sums.passes,
         "mi_refract:variance_freedom": sums.freedom,
-        "mi_refract:variance_from": _source(sums),
+        "mi_refract:variance_from": source,
         "mi_refract:nonfinite_pixels": nonfinite_pixels(sums),
         "mi_refract:identity": json.dumps(progress.identity, sort_keys=True),
-        "mi_refract:contrasts": json.dumps([float(f"{each:.9g}") for each in sums.contrasts]),
+        "mi_refract:contrasts": json.dumps([float(f"{contrast:.9g}") for contrast in sums.contrasts]),
         "mi_refract:ended_by": ended_by,
         "mi_refract:render_seconds": progress.seconds,
-        "mi_refract:machines": ", ".join(sorted(set(progress.machines))),
+        "mi_refract:machines": ", ".join(sorted(progress.machines)),
     }
 
 
 def write(output: Path, channels: tuple[str, ...], sums: PassSums, header: Metadata) -> None:
-    """Write what a render has. Errors: those of `write_exr`."""
+    """Write the image and its variance. Errors: those of `write_exr`."""
     pixels, names = [sums.mean], list(channels)
     if (variance := sums.variance) is not None:
         pixels.append(variance)
@@ -47,28 +46,25 @@ def write(output: Path, channels: tuple[str, ...], sums: PassSums, header: Metad
         write_exr(output, np.concatenate(pixels, -1, dtype=np.float32, casting="same_kind"), names, header)
 
 
-def _source(sums: PassSums) -> str:
-    """What the variance was estimated from."""
-    return "nothing" if not sums.freedom else "passes" if sums.within is None else SAMPLES
-
-
 def nonfinite_pixels(sums: PassSums) -> int:
     """Pixels with a value that is not finite."""
     return int((~np.isfinite(sums.total).all(-1)).sum())
 
 
 def read(output: Path, channels: tuple[str, ...], identity: dict[str, Any]) -> Progress | None:
-    """The finished render that a file holds, to go on from; None where there is none of this scene, seed and version.
+    """The finished render that a file holds, to be refined; None where there is none of this identity.
 
     Its sums are those of the file's float32.
     """
     try:
         image = image_file.read(output, image_file.MAX_VALUES * 4)
-        said = {name: image.metadata[f"mi_refract:{name}"] for name in _KEPT}
+        said = {name.removeprefix("mi_refract:"): value for name, value in image.metadata.items()}
         spp, passes = int(said["spp"]), int(said["passes"])
-        different = changed(apart_from_passes(json.loads(said["identity"])), identity)
-        contrasts = [float(each) for each in json.loads(said["contrasts"])]
-        if different or not 1 <= passes <= spp or len(contrasts) != passes - 1:
+        contrasts = [float(contrast) for contrast in json.loads(said["contrasts"])]
+        machines = {name for name in str(said["machines"]).split(", ") if name}
+        progress = Progress(identity, seconds=float(said["render_seconds"]), machines=machines)
+        progress.base_ended_by, variance_from = str(said["ended_by"]), said["variance_from"]
+        if changes(json.loads(said["identity"]), identity) or not 1 <= passes <= spp or len(contrasts) != passes - 1:
             return None
         mean = image.select(channels).astype(np.float64)
         variance = image.select([VARIANCE.format(name) for name in channels]) if spp > 1 else np.zeros(())
@@ -76,9 +72,8 @@ def read(output: Path, channels: tuple[str, ...], identity: dict[str, Any]) -> P
         return None
     variance = np.broadcast_to(variance.astype(np.float64), mean.shape)
     # Their sum over freedom is the variance that the file holds; under a wide filter a pixel has the expected weight.
-    within = variance * (spp - passes) if said["variance_from"] == SAMPLES and passes < FEW else None
-    sums = PassSums(spp, passes, mean * spp, variance * (passes - 1), within)
-    sums.contrasts, sums.colours = contrasts, int(identity["colours"])
-    machines = [name for name in str(said["machines"]).split(", ") if name]
-    seconds = float(said["render_seconds"])
-    return Progress(identity, base=sums, seconds=seconds, machines=machines, base_ended_by=str(said["ended_by"]))
+    within = variance * (spp - passes) if variance_from == SAMPLES and passes < FEW else None
+    progress.base = PassSums(
+        spp, passes, mean * spp, variance * (passes - 1), within, contrasts=contrasts, colours=int(identity["colours"])
+    )
+    return progress

@@ -1,14 +1,19 @@
-"""Scene files: loaded, with their errors in one line."""
+"""Scene files: parsed and loaded, with their errors in one line."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mi_refract.io.image_file import one_line
+
+if TYPE_CHECKING:  # they import Dr.Jit and Mitsuba
+    from mi_refract.numerics import Scene
+    from mi_refract.plugins.scene_parser import ParsedScene
 
 TAKEN = ("config", "filename")  # names that mi.parser.parse_file would take for its own
 REPRODUCIBLE: Any = {"parallel": False, "optimize": False}  # for mi.load_file, as `ParsedScene.load` does
@@ -28,52 +33,71 @@ def parse_defines(items: Sequence[str]) -> dict[str, str]:
     return defines
 
 
-def load_scene(
-    path: str | os.PathLike[str],
-    defines: Mapping[str, str] | None = None,
-    allow_plugins: Collection[str] = (),
-    moved: Mapping[str, str] | None = None,
-) -> Any:
-    """Load the Mitsuba scene in an XML file, in the present variant; `defines` replace values of its `<default>`s.
+def parse_scene(path: str | os.PathLike[str], defines: Mapping[str, str] | None = None) -> ParsedScene:
+    """Parse a Mitsuba scene in an XML file, for the present variant; nothing of it runs.
 
-    A scene may bring plugins, which are code: none is loaded but those in `allow_plugins`, Mitsuba's own and ours.
-    `moved`: where files are now, by their names in the scene.
-    FileNotFoundError for a missing file; ValueError, in one line, for other plugins, a file beyond the limits of
-    `mi_refract.plugins.scene_limits`, what Mitsuba does not accept, and a scene without a sensor.
+    `defines`: values that replace those of its `<default>`s. FileNotFoundError for a missing file; ValueError, in one
+    line, beyond the limits of `mi_refract.plugins.scene_limits` and for what Mitsuba's parser does not accept.
     """
-    import mitsuba as mi
-
-    from mi_refract.plugins import check_integrator, scene_parser
+    from mi_refract.plugins import scene_parser
 
     path, defines = Path(path), dict(defines or {})
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such scene file")
     if taken := [name for name in TAKEN if name in defines]:
         raise ValueError(f"define {taken[0]!r}: taken by Mitsuba's parser; expected any name but {TAKEN}")
+    with _in_one_line(path):
+        return scene_parser.parse(path, defines)
+
+
+def load_parsed(
+    parsed: ParsedScene, allow_plugins: Collection[str] = (), moved: Mapping[str, str] | None = None
+) -> Scene:
+    """Load a parsed scene, once.
+
+    A scene may bring plugins, which are code: only those in `allow_plugins`, Mitsuba's own and ours are loaded.
+    `moved`: where files are now, by their names in the scene. ValueError, in one line, for other plugins, what Mitsuba
+    does not accept, a scene without a sensor, and a film that is too large.
+    """
+    import mitsuba as mi
+
+    from mi_refract.plugins import check_integrator
+
+    path = parsed.path
+    with _in_one_line(path):
+        scene: Any = parsed.load(allow_plugins, moved)
+        if not isinstance(scene, mi.Scene):
+            raise ValueError(f"{path}: holds a {type(scene).__name__}; expected a <scene>")
+        if not scene.sensors():
+            raise ValueError(f"{path}: a scene without a sensor; expected at least one")
+        check_integrator(scene)
+        width, height = scene.sensors()[0].film().crop_size()
+        if width * height > PIXELS:
+            raise ValueError(f"{path}: a film of {width} × {height} pixels; expected up to {PIXELS}")
+    return scene
+
+
+def load_scene(
+    path: str | os.PathLike[str], defines: Mapping[str, str] | None = None, allow_plugins: Collection[str] = ()
+) -> Scene:
+    """Parse a scene file and load it, in the present variant. Arguments and errors: those of both."""
+    return load_parsed(parse_scene(path, defines), allow_plugins)
+
+
+def formulas_in(scene: Scene) -> list[str]:
+    """The formulas of the `refract` BSDFs in a scene, sorted; "promoted (auto)" where the plugin chose it."""
+    texts = (str(shape.bsdf()) for shape in scene.shapes())
+    return sorted({name for text in texts for name in re.findall(r"Refract\[.*?formula = (.+?),\n", text, re.DOTALL)})
+
+
+@contextlib.contextmanager
+def _in_one_line(path: Path) -> Iterator[None]:
     try:
-        scene = scene_parser.parse(path, defines).load(allow_plugins, moved)
+        yield
     except OSError:
         raise
     except Exception as error:  # RuntimeError from the parser; whatever a Python plugin raises
         raise ValueError(naming(path, error)) from None
-    if not isinstance(scene, mi.Scene):
-        raise ValueError(f"{path}: holds a {type(scene).__name__}; expected a <scene>")
-    if not scene.sensors():
-        raise ValueError(f"{path}: a scene without a sensor; expected at least one")
-    try:
-        check_integrator(scene)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    width, height = scene.sensors()[0].film().crop_size()
-    if width * height > PIXELS:
-        raise ValueError(f"{path}: a film of {width} × {height} pixels; expected up to {PIXELS}")
-    return scene
-
-
-def formulas_in(scene: Any) -> list[str]:
-    """The formulas of the `refract` BSDFs in a scene, sorted; "promoted (auto)" where the plugin chose it."""
-    texts = (str(shape.bsdf()) for shape in scene.shapes())
-    return sorted({name for text in texts for name in re.findall(r"Refract\[.*?formula = (.+?),\n", text, re.DOTALL)})
 
 
 def naming(path: str | os.PathLike[str], error: Exception) -> str:

@@ -56,25 +56,15 @@ def encoded(pixels: Any, limit: float = np.inf, scale: float = 1.0) -> dict[str,
 
     Where they do not fit, values are rounded, then blocks of pixels averaged.
     """
-    side, notes = 1, []
-    codes = _halves(pixels, scale)
+    side, codes = 1, _halves(pixels, scale)
     while (bits := _fitting(codes, limit)) is None and min(pixels.shape[:2]) > side:
         side *= 2
         codes = _halves(block_mean(pixels, side), scale)
-    if side > 1:
-        notes.append(f"means of {side} × {side} pixels")
-    if bits:
-        notes.append(f"values within {100 * 2.0 ** (bits - 11):.2g} %")
-    height, width, channels = codes.shape
+    notes = [f"means of {side} × {side} pixels"] if side > 1 else []
+    notes += [f"values within {100 * 2.0 ** (bits - 11):.2g} %"] if bits else []
+    size = dict(zip(("height", "width", "channels"), codes.shape, strict=True))
     data = base64.b64encode(_deflated(_rounded(codes, bits or 0))).decode()
-    return {
-        "width": width,
-        "height": height,
-        "channels": channels,
-        "scale": float(scale),
-        "data": data,
-        "note": ", ".join(notes),
-    }
+    return {**size, "scale": float(scale), "data": data, "note": ", ".join(notes)}
 
 
 def packed(text: str) -> str:
@@ -106,17 +96,12 @@ def strongest(values: Any, width: int) -> Any:
 def _halves(pixels: Any, scale: float) -> Any:
     """The bits of little-endian halves, of pixels / `scale`. Finite stays finite, and every NaN is the same."""
     codes = np.empty(pixels.shape, "<u2")
-    for start in range(
-        0, len(pixels), LINES
-    ):  # in parts: the intermediates of a whole image are several times its size
-        codes[start : start + LINES] = _half_lines(pixels[start : start + LINES] / np.float32(scale))
+    for start in range(0, len(pixels), LINES):  # the intermediates of a whole image are several times its size
+        part = pixels[start : start + LINES] / np.float32(scale)
+        with np.errstate(over="ignore", invalid="ignore"):
+            halves = np.where(np.isinf(part), part, np.clip(part, -LARGEST, LARGEST)).astype("<f2")
+        codes[start : start + LINES] = np.where(np.isnan(halves), np.float16(np.nan), halves).astype("<f2").view("<u2")
     return codes
-
-
-def _half_lines(pixels: Any) -> Any:
-    with np.errstate(over="ignore", invalid="ignore"):
-        clipped = np.where(np.isinf(pixels), pixels, np.clip(pixels, -LARGEST, LARGEST)).astype("<f2")
-    return np.where(np.isnan(clipped), np.float16(np.nan), clipped).astype("<f2").view("<u2")
 
 
 def _rounded(codes: Any, bits: int) -> Any:

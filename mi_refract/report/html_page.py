@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,6 @@ from mi_refract.io.atomic import write_atomically
 from mi_refract.io.sanitise import printable_lines
 
 from .embedded_images import EmbeddedImages
-from .first_page import code
 from .number_text import compact
 
 if TYPE_CHECKING:
@@ -56,15 +56,18 @@ def _environment() -> Environment:
     from markupsafe import Markup
 
     options: Any = {"autoescape": True, "undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
-    options["finalize"] = lambda value: value if isinstance(value, Markup) else _text(value)
+    options["finalize"] = lambda x: printable_lines(x) if isinstance(x, str) and not isinstance(x, Markup) else x
     environment = Environment(loader=FileSystemLoader(HERE), **options)
     filters: dict[str, Any] = {"compact": compact, "words": words, "code": code}
     environment.filters |= filters
     return environment
 
 
-def _text(value: Any) -> Any:
-    return printable_lines(value) if isinstance(value, str) else value
+def code(text: str) -> Any:
+    """Escaped HTML in which words between backticks are `<code>`."""
+    from markupsafe import Markup, escape
+
+    return Markup(re.sub("`([^`]*)`", r"<code>\1</code>", str(escape(printable_lines(text)))))
 
 
 def words(value: Any) -> str:

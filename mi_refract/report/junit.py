@@ -38,7 +38,13 @@ def write_junit(path: str | Path, name: str, suites: Mapping[str, Sequence[Case]
     for title, cases in suites.items():
         suite = xml.SubElement(root, "testsuite", {"name": printable(title)} | _counts(cases))
         for case in cases:
-            _append(suite, case)
+            element = xml.SubElement(suite, "testcase", classname=printable(case.group), name=printable(case.name))
+            details = "\n".join(map(printable, case.details)) or None
+            if case.outcome:
+                kind = {"type": printable(case.kind)} if case.kind else {}
+                xml.SubElement(element, case.outcome, kind | {"message": printable(case.message)}).text = details
+            elif details:
+                xml.SubElement(element, "system-out").text = details
     root.attrib |= _counts([case for cases in suites.values() for case in cases])
     xml.indent(root)
     document: bytes = xml.tostring(root, encoding="utf-8", xml_declaration=True)
@@ -49,13 +55,3 @@ def _counts(cases: Sequence[Case]) -> dict[str, str]:
     ends = Counter(case.outcome for case in cases)
     counts = {"failures": ends["failure"], "errors": ends["error"], "skipped": ends["skipped"]}
     return {key: str(count) for key, count in ({"tests": len(cases)} | counts).items()}
-
-
-def _append(suite: xml.Element, case: Case) -> None:
-    element = xml.SubElement(suite, "testcase", classname=printable(case.group), name=printable(case.name))
-    if case.outcome:
-        kind = {"type": printable(case.kind)} if case.kind else {}
-        end = xml.SubElement(element, case.outcome, kind | {"message": printable(case.message)})
-        end.text = "\n".join(map(printable, case.details)) or None
-    elif case.details:
-        xml.SubElement(element, "system-out").text = "\n".join(map(printable, case.details))

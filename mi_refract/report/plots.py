@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ Points = Sequence[tuple[float, float]]
 # Stand-in colours: matplotlib writes them, `_page_svg` turns each into the style sheet's variable.
 INK, MUTED, LINE = "#010203", "#010204", "#010205"
 SERIES = [f"#0102{16 + i:02x}" for i in range(10)]
+DASHED = (0, (4, 3))
 VARIABLES = {INK: "--ink", MUTED: "--muted", LINE: "--line"} | {c: f"--c{i}" for i, c in enumerate(SERIES)}
 
 STYLE: dict[str, Any] = {
@@ -88,48 +90,40 @@ def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str, size: tup
     lines = {name: drawable(points, axes) for name, points in curves.items()}
     if not any(lines.values()):
         return ""
-    import matplotlib
-
-    with matplotlib.rc_context(_style(salt)):
-        from matplotlib.figure import Figure
-
-        figure = Figure(layout="constrained", dpi=72)
+    with _figure(salt) as figure:
         panel = figure.add_subplot(xscale=axes.x_scale, yscale=axes.y_scale, xlabel=axes.x, ylabel=axes.y)
         for i, (name, points) in enumerate(lines.items()):
             if points:
-                style = {"color": SERIES[i % len(SERIES)], "marker": "o", "markersize": 3.5, "linewidth": 1.6}
-                panel.plot(*zip(*points, strict=True), label=name, **style)  # type: ignore[arg-type]
+                xs, ys = zip(*points, strict=True)
+                panel.plot(xs, ys, label=name, color=SERIES[i % len(SERIES)], marker="o", markersize=3.5, linewidth=1.6)
         if axes.slope is not None:
-            _guide(panel, [points for points in lines.values() if points], axes.slope)
+            first = next(points for points in lines.values() if points)
+            start, y = min(first)
+            stop = max(x for points in lines.values() for x, _ in points)
+            if stop > start:
+                ends, label = [y, y * (stop / start) ** axes.slope], f"slope {axes.slope:g}".replace("-", "−")
+                panel.plot([start, stop], ends, color=MUTED, linewidth=1, linestyle=DASHED, label=label)
         _ticks(panel, axes.logarithmic)
-        _legend_below(figure, panel, size)
+        # Below the axes the legend covers no point; it has as many columns as its longest name leaves room for.
+        handles, names = panel.get_legend_handles_labels()
+        columns = max(1, min(len(names), int(size[0] * 72 // (5 * max(map(len, names)) + 44))))
+        figure.set_size_inches(size[0], size[1] + 0.21 * math.ceil(len(names) / columns))
+        figure.legend(handles, names, loc="outside lower left", ncols=columns, borderaxespad=0, columnspacing=1.2)
         return _page_svg(figure)
-
-
-def _legend_below(figure: Figure, panel: Panel, size: tuple[float, float]) -> None:
-    """A legend under the axes, where it covers no point, in as many columns as its longest name leaves room for."""
-    handles, names = panel.get_legend_handles_labels()
-    width, height = size
-    columns = max(1, min(len(names), int(width * 72 // (5 * max(map(len, names)) + 44))))
-    figure.set_size_inches(width, height + 0.21 * math.ceil(len(names) / columns))
-    figure.legend(handles, names, loc="outside lower left", ncols=columns, borderaxespad=0, columnspacing=1.2)
 
 
 def histogram_svg(values: Any, x: str, y: str, *, salt: str, bins: int = 20) -> str:
     """Shares of values from 0 to 1 in equal bins, and a dashed line where all would be the same. "" without values."""
     if not len(values):
         return ""
-    import matplotlib
     import numpy as np
 
     counts, edges = np.histogram(values, bins, (0, 1))
-    with matplotlib.rc_context(_style(salt)):
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(5.3, 2.4), layout="constrained", dpi=72)
+    with _figure(salt) as figure:
+        figure.set_size_inches(5.3, 2.4)
         panel = figure.add_subplot(xlabel=x, ylabel=y, xlim=(0, 1))
         panel.stairs(counts / len(values), edges, fill=True, color=SERIES[0])
-        panel.axhline(1 / bins, color=MUTED, linewidth=1, linestyle=(0, (4, 3)))
+        panel.axhline(1 / bins, color=MUTED, linewidth=1, linestyle=DASHED)
         return _page_svg(figure)
 
 
@@ -155,24 +149,27 @@ def scatter_svg(panels: Mapping[str, Scatter], axes: Axes, *, floor: str, front:
     drawn = {setting: subjects for setting, subjects in drawn.items() if subjects}
     if not drawn:
         return ""
-    import matplotlib
-
-    with matplotlib.rc_context(_style(salt)):
-        from matplotlib.figure import Figure
-
+    names = dict.fromkeys(s for subjects in drawn.values() for s in subjects)
+    colours = {s: SERIES[i % len(SERIES)] for i, s in enumerate(names)}
+    with _figure(salt) as figure:
         columns = min(len(drawn), 2)
         lines = math.ceil(len(drawn) / columns)
-        figure = Figure(figsize=(10.6 if columns == 2 else 7.5, 3.7 * lines), layout="constrained", dpi=72)
+        figure.set_size_inches(10.6 if columns == 2 else 7.5, 3.7 * lines)
         grid = figure.subplots(lines, columns, sharey=True, squeeze=False).flatten()
-        names = dict.fromkeys(s for subjects in drawn.values() for s in subjects)
-        colours = {s: SERIES[i % len(SERIES)] for i, s in enumerate(names)}
         for panel, (setting, subjects) in zip(grid, drawn.items(), strict=False):
             panel.set(xscale=axes.x_scale, yscale=axes.y_scale, title=setting, xlabel=axes.x)
-            _points(panel, subjects, panels[setting].intervals, colours)
-            if axes.x_scale == "linear" and min(x for points in subjects.values() for x, _ in points) >= 0:
+            _strokes(panel, subjects, panels[setting], colours)
+            every = [point for points in subjects.values() for point in points]
+            if axes.x_scale == "linear" and min(every)[0] >= 0:
                 panel.set_xlim(left=0)
-            _floor(panel, panels[setting].floor, floor)
-            _front(panel, subjects if front else {})
+            if math.isfinite(x := panels[setting].floor):
+                panel.axvline(x, color=MUTED, linewidth=1, linestyle=(0, (1, 2)))
+                place = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "fontsize": 9.5}
+                panel.annotate(floor, (x, 0), (-4, 6), color=MUTED, ha="right", **place)
+            if front:  # steps along the front, on to the panel's edges
+                best, (_, right), (_, top) = pareto(every), panel.get_xlim(), panel.get_ylim()
+                xs, ys = zip((best[0][0], top), *best, (right, best[-1][1]), strict=True)
+                panel.step(xs, ys, where="post", color=MUTED, linewidth=1, zorder=1, scalex=False, scaley=False)
             _ticks(panel, axes.logarithmic)
         _printable(figure)
         figure.canvas.draw()  # settles the layout that the labels' places depend on
@@ -194,42 +191,26 @@ def pareto(points: Points) -> list[tuple[float, float]]:
     return front
 
 
-def _points(panel: Panel, subjects: Mapping[str, Points], intervals: Any, colours: Mapping[str, str]) -> None:
+def _strokes(panel: Panel, subjects: Mapping[str, Points], given: Scatter, colours: Mapping[str, str]) -> None:
     for subject, points in subjects.items():
-        style = {"color": colours[subject], "marker": "o", "markersize": 4.5, "linewidth": 1}
-        panel.plot(*zip(*points, strict=True), **style)  # type: ignore[arg-type]
-    for subject, low, high, y in intervals:
+        x, y = zip(*points, strict=True)
+        panel.plot(x, y, color=colours[subject], marker="o", markersize=4.5, linewidth=1)
+    for subject, low, high, height in given.intervals:
         if subject in subjects:
-            panel.plot([low, high], [y, y], color=colours[subject], linewidth=1)
+            panel.plot([low, high], [height, height], color=colours[subject], linewidth=1)
     panel.margins(x=0.3, y=0.1)
 
 
-def _floor(panel: Panel, x: float, name: str) -> None:
-    if math.isfinite(x):
-        panel.axvline(x, color=MUTED, linewidth=1, linestyle=(0, (1, 2)))
-        place = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "fontsize": 9.5}
-        panel.annotate(name, (x, 0), (-4, 6), color=MUTED, ha="right", **place)  # type: ignore[arg-type]
+@contextmanager
+def _figure(salt: str) -> Iterator[Figure]:
+    """An empty figure in the page's style, which holds as long as the context."""
+    import matplotlib
 
+    style: Any = STYLE | {"svg.hashsalt": salt}
+    with matplotlib.rc_context(style):
+        from matplotlib.figure import Figure
 
-def _front(panel: Panel, subjects: Mapping[str, Points]) -> None:
-    """Steps along the front, on to the panel's edges."""
-    if front := pareto([point for points in subjects.values() for point in points]):
-        (_, right), (_, top) = panel.get_xlim(), panel.get_ylim()
-        x, y = zip((front[0][0], top), *front, (right, front[-1][1]), strict=True)
-        panel.step(x, y, where="post", color=MUTED, linewidth=1, zorder=1, scalex=False, scaley=False)
-
-
-def _style(salt: str) -> Any:
-    return STYLE | {"svg.hashsalt": salt}
-
-
-def _guide(panel: Panel, lines: list[list[tuple[float, float]]], slope: float) -> None:
-    start, y = min(lines[0])
-    stop = max(x for points in lines for x, _ in points)
-    if stop > start:
-        end = y * (stop / start) ** slope
-        label = f"slope {slope:g}".replace("-", "−")
-        panel.plot([start, stop], [y, end], color=MUTED, linewidth=1, linestyle=(0, (4, 3)), label=label)
+        yield Figure(layout="constrained", dpi=72)
 
 
 def _ticks(panel: Panel, which: str) -> None:

@@ -17,16 +17,28 @@ from typing import Any
 SCHEMA = 1
 
 
+class Reason(str):
+    """Why a row was not run, and in `remedy` what would make it run, e.g. "`--profile full`"."""
+
+    remedy: str
+
+    def __new__(cls, text: str, remedy: str = "") -> Reason:
+        """`text` with a remedy."""
+        reason = super().__new__(cls, text)
+        reason.remedy = remedy
+        return reason
+
+
 @dataclass(frozen=True)
 class Row:
-    """One measurement: who, on what, under which backend, what came out, what was allowed.
+    """One measurement: subject, case, backend, measured values and their bounds.
 
-    `values` are the numbers by metric name. `budgets` are upper bounds for some of them; a value that is NaN
-    breaks its budget. `goals` are upper bounds too, for what a busy machine can spoil (times): a missed goal is
-    shown, and decides no verdict. A row without values was not run, and `reason` says why; otherwise `reason` is
-    a remark. `replay` is what repeats the row: seed, sizes, hex floats. `images` are EXR paths relative to the output
-    folder, by role (`reference`, `test`, `overlay`, `difference`). `curves` are named lists of (x, y) points; what x
-    and y are is said once per study, by its `axes` in the context.
+    `values` are the numbers by metric name. `budgets` are upper bounds for some of them; a NaN breaks its budget.
+    `goals` are upper bounds for what a busy machine can spoil (times): a missed goal is shown and decides no verdict.
+    A row without values was not run: `reason` says why, and `remedy`, which a `Reason` brings, what would make it run;
+    with values, `reason` is a remark. `replay` repeats the row: seed, sizes, hex floats. `images` are EXR paths
+    relative to the output folder, by role (`reference`, `test`, `overlay`, `difference`). `curves` are named lists of
+    (x, y) points; the study's `axes` in the context say what x and y are.
     """
 
     study: str  # "directions"
@@ -40,6 +52,7 @@ class Row:
     replay: dict[str, Any] = field(default_factory=dict)
     images: dict[str, str] = field(default_factory=dict)
     curves: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    remedy: str = ""
 
     def __post_init__(self) -> None:
         """Check that every bound has its value, and that a row without values says why. Errors: ValueError."""
@@ -48,6 +61,9 @@ class Row:
             raise ValueError(f"row {self.name}: a bound without a value: {sorted(unmeasured)}")
         if not self.values and not self.reason:
             raise ValueError(f"row {self.name}: neither values nor the reason why it was not run")
+        if isinstance(self.reason, Reason):
+            object.__setattr__(self, "remedy", self.reason.remedy)
+            object.__setattr__(self, "reason", str(self.reason))
 
     @property
     def name(self) -> str:
@@ -61,16 +77,13 @@ class Row:
 
     @property
     def broken(self) -> dict[str, float]:
-        """The budgets that did not hold. `not (v <= b)`, so that NaN breaks them."""
-        return self._exceeded(self.budgets)
+        """The budgets that did not hold, by metric."""
+        return _exceeded(self.values, self.budgets)
 
     @property
     def missed(self) -> dict[str, float]:
         """The goals that were not reached."""
-        return self._exceeded(self.goals)
-
-    def _exceeded(self, bounds: dict[str, float]) -> dict[str, float]:
-        return {m: b for m, b in bounds.items() if self.values and not (self.values[m] <= b)}
+        return _exceeded(self.values, self.goals)
 
     @property
     def verdict(self) -> str:
@@ -86,9 +99,14 @@ class Row:
         return dataclasses.asdict(self) | {"verdict": self.verdict}
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Row:
-        """The row whose fields `data` holds; other entries are left out. Errors: KeyError, ValueError."""
-        return cls(**{f.name: data[f.name] for f in dataclasses.fields(cls)})
+    def from_dict(cls, data: Any) -> Row:
+        """The row whose fields `data` holds, as JSON has them; other entries are ignored.
+
+        Errors: ValueError, one line, for a missing field or another type.
+        """
+        import msgspec
+
+        return msgspec.convert(data, cls, strict=False)  # not strict: NaN and the infinities are words
 
     @property
     def replay_text(self) -> str:
@@ -96,6 +114,10 @@ class Row:
         form: Any = {"ensure_ascii": False, "default": str}
         entries = [f" {json.dumps(k, **form)}: {json.dumps(v, **form)}" for k, v in strict(self.replay).items()]
         return "{\n" + ",\n".join(entries) + "\n}" if entries else ""
+
+
+def _exceeded(values: dict[str, float], bounds: dict[str, float]) -> dict[str, float]:
+    return {m: b for m, b in bounds.items() if values and not (values[m] <= b)}  # not ≤: NaN breaks its bound
 
 
 def by_study(rows: Iterable[Row]) -> dict[str, list[Row]]:

@@ -8,7 +8,6 @@ Everything here lays out what the rows already say; nothing is measured, average
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,11 +24,9 @@ from .row import SCHEMA, Row, by_study, strict
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-WORDS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
-
 
 def write_json(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]) -> None:
-    """Write the document `row.py` describes, as strict JSON: NaN and the infinities become words.
+    """Write the document that `row.py` describes, as strict JSON: NaN and the infinities become words.
 
     Errors: TypeError for a value JSON has no form for; OSError.
     """
@@ -44,44 +41,30 @@ def read_json(path: str | Path) -> tuple[list[Row], dict[str, Any]]:
     Errors: a one-line ValueError naming the file for another schema, a malformed document, or a verdict that
     does not follow from its row; OSError.
     """
+    import msgspec
+
     try:
-        document = json.loads(Path(path).read_bytes(), parse_constant=_no_constant)
-        found = document.get("schema") if isinstance(document, dict) else None
-        if found != SCHEMA:
-            raise ValueError(f"schema {found!r}, expected {SCHEMA}")
-        rows = [_row(number, data) for number, data in enumerate(document["rows"])]
+        document = msgspec.json.decode(Path(path).read_bytes(), type=dict[str, Any])
+        if document.get("schema") != SCHEMA:
+            raise ValueError(f"schema {document.get('schema')!r}; expected {SCHEMA}")
+        rows = [_row(f"$.rows[{number}]", data) for number, data in enumerate(document["rows"])]
         return rows, dict(document["context"])
     except RecursionError:
         raise ValueError(f"{path}: brackets nested too deeply; expected JSON as `write_json` writes it") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        what = f"missing {error}" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"{path}: {' '.join(what.split())}") from error
-
-
-def _no_constant(word: str) -> float:
-    raise ValueError(f"{word} is not strict JSON")
-
-
-def _number(value: Any) -> float:
-    if isinstance(value, str) and value in WORDS:
-        return WORDS[value]
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        return value
-    raise ValueError(f"{value!r} is not a number")
-
-
-def _row(number: int, data: dict[str, Any]) -> Row:
-    try:
-        numbers = {f: {m: _number(v) for m, v in data[f].items()} for f in ("values", "budgets", "goals")}
-        curves = {name: [(_number(x), _number(y)) for x, y in pts] for name, pts in data["curves"].items()}
-        row = Row.from_dict(data | numbers | {"curves": curves})
-        if data["verdict"] != row.verdict:
-            raise ValueError(f"verdict {data['verdict']!r} does not follow from the values")
-        return row
     except KeyError as error:
-        raise ValueError(f"row {number}: missing {error}") from error
-    except (ValueError, TypeError, AttributeError) as error:
-        raise ValueError(f"row {number}: {error}") from error
+        raise ValueError(f"{path}: {error} is missing") from error
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
+
+
+def _row(where: str, data: Any) -> Row:
+    try:
+        row = Row.from_dict(data)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+    if data.get("verdict") != row.verdict:
+        raise ValueError(f"{where}: verdict {data.get('verdict')!r}; expected {row.verdict!r}, as the values say")
+    return row
 
 
 def verdict(rows: Sequence[Row]) -> str:
@@ -92,20 +75,16 @@ def verdict(rows: Sequence[Row]) -> str:
     if not measured:
         sentence = "Nothing was checked"
     elif broken:
-        sentence = f"{broken:,} of {_count(measured, 'check')} failed"
+        sentence = f"{broken:,} of {measured:,} check{'s' * (measured != 1)} failed"
     else:
         sentence = f"All {measured:,} checks passed" if measured > 1 else "The one check passed"
-    return sentence + (f", {_count(missing, 'measurement')} not run" if missing else "")
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number:,} {noun}" + ("" if number == 1 else "s")
+    return sentence + (f", {missing:,} measurement{'s' * (missing != 1)} not run" if missing else "")
 
 
 def write_junit(path: str | Path, rows: Sequence[Row], context: Mapping[str, Any]) -> None:
     """One suite per study, one case per measured budget, one skipped case per row that was not run.
 
-    Rows that demand nothing are left out: a case that cannot fail is no test. Errors: OSError.
+    Rows without a budget are left out: a case that cannot fail is no test. Errors: OSError.
     """
     suites = {study: [case for row in members for case in _cases(row)] for study, members in by_study(rows).items()}
     junit.write_junit(path, context.get("title", "mi_refract"), suites)
@@ -115,16 +94,16 @@ def _cases(row: Row) -> list[junit.Case]:
     name = " / ".join((row.subject, row.case, row.setting))
     if not row.values:
         return [junit.Case(row.study, name, "skipped", row.reason)]
-    return [_case(row, f"{name}: {metric}", metric) for metric in row.budgets]
-
-
-def _case(row: Row, name: str, metric: str) -> junit.Case:
-    if metric not in row.broken:
-        return junit.Case(row.study, name)
-    value, budget = row.values[metric], row.budgets[metric]
-    text, limit = distinguishable(value, budget)
-    details = "\n".join(filter(None, (f"value {value!r}, budget {budget!r}", row.reason, row.replay_text)))
-    return junit.Case(row.study, name, "failure", f"{metric} {text}, budget {limit}", details.splitlines())
+    cases = []
+    for metric, budget in row.budgets.items():
+        case = junit.Case(row.study, f"{name}: {metric}")
+        if metric in row.broken:
+            text, limit = distinguishable(row.values[metric], budget)
+            details = f"value {row.values[metric]!r}, budget {budget!r}\n{row.reason}\n{row.replay_text}"
+            lines = [line for line in details.splitlines() if line]
+            case = junit.Case(case.group, case.name, "failure", f"{metric} {text}, budget {limit}", lines)
+        cases.append(case)
+    return cases
 
 
 def summary(rows: Sequence[Row], context: Mapping[str, Any] | None = None) -> RenderableType:
@@ -134,9 +113,9 @@ def summary(rows: Sequence[Row], context: Mapping[str, Any] | None = None) -> Re
 
     page = (context or {}).get("first_page")
     broken = [(row, metric) for row in rows for metric in row.broken]
-    parts: list[RenderableType] = (
-        [_bounds_table("broken budget", "budget", broken, "bold red"), Text()] if broken else []
-    )
+    parts: list[RenderableType] = []
+    if broken:
+        parts += [_bounds_table("broken budget", "budget", broken, "bold red"), Text()]
     parts += first_page.terminal(page) if page else []
     return Group(*parts, Text(verdict(rows), style="bold red" if broken else "bold"))
 
@@ -150,14 +129,14 @@ def goals_table(rows: Sequence[Row]) -> RenderableType:
     return _bounds_table("goal", "goal", goals, "") if goals else Text("No goal was measured")
 
 
-def _bounds_table(heading: str, bound: str, found: Sequence[tuple[Row, str]], style: str) -> RenderableType:
+def _bounds_table(heading: str, bound: str, bounds: Sequence[tuple[Row, str]], style: str) -> RenderableType:
     from rich.table import Table
     from rich.text import Text
 
     table = Table(heading, "metric", box=None, pad_edge=False)
     table.add_column("value", justify="right", style=style)
     table.add_column(bound, justify="right")
-    for row, metric in found:
+    for row, metric in bounds:
         value, limit = distinguishable(row.values[metric], row.bounds[metric])
         missed = "yellow" if metric in row.missed else ""
         table.add_row(Text(printable(row.name)), Text(printable(metric)), Text(value, style=missed), limit)

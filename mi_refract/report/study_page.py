@@ -1,4 +1,4 @@
-"""What the page shows, laid out from the rows: panels, tables, plots, images. Nothing is measured or judged here.
+"""The content of the page, laid out from the rows: panels, tables, plots, images. Nothing is measured or judged here.
 
 `context` is what all rows share. Every entry is shown as it is, except five that steer the page:
 
@@ -16,24 +16,36 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from . import first_page
 from .embedded_images import EmbeddedImages, packed
 from .number_text import compact, distinguishable
-from .plots import Axes, Scatter, curves_svg, drawable, scatter_svg
+from .plots import Axes, Points, Scatter, curves_svg, drawable, scatter_svg
 from .row import Row, as_json, by_study
 
 STEERING = ("first_page", "title", "studies", "scatter", "replay")
 ROLES = ("reference", "test", "overlay", "difference")
+LABELS = ("subject", "case", "setting")
 
 
 def prepare(rows: Sequence[Row], context: Mapping[str, Any], images: EmbeddedImages) -> dict[str, Any]:
     """The values for the template `report.html.j2`. Errors: those of `EmbeddedImages.embed`."""
     verdicts = Counter(row.verdict for row in rows)
-    keys = {name: f"study-{number}" for number, name in enumerate(by_study(rows), 1)}
+    studies = by_study(rows)
+    keys = {name: f"study-{number}" for number, name in enumerate(studies, 1)}
     first, anchors = context.get("first_page"), keys | {first_page.NOT_RUN: "missing"}
+    failures = [
+        {
+            "row": row,
+            "broken": [(m, _cell(row, m)) for m in row.broken],
+            "others": [_phrase(row, m) for m in row.values if m not in row.broken],
+            "replay": row.replay_text,
+        }
+        for row in rows
+        if row.broken
+    ]
     return {
         "first": first_page.prepare(rows, first, anchors, images) if first else None,
         "title": context.get("title", "mi_refract"),
@@ -41,86 +53,67 @@ def prepare(rows: Sequence[Row], context: Mapping[str, Any], images: EmbeddedIma
         "counts": [(word, verdicts[word]) for word in ("pass", "fail", "not run", "info")],
         "context": {key: value for key, value in context.items() if key not in STEERING},
         "command": context.get("replay", ""),
-        "failures": [
-            {
-                "row": r,
-                "broken": [(m, _cell(r, m)) for m in r.broken],
-                "others": [_phrase(r, m) for m in r.values if m not in r.broken],
-                "replay": r.replay_text,
-            }
-            for r in rows
-            if r.broken
-        ],
+        "failures": failures,
         "missing": first_page.not_run(rows),
         "absent": verdicts["not run"],
-        "studies": [_study(name, members, context, images, keys[name]) for name, members in by_study(rows).items()],
+        "studies": [_study(name, members, context, images, keys[name]) for name, members in studies.items()],
     }
 
 
 def _study(name: str, rows: list[Row], context: Mapping[str, Any], images: EmbeddedImages, key: str) -> dict[str, Any]:
     about = context.get("studies", {}).get(name, {})
     metrics = list(dict.fromkeys(metric for row in rows for metric in row.values))
-    measured = _measured(rows)
     axes = Axes(**about.get("axes", {}))
     plots = [
-        (row, curves_svg(row.curves, axes, salt=f"{key}-{number}"), _left_out(row, axes))
+        (row, curves_svg(row.curves, axes, salt=f"{key}-{number}"), _undrawn(row.curves.values(), axes))
         for number, row in enumerate(rows)
         if row.curves
     ]
     scatters = [scatter for scatter in context.get("scatter", ()) if scatter["study"] == name]
+    drawn = [_scatter(scatter, rows, f"{key}-scatter-{i}") for i, scatter in enumerate(scatters)]
+    positive = [x for row in rows if 0 < (x := row.values.get(metrics[0], 0)) < math.inf] if metrics else []
+    scale = (min(positive), max(positive)) if positive else None
     return {
         "key": key,
         "title": about.get("title", name),
         "text": about.get("text", ""),
         "terms": about.get("terms", {}),
         "failures": sum(row.verdict == "fail" for row in rows),
-        "scale": (scale := _scale(rows, metrics)),
-        "panels": _panels(measured, metrics, scale) if measured else [],
+        "scale": scale,
+        "panels": _panels(rows, metrics, scale),
         "missing": first_page.not_run(rows),
         "data": packed(as_json(rows)),
         "count": len(rows),
-        "scatters": [s for i, each in enumerate(scatters) if (s := _scatter(each, rows, f"{key}-scatter-{i}"))],
+        "scatters": [scatter for scatter in drawn if scatter],
         "plots": plots,
         "figures": [_figure(row, images) for row in rows if row.images],
     }
 
 
-def _measured(rows: list[Row]) -> list[Row]:
-    """The rows without the subjects and the cases of which, in their setting, nothing was run."""
-    run = {(row.setting, label) for row in rows if row.values for label in (("s", row.subject), ("c", row.case))}
-    return [row for row in rows if {(row.setting, ("s", row.subject)), (row.setting, ("c", row.case))} <= run]
-
-
 def _panels(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> list[dict[str, Any]]:
-    """A table per setting, under a matrix of subjects by cases, where there is enough to see.
+    """A table per setting, under a matrix of subjects by cases, where there is enough to see; else one of all settings.
 
-    Else one of all settings; rows that share no metric with the others have a table of their own.
+    Subjects and cases of which nothing was run in a setting are left out. Without matrices, rows that share no metric
+    with the others have a table of their own.
     """
-    settings = list(dict.fromkeys(row.setting for row in rows))
+    run = {(row.setting, label) for row in rows if row.values for label in (("s", row.subject), ("c", row.case))}
+    rows = [row for row in rows if {(row.setting, ("s", row.subject)), (row.setting, ("c", row.case))} <= run]
+    settings = dict.fromkeys(row.setting for row in rows)
     parts = {setting: [row for row in rows if row.setting == setting] for setting in settings}
     matrices = {setting: _matrix(part, metrics, scale) for setting, part in parts.items()}
-    if not any(matrices.values()):
-        return [{"heading": "", "matrix": None, "table": _table(part, metrics)} for part in _comparable(rows)]
-    return [
-        {
-            "heading": s,
-            "matrix": matrices[s],
-            "table": _table(parts[s], metrics, s),
-        }
-        for s in settings
-    ]
-
-
-def _comparable(rows: list[Row]) -> list[list[Row]]:
-    """The rows with values in parts, so that those with a common metric are in one; in their order."""
-    parts: list[tuple[set[str], set[int]]] = []  # metrics, and numbers of rows
-    for number, row in enumerate(rows := [row for row in rows if row.values]):
-        metrics, numbers = set(row.values), {number}
-        for part in [part for part in parts if part[0] & metrics]:
-            parts.remove(part)
-            metrics, numbers = metrics | part[0], numbers | part[1]
-        parts.append((metrics, numbers))
-    return [[rows[i] for i in sorted(numbers)] for _, numbers in sorted(parts, key=lambda part: min(part[1]))]
+    if any(matrices.values()):
+        return [{"heading": s, "matrix": matrices[s], "table": _table(part, metrics, s)} for s, part in parts.items()]
+    groups: list[tuple[set[str], list[int]]] = []  # metrics, and the places of the rows that have any of them
+    rows = [row for row in rows if row.values]
+    for place, row in enumerate(rows):
+        joined, places = set(row.values), [place]
+        for group in [group for group in groups if group[0] & joined]:
+            groups.remove(group)
+            joined, places = joined | group[0], places + group[1]
+        groups.append((joined, sorted(places)))
+    groups.sort(key=lambda group: group[1])
+    tables = [_table([rows[place] for place in places], metrics) for _, places in groups]
+    return [{"heading": "", "matrix": None, "table": table} for table in tables]
 
 
 def _matrix(rows: list[Row], metrics: list[str], scale: tuple[float, float] | None) -> dict[str, Any] | None:
@@ -142,56 +135,14 @@ def _shade(row: Row | None, metric: str, scale: tuple[float, float]) -> dict[str
     low, high = map(math.log, scale)
     value = row.values.get(metric, 0)
     place = (math.log(value) - low) / (high - low) if 0 < value < math.inf and high > low else 0
-    depth = round(place, 3) if value < math.inf else 1  # NaN is no small error
-    hint = "\n".join(_phrase(row, m) for m in row.values)
-    broken = [_bound(row, m) if m == metric else _phrase(row, m) for m in (*row.broken, *row.missed)]
     cell = _cell(row, metric)
     return {
         "text": cell["text"] if cell else "·",
         "state": row.verdict,
-        "depth": depth,
-        "hint": hint,
-        "broken": broken,
+        "depth": round(place, 3) if value < math.inf else 1,  # NaN is no small error
+        "hint": "\n".join(_phrase(row, m) for m in row.values),
+        "broken": [_bound(row, m) if m == metric else _phrase(row, m) for m in (*row.broken, *row.missed)],
     }
-
-
-def _scale(rows: list[Row], metrics: list[str]) -> tuple[float, float] | None:
-    values = [row.values[metrics[0]] for row in rows if metrics and metrics[0] in row.values]
-    positive = [value for value in values if 0 < value < math.inf]
-    return (min(positive), max(positive)) if positive else None
-
-
-def _phrase(row: Row, metric: str) -> str:
-    if metric not in row.bounds:
-        return f"{metric} {compact(row.values[metric])}"
-    return f"{metric} {distinguishable(row.values[metric], row.bounds[metric])[0]} {_bound(row, metric)}"
-
-
-def _bound(row: Row, metric: str) -> str:
-    """The budget or goal with how the value stands to it; NaN is neither above nor below."""
-    value, budget = row.values[metric], row.bounds[metric]
-    sign = "≤" if value <= budget else ">" if value > budget else "≰"
-    return f"{sign} {distinguishable(value, budget)[1]}"
-
-
-def _table(rows: list[Row], metrics: list[str], heading: str = "") -> dict[str, Any]:
-    """Columns: what tells the rows apart, then every metric; a label equal to the one above is marked."""
-    rows = [row for row in rows if row.values]
-    keys = [k for k in ("subject", "case", "setting") if len({getattr(row, k) for row in rows}) > 1]
-    keys = keys or ["subject"]
-    used = [m for m in metrics if any(m in row.values for row in rows)]
-    lines, above = [], [""] * len(keys)
-    for row in rows:
-        labels = [getattr(row, key) for key in keys]
-        again = [labels[: i + 1] == above[: i + 1] for i in range(len(keys))]
-        cells = [_cell(row, metric) for metric in used]
-        lines.append(
-            {"row": row, "labels": list(zip(labels, again, strict=True)), "cells": cells, "replay": row.replay_text}
-        )
-        above = labels
-    shared = [getattr(rows[0], k) for k in ("subject", "case", "setting") if k not in keys]
-    shared = [label for label in shared if label and label != heading]
-    return {"keys": keys, "metrics": used, "lines": lines, "shared": " · ".join(shared)}
 
 
 def _cell(row: Row, metric: str) -> dict[str, str] | None:
@@ -204,8 +155,37 @@ def _cell(row: Row, metric: str) -> dict[str, str] | None:
     return {"state": state, "text": text, "budget": _bound(row, metric)}
 
 
-def _left_out(row: Row, axes: Axes) -> int:
-    return sum(len(points) - len(drawable(points, axes)) for points in row.curves.values())
+def _phrase(row: Row, metric: str) -> str:
+    cell = _cell(row, metric)
+    return " ".join(filter(None, (metric, cell["text"], cell["budget"]))) if cell else metric
+
+
+def _bound(row: Row, metric: str) -> str:
+    """The budget or goal with how the value compares with it; NaN is neither above nor below."""
+    value, budget = row.values[metric], row.bounds[metric]
+    sign = "≤" if value <= budget else ">" if value > budget else "≰"
+    return f"{sign} {distinguishable(value, budget)[1]}"
+
+
+def _table(rows: list[Row], metrics: list[str], heading: str = "") -> dict[str, Any]:
+    """Columns: the labels that differ between rows, then every metric; a label equal to the one above is marked."""
+    rows = [row for row in rows if row.values]
+    keys = [k for k in LABELS if len({getattr(row, k) for row in rows}) > 1] or ["subject"]
+    used = [m for m in metrics if any(m in row.values for row in rows)]
+    lines, above = [], [""] * len(keys)
+    for row in rows:
+        labels = [getattr(row, key) for key in keys]
+        again = [labels[: i + 1] == above[: i + 1] for i in range(len(keys))]
+        cells = [_cell(row, metric) for metric in used]
+        marked = list(zip(labels, again, strict=True))
+        lines.append({"row": row, "labels": marked, "cells": cells, "replay": row.replay_text})
+        above = labels
+    shared = [label for k in LABELS if k not in keys and (label := getattr(rows[0], k)) and label != heading]
+    return {"keys": keys, "metrics": used, "lines": lines, "shared": " · ".join(shared)}
+
+
+def _undrawn(lines: Iterable[Points], axes: Axes) -> int:
+    return sum(len(points) - len(drawable(points, axes)) for points in lines)
 
 
 def _scatter(scatter: Mapping[str, Any], rows: list[Row], salt: str) -> dict[str, Any] | None:
@@ -219,22 +199,16 @@ def _scatter(scatter: Mapping[str, Any], rows: list[Row], salt: str) -> dict[str
             panel.intervals.append((row.subject, low, high, row.values[y]))
         elif x in row.values and row.subject == scatter.get("floor"):
             panel.floor = row.values[x]
-    points = [point for panel in panels.values() for each in panel.points.values() for point in each]
-    if not points:
+    lines = [points for panel in panels.values() for points in panel.points.values()]
+    if not lines:
         return None
     axes = Axes(x, y, x_scale="linear")
     svg = scatter_svg(panels, axes, floor=scatter.get("floor", ""), front=scatter.get("front", False), salt=salt)
-    omitted = len(points) - len(drawable(points, axes))
-    return {"title": scatter.get("title", f"{y} against {x}"), "svg": svg, "omitted": omitted}
+    return {"title": scatter.get("title", f"{y} against {x}"), "svg": svg, "omitted": _undrawn(lines, axes)}
 
 
 def _figure(row: Row, images: EmbeddedImages) -> dict[str, Any]:
-    roles = [role for role in ROLES if role in row.images]
-    roles += [role for role in row.images if role not in ROLES]
-    panes = [_pane(role) | images.embed(row.images[role]) for role in roles]
+    roles = sorted(row.images, key=lambda role: ROLES.index(role) if role in ROLES else len(ROLES))
+    paints = {role: ("signed", 3) if role == "difference" else ("light", None) for role in roles}
+    panes = [{"role": r, "paint": p, "gain": gain} | images.embed(row.images[r]) for r, (p, gain) in paints.items()]
     return {"row": row, "panes": panes, "paired": roles[:2] == ["reference", "test"]}
-
-
-def _pane(role: str) -> dict[str, Any]:
-    signed = role == "difference"
-    return {"role": role, "paint": "signed" if signed else "light", "gain": 3 if signed else None}

@@ -14,37 +14,30 @@ from mi_refract.io.pixels import block_mean, srgb_encode
 from .embedded_images import strongest
 
 SIDE, DIFFERENCE_SIDE = 160, 64  # pixels of the longer side, at most; of a difference one alone is to be seen
-NOT_A_NUMBER = (255, 0, 255)  # as in the page's script
+NOT_A_NUMBER = np.array((255, 0, 255), np.uint8)  # as in the page's script
 EQUAL, LESS, MORE = np.array((247, 247, 247)), np.array((33, 102, 172)), np.array((178, 24, 43))
 Bytes = NDArray[np.uint8]
 
 
 def of_image(pixels: Any, coded: bool) -> bytes:
     """H × W × (1 or 3) pixels; `coded`: they are sRGB codes, else linear light."""
-    small = block_mean(pixels, _block(pixels, SIDE))
+    small = block_mean(pixels, -(-max(pixels.shape[:2]) // SIDE))
     unit = np.clip(np.nan_to_num(small), 0, 1)
     codes = unit if coded else srgb_encode(unit)
     rgb = np.broadcast_to(np.rint(255 * codes), (*small.shape[:2], 3)).astype(np.uint8)
-    return png(_marked(rgb, np.isnan(small).any(-1)))
+    return png(np.where(np.isnan(small).any(-1, keepdims=True), NOT_A_NUMBER, rgb))
 
 
 def of_difference(values: Any) -> bytes:
     """H × W × C differences, of every block the strongest; colours are full at the upper hundredth of what is not 0."""
-    small = strongest(values, max(values.shape[1] // _block(values, DIFFERENCE_SIDE), 1))[..., 0]
+    block = -(-max(values.shape[:2]) // DIFFERENCE_SIDE)
+    small = strongest(values, max(values.shape[1] // block, 1))[..., 0]
     finite = np.where(np.isfinite(small), small, np.copysign(np.inf, small))
     some = np.abs(finite[np.isfinite(small) & (small != 0)])
     full = float(np.quantile(some, 0.99)) if some.size else 1.0
     share = np.clip(np.abs(finite) / full, 0, 1)[..., None]
     rgb = EQUAL + (np.where(finite[..., None] < 0, LESS, MORE) - EQUAL) * share
-    return png(_marked(np.rint(rgb).astype(np.uint8), np.isnan(small)))
-
-
-def _block(pixels: Any, side: int) -> int:
-    return -(-int(max(pixels.shape[:2])) // side)
-
-
-def _marked(rgb: Bytes, bad: Any) -> Bytes:
-    return np.where(bad[..., None], np.array(NOT_A_NUMBER, np.uint8), rgb)
+    return png(np.where(np.isnan(small)[..., None], NOT_A_NUMBER, np.rint(rgb).astype(np.uint8)))
 
 
 def png(rgb: Bytes) -> bytes:
@@ -52,9 +45,7 @@ def png(rgb: Bytes) -> bytes:
     height, width, _ = rgb.shape
     lines = np.concatenate([np.zeros((height, 1), np.uint8), rgb.reshape(height, -1)], 1)  # each with filter 0
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 6)), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(kind, data) for kind, data in chunks)
-
-
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    content = b"\x89PNG\r\n\x1a\n"
+    for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 6)), (b"IEND", b"")):
+        content += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return content

@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mi_refract.io.image_file import read_exr
 
@@ -35,21 +33,26 @@ def load(path: str | os.PathLike[str], *, level: int = LEVEL, **defines: str) ->
         raise FileNotFoundError(f"{path}: no such scene file")
     root = SceneFile(path, defines).node(0)
     shapes: list[Mesh] = []
-    found: dict[str, Any] = {}
-    readers = {"Sensor": _camera, "Integrator": _max_depth, "Emitter": _sky}
+    camera: Camera | None = None
+    max_depth: int | None = None
+    sky: Colour | Environment | None = None
     for child in root.children():
         if child.kind == "Shape":
             shapes += meshes_of_shape(child, level, MOST - sum(len(mesh.faces) for mesh in shapes))
-        elif child.kind in readers and child.kind not in found:
-            found[child.kind] = readers[child.kind](child)
+        elif child.kind == "Sensor" and camera is None:
+            camera = _camera(child)
+        elif child.kind == "Integrator" and max_depth is None:
+            max_depth = _max_depth(child)
+        elif child.kind == "Emitter" and sky is None:
+            sky = _sky(child)
         elif child.kind != "BSDF":  # a named BSDF is read with the shapes that use it
             raise child.error(f"one {child.kind.lower()} too many", "shapes, and one sensor, integrator and sky")
     root.finish()
-    for kind in ("Sensor", "Integrator"):
-        if kind not in found:
-            raise ValueError(f"{path}: no {kind.lower()}; expected a scene with one")
-    sky = found.get("Emitter", (0.0, 0.0, 0.0))
-    return PlainScene(path.stem, with_unique_names(shapes), sky, found["Sensor"], found["Integrator"])
+    if camera is None:
+        raise ValueError(f"{path}: no sensor; expected a scene with one")
+    if max_depth is None:
+        raise ValueError(f"{path}: no integrator; expected a scene with one")
+    return PlainScene(path.stem, with_unique_names(shapes), sky or (0.0, 0.0, 0.0), camera, max_depth)
 
 
 def _max_depth(integrator: Node) -> int:
@@ -77,15 +80,11 @@ def _camera(sensor: Node) -> Camera:
         elif child.kind != "Sampler":
             raise child.error(f"a {child.kind.lower()} of a sensor", "a film and a sampler")
     sensor.ignore("near_clip", "far_clip", "focus_distance")
-    origin, axes = frame[:3, 3], frame[:3, :3] / np.linalg.norm(frame[:3, :3], axis=0)
+    axes, origin = frame[:3, :3] / np.linalg.norm(frame[:3, :3], axis=0), frame[:3, 3]
+    (x, y, z), (to_x, to_y, to_z), (up_x, up_y, up_z) = np.stack([origin, origin + axes[:, 2], axes[:, 1]]).tolist()
     fov = _fov_x(sensor, width, height)
     sensor.finish()
-    return Camera(_triple(origin), _triple(origin + axes[:, 2]), _triple(axes[:, 1]), fov, width, height)
-
-
-def _triple(vector: NDArray[np.float64]) -> tuple[float, float, float]:
-    x, y, z = (float(number) for number in vector)
-    return x, y, z
+    return Camera((x, y, z), (to_x, to_y, to_z), (up_x, up_y, up_z), fov, width, height)
 
 
 def _fov_x(sensor: Node, width: int, height: int) -> float:
@@ -113,26 +112,23 @@ def _film(film: Node) -> tuple[int, int]:
 
 
 def _sky(emitter: Node) -> Colour | Environment:
+    sky: Colour | Environment
     if emitter.type == "constant":
-        sky: Colour | Environment = emitter.colour("radiance", 1.0)
+        sky = emitter.colour("radiance", 1.0)
     elif emitter.type == "envmap":
         path, scale = emitter.scene.resolve(emitter.value(str, "filename")), emitter.value(float, "scale", 1.0)
-        turn = emitter.transform()[:3, :3]
-        if not np.allclose(turn.T @ turn, np.eye(3), atol=1e-9):
+        try:
+            pixels = read_exr(path)[0]
+        except (OSError, ValueError) as error:
+            raise emitter.error(str(error), "an OpenEXR file") from None
+        if pixels.shape[2] != 3 or min(pixels.shape[:2]) < 2 or not np.isfinite(pixels).all() or (pixels < 0).any():
+            raise emitter.error(f"{path}: {pixels.shape[1]} × {pixels.shape[0]} × {pixels.shape[2]}", "finite RGB")
+        rotation = emitter.transform()[:3, :3]
+        if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-9):
             raise emitter.error("to_world is no rotation", "a rotation")
-        sky = Environment(scale * _pixels(emitter, path), turn)
+        sky = Environment(scale * pixels, rotation)
     else:
         raise emitter.error("an emitter of another kind", "constant, envmap, and area on a shape")
     emitter.ignore("sampling_weight", "mis_compensation")
     emitter.finish()
     return sky
-
-
-def _pixels(emitter: Node, path: Path) -> NDArray[np.float32]:
-    try:
-        pixels = read_exr(path)[0]
-    except (OSError, ValueError) as error:
-        raise emitter.error(str(error), "an OpenEXR file") from None
-    if pixels.shape[2] != 3 or min(pixels.shape[:2]) < 2 or not np.isfinite(pixels).all() or (pixels < 0).any():
-        raise emitter.error(f"{path}: {pixels.shape[1]} × {pixels.shape[0]} × {pixels.shape[2]}", "finite RGB")
-    return pixels

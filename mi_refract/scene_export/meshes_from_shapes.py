@@ -16,16 +16,17 @@ from mi_refract.plugins import PLUGIN, read_ior, scene_parser
 from . import tessellation
 from .mitsuba_nodes import Node
 from .plain_scene import Colour, Diffuse, Glass, Light, Material, Mesh
-from .tessellation import Triangles
+from .tessellation import Triangles, Vertices
 
 GLASSES = ("dielectric", PLUGIN, *(f"{PLUGIN}_{name}" for name in FORMULAS))
 FILES = ("obj", "ply")
-SHAPES: dict[str, Callable[[int], Triangles]] = {
-    "cube": lambda level: tessellation.cube(),
-    "cylinder": tessellation.cylinder,
-    "disk": tessellation.disk,
-    "rectangle": lambda level: tessellation.rectangle(),
-    "sphere": tessellation.sphere,
+# How many triangles a shape has at a level of the tessellation, and what makes them.
+SHAPES: dict[str, tuple[Callable[[int], int], Callable[[int], Triangles]]] = {
+    "cube": (lambda level: 12, lambda level: tessellation.cube()),
+    "cylinder": (lambda level: 16 << level, tessellation.cylinder),
+    "disk": (lambda level: 8 << level, tessellation.disk),
+    "rectangle": (lambda level: 2, lambda level: tessellation.rectangle()),
+    "sphere": (lambda level: 20 << 2 * level, tessellation.sphere),
 }
 FARTHEST = 1e30  # of all coordinates: float32 holds products with directions
 MOST = 2**24  # triangles of all shapes, counted before they are made
@@ -49,9 +50,12 @@ def meshes_of_shape(shape: Node, level: int, most: int = MOST) -> Iterator[Mesh]
     """
     surface, frame = _surface(shape), _frame(shape)
     flipped = shape.value(bool, "flip_normals", False)
-    _check_count(shape, _count(shape, surface, level), most)
+    if surface.scales:
+        _check_count(shape, 2 * math.prod(max(math.ceil(2 * scale), 1) for scale in surface.scales), most)
+    elif shape.type in SHAPES:
+        _check_count(shape, SHAPES[shape.type][0](level), most)
     parts = _parts(shape, surface, level)
-    _check_count(shape, sum(len(faces) for _, faces in parts), most)
+    _check_count(shape, sum(len(faces) for _, faces in parts), most)  # a file's triangles are counted once it is read
     shape.finish()
     if surface.one_sided and (flipped or not all(tessellation.is_closed(faces) for _, faces in parts)):
         raise shape.error("diffuse on one side of an open surface", "its BSDF in a `twosided`, or a closed shape")
@@ -65,11 +69,11 @@ def meshes_of_shape(shape: Node, level: int, most: int = MOST) -> Iterator[Mesh]
         yield Mesh(f"{name}_{i}" if i else name, placed, faces[:, ::-1] if flipped else faces, material)
 
 
-def with_unique_names(found: Iterable[Mesh]) -> tuple[Mesh, ...]:
+def with_unique_names(meshes: Iterable[Mesh]) -> tuple[Mesh, ...]:
     """The meshes, renamed: letters, digits and underscores only, unique without regard to case."""
     taken: set[str] = set()
     result = []
-    for mesh in found:
+    for mesh in meshes:
         name = stem = re.sub(r"\W", "_", mesh.name, flags=re.ASCII)
         count = 1
         while name.lower() in taken:
@@ -85,28 +89,16 @@ def _check_count(shape: Node, count: int, most: int) -> None:
         raise shape.error(f"{count} triangles where {most} are left", f"{MOST} in all; a lower level, fewer cells")
 
 
-def _count(shape: Node, surface: Surface, level: int) -> int:
-    """The number of triangles; of a file, which is read first, 0."""
-    if surface.scales:
-        return 2 * math.prod(max(math.ceil(2 * scale), 1) for scale in surface.scales)
-    counts = {"sphere": 20 << 2 * level, "cylinder": 16 << level, "disk": 8 << level, "cube": 12, "rectangle": 2}
-    return counts.get(shape.type, 0)
-
-
 def _parts(shape: Node, surface: Surface, level: int) -> tuple[Triangles, ...]:
     """Triangles in the shape's own coordinates, one part per material."""
     if surface.scales:
         if shape.type != "rectangle":
             raise shape.error("a checkerboard", "one on a rectangle")
         return tessellation.checkerboard(*surface.scales)
-    if shape.type in FILES:
-        return (_from_file(shape),)
-    if shape.type not in SHAPES:
+    if shape.type in SHAPES:
+        return (SHAPES[shape.type][1](level),)
+    if shape.type not in FILES:
         raise shape.error("a shape of another type", f"{', '.join((*SHAPES, *FILES))}")
-    return (SHAPES[shape.type](level),)
-
-
-def _from_file(shape: Node) -> Triangles:
     path, flat = shape.scene.resolve(shape.value(str, "filename")), shape.value(bool, "face_normals", False)
     try:
         with scene_parser.folders(scene_parser.own_folder()):
@@ -118,11 +110,10 @@ def _from_file(shape: Node) -> Triangles:
     if mesh.has_vertex_normals():
         raise shape.error("smooth normals", "face_normals = true")
     vertices = np.array(mesh.vertex_positions_buffer(), np.float64).reshape(-1, 3)
-    faces = np.array(mesh.faces_buffer(), np.int64).reshape(-1, 3)
-    return vertices, faces
+    return ((vertices, np.array(mesh.faces_buffer(), np.int64).reshape(-1, 3)),)
 
 
-def _frame(shape: Node) -> np.ndarray:
+def _frame(shape: Node) -> Vertices:
     """(4, 4): from the coordinates of `_parts` to the scene's."""
     frame, local = shape.transform(), np.eye(4)
     if shape.type == "sphere":
@@ -143,7 +134,7 @@ def _positive(shape: Node, name: str, value: float) -> float:
     return value
 
 
-def _basis(z: np.ndarray) -> np.ndarray:
+def _basis(z: Vertices) -> Vertices:
     """(3, 3): an orthonormal, right-handed basis with last column z; the identity for (0, 0, 1). Duff et al. 2017."""
     x, y, _ = z
     sign = np.copysign(1.0, z[2])

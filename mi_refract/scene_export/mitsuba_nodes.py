@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,14 @@ from mi_refract.plugins import scene_limits, scene_parser
 from .plain_scene import Colour
 
 Kind = TypeVar("Kind", int, float, str, bool)
+ParserNode: TypeAlias = Any  # `mi.parser.SceneNode`
 REFERENCE = "ResolvedReference"  # to another node; Mitsuba does not export the class
 
 
 class Node:
     """A plugin of the parsed scene. Its parameters are taken one by one; `finish` raises for those that are left."""
 
-    def __init__(self, scene: SceneFile, node: Any) -> None:
+    def __init__(self, scene: SceneFile, node: ParserNode) -> None:
         """`node`: of Mitsuba's parser."""
         self.scene, self._node, self.props, self.type = scene, node, node.props, node.props.plugin_name()
         self.names = list(node.props.keys())
@@ -32,13 +33,13 @@ class Node:
     @property
     def kind(self) -> str:
         """The kind of plugin: Shape, BSDF, Emitter, …"""
-        return self._node.type.name
+        return str(self._node.type.name)
 
     def __str__(self) -> str:
         """The plugin's name and its id, for errors."""
         return f"{self.type} {self.props.id()}".strip()
 
-    def take(self, name: str, default: Any = None) -> Any:
+    def take(self, name: str, default: object = None) -> Any:
         """A parameter as Mitsuba holds it; a Node where it is a nested plugin."""
         self.unread.discard(name)
         value = self.props.get(name, default)

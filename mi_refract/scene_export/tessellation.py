@@ -30,17 +30,13 @@ def sphere(level: int) -> Triangles:
     inward = np.linalg.det(triangles) < 0
     triangles[inward] = triangles[inward, ::-1]
     for _ in range(level):
-        triangles = _halved(triangles)
+        a, b, c = triangles.swapaxes(0, 1)
+        ab, bc, ca = ((p + q) / np.linalg.norm(p + q, axis=-1, keepdims=True) for p, q in ((a, b), (b, c), (c, a)))
+        quarters = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+        triangles = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters])
     vertices, order = welded(triangles)
     vertices.flags.writeable = order.flags.writeable = False  # the cache shares them
     return vertices, order
-
-
-def _halved(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
-    a, b, c = triangles.swapaxes(0, 1)
-    ab, bc, ca = ((p + q) / np.linalg.norm(p + q, axis=-1, keepdims=True) for p, q in ((a, b), (b, c), (c, a)))
-    corners = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
-    return np.concatenate([np.stack(corner, axis=1) for corner in corners])
 
 
 def welded(triangles: NDArray[np.float64]) -> Triangles:
@@ -52,8 +48,8 @@ def welded(triangles: NDArray[np.float64]) -> Triangles:
 def is_closed(faces: Faces) -> bool:
     """Whether each edge borders two faces, once in either direction. Precondition: the vertices are welded."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    there = {(int(a), int(b)) for a, b in edges}
-    return len(there) == len(edges) and all((b, a) in there for a, b in there)
+    directed = {(int(a), int(b)) for a, b in edges}
+    return len(directed) == len(edges) and all((b, a) in directed for a, b in directed)
 
 
 def grid(u: NDArray[np.float64], v: NDArray[np.float64], chosen: NDArray[np.bool_]) -> Triangles:
@@ -72,17 +68,12 @@ def rectangle() -> Triangles:
 
 def checkerboard(scale_u: float, scale_v: float) -> tuple[Triangles, Triangles]:
     """The two parts of the rectangle, of `color0` and of `color1`, for a checkerboard with these scales of uv."""
-    u, v = _cuts(scale_u), _cuts(scale_v)
+    # 0, the ends of the cells, 1: a cell is half a unit of the scaled coordinate.
+    u, v = (np.array([0, *np.arange(1, np.ceil(2 * scale)) / (2 * scale), 1.0]) for scale in (scale_u, scale_v))
     # The middle of a cell in half units of the scaled coordinate: odd where Mitsuba's fraction is above one half.
     odd_u, odd_v = (np.floor((x[:-1] + x[1:]) * scale) % 2 == 1 for x, scale in ((u, scale_u), (v, scale_v)))
     same = odd_u[:, None] == odd_v
     return grid(2 * u - 1, 2 * v - 1, same), grid(2 * u - 1, 2 * v - 1, ~same)
-
-
-def _cuts(scale: float) -> NDArray[np.float64]:
-    """0, the ends of the cells, 1. A cell is half a unit of the scaled coordinate."""
-    lines = np.arange(1, np.ceil(2 * scale)) / (2 * scale)
-    return np.concatenate([[0.0], lines, [1.0]])
 
 
 def cube() -> Triangles:
@@ -95,20 +86,12 @@ def cube() -> Triangles:
     return welded(np.concatenate([turn[order] for turn in turns]))
 
 
-def segments(level: int) -> int:
-    """The number of segments of a circle."""
-    return 8 << level
-
-
 def disk(level: int) -> Triangles:
     """The unit disk in the plane z = 0."""
     rim = _circle(level)
-    return np.concatenate([rim, np.zeros((1, 3))]), _fan(len(rim))
-
-
-def _fan(count: int) -> Faces:
-    i = np.arange(count)
-    return np.stack([i, (i + 1) % count, np.full(count, count)], axis=1)
+    i = np.arange(len(rim))
+    faces = np.stack([i, (i + 1) % len(rim), np.full(len(rim), len(rim))], axis=1)
+    return np.concatenate([rim, np.zeros((1, 3))]), faces
 
 
 def cylinder(level: int) -> Triangles:
@@ -121,5 +104,7 @@ def cylinder(level: int) -> Triangles:
 
 
 def _circle(level: int) -> Vertices:
-    angle = 2 * np.pi * np.arange(segments(level)) / segments(level)
-    return np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))], axis=1)
+    """8 · 2^level vertices."""
+    segments = 8 << level
+    angle = 2 * np.pi * np.arange(segments) / segments
+    return np.stack([np.cos(angle), np.sin(angle), np.zeros(segments)], axis=1)

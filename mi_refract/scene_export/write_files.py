@@ -9,17 +9,17 @@ from pathlib import Path
 from mi_refract.io import atomic
 
 from .plain_scene import PlainScene
-from .targets import cycles, luxcore, mitsuba, obj, povray, radiance, raysect
+from .targets import luxcore, mitsuba, povray, radiance, scene_json
 from .targets.shared_files import Files
 
 TARGETS: dict[str, Callable[[PlainScene], Files]] = {
-    "cycles": cycles.files,
+    "cycles": scene_json.cycles_files,
     "luxcore": luxcore.files,
     "radiance": radiance.files,
-    "raysect": raysect.files,
+    "raysect": scene_json.raysect_files,
     "povray": povray.files,
     "mitsuba": mitsuba.files,
-    "obj+json": obj.files,
+    "obj+json": scene_json.obj_files,
 }
 
 
@@ -31,16 +31,6 @@ def write(plain: PlainScene, target: str, folder: str | os.PathLike[str]) -> lis
     """
     if target not in TARGETS:
         raise ValueError(f"target {target!r}: unknown; expected {', '.join(TARGETS)}")
-    place = _new_or_empty(folder)
-    files = TARGETS[target](plain)
-    with atomic.replacing(place, folder=True) as temporary:
-        for name, content in files.items():
-            (temporary / name).write_bytes(content)
-    return [Path(folder) / name for name in sorted(files)]
-
-
-def _new_or_empty(folder: str | os.PathLike[str]) -> Path:
-    """The path of the folder, its links resolved. OSError unless the folder is empty or can be made."""
     place = Path(folder).resolve()
     if place.is_dir():
         if any(place.iterdir()):
@@ -48,4 +38,8 @@ def _new_or_empty(folder: str | os.PathLike[str]) -> Path:
     elif place.exists():
         raise NotADirectoryError(f"{folder}: is not a folder; expected a new folder or an empty one")
     atomic.check_parent(place)
-    return place
+    files = TARGETS[target](plain)
+    with atomic.replacing(place, folder=True) as temporary:
+        for name, content in files.items():
+            (temporary / name).write_bytes(content)
+    return [Path(folder) / name for name in sorted(files)]

@@ -12,14 +12,13 @@ import pytest
 from support.processes import ENVIRONMENT, python
 
 from mi_refract import cli
-from mi_refract.io import atomic
 from validation.run.context import SCENES
 
 
-def interrupted(process, code):
-    """Send SIGINT; it ends with this code, soon."""
+def interrupted(process, code, number=signal.SIGINT):
+    """Send the signal; it ends with this code, soon."""
     try:
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         assert process.wait(timeout=30) == code, process.stderr.read()
     finally:
         process.kill()  # or a failure would wait for it without end
@@ -104,28 +103,15 @@ sys.exit(cli.main())
 """
 
 
-def test_what_is_unfinished_is_removed_also_where_a_thread_makes_it_anew(tmp_path):
-    with python(UNFINISHED, tmp_path, TMPDIR=str(tmp_path)) as process:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_what_is_unfinished_is_removed_also_where_a_thread_makes_it_anew(number, tmp_path):
+    code = f"import signal\nsignal.signal({number:d}, signal.SIG_DFL)\n{UNFINISHED}"  # nohup has it ignored
+    with python(code, tmp_path, TMPDIR=str(tmp_path)) as process:
         assert process.stdout.readline() == "there\n"
         assert len([*tmp_path.iterdir()]) == 2
-        interrupted(process, 130)
+        interrupted(process, 128 + number, number)
         assert process.stderr.read() == ""
     assert not [*tmp_path.iterdir()]
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_another_signal_ends_it_and_the_next_command_sweeps(number, tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("old")
-    code = f"import signal\nsignal.signal({number:d}, signal.SIG_DFL)\n{UNFINISHED}"  # nohup has it ignored
-    with python(code, tmp_path) as process:
-        assert process.stdout.readline() == "there\n"
-        process.send_signal(number)
-        assert process.wait(timeout=30) == -number
-    left = [path.name for path in tmp_path.iterdir()]
-    assert len(left) == 2 and (tmp_path / "file").read_text() == "old"
-    monkeypatch.setattr(atomic, "_swept", set())
-    atomic.write_atomically(tmp_path / "file", "new")
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 BACKGROUND = """

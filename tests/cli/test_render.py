@@ -217,12 +217,12 @@ from mi_refract import cli
 run = cli._run
 def run_and_tell(arguments):
     from mi_refract.rendering import scene_files  # numpy's threads start here
-    load = scene_files.load_scene
+    load = scene_files.load_parsed
     def load_and_tell(*arguments):
         scene = load(*arguments)
         print("loaded", flush=True)
         return scene
-    scene_files.load_scene = load_and_tell
+    scene_files.load_parsed = load_and_tell
     return run(arguments)
 cli._run = run_and_tell
 sys.argv[1:] = ["render", sys.argv[2], "-o", sys.argv[3], "--spp", "20000000", "--variant", sys.argv[4]]

@@ -1,16 +1,20 @@
-"""`mi-refract render --scheduler` and `--workers`: exit codes, what is said, what is kept, and what is ended."""
+"""`mi-refract render --scheduler` and `--workers`: exit codes, messages, what is kept and ended; and by TLS."""
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import signal
 import subprocess
 import sys
-import time
 
+import dask
 import numpy as np
+import psutil
 import pytest
-from support.dask_workers import until
+from distributed import Security
+from support.dask_workers import program, tls_settings, until
 from support.processes import ENVIRONMENT
 
 from mi_refract.cluster import worker_facts
@@ -43,24 +47,11 @@ def render(scene, run):
     return call
 
 
-@pytest.fixture
-def started(scene):
-    """`started("--workers", 1)`: the command in a process of its own, ended with the test."""
-    processes = []
-
-    def call(*options):
-        command = [sys.executable, "-m", "mi_refract.cli", "render", scene, "-o", scene.with_name("out.exr")]
-        command += ["--variant", "scalar_rgb", "--pass-spp", "1", *options]
-        process = subprocess.Popen(
-            list(map(str, command)), env=ENVIRONMENT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-        )
-        processes.append(process)
-        return process
-
-    yield call
-    for process in processes:
-        process.kill()
-        process.communicate()
+def refused(outcome, *messages):
+    """Exit code 2 and one line."""
+    code, out, err = outcome
+    assert (code, out, err.count("\n")) == (2, "", 1) and err.startswith("mi-refract: ")
+    assert all(message in err for message in messages), err
 
 
 @pytest.mark.parametrize(
@@ -69,36 +60,20 @@ def started(scene):
         (("--scheduler", "tcp://h:1", "--workers", 2), "--scheduler and --workers; expected one of them"),
         (("--workers", 0), "--workers"),
         (("--mixed-workers",), "expected --scheduler ADDRESS or --workers N with it"),
-        (
-            ("--workers", 1, "--allow-plugins", "evil"),
-            "--allow-plugins evil: native code, which is not sent to workers",
-        ),
+        (("--workers", 1, "--allow-plugins", "evil"), "--allow-plugins evil: native code is not sent to workers"),
         (("--scheduler", "nonsense"), "--scheduler nonsense: no Dask scheduler answers: missing port number"),
+        (("--scheduler", "tcp://127.0.0.1:9"), "--scheduler tcp://127.0.0.1:9: no Dask scheduler answers: "),
     ],
 )
 def test_misuse(render, scene, options, message):
-    code, out, err = render(*options)
-    assert (code, out, err.count("\n")) == (2, "", 1)
-    assert err.startswith("mi-refract: ") and message in err
-    assert list(scene.parent.iterdir()) == [scene]
-
-
-def test_no_scheduler(started, scene):
-    """Within 10 s, Python's own start included."""
-    began = time.monotonic()
-    process = started("--scheduler", "tcp://127.0.0.1:9")
-    out, err = process.communicate()
-    assert time.monotonic() - began < 10
-    assert (process.returncode, out, err.count("\n")) == (2, "", 1)
-    assert "--scheduler tcp://127.0.0.1:9: no Dask scheduler answers: " in err and "; expected the address of" in err
+    refused(render(*options), message)
     assert list(scene.parent.iterdir()) == [scene]
 
 
 def test_too_large_for_a_cluster(render, scene):
     scene.write_text(SCENE + f"<!-- {'x' * 2**20} -->")
-    code, _, err = render("--workers", 1, "--bundle-limit", 1)
-    assert (code, err.count("\n")) == (2, 1)
-    assert f"{scene}: 1.0 MiB of files" in err and "expected with a cluster: 1 MiB, or --bundle-limit 2" in err
+    found = render("--workers", 1, "--bundle-limit", 1)
+    refused(found, f"{scene}: 1.0 MiB of files", "expected with a cluster: 1 MiB, or --bundle-limit 2")
 
 
 def test_another_libllvm_is_refused_unless_mixed_workers_are_accepted(render, monkeypatch):
@@ -111,61 +86,95 @@ def test_another_libllvm_is_refused_unless_mixed_workers_are_accepted(render, mo
 
 def test_without_dask(render, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    code, _, err = render("--workers", 1)
-    assert (code, err.count("\n")) == (2, 1) and "pip install 'mi-refract[cluster]'" in err
+    refused(render("--workers", 1), "pip install 'mi-refract[cluster]'")
+
+
+# Ended from outside ---------------------------------------------------------------------------------------------------
 
 
 def leader_of_workers(process):
-    """The process of the local cluster that `process` started, once it has a worker."""
-    found = subprocess.run(["ps", "-eo", "pid=,ppid=,pgid="], capture_output=True, text=True, check=True).stdout
-    rows = [tuple(map(int, line.split())) for line in found.splitlines()]
-    leaders = [pid for pid, parent, group in rows if parent == process.pid and pid == group]
-    return leaders[0] if leaders and sum(group == leaders[0] for _, _, group in rows) >= 2 else None
+    """The process of the local cluster that `process` started."""
+    children = psutil.Process(process.pid).children()
+    return next(child.pid for child in children if os.getpgid(child.pid) == child.pid)
 
 
-def group_ended(leader):
-    found = subprocess.run(["ps", "-eo", "pgid=,stat="], capture_output=True, text=True, check=True).stdout
-    return not any(line.split()[0] == str(leader) and "Z" not in line for line in found.splitlines())
+def ended(leader):
+    """Whether no process of the group is left."""
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.NoSuchProcess, ProcessLookupError):
+            if os.getpgid(process.pid) == leader and process.status() != psutil.STATUS_ZOMBIE:
+                return False
+    return True
 
 
-def begun(process, scene):
-    """Wait until some passes are done: the preview is of them."""
-    until(lambda: scene.with_name("so-far.png").exists() or process.poll() is not None)
-    assert process.poll() is None, process.communicate()
-
-
-@pytest.mark.parametrize("ended_by", [signal.SIGINT, signal.SIGKILL])
-def test_the_scheduler_ends_and_the_render_goes_on_here(started, render, scene, ended_by):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_the_scheduler_ends_and_the_render_resumes_here(render, scene, number):
     """Ctrl-C ends the render and its local cluster, a lost scheduler is an error: both leave a checkpoint."""
-    preview = ("--preview", scene.with_name("so-far.png"), "--spp", 100_000)
-    process = started("--workers", 1, *preview)
-    begun(process, scene)
-    leader = leader_of_workers(process)
-    if ended_by == signal.SIGINT:
-        process.send_signal(signal.SIGINT)
-    else:
-        os.killpg(leader, signal.SIGKILL)
-    _, err = process.communicate(timeout=30)
-    until(lambda: group_ended(leader), 10)
-    assert process.returncode == (130 if ended_by == signal.SIGINT else 2)
-    if ended_by == signal.SIGKILL:
-        assert (
-            err.count("\n") == 1 and "the Dask scheduler is gone, or has given up its tasks; expected one that" in err
-        )
-    assert scene.with_name("out.exr.checkpoint").exists()
-    goes_on(render, scene)
-
-
-def goes_on(render, scene):
-    """From the checkpoint, here, to the bits of a render that was never elsewhere."""
-    from mi_refract.rendering import checkpoint
-
-    with np.load(scene.with_name("out.exr.checkpoint")) as file:
-        done = checkpoint.json.loads(bytes(file["header"]))["passes"]
-    spp = done + 3
-    code, _, err = render("--spp", spp, "--pass-spp", 1)
+    preview, checkpoint = scene.with_name("so-far.png"), scene.with_name("out.exr.checkpoint")
+    words = ("--variant", "scalar_rgb", "--pass-spp", 1, "--workers", 1, "--spp", 100_000, "--preview", preview)
+    command = [sys.executable, "-m", "mi_refract.cli", "render", scene, "-o", scene.with_name("out.exr"), *words]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([*map(str, command)], env=ENVIRONMENT, **pipes) as process:
+        try:
+            until(lambda: preview.exists() or process.poll() is not None)  # some passes are done
+            assert process.poll() is None, process.communicate()
+            leader = leader_of_workers(process)
+            if number == signal.SIGINT:
+                process.send_signal(number)
+            else:
+                os.killpg(leader, number)
+            _, err = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    until(lambda: ended(leader))
+    assert process.returncode == (130 if number == signal.SIGINT else 2)
+    if number == signal.SIGKILL:
+        assert err.count("\n") == 1 and "the Dask scheduler has ended or cancelled the tasks; run the same" in err
+    with np.load(checkpoint) as file:
+        done = json.loads(bytes(file["header"]))["passes"]
+    code, _, err = render("--spp", done + 3, "--pass-spp", 1)
     assert code == 0 and f"resuming from {done} spp" in err
-    assert render("--spp", spp, "--pass-spp", 1, output="local.exr")[0] == 0
+    assert render("--spp", done + 3, "--pass-spp", 1, output="local.exr")[0] == 0
     (found, header), (expected, _) = (read_exr(scene.with_name(name)) for name in ("out.exr", "local.exr"))
     np.testing.assert_array_equal(found, expected)
-    assert header["mi_refract:spp"] == spp and done > 0
+    assert header["mi_refract:spp"] == done + 3 > 3
+
+
+# TLS, with a scheduler and a worker that are started as the README says ----------------------------------------------
+
+OWN, OTHER = Security.temporary(), Security.temporary()
+MIXED = Security.temporary()
+MIXED.tls_ca_file = OWN.tls_ca_file  # trusts the scheduler, which does not trust it
+DOUBTING = Security(**{f"tls_client_{part}": getattr(OWN, f"tls_client_{part}") for part in ("cert", "key")})
+DOUBTING.tls_ca_file = OTHER.tls_ca_file
+
+
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory):
+    """The address of one that asks for TLS; a worker joins it."""
+    folder = tmp_path_factory.mktemp("tls")
+    file = folder / "scheduler.json"
+    common = ("--scheduler-file", str(file), "--host", "127.0.0.1", "--protocol", "tls")
+    worker = ("worker", "--nthreads", "1", "--no-nanny", "--local-directory", str(folder))
+    with program("scheduler", "--port", "0", *common, security=OWN), program(*worker, *common, security=OWN):
+        until(file.exists)
+        yield json.loads(file.read_text())["address"]
+
+
+def test_the_bits_by_tls_are_those_of_a_render_here(render, scheduler, scene):
+    assert scheduler.startswith("tls://")
+    passes = ("--spp", 20, "--pass-spp", 1)
+    with dask.config.set(tls_settings(OWN)):
+        assert render("--scheduler", scheduler, *passes)[0] == render(*passes, output="here.exr")[0] == 0
+    found, expected = (read_exr(scene.with_name(name))[0] for name in ("out.exr", "here.exr"))
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("security, protocol", [(MIXED, "tls"), (DOUBTING, "tls"), (Security(), "tls"), (OWN, "tcp")])
+def test_who_is_not_trusted_is_refused(render, scheduler, scene, security, protocol):
+    address = scheduler.replace("tls", protocol)
+    with dask.config.set(tls_settings(security)):
+        outcome = render("--scheduler", address)
+    hint = "and the files of `distributed.comm.tls` in Dask's configuration"
+    refused(outcome, f"--scheduler {address}: no Dask scheduler answers: ", hint)
+    assert list(scene.parent.iterdir()) == [scene]

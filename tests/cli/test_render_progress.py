@@ -13,7 +13,8 @@ from rich.console import Console
 
 from mi_refract.cli import render_progress
 from mi_refract.io.image_file import read
-from mi_refract.rendering.long_render import Job, Limits, LongRender
+from mi_refract.rendering.end_conditions import Limits
+from mi_refract.rendering.long_render import Job, resume
 
 BALL = Path(__file__).parents[2] / "scenes" / "sphere.xml"
 
@@ -24,7 +25,7 @@ def rendering(tmp_path, needs_variant):
     mi.set_variant("llvm_ad_rgb")
 
     def make(**limits):
-        return LongRender(Job(BALL, {"res": "8"}), tmp_path / "a.exr", Limits(**limits))
+        return resume(Job(BALL, {"res": "8"}), tmp_path / "a.exr", Limits(**limits))
 
     return make
 

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 from support.hostile import shows_more_than_text
 
-from mi_refract import backend
 from mi_refract.cli import app
-from mi_refract.planar import figure, path_tree, scene_file, scene_schema, tracer
+from mi_refract.planar import scene_file, tracer
 
 BALL = """
 title = "A glass ball"
@@ -34,7 +33,6 @@ to = [-3, 0.9]
 direction = [1, 0]
 count = 7
 """
-SCENES = sorted((Path(__file__).parents[2] / "scenes" / "planar").glob("*.toml"))
 FORMATS = {".svg": b"<?xml", ".png": b"\x89PNG", ".pdf": b"%PDF"}
 
 
@@ -74,16 +72,6 @@ def test_an_image_of_each_kind(trace, ball, suffix):
     assert sorted(ball.parent.iterdir()) == sorted([ball, output])
 
 
-def test_an_image_is_replaced(trace, ball):
-    output = ball.with_name("image.svg")
-    trace("-o", output)
-    first = output.read_bytes()
-    trace("-o", output)
-    assert output.read_bytes() == first
-    trace("-o", output, "--rays", 3)
-    assert output.read_bytes() != first
-
-
 def test_json_is_the_paths(trace, ball):
     scene = scene_file.load(ball)
     expected = tracer.trace(scene.segments[0], scene.origins, scene.directions, scene.max_depth, weights=True)
@@ -106,12 +94,6 @@ def test_json_shows_nothing_of_a_title_but_ascii(trace, ball):
     assert out[:-1].isascii() and out[:-1].isprintable() and not shows_more_than_text(out)
     assert json.loads(out)["title"] == "\x1b[31m\x7f\u202e ##[error]::error::"
     assert json.loads(out)["scene"] == str(scene)
-
-
-def test_json_and_an_image(trace, ball):
-    output = ball.with_name("image.png")
-    assert len(paths_of(trace("--json", "-o", output))) == 7
-    assert output.exists()
 
 
 def test_the_table(trace):
@@ -156,64 +138,39 @@ def test_rays_and_depth(trace):
     assert trace("--max-depth", 1)[1] == "ball.toml: 7 rays, 7 hits, 7 stopped at max_depth\n"
 
 
-def test_the_precision(trace, needs_variant):
+def directions(result):
+    return np.array([path["direction"] for path in paths_of(result)])
+
+
+def test_a_formula_a_backend_and_a_precision(trace, needs_variant):
+    default = directions(trace("--json"))
+    for options in (("--formula", "promoted"), ("--backend", "scalar")):
+        found = directions(trace("--json", *options))
+        np.testing.assert_allclose(found, default, atol=1e-12)
+        assert (found != default).any()
     needs_variant("llvm_ad_rgb")
-    double, single = (paths_of(trace("--json", "--precision", p)) for p in ("float64", "float32"))
-    a, b = (np.array([path["points"] for path in paths]) for paths in (double, single))
-    assert 0 < np.abs(a - b).max() < 1e-5
-    np.testing.assert_array_equal(b, b.astype(np.float32))
-
-
-def test_scalar_arrays_have_no_float32(trace, ball):
-    """They compute in double: float32 is refused in one line, and nothing is written."""
-    output = ball.with_name("image.svg")
-    code, out, err = trace("--backend", "scalar", "--precision", "float32", "-o", output)
-    assert (code, out, err.count("\n")) == (2, "", 1)
-    assert err.startswith("mi-refract: precision = 'float32': scalar arrays compute in double; expected float64")
-    assert not output.exists()
-    assert trace("--backend", "scalar", "--precision", "float64")[0] == 0
-
-
-def test_a_formula(trace):
-    """All of them are in tests/planar/test_tracer.py."""
-    found = np.array([path["direction"] for path in paths_of(trace("--json", "--formula", "promoted"))])
-    default = np.array([path["direction"] for path in paths_of(trace("--json"))])
-    np.testing.assert_allclose(found, default, atol=1e-12)
-
-
-def test_the_formula_is_the_one_asked_for(trace, monkeypatch):
-    asked = []
-    follow = path_tree.Tracer
-    monkeypatch.setattr(path_tree, "Tracer", lambda *a, **how: asked.append(how) or follow(*a, **how))
-    trace("--formula", "cross", "--backend", "scalar", "--precision", "float32")
-    assert asked == [{"formula": "cross", "backend": "scalar", "precision": "float32"}]
-
-
-def test_a_backend(trace):
-    scalar, best = (paths_of(trace("--json", *options)) for options in (("--backend", "scalar"), ()))
-    for one, other in zip(scalar, best, strict=True):
-        np.testing.assert_allclose(one["points"], other["points"], atol=1e-14)
+    single = directions(trace("--json", "--precision", "float32"))
+    np.testing.assert_array_equal(single, single.astype(np.float32))
+    np.testing.assert_allclose(single, default, atol=1e-5)
 
 
 BAD = {
     "no plane": (("--plane", "here"), "--plane here; expected X,Y or X,Y,DEGREES, finite numbers"),
-    "a number too many": (("--plane", "1,2,3,4"), "--plane 1,2,3,4; expected X,Y or X,Y,DEGREES"),
-    "a plane at infinity": (("--plane", "inf,0"), "--plane inf,0; expected"),
     "suffix": (("-o", "{}/image.gif"), "expected a file name that ends in .svg or .png or .pdf"),
-    "no suffix": (("-o", "{}/image"), "expected a file name that ends in"),
     "no folder": (("-o", "{}/none/image.svg"), "is not a folder"),
     "folder": (("-o", "{}/folder.svg"), "is a folder"),
     "branches": (("--branches", "-1"), "--branches"),
-    "branches, no number": (("--branches", "some"), "--branches"),
     "no rays": (("--rays", "0"), "--rays"),
     "no depth": (("--max-depth", "0"), "--max-depth"),
     "precision": (("--precision", "half"), "precision = 'half'; expected float32, float64"),
     "formula": (("--formula", "snell"), "formula = 'snell': unknown; expected wedge"),
     "backend": (("--backend", "metal"), "backend = 'metal'; expected scalar"),
+    "no float32": (
+        ("--backend", "scalar", "--precision", "float32"),
+        "scalar arrays compute in double; expected float64",
+    ),
     "option": (("--nonesuch",), "--nonesuch"),
     "too much": (("--rays", "4000000"), "expected fewer rays"),
-    "far too much": (("--rays", "1000000000000"), "expected fewer rays"),
-    "beyond numbers": (("--rays", f"1{'0' * 30}"), "expected fewer rays"),
     "too deep": (("--max-depth", f"1{'0' * 30}"), "expected fewer rays"),
 }
 
@@ -232,49 +189,32 @@ def test_bad_options(trace, ball, options, message):
 
 @pytest.mark.parametrize(
     "old, new, message",
-    [
-        ("radius = 1.0", "radius = nan", "radius"),
-        ("radius = 1.0", "radios = 1.0", "radios"),
-        ("n = 1.5", "n = -1.5", "n"),
-        ("n = 1.5", "n = [1.5, 1.6]", "n"),
-        ("branches = 0", "max_depth = 0", "max_depth"),
-        ('title = "A glass ball"', "title = 3", "title"),
-        ("[[beam]]", "[[bean]]", "bean"),
-        (BALL, "", "shape"),
-        (BALL, "[[", "TOML"),
-        ("branches = 0", 'colours = ["ultraviolent"]', "ultraviolent"),
-    ],
+    [("radius = 1.0", "radius = nan", "radius"), ("branches = 0", 'colours = ["ultraviolent"]', "ultraviolent")],
 )
-def test_bad_scenes(trace, ball, old, new, message):
+def test_a_bad_scene_leaves_the_old_image(trace, ball, old, new, message):
+    output = ball.with_name("image.svg")
+    output.write_text("old")
     ball.write_text(BALL.replace(old, new))
-    code, out, err = trace("-o", ball.with_name("image.svg"), "--json")
+    code, out, err = trace("-o", output, "--json")
     assert (code, out, err.count("\n")) == (2, "", 1)
-    assert err.startswith(f"mi-refract: {ball}")
-    assert message in err
-    assert list(ball.parent.iterdir()) == [ball]
-
-
-def test_no_scene(trace, ball):
-    code, out, err = trace("-o", ball.with_name("image.svg"), scene=ball.with_name("none.toml"))
-    assert (code, out, err.count("\n")) == (2, "", 1)
-    assert "none.toml" in err
+    assert err.startswith(f"mi-refract: {ball}") and message in err
+    assert output.read_text() == "old"
 
 
 def test_without_matplotlib(trace, ball, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert trace()[0] == 0
-    monkeypatch.setattr(scene_file, "load", lambda path: pytest.fail("said too late"))
     code, out, err = trace("-o", ball.with_name("image.svg"))
-    assert (code, out) == (2, "")
-    assert err == "mi-refract: images need the extra `plot`: pip install 'mi-refract[plot]'\n"
+    assert (code, out, err) == (2, "", "mi-refract: images need the extra `plot`: pip install 'mi-refract[plot]'\n")
 
 
-def test_a_failed_image_keeps_the_old_one(trace, ball, monkeypatch):
-    output = ball.with_name("image.svg")
-    output.write_text("old")
-    ball.write_text(BALL.replace("n = 1.5", "n = 0"))
-    assert trace("-o", output)[0] == 2
-    assert output.read_text() == "old"
+def test_the_keys_of_a_scene_are_printed_without_one(run):
+    code, out, err = run("trace", "--keys")
+    assert (code, err) == (0, "")
+    assert out == scene_file.reference() + "\n"
+    keys = "`title`", "`wavelengths`", "`luneburg`", "`focal_length` (number > 0) from the front", "`from`", "`scale`"
+    assert all(key in out for key in keys)
+    assert all(line.count("|") == 4 for line in out.splitlines() if line)
 
 
 PYTHON = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(app.__file__).parents[2]), *filter(None, sys.path)])}
@@ -286,14 +226,6 @@ def shell(before, *arguments):
     code = f"{imports}\n{before}\nsys.exit(cli.main())"
     command = [sys.executable, "-c", code, *map(str, arguments)]
     return subprocess.Popen(command, env=PYTHON, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-
-
-def test_matplotlib_is_only_loaded_for_images(ball):
-    more = "import atexit; atexit.register(lambda: print('matplotlib' in sys.modules))"
-    with shell(more, "trace", ball, "--table") as process:
-        out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err  # Dr.Jit itself writes there where it finds no libLLVM
-    assert out.splitlines()[-1] == "False"
 
 
 def test_ctrl_c_leaves_nothing_half_written(ball):
@@ -313,23 +245,3 @@ atomic.Path.replace = slow
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=30) == 130, process.stderr.read()
     assert list(ball.parent.iterdir()) == [ball]
-
-
-@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
-def test_every_scene_of_ours_is_consistent(trace, path):
-    # Scalar arrays follow one ray after the other: a few do there.
-    few = () if backend.detect()["llvm"].usable else ("--rays", "5")
-    code, out, err = trace(*few, scene=path)
-    assert (code, err) == (0, "")
-    assert " escaped" in out
-    assert "mismatch" not in out
-
-
-def test_formats_are_those_that_are_drawn():
-    assert set(figure.FORMATS) == set(FORMATS) == set(figure.DPI) == set(figure.UNDATED)
-
-
-def test_the_keys_of_a_scene_are_printed_without_one(capfd):
-    assert app.main(["trace", "--keys"]) == 0
-    printed = capfd.readouterr().out
-    assert all(f"`{name}`" in printed for name in (*scene_schema.SHAPES, *scene_schema.BEAMS, *scene_schema.SCENE))

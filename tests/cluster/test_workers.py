@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import os
 import re
-import time
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from support.dask_workers import accepted, until
+from support.processes import ENVIRONMENT
 
-from mi_refract.cluster import worker_facts, workers
-from mi_refract.cluster.connection import LostSchedulerError, connected
+from mi_refract.cluster import worker_facts
+from mi_refract.cluster.connection import connected
 from mi_refract.cluster.worker_facts import HOST, LLVM, MIXED, UNUSABLE, WIDTH, differences, machine
 from mi_refract.cluster.workers import Workers
+from mi_refract.io.errors import NoWorkersError
 
 HERE = {"mitsuba": "3.9.1", LLVM: "19.1", WIDTH: "8", UNUSABLE: "", HOST: "here"}
 
@@ -114,20 +119,25 @@ def test_a_worker_that_goes_with_its_answer_is_asked_again(client, monkeypatch, 
     assert lost and not found.refused
 
 
-def test_no_workers_at_all(client, monkeypatch, variant):
-    monkeypatch.setattr(workers, "_NOBODY", 0.1)
+@pytest.mark.parametrize("task", ["work", "render"])
+def test_no_workers_at_all(client, monkeypatch, task):
     monkeypatch.setattr(client, "nthreads", dict)
-    with pytest.raises(ConnectionError, match="no worker that may work: no workers; expected"):
-        accepted(client, variant)
-    with pytest.raises(ConnectionError, match="no worker that may render: no workers; expected"):
-        accepted(client, variant, task="render")
+    with pytest.raises(NoWorkersError, match=f"no worker that may {task}: no workers; expected"):
+        Workers(client, "scalar_rgb", HERE, task=task).wait(nobody=0.1)
 
 
-def test_a_scheduler_that_hangs(client, monkeypatch, variant):
-    found = accepted(client, variant)
-    monkeypatch.setattr(workers, "SILENT", 0.1)
-    monkeypatch.setattr(client, "nthreads", lambda: time.sleep(1))
-    found.look(at_once=True)
-    time.sleep(0.2)
-    with pytest.raises(LostSchedulerError, match="the Dask scheduler has not answered for 0 s; expected one that does"):
-        found.look()
+def test_the_version_has_a_digest_of_the_sources(tmp_path):
+    """Of names and contents: two installations of the same version may differ in a line."""
+    package = Path(worker_facts.__file__).parents[1]
+    copy = tmp_path / "mi_refract"
+    shutil.copytree(package, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    code = "from mi_refract.cluster.worker_facts import our_version; print(our_version())"
+    versions = []
+    for path, text in ((None, ""), (copy / "formulas" / "__init__.py", "# a comment"), (copy / "new.py", "")):
+        if path:
+            path.write_text(text + (path.read_text() if path.exists() else ""))
+        command = [sys.executable, "-c", code]
+        environment = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
+        options = {"env": environment, "cwd": tmp_path, "capture_output": True, "text": True, "check": True}
+        versions.append(subprocess.run(command, **options).stdout)
+    assert versions[0].strip() == worker_facts.our_version() and len(set(versions)) == 3

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import plain_yaml
-from support.actions_runner import BASH, Job, run_action
+from support.actions_runner import BASH, Job, read_yaml, run_action
 from support.diff_images import image
 from support.processes import ENVIRONMENT
 from support.readme import blocks
@@ -202,7 +201,7 @@ def test_names_that_github_refuses_and_hostile_ones_are_left_out(tmp_path, capsy
 def test_the_action_is_one_that_a_runner_can_trust():
     """Other actions have a version, no expression stands in a script, and every step names its shell."""
     text = (ACTION / "action.yml").read_text("utf-8")
-    action = plain_yaml.loads(text)
+    action = read_yaml(text)
     for step in action["runs"]["steps"]:
         assert "${{" not in step.get("run", "")
         assert re.fullmatch(r"[\w-]+/[\w-]+@v\d+", step["uses"]) if "uses" in step else step["shell"] == "bash"
@@ -215,12 +214,12 @@ def test_the_action_is_one_that_a_runner_can_trust():
 
 def test_the_readme_names_every_input_and_output():
     section = README.read_text("utf-8").partition("## In CI")[2].partition("\n## ")[0]
-    action = plain_yaml.loads((ACTION / "action.yml").read_text("utf-8"))
+    action = read_yaml((ACTION / "action.yml").read_text("utf-8"))
     assert not [name for name in (*action["inputs"], *action["outputs"]) if f"`{name}`" not in section]
 
 
 def test_the_workflow_of_the_readme(act, project):
-    steps = plain_yaml.loads(blocks(README, "yaml")[0])["jobs"]["images"]["steps"]
+    steps = read_yaml(blocks(README, "yaml")[0])["jobs"]["images"]["steps"]
     assert [step for step in steps if "run" in step] == [{"run": "./render_all new/"}]
     last = steps[-1]
     assert re.fullmatch(r"OWNER/mi_refract/(.*)@\w+", last["uses"])[1] == str(ACTION.relative_to(ROOT))
@@ -230,7 +229,7 @@ def test_the_workflow_of_the_readme(act, project):
 
 def test_the_job_of_this_project_that_uses_the_action(environment, tmp_path):
     text = (ROOT / ".github" / "workflows" / "ci.yml").read_text("utf-8")
-    prepare, use = plain_yaml.loads(text)["jobs"]["action"]["steps"][1:]
+    prepare, use = read_yaml(text)["jobs"]["action"]["steps"][1:]
     assert ROOT / use["uses"] == ACTION
     (workspace := tmp_path / "workspace").mkdir()
     subprocess.run([*BASH, "-c", prepare["run"]], cwd=workspace, check=True)
@@ -243,7 +242,7 @@ def test_the_job_of_this_project_that_uses_the_action(environment, tmp_path):
 
 @pytest.mark.parametrize(("gain", "code"), [(1.0, 0), (1.1, 1), (np.nan, 1)])
 def test_the_gitlab_job_of_the_readme(project, environment, programs, gain, code):
-    job = plain_yaml.loads(blocks(README, "yaml")[1])["images"]
+    job = read_yaml(blocks(README, "yaml")[1])["images"]
     set_gain(project, gain)
     done = subprocess.run(
         [*BASH, "-c", "\n".join(job["script"])],
@@ -292,27 +291,3 @@ def test_the_ctest_of_the_readme(project, environment, tmp_path, render, failed)
     assert ("images (Not Run)" in done.stdout) is (render is None)
     assert ("different  inner/other.exr" in done.stdout) is (render == 1.1)
     assert (build / "images.html").exists() is (render is not None)
-
-
-# The reader -------------------------------------------------------------------------------------------------------
-
-
-FILES_IN_YAML = {
-    "action": lambda: (ACTION / "action.yml").read_text("utf-8"),
-    "workflow": lambda: (ROOT / ".github" / "workflows" / "ci.yml").read_text("utf-8"),
-    "README, GitHub": lambda: blocks(README, "yaml")[0],
-    "README, GitLab": lambda: blocks(README, "yaml")[1],
-}
-
-
-@pytest.mark.parametrize("name", FILES_IN_YAML)
-def test_the_reader_of_these_tests_reads_as_pyyaml_does(name):
-    yaml = pytest.importorskip("yaml", reason="no PyYAML (it comes with the extra `dev`)")
-    text = FILES_IN_YAML[name]()
-    assert plain_yaml.loads(text) == yaml.load(text, yaml.BaseLoader)
-
-
-@pytest.mark.parametrize("text", ["a: 1\na: 2", "a: &b 1", "a:\n    b: 1\n  c: 1", "only words", "a: >\n  folded"])
-def test_what_the_reader_does_not_know_is_an_error(text):
-    with pytest.raises(ValueError):
-        plain_yaml.loads(text)

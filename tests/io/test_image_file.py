@@ -1,4 +1,4 @@
-"""Images in files of any format: what is read, and that every bad file is one line."""
+"""Images in files: EXR round trips, every format that is read, and bad files, each of which is one line."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import shlex
 import shutil
 import struct
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
@@ -15,13 +16,18 @@ import pytest
 from support.diff_images import cut
 
 from mi_refract.io import image_file
-from mi_refract.io.image_file import read, write_exr
+from mi_refract.io.image_file import read, read_exr, write_exr
 
 PIXELS = np.random.default_rng(1).random((48, 40, 3)).astype(np.float32)
+# Values that a detour over half floats, clamping or a colour transform would change.
+HARD = np.array([[[0.1, -2.5, 1e20], [np.inf, 1e-30, 3]], [[1, np.nan, 65505], [4, 5, 6]], [[7, 8, 9], [0, -0.0, 1]]])
 
 
-def save(path, pixels, kind="float", **attributes):
+def save(path, pixels, kind="float", unassociated=False, **attributes):
+    """An image by OpenImageIO; `unassociated`: colours are not multiplied by alpha."""
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
+    if unassociated:
+        spec.attribute("oiio:UnassociatedAlpha", 1)
     for name, value in attributes.items():
         setattr(spec, name, value)
     output = oiio.ImageOutput.create(str(path))
@@ -31,73 +37,88 @@ def save(path, pixels, kind="float", **attributes):
     return path
 
 
+# EXR files that we write --------------------------------------------------------------------------------------------
+
+
+def test_what_is_written_is_read(tmp_path):
+    metadata = {"mi_refract:scene": "a b/ü.xml", "mi_refract:spp": 7, "mi_refract:seconds": 0.25, "Software": "us"}
+    write_exr(tmp_path / "a.exr", HARD, metadata=metadata | {"mi_refract:seed": 2**32 - 1})
+    pixels, header = read_exr(tmp_path / "a.exr")
+    assert pixels.dtype == np.float32
+    np.testing.assert_array_equal(pixels, HARD.astype(np.float32))
+    assert header["channels"] == ("R", "G", "B")
+    assert {name: header[name] for name in metadata} == metadata
+    assert header["mi_refract:seed"] == str(2**32 - 1)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_channels_by_name(tmp_path):
+    names = ("S0.R", "A", "B", "G", "R")
+    write_exr(tmp_path / "a.exr", np.arange(30.0).reshape(3, 2, 5), names)
+    image = read(tmp_path / "a.exr")
+    assert sorted(image.channels) == sorted(names)
+    np.testing.assert_array_equal(image.select(names), np.arange(30.0).reshape(3, 2, 5))
+    with pytest.raises(ValueError, match=r"a\.exr: no channel 'Z'; expected .*S0\.R"):
+        image.select(["Z"])
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "error", "message"),
+    [("a.exr", {"channels": names, "pixels": np.zeros(shape)}, ValueError, r"a\.exr: .*expected")
+     for shape, names in (((2, 2), "RGB"), ((2, 2, 4), "RGB"), ((0, 2, 3), "RGB"), ((2, 2, 3), "RGR"))]
+    + [("a.exr", {"metadata": {"x": value}}, ValueError, "expected str, int, float") for value in (None, [1], {}, b"x")]
+    + [("a.png", {}, ValueError, "a.png"), ("folder.exr", {}, IsADirectoryError, "folder.exr"),
+       ("none/a.exr", {}, NotADirectoryError, "none/a.exr"), ("file/a.exr", {}, NotADirectoryError, "file/a.exr")],
+)  # fmt: skip
+def test_what_cannot_be_written(tmp_path, name, options, error, message):
+    (tmp_path / "folder.exr").mkdir()
+    (tmp_path / "file").touch()
+    with pytest.raises(error, match=message):
+        write_exr(tmp_path / name, **{"pixels": HARD} | options)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.exr"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+@pytest.mark.parametrize("side", [2, 400], ids=["within a buffer", "beyond it"])
+def test_a_full_disk_keeps_the_old_file(tmp_path, side, monkeypatch):
+    path = tmp_path / "a.exr"
+    path.write_text("old")
+    monkeypatch.setattr(Path, "touch", lambda self, **_: self.symlink_to("/dev/full"))
+    with pytest.raises(OSError, match=r"^[^\n]*a\.exr: cannot be written: [^\n]+$"):
+        write_exr(path, np.random.default_rng(1).random((side, side, 3)))
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+# Files of any format --------------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize(
     "name, kind, error",
     [("a.exr", "float", 0), ("a.tif", "float", 0), ("a.png", "uint8", 1 / 509), ("a.hdr", "float", 0.01)],
 )
 def test_formats(tmp_path, name, kind, error):
     image = read(save(tmp_path / name, PIXELS, kind))
-    assert image.pixels.dtype == np.float32
-    assert image.channels == ("R", "G", "B")
+    assert image.pixels.dtype == np.float32 and image.channels == ("R", "G", "B")
     np.testing.assert_allclose(image.pixels, PIXELS, atol=error, rtol=0)
     assert image_file.count_values(tmp_path / name) == PIXELS.size
 
 
-def test_several_at_once_keep_their_order_and_their_errors(tmp_path):
-    paths = [save(tmp_path / f"{i}.exr", PIXELS + i) for i in range(5)]
-    assert [image.path for image in image_file.read_all(paths)] == paths
-    paths[3].write_bytes(b"")
-    with pytest.raises(ValueError, match=r"3\.exr: corrupt"):
-        image_file.read_all(paths)
-
-
-def test_channels_window_and_header(tmp_path):
-    image = read(save(tmp_path / "a.exr", PIXELS, x=-3, y=5, channelnames=("B", "Z", "a.X")))
-    assert image.origin == (-3, 5)
-    assert sorted(image.channels) == ["B", "Z", "a.X"]
-    np.testing.assert_array_equal(image.select(("B", "Z", "a.X")), PIXELS)
-    with pytest.raises(ValueError, match=r"a\.exr: no channel 'R'; expected .*Z"):
-        image.select(["R"])
-    write_exr(tmp_path / "b.exr", PIXELS, metadata={"mi_refract:spp": 7})
-    assert read(tmp_path / "b.exr").metadata["mi_refract:spp"] == 7
-
-
-def test_colour_under_a_transparent_alpha_is_kept(tmp_path):
+def test_the_window_and_colour_under_a_transparent_alpha_are_kept(tmp_path):
+    assert read(save(tmp_path / "a.exr", PIXELS, x=-3, y=5)).origin == (-3, 5)
     pixels = np.dstack([PIXELS, np.zeros((48, 40))]).astype(np.float32)
-    path = tmp_path / "a.png"
-    spec = oiio.ImageSpec(40, 48, 4, "uint8")
-    spec.attribute("oiio:UnassociatedAlpha", 1)
-    output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), spec)
-    assert output.write_image(pixels)
-    assert output.close()
-    np.testing.assert_allclose(read(path).pixels, pixels, atol=1 / 509)
+    save(tmp_path / "a.png", pixels, "uint8", unassociated=True)
+    np.testing.assert_allclose(read(tmp_path / "a.png").pixels, pixels, atol=1 / 509)
 
 
-def test_numbers_that_float32_does_not_hold_stay_apart(tmp_path):
+def test_float64_is_kept_and_idiff_compares_float32_multiplied_by_alpha(tmp_path):
     wide = np.array([[[1.0]], [[1 + 2.0**-40]]])
-    values = read(save(tmp_path / "a.tif", wide, "double")).pixels
-    assert values.dtype == np.float64
-    np.testing.assert_array_equal(values, wide)
-
-
-def test_the_numbers_that_idiff_compares(tmp_path):
-    """float32, and colours multiplied by alpha."""
-    path = save(tmp_path / "a.tif", np.full((2, 2, 3), 1 + 2.0**-40), "double")
+    path = save(tmp_path / "a.tif", wide, "double")
+    np.testing.assert_array_equal(read(path).pixels, wide)
     (image,) = image_file.read_parts(path, as_idiff=True)
     assert image.pixels.dtype == np.float32 and (image.pixels == 1).all()
-    spec = oiio.ImageSpec(1, 1, 4, "float")
-    spec.attribute("oiio:UnassociatedAlpha", 1)
-    output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), spec) and output.write_image(np.float32([[[1, 1, 1, 0.5]]])) and output.close()
+    save(path, np.float32([[[1, 1, 1, 0.5]]]), unassociated=True)
     assert image_file.read_parts(path, as_idiff=True)[0].pixels[0, 0, 0] == 0.5
     assert read(path).pixels[0, 0, 0] == 1
-
-
-def test_what_openimageio_reads_wrongly_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"a\.tif: one row of 64-bit numbers in a TIFF file; expected several rows"):
-        read(save(tmp_path / "a.tif", np.ones((1, 4, 3)), "double"))
-    assert read(save(tmp_path / "b.tif", np.ones((1, 4, 3), np.float32), "float")).pixels.shape == (1, 4, 3)
 
 
 def multipart(path):
@@ -112,14 +133,11 @@ def multipart(path):
 
 def deep(path):
     spec = oiio.ImageSpec(2, 2, 1, "float")
-    spec.channelnames = ("Z",)
-    spec.deep = True
+    spec.channelnames, spec.deep = ("Z",), True
     data = oiio.DeepData()
     data.init(4, 1, ["float"], ["Z"])
     output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), spec)
-    assert output.write_deep_image(data)
-    assert output.close()
+    assert output.open(str(path), spec) and output.write_deep_image(data) and output.close()
 
 
 def window(path, x, y):
@@ -146,18 +164,29 @@ BAD = {
     "black.null": lambda path: path.write_text("read as black, whatever it holds"),
     "pipe.exr": os.mkfifo,
     "header.tif": lambda path: path.write_bytes(b"II*\0\x08\0\0\0"),
+    "one row.tif": lambda path: save(path, np.ones((1, 4, 3)), "double"),  # OpenImageIO reads what lay in memory
+    "a\udcff.exr": lambda path: save(path.with_name("a.exr"), PIXELS).rename(path),
 }
+BAD |= {
+    f"truncated {keep}.{ending}": lambda path, keep=keep, kind=kind: cut(save(path, PIXELS, kind), keep)
+    for ending, kind in (("exr", "float"), ("png", "uint8"), ("hdr", "float"), ("tif", "float"))
+    for keep in (0, 6, 0.3, 0.7, 0.97)
+}
+BAD |= {f"truncated {keep}.exr": lambda path, keep=keep: cut(save(path, PIXELS), keep) for keep in (4, 60, -40, -1)}
 
 
 @pytest.mark.parametrize("name", BAD)
 def test_bad_files_are_one_line_that_names_them(tmp_path, name):
     path = tmp_path / name
     BAD[name](path)
-    with pytest.raises(ValueError) as error:
-        read(path)
-    assert str(error.value).startswith(f"{path}: ")
-    assert str(error.value).count(str(tmp_path)) == 1
-    assert "\n" not in str(error.value)
+    before = oiio.get_int_attribute("limits:imagesize_MB")
+    for reader in (read, read_exr) if path.suffix == ".exr" and name != "pipe.exr" else (read,):
+        with pytest.raises(ValueError) as error:
+            reader(path)
+        text = str(error.value)
+        assert text.startswith(f"{path}: ") and text.count(str(tmp_path)) == 1 and "\n" not in text
+        assert not name.startswith("truncated") or "corrupt" in text or "not an EXR file" in text
+    assert oiio.get_int_attribute("limits:imagesize_MB") == before
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.png", "a.tif", "a.gif", "a.jp2", "a.jxl", "jp2 as.png", "gif as.exr"])
@@ -171,7 +200,6 @@ def test_the_size_is_asked_of_the_header(tmp_path, name):
     with pytest.raises(ValueError, match=r"\(max-values\)$|not a|Not a") as error:
         read(path, side * side)
     assert ("max-values" in str(error.value)) is (" " not in name)
-    assert error.value.args[0].count(str(tmp_path)) == 1
     with pytest.raises(ValueError, match=r"corrupt|holds an image of format"):
         read(path)
 
@@ -185,36 +213,12 @@ def test_as_many_values_as_are_allowed_are_read(tmp_path):
         read(path, pixels.size - 1)
 
 
-def test_a_limit_of_openimageio_is_left_as_it_was(tmp_path):
-    before = oiio.get_int_attribute("limits:imagesize_MB")
-    read(save(tmp_path / "a.exr", PIXELS))
-    with pytest.raises(ValueError, match="corrupt"):
-        BAD["text.exr"](tmp_path / "a.exr")
-        read(tmp_path / "a.exr")
-    assert oiio.get_int_attribute("limits:imagesize_MB") == before
-
-
-@pytest.mark.parametrize("name, kind", [("a.exr", "float"), ("a.png", "uint8"), ("a.hdr", "float"), ("a.tif", "float")])
-@pytest.mark.parametrize("keep", [0, 6, 0.3, 0.7, 0.97])
-def test_truncated_files(tmp_path, name, kind, keep):
-    path = save(tmp_path / name, PIXELS, kind)
-    cut(path, keep)
-    with pytest.raises(ValueError, match=f"{name}: corrupt") as error:
-        read(path)
-    assert "\n" not in str(error.value)
-
-
-def test_a_name_that_is_no_utf8(tmp_path):
-    save(tmp_path / "a.exr", PIXELS).rename(path := tmp_path / "a\udcff.exr")
-    with pytest.raises(ValueError, match="expected a name in UTF-8"):
-        read(path)
-
-
 def test_what_the_system_does_not_give(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"none\.exr"):
-        read(tmp_path / "none.exr")
-    with pytest.raises(OSError, match=str(tmp_path)):
-        read(tmp_path)
+    for reader in (read, read_exr):
+        with pytest.raises(FileNotFoundError, match=r"none\.exr"):
+            reader(tmp_path / "none.exr")
+        with pytest.raises(OSError, match=str(tmp_path)):
+            reader(tmp_path)
     path = save(tmp_path / "a.exr", PIXELS)
     path.chmod(0)
     if os.access(path, os.R_OK):
@@ -225,8 +229,8 @@ def test_what_the_system_does_not_give(tmp_path):
 
 # Git LFS ----------------------------------------------------------------------------------------------------------
 
-POINTER = """version https://git-lfs.github.com/spec/v1
-oid sha256:4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1258daaa5e2ca24d17e2393
+POINTER = f"""version https://git-lfs.github.com/spec/v1
+oid sha256:{64 * "4"}
 size 12345
 """
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from mi_refract.io import process_group
+from mi_refract.io.errors import TooMuchOutputError
 
-LINUX = sys.platform.startswith("linux")
 # Leaves its number in a file, and sleeps.
 SLEEPER = 'echo $$ > "$0.part"; mv "$0.part" "$0"; exec sleep 600'
 
@@ -48,7 +48,7 @@ def test_what_goes_in_and_what_comes_out():
 @pytest.mark.parametrize("stream", ["1", "2"])
 def test_more_than_it_may_say(tmp_path, stream):
     endless = f'echo $$ > "$0"; while :; do echo yyyyyyyyyyyyyyyyyyyyyyyyyyyyyyyy >&{stream}; done'
-    with pytest.raises(process_group.TooMuchOutputError, match="more than 20000 bytes"):
+    with pytest.raises(TooMuchOutputError, match="more than 20000 bytes"):
         process_group.run(shell(endless, tmp_path / "pid"), b"", 60, keep_stderr=True, most=20_000)
     assert not alive(int((tmp_path / "pid").read_text()))
     assert len(process_group.run(shell("head -c 20000 /dev/zero"), b"", 60, most=20_000).out) == 20_000
@@ -71,6 +71,7 @@ def test_a_timeout_ends_it(text):
 PARENT = f"""
 import signal, sys
 from mi_refract.io import process_group
+from mi_refract.io.errors import TooMuchOutputError
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
 for number in (signal.SIGTERM, signal.SIGHUP):
     signal.signal(number, signal.SIG_DFL)
@@ -86,7 +87,7 @@ def test_a_signal_to_us_ends_it_too(tmp_path, number):
     try:
         assert wait_for((tmp_path / "pid").exists)
         us.send_signal(number)
-        assert us.wait(60) == -number
+        assert us.wait(60) in (-number, 128 + number)
     finally:
         us.kill()
         us.wait()
@@ -101,35 +102,3 @@ def test_a_signal_that_the_caller_handles_is_left_to_him(number):
     finally:
         signal.signal(number, before)
     assert signal.getsignal(number) is before
-
-
-# A child that leaves the group, in a session of its own, and starts another; each leaves its number.
-AWAY = f"""
-import os, subprocess, sys
-if os.fork() == 0:
-    os.setsid()
-    if os.fork() == 0:
-        null = os.open(os.devnull, os.O_RDWR)
-        for number in range(3):
-            os.dup2(null, number)
-        subprocess.Popen(["sh", "-c", {SLEEPER!r}, sys.argv[1]], start_new_session=True)
-        os.execvp("sh", ["sh", "-c", {SLEEPER!r}, sys.argv[2]])
-    os._exit(0)
-os.wait()
-import time
-while not all(map(os.path.exists, sys.argv[1:3])): time.sleep(0.01)
-print("x")
-"""
-
-
-@pytest.mark.skipif(not LINUX, reason="only Linux lets us adopt orphans")
-def test_a_double_fork_is_ended_where_we_adopt(tmp_path):
-    other = subprocess.Popen(["sleep", "600"])  # a child of ours that the program did not start
-    try:
-        command = [sys.executable, "-S", "-c", AWAY, str(tmp_path / "a"), str(tmp_path / "b")]
-        assert process_group.run(command, b"", 60, adopt=True).out == b"x\n"
-        assert not any(alive(int((tmp_path / name).read_text())) for name in "ab")
-        assert other.poll() is None
-    finally:
-        other.kill()
-        other.wait()

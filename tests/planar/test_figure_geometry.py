@@ -57,17 +57,6 @@ def test_what_colours_share_is_there_once():
     assert (one.colour == 0).all()
 
 
-def test_an_escaped_ray_goes_to_the_edge_and_an_exhausted_one_ends():
-    given = scene(ball(1.5), [[-1.5, 0.3]], (1, 0), max_depth=1)
-    legs = figure_geometry.legs(follow_scene(given), VIEW)
-    assert len(legs) == 1
-    given = scene(ball(1.5), [[-1.5, 0.3]], (1, 0), max_depth=2)
-    legs = figure_geometry.legs(follow_scene(given), VIEW)
-    assert len(legs) == 3
-    x, y = legs.end[-1]
-    assert x == pytest.approx(3) or abs(y) == pytest.approx(1)
-
-
 def test_the_default_view_holds_everything():
     given = scene(ball(1.5), beam(3, 0.5, x=-9), (1, 0))
     x0, x1, y0, y1 = figure_geometry.around(given, follow_scene(given))
@@ -92,15 +81,6 @@ def test_density_is_where_the_line_is():
     assert set(columns.tolist()) == set(range(50))
     upright = figure_geometry.density(lines((-1, -2), (1, 3)), np.array([1.0]), (-1, 1, -2, 3), 20, 50)
     np.testing.assert_allclose(upright, pixels.T, atol=1e-12)
-
-
-def test_density_in_parts_is_the_density(monkeypatch):
-    rng = np.random.default_rng(4)
-    start, end, inside = figure_geometry.clip(*rng.uniform(-3, 3, (2, 300, 2)), VIEW)
-    several, value = lines(start[inside], end[inside]), rng.uniform(size=inside.sum())
-    whole = figure_geometry.density(several, value, VIEW, 80, 40)
-    monkeypatch.setattr(figure_geometry, "SAMPLES", 7 * 80)
-    np.testing.assert_allclose(figure_geometry.density(several, value, VIEW, 80, 40), whole, atol=1e-12)
 
 
 def test_arcs_are_round_and_pieces_are_joined():

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from support.planar_scenes import polygon, star, together
 
-from mi_refract.planar import Event, Segments, mesh_acceleration, trace
-from mi_refract.planar.intersect_segments import NOWHERE
+from mi_refract.planar import Event, Segments, trace
 
 RAYS = 600
 
@@ -166,26 +165,6 @@ def test_paths_are_those_of_trying_all(llvm, case, precision):
         assert np.array_equal(getattr(brute, name), getattr(mesh, name), equal_nan=True), name
     assert not (brute.events == Event.MEDIUM_MISMATCH).any()
     assert (brute.hits >= 0).sum() > RAYS / 4
-
-
-def no_neighbours(vertices, count):
-    """A stroke names no segment but its own; that of a vertex none."""
-    return np.zeros(len(vertices) + count, int), np.array([NOWHERE])
-
-
-@pytest.mark.parametrize(
-    ("case", "defect"),
-    [
-        ("slivers", ("_wedge_shares", lambda a, b, vertices: np.zeros(a.shape))),
-        ("fine circle, along its wall", ("MARGIN", 2.0**-26)),
-        ("star, at tips", ("OFFSET", 2.0**-9)),
-        ("fine circle, along its wall", ("_around", no_neighbours)),
-    ],
-)
-def test_each_precaution_is_needed(llvm, monkeypatch, case, defect):
-    monkeypatch.setattr(mesh_acceleration, *defect)
-    with pytest.raises(AssertionError):
-        test_paths_are_those_of_trying_all(None, case, "float64")
 
 
 def test_scalar_variants_have_strokes_too():

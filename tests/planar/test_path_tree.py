@@ -12,9 +12,9 @@ from support.planar_scenes import SLAB, ball, beam, polygon, scene
 
 from mi_refract.backend import detect
 from mi_refract.planar import Event, Segments, path_tree, trace
+from mi_refract.planar.light import Light
 from mi_refract.planar.path_tree import as_data, count, follow, follow_scene, summary, with_rays
-from mi_refract.planar.paths import REFLECT_BITS
-from mi_refract.planar.scene_file import load
+from mi_refract.planar.segments import REFLECT_BITS
 
 OBLIQUE = math.cos(0.6), math.sin(0.6)
 
@@ -102,36 +102,27 @@ def test_paths_end_in_every_way():
     np.testing.assert_allclose(traced[0].tips, [[1, 0.5]])
 
 
-def test_too_many_branches_are_refused(monkeypatch):
+def test_more_legs_than_fit_in_memory_are_refused():
+    """2²⁵ legs of all paths, colours and partial reflections: counted before they are traced."""
+    one = scene(polygon(SLAB, 1.5), np.tile([-2.0, 0], (2**16, 1)), OBLIQUE, max_depth=511)
     with pytest.raises(ValueError, match="branches = -1; expected"):
         through_slab(-1)
-    monkeypatch.setattr(path_tree, "MOST", 30)
-    with pytest.raises(ValueError, match="3 paths of up to 20 boundaries with up to 1 partial reflections; expected "):
-        through_slab(1)
+    with pytest.raises(
+        ValueError, match="131072 paths of up to 511 boundaries with up to 0 partial reflections; expected"
+    ):
+        follow_scene(replace(one, segments=one.segments * 2, light=Light(("red", "blue"))))
+    legs = r"3 paths of up to 20 .* 1 partial reflections; .* other colours take 33554400"
+    with pytest.raises(ValueError, match=legs):
+        follow(polygon(SLAB, 1.5), np.array([[-2.0, 0]]), np.array([OBLIQUE]), 20, 1, most=32)
 
 
-def test_legs_of_all_colours_are_counted_before_the_first_is_traced(monkeypatch):
-    """16 rays of up to 10 legs."""
-    colours = ("red", "blue")
-    given = scene((polygon(SLAB, 1.5), polygon(SLAB, 1.6)), beam(16, 1.0), (1, 0), colours=colours, max_depth=9)
-    monkeypatch.setattr(path_tree, "MOST", 320)
-    assert len(follow_scene(given)) == 2
-    with pytest.raises(ValueError, match=r"320 legs altogether"):
-        follow_scene(replace(given, branches=1))
-    monkeypatch.setattr(path_tree, "MOST", 319)
-    monkeypatch.setattr(path_tree, "Tracer", lambda *arguments, **how: pytest.fail("traced"))
-    with pytest.raises(ValueError, match="32 paths of up to 9 boundaries"):
-        follow_scene(given)
-
-
-def test_what_one_colour_takes_is_not_left_for_the_next(monkeypatch):
-    """48 paths of one colour: those of 16 rays, and 2 partial reflections of each."""
-    given = scene((polygon(SLAB, 1.5),) * 2, beam(16, 1.0), (1, 0), colours=("red", "blue"), max_depth=9, branches=1)
-    monkeypatch.setattr(path_tree, "MOST", 960)
-    assert [len(branches.rays) for branches in follow_scene(given)] == [48, 48]
-    monkeypatch.setattr(path_tree, "MOST", 950)
-    with pytest.raises(ValueError, match="950 legs altogether, of which other colours take 480"):
-        follow_scene(given)
+def test_what_one_colour_takes_is_not_left_for_the_next(needs_variant):
+    """2¹⁶ rays of up to 170 legs: 3 · 2¹⁶ paths of a colour are 2²⁵, two colours are more."""
+    needs_variant("llvm_ad_rgb")
+    one = scene(polygon(SLAB, 1.5), np.tile([-2.0, 0], (2**13, 1)), OBLIQUE, max_depth=900, branches=1)
+    assert len(follow_scene(one)[0].rays) == 3 * 2**13
+    with pytest.raises(ValueError, match="of which other colours take 22142976"):
+        follow_scene(replace(one, segments=one.segments * 2, light=Light(("red", "blue"))))
 
 
 def test_the_data_is_strict_json():
@@ -147,12 +138,6 @@ def test_the_data_is_strict_json():
     assert path["points"] == traced[1].paths.points[0, :3].tolist()
     assert len(path["hits"]) == 2
     assert path["weights"][0] == 1.0 > path["weights"][1] > path["weights"][2] > 0.8
-
-
-def test_a_ray_that_meets_nothing_has_no_index():
-    given = scene(polygon(SLAB, 1.5), [[-2.0, 0]], (-1, 0))
-    path = as_data(given, follow_scene(given))["colours"][0]["paths"][0]
-    assert (path["indices"], path["hits"], path["points"]) == ([None], [], [[-2.0, 0.0]])
 
 
 def test_more_rays_lie_between_those_of_the_beam():
@@ -199,27 +184,13 @@ def test_the_last_bit_is_that_of_one_boundary(backend):
     assert (paths.events == Event.ESCAPED).sum(1).tolist() == [1, 1]
 
 
-def beams(tmp_path, angles, count):
-    path = tmp_path / "fan.toml"
-    path.write_text(f"""
-        [[shape]]
-        kind = "circle"
-        radius = 1.0
-        n = 1.5
-        [[beam]]
-        kind = "fan"
-        at = [0.0, 0.0]
-        angles = {list(angles)}
-        count = {count}
-    """)
-    return load(path)
-
-
 @pytest.mark.parametrize("angles", [(-170.0, 170.0), (0.0, 360.0), (170.0, -170.0), (10.0, 20.0)])
 @pytest.mark.parametrize("count", [2, 3, 9])
-def test_more_rays_of_a_fan_go_the_same_way_round(angles, count, tmp_path):
+def test_more_rays_of_a_fan_go_the_same_way_round(angles, count):
     """Whatever number of rays the file has: steps of 180° and more."""
-    found = with_rays(beams(tmp_path, angles, count), 7).directions
+    fan = np.radians(np.linspace(*angles, count))
+    directions = np.column_stack([np.cos(fan), np.sin(fan)])
+    found = with_rays(scene(ball(1.5), np.zeros((count, 2)), directions, fans=(angles,)), 7).directions
     expected = np.radians(np.linspace(*angles, 7))
     assert found == pytest.approx(np.column_stack([np.cos(expected), np.sin(expected)]), abs=1e-12)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
@@ -11,7 +12,7 @@ pytest.importorskip("typer")
 
 from mi_refract import planar
 from mi_refract.cli import app
-from mi_refract.planar import scene_file, scene_schema
+from mi_refract.planar import scene_file
 
 TEXT = Path(planar.__file__).with_name("README.md").read_text()
 ROOT = Path(__file__).parents[2]
@@ -42,5 +43,8 @@ def test_every_option_kind_and_event_is_there(capfd):
         app.app(["trace", "--help"], prog_name="mi-refract")
     options = set(re.findall(r"(--[a-z][a-z-]+)", capfd.readouterr().out)) - {"--help"}
     assert all(f"| `{option}" in TEXT or f"`{option}`" in TEXT for option in options - {"--output"})
-    kinds = [*scene_schema.SHAPES, *scene_schema.BEAMS, *(event.name for event in planar.Event)]
+    kinds = [
+        kind.__struct_config__.tag for union in (scene_file.AnyShape, scene_file.AnyBeam) for kind in get_args(union)
+    ]
+    kinds += [event.name for event in planar.Event]
     assert all(f"`{name}`" in TEXT for name in kinds)

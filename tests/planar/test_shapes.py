@@ -43,8 +43,6 @@ def every_shape():
     yield "flat lens", shapes.lens((0, -0.05), 3)
     yield "concave lens", shapes.lens((-0.05, 0.05), 1, radius=8)
     yield "ellipse lens", shapes.ellipse_lens(1.5, 4, 1.5, 1.5)
-    yield "document's lens", shapes.document_lens()
-    yield "document's polyline", shapes.document_lens(0.05)
     yield "faceted circle", shapes.circle(1).faceted(37)
 
 
@@ -126,7 +124,6 @@ def test_arcs_turn_by_what_they_are_told():
 def test_smooth_curves_have_one_tangent_at_their_joints():
     lens = shapes.lens((0.02, -0.03), 5, radius=9, conic=(-1.5, 0.4))
     smooth = [(shapes.circle(3), range(4)), (shapes.ellipse(5, 0.1), range(4)), (lens, (1, 4))]
-    smooth.append((shapes.document_lens(), (1, 3)))
     bend = shapes.polyline([(0, 0), (4, 0), (7, 3), (7, 9)], [0, 90, 0])
     for curve, joints in (*smooth, (bend, (1, 2))):
         before, after = curve.end - curve.control, curve.control - curve.start
@@ -184,56 +181,6 @@ def test_facets_are_as_many_as_asked_for_and_lie_on_the_curve():
         shapes.circle(2).faceted(3)
     with pytest.raises(ValueError, match="for 0 arcs"):
         shapes.rectangle(1, 1).faceted(100)
-
-
-# The document's lens ----------------------------------------------------------------------------------------------
-
-
-def original_samples(resolution=0.05, c=-0.04, k=8.2, conic=1.9):
-    """Radii and half widths at which the program of document 004 samples its lens."""
-
-    def width(r):
-        square = 1 - (conic + 1) * c * c * r * r
-        return -1.0 if square < 0 else k + (c * r * r) / (1 + math.sqrt(square))
-
-    found, r = [], 0.0
-    while width(r) > 0:
-        found.append((r, width(r)))
-        r += resolution
-    return np.array(found)
-
-
-def test_the_documents_polyline_has_the_originals_vertices_and_closes_at_its_tips():
-    samples = original_samples()
-    assert len(samples) == 294
-    assert samples[-1, 1] > 0.1  # where the original leaves it open
-    lens = shapes.document_lens(0.05)
-    assert len(lens) == 1172
-    quarter = lens.vertices[(lens.vertices >= 0).all(1)]
-    quarter = quarter[np.argsort(quarter[:, 0])]
-    assert quarter[:-1, 0].tolist() == (4 * samples[:-1, 0]).tolist()
-    assert np.abs(quarter[:-1, 1] - samples[:-1, 1]).max() <= 1e-13
-    tip, exact = quarter[-1], shapes.document_lens()
-    assert tip.tolist() == exact.vertices[2].tolist()
-    assert tip[1] == 0
-    assert 4 * samples[-1, 0] < tip[0] < 4 * (samples[-1, 0] + 0.05)
-    # From its own equation at width 0: c r² = −2 k − c (1 + K) k².
-    assert tip[0] == pytest.approx(4 * math.sqrt((-2 * 8.2 + 0.04 * 2.9 * 8.2**2) / -0.04), rel=4 * ULP)
-
-
-@pytest.mark.parametrize("resolution", [0.0, -0.05, math.nan])
-def test_a_polyline_needs_a_resolution(resolution):
-    with pytest.raises(ValueError, match="expected above 0"):
-        shapes.document_lens(resolution)
-
-
-def test_the_documents_arcs_are_its_formula():
-    x, y = points(shapes.document_lens().between(1, 4.4), 200).reshape(-1, 2).T
-    for sign in (1, -1):
-        half = np.stack([sign * y - 8.2, x / 4], 1)[sign * y >= 0]
-        assert off_conic(half, -0.04, 1.9).max() <= 4 * ULP * 16
-    c, s = -0.04, original_samples()[:, 0]
-    assert np.abs(8.2 + shapes.sag(s, c, 1.9) - original_samples()[:, 1]).max() <= 1e-13
 
 
 # Lenses -----------------------------------------------------------------------------------------------------------

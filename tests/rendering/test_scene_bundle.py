@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from mi_refract.rendering import scene_bundle
 from mi_refract.rendering.render_pass import pass_renderer
-from mi_refract.rendering.scene_bundle import pack
-from mi_refract.rendering.scene_files import load_scene
+from mi_refract.rendering.scene_files import load_scene, parse_scene
 
 SCENE = """<scene version="3.0.0">
   <default name="tint" value="none"/>
@@ -48,114 +45,119 @@ def written(folder, texture="../common/bright.exr", more=SKY):
     return path
 
 
+def pack(scene, defines=None, limit=256):
+    return scene_bundle.pack(parse_scene(scene, defines), defines or {}, limit)
+
+
 def image(scene):
     return pass_renderer(scene, 0).render(0, 2).total
 
 
-def elsewhere(folder, bundle, defines=None):
+def elsewhere(folder, bundle):
     """The scene of a bundle, loaded after all that it was made of has gone."""
     target = folder.parent / f"{folder.name}-there"
-    target.mkdir(exist_ok=True)
-    for each in ("scenes", "common", "far"):
-        (folder / each).rename(folder / f"{each}-gone")
-    return scene_bundle.load(bundle, str(mi.variant()), defines or {}, str(target))[0]
+    target.mkdir()
+    for name in ("scenes", "common", "far"):
+        (folder / name).rename(folder / f"{name}-gone")
+    return scene_bundle.load(bundle, str(mi.variant()), str(target))[0]
 
 
-@pytest.mark.parametrize("name", ["../common/bright.exr", "{far}/dark.exr", "dark.exr"])
-def test_the_same_image_elsewhere(folder, name):
-    """`dark.exr` is found through a <path>; XML by `../`, also through a folder that holds nothing else."""
-    more = f'{SKY}<path value="../far"/>' if name == "dark.exr" else SKY
+@pytest.mark.parametrize(
+    ("name", "more", "defines"),
+    [
+        ("../common/bright.exr", SKY, {}),
+        ("{far}/dark.exr", SKY, {}),
+        ("dark.exr", f'{SKY}<path value="../far"/>', {}),
+        ("$tint", SKY, {"tint": "{far}/dark.exr"}),
+    ],
+)
+def test_the_same_image_elsewhere(folder, name, more, defines):
+    """Named by `../`, by an absolute path, through a <path>, by a define; XML through a folder that is empty."""
+    defines = {key: value.format(far=folder / "far") for key, value in defines.items()}
     scene = written(folder, name.format(far=folder / "far"), more)
-    expected = image(load_scene(scene))
-    bundle = pack(scene, {})
-    assert len(bundle.files) == 3
-    found = image(elsewhere(folder, bundle))
-    np.testing.assert_array_equal(found, expected)
-    assert found.std() > 0
-
-
-def test_a_define_may_name_a_file(folder):
-    scene = written(folder, "$tint")
-    defines = {"tint": str(folder / "far" / "dark.exr")}
     expected = image(load_scene(scene, defines))
-    np.testing.assert_array_equal(image(elsewhere(folder, pack(scene, defines), defines)), expected)
+    bundle = pack(scene, defines)
+    assert len(bundle.files) == 3
+    np.testing.assert_array_equal(image(elsewhere(folder, bundle)), expected)
+    assert expected.std() > 0
 
 
-def test_unpacked_and_loaded_once(folder, tmp_path_factory):
-    bundle, target = pack(written(folder), {}), str(tmp_path_factory.mktemp("there"))
-    first, second = (scene_bundle.load(bundle, "scalar_rgb", {}, target) for _ in range(2))
-    assert first[0] is second[0] and len([*Path(target).iterdir()]) == 1
+def test_unpacked_and_loaded_once_for_each_set_of_defines(folder, tmp_path_factory):
+    """The same files with another value are another scene."""
+
+    target = tmp_path_factory.mktemp("there")
+    more = '<emitter type="constant"><float name="radiance" value="$light"/></emitter>'
+    scene = written(folder, more=f'<default name="light" value="1"/>{more}')
+    bundles = [pack(scene, {"light": light}) for light in ("1", "1", "3")]
+    one, same, other = (scene_bundle.load(bundle, "scalar_rgb", str(target))[0] for bundle in bundles)
+    assert one is same and len([*target.iterdir()]) == 2
+    np.testing.assert_allclose(image(other), 3 * image(one), rtol=1e-6)
 
 
 def test_the_digest_is_of_every_byte(folder):
-    before = pack(written(folder), {}).digest
-    assert pack(written(folder), {}).digest == before
+    before = pack(written(folder)).digest
+    assert pack(written(folder)).digest == before
     content = bytearray((folder / "common" / "bright.exr").read_bytes())
     content[-1] ^= 1
     (folder / "common" / "bright.exr").write_bytes(content)
-    assert pack(written(folder), {}).digest != before
-
-
-def refusal(scene, limit=256):
-    with pytest.raises(ValueError) as caught:
-        pack(scene, {}, limit)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+    assert pack(written(folder)).digest != before
 
 
 def test_too_large(folder):
     scene = written(folder)
     mi.Bitmap(np.random.default_rng(0).random((400, 400, 3), np.float32)).write(str(folder / "common" / "bright.exr"))
-    text = refusal(scene, 1)
-    assert f"{scene}: 1." in text and f"the largest {folder}/common/bright.exr" in text
-    assert text.endswith("expected with a cluster: 1 MiB, or --bundle-limit 2, if all workers have the memory")
+    message = rf"{scene}: 1\.\d MiB of files, the largest {folder}/common/bright\.exr \(1\.\d MiB\); "
+    message += "expected with a cluster: 1 MiB, or --bundle-limit 2, if all workers have the memory"
+    with pytest.raises(ValueError, match=message):
+        pack(scene, limit=1)
 
 
-ONLY_HERE = (
-    "by an absolute name or from the working folder; expected with a cluster a name relative to the scene's folder"
+ABSOLUTE = (
+    "by an absolute name or from the working folder; expected with a cluster: a name relative to the scene's folder"
 )
+BRIGHT = "../common/bright.exr"
+SPECTRUM = '<emitter type="constant"><spectrum name="radiance" filename="{common}/glass.spd"/></emitter>'
 
 
-def test_an_include_that_is_found_only_here(folder):
-    text = refusal(written(folder, more=f'<include filename="{folder}/common/sky.xml"/>'))
-    assert text == f"{folder}/common/sky.xml: included, {ONLY_HERE}"
-
-
-@pytest.mark.parametrize("value, accepted", [("{common}", False), ("../common", True)])
-def test_a_path_that_is_found_only_here(folder, value, accepted):
-    value = value.format(common=folder / "common")
-    scene = written(folder, more=f'<path value="{value}"/><include filename="sky.xml"/>')
-    if accepted:
-        assert len(pack(scene, {}).files) == 3
-    else:
-        assert ONLY_HERE in refusal(scene)
-
-
-def test_an_empty_path_is_there_as_well(folder):
-    """Mitsuba refuses a <path> to a folder that is not there."""
-    (folder / "scenes" / "empty").mkdir()
-    bundle = pack(written(folder, more=f'{SKY}<path value="empty"/>'), {})
-    assert image(elsewhere(folder, bundle)).std() > 0
-
-
-def test_a_spectrum_that_is_found_only_here(folder):
+@pytest.mark.parametrize(
+    ("texture", "more", "message"),
+    [
+        (
+            "../common/bright.exr",
+            '<include filename="{common}/sky.xml"/>',
+            f"{{common}}/sky.xml: is included {ABSOLUTE}",
+        ),
+        (BRIGHT, '<path value="{common}"/>', f"{{common}}: is the folder of a <path> {ABSOLUTE}"),
+        (BRIGHT, SPECTRUM, f"{{common}}/glass.spd: is opened by <spectrum> {ABSOLUTE}"),
+        (
+            "link/../common/bright.exr",
+            SKY,
+            "link/../common/bright.exr: '..' after a symbolic link; expected with a cluster",
+        ),
+    ],
+)
+def test_what_is_found_only_here_is_refused(folder, texture, more, message):
     (folder / "common" / "glass.spd").write_text("400 1\n700 1\n")
-    spectrum = f'<spectrum name="radiance" filename="{folder}/common/glass.spd"/>'
-    text = refusal(written(folder, more=f'<emitter type="constant">{spectrum}</emitter>'))
-    assert text == (f"{folder}/common/glass.spd: opened by <spectrum>, {ONLY_HERE}")
-
-
-def test_parents_behind_a_link(folder):
-    """`link/..` is another folder than the text says."""
     (folder / "scenes" / "link").symlink_to(folder / "far")
-    text = refusal(written(folder, "link/../common/bright.exr"))
-    assert "by a symbolic link; expected" in text
-
-
-def test_errors_name_the_files_as_they_are_here(folder):
-    scene = written(folder)
-    bundle = pack(scene, {})
-    (folder / "there").mkdir()
+    common = folder / "common"
     with pytest.raises(ValueError) as caught:
-        scene_bundle.load(bundle, "scalar_rgb", {"nonesuch": "1"}, str(folder / "there"))
-    assert str(caught.value).startswith(f"{scene}: ") and str(folder / "there") not in str(caught.value)
+        pack(written(folder, texture, more.format(common=common)))
+    assert message.format(common=common) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "more", ['<path value="../common"/><include filename="sky.xml"/>', f'{SKY}<path value="empty"/>']
+)
+def test_a_relative_path_is_there_as_well(folder, more):
+    """Also one to an empty folder: Mitsuba refuses a <path> to a folder that is not there."""
+    (folder / "scenes" / "empty").mkdir()
+    assert image(elsewhere(folder, pack(written(folder, more=more)))).std() > 0
+
+
+def test_errors_name_the_files_as_they_are_here(folder, tmp_path_factory):
+    scene, there = written(folder), str(tmp_path_factory.mktemp("there"))
+    bundle = pack(scene)
+    bundle.defines["nonesuch"] = "1"
+    with pytest.raises(ValueError, match=f"^{scene}: ") as caught:
+        scene_bundle.load(bundle, "scalar_rgb", there)
+    assert there not in str(caught.value)

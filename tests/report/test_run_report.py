@@ -82,15 +82,15 @@ def test_json_keeps_every_row_and_is_strict(tmp_path):
 @pytest.mark.parametrize(
     ("damage", "complaint"),
     [
-        (lambda t: t.replace('"schema": 1', '"schema": 2'), "schema 2, expected 1"),
-        (lambda t: "[]", "schema None"),
-        (lambda t: t[: len(t) // 2], "line"),
-        (lambda t: t.replace('"case"', '"Case"', 1), "row 0: missing 'case'"),
-        (lambda t: t.replace("5e-08", '"small"'), "row 0: 'small' is not a number"),
-        (lambda t: t.replace("5e-08", "NaN"), "NaN is not strict JSON"),
-        (lambda t: t.replace("5e-08", "5"), "row 0: verdict 'pass' does not follow"),
-        (lambda t: t.replace('"rows"', '"row"'), "missing 'rows'"),
-        (lambda t: "\udc80", "decode"),
+        (lambda t: t.replace('"schema": 1', '"schema": 2'), "schema 2; expected 1"),
+        (lambda t: "[]", "Expected `object`, got `array`"),
+        (lambda t: t[: len(t) // 2], "truncated"),
+        (lambda t: t.replace('"case"', '"Case"', 1), "$.rows[0]: Object missing required field `case`"),
+        (lambda t: t.replace("5e-08", '"small"'), "$.rows[0]: Expected `float`, got `str` - at `$.values"),
+        (lambda t: t.replace("5e-08", "NaN"), "JSON is malformed"),
+        (lambda t: t.replace("5e-08", "5"), "$.rows[0]: verdict 'pass'; expected 'fail'"),
+        (lambda t: t.replace('"rows"', '"row"'), "'rows' is missing"),
+        (lambda t: "\udc80", "malformed"),
     ],
 )
 def test_json_refuses_what_it_did_not_write(tmp_path, damage, complaint):
@@ -393,6 +393,6 @@ def test_the_page_works_from_a_file(tmp_path):
 
 
 def test_json_that_is_nested_too_deeply_is_one_line(tmp_path):
-    (tmp_path / "rows.json").write_text("[" * 100_000)
+    (tmp_path / "rows.json").write_text('{"rows": ' + "[" * 100_000)
     with pytest.raises(ValueError, match="nested too deeply"):
         run_report.read_json(tmp_path / "rows.json")

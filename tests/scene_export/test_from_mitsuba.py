@@ -13,8 +13,8 @@ import pytest
 
 from mi_refract.io import image_file
 from mi_refract.scene_export import from_mitsuba, meshes_from_shapes, write_files
-from mi_refract.scene_export.plain_scene import Diffuse, Environment, Glass, Light
-from mi_refract.scene_export.targets.environment_map import radiance
+from mi_refract.scene_export.mitsuba_nodes import SceneFile
+from mi_refract.scene_export.plain_scene import Diffuse, Glass, Light
 
 SCENES = Path(__file__).parents[2] / "scenes"
 NAMES = sorted(path.stem for path in SCENES.glob("*.xml"))
@@ -71,6 +71,7 @@ def test_what_is_read(scene):
     ball, box, lamp = found.meshes
     assert (ball.name, box.name, lamp.name) == ("ball", "box", "rectangle")
     assert ball.material == Glass(1.333, 1.000277) and len(ball.faces) == 80
+    np.testing.assert_allclose(ball.vertices.mean(0), 0, atol=1e-12)
     assert box.material == Diffuse((0.5, 0.5, 0.5)) and box.vertices.min(0).tolist() == [2, -1, -1]
     assert lamp.material == Light((2, 2, 2))
     assert found.sky == (0.5, 0.25, 1) and found.max_depth == 5
@@ -202,37 +203,6 @@ def test_a_difference_is_seen(old, new, tmp_path):
     assert disagreements(original(SCENES / "prism.xml"), other) > 0.004
 
 
-def test_turned_environment(scene, tmp_path):
-    (tmp_path / "lamps.exr").write_bytes((SCENES / "lamps.exr").read_bytes())
-    turn = '<transform name="to_world"><rotate x="0.6" y="0.8" angle="70"/></transform>'
-    path = scene(
-        '<emitter type="constant"><rgb name="radiance" value="0.5, 0.25, 1"/></emitter>',
-        f'<emitter type="envmap"><string name="filename" value="lamps.exr"/><float name="scale" value="3"/>{turn}'
-        "</emitter>",
-    )
-    sky, emitter = from_mitsuba.load(path).sky, original(path).environment()
-    assert isinstance(sky, Environment)
-    directions = np.random.default_rng(2).normal(size=(500, 3))
-    expected = []
-    for direction in directions:
-        si = mi.SurfaceInteraction3f()
-        si.wi = -mi.Vector3f(direction / np.linalg.norm(direction))
-        expected.append(list(emitter.eval(si)))
-    np.testing.assert_allclose(radiance(sky, directions), expected, rtol=1e-3, atol=1e-3)
-    assert not np.allclose(radiance(sky, directions * [1, 1, -1]), expected, rtol=0.1, atol=0.1)
-
-
-def test_a_basis_is_orthonormal_and_right_handed():
-    directions = np.random.default_rng(4).normal(size=(20, 3))
-    directions[:3] = [0, 0, 1], [0, 0, -1], [1, 0, -1e-9]
-    for z in directions / np.linalg.norm(directions, axis=1, keepdims=True):
-        found = meshes_from_shapes._basis(z)
-        np.testing.assert_allclose(found.T @ found, np.eye(3), atol=1e-12)
-        assert np.linalg.det(found) == pytest.approx(1)
-        np.testing.assert_array_equal(found[:, 2], z)
-    np.testing.assert_array_equal(meshes_from_shapes._basis(np.array([0.0, 0.0, 1.0])), np.eye(3))
-
-
 CONSTANT = '<emitter type="constant"><rgb name="radiance" value="0.5, 0.25, 1"/></emitter>'
 SKY = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
 
@@ -311,11 +281,6 @@ def test_what_is_no_colour_is_refused_in_one_line(scene, value):
     with pytest.raises(ValueError, match=r"constant: radiance = .*; expected an RGB colour of finite") as error:
         from_mitsuba.load(path)
     assert "\n" not in str(error.value)
-
-
-def test_a_ball_without_a_centre_is_around_the_origin(scene):
-    (mesh,) = [mesh for mesh in from_mitsuba.load(scene()).meshes if mesh.name == "ball"]
-    np.testing.assert_allclose(mesh.vertices.mean(0), 0, atol=1e-12)
 
 
 BALL = 'type="sphere" id="ball">'
@@ -406,43 +371,54 @@ def test_a_face_without_its_vertices_is_refused(last, smooth, scene, tmp_path):
         from_mitsuba.load(path)
 
 
-def test_triangles_are_counted_before_they_are_made(scene, monkeypatch):
-    """80 of the ball, 12 of the box, 2 of the lamp."""
-    monkeypatch.setattr(from_mitsuba, "MOST", 94)
-    assert len(from_mitsuba.load(scene(), level=1).meshes) == 3
-    monkeypatch.setattr(meshes_from_shapes.tessellation, "sphere", lambda level: pytest.fail("made"))
-    monkeypatch.setattr(from_mitsuba, "MOST", 79)
-    with pytest.raises(ValueError, match="sphere ball: 80 triangles where 79 are left; expected "):
-        from_mitsuba.load(scene(), level=1)
+def first_shape(path):
+    scene = SceneFile(path, {})
+    return next(child for child in scene.node(0).children() if child.kind == "Shape")
 
 
-@pytest.mark.parametrize("name", meshes_from_shapes.SHAPES)
-def test_the_count_of_triangles_is_the_number_that_is_made(name, scene, monkeypatch):
-    twosided = '<bsdf type="twosided"><bsdf type="diffuse"/></bsdf>'
-    path = scene("</scene>", f'<shape type="{name}" id="last">{twosided}</shape></scene>')
-    (made,) = (len(mesh.faces) for mesh in from_mitsuba.load(path, level=2).meshes if mesh.name == "last")
-    monkeypatch.setattr(from_mitsuba, "MOST", 320 + 12 + 2 + made - 1)
-    monkeypatch.setattr(
-        meshes_from_shapes,
-        "_parts",
-        lambda *a, parts=meshes_from_shapes._parts: pytest.fail("made") if a[0].props.id() == "last" else parts(*a),
+LAMP = '<emitter type="area"><rgb name="radiance" value="2"/></emitter>'
+SCALED = (
+    '<texture type="checkerboard" name="radiance"><transform name="to_uv"><scale x="{}" y="{}"/></transform></texture>'
+)
+BOARDS = {"board 2 × 3": (2, 3, 48), "board 1.3 × 0.4": (1.3, 0.4, 6), "board of one cell": (0.2, 0.2, 2)}
+
+
+@pytest.mark.parametrize("name", [*meshes_from_shapes.SHAPES, *BOARDS])
+def test_triangles_are_counted_before_they_are_made(name, tmp_path):
+    """The count is the number that is made; a level or a scale that no machine could make is an error at once."""
+    path = tmp_path / "scene.xml"
+    if name in BOARDS:
+        *scales, count = BOARDS[name]
+        shape = f"{AREA}{SCALED.format(*scales)}</emitter></shape>"
+    else:
+        count = {"sphere": 320, "cylinder": 64, "disk": 32, "cube": 12, "rectangle": 2}[name]
+        shape = f'<shape type="{name}">{LAMP}</shape>'
+    path.write_text(f'<scene version="3.0.0">{shape}</scene>')
+    made = sum(len(mesh.faces) for mesh in meshes_from_shapes.meshes_of_shape(first_shape(path), 2, count))
+    assert made == count
+    with pytest.raises(ValueError, match=f": {count} triangles where {count - 1} are left; expected "):
+        next(meshes_from_shapes.meshes_of_shape(first_shape(path), 2, count - 1))
+    if name in BOARDS:
+        path.write_text(path.read_text().replace('scale x="', 'scale x="999999999', 1))
+    if name not in ("cube", "rectangle"):
+        with pytest.raises(ValueError, match="triangles where 16777216 are left"):
+            next(meshes_from_shapes.meshes_of_shape(first_shape(path), 60))
+
+
+@pytest.mark.parametrize("end", [(0, 0, 2), (0, 0, -2), (1, 0, -1e-9), (3, -1, 2)])
+def test_a_cylinder_lies_around_its_axis_and_faces_outward(end, tmp_path):
+    ends = '<point name="p0" x="1" y="2" z="3"/><point name="p1" x="{}" y="{}" z="{}"/>'.format(*np.add(end, (1, 2, 3)))
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        f'<scene version="3.0.0"><shape type="cylinder"><float name="radius" value="0.5"/>{ends}{LAMP}</shape></scene>'
     )
-    with pytest.raises(ValueError, match=f"{name} last: {made} triangles where {made - 1} are left"):
-        from_mitsuba.load(path, level=2)
-
-
-@pytest.mark.parametrize(("scale", "cells"), [((2, 3), 24), ((1.3, 0.4), 3), ((0.2, 0.2), 1)])
-def test_the_cells_of_a_checkerboard_are_counted_before_they_are_made(scale, cells, scene, monkeypatch):
-    uv = f'<transform name="to_uv"><scale x="{scale[0]}" y="{scale[1]}"/></transform>'
-    path = scene(LIGHT, f"{AREA}{BOARD.replace('/>', '>')}{uv}</texture>")
-    made = sum(len(mesh.faces) for mesh in from_mitsuba.load(path, level=0).meshes)
-    assert made == 20 + 12 + 2 * cells
-    monkeypatch.setattr(from_mitsuba, "MOST", made)
-    assert len(from_mitsuba.load(path, level=0).meshes) > 2
-    monkeypatch.setattr(from_mitsuba, "MOST", made - 1)
-    monkeypatch.setattr(meshes_from_shapes.tessellation, "checkerboard", lambda *scales: pytest.fail("made"))
-    with pytest.raises(ValueError, match=f"{2 * cells} triangles where {2 * cells - 1} are left"):
-        from_mitsuba.load(path, level=0)
+    (mesh,) = meshes_from_shapes.meshes_of_shape(first_shape(path), 2)
+    axis, places = np.divide(end, np.linalg.norm(end)), mesh.vertices - (1, 2, 3)
+    np.testing.assert_allclose(np.linalg.norm(np.cross(places, axis), axis=1), 0.5, rtol=1e-12)
+    assert {round(float(x), 9) for x in places @ axis} == {0, round(float(np.linalg.norm(end)), 9)}
+    a, b, c = (mesh.triangles() - (1, 2, 3)).swapaxes(0, 1)
+    outward = a - (a @ axis)[:, None] * axis
+    assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), outward) > 0).all()
 
 
 def test_other_errors(scene):

@@ -9,9 +9,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from support import plain_yaml
+import yaml
 
 BASH = ["bash", "--noprofile", "--norc", "-e", "-o", "pipefail"]  # what `shell: bash` is on a runner
+
+
+def read_yaml(text: str) -> Any:
+    """The document; every scalar is a text, as GitHub's expressions see it."""
+    return yaml.load(text, yaml.BaseLoader)
 
 
 @dataclass
@@ -36,7 +41,7 @@ def run_action(folder: Path, inputs: dict[str, str], workspace: Path, temporary:
 
     ValueError for an input that the action does not have, or one that is required and missing.
     """
-    action = plain_yaml.loads((folder / "action.yml").read_text("utf-8"))
+    action = read_yaml((folder / "action.yml").read_text("utf-8"))
     declared = action["inputs"]
     if unknown := inputs.keys() - declared.keys():
         raise ValueError(f"inputs {sorted(unknown)}; expected {', '.join(declared)}")

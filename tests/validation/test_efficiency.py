@@ -80,20 +80,20 @@ def the_same_image_has_the_same_error_and_more_samples_less(rows):
 def test_the_best_sampler_has_the_least_variance_and_time(monkeypatch, noise, seconds, best):
     """The first one's noise and time are given, the other's are 1; the first image of each took forever."""
 
-    def look(path, method, resolution, sampler, extent):
+    def look(path, resolution, sampler, extent):
         first = sampler == error_against_time.STRATIFIED[0]
         shots = iter([1e9] + 3 * [seconds if first else 1.0])
         rng = np.random.default_rng(1)
         return lambda spp, seed: (rng.normal(size=(8, 8, 3)) * (noise if first else 1.0), next(shots))
 
-    monkeypatch.setattr(error_against_time, "_camera", look)
+    monkeypatch.setattr(error_against_time, "builtin_camera", look)
     assert error_against_time.best_sampler(SCENES / "balls.xml", 8, SMALL) == error_against_time.STRATIFIED[best]
 
 
 def test_images_grow_until_their_time_can_be_told(context, monkeypatch):
     monkeypatch.setattr(error_against_time, "LARGEST", 64)
     path = SCENES / "furnace.xml"
-    sizes = [error_against_time._resolution(path, dataclasses.replace(SMALL, seconds=s)) for s in (0.0, 1e-9, 1e9)]
+    sizes = [error_against_time.resolution_of(path, dataclasses.replace(SMALL, seconds=s)) for s in (0.0, 1e-9, 1e9)]
     assert sizes == [32, 32, 64]
 
 
@@ -128,11 +128,6 @@ def test_scalar_variants_are_not_run(scalar_context):
     context = scalar_context()
     found = error_against_time.scene_rows(context, SCENES / "balls.xml") + scaling.knob_rows(context, "glasses")
     assert {row.verdict for row in found} == {"not run"}
-
-
-def test_a_wrong_parameter_is_no_missing_integrator(scalar_variant):
-    with pytest.raises(RuntimeError, match="split_depth"):
-        _ = Method("wrong", "path", "refract", {"split_depth": 1}).missing
 
 
 def test_a_method_renders_to_the_depth_of_the_scene_or_to_another(scalar_variant):

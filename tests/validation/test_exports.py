@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from mi_refract.scene_export import write_files
+from mi_refract.scene_export.targets import luxcore, povray, scene_json
+from mi_refract.scene_export.targets.shared_files import sky_exr
 from validation import limits
 from validation.suite import exports
 from validation.suite.renderers import SYSTEMS, environments
@@ -50,17 +52,10 @@ def edited(target, name, pattern, new):
     return files
 
 
-def under_the_ground(target):
+def under_the_ground(target, direction_at):
     """The target's files with a sky upside down."""
-    make, sky = write_files.TARGETS[target], write_files.TARGETS[target].__globals__["scene_json"].sky
-
-    def files(plain):
-        def downward(u, v):
-            return make.__globals__["direction_at"](u, 1 - v)
-
-        return make(plain) | sky(plain, downward)
-
-    return files
+    make = write_files.TARGETS[target]
+    return lambda plain: make(plain) | sky_exr(plain, lambda u, v: direction_at(u, 1 - v))
 
 
 DEFECTS = {
@@ -98,9 +93,9 @@ DEFECTS = {
         "raysect",
         lambda: edited("raysect", "render.py", r'\(entry\["int_ior"\]', '(entry["ext_ior"]'),
     ),
-    "sky of LuxCore": ("LuxCore", lambda: under_the_ground("luxcore")),
-    "sky of Cycles": ("Cycles", lambda: under_the_ground("cycles")),
-    "sky of POV-Ray": ("POV-Ray", lambda: under_the_ground("povray")),
+    "sky of LuxCore": ("LuxCore", lambda: under_the_ground("luxcore", luxcore.direction_at)),
+    "sky of Cycles": ("Cycles", lambda: under_the_ground("cycles", scene_json.cycles_direction_at)),
+    "sky of POV-Ray": ("POV-Ray", lambda: under_the_ground("povray", povray.direction_at)),
 }
 
 

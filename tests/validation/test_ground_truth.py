@@ -1,6 +1,5 @@
 """Benches and the rainbow: their answers without Mitsuba, their bounds, and planted defects that break every row."""
 
-import dataclasses
 import functools
 import math
 
@@ -10,17 +9,17 @@ import pytest
 from support.variants import switch
 
 from validation import limits
-from validation.ground_truth import rainbow, traced_bodies, traced_system, traced_systems
+from validation.ground_truth import bench, rainbow, traced_bodies
 from validation.reference import closed_forms, optical_systems
 
 DEFECT = 1e-4  # of an index
-NAMES = [*traced_systems.BENCHES]
+NAMES = [*bench.benches()]
 
 
 @pytest.fixture(scope="module")
 def made():
     """Every bench, with its bounds."""
-    return {name: make() for name, make in traced_systems.BENCHES.items()}
+    return bench.benches()
 
 
 @pytest.fixture
@@ -31,22 +30,22 @@ def scalar(scalar_context):
 @pytest.mark.parametrize("name", NAMES)
 def test_the_exact_path_has_the_closed_answer(name, made):
     case = made[name]
-    for answer, x in case.deviations(case.exact()).items():
+    for answer, x in case.deviations(case.system.path()).items():
         # Of the print, √3 and √2 times what it rounds to.
-        assert x.max() <= case.printed.get(answer, 1e-15)
+        assert x.max() <= case.system.printed.get(answer, 1e-15)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_bounds_hold_whatever_is_rounded_and_are_not_idle(name, made):
     case, rng, ratios = made[name], np.random.default_rng(5), []
-    sizes, exact = case.roundings(), case.off(case.exact())
+    system, sizes, exact = case.system, case.roundings(), case.system.off(case.system.path())
     for _ in range(30):
         # Each value off by all that it may, in a direction of its own.
         shifts = {key: size * optical_systems.unit(rng.normal(size=(len(size), 3))) for key, size in sizes.items()}
-        off = case.off(case.exact(lambda j, what, x, axis, shifts=shifts: x + shifts[j, what]))
+        off = system.off(system.path(moved=lambda j, what, x, axis, s=shifts: x + s.get((j, what), 0)))
         ratios += [
             optical_systems.dot(x - exact[answer], x - exact[answer])[..., 0] ** 0.5
-            / (case.bounds[answer] - case.printed.get(answer, 0))
+            / (case.bounds[answer] - system.printed.get(answer, 0))
             for answer, x in off.items()
         ]
     worst = max(float(x.max()) for x in ratios)
@@ -69,8 +68,8 @@ def test_an_index_off_by_1e_4_breaks_every_row(name, made, scalar, monkeypatch):
     def off(plugin, *indices):
         return glass(plugin, *(n + DEFECT * (n > 1) for n in indices))
 
-    glass = traced_systems.glass
-    monkeypatch.setattr(traced_systems, "glass", off)
+    glass = bench.glass
+    monkeypatch.setattr(bench, "glass", off)
     assert traced_bodies.bench_row(name, made[name], "refract", "scalar_rgb").broken == {"error / bound": 1.0}
 
 
@@ -87,26 +86,10 @@ def test_normals_of_the_wrong_sign_break_every_row(name, made, scalar, monkeypat
 
 
 def test_a_bound_that_would_hold_whatever_comes_fails(scalar, monkeypatch):
-    monkeypatch.setattr(traced_system, "PLACE", 100 * traced_system.PLACE)
-    assert traced_bodies.bench_row("slab", traced_systems.slab(), "refract", "scalar_rgb").broken == {
+    monkeypatch.setattr(bench, "PLACE", 100 * bench.PLACE)
+    assert traced_bodies.bench_row("slab", bench.benches()["slab"], "refract", "scalar_rgb").broken == {
         "index seen": limits.INDEX_SEEN
     }
-
-
-def test_a_ray_that_misses_is_off_by_infinity(made, scalar, monkeypatch):
-    sphere = {"type": "sphere", "radius": 1.0, "bsdf": traced_systems.glass("refract", traced_systems.BK7)}
-    missed = dataclasses.replace(traced_systems.aplanatic(), scenes=lambda plugin: [{"ball": sphere}])
-    assert traced_bodies.bench_row("aplanatic ball", missed, "refract", "scalar_rgb").values["miss / mm"] == math.inf
-
-
-def test_what_does_not_run_says_why(scalar):
-    rows = [
-        *traced_bodies.variant_rows(scalar, "cuda_ad_double"),
-        traced_bodies.double_row(),
-        *traced_bodies.bow_rows(scalar),
-    ]
-    assert [row.verdict for row in rows] == ["not run"] * 3
-    assert [row.setting for row in rows] == ["cuda_ad_double", "double precision", "scalar_rgb"]
 
 
 def test_compiled_rays_are_those_of_the_scalar_variant(made, needs_variant, scalar):
@@ -161,7 +144,7 @@ def test_the_rainbow_of_a_noisy_bow_sees_an_index_off_by_1e_4(defect):
 def test_a_rendered_rainbow_stands_where_it_should_and_not_at_the_angle_of_another_index(llvm_variant, monkeypatch):
     """Four renders: with 3 degrees of freedom chance may take 22 standard errors."""
     monkeypatch.setattr(limits, "RAINBOW_RESOLVED", 0.005)
-    found = rainbow.images(traced_systems.glass("refract", rainbow.INDEX), 4)
+    found = rainbow.images(bench.glass("refract", rainbow.INDEX), 4)
     assert traced_bodies.bow_row("refract", "llvm_ad_rgb", found, {}).verdict == "pass"
     off = rainbow.angle(rainbow.INDEX - 1e-3)
     monkeypatch.setattr(rainbow, "angle", lambda: off)

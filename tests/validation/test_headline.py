@@ -6,33 +6,39 @@ import math
 import pytest
 
 from mi_refract.report.first_page import STATES
-from mi_refract.report.row import Row
+from mi_refract.report.row import Reason, Row
 from validation.directions import per_formula
 from validation.efficiency import error_against_time
 from validation.ground_truth import traced_bodies
 from validation.renders import against_dielectric
-from validation.run import headline
+from validation.run import headline, metrics
 from validation.stability import layered_paths, optical_chains
 
 WORST = {"worst rad": 5e-8, "worst / u": 0.9, "TIR misclassified": 0.0, "TIR misclassified, beyond its bound": 0.0}
-OURS = Row(
-    "directions",
-    "promoted",
-    "all regimes",
-    "llvm float32",
-    WORST,
-    {"TIR misclassified, beyond its bound": 0.0},
-    replay={"rays": 1000},
-)
-TEXTBOOK = dataclasses.replace(
-    OURS, subject="cross", values={**WORST, "worst rad": math.pi / 2, "TIR misclassified": 70.0}
-)
+DECIDED = {"TIR misclassified, beyond its bound": 0.0}
+OURS = Row("directions", "promoted", "all regimes", "llvm float32", WORST, DECIDED, replay={"rays": 1000})
+HARD = {**WORST, "worst rad": math.pi / 2, "TIR misclassified": 70.0}
+TEXTBOOK = dataclasses.replace(OURS, subject="cross", values=HARD)
 DOUBLE = dataclasses.replace(OURS, setting="llvm float64", values={**WORST, "worst rad": 1e-16})
 RENDER = {"changed share": 0.01, "|mean ratio − 1|": 1e-6, "Welch alarms": 0.0, "time / dielectric": 1.1}
 SPHERE = Row("renders", "refract", "sphere", "llvm_ad_rgb", RENDER, {"Welch alarms": 0.0})
 MIRAGE = dataclasses.replace(SPHERE, case="mirage", values={**RENDER, "Welch alarms": 7.0}, budgets={})
+FAST = Row("efficiency", "refract_path, split 3", "balls", "llvm_ad_rgb", {"equal-time MSE": 0.055})
 ABSENT = Row("directions", "promoted", "all", "cuda float32", reason="no NVIDIA driver: libcuda.so.1 not found")
-RENDERER = Row("per_ray", "PyGLM", "every set", "f32", reason="python -m validation renderers --install pyglm")
+INSTALL = "python -m validation renderers --install pyglm"
+RENDERER = Row("per_ray", "PyGLM", "every set", "f32", reason=Reason(INSTALL, f"other renderers, by `{INSTALL}`"))
+TRACED = [
+    Row("paths", name, "mirage: path", "llvm_ad_rgb", {"wrong path": lost}, replay={"rays": 64})
+    for name, lost in (("refract", 0.0), ("dielectric", 11.0), ("exact, indices in float32", 7.0))
+]
+LAYERS = [
+    Row("stability", name, f"mirage askew, 1000 layers, {given}", "llvm float32", {"89.55°": error})
+    for name, given, error in (("promoted", "contrasts", 1e-4), ("mi.fresnel + mi.refract", "indices", 0.5))
+]
+
+
+def answers(*rows, profile=""):
+    return headline.first_page(rows, profile)["answers"]
 
 
 def test_the_names_are_those_of_the_studies():
@@ -43,17 +49,13 @@ def test_the_names_are_those_of_the_studies():
         error_against_time: headline.EFFICIENCY,
         layered_paths: headline.PATHS,
     }
-    assert all(name == study.NAME for study, name in named.items())
-    assert per_formula.ALL == headline.EVERYTHING and against_dielectric.TIME == headline.TIME
-    known = {headline.COMMON, headline.WORST_IN_U, headline.MISCLASSIFIED, headline.MISCLASSIFIED_FAR}
+    assert all(name == study.NAME for study, name in named.items()) and per_formula.ALL == headline.EVERYTHING
+    known = {headline.COMMON, metrics.WORST_IN_U, metrics.MISCLASSIFIED, metrics.MISCLASSIFIED_FAR}
     assert known <= per_formula.TERMS.keys()
-    assert headline.EQUAL_TIME in error_against_time.TERMS and headline.WRONG_PATH in layered_paths.TERMS
-    assert {headline.CHANGED_SHARE, headline.WELCH_ALARMS, headline.TIME} <= against_dielectric.TERMS.keys()
-    assert headline.ERROR_OVER_BOUND in traced_bodies.TERMS and headline.SHALLOW in optical_chains.TERMS
-
-
-def answers(*rows):
-    return headline.first_page(rows)["answers"]
+    assert metrics.EQUAL_TIME in error_against_time.TERMS and metrics.WRONG_PATH in layered_paths.TERMS
+    compared = {metrics.CHANGED_SHARE, metrics.WELCH_ALARMS, metrics.TIME_OVER_DIELECTRIC}
+    assert compared <= against_dielectric.TERMS.keys()
+    assert metrics.ERROR_OVER_BOUND in traced_bodies.TERMS and headline.SHALLOW in optical_chains.TERMS
 
 
 def test_a_run_of_nothing_says_so():
@@ -63,58 +65,48 @@ def test_a_run_of_nothing_says_so():
     assert "image" not in page and "plot" not in page
 
 
-def test_what_is_right_is_said_with_numbers():
-    right, trusted, *_ = answers(OURS, DOUBLE, TEXTBOOK)
-    assert right["state"] == trusted["state"] == "yes"
-    for words in ("Yes.", "1,000 rays", "2.9\u00a0×\u00a010⁻⁶°", "no more than rounding"):
-        assert words in right["text"], words
-    for words in ("5.7\u00a0×\u00a010⁻¹⁵° in double", "90° (`cross`)", "7 % of these"):
-        assert words in trusted["text"], words
+SCALAR = dataclasses.replace(DOUBLE, setting="scalar float64")
+SLOW = dataclasses.replace(SPHERE, setting="scalar_rgb", values={**RENDER, "time / dielectric": 67.0})
+SPOILT = dataclasses.replace(OURS, values=WORST | {"TIR misclassified, beyond its bound": 3.0})
+BODY = Row("ground_truth", "refract", "prism", "llvm_ad_rgb", {"error / bound": 0.5}, {"error / bound": 1.0})
 
 
 @pytest.mark.parametrize(
-    ("metric", "value", "words"), [("TIR misclassified, beyond its bound", 3.0, "on 3 of them"), ("worst / u", 2.0, "")]
-)
-def test_what_is_wrong_is_not_praised(metric, value, words):
-    spoilt = dataclasses.replace(OURS, values={**WORST, metric: value}, budgets={metric: 1.0})
-    right = answers(spoilt)[0]
-    assert right["state"] == "no" and right["text"].startswith("No: a check failed.") and words in right["text"]
-    assert metric != "worst / u" or "no more than rounding" not in right["text"]
+    ("rows", "question", "state", "present", "absent"),
+    [
+        ([OURS, DOUBLE, TEXTBOOK], 0, "yes", ["Yes.", "1,000 rays", "2.9\u00a0×\u00a010⁻⁶°"], ["classified on"]),
+        ([OURS, DOUBLE, TEXTBOOK], 1, "yes", ["5.7\u00a0×\u00a010⁻¹⁵° in double", "90° (`cross`)", "7 % of these"], []),
+        ([SPOILT], 0, "no", ["No: a check failed.", "on 3 of them"], ["Yes"]),
+        ([dataclasses.replace(OURS, values=WORST | {"worst / u": 2.0})], 0, "yes", ["Yes."], ["no more than rounding"]),
+        ([BODY], 0, "yes", ["Yes.", "Through 1 bodies", "all its rays stay within"], ["direction"]),
+        ([dataclasses.replace(BODY, values={"error / bound": 2.0})], 0, "no", ["No:", "some of its rays leave"], []),
+        ([SCALAR, SLOW], 1, "yes", ["in double precision"], ["single"]),
+        ([SCALAR, SLOW], 2, "plain", ["67 times as long", "use a compiled one"], ["%"]),
+        ([SPHERE, FAST], 2, "plain", ["10 % slower", "5.5 % (`balls`)"], []),
+        ([SPHERE, MIRAGE, *TRACED], 3, "yes", ["1 of 2 scenes they do not differ", "In `mirage`, 1.0 % of"], []),
+        ([SPHERE, MIRAGE, *TRACED], 3, "yes", ["follows all 64 exact", "`dielectric` loses 11", "even exact"], []),
+        ([MIRAGE, *LAYERS], 3, "plain", ["In `mirage`", "0.010 %, Mitsuba's by 50 %"], ["do not differ"]),
+        ([OURS], 4, "plain", ["Everything was run."], []),
+    ],
+)  # fmt: skip
+def test_what_is_said_and_what_is_not(rows, question, state, present, absent):
+    answer = answers(*rows)[question]
+    assert answer["state"] == state, answer
+    assert [words for words in present if words not in answer["text"]] == [], answer["text"]
+    assert [words for words in absent if words in answer["text"]] == [], answer["text"]
 
 
-def test_scenes_that_differ_are_named_with_what_is_right_there():
-    traced = [
-        Row("paths", name, "mirage: path", "llvm_ad_rgb", {"wrong path": lost}, replay={"rays": 64})
-        for name, lost in (("refract", 0.0), ("dielectric", 11.0), ("exact, indices in float32", 7.0))
-    ]
-    text = answers(SPHERE, MIRAGE, *traced)[3]["text"]
-    for words in ("1 of 2 scenes nowhere", "In `mirage`, 1.0 % of the pixels", "all 64 exact", "`dielectric` loses 11"):
-        assert words in text, words
-    assert "nowhere" not in answers(MIRAGE)[3]["text"]
-
-
-def test_the_times_of_renders_and_of_equal_error():
-    fast = Row("efficiency", "refract_path, split 3", "balls", "llvm_ad_rgb", {"equal-time MSE": 0.055})
-    text = answers(SPHERE, fast)[2]["text"]
-    assert "10 % slower" in text and "5.5 % (`balls`)" in text
-
-
-def test_without_a_compiled_variant_only_double_precision_is_trusted_and_the_time_is_explained():
-    scalar = dataclasses.replace(DOUBLE, setting="scalar float64")
-    slow = dataclasses.replace(SPHERE, setting="scalar_rgb", values={**RENDER, "time / dielectric": 67.0})
-    _, trusted, fast, *_ = answers(scalar, slow)
-    assert "in double precision" in trusted["text"] and "single" not in trusted["text"]
-    assert "67 times as long" in fast["text"] and "use a compiled one" in fast["text"] and "%" not in fast["text"]
-
-
-def test_what_was_not_run_is_counted_by_what_would_bring_it():
-    other = dataclasses.replace(ABSENT, reason="Dr.Jit cannot")
+def test_what_was_not_run_is_counted_by_what_would_make_it_run():
+    other = dataclasses.replace(ABSENT, setting="llvm float32", reason="Dr.Jit cannot")
     text = answers(OURS, ABSENT, ABSENT, RENDERER, other)[4]["text"]
     assert text.startswith("4 of 5 measurements: 2 need an NVIDIA GPU")
-    assert "1 need other renderers, by `python -m validation renderers --install pyglm`" in text
-    assert "1 have other reasons" in text
-    assert answers(OURS)[4]["text"] == "Everything was run."
-    assert "`--profile standard` runs every study" in headline.first_page([OURS], "quick")["answers"][4]["text"]
+    assert f"1 needs other renderers, by `{INSTALL}`;" in text and text.endswith("1 has other reasons.")
+    second = dataclasses.replace(RENDERER, remedy=RENDERER.remedy.replace("pyglm", "batoid"))
+    assert (
+        "2 need other renderers, by `python -m validation renderers --install batoid,pyglm`"
+        in (answers(RENDERER, second)[4]["text"])
+    )
+    assert "`--profile standard` runs every study" in answers(OURS, profile="quick")[4]["text"]
 
 
 def test_the_image_is_of_the_scene_that_differs_and_the_plot_of_methods_in_turn():
@@ -123,14 +115,7 @@ def test_the_image_is_of_the_scene_that_differs_and_the_plot_of_methods_in_turn(
     rows = [dataclasses.replace(row, images=images, curves=curves) for row in (SPHERE, MIRAGE)]
     page = headline.first_page(rows)
     assert page["image"]["row"] == rows[1].name and page["plot"]["row"] == rows[0].name
-    methods = Row(
-        "efficiency",
-        "every method",
-        "balls",
-        "llvm_ad_rgb",
-        reason="",
-        values={"x": 1.0},
-        curves={"path + refract": [(1.0, 1.0)]},
-    )
+    drawn = {"path + refract": [(1.0, 1.0)]}
+    methods = Row("efficiency", "every method", "balls", "llvm_ad_rgb", {"x": 1.0}, curves=drawn)
     assert headline.first_page([*rows, methods])["plot"]["labels"] == {"path + refract": "refract"}
     assert {answer["state"] for answer in page["answers"]} <= set(STATES)

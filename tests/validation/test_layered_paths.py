@@ -91,7 +91,7 @@ def test_a_deviation_is_the_one_that_was_put_in():
 
 
 def test_every_plugin_is_traced_and_only_forms_at_the_rounding_limit_keep_to_the_path(llvm_variant, context):
-    rows = {row.subject: row for row in layered_paths._path_rows(context, MIRAGE) if row.case == "mirage: path"}
+    rows = {row.subject: row for row in layered_paths.path_rows(context, MIRAGE) if row.case == "mirage: path"}
     assert list(rows) == [*layered_paths.plugins(), layered_paths.INDICES, layered_paths.RATIOS]
     held = rows["refract"]
     assert held.verdict == rows["refract_compensated"].verdict == rows["refract_promoted"].verdict == "pass"
@@ -105,7 +105,7 @@ def test_every_plugin_is_traced_and_only_forms_at_the_rounding_limit_keep_to_the
 
 
 def test_a_fibre_guides_every_ray_with_every_plugin(llvm_variant, context):
-    rows = [row for row in layered_paths._path_rows(context, FIBRE) if row.case == "fibre: path"]
+    rows = [row for row in layered_paths.path_rows(context, FIBRE) if row.case == "fibre: path"]
     assert {row.values["wrong path"] for row in rows} == {0.0}
     assert all(row.values["direction"] < 0.01 for row in rows)
 
@@ -122,12 +122,12 @@ def test_the_built_in_differs_from_both_right_formulas_in_the_telescope(llvm_var
     view, views = layered_paths.View, {}
     once = lambda *asked: views.get(asked[1]) or views.setdefault(asked[1], view(*asked))  # noqa: E731
     monkeypatch.setattr(layered_paths, "View", once)
-    (row,) = layered_paths._view_rows(context, *layered_paths.VIEWS[0])
+    (row,) = layered_paths.view_rows(context, *layered_paths.VIEWS[0])
     assert row.values["pixels off"] > 5e-3
     assert row.verdict == "pass"
     assert all((context.out / path).is_file() for path in row.images.values())
-    monkeypatch.setattr(layered_paths, "_other_right_formula", lambda: "refract_decomposed")
-    (row,) = layered_paths._view_rows(context, *layered_paths.VIEWS[0])
+    monkeypatch.setattr(layered_paths, "other_right_formula", lambda: "refract_decomposed")
+    (row,) = layered_paths.view_rows(context, *layered_paths.VIEWS[0])
     assert row.broken.keys() == {"pixels off, control"}
 
 

@@ -102,7 +102,7 @@ def test_through_mitsubas_intersections_the_achromat_shifts_alike(needs_variant,
 
 def test_an_index_off_by_1e_12_moves_prism_and_bows(monkeypatch):
     index = light.Light.indices
-    monkeypatch.setattr(light.Light, "indices", lambda *x: tuple(n * (1 + 1e-12) for n in index(*x)))
+    monkeypatch.setattr(light.Light, "indices", lambda *x: tuple(n * (1 + 1e-12 * (n > 1)) for n in index(*x)))
     rows = [closed_forms.prism_row(), closed_forms.bow_row(1), closed_forms.bow_row(2)]
     # The prism's closed form takes the index of the scene, and its incidence with it.
     assert [row.verdict for row in rows] == ["pass", "fail", "fail"]

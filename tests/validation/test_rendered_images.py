@@ -12,8 +12,7 @@ from mi_refract.io import image_file
 from mi_refract.rendering import scene_files
 from mi_refract.scene_export import write_files
 from mi_refract.scene_export.plain_scene import Glass
-from mi_refract.scene_export.targets import cycles, environment_map, luxcore
-from mi_refract.scene_export.targets.environment_map import longitude_latitude, radiance
+from mi_refract.scene_export.targets import shared_files
 from validation import readme_tables
 from validation.run.context import PROFILES, Context
 from validation.run.render_methods import Camera
@@ -156,47 +155,20 @@ def test_every_scene_of_a_painter_is_one_of_the_study():
     assert set(rendered_images.WHY) <= set(image_renderers.IMAGE_RENDERERS)
 
 
-# Environments ------------------------------------------------------------------------------------------------------
+# Environments and cameras: what the tests of exports do not show ---------------------------------------------------
 
 
-def directions(count=4000):
-    drawn = np.random.default_rng(3).normal(size=(count, 3))
-    return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
-
-
-def test_an_environment_is_what_mitsuba_makes_of_it():
-    sky, seen = rendered_images.askew(), directions()
-    turn = np.eye(4)
-    turn[:3, :3] = sky.rotation
-    emitter = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(sky.pixels), "to_world": mi.ScalarTransform4f(turn)})
-    si = mi.SurfaceInteraction3f()
-    si.wi = mi.Vector3f((-seen).T)
-    measured = np.array(emitter.eval(si)).T
-    assert np.abs(measured - radiance(sky, seen)).max() < 1e-4
-    assert np.abs(measured - radiance(sky, seen * [-1, 1, 1])).max() > 0.1  # a mirror would be seen
-
-
-# Where each renderer looks a direction up: u to the right, v from the top of the image.
-LOOKED_UP = {
-    cycles.direction_at: lambda x, y, z: (0.5 - np.arctan2(y, x) / (2 * np.pi), np.arccos(z) / np.pi),
-    luxcore.direction_at: lambda x, y, z: (np.arctan2(y, x) / (2 * np.pi) % 1, np.arccos(z) / np.pi),
-    image_renderers.equirectangular: lambda x, y, z: (0.5 + np.arctan2(z, x) / (2 * np.pi), np.arccos(y) / np.pi),
-}
-
-
-@pytest.mark.parametrize("renderer", LOOKED_UP)
-def test_a_renderer_finds_the_sky_where_it_looks(renderer, monkeypatch):
-    monkeypatch.setattr(environment_map, "FINER", 8)
-    sky, seen = rendered_images.askew(), directions()
-    image = longitude_latitude(sky, renderer)
-    u, v = LOOKED_UP[renderer](*seen.T)
+def test_three_finds_the_sky_where_it_looks(monkeypatch):
+    monkeypatch.setattr(shared_files, "FINER", 8)
+    sky, directions = rendered_images.askew(), np.random.default_rng(3).normal(size=(4000, 3))
+    x, y, z = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
+    image = shared_files.longitude_latitude(sky, image_renderers.equirectangular)
+    u, v = 0.5 + np.arctan2(z, x) / (2 * np.pi), np.arccos(y) / np.pi
     rows, columns = image.shape[:2]
     texel = image[np.minimum((v * rows).astype(int), rows - 1), np.minimum((u * columns).astype(int), columns - 1)]
-    assert np.abs(texel - radiance(sky, seen)).max() < 0.01  # half a texel is 0.003 rad, the sky's slope below 2
-    assert np.abs(texel - radiance(sky, seen * [1, 1, -1])).max() > 0.1
-
-
-# Cameras -----------------------------------------------------------------------------------------------------------
+    # Half a texel is 0.003 rad, the sky's slope below 2.
+    assert np.abs(texel - shared_files.radiance(sky, directions)).max() < 0.01
+    assert np.abs(texel - shared_files.radiance(sky, directions * [1, 1, -1])).max() > 0.1
 
 
 def test_radiance_is_given_mitsubas_rays(tmp_path):

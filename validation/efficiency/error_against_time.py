@@ -14,13 +14,12 @@ import math
 import statistics
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mi_refract.image_diff import tile_statistics
 from mi_refract.plugins import scene_features
-from mi_refract.report.row import Row
+from mi_refract.report.row import Reason, Row
 from validation import limits
 from validation.run import kernel_timing
 from validation.run.context import NO_REFERENCE, SCENES, Context, beyond_builtin
@@ -115,84 +114,78 @@ def tasks(context: Context) -> list[Task]:
 
 
 def scene_rows(context: Context, path: Path, methods: tuple[Method, ...] = METHODS) -> list[Row]:
-    """A row per method and sampler, and one of the curves; a single one with the reason where there is no question."""
+    """A row per method and sampler, and one of the curves; a single one with the reason where nothing is measured."""
     extent = EXTENTS[context.profile.name]
     reason = ""
     if context.variant.startswith("scalar"):
         reason = SCALAR
     elif extent.scenes and path.stem not in extent.scenes:
-        reason = f"left out: the profile {context.profile.name} measures {', '.join(extent.scenes)}"
+        text = f"left out: the profile {context.profile.name} measures {', '.join(extent.scenes)}"
+        reason = Reason(text, "`--profile full`")
     elif path.stem in NO_REFERENCE:
         reason = f"left out: {NO_REFERENCE[path.stem]}"
-    elif (noise := _noise(path, extent)) < limits.NOISE:
-        reason = f"left out: no noise, so no error against time: two seeds differ by {noise:.1e} at most"
+    else:
+        look = builtin_camera(path, extent.resolution, INDEPENDENT, extent)
+        noise = float(np.abs(look(1, seed=0)[0] - look(1, seed=1)[0]).max())
+        if noise < limits.NOISE:
+            reason = f"left out: no noise, so no error against time: two seeds differ by {noise:.1e} at most"
     if reason:
         return [Row(NAME, "every method", path.stem, context.variant, reason=reason)]
     return _measured_rows(context, path, extent, methods)
 
 
 def _measured_rows(context: Context, path: Path, extent: Extent, methods: tuple[Method, ...]) -> list[Row]:
-    resolution = _resolution(path, extent)
     absent = {method.name: reason for method in methods if (reason := method.missing)}
     rows = [Row(NAME, name, path.stem, context.variant, reason=reason) for name, reason in absent.items()]
+    resolution = resolution_of(path, extent)
     sampler = best_sampler(path, resolution, extent)
-    subjects = [Subject(BUILTIN, INDEPENDENT), Subject(BUILTIN, sampler)]
-    subjects += [Subject(m, sampler) for m in methods if m != BUILTIN and m.name not in absent]
-    cameras = {s.name: _camera(path, s.method, resolution, s.sampler, extent) for s in subjects}
-    references = _references(cameras[subjects[1].name], extent)
-    found = measure(cameras, references, extent)
-    facts = scene_features.inspect(cameras[subjects[1].name].scene)
-    goals = goals_of(subjects, found, facts.only_glass)
-    replay = _replay(path, resolution, sampler, extent)
-    remark = f"the best stratified sampler here: {sampler}"
-    for subject in subjects:
-        values = _values(subject, subjects[:2], found, references)
-        # The reference is the built-in's own.
-        budgets = {} if subject.method == BUILTIN else {WELCH_ALARMS: 0.0}
-        rows.append(
-            Row(
-                NAME,
-                subject.name,
-                path.stem,
-                context.variant,
-                values,
-                budgets,
-                goals.get(subject.name, {}),
-                remark,
-                replay | {"method": subject.method.plugin(-1)},
-            )
-        )
-    own = {"reference variance": float(references.var(0, ddof=1).mean() / len(references))}
-    rows.append(Row(NAME, "every method", path.stem, context.variant, own, {}, {}, remark, replay, {}, _curves(found)))
-    return rows
-
-
-def _replay(path: Path, resolution: int, sampler: str, extent: Extent) -> dict[str, Any]:
-    return {
+    builtins = [Subject(BUILTIN, INDEPENDENT), Subject(BUILTIN, sampler)]
+    subjects = builtins + [Subject(m, sampler) for m in methods if m != BUILTIN and m.name not in absent]
+    spp = extent.spp[-1]
+    cameras = {s.name: camera(path, s.method, resolution, sampler=s.sampler, spp=spp) for s in subjects}
+    look = cameras[builtins[1].name]
+    references = np.stack([look(spp, seed=FIRST_REFERENCE + i)[0] for i in range(extent.references)])
+    measured = measure(cameras, references, extent)
+    goals = goals_of(subjects, measured, scene_features.inspect(look.scene).only_glass)
+    replay = {
         "scene": path.name,
         "resolution": resolution,
-        "spp": extent.spp[-1],
+        "spp": spp,
         "rounds": extent.rounds,
         "reference renders": extent.references,
         "reference seeds from": FIRST_REFERENCE,
         "sampler": sampler,
     }
+    about_sampler = f"the best stratified sampler here: {sampler}"
+    for subject in subjects:
+        values = _values(subject, builtins, measured, references)
+        budgets = {} if subject.method == BUILTIN else {WELCH_ALARMS: 0.0}  # the reference is the built-in's own
+        own = replay | {"method": subject.method.plugin(-1)}
+        mine = goals.get(subject.name, {})
+        rows.append(Row(NAME, subject.name, path.stem, context.variant, values, budgets, mine, about_sampler, own))
+    curves = {
+        name: [
+            (statistics.median(m.seconds), math.sqrt(max(statistics.fmean(m.figures["MSE"]), 0)))  # RMSE
+            for m in by_spp.values()
+        ]
+        for name, by_spp in measured.items()
+    }
+    own_variance = {"reference variance": float(references.var(0, ddof=1).mean() / len(references))}
+    every = (NAME, "every method", path.stem, context.variant)
+    rows.append(Row(*every, own_variance, {}, {}, about_sampler, replay, {}, curves))
+    return rows
 
 
-def _camera(path: Path, method: Method, resolution: int, sampler: str, extent: Extent) -> Camera:
-    return camera(path, method, resolution, sampler=sampler, spp=extent.spp[-1])
+def builtin_camera(path: Path, resolution: int, sampler: str, extent: Extent) -> Camera:
+    """The scene for the built-in, which chooses sampler and resolution."""
+    return camera(path, BUILTIN, resolution, sampler=sampler, spp=extent.spp[-1])
 
 
-def _noise(path: Path, extent: Extent) -> float:
-    look = _camera(path, BUILTIN, extent.resolution, INDEPENDENT, extent)
-    return float(np.abs(look(1, seed=0)[0] - look(1, seed=1)[0]).max())
-
-
-def _resolution(path: Path, extent: Extent) -> int:
+def resolution_of(path: Path, extent: Extent) -> int:
     """The image size at which the fixed cost of a render is negligible beside that of its samples."""
     resolution = extent.resolution
     while resolution < LARGEST and extent.seconds:
-        look = _camera(path, BUILTIN, resolution, INDEPENDENT, extent)
+        look = builtin_camera(path, resolution, INDEPENDENT, extent)
         if min(look(extent.spp[-1], seed=i)[1] for i in range(2)) >= extent.seconds:
             break
         resolution *= 2
@@ -203,39 +196,33 @@ def best_sampler(path: Path, resolution: int, extent: Extent, seeds: int = 3) ->
     """The stratified sampler with which the built-in has the least variance × time."""
     costs = {}
     for sampler in STRATIFIED:
-        look = _camera(path, BUILTIN, resolution, sampler, extent)
+        look = builtin_camera(path, resolution, sampler, extent)
         shots = [look(extent.spp[-1], seed=FIRST_REFERENCE - 1 - i) for i in range(seeds + 1)][1:]
         variance = np.stack([image for image, _ in shots]).var(0, ddof=1).mean()
         costs[sampler] = float(variance) * statistics.median(seconds for _, seconds in shots)
     return min(costs, key=lambda sampler: costs[sampler])
 
 
-def _references(look: Camera, extent: Extent) -> np.ndarray:
-    return np.stack([look(extent.spp[-1], seed=FIRST_REFERENCE + i)[0] for i in range(extent.references)])
-
-
 def measure(cameras: dict[str, Camera], references: np.ndarray, extent: Extent) -> Found:
-    """By subject and samples per pixel."""
+    """By subject and samples per pixel. An image a round of each; every second round in the reverse order.
+
+    The first image of each is thrown away: it compiles.
+    """
     mean, own = references.mean(0), references.var(0, ddof=1) / len(references)
     found: Found = {name: {} for name in cameras}
     for spp in extent.spp:
-        for name, shots in _rounds(cameras, spp, extent.rounds).items():
-            figures = [errors(image, mean, own) for image, _ in shots]
-            by_metric = {metric: [figure[metric] for figure in figures] for metric in METRICS}
-            kept = [image for image, _ in shots] if spp == extent.spp[-1] else []
-            found[name][spp] = Measured([seconds for _, seconds in shots], by_metric, kept)
+        shots: dict[str, list[tuple[np.ndarray, float]]] = {name: [] for name in cameras}
+        order = list(cameras)
+        for seed in range(extent.rounds + 1):
+            for name in order:
+                shots[name].append(cameras[name](spp, seed))
+            order.reverse()
+        for name, (_, *rounds) in shots.items():
+            by_round = [errors(image, mean, own) for image, _ in rounds]
+            figures = {metric: [figure[metric] for figure in by_round] for metric in METRICS}
+            kept = [image for image, _ in rounds] if spp == extent.spp[-1] else []
+            found[name][spp] = Measured([seconds for _, seconds in rounds], figures, kept)
     return found
-
-
-def _rounds(cameras: dict[str, Camera], spp: int, rounds: int) -> dict[str, list[tuple[np.ndarray, float]]]:
-    """An image a round of each camera; every second round in the reverse order, the first one thrown away."""
-    shots: dict[str, list[tuple[np.ndarray, float]]] = {name: [] for name in cameras}
-    order = list(cameras)
-    for seed in range(rounds + 1):
-        for name in order:
-            shots[name].append(cameras[name](spp, seed))
-        order.reverse()
-    return {name: found[1:] for name, found in shots.items()}
 
 
 def errors(image: np.ndarray, mean: np.ndarray, own: np.ndarray) -> dict[str, float]:
@@ -285,17 +272,6 @@ def goals_of(subjects: list[Subject], found: Found, only_glass: bool) -> dict[st
         if only_glass and not subject.method.parameters:
             goals[subject.name][TIME_OVER_BUILTIN] = limits.ONLY_GLASS_TIME
     return goals
-
-
-def _curves(found: Found) -> dict[str, list[tuple[float, float]]]:
-    """RMSE against seconds."""
-    return {
-        name: [
-            (statistics.median(m.seconds), math.sqrt(max(statistics.fmean(m.figures["MSE"]), 0)))
-            for m in by_spp.values()
-        ]
-        for name, by_spp in found.items()
-    }
 
 
 STUDY = Study(NAME, "Efficiency", about(__doc__), TERMS, tasks, axes=AXES)

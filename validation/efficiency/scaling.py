@@ -24,6 +24,7 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from mi_refract.report.row import Row
 from validation import limits
@@ -55,10 +56,6 @@ class Knob:
     quick: tuple[int, ...]
     full: tuple[int, ...]
     every: bool = False
-
-    def sizes(self, profile: str) -> tuple[int, ...]:
-        """Those of a profile."""
-        return self.full if profile == "full" else self.quick
 
 
 @dataclass(frozen=True)
@@ -109,20 +106,16 @@ def _triangles(method: Method, size: int, resolution: int) -> Camera:
 
 
 def ball_mesh(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices of a closed unit sphere of rings and its triangles, 4 r (r − 1) of them for r rings, facing out."""
-    rings = max(round((1 + math.sqrt(1 + size)) / 2), 2)
-    around = 2 * rings
-    polar, turn = np.pi * np.arange(1, rings) / rings, 2 * np.pi * np.arange(around) / around
-    circle = np.stack([np.cos(turn), np.sin(turn)], 1)
-    body = [np.column_stack([np.sin(p) * circle, np.full(around, np.cos(p))]) for p in polar]
-    vertices = np.concatenate([*body, [[0, 0, 1], [0, 0, -1]]])
-    i, j = np.arange(around), (np.arange(around) + 1) % around
-    north, south, last = len(vertices) - 2, len(vertices) - 1, (rings - 2) * around
-    faces = [(np.full(around, north), i, j), (np.full(around, south), last + j, last + i)]
-    for a in around * np.arange(rings - 2):
-        b = a + around
-        faces += [(a + i, b + i, b + j), (a + i, b + j, a + j)]
-    return vertices.astype(np.float32), np.concatenate([np.column_stack(x) for x in faces]).astype(np.uint32)
+    """Vertices and triangles of a closed unit sphere of `size` triangles, facing out: the hull of Fibonacci points."""
+    count = size // 2 + 2
+    i = np.arange(count) + 0.5
+    z, turn = 1 - 2 * i / count, np.pi * (1 + math.sqrt(5)) * i
+    vertices = np.column_stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z])
+    faces = ConvexHull(vertices).simplices
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    inward = np.einsum("ij,ij->i", a, np.cross(b, c)) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return vertices.astype(np.float32), faces.astype(np.uint32)
 
 
 def _in_memory(method: Method, parts: dict[str, Any], extent: float, resolution: int) -> Camera:
@@ -135,24 +128,18 @@ def _in_memory(method: Method, parts: dict[str, Any], extent: float, resolution:
     return Camera(scene, mi.load_dict(method.plugin(24)))
 
 
-def _depth(method: Method, size: int, resolution: int) -> Camera:
-    return camera(SCENES / "lightpipe.xml", method, resolution, max_depth=size)
-
-
-def _pixels(method: Method, size: int, resolution: int) -> Camera:
-    return camera(SCENES / "balls.xml", method, math.isqrt(size))
-
-
-def _spp(method: Method, size: int, resolution: int) -> Camera:
-    return camera(SCENES / "balls.xml", method, resolution)
-
-
 KNOBS = {
     "glasses": Knob(_glasses, (1, 64), (1, 4, 16, 64, 256, 1000)),
     "triangles": Knob(_triangles, (30_000,), (1000, 10_000, 100_000, 1_000_000)),
-    "depth": Knob(_depth, (4, 64), (4, 16, 64, 256)),
-    "pixels": Knob(_pixels, (128**2,), (32**2, 128**2, 512**2, 1024**2)),
-    "spp": Knob(_spp, (16,), (4, 32, 256), every=True),
+    "depth": Knob(
+        lambda m, size, res: camera(SCENES / "lightpipe.xml", m, res, max_depth=size), (4, 64), (4, 16, 64, 256)
+    ),
+    "pixels": Knob(
+        lambda m, size, res: camera(SCENES / "balls.xml", m, math.isqrt(size)),
+        (128**2,),
+        (32**2, 128**2, 512**2, 1024**2),
+    ),
+    "spp": Knob(lambda m, size, res: camera(SCENES / "balls.xml", m, res), (16,), (4, 32, 256), every=True),
 }
 
 
@@ -170,25 +157,19 @@ def measure(job: Job) -> dict[str, float]:
     look = KNOBS[job.knob].make(method, job.size, job.resolution)
     spp = job.size if job.knob == "spp" else job.spp
     first, *later = [look(spp, seed)[1] for seed in range(1 + job.renders)]
-    found = {"first image": first, "render": statistics.median(later), "arrays MB": _watermark() / 1e6}
+    arrays = dr.detail.malloc_watermark(dr.backend_v(mi.Float))
+    found = {"first image": first, "render": statistics.median(later), "arrays MB": arrays / 1e6}
     parameters = mi.traverse(look.scene)
     name = next(name for name in parameters.keys() if name.endswith("eta"))  # noqa: SIM118  no dictionary
     parameters[name] = parameters[name] * 1.01
     parameters.update()
-    return found | {"after an edit": look(spp, seed=0)[1], "process MB": _peak() / 1e6}
-
-
-def _watermark() -> int:
-    import mitsuba as mi
-
-    return int(dr.detail.malloc_watermark(dr.backend_v(mi.Float)))
-
-
-def _peak() -> float:
-    """Bytes; NaN where the system does not say. `getrusage` would not do: a child inherits its parent's peak."""
+    found["after an edit"] = look(spp, seed=0)[1]
+    # The peak of the process; `getrusage` would not do: a child inherits its parent's.
     status = Path("/proc/self/status")
     lines = status.read_text().splitlines() if status.exists() else []
-    return next((1024 * float(line.split()[1]) for line in lines if line.startswith("VmHWM:")), math.nan)
+    return found | {
+        "process MB": next((1.024e-3 * float(x.split()[1]) for x in lines if x.startswith("VmHWM:")), math.nan)
+    }
 
 
 def run(job: Job, home: str) -> dict[str, float]:
@@ -238,7 +219,7 @@ def knob_rows(context: Context, knob: str, methods: tuple[Method, ...] = METHODS
     absent = {method.name: reason for method in methods if (reason := method.missing)}
     rows = [Row(NAME, name, knob, context.variant, reason=reason) for name, reason in absent.items()]
     present = [method for method in methods if method.name not in absent]
-    sizes = KNOBS[knob].sizes(context.profile.name)
+    sizes = KNOBS[knob].full if context.profile.name == "full" else KNOBS[knob].quick
     by_size = {size: _size_rows(context, knob, size, present) for size in sizes}
     rows += [row for found in by_size.values() for row in found]
     for metric in TIMES[:2] if len(sizes) > 1 else ():
@@ -252,41 +233,30 @@ def knob_rows(context: Context, knob: str, methods: tuple[Method, ...] = METHODS
 
 
 def _size_rows(context: Context, knob: str, size: int, methods: list[Method]) -> list[Row]:
-    """In the order of the methods, of which the first is the built-in."""
-    jobs = {method.name: _job(context, knob, size, method) for method in methods}
-    found, rows = _rounds(jobs, _processes(context)), []
-    for name, values in found.items():
+    """In the order of the methods, of which the first is the built-in; medians over processes that take turns."""
+    full = context.profile.name == "full"
+    resolution, renders = (128, 5) if full else (64, 3)
+    jobs = {m.name: Job(context.variant, knob, size, m.name, resolution, 16, renders) for m in methods}
+    measured: dict[str, list[dict[str, float]]] = {name: [] for name in jobs}
+    order = list(jobs)
+    for _ in range(_processes(context)):
+        for name in order:
+            with tempfile.TemporaryDirectory() as home:
+                measured[name].append(run(jobs[name], home))
+        order.reverse()
+    rows, medians = [], {n: {m: statistics.median(v[m] for v in runs) for m in runs[0]} for n, runs in measured.items()}
+    for name, values in medians.items():
         goals: dict[str, float] = {}
         if name != BUILTIN.name:
-            values |= {f"{metric} / built-in": values[metric] / found[BUILTIN.name][metric] for metric in TIMES}
+            values |= {f"{metric} / built-in": values[metric] / medians[BUILTIN.name][metric] for metric in TIMES}
             goals = limits.SCALING.get((knob, size), {})
-        case = f"{knob} = {size}"
-        rows.append(Row(NAME, name, case, context.variant, values, goals=goals, replay=vars(jobs[name])))
+        case, replay = f"{knob} = {size}", vars(jobs[name])
+        rows.append(Row(NAME, name, case, context.variant, values, goals=goals, replay=replay))
     return rows
 
 
 def _processes(context: Context) -> int:
     return 3 if context.profile.name == "full" else 1
-
-
-def _job(context: Context, knob: str, size: int, method: Method) -> Job:
-    full = context.profile.name == "full"
-    return Job(context.variant, knob, size, method.name, 128 if full else 64, 16, 5 if full else 3)
-
-
-def _rounds(jobs: dict[str, Job], rounds: int) -> dict[str, dict[str, float]]:
-    """Medians by method, which take turns; every second round in the reverse order."""
-    measured: dict[str, list[dict[str, float]]] = {name: [] for name in jobs}
-    order = list(jobs)
-    for _ in range(rounds):
-        for name in order:
-            with tempfile.TemporaryDirectory() as home:
-                measured[name].append(run(jobs[name], home))
-        order.reverse()
-    return {
-        name: {metric: statistics.median(values[metric] for values in found) for metric in found[0]}
-        for name, found in measured.items()
-    }
 
 
 STUDY = Study(NAME, "Scaling", about(__doc__), TERMS, tasks, axes=AXES)

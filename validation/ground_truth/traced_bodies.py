@@ -2,7 +2,7 @@
 
 Rays are intersected with Mitsuba's shapes and refracted by the plugin's own samples, boundary by boundary, through
 bodies whose answer is known. Their errors are divided by a worst-case bound on what float32 may do on the way
-(`validation/ground_truth/traced_system.py`). The double Gauss is read from
+(`validation/ground_truth/bench.py`). The double Gauss is read from
 `validation/reference/double_gauss_codev.json`: CODE V's listing, as ray-optics (BSD-3-Clause) has it. The rainbow is
 measured on an image (`validation/ground_truth/rainbow.py`); its error is divided by a bound that chance exceeds once in
 ten thousand runs. The built-in `dielectric` is shown for comparison, without budgets.
@@ -28,12 +28,20 @@ from validation.run.render_methods import under
 from validation.study import Study, Task, about
 
 from . import rainbow
-from .traced_system import Bench
-from .traced_systems import BENCHES, glass
+from .bench import Bench, benches, glass
 
 BUILTIN = "dielectric"
 PLUGINS = PLUGIN, BUILTIN
-TERMS = {name: " ".join((make.__doc__ or "").split()) for name, make in BENCHES.items()} | {
+TERMS = {
+    "slab": "a block of BK7 50 mm thick, rays at 1 … 85°: moved aside by 50 mm sin(i − r)/cos r, direction restored",
+    "prism, least deviation": "of scenes/prism.xml, 2 asin(n sin(A/2)) − A, A = 60°, anywhere on its side",
+    "prism, 32 … 85°": "the same at these incidences: i + asin(n sin(A − r)) − A",
+    "aplanatic ball": "R = 50 mm: rays that aim at n R behind its centre all meet R/n behind it",
+    "ellipsoid lens": "an ellipsoid of eccentricity 1/n, half axis 50 mm, and a sphere around its far focus, where "
+    "rays along the axis, to 80° of eccentric anomaly, all meet",
+    "drop, one reflection": "index 1.333, R = 50 mm, rays at 2 … 80°, reflected once within: deflected by π + 2i − 4r",
+    "drop, two reflections": "the same with two reflections: 2π + 2i − 6r",
+    "double Gauss": "CODE V's: places and tangents of nine rays at its eleven surfaces, as it prints them",
     "shift, place, miss / mm": "largest distance from where the ray should be; of a miss, of its line from the focus",
     "direction / °": "largest |d − exact|, as an angle",
     "tangent": "largest deviation of (dx/dz, dy/dz)",
@@ -50,6 +58,11 @@ AXES = {"x": "surface", "y": "mm, or tangent", "x_scale": "linear", "y_scale": "
 NAME = "ground_truth"
 VARIANTS = "scalar_rgb", "llvm_ad_rgb", "cuda_ad_rgb"
 RENDERS = {"standard": 10, "full": 40}
+LABELS = {name: f"{name} / mm" for name in ("shift", "place", "miss")} | {
+    "direction": "direction / °",
+    "tangent": "tangent",
+}
+UNITS = {"direction": math.degrees(1)}
 
 
 def tasks(context: Context) -> list[Task]:
@@ -73,8 +86,7 @@ def variant_rows(context: Context, variant: str) -> list[Row]:
     if reason is not None:
         return [Row(NAME, PLUGIN, "every body", variant, reason=reason)]
     with under(variant):
-        made = {name: make() for name, make in BENCHES.items()}
-        return [bench_row(name, bench, plugin, variant) for name, bench in made.items() for plugin in PLUGINS]
+        return [bench_row(name, bench, plugin, variant) for name, bench in benches().items() for plugin in PLUGINS]
 
 
 def double_row() -> Row:
@@ -87,21 +99,18 @@ def bench_row(name: str, bench: Bench, plugin: str, setting: str) -> Row:
     """A plugin through a body: deviations of each answer, over their bounds."""
     found = bench.deviations(bench.traced(plugin))
     spawned = bench.deviations(bench.traced(plugin, spawned=True))
-    values = {answer: float(x.max()) for answer, x in found.items()}
+    values = {LABELS[answer]: float(x.max()) * UNITS.get(answer, 1) for answer, x in found.items()}
     values[ERROR_OVER_BOUND] = max(float((x / bench.bounds[answer]).max()) for answer, x in found.items())
     values["index seen"] = bench.index_seen
-    values |= {f"{answer}, spawned": float(x.max()) for answer, x in spawned.items()}
+    values |= {f"{LABELS[answer]}, spawned": float(x.max()) * UNITS.get(answer, 1) for answer, x in spawned.items()}
     budgets = {ERROR_OVER_BOUND: limits.BODY, "index seen": limits.INDEX_SEEN} if plugin == PLUGIN else {}
-    replay = {"definition": name, "rays": len(bench.origins), "boundaries": len(bench.boundaries)}
-    curves = _by_surface(found, bench) if bench.printed else {}
+    replay = {"definition": name, "rays": len(bench.system.origins), "boundaries": len(bench.system.boundaries)}
+    curves = {}
+    if bench.system.printed:  # the worst ray's deviation and the least bound, surface by surface
+        lines = {LABELS[answer]: x.max(0) for answer, x in found.items()}
+        lines |= {f"{LABELS[answer]}, bound": x.min(0) for answer, x in bench.bounds.items()}
+        curves = {name: [(j + 1.0, float(y)) for j, y in enumerate(line)] for name, line in lines.items()}
     return Row(NAME, plugin, name, setting, values, budgets, replay=replay, curves=curves)
-
-
-def _by_surface(found: dict[str, Array], bench: Bench) -> dict[str, list[tuple[float, float]]]:
-    """The worst ray's deviation and the least bound, surface by surface."""
-    lines = {answer: x.max(0) for answer, x in found.items()}
-    lines |= {f"{answer}, bound": x.min(0) for answer, x in bench.bounds.items()}
-    return {name: [(j + 1.0, float(y)) for j, y in enumerate(line)] for name, line in lines.items()}
 
 
 # The rainbow ---------------------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from mi_refract.planar.path_tree import Branches, follow_scene
 from mi_refract.plugins import integrator_context
 from mi_refract.report.row import Row
 from validation.limits import BOW_ANGLE, FOCAL_DISTANCE, PRISM_ANGLE
+from validation.reference import closed_forms as closed
 from validation.run.context import SCENES, Context
 from validation.run.render_methods import under
 from validation.study import Study, Task, about
@@ -47,7 +48,7 @@ def prism_row() -> Row:
     for line in "CdF":
         scene = scene_file.load(FOLDER / "spectrum.toml", [LINES[line]])
         n = scene.regions[0].indices[0]
-        deviation = 2 * math.asin(n * math.sin(apex / 2)) - apex
+        deviation = 2 * float(closed.least_deviated(apex, n)) - apex
         along = np.array([math.cos(deviation / 2), math.sin(deviation / 2)])
         face = np.array([-15.0, 34.64101615137755 * 2 / 3 - 15.0 * math.sqrt(3)])  # on the left face
         traced = _traced(scene, [face - 20 * along], [along])
@@ -61,10 +62,9 @@ def bow_row(reflections: int) -> Row:
     for wavelength in BOWS:
         scene = scene_file.load(FOLDER / "double_rainbow.toml", [wavelength])
         n = media.index("MATERIAL:water", wavelength) / media.LABORATORY_AIR.index(wavelength)
-        theta = math.acos(math.sqrt((n * n - 1) / (reflections * (reflections + 2))))
-        inside = math.asin(math.sin(theta) / n)
-        turn = 2 * (theta - inside) + reflections * (math.pi - 2 * inside)  # clockwise, of a ray above the axis
-        traced = _traced(scene, [[-16.0, math.sin(theta)]], [[1.0, 0.0]])
+        incidence = closed.rainbow_incidence(n, reflections)
+        turn = float(closed.deflection(incidence, n, reflections))  # clockwise, of a ray above the axis
+        traced = _traced(scene, [[-16.0, math.sin(incidence)]], [[1.0, 0.0]])
         bits = {1: 2, 2: 6}[reflections]
         errors.append(_angle(traced, np.array([math.cos(turn), -math.sin(turn)]), bits))
     case = {1: "primary bow", 2: "secondary bow"}[reflections]

@@ -12,6 +12,8 @@ ones near them; the profile `quick` takes at most 100 of the file's, in the firs
 from __future__ import annotations
 
 import functools
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,12 +102,28 @@ class Case:
 
 def tasks(context: Context) -> list[Task]:
     """One task per backend and precision."""
-    return [Task(f"planar: {s.label}", functools.partial(_setting_rows, context, s)) for s in settings(context)]
+    return by_setting(context, NAME, "planar", "every scene", setting_rows)
 
 
-def _setting_rows(context: Context, setting: Setting) -> list[Row]:
-    if setting.vector is None:
-        return [Row(NAME, TRACE, "every scene", setting.label, reason=setting.reason)]
+def by_setting(
+    context: Context,
+    name: str,
+    title: str,
+    every: str,
+    rows: Callable[[Context, Setting], list[Row]],
+    timed: bool = False,
+) -> list[Task]:
+    """A task per backend and precision: `rows`, or one row, of the case `every`, that says why it cannot run."""
+
+    def run(setting: Setting) -> list[Row]:
+        absent = setting.vector is None
+        return [Row(name, TRACE, every, setting.label, reason=setting.reason)] if absent else rows(context, setting)
+
+    return [Task(f"{title}: {s.label}", functools.partial(run, s), timed=timed) for s in settings(context)]
+
+
+def setting_rows(context: Context, setting: Setting) -> list[Row]:
+    """Of every scene in a setting."""
     rays = SCALAR_RAYS if setting.is_scalar else RAYS[context.profile.name]
     if context.profile.quick:
         return [file_row(FOLDER / f"{SHOWN}.toml", setting, rays)]
@@ -234,7 +252,8 @@ def judge(paths: Paths, case: Case, u: float, offset: float = 0.0) -> dict[str, 
     ratio = np.maximum(np.nanmax(off / points, axis=1), turned / ends)
     same = paths.hits == exact.hits
     # Of two segments that share a vertex either is right there, if it does the same to the ray.
-    same |= _at_their_vertex(paths.hits, case) & (ratio <= 1)[:, None]
+    touching = 2.0**-50 * np.abs([case.segments.start, case.segments.end]).max()
+    same |= at_shared_vertex(paths.hits, exact, case.segments, touching) & (ratio <= 1)[:, None]
     wrong = ~same.all(1) | (paths.events != exact.events).any(1)
     near = undecided(exact, paths, case.segments, points, directions)
     worst = np.maximum(off.max(1) / case.extent, turned)
@@ -248,16 +267,13 @@ def judge(paths: Paths, case: Case, u: float, offset: float = 0.0) -> dict[str, 
     }
 
 
-def _at_their_vertex(hits: Array, case: Case) -> Array:
-    """Where (N × D) an exact path passes, but for rounding, the vertex that its segment and that of `hits` share."""
-    start, end = (np.asarray(x) for x in (case.segments.start, case.segments.end))
-    ours, theirs = ([x[ids] for x in (start, end)] for ids in (hits, case.exact.hits))
-    touching = 2.0**-50 * np.abs([start, end]).max()
+def at_shared_vertex(hits: Array, exact: Retraced, segments: Segments, near: Any) -> Array:
+    """Where (N × D) an exact path passes, but for `near`, a vertex that its segment and that of `hits` share."""
+    ours, theirs = ([np.asarray(x)[ids] for x in (segments.start, segments.end)] for ids in (hits, exact.hits))
     there = np.zeros(hits.shape, bool)
-    for vertex in theirs:
-        shared = (vertex == ours[0]).all(2) | (vertex == ours[1]).all(2)
-        there |= shared & (np.hypot(*(case.exact.points[:, 1:] - vertex).transpose(2, 0, 1)) <= touching)
-    return there & (hits >= 0) & (case.exact.hits >= 0)
+    for vertex, own in itertools.product(theirs, ours):
+        there |= (vertex == own).all(2) & (np.hypot(*(exact.points[:, 1:] - vertex).transpose(2, 0, 1)) <= near)
+    return there & (hits >= 0) & (exact.hits >= 0)
 
 
 def _nearest(off: Array, points: Array, turned: Array, ends: Array) -> dict[str, float]:

@@ -23,13 +23,13 @@ from validation import limits, repeated
 from validation.reference import closed_forms as closed
 from validation.reference.planar_retrace import Array, Retraced
 from validation.run import seeds
-from validation.run.array_settings import Setting, settings
+from validation.run.array_settings import Setting
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND
 from validation.study import Study, Task, about
 
 from . import against_retrace
-from .against_retrace import Case, budgets, judge, unit
+from .against_retrace import Case, budgets, by_setting, judge, unit
 
 TERMS = against_retrace.TERMS | {
     "error": "largest deviation from the closed answer: of a line from the point that it should meet, over the "
@@ -74,12 +74,10 @@ class Closed:
 
 def tasks(context: Context) -> list[Task]:
     """One task per backend and precision."""
-    return [Task(f"planar, closed: {s.label}", functools.partial(_setting_rows, context, s)) for s in settings(context)]
+    return by_setting(context, NAME, "planar, closed", "every answer", _setting_rows)
 
 
 def _setting_rows(context: Context, setting: Setting) -> list[Row]:
-    if setting.vector is None:
-        return [Row(NAME, "trace", "every answer", setting.label, reason=setting.reason)]
     few = setting.is_scalar
     counts = REFLECTIONS[:2] if context.profile.quick else REFLECTIONS
     rows = [_box_row(setting, count, 4 if few else 16) for count in counts]

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,11 +21,12 @@ from mi_refract.planar.curves import Curve, affine, unit
 from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.planar_retrace import Array, Retraced, retrace
-from validation.run.array_settings import Setting, settings
+from validation.run.array_settings import Setting
 from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND, WRONG_PATH, WRONG_PATH_FAR
 from validation.study import Study, Task, about
 
+from .against_retrace import at_shared_vertex, by_setting
 from .against_retrace import unit as of_length_1
 from .error_growth import ROUNDINGS, growth
 
@@ -47,8 +48,7 @@ SCALAR_SHARE = 100  # one ray in so many
 INDEX = 1.25  # sine of the critical angle 4/5
 
 
-@dataclass(frozen=True)
-class Aimed:
+class Aimed(NamedTuple):
     """Rays that are aimed exactly (N × 2); `reflect` as for `planar.trace`."""
 
     segments: Segments
@@ -57,44 +57,31 @@ class Aimed:
     depth: int
     reflect: int = 0
 
-    def nudged(self, precision: type, ulps: tuple[int, ...], every: int) -> tuple[Array, Array]:
-        """Origins and directions, numbers of a precision, so many ulps beside; one ray in `every`."""
-        origins: Array = self.origins[::every].astype(precision)
-        d: Array = self.directions[::every].astype(precision)
-        ulp = np.eye(2, dtype=precision)[np.abs(d).argmin(1)] * np.spacing(np.abs(d).max(1))[:, None]
-        directions = np.concatenate([d + steps * ulp for steps in ulps])
-        return np.tile(origins, (len(ulps), 1)).astype(float), directions.astype(float)
-
 
 def tasks(context: Context) -> list[Task]:
     """One task per backend and precision."""
-    return [Task(f"planar, joints: {s.label}", functools.partial(_rows, context, s)) for s in settings(context)]
-
-
-def _rows(context: Context, setting: Setting) -> list[Row]:
-    if setting.vector is None:
-        return [Row(NAME, "trace", "every aim", setting.label, reason=setting.reason)]
-    turns, ulps = (TURNS[1:2], ULPS[:3]) if context.profile.quick else (TURNS, ULPS)
-    return [row(name, setting, turns, ulps) for name in AIMS]
+    aims = (TURNS[1:2], ULPS[:3]) if context.profile.quick else (TURNS, ULPS)
+    return by_setting(context, NAME, "planar, joints", "every aim", lambda _, s: [row(name, s, *aims) for name in AIMS])
 
 
 def row(name: str, setting: Setting, turns: tuple[float, ...] = TURNS, ulps: tuple[int, ...] = ULPS) -> Row:
-    """All figures of a kind, turned by `turns` degrees."""
+    """All figures of a kind, turned by `turns` degrees; rays so many ulps beside their aim."""
     ratios, changed = [], 0
     for aimed in (aimed for turn in turns for aimed in AIMS[name](turn)):
-        rays = aimed.nudged(setting.precision, ulps, SCALAR_SHARE if setting.is_scalar else 1)
+        every = SCALAR_SHARE if setting.is_scalar else 1
+        origins: Array = aimed.origins[::every].astype(setting.precision)
+        d: Array = aimed.directions[::every].astype(setting.precision)
+        ulp = np.eye(2, dtype=setting.precision)[np.abs(d).argmin(1)] * np.spacing(np.abs(d).max(1))[:, None]
+        directions = np.concatenate([d + steps * ulp for steps in ulps])
+        rays = np.tile(origins, (len(ulps), 1)).astype(float), directions.astype(float)
         tracer = Tracer(aimed.segments, backend=setting.backend, precision=setting.name)
-        paths = tracer(*rays, aimed.depth, reflect=aimed.reflect)
-        found = nearest(paths, aimed, rays, setting.roundoff)
+        found = nearest(tracer(*rays, aimed.depth, reflect=aimed.reflect), aimed, rays, setting.roundoff)
         ratios.append(found.min(0))
         changed += int(np.isinf(found[0]).sum())
     ratio = np.concatenate(ratios)
     kept = ratio[np.isfinite(ratio)]
-    values = {
-        WRONG_PATH: float(changed),
-        WRONG_PATH_FAR: float(len(ratio) - len(kept)),
-        ERROR_OVER_BOUND: float(kept.max(initial=0)),
-    }
+    values = {WRONG_PATH: float(changed), WRONG_PATH_FAR: float(len(ratio) - len(kept))}
+    values[ERROR_OVER_BOUND] = float(kept.max(initial=0))
     budgets = {WRONG_PATH_FAR: 0.0, ERROR_OVER_BOUND: limits.GROWN}
     return Row(NAME, "trace", name, setting.label, values, budgets, replay={"rays": len(ratio)})
 
@@ -129,7 +116,7 @@ def _ratios(paths: Paths, chosen: Array, exact: Retraced, segments: Segments, u:
     off = np.hypot(*(paths.points[chosen] - exact.points).transpose(2, 0, 1)).astype(float)
     ratio = np.where(np.isnan(exact.points[..., 0]), 0, np.nan_to_num(off / points, nan=np.inf)).max(1)
     turned = np.hypot(*(of_length_1(way) - exact.directions).T).astype(float)
-    same = (hits == exact.hits) | _at_a_shared_vertex(hits, exact, segments, points[:, 1:])
+    same = (hits == exact.hits) | at_shared_vertex(hits, exact, segments, points[:, 1:])
     # Beyond the last boundary nothing is aimed at.
     same = same.all(1) & (paths.events[chosen] == exact.events)[:, : hits.shape[1]].all(1)
     cos = np.abs((exact.legs[:, 0] * exact.normals[:, 0]).sum(1))
@@ -137,64 +124,48 @@ def _ratios(paths: Paths, chosen: Array, exact: Retraced, segments: Segments, u:
     return np.where(same, np.maximum(ratio, turned / exact.last(directions)), np.inf)
 
 
-def _at_a_shared_vertex(hits: Array, exact: Retraced, segments: Segments, bound: Array) -> Array:
-    """Where (N × D) a path passes a vertex that its boundary and that of `hits` share, within the bound."""
-    ours, theirs = ([np.asarray(x)[ids] for x in (segments.start, segments.end)] for ids in (hits, exact.hits))
-    there = np.zeros(hits.shape, bool)
-    for vertex, own in itertools.product(theirs, ours):
-        close = np.hypot(*(exact.points[:, 1:] - vertex).transpose(2, 0, 1)) <= bound
-        there |= (vertex == own).all(2) & close
-    return there & (hits >= 0) & (exact.hits >= 0)
-
-
 # What is aimed at ----------------------------------------------------------------------------------------------
 
 
-def _to_vertices(curve: Curve, reflections: int) -> Iterator[Aimed]:
-    """From places near the outline to each vertex: from within, reflected so often, and from outside."""
-    segments, middle = curve.between(INDEX, 1.0), curve.vertices.mean(0)
-    places = curve.outline(5) - middle
-    for far, depth, reflect in ((0.75, reflections, 2**reflections - 1), (0.75, 2, 0), (1.5, 3, 0)):
-        origins = np.repeat(middle + far * places, len(curve.vertices), axis=0)
-        targets = np.tile(curve.vertices, (len(places), 1))
-        yield Aimed(segments, origins, targets - origins, depth, reflect)
-
-
-def _joints(turn: float) -> Iterator[Aimed]:
-    bend = shapes.polygon([(-3, -1), (0, -1), (1, 0), (0, 1), (-3, 1)], [0, 90, 90, 0, 0])
-    for curve in (shapes.circle(1.0), shapes.ellipse(1.0, 0.5), bend):
-        yield from _to_vertices(curve.mapped(affine(turn)), 4)
-
-
-def _vertices(turn: float) -> Iterator[Aimed]:
-    lens = shapes.lens((0.5, -0.5), 0.75, radius=0.5)
-    for curve in (shapes.rectangle(2.0, 1.0), shapes.prism(60.0, 1.0), lens):
-        yield from _to_vertices(curve.mapped(affine(turn)), 2)
+def _to_vertices(curves: Sequence[Curve], reflections: int, turn: float) -> Iterator[Aimed]:
+    """From places near an outline to each vertex: from within, reflected so often, and from outside."""
+    for curve in (curve.mapped(affine(turn)) for curve in curves):
+        middle = curve.vertices.mean(0)
+        places = curve.outline(5) - middle
+        for far, depth, reflect in ((0.75, reflections, 2**reflections - 1), (0.75, 2, 0), (1.5, 3, 0)):
+            origins = np.repeat(middle + far * places, len(curve.vertices), axis=0)
+            targets = np.tile(curve.vertices, (len(places), 1))
+            yield Aimed(curve.between(INDEX, 1.0), origins, targets - origins, depth, reflect)
 
 
 def _tangents(turn: float) -> Iterator[Aimed]:
-    along = np.array([unit(turn + degrees + 90) for degrees in range(0, 360, 30)])
-    along = np.concatenate([along, -along])
-    touched = np.tile(np.array([unit(turn + degrees) for degrees in range(0, 360, 30)]), (2, 1))
-    circle = shapes.circle(1.0).mapped(affine(turn)).between(INDEX, 1.0)
-    yield Aimed(circle, touched - 2 * along, along, 1)
+    touched, along = (np.array([unit(turn + x + degrees) for degrees in range(0, 360, 30)]) for x in (0, 90))
+    along, touched = np.concatenate([along, -along]), np.tile(touched, (2, 1))
+    yield Aimed(shapes.circle(1.0).mapped(affine(turn)).between(INDEX, 1.0), touched - 2 * along, along, 1)
     curve = shapes.rectangle(2.0, 1.0).mapped(affine(turn))
     sides = np.concatenate([curve.end - curve.start, curve.start - curve.end])
     yield Aimed(curve.between(INDEX, 1.0), np.concatenate([curve.start, curve.end]) - sides, sides, 1)
 
 
 def _critical(turn: float) -> Iterator[Aimed]:
-    corners = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+    corners, right, places = [(-1, -1), (1, -1), (1, 1), (-1, 1)], affine(turn), np.linspace(-0.5, 0.75, 11)
     for curve in (shapes.polygon(corners), shapes.polygon(corners, [0, 0, 30, 0])):
-        curve = curve.mapped(affine(turn))
-        right, places = affine(turn), np.linspace(-0.5, 0.75, 11)
         for side in (1.0, -1.0):  # of the normal
             origins = np.stack([np.full(11, 0.25), side * places], 1) @ right.T
-            yield Aimed(curve.between(INDEX, 1.0), origins, np.tile([0.6, -0.8 * side], (11, 1)) @ right.T, 1)
-    circle = shapes.circle(1.0).mapped(affine(turn))
-    ways = [(x * 0.6 - y * s * 0.8, y * 0.6 + x * s * 0.8) for x, y in circle.vertices for s in (1, -1)]
-    yield Aimed(circle.between(INDEX, 1.0), np.repeat(circle.vertices, 2, 0) - 0.5 * np.array(ways), np.array(ways), 1)
+            directions = np.tile([0.6, -0.8 * side], (11, 1)) @ right.T
+            yield Aimed(curve.mapped(right).between(INDEX, 1.0), origins, directions, 1)
+    circle = shapes.circle(1.0).mapped(right)
+    ways = np.array([(x * 0.6 - y * s * 0.8, y * 0.6 + x * s * 0.8) for x, y in circle.vertices for s in (1, -1)])
+    yield Aimed(circle.between(INDEX, 1.0), np.repeat(circle.vertices, 2, 0) - 0.5 * ways, ways, 1)
 
 
-AIMS = {"joints": _joints, "vertices": _vertices, "tangents": _tangents, "critical angles": _critical}
+BEND = shapes.polygon([(-3, -1), (0, -1), (1, 0), (0, 1), (-3, 1)], [0, 90, 90, 0, 0])
+JOINED = shapes.circle(1.0), shapes.ellipse(1.0, 0.5), BEND
+POINTED = shapes.rectangle(2.0, 1.0), shapes.prism(60.0, 1.0), shapes.lens((0.5, -0.5), 0.75, radius=0.5)
+AIMS: dict[str, Callable[[float], Iterator[Aimed]]] = {
+    "joints": functools.partial(_to_vertices, JOINED, 4),
+    "vertices": functools.partial(_to_vertices, POINTED, 2),
+    "tangents": _tangents,
+    "critical angles": _critical,
+}
 STUDY = Study(NAME, "Planar, joints and symmetry", about(__doc__), TERMS, tasks)

@@ -18,13 +18,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from mi_refract.planar import Paths, Segments, Tracer, shapes
+from mi_refract.planar.curves import affine
 from mi_refract.planar.segments import Array
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing
-from validation.run.array_settings import Setting, settings
+from validation.run.array_settings import Setting
 from validation.run.context import Context
 from validation.study import Study, Task, about
+
+from .against_retrace import by_setting
 
 PER_PATH = "µs per path"
 TERMS = {
@@ -40,7 +43,7 @@ TERMS = {
 AXES = {"x": "segments", "y": PER_PATH, "x_scale": "log", "y_scale": "log", "slope": None}
 NAME = "planar_times"
 SEED = 2033
-ORIGINAL = 0.05  # its resolution, 1172 segments
+ORIGINAL = 1172  # chords of the original program
 SIZES = (10, 100, 1000, 10_000, 100_000, 1_000_000)
 BRUTE_SIZES = (0, 10, 100, 1000)
 ROUNDS = {"quick": 6, "standard": 7, "full": 21}
@@ -52,15 +55,10 @@ BOUNDARIES = 2
 
 def tasks(context: Context) -> list[Task]:
     """One task per backend and precision."""
-    return [
-        Task(f"planar, times: {s.label}", functools.partial(_setting_rows, context, s), timed=True)
-        for s in settings(context)
-    ]
+    return by_setting(context, NAME, "planar, times", "every size", _setting_rows, timed=True)
 
 
 def _setting_rows(context: Context, setting: Setting) -> list[Row]:
-    if setting.vector is None:
-        return [Row(NAME, "trace", "every size", setting.label, reason=setting.reason)]
     sizes = SIZES[:3] if context.profile.quick else SIZES
     return measure(context, setting, SIZES[:1] if setting.is_scalar else sizes)
 
@@ -85,13 +83,14 @@ class Field:
 
 @functools.cache
 def field(size: int) -> Field:
-    """About `size` segments, on lenses of a thousand; 0: the one lens, as the original cuts it."""
+    """About `size` segments, on lenses of a thousand; 0: the one lens, of as many chords as the original."""
     side = max(1, round(math.sqrt(size / 1000)))
-    curve = shapes.document_lens().faceted(size // side**2) if size else shapes.document_lens(ORIGINAL)
+    lens = shapes.lens((0.04, -0.04), 16.4, conic=(1.9, 1.9), vertex=-8.2).mapped(affine(90, (1, 4)))
+    curve = lens.faceted(size // side**2 if size else ORIGINAL)
     pitch = 1.2 * np.ptp(curve.vertices, axis=0)
     places = pitch * np.stack(np.meshgrid(*[np.arange(side)] * 2), 2).reshape(-1, 1, 2)
     start, end = ((places + x).reshape(-1, 2) for x in (curve.start, curve.end))
-    media = np.full(len(start), shapes.LENS_INDEX), np.ones(len(start))
+    media = np.full(len(start), 4.4), np.ones(len(start))
     return Field(Segments(start, end, *media), side, pitch)
 
 

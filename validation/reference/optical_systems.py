@@ -1,20 +1,21 @@
-"""Optical systems with closed answers, and what an error at each of their boundaries makes of the answer.
+"""Optical systems with closed answers: rays, the boundaries that they meet, and how far a path is from the answer.
 
-A system is `trace(refract) -> (N, m)`: what comes out minus the closed form, for N rays. `refract(a, n, k) -> b` is
-asked at every boundary; a, n, b (N, 3), k = n_from/n_to. Intersections and closed forms are in extended precision,
-whatever the precision of `refract`: they are geometry, not refraction. All systems stand askew, so that no normal is
-an axis, and have the unit of length 1. Directions are compared by their chord, a small angle in radians.
+One description has three tracers: Snell's law in extended precision, where anything may be moved a little on the way;
+a formula that refracts at each boundary; and Mitsuba (`validation/ground_truth/bench.py`). Places and closed forms are
+in extended precision: they are geometry, not refraction. Lengths are in mm, of the order of 100; bodies are of BK7 in
+air unless stated otherwise. A system is turned by ASKEW for whatever traces it, so that no axis is special.
 
-Closed forms: `closed`, and Born and Wolf, Principles of Optics, 4.2.3 (aplanatic points); Descartes, La Dioptrique,
-1637 (ellipsoid).
+Closed forms: `closed_forms`, and Born and Wolf, Principles of Optics, 4.2.3 (aplanatic points); Descartes, La
+Dioptrique, 1637 (ellipsoid).
 """
 
 from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path as File
 from typing import Any
 
 import numpy as np
@@ -23,16 +24,19 @@ from numpy.typing import NDArray
 from . import closed_forms
 
 Array = NDArray[Any]
-Refract = Callable[[Array, Array, Any], Array]
-Trace = Callable[[Refract], Array]
+Refract = Callable[[Array, Array, Any], Array]  # (a, n, k) → b; a, n, b: N × 3, k = n_from/n_to
+Answers = dict[str, Array]  # by name, N × A × components; directions in radians
+Moved = Callable[[int, str, Any, Any], Any]  # number of the boundary, name of the value, value, its axis → value
 
 RAYS = 32
 BK7 = np.longdouble(1.5168)  # a crown glass
-WATER = 1.331, 1.344  # for red and for violet
-PRINT = Path(__file__).with_name("double_gauss_codev.json")
+WATER = np.longdouble(1.333)
+SIDE, RADIUS, BUBBLE, THICKNESS = 60, 50.0, 5.0, 50  # of the prism's section, balls, the small ball, the slab
+PRINT = File(__file__).with_name("double_gauss_codev.json")
 # What printing rounds to: see "digits" in the file.
 TANGENT, POSITION = 5e-7, 2.3e-6
 FIELDS = {0.0: 0.0, 0.176327: 10.0, 0.249328: 14.0}  # printed tangent: degrees
+NUDGE = 1e-8  # mm, radians, and share of an index
 
 
 # Vectors -------------------------------------------------------------------------------------------------------
@@ -43,14 +47,19 @@ def dot(x: Array, y: Array) -> Array:
     return (x * y).sum(-1, keepdims=True)
 
 
+def length(x: Array) -> Array:
+    """Of vectors (… × 3), as … × 1."""
+    return np.sqrt(dot(x, x))
+
+
 def unit(x: Array) -> Array:
     """Vectors (… × 3) of length 1."""
-    return x / np.sqrt(dot(x, x))
+    return x / length(x)
 
 
 def vectors(*components: Any) -> Array:
     """Three components of any shapes as (N, 3) in extended precision."""
-    return np.stack(np.broadcast_arrays(*(np.asarray(x, np.longdouble) for x in components)), axis=-1)
+    return np.stack(np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, np.longdouble)) for x in components)), axis=-1)
 
 
 def degrees(first: float, last: float, count: int = RAYS) -> Array:
@@ -66,112 +75,270 @@ def snell(a: Array, n: Array, k: Any) -> Array:
     return (k * np.cross(w, n) + along * n) / dot(n, n)
 
 
-_X, _Y = unit(vectors([3], 1, 2)), unit(vectors([-1], 1, 1))
+def across(x: Array, way: int) -> Array:
+    """One of two unit vectors at right angles to each vector and to each other."""
+    smallest = np.eye(3, dtype=np.longdouble)[np.abs(x).argmin(axis=1)]
+    aside = unit(np.cross(x, smallest))
+    return np.cross(unit(x), aside) if way else aside
+
+
+_X, _Y = unit(vectors(3, 1, 2)), unit(vectors(-1, 1, 1))
 ASKEW = np.concatenate([_X, _Y, np.cross(_X, _Y)])
 
 
-def askew(trace: Trace) -> Trace:
-    """The same system, turned so that no axis is special."""
-
-    @functools.wraps(trace)
-    def turned(refract: Refract) -> Array:
-        return trace(lambda a, n, k: refract(a @ ASKEW, n @ ASKEW, k) @ ASKEW.T)
-
-    return turned
+# Boundaries and systems ----------------------------------------------------------------------------------------
 
 
-# Systems -------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Plane:
+    """Through `point`, with a unit `normal` (1 × 3, or one for each ray)."""
+
+    point: Array
+    normal: Array
+    bend = 0.0
+
+    def meet(self, p: Array, d: Array) -> tuple[Array, Array]:
+        """Where rays from `p` along `d` (N × 3) meet it, and the unit normals there."""
+        return p + d * (dot(self.normal, self.point - p) / dot(self.normal, d)), np.broadcast_to(self.normal, p.shape)
 
 
-@askew
-def slab(refract: Refract) -> Array:
-    """A plane-parallel plate: the direction is restored, the ray shifted by d sin(θ − θ')/cos θ'.
+@dataclass(frozen=True)
+class Ball:
+    """An ellipsoid along the axes, or a sphere; `far`: met from within."""
 
-    Rays at 1 … 89 degrees through a plate of BK7, d = 1. (shift − closed form, direction restored − a).
+    centre: Array
+    axes: Array
+    far: bool = False
+
+    @property
+    def bend(self) -> float:
+        """The most that its normal turns a mm."""
+        return float(self.axes.max() / self.axes.min() ** 2)
+
+    def meet(self, p: Array, d: Array) -> tuple[Array, Array]:
+        """Where rays from `p` along `d` (N × 3) meet it, and the unit normals there; NaN where they miss."""
+        q, e = (p - self.centre) / self.axes, d / self.axes
+        b, square = dot(q, e), dot(e, e)
+        with np.errstate(invalid="ignore"):
+            root = np.sqrt(b * b - square * (dot(q, q) - 1))
+        p = p + d * ((root if self.far else -root) - b) / square
+        return p, unit((p - self.centre) / self.axes**2)
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """`k` = n_from/n_to, one for all rays or one for each; None: reflected. `size`: its extent from the origin, mm.
+
+    Behind it, places count from `thickness` further along z.
     """
-    angle = degrees(1, 89)
-    a, n = vectors(np.sin(angle), 0, np.cos(angle)), vectors(np.zeros(RAYS), 0, 1)
-    inside = refract(a, n, 1 / BK7)
-    p = inside / dot(inside, n)
-    out = refract(inside, n, BK7)
-    shift = np.sqrt(dot(np.cross(p, a), np.cross(p, a)))
-    return np.concatenate([shift - closed_forms.lateral_shift(angle, BK7)[:, None], unit(out) - a], axis=1)
+
+    surface: Plane | Ball
+    k: Any
+    size: float = 0.0
+    thickness: float = 0.0
 
 
-@askew
-def round_trip(refract: Refract) -> Array:
-    """Into a denser medium and back through the same boundary: the direction is restored.
+@dataclass(frozen=True)
+class Path:
+    """Of N rays at B boundaries: places, and unit directions behind each, B × N × 3."""
 
-    Rays at 1 … 89.9 degrees, each with its own index between 1.0001 and 4. (direction restored − a).
+    places: Array
+    directions: Array
+
+
+@dataclass(frozen=True)
+class System:
+    """Rays (N × 3, extended precision) and the boundaries that they meet one after the other.
+
+    `off(path)`: by answer, what the path says less the closed form. `printed`: how far from the truth the other side of
+    that may itself be, by answer.
     """
-    angle, index = degrees(1, 89.9), 1 + np.geomspace(1e-4, 3, 7)[np.arange(RAYS) % 7].astype(np.longdouble)
-    a, n = vectors(np.sin(angle), 0, np.cos(angle)), vectors(np.zeros(RAYS), 0, 1)
-    return unit(refract(refract(a, n, 1 / index), n, index)) - a
+
+    origins: Array
+    directions: Array
+    boundaries: tuple[Boundary, ...]
+    off: Callable[[Path], Answers]
+    turn: Array = field(default_factory=lambda: ASKEW)
+    printed: dict[str, float] = field(default_factory=dict)
+
+    def walk(
+        self, refract: Refract = snell, moved: Moved = lambda j, what, x, axis: x
+    ) -> Iterator[tuple[Array, Array, Array, Array, Array]]:
+        """At each boundary: where the rays come from, place, normal, directions before and behind.
+
+        `moved` may disturb the values "into", "normal", "index", "onward" and "place" of each boundary; −1: the start.
+        """
+        b = moved(-1, "onward", self.directions, self.directions)
+        p = moved(-1, "place", self.origins, b)
+        for j, boundary in enumerate(self.boundaries):
+            start, (p, n) = p, boundary.surface.meet(p, b)
+            a, normal = moved(j, "into", b, b), moved(j, "normal", n, n)
+            if boundary.k is None:
+                b = a - 2 * dot(normal, a) * normal
+            else:
+                b = refract(a, normal, moved(j, "index", boundary.k, None))
+            b = moved(j, "onward", b, b)
+            p = moved(j, "place", p, b)
+            yield start, p, n, a, b
+            p = p - vectors(0, 0, boundary.thickness)
+
+    def path(self, refract: Refract = snell, moved: Moved = lambda j, what, x, axis: x) -> Path:
+        """By Snell's law in extended precision, or by a formula, in the coordinates of the system."""
+        steps = list(self.walk(refract, moved))
+        return Path(np.array([p for _, p, _, _, _ in steps]), np.array([unit(b) for _, _, _, _, b in steps]))
+
+    def errors(self, refract: Refract, moved: Moved = lambda j, what, x, axis: x) -> Array:
+        """N × m: all answers less those of the exact path, by a formula that gets them turned askew."""
+
+        def turned(a: Array, n: Array, k: Any) -> Array:
+            return refract(a @ self.turn, n @ self.turn, k) @ self.turn.T
+
+        found, exact = (self.off(path) for path in (self.path(turned, moved), self.path()))
+        return np.concatenate([(found[name] - x).reshape(len(x), -1) for name, x in exact.items()], axis=1)
+
+    @functools.cached_property
+    def condition(self) -> Array:
+        """(N,): by how many u the answer is off, if the first a and every n, k and b were off by u, to first order.
+
+        The sum over all of them of the norm of the derivative, from differences of the exact path; a, n and b move at
+        right angles to themselves, for their length is not asked for.
+        """
+        total = np.zeros(len(self.origins), np.longdouble)
+        for j, boundary in enumerate(self.boundaries):
+            for what in (*["into"] * (j == 0), "normal", "index", "onward") if boundary.k is not None else ():
+                moved = [self.errors(snell, nudged(j, what, way)) for way in range(1 if what == "index" else 2)]
+                total += np.sqrt(sum((x**2).sum(1) for x in moved)) / NUDGE
+        return total
 
 
-@askew
-def prism(refract: Refract) -> Array:
-    """A prism at minimum deviation, D = 2 asin(n sin(A/2)) − A.
+def nudged(boundary: int, what: str, way: int) -> Moved:
+    """Moves one value by NUDGE: an index by a share, a vector across its axis (0, 1) or along it (2)."""
 
-    Apex angles A of 10 … 80 degrees, BK7; the first incidence is asin(n sin(A/2)). (deviation − closed form).
+    def moved(j: int, name: str, x: Any, axis: Any) -> Any:
+        if (j, name) != (boundary, what):
+            return x
+        return x * (1 + NUDGE) if what == "index" else x + NUDGE * (across(axis, way) if way < 2 else unit(axis))
+
+    return moved
+
+
+def _direction(after: Array) -> Callable[[Path], Answers]:
+    return lambda path: {"direction": (path.directions[-1] - after)[:, None]}
+
+
+# Plane faces ---------------------------------------------------------------------------------------------------
+
+
+def slab(last: float = 89) -> System:
+    """A plane-parallel plate: moved aside by its thickness times sin(i − r)/cos r, the direction restored; 1 … 89°."""
+    inward, i = vectors(0, 0, 1), degrees(1, last)
+    a = vectors(np.sin(i), 0, np.cos(i))
+    shift = THICKNESS * closed_forms.lateral_shift(i, BK7)[:, None] * unit(inward - dot(inward, a) * a)
+    origins = vectors(-25, 3, -THICKNESS / 2) - 20 * a
+
+    def off(path: Path) -> Answers:
+        w = path.places[-1] - origins
+        return {"shift": (w - dot(w, a) * a - shift)[:, None], "direction": (path.directions[-1] - a)[:, None]}
+
+    faces = ((-THICKNESS / 2, 1 / BK7), (THICKNESS / 2, BK7))
+    return System(origins, a, tuple(Boundary(Plane(vectors(0, 0, z), inward), k, 90) for z, k in faces), off)
+
+
+def round_trip() -> System:
+    """Into a denser medium and out of it through a parallel face: the direction is restored.
+
+    Rays at 1 … 89.9°, each with its own index between 1.0001 and 4.
     """
-    half = degrees(5, 40)
-    incidence = closed_forms.least_deviated(2 * half, BK7)
-    left, right = vectors(np.cos(half), 0, -np.sin(half)), vectors(np.cos(half), 0, np.sin(half))
-    angle = incidence - half  # inside, the ray runs along x
-    a = vectors(np.cos(angle), 0, np.sin(angle))
-    b = refract(refract(a, left, 1 / BK7), right, BK7)
-    deviation = np.arctan2(np.sqrt(dot(np.cross(a, b), np.cross(a, b))), dot(a, b))
-    return deviation - (2 * incidence - 2 * half)[:, None]
+    i, index = degrees(1, 89.9), 1 + np.geomspace(1e-4, 3, 7)[np.arange(RAYS) % 7].astype(np.longdouble)
+    a = vectors(np.sin(i), 0, np.cos(i))
+    faces = ((0, 1 / index), (1, index))
+    boundaries = tuple(Boundary(Plane(vectors(0, 0, z), vectors(0, 0, 1)), k) for z, k in faces)
+    return System(-a, a, boundaries, _direction(a))
 
 
-@askew
-def weierstrass(refract: Refract) -> Array:
-    """A sphere's aplanatic points: rays from the distance R/n within leave as if from nR, all of them.
+def prism(apex: Any, i: Array, down: Any = 0.4) -> System:
+    """A prism deviates by i + asin(n sin(A − r)) − A. Rays come onto its left side, the share `down` from the apex."""
+    half = apex / 2
+    height, angle = SIDE * np.cos(half), i - half
+    top = vectors(0, 2 * height / 3, 0)
+    normals = [vectors(0, np.sin(half), side * np.cos(half)) for side in (-1, 1)]
+    a, after = (vectors(0, np.sin(x), np.cos(x)) for x in (angle, angle - closed_forms.deviation(i, apex, BK7)))
+    place = top + vectors(11, 0, 0) - np.reshape(down, (-1, 1)) * vectors(0, height, SIDE * np.sin(half))
+    boundaries = tuple(Boundary(Plane(top, n), k, 60) for n, k in zip(normals, (1 / BK7, BK7), strict=True))
+    return System(place - 40 * a, a, boundaries, _direction(after))
 
-    Rays at 91 … 179 degrees to the axis, all around it, R = 1, BK7. (direction − closed form).
-    """
-    angle, around = degrees(91, 179), degrees(0, 3000)
-    towards = angle - np.arcsin(np.sin(angle) / BK7)  # the angle at the centre; the sines are as R to R/n
+
+def least_deviated() -> System:
+    """Prisms of 10 … 80° at their least deviation, 2 asin(n sin(A/2)) − A."""
+    apex = 2 * degrees(5, 40)
+    return prism(apex, closed_forms.least_deviated(apex, BK7))
+
+
+# Balls ---------------------------------------------------------------------------------------------------------
+
+
+def ball(far: bool = False) -> Ball:
+    """A ball around the origin."""
+    return Ball(vectors(0, 0, 0), RADIUS * vectors(1, 1, 1), far)
+
+
+def _miss(path: Path, focus: Array) -> Answers:
+    """From the last line to a point."""
+    to, b = focus - path.places[-1], path.directions[-1]
+    return {"miss": (to - dot(to, b) * b)[:, None]}
+
+
+def aplanatic() -> System:
+    """A ball of radius R: rays that aim at n R behind its centre all meet R/n behind it."""
+    angle, around = degrees(100, 179), degrees(0, 3000)
+    towards = angle - closed_forms.refracted(angle, BK7)  # the angle at the centre; the sines are as R to R/n
     radius = np.sin(towards)
-    p = vectors(np.cos(towards), radius * np.cos(around), radius * np.sin(around))
-    a = unit(p - vectors([1 / BK7], 0, 0))
-    return unit(refract(a, p, BK7)) - unit(p - vectors([BK7], 0, 0))
+    p = RADIUS * vectors(radius * np.cos(around), radius * np.sin(around), np.cos(towards))
+    a = unit(RADIUS * vectors(0, 0, BK7) - p)
+    boundaries = (Boundary(ball(), 1 / BK7, RADIUS),)
+    return System(p - 60 * a, a, boundaries, lambda path: _miss(path, RADIUS * vectors(0, 0, 1 / BK7)))
 
 
-@askew
-def ellipsoid(refract: Refract) -> Array:
-    """An ellipsoid of eccentricity 1/n: light parallel to its axis meets in the far focus.
+def weierstrass() -> System:
+    """A ball's aplanatic points: rays from R/n within it leave as if from n R, all of them; 91 … 179° to the axis."""
+    angle, around = degrees(91, 179), degrees(0, 3000)
+    towards = angle - closed_forms.refracted(angle, BK7)
+    radius = np.sin(towards)
+    p = RADIUS * vectors(radius * np.cos(around), radius * np.sin(around), np.cos(towards))
+    start = np.broadcast_to(RADIUS * vectors(0, 0, 1 / BK7), p.shape)
+    after = unit(p - RADIUS * vectors(0, 0, BK7))
+    return System(start, unit(p - start), (Boundary(ball(far=True), BK7, RADIUS),), _direction(after))
 
-    Major half-axis 1, BK7, rays at 1 … 89 degrees of eccentric anomaly. (direction − closed form).
+
+def ellipsoid(last: float = 89) -> System:
+    """An ellipsoid of eccentricity 1/n, and a sphere around its far focus: rays along the axis all meet there.
+
+    To 89° of eccentric anomaly.
     """
-    e = 1 / BK7
+    e, anomaly, around = 1 / BK7, degrees(1, last), degrees(0, 3000)
     minor = np.sqrt((1 - e) * (1 + e))
-    anomaly, around = degrees(1, 89), degrees(0, 3000)
-    radius = np.sin(anomaly)
-    p = vectors(-np.cos(anomaly), minor * radius * np.cos(around), minor * radius * np.sin(around))
-    n = unit(p / vectors([1], minor**2, minor**2))
-    b = refract(np.broadcast_to(vectors([1], 0, 0), p.shape), n, 1 / BK7)
-    return unit(b) - unit(vectors([e], 0, 0) - p)
+    axes, focus = RADIUS * vectors(minor, minor, 1), RADIUS * vectors(0, 0, e)
+    place = axes * vectors(np.sin(anomaly) * np.cos(around), np.sin(anomaly) * np.sin(around), -np.cos(anomaly))
+    boundaries = (
+        Boundary(Ball(vectors(0, 0, 0), axes), 1 / BK7, RADIUS),
+        Boundary(Ball(focus, BUBBLE * vectors(1, 1, 1)), BK7, RADIUS),
+    )
+    along = np.broadcast_to(vectors(0, 0, 1), place.shape)
+    return System(place - 40 * along, along, boundaries, lambda path: _miss(path, focus))
 
 
-@askew
-def rainbow(refract: Refract) -> Array:
-    """The rainbows of order 1 … 4 in a drop of water: rays at the stationary angle, D = mπ + 2i − 2(m + 1) r.
+def drop(order: int, i: Array, index: Any = WATER) -> System:
+    """A drop with `order` reflections inside, rays at incidences `i`: deflected by mπ + 2i − 2(m + 1) r."""
+    a, p, d = vectors(0 * i, 0, 1), RADIUS * vectors(np.sin(i), 0, -np.cos(i)), closed_forms.deflection(i, index, order)
+    surfaces = [(ball(), 1 / index), *[(ball(far=True), None)] * order, (ball(far=True), index)]
+    boundaries = tuple(Boundary(surface, k, RADIUS) for surface, k in surfaces)
+    return System(p - 40 * a, a, boundaries, _direction(vectors(-np.sin(d), 0, np.cos(d))))
 
-    The reflections within are geometry. (direction − closed form).
-    """
-    order = np.arange(RAYS) % 4 + 1
-    index = np.linspace(*WATER, RAYS).astype(np.longdouble)
-    incidence = closed_forms.rainbow_incidence(index, order)
-    d = closed_forms.deflection(incidence, index, order)
-    a, p = vectors(np.ones(RAYS), 0, 0), vectors(-np.cos(incidence), 0, np.sin(incidence))
-    b = unit(refract(a, p, 1 / index))
-    for reflection in range(1 + order.max()):
-        inside = (reflection <= order)[:, None]
-        p = np.where(inside, unit(p - 2 * dot(p, b) * b), p)
-        b = np.where((reflection < order)[:, None], b - 2 * dot(p, b) * p, b)
-    return unit(refract(b, p, index)) - vectors(np.cos(d), 0, -np.sin(d))
+
+def rainbow(order: int) -> System:
+    """The rainbow of a drop of water: rays at the stationary angle, D = mπ + 2i − 2(m + 1) r, from red to violet."""
+    index = np.linspace(1.331, 1.344, RAYS).astype(np.longdouble)
+    return drop(order, closed_forms.rainbow_incidence(index, order), index)
 
 
 # The double Gauss ----------------------------------------------------------------------------------------------
@@ -183,122 +350,47 @@ def double_gauss_data() -> dict[str, Any]:
     return json.loads(PRINT.read_text())
 
 
-def printed_rays() -> tuple[Array, Array]:
-    """Where the nine rays are on the first surface, and their directions before it."""
+def double_gauss(prescription: Any = None) -> System:
+    """CODE V's double Gauss: places and tangents of nine rays at its eleven surfaces, as it prints them.
+
+    The vertex of each surface is an origin.
+    """
     rays = double_gauss_data()["rays"]
     angle = np.deg2rad(np.array([FIELDS[ray["object"][4]] for ray in rays], np.longdouble))
-    first = np.array([ray["surfaces"][0][:3] for ray in rays], np.longdouble)
-    return first, vectors(np.zeros(len(rays)), np.sin(angle), np.cos(angle))
+    a = vectors(0, np.sin(angle), np.cos(angle))
+    numbers = np.array([ray["surfaces"] for ray in rays], np.longdouble)  # rays × surfaces × 5
+    boundaries, before = [], 1.0
+    for c, thickness, after in prescription or double_gauss_data()["prescription"]:
+        surface: Plane | Ball = Plane(vectors(0, 0, 0), vectors(0, 0, 1))
+        if c:
+            radius = 1 / np.longdouble(c)
+            surface = Ball(vectors(0, 0, radius), np.abs(radius) * vectors(1, 1, 1), far=c < 0)
+        boundaries.append(Boundary(surface, np.longdouble(before) / after, 2 / abs(c) if c else 60, thickness))
+        before = after
 
+    def off(path: Path) -> Answers:
+        p, b = (x.swapaxes(0, 1) for x in (path.places, path.directions))
+        return {"place": p - numbers[..., :3], "tangent": b[..., :2] / b[..., 2:] - numbers[..., 3:5]}
 
-def printed() -> tuple[Array, Array]:
-    """Positions (surfaces, 9, 3) and tangents (surfaces, 9, 2) behind the surfaces."""
-    numbers = np.array([ray["surfaces"] for ray in double_gauss_data()["rays"]]).swapaxes(0, 1)
-    return numbers[..., :3], numbers[..., 3:5]
-
-
-def meet(p: Array, d: Array, curvature: float) -> tuple[Array, Array]:
-    """Where rays meet the surface c (x² + y² + z²) = 2 z next to its vertex, and its unit normal; NaN if they miss."""
-    p = p - d * (p[:, 2:] / d[:, 2:])  # on the vertex plane, where the smaller root is the near one
-    e = curvature * dot(p[:, :2], p[:, :2])
-    f = d[:, 2:] - curvature * dot(d[:, :2], p[:, :2])
-    with np.errstate(invalid="ignore"):
-        p = p + d * (e / (f + np.copysign(np.sqrt(f * f - curvature * e), f)))
-    return p, vectors(0, 0, 1) - curvature * p
-
-
-def retrace(refract: Refract, prescription: Any = None) -> tuple[Array, Array]:
-    """Positions (surfaces, 9, 3), each from its vertex, and directions (surfaces, 9, 3) of the printed rays."""
-    (p, b), index = printed_rays(), 1.0
-    positions, directions = [], []
-    for curvature, thickness, after in prescription or double_gauss_data()["prescription"]:
-        p, n = meet(p, unit(b), curvature)
-        b, index = refract(b, n, index / after), after
-        positions.append(p)
-        directions.append(b)
-        p = p - vectors(0, 0, thickness)
-    return np.array(positions), np.array(directions)
+    printed = {"place": np.sqrt(3) * POSITION, "tangent": np.sqrt(2) * TANGENT}
+    upright = np.eye(3, dtype=np.longdouble)
+    return System(numbers[:, 0, :3] - 20 * a, a, tuple(boundaries), off, upright, printed)
 
 
 def off_print(refract: Refract, prescription: Any = None) -> float:
     """The largest deviation from the print, over what printing rounds to: 1 is within the print."""
-    positions, directions = retrace(refract, prescription)
-    said, tangents = printed(), directions[..., :2] / directions[..., 2:]
-    deviations = (positions - said[0]) / POSITION, (tangents - said[1]) / TANGENT
-    return float(max(np.abs(x).max() for x in deviations))
+    system = double_gauss(prescription)
+    off = system.off(system.path(refract))
+    return float(max(np.abs(off["place"]).max() / POSITION, np.abs(off["tangent"]).max() / TANGENT))
 
 
-def double_gauss(refract: Refract) -> Array:
-    """CODE V's double Gauss, eleven surfaces: nine rays against the retrace in extended precision.
-
-    (direction − exact) after the last surface; that the exact retrace is the printed one is `off_print`.
-    """
-    return unit(retrace(refract)[1][-1]) - unit(retrace(snell)[1][-1])
-
-
-SYSTEMS: dict[str, Trace] = {
-    "slab": slab,
-    "round trip": round_trip,
-    "prism": prism,
-    "Weierstrass sphere": weierstrass,
-    "ellipsoid lens": ellipsoid,
-    "rainbows": rainbow,
-    "double Gauss": double_gauss,
+# For formulas; Mitsuba has some others.
+SYSTEMS: dict[str, Callable[[], System]] = {
+    "slab": functools.cache(slab),
+    "round trip": functools.cache(round_trip),
+    "prism": functools.cache(least_deviated),
+    "Weierstrass sphere": functools.cache(weierstrass),
+    "ellipsoid lens": functools.cache(ellipsoid),
+    "double Gauss": functools.cache(double_gauss),
 }
-
-
-# Conditions ----------------------------------------------------------------------------------------------------
-
-NUDGE = 1e-8
-
-
-@functools.cache
-def condition(trace: Trace) -> Array:
-    """(N,): by how many u the answer is off, if the first a and every n, k and b were off by u, to first order.
-
-    The sum over all of them of the norm of the derivative, from differences of the exact trace; a, n and b move at
-    right angles to themselves, for their length is not asked for.
-    """
-    exact, asked = trace(snell), 0
-
-    def counted(a: Array, n: Array, k: Any) -> Array:
-        nonlocal asked
-        asked += 1
-        return snell(a, n, k)
-
-    trace(counted)
-    total = np.zeros(len(exact), np.longdouble)
-    for call in range(asked):
-        for what in (*("a",) * (call == 0), "n", "k", "b"):
-            ways = range(1 if what == "k" else 2)
-            moved = [trace(_nudged(call, what, way)) - exact for way in ways]
-            total += np.sqrt(sum((x**2).sum(1) for x in moved)) / NUDGE
-    return total
-
-
-def _nudged(call: int, what: str, way: int) -> Refract:
-    """`snell`, but at one call one of its arguments or its result is moved a little."""
-    calls = iter(range(1 << 30))
-
-    def refract(a: Array, n: Array, k: Any) -> Array:
-        here = next(calls) == call
-        if here and what == "a":
-            a = _aside(a, way)
-        if here and what == "n":
-            n = _aside(n, way)
-        b = snell(a, n, k * (1 + NUDGE) if here and what == "k" else k)
-        return _aside(b, way) if here and what == "b" else b
-
-    return refract
-
-
-def _aside(x: Array, way: int) -> Array:
-    """Each vector, moved by NUDGE of its length in one of two directions at right angles to it."""
-    return x + NUDGE * np.sqrt(dot(x, x)) * across(x, way)
-
-
-def across(x: Array, way: int) -> Array:
-    """One of two unit vectors at right angles to each vector and to each other."""
-    smallest = np.eye(3, dtype=np.longdouble)[np.abs(x).argmin(axis=1)]
-    aside = unit(np.cross(x, smallest))
-    return np.cross(unit(x), aside) if way else aside
+SYSTEMS |= {f"rainbow of order {m}": functools.cache(functools.partial(rainbow, m)) for m in (1, 2, 3, 4)}

@@ -26,7 +26,8 @@ import numpy as np
 from mi_refract.io.image_file import write_exr
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.rendering import error_estimate
-from mi_refract.rendering.long_render import Job, Limits, LongRender
+from mi_refract.rendering.end_conditions import Limits
+from mi_refract.rendering.long_render import Job, LongRender, resume
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run.context import SCENES, Context
@@ -74,7 +75,7 @@ class _Still:
     def render(self, seed: int, given: Limits) -> LongRender:
         """One render of it from its first pass to its end."""
         job = Job(self.job.scene, self.job.defines, seed)
-        found = LongRender(job, self.folder / "image.exr", given, restart=True)
+        found = resume(job, self.folder / "image.exr", given, restart=True)
         found.run()
         return found
 
@@ -135,7 +136,7 @@ def time_rows(context: Context, spp: int) -> list[Row]:
         job, output = Job(SCENES / "sphere.xml", {"res": "512", "bsdf": PLUGIN}), Path(folder) / "passes.exr"
         one = Path(folder) / "one.exr"
         for _ in range(PAIRS[context.profile.name] + 1):
-            passes = LongRender(job, output, Limits(spp=spp), restart=True)
+            passes = resume(job, output, Limits(spp=spp), restart=True)
             called, image = _timed(lambda scene=passes.scene: np.array(mi.render(scene, spp=spp)))
             written, _ = _timed(lambda image=image: write_exr(one, image))
             in_passes, _ = _timed(passes.run)

@@ -1,9 +1,9 @@
 """Mutants of our own code: a line is changed as by a slip, and a test must notice.
 
-Lines of five packages are drawn with a seed. Each gets one change that cosmic-ray would make there, in a private copy
-of the source tree, where the tests that guard the package run until one fails. A mutant that all of them pass has
+Lines of all rooms are drawn with a seed. Each gets one change that cosmic-ray would make there, in a private copy of
+the source tree, where the tests of its room run until one fails (`cosmic-ray.toml`). A mutant that all of them pass has
 survived: a test is missing, or the change cannot be observed, which `explained_mutants.json` says in one line. The
-unmutated copy must pass first.
+unchanged copy must pass first.
 
 `python -m validation.robustness.code_mutants COUNT [SEED]` prints each outcome, and at the end the counts as JSON.
 """
@@ -13,51 +13,36 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
-import multiprocessing
 import os
 import random
 import shutil
 import signal
 import sys
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import chdir
 from dataclasses import dataclass
-from functools import cache
 from importlib.util import find_spec
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-from mi_refract.io import process_group
 from mi_refract.report.row import Row
 from validation.limits import UNEXPLAINED
 from validation.run.context import Context
 from validation.study import Study, Task, about
 
 ROOT = Path(__file__).parents[2]
+CONFIG = Path(__file__).with_name("cosmic-ray.toml")
 COPIED = ("mi_refract", "tests", "validation", "scenes", ".ci", ".github")  # and the files beside them
 COUNTS = {"quick": 3, "standard": 20, "full": 220}
-ALL = "all packages"
-# Tests by package; those named after a module come first.
-GUARDS = {
-    "plugins": ("plugins", "rendering/test_render_pass.py", "rendering/test_scene_files.py", "test_rooms.py"),
-    "image_diff": ("image_diff", "cli/test_diff.py", "cli/test_diff_forms.py", "test_rooms.py"),
-    "ray_sets": ("ray_sets", "cli/test_rays.py", "test_rooms.py"),
-    "accuracy": ("accuracy", "ray_sets", "formulas", "validation/test_sweep.py", "test_rooms.py"),
-    "scene_export": ("scene_export", "cli/test_scene.py", "test_rooms.py"),
-}
-LONGEST = 600.0  # seconds of a package's tests without a mutant
-MEMORY = 24 << 20  # KiB of address space, of all processes together
-# Without the tests that some machines skip: a browser takes more address space than a process may here.
-PYTEST = (sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not skipif")
-PASSED, FAILED = 0, 1  # pytest's exit codes; others above 1 are of pytest itself
+SEED = 0  # a new one for each release
+ALL = "all rooms"
 TERMS = {
     "mutants": "changes of a line, one at a time",
     "killed": "changes that a test noticed, or that never ended",
     "survived": "changes that all tests passed",
-    "explained": "those of them that cannot be observed, each for a reason that is kept",
+    "explained": "those of them that cannot be observed, each for a recorded reason",
     "score": "killed or explained, of all",
     "unexplained": "neither killed nor explained, of all",
 }
@@ -76,36 +61,19 @@ class Mutant:
 
     @property
     def room(self) -> str:
-        """The package that it is in."""
-        return Path(self.path).parts[1]
+        """The package, or the module, that it is in."""
+        return Path(self.path).parts[1].removesuffix(".py")
 
     @property
-    def key(self) -> tuple[str, str, str, str]:
-        """What stays the same when other lines come and go."""
-        return self.path, self.operator, self.line, self.becomes
+    def reason(self) -> str:
+        """Why it cannot be observed; "" where nothing says so. Numbers of lines do not matter."""
+        entries = json.loads(Path(__file__).with_name("explained_mutants.json").read_text("utf-8"))
+        key = {"file": self.path, "operator": self.operator, "line": self.line, "becomes": self.becomes}
+        return next((entry["reason"] for entry in entries if entry.items() >= key.items()), "")
 
     def __str__(self) -> str:
         """Where it is, and what changes."""
         return f"{self.path}:{self.number}: {self.operator}: {self.line} → {self.becomes}"
-
-
-@dataclass(frozen=True)
-class Found:
-    """What became of a mutant; `reason` explains why it survived, "" where nothing does."""
-
-    mutant: Mutant
-    killed: bool
-    said: str
-    seconds: float
-    reason: str = ""
-
-    @property
-    def unexplained(self) -> bool:
-        """Whether a test is missing."""
-        return not self.killed and not self.reason
-
-
-# The sample -----------------------------------------------------------------------------------------------------------
 
 
 def sample(root: Path, count: int, seed: int) -> list[Mutant]:
@@ -115,7 +83,7 @@ def sample(root: Path, count: int, seed: int) -> list[Mutant]:
     lines that it changes, and nothing else.
     """
     drawn = []
-    for path in [path for room in GUARDS for path in sorted((root / "mi_refract" / room).rglob("*.py"))]:
+    for path in sorted((root / "mi_refract").rglob("*.py")):
         before: Counter[str] = Counter()
         name = path.relative_to(root).as_posix()
         for number, line in enumerate(path.read_text("utf-8").splitlines(), 1):
@@ -123,78 +91,51 @@ def sample(root: Path, count: int, seed: int) -> list[Mutant]:
             key = repr((seed, name, line.strip(), before[line.strip()]))
             drawn.append((hashlib.sha256(key.encode()).hexdigest(), name, number))
     found: list[Mutant] = []
+    by_file: dict[str, list[Mutant]] = {}
     for digest, name, number in sorted(drawn):
         if len(found) == count:
             break
-        places = [each for (line, *_), each in _places((root / name).read_text("utf-8")).items() if line == number]
-        rng = random.Random(digest)
-        rng.shuffle(places)
-        chosen = (_mutant(root, name, *rng.choice(place)) for place in places)
-        found += [mutant for mutant in chosen if mutant][:1]
+        if name not in by_file:
+            by_file[name] = every(root, name)
+        here = [mutant for mutant in by_file[name] if mutant.number == number]
+        # A binary operator has eleven replacements: first choose the kind of change, then the change.
+        kinds = sorted({mutant.operator.partition("_")[0] for mutant in here})
+        if kinds:
+            rng = random.Random(digest)
+            kind = rng.choice(kinds)
+            found.append(rng.choice([mutant for mutant in here if mutant.operator.partition("_")[0] == kind]))
     return found
 
 
 def every(root: Path, name: str) -> list[Mutant]:
-    """All mutants of a file."""
-    places = _places((root / name).read_text("utf-8")).values()
-    made = (_mutant(root, name, *each) for place in places for each in place)
-    return [mutant for mutant in made if mutant]
-
-
-@cache
-def operators() -> dict[str, Any]:
-    """Cosmic-ray's operators by name, but for those that take arguments and draw random numbers."""
+    """All mutants of a file that change what it does."""
+    from cosmic_ray.ast import ast_nodes, get_ast
+    from cosmic_ray.mutating import mutate_code
     from cosmic_ray.operators.provider import OperatorProvider
 
-    provider = OperatorProvider()
-    return {name: provider[name]() for name in sorted(provider) if not provider[name].arguments()}
-
-
-@cache
-def _places(source: str) -> dict[tuple[int, int, str], list[tuple[str, int]]]:
-    """Operators and occurrences by line, column and family: a binary operator has eleven replacements in one place."""
-    from cosmic_ray.ast import ast_nodes, get_ast
-
+    source = (root / name).read_text("utf-8")
     nodes: list[Any] = list(ast_nodes(get_ast(source)))
-    found: dict[tuple[int, int, str], list[tuple[str, int]]] = {}
-    for name, operator in operators().items():
-        starts = (start for node in nodes for start, _ in operator.mutation_positions(node))
-        for occurrence, start in enumerate(starts):
-            found.setdefault((*start, name.partition("_")[0]), []).append((name, occurrence))
+    unchanged, old, provider, found = _behaviour(source), source.splitlines(), OperatorProvider(), []
+    for operator in sorted(provider):
+        if provider[operator].arguments():
+            continue
+        instance = provider[operator]()
+        places = [start for node in nodes for start, _ in instance.mutation_positions(node)]
+        for occurrence, (number, _) in enumerate(places):
+            changed = str(mutate_code(source, instance, occurrence))
+            if _behaviour(changed) not in (unchanged, ""):
+                new = changed.splitlines() if operator != "RemoveDecorator" else [""] * len(old)
+                line, becomes = (" ".join(text[number - 1].split()) for text in (old, new))
+                found.append(Mutant(name, operator, occurrence, number, line, becomes))
     return found
 
 
-def _mutant(root: Path, name: str, operator: str, occurrence: int) -> Mutant | None:
-    """The mutant; None where it does not compile, or cannot change what the module does."""
-    source = (root / name).read_text("utf-8")
-    changed = _mutated(source, operator, occurrence)
-    try:
-        if _behaviour(changed) == _behaviour(source):
-            return None
-    except SyntaxError:
-        return None
-    old, new = source.splitlines(), changed.splitlines()
-    index = next(i for i, (a, b) in enumerate(zip_longest(old, new)) if a != b)
-    becomes = plain(new[index])
-    if operator == "RemoveDecorator":  # with the empty lines above it
-        index, becomes = next(i for i in range(index, len(old)) if old[i].lstrip().startswith("@")), ""
-    return Mutant(name, operator, occurrence, index + 1, plain(old[index]), becomes)
-
-
-def _mutated(source: str, operator: str, occurrence: int) -> str:
-    from cosmic_ray.mutating import mutate_code
-
-    return str(mutate_code(source, operators()[operator], occurrence))
-
-
-def plain(line: str) -> str:
-    """As mutants name it."""
-    return " ".join(line.split())
-
-
 def _behaviour(source: str) -> str:
-    """The module without annotations, `__all__` and what is imported for annotations."""
-    tree = ast.parse(source)
+    """The module without annotations, `__all__` and imports for annotations; "" where it does not compile."""
+    try:
+        tree = ast.parse(source)
+    except SyntaxError:
+        return ""
     for node in ast.walk(tree):
         for name in {"annotation", "returns"} & {*node._fields}:
             setattr(node, name, None)
@@ -205,111 +146,80 @@ def _behaviour(source: str) -> str:
     return ast.dump(tree)
 
 
-# Tests ----------------------------------------------------------------------------------------------------------------
+def guards(root: Path, path: str) -> list[str]:
+    """The tests of a file: those named after it, then those of its room, of the commands, of structure."""
+    room, stem = Path(path).parts[1].removesuffix(".py"), Path(path).stem
+    named = sorted((root / "tests").rglob(f"test_{stem}.py"))
+    places = [*named, root / "tests" / room, root / "tests" / f"test_{room}.py", root / "tests" / "cli"]
+    places.append(root / "tests" / "test_rooms.py")
+    return list(dict.fromkeys(place.relative_to(root).as_posix() for place in places if place.exists()))
 
 
-def guards(root: Path, mutant: Mutant) -> list[str]:
-    """Test files of the mutant's package: its module's own first, then those that name the module."""
-    stem = Path(mutant.path).stem
-    paths = {path: (root / path).read_text("utf-8") for path in test_files(root, mutant.room)}
-    return sorted(paths, key=lambda path: (Path(path).name != f"test_{stem}.py", stem not in paths[path], path))
+def examine(mutants: Sequence[Mutant], root: Path = ROOT) -> Iterator[tuple[Mutant, bool]]:
+    """Whether each was killed, file by file. ValueError where tests fail without a mutant."""
+    from cosmic_ray.commands import execute
+    from cosmic_ray.config import load_config
+    from cosmic_ray.testing import TestOutcome, run_tests
+    from cosmic_ray.work_db import use_db
+    from cosmic_ray.work_item import MutationSpec, WorkerOutcome, WorkItem
+
+    with tempfile.TemporaryDirectory(prefix="mutants-", ignore_cleanup_errors=True) as folder:
+        copy, temporary = Path(folder, "tree"), Path(folder, "tmp")
+        for made in (copy, temporary):
+            made.mkdir()
+        for entry in root.iterdir():
+            if entry.is_file():
+                shutil.copy2(entry, copy)
+            elif entry.name in COPIED:
+                shutil.copytree(entry, copy / entry.name, ignore=shutil.ignore_patterns("__pycache__"))
+        os.environ |= {"PYTHONPATH": str(copy), "TMPDIR": str(temporary), "PYTHONDONTWRITEBYTECODE": "1"}
+        os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+        os.environ.pop("PYTEST_ADDOPTS", None)
+        passed: set[str] = set()
+        for path in dict.fromkeys(mutant.path for mutant in mutants):
+            config = load_config(str(CONFIG))
+            config["test-command"] = command = config.test_command.format(tests=" ".join(guards(root, path)))
+            room = Path(path).parts[1]
+            with chdir(copy), use_db(str(Path(folder, "session.sqlite"))) as database:
+                if room not in passed:
+                    outcome, output = run_tests(command, config.timeout)
+                    if outcome is not TestOutcome.SURVIVED:
+                        raise ValueError(f"the tests of {room} fail without a mutant: {_said(output)}")
+                    passed.add(room)
+                here = {str(i): mutant for i, mutant in enumerate(mutants) if mutant.path == path}
+                database.clear()
+                for i, mutant in here.items():
+                    place = (mutant.number, 0), (mutant.number, 1)
+                    spec = MutationSpec(path, f"core/{mutant.operator}", mutant.occurrence, *place)
+                    database.add_work_item(WorkItem.single(i, spec))
+                execute(database, config)
+                results = dict(database.results)
+            for i, result in results.items():
+                if result.worker_outcome is not WorkerOutcome.NORMAL:
+                    raise ValueError(f"{here[i]}: not tested: {_said(result.output)}")
+                yield here[i], result.is_killed
 
 
-def test_files(root: Path, room: str) -> list[str]:
-    """Of a package."""
-    places = [root / "tests" / name for name in GUARDS[room]]
-    files = [path for place in places for path in (sorted(place.rglob("test_*.py")) if place.is_dir() else [place])]
-    return [path.relative_to(root).as_posix() for path in files]
+def _said(output: str) -> str:
+    lines = [line for line in output.splitlines() if line.strip()]
+    failed = [line for line in lines if line.startswith(("FAILED ", "ERROR "))]
+    return (failed or lines or [""])[-1][:300]
 
 
-Tests = tuple[Sequence[str], float, Mutant | None]  # files, the seconds that they may take, what is mutated
-_COPY = Path()  # of the tree, for the tests of this process
-
-
-def _copy(root: Path, folder: str) -> None:
-    global _COPY
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    _COPY = Path(tempfile.mkdtemp(dir=folder))
-    for path in root.iterdir():
-        if path.is_file():
-            shutil.copy2(path, _COPY)
-        elif path.name in COPIED:
-            shutil.copytree(path, _COPY / path.name, ignore=shutil.ignore_patterns("__pycache__"))
-
-
-def _test(tests: Tests) -> tuple[bool, str, float]:
-    """Whether they passed, what was said last, and the seconds. ValueError where there was no test to run."""
-    (files, timeout, mutant), began, temporary = tests, time.monotonic(), _COPY / "tmp"
-    source = "" if mutant is None else (_COPY / mutant.path).read_text("utf-8")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir()
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
-    own = {"PYTHONPATH": str(_COPY), "TMPDIR": str(temporary), "PYTHONDONTWRITEBYTECODE": "1"}
-    limit = f'ulimit -v {MEMORY // (os.cpu_count() or 1)} 2>/dev/null; exec "$@"'  # not every system limits it
-    command = ["sh", "-c", limit, "sh", *PYTEST, f"--basetemp={_COPY / 'temporary'}", *files]
-    try:
-        if mutant:
-            (_COPY / mutant.path).write_text(_mutated(source, mutant.operator, mutant.occurrence), "utf-8")
-        ended = process_group.run(command, b"", timeout, cwd=_COPY, env=kept | own, keep_stderr=True)
-    except (TimeoutError, process_group.TooMuchOutputError) as error:
-        return False, str(error), time.monotonic() - began
-    finally:
-        if mutant:
-            (_COPY / mutant.path).write_text(source, "utf-8")
-    said = [line for line in ended.out.decode(errors="replace").splitlines() if line.strip()]
-    if ended.status > FAILED and not mutant:
-        raise ValueError(f"{ended.how}: {' '.join(files)[:200]}")
-    failed = [line for line in said if line.startswith(("FAILED ", "ERROR "))]
-    return ended.status == PASSED, (failed or said or [""])[-1][:300], time.monotonic() - began
-
-
-def examine(chosen: Sequence[Mutant], root: Path = ROOT) -> Iterator[Found]:
-    """What became of each, as it is known. ValueError where tests fail without a mutant."""
-    reasons = explained()
-    workers = max(1, min(os.cpu_count() or 1, len(chosen)))
-    spawned = multiprocessing.get_context("spawn")  # a fork would lack the threads of Dr.Jit
-    with (
-        tempfile.TemporaryDirectory(prefix="mutants-", ignore_cleanup_errors=True) as folder,
-        spawned.Pool(workers, _copy, (root, folder)) as pool,  # ends its processes at the end, and they their tests
-    ):
-        rooms, times = sorted({mutant.room for mutant in chosen}), {}
-        unmutated = pool.imap(_test, [(test_files(root, room), LONGEST, None) for room in rooms])
-        for room, (passed, said, seconds) in zip(rooms, unmutated, strict=True):
-            if not passed:
-                raise ValueError(f"the tests of {room} fail without a mutant: {said}")
-            times[room] = seconds
-        work = [(guards(root, mutant), 5 * times[mutant.room] + 60, mutant) for mutant in chosen]
-        for mutant, (passed, said, seconds) in zip(chosen, pool.imap(_test, work), strict=True):
-            reason = reasons.get(mutant.key, "") if passed else ""
-            yield Found(mutant, not passed, said, seconds, reason)
-
-
-# Rows -----------------------------------------------------------------------------------------------------------------
-
-
-def explained() -> dict[tuple[str, ...], str]:
-    """Reasons by the key of a mutant."""
-    entries = json.loads(Path(__file__).with_name("explained_mutants.json").read_text("utf-8"))
-    return {(e["file"], e["operator"], e["line"], e["becomes"]): e["reason"] for e in entries}
-
-
-def rows(found: Sequence[Found], seed: int) -> list[Row]:
-    """A row per package, and one for all, which has the bound: a package may have three mutants."""
+def rows(found: Sequence[tuple[Mutant, bool]], seed: int) -> list[Row]:
+    """A row per room, and one for all, which has the bound: a room may have three mutants."""
     made = []
-    for room in (ALL, *GUARDS):
-        here = [each for each in found if room in (ALL, each.mutant.room)]
-        if not here:
-            continue
-        count, survived = len(here), sum(not each.killed for each in here)
-        missed = [str(each.mutant) for each in here if each.unexplained]
-        values = {"mutants": count, "killed": count - survived, "survived": survived}
-        values |= {"explained": survived - len(missed)}
-        shares = {"score": 1 - len(missed) / count, "unexplained": len(missed) / count}
+    for room in dict.fromkeys([ALL, *sorted(mutant.room for mutant, _ in found)]):
+        here = [(mutant, killed) for mutant, killed in found if room in (ALL, mutant.room)]
+        survived = [mutant for mutant, killed in here if not killed]
+        missed = [str(mutant) for mutant in survived if not mutant.reason]
+        values: dict[str, float] = {"mutants": len(here), "killed": len(here) - len(survived)}
+        values |= {"survived": len(survived), "explained": len(survived) - len(missed)}
+        values |= {"score": 1 - len(missed) / len(here), "unexplained": len(missed) / len(here)}
         replay: dict[str, Any] = {"seed": seed, "command": f"python -m {MODULE} {len(found)} {seed}"}
         replay |= {"survivors": missed} if missed else {}
         budgets = {"unexplained": UNEXPLAINED} if room == ALL else {}
-        row = Row(STUDY.name, room, "mutated code", "", values | shares, budgets=budgets, replay=replay)
-        made.append(row)
+        made.append(Row(STUDY.name, room, "mutated code", "", values, budgets, replay=replay))
     return made
 
 
@@ -324,7 +234,7 @@ def missing(root: Path = ROOT) -> str:
 def _rows(context: Context) -> list[Row]:
     if reason := missing():
         return [Row(STUDY.name, ALL, "mutated code", "", reason=reason)]
-    return rows(list(examine(sample(ROOT, COUNTS[context.profile.name], seed=0))), seed=0)
+    return rows(list(examine(sample(ROOT, COUNTS[context.profile.name], SEED))), SEED)
 
 
 MODULE = "validation.robustness.code_mutants"
@@ -339,15 +249,14 @@ STUDY = Study(
 
 def main(arguments: Sequence[str]) -> int:
     """`COUNT [SEED]`; 1 where the bound is broken."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # ends the tests, removes the copies
-    count, seed = int(arguments[0]), int(arguments[1]) if arguments[1:] else 0
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # removes the copy
+    count, seed = int(arguments[0]), int(arguments[1]) if arguments[1:] else SEED
     if reason := missing():
         raise SystemExit(f"code mutants: {reason}")
     found = []
-    for each in examine(sample(ROOT, count, seed)):
-        found.append(each)
-        outcome = "killed" if each.killed else "explained" if each.reason else "SURVIVED"
-        print(f"{outcome} {each.seconds:.0f} s {each.mutant} [{each.reason or each.said}]", file=sys.stderr, flush=True)
+    for mutant, killed in examine(sample(ROOT, count, seed)):
+        found.append((mutant, killed))
+        print(f"{'killed' if killed else mutant.reason or 'SURVIVED'}: {mutant}", file=sys.stderr, flush=True)
     made = rows(found, seed)
     print(json.dumps({row.subject: row.values | row.replay for row in made}, indent=1))
     return int(any(row.verdict == "fail" for row in made))

@@ -82,14 +82,7 @@ class Setting:
 
 def settings(context: Context) -> list[Setting]:
     """Every backend and precision; the profile `quick` leaves scalar arrays out where compiled ones run."""
-    every = _settings(context)
-    if not context.profile.quick or context.scalar:
-        return every
-    return [setting for setting in every if not setting.is_scalar]
-
-
-def _settings(context: Context) -> list[Setting]:
-    found = [Setting.of("scalar", "float64")]
+    found = [] if context.profile.quick and not context.scalar else [Setting.of("scalar", "float64")]
     for backend in ("llvm", "cuda"):
         entry = context.backends[backend]
         for precision in (np.float32, np.float64):

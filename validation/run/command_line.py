@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 
 import typer
@@ -17,7 +18,8 @@ def application() -> typer.Typer:
 
 def exit_code(app: typer.Typer, name: str, arguments: list[str]) -> int:
     """Run the command; its exit code, 2 after an error, 130 after an interruption."""
-    return exits.exit_code(name, lambda: app(arguments, prog_name=f"python -m {name}", standalone_mode=False))
+    run = functools.partial(app, arguments, prog_name=f"python -m {name}", standalone_mode=False)
+    return exits.exit_code(name, run, (KeyboardInterrupt, typer.Abort))
 
 
 def misuse(name: str, message: str) -> int:

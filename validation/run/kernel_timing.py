@@ -33,7 +33,6 @@ TERMS = {
     "operations": "Dr.Jit's count for the whole kernel",
     "compile ms": "code generation and compilation of the kernel, by Dr.Jit's record, with a literal no cache can know",
 }
-Clock = Callable[[Subject], float]
 
 
 def copy(a: Any, n: Any, k: Any) -> tuple[Any, Any]:
@@ -42,19 +41,35 @@ def copy(a: Any, n: Any, k: Any) -> tuple[Any, Any]:
 
 
 def measure(context: Context, setting: Setting) -> dict[str, dict[str, float]]:
-    """Values by subject of the setting, and of the copy."""
+    """Values by subject of the setting, and of the copy, on generic rays."""
     subjects = {COPY: copy, **setting.subjects}
-    rays = context.profile.scalar_rays if setting.is_scalar else context.profile.streamed_rays
-    inputs = _inputs(setting, rays)
-    clock = _scalar_clock(inputs) if setting.is_scalar else _kernel_clock(inputs)
+    count = context.profile.scalar_rays if setting.is_scalar else context.profile.streamed_rays
+    rays = regimes.make("generic", min(count, DIFFERENT), setting.precision, SEED)[np.arange(count) % DIFFERENT]
+    vector = setting.vector
+    if setting.is_scalar:
+        single = [(vector(a), vector(n), float(k)) for a, n, k in zip(rays.a, rays.n, rays.k, strict=True)]
+
+        def clock(subject: Subject) -> float:
+            start = time.perf_counter()
+            for ray in single:
+                subject(*ray)
+            return time.perf_counter() - start
+    else:
+        streamed = vector(rays.a.T), vector(rays.n.T), dr.value_t(vector)(rays.k)
+        dr.eval(streamed)
+
+        def clock(subject: Subject) -> float:
+            return float(sum(kernel["execution_time"] for kernel in kernels(lambda: subject(*streamed)))) / 1e3
+
     seconds = rounds(subjects, clock, context.profile.repeats)
-    found = {name: ratio(TIME_OVER_COPY, seconds[name], seconds[COPY]) for name in subjects}
+    found: dict[str, dict[str, float]] = {}
     for name, subject in subjects.items():
+        found[name] = ratio(TIME_OVER_COPY, seconds[name], seconds[COPY])
         found[name] |= ratio(TIME_OVER_PLAIN, seconds[name], seconds[PLAIN])
         if setting.backend == "cuda":
-            found[name] |= interval("ns per ray", [s / rays * 1e9 for s in seconds[name]])
+            found[name] |= interval("ns per ray", [s / count * 1e9 for s in seconds[name]])
         if not setting.is_scalar:
-            found[name] |= _kernel(subject, inputs)
+            found[name] |= _kernel(subject, streamed)
     return found
 
 
@@ -90,31 +105,6 @@ def interval(metric: str, x: list[float]) -> dict[str, float]:
     rank = max(int(binom.ppf(0.025, len(x), 0.5)), 1)
     ordered = sorted(x)
     return {metric: statistics.median(x), f"{metric}, low": ordered[rank - 1], f"{metric}, high": ordered[-rank]}
-
-
-def _inputs(setting: Setting, count: int) -> Any:
-    """(a, n, k) of generic rays: arrays in memory, or a list of single rays."""
-    rays = regimes.make("generic", min(count, DIFFERENT), setting.precision, SEED)[np.arange(count) % DIFFERENT]
-    vector = setting.vector
-    if setting.is_scalar:
-        return [(vector(a), vector(n), float(k)) for a, n, k in zip(rays.a, rays.n, rays.k, strict=True)]
-    inputs = vector(rays.a.T), vector(rays.n.T), dr.value_t(vector)(rays.k)
-    dr.eval(inputs)
-    return inputs
-
-
-def _scalar_clock(inputs: Any) -> Clock:
-    def clock(subject: Subject) -> float:
-        start = time.perf_counter()
-        for a, n, k in inputs:
-            subject(a, n, k)
-        return time.perf_counter() - start
-
-    return clock
-
-
-def _kernel_clock(inputs: Any) -> Clock:
-    return lambda subject: sum(kernel["execution_time"] for kernel in kernels(lambda: subject(*inputs))) / 1e3
 
 
 def _kernel(subject: Subject, inputs: Any) -> dict[str, float]:

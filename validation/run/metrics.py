@@ -15,6 +15,7 @@ WORST_ANGLE = "worst rad"
 TIME_OVER_COPY = "time / copy"
 TIME_OVER_PLAIN = "time / plain"
 TIME_OVER_BUILTIN = "time / built-in"
+TIME_OVER_DIELECTRIC = "time / dielectric"
 # Paths
 WRONG_PATH = "wrong path"
 WRONG_PATH_FAR = "wrong path, beyond rounding"

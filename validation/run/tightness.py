@@ -1,8 +1,8 @@
-"""Bounds far above the errors: where a budget is more than 100 times the largest error seen, the report says so.
+"""Bounds far above the errors: budgets that are more than 100 times the largest error seen.
 
 A row per study: how many of its checks are that far from their bound, and for each subject and metric the largest share
-of the bound that any case has used. Where some case comes near, the bound is that of the hardest case, and the others
-are easy. Where none does, the row must say what the bound still excludes: `EXCLUDES`.
+of the bound that any case uses. Where one case comes near, the bound is that of the hardest case. Where none does, the
+row must say what the bound still excludes: `EXCLUDES`.
 """
 
 from __future__ import annotations
@@ -28,15 +28,9 @@ ABOUT = {
     },
 }
 # By study and metric, for bounds that no case comes near: what they still exclude.
+DIFFUSE = "roundings of thousands of nodes average out; 12.5 u = 7.5e-7 excludes an index off by 1e-6"
 EXCLUDES = {
-    (
-        "energy",
-        "inside: 1 − R / u",
-    ): "roundings of thousands of nodes average out, and a worst case cannot count on it; "
-    "12.5 u = 7.5e-7 excludes an index off by 1e-6",
-    ("energy", "inside: R / u"): "as for 1 − R: an index off by 1e-6",
-    ("energy", "outside: 1 − R / u"): "as for the inside: an index off by 1e-6",
-    ("energy", "outside: R / u"): "as for the inside: an index off by 1e-6",
+    **{("energy", f"{side}: {power} / u"): DIFFUSE for side in ("inside", "outside") for power in ("R", "1 − R")},
     ("paths", "pixels off, control"): "no lobe flipped; more than 1 pixel of 1000 would be another path",
     ("samples", "eta worst"): "equal to the last bit; an index off by 2e-7, an ulp of 1.5",
     ("samples", "lobe flips"): "none flipped; a density off by 1e-2 on a thousand rays",
@@ -56,28 +50,20 @@ def rows(found: Iterable[Row]) -> list[Row]:
     """A row per study that has budgets other than 0."""
     made = []
     for study, members in by_study(found).items():
-        shares = _shares(members)
+        shares: dict[tuple[str, str], list[float]] = {}  # by subject and metric: value over bound of every case
+        for row in members:
+            for metric, bound in row.budgets.items() if row.values else ():
+                if bound > 0 and math.isfinite(row.values[metric]):
+                    shares.setdefault((row.subject, metric), []).append(row.values[metric] / bound)
         if shares:
             made.append(_row(study, shares))
     return made
 
 
-def _shares(members: Iterable[Row]) -> dict[tuple[str, str], list[float]]:
-    """By subject and metric, |value| over bound of every case and setting."""
-    shares: dict[tuple[str, str], list[float]] = {}
-    for row in members:
-        for metric, bound in row.budgets.items() if row.values else ():
-            value = row.values[metric]
-            if bound > 0 and math.isfinite(value):
-                shares.setdefault((row.subject, metric), []).append(value / bound)
-    return shares
-
-
 def _row(study: str, shares: dict[tuple[str, str], list[float]]) -> Row:
     checks = sum(map(len, shares.values()))
-    far = {key: sum(LOOSE * x < 1 for x in each) for key, each in shares.items()}
-    listed = sorted((key for key in shares if far[key]), key=lambda key: max(shares[key]))
-    loose = [key for key in listed if far[key] == len(shares[key])]
+    far = {key: count for key, used in shares.items() if (count := sum(LOOSE * x < 1 for x in used))}
+    loose = {key for key, count in far.items() if count == len(shares[key])}
     unexplained = [key for key in loose if (study, key[1]) not in EXCLUDES]
     values = {
         "checks": float(checks),
@@ -86,18 +72,14 @@ def _row(study: str, shares: dict[tuple[str, str], list[float]]) -> Row:
         "loose in every case": float(len(loose)),
         "unexplained": float(len(unexplained)),
     }
-    said = [_said(study, *key, far[key], shares[key]) for key in listed]
+    said = []
+    for key in sorted(far, key=lambda key: max(shares[key])):
+        text = f"{', '.join(key)}: {far[key]} of {len(shares[key])} rows"
+        if key in loose:
+            said.append(f"{text}; excludes: {EXCLUDES.get((study, key[1]), 'not stated')}")
+        else:
+            said.append(f"{text}, others use up to {compact(max(shares[key]), 2)} of it")
     more = [f"and {len(said) - SHOWN} more subjects and metrics, listed in `replay`"] if len(said) > SHOWN else []
-    replay = {"far from their bounds": said}
+    reason, replay = "; ".join(said[:SHOWN] + more), {"far from their bounds": said}
     case = f"more than {LOOSE:g} times the largest error"
-    return Row(
-        NAME, study, case, "", values, {"unexplained": 0.0}, reason="; ".join(said[:SHOWN] + more), replay=replay
-    )
-
-
-def _said(study: str, subject: str, metric: str, far: int, shares: list[float]) -> str:
-    """ "subject, metric: 3 of 12 rows, elsewhere up to 0.8 of the bound", or what the bound excludes."""
-    text = f"{subject}, {metric}: {far} of {len(shares)} rows"
-    if far < len(shares):
-        return f"{text}, others use up to {compact(max(shares), 2)} of it"
-    return f"{text}; excludes: {EXCLUDES.get((study, metric), 'not said')}"
+    return Row(NAME, study, case, "", values, {"unexplained": 0.0}, reason=reason, replay=replay)

@@ -35,13 +35,7 @@ from validation.study import Study, Task, about
 from .derivative_conditions import condition_of, condition_of_etendue, size_of_powers
 
 NAME = "derivatives"
-AXES = {
-    "x": "cos²θt, transmitted",
-    "y": "largest error of k ∂b/∂k",
-    "x_scale": "log",
-    "y_scale": "log",
-    "slope": None,
-}
+AXES = {"x": "cos²θt, transmitted", "y": "largest error of k ∂b/∂k", "x_scale": "log", "y_scale": "log"}
 TERMS = {
     "∂b/∂k": "times k: the change of the direction with the relative index",
     "∂b/∂a in the plane": "along the unit vector at right angles to `a` in the plane of incidence",
@@ -54,6 +48,9 @@ TERMS = {
 }
 SEED = 2029
 BINS = np.geomspace(1e-9, 1, 19)
+
+
+Array = np.ndarray
 
 
 @dataclass(frozen=True)
@@ -84,14 +81,8 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
         found, curves[name] = formula_rows(name, formula, given, setting)
         rows += found
     curves["condition · u"] = binned(given, given.condition * setting.roundoff)
-    problem = Row(
-        NAME,
-        "the problem",
-        "∂b/∂k",
-        setting.label,
-        curves=curves,
-        values={"condition · u": float(given.condition.max()) * setting.roundoff},
-    )
+    values = {"condition · u": float(given.condition.max()) * setting.roundoff}
+    problem = Row(NAME, "the problem", "∂b/∂k", setting.label, values, curves=curves)
     return [*rows, problem, reflectance_row(given, setting)]
 
 
@@ -147,15 +138,10 @@ def forward(function: Callable[[Any], Any], x: Any, direction: Any) -> tuple[Any
     return dr.detach(y), found
 
 
-def differentiable(setting: Setting) -> Any:
-    """The setting's type of 3-vectors, with derivatives."""
-    vector: Any = dr.diff_array_t(setting.vector)
-    return vector
-
-
 def differentiate(formula: Any, given: Inputs, setting: Setting) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """The derivatives of b, (N, 3) in extended precision, and which rays were transmitted."""
-    vector, rays = differentiable(setting), given.rays
+    vector: Any = dr.diff_array_t(setting.vector)
+    rays = given.rays
     number = dr.value_t(vector)
     (a, n, k), found = arrays(rays, vector), {}
     for name, e in given.along.items():
@@ -172,7 +158,10 @@ def formula_rows(
     found, transmitted = differentiate(formula, given, setting)
     right, rows = transmitted == given.certified.transmitted, []
     curve: list[tuple[float, float]] = []
-    budgets, budgets_of_area = budgets_of(name, setting)
+    rounded_once = name == "promoted" and setting.precision is np.float32
+    most = (limits.ROUNDED_DERIVATIVE, limits.ROUNDED_ETENDUE) if rounded_once else (limits.DERIVATIVE, limits.ETENDUE)
+    at_limit = FORMULAS[name].budget.at_the_limit
+    budgets, of_area = ({"error / condition": x, "not finite": 0.0} if at_limit else {} for x in most)
     for case, exact in given.exact.items():
         error = lengths(found[case] - exact) / np.maximum(1, lengths(exact))
         rows.append(row(name, case, error, given, setting, right, budgets))
@@ -184,28 +173,12 @@ def formula_rows(
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.abs(np.abs(along_b) * cos_t / (k * k * given.certified.cos_i) - 1)
     steep = dataclasses.replace(given, condition=condition_of_etendue(given.condition, given.certified.cos_i))
-    rows.append(row(name, "étendue", error, steep, setting, through, budgets_of_area))
+    rows.append(row(name, "étendue", error, steep, setting, through, of_area))
     return rows, curve
 
 
-def budgets_of(name: str, setting: Setting) -> tuple[dict[str, float], dict[str, float]]:
-    """The budgets of a formula's derivatives and of its étendue; empty of a form that is not at the rounding limit."""
-    if not FORMULAS[name].budget.at_the_limit:
-        return {}, {}
-    rounded_once = name == "promoted" and setting.precision is np.float32
-    found = limits.ROUNDED_DERIVATIVE if rounded_once else limits.DERIVATIVE
-    area = limits.ROUNDED_ETENDUE if rounded_once else limits.ETENDUE
-    return {"error / condition": found, "not finite": 0.0}, {"error / condition": area, "not finite": 0.0}
-
-
 def row(
-    subject: str,
-    case: str,
-    error: np.ndarray,
-    given: Inputs,
-    setting: Setting,
-    right: np.ndarray,
-    budgets: dict[str, float],
+    subject: str, case: str, error: Array, given: Inputs, setting: Setting, right: Array, budgets: dict[str, float]
 ) -> Row:
     """The worst error of a derivative, relative and over the condition of its ray."""
     finite = np.isfinite(error)
@@ -218,11 +191,8 @@ def row(
         "not finite": float((right & ~finite).sum()),
     }
     a, n = ([float(x).hex() for x in v[worst]] for v in (given.rays.a, given.rays.n))
-    replay = {
-        "seed": seeds.current(SEED),
-        "rays": len(error),
-        "worst": {"regime": str(given.regime[worst]), "a": a, "n": n, "k": float(given.rays.k[worst]).hex()},
-    }
+    ray = {"regime": str(given.regime[worst]), "a": a, "n": n, "k": float(given.rays.k[worst]).hex()}
+    replay = {"seed": seeds.current(SEED), "rays": len(error), "worst": ray}
     return Row(NAME, subject, case, setting.label, values, budgets, replay=replay)
 
 
@@ -239,7 +209,7 @@ def binned(given: Inputs, y: np.ndarray) -> list[tuple[float, float]]:
 
 def reflectance_row(given: Inputs, setting: Setting) -> Row:
     """Of exact cosines: those of the rays, rounded."""
-    number = dr.value_t(differentiable(setting))
+    number = dr.value_t(dr.diff_array_t(setting.vector))
     k: Any = given.rays.k
     cos_i: Any = given.certified.cos_i.astype(setting.precision)
     exact = derivatives.derivative_of_powers(cos_i, k, 0.0, k)

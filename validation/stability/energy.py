@@ -7,7 +7,6 @@ the unit circle; its error is a distance. The exact values are for the very cosi
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -54,10 +53,15 @@ SUMMED = POWERS | {"R + T − 1 / u": limits.POWER_SUM}
 AMPLITUDES = dict.fromkeys(("r_s / u", "r_p / u", "phase / u"), limits.AMPLITUDE)
 
 
+# Regimes whose rays do not rest on denormal numbers: where a backend takes those for 0 they are other rays.
+CASES = [name for name, regime in regimes.REGIMES.items() if not regime.rests_on_denormals]
+
+
 def tasks(context: Context) -> list[Task]:
     """One task per backend and precision, and one for the plugins."""
-    found = [Task(f"energy: {s.label}", functools.partial(setting_rows, context, s)) for s in settings(context)]
-    return [*found, Task(f"energy: plugins, {context.variant}", functools.partial(plugin_rows, context))]
+    made = [Task(f"energy: {s.label}", functools.partial(setting_rows, context, s)) for s in settings(context)]
+    plugins = functools.partial(plugin_rows, context)
+    return [*made, Task(f"energy: plugins, {context.variant}", plugins)]
 
 
 def setting_rows(context: Context, setting: Setting) -> list[Row]:
@@ -65,14 +69,9 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
         return [Row(NAME, name, "all", setting.label, reason=setting.reason) for name in ("powers", "amplitudes")]
     count = context.profile.scalar_rays // 3 if setting.is_scalar else context.profile.rays // 8
-    rows = [row for regime in cases() for row in regime_rows(regime, setting, count)]
+    rows = [row for regime in CASES for row in regime_rows(regime, setting, count)]
     rows += [diffuse_row(setting, index) for index in INDICES]
     return [*rows, reciprocity_row(setting, count), matched_row(setting)]
-
-
-def cases() -> list[str]:
-    """Regimes but those whose rays rest on denormal numbers: where a backend takes those for 0 they are other rays."""
-    return [name for name, regime in regimes.REGIMES.items() if not regime.rests_on_denormals]
 
 
 # Against certified values --------------------------------------------------------------------------------------
@@ -131,56 +130,39 @@ def regime_rows(regime: str, setting: Setting, count: int) -> list[Row]:
     """Powers, amplitudes and, where Mitsuba runs, its own function in a regime."""
     cos_i, k, exact = given(regime, count, setting.precision)
     replay = {"regime": regime, "text": regimes.REGIMES[regime].text, "count": count, "seed": seeds.current(SEED)}
-    rows = [
-        power_row("powers", regime, setting, each(ours, setting, cos_i, k), exact, SUMMED, replay),
-        amplitude_row(regime, setting, each(fresnel.amplitudes, setting, cos_i, k), exact, replay),
-    ]
+    found = power_errors(each(ours, setting, cos_i, k), exact, setting)
+    budgets = SUMMED | {MISCLASSIFIED: 0.0}
+    rows = [Row(NAME, "powers", regime, setting.label, found, budgets, replay=replay)]
+    # The certified amplitudes are doubles, right to 2⁻⁵³ of each part: float64 is held to that much more.
+    slack, u = float(setting.precision is np.float64), setting.roundoff
+    values: dict[str, float] = {}
+    computed = each(fresnel.amplitudes, setting, cos_i, k)
+    for name, r, certified in zip("sp", computed, (exact.amplitude_s, exact.amplitude_p), strict=True):
+        size, error = np.maximum(np.abs(certified), np.finfo(setting.precision).tiny), np.abs(r - certified)
+        values[f"r_{name} / u"] = worst((error / size)[exact.transmitted]) / u
+        values["phase / u"] = max(values.get("phase / u", 0.0), worst(error[~exact.transmitted]) / u)
+    budgets = {name: budget + slack for name, budget in AMPLITUDES.items()}
+    rows.append(Row(NAME, "amplitudes", regime, setting.label, values, budgets, replay=replay))
     if setting.mitsuba:
         rows.append(pipeline_row(regime, setting, cos_i, k, replay))
-        found = each(builtin(setting.mitsuba), setting, cos_i, k)
-        rows.append(power_row(BUILTIN, regime, setting, found, exact, {}, replay))
+        found = power_errors(each(builtin(setting.mitsuba), setting, cos_i, k), exact, setting)
+        rows.append(Row(NAME, BUILTIN, regime, setting.label, found, replay=replay))
     return rows
 
 
-def power_row(
-    subject: str,
-    case: str,
-    setting: Setting,
-    found: list[np.ndarray],
-    exact: oracle.Certified,
-    budgets: dict[str, float],
-    replay: dict[str, Any],
-    right: Any = True,
-) -> Row:
-    """Errors of R, T and the decision: `found` is (R, T, transmitted), each (N,)."""
+def power_errors(
+    found: list[np.ndarray], exact: oracle.Certified, setting: Setting, judged: Any = True
+) -> dict[str, float]:
+    """Errors of R and T of the judged rays, and of the decision: `found` is (R, T, transmitted), each (N,)."""
     r, t, transmitted = found
     misclassified = transmitted != exact.transmitted
-    right, u = right & ~misclassified, setting.roundoff
-    values = {
+    right, u = judged & ~misclassified, setting.roundoff
+    return {
         "R / u": worst(relative(r, exact.reflectance, exact.reflectance_low, setting)[right]) / u,
         "1 − R / u": worst(relative(t, exact.transmittance, exact.transmittance_low, setting)[right]) / u,
         "R + T − 1 / u": worst(np.abs(r + t - 1)) / u,
         MISCLASSIFIED: float(misclassified.sum()),
     }
-    return Row(
-        NAME, subject, case, setting.label, values, budgets | ({MISCLASSIFIED: 0.0} if budgets else {}), replay=replay
-    )
-
-
-def amplitude_row(
-    case: str, setting: Setting, found: list[np.ndarray], exact: oracle.Certified, replay: dict[str, Any]
-) -> Row:
-    """Errors of r_s, r_p and their phases: `found` is (r_s, r_p), complex (N,)."""
-    # The certified amplitudes are doubles, right to 2⁻⁵³ of each part: float64 is held to that much more.
-    slack = 1.0 if setting.precision is np.float64 else 0.0
-    values = {}
-    for name, ours, certified in zip("sp", found, (exact.amplitude_s, exact.amplitude_p), strict=True):
-        size = np.maximum(np.abs(certified), np.finfo(setting.precision).tiny)
-        values[f"r_{name} / u"] = worst(np.abs(ours - certified)[exact.transmitted] / size[exact.transmitted])
-        values["phase / u"] = max(values.get("phase / u", 0.0), worst(np.abs(ours - certified)[~exact.transmitted]))
-    values = {name: value / setting.roundoff for name, value in values.items()}
-    budgets = {name: budget + slack for name, budget in AMPLITUDES.items()}
-    return Row(NAME, "amplitudes", case, setting.label, values, budgets, replay=replay)
 
 
 def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray, replay: dict[str, Any]) -> Row:
@@ -200,22 +182,20 @@ def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray
         _, transmitted = formula.unchecked(ray, setting.vector(0, 0, 1), wide, contrast)
         return *fresnel.local_powers(ray, transmitted, wide, contrast), transmitted
 
-    far = resolved(a, k, exact, setting.roundoff) | ~exact.transmitted
-    row = power_row("pipeline", regime, setting, each(powers, setting, *a.T, k), exact, POWERS, replay, far)
-    return dataclasses.replace(row, values=row.values | {"nearer than rounding": float((~far).sum())})
-
-
-def resolved(a: np.ndarray, k: np.ndarray, exact: oracle.Certified, u: float) -> np.ndarray:
-    """Whether an error of `limits.RADICAND` moves T by less than u/2: by ε/2ρ, ρ the radicand over its larger term."""
+    # An error of RADICAND moves T by less than u/2: by ε/2ρ, ρ the radicand over its larger term.
     x, y, z = a.astype(np.longdouble).T
     terms = np.maximum(z * z, np.abs(k.astype(np.longdouble) ** 2 - 1) * (x * x + y * y))
-    return exact.cos_t**2 * lengths(a) ** 2 > limits.RADICAND / u * terms
+    far = exact.cos_t**2 * lengths(a) ** 2 > limits.RADICAND / setting.roundoff * terms
+    far |= ~exact.transmitted
+    values = power_errors(each(powers, setting, *a.T, k), exact, setting, far)
+    values |= {"nearer than rounding": float((~far).sum())}
+    return Row(NAME, "pipeline", regime, setting.label, values, POWERS | {MISCLASSIFIED: 0.0}, replay=replay)
 
 
 def relative(x: np.ndarray, exact: np.ndarray, low: np.ndarray, setting: Setting) -> np.ndarray:
     """|x/exact − 1|; below the smallest normal number, |x − exact| over that number."""
-    error = np.abs((x - exact) - low) / np.maximum(np.abs(exact), np.finfo(setting.precision).tiny)
-    return np.nan_to_num(error.astype(float), nan=np.inf)
+    error: np.ndarray = np.abs((x - exact) - low) / np.maximum(np.abs(exact), np.finfo(setting.precision).tiny)
+    return error.astype(float)
 
 
 def worst(x: np.ndarray) -> float:
@@ -227,32 +207,24 @@ def worst(x: np.ndarray) -> float:
 
 
 def reciprocity_row(setting: Setting, count: int) -> Row:
-    """`_powers` is symmetric: cos_i ↔ cos_t, k ↔ 1/k changes no exact value. Left are two roundings of T and that of
+    """`powers` is symmetric: cos_i ↔ cos_t, k ↔ 1/k changes no exact value. Left are two roundings of T and that of
     1/k, which T feels once at most: 3u."""
-    values = {"T there and back / u": 0.0}
+    back_error = 0.0
 
     def both(cos_i: Any, k: Any) -> tuple:
         cos_t, transmitted = fresnel.refracted_cosine(cos_i, k)
-        back = fresnel.transmittance(cos_t, cos_i, transmitted, 1 / k)
-        return fresnel.transmittance(cos_i, cos_t, transmitted, k), back, transmitted
+        _, back = fresnel.powers(cos_t, cos_i, transmitted, 1 / k)
+        return fresnel.powers(cos_i, cos_t, transmitted, k)[1], back, transmitted
 
-    for regime in cases():
+    for regime in CASES:
         cos_i, k, exact = given(regime, count, setting.precision)
         there, back, transmitted = each(both, setting, cos_i, k)
         # A cosine of 0 goes no way back; and neither does one that float32 cannot square.
         used = transmitted & (exact.transmittance > np.finfo(setting.precision).tiny)
-        error = worst(np.abs(there[used] / back[used] - 1)) / setting.roundoff
-        values["T there and back / u"] = max(error, values["T there and back / u"])
-    replay = {"regimes": cases(), "count": count, "seed": seeds.current(SEED)}
-    return Row(
-        NAME,
-        "powers",
-        "reciprocity",
-        setting.label,
-        values,
-        {"T there and back / u": limits.RECIPROCITY},
-        replay=replay,
-    )
+        back_error = max(back_error, worst(np.abs(there[used] / back[used] - 1)) / setting.roundoff)
+    replay = {"regimes": CASES, "count": count, "seed": seeds.current(SEED)}
+    values, budgets = {"T there and back / u": back_error}, {"T there and back / u": limits.RECIPROCITY}
+    return Row(NAME, "powers", "reciprocity", setting.label, values, budgets, replay=replay)
 
 
 def diffuse_row(setting: Setting, index: float) -> Row:
@@ -262,6 +234,7 @@ def diffuse_row(setting: Setting, index: float) -> Row:
     """
     outside, inside, weight = nodes(index, setting.precision)
     values: dict[str, float] = {}
+    budgets: dict[str, float] = {}
     contrast = (index - 1) * (index + 1)
     for side, cosines, k, kappa in (
         ("outside", (outside, inside), 1 / index, -contrast / index**2),
@@ -271,14 +244,14 @@ def diffuse_row(setting: Setting, index: float) -> Row:
         share = np.longdouble(1) if side == "outside" else 1 / np.longdouble(index) ** 2
         reflected, exact = share * (weight * r).sum() + (1 - share), hemispherical(index)[side]
         transmitted = share * (weight * t).sum()
-        values |= {
-            f"{side}: R": float(reflected),
+        errors = {
             f"{side}: R / u": float(abs(reflected / exact - 1)) / setting.roundoff,
             f"{side}: 1 − R / u": float(abs(transmitted / (1 - exact) - 1)) / setting.roundoff,
         }
-    budgets = {name: limits.DIFFUSE for name in values if name.endswith("/ u")}
-    case, replay = f"diffuse light, n = {index}", {"nodes": GRADE}
-    return Row(NAME, "powers", case, setting.label, values, budgets, replay=replay)
+        values |= {f"{side}: R": float(reflected)} | errors
+        budgets |= dict.fromkeys(errors, limits.DIFFUSE)
+    case = f"diffuse light, n = {index}"
+    return Row(NAME, "powers", case, setting.label, values, budgets, replay={"nodes": GRADE})
 
 
 def matched_row(setting: Setting) -> Row:
@@ -293,7 +266,7 @@ def matched_row(setting: Setting) -> Row:
         r = each(subject, setting, cos_i, k)[0]
         error = relative(r, exact.reflectance, exact.reflectance_low, setting).reshape(len(cosines), -1).max(0)
         curves[name] = list(zip(steps.tolist(), (error / setting.roundoff).tolist(), strict=True))
-    values = {"R / u": max(y for _, y in curves["powers"])}
+    values = {"R / u": worst(np.array([y for _, y in curves["powers"]]))}
     replay = {"cosines": cosines}
     return Row(NAME, "powers", "k → 1", setting.label, values, {"R / u": limits.POWER}, replay=replay, curves=curves)
 
@@ -306,58 +279,43 @@ def plugin_rows(context: Context) -> list[Row]:
     return [row(context, plugin) for plugin in ("refract", "dielectric") for row in (furnace_row, radiance_row)]
 
 
-def directions(context: Context) -> np.ndarray:
-    """Uniform, and as many more that graze the surface."""
+def furnace_row(context: Context, plugin: str) -> Row:
+    """Both weights are 1 where nothing is tinted, so the sum is R + T: right to an ulp of 1.
+
+    Directions are uniform, and as many more graze the surface.
+    """
     import mitsuba as mi
 
     rng, count = np.random.default_rng(seeds.current(SEED)), context.profile.rays // 4 if dr.is_jit_v(mi.Float) else 30
     wi = rng.normal(size=(2 * count, 3))
     wi[count:, 2] *= 10.0 ** rng.uniform(-6, 0, count)
-    return wi / np.linalg.norm(wi, axis=1, keepdims=True)
-
-
-def furnace_row(context: Context, plugin: str) -> Row:
-    """Both weights are 1 where nothing is tinted, so the sum is R + T: right to an ulp of 1."""
-    import mitsuba as mi
-
-    wi, values = directions(context), {"white furnace": 0.0}
-    asked = mi.BSDFContext(mi.TransportMode.Importance)
+    wi /= np.linalg.norm(wi, axis=1, keepdims=True)
+    off, mode = 0.0, mi.BSDFContext(mi.TransportMode.Importance)
     for index in INDICES:
         bsdf = mi.load_dict({"type": plugin, "int_ior": index, "ext_ior": 1.0})
-        lobes = [sample_all(bsdf, asked, wi, np.full(len(wi), s)) for s in (0.0, 1 - 2.0**-24)]
-        total = sum(x["pdf"] * x["weight"][:, :1] for x in lobes)
+        lobes = [sample_all(bsdf, mode, wi, np.full(len(wi), s)) for s in (0.0, 1 - 2.0**-24)]
+        first, second = (x["pdf"] * x["weight"][:, :1] for x in lobes)
         # Under total internal reflection both samples take the one lobe there is.
         alone = (lobes[0]["type"] == lobes[1]["type"])[:, None]
-        total = np.where(alone, lobes[0]["pdf"] * lobes[0]["weight"][:, :1], total)
-        values["white furnace"] = max(values["white furnace"], worst(np.abs(total - 1)))
+        off = max(off, worst(np.abs(first + np.where(alone, 0, second) - 1)))
     budgets = {"white furnace": limits.WHITE_FURNACE} if plugin == "refract" else {}
-    return Row(
-        NAME,
-        plugin,
-        "white furnace",
-        context.variant,
-        values,
-        budgets,
-        replay={"indices": INDICES, "directions": len(wi), "seed": seeds.current(SEED)},
-    )
+    replay = {"indices": INDICES, "directions": len(wi), "seed": seeds.current(SEED)}
+    return Row(NAME, plugin, "white furnace", context.variant, {"white furnace": off}, budgets, replay=replay)
 
 
 def radiance_row(context: Context, plugin: str) -> Row:
     """Radiance over n² is the same on both sides: weights k² and 1/k², each with k rounded and squared, 3u."""
     import mitsuba as mi
 
-    values, asked = {"weights in and out / u": 0.0}, mi.BSDFContext(mi.TransportMode.Radiance)
+    both, single, mode = [0.0], [0.0], mi.BSDFContext(mi.TransportMode.Radiance)
     for index in INDICES:
         bsdf = mi.load_dict({"type": plugin, "int_ior": index, "ext_ior": 1.0})
         wi = np.array([[0.6, 0, 0.8], [0, 0, 1.0]])
-        there = sample_all(bsdf, asked, wi, np.full(2, 1 - 2.0**-24))
-        back = sample_all(bsdf, asked, there["wo"], np.full(2, 1 - 2.0**-24))
-        error = worst(np.abs(there["weight"] * back["weight"] - 1)) / 2.0**-24
-        off = worst(np.abs(there["weight"][:, 0] * index**2 - 1)) / 2.0**-24
-        values = {
-            "weights in and out / u": max(error, values["weights in and out / u"]),
-            "weight against 1/n² / u": max(off, values.get("weight against 1/n² / u", 0.0)),
-        }
+        there = sample_all(bsdf, mode, wi, np.full(2, 1 - 2.0**-24))
+        back = sample_all(bsdf, mode, there["wo"], np.full(2, 1 - 2.0**-24))
+        both.append(worst(np.abs(there["weight"] * back["weight"] - 1)) / 2.0**-24)
+        single.append(worst(np.abs(there["weight"][:, 0] * index**2 - 1)) / 2.0**-24)
+    values = {"weights in and out / u": max(both), "weight against 1/n² / u": max(single)}
     allowed = {"weights in and out / u": limits.IN_AND_OUT, "weight against 1/n² / u": limits.INDEX_SQUARED}
     budgets = allowed if plugin == "refract" else {}
     return Row(NAME, plugin, "basic radiance", context.variant, values, budgets, replay={"indices": INDICES})

@@ -74,9 +74,23 @@ def carry(subject: Subject, chain: Chain, a: Array, stop: Array, setting: Settin
     """Rays `a` (N, 3) from the top to boundary `stop` (N,), or back out of the top, by one formula; one launch."""
     if dr.is_jit_v(setting.vector):
         return _compiled(subject, chain, a, stop, setting)
-    parts = [_scalar(subject, chain, ray, a, int(stop[ray]), setting) for ray in range(len(a))]
-    b, place, passed = zip(*parts, strict=True)
-    return Carried(np.array([list(x) for x in b], np.longdouble), np.array(place), np.array(passed))
+    normals: Array = np.asarray(chain.normals, setting.precision)
+    k = chain.k.astype(setting.precision).tolist()
+    contrasts = None if chain.contrasts is None else chain.contrasts.astype(np.float64).tolist()
+
+    def boundary(mine: list[Any], place: int, way: int) -> tuple:
+        here = place if way > 0 else place + chain.count
+        known = () if contrasts is None else (contrasts[here],)
+        return mine[place if len(mine) > 1 else 0], k[here], *known
+
+    found = []
+    for i, ray in enumerate(a):
+        mine = [setting.vector(n) for n in normals[i if len(normals) > 1 else 0]]
+        start = (setting.vector(ray.astype(setting.precision)), 0, 1, 0, 2 * chain.count + 2)
+        b, place, _, passed, _ = _follow(subject, functools.partial(boundary, mine), chain.turns, int(stop[i]), start)
+        found.append(([*b], place, passed))
+    b, place, passed = zip(*found, strict=True)
+    return Carried(np.array(b, np.longdouble), np.array(place), np.array(passed))
 
 
 def _follow(subject: Subject, boundary: Callable[..., tuple], turns: Any, stop: Any, start: tuple) -> tuple:
@@ -121,22 +135,6 @@ def _compiled(subject: Subject, chain: Chain, a: Array, stop: Array, setting: Se
     b, place, _, passed, _ = _follow(detached, boundary, turns, end, start)
     dr.eval(b, place, passed)
     return Carried(np.array(b).T.astype(np.longdouble), np.array(place), np.array(passed))
-
-
-def _scalar(subject: Subject, chain: Chain, ray: int, a: Array, stop: int, setting: Setting) -> tuple:
-    rows, columns, _ = chain.normals.shape
-    normals = [setting.vector(n) for n in chain.normals[ray if rows > 1 else 0].astype(setting.precision)]
-    k = chain.k.astype(setting.precision).tolist()
-    contrasts = None if chain.contrasts is None else chain.contrasts.astype(np.float64).tolist()
-
-    def boundary(place: int, way: int) -> tuple:
-        here = place if way > 0 else place + chain.count
-        known = () if contrasts is None else (contrasts[here],)
-        return normals[place if columns > 1 else 0], k[here], *known
-
-    start = (setting.vector(a[ray].astype(setting.precision)), 0, 1, 0, 2 * chain.count + 2)
-    b, place, _, passed, _ = _follow(subject, boundary, chain.turns, stop, start)
-    return b, place, passed
 
 
 # The mirage ----------------------------------------------------------------------------------------------------

@@ -45,7 +45,7 @@ TERMS = {
     "pixels off": "pixels of which a channel differs by more than 0.1 from the built-in's, same seed",
     "pixels off, control": "the same between two formulas at the rounding limit: caused by flipped lobes alone",
 }
-AXES = {"x": "distance, or mrad of entry", "y": "deviation", "x_scale": "linear", "y_scale": "log", "slope": None}
+AXES = {"x": "distance, or mrad of entry", "y": "deviation", "x_scale": "linear", "y_scale": "log"}
 NAME = "paths"
 BUILTIN = "dielectric"
 SCALAR = "needs a compiled variant: on scalar arrays formulas compute in double precision"
@@ -78,14 +78,14 @@ class Bundle:
 def tasks(context: Context) -> list[Task]:
     """One task per scene for the paths, one per view for the images; `quick` has the paths of the mirage."""
     scenes, seen = ((MIRAGE,), ()) if context.profile.quick else ((MIRAGE, FIBRE), VIEWS)
-    paths = [(layers.scene, functools.partial(_path_rows, context, layers)) for layers in scenes]
-    views = [(f"image of the {view[2]}", functools.partial(_view_rows, context, *view)) for view in seen]
+    paths = [(layers.scene, functools.partial(path_rows, context, layers)) for layers in scenes]
+    views = [(f"image of the {view[2]}", functools.partial(view_rows, context, *view)) for view in seen]
     return [Task(f"paths: {name}", work) for name, work in paths + views]
 
 
 def drawn_rows(context: Context) -> list[Row]:
     """The paths through the fibre, whose rays are random; those of the mirage are not."""
-    return _path_rows(context, FIBRE)
+    return path_rows(context, FIBRE)
 
 
 def plugins() -> list[str]:
@@ -101,11 +101,8 @@ def bundle(layers: Layers) -> Bundle:
     if layers is MIRAGE:
         sine = np.geomspace(1.5e-4, 9e-3, RAYS)
         directions = np.stack([np.sqrt(1 - sine**2), -sine, 0 * sine], 1)
-        origins, media, shown = (
-            np.tile([-layered_scenes.POOL, 0.005, 0.0], (RAYS, 1)),
-            np.zeros(RAYS, int),
-            RAYS * 2 // 5,
-        )
+        origins, media = np.tile([-layered_scenes.POOL, 0.005, 0.0], (RAYS, 1)), np.zeros(RAYS, int)
+        shown = RAYS * 2 // 5
     else:
         rng = np.random.default_rng(seeds.current(SEED))
         media = rng.integers(2, len(layers.indices) - 1, RAYS)
@@ -182,78 +179,65 @@ def deviation(layers: Layers, exact: Path, segments: np.ndarray) -> Deviation:
     )
 
 
-def _path_rows(context: Context, layers: Layers) -> list[Row]:
+def path_rows(context: Context, layers: Layers) -> list[Row]:
+    """A row of every plugin and of exact arithmetic with rounded inputs, and rows of curves."""
     if context.variant.startswith("scalar"):
         return [Row(NAME, plugin, layers.scene, context.variant, reason=SCALAR) for plugin in plugins()]
+    import mitsuba as mi
+
     rays = bundle(layers)
     exact = rays.exact(layers)
-    steps = 4 * max(len(path.media) for path in exact)
-    found = {plugin: _deviations(layers, rays, exact, plugin, steps) for plugin in plugins()}
-    found |= {name: _exact_deviations(other, layers, rays, exact) for name, other in rounded(layers).items()}
+    found: dict[str, list[Deviation]] = {}
+    for plugin in plugins():
+        scene = mi.load_file(str(SCENES / f"{layers.scene}.xml"), **scene_files.REPRODUCIBLE, bsdf=plugin)
+        segments = trace(scene, layers, rays, 4 * max(len(path.media) for path in exact))
+        found[plugin] = [deviation(layers, path, segments[:, :, i]) for i, path in enumerate(exact)]
+    # The errors of the inputs alone: indices, or their ratios, rounded to float32 as a plugin may get them.
+    n = np.array(layers.indices)
+    ratios = (n[1:] / n[:-1]).astype(np.float32).astype(float)
+    for name, x in ((INDICES, n.astype(np.float32).astype(float)), (RATIOS, n[0] * np.cumprod([1.0, *ratios]))):
+        others = rays.exact(dataclasses.replace(layers, indices=tuple(x.tolist())))
+        found[name] = [deviation(layers, p, q.segments()) for p, q in zip(exact, others, strict=True)]
     replay = {"scene": f"{layers.scene}.xml", "rays": RAYS, "seed": seeds.current(SEED), "shown": rays.shown}
-    rows = [
-        Row(
-            NAME,
-            plugin,
-            f"{layers.scene}: path",
-            context.variant,
-            _values(exact, parts),
-            _budgets(layers, plugin, exact),
-            replay=replay | {"plugin": plugin},
+    case, rows = f"{layers.scene}: path", []
+    for plugin, parts in found.items():
+        values, budgets = _values(exact, parts), _budgets(layers, plugin, exact)
+        rows.append(Row(NAME, plugin, case, context.variant, values, budgets, replay=replay | {"plugin": plugin}))
+    # How far the ray offset moves the exact paths; the median, as some turn elsewhere without it.
+    plain = zip(rays.exact(layers, offset=0.0), exact, strict=True)
+    offset = {"ray offset": float(np.median([deviation(layers, p, q.segments()).place.max() for p, q in plain]))}
+    for name, curves in _curves(rays, found).items():
+        row = Row(
+            NAME, "every plugin", f"{layers.scene}: {name}", context.variant, offset, replay=replay, curves=curves
         )
-        for plugin, parts in found.items()
-    ]
-    offset = {"ray offset": _moved(layers, rays, exact)}
-    for case, curves in _curves(rays, found).items():
-        case = f"{layers.scene}: {case}"
-        rows.append(Row(NAME, "every plugin", case, context.variant, offset, replay=replay, curves=curves))
+        rows.append(row)
     return rows
 
 
 def _curves(rays: Bundle, found: dict[str, list[Deviation]]) -> dict[str, dict[str, list[tuple[float, float]]]]:
     """By case and plugin: along the path that is shown, and at the end of every path."""
-    shown = {plugin: parts[rays.shown] for plugin, parts in found.items()}
     entry = 1e3 * np.hypot(rays.directions[:, 1], rays.directions[:, 0] if rays.media.any() else 0)
-    end = {plugin: [part.direction[-1] for part in parts] for plugin, parts in found.items()}
-    return {
-        "direction along a path": {p: _points(part.along, part.direction) for p, part in shown.items()},
-        "place along a path": {p: _points(part.along, part.place) for p, part in shown.items()},
-        "direction at the end, by angle of entry": {p: _points(entry, x) for p, x in end.items()},
-    }
-
-
-def _points(x: Any, y: Any) -> list[tuple[float, float]]:
-    return [(float(x_i), float(y_i)) for x_i, y_i in zip(x, y, strict=True)]
-
-
-def _deviations(layers: Layers, rays: Bundle, exact: list[Path], plugin: str, steps: int) -> list[Deviation]:
-    import mitsuba as mi
-
-    scene = mi.load_file(str(SCENES / f"{layers.scene}.xml"), **scene_files.REPRODUCIBLE, bsdf=plugin)
-    segments = trace(scene, layers, rays, steps)
-    return [deviation(layers, path, segments[:, :, i]) for i, path in enumerate(exact)]
-
-
-def rounded(layers: Layers) -> dict[str, Layers]:
-    """The errors of the inputs alone: indices, or their ratios, rounded to float32 as a plugin may get them."""
-    n = np.array(layers.indices)
-    ratios = (n[1:] / n[:-1]).astype(np.float32).astype(float)
-    indices = {INDICES: n.astype(np.float32).astype(float), RATIOS: n[0] * np.cumprod([1.0, *ratios])}
-    return {name: dataclasses.replace(layers, indices=tuple(x.tolist())) for name, x in indices.items()}
-
-
-def _exact_deviations(other: Layers, layers: Layers, rays: Bundle, exact: list[Path]) -> list[Deviation]:
-    return [deviation(layers, p, q.segments()) for p, q in zip(exact, rays.exact(other), strict=True)]
+    curves: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for plugin, parts in found.items():
+        shown, end = parts[rays.shown], np.array([part.direction[-1] for part in parts])
+        for case, x, y in (
+            ("direction along a path", shown.along, shown.direction),
+            ("place along a path", shown.along, shown.place),
+            ("direction at the end, by angle of entry", entry, end),
+        ):
+            curves.setdefault(case, {})[plugin] = list(zip(x.tolist(), y.tolist(), strict=True))
+    return curves
 
 
 def _values(exact: list[Path], parts: list[Deviation]) -> dict[str, float]:
+    directions, places = ([getattr(part, name).max() for part in parts] for name in ("direction", "place"))
     wrong = [part.boundaries != len(path.media) - 1 for path, part in zip(exact, parts, strict=True)]
     return {
-        DIRECTION: float(max(part.direction.max() for part in parts)),
+        DIRECTION: float(max(directions)),
         "direction / condition": float(max(part.conditioned.max() for part in parts)),
-        MEDIAN_DIRECTION: float(np.median([part.direction.max() for part in parts])),
-        PLACE: float(max(part.place.max() for part in parts)),
-        "median place": float(np.median([part.place.max() for part in parts])),
+        MEDIAN_DIRECTION: float(np.median(directions)),
+        PLACE: float(max(places)),
+        "median place": float(np.median(places)),
         WRONG_PATH: float(sum(wrong)),
     }
 
@@ -268,26 +252,18 @@ def _budgets(layers: Layers, plugin: str, exact: list[Path]) -> dict[str, float]
     if plugin != PLUGIN and (name not in FORMULAS or not FORMULAS[name].budget.at_the_limit):
         return {}
     most = max(len(path.media) - 1 for path in exact)
-    return {WRONG_PATH: 0.0} | (
-        {} if layers.round else {"direction / condition": (2 * most + 1) * limits.PATH_BOUNDARY}
-    )
-
-
-def _moved(layers: Layers, rays: Bundle, exact: list[Path]) -> float:
-    """How far the ray offset moves the exact paths, as `place`; the median, for some turn elsewhere without it."""
-    plain = rays.exact(layers, offset=0.0)
-    moved = [deviation(layers, p, q.segments()) for p, q in zip(plain, exact, strict=True)]
-    return float(np.median([part.place.max() for part in moved]))
+    direction = {} if layers.round else {"direction / condition": (2 * most + 1) * limits.PATH_BOUNDARY}
+    return {WRONG_PATH: 0.0} | direction
 
 
 # Images ------------------------------------------------------------------------------------------------------
 
 
-def _view_rows(context: Context, scene: str, parameters: dict[str, str], name: str) -> list[Row]:
+def view_rows(context: Context, scene: str, parameters: dict[str, str], name: str) -> list[Row]:
     """`refract` and the built-in, image against image; and what flipped lobes alone do, as a control."""
     if context.variant.startswith("scalar"):
         return [Row(NAME, PLUGIN, f"{name}: image", context.variant, reason=SCALAR)]
-    profile, right = context.profile, _other_right_formula()
+    profile, right = context.profile, other_right_formula()
     spp = max(1, profile.spp // 4)
     views = {p: View(scene, p, parameters, profile.resolution, spp) for p in (BUILTIN, PLUGIN, right)}
     reference, test, control = (view.image for view in views.values())
@@ -300,12 +276,11 @@ def _view_rows(context: Context, scene: str, parameters: dict[str, str], name: s
         role: path_overlay.save(context.out, f"{name} {plugin} with paths", _with_paths(views[plugin], scene), about)
         for role, plugin in (("reference", BUILTIN), ("test", PLUGIN))
     }
-    replay = about | {"control": right}
-    budgets = {"pixels off, control": limits.FLIPPED}
+    replay, budgets = about | {"control": right}, {"pixels off, control": limits.FLIPPED}
     return [Row(NAME, PLUGIN, f"{name}: image", context.variant, values, budgets, replay=replay, images=images)]
 
 
-def _other_right_formula() -> str:
+def other_right_formula() -> str:
     """A plugin at the rounding limit whose formula is not the default's."""
     import mitsuba as mi
 
@@ -326,14 +301,12 @@ def _with_paths(view: View, scene: str) -> np.ndarray:
     exact = rays.exact(layers)
     segments = trace(view.scene, layers, rays, 4 * max(len(path.media) for path in exact))
     ends = np.array([x[np.isfinite(x).all((1, 2))][-1, 2] for x in np.moveaxis(segments, 2, 0)])
-    return path_overlay.draw(view, [_until(layers, path, end) for path, end in zip(exact, ends, strict=True)], ends)
-
-
-def _until(layers: Layers, path: Path, end: np.ndarray) -> np.ndarray:
-    """The corners of a path, and its last segment prolonged to where `end` is along the axis."""
-    p, d = path.starts[-1], path.directions[-1]
-    last = p + d * (end[layers.axis] - p[layers.axis]) / d[layers.axis]
-    return np.concatenate([np.stack([path.starts, path.ends], 1).reshape(-1, 3)[:-1], [last]])
+    lines = []
+    for path, end in zip(exact, ends, strict=True):  # the last segment ends where the plugin's does along the axis
+        p, d = path.starts[-1], path.directions[-1]
+        last = p + d * (end[layers.axis] - p[layers.axis]) / d[layers.axis]
+        lines.append(np.concatenate([np.stack([path.starts, path.ends], 1).reshape(-1, 3)[:-1], [last]]))
+    return path_overlay.draw(view, lines, ends)
 
 
 STUDY = Study(NAME, "Paths", about(__doc__), TERMS, tasks, axes=AXES, again=drawn_rows)

@@ -9,6 +9,7 @@ the exact answers could cause it. Above 1 it is that of the formula. Mitsuba's f
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,16 +28,11 @@ from validation.run.context import Context
 from validation.run.metrics import MISCLASSIFIED
 from validation.study import Study, Task, about
 
+from .energy import worst
 from .layer_chains import FEEDS, Array, Fed, Layers, air, carry, cosine, enter, exact_ratios, frame, pipe
 
 NAME = "stability"
-AXES = {
-    "x": "layers passed",
-    "y": "relative error of the cosine",
-    "x_scale": "log",
-    "y_scale": "log",
-    "slope": None,
-}
+AXES = {"x": "layers passed", "y": "relative error of the cosine", "x_scale": "log", "y_scale": "log"}
 SEEN_AT = 89.4  # degrees: the ray of the curves
 PASSING, TURNING = (88.0, 89.0, 89.4, 89.55), (89.6, 89.8, 89.95)
 # A normal, and the direction along the layers.
@@ -44,6 +40,12 @@ PLANES = {"upright": np.array([[0, 0, 1], [1, 0, 0]]), "askew": np.array([[0.36,
 CORE = 1.5  # the index of the light pipe
 PIPE_RAYS = 8
 PROBLEM = "the problem"
+
+
+def definition(make: Callable[[], optical_systems.System]) -> str:
+    """Of an optical system, in words."""
+    return " ".join((getattr(make, "func", make).__doc__ or "").split())
+
 
 TERMS = {
     "error / condition": "the worst error over condition · u of its ray",
@@ -59,7 +61,7 @@ TERMS = {
     **FEEDS,
     PROBLEM: f"condition · u of the ray that enters at {SEEN_AT}°, with the error of every formula layer by layer",
     "light pipe": f"total internal reflections in a square pipe of index {CORE}, askew; only signs should change",
-} | {name: " ".join((trace.__doc__ or "").split()) for name, trace in optical_systems.SYSTEMS.items()}
+} | {name: definition(make) for name, make in optical_systems.SYSTEMS.items()}
 
 
 @dataclass(frozen=True)
@@ -93,15 +95,14 @@ def settings(context: Context) -> list[Setting]:
 
 def tasks(context: Context) -> list[Task]:
     """Chains and systems in every setting; in the profile `quick` chains in the first one that runs, float32 if any."""
-    every = settings(context)
+    every, both = settings(context), {"chains": chain_rows, "systems": system_rows}
     if context.profile.quick:
-        running = [s for s in every if s.vector is not None and not (s.is_scalar and s.precision is np.float32)]
-        first = running[0]
-        return [Task(f"stability: {first.label}, chains", functools.partial(chain_rows, context, first))]
+        every = [s for s in every if s.vector is not None and not (s.is_scalar and s.precision is np.float32)][:1]
+        both = {"chains": chain_rows}
     return [
         Task(f"stability: {setting.label}, {name}", functools.partial(rows, context, setting))
         for setting in every
-        for name, rows in (("chains", chain_rows), ("systems", system_rows))
+        for name, rows in both.items()
         if setting.vector is not None or name == "chains"
     ]
 
@@ -131,22 +132,12 @@ def chain_rows(context: Context, setting: Setting) -> list[Row]:
     if setting.vector is None:
         return rows
     how, found = extent(context, setting), subjects(context, setting)
-    for case, layers, plane in mirages(how):
-        rows += mirage_rows(found, case, layers, plane, setting, how)
+    for count in how.layers:
+        for plane in how.planes:
+            case = f"mirage {plane}, {count} layers"
+            rows += mirage_rows(found, case, air(count), PLANES[plane], setting, how)
+    rows += mirage_rows(found, "exact ratios askew, 250 layers", exact_ratios(250), PLANES["askew"], setting, how)
     return [*rows, *(pipe_row(name, subject, setting, how) for name, subject in found.items())]
-
-
-def mirages(how: Extent) -> list[tuple[str, Layers, Array]]:
-    """(case, layers, normal and direction along them)."""
-    cases = [(f"mirage {plane}, {n} layers", air(n), PLANES[plane]) for n in how.layers for plane in how.planes]
-    return [*cases, ("exact ratios askew, 250 layers", exact_ratios(250), PLANES["askew"])]
-
-
-def feeds(layers: Layers, setting: Setting) -> list[str]:
-    """The ways to give a formula its ratios: one where float32 holds them exactly; two in float64, where all agree."""
-    if layers.exact:
-        return ["ratios"]
-    return [*FEEDS] if setting.precision is np.float32 else ["ratios", "contrasts"]
 
 
 def at_limit(name: str) -> bool:
@@ -157,23 +148,29 @@ def at_limit(name: str) -> bool:
 def mirage_rows(
     found: dict[str, Subject], case: str, layers: Layers, plane: Array, setting: Setting, how: Extent
 ) -> list[Row]:
-    """A row per formula and per way to feed it, and one of the problem with the curves of all of them."""
+    """A row per formula and per way to feed it, and one of the problem with the curves of all of them.
+
+    There is one way where float32 holds the ratios exactly, and there are two in float64, where all agree.
+    """
     drawn = how.curves and plane is PLANES["askew"]
     seen = np.unique(np.geomspace(1, layers.count, 25).astype(int)) if drawn else np.array([], int)
     degrees = np.concatenate([how.angles, np.full(len(seen), SEEN_AT)])
     stop = np.concatenate([np.full(len(how.angles), layers.count), seen])
     rays = enter(layers, degrees, stop, plane, setting.precision)
     rows = []
-    for feed in feeds(layers, setting):
+    feeds = ["ratios"] if layers.exact else [*FEEDS] if setting.precision is np.float32 else ["ratios", "contrasts"]
+    for feed in feeds:
         fed, curves = rays.fed(feed, setting.precision), {}
         for name, subject in found.items():
-            if feed == "contrasts" and not at_limit(name):
-                continue
-            row, error = mirage_row(name, subject, case, fed, setting, how)
-            rows.append(row)
-            curves[name] = error[len(how.angles) :]
-        if drawn:
-            rows.append(problem_row(case, fed, setting, curves))
+            if feed != "contrasts" or at_limit(name):
+                row, error = mirage_row(name, subject, case, fed, setting, how)
+                rows.append(row)
+                curves[name] = error[len(how.angles) :]
+        if drawn:  # the condition of the problem in u, and the error of every formula, by the number of layers
+            curves["condition · u"] = (fed.condition * setting.roundoff).astype(float)[len(how.angles) :]
+            lines = {name: list(zip(seen.tolist(), y.tolist(), strict=True)) for name, y in curves.items()}
+            values = {"condition · u": lines["condition · u"][-1][1]}
+            rows.append(Row(NAME, PROBLEM, f"{case}, {fed.feed}", setting.label, values, curves=lines))
     return rows
 
 
@@ -184,11 +181,12 @@ def mirage_row(name: str, subject: Subject, case: str, fed: Fed, setting: Settin
     carried = carry(subject, fed.chain, rays.a, rays.stop, setting)
     right = (carried.place >= rays.stop) == rays.passes
     error = np.where(right, np.abs(cosine(carried.b, rays.normal) / rays.end - 1), 1)
-    error = np.nan_to_num(error.astype(float), nan=np.inf)
+    error = np.where(np.isnan(error), np.inf, error.astype(float))
     turned = np.where(carried.place < 0, carried.passed // 2, rays.stop)
     length = np.sqrt((carried.b**2).sum(1) / (rays.a.astype(np.longdouble) ** 2).sum(1))
+    over_condition = error / (fed.condition * setting.roundoff)
     values = {
-        "error / condition": worst((error / (fed.condition * setting.roundoff))[final][right[final]]),
+        "error / condition": worst(over_condition[final][right[final]]),
         "error": worst(error[final]),
         MISCLASSIFIED: float((~right)[final].sum()),
         "turning height": worst((np.abs(turned - rays.last) / count)[final][~rays.passes[final]]),
@@ -196,15 +194,9 @@ def mirage_row(name: str, subject: Subject, case: str, fed: Fed, setting: Settin
     } | {f"{angle}°": float(e) for angle, e in zip(how.angles, error, strict=False) if angle in PASSING}
     budgets = mirage_budgets(fed, setting.roundoff, final) if at_limit(name) else {}
     remark = how.remark if budgets or not at_limit(name) else "; ".join(filter(None, (NOTHING, how.remark)))
-    replay = {
-        "layers": count,
-        "n_0": float(rays.layers.index[0]),
-        "n_last": float(rays.layers.index[-1]),
-        "angles": how.angles,
-        "normal": [float(x).hex() for x in rays.normal],
-    }
-    case = f"{case}, {fed.feed}"
-    return Row(NAME, name, case, setting.label, values, budgets, reason=remark, replay=replay), error
+    ends = {"n_0": float(rays.layers.index[0]), "n_last": float(rays.layers.index[-1])}
+    replay = {"layers": count, **ends, "angles": how.angles, "normal": [float(x).hex() for x in rays.normal]}
+    return Row(NAME, name, f"{case}, {fed.feed}", setting.label, values, budgets, reason=remark, replay=replay), error
 
 
 NOTHING = "no budget: with every input and output off by u, these rays may go anywhere"
@@ -229,21 +221,6 @@ def mirage_budgets(fed: Fed, u: float, final: slice) -> dict[str, float]:
     return budgets
 
 
-def worst(x: Array) -> float:
-    """The largest, NaN taken for infinity; 0 of nothing."""
-    return float(np.nan_to_num(x.astype(float), nan=np.inf).max(initial=0))
-
-
-def problem_row(case: str, fed: Fed, setting: Setting, curves: dict[str, Array]) -> Row:
-    """The condition of the problem in u, and the error of every formula, against the number of layers."""
-    stop = fed.rays.stop
-    seen = len(stop) - len(next(iter(curves.values())))
-    curves = curves | {"condition · u": (fed.condition * setting.roundoff).astype(float)[seen:]}
-    lines = {name: list(zip(stop[seen:].tolist(), y.tolist(), strict=True)) for name, y in curves.items()}
-    values = {"condition · u": lines["condition · u"][-1][1]}
-    return Row(NAME, PROBLEM, f"{case}, {fed.feed}", setting.label, values, curves=lines)
-
-
 def pipe_row(name: str, subject: Subject, setting: Setting, how: Extent) -> Row:
     """Total internal reflections in a square pipe."""
     rays = 2 if setting.is_scalar else PIPE_RAYS
@@ -251,18 +228,15 @@ def pipe_row(name: str, subject: Subject, setting: Setting, how: Extent) -> Row:
     carried = carry(subject, chain, a, np.full(rays, how.reflections), setting)
     lengths = [np.sqrt((x.astype(np.longdouble) ** 2).sum(1)) for x in (carried.b, a)]
     chord = np.sqrt(((carried.b - exact) ** 2).sum(1)) / lengths[1]
-    # Every reflection passes on what is wrong with the direction, and adds its own: at most u each.
-    condition = how.reflections
-    values = {
-        "error / condition": worst(chord / (condition * setting.roundoff)),
+    values = {  # every reflection passes on what is wrong with the direction, and adds its own: at most u each
+        "error / condition": worst(chord / (how.reflections * setting.roundoff)),
         "error": worst(chord),
         MISCLASSIFIED: float(carried.passed.sum()),
         "length drift": worst(np.abs(lengths[0] / lengths[1] - 1)),
     }
     budgets = {"error / condition": limits.LIGHT_PIPE, MISCLASSIFIED: 0.0} if at_limit(name) else {}
-    axis = [float(x).hex() for x in frame(setting.precision)[2]]
+    case, axis = f"light pipe, {how.reflections} reflections", [float(x).hex() for x in frame(setting.precision)[2]]
     replay = {"reflections": how.reflections, "rays": rays, "axis": axis}
-    case = f"light pipe, {how.reflections} reflections"
     return Row(NAME, name, case, setting.label, values, budgets, reason=how.remark, replay=replay)
 
 
@@ -293,10 +267,10 @@ def system_rows(context: Context, setting: Setting) -> list[Row]:
 
 def system_row(name: str, subject: Subject, case: str, setting: Setting) -> Row:
     """The errors of a subject at the end of a system."""
-    trace, refractor = optical_systems.SYSTEMS[case], Refractor(subject, setting)
-    error = np.sqrt((trace(refractor) ** 2).sum(1))
+    system, refractor = optical_systems.SYSTEMS[case](), Refractor(subject, setting)
+    error = np.sqrt((system.errors(refractor) ** 2).sum(1))
     values = {
-        "error / condition": worst(error / (optical_systems.condition(trace) * setting.roundoff)),
+        "error / condition": worst(error / (system.condition * setting.roundoff)),
         "error": worst(error),
         MISCLASSIFIED: float(refractor.mirrored),
     }
@@ -307,7 +281,7 @@ def system_row(name: str, subject: Subject, case: str, setting: Setting) -> Row:
         values["over print"] = optical_systems.off_print(Refractor(subject, setting))
         # Angles stay below 45°, where a surface costs any formula 20u, and 11 · 20 · 2⁻⁵³ is far below the print.
         budgets |= {"over print": limits.PRINT} if setting.precision is np.float64 else {}
-    replay = {"definition": " ".join((trace.__doc__ or "").split()), "rays": len(error)}
+    replay = {"definition": definition(optical_systems.SYSTEMS[case]), "rays": len(error)}
     return Row(NAME, name, case, setting.label, values, budgets, replay=replay)
 
 

@@ -4,13 +4,11 @@ In: rays and plain scenes, given to the programs of `renderers/`. Out: rows per 
 """
 
 __all__ = [
-    "dispersion",
     "exports",
     "glasses",
     "lenses",
     "matrix",
     "matrix_page",
-    "matrix_table",
     "per_ray",
     "rendered_images",
     "small_mistakes",

@@ -27,7 +27,7 @@ from validation.run.render_methods import Camera
 from validation.study import Study, Task, about
 from validation.suite.renderers.image_renderers import IMAGE_RENDERERS
 
-from .rendered_images import THREE, askew, why_not
+from .rendered_images import THREE, askew, no_images, why_not
 from .renderers import SYSTEMS, environments
 
 NAME = "exports"
@@ -84,21 +84,18 @@ def tasks(context: Context) -> list[Task]:
 
 def rows(context: Context, title: str) -> list[Row]:
     """A renderer against `refract`: one row."""
-    renderer = IMAGE_RENDERERS[title]
-    system, setting = SYSTEMS[renderer.system], f"{SIZE[0]} × {SIZE[1]}"
+    system = SYSTEMS[IMAGE_RENDERERS[title].system]
+    row = functools.partial(Row, NAME, title, "balls", f"{SIZE[0]} × {SIZE[1]}")
     if reason := why_not(system, context):
-        return [Row(NAME, title, "balls", setting, reason=reason)]
+        return [row(reason=reason)]
     try:
         theirs = drawn(title)
-    except environments.Unable as why:
-        return [Row(NAME, title, "balls", setting, reason=" ".join(str(why).split()))]
-    except (environments.Broken, OSError, ValueError) as defect:
-        values = {"not rendered": float(RENDERS)}
-        return [Row(NAME, title, "balls", setting, values, {"not rendered": 0.0}, reason=str(defect))]
+    except (environments.Unable, environments.Broken, OSError, ValueError) as error:
+        return [no_images(row, error)]
     values = compared(reference(diffuse=title != "POV-Ray"), theirs)
     budgets = {OVER: 1.0, NOISE: float(limits.EXPORT_NOISE)}
     replay = {"renderer": system.source, "spp": spp(title), "reference spp": SPP, "seeds": [*range(1, RENDERS + 1)]}
-    return [Row(NAME, title, "balls", setting, values, budgets, replay=replay)]
+    return [row(values, budgets, replay=replay)]
 
 
 def spp(title: str) -> int:

@@ -21,7 +21,7 @@ import numpy as np
 from mi_refract.media import LINES
 from mi_refract.planar import scene_file
 from mi_refract.planar.path_tree import follow_scene
-from mi_refract.report.row import Row
+from mi_refract.report.row import Reason, Row
 from validation import limits
 from validation.reference.exact_lens import Crossing, Lens, crossing
 from validation.run.context import SCENES, Context
@@ -103,7 +103,7 @@ def system_rows(system: System, context: Context) -> list[Row]:
     """Two rows per case, or one that says why there are none."""
     reason = environments.absent(system)
     if not reason and not system.small and context.profile.name != "full":
-        reason = f"{system.megabytes} MB: in the full profile only"
+        reason = Reason(f"{system.megabytes} MB: in the full profile only", "`--profile full`")
     if reason:
         return [Row(NAME, system.title, "every ray", "float64", reason=reason)]
     try:

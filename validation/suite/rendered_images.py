@@ -26,7 +26,7 @@ from mi_refract.io import image_file
 from mi_refract.io.image_file import Image
 from mi_refract.plugins.refract import PLUGIN
 from mi_refract.rendering import scene_files
-from mi_refract.report.row import Row
+from mi_refract.report.row import Reason, Row
 from mi_refract.scene_export import from_mitsuba, write_files
 from mi_refract.scene_export.plain_scene import Diffuse, Environment, Glass, Light, Mesh, PlainScene
 from validation import limits
@@ -182,28 +182,48 @@ def why_not(system: System, context: Context) -> str:
     if reason := environments.absent(system):
         return reason
     if not system.small and context.profile.name != "full":
-        return f"{system.megabytes} MB: in the full profile only"
+        return Reason(f"{system.megabytes} MB: in the full profile only", "`--profile full`")
     return COMPILED if context.variant.startswith("scalar") else ""
+
+
+def no_images(row: Callable[..., Row], error: Exception) -> Row:
+    """The row of a renderer that raised: not run where it cannot run here, failed where it broke."""
+    if isinstance(error, environments.Unable):
+        return row(reason=" ".join(str(error).split()))
+    return row({"not rendered": float(RENDERS)}, {"not rendered": 0.0}, reason=str(error))
 
 
 def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
     """A renderer against `refract` in a scene: one row."""
     renderer, size = IMAGE_RENDERERS[title], SIZES[context.profile.name]
-    system = SYSTEMS[renderer.system]
-    setting = f"{size.resolution}²"
-    if reason := why_not(system, context):
-        return [Row(NAME, title, scene, setting, reason=reason)]
-    given, seeds = SCENES[scene].load(size.resolution), range(1, RENDERS + 1)
+    row = functools.partial(Row, NAME, title, scene, f"{size.resolution}²")
+    if reason := why_not(SYSTEMS[renderer.system], context):
+        return [row(reason=reason)]
+    plain, seeds = SCENES[scene].load(size.resolution), range(1, RENDERS + 1)
     spp = max(renderer.spp[scene] // size.less, 1)
     try:
         with tempfile.TemporaryDirectory() as folder:
-            test = renderer.draw(given, Path(folder), spp, seeds)
-    except (environments.Unable, ValueError) as why:  # ValueError: a scene that the renderer cannot say
-        return [Row(NAME, title, scene, setting, reason=" ".join(str(why).split()))]
-    except (environments.Broken, OSError) as defect:
-        values = {"not rendered": float(RENDERS)}
-        return [Row(NAME, title, scene, setting, values, {"not rendered": 0.0}, reason=str(defect))]
-    return [_row(context, title, scene, reference(scene, size), test, {"spp": spp, "seeds": list(seeds)})]
+            theirs = renderer.draw(plain, Path(folder), spp, seeds)
+    except ValueError as why:  # a scene that the renderer's format cannot hold
+        return [row(reason=" ".join(str(why).split()))]
+    except (environments.Unable, environments.Broken, OSError) as error:
+        return [no_images(row, error)]
+    ours, known = reference(scene, size), known_to_differ(title, scene)
+    # Not their pixels: some of the renderers sample every pixel on one grid, whatever the seed.
+    found = compare("welch", ours, theirs, family_error=limits.SUITE_ERROR, resolution=size.wanted, pixels="no")
+    values = measured(found, *(np.stack([image.pixels for image in side]) for side in (ours, theirs)))
+    goals, budgets = {INCONCLUSIVE: 0.0}, {"tests that differ": 0.0, "tiles that differ without noise": 0.0}
+    reason = f"{found.verdict}: {found.reason}"
+    if known:
+        values["not seen to differ"] = float(found.verdict is not Verdict.DIFFERENT)
+        budgets = {"not seen to differ": 0.0}
+        reason += f"; {known}" if found.verdict is Verdict.DIFFERENT else ""
+    else:
+        goals[DETECTABLE] = size.wanted
+    replay = {"verdict": str(found.verdict), "scene": scene, "resolution": size.resolution, "spp": spp}
+    replay |= {"reference spp": SCENES[scene].more * size.spp, "seeds": list(seeds)}
+    replay["renderer"] = SYSTEMS[renderer.system].source
+    return [row(values, budgets, goals, reason, replay, _saved(context, title, scene, ours, theirs))]
 
 
 @functools.cache
@@ -213,33 +233,7 @@ def reference(scene: str, size: Size) -> list[Image]:
         write_files.write(SCENES[scene].load(size.resolution), "mitsuba", Path(folder) / "scene")
         camera = Camera(scene_files.load_scene(Path(folder) / "scene" / "scene.xml", {"bsdf": PLUGIN}))
         renders = [mean(camera, SCENES[scene].more * size.spp, OURS + i) for i in range(RENDERS)]
-    return [image_file.named(f"{PLUGIN} {scene} {i}", each) for i, each in enumerate(renders)]
-
-
-def _row(context: Context, title: str, scene: str, ours: Sequence[Image], theirs: Sequence[Image], about: dict) -> Row:
-    size = SIZES[context.profile.name]
-    # Not their pixels: some of the renderers sample every pixel on one grid, whatever the seed.
-    found = compare("welch", ours, theirs, family_error=limits.SUITE_ERROR, resolution=size.wanted, pixels="no")
-    values = measured(found, *(np.stack([image.pixels for image in side]) for side in (ours, theirs)))
-    known = known_to_differ(title, scene)
-    if known:
-        values["not seen to differ"] = float(found.verdict is not Verdict.DIFFERENT)
-    budgets = {"not seen to differ": 0.0}
-    if not known:
-        budgets = {"tests that differ": 0.0, "tiles that differ without noise": 0.0}
-    goals = {INCONCLUSIVE: 0.0} | ({DETECTABLE: size.wanted} if not known else {})
-    reason = f"{found.verdict}: {found.reason}"
-    if known and found.verdict is Verdict.DIFFERENT:
-        reason += f"; {known}"
-    replay = {
-        "verdict": str(found.verdict),
-        "scene": scene,
-        "resolution": size.resolution,
-        "reference spp": SCENES[scene].more * size.spp,
-    }
-    replay |= about | {"renderer": SYSTEMS[IMAGE_RENDERERS[title].system].source}
-    images = _saved(context, title, scene, ours, theirs)
-    return Row(NAME, title, scene, f"{size.resolution}²", values, budgets, goals, reason, replay, images)
+    return [image_file.named(f"{PLUGIN} {scene} {i}", pixels) for i, pixels in enumerate(renders)]
 
 
 def measured(found: Comparison, ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refract.image_diff.comparison import Verdict
+from mi_refract.image_diff.comparison import Comparison, Verdict
 from mi_refract.image_diff.methods import compare
 from mi_refract.io import image_file
 from mi_refract.io.image_file import Image
@@ -37,7 +37,7 @@ from validation.run.metrics import DETECTABLE
 from validation.run.render_methods import Camera, under
 from validation.study import Study, Task, about
 
-from .rendered_images import DETECTABLE_IMAGE, INCONCLUSIVE, OURS, RENDERS, TERMS, Size, measured, why_not
+from .rendered_images import DETECTABLE_IMAGE, INCONCLUSIVE, OURS, RENDERS, TERMS, Size, measured, no_images, why_not
 from .renderers import environments
 from .renderers.image_renderers import IMAGE_RENDERERS
 from .renderers.table import SYSTEMS
@@ -66,57 +66,54 @@ def tasks(context: Context) -> list[Task]:
     return [*found, Task(f"{NAME}: {MIXED}", functools.partial(mixed_rows, context))]
 
 
-def _reason(context: Context) -> str:
+def _why_not(context: Context) -> str:
     return context.variants.get(VARIANT, "not in this wheel") or why_not(SYSTEMS["raysect"], context)
 
 
 def line_rows(context: Context, line: str) -> list[Row]:
     """Equal within the noise, which hides at most 1 % of the image's mean."""
     size = SIZES[context.profile.name]
-    setting = f"{size.resolution}²"
-    if reason := _reason(context):
-        return [Row(NAME, OTHER, line, setting, reason=reason)]
+    row = functools.partial(Row, NAME, OTHER, line, f"{size.resolution}²")
+    if reason := _why_not(context):
+        return [row(reason=reason)]
     try:
-        sides = ours(line, size), theirs(line, size)
-    except environments.Unable as why:
-        return [Row(NAME, OTHER, line, setting, reason=" ".join(str(why).split()))]
-    except (environments.Broken, OSError) as defect:
-        values = {"not rendered": float(RENDERS)}
-        return [Row(NAME, OTHER, line, setting, values, {"not rendered": 0.0}, reason=str(defect))]
-    found, values = _compared(*sides, size)
+        found, values = _compared(ours(line, size), theirs(line, size), size)
+    except (environments.Unable, environments.Broken, OSError) as error:
+        return [no_images(row, error)]
     values[DIFFERENT] = float(found.verdict is Verdict.DIFFERENT)
     budgets = {DIFFERENT: 0.0, "tests that differ": 0.0, "tiles that differ without noise": 0.0}
     budgets |= {DETECTABLE_IMAGE: float(limits.LINE_DETECTABLE)}
     goals = {INCONCLUSIVE: 0.0, DETECTABLE: size.wanted}
-    replay = {"verdict": str(found.verdict), "nm": LINES[line], "reference spp": size.spp, "spp": _spp(size)}
-    return [Row(NAME, OTHER, line, setting, values, budgets, goals, f"{found.verdict}: {found.reason}", replay)]
+    replay = {
+        "verdict": str(found.verdict),
+        "nm": LINES[line],
+        "reference spp": size.spp,
+        "spp": THEIR_SPP // size.less,
+    }
+    return [row(values, budgets, goals, f"{found.verdict}: {found.reason}", replay)]
 
 
 def mixed_rows(context: Context) -> list[Row]:
     """Raysect's image at a line against ours at the next one."""
     size = SIZES[context.profile.name]
-    setting = f"{size.resolution}²"
-    if reason := _reason(context):
-        return [Row(NAME, MIXED, "every line", setting, reason=reason)]
+    row = functools.partial(Row, NAME, MIXED, setting=f"{size.resolution}²")
+    if reason := _why_not(context):
+        return [row(case="every line", reason=reason)]
     rows = []
     for line, other in (("C", "d"), ("F", "d")):
         try:
             found, _ = _compared(ours(other, size), theirs(line, size), size)
         except (environments.Unable, environments.Broken, OSError) as why:
-            rows.append(Row(NAME, MIXED, line, setting, reason=" ".join(str(why).split())))
+            rows.append(row(case=line, reason=" ".join(str(why).split())))
             continue
         values = {NOT_SEEN: float(found.verdict is not Verdict.DIFFERENT)}
-        rows.append(Row(NAME, MIXED, f"{line} for {other}", setting, values, {NOT_SEEN: 0.0}, reason=found.reason))
+        rows.append(row(case=f"{line} for {other}", values=values, budgets={NOT_SEEN: 0.0}, reason=found.reason))
     return rows
 
 
-def _compared(one: list[Image], two: list[Image], size: Size) -> Any:
+def _compared(one: list[Image], two: list[Image], size: Size) -> tuple[Comparison, dict[str, float]]:
     found = compare("welch", one, two, family_error=limits.SUITE_ERROR, resolution=size.wanted, pixels=PIXELS)
     return found, measured(found, *(np.stack([image.pixels for image in side]) for side in (one, two)))
-
-
-def _spp(size: Size) -> int:
-    return THEIR_SPP // size.less
 
 
 # The two renderers -------------------------------------------------------------------------------------------------
@@ -158,7 +155,7 @@ def theirs(line: str, size: Size) -> list[Image]:
     band = ["--band", *(str(LINES[line] + side) for side in (-HALF, HALF))]
     with tempfile.TemporaryDirectory() as folder:
         draw, seeds = IMAGE_RENDERERS[OTHER].draw, range(1, RENDERS + 1)
-        images = draw(plain(size.resolution), Path(folder), _spp(size), seeds, edit=dispersive, more=band)
+        images = draw(plain(size.resolution), Path(folder), THEIR_SPP // size.less, seeds, edit=dispersive, more=band)
     return [image_file.named(image.path.name, image.pixels[..., :1]) for image in images]
 
 

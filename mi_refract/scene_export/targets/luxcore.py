@@ -6,10 +6,8 @@ from importlib.resources import files as resources
 
 import numpy as np
 
-from ..plain_scene import Camera, Colour, Environment, Glass, Light, Material, PlainScene
-from . import scene_json
-from .environment_map import Array
-from .shared_files import Files, numbers, ply, readme
+from ..plain_scene import Environment, Glass, Light, Material, PlainScene
+from .shared_files import Array, Files, material_names, numbers, ply_files, readme, sky_exr
 
 COMMANDS = """
 pip install pyluxcore==2.11.2
@@ -46,14 +44,14 @@ batch.haltspp = 256
 def files(plain: PlainScene) -> Files:
     """The files of the export, by name."""
     return (
-        {
+        ply_files(plain)
+        | sky_exr(plain, direction_at)
+        | {
             "scene.scn": _scene(plain).encode(),
             "scene.cfg": CONFIG.format(camera=plain.camera, depth=plain.max_depth).encode(),
             "render.py": resources(__package__).joinpath("render_luxcore.py").read_bytes(),
             "README.txt": readme(plain, "LuxCore", COMMANDS, ASSUMPTIONS),
         }
-        | scene_json.sky(plain, direction_at)
-        | {f"{mesh.name}.ply": ply(mesh) for mesh in plain.meshes}
     )
 
 
@@ -64,40 +62,33 @@ def direction_at(u: Array, v: Array) -> Array:
 
 
 def _scene(plain: PlainScene) -> str:
-    names = scene_json.material_names(plain)
-    lines = _camera(plain.camera) + _sky(plain.sky)
+    camera, names = plain.camera, material_names(plain)
+    height, row = camera.height / camera.width, 2 / camera.width  # of the screen window, which is 2 wide
+    view = {
+        "lookat.orig": camera.origin,
+        "lookat.target": camera.target,
+        "up": camera.up,
+        "fieldofview": [camera.fov_x_degrees],
+        "screenwindow": [-1, 1, -height - row, height - row],
+        "cliphither": [1e-3],
+        "clipyon": [1e6],
+        "autofocus.enable": [0],
+    }
+    lines = ['scene.camera.type = "perspective"', *(f"scene.camera.{key} = {numbers(view[key])}" for key in view)]
+    if isinstance(plain.sky, Environment):
+        # Without "clamp" LuxCore interpolates between the two poles.
+        sky = {"type": '"infinite"', "file": '"sky.exr"', "gamma": "1", "storage": '"float"', "wrap": '"clamp"'}
+    elif any(plain.sky):
+        sky = {"type": '"constantinfinite"', "color": numbers(plain.sky)}
+    else:
+        sky = {}
+    lines += [f"scene.lights.sky.{key} = {value}" for key, value in sky.items()]
     for material, name in names.items():
         lines += [f"scene.materials.{name}.{line}" for line in _material(material)]
     for mesh in plain.meshes:
         lines.append(f'scene.objects.{mesh.name}.ply = "{mesh.name}.ply"')
         lines.append(f'scene.objects.{mesh.name}.material = "{names[mesh.material]}"')
     return "\n".join(lines) + "\n"
-
-
-def _camera(camera: Camera) -> list[str]:
-    tall, row = camera.height / camera.width, 2 / camera.width
-    own = {
-        "lookat.orig": camera.origin,
-        "lookat.target": camera.target,
-        "up": camera.up,
-        "fieldofview": [camera.fov_x_degrees],
-        "screenwindow": [-1, 1, -tall - row, tall - row],
-        "cliphither": [1e-3],
-        "clipyon": [1e6],
-        "autofocus.enable": [0],
-    }
-    return ['scene.camera.type = "perspective"', *(f"scene.camera.{key} = {numbers(own[key])}" for key in own)]
-
-
-def _sky(sky: Colour | Environment) -> list[str]:
-    if isinstance(sky, Environment):
-        # Without "clamp" LuxCore interpolates between the two poles.
-        own = {"type": '"infinite"', "file": '"sky.exr"', "gamma": "1", "storage": '"float"', "wrap": '"clamp"'}
-    elif any(sky):
-        own = {"type": '"constantinfinite"', "color": numbers(sky)}
-    else:
-        own = {}
-    return [f"scene.lights.sky.{key} = {value}" for key, value in own.items()]
 
 
 def _material(material: Material) -> list[str]:

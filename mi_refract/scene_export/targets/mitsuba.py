@@ -7,7 +7,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from ..plain_scene import Colour, Diffuse, Environment, Glass, Material, Mesh, PlainScene
-from .shared_files import Files, exr, numbers, ply, readme
+from .shared_files import Files, exr, numbers, ply_files, readme
 
 COMMANDS = "mi-refract render scene.xml -o image.exr --spp 1024        (-D bsdf=dielectric for Mitsuba's own glass)"
 SCENE = """<scene version="3.0.0">
@@ -48,17 +48,13 @@ SCENE = """<scene version="3.0.0">
 
 def files(plain: PlainScene) -> Files:
     """The files of the export, by name."""
-    meshes: Files = {f"{mesh.name}.ply": ply(mesh) for mesh in plain.meshes}
-    sky: Files = {"sky.exr": exr(plain.sky.pixels)} if isinstance(plain.sky, Environment) else {}
-    text = {"scene.xml": _scene(plain).encode(), "README.txt": readme(plain, "Mitsuba", COMMANDS, ())}
-    return meshes | sky | text
-
-
-def _scene(plain: PlainScene) -> str:
     camera = plain.camera
     vectors = {name: numbers(getattr(camera, name), ", ") for name in ("origin", "target", "up")}
     shapes = "\n".join(map(_shape, plain.meshes))
-    return SCENE.format(camera=camera, max_depth=plain.max_depth, shapes=shapes, sky=_sky(plain.sky), **vectors)
+    text = SCENE.format(camera=camera, max_depth=plain.max_depth, shapes=shapes, sky=_sky(plain.sky), **vectors)
+    sky = {"sky.exr": exr(plain.sky.pixels)} if isinstance(plain.sky, Environment) else {}
+    own = {"scene.xml": text.encode(), "README.txt": readme(plain, "Mitsuba", COMMANDS, ())}
+    return ply_files(plain) | sky | own
 
 
 def _shape(mesh: Mesh) -> str:

@@ -3,24 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
-from ..plain_scene import (
-    Camera,
-    Colour,
-    Diffuse,
-    Environment,
-    Glass,
-    Light,
-    Material,
-    Mesh,
-    PlainScene,
-)
+from ..plain_scene import Camera, Diffuse, Environment, Glass, Light, Material, Mesh, PlainScene
 from ..tessellation import is_closed
-from . import scene_json
-from .environment_map import Array
-from .shared_files import LIGHT_INSIDE, Files, numbers, readme
+from .shared_files import LIGHT_INSIDE, Array, Files, numbers, readme, sky_exr
 
 COMMANDS = """
 povray +Iscene.pov +Oimage.exr +FE +W{width} +H{height} -A -D File_Gamma=1.0 Declare=dx=0.5 Declare=dy=0.5
@@ -47,12 +36,21 @@ def files(plain: PlainScene) -> Files:
             raise ValueError(f"{place}: glass with an open surface; for POV-Ray expected a closed surface")
         if isinstance(mesh.material, Diffuse) and any(mesh.material.reflectance):
             raise ValueError(f"{place}: a diffuse surface; for POV-Ray expected glass and lights")
+    # POV-Ray assumes that the outermost medium has index 1: indices are relative to that one.
+    glasses = [(mesh.vertices[:, 0].max(), mesh.material) for mesh in plain.meshes if isinstance(mesh.material, Glass)]
+    outside = max(glasses, key=lambda glass: glass[0])[1].ext_ior if glasses else 1.0
+    if isinstance(plain.sky, Environment):
+        sky = 'sky_sphere { pigment { image_map { exr "sky.exr" gamma 1.0 map_type 1 interpolate 2 } } }\n'
+    else:
+        sky = f"background {{ rgb {_vector(plain.sky)} }}\n"
+    settings = (
+        "#version 3.7;\n"
+        f"global_settings {{ assumed_gamma 1.0 max_trace_level {min(plain.max_depth, 256)} adc_bailout {BAILOUT} }}\n"
+    )
     camera = plain.camera
-    outside = _outside(plain)
-    parts = [_settings(plain), _camera(camera), _sky(plain.sky), *(_mesh(mesh, outside) for mesh in plain.meshes)]
     commands = COMMANDS.format(width=camera.width, height=camera.height)
-    return scene_json.sky(plain, direction_at) | {
-        "scene.pov": "\n".join(parts).encode(),
+    return sky_exr(plain, direction_at) | {
+        "scene.pov": "\n".join([settings, _camera(camera), sky, *(_mesh(m, outside) for m in plain.meshes)]).encode(),
         "README.txt": readme(plain, "POV-Ray 3.7", commands, ASSUMPTIONS),
     }
 
@@ -63,21 +61,7 @@ def direction_at(u: Array, v: Array) -> Array:
     return np.stack([np.cos(phi) * np.sin(theta), np.cos(theta), np.sin(phi) * np.sin(theta)], axis=-1)
 
 
-def _settings(plain: PlainScene) -> str:
-    return (
-        "#version 3.7;\n"
-        f"global_settings {{ assumed_gamma 1.0 max_trace_level {min(plain.max_depth, 256)} adc_bailout {BAILOUT} }}\n"
-    )
-
-
-def _outside(plain: PlainScene) -> float:
-    """The index of the outermost medium. POV-Ray takes it for 1: its indices are relative to this one."""
-    glasses = [mesh for mesh in plain.meshes if isinstance(mesh.material, Glass)]
-    outer = max(glasses, key=lambda mesh: mesh.vertices[:, 0].max(), default=None)
-    return outer.material.ext_ior if outer and isinstance(outer.material, Glass) else 1.0
-
-
-def _vector(values: np.ndarray | tuple[float, ...]) -> str:
+def _vector(values: Iterable[float]) -> str:
     return f"<{numbers(values, ', ')}>"
 
 
@@ -94,12 +78,6 @@ def _camera(camera: Camera) -> str:
         f"camera {{ perspective location {_vector(camera.origin)} right Right up Up\n"
         f"  direction {_vector(ahead)} + Right*(dx - 0.5)/{camera.width} - Up*(dy - 0.5)/{camera.height} }}\n"
     )
-
-
-def _sky(sky: Colour | Environment) -> str:
-    if not isinstance(sky, Environment):
-        return f"background {{ rgb {_vector(sky)} }}\n"
-    return 'sky_sphere { pigment { image_map { exr "sky.exr" gamma 1.0 map_type 1 interpolate 2 } } }\n'
 
 
 def _mesh(mesh: Mesh, outside: float) -> str:

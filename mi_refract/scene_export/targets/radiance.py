@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 
-from ..plain_scene import Camera, Diffuse, Environment, Glass, Material, Mesh, PlainScene
-from . import scene_json
-from .shared_files import Files, numbers, readme
+from ..plain_scene import Camera, Colour, Diffuse, Environment, Glass, Material, PlainScene
+from .shared_files import Array, Files, material_names, numbers, readme
 
 COMMANDS = """
 oconv scene.rad > scene.oct
@@ -31,14 +29,19 @@ ASSUMPTIONS = (
 
 def files(plain: PlainScene) -> Files:
     """The files of the export, by name."""
-    sky, maps = _sky(plain)
-    camera = plain.camera
+    sky, maps = _sky(plain.sky)
+    camera, names = plain.camera, material_names(plain)
     commands = COMMANDS.format(width=camera.width, height=camera.height, depth=plain.max_depth)
-    materials = scene_json.material_names(plain)
-    parts = ["".join(f"void {_material(material, name)}" for material, name in materials.items())]
-    parts += ["".join(_polygons(mesh, materials[mesh.material])) for mesh in plain.meshes]
+    meshes = [
+        "".join(
+            f"{names[mesh.material]} polygon {mesh.name}.{i} 0 0 9 {numbers(corners.ravel())}\n"
+            for i, corners in enumerate(mesh.triangles())
+        )
+        for mesh in plain.meshes
+    ]
+    materials = "".join(f"void {_material(material, name)}" for material, name in names.items())
     return maps | {
-        "scene.rad": "\n".join([*parts, sky]).encode(),
+        "scene.rad": "\n".join([materials, *meshes, sky]).encode(),
         "camera.vf": _view(camera).encode(),
         "README.txt": readme(plain, "Radiance", commands, ASSUMPTIONS),
     }
@@ -52,11 +55,6 @@ def _material(material: Material, name: str) -> str:
     return f"glow {name} 0 0 4 {numbers(material.radiance)} 0\n"
 
 
-def _polygons(mesh: Mesh, material: str) -> Iterator[str]:
-    for i, corners in enumerate(mesh.triangles()):
-        yield f"{material} polygon {mesh.name}.{i} 0 0 9 {numbers(corners.ravel())}\n"
-
-
 def _view(camera: Camera) -> str:
     ahead = np.subtract(camera.target, camera.origin)
     wide = math.tan(math.radians(camera.fov_x_degrees) / 2)
@@ -65,9 +63,8 @@ def _view(camera: Camera) -> str:
     return f"VIEW= -vtv {where} -vh {camera.fov_x_degrees!r} -vv {fov_y!r}\n"
 
 
-def _sky(plain: PlainScene) -> tuple[str, Files]:
+def _sky(sky: Colour | Environment) -> tuple[str, Files]:
     """The sky's lines in the scene, and the files that they name."""
-    sky = plain.sky
     source = "sky source everywhere 0 0 4 0 0 1 360\n"
     if not isinstance(sky, Environment):
         return f"void glow sky 0 0 4 {numbers(sky)} 0\n{source}" if any(sky) else "", {}
@@ -84,5 +81,5 @@ def _sky(plain: PlainScene) -> tuple[str, Files]:
     return f"{lines}map glow sky 0 0 4 1 1 1 0\n{source}", maps | {"sky.cal": functions.encode()}
 
 
-def _table(values: np.ndarray) -> str:
+def _table(values: Array) -> str:
     return "\n".join(" ".join(map(repr, row)) for row in values.astype(float).tolist()) + "\n"

@@ -1,48 +1,149 @@
-"""A plain scene as `scene.json`, a PLY file per mesh, and `sky.exr` where the sky is a map."""
+"""Programs that read `scene.json`: Cycles and raysect by a script of their Pythons, and programs without a target."""
 
 from __future__ import annotations
 
-import dataclasses
-import json
-from collections.abc import Mapping
-from typing import Any
+import io
+from collections.abc import Iterator
+from importlib.resources import files as resources
 
-from ..plain_scene import Environment, Material, PlainScene
-from .environment_map import Lookup, longitude_latitude
-from .shared_files import Files, exr, ply
+import numpy as np
+
+from ..plain_scene import Diffuse, Environment, Glass, Material, PlainScene
+from .shared_files import (
+    LIGHT_INSIDE,
+    Array,
+    Files,
+    json_and_ply,
+    longitude_latitude,
+    material_names,
+    numbers,
+    readme,
+    scene_json,
+    sky_exr,
+)
+
+# Cycles ------------------------------------------------------------------------------------------------------------
+
+CYCLES_COMMANDS = """
+pip install bpy==5.0.1          (Python 3.11)
+python render.py --spp 256 --seeds 1 2 3 4 --out .
+"""
+CYCLES_ASSUMPTIONS = (
+    "max_bounces and every other limit of bounces are Mitsuba's max_depth - 2. min_light_bounces is so, too, and "
+    "switches Russian roulette off.",
+    "A box filter of one pixel, no clamping, no blurred caustics (blur_glossy = 0), light_sampling_threshold = 0, no "
+    "adaptive sampling, no denoising.",
+    "A light emits on one side and is black from behind.",
+    "A map of the sky is resampled: in Cycles the zenith is +z, and no row is centred on a pole.",
+    LIGHT_INSIDE,
+)
 
 
-def files(plain: PlainScene, direction_at: Lookup) -> Files:
-    """The files, by name. The renderer shows the sky's pixel at (u, v) in direction `direction_at(u, v)`."""
-    meshes = {f"{mesh.name}.ply": ply(mesh) for mesh in plain.meshes}
-    places = {mesh.name: {"file": f"{mesh.name}.ply"} for mesh in plain.meshes}
-    return {"scene.json": document(plain, places)} | meshes | sky(plain, direction_at)
+def cycles_files(plain: PlainScene) -> Files:
+    """The files of the export, by name."""
+    return (
+        json_and_ply(plain)
+        | sky_exr(plain, cycles_direction_at)
+        | {
+            "render.py": resources(__package__).joinpath("render_cycles.py").read_bytes(),
+            "README.txt": readme(plain, "Cycles", CYCLES_COMMANDS, CYCLES_ASSUMPTIONS),
+        }
+    )
 
 
-def document(plain: PlainScene, places: Mapping[str, Mapping[str, str]]) -> bytes:
-    """The text of `scene.json`. `places`: by mesh, where its triangles are."""
-    names = material_names(plain)
-    shown: dict[str, Any] = {
-        "name": plain.name,
-        "max_depth": plain.max_depth,
-        "camera": dataclasses.asdict(plain.camera),
-        "sky": {"environment": "sky.exr"} if isinstance(plain.sky, Environment) else {"radiance": plain.sky},
-        "materials": {
-            name: {"type": type(material).__name__.lower()} | dataclasses.asdict(material)
-            for material, name in names.items()
-        },
-        "meshes": {mesh.name: {**places[mesh.name], "material": names[mesh.material]} for mesh in plain.meshes},
+def cycles_direction_at(u: Array, v: Array) -> Array:
+    """(…, 3): the direction in which Cycles shows the pixel at (u, v) of the map, v from the top."""
+    phi, theta = np.pi * (1 - 2 * u), np.pi * v
+    return np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], axis=-1)
+
+
+# raysect -----------------------------------------------------------------------------------------------------------
+
+RAYSECT_COMMANDS = """
+pip install raysect==0.9.0
+python render.py --spp 256 --seeds 1 2 3 4 --out .
+"""
+RAYSECT_ASSUMPTIONS = (
+    "A ray carries a spectrum of three bins, which are red, green and blue; an index is the same for all of them.",
+    "ray_max_depth is Mitsuba's max_depth. Russian roulette (extinction) and importance sampling are off: a lamp and "
+    "the sky are met by chance.",
+    "raysect's pinhole camera weighs a ray by the cosine to where it looks; here it does not.",
+    "At a smooth boundary reflection or transmission is chosen by Fresnel's R, as in Mitsuba; at the critical angle "
+    "itself light is reflected.",
+    "Coordinates are scaled so that the largest is 0.5: raysect meets triangles in float32 and starts rays 1e-6 beside "
+    "them.",
+    "The sky is a sphere that emits, 20 times as large as the scene. A map of it is resampled: no row is "
+    "centred on a pole.",
+    "A light emits on one side and is black from behind.",
+    LIGHT_INSIDE,
+)
+
+
+def raysect_files(plain: PlainScene) -> Files:
+    """The files of the export, by name."""
+    files = json_and_ply(plain, sky_file="sky.npy")
+    if isinstance(plain.sky, Environment):
+        file = io.BytesIO()
+        np.save(file, longitude_latitude(plain.sky, own_direction_at))
+        files["sky.npy"] = file.getvalue()
+    return files | {
+        "render.py": resources(__package__).joinpath("render_raysect.py").read_bytes(),
+        "README.txt": readme(plain, "raysect", RAYSECT_COMMANDS, RAYSECT_ASSUMPTIONS),
     }
-    return json.dumps(shown, indent=1).encode()
 
 
-def material_names(plain: PlainScene) -> dict[Material, str]:
-    """A name for each material."""
-    return {material: f"material{number}" for number, material in enumerate(plain.materials)}
+# Programs without a target of their own: Wavefront OBJ, and everything else as JSON -----------------------------------
+
+OBJ_COMMANDS = """
+scene.obj    the triangles, one object per mesh
+scene.mtl    the materials as far as Wavefront's format can say them
+scene.json   camera, sky, max_depth, all materials, and the material of each object by name
+sky.exr      only where the sky is a map, by longitude and latitude
+"""
+OBJ_ASSUMPTIONS = (
+    "Coordinates are right-handed. Triangles are counterclockwise as seen from the medium of a glass's ext_ior, and "
+    "from the side on which a light emits. Lights are black from behind. All shading is flat.",
+    "The camera is a pinhole that looks from origin to target; up points up in the image; fov_x_degrees is the angle "
+    "from the left border to the right one. A pixel is the mean over its square.",
+    "max_depth counts the segments of a path from the camera: 2 is light, one surface, camera.",
+    "sky.exr: +y is the zenith. The pixel in row j of H and column i of W has its centre at theta = pi (j + 1/2) / H, "
+    "phi = 2 pi (i + 1/2) / W, and is seen in direction (sin(phi) sin(theta), cos(theta), -cos(phi) sin(theta)).",
+    "Your program may scale radiance by the square of the index at a boundary, or not: the images differ only where a "
+    "camera, a light or a diffuse surface is inside glass.",
+)
 
 
-def sky(plain: PlainScene, direction_at: Lookup) -> Files:
-    """`sky.exr` where the sky is a map, resampled for a renderer with this `direction_at`."""
-    if not isinstance(plain.sky, Environment):
-        return {}
-    return {"sky.exr": exr(longitude_latitude(plain.sky, direction_at))}
+def obj_files(plain: PlainScene) -> Files:
+    """The files of the export, by name."""
+    names = material_names(plain)
+    return sky_exr(plain, own_direction_at) | {
+        "scene.obj": "".join(_objects(plain, names)).encode(),
+        "scene.mtl": "".join(f"newmtl {name}\n{_mtl(material)}" for material, name in names.items()).encode(),
+        "scene.json": scene_json(plain, {mesh.name: {"object": mesh.name} for mesh in plain.meshes}),
+        "README.txt": readme(plain, "a program of your own", OBJ_COMMANDS, OBJ_ASSUMPTIONS),
+    }
+
+
+def own_direction_at(u: Array, v: Array) -> Array:
+    """(…, 3): as in Mitsuba, but with the pixels of all rows at their centres."""
+    phi, theta = 2 * np.pi * u, np.pi * v
+    return np.stack([np.sin(phi) * np.sin(theta), np.cos(theta), -np.cos(phi) * np.sin(theta)], axis=-1)
+
+
+def _objects(plain: PlainScene, names: dict[Material, str]) -> Iterator[str]:
+    """The text of the OBJ file. It counts vertices from 1, through all objects."""
+    first = 1
+    yield "mtllib scene.mtl\n"
+    for mesh in plain.meshes:
+        yield f"o {mesh.name}\nusemtl {names[mesh.material]}\n"
+        yield "".join(f"v {numbers(vertex)}\n" for vertex in mesh.vertices.tolist())
+        yield "".join(f"f {a} {b} {c}\n" for a, b, c in (mesh.faces + first).tolist())
+        first += len(mesh.vertices)
+
+
+def _mtl(material: Material) -> str:
+    if isinstance(material, Glass):
+        return f"illum 7\nKd 0 0 0\nKs 1 1 1\nTf 1 1 1\nNi {material.int_ior / material.ext_ior!r}\n"
+    if isinstance(material, Diffuse):
+        return f"illum 1\nKd {numbers(material.reflectance)}\n"
+    return f"illum 1\nKd 0 0 0\nKe {numbers(material.radiance)}\n"

@@ -1,9 +1,11 @@
-"""Files that several targets write: meshes, environment maps, README.txt."""
+"""Files that several targets write: meshes, maps of the sky, `scene.json`, README.txt."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,29 +14,20 @@ from mi_refract import __version__
 from mi_refract.io.atomic import temporary_folder
 from mi_refract.io.image_file import NO_DATE, write_exr
 
-from ..plain_scene import Mesh, PlainScene
+from ..plain_scene import Environment, Material, Mesh, PlainScene
 
 Files = dict[str, bytes]  # contents by name
-
-
-def ply(mesh: Mesh) -> bytes:
-    """Binary PLY, little-endian, float32, without normals."""
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(mesh.vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    faces = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", 3)])
-    faces["count"], faces["index"] = 3, mesh.faces
-    return header.encode() + mesh.vertices.astype("<f4").tobytes() + faces.tobytes()
-
-
-def exr(pixels: NDArray[np.floating]) -> bytes:
-    """An OpenEXR file of pixels (H, W, 3)."""
-    with temporary_folder() as folder:
-        path = folder / "map.exr"
-        write_exr(path, pixels, metadata=NO_DATE)
-        return path.read_bytes()
+Array = NDArray[np.float64]
+# Where a renderer shows the pixel at (u, v) of its map of the sky: (u, v) in [0, 1]², v from the top row down,
+# to directions (…, 3).
+Lookup = Callable[[Array, Array], Array]
+# Other renderers place texels at their centres, Mitsuba places its first and last row at the poles. Between its texels
+# a map is linear. A finer map reproduces that, except in those of its cells that a texel of the first map divides.
+FINER = 16
+LIGHT_INSIDE = (
+    "Radiance is not scaled by the square of the index inside glass. The image is the same as long as camera, lights "
+    "and diffuse surfaces are all in the outermost medium."
+)
 
 
 def numbers(values: Iterable[float], separator: str = " ") -> str:
@@ -60,7 +53,89 @@ def readme(plain: PlainScene, target: str, commands: str, assumptions: Sequence[
     return ("\n".join(lines) + "\n").encode()
 
 
-LIGHT_INSIDE = (
-    "Radiance is not scaled by the square of the index inside glass. The image is the same as long as camera, lights "
-    "and diffuse surfaces are all in the outermost medium."
-)
+# Meshes and materials ----------------------------------------------------------------------------------------------
+
+
+def material_names(plain: PlainScene) -> dict[Material, str]:
+    """A name for each material."""
+    return {material: f"material{number}" for number, material in enumerate(plain.materials)}
+
+
+def ply_files(plain: PlainScene) -> Files:
+    """A PLY file per mesh: binary, little-endian, float32, without normals."""
+    return {f"{mesh.name}.ply": _ply(mesh) for mesh in plain.meshes}
+
+
+def _ply(mesh: Mesh) -> bytes:
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(mesh.vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", 3)])
+    faces["count"], faces["index"] = 3, mesh.faces
+    return header.encode() + mesh.vertices.astype("<f4").tobytes() + faces.tobytes()
+
+
+def scene_json(plain: PlainScene, where: Mapping[str, Mapping[str, str]], sky_file: str = "sky.exr") -> bytes:
+    """The text of `scene.json`. `where`: by mesh, where its triangles are; `sky_file`: the file of a map."""
+    names = material_names(plain)
+    document = {
+        "name": plain.name,
+        "max_depth": plain.max_depth,
+        "camera": dataclasses.asdict(plain.camera),
+        "sky": {"environment": sky_file} if isinstance(plain.sky, Environment) else {"radiance": plain.sky},
+        "materials": {
+            name: {"type": type(material).__name__.lower()} | dataclasses.asdict(material)
+            for material, name in names.items()
+        },
+        "meshes": {mesh.name: {**where[mesh.name], "material": names[mesh.material]} for mesh in plain.meshes},
+    }
+    return json.dumps(document, indent=1).encode()
+
+
+def json_and_ply(plain: PlainScene, sky_file: str = "sky.exr") -> Files:
+    """`scene.json`, and the PLY files that it names."""
+    where = {mesh.name: {"file": f"{mesh.name}.ply"} for mesh in plain.meshes}
+    return {"scene.json": scene_json(plain, where, sky_file)} | ply_files(plain)
+
+
+# The sky -----------------------------------------------------------------------------------------------------------
+
+
+def exr(pixels: NDArray[np.floating]) -> bytes:
+    """An OpenEXR file of pixels (H, W, 3)."""
+    with temporary_folder() as folder:
+        path = folder / "map.exr"
+        write_exr(path, pixels, metadata=NO_DATE)
+        return path.read_bytes()
+
+
+def sky_exr(plain: PlainScene, direction_at: Lookup) -> Files:
+    """`sky.exr` where the sky is a map, resampled for a renderer with this `direction_at`."""
+    if not isinstance(plain.sky, Environment):
+        return {}
+    return {"sky.exr": exr(longitude_latitude(plain.sky, direction_at))}
+
+
+def longitude_latitude(environment: Environment, direction_at: Lookup) -> NDArray[np.float32]:
+    """(H, W, 3): the map for a renderer that shows its pixel at (u, v) in direction `direction_at(u, v)`."""
+    height = FINER * (environment.pixels.shape[0] - 1)
+    width = FINER * environment.pixels.shape[1]
+    v, u = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
+    return radiance(environment, direction_at(u, v)).astype(np.float32)
+
+
+def radiance(environment: Environment, directions: Array) -> Array:
+    """(…, 3): the radiance in these directions of the scene (…, 3), of any length but 0."""
+    x, y, z = np.moveaxis(directions @ environment.rotation, -1, 0)
+    pixels = environment.pixels.astype(float)
+    height, width = pixels.shape[:2]
+    column = np.arctan2(x, -z) / (2 * np.pi) * width - 0.5
+    row = np.arctan2(np.hypot(x, z), y) / np.pi * (height - 1)
+    left, top = np.floor(column).astype(int), np.clip(np.floor(row).astype(int), 0, max(height - 2, 0))
+    right, bottom = (left + 1) % width, np.minimum(top + 1, height - 1)
+    a, b = (column - left)[..., None], (row - top)[..., None]
+    upper = (1 - a) * pixels[top, left % width] + a * pixels[top, right]
+    lower = (1 - a) * pixels[bottom, left % width] + a * pixels[bottom, right]
+    return np.asarray((1 - b) * upper + b * lower)

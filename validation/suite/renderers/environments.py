@@ -13,7 +13,9 @@ from pathlib import Path
 
 from mi_refract.io import process_group
 from mi_refract.io.atomic import write_atomically
+from mi_refract.io.errors import TooMuchOutputError
 from mi_refract.ray_sets import renderer_file
+from mi_refract.report.row import Reason
 
 from .system import LOCKS, SCRIPTS, Apt, Npm, Pip, System
 
@@ -43,7 +45,9 @@ def folder(system: System) -> Path:
 
 def absent(system: System) -> str:
     """ "" where the system is installed in its pinned version; otherwise the command that brings it."""
-    return "" if _present(system) else f"{COMMAND} {system.name}"
+    return (
+        "" if _present(system) else Reason(f"{COMMAND} {system.name}", f"other renderers, by `{COMMAND} {system.name}`")
+    )
 
 
 def _present(system: System) -> bool:
@@ -59,7 +63,7 @@ def _said_version(program: str) -> str:
     """What a program says to --version; "" where it does not say it in time."""
     try:
         ended = process_group.run([program, "--version"], b"", _ASKING, keep_stderr=True)
-    except (OSError, TimeoutError, process_group.TooMuchOutputError):
+    except (OSError, TimeoutError, TooMuchOutputError):
         return ""
     return (ended.out + ended.said).decode(errors="replace")
 
@@ -201,14 +205,14 @@ def run(command: Sequence[str], given: str = "", timeout: float | None = None, w
     limit = TIMEOUT if timeout is None else timeout
     try:
         ended = process_group.run(command, given.encode(), limit, keep_stderr=True, cwd=where, env=own)
-    except (TimeoutError, process_group.TooMuchOutputError) as error:
+    except (TimeoutError, TooMuchOutputError) as error:
         raise Broken(str(error)) from None
     except OSError as error:
         raise Broken(f"{command[0]}: {error.strerror}") from None
     if ended.status == CANNOT:
         raise Unable(_last_word(ended.said))
     if ended.status:
-        raise Broken(f"{ended.how}: {_last_word(ended.said)}")
+        raise Broken(f"{ended.describe}: {_last_word(ended.said)}")
     try:
         return ended.out.decode()
     except UnicodeDecodeError:

@@ -33,7 +33,7 @@ class OtherIndex:
 
 @dataclass(frozen=True)
 class GlassCatalogue:
-    """Glasses of a system: `script` of scripts/ reads rays with media and wavelengths, and answers with `n_ratio`.
+    """Glasses of a system: `script` of scripts/, asked for `glasses`, reads rays with media and answers with `n_ratio`.
 
     `glasses`: those of GLASSES that it has. `told`: the signal of total internal reflection. `others`: those with
     another index there.
@@ -75,9 +75,9 @@ _RAYSECT = {
 }
 # By the name of a system in `table`.
 CATALOGUES = {
-    "rayoptics": GlassCatalogue("rayoptics_glasses.py", GLASSES, "nan"),
-    "optiland": GlassCatalogue("optiland_glasses.py", GLASSES, "nan", _OPTILAND),
-    "raysect": GlassCatalogue("raysect_glasses.py", tuple(_RAYSECT), "reflected", _RAYSECT),
+    "rayoptics": GlassCatalogue("rayoptics_rays.py", GLASSES, "nan"),
+    "optiland": GlassCatalogue("optiland_rays.py", GLASSES, "nan", _OPTILAND),
+    "raysect": GlassCatalogue("raysect_rays.py", tuple(_RAYSECT), "reflected", _RAYSECT),
     # No catalogue: two glasses that a telescope of its data calls by Schott's names.
-    "batoid": GlassCatalogue("batoid_glasses.py", ("SCHOTT:N-BK7", "SCHOTT:N-LAK10"), "nan"),
+    "batoid": GlassCatalogue("batoid_rays.py", ("SCHOTT:N-BK7", "SCHOTT:N-LAK10"), "nan"),
 }

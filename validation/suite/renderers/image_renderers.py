@@ -19,7 +19,7 @@ from mi_refract.io.image_file import Image
 from mi_refract.rendering import scene_files
 from mi_refract.scene_export import write_files
 from mi_refract.scene_export.plain_scene import PlainScene
-from mi_refract.scene_export.targets import cycles, luxcore, povray, radiance, raysect, scene_json
+from mi_refract.scene_export.targets import luxcore, povray, radiance, scene_json, shared_files
 from validation.run.render_methods import Camera
 
 from . import environments
@@ -106,7 +106,8 @@ def _three(mis: str) -> Callable[[PlainScene, Path, int, Sequence[int]], list[Im
         if not (chromium and node):
             raise environments.Unable("no node or no Chromium in PATH")
         (folder / "scene").mkdir()
-        for name, content in scene_json.files(plain, equirectangular).items():
+        files = shared_files.json_and_ply(plain) | shared_files.sky_exr(plain, equirectangular)
+        for name, content in files.items():
             (folder / "scene" / name).write_bytes(content)
         script = environments.SCRIPTS / "three_images.mjs"
         places = [str(script), str(environments.folder(SYSTEMS["three"])), chromium, str(folder / "scene"), str(folder)]
@@ -196,8 +197,8 @@ IMAGE_RENDERERS: dict[str, ImageRenderer] = {
     "Mitsuba, prb": ImageRenderer("mitsuba", _mitsuba("prb"), MITSUBA_SPP, MITSUBA),
     "Mitsuba, ptracer": ImageRenderer("mitsuba", _mitsuba("ptracer"), {"caustic": 32768, "sphere": 512}, PTRACER),
     "Radiance": ImageRenderer("radiance", _radiance, _spp(960, 448, 24), radiance.ASSUMPTIONS),
-    "Cycles": ImageRenderer("cycles", _by_script("cycles"), _spp(512, 128, 32), cycles.ASSUMPTIONS),
-    "raysect": ImageRenderer("raysect", _by_script("raysect", "pfm"), RAYSECT_SPP, raysect.ASSUMPTIONS),
+    "Cycles": ImageRenderer("cycles", _by_script("cycles"), _spp(512, 128, 32), scene_json.CYCLES_ASSUMPTIONS),
+    "raysect": ImageRenderer("raysect", _by_script("raysect", "pfm"), RAYSECT_SPP, scene_json.RAYSECT_ASSUMPTIONS),
     "LuxCore": ImageRenderer("luxcore", _by_script("luxcore"), _spp(1280, 1024, 576), luxcore.ASSUMPTIONS),
     "POV-Ray": ImageRenderer("povray", _povray, _spp(64, 64, 64), POVRAY),
     "three-gpu-pathtracer": ImageRenderer("three", _three("1"), {"prism": 8, "furnace": 8}, THREE),

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
-from mi_refract.io.toml_schema import TEXT, TEXTS, Key, Table, read, whole
-from mi_refract.ray_sets.renderer_file import FLAG, ImagesCommand, RaysCommand, RendererFile
+import msgspec
+from msgspec import Meta
+
+from mi_refract.io.typed_table import convert
+from mi_refract.ray_sets import renderer_file
+from mi_refract.ray_sets.renderer_file import ImagesCommand, RaysCommand, Text
 
 SCRIPTS = Path(__file__).parent / "scripts"
 LOCKS = Path(__file__).parent / "locks"
@@ -77,39 +82,48 @@ class System:
         return "with this package" if self.folder is None or self.folder.parent.name == "systems" else str(self.folder)
 
 
-INSTALL = {
-    "pip": Key(TEXTS, "packages of PyPI, in an environment of their own", None),
-    "python": Key(TEXT, "the one version of Python that they are for", None),
-    "built": Key(TEXT, "the one of them that has no wheel", None),
-    "npm": Key(TEXTS, "packages of npm, in a folder of their own", None),
-    "apt": Key(TEXTS, "packages of the distribution, as PACKAGE=VERSION", None),
-    "program": Key(TEXT, "of apt: the program that is found in PATH", None),
-    "version": Key(TEXT, "of apt: what the program says of itself", ""),
-    "megabytes": Key(whole(1, 100_000), "on disk"),
-    "small": Key(FLAG, "whether it is fit for every run", False),
-}
+class Install(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [install]: one of pip, npm and apt."""
+
+    megabytes: Annotated[int, Meta(ge=1, le=100_000)]  # on disk
+    pip: tuple[Text, ...] = ()  # packages of PyPI, in an environment of their own
+    python: str = ""  # the one version of Python that they are for
+    built: str = ""  # the one of them that has no wheel
+    npm: tuple[Text, ...] = ()  # packages of npm, in a folder of their own
+    apt: tuple[Text, ...] = ()  # packages of the distribution, as PACKAGE=VERSION
+    program: str = ""  # of apt: the program that is found in PATH
+    version: str = ""  # of apt: what the program says of itself
+    small: bool = False  # fit for every run
+
+    def __post_init__(self) -> None:
+        """ValueError for none of them, or several."""
+        if sum(map(bool, (self.pip, self.npm, self.apt))) != 1:
+            raise ValueError("expected one of pip, npm and apt")
+
+    @property
+    def needs(self) -> Pip | Npm | Apt:
+        """What is to be installed."""
+        if self.npm:
+            return Npm(self.npm)
+        if self.apt:
+            return Apt(self.program, self.apt, self.version)
+        return Pip(self.pip, self.python, self.built)
 
 
-def from_file(known: RendererFile) -> System:
-    """The system that a file tells of. ValueError for an unknown key of [install]."""
-    given = None if known.install is None else read(known.install, INSTALL, f"{known.folder}: install.")
+def load(folder: Path) -> System:
+    """The system of a folder with a `mi-refract-renderer.toml`. Errors as of `renderer_file.load`."""
+    known = renderer_file.load(folder)
+    where = f"{folder / renderer_file.NAME}: install"
+    install = None if known.install is None else convert(known.install, Install, where)
     return System(
-        known.name,
+        folder.resolve().name,
         known.title,
         known.licence,
-        None if given is None else _needs(given),
-        megabytes=0 if given is None else given["megabytes"],
-        small=given is None or given["small"],
+        install.needs if install else None,
+        megabytes=install.megabytes if install else 0,
+        small=install is None or install.small,
         calls=known.rays,
         lens=known.lens,
         images=known.images,
-        folder=known.folder,
+        folder=folder,
     )
-
-
-def _needs(given: Table) -> Pip | Npm | Apt:
-    if given["npm"]:
-        return Npm(tuple(given["npm"]))
-    if given["apt"]:
-        return Apt(given["program"], tuple(given["apt"]), given["version"])
-    return Pip(tuple(given["pip"]), given["python"] or "", given["built"] or "")

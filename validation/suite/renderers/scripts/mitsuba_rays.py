@@ -28,6 +28,5 @@ def dielectric(a, n, n_from, n_to):
 
 rays = table.Rays("float32")
 subject = dielectric if sys.argv[1:] == ["dielectric"] else functions
-rows = zip(rays.a.tolist(), rays.n.tolist(), rays.n_from.tolist(), rays.n_to.tolist(), strict=True)
-b, transmitted = zip(*(subject(np.array(a), n, n_from, n_to) for a, n, n_from, n_to in rows), strict=True)
+b, transmitted = zip(*(subject(a.astype(float), n.tolist(), *pair) for a, n, *pair in rays.each()), strict=True)
 table.write(rays, np.array(b), f"Mitsuba {mi.__version__}, {mi.variant()}", transmitted)

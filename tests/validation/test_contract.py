@@ -1,0 +1,238 @@
+"""What every study must keep to: tasks and rows have names of their own, bounds have reasons and exclude something.
+
+Rows are those of the studies whose quick form takes a second or two; the validation itself runs all of them.
+"""
+
+import functools
+import importlib
+import inspect
+import math
+import time
+import types
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mi_refract import backend
+from mi_refract.io.pixels import srgb_decode
+from mi_refract.media import glass_catalogs
+from mi_refract.report.row import Row
+from validation import __main__ as command
+from validation import limits, repeated, runner
+from validation.ground_truth import rainbow
+from validation.run import kernel_timing, seeds, tightness
+from validation.run.context import Context, profiles
+from validation.study import Study
+
+MODULES = command.modules([], "full")
+STUDIES = {name: importlib.import_module(f"validation.{name}").STUDY for name in MODULES}
+VARIANTS = ("scalar_rgb", "llvm_ad_rgb")
+RUN = (
+    *("directions.bsdf_samples", "diff.planted_defects", "planar.against_retrace", "media.catalogs"),
+    *("media.closed_forms", "stability.derivatives", "stability.energy", "stability.layered_paths"),
+    "stability.optical_chains",
+)
+
+
+def context(variant, folder=Path(), profile="quick"):
+    return Context(profiles(variant)[profile], folder, variant, backend.detect(), backend.usable_variants())
+
+
+# Studies and tasks ---------------------------------------------------------------------------------------------------
+
+
+def test_every_study_is_in_a_room_and_described():
+    root = Path(command.__file__).parent
+    modules = {".".join(path.relative_to(root).with_suffix("").parts): path.read_text() for path in root.glob("*/*.py")}
+    assert {name for name, text in modules.items() if "\nSTUDY = Study(" in text} == set(MODULES)
+    assert set(command.QUICK) < set(MODULES) == set(command.modules([], "standard"))
+    assert len({study.name for study in STUDIES.values()}) == len(STUDIES)
+    assert all(study.title and study.text and study.terms for study in STUDIES.values())
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_tasks_have_different_names_and_those_that_time_something_say_so(variant, needs_variant):
+    needs_variant(variant)
+    for profile in profiles(variant):
+        tasks = runner.tasks(list(STUDIES.values()), context(variant, profile=profile))
+        assert {task.name for task in tasks if not task.timed and reached(task.run) & CLOCKS} == set()
+        assert any(task.timed for task in tasks)
+
+
+# A task that reaches one of them measures a time. What `Camera` measures is not judged by those that are not `timed`.
+CLOCKS = {"perf_counter", "process_time", "kernel_timing.interval", "scaling.run"}
+NOT_JUDGED = "render_methods.Camera.__call__"
+
+
+def reached(start):
+    """Clocks, and functions of the validation (module.name), that `start` may call, by the names in their code."""
+    found, left = set(), [start]
+    while left:
+        this = left.pop()
+        if isinstance(this, functools.partial):
+            left += [this.func, *this.args]
+        elif isinstance(this, Study):
+            left.append(this.again)
+        elif inspect.isclass(this):
+            left += vars(this).values()
+        elif isinstance(this := inspect.unwrap(this) if callable(this) else None, types.FunctionType):
+            name = f"{this.__module__.rpartition('.')[2]}.{this.__qualname__}"
+            if this.__module__.startswith(("validation", __name__)) and name not in found | {NOT_JUDGED}:
+                names = names_in(this.__code__)
+                found |= {name} | names & CLOCKS
+                scopes = [this.__globals__, *(x for x in this.__globals__.values() if inspect.ismodule(x))]
+                scopes = [vars(x) if inspect.ismodule(x) else x for x in scopes if is_ours(x)]
+                left += [scope[name] for scope in scopes for name in names & scope.keys()]
+                left += [cell.cell_contents for cell in this.__closure__ or ()]
+    return found
+
+
+def is_ours(scope):
+    return not inspect.ismodule(scope) or scope.__name__.startswith("validation")
+
+
+def names_in(code):
+    inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
+    return set(code.co_names).union(*map(names_in, inner))
+
+
+def test_a_task_that_times_something_is_found():
+    def direct():
+        return kernel_timing.ratio("time / plain", [1.0], [2.0])
+
+    def by_hand():
+        return time.process_time()
+
+    def through_a_study(study):
+        return study.again(None)
+
+    again = Study("s", "", "", {}, lambda c: [], again=lambda c: [direct() for _ in range(1)])
+    assert all(reached(work) & CLOCKS for work in (direct, by_hand, functools.partial(through_a_study, again)))
+    assert not reached(through_a_study) & CLOCKS
+
+
+# Seeds ---------------------------------------------------------------------------------------------------------------
+
+# Their random draws decide no verdict on errors: times, noise of several seeds of their own, or a sampled defect.
+OTHERWISE = {
+    "renders.against_dielectric": "eight seeds a side, compared by a test with a stated probability of alarm",
+    "renders.colours": "images are shown; no figure has a bound",
+    "renders.unused_features": "times and equality to the last bit",
+    "efficiency.error_against_time": "several seeds a method, with intervals",
+    "efficiency.changing_indices": "times",
+    "efficiency.scaling": "times",
+    "planar.times": "times",
+    "diff.planted_defects": "trials with seeds of their own",
+    "diff.times": "times",
+    "suite.rendered_images": "several seeds a side",
+    "media.hero_wavelength": "times and variances; no figure has a bound",
+    "media.renders": "sixteen seeds a side in the furnace, eight by Welch's test; the rest is times and closed forms",
+    "robustness.code_mutants": "each mutant is a case of its own, and the study is longer in full",
+    "ground_truth.traced_bodies": "bodies are fixed; the rainbow's seeds are its sample",
+}
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_study_that_draws_is_repeated_with_other_seeds_or_says_why_not(name):
+    source = Path(importlib.import_module(f"validation.{name}").__file__).read_text()
+    draws = any(word in source for word in ("default_rng", "regimes.make(", "seed=", "SEED"))
+    assert STUDIES[name].again is not None or name in OTHERWISE or not draws
+    assert STUDIES[name].again is None or name not in OTHERWISE
+
+
+def drawn(context):
+    """A bound that holds for the study's own seed and for no other."""
+    value, own = np.random.default_rng(seeds.current(5)).random(), np.random.default_rng(5).random()
+    return [Row("s", "x", "case", "", {"error": abs(value - own)}, {"error": 1e-9})]
+
+
+@pytest.mark.parametrize(("profile", "count"), [("quick", 0), ("standard", 3), ("full", 10)])
+def test_a_bound_that_only_its_own_seed_holds_fails(profile, count, tmp_path):
+    here = context("scalar_rgb", tmp_path, profile)
+    assert drawn(here)[0].verdict == "pass"
+    tasks = repeated.tasks(Study("s", "S", "", {}, lambda context: [], again=drawn), here)
+    assert len(tasks) == count
+    for task in tasks:
+        summary, broken = task.run()
+        assert (summary.values["checks"], summary.values["broken"], summary.verdict) == (1, 1, "fail")
+        assert summary.values["largest share"] > 1e6 and broken.verdict == "fail"
+    assert seeds.current(5) == 5
+
+
+def test_a_repetition_that_checks_nothing_fails():
+    nothing = Study("s", "S", "", {}, lambda c: [], again=lambda c: [Row("s", "x", "y", "", {"error": 1.0})])
+    assert repeated.rows_of(nothing, context("scalar_rgb"), 1)[0].broken == {"nothing checked": 0.0}
+
+
+def test_what_is_drawn_is_kept_by_seed():
+    calls = []
+    draw = seeds.cached(lambda x: calls.append(x) or seeds.current(x))
+    with seeds.shifted(1):
+        other = draw(1)
+    assert (draw(1), draw(1), other) == (1, 1, 1 + seeds.STEP)
+    assert calls == [1, 1]
+
+
+@pytest.mark.parametrize(("value", "bound", "share"), [(0, 0, 0), (1, 0, np.inf), (np.nan, 0, np.nan), (1, 4, 0.25)])
+def test_shares_of_bounds(value, bound, share):
+    assert repeated.share(float(value), float(bound)) == pytest.approx(share, nan_ok=True)
+
+
+# Rows and bounds -----------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def rows_of(name, folder):
+    tasks = STUDIES[name].tasks(context("llvm_ad_rgb", folder))
+    return STUDIES[name].summarise([row for task in tasks for row in task.run()])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("contract")
+
+
+@pytest.mark.parametrize("name", RUN)
+def test_a_study_holds_its_bounds_none_of_which_is_a_hundred_times_too_wide(name, folder, llvm_variant, monkeypatch):
+    one = {"SCHOTT": glass_catalogs.CATALOGS["SCHOTT"]}  # each takes a second
+    monkeypatch.setattr(glass_catalogs, "CATALOGS", one)
+    rows = rows_of(name, folder)
+    assert {row.study for row in rows} <= {STUDIES[name].name, "self-test"}
+    assert [name for name, count in Counter(row.name for row in rows).items() if count > 1] == []
+    assert [(row.name, row.broken) for row in rows if row.verdict == "fail"] == []
+    assert any(row.verdict == "pass" for row in rows)
+    assert all(math.isfinite(bound) and bound >= 0 for row in rows for bound in row.budgets.values())
+    assert [row.reason for row in tightness.rows(rows) if row.verdict != "pass"] == []
+
+
+def test_a_limit_is_a_number_with_a_reason():
+    table = limits.table()
+    assert len(table) > 50
+    assert [name for name, limit in table.items() if not (limit.reason and math.isfinite(limit) and limit > 0)] == []
+
+
+def test_limits_on_noise_let_no_defect_hide_that_they_are_for():
+    """An index off by INDEX_SEEN moves the rainbow; one code of an 8-bit image is the least that is seen in white."""
+    moved = abs(rainbow.angle(rainbow.INDEX + limits.INDEX_SEEN) - rainbow.angle())
+    assert moved / 11 < limits.RAINBOW_RESOLVED < moved / 9
+    assert (1 - srgb_decode(np.array(254 / 255))) / 2 > limits.FURNACE_CHANNEL
+
+
+def bounded(subject, case, value, bound=1.0, study="energy", metric="error"):
+    return Row(study, subject, case, "", {metric: value}, {metric: bound})
+
+
+def test_bounds_far_above_the_errors_are_listed_and_must_be_explained():
+    """Far in one case of two: the bound is the other's. Far in every case: an explanation, or the row fails."""
+    near = [bounded("x", "easy", 0.001), bounded("x", "hard", 0.5), bounded("x", "never", 0.0, bound=0.0)]
+    (row,) = tightness.rows(near)
+    assert (row.values["checks"], row.values["far from the bound"], row.verdict) == (2, 1, "pass")
+    assert row.reason == "x, error: 1 of 2 rows, others use up to 0.5 of it"
+    (row,) = tightness.rows([*near, bounded("y", "easy", 0.002)])
+    assert row.values["loose in every case"] == 1
+    assert row.broken == {"unexplained": 0.0}
+    (row,) = tightness.rows([bounded("powers", "n = 2", 1e-4, metric="inside: R / u")])
+    assert row.verdict == "pass"
+    assert "excludes: roundings" in row.reason

@@ -1,0 +1,181 @@
+"""The studies of directions and of renders hold what they measure to its budget, and see planted defects."""
+
+import dataclasses
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_refract import FORMULAS, oracle, regimes
+from mi_refract.accuracy import errors
+from mi_refract.plugins import refract as bsdf
+from validation import limits
+from validation.directions import bsdf_samples, keep_worst, per_formula
+from validation.renders import against_dielectric, colours, scene_needs
+from validation.run import array_settings as settings
+from validation.run import render_methods
+from validation.run.context import SCENES
+
+
+@pytest.fixture
+def context(scalar_context):
+    return scalar_context(scalar_rays=60, resolution=8, spp=4, pairs=8, curve_spp=(1,))
+
+
+def defective(props):
+    """A plugin whose index is off by one part in a hundred."""
+    plugin = bsdf.plugin_class(mi.scalar_rgb)(props)
+    params = mi.traverse(plugin)
+    params["eta"] = 1.01 * float(plugin.eta[0])
+    params.update()
+    return plugin
+
+
+def tinted(props):
+    props["specular_transmittance"] = 0.999
+    return props
+
+
+def test_errors_are_those_that_were_put_in():
+    rays = regimes.make("generic", 50, np.float64, seed=1)
+    exact = oracle.refract(rays.a, rays.n, rays.k, progress=False)
+    length = np.sqrt((rays.a.astype(np.longdouble) ** 2).sum(1))[:, None]
+    direction = exact.direction.astype(np.longdouble) + exact.direction_low
+    chord, angle, drift = errors(direction * length, rays, exact)
+    assert max(chord.max(), angle.max(), drift.max()) < 1e-18
+    across = np.cross(direction, np.roll(direction, 1, axis=1))
+    across /= np.sqrt((across**2).sum(1))[:, None]
+    chord, angle, _ = errors((direction + 1e-9 * across) * length, rays, exact)
+    assert chord == pytest.approx(1e-9, rel=1e-6)
+    assert angle == pytest.approx(1e-9, rel=1e-6)
+    chord, angle, drift = errors(direction * 1.001 * length, rays, exact)
+    assert (chord, drift) == (pytest.approx(1e-3), pytest.approx(1e-3))
+    assert angle.max() < 1e-18
+    chord, _, _ = errors(direction * np.nan, rays, exact)
+    assert np.isinf(chord).all()
+
+
+def test_directions_name_what_does_not_run_and_hold_what_does(context):
+    rows = [row for task in per_formula.tasks(context) if "scalar" in task.name for row in task.run()]
+    assert {row.verdict for row in rows} == {"info", "pass"}
+    absent = [s for s in settings.settings(context) if s.vector is None]
+    assert all(row.verdict == "not run" and row.reason for s in absent for row in per_formula._setting_rows(context, s))
+    worst = next(row for row in rows if row.subject == "promoted" and row.case == "critical")
+    assert {"error / bound", "TIR misclassified, beyond its bound"} == set(worst.budgets)
+    assert len(worst.replay["largest error"]["a"]) == 3
+
+
+@pytest.mark.parametrize(("constant", "factor"), [("linear", 6), ("radicand", 6), ("linear", 1), ("linear", 0.2)])
+def test_a_budget_that_is_loose_or_too_tight_fails_the_full_sweep(constant, factor, context, monkeypatch):
+    monkeypatch.setattr(limits, "SLACK_FROM_RAYS", 60)
+    formula = FORMULAS["decomposed"]
+    off = dataclasses.replace(formula.budget, **{constant: factor * getattr(formula.budget, constant)})
+    monkeypatch.setitem(FORMULAS, "decomposed", dataclasses.replace(formula, budget=off))
+    setting = settings.settings(context)[0]
+    parts = [per_formula._regime_row("decomposed", formula, r, setting, 3000) for r in ("grazing", "critical", "k ≫ 1")]
+    whole = per_formula._summary("decomposed", parts, setting, {})
+    assert set(whole.budgets) == {"slack, linear", "slack, radicand"}
+    broken = {metric for row in (whole, *parts) for metric in row.broken}
+    assert broken == ({f"slack, {constant}"} if factor > 1 else {"error / bound"} if factor < 1 else set())
+
+
+def test_samples_pass_and_see_an_index_that_is_off(context, monkeypatch):
+    modes = bsdf_samples._modes()
+    assert all(bsdf_samples._mode_row(*mode, 200, "scalar_rgb").verdict == "pass" for mode in modes)
+    load = mi.load_dict
+    # By 1e-5: one bound for all rays, that of the critical angle, would allow 1.4e-3.
+    monkeypatch.setattr(mi, "load_dict", lambda d: load(d | {"int_ior": 1.50001} if d["type"] == "refract" else d))
+    broken = bsdf_samples._mode_row(*modes[0], 200, "scalar_rgb").broken
+    assert {"eta worst", "wo / bound", "pdf / bound", "weight / bound"} <= set(broken)
+
+
+@pytest.mark.parametrize(("expected", "most"), [(0.0, 0), (1e-7, 0), (1e-3, 1), (0.05, 3), (1.0, 9)])
+def test_flips_are_allowed_as_chance_has_them(expected, most):
+    """The smallest m with P(Poisson > m) ≤ 1e-6: for a small mean x, x^(m+1)/(m+1)!."""
+    assert bsdf_samples.most_flips(expected) == most
+
+
+@pytest.mark.parametrize(("plugin", "verdict"), [("refract", "pass"), ("refract_defect", "fail")])
+def test_renders_agree_and_see_an_index_that_is_off(context, plugin, verdict):
+    mi.register_bsdf("refract_defect", defective)
+    (row,) = against_dielectric._compare(context, SCENES / "sphere.xml", plugin)
+    assert row.verdict == verdict, row.values
+    assert sorted(path.name for path in (context.out / "images/sphere").iterdir()) == sorted(
+        ["dielectric.exr", f"{plugin} difference.exr", f"{plugin} test.exr"]
+    )
+    assert set(row.curves) == ({"refract", "dielectric"} if plugin == "refract" else set())
+
+
+def test_what_is_the_same_is_not_tested_by_chance_and_still_compared(context):
+    """The furnace has no noise: no Welch test, but an image that is off fails; and NaN is no image at all."""
+    mi.register_bsdf("refract_tinted", lambda props: bsdf.plugin_class(mi.scalar_rgb)(tinted(props)))
+    right, wrong = (
+        against_dielectric._compare(context, SCENES / "furnace.xml", p)[0] for p in ("refract", "refract_tinted")
+    )
+    assert right.verdict == "pass" and right.reason.startswith("left out: Welch's test")
+    assert "Welch alarms" not in right.values and not right.curves
+    assert {"|mean ratio − 1|", "changed share"} <= set(wrong.broken)
+    quiet, noisy = np.ones((4, 8, 8, 3)), np.random.default_rng(1).random((4, 8, 8, 3))
+    assert against_dielectric._budgets("nested", "").keys() == {"|mean ratio − 1|", "Welch alarms"}
+    assert against_dielectric._budgets("nested", "left out").keys() == {"|mean ratio − 1|", "changed share"}
+    assert against_dielectric._budgets("mirage", "left out") == {}
+    assert "bit for bit" in against_dielectric.no_question(noisy, noisy)
+    assert "independent seeds" in against_dielectric.no_question(quiet + 1e-7, quiet)
+    assert against_dielectric.no_question(quiet * np.nan, quiet) == against_dielectric.no_question(noisy, quiet) == ""
+
+
+def test_scenes_say_what_they_need_and_what_is_left_out(context):
+    (row,) = scene_needs.scene_rows(context, SCENES / "slab.xml")
+    assert {name for name, value in row.values.items() if value} == {
+        "sampleable",
+        "lamps",
+        "area",
+        "environment",
+        "plain environment",
+        "only glass",
+        "textured",
+        "polarising",
+        "refracting",
+        "deterministic",
+    }
+    assert row.reason == "left out: emitter sampling, a random number, media, null lobes, dispersion, absorption"
+    assert row.replay["left out"]["dispersion"] == "no BSDF bends light by its wavelength"
+
+
+def test_an_image_of_colours_is_of_as_many_renders_as_its_noise_asks_for():
+    """Of 48 × 48 numbers with a relative noise of 0.4: 64 renders leave 0.05; its estimate is off by 1 %."""
+    rng = np.random.default_rng(5)
+
+    def camera(spp, seed):
+        return (rng.normal(2, 0.8, (48, 48, 3)),)
+
+    for count, most, expected in ((16, 1, 16), (16, 2, 32), (16, 16, 64 + 16), (80, 4, 80)):
+        image, noise, seeds = colours._mean(camera, 1, count, most)
+        assert seeds == pytest.approx(expected, abs=16 if most == 16 else 0)
+        assert noise == pytest.approx(0.4 / np.sqrt(seeds), rel=0.06)
+        assert image.mean() == pytest.approx(2, rel=0.01)
+
+
+def test_colours_are_shown_where_the_spectral_variant_runs(context, needs_variant):
+    path = SCENES / "rainbow_drop.xml"
+    (row,) = colours.scene_rows(context, path)
+    assert (row.values, row.reason) == ({}, colours.SCALAR)
+    needs_variant("llvm_ad_spectral")
+    (row,) = colours.scene_rows(dataclasses.replace(context, variant="llvm_ad_rgb"), path)
+    assert row.setting == "llvm_ad_spectral" and row.values[colours.COLOUR] > 0.1
+    assert (context.out / row.images["test"]).is_file()
+    assert mi.variant() == "scalar_rgb"
+
+
+def test_a_scene_is_loaded_in_the_same_order_every_time(context):
+    """Loading with Mitsuba's defaults gives one of two images, about one time in four the other one."""
+    scenes = [render_methods.opened(SCENES / "diamond.xml", "dielectric", 8) for _ in range(12)]
+    images = [render_methods.Camera(scene)(1, seed=0)[0] for scene in scenes]
+    assert all((image == images[0]).all() for image in images)
+
+
+def test_keeping_the_worst_rays_refuses_what_is_no_formula(capsys):
+    assert keep_worst.main(["promoted", "nope"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("validation.directions.keep_worst: unknown formula 'nope'; expected ")
+    assert len(error.splitlines()) == 1

@@ -1,0 +1,225 @@
+"""Optical systems in a scene of Mitsuba: what it makes of the rays, and what its float32 may make of them.
+
+Mitsuba has a system turned by ASKEW; its intersections and its samples, of the lobe that is asked for, are turned back
+in extended precision. A ray goes on along itself, STEP further: Mitsuba's own way, which is measured beside it, sets it
+off along the normal by 1500 ε (1 + |p|), and that is more than everything else here.
+
+The bound is of first order. Each boundary is given its share of roundings; what a change of any of them does to the
+answer is taken from differences of the exact path, and all of them add up. In units of u = 2⁻²⁴:
+
+- FIRST: the first ray's direction and origin, rounded: 1u of each component.
+- INTO: wi, three dot products of unit vectors, 3u each, √3 · 3u in all; a frame that Gram-Schmidt leaves orthogonal and
+  unit to 7u turns by half of that.
+- NORMAL: of a face, edges between turned corners (6u each), their product (3u), its length (2u), the turn's own entries
+  (2u); or a given normal by the inverse of a turn (6u), product and length (5u), interpolated (5u). A sphere's is off
+  by less; and by its place's error over its radius.
+- PLACE, of the largest length S in play: the ray's way, a coordinate, the shape's extent. A sphere: nearest point to
+  the centre (2u), half the difference of squares (2.5u) and its root (3u), way and place (2u), back on the sphere (4u);
+  its own place, the step onward and the next vertex (4u); of an instance, the ray and the place turned (12u) and no own
+  place. A triangle, by Möller and Trumbore: a numerator 7u and the denominator 6u in two directions (√2 · 13u), its
+  inverse (1u), corners (3u), interpolation (3u), the step (1u). All over cos θ.
+- ONWARD: wo by the formula (1u), three sums of products (√3 · 3u), the frame again (3.5u).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from validation.reference import closed_forms, optical_systems
+from validation.reference.optical_systems import (
+    ASKEW,
+    BK7,
+    BUBBLE,
+    NUDGE,
+    RADIUS,
+    THICKNESS,
+    WATER,
+    Answers,
+    Array,
+    Ball,
+    Boundary,
+    Path,
+    System,
+    degrees,
+    dot,
+    length,
+    nudged,
+    unit,
+)
+from validation.run.context import SCENES
+
+U = 2.0**-24
+FIRST, INTO, NORMAL, PLACE, ONWARD = 1.0, 9.0, 20.0, 28.0, 10.0
+STEP = 1e-2  # mm
+APEX = closed_forms.HALF_TURN / 3
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A system, and its scenes: `scenes(plugin)`, one a boundary or one for all, shapes by name for Mitsuba."""
+
+    system: System
+    scenes: Callable[[str], list[dict[str, Any]]]
+
+    def roundings(self) -> dict[tuple[int, str], Array]:
+        """How far each value may be off: N × 1, of places in mm."""
+        system, one = self.system, np.ones((len(self.system.origins), 1))
+        sizes = {(-1, "place"): FIRST * length(system.origins), (-1, "onward"): FIRST * one}
+        for j, (start, p, n, a, _) in enumerate(system.walk()):
+            surface, size = system.boundaries[j].surface, system.boundaries[j].size
+            longest = np.max([length(start), length(p), length(p - start), size * one], axis=0)
+            place = PLACE * longest / np.abs(dot(n, a))
+            sizes |= {(j, "place"): place, (j, "normal"): NORMAL + surface.bend * place}
+            sizes |= {(j, "into"): INTO * one, (j, "onward"): ONWARD * one}
+        return {key: U * size for key, size in sizes.items()}
+
+    @functools.cached_property
+    def bounds(self) -> Answers:
+        """Of the norm of each answer's deviation, N × A: roundings, and what was printed."""
+        system = self.system
+        exact = system.off(system.path())
+        totals = {name: np.full(x.shape[:2], system.printed.get(name, 0), np.longdouble) for name, x in exact.items()}
+        for (boundary, what), size in self.roundings().items():
+            for way in range(3 if what == "place" else 2):
+                moved = system.off(system.path(moved=nudged(boundary, what, way)))
+                for name, total in totals.items():
+                    total += size / NUDGE * length(moved[name] - exact[name])[..., 0]
+        return totals
+
+    @property
+    def index_seen(self) -> float:
+        """The least error, relative, of the index of the denser side everywhere that takes an answer to its bound."""
+
+        def denser(j: int, what: str, x: Any, axis: Any) -> Any:
+            if what != "index" or x == 1:
+                return x
+            return x * (1 + NUDGE) if x > 1 else x / (1 + NUDGE)
+
+        exact, wrong = self.system.off(self.system.path()), self.system.off(self.system.path(moved=denser))
+        ratios = [length(x - exact[name])[..., 0] / NUDGE / self.bounds[name] for name, x in wrong.items()]
+        return 1 / max(float(ratio.max()) for ratio in ratios)
+
+    def traced(self, plugin: str, spawned: bool = False) -> Path:
+        """By Mitsuba, in its present variant. `spawned`: rays go on as Mitsuba would have them."""
+        import mitsuba as mi
+
+        system = self.system
+        scenes = [mi.load_dict({"type": "scene", **shapes}) for shapes in self.scenes(plugin)]
+        scenes *= len(system.boundaries) // len(scenes)
+        origins, directions = ((x @ system.turn).astype(np.float32) for x in (system.origins, system.directions))
+        if dr.is_jit_v(mi.Float):
+            found = np.moveaxis(_through(scenes, system.boundaries, origins.T, directions.T, spawned), 2, 3)
+        else:
+            rays = zip(origins, directions, strict=True)
+            found = np.stack([_through(scenes, system.boundaries, o, d, spawned) for o, d in rays], axis=2)
+        places, directions = found
+        return Path(places @ system.turn.T, unit(directions @ system.turn.T))
+
+    def deviations(self, path: Path) -> Answers:
+        """The norm of each answer's deviation, N × A; a ray that did not get there is off by infinity."""
+        return {name: np.nan_to_num(length(x)[..., 0], nan=np.inf) for name, x in self.system.off(path).items()}
+
+
+def _through(scenes: list[Any], boundaries: tuple[Boundary, ...], o: Array, d: Array, spawned: bool) -> Array:
+    """Places and directions behind the boundaries, 2 × B × 3 (× N); one kernel where there are any."""
+    import mitsuba as mi
+
+    ray, places, directions = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), [], []
+    sampling = mi.BSDFContext()
+    for scene, boundary in zip(scenes, boundaries, strict=True):
+        si = scene.ray_intersect(ray)
+        met = si.is_valid()
+        if met is False:  # a scalar variant has no BSDF to ask then, and ends the process
+            return np.full((2, len(boundaries), 3), np.nan)
+        sampling.component = int(boundary.k is not None)  # of both plugins: 0 reflects, 1 transmits
+        onward = si.to_world(si.bsdf().sample(sampling, si, 0.5, [0.5, 0.5])[0].wo)
+        onward = dr.select(met, onward, dr.nan)
+        places.append(si.p)
+        directions.append(onward)
+        ray = si.spawn_ray(onward) if spawned else mi.Ray3f(dr.fma(STEP, onward, si.p), onward)
+        ray.o.z -= boundary.thickness
+    dr.eval(places, directions)
+    return np.array([[np.array(x, np.longdouble) for x in vectors] for vectors in (places, directions)])
+
+
+# Scenes --------------------------------------------------------------------------------------------------------
+
+
+def glass(plugin: str, inside: Any, outside: Any = 1.0) -> dict[str, Any]:
+    """Mitsuba's dictionary of a glass by its two indices."""
+    return {"type": plugin, "int_ior": float(inside), "ext_ior": float(outside)}
+
+
+def _placed(scale: Any = 1.0) -> Any:
+    """Mitsuba's transform of a shape: stretched along the axes, then turned by ASKEW."""
+    import mitsuba as mi
+
+    matrix = np.eye(4)
+    matrix[:3, :3] = ASKEW.T * np.asarray(scale, float)
+    return mi.ScalarTransform4f(matrix.tolist())
+
+
+def _slab(plugin: str) -> list[dict[str, Any]]:
+    return [{"block": {"type": "cube", "to_world": _placed([60, 60, THICKNESS / 2]), "bsdf": glass(plugin, BK7)}}]
+
+
+def _prism(plugin: str) -> list[dict[str, Any]]:
+    file = {"type": "ply", "filename": str(SCENES / "meshes" / "prism.ply"), "face_normals": True}
+    return [{"prism": {**file, "to_world": _placed(), "bsdf": glass(plugin, BK7)}}]
+
+
+def _ball(index: Any, plugin: str) -> list[dict[str, Any]]:
+    return [{"ball": {"type": "sphere", "radius": RADIUS, "bsdf": glass(plugin, index)}}]
+
+
+def _ellipsoid(plugin: str) -> list[dict[str, Any]]:
+    front, bubble = (boundary.surface for boundary in optical_systems.ellipsoid().boundaries)
+    assert isinstance(front, Ball) and isinstance(bubble, Ball)
+    centre = (bubble.centre[0] @ ASKEW).astype(float).tolist()
+    inner = {"type": "sphere", "center": centre, "radius": BUBBLE, "bsdf": glass(plugin, 1, BK7)}
+    group = {"type": "shapegroup", "shape": {"type": "sphere", "bsdf": glass(plugin, BK7)}}
+    stretched = {"type": "instance", "group": {"type": "ref", "id": "ball"}, "to_world": _placed(front.axes[0])}
+    return [{"ball": group, "front": stretched, "bubble": inner}]
+
+
+def _double_gauss(plugin: str) -> list[dict[str, Any]]:
+    """Each surface is a whole sphere, or a rectangle, in a scene of its own whose origin is the vertex.
+
+    The side to which its normal points is the outside: of a sphere that bulges towards the light, the light's.
+    """
+    import mitsuba as mi
+
+    scenes, before = [], 1.0
+    for c, _, after in optical_systems.double_gauss_data()["prescription"]:
+        inside, outside = (after, before) if c > 0 else (before, after)
+        if c:
+            shape = {"type": "sphere", "center": [0, 0, 1 / c], "radius": 1 / abs(c)}
+        else:
+            shape = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(40)}
+        scenes.append({"surface": shape | {"bsdf": glass(plugin, inside, outside)}})
+        before = after
+    return scenes
+
+
+def benches() -> dict[str, Bench]:
+    """All of them, by name."""
+    down = np.linspace(0.3, 0.6, optical_systems.RAYS)
+    least = optical_systems.prism(APEX, closed_forms.least_deviated(APEX, BK7) + 0 * degrees(0, 1), down)
+    drops = {order: optical_systems.drop(order, degrees(2, 80)) for order in (1, 2)}
+    ball, water = functools.partial(_ball, BK7), functools.partial(_ball, WATER)
+    return {
+        "slab": Bench(optical_systems.slab(85), _slab),
+        "prism, least deviation": Bench(least, _prism),
+        "prism, 32 … 85°": Bench(optical_systems.prism(APEX, degrees(32, 85)), _prism),
+        "aplanatic ball": Bench(optical_systems.aplanatic(), ball),
+        "ellipsoid lens": Bench(optical_systems.ellipsoid(80), _ellipsoid),
+        "drop, one reflection": Bench(drops[1], water),
+        "drop, two reflections": Bench(drops[2], water),
+        "double Gauss": Bench(optical_systems.double_gauss(), _double_gauss),
+    }
