@@ -23,7 +23,7 @@ import numpy as np
 from mi_refract.formulas import FORMULAS, automatic
 from mi_refract.image_diff import pixelwise, tile_statistics
 from mi_refract.io import image_file
-from mi_refract.plugins.refract import PLUGIN
+from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing

@@ -17,8 +17,8 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.formulas import FORMULAS
-from mi_refract.plugins import integrator_context
-from mi_refract.plugins.refract import LOBES, PLUGIN
+from mi_refract.plugins import PLUGIN, integrator_context
+from mi_refract.plugins.refract import LOBES
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing
