@@ -119,13 +119,6 @@ def test_a_first_image_is_one_that_no_cache_knows(context):
         assert all(entry["cache_hit"] for entry in later)
 
 
-def test_times_are_ratios_with_goals(context):
-    seconds = {unused_features.PLUGIN: 1.0, unused_features.BUILTIN: 4.0}
-    row = unused_features.ratio_row(context, "case", "edit", seconds.get, 0.2)
-    assert row.values["edit / dielectric"] == 0.25
-    assert row.missed == {"edit / dielectric": 0.2}
-
-
 def test_a_frozen_image_that_does_not_follow_an_edit_is_seen(context, monkeypatch):
     monkeypatch.setattr(unused_features, "GLASSES", (3,))
     (row,) = unused_features.frozen_rows(context)
