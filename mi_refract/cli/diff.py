@@ -163,7 +163,13 @@ def diff(
     if github:
         for line in text_reports.workflow_commands(found):
             print(line)
-        text_reports.append_summary(found, _pages(report, report_url) if report else None)
+        pages = None
+        if report:
+            from mi_refract.image_diff import html_report
+
+            page_of = html_report.page_of if _is_folder(report) else lambda result: ""
+            pages = text_reports.Pages(report, page_of, report_url)
+        text_reports.append_summary(found, pages)
     raise typer.Exit(found.exit_code)
 
 
@@ -300,12 +306,6 @@ def _is_folder(report: str) -> bool:
     path = Path(report)
     named_so = report.endswith(("/", os.sep)) or not path.suffix
     return bool(report) and (named_so or (path.suffix.lower() not in HTML and path.is_dir()))
-
-
-def _pages(report: str, url: str) -> text_reports.Pages:
-    from mi_refract.image_diff import html_report
-
-    return text_reports.Pages(report, html_report.page_of if _is_folder(report) else lambda result: "", url)
 
 
 @contextlib.contextmanager

@@ -8,7 +8,7 @@ difference.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -139,20 +139,15 @@ def _compare_parts(
     elif places[shown]:
         alike = sum(each.verdict is worst.verdict for each in found.values())
         reason = f"{places[shown]}: {reason}; {worst.verdict}: {alike} of {len(found)} parts and MIP levels"
-    verdict, warning = worst.verdict, _warning(found, places)
+    verdict, warning = worst.verdict, ""
+    warned = [part for part in found if found[part].warning]
+    if warned and verdict is not Verdict.DIFFERENT:
+        place = f"{places[warned[0]]}: " if places[warned[0]] else ""
+        more = f", and in {len(warned) - 1} more parts and MIP levels" if len(warned) > 1 else ""
+        warning = f"{place}{found[warned[0]].warning}{more}"
     if lone := sorted(one.keys() ^ two.keys()):
         more = f", and {len(lone) - 1} more" if len(lone) > 1 else ""
         changed = "is missing" if lone[0] in one else "was added"
         verdict, warning = Verdict.DIFFERENT, ""
         reason = f"{(one | two)[lone[0]].place} {changed}{more}; {reason}"
     return replace(worst, verdict=verdict, reason=reason, warning=warning, part=shown), (one[shown], two[shown])
-
-
-def _warning(found: Mapping[Part, Comparison], places: Mapping[Part, str]) -> str:
-    """The first warning, with its place, and how many there are; none where an image is different."""
-    warned = [part for part in found if found[part].warning]
-    if not warned or any(each.verdict is Verdict.DIFFERENT for each in found.values()):
-        return ""
-    place = f"{places[warned[0]]}: " if places[warned[0]] else ""
-    more = f", and in {len(warned) - 1} more parts and MIP levels" if len(warned) > 1 else ""
-    return f"{place}{found[warned[0]].warning}{more}"

@@ -72,8 +72,13 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Pair]:
     else:
         found = [Pair(name, old.get(name), new.get(name), Path(name)) for name in sorted(old | new)]
     found = [replace(pair, target=reference / pair.target, how=settings.of(pair.name)) for pair in found]
-    # Masks and variances that the settings name for a pair are no images to compare.
-    own = {file for pair in found for file in _own_files(pair, (reference, test))}
+    own: set[Path] = set()  # masks and variances that the settings name for a pair: they are no images to compare
+    for pair in found:
+        sides = [(path, root) for path, root in ((pair.reference, reference), (pair.test, test)) if path]
+        files = {mask} if (mask := _mask_of(pair, reference)) else set()
+        if pair.how.reads_variance:
+            files |= {beside(pair.how.variance, path, root) for path, root in sides}
+        own |= files - {pair.reference, pair.test}
     found = [pair for pair in found if not {pair.reference, pair.test} - {None} <= own]
     found = _with_all_variants(found, [path for path in old.values() if path not in own])
     if not found and not lost and not missed:
@@ -147,14 +152,6 @@ def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> 
 def _mask_of(pair: Pair, root: Path) -> Path | None:
     """The mask that the settings name for a pair; `root`: the folder of the references."""
     return beside(pair.how.mask, pair.target, root) if pair.how.mask else None
-
-
-def _own_files(pair: Pair, roots: tuple[Path, Path]) -> list[Path]:
-    """The mask and the variances that the settings name for a pair."""
-    how, sides = pair.how, zip((pair.reference, pair.test), roots, strict=True)
-    files = [mask] if (mask := _mask_of(pair, roots[0])) else []
-    files += [beside(how.variance, path, root) for path, root in sides if path] if how.reads_variance else []
-    return [file for file in files if file not in (pair.reference, pair.test)]
 
 
 def _with_all_variants(found: list[Pair], references: list[Path]) -> list[Pair]:
