@@ -124,11 +124,6 @@ class Findings:
         return self.total("right")
 
     @property
-    def farthest(self) -> RegimeErrors:
-        """The regime with the largest angle. ValueError where nothing was answered."""
-        return max(self.regimes, key=lambda regime: (regime.compared > 0, regime.worst))
-
-    @property
     def diagnosis(self) -> Explanation | None:
         """The mistake that explains the answers, where exactly one does."""
         certain = [explanation for explanation in self.explanations if explanation.explains]

@@ -89,7 +89,8 @@ def _directions(findings: Findings) -> str:
         return f"{answers}, none of them a {'decidable ' if findings.total('compared') else ''}direction"
     if findings.total("exact") == findings.answered:
         return f"{answers}, all exact up to rounding"
-    worst = f"the largest error is {compact(findings.farthest.worst)} rad ({findings.farthest.regime})"
+    farthest = max(findings.regimes, key=lambda x: (x.compared > 0, x.worst))
+    worst = f"the largest error is {compact(farthest.worst)} rad ({farthest.regime})"
     wide = findings.total("undecidable")
     undecidable = f"; {wide} rays are undecidable (error bound above 0.1 rad)" if wide else ""
     if findings.right == findings.answered:
