@@ -40,8 +40,7 @@ class Progress:
     """What a render has: `base`, an older image that it refines, the `tree` of its passes, and `rest`.
 
     `identity`: everything that the bits depend on. `rest`: the last pass, where it has fewer samples than the others.
-    `seconds`: of rendering; `machines`: where; `base_ended_by`: what ended the render of the base. `lock` is held
-    where any of it changes or is written.
+    `seconds`: of rendering; `machines`: where. `lock` is held where any of it changes or is written.
     """
 
     identity: dict[str, Any]
@@ -50,7 +49,6 @@ class Progress:
     rest: PassSums | None = None
     seconds: float = 0.0
     machines: set[str] = field(default_factory=set)
-    base_ended_by: str = ""
     lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     @property

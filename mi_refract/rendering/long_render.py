@@ -31,7 +31,7 @@ from mi_refract.plugins.scene_parser import ParsedScene
 
 from . import checkpoint, error_estimate, rendered_file
 from .checkpoint import PASS, CheckpointWriter, Progress
-from .end_conditions import NO_NOISE, Limits, reached
+from .end_conditions import Limits, reached
 from .pass_plan import PassPlan, next_stop, plan_passes
 from .pass_sums import PassSums
 from .render_pass import PassRenderer, pass_renderer
@@ -221,8 +221,6 @@ class LongRender:
     def end(self) -> str:
         """What ends the render with what it has; "" where passes are left to render."""
         progress, full = self.progress, self.plan.full_passes
-        if progress.base_ended_by == NO_NOISE:
-            return NO_NOISE
         passes = progress.passes
         if passes == 1 or (passes and next_stop(passes - 1) == passes):
             sums = progress.sums()

@@ -63,7 +63,7 @@ def read(output: Path, channels: tuple[str, ...], identity: dict[str, Any]) -> P
         contrasts = [float(contrast) for contrast in json.loads(said["contrasts"])]
         machines = {name for name in str(said["machines"]).split(", ") if name}
         progress = Progress(identity, seconds=float(said["render_seconds"]), machines=machines)
-        progress.base_ended_by, variance_from = str(said["ended_by"]), said["variance_from"]
+        variance_from = said["variance_from"]
         if changes(json.loads(said["identity"]), identity) or not 1 <= passes <= spp or len(contrasts) != passes - 1:
             return None
         mean = image.select(channels).astype(np.float64)
