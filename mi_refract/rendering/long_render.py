@@ -212,7 +212,15 @@ class LongRender:
         self.checkpoints.wait()
         total = progress.sums()
         assert total is not None
-        header = rendered_file.header(progress, total, self._metadata(), self.ended_by)
+        metadata = {
+            "mi_refract:variant": str(mi.variant()),
+            "mi_refract:seed": self.job.seed,
+            "mi_refract:scene": str(self.job.scene),
+            "mi_refract:defines": json.dumps(dict(self.job.defines), sort_keys=True),
+            "mi_refract:formulas": ", ".join(formulas_in(self.scene)) or "none",
+        }
+        metadata |= provenance() | self.renderer.filter_header
+        header = rendered_file.header(progress, total, metadata, self.ended_by)
         if not nothing_new:
             rendered_file.write(self.output, self.renderer.channels, total, header)
         self.checkpoints.path.unlink(missing_ok=True)
@@ -265,16 +273,6 @@ class LongRender:
         """What changes when another render writes the image or the checkpoint."""
         paths = (self.output, self.checkpoints.path)
         return [(s.st_ino, s.st_mtime_ns) if path.exists() and (s := path.stat()) else None for path in paths]
-
-    def _metadata(self) -> Metadata:
-        own = {
-            "mi_refract:variant": str(mi.variant()),
-            "mi_refract:seed": self.job.seed,
-            "mi_refract:scene": str(self.job.scene),
-            "mi_refract:defines": json.dumps(dict(self.job.defines), sort_keys=True),
-            "mi_refract:formulas": ", ".join(formulas_in(self.scene)) or "none",
-        }
-        return provenance() | own | self.renderer.filter_header
 
 
 def render_to_exr(
