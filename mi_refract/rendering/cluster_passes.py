@@ -118,7 +118,7 @@ class _Node:
 
     @property
     def stop(self) -> int:
-        return self.first + ARITY**self.level
+        return self.first + int(ARITY**self.level)
 
 
 class ClusterPasses:

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import mitsuba as mi
 import numpy as np
@@ -30,7 +30,7 @@ from mi_refract.numerics import Scene
 from mi_refract.plugins.scene_parser import ParsedScene
 
 from . import checkpoint, error_estimate, rendered_file
-from .checkpoint import PASS, CheckpointWriter, Progress
+from .checkpoint import PASS, CheckpointWriter, Identity, Progress
 from .end_conditions import Limits, reached
 from .pass_plan import PassPlan, next_stop, plan_passes
 from .pass_sums import PassSums
@@ -118,7 +118,7 @@ def resume(
     return LongRender(job, path, limits, parsed, scene, renderer, spp, chosen, progress)
 
 
-def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> dict[str, Any]:
+def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> Identity:
     """Everything that the bits of a render depend on, by names for messages; but for PASS, which its plan says."""
     digest = hashlib.sha256()
     for name, path in [*(("", xml) for xml in parsed.xml), *parsed.files(job.allow_plugins).items()]:

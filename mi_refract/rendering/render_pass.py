@@ -13,7 +13,7 @@ import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +24,9 @@ from mi_refract.numerics import Scene, Spectrum
 
 from .pass_plan import FEW, scalar_seed_of, seed_of
 from .pass_sums import Doubles, PassSums
-from .sample_sums import Film, image_sums
+from .sample_sums import Film, Filter, image_sums
+
+MitsubaFilm: TypeAlias = Any  # an `mi.Film`
 
 # One thread would be the caller's own, which keeps denormals: the others take them for 0, and bits would differ.
 LEAST_THREADS = 2
@@ -107,7 +109,7 @@ def pass_renderer(scene: Scene, seed: int) -> PassRenderer:
     return PassRenderer(scene, seed, channels, keeps, expected=_expected_weights(film))
 
 
-def _expected_weights(film: Any) -> Doubles | None:
+def _expected_weights(film: MitsubaFilm) -> Doubles | None:
     """∫ w over all places of samples, for each pixel, H × W × 1; None for a box. Filters are products of two in 1D."""
     rfilter = film.rfilter()
     if rfilter.is_box_filter():
@@ -125,7 +127,7 @@ def _expected_weights(film: Any) -> Doubles | None:
     return np.asarray(along(height)[:, None, None] * along(width)[:, None])
 
 
-def _weights(rfilter: Any) -> Doubles:
+def _weights(rfilter: Filter) -> Doubles:
     """The weights in one dimension, at STEPs from −radius to radius."""
     half = math.ceil(rfilter.radius() / STEP)
     places = (np.arange(-half, half) + 0.5) * STEP
