@@ -71,8 +71,7 @@ def write_exr(
                 raise OSError(one_line(message or output.geterror()) or "OpenImageIO gives no reason")
             # On a full disk `close` is True all the same when the image was small enough for a buffer.
             source = oiio.ImageInput.open(str(temporary))
-            last = source and source.read_scanlines(0, 0, rows - 1, rows, 0, 0, count, "float")
-            if last is None:
+            if source is None or source.read_scanlines(0, 0, rows - 1, rows, 0, 0, count, "float") is None:
                 (source or oiio).geterror()  # or OpenImageIO would print it at the end of the process
                 raise OSError("the last row of pixels is missing; is the disk full?")
             source.close()
