@@ -167,6 +167,12 @@ def test_a_repetition_that_checks_nothing_fails():
     assert repeated.rows_of(nothing, context("scalar_rgb"), 1)[0].broken == {"nothing checked": 0.0}
 
 
+def test_a_repetition_of_what_cannot_be_run_is_not_run():
+    absent = Study("s", "S", "", {}, lambda c: [], again=lambda c: [Row("s", "x", "y", "", reason="install x")])
+    (row,) = repeated.rows_of(absent, context("scalar_rgb"), 1)
+    assert (row.verdict, row.case, row.reason) == ("not run", "other seed 1", "install x")
+
+
 def test_what_is_drawn_is_kept_by_seed():
     calls = []
     draw = seeds.cached(lambda x: calls.append(x) or seeds.current(x))
