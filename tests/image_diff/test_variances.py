@@ -15,6 +15,7 @@ from mi_refract.image_diff import (
     accept,
     channels,
     folders,
+    pairing,
     panes,
     report_folder,
     self_test,
@@ -445,11 +446,17 @@ def test_welch_is_chosen_and_the_reports_say_why(films, tmp_path):
         results = folders.diff(*films, view=folder.view)
         folder.write(results, {}, "")
     assert statuses(results) == {"off.exr": Status.DIFFERENT, "same.exr": Status.EQUAL}
-    assert str(text_reports.table(results)).count(BOTH) == 2
+    assert text_reports.plain(text_reports.table(results)).count(BOTH) == 2
     assert "the variance of both is known" in html.unescape(text_reports.markdown(results))
     entries = text_reports.as_data(results)["results"]
     assert {(x["method"], x["method_why"]) for x in entries} == {("welch", "the variance of both is known")}
     assert BOTH in (tmp_path / "report/index.html").read_text("utf-8")
+
+
+def test_check_settings_shows_them(pair):
+    pairs = pairing.pairs(*pair, settings(**BESIDE, channels=(("X", "a.X"), ("Y", "Y"))))
+    shown = text_reports.settings_table(pairs)[1][1]
+    assert shown.endswith("spp_reference=64, spp_test=16, variance {stem}_var.exr, channels X=a.X,Y")
 
 
 def test_a_method_that_is_named_is_used(films, tmp_path):
