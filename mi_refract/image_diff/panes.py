@@ -19,8 +19,7 @@ import numpy as np
 from mi_refract.io import exit_code
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels, block_mean
-from mi_refract.report import thumbnails
-from mi_refract.report.embedded_images import encoded, shown, strongest
+from mi_refract.report.embedded_images import difference_thumbnail, encoded, shown, strongest, thumbnail
 from mi_refract.report.plots import histogram_svg
 
 from . import flip
@@ -72,14 +71,14 @@ def _shown(result: Result, image_bytes: float, map_bytes: float, thumbs: bool) -
     if thumbs and sides:
         role, image = list(sides.items())[-1]
         coded = _paint(image) == "code"
-        small[role] = thumbnails.of_image(image.pixels, coded)
+        small[role] = thumbnail(image.pixels, coded)
     one, two = sides.get("reference"), sides.get("test")
     if one and two and one.pixels.shape == two.pixels.shape:
         with np.errstate(invalid="ignore"):
             change = two.pixels - one.pixels
         makers.append(functools.partial(map_pane, "difference", change, map_bytes))
         if thumbs:
-            small["difference"] = thumbnails.of_difference(change)
+            small["difference"] = difference_thumbnail(change)
         if "flip" not in maps and all(np.isfinite(x.pixels.astype(np.float32)).all() for x in (one, two)):
             makers.append(functools.partial(_flip, one, two, map_bytes))
     histogram = ""
