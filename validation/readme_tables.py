@@ -17,7 +17,7 @@ from mi_refract.image_diff.methods import METHODS
 from mi_refract.io import image_file
 from mi_refract.io.atomic import update_between, write_atomically
 from mi_refract.io.pixels import srgb_encode
-from mi_refract.plugins.refract import PLUGIN
+from mi_refract.plugins import PLUGIN
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
 from mi_refract.report.thumbnails import png

@@ -94,5 +94,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line, or `arguments`; the exit code. Warnings are one line on stderr, as errors are."""
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: print(printable(f"mi-refract: {message}"), file=sys.stderr)
-        run = functools.partial(app, arguments, prog_name="mi-refract", standalone_mode=False)
+        words = sys.argv[1:] if arguments is None else arguments
+        # `obj`: a command may show the command line that repeats it.
+        run = functools.partial(app, words, prog_name="mi-refract", standalone_mode=False, obj=words)
         return exit_code("mi-refract", run, (KeyboardInterrupt, typer.Abort))

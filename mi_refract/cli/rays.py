@@ -6,9 +6,9 @@ import importlib.util
 import math
 import shlex
 import sys
-from dataclasses import dataclass, replace
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -110,7 +110,10 @@ def check(
     answers: Annotated[
         Path, typer.Argument(metavar="ANSWERS.csv|.npz|.exr", help="Columns id, bx, by, bz[, transmitted][, n_ratio].")
     ],
-    file: Annotated[Path, typer.Option("--rays", metavar="RAYS.csv|.npz|.exr", help="The rays, as exported.")],
+    file: Annotated[
+        Path | None,
+        typer.Option("--rays", metavar="FILE", help="The rays. Default: those of `export` without options."),
+    ] = None,
     tir: Tir = "auto",
     formula: Formula = None,
     backward: Backward = None,
@@ -122,14 +125,13 @@ def check(
 
     Exit code 0: every answer is right; 1: some are wrong; 2: the answers do not match the rays.
     """
-    checking = _Check(tir, formula, backward, report, junit, json)
-    rays = files.read(file)
-    read = files.read_answers(answers, most=files.most_answers(rays))
-    raise typer.Exit(checking.run(rays, read, str(answers), _replay(context)))
+    checked = _checker(context, tir, formula, backward, report, junit, json)
+    rays = files.read(file) if file else ray_set.make()
+    raise typer.Exit(checked(rays, files.read_answers(answers, most=files.most_answers(rays)), str(answers)))
 
 
 # Those of `run` that choose the rays.
-CHOOSING = ("regime", "count", "precision", "seed", "two_sided", "medium", "wavelengths")
+CHOOSING = ("regime", "count", "seed", "two_sided", "medium", "wavelengths")
 
 
 @app.command()
@@ -171,22 +173,21 @@ def run(
     Exit code 0: every answer is right; 1: some are wrong; 2: the answers do not match the rays, or the command fails or
     exceeds its time limit. With --renderer, the largest exit code of its functions.
     """
-    checking = _Check(tir, formula, backward, report, junit, json)
-    typed = _typed(context)
-    if file and (
-        choosing := [typed[name][0] for name in CHOOSING if name in typed and not (renderer and name == "precision")]
-    ):
-        raise ValueError(f"--rays {file} and {choosing[0]}: both choose the rays; expected one of them")
+    checked = _checker(context, tir, formula, backward, report, junit, json)
+    choosing = (*CHOOSING, *([] if renderer else ["precision"]))
+    for name in choosing if file else ():
+        if getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE":
+            option = f"--{name.replace('_', '-')}"
+            raise ValueError(f"--rays {file} and {option}: both choose the rays; expected one of them")
 
-    def answered(words: list[str], title: str, checking: _Check, precision: str, folder: Path | None = None) -> int:
+    def answered(words: list[str], title: str, precision: str, tir: str = "auto") -> int:
         rays = files.read(file) if file else _made(regime, count, precision, seed, two_sided, medium, wavelengths)
         with as_exceptions():
-            answers = run_program.answers_of(words, rays, timeout=timeout, cwd=folder)
-        return checking.run(rays, answers, title, _replay(context))
+            answers = run_program.answers_of(words, rays, timeout=timeout, cwd=renderer)
+        return checked(rays, answers, title, tir)
 
     if not renderer:
-        title = shlex.join(command or [])
-        raise typer.Exit(answered(command or [], title, checking, precision or ray_set.PRECISION))
+        raise typer.Exit(answered(command or [], shlex.join(command or []), precision or ray_set.PRECISION))
 
     from mi_refract.ray_sets import renderer_file
 
@@ -199,87 +200,56 @@ def run(
         raise ValueError(f"{renderer}: {len(functions)} functions, and one report; expected --precision of one of them")
     codes = []
     for function in functions:
-        declared = replace(checking, tir=function.tir) if tir == "auto" else checking
         words = renderer_file.filled(function.command)
-        codes.append(answered(words, function.title, declared, function.precision, renderer))
+        codes.append(answered(words, function.title, function.precision, function.tir))
         for name, reason in function.deviations.items():
             print(printable(f"known deviation of {function.title}: {name}: {reason}"))
     raise typer.Exit(max(codes))
 
 
-@dataclass(frozen=True)
-class _Check:
-    """How answers are checked, and which files are written."""
+def _checker(
+    context: typer.Context,
+    tir: str,
+    formula: str | None,
+    backward: float | None,
+    report: Path | None,
+    junit: Path | None,
+    json: Path | None,
+) -> Callable[..., int]:
+    """`checked(rays, answers, title, tir="auto")`: check the answers, print and write the reports; the exit code.
 
-    tir: str
-    formula: str | None
-    backward: float | None
-    report: Path | None
-    junit: Path | None
-    json: Path | None
+    `tir` there is the declared signal, which an option overrides. ValueError or OSError, before anything runs, for an
+    option that cannot be met.
+    """
+    needed = ("flint", "jinja2") if report else ("flint",)
+    if not all(map(importlib.util.find_spec, needed)):
+        raise ValueError("checking rays needs the extra `validation`: pip install 'mi-refract[validation]'")
+    from mi_refract.ray_sets import check_answers, reports
+    from mi_refract.ray_sets.tir_signal import LOOSEST
 
-    def __post_init__(self) -> None:
-        """ValueError or OSError, before anything runs, for an option that cannot be met."""
-        needed = ("flint", "jinja2") if self.report else ("flint",)
-        if not all(map(importlib.util.find_spec, needed)):
-            raise ValueError("checking rays needs the extra `validation`: pip install 'mi-refract[validation]'")
-        from mi_refract.ray_sets import check_answers
+    error_bound = formula or LOOSEST
+    most_backward = math.inf if backward is None else backward
+    check_answers.check_options(tir, error_bound, most_backward)
+    for path, suffixes in ((report, (".html", ".htm")), (junit, (".xml",)), (json, (".json",))):
+        if path:
+            writable(path, suffixes)
 
-        check_answers.check_options(**self._options)
-        for path, suffixes in ((self.report, (".html", ".htm")), (self.junit, (".xml",)), (self.json, (".json",))):
-            if path:
-                writable(path, suffixes)
-
-    @property
-    def _options(self) -> dict[str, Any]:
-        from mi_refract.ray_sets.tir_signal import LOOSEST
-
-        most = math.inf if self.backward is None else self.backward
-        return {"tir": self.tir, "error_bound": self.formula or LOOSEST, "most_backward": most}
-
-    def run(self, rays: RaySet, answers: Answers, title: str, replay: str) -> int:
-        """Check the answers, print and write the reports; the exit code. `replay`: the command, for the HTML page."""
-        from mi_refract.ray_sets import check_answers, reports
-
+    def checked(rays: RaySet, answers: Answers, title: str, declared: str = "auto") -> int:
         print(printable(f"{title}: {_summary(rays)}"))
-        found = check_answers.check(rays, answers, **self._options)
+        signal = declared if tir == "auto" else tir
+        found = check_answers.check(rays, answers, tir=signal, error_bound=error_bound, most_backward=most_backward)
         # On a terminal, too: a wrapped line is easier to read than a squeezed column.
         Console(width=UNWRAPPED).print(reports.table(found), highlight=False)
-        if self.report:
+        if report:
             about = {"answers": title} | {key: rays.header[key] for key in ("seed", "checksum")} | provenance()
-            reports.write_html(self.report, found, about, replay)
-        if self.junit:
-            reports.write_junit(self.junit, found, title)
-        if self.json:
-            reports.write_json(self.json, found)
+            reports.write_html(report, found, about, shlex.join(["mi-refract", *context.obj]))
+        if junit:
+            reports.write_junit(junit, found, title)
+        if json:
+            reports.write_json(json, found)
         return found.exit_code
 
-
-def _typed(context: typer.Context) -> dict[str, list[str]]:
-    """The options on the command line, as words, by name of the parameter; of arguments the values alone."""
-    words = {}
-    for parameter in context.command.params:
-        source, value = context.get_parameter_source(parameter.name or ""), context.params.get(parameter.name or "")
-        if source is None or source.name != "COMMANDLINE" or value is None:
-            continue
-        values = list(value) if isinstance(value, list | tuple) else [value]
-        if parameter.param_type_name == "argument":
-            words[parameter.name or ""] = list(map(str, values))
-        elif isinstance(value, bool):
-            words[parameter.name or ""] = [parameter.opts[-1]]
-        else:
-            words[parameter.name or ""] = [word for x in values for word in (parameter.opts[-1], str(x))]
-    return words
-
-
-def _replay(context: typer.Context) -> str:
-    """The command that repeats the check, without the reports that it writes."""
-    typed = _typed(context)
-    words = [
-        word for name, option in typed.items() if name not in ("command", "report", "junit", "json") for word in option
-    ]
-    program = ["--", *typed["command"]] if "command" in typed else []
-    return shlex.join(["mi-refract", "rays", str(context.info_name), *words, *program])
+    return checked
 
 
 def _made(

@@ -53,6 +53,7 @@ def self_test(reference: Images = None, max_values: MaxValues = MAX_VALUES, allo
         renders = np.stack([np.array(mi.render(scene, spp=SPP, seed=seed)) for seed in range(RENDERS)])
     rows = self_tests.examine(renders, str(reference or "a glass ball"))
     print_table(self_tests.table(rows))
+    print("\n".join(self_tests.summary(rows)))
     raise typer.Exit(int(any(row.verdict == "fail" for row in rows)))
 
 

@@ -41,8 +41,8 @@ def spreads(channels: Sequence[str]) -> dict[str, tuple[str, bool]]:
         squares = [".".join([*parts[:i], f"m2_{parts[i]}", *parts[i + 1 :]]) for i in range(len(parts))]
         moments = [(spread, True) for spread in (*squares, SQUARES.format(name))]
         variances = [(form.format(name), False) for form in VARIANCES]
-        if found := [pair for pair in (*moments, *variances) if pair[0] in there]:
-            pairs[name] = found[-1]
+        if spread_of := [pair for pair in (*moments, *variances) if pair[0] in there]:
+            pairs[name] = spread_of[-1]
     return pairs
 
 

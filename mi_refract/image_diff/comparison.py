@@ -62,6 +62,15 @@ class Comparison:
     chosen: str = ""
 
     @property
+    def is_equal(self) -> bool:
+        """Whether the images are equal."""
+        return self.verdict is Verdict.EQUAL
+
+    def but(self, verdict: Verdict, reason: str) -> Comparison:
+        """The result with another verdict, and the reason for that before its own."""
+        return replace(self, verdict=verdict, reason=f"{reason}; {self.reason}")
+
+    @property
     def method_in_words(self) -> str:
         """The method, and why it is this one: "welch (the variance of both is known)"."""
         return f"{self.method} ({self.chosen})" if self.chosen else self.method
@@ -84,7 +93,9 @@ def preconditions(reference: Image, test: Image, allow_nonfinite: bool = False) 
         return ""
     if allow_nonfinite:
         lone = ~(whole[0] & whole[1]) & ~((a == b) | (np.isnan(a) & np.isnan(b)))
-        return f"not finite in one image only, or otherwise: {_located(reference, a, lone)}" if lone.any() else ""
+        return (
+            f"not finite in one image only, or not the same value: {_located(reference, a, lone)}" if lone.any() else ""
+        )
     two = replace(test, channels=reference.channels)
     texts = (_located(image, x, ~good) for image, x, good in zip((reference, two), (a, b), whole, strict=True))
     return "; ".join(filter(None, texts))

@@ -61,11 +61,11 @@ def flip(
         raise ValueError(f"hdr = {hdr!r}; expected auto, yes, no")
     if not 1 <= ppd <= 1000:  # below, its filters see nothing; above, they are larger than any image
         raise ValueError(f"ppd = {ppd}; expected 1 to 1000")
-    found = _of_colours(reference, test, options)
+    result = _of_colours(reference, test, options)
     others = [name for name in reference.channels if name not in _colours(reference)]
     for names in filter(None, ([n for n in others if n == ALPHA], [n for n in others if n != ALPHA])):
-        found = _with_others(found, _only(reference, names), _only(test, names), options)
-    return found
+        result = _with_others(result, _only(reference, names), _only(test, names), options)
+    return result
 
 
 def _of_colours(reference: Image, test: Image, options: Options) -> Comparison:
@@ -88,11 +88,11 @@ def _of_colours(reference: Image, test: Image, options: Options) -> Comparison:
     return Comparison("flip", verdict_of(metrics), reason, metrics, maps={"flip": error, "local": around})
 
 
-def _with_others(found: Comparison, reference: Image, test: Image, options: Options) -> Comparison:
+def _with_others(result: Comparison, reference: Image, test: Image, options: Options) -> Comparison:
     """FLIP's comparison with that of the channels, alpha or others, that it does not look at."""
     names = ", ".join(reference.channels)
     if np.array_equal(reference.pixels, test.pixels, equal_nan=True):
-        return replace(found, reason=f"{found.reason}; not looked at, but the same: {names}")
+        return replace(result, reason=f"{result.reason}; not compared by FLIP, but identical: {names}")
     coverage = all(bool(((x.pixels >= 0) & (x.pixels <= 1)).all()) for x in (reference, test))
     if reference.channels == (ALPHA,) and coverage:
         reference, test = (replace(image, metadata={"oiio:ColorSpace": "sRGB"}) for image in (reference, test))
@@ -102,11 +102,11 @@ def _with_others(found: Comparison, reference: Image, test: Image, options: Opti
     else:
         others, method, black = tolerance(reference, test), "tolerance", passes_black(tolerance, [reference], {})
         bounded, maps = others.metrics[:1], {}
-    metrics = (*found.metrics, *(replace(metric, name=f"{metric.name}, in {names}") for metric in bounded))
-    verdict, reason = verdict_of(metrics), f"{found.reason}; by {method} {names}: {others.reason}"
+    metrics = (*result.metrics, *(replace(metric, name=f"{metric.name}, in {names}") for metric in bounded))
+    verdict, reason = verdict_of(metrics), f"{result.reason}; by {method} {names}: {others.reason}"
     if verdict is Verdict.EQUAL and black:
-        verdict, reason = Verdict.INCONCLUSIVE, f"{reason}, as would be if they were black"
-    return replace(found, verdict=verdict, reason=reason, metrics=metrics, maps=found.maps | maps)
+        verdict, reason = Verdict.INCONCLUSIVE, f"{reason}, but black would pass as well"
+    return replace(result, verdict=verdict, reason=reason, metrics=metrics, maps=result.maps | maps)
 
 
 def views(image: Image, options: Options) -> Iterator[Image]:

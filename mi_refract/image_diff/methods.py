@@ -163,14 +163,12 @@ def compare(
     method, why = choice(*sides, spp=any(options.get(name) for name in ("spp", "spp_reference", "spp_test")))
     unused = options_of_auto().keys() - METHODS[method].options.keys()
     options = {name: value for name, value in options.items() if name not in unused}
-    found = replace(_compare(method, sides, allow_nonfinite, named, options), chosen=why)
-    few_fail = found.verdict is Verdict.EQUAL and found.metrics[0].value > 0
-    if method == "tolerance" and few_fail and not options.keys() & DECIDING:
+    result = replace(_compare(method, sides, allow_nonfinite, named, options), chosen=why)
+    if method == "tolerance" and result.is_equal and result.metrics[0].value > 0 and not options.keys() & DECIDING:
         a, b = _finite_pair(*(channels.without_variances(side[0], named) for side in sides))
         if where := tolerance.outrageous(a, b, options.get("fail", METHODS[method].options["fail"].default)):
-            reason = f"one pixel is outrageous: {where}; {found.reason}"
-            return replace(found, verdict=Verdict.DIFFERENT, reason=reason)
-    return found
+            return result.but(Verdict.DIFFERENT, f"one pixel is far too bright: {where}")
+    return result
 
 
 def _compare(
@@ -185,31 +183,24 @@ def _compare(
     bare = [[channels.without_variances(image, named) for image in side] for side in sides]
     single = len(bare[0]) == len(bare[1]) == 1
     if chosen.takes_renders:
-        found = chosen.function(*(sides if single else bare), allow_nonfinite=allow_nonfinite, **checked)
-        doubt = _untested(sides[0][0], sides[1][0], allow_nonfinite) if single and _is_equal(found) else ""
+        result = chosen.function(*(sides if single else bare), allow_nonfinite=allow_nonfinite, **checked)
+        doubt = _untested(sides[0][0], sides[1][0], allow_nonfinite) if single and result.is_equal else ""
     elif not single:
         raise ValueError(f"{method}: {len(bare[0])} and {len(bare[1])} images; expected one a side")
     else:
         a, b, besides = shared_channels(bare[0][0], bare[1][0])
         if reason := preconditions(a, b, allow_nonfinite):
-            found = nonfinite_result(method, reason, *aligned(a, b))
+            result = nonfinite_result(method, reason, *aligned(a, b))
         else:
             a, b = _finite_pair(a, b)
-            found = chosen.function(a, b, **checked)
+            result = chosen.function(a, b, **checked)
         if besides:
-            return replace(
-                found, verdict=Verdict.DIFFERENT, reason=f"{besides}; the others: {found.reason}", warning=""
-            )
-        doubt = blind_to(chosen, a, b, checked) if _is_equal(found) else ""
-    if not _is_equal(found):
-        return found
+            reason = f"{besides}; the other channels: {result.reason}"
+            return replace(result, verdict=Verdict.DIFFERENT, reason=reason, warning="")
+        doubt = blind_to(chosen, a, b, checked) if result.is_equal else ""
     if doubt:
-        return replace(found, verdict=Verdict.INCONCLUSIVE, reason=f"{doubt}; {found.reason}")
-    return _with_what_is_left_out(found, bare[0][0])
-
-
-def _is_equal(found: Comparison) -> bool:
-    return found.verdict is Verdict.EQUAL
+        return result.but(Verdict.INCONCLUSIVE, doubt)
+    return _with_what_is_left_out(result, bare[0][0]) if result.is_equal else result
 
 
 def _finite_pair(reference: Image, test: Image) -> tuple[Image, Image]:
@@ -218,27 +209,24 @@ def _finite_pair(reference: Image, test: Image) -> tuple[Image, Image]:
     return replace(reference, pixels=a), replace(test, pixels=b, channels=reference.channels)
 
 
-def _with_what_is_left_out(found: Comparison, reference: Image) -> Comparison:
-    """The comparison and how many values were not finite; INCONCLUSIVE where that is all of a channel."""
+def _with_what_is_left_out(result: Comparison, reference: Image) -> Comparison:
+    """The result and how many values were not finite; INCONCLUSIVE where that is all of a channel."""
     is_finite = np.isfinite(reference.pixels).reshape(-1, len(reference.channels))
     if is_finite.all():
-        return found
-    empty = [name for name, any_value in zip(reference.channels, is_finite.any(0), strict=True) if not any_value]
-    if empty:
-        reason = f"no value is finite, and nothing was compared, in {', '.join(empty)}; {found.reason}"
-        return replace(found, verdict=Verdict.INCONCLUSIVE, reason=reason)
+        return result
+    if empty := [name for name, some in zip(reference.channels, is_finite.any(0), strict=True) if not some]:
+        return result.but(Verdict.INCONCLUSIVE, f"no value is finite, and nothing was compared, in {', '.join(empty)}")
     count = int(is_finite.size - is_finite.sum())
-    return replace(found, reason=f"{found.reason}; not compared: {count} of {is_finite.size} values, not finite")
+    return replace(result, reason=f"{result.reason}; not compared: {count} of {is_finite.size} values, not finite")
 
 
 def _untested(reference: Image, test: Image, allow_nonfinite: bool) -> str:
     """Which channels of single images whose variance is known have none themselves, and are not equal without."""
-    sides = variances.untested(reference, test)
-    if not sides:
+    if not (sides := variances.untested(reference, test)):
         return ""
-    found = compare("tolerance", *sides, allow_nonfinite=allow_nonfinite)
+    result = compare("tolerance", *sides, allow_nonfinite=allow_nonfinite)
     names = ", ".join(sides[0].channels)
-    return "" if _is_equal(found) else f"not tested, without variance: {names}: {found.reason}"
+    return "" if result.is_equal else f"not tested, without variance: {names}: {result.reason}"
 
 
 # Would black pass? -----------------------------------------------------------------------------------------------
@@ -246,12 +234,12 @@ def _untested(reference: Image, test: Image, allow_nonfinite: bool) -> str:
 
 def groups(names: Sequence[str]) -> dict[str, list[str]]:
     """Channels by what they are part of: the colours, and the alpha and the depth, of each layer."""
-    found: dict[str, list[str]] = {}
+    parts: dict[str, list[str]] = {}
     for name in names:
         layer, dot, last = name.rpartition(".")
         alone = last == "A" or (last == "Z" and not dot)  # a layer's X, Y, Z are a vector
-        found.setdefault(name if alone else layer + dot, []).append(name)
-    return found
+        parts.setdefault(name if alone else layer + dot, []).append(name)
+    return parts
 
 
 def blind_to(method: Method, a: Image, b: Image, options: Options) -> str:

@@ -19,7 +19,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -33,9 +33,6 @@ from .comparison import Verdict
 from .defects import DEFECTS, Renders, through_a_file
 from .file_pair import read_renders
 from .methods import METHODS
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
 
 STUDY = "self-test"
 TILE = METHODS["welch"].options["tile"].default
@@ -263,24 +260,20 @@ def noise(renders: Pixels) -> float:
     return float(np.median(deviation[lit] / mean[lit])) if lit.any() else 0.0
 
 
-def table(rows: Sequence[Row]) -> RenderableType:
-    """What `examine` found, for rich's console: a line for each defect, a column for each method, and what failed."""
-    from rich.console import Group
-    from rich.table import Table
-    from rich.text import Text
-
-    shares = Table("seen", box=None, pad_edge=False)
-    for name in (*METHODS, "size"):
-        shares.add_column(name, justify="right")
-    shares.add_column("")
-    lines = []
+def table(rows: Sequence[Row]) -> list[tuple[str, ...]]:
+    """A line for each defect, a column for each method: the share of trials in which it saw the defect."""
+    lines: list[tuple[str, ...]] = [("seen", *METHODS, "size", "")]
     for row in rows:
         if row.subject in DEFECTS:
             size = f"{row.values['size']:.2%}" if "size" in row.values else ""
             cells = [f"{row.values[name]:.0%}" if name in row.values else "–" for name in METHODS]
-            shares.add_row(row.subject, *cells, size, row.reason)
-        elif row.values:
-            lines.append(f"{row.subject}: " + ", ".join(f"{name} {x:.3g}" for name, x in row.values.items()))
+            lines.append((row.subject, *cells, size, row.reason))
+    return lines
+
+
+def summary(rows: Sequence[Row]) -> list[str]:
+    """Lines about the renders and the equal pairs, and what failed."""
+    others = [row for row in rows if row.values and row.subject not in DEFECTS]
+    lines = [f"{row.subject}: " + ", ".join(f"{name} {x:.3g}" for name, x in row.values.items()) for row in others]
     broken = [f"{row.subject}: {', '.join(row.broken)}" for row in rows if row.verdict == "fail"]
-    lines.append(f"failed: {'; '.join(broken)}" if broken else "every defect that had to be seen was seen")
-    return Group(shares, *map(Text, lines))
+    return [*lines, f"failed: {'; '.join(broken)}" if broken else "every defect that had to be seen was seen"]

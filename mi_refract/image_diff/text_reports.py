@@ -10,26 +10,23 @@ import math
 import os
 import re
 import sys
+import unicodedata
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 from urllib.parse import quote
 
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.sanitise import printable
 from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.row import strict
-from mi_refract.report.text_table import Group, Plain, Table, Text
 
 from . import idiff_flags
 from .pairing import Pair
 from .results import FAILED, Result, Results, Status
 from .settings import written
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
 
 SCHEMA = 1
 FEW = 20  # equal images that are listed one by one
@@ -42,12 +39,14 @@ WORDS = {
     Status.SKIPPED: "skipped",
 }
 STYLES = {
-    Status.ERROR: "bold red",
-    Status.DIFFERENT: "bold red",
-    Status.INCONCLUSIVE: "yellow",
-    Status.EQUAL: "green",
-    Status.SKIPPED: "dim",
-}
+    "different": "bold red",
+    "added": "bold red",
+    "removed": "bold red",
+    "inconclusive": "yellow",
+    "equal": "green",
+    "skipped": "dim",
+}  # of rich, by the first word of a row
+Rows = list[tuple[str, ...]]  # of a table; the first holds the names of the columns
 
 
 # Terminal -----------------------------------------------------------------------------------------------------------
@@ -60,7 +59,11 @@ def print_results(results: Results) -> None:
     for line in lines:
         print(f"mi-refract: {printable(line)}", file=sys.stderr)
     if len(results.results) > len(results.of(Status.ERROR)):
-        print_table(table(results))
+        print_table(table(results), STYLES)
+        more = len([result for result in results.of(Status.EQUAL) if not result.warning]) - FEW
+        if more > 0:
+            print(f"… and {more} more that are equal")
+        print(sentence(results))
 
 
 def print_errors(results: Results) -> None:
@@ -69,16 +72,36 @@ def print_errors(results: Results) -> None:
         print(f"mi-refract: {printable(result.error)}", file=sys.stderr)
 
 
-def print_table(table: Plain | RenderableType) -> None:
-    """Print it on stdout, as plain text where that is no terminal."""
-    if isinstance(table, Plain) and not (sys.stdout.isatty() or os.environ.get("FORCE_COLOR")):
-        print(table)
+def print_table(rows: Rows, styles: Mapping[str, str] | None = None) -> None:
+    """Print it on stdout: by rich on a terminal, else as plain text. `styles`: of rich, by the first cell of a row."""
+    terminal = sys.stdout.isatty()
+    if len(rows) < 2 or not (terminal or os.environ.get("FORCE_COLOR")):
+        print(plain(rows))
         return
     from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
 
+    shown = Table(*rows[0], box=None, pad_edge=False)
+    for first, *others in rows[1:]:
+        shown.add_row(Text(first, style=(styles or {}).get(first, "")), *map(Text, others))
     # In a file it is as wide as it must be: no line of a log is a wrapped one.
-    console = Console() if sys.stdout.isatty() else Console(width=10_000)
-    console.print(table, highlight=False)
+    Console(width=None if terminal else 10_000).print(shown, highlight=False)
+
+
+def plain(rows: Rows) -> str:
+    """The rows in columns, one line each however long."""
+    widths = [max(map(_width, column)) for column in zip(*rows, strict=True)]
+    padded = ([cell + " " * (w - _width(cell)) for cell, w in zip(row, widths, strict=True)] for row in rows)
+    return "\n".join("  ".join(cells).rstrip() for cells in padded)
+
+
+def _width(text: str) -> int:
+    """The columns of a terminal that the text takes."""
+    if text.isascii():
+        return len(text)
+    wide = sum(unicodedata.east_asian_width(character) in "WF" for character in text)
+    return len(text) + wide - sum(unicodedata.combining(character) > 0 for character in text)
 
 
 def sentence(results: Results) -> str:
@@ -92,21 +115,20 @@ def sentence(results: Results) -> str:
     return f"{number} image{'' if number == 1 else 's'}: {counted}{warned}{also}"
 
 
-def table(results: Results) -> Group:
-    """Failures first, then equal images with a warning, FEW others, and the sentence."""
+def table(results: Results) -> Rows:
+    """Failures first, then equal images with a warning, FEW others, and skipped ones."""
     equal = [result for result in results.of(Status.EQUAL) if not result.warning]
     failed = [*results.of(Status.DIFFERENT, Status.INCONCLUSIVE), *_warned(results)]
-    rows = Table(("verdict", "image", "method", "why"))
+    rows: Rows = [("verdict", "image", "method", "why")]
     for result in [*failed, *equal[:FEW], *results.of(Status.SKIPPED)]:
-        cells = map(printable, (result.name, _method(result, in_words=True), why(result)))
-        rows.add_row(Text(_word(result), style=STYLES[result.status]), *map(Text, cells))
-    more = [Text(f"… and {len(equal) - FEW} more that are equal", style="dim")] if len(equal) > FEW else []
-    return Group((*([rows] if rows.rows else []), *more, Text(sentence(results))))
+        cells = (_word(result), result.name, _method(result, in_words=True), why(result))
+        rows.append(tuple(map(printable, cells)))
+    return rows
 
 
-def settings_table(pairs: Sequence[Pair]) -> Table:
+def settings_table(pairs: Sequence[Pair]) -> Rows:
     """How each image would be compared, and the tables of the settings file that say so."""
-    rows = Table(("image", "compared by", "from", "why"))
+    rows: Rows = [("image", "compared by", "from", "why")]
     for pair in pairs:
         how, parts = pair.how, ["skipped"]
         if not how.skip:
@@ -116,7 +138,7 @@ def settings_table(pairs: Sequence[Pair]) -> Table:
             parts += [f"{name} {value}" for name, value in others.items() if value]
             parts += [f"without {list(rectangle)}" for rectangle in how.ignore]
         cells = pair.name, ", ".join(parts), ", ".join(how.entries) or "–", how.reason
-        rows.add_row(*(Text(printable(cell)) for cell in cells))
+        rows.append(tuple(map(printable, cells)))
     return rows
 
 

@@ -33,17 +33,17 @@ def tolerance(
     reference: Image,
     test: Image,
     *,
-    fail: Annotated[float, "difference up to which values count as equal"] = 0.004,
-    fail_relative: Annotated[float, "the same, as a share of the mean of both"] = 0.001,
-    fail_percent: Annotated[float, "percentage of the pixels that may differ by more"] = 0.02,
+    fail: Annotated[float, "absolute difference up to which values count as equal"] = 0.004,
+    fail_relative: Annotated[float, "relative difference up to which they do, as a share of the mean of both"] = 0.001,
+    fail_percent: Annotated[float, "percentage of the pixels that may differ by more than both"] = 0.02,
     hard_fail: Annotated[
-        float, "no value may differ by more than this, where more than allow_failures differ"
+        float, "largest absolute difference of any value, where more than allow_failures pixels differ"
     ] = np.inf,
-    allow_failures: Annotated[int, "so many pixels may differ by any amount"] = 0,
-    warn: Annotated[float, "difference above which a pixel gives a warning"] = np.inf,
-    warn_relative: Annotated[float, "the same, as a share of the mean of both"] = 0.0,
+    allow_failures: Annotated[int, "number of pixels that may differ by any amount"] = 0,
+    warn: Annotated[float, "absolute difference above which a pixel counts for a warning"] = np.inf,
+    warn_relative: Annotated[float, "relative difference above which it does, as a share of the mean of both"] = 0.0,
     warn_percent: Annotated[float, "percentage of the pixels that may do so without a warning"] = 0.0,
-    hard_warn: Annotated[float, "any larger difference gives a warning"] = np.inf,
+    hard_warn: Annotated[float, "absolute difference of any value above which there is a warning"] = np.inf,
 ) -> Comparison:
     """Differences within absolute and relative thresholds, except for a few pixels, as `idiff` counts them.
 
@@ -107,7 +107,7 @@ def outrageous(reference: Image, test: Image, fail: float) -> str:
         if excess.any():
             y, x, _ = np.unravel_index(int(excess.argmax()), excess.shape)
             most = f"{compact(float(excess.max()))} at {place(excess, reference)}, of {image.path}"
-            return f"{most} for at most {compact(float(around[y, x].max()))} in the other image within {NEAR} pixels"
+            return f"{most}; the other image has at most {compact(float(around[y, x].max()))} within {NEAR} pixels"
     return ""
 
 

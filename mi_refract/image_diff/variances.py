@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from mi_refract.io import image_file
 from mi_refract.io.image_file import MAX_VALUES, Image
 from mi_refract.io.pixels import Pixels
-from mi_refract.io.toml_schema import shown
 
 from .channels import ROUNDED, XYZ, matched, means, selected, spreads
 from .pixel_statistics import RADIUS
@@ -147,7 +146,7 @@ def samples(image: Image, side: str, spp: int, least: int = 2) -> int:
     value = spp or image.metadata.get(SPP, "no samples per pixel")
     if (count := _whole(value)) < least:
         where = "samples per pixel:" if spp else "its header names"
-        raise ValueError(f"{image.path}: {where} {shown(value)}; expected `spp` or `spp_{side}`, {least} to 10¹⁵")
+        raise ValueError(f"{image.path}: {where} {value!r:.60}; expected `spp` or `spp_{side}`, {least} to 10¹⁵")
     return count
 
 
@@ -155,7 +154,7 @@ def _freedom(image: Image) -> int:
     """The degrees of freedom that the header names, which may hold anything."""
     value = image.metadata[FREEDOM]
     if (count := _whole(value)) < 1:
-        raise ValueError(f"{image.path}: {FREEDOM} = {shown(value)}; expected a whole number, 1 to 10¹⁵")
+        raise ValueError(f"{image.path}: {FREEDOM} = {value!r:.60}; expected a whole number, 1 to 10¹⁵")
     return count
 
 

@@ -37,11 +37,15 @@ def compare_renders(
     allow_nonfinite: bool = False,
     tile: Annotated[int, "side of a tile in pixels"] = 16,
     family_error: Annotated[float, "probability that equal images are called different"] = 0.001,
-    correction: Annotated[str, "for the number of tiles: sidak or holm"] = "sidak",
-    equivalence_margin: Annotated[float, "relative difference of a tile that counts as none"] = 0.001,
-    resolution: Annotated[float, "relative difference that must be visible in a tile, or it is inconclusive"] = 0.05,
-    hidden: Annotated[float, "share of the tiles, in any channel, whose noise may hide that difference"] = 0.1,
-    pixels: Annotated[str, "test them, too: yes, or no for renders that share a fixed grid of samples"] = "yes",
+    correction: Annotated[str, "correction for the number of tests: sidak or holm"] = "sidak",
+    equivalence_margin: Annotated[float, "relative difference of a tile that counts as no difference"] = 0.001,
+    resolution: Annotated[
+        float, "relative difference of a tile that the noise must not hide, or the result is inconclusive"
+    ] = 0.05,
+    hidden: Annotated[float, "share of the tiles, in any channel, whose noise may hide it"] = 0.1,
+    pixels: Annotated[
+        str, "test single pixels as well: yes; no for renders that share a fixed grid of samples"
+    ] = "yes",
     spp: Annotated[int, "samples per pixel of each image; 0: as their headers say"] = 0,
     spp_reference: Annotated[int, "the reference's, where the sides differ; 0: `spp`"] = 0,
     spp_test: Annotated[int, "the new image's, where the sides differ; 0: `spp`"] = 0,
@@ -61,7 +65,7 @@ def compare_renders(
     missed rare light. Renders count alike, unless all of them say their samples per pixel.
 
     EQUAL, however noisy, where both hold the variance themselves and are the same in every value of every channel.
-    INCONCLUSIVE where only tiles differ of which a t-test knows little (with the noise of a few pixels, or without
+    INCONCLUSIVE where the only tiles that differ are unsuited to a t-test (with the noise of a few pixels, or without
     noise, and by little or in a few pixels), and where the noise hides differences of `resolution`, with the number of
     samples that would show them. ValueError for fewer renders, the same render twice, options out of range, images that
     cannot be compared.
@@ -87,7 +91,7 @@ def compare_renders(
         if reason := preconditions(reference[0], image, allow_nonfinite):
             return nonfinite_result("welch", reason, reference[0].pixels, aligned(reference[0], image)[1])
     if same:
-        return Comparison("welch", Verdict.EQUAL, "the same in every value, noise and all", (IDENTICAL,))
+        return Comparison("welch", Verdict.EQUAL, "identical in every value, variances included", (IDENTICAL,))
 
     tile = min(tile, max(reference[0].pixels.shape[:2]))
     channels: Sequence[str] = reference[0].channels
@@ -199,8 +203,8 @@ def _verdict(tests: TileTests, resolution: float, hidden: float) -> tuple[Verdic
     if differing := ", ".join(f"{count} {name}" for name, count in counts.items() if count):
         return Verdict.DIFFERENT, f"{differing} differ, of {tests.p.size} tests"
     if tests.silent_differing or tests.heavy_differing:
-        where = f"{tests.silent_differing} tiles noise-free, {tests.heavy_differing} heavy-tailed"
-        return Verdict.INCONCLUSIVE, f"differences only where a t-test knows little: {where}"
+        where = f"{tests.silent_differing} without noise, {tests.heavy_differing} heavy-tailed"
+        return Verdict.INCONCLUSIVE, f"only tiles that are unsuited to a t-test differ: {where}"
     if tests.levels[0].silent.all():
         return Verdict.EQUAL, "no noise, and no tile differs beyond the margin"
     visible, share = tests.minimum_detectable(), tests.hidden_share(resolution)

@@ -42,7 +42,7 @@ def convert(value: Any, kind: type[T], where: str, *, infinite: bool = False) ->
         key = re.sub(r"^(key` in `)?\$\.?", "", path.removesuffix("`"))
         message = f"{message[0].lower()}{message[1:]}"
         if message.startswith("object contains unknown field") and not key:
-            message = f"unknown key{message[29:]}; expected {', '.join(getattr(kind, '__struct_fields__', ()))}"
+            message = f"unknown key{message[29:]}; expected {', '.join(getattr(kind, '__struct_encode_fields__', ()))}"
         raise ValueError(" ".join(f"{where}: {f'{key}: ' if key else ''}{message}".split())) from None
 
 

@@ -84,13 +84,14 @@ def _numbers(arguments: str, label: str, counts: Sequence[int], says: str) -> li
     return values
 
 
-def _cauchy(arguments: str, label: str) -> Formula:
+def cauchy(arguments: str, label: str) -> Formula:
+    """Of `A, B, …`."""
     counts = range(1, len(CAUCHY_NAMES) + 1)
     return *dispersion.cauchy(_numbers(arguments, label, counts, "cauchy(A, B, …), λ in nm, up to 8")), ANY
 
 
-def _sellmeier(arguments: str, label: str, squared: bool = False) -> Formula:
-    """`squared`: the arguments are resonances L, whose squares are the C."""
+def sellmeier(arguments: str, label: str, squared: bool = False) -> Formula:
+    """Of `B1, …, C1, …`; `squared`: of resonances L, whose squares are the C."""
     name, letter, unit, factor = ("sellmeier_nm", "L", "nm", "1e3") if squared else ("sellmeier", "C", "nm²", "1e6")
     says = f"{name}(B1, …, {letter}1, …), as many {letter} in {unit} as B, up to 6"
     values = _numbers(arguments, label, range(2, 14, 2), says)
@@ -101,14 +102,16 @@ def _sellmeier(arguments: str, label: str, squared: bool = False) -> Formula:
     return *dispersion.sellmeier(values, squared), ANY
 
 
-def _abbe(arguments: str, label: str) -> Formula:
+def abbe(arguments: str, label: str) -> Formula:
+    """Of `n_d, V_d`."""
     n_d, v_d = _numbers(arguments, label, [2], "abbe(n_d, V_d)")
     if v_d == 0:
         raise ValueError(f"{label}: V_d = 0; expected (n_d − 1)/(n_F − n_C), which is not 0")
     return Abbe(), {"n_d": n_d, "V_d": v_d}, ANY
 
 
-def _table(arguments: str, label: str) -> Formula:
+def table(arguments: str, label: str) -> Formula:
+    """Of `wavelength: n, …`."""
     accepted = "expected table(400: 1.53, 500: 1.52, …), two or more, wavelengths in nm, increasing"
     try:
         knots = [(float(w), float(n)) for w, n in (pair.split(":") for pair in arguments.split(","))]
@@ -125,11 +128,11 @@ def _table(arguments: str, label: str) -> Formula:
 
 
 FORMULAS_OF_N: dict[str, Callable[[str, str], Formula]] = {
-    "cauchy": _cauchy,
-    "sellmeier": _sellmeier,
-    "sellmeier_nm": functools.partial(_sellmeier, squared=True),
-    "abbe": _abbe,
-    "table": _table,
+    "cauchy": cauchy,
+    "sellmeier": sellmeier,
+    "sellmeier_nm": functools.partial(sellmeier, squared=True),
+    "abbe": abbe,
+    "table": table,
 }
 
 

@@ -79,7 +79,7 @@ def integrator_class(v: Variant) -> type:
         """From the world to the camera, whose rays leave the plane z = 0; None where they start at the sensor."""
         return sensor.world_transform().inverse() if isinstance(sensor, v.ProjectiveCamera) else None
 
-    class RefractPath(v.SamplingIntegrator):
+    class RefractPath(v.SamplingIntegrator):  # type: ignore[misc]
         """See the module docstring."""
 
         def __init__(self, props: Properties) -> None:

@@ -28,13 +28,6 @@ from .header import FORMAT, PRECISIONS, Header, Ids
 # Their vectors are unit up to the rounding of each component, as the documented formulas require.
 DEFAULT = tuple(name for name, regime in regimes.REGIMES.items() if regime.unit and not regime.rests_on_denormals)
 COUNT, PRECISION = 1000, "f32"
-CONVENTIONS = {
-    "a": "incident direction, pointing toward the surface",
-    "n": "normal, on the side that the ray comes from: n.a <= 0",
-    "n, two-sided": "normal, on either side of the surface",
-    "n_from, n_to": "indices of the media that the ray leaves and enters; k = n_from / n_to is exact",
-    "answer": "id, bx, by, bz: the direction after the surface; optionally transmitted: 1, or 0 where all is reflected",
-}
 
 
 def indices(k: Array) -> tuple[Array, Array]:
@@ -140,32 +133,7 @@ def make(
     """`count` rays of each regime in `names`, by default those of `default`. Normals face the ray unless `two_sided`.
 
     `media`: what `mi_refract.media` parses; each ray passes between one of them and air, at one of the `wavelengths` in
-    nm. Errors as of `header_of`.
-    """
-    header = header_of(names, count, precision, seed, two_sided, media, wavelengths)
-    parts = []
-    for name, (first, last) in header["regimes"].items():
-        if media_rays.has_media(header):
-            k = media_rays.ratios(header, np.arange(first, last + 1))
-            parts.append(regimes.make_given(name, k, PRECISIONS[precision], seed))
-        else:
-            parts.append(regimes.make(name, count, PRECISIONS[precision], seed))
-    rays = Rays.joined(parts if two_sided else [facing(part) for part in parts])
-    return with_checksum(RaySet(rays, np.arange(len(rays)), header))
-
-
-def header_of(
-    names: Iterable[str] | None,
-    count: int,
-    precision: str,
-    seed: int,
-    two_sided: bool,
-    media: Sequence[str] = (),
-    wavelengths: Sequence[float] = (),
-) -> Header:
-    """The header of the set that is made so, without its checksum.
-
-    ValueError for an unknown regime or precision, a regime given twice, or no ray at all; of media see
+    nm. ValueError, one line, for an unknown regime or precision, a regime given twice, no ray at all; of media see
     `media_rays.header_of` and `media_rays.check_regimes`.
     """
     from mi_refract import __version__
@@ -184,14 +152,27 @@ def header_of(
         "seed": seed,
         "count": count,
         "two_sided": two_sided,
-        **{key: text for key, text in CONVENTIONS.items() if key not in ("n", "n, two-sided")},
-        "n": CONVENTIONS["n, two-sided" if two_sided else "n"],
+        "a": "incident direction, pointing toward the surface",
+        "n_from, n_to": "indices of the media that the ray leaves and enters; k = n_from / n_to is exact",
+        "answer": "id, bx, by, bz: the direction after the surface; optionally transmitted: 1, or 0 where all is "
+        "reflected",
+        "n": "normal, on either side of the surface"
+        if two_sided
+        else "normal, on the side that the ray comes from: n.a <= 0",
         "regimes": {name: [i * count, (i + 1) * count - 1] for i, name in enumerate(names)},
     }
     if len(media) or len(wavelengths):
         header |= media_rays.header_of(media, wavelengths, precision)
         media_rays.check_regimes(header)
-    return header
+    parts = []
+    for name, (first, last) in header["regimes"].items():
+        if media_rays.has_media(header):
+            k = media_rays.ratios(header, np.arange(first, last + 1))
+            parts.append(regimes.make_given(name, k, PRECISIONS[precision], seed))
+        else:
+            parts.append(regimes.make(name, count, PRECISIONS[precision], seed))
+    rays = Rays.joined(parts if two_sided else [facing(part) for part in parts])
+    return with_checksum(RaySet(rays, np.arange(len(rays)), header))
 
 
 def facing(rays: Rays) -> Rays:

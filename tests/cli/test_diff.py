@@ -484,6 +484,16 @@ def test_many_equal_images_are_counted_and_not_listed(tmp_path, run):
     ]
 
 
+def test_columns_are_aligned_and_verdicts_coloured_where_colours_are_wanted(run, pair, monkeypatch):
+    rows = [("verdict", "image", "why"), ("ガラス", "球.exr", "x" * 300), ("e\u0301", "[b].exr", "")]
+    assert text_reports.plain(rows) == "\n".join(
+        ["verdict  image    why", f"ガラス   球.exr   {'x' * 300}", "e\u0301        [b].exr"]
+    )
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm")
+    assert "\x1b[1;31mdifferent" in run("diff", *pair)[1]
+
+
 def test_a_long_summary_is_cut(tmp_path):
     number = text_reports.SUMMARY_ROWS + 7
     results = tuple(Result(f"{i}.exr", Status.ERROR, tmp_path, tmp_path, error="bad") for i in range(number))

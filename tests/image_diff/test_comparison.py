@@ -162,8 +162,8 @@ def test_a_channel_that_one_image_has_besides_is_a_difference_with_a_name(method
     for sides, word in (((plain, more), "added"), ((more, plain), "missing")):
         found = compare(method, *sides)
         assert found.verdict is DIFFERENT
-        assert found.reason.startswith(f"channels {word}: {words}; the others: ")
-    assert "the others: 1 of 1920 pixels" in compare("exact", more, altered(0.9)).reason
+        assert found.reason.startswith(f"channels {word}: {words}; the other channels: ")
+    assert "the other channels: 1 of 1920 pixels" in compare("exact", more, altered(0.9)).reason
 
 
 # Methods of pixels -------------------------------------------------------------------------------------------------

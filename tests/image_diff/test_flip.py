@@ -248,7 +248,7 @@ def test_an_image_in_which_black_would_not_be_seen_knows_nothing():
 
 def test_what_it_does_not_look_at():
     four = of(np.dstack([SMOOTH, SMOOTH[..., :1]]))
-    assert compare("flip", four, four).reason.endswith("not looked at, but the same: A")
+    assert compare("flip", four, four).reason.endswith("not compared by FLIP, but identical: A")
     xyz = of(SMOOTH, ("X", "Y", "Z"))
     with pytest.raises(ValueError, match="expected by FLIP"):
         compare("flip", xyz, xyz)

@@ -114,6 +114,14 @@ def test_a_scene_may_be_small(follow, setting):
     assert small.points[0, :3] / size == pytest.approx(plain.points[0, :3], abs=16 * setting.roundoff)
 
 
+def test_a_scene_far_from_0_keeps_its_digits(follow, setting):
+    """Where float32 has steps of 0.125: differences of coordinates are exact, and only they count."""
+    triangle, origin = np.array([(0, 0), (1, 0), (0.25, 1)]), np.array([-1, 0.125])
+    plain, far = (follow(polygon(triangle + x), origin + x, (1, 0.17)) for x in (0.0, 2.0**20))
+    assert story(far) == story(plain)
+    assert far.directions == pytest.approx(plain.directions, abs=16 * setting.roundoff)
+
+
 @pytest.mark.parametrize("method", ["auto", "brute", "mesh"])
 def test_nothing_but_segments_of_length_zero_is_no_boundary_either(follow, method):
     dots = together(*[polygon([(0.5, 0.5)])] * 60)

@@ -192,10 +192,12 @@ def test_pointed_lenses_end_where_their_surfaces_meet():
         ((0.03, 0.02), (0, 0), 2),
         ((0, -0.05), (0, 0), 3),
         ((0.1, 0.0), (-1, 0), 2),
+        ((0.3, 0.05), (-3, -1), 1),  # meet again at r = 24
     ):
         curve = shapes.lens(curvature, thickness, conic=conic)
         z, r = curve.vertices[0]
         assert len(curve) == 4
+        assert conic != (-3, -1) or r < 15
         assert off_conic(np.array([z, r]), curvature[0], conic[0]) <= 8 * ULP * r
         assert off_conic(np.array([z - thickness, r]), curvature[1], conic[1]) <= 8 * ULP * r
 

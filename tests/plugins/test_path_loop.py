@@ -8,13 +8,13 @@ import math
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.glass_scenes import GLASS
 
 from mi_refract.plugins import path_loop, sampling
 from mi_refract.rendering.scene_files import REPRODUCIBLE
 
 pytestmark = pytest.mark.usefixtures("scalar_variant")
 
-GLASS = {"type": "refract", "int_ior": 1.5, "ext_ior": 1.0}
 REFLECTED, TRANSMITTED, UPWARD = (0.0, 0.5), (0.999, 0.5), (0.5, 0.5)
 ALBEDO, RADIANCE = 0.5, 3.0
 
@@ -50,12 +50,12 @@ def wall():
     return sheet(-1, bsdf={"type": "diffuse", "reflectance": ALBEDO})
 
 
-def follow(parts, points, o=(0, 0, 1), d=(0.6, 0, -0.8), **parameters):
-    """The radiance and the alpha of one sample along a ray."""
-    scene = mi.load_dict({"type": "scene"} | parts)
-    method = mi.load_dict({"type": "refract_path"} | parameters)
-    plan = method.path_features(method.scene_features(scene))
-    end = path_loop.PathLoop(mi.scalar_rgb, scene, plan, Given(*points)).run(mi.Ray3f(o, d), None, True)
+def follow(parts, numbers, o=(0, 0, 1), d=(0.6, 0, -0.8), **parameters):
+    """The radiance and the alpha of one sample along a ray. `numbers`: points, or what gives numbers."""
+    scene, method = mi.load_dict({"type": "scene"} | parts), mi.load_dict({"type": "refract_path"} | parameters)
+    features = method.path_features(method.scene_features(scene))
+    numbers = Given(*numbers) if isinstance(numbers, list) else numbers
+    end = path_loop.PathLoop(mi.scalar_rgb, scene, features, numbers).run(mi.Ray3f(o, d), None, True)
     return np.array(end.result), bool(end.valid_ray)
 
 
@@ -108,12 +108,8 @@ class Recorded(Given):
 
 def test_no_two_vertices_of_branches_have_the_same_random_number():
     """Four sheets of glass, of which each splits, two of them on either side."""
-    parts = {f"sheet {z}": sheet(z, bsdf=GLASS) for z in range(4)}
-    scene = mi.load_dict({"type": "scene"} | parts)
-    method = mi.load_dict({"type": "refract_path", "split_depth": 4, "split_weight": 1e-3, "max_depth": 7})
-    plan = method.path_features(method.scene_features(scene))
-    numbers = Recorded()
-    path_loop.PathLoop(mi.scalar_rgb, scene, plan, numbers).run(mi.Ray3f((0, 0, 1.5), (0.6, 0, -0.8)), None, True)
+    numbers, parts = Recorded(), {f"sheet {z}": sheet(z, bsdf=GLASS) for z in range(4)}
+    follow(parts, numbers, (0, 0, 1.5), split_depth=4, split_weight=1e-3, max_depth=7)
     assert len(numbers.keys) > 10
     assert len(set(numbers.keys)) == len(numbers.keys)
 

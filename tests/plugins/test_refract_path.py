@@ -13,7 +13,7 @@ from support.glass_scenes import BLACK, GLASS, SKY, camera, equal_means, glass_b
 from support.variants import switch
 
 from mi_refract.image_diff import pixelwise, tile_statistics
-from mi_refract.plugins import path_loop, refract_path, sampling, scene_features
+from mi_refract.plugins import refract_path, sampling, scene_features
 from mi_refract.rendering import scene_files
 from validation.run.context import SCENES
 
@@ -50,29 +50,22 @@ def test_where_nothing_is_left_out_the_numbers_and_the_image_are_those_of_path(
     assert pixelwise.changes(theirs, ours, 1e-4).share <= 1e-3
 
 
-@functools.cache
-def stack_of_path(name):
-    """Eight images of a scene, one a seed; every test that compares with `path` by Welch's test reads these."""
-    scene = load(name)
-    return np.stack([by_path(scene, seed=i) for i in range(8)])
-
-
-@functools.cache
-def stack(name, **parameters):
-    """As many by `refract_path`, of other seeds."""
-    scene = load(name)
-    return np.stack([render(scene, seed=100 + i, **parameters) for i in range(8)])
-
-
 FOLLOWED = [(name, {}) for name in ("balls", "slab", "sphere", "nested")]
 FOLLOWED += [(name, {"split_depth": 1}) for name in ("balls", "sphere")]
 FOLLOWED += [(name, {"split_depth": 4, "rr_depth": 3}) for name in ("slab", "lightpipe", "nested")]
 
 
+@functools.cache
+def stack_of_path(name):
+    scene = load(name)
+    return np.stack([by_path(scene, seed=i) for i in range(8)])
+
+
 @pytest.mark.parametrize(("name", "parameters"), FOLLOWED, ids=str)
 def test_other_numbers_give_the_same_mean(name, parameters, llvm_variant):
     """Welch's test on tiles, one false alarm in 1000 images."""
-    theirs, ours = stack_of_path(name), stack(name, **parameters)
+    scene, theirs = load(name), stack_of_path(name)
+    ours = np.stack([render(scene, seed=100 + i, **parameters) for i in range(8)])
     assert tile_statistics.compare_stacks(theirs, ours, 8, 1e-3, 1e-5).alarms == 0
     assert ours.mean() == pytest.approx(theirs.mean(), rel=2e-2)
 
@@ -89,39 +82,14 @@ def lamps():
     return parts
 
 
-@functools.cache
-def stack_of_lamps(variant, kind="refract_path", first=100, **parameters):
-    """Eight images of the lamps in the variant that is set."""
+@pytest.mark.parametrize("split_depth", [0, 2])
+def test_lamps_are_chosen_by_their_weights_and_the_sky_is_met(split_depth, typical_variant):
+    """Welch's test on one tile, one false alarm in 1000."""
     vectorised = dr.is_jit_v(mi.Float)
     scene, spp = glass_ball(24 if vectorised else 4, **lamps()), 64 if vectorised else 8
-    return np.stack([render(scene, spp, first + i, type=kind, **parameters) for i in range(8)])
-
-
-def lamps_that_alarm(variant, ours):
-    """Welch's test on one tile, one false alarm in 1000."""
-    theirs = stack_of_lamps(variant, "path", 0)
-    return tile_statistics.compare_stacks(theirs, ours, theirs.shape[1], 1e-3, 1e-5).alarms
-
-
-def test_lamps_are_chosen_by_their_weights_and_the_sky_is_met(typical_variant):
-    ours = stack_of_lamps(typical_variant, split_depth=2)
-    assert lamps_that_alarm(typical_variant, ours) == 0
-
-
-def test_without_a_split_lamps_are_chosen_alike_and_a_probability_that_is_off_is_seen(llvm_variant, monkeypatch):
-    assert lamps_that_alarm("llvm_ad_rgb", stack_of_lamps("llvm_ad_rgb")) == 0
-    choose = mi.DiscreteDistribution.sample_reuse_pmf
-    slip = lambda *a: (*choose(*a)[:2], mi.Float(0.4))  # noqa: E731
-    monkeypatch.setattr(mi.DiscreteDistribution, "sample_reuse_pmf", slip)
-    assert lamps_that_alarm("llvm_ad_rgb", stack_of_lamps.__wrapped__("llvm_ad_rgb")) > 0
-
-
-@pytest.mark.parametrize("name", ["area", "environment", "all_of_hit"])
-def test_leaving_out_what_a_scene_needs_is_seen(name, llvm_variant, monkeypatch):
-    scene = "slab" if name == "all_of_hit" else "sphere"
-    monkeypatch.setattr(refract_path, "PathFeatures", lambda *a, **k: path_loop.PathFeatures(*a, **k | {name: False}))
-    ours = stack.__wrapped__(scene)  # not one that is there already
-    assert tile_statistics.compare_stacks(stack_of_path(scene), ours, 8, 1e-3, 1e-5).alarms > 0
+    theirs = np.stack([by_path(scene, spp, i) for i in range(8)])
+    ours = np.stack([render(scene, spp, 100 + i, split_depth=split_depth) for i in range(8)])
+    assert tile_statistics.compare_stacks(theirs, ours, theirs.shape[1], 1e-3, 1e-5).alarms == 0
 
 
 @pytest.mark.parametrize("name", ["sphere", "slab"])
@@ -211,16 +179,6 @@ def test_a_deterministic_image_errs_by_what_it_says_was_truncated(llvm_variant):
     assert coarse[..., 3].max() > 10 * exact[..., 3].max() > 0
     assert off.max() > 1e-3
     assert exact[..., 3].max() < 0.01
-
-
-def test_a_white_sky_shows_what_was_truncated(llvm_variant):
-    scene = load("slab", sampler="multijitter")
-    flat = glass_ball(sky={"type": "constant"})
-    image, truncated = np.split(render(flat, 1, 1, deterministic=True), [3], axis=2)
-    assert (image <= 1 + 1e-5).all()
-    assert (image >= 1 - 1e-5 - truncated).all()
-    assert 1e-4 < truncated.max() < 1e-2
-    assert render(scene, 1, deterministic=True).shape == (32, 32, 4)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ from mi_refract.accuracy import lengths
 from mi_refract.formulas import FORMULAS
 from mi_refract.ray_sets import ray_set, reports, tir_signal
 from mi_refract.ray_sets.check_answers import LOOSEST, check
-from mi_refract.ray_sets.diagnosis import MISTAKES
 from mi_refract.ray_sets.judged_answers import RIGHT
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.regimes import Rays
@@ -222,11 +221,7 @@ def test_a_mistake_is_called_by_its_name(precision, name, i):
     assert found.exit_code == 1
     assert found.diagnosis is not None, found.explanations
     assert found.diagnosis.mistake == name
-    assert len({x.mistake for x in found.explanations}) == len(found.explanations) == len(MISTAKES) + 2
-
-
-def test_every_usual_mistake_was_planted():
-    assert set(BAD) == set(MISTAKES)
+    assert [x.mistake for x in found.explanations] == [*BAD, "f32 where f64 was claimed", "too few digits"]
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)

@@ -169,7 +169,7 @@ HEADERS = {
     "a count that is true": ({"count": True}, "header: count: expected `int`, got `bool`"),
     "another precision": ({"precision": "f16"}, "header: precision: invalid enum value 'f16'"),
     "NaN": ({"two_sided": float("nan")}, "header: two_sided: expected a finite number"),
-    "more": ({"another": 1}, "header: object contains unknown field `another`"),
+    "more": ({"another": 1}, "header: unknown key `another`"),
     "a long text": ({"version": "x" * 201}, "header: version: expected `str` of length <= 200"),
 }
 

@@ -12,6 +12,7 @@ import pytest
 
 from mi_refract.image_diff import flip, folders, self_test, tile_statistics
 from mi_refract.image_diff.methods import METHODS
+from mi_refract.image_diff.settings import Settings
 from mi_refract.report.row import Row
 from validation import limits, readme_tables
 from validation.diff import planted_defects, times, visible_changes, welch_nulls
@@ -170,11 +171,11 @@ def test_what_is_timed_is_told_apart(tmp_path):
     """An image that differs is what the page shows; the folder's images are equal for what `auto` tests."""
     times.write(tmp_path, SMALL)
     one, other = tmp_path / "a/0.exr", tmp_path / "b/0.exr"
-    assert folders.diff(one, other, times.settings("tolerance")).exit_code == 1
+    assert folders.diff(one, other, Settings.for_all(method="tolerance")).exit_code == 1
     assert folders.diff(tmp_path / "a", tmp_path / "b", renders=True).exit_code == 1
     many = tmp_path / "many_a", tmp_path / "many_b"
     assert (folders.diff(*many).exit_code, len(folders.diff(*many).results)) == (0, SMALL.pairs)
-    assert folders.diff(*many, times.settings("exact")).exit_code == 1
+    assert folders.diff(*many, Settings.for_all(method="exact")).exit_code == 1
 
 
 def test_rows_of_times():

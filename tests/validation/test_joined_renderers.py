@@ -107,7 +107,7 @@ def test_its_images_are_compared(joined, context, monkeypatch, needs_variant):
         (TOML.replace("program.py", "{nothing}"), "command: {python} {nothing}: 'nothing'; expected {python}"),
         (
             TOML + "[install]\nmegabytes = 1\npip = ['x']\ncargo = ['x']\n",
-            "install: object contains unknown field `cargo`",
+            "install: unknown key `cargo`; expected megabytes",
         ),
     ],
 )

@@ -12,7 +12,7 @@ from mi_refract.planar import Event, Paths, Segments, path_loop, shapes
 from mi_refract.planar import tracer as tracer
 from mi_refract.planar.intersect_arcs import ConicArcs
 from validation.planar import against_retrace, closed_paths, extruded_scenes, joints, times, wall_scene
-from validation.planar.error_growth import _transfer
+from validation.planar.error_growth import _transfer, growth
 from validation.reference.planar_retrace import retrace
 from validation.run.array_settings import settings
 from validation.run.metrics import WRONG_PATH, WRONG_PATH_FAR
@@ -75,6 +75,17 @@ def test_the_transfer_is_the_derivative():
         assert (turned / step).astype(float) == pytest.approx(phi.astype(float), rel=1e-5), column
         across = d[:, 0] * off[:, 1] - d[:, 1] * off[:, 0]
         assert (across / step).astype(float) == pytest.approx(h.astype(float), rel=1e-5), column
+
+
+def test_the_bound_of_a_direction_behind_a_plane_is_the_sum_of_what_was_added():
+    """At 60°, in units of 2u: φ' = g φ + 1 + |g| + 1/|d'_n| + |1 − g| S/ℓ, φ = 1, ℓ = 4, S = 2 the segment's end."""
+    plane = Segments([[0.0, -2]], [[0.0, 2]], [1.0], [1.5])
+    angle = np.radians(60)
+    path = retrace(plane, [[-1.0, -1.0]], [[0.5, np.sin(angle)]], 1)
+    behind = np.sqrt(1 - (np.sin(angle) / 1.5) ** 2)
+    g = 0.5 / (1.5 * behind)
+    expected = 2 * (g + 1 + g + 1 / behind + (1 - g) * 2 / 4)
+    assert growth(path, plane)[1][0] == pytest.approx([2, expected])
 
 
 # Planted defects -----------------------------------------------------------------------------------------------

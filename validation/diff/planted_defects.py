@@ -19,7 +19,7 @@ import numpy as np
 
 from mi_refract.image_diff import self_test
 from mi_refract.image_diff.defects import DEFECTS
-from mi_refract.plugins import read_ior, refract
+from mi_refract.plugins import PLUGIN, read_ior, refract
 from mi_refract.rendering.scene_files import REPRODUCIBLE
 from mi_refract.report.row import Row
 from validation.run.context import SCENES, Context
@@ -121,7 +121,7 @@ def register(variant: Any) -> None:
 # Renders -------------------------------------------------------------------------------------------------------
 
 
-def opened(name: str, glass: str = refract.PLUGIN, resolution: int = RESOLUTION, count: int = 1, **more: Any) -> Camera:
+def opened(name: str, glass: str = PLUGIN, resolution: int = RESOLUTION, count: int = 1, **more: Any) -> Camera:
     """A scene of `scenes/`, the ball with its lamp; `count` cameras side by side on one film.
 
     Pixels are independent, so these are as many renders.

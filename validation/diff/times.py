@@ -147,21 +147,16 @@ def subjects_of(root: Path, size: Size) -> dict[str, Subject]:
     }
     for name, method in METHODS.items():
         sides = (a, b) if method.takes_renders else (a / "0.exr", b / "0.exr")
-        compare = functools.partial(folders.diff, *sides, settings(name), renders=method.takes_renders)
+        compare = functools.partial(folders.diff, *sides, Settings.for_all(method=name), renders=method.takes_renders)
         beside = "read the renders" if method.takes_renders else "read the pair"
         found[name] = Subject(several if method.takes_renders else one, compare, beside)
     found[AUTO] = Subject(many, functools.partial(folders.diff, root / "many_a", root / "many_b"), "read the folder")
     small = [str(root / side / "0000.exr") for side in ("many_a", "many_b")]
     shell = functools.partial(python, "-m", "mi_refract.cli", "diff", *small)
     found[SHELL] = Subject(f"a pair of {SMALL}²", shell, LIBRARIES, "time / libraries")
-    judged = folders.diff(a / "0.exr", b / "0.exr", settings("tolerance"), maps=True)
+    judged = folders.diff(a / "0.exr", b / "0.exr", Settings.for_all(method="tolerance"), maps=True)
     found["page"] = Subject(one, functools.partial(html_report.write, root / "page.html", judged))
     return found
-
-
-def settings(method: str) -> Settings:
-    """Settings that compare by one method."""
-    return Settings.for_all(method=method)
 
 
 def python(*words: str) -> str:

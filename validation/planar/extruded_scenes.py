@@ -18,7 +18,7 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.planar import Event, Paths
-from mi_refract.plugins.refract import PLUGIN
+from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation import repeated
 from validation.reference.layered_scenes import OFFSET

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mi_refract.planar import Segments, curves
-from mi_refract.plugins.refract import PLUGIN
+from mi_refract.plugins import PLUGIN
 from validation.reference.planar_retrace import Array
 
 Z = -1.0, 2.0  # a ray at z = 0 does not meet the triangles' common edge in the middle of a wall
