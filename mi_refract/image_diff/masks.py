@@ -64,6 +64,6 @@ def applied(image: Image, mask: Mask | None) -> Image:
 
 
 def warning(mask: Mask | None) -> str:
-    """What to tell of a mask that leaves out more than MOST; "" of others."""
+    """The warning for a mask that leaves out more than MOST; "" for others."""
     left_out = 0.0 if mask is None else 1 - float(mask.mean())
     return f"the mask leaves out {left_out:.0%} of the pixels" if left_out > MOST else ""
