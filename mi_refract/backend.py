@@ -330,7 +330,6 @@ def _complaint(name: str, stderr: str) -> str:
 # Remembering ---------------------------------------------------------------------------------------------------
 
 
-@functools.cache
 def _circumstances() -> str:
     """What decides, besides the library: Dr.Jit, the CPU's instruction sets, and the probe itself."""
     try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import hypothesis
@@ -102,28 +101,11 @@ def polarized_variant(each_variant: str) -> str:
     return each_variant
 
 
-@dataclass(frozen=True)
-class Setting:
-    """A Dr.Jit backend in a precision, "float32" or "float64"."""
+def setting_of(request: pytest.FixtureRequest) -> Any:
+    """The `Setting` of a backend and a precision; it imports Dr.Jit."""
+    from validation.run.array_settings import Setting
 
-    backend: str
-    name: str
-
-    @property
-    def precision(self):
-        import numpy as np
-
-        return getattr(np, self.name)
-
-    @property
-    def roundoff(self) -> float:
-        return {"float32": 2.0**-24, "float64": 2.0**-53}[self.name]
-
-    @property
-    def vector(self):
-        import drjit as dr
-
-        return getattr(getattr(dr, self.backend), {"float32": "Array3f", "float64": "Array3f64"}[self.name])
+    return Setting.of(*request.param)
 
 
 # Scalar arrays compute in double whatever they store: float32 is judged on the vectorised backends.
@@ -131,21 +113,21 @@ SETTINGS = [("scalar", "float64")] + [(b, p) for b in ("llvm", "cuda") for p in 
 
 
 @pytest.fixture(scope="module")
-def setting(request: pytest.FixtureRequest) -> Setting:
+def setting(request: pytest.FixtureRequest) -> Any:
     """Every backend and precision that runs here; see `pytest_generate_tests`."""
-    return Setting(*request.param)
+    return setting_of(request)
 
 
 @pytest.fixture(scope="module")
-def float32(request: pytest.FixtureRequest) -> Setting:
+def float32(request: pytest.FixtureRequest) -> Any:
     """Those in float32: for what takes long and depends on the precision in nothing but numbers."""
-    return Setting(*request.param)
+    return setting_of(request)
 
 
 @pytest.fixture(scope="module")
-def vectorised(request: pytest.FixtureRequest) -> Setting:
+def vectorised(request: pytest.FixtureRequest) -> Any:
     """Those that carry derivatives."""
-    return Setting(*request.param)
+    return setting_of(request)
 
 
 def _case(case: str | tuple[str, str]) -> tuple[str, str, str | None]:

@@ -22,7 +22,7 @@ PYTHON = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, 
 def apart(tmp_path, monkeypatch):
     """A memory of its own for every test, and no answer from before."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    cached = (backend.llvm, backend.cuda, backend._circumstances)
+    cached = backend.llvm, backend.cuda
     for function in cached:
         function.cache_clear()
     yield
@@ -42,34 +42,40 @@ def one_line(text):
     return text and "\n" not in text
 
 
-@pytest.mark.parametrize(
-    "name, version",
-    [
-        ("libLLVM.so.19.1", (19, 1)),
-        ("libLLVM-15.so.1", (15,)),
-        ("libLLVM-14.0.6.so.1", (14, 0, 6)),
-        ("libLLVM-19.so", (19,)),
-        ("libLLVM.so", ()),
-        ("libLLVM.dylib", ()),
-        ("libLLVMSupport.so.19", None),
-        ("libLLVM-C.so", None),
-        ("libLLVMCore.a", None),
-    ],
-)
-def test_version_from_the_name(name, version):
-    assert backend._version(f"/usr/lib/{name}") == version
-
-
-def test_highest_version_first(tmp_path, monkeypatch):
-    for name in ("libLLVM-9.so.1", "libLLVM.so.21.1", "libLLVM.so.100"):
+def test_highest_version_first_and_llvms_c_interface_only(tmp_path, monkeypatch):
+    versions = ["libLLVM.so.100", "libLLVM.so.21.1", "libLLVM-15.so.1", "libLLVM-14.0.6.so.1", "libLLVM-9.so"]
+    versions.append("libLLVM.so")
+    for name in [*sorted(versions), "libLLVMSupport.so.19", "libLLVM-C.so", "libLLVMCore.a"]:
         (tmp_path / name).touch()
     monkeypatch.setenv("LD_LIBRARY_PATH", str(tmp_path))
-    monkeypatch.setattr(backend, "_loaded", set)
-    names = [Path(path).name for path in backend.candidates() if path.startswith(str(tmp_path))]
-    assert names == ["libLLVM.so.100", "libLLVM.so.21.1", "libLLVM-9.so.1"]
+    assert [Path(path).name for path in backend.candidates() if path.startswith(str(tmp_path))] == versions
 
 
 # What a library can do to a process
+
+
+@pytest.fixture
+def probed(tmp_path, monkeypatch):
+    """`probed(code)`: what is wrong with a library whose kernel does this, and how many probes there have been."""
+    modules, log, library = tmp_path / "modules", tmp_path / "log", tmp_path / "libLLVM.so.19.1"
+    modules.mkdir()
+    library.write_text("one")
+    monkeypatch.syspath_prepend(modules)
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    monkeypatch.setenv(backend.CHOICE, str(library))
+    monkeypatch.delenv(backend.OWN_CHOICE, raising=False)
+
+    def probe(code="import sys; sys.exit('is made up')"):
+        (modules / "drjit.py").write_text(f"open({str(log)!r}, 'a').write('1')\n{code}")
+        (entry,) = backend.libraries()
+        assert entry.path == str(library) and entry.works == (not entry.defect)
+        return entry.defect, len(log.read_text())
+
+    return probe
+
+
+WORKS = "print('works'); import os, sys; sys.stdout.flush(); os._exit(0)"
+MADE_UP = "is made up"
 
 
 @pytest.mark.parametrize(
@@ -77,13 +83,12 @@ def test_highest_version_first(tmp_path, monkeypatch):
     [(b"no library at all", "file too short"), (b"\x7fELF" + bytes(4096), "refused"), (None, "refused by Dr.Jit")],
     ids=["text", "broken ELF", "another library"],
 )
-def test_a_file_that_is_not_llvm(tmp_path, content, defect):
+def test_a_file_that_is_not_llvm(tmp_path, content, defect, monkeypatch):
     path = tmp_path / "libLLVM.so.19.1"
     path.write_bytes(NANOTHREAD.read_bytes() if content is None else content)
-    library = backend._try(str(path))
-    assert not library.works
-    assert defect in library.defect
-    assert one_line(library.defect)
+    monkeypatch.setenv(backend.CHOICE, str(path))
+    (library,) = backend.libraries()
+    assert not library.works and defect in library.defect and one_line(library.defect)
 
 
 @pytest.mark.parametrize(
@@ -94,17 +99,74 @@ def test_a_file_that_is_not_llvm(tmp_path, content, defect):
         ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "SIGKILL", False),
         ("import time; print('works', flush=True); time.sleep(60)", "longer than", False),
         ("raise RuntimeError('first\\nsecond')", "second", True),
-        ("pass", "no answer", True),
+        ("import os; os._exit(0)", "no answer", True),
+        (WORKS, "", True),
     ],
-    ids=["abort", "segmentation fault", "killed", "hangs", "raises", "silent"],
+    ids=["abort", "segmentation fault", "killed", "hangs", "raises", "silent", "works"],
 )
-def test_a_probe_that_ends_badly(monkeypatch, code, defect, lasting):
-    monkeypatch.setattr(backend, "_PROBE", code)
-    monkeypatch.setattr(backend, "TIMEOUT", 1.0 if "sleep" in code else 60.0)
-    found, kept = backend._probe("llvm", {})
-    assert defect in found
-    assert one_line(found)
-    assert kept is lasting
+def test_the_end_of_a_probe_is_remembered_where_it_would_be_found_again(probed, monkeypatch, code, defect, lasting):
+    monkeypatch.setattr(backend, "TIMEOUT", 3.0 if "sleep" in code else 60.0)
+    found, count = probed(code)
+    assert defect in found if defect else found == ""
+    assert count == 1 and "\n" not in found
+    assert probed(code) == (found, 1 if lasting else 2)
+
+
+# Memory
+
+
+@pytest.mark.parametrize("change", ["content", "time", "drjit"])
+def test_a_change_asks_again(probed, monkeypatch, change):
+    assert probed() == probed() == (MADE_UP, 1)
+    library = Path(os.environ[backend.CHOICE])
+    if change == "content":
+        state = library.stat()
+        library.write_text("another")
+        os.utime(library, ns=(state.st_atime_ns, state.st_mtime_ns))
+    elif change == "time":
+        os.utime(library, (1, 1))
+    else:
+        monkeypatch.setattr(backend.importlib.metadata, "version", lambda name: "99")
+    assert probed(WORKS) == ("", 2)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[1]", '{"key": 1}', "null", "\x00"])
+def test_a_spoilt_memory_is_an_empty_one(probed, content, tmp_path):
+    memory = tmp_path / "cache" / "mi_refract" / "backend.json"
+    memory.parent.mkdir(parents=True)
+    memory.write_text(content)
+    assert probed() == probed() == (MADE_UP, 1)
+    assert list(json.loads(memory.read_text()).values()) == [MADE_UP] and list(memory.parent.iterdir()) == [memory]
+
+
+def test_a_memory_that_cannot_be_written(probed, monkeypatch, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert [probed(), probed()] == [(MADE_UP, 1), (MADE_UP, 2)]
+
+
+# Choice
+
+
+def test_the_users_choice_is_the_only_candidate(probed):
+    probed()
+    here = backend.llvm()
+    assert not here.usable
+    assert here.reason.startswith(f"{backend.CHOICE}={os.environ[backend.CHOICE]}: {MADE_UP}; expected ")
+
+
+def test_our_own_choice_is_not_the_users_and_there_may_be_no_library(probed, monkeypatch):
+    library = os.environ[backend.CHOICE]
+    probed()
+    monkeypatch.setenv(backend.OWN_CHOICE, library)
+    monkeypatch.setattr(backend, "candidates", lambda: [library, library])
+    assert [entry.path for entry in backend.libraries()] == [library, library]
+    assert backend.llvm().reason.startswith(f"libLLVM 19.1: {MADE_UP}; libLLVM 19.1: ")
+    backend.llvm.cache_clear()
+    monkeypatch.setattr(backend, "candidates", list)
+    here = backend.llvm()
+    assert not here.usable and here.library is None and here.reason.startswith("no libLLVM found; ")
+    assert "LLVM 17" in here.reason or "libllvm19" in here.reason
 
 
 # The verdict of the tiny kernel is compared with what matters: does an image come out, or does the process die?
@@ -118,13 +180,16 @@ print(np.isfinite(np.array(mi.render(mi.load_dict(scene), spp=1))).all())
 
 
 @pytest.mark.parametrize("path", backend.candidates() or [None])
-def test_the_verdict_is_the_fate_of_an_image(path, tmp_path):
+def test_the_verdict_is_the_fate_of_an_image(path, tmp_path, monkeypatch):
     if path is None:
         pytest.skip("no libLLVM on this machine")
     environment = PYTHON | {backend.CHOICE: path, "DRJIT_CACHE_DIR": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", IMAGE], env=environment, capture_output=True, text=True)
     drawn = done.returncode == 0 and done.stdout == "True\n"
-    assert backend._try(path).works == drawn, done.stderr[-500:]
+    monkeypatch.setenv(backend.CHOICE, path)
+    monkeypatch.delenv(backend.OWN_CHOICE, raising=False)
+    (library,) = backend.libraries()
+    assert library.works == drawn, done.stderr[-500:]
 
 
 def test_llvm_15_does_not_end_this_process(monkeypatch):
@@ -139,124 +204,6 @@ def test_llvm_15_does_not_end_this_process(monkeypatch):
     assert path in here.reason
     code = "from mi_refract import backend; print(backend.activate(may_restart=True))"
     assert run(code, **{backend.CHOICE: path}).stdout == "scalar_rgb\n"
-
-
-# Memory
-
-
-@pytest.fixture
-def counted(monkeypatch, tmp_path):
-    """A library, and the list of the probes it has seen."""
-    probes = []
-
-    def probe(name, environment):
-        probes.append(environment[backend.CHOICE])
-        return "is made up", True
-
-    monkeypatch.setattr(backend, "_probe", probe)
-    library = tmp_path / "libLLVM.so.19.1"
-    library.write_text("one")
-    return str(library), probes
-
-
-def test_an_answer_is_remembered(counted):
-    library, probes = counted
-    assert backend._try(library) == backend._try(library) == backend.Library(library, "is made up")
-    assert len(probes) == 1
-    memory = backend._cache_file()
-    assert list(json.loads(memory.read_text()).values()) == ["is made up"]
-    assert list(memory.parent.iterdir()) == [memory]
-
-
-def test_a_good_answer_is_remembered_too(counted, monkeypatch):
-    library, _ = counted
-    monkeypatch.setattr(backend, "_probe", lambda name, environment: ("", True))
-    assert backend._try(library).works
-    monkeypatch.setattr(backend, "_probe", lambda name, environment: ("asked again", True))
-    assert backend._try(library).works
-
-
-@pytest.mark.parametrize("change", ["content", "time", "drjit", "probe"])
-def test_a_change_asks_again(counted, monkeypatch, change):
-    library, probes = counted
-    backend._try(library)
-    if change == "content":
-        state = Path(library).stat()
-        Path(library).write_text("another")
-        os.utime(library, ns=(state.st_atime_ns, state.st_mtime_ns))
-    elif change == "time":
-        os.utime(library, (1, 1))
-    elif change == "drjit":
-        monkeypatch.setattr(backend.importlib.metadata, "version", lambda name: "99")
-    else:
-        monkeypatch.setattr(backend, "_PROBE", "pass")
-    backend._circumstances.cache_clear()
-    backend._try(library)
-    assert len(probes) == 2
-
-
-def test_what_may_pass_is_not_remembered(counted, monkeypatch):
-    library, _ = counted
-    monkeypatch.setattr(backend, "_probe", lambda name, environment: ("took too long", False))
-    assert backend._try(library).defect == "took too long"
-    assert not backend._cache_file().exists()
-
-
-@pytest.mark.parametrize("content", ["", "{", "[1]", '{"key": 1}', "null", "\x00"])
-def test_a_spoilt_memory_is_an_empty_one(counted, content):
-    library, probes = counted
-    backend._cache_file().parent.mkdir(parents=True)
-    backend._cache_file().write_text(content)
-    assert backend._try(library) == backend._try(library)
-    assert len(probes) == 1
-
-
-def test_a_memory_that_cannot_be_written(counted, monkeypatch, tmp_path):
-    library, probes = counted
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert backend._try(library) == backend._try(library)
-    assert len(probes) == 2
-
-
-# Choice
-
-
-def test_the_users_choice_is_the_only_candidate(counted, monkeypatch):
-    library, probes = counted
-    monkeypatch.setenv(backend.CHOICE, library)
-    here = backend.llvm()
-    assert probes == [library]
-    assert not here.usable
-    assert here.reason.startswith(f"{backend.CHOICE}={library}: is made up; expected ")
-    assert [entry.path for entry in backend.libraries()] == [library]
-
-
-def test_our_own_choice_is_not_the_users(counted, monkeypatch):
-    library, _ = counted
-    monkeypatch.setenv(backend.CHOICE, library)
-    monkeypatch.setenv(backend.OWN_CHOICE, library)
-    monkeypatch.setattr(backend, "candidates", lambda: ["/lib/libLLVM.so.18", "/lib/libLLVM.so.17"])
-    assert "no libLLVM" not in backend.llvm().reason
-    assert [entry.path for entry in backend.libraries()] == ["/lib/libLLVM.so.18", "/lib/libLLVM.so.17"]
-
-
-def test_no_library_at_all(monkeypatch):
-    monkeypatch.delenv(backend.CHOICE, raising=False)
-    monkeypatch.setattr(backend, "candidates", list)
-    here = backend.llvm()
-    assert not here.usable
-    assert here.library is None
-    assert here.reason.startswith("no libLLVM found; ")
-    assert "LLVM 17" in here.reason or "libllvm19" in here.reason
-
-
-def test_the_next_best_library_is_taken(tmp_path, monkeypatch):
-    monkeypatch.delenv(backend.CHOICE, raising=False)
-    monkeypatch.setattr(backend, "candidates", lambda: ["a", "b", "c"])
-    monkeypatch.setattr(backend, "_try", lambda path: backend.Library(path, "bad" if path == "a" else ""))
-    monkeypatch.setattr(backend, "_loaded", lambda: {"/x/b"})
-    assert backend.llvm() == backend.Backend("llvm", True, "b", "b")
 
 
 def test_every_variant_has_an_answer(usable_variants, monkeypatch):

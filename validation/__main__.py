@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 # By name on the command line, which is that of the room: the modules whose STUDY is run, in the order of the report.
 ROOMS = {
     "directions": ("per_formula", "planted_defects", "bsdf_samples", "sweep", "search"),
-    "stability": ("optical_chains", "energy", "derivatives", "gradients", "layered_paths"),
+    "stability": ("optical_chains", "energy", "derivatives", "layered_paths"),
     "renders": (
         *("scene_needs", "against_dielectric", "colours", "unused_features", "invisible_changes"),
-        *("neighbours", "random_numbers", "rendering_passes"),
+        *("neighbours", "random_numbers", "gradients", "rendering_passes"),
     ),
     "efficiency": ("error_against_time", "scaling", "changing_indices"),
     "media": ("catalogs", "ray_directions", "closed_forms", "renders", "hero_wavelength"),

@@ -17,7 +17,7 @@ from mi_refract.image_diff.methods import METHODS
 from mi_refract.io import image_file
 from mi_refract.io.atomic import update_between, write_atomically
 from mi_refract.io.pixels import srgb_encode
-from mi_refract.plugins.refract import PLUGIN
+from mi_refract.plugins import PLUGIN
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
 from mi_refract.report.thumbnails import png
@@ -49,7 +49,7 @@ from validation.run.metrics import (
     low,
 )
 from validation.stability import layered_paths
-from validation.suite import matrix_table
+from validation.suite import matrix
 
 ROOT = SCENES.parent
 GALLERY = SCENES / "gallery.png"
@@ -318,7 +318,7 @@ def visible(rows: list[Row]) -> str:
 
 def suite(rows: list[Row]) -> str:
     """How far every system is off at most, check by check."""
-    return _table(*matrix_table.table(rows), "other renderers were run")
+    return _table(*matrix.table(rows), "other renderers were run")
 
 
 TABLES = {

@@ -6,16 +6,22 @@ arrays (`evaluate` gets them from a formula). Out: a `Judgement`, ray by ray, ag
 """
 
 from . import backward_error
-from .direction_errors import (
+from .judge import (
+    BUDGETS,
     DirectionErrors,
+    Judgement,
+    RayBounds,
+    Subject,
     absolute_radicand,
+    arrays,
     errors,
     errors_of_normalised,
+    evaluate,
+    judge,
+    judge_formula,
     lengths,
     relative_radicand,
 )
-from .evaluate import Subject, arrays, evaluate
-from .judge import BUDGETS, Judgement, RayBounds, judge, judge_formula
 
 __all__ = [
     "BUDGETS",

@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 from mi_refract.regimes import Array, Rays
 
-from .direction_errors import absolute_radicand, lengths
+from .judge import absolute_radicand, lengths
 
 _TURNS = np.linspace(0, np.pi / 2, 33)  # of φ: the largest is found to 1 part in 1000
 

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
+import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_refract import oracle
+from mi_refract import oracle, regimes
 from mi_refract.formulas import NEGLIGIBLE, UNIT, Budget, radicand_for
-from mi_refract.numerics import ArrayType
+from mi_refract.numerics import ArrayType, Mask, Number, Vector3, from_numpy
 from mi_refract.regimes import Array, Rays
-
-from .direction_errors import absolute_radicand, errors, errors_of_normalised, lengths, relative_radicand
-from .evaluate import Subject, evaluate
 
 Flags = NDArray[np.bool_]
 
@@ -23,6 +22,65 @@ Flags = NDArray[np.bool_]
 NORMALISING = 3.0
 # The most that `Judgement.values` may be.
 BUDGETS = {"error / bound": 1.0, "TIR misclassified, beyond its bound": 0.0}
+
+
+# Errors ---------------------------------------------------------------------------------------------------------------
+
+
+class DirectionErrors(NamedTuple):
+    """Errors of directions b, (N,) float64 each; infinite where b is NaN."""
+
+    chord: Array  # |b/|a| − exact|
+    angle: Array  # between b and the exact direction, radians
+    drift: Array  # of the length: | |b|/|a| − 1 |
+
+
+def errors(b: Array, rays: Rays, exact: oracle.Certified) -> DirectionErrors:
+    """Errors of `b` (N, 3), which should have the length of `a`, relative to |a|."""
+    unit, low = b / lengths(rays.a)[:, None], exact.direction_low.astype(np.longdouble)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # b may be anything
+        difference = (unit - exact.direction) - low
+        chord, norm = lengths(difference), lengths(unit)
+        across = lengths(np.cross(unit, difference)) / norm
+        angle = np.arctan2(across, norm - (unit * difference).sum(1) / norm)
+        return DirectionErrors(*(np.nan_to_num(x.astype(float), nan=np.inf) for x in (chord, angle, np.abs(norm - 1))))
+
+
+def errors_of_normalised(b: Array, rays: Rays, exact: oracle.Certified) -> DirectionErrors:
+    """Errors of `b` (N, 3) that may also have been made unit: `drift` is | |b| − 1 | where that is less.
+
+    Chord and angle are those of b scaled to the length of `a`. NaN stays in `drift`.
+    """
+    with np.errstate(all="ignore"):  # b may be anything
+        length, kept = lengths(b), lengths(rays.a)
+        drift = np.fmin(np.abs(length - 1), np.abs(length / kept - 1)).astype(float)
+        return errors(b * (kept / length)[:, None], rays, exact)._replace(drift=drift)
+
+
+def absolute_radicand(rays: Rays) -> Array:
+    """(N,) |1 − k² sin²θ_i|, in extended precision: how far each ray is from the critical angle."""
+    a, n, k = (x.astype(np.longdouble) for x in (rays.a, rays.n, rays.k))
+    return np.abs(1 - (k * lengths(np.cross(n, a)) / (lengths(a) * lengths(n))) ** 2)
+
+
+def relative_radicand(rays: Rays) -> Array:
+    """(N,) |(n·a)² − κ|n×a|²| over the mean of its two terms, right to 2⁻¹⁴⁰; NaN where both are 0.
+
+    Near the critical angle, where the terms are alike, it is the modulus of `oracle.relative_radicand`.
+    """
+    _, d, terms = regimes.radicand(*(x.T.astype(np.float64) for x in (rays.a, rays.n, rays.k)))
+    with np.errstate(invalid="ignore"):
+        ratio: Array = np.abs(d[0]) / (terms / 2)
+    return ratio
+
+
+def lengths(v: Array) -> Array:
+    """(N,) of (N, 3), in extended precision."""
+    length: Array = np.sqrt((v.astype(np.longdouble) ** 2).sum(1))
+    return length
+
+
+# Bounds and verdict ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -168,14 +226,6 @@ class Judgement:
         return {"error / bound": float(self.share.max()), "TIR misclassified, beyond its bound": float(self.far.sum())}
 
 
-def judge_formula(
-    subject: Subject, rays: Rays, exact: oracle.Certified, vector: ArrayType, budget: Budget
-) -> Judgement:
-    """`judge` what `subject` returns for all rays, computed in arrays of the 3-vector type `vector`."""
-    u = float(np.finfo(rays.a.dtype).eps) / 2
-    return judge(*evaluate(subject, rays, vector), RayBounds(rays, exact, budget, u))
-
-
 def judge(
     b: Array, transmitted: Flags, bounds: RayBounds, directed: Flags | bool = True, blank: Flags | bool = False
 ) -> Judgement:
@@ -197,3 +247,36 @@ def judge(
         misjudged=misjudged,
         blank=np.broadcast_to(blank, len(exact)),
     )
+
+
+# Formulas -------------------------------------------------------------------------------------------------------------
+
+# What is called as the entries of FORMULAS are: `subject(a, n, k) -> (b, transmitted)`.
+Subject: TypeAlias = Callable[[Vector3, Vector3, Number], tuple[Vector3, Mask]]
+
+
+def evaluate(subject: Subject, rays: Rays, vector: ArrayType) -> tuple[Array, NDArray[np.bool_]]:
+    """(b, transmitted) of all rays, (N, 3) in extended precision and (N,).
+
+    `vector`: the 3-vector type of Dr.Jit to compute with. With scalar types the subject is called ray by ray.
+    """
+    if dr.is_jit_v(vector):
+        b, transmitted = subject(*arrays(rays, vector))
+        dr.eval(b, transmitted)  # in one kernel
+        parts = np.broadcast_arrays(*(np.array(x) for x in b))
+        return np.stack(parts, 1).astype(np.longdouble), np.array(transmitted)
+    pairs = [subject(vector(a), vector(n), float(k)) for a, n, k in zip(rays.a, rays.n, rays.k, strict=True)]
+    return np.array([list(b) for b, _ in pairs], np.longdouble), np.array([t for _, t in pairs], bool)
+
+
+def arrays(rays: Rays, vector: ArrayType) -> tuple[Vector3, Vector3, Number]:
+    """(a, n, k) of all rays, as vectors of a vectorised type and their numbers."""
+    return from_numpy(vector, rays.a), from_numpy(vector, rays.n), from_numpy(dr.value_t(vector), rays.k)
+
+
+def judge_formula(
+    subject: Subject, rays: Rays, exact: oracle.Certified, vector: ArrayType, budget: Budget
+) -> Judgement:
+    """`judge` what `subject` returns for all rays, computed in arrays of the 3-vector type `vector`."""
+    u = float(np.finfo(rays.a.dtype).eps) / 2
+    return judge(*evaluate(subject, rays, vector), RayBounds(rays, exact, budget, u))

@@ -38,7 +38,7 @@ COMMANDS = {
     "render": Command("render", "render", "Render a Mitsuba scene, with our plugins, into an EXR file."),
     "trace": Command("trace", "trace", "Trace rays through a planar scene; draw them, print focal points."),
     "diff": Command("diff", "diff", "Compare images with their references: equal or different?"),
-    "accept": Command("accept", "accept", "Make the images that differ the new references."),
+    "accept": Command("diff", "accept", "Make the images that differ the new references."),
     "self-test": Command("self_test", "self_test", "Show which defects a comparison of images would detect."),
     "rays": Command("rays", "app", "Check another program's refraction, ray by ray."),
     "scene": Command("scene", "app", "Export a Mitsuba scene for another renderer."),
@@ -94,5 +94,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line, or `arguments`; the exit code. Warnings are one line on stderr, as errors are."""
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: print(printable(f"mi-refract: {message}"), file=sys.stderr)
-        run = functools.partial(app, arguments, prog_name="mi-refract", standalone_mode=False)
+        words = sys.argv[1:] if arguments is None else arguments
+        # `obj`: a command may show the command line that repeats it.
+        run = functools.partial(app, words, prog_name="mi-refract", standalone_mode=False, obj=words)
         return exit_code("mi-refract", run, (KeyboardInterrupt, typer.Abort))

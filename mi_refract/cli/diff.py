@@ -1,54 +1,36 @@
-"""The command `mi-refract diff`: its options, and its output."""
+"""The commands `mi-refract diff` and `mi-refract accept`: compare images with references, and replace references.
+
+What only some calls need is imported there: of a comparison that takes a third of a second the imports are the most.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import enum
+import importlib.util
 import os
-import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mi_refract.image_diff import folders, pairing, settings_file, text_reports
-from mi_refract.image_diff.methods import AUTO
-from mi_refract.image_diff.results import Results, as_word
-from mi_refract.image_diff.settings import Settings
+from mi_refract.image_diff import folders, pairing, text_reports
+from mi_refract.image_diff.methods import AUTO, METHODS
+from mi_refract.image_diff.results import Status
+from mi_refract.image_diff.settings import FILE, Settings
 from mi_refract.io.atomic import writable
+from mi_refract.io.exit_code import MISUSE
 from mi_refract.io.image_file import MAX_VALUES
 from mi_refract.io.sanitise import printable
 
-from .comparing import (
-    Channels,
-    File,
-    Idiff,
-    MaxValues,
-    Method,
-    Names,
-    Nonfinite,
-    Set,
-    Variance,
-    print_table,
-    progress,
-    require_extra,
-    say,
-    settings_of,
-)
-
 if TYPE_CHECKING:
     from mi_refract.image_diff.html_report import Page
-    from mi_refract.image_diff.report_folder import Folder as ReportFolder
+    from mi_refract.image_diff.report_folder import Folder
 
-Reference = Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")]
-Test = Annotated[
-    Path | None,
-    typer.Argument(metavar="TEST", help="The image or folder to compare with it; optional with --check-settings."),
-]
-OUTPUTS = ((".xml",), (".json",))  # of --junit, --json
-PAGES = (".html", ".htm")
+HTML = (".html", ".htm")
 
 
 class Inconclusive(enum.StrEnum):
@@ -58,8 +40,10 @@ class Inconclusive(enum.StrEnum):
     FAIL = "fail"
 
 
-def _print_methods(asked: bool) -> None:
-    if asked:
+def _print_methods(wanted: bool) -> None:
+    if wanted:
+        from mi_refract.image_diff import settings_file
+
         text = settings_file.reference()
         if sys.stdout.isatty():
             from rich.console import Console
@@ -71,126 +55,107 @@ def _print_methods(asked: bool) -> None:
         raise typer.Exit
 
 
-Renders = Annotated[bool, typer.Option("--renders", help="Each folder holds several renders of one image.")]
-CountsAs = Annotated[
-    Inconclusive | None, typer.Option(help="What an inconclusive image counts as; exit code 3 by default.")
+Names = Annotated[
+    list[str] | None, typer.Argument(metavar="NAME", help="Only these images: paths in the folders, * and ?.")
 ]
-Report = Annotated[
-    str,
-    typer.Option(
-        metavar="OUT.html|FOLDER/", help="Write an HTML page with the images; a folder has them all, one page a pair."
-    ),
+Method = Annotated[str, typer.Option(help=f"Comparison method: {'|'.join((AUTO, *METHODS))}; see --methods.")]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help=f"Any key of [defaults] in {FILE}, for all images; see --methods."),
 ]
-ReportUrl = Annotated[
-    str,
-    typer.Option(
-        metavar="URL",
-        envvar="MI_REFRACT_REPORT_URL",
-        help="Where the report will be found, for the job's summary; below URL/ every page is linked.",
-    ),
+Idiff = Annotated[
+    str | None,
+    typer.Option("--idiff", metavar="FLAGS", help="Flags of OpenImageIO's idiff: --method tolerance with them."),
 ]
-JUnit = Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")]
-Json = Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")]
-GitHub = Annotated[bool, typer.Option("--github", help="Print GitHub annotations, write the job's summary.")]
-Methods = Annotated[
-    bool, typer.Option("--methods", is_eager=True, callback=_print_methods, help="Print the methods and their options.")
+File = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.toml", help=f"Settings of single images; by default {FILE} beside the references."),
 ]
-CheckSettings = Annotated[
-    bool, typer.Option("--check-settings", help="Print how each image would be compared, and which settings say so.")
+MaxValues = Annotated[
+    int, typer.Option("--max-values", metavar="N", min=1, help="Width × height × channels of an image, at most.")
 ]
 
 
 def diff(
-    reference: Reference,
-    test: Test = None,
+    reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="An image, or a folder of them.")],
+    test: Annotated[
+        Path | None,
+        typer.Argument(metavar="TEST", help="The image or folder to compare with it; optional with --check-settings."),
+    ] = None,
     names: Names = None,
     method: Method = AUTO,
     options: Set = None,
-    renders: Renders = False,
     idiff: Idiff = None,
     settings: File = None,
-    allow_nonfinite: Nonfinite = None,
-    variance: Variance = "",
-    channels: Channels = "",
     max_values: MaxValues = MAX_VALUES,
-    inconclusive: CountsAs = None,
-    report: Report = "",
-    report_url: ReportUrl = "",
-    junit: JUnit = None,
-    json: Json = None,
-    github: GitHub = False,
-    methods: Methods = False,
-    check_settings: CheckSettings = False,
+    renders: Annotated[bool, typer.Option("--renders", help="Each folder holds several renders of one image.")] = False,
+    inconclusive: Annotated[
+        Inconclusive | None, typer.Option(help="What an inconclusive image counts as; exit code 3 by default.")
+    ] = None,
+    report: Annotated[
+        str,
+        typer.Option(
+            metavar="OUT.html|FOLDER/",
+            help="Write an HTML page with the images; a folder has them all, one page a pair.",
+        ),
+    ] = "",
+    report_url: Annotated[
+        str,
+        typer.Option(
+            metavar="URL",
+            envvar="MI_REFRACT_REPORT_URL",
+            help="Where the report will be published, for the job's summary; below URL/ every page is linked.",
+        ),
+    ] = "",
+    junit: Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")] = None,
+    json: Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")] = None,
+    github: Annotated[
+        bool, typer.Option("--github", help="Print GitHub annotations, write the job's summary.")
+    ] = False,
+    methods: Annotated[
+        bool,
+        typer.Option(
+            "--methods", is_eager=True, callback=_print_methods, help="Print the methods, their options and all keys."
+        ),
+    ] = False,
+    check_settings: Annotated[
+        bool,
+        typer.Option("--check-settings", help="Print how each image would be compared, and which settings say so."),
+    ] = False,
 ) -> None:
     """Compare images with their references. Exit code 0: equal, 1: different, 2: not comparable, 3: inconclusive."""
     require_extra("scipy", *(("jinja2", "matplotlib") if report else ()))
     if test is None and not check_settings:
         raise ValueError("two paths are needed; expected mi-refract diff REFERENCE TEST")
-    chosen = settings_of(reference, method, options, idiff, settings, allow_nonfinite, max_values, variance, channels)
+    chosen = _settings(reference, method, options or [], idiff, settings, max_values)
     if check_settings or test is None:
-        raise typer.Exit(_check_settings(reference, test, names or [], chosen))
-    for path, suffixes in zip((junit, json), OUTPUTS, strict=True):
+        raise typer.Exit(_check_settings(reference, test or reference, names or [], chosen))
+    for path, suffix in ((junit, ".xml"), (json, ".json")):
         if path:
-            writable(path, suffixes)
-    wanted = inconclusive or ""
-    with _reporting(report, reference, test) as page:
-        with progress() as tell:
+            writable(path, (suffix,))
+    if _is_folder(report):
+        from mi_refract.image_diff import report_folder
+
+        report_folder.require_free(Path(report), reference, test)
+    with _report(report) as page:
+        with _progress() as progress:
             found = folders.diff(
                 reference,
                 test,
                 chosen,
                 names=names or [],
                 renders=renders,
-                inconclusive=wanted,
+                inconclusive=inconclusive or "",
                 view=page.view if page else None,
                 digests=bool(json),
-                tell=tell,
+                progress=progress,
             )
-        say(found)
+        text_reports.print_results(found)
         if page:
             from mi_refract.io.provenance import provenance
 
             software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
-            page.write(found, software, _replay(found, names or []), str(json or ""))
-    _write(found, junit, json, _pages(report, report_url) if github else None, github)
-    raise typer.Exit(found.exit_code)
-
-
-@contextlib.contextmanager
-def _reporting(report: str, *sides: Path) -> Iterator[Page | ReportFolder | None]:
-    """What writes the report that was asked for. ValueError or OSError where that cannot be written."""
-    if not report:
-        yield None
-        return
-    from mi_refract.image_diff import html_report, report_folder
-
-    if _is_folder(report):
-        report_folder.require_free(Path(report), *sides)
-        with report_folder.writing(Path(report)) as folder:
-            yield folder
-    else:
-        yield html_report.Page(writable(report, PAGES))
-
-
-def _is_folder(report: str) -> bool:
-    """Whether the report is a folder: it ends in /, has no ending, or is one already."""
-    path = Path(report)
-    return report.endswith(("/", os.sep)) or (path.suffix.lower() not in PAGES and (not path.suffix or path.is_dir()))
-
-
-def _pages(report: str, url: str) -> text_reports.Pages | None:
-    if not report:
-        return None
-    from mi_refract.image_diff import report_rows
-
-    page = report_rows.page_of if _is_folder(report) else lambda result: ""
-    return text_reports.Pages(report, page, url)
-
-
-def _write(
-    found: Results, junit: Path | None, json: Path | None, pages: text_reports.Pages | None, github: bool
-) -> None:
-    """Write the JSON and JUnit files, and the GitHub annotations, that were asked for."""
+            page.write(found, software, found.command("diff", *(names or [])), str(json or ""))
     if junit:
         text_reports.write_junit(junit, found)
     if json:
@@ -198,24 +163,160 @@ def _write(
     if github:
         for line in text_reports.workflow_commands(found):
             print(line)
-        text_reports.append_summary(found, pages)
+        text_reports.append_summary(found, _pages(report, report_url) if report else None)
+    raise typer.Exit(found.exit_code)
 
 
-def _replay(found: Results, names: Sequence[str]) -> str:
-    """The command that repeats the whole comparison."""
-    sides = (as_word(path) for path in (found.reference, found.test))
-    return shlex.join(["mi-refract", "diff", *sides, *names, *found.flags, *["--renders"] * found.renders])
+def accept(
+    reference: Annotated[
+        Path | None,
+        typer.Argument(help="As for diff; with --from optional: by default the paths that were compared."),
+    ] = None,
+    test: Annotated[Path | None, typer.Argument(help="As for diff; with --from optional, as REFERENCE.")] = None,
+    names: Names = None,
+    method: Method = AUTO,
+    options: Set = None,
+    idiff: Idiff = None,
+    settings: File = None,
+    max_values: MaxValues = MAX_VALUES,
+    source: Annotated[
+        Path | None,
+        typer.Option("--from", metavar="OUT.json", help="What diff --json wrote: exactly the images that it compared."),
+    ] = None,
+    as_variant: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="Keep the references: the new images become further ones, named by `accept` of the settings.",
+        ),
+    ] = "",
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Show which images are not equal to their references, ask, and copy them over. Nothing is deleted."""
+    require_extra("scipy")
+    from mi_refract.image_diff import accept as accepting
+
+    if source:
+        from mi_refract.image_diff import results_file
+
+        if (reference is None) != (test is None):
+            raise ValueError(f"{reference}: one path; expected with --from both folders before any names, or none")
+        if options or method != AUTO or idiff is not None:
+            raise ValueError("--from takes what was compared; expected no --method, --set or --idiff")
+        found = results_file.read(source, reference, test)
+        found = replace(found, results=tuple(pairing.named(found.results, names or [])))
+        found = results_file.with_settings(found, _settings(found.reference, AUTO, [], None, settings, max_values))
+        text_reports.print_errors(found)
+    elif reference is None or test is None:
+        raise ValueError("two paths are needed; expected mi-refract accept REFERENCE TEST, or --from OUT.json")
+    else:
+        chosen = _settings(reference, method, options or [], idiff, settings, max_values)
+        with _progress() as progress:
+            found = folders.diff(reference, test, chosen, names=names or [], to_accept=True, progress=progress)
+        text_reports.print_results(found)
+    try:
+        copies = list(accepting.changes(found, as_variant))
+    except accepting.UnreadableImage as error:
+        if error.result.status is Status.ERROR:  # and printed
+            raise typer.Exit(MISUSE) from None
+        raise
+    for copy in copies:
+        print(printable(f"{copy.new} → {copy.reference}{'' if copy.replaced else ' (new)'}"))
+    if not copies:
+        print("nothing to accept")
+        return
+    if not yes and not sys.stdin.isatty():
+        raise ValueError("accept asks on a terminal only; elsewhere expected --yes")
+    if not yes and not typer.confirm(f"Accept {len(copies)} as the reference{'' if len(copies) == 1 else 's'}?"):
+        print("nothing accepted")
+        raise typer.Exit(1)
+    accepting.accept(copies)
+    print(f"{len(copies)} accepted")
 
 
-def _check_settings(reference: Path, test: Path | None, names: Sequence[str], chosen: Settings) -> int:
+# Options ------------------------------------------------------------------------------------------------------------
+
+
+def require_extra(*packages: str) -> None:
+    """ValueError, before anything is compared, where a package is not installed."""
+    if not all(map(importlib.util.find_spec, packages)):
+        raise ValueError("comparing needs the extra `diff`: pip install 'mi-refract[diff]'")
+
+
+def _settings(
+    reference: Path, method: str, words: Sequence[str], idiff: str | None, file: Path | None, max_values: int
+) -> Settings:
+    """What the options and the settings file say. ValueError or OSError for what they cannot mean."""
+    beside = (reference if reference.is_dir() else reference.parent) / FILE
+    path = file or (beside if beside.exists() else None)
+    flags = ["--method", method] if method != AUTO else []
+    flags += ["--idiff", idiff] if idiff is not None else []
+    flags += [each for word in words for each in ("--set", word)]
+    flags += ["--max-values", str(max_values)] if max_values != MAX_VALUES else []
+    flags += ["--settings", str(file)] if file else []
+    if not flags and path is None:
+        return Settings()
+    from mi_refract.image_diff import settings_file
+
+    layer = settings_file.from_words(method, words, idiff)
+    settings = settings_file.load(path, layer, max_values) if path else Settings((layer,), max_values=max_values)
+    return replace(settings, flags=tuple(flags))
+
+
+def _check_settings(reference: Path, test: Path, names: Sequence[str], chosen: Settings) -> int:
     """Print how each image would be compared, and which entries say so; 2 where that is wrong for one."""
-    every = pairing.pairs(reference, test or reference, chosen)
+    every = pairing.pairs(reference, test, chosen)
     pairs = pairing.named(every, names)
-    print_table(text_reports.settings_table(pairs))
-    for pattern in chosen.unused([pair.name for pair in pairs]):
-        print(f"mi-refract: {printable(pattern)}: matches no image", file=sys.stderr)
-    wrong = {pair.name: pairing.error_of(pair, reference) for pair in (*pairs, *pairing.wrong_entries(chosen, every))}
-    for name, error in wrong.items():
-        if error:
-            print(f"mi-refract: {printable(name)}: {printable(error)}", file=sys.stderr)
-    return 2 if any(wrong.values()) else 0
+    lines = [f"{pattern}: matches no image" for pattern in chosen.unused([pair.name for pair in pairs])]
+    checked = ((pair, pairing.error_of(pair, reference)) for pair in (*pairs, *pairing.wrong_entries(chosen, every)))
+    errors = [f"{pair.name}: {error}" for pair, error in checked if error]
+    text_reports.print_table(text_reports.settings_table(pairs))
+    for line in lines + errors:
+        print(f"mi-refract: {printable(line)}", file=sys.stderr)
+    return MISUSE if errors else 0
+
+
+# Output -------------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _report(report: str) -> Iterator[Page | Folder | None]:
+    """The writer of the report, if any. ValueError or OSError where it cannot be written."""
+    if _is_folder(report):
+        from mi_refract.image_diff import report_folder
+
+        with report_folder.writing(Path(report)) as folder:
+            yield folder
+    elif report:
+        from mi_refract.image_diff import html_report
+
+        yield html_report.Page(writable(report, HTML))
+    else:
+        yield None
+
+
+def _is_folder(report: str) -> bool:
+    """Whether the report is a folder: it ends in /, has no ending, or is one already."""
+    path = Path(report)
+    named_so = report.endswith(("/", os.sep)) or not path.suffix
+    return bool(report) and (named_so or (path.suffix.lower() not in HTML and path.is_dir()))
+
+
+def _pages(report: str, url: str) -> text_reports.Pages:
+    from mi_refract.image_diff import html_report
+
+    return text_reports.Pages(report, html_report.page_of if _is_folder(report) else lambda result: "", url)
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Callable[[int, int], None]]:
+    """A function to call with the numbers of images done and of all; a progress bar on a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda done, total: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("comparing", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -1,4 +1,4 @@
-"""The command `mi-refract doctor`: what runs on this machine."""
+"""The command `mi-refract doctor`: what runs on this machine; and the variant of Mitsuba that a command runs."""
 
 from __future__ import annotations
 
@@ -11,28 +11,23 @@ from mi_refract import __version__, backend
 from mi_refract.io.provenance import installed_version
 from mi_refract.io.sanitise import json_text, printable_lines
 
-from . import variants
+from .interrupts import as_exceptions
 
 
 def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
     """Show which Mitsuba variants run on this machine, why the others do not, and what to install."""
-    variants.probe()
-    facts = diagnose()
+    probe()
+    libraries = {library.path: library.defect or "works" for library in backend.libraries()}
+    versions = {name: installed_version(name) for name in ("mitsuba", "drjit", "numpy", "OpenImageIO")}
+    facts: dict[str, Any] = {
+        "variants": backend.usable_variants(),
+        "libllvm": libraries,
+        "versions": {"mi_refract": __version__, "python": sys.version.split()[0]} | versions,
+        "advice": backend.advice(),
+    }
     print(json_text(facts, indent=2) if as_json else printable_lines(_as_text(facts)))
     if None not in facts["variants"].values():
         raise ValueError("no Mitsuba variant can run on this machine")
-
-
-def diagnose() -> dict[str, Any]:
-    """What `doctor` prints: `variants` (None, or why not), `libllvm` ("works", or the defect), `versions`, `advice`."""
-    names = ("mitsuba", "drjit", "numpy", "OpenImageIO")
-    versions = {"mi_refract": __version__, "python": sys.version.split()[0]}
-    return {
-        "variants": backend.usable_variants(),
-        "libllvm": {library.path: library.defect or "works" for library in backend.libraries()},
-        "versions": versions | {name: installed_version(name) for name in names},
-        "advice": backend.advice(),
-    }
 
 
 def _as_text(facts: dict[str, Any]) -> str:
@@ -43,3 +38,20 @@ def _as_text(facts: dict[str, Any]) -> str:
         width = max(map(len, table))
         lines += [title, *(f"  {name:{width}}  {text}".rstrip() for name, text in table.items()), ""]
     return "\n".join([*lines, facts["advice"]])
+
+
+def probe(*, every_backend: bool = True) -> None:
+    """Try the libLLVMs, and `every_backend`, in processes that Ctrl-C ends, too; `backend` remembers the outcome.
+
+    It may start the command line again.
+    """
+    with as_exceptions():
+        backend.restart_if_needed()
+        if every_backend:
+            backend.detect()
+
+
+def activate(variant: str | None = None) -> str:
+    """Set the variant, or the best that runs here, and return its name. Errors: those of `backend.activate`."""
+    probe(every_backend=variant is not None and not variant.startswith("scalar_"))
+    return backend.activate(variant)

@@ -2,48 +2,85 @@
 
 from __future__ import annotations
 
+import importlib.util
+import math
 import shlex
-from dataclasses import replace
+import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+from rich.console import Console
+from rich.table import Table
 
-from mi_refract.cluster.connection import ClusterTarget
 from mi_refract.io.atomic import writable
+from mi_refract.io.provenance import provenance
 from mi_refract.io.sanitise import printable
-from mi_refract.ray_sets import files, ray_set, run_program
-from mi_refract.ray_sets.ray_set import RaySet
+from mi_refract.ray_sets import files, ray_set, run_program, tables
+from mi_refract.ray_sets.ray_set import Answers, RaySet
+from mi_refract.regimes import REGIMES
 
 from .interrupts import as_exceptions
-from .rays_options import (
-    Backward,
-    CheckOptions,
-    Count,
-    File,
-    Formula,
-    Json,
-    Junit,
-    MadeRays,
-    Medium,
-    Precision,
-    Regime,
-    Regimes,
-    Report,
-    Seed,
-    Tir,
-    TwoSided,
-    Wavelengths,
-)
-
-if TYPE_CHECKING:
-    from mi_refract.ray_sets.renderer_file import RaysCommand, RendererFile
 
 app = typer.Typer(
     help="Check the refraction of other programs against certified answers.",
     add_completion=False,
     rich_markup_mode=None,
 )
+
+UNWRAPPED = 10_000  # columns: wider than any line
+
+
+def _print_regimes(wanted: bool) -> None:
+    if wanted:
+        table = Table("regime", "rays", "", box=None, pad_edge=False)
+        for name, regime in REGIMES.items():
+            table.add_row(name, regime.text, "" if name in ray_set.DEFAULT else "only with --regime")
+        Console(width=None if sys.stdout.isatty() else UNWRAPPED).print(table, highlight=False)
+        raise typer.Exit
+
+
+Regime = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME",
+        help="A regime of rays, see `export --regimes`; may be repeated. Default: all with unit vectors.",
+    ),
+]
+Count = Annotated[int, typer.Option(min=1, help="Number of rays per regime.")]
+Precision = Annotated[str, typer.Option(help="f32 or f64.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the ray generator.")]
+TwoSided = Annotated[
+    bool, typer.Option("--two-sided", help="Put normals on either side of the surface; by default they face the ray.")
+]
+Medium = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="SPEC",
+        help="Material of one side, such as SCHOTT:N-BK7; the other side is air. May be repeated.",
+    ),
+]
+Wavelengths = Annotated[str | None, typer.Option(metavar="NM,…", help="Wavelengths in nm, with --medium.")]
+Tir = Annotated[
+    str,
+    typer.Option(help="How answers signal total internal reflection: auto, zero, nan, reflected, tangent or flag."),
+]
+Formula = Annotated[
+    str | None,
+    typer.Option("--error-bound", metavar="FORMULA", help="Formula whose error bound applies. Default: the loosest."),
+]
+Backward = Annotated[
+    float | None,
+    typer.Option(
+        "--backward-error",
+        metavar="M",
+        help="Also require each answer to be exact for inputs perturbed by at most M roundings (a sound program: 4).",
+    ),
+]
+Report = Annotated[Path | None, typer.Option(metavar="OUT.html", help="Write an HTML page.")]
+Junit = Annotated[Path | None, typer.Option(metavar="OUT.xml", help="Write JUnit XML.")]
+Json = Annotated[Path | None, typer.Option(metavar="OUT.json", help="Write JSON.")]
 
 
 @app.command()
@@ -56,71 +93,66 @@ def export(
     two_sided: TwoSided = False,
     medium: Medium = None,
     wavelengths: Wavelengths = None,
-    regimes: Regimes = False,
+    regimes: Annotated[
+        bool, typer.Option("--regimes", is_eager=True, callback=_print_regimes, help="List the regimes.")
+    ] = False,
 ) -> None:
     """Write rays for another program: incident directions, normals and indices of refraction."""
-    writable(output, files.SUFFIXES)
-    made = MadeRays(regime, count, precision, seed, two_sided, medium, wavelengths)
-    rays = ray_set.make(**made.arguments)
+    writable(output, tables.SUFFIXES)
+    rays = _made(regime, count, precision, seed, two_sided, medium, wavelengths)
     files.write(output, rays)
     print(printable(f"{output}: {_summary(rays)}"))
 
 
 @app.command()
 def check(
+    context: typer.Context,
     answers: Annotated[
-        Path, typer.Argument(metavar="ANSWERS.csv|.npz|.exr", help="id, bx, by, bz[, transmitted][, n_ratio].")
+        Path, typer.Argument(metavar="ANSWERS.csv|.npz|.exr", help="Columns id, bx, by, bz[, transmitted][, n_ratio].")
     ],
-    file: File = None,
+    file: Annotated[
+        Path | None,
+        typer.Option("--rays", metavar="FILE", help="The rays. Default: those of `export` without options."),
+    ] = None,
     tir: Tir = "auto",
     formula: Formula = None,
     backward: Backward = None,
-    regime: Regime = None,
-    count: Count = ray_set.COUNT,
-    precision: Precision = ray_set.PRECISION,
-    seed: Seed = 0,
-    two_sided: TwoSided = False,
-    medium: Medium = None,
-    wavelengths: Wavelengths = None,
     report: Report = None,
     junit: Junit = None,
     json: Json = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Certify on the workers of this Dask scheduler.")
-    ] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, max=1024, help="Number of worker processes that certify (Dask).")
-    ] = None,
 ) -> None:
-    """Check answers against certified ones. Exit code 0: right, 1: wrong, 2: the answers do not match the rays.
+    """Check a file of answers against certified ones.
 
-    Without --rays: the rays that `export` generates with the same options. The answers file never selects the rays.
+    Exit code 0: every answer is right; 1: some are wrong; 2: the answers do not match the rays.
     """
-    target = ClusterTarget(scheduler, workers)
-    options = CheckOptions(tir, formula, backward, report, junit, json, target)
-    made = MadeRays(regime, count, precision, seed, two_sided, medium, wavelengths)
-    chosen = _chosen(file, made.words)
-    rays = files.read(file) if file else ray_set.make(**made.arguments)
-    given = files.read_answers(answers, most=files.most_answers(rays))
-    origin = "" if chosen else ", as of `export` without options; others: --rays FILE"
-    print(printable(f"{answers}: {_summary(rays)}{origin}"))
-    raise typer.Exit(options.check(rays, given, str(answers), ["check", str(answers), *chosen, *options.words]))
+    checked = _checker(context, tir, formula, backward, report, junit, json)
+    rays = files.read(file) if file else ray_set.make()
+    raise typer.Exit(checked(rays, files.read_answers(answers, most=files.most_answers(rays)), str(answers)))
+
+
+# Those of `run` that choose the rays.
+CHOOSING = ("regime", "count", "seed", "two_sided", "medium", "wavelengths")
 
 
 @app.command()
 def run(
+    context: typer.Context,
     command: Annotated[
-        list[str] | None, typer.Argument(metavar="-- COMMAND", help="It reads rays and writes answers, as CSV.")
+        list[str] | None,
+        typer.Argument(metavar="-- COMMAND", help="Reads rays from stdin, writes answers to stdout, as CSV."),
     ] = None,
     renderer: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="In place of COMMAND: every function of FOLDER/mi-refract-renderer.toml."),
+        typer.Option(metavar="FOLDER", help="Instead of COMMAND: every function of FOLDER/mi-refract-renderer.toml."),
     ] = None,
-    file: File = None,
+    file: Annotated[
+        Path | None,
+        typer.Option("--rays", metavar="FILE", help="Use these rays, as exported, instead of generating some."),
+    ] = None,
     regime: Regime = None,
     count: Count = ray_set.COUNT,
     precision: Annotated[
-        str | None, typer.Option(help="f32 (default) or f64; of a renderer, that of each function.")
+        str | None, typer.Option(help="f32 (default) or f64; with --renderer, only the functions of this precision.")
     ] = None,
     seed: Seed = 0,
     two_sided: TwoSided = False,
@@ -136,83 +168,118 @@ def run(
     junit: Junit = None,
     json: Json = None,
 ) -> None:
-    """Run a command on rays and check its answers: rays go to its stdin, answers come from its stdout.
+    """Run a command on rays and check its answers.
 
-    Exit code 0: right, 1: wrong, 2: the answers do not match the rays, or the command fails or takes too long. With
-    --renderer, the largest exit code of its functions.
+    Exit code 0: every answer is right; 1: some are wrong; 2: the answers do not match the rays, or the command fails or
+    exceeds its time limit. With --renderer, the largest exit code of its functions.
     """
-    options = CheckOptions(tir, formula, backward, report, junit, json)
-    made = MadeRays(regime, count, precision or ray_set.PRECISION, seed, two_sided, medium, wavelengths)
-    if renderer:
-        raise typer.Exit(_run_renderer(renderer, command, file, made, precision, options, timeout))
-    chosen = _chosen(file, made.words)
-    rays = files.read(file) if file else ray_set.make(**made.arguments)
-    with as_exceptions():
-        given = run_program.answers_of(command or [], rays, timeout=timeout)
-    name = shlex.join(command or [])
-    print(printable(f"{name}: {_summary(rays)}"))
-    raise typer.Exit(options.check(rays, given, name, ["run", *chosen, *options.words, "--", *(command or [])]))
+    checked = _checker(context, tir, formula, backward, report, junit, json)
+    choosing = (*CHOOSING, *([] if renderer else ["precision"]))
+    for name in choosing if file else ():
+        if getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE":
+            option = f"--{name.replace('_', '-')}"
+            raise ValueError(f"--rays {file} and {option}: both choose the rays; expected one of them")
 
+    def answered(words: list[str], title: str, precision: str, tir: str = "auto") -> int:
+        rays = files.read(file) if file else _made(regime, count, precision, seed, two_sided, medium, wavelengths)
+        with as_exceptions():
+            answers = run_program.answers_of(words, rays, timeout=timeout, cwd=renderer)
+        return checked(rays, answers, title, tir)
 
-def _run_renderer(
-    folder: Path,
-    command: list[str] | None,
-    file: Path | None,
-    made: MadeRays,
-    precision: str | None,
-    options: CheckOptions,
-    timeout: float,
-) -> int:
-    """Every function of a renderer that has the precision asked for, if one is; the largest exit code."""
+    if not renderer:
+        raise typer.Exit(answered(command or [], shlex.join(command or []), precision or ray_set.PRECISION))
+
     from mi_refract.ray_sets import renderer_file
 
     if command:
-        raise ValueError(f"--renderer {folder} and {command[0]}; expected one of them")
-    known = renderer_file.load(folder)
-    calls = [call for call in known.rays if precision in (None, call.precision)]
-    if not calls:
-        raise ValueError(f"{folder}: no function{f' in {precision}' if precision else ''}; expected [[rays]]")
-    if len(calls) > 1 and (options.report or options.junit or options.json):
-        raise ValueError(f"{folder}: {len(calls)} functions, and one report; expected --precision of one of them")
-    return max(_run_function(known, call, file, made, options, timeout) for call in calls)
+        raise ValueError(f"--renderer {renderer} and {command[0]}; expected one of them")
+    functions = [x for x in renderer_file.load(renderer).rays if precision in (None, x.precision)]
+    if not functions:
+        raise ValueError(f"{renderer}: no function{f' in {precision}' if precision else ''}; expected [[rays]]")
+    if len(functions) > 1 and (report or junit or json):
+        raise ValueError(f"{renderer}: {len(functions)} functions, and one report; expected --precision of one of them")
+    codes = []
+    for function in functions:
+        words = renderer_file.filled(function.command)
+        codes.append(answered(words, function.title, function.precision, function.tir))
+        for name, reason in function.deviations.items():
+            print(printable(f"known deviation of {function.title}: {name}: {reason}"))
+    raise typer.Exit(max(codes))
 
 
-def _run_function(
-    known: RendererFile, call: RaysCommand, file: Path | None, made: MadeRays, options: CheckOptions, timeout: float
-) -> int:
-    from mi_refract.ray_sets.renderer_file import filled
+def _checker(
+    context: typer.Context,
+    tir: str,
+    formula: str | None,
+    backward: float | None,
+    report: Path | None,
+    junit: Path | None,
+    json: Path | None,
+) -> Callable[..., int]:
+    """`checked(rays, answers, title, tir="auto")`: check the answers, print and write the reports; the exit code.
 
-    made = replace(made, precision=call.precision)
-    chosen = _chosen(file, made.words)
-    rays = files.read(file) if file else ray_set.make(**made.arguments)
-    command = filled(call.command)
-    with as_exceptions():
-        given = run_program.answers_of(command, rays, timeout=timeout, cwd=known.folder)
-    print(printable(f"{call.title}: {_summary(rays)}"))
-    asked = replace(options, tir=call.tir) if options.tir == "auto" else options
-    code = asked.check(rays, given, call.title, ["run", "--renderer", str(known.folder), *chosen, *options.words])
-    for regime, reason in call.deviations.items():
-        print(printable(f"known of {call.title}: {regime}: {reason}"))
-    return code
+    `tir` there is the declared signal, which an option overrides. ValueError or OSError, before anything runs, for an
+    option that cannot be met.
+    """
+    needed = ("flint", "jinja2") if report else ("flint",)
+    if not all(map(importlib.util.find_spec, needed)):
+        raise ValueError("checking rays needs the extra `validation`: pip install 'mi-refract[validation]'")
+    from mi_refract.ray_sets import check_answers, reports
+    from mi_refract.ray_sets.tir_signal import LOOSEST
+
+    error_bound = formula or LOOSEST
+    most_backward = math.inf if backward is None else backward
+    check_answers.check_options(tir, error_bound, most_backward)
+    for path, suffixes in ((report, (".html", ".htm")), (junit, (".xml",)), (json, (".json",))):
+        if path:
+            writable(path, suffixes)
+
+    def checked(rays: RaySet, answers: Answers, title: str, declared: str = "auto") -> int:
+        print(printable(f"{title}: {_summary(rays)}"))
+        signal = declared if tir == "auto" else tir
+        found = check_answers.check(rays, answers, tir=signal, error_bound=error_bound, most_backward=most_backward)
+        # On a terminal, too: a wrapped line is easier to read than a squeezed column.
+        Console(width=UNWRAPPED).print(reports.table(found), highlight=False)
+        if report:
+            about = {"answers": title} | {key: rays.header[key] for key in ("seed", "checksum")} | provenance()
+            reports.write_html(report, found, about, shlex.join(["mi-refract", *context.obj]))
+        if junit:
+            reports.write_junit(junit, found, title)
+        if json:
+            reports.write_json(json, found)
+        return found.exit_code
+
+    return checked
 
 
-def _chosen(file: Path | None, made: list[str]) -> list[str]:
-    """The options that choose the rays, none for those of `export` without options. `made`: those of `export`."""
-    if file and made:
-        raise ValueError(f"--rays {file} and {made[0]}: both choose the rays; expected one of them")
-    return ["--rays", str(file)] if file else made
+def _made(
+    regime: list[str] | None,
+    count: int,
+    precision: str,
+    seed: int,
+    two_sided: bool,
+    medium: list[str] | None,
+    wavelengths: str | None,
+) -> RaySet:
+    """The rays that these options choose; `>>` and `<<` stand for ≫ and ≪."""
+    try:
+        in_nm = tuple(map(float, wavelengths.split(","))) if wavelengths is not None else ()
+    except ValueError:
+        raise ValueError(f"--wavelengths {wavelengths}; expected numbers in nm, such as 486.1327,587.5618") from None
+    names = [name.replace(">>", "≫").replace("<<", "≪") for name in regime or []]
+    return ray_set.make(
+        names or None, count, precision, seed, two_sided=two_sided, media=medium or (), wavelengths=in_nm
+    )
 
 
 def _summary(rays: RaySet) -> str:
-    number = len(rays.header["regimes"])
-    regimes = f"{number} regime{'' if number == 1 else 's'}"
-    return f"{len(rays)} rays, {regimes}, {rays.precision}, seed {rays.header['seed']}{_media(rays)}"
+    def counted(number: int, one: str, more: str) -> str:
+        return f"{number} {one if number == 1 else more}"
 
-
-def _media(rays: RaySet) -> str:
-    """How many media and wavelengths there are; "" without media."""
-    if not (pairs := rays.header.get("media")):
-        return ""
-    media, wavelengths = len(pairs) // 2, len(rays.header["wavelengths"])
-    kinds = "medium" if media == 1 else "media"
-    return f", {media} {kinds} at {wavelengths} wavelength{'' if wavelengths == 1 else 's'}"
+    header = rays.header
+    text = f"{len(rays)} rays, {counted(len(header['regimes']), 'regime', 'regimes')}, {rays.precision}"
+    text += f", seed {header['seed']}"
+    if "media" not in header:
+        return text
+    media = counted(len(header["media"]) // 2, "medium", "media")
+    return f"{text}, {media} at {counted(len(header['wavelengths']), 'wavelength', 'wavelengths')}"

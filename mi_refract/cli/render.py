@@ -17,7 +17,8 @@ from mi_refract.cluster.connection import ClusterTarget
 from mi_refract.io.sanitise import printable
 from mi_refract.rendering import scene_files
 
-from . import interrupts, variants
+from . import interrupts
+from .doctor import activate
 from .quantities import parse_seconds, parse_share, shown_error
 from .render_cluster import ClusterOptions, cluster_passes
 from .render_progress import shown
@@ -94,7 +95,7 @@ def render(
     seconds = parse_seconds(duration, "--time") if duration else None
     if preview is not None:
         writable(preview, (".png",))
-    chosen = variants.activate(variant)
+    chosen = activate(variant)
     from mi_refract.rendering.end_conditions import Limits
     from mi_refract.rendering.long_render import Job, resume
 

@@ -10,7 +10,7 @@ import typer
 from mi_refract.io.sanitise import printable
 from mi_refract.rendering import scene_files
 
-from . import variants
+from .doctor import activate
 
 app = typer.Typer(
     help="Write scenes for other renderers.", no_args_is_help=True, add_completion=False, rich_markup_mode=None
@@ -39,7 +39,7 @@ def export(
 ) -> None:
     """Write a Mitsuba scene as triangles for another renderer, with a README.txt that says how to render it."""
     defines = scene_files.parse_defines(define or [])
-    variants.activate("scalar_rgb")
+    activate("scalar_rgb")
     from mi_refract.scene_export import from_mitsuba
     from mi_refract.scene_export.write_files import write
 

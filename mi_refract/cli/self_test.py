@@ -1,19 +1,18 @@
-"""The command `mi-refract self-test`: which defects would the comparison of images see?"""
+"""The command `mi-refract self-test`: which defects does a comparison of images detect?"""
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
+from mi_refract.image_diff.text_reports import print_table
 from mi_refract.io.image_file import MAX_VALUES
-from mi_refract.io.pixels import Pixels
 
-from . import variants
-from .comparing import MaxValues, print_table, require_extra
+from .diff import MaxValues, require_extra
+from .doctor import activate
 
 RENDERS, SPP = 16, 16
 RESOLUTION = 64
@@ -39,45 +38,27 @@ def self_test(reference: Images = None, max_values: MaxValues = MAX_VALUES, allo
     from mi_refract.image_diff import self_test as self_tests
 
     require_extra("scipy")
-    if allow_plugins and (reference is None or reference.suffix != SCENE):
+    is_scene = reference is not None and reference.suffix == SCENE
+    if allow_plugins and not is_scene:
         raise ValueError("--allow-plugins: only a scene brings plugins; expected with SCENE.xml")
-    if reference is None:
-        renders = glass_ball()
-    elif reference.suffix == SCENE:
-        renders = of_file(reference, allow_plugins or ())
-    else:
+    if reference is not None and not is_scene:
         renders = self_tests.read_images(reference, max_values)
+    else:
+        from mi_refract.rendering.scene_files import load_scene
+
+        activate()
+        import mitsuba as mi
+
+        scene = load_scene(reference, allow_plugins=allow_plugins or ()) if reference else mi.load_dict(_glass_ball())
+        renders = np.stack([np.array(mi.render(scene, spp=SPP, seed=seed)) for seed in range(RENDERS)])
     rows = self_tests.examine(renders, str(reference or "a glass ball"))
     print_table(self_tests.table(rows))
-    raise typer.Exit(int(self_tests.failed(rows)))
-
-
-def of_file(path: Path, allow_plugins: Collection[str] = ()) -> Pixels:
-    """Independent renders of a scene file, number × H × W × C.
-
-    `allow_plugins`: names of plugins that the scene may bring, which are code. Errors: those of `load_scene`.
-    """
-    from mi_refract.rendering.scene_files import load_scene
-
-    variants.activate()
-    return _rendered(load_scene(path, allow_plugins=allow_plugins))
-
-
-def glass_ball() -> Pixels:
-    """Independent renders of a glass ball on a floor under a sky and a lamp, number × H × W × 3."""
-    variants.activate()
-    import mitsuba as mi
-
-    return _rendered(mi.load_dict(_glass_ball()))
-
-
-def _rendered(scene: Any) -> Pixels:
-    import mitsuba as mi
-
-    return np.stack([np.array(mi.render(scene, spp=SPP, seed=seed)) for seed in range(RENDERS)])
+    print("\n".join(self_tests.summary(rows)))
+    raise typer.Exit(int(any(row.verdict == "fail" for row in rows)))
 
 
 def _glass_ball() -> dict[str, Any]:
+    """A scene: a glass ball on a floor under a sky and a lamp."""
     import mitsuba as mi
 
     look_at = mi.ScalarTransform4f().look_at

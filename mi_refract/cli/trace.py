@@ -13,7 +13,7 @@ from mi_refract.io.sanitise import json_text, printable
 from mi_refract.planar import figure, focal_points, light, scene_file
 from mi_refract.planar.path_tree import as_data, follow_scene, summary, with_rays
 
-from . import variants
+from .doctor import probe
 
 
 def _print_keys(wanted: bool) -> None:
@@ -50,7 +50,7 @@ def trace(
     ] = False,
 ) -> None:
     """Trace the rays of a planar scene; draw them, print their paths, or print focal points."""
-    variants.probe()
+    probe()
     if output:
         atomic.writable(output, figure.FORMATS)
         figure.require_matplotlib()

@@ -4,32 +4,43 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from mi_refract.io import image_file
+from mi_refract.io import image_file, regular_file
 from mi_refract.io.atomic import replacing
+from mi_refract.io.exit_code import describe
 
 from . import pairing
-from .folders import digest, opened
+from .folders import digest
 from .results import FAILED, Result, Results
 
 BLOCK = 2**20  # bytes that are copied at once
+
+
+class UnreadableImage(ValueError):
+    """A new image that cannot be read, and so can be no reference; `result` is its comparison."""
+
+    def __init__(self, result: Result, text: str) -> None:
+        """`text`: what the error says."""
+        super().__init__(text)
+        self.result = result
 
 
 @dataclass(frozen=True)
 class Copy:
     """A new image that is to become the reference.
 
-    `shown`, `replaced`: what `digest` said of the new image and of the reference when they were compared.
+    `compared`, `replaced`: the digests of the new image and of the reference when they were compared.
     """
 
     new: Path
     reference: Path
-    shown: str
+    compared: str
     replaced: str
 
 
@@ -37,53 +48,49 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
     """A copy for each image that is not equal to its reference, or has none. `results`: of a `diff(to_accept=True)`.
 
     `variant`: the copies become other references beside the old ones, of that name; see `pairing.variant`.
-    ValueError or OSError for a new image that can be no reference: unreadable, with values that are not finite, or of
-    another format than the reference's name says.
+    ValueError or OSError for a new image that can be no reference: UnreadableImage, or one with values that are not
+    finite, or of another format than the reference's name says.
     """
     taken = {result.target for result in results.results} if variant else set()
     for result in results.of(*FAILED):
         if result.test is None or result.digests is None:
             if result.error:
-                raise ValueError(result.error)
+                raise UnreadableImage(result, result.error)
             if result.test:
                 raise ValueError(f"{result.test}: compared without digests; expected results of diff(to_accept=True)")
             continue
-        target = _target(result, results, variant)
+        target = result.target or results.reference
+        if variant and result.reference is None:
+            raise ValueError(f"{result.test}: has no reference yet; expected without --as-variant")
+        if variant:
+            target = pairing.variant(target, result.how, variant)
         if target in taken or (variant and target.exists() and target not in result.variants):
             raise ValueError(f"{target}: the reference of another image, too; expected one new image for each")
         taken.add(target)
-        images = image_file.read_parts(result.test, result.how.max_values)
+        try:
+            images = image_file.read_parts(result.test, result.how.max_values)
+        except (ValueError, OSError) as error:
+            raise UnreadableImage(result, describe(error)) from error
         finite = all(np.isfinite(image.pixels).all() for image in images)
         if not result.how.options.get("allow_nonfinite") and not finite:
-            raise ValueError(f"{result.test}: values that are not finite; accepted with --allow-nonfinite")
+            raise ValueError(f"{result.test}: values that are not finite; expected with --set allow_nonfinite=true")
         if target.suffix.lower() != result.test.suffix.lower():
             raise ValueError(f"{target}: expected a name that ends in {result.test.suffix}, as {result.test} does")
         yield Copy(result.test, target, result.digests[result.test], result.digests.get(target, ""))
-        yield from _of_variance(result.test, target, results, result)
+        if result.how.reads_variance:
+            yield from _copy_of_variance(result.test, target, results, result)
 
 
-def _of_variance(new: Path, target: Path, results: Results, result: Result) -> Iterator[Copy]:
+def _copy_of_variance(new: Path, target: Path, results: Results, result: Result) -> Iterator[Copy]:
     """A copy of the new image's variance, where the reference has one; ValueError where the new image has none."""
-    roots = (path if path.is_dir() else path.parent for path in (results.test, results.reference))
-    how, digests = result.how, result.digests or {}
-    if not how.reads_variance:
-        return
-    source, to = (pairing.beside(how.variance, path, root) for path, root in zip((new, target), roots, strict=True))
+    digests, (references, tests) = result.digests or {}, results.roots
+    source, to = (pairing.beside(result.how.variance, *side) for side in ((new, tests), (target, references)))
     if source.exists():
         yield Copy(source, to, digests.get(source, ""), digests.get(to, ""))
     elif to.exists():
         raise ValueError(
             f"{source}: no such file, and {to} belongs to a different render; expected a variance of {new}"
         )
-
-
-def _target(result: Result, results: Results, variant: str) -> Path:
-    target = result.target or results.reference
-    if not variant:
-        return target
-    if result.reference is None:
-        raise ValueError(f"{result.test}: has no reference yet; expected without --as-variant")
-    return pairing.variant(target, result.how, variant)
 
 
 def accept(copies: Sequence[Copy]) -> None:
@@ -96,27 +103,22 @@ def accept(copies: Sequence[Copy]) -> None:
     with contextlib.ExitStack() as unfinished:
         for copy in copies:
             copy.reference.parent.mkdir(parents=True, exist_ok=True)
-            if _copied(copy.new, unfinished.enter_context(replacing(copy.reference))) != copy.shown:
+            temporary, copied = unfinished.enter_context(replacing(copy.reference)), hashlib.sha256()
+            with regular_file.opened(copy.new, sys.maxsize) as file, temporary.open("wb") as target:
+                while block := file.read(BLOCK):
+                    copied.update(block)
+                    target.write(block)
+            if copied.hexdigest() != copy.compared:
                 raise _changed(copy.new)
         _require_unchanged(copies)
 
 
 def _require_unchanged(copies: Sequence[Copy]) -> None:
     for copy in copies:
-        for path, before in ((copy.new, copy.shown), (copy.reference, copy.replaced)):
+        for path, before in ((copy.new, copy.compared), (copy.reference, copy.replaced)):
             if digest(path) != before:
                 raise _changed(path)
 
 
 def _changed(path: Path) -> OSError:
-    return OSError(f"{path}: changed since it was compared; expected what was shown")
-
-
-def _copied(source: Path, to: Path) -> str:
-    """The digest of what was copied."""
-    found = hashlib.sha256()
-    with opened(source) as file, to.open("wb") as written:
-        while block := file.read(BLOCK):
-            found.update(block)
-            written.write(block)
-    return found.hexdigest()
+    return OSError(f"{path}: changed since it was compared")

@@ -30,23 +30,20 @@ Names = tuple[tuple[str, str], ...]  # of the reference and of the test
 
 
 def spreads(channels: Sequence[str]) -> dict[str, tuple[str, bool]]:
-    """Of every channel that has one: the name of the channel of its variance (False) or second moment (True)."""
-    there = set(channels)
-    return {
-        name: (spread, moment)
-        for name in channels
-        for spread, moment in (
-            *((each, True) for each in (*_squares(name), SQUARES.format(name))),
-            *((form.format(name), False) for form in VARIANCES),
-        )
-        if spread in there
-    }
+    """Of every channel that has one: the name of the channel of its variance (False) or second moment (True).
 
-
-def _squares(name: str) -> list[str]:
-    """What `moment` may call the squares of "img.nested.X": "m2_" stands before the name of one integrator."""
-    parts = name.split(".")
-    return [".".join([*parts[:i], f"m2_{parts[i]}", *parts[i + 1 :]]) for i in range(len(parts))]
+    `moment` puts "m2_" before the name of one integrator: of "img.nested.X" the squares are m2_img.nested.X,
+    img.m2_nested.X or img.nested.m2_X.
+    """
+    there, pairs = set(channels), dict[str, tuple[str, bool]]()
+    for name in channels:
+        parts = name.split(".")
+        squares = [".".join([*parts[:i], f"m2_{parts[i]}", *parts[i + 1 :]]) for i in range(len(parts))]
+        moments = [(spread, True) for spread in (*squares, SQUARES.format(name))]
+        variances = [(form.format(name), False) for form in VARIANCES]
+        if spread_of := [pair for pair in (*moments, *variances) if pair[0] in there]:
+            pairs[name] = spread_of[-1]
+    return pairs
 
 
 def means(channels: Sequence[str]) -> list[str]:
@@ -114,21 +111,21 @@ def matched(reference: Image, test: Image) -> tuple[Image, Image]:
     these repeat it, as X, Y, Z; whatever the nested integrator is called. They are compared with the colours of a film
     that has no moments.
     """
-    layers = moment_layer(reference), moment_layer(test)
+    images = reference, test
+    layers = [moment_layer(image) for image in images]
     if all(layers) or (any(layers) and set(means(reference.channels)) != set(means(test.channels))):
-        sides = zip((reference, test), layers, strict=True)
-        one, two = (_of_layer(image, layer) if layer else _as_xyz(image) for image, layer in sides)
+        one, two = (_of_layer(x, layer) if layer else _as_xyz(x) for x, layer in zip(images, layers, strict=True))
         return one, two
-    if any(set(XYZ) <= set(image.variances) - set(image.channels) for image in (reference, test)):
+    if any(set(XYZ) <= set(image.variances) - set(image.channels) for image in images):
         return _as_xyz(reference), _as_xyz(test)
-    return reference, test
+    return images
 
 
 def moment_layer(image: Image) -> str:
     """The name before ".X" of the channels that have squares and repeat the film's own colours; "" where none do."""
     pairs = spreads(image.channels)
     layers = [name[:-2] for name in image.channels if name.endswith(".X") and name in pairs]
-    film = next((each for each in (RGB, XYZ, ("Y",)) if set(each) <= set(image.channels)), ())
+    film = next((names for names in (RGB, XYZ, ("Y",)) if set(names) <= set(image.channels)), ())
     for layer in layers if film else []:
         nested = [f"{layer}.{name}" for name in XYZ]
         if set(nested) <= set(pairs) and _repeats(image.select(film), image.select(nested)):
@@ -138,26 +135,24 @@ def moment_layer(image: Image) -> str:
 
 def _repeats(film: Pixels, nested: Pixels) -> bool:
     """Whether the film's colours, R, G, B or X, Y, Z or Y, are X, Y, Z of `nested` but for rounding, or NaN with it."""
-    shown = nested[..., 1:2] if film.shape[-1] == 1 else nested
-    ways = [(film, np.abs(film))]
-    if film.shape[-1] == len(RGB):
-        ways.append((film @ TO_XYZ.T, np.abs(film) @ TO_XYZ.T))
-    broken = ~np.isfinite(film).all(-1, keepdims=True) & ~np.isfinite(shown).all(-1, keepdims=True)
+    nested = nested[..., 1:2] if film.shape[-1] == 1 else nested
+    broken = ~np.isfinite(film).all(-1, keepdims=True) & ~np.isfinite(nested).all(-1, keepdims=True)
     with np.errstate(invalid="ignore"):
-        return any(
-            bool((broken | (np.abs(colours - shown) <= ROUNDED * (size + np.abs(shown)) + SMALLEST)).all())
-            for colours, size in ways
-        )
+        for matrix in (np.eye(film.shape[-1]), *([TO_XYZ] if film.shape[-1] == len(RGB) else [])):
+            most = ROUNDED * (np.abs(film) @ matrix.T + np.abs(nested)) + SMALLEST
+            if (broken | (np.abs(film @ matrix.T - nested) <= most)).all():
+                return True
+    return False
 
 
 def _of_layer(image: Image, layer: str) -> Image:
     """The image with the layer's channels, without its name before theirs, in place of the film's colours."""
-    others = (each for each in means(image.channels) if each not in (*RGB, *XYZ))
-    return selected(image, {each: each.removeprefix(f"{layer}.") for each in others})
+    others = (name for name in means(image.channels) if name not in (*RGB, *XYZ))
+    return selected(image, {name: name.removeprefix(f"{layer}.") for name in others})
 
 
 def _as_xyz(image: Image) -> Image:
     """The image with X, Y, Z in place of R, G, B."""
-    colours = set(RGB) <= set(image.channels)
-    names = {each: each for each in means(image.channels) if not (colours and each in RGB)}
-    return selected(image, names | {each: each for each in XYZ}) if colours else image
+    if not set(RGB) <= set(image.channels):
+        return image
+    return selected(image, {name: name for name in (*means(image.channels), *XYZ) if name not in RGB})

@@ -6,8 +6,9 @@ What cannot be compared is an error, and a value that is not finite equals nothi
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,15 @@ class Comparison:
     chosen: str = ""
 
     @property
+    def is_equal(self) -> bool:
+        """Whether the images are equal."""
+        return self.verdict is Verdict.EQUAL
+
+    def but(self, verdict: Verdict, reason: str) -> Comparison:
+        """The result with another verdict, and the reason for that before its own."""
+        return replace(self, verdict=verdict, reason=f"{reason}; {self.reason}")
+
+    @property
     def method_in_words(self) -> str:
         """The method, and why it is this one: "welch (the variance of both is known)"."""
         return f"{self.method} ({self.chosen})" if self.chosen else self.method
@@ -71,22 +81,24 @@ def verdict_of(metrics: Sequence[Metric]) -> Verdict:
     return Verdict.EQUAL if all(metric.holds for metric in metrics) else Verdict.DIFFERENT
 
 
-def preconditions(reference: Image, test: Image, allow_nonfinite: bool = False) -> str | None:
-    """Why the two differ before any method is applied: values that are not finite, counted and located; else None.
+def preconditions(reference: Image, test: Image, allow_nonfinite: bool = False) -> str:
+    """Why the two differ before any method is applied: values that are not finite, counted and located; "" if not.
 
     With `allow_nonfinite` such a value is allowed where the other image has the same one: NaN, Inf or -Inf.
     ValueError where the images cannot be compared, as `aligned`.
     """
     a, b = aligned(reference, test)
-    if np.isfinite(a).all() and np.isfinite(b).all():
-        return None
-    if not allow_nonfinite:
-        # Both have the reference's order of channels here.
-        two = replace(test, channels=reference.channels)
-        found = [_located(image, values, ~np.isfinite(values)) for image, values in ((reference, a), (two, b))]
-        return "; ".join(text for text in found if text)
-    lone = ~(np.isfinite(a) & np.isfinite(b)) & ~_same(a, b)
-    return f"not finite in one image only, or otherwise: {_located(reference, a, lone)}" if lone.any() else None
+    whole = np.isfinite(a), np.isfinite(b)
+    if all(x.all() for x in whole):
+        return ""
+    if allow_nonfinite:
+        lone = ~(whole[0] & whole[1]) & ~((a == b) | (np.isnan(a) & np.isnan(b)))
+        return (
+            f"not finite in one image only, or not the same value: {_located(reference, a, lone)}" if lone.any() else ""
+        )
+    two = replace(test, channels=reference.channels)
+    texts = (_located(image, x, ~good) for image, x, good in zip((reference, two), (a, b), whole, strict=True))
+    return "; ".join(filter(None, texts))
 
 
 def aligned(reference: Image, test: Image) -> tuple[Pixels, Pixels]:
@@ -108,37 +120,22 @@ def shared_channels(reference: Image, test: Image) -> tuple[Image, Image, str]:
 
     Where each of them has channels that the other lacks nothing is said: these images cannot be compared.
     """
-    added, missing = ([c for c in x.channels if c not in y.channels] for x, y in ((test, reference), (reference, test)))
     shared = [name for name in reference.channels if name in test.channels]
+    added, missing = ([c for c in image.channels if c not in shared] for image in (test, reference))
     if bool(added) == bool(missing) or not shared:
         return reference, test, ""
-    text = f"channels added: {_values(test, added)}" if added else f"channels missing: {_values(reference, missing)}"
-    one, two = (replace(x, pixels=x.select(shared), channels=tuple(shared)) for x in (reference, test))
-    return one, two, text
-
-
-def _values(image: Image, names: Sequence[str]) -> str:
-    """The channels, and their value where it is one: an opaque alpha is 1."""
+    word, image, names = ("added", test, added) if added else ("missing", reference, missing)
     pixels = image.select(names)
     first = float(pixels.flat[0])
-    if not (pixels == first).all():
-        return ", ".join(names)
     opaque = "opaque: " if first == 1 and all(name.rpartition(".")[2] == "A" for name in names) else ""
-    return f"{', '.join(names)} ({opaque}{first:g} everywhere)"
+    value = f" ({opaque}{first:g} everywhere)" if (pixels == first).all() else ""
+    one, two = (replace(x, pixels=x.select(shared), channels=tuple(shared)) for x in (reference, test))
+    return one, two, f"channels {word}: {', '.join(names)}{value}"
 
 
-def checked_pixels(method: str, reference: Image, test: Image, allow: bool) -> tuple[Pixels, Pixels, Comparison | None]:
-    """The pixels of both, finite, and None; or, where the preconditions decide, the comparison that they lead to.
-
-    `allow`: allowed values that are not finite become 0. ValueError as `preconditions`.
-    """
-    reason = preconditions(reference, test, allow)
-    a, b = aligned(reference, test)
-    if reason:
-        return a, b, nonfinite_result(method, reason, a, b)
-    if allow:
-        a, b = np.where(np.isfinite(a), a, 0), np.where(np.isfinite(b), b, 0)
-    return a, b, None
+def finite(pixels: Pixels) -> Pixels:
+    """The pixels with 0 for what is not finite."""
+    return pixels if np.isfinite(pixels).all() else np.nan_to_num(pixels, posinf=0, neginf=0)
 
 
 def counted(image: Image) -> int:
@@ -146,47 +143,31 @@ def counted(image: Image) -> int:
     return image.pixels[..., 0].size if image.mask is None else int(image.mask.sum())
 
 
-def not_compared(reference: Image) -> tuple[int, list[str]]:
-    """How many values are not finite, and the channels that hold no other ones: there nothing was compared."""
-    finite = np.isfinite(reference.pixels).reshape(-1, len(reference.channels))
-    if finite.all():
-        return 0, []
-    seen = zip(reference.channels, finite.any(0), strict=True)
-    return int(finite.size - finite.sum()), [name for name, any_value in seen if not any_value]
+def passes_black(method: Callable[..., Comparison], views: Iterable[Image], options: Mapping[str, Any]) -> bool:
+    """Whether a method with these options calls black different from none of these images."""
+    black = ((image, replace(image, pixels=np.zeros_like(image.pixels))) for image in views)
+    return all(method(*pair, **options).verdict is not Verdict.DIFFERENT for pair in black)
 
 
 def nonfinite_result(method: str, reason: str, *pixels: Pixels) -> Comparison:
     """DIFFERENT, for images with values that are not finite; the map "nonfinite" marks them."""
-    bad = sum((~np.isfinite(each) for each in pixels), np.zeros(pixels[0].shape, np.float32))
+    bad = sum((~np.isfinite(x) for x in pixels), np.zeros(pixels[0].shape, np.float32))
     metrics = (Metric("values that are not finite", float(bad.sum()), 0.0),)
     return Comparison(method, Verdict.DIFFERENT, reason, metrics, maps={"nonfinite": (bad > 0).astype(np.float32)})
 
 
-def _same(a: Pixels, b: Pixels) -> NDArray[np.bool_]:
-    same: NDArray[np.bool_] = (a == b) | (np.isnan(a) & np.isnan(b))
-    return same
+def place(at: NDArray[np.bool_] | Pixels, image: Image) -> str:
+    """The pixel and channel of the first largest value of `at`, H × W × C: "x = 3, y = 5, channel R"."""
+    y, x, c = np.unravel_index(int(at.argmax()), at.shape)
+    return f"x = {x + image.origin[0]}, y = {y + image.origin[1]}, channel {image.channels[c]}"
 
 
 def _located(image: Image, values: Pixels, bad: NDArray[np.bool_]) -> str:
     if not bad.any():
         return ""
-    y, x, c = np.unravel_index(int(bad.argmax()), bad.shape)
     kinds = {"NaN": np.isnan(values[bad]).sum(), "Inf": np.isinf(values[bad]).sum()}
     counts = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count) or f"{bad.sum()} finite"
-    place = f"x = {x + image.origin[0]}, y = {y + image.origin[1]}, channel {image.channels[c]}"
-    return f"{image.path}: {counts}, the first at {place}"
-
-
-def _size(image: Image) -> str:
-    return f"{image.pixels.shape[1]} × {image.pixels.shape[0]}"
-
-
-def _channels(image: Image) -> str:
-    return ", ".join(sorted(image.channels))
-
-
-def _window(image: Image) -> str:
-    return "from x = {}, y = {}".format(*image.origin)
+    return f"{image.path}: {counts}, the first at {place(bad, image)}"
 
 
 def _display(image: Image) -> str:
@@ -194,10 +175,10 @@ def _display(image: Image) -> str:
     return f"{width} × {height} from x = {x}, y = {y}"
 
 
-HEADER: dict[str, Callable[[Image], str]] = {
-    "size": _size,
-    "channels": _channels,
-    "data window": _window,
+HEADER: dict[str, Callable[[Image], str]] = {  # what must be the same, in words
+    "size": lambda image: f"{image.pixels.shape[1]} × {image.pixels.shape[0]}",
+    "channels": lambda image: ", ".join(sorted(image.channels)),
+    "data window": lambda image: "from x = {}, y = {}".format(*image.origin),
     "display window": _display,
     "pixel aspect ratio": lambda image: str(image.metadata.get("PixelAspectRatio", 1.0)),
     "orientation": lambda image: str(image.metadata.get("Orientation", 1)),

@@ -34,8 +34,8 @@ class Defect:
         return [self.plant(renders[0]), *renders[1:]]
 
 
-def _with_centre(value: Callable[[Pixels], float]) -> Callable[[Pixels], Pixels]:
-    """All channels of one pixel replaced."""
+def _pixel(value: Callable[[Pixels], float]) -> Callable[[Pixels], Pixels]:
+    """A defect of the pixel in the centre, in all channels."""
 
     def plant(image: Pixels) -> Pixels:
         spoilt = image.copy()
@@ -46,9 +46,9 @@ def _with_centre(value: Callable[[Pixels], float]) -> Callable[[Pixels], Pixels]
 
 
 def _blurred(image: Pixels) -> Pixels:
-    height, width = image.shape[:2]
-    padded = np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    blurred: Pixels = np.mean([padded[y : y + height, x : x + width] for y in range(3) for x in range(3)], 0)
+    from scipy.ndimage import uniform_filter
+
+    blurred: Pixels = uniform_filter(image, (3, 3, 1), mode="nearest")
     return blurred
 
 
@@ -57,19 +57,13 @@ def _in_8_bits(image: Pixels) -> Pixels:
     return srgb_decode(np.round(255 * srgb_encode(np.clip(image, 0, 1))) / 255)
 
 
-def _truncated(image: Pixels) -> Pixels:
-    """Through a file that lost its second half."""
-    return through_a_file(image, share=0.5)
-
-
 def through_a_file(image: Pixels, share: float = 1.0) -> Pixels:
     """The image written as EXR, cut to a share of the bytes, and read again. ValueError for what cannot be read."""
     channels = image_file.named("", image).channels
     with atomic.temporary_folder() as folder:
         path = folder / "image.exr"
         image_file.write_exr(path, image, channels)
-        written = path.read_bytes()
-        path.write_bytes(written[: int(share * len(written))])
+        path.write_bytes((data := path.read_bytes())[: int(share * len(data))])
         return image_file.read(path).select(channels)
 
 
@@ -79,9 +73,11 @@ DEFECTS = {
     "swapped channels": Defect("the first and the last", lambda x: x[..., ::-1]),
     "blur": Defect("mean of 3 × 3 pixels", _blurred),
     "8 bits": Defect("through an 8-bit sRGB file", _in_8_bits),
-    "firefly": Defect("one pixel a thousand times as bright as the mean", _with_centre(lambda x: 1e3 * x.mean())),
-    "NaN": Defect("one pixel of one image", _with_centre(lambda x: math.nan), once=True, always_due=True),
-    "Inf": Defect("one pixel of one image", _with_centre(lambda x: math.inf), once=True, always_due=True),
+    "firefly": Defect("one pixel a thousand times as bright as the mean", _pixel(lambda x: 1e3 * x.mean())),
+    "NaN": Defect("one pixel of one image", _pixel(lambda x: math.nan), once=True, always_due=True),
+    "Inf": Defect("one pixel of one image", _pixel(lambda x: math.inf), once=True, always_due=True),
     "wrong size": Defect("one image lacks a column", lambda x: x[:, 1:], once=True, always_due=True),
-    "truncated": Defect("half of one image's file is missing", _truncated, once=True, always_due=True),
+    "truncated": Defect(
+        "half of one image's file is missing", lambda x: through_a_file(x, 0.5), once=True, always_due=True
+    ),
 }

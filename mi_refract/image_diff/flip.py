@@ -7,7 +7,7 @@ Rendered High Dynamic Range Images", Eurographics Short Papers 2021; computed by
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any
 
@@ -16,10 +16,10 @@ import numpy as np
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels, block_mean, srgb_decode
 
-from .comparison import Comparison, Metric, Verdict, checked_pixels, verdict_of
+from .comparison import Comparison, Metric, Verdict, passes_black, verdict_of
 from .local_error import WINDOW, local_error, patch_error
 from .pixelwise import require_nonnegative
-from .tolerance import tolerance, tolerance_passes_black
+from .tolerance import tolerance
 
 PIXELS_PER_DEGREE = 67.0  # of the viewer's field: FLIP's default, a screen of 0.7 m and 3840 pixels at 0.7 m
 RGB = ("R", "G", "B")
@@ -33,14 +33,15 @@ CODED = re.compile(r"srgb|gamma|^g\d\d")  # colour spaces, in OpenImageIO's word
 LINEAR = re.compile(r"^lin|linear|^aces|^raw$|^data$")
 INTEGERS = ("uint8", "uint16")  # a file of these that names no colour space holds what a display is sent
 DARKER = 4.0  # two stops: where the brightest light is shown nearly white, light twice as bright is, too
-AROUND = 0.5  # degrees: where black is seen so near to the brightest window, the rest need not be asked
+AROUND = 0.5  # degrees: where black is seen so near to the brightest window, the rest need not be looked at
+
+Options = Mapping[str, Any]  # all options of `flip`, by name
 
 
 def flip(
     reference: Image,
     test: Image,
     *,
-    allow_nonfinite: bool = False,
     local: Annotated[
         float, "mean FLIP error allowed in any square of 0.12 degrees, 0 to 1; in wider ones less"
     ] = LOCAL,
@@ -54,24 +55,21 @@ def flip(
     The verdict is that of the worst window, see `local_error`. Alpha is looked at as a gray image; any other channels
     than R, G, B are compared by `tolerance` with its defaults.
     """
-    require_nonnegative(locals())
+    options: Options = {"local": local, "patch": patch, "largest": largest, "hdr": hdr, "ppd": ppd}
+    require_nonnegative(options)
     if hdr not in ("auto", "yes", "no"):
         raise ValueError(f"hdr = {hdr!r}; expected auto, yes, no")
     if not 1 <= ppd <= 1000:  # below, its filters see nothing; above, they are larger than any image
         raise ValueError(f"ppd = {ppd}; expected 1 to 1000")
-    _, _, found = checked_pixels("flip", reference, test, allow_nonfinite)
-    if found:
-        return found
-    options = {"local": local, "patch": patch, "largest": largest, "hdr": hdr, "ppd": ppd}
-    found = _seen(reference, test, options)
+    result = _of_colours(reference, test, options)
     others = [name for name in reference.channels if name not in _colours(reference)]
     for names in filter(None, ([n for n in others if n == ALPHA], [n for n in others if n != ALPHA])):
-        found = _with_others(found, _only(reference, names), _only(test, names), options, allow_nonfinite)
-    return found
+        result = _with_others(result, _only(reference, names), _only(test, names), options)
+    return result
 
 
-def _seen(reference: Image, test: Image, options: Mapping[str, Any]) -> Comparison:
-    """What FLIP sees in the colours; `options`: all of them, by name."""
+def _of_colours(reference: Image, test: Image, options: Options) -> Comparison:
+    """What FLIP sees in the colours."""
     wide = is_hdr(reference, test, options["hdr"])
     error = flip_map(reference, test, wide, options["ppd"])
     (worst, around), patch = local_error(error, options["ppd"]), patch_error(error, options["ppd"])
@@ -90,53 +88,40 @@ def _seen(reference: Image, test: Image, options: Mapping[str, Any]) -> Comparis
     return Comparison("flip", verdict_of(metrics), reason, metrics, maps={"flip": error, "local": around})
 
 
-def _only(image: Image, channels: Sequence[str]) -> Image:
-    return replace(image, pixels=image.select(channels), channels=tuple(channels))
-
-
-def _with_others(
-    found: Comparison, reference: Image, test: Image, options: Mapping[str, Any], allow_nonfinite: bool
-) -> Comparison:
+def _with_others(result: Comparison, reference: Image, test: Image, options: Options) -> Comparison:
     """FLIP's comparison with that of the channels, alpha or others, that it does not look at."""
     names = ", ".join(reference.channels)
     if np.array_equal(reference.pixels, test.pixels, equal_nan=True):
-        return replace(found, reason=f"{found.reason}; not looked at, but the same: {names}")
-    if reference.channels == (ALPHA,) and all(_is_coverage(image) for image in (reference, test)):
+        return replace(result, reason=f"{result.reason}; not compared by FLIP, but identical: {names}")
+    coverage = all(bool(((x.pixels >= 0) & (x.pixels <= 1)).all()) for x in (reference, test))
+    if reference.channels == (ALPHA,) and coverage:
         reference, test = (replace(image, metadata={"oiio:ColorSpace": "sRGB"}) for image in (reference, test))
         options = {**options, "hdr": "no"}
-        others, method = _seen(reference, test, options), "FLIP"
-        bounded, maps, blind = others.metrics[:3], {f"flip of {ALPHA}": others.maps["flip"]}, flip_passes_black
+        others, method, black = _of_colours(reference, test, options), "FLIP", passes_black(flip, [reference], options)
+        bounded, maps = others.metrics[:3], {f"flip of {ALPHA}": others.maps["flip"]}
     else:
-        others, method = tolerance(reference, test, allow_nonfinite=allow_nonfinite), "tolerance"
-        bounded, maps, blind = others.metrics[:1], {}, tolerance_passes_black
-        options = tolerance.__kwdefaults__ or {}
-    metrics = (*found.metrics, *(replace(each, name=f"{each.name}, in {names}") for each in bounded))
-    verdict, reason = verdict_of(metrics), f"{found.reason}; by {method} {names}: {others.reason}"
-    if verdict is Verdict.EQUAL and blind(reference, options):
-        verdict, reason = Verdict.INCONCLUSIVE, f"{reason}, as would be if they were black"
-    return replace(found, verdict=verdict, reason=reason, metrics=metrics, maps=found.maps | maps)
+        others, method, black = tolerance(reference, test), "tolerance", passes_black(tolerance, [reference], {})
+        bounded, maps = others.metrics[:1], {}
+    metrics = (*result.metrics, *(replace(metric, name=f"{metric.name}, in {names}") for metric in bounded))
+    verdict, reason = verdict_of(metrics), f"{result.reason}; by {method} {names}: {others.reason}"
+    if verdict is Verdict.EQUAL and black:
+        verdict, reason = Verdict.INCONCLUSIVE, f"{reason}, but black would pass as well"
+    return replace(result, verdict=verdict, reason=reason, metrics=metrics, maps=result.maps | maps)
 
 
-def _is_coverage(image: Image) -> bool:
-    return bool(((image.pixels >= 0) & (image.pixels <= 1)).all())
-
-
-def flip_passes_black(reference: Image, options: Mapping[str, Any]) -> bool:
-    """Whether `flip` would call a black test image equal to `reference`; `options`: all of them, by name."""
-    for part in (_brightest(reference, options["ppd"]), reference):
-        black = replace(part, pixels=np.zeros_like(part.pixels))
-        if _seen(part, black, options).verdict is Verdict.DIFFERENT:
-            return False
-    return True
-
-
-def _brightest(image: Image, ppd: float) -> Image:
-    """The part of the image around its brightest window."""
-    side, around = max(1, round(WINDOW * ppd)), max(1, round(AROUND * ppd))
+def views(image: Image, options: Options) -> Iterator[Image]:
+    """The colours around the brightest window, where black is seen first, and all of them."""
+    image = _only(image, _colours(image))
+    side, around = max(1, round(WINDOW * options["ppd"])), max(1, round(AROUND * options["ppd"]))
     light = block_mean(_linear(image), side).sum(-1)
     y, x = (side * int(i) for i in np.unravel_index(int(light.argmax()), light.shape))
     rows, columns = (slice(max(at - around, 0), at + side + around) for at in (y, x))
-    return replace(image, pixels=image.pixels[rows, columns])
+    yield replace(image, pixels=image.pixels[rows, columns])
+    yield image
+
+
+def _only(image: Image, channels: Sequence[str]) -> Image:
+    return replace(image, pixels=image.select(channels), channels=tuple(channels))
 
 
 def is_hdr(reference: Image, test: Image, hdr: str = "auto") -> bool:
@@ -155,13 +140,13 @@ def flip_map(reference: Image, test: Image, hdr: bool, ppd: float = PIXELS_PER_D
     linear = [_linear(image) for image in (reference, test)]
     light = linear[0] @ LUMINANCE
     lit = light[light > 0]
-    # Not the very largest: one firefly would ask for many exposures at which all else is black.
+    # Not the very largest: one firefly would need many exposures at which all else is black.
     median, brightest = map(float, np.quantile(lit, (0.5, 0.999))) if lit.size else (0.18, 2.0)
     one, two = (oiio.ImageBuf(pixels) for pixels in linear)
-    found = oiio.ImageBufAlgo.FLIP_diff(one, two, int(hdr), DARKER * brightest, median, ppd)
-    if found.has_error:
-        raise ValueError(f"{test.path}: FLIP: {found.geterror()}")
-    error: Pixels = np.asarray(found.get_pixels(), np.float32)[..., 0]
+    result = oiio.ImageBufAlgo.FLIP_diff(one, two, int(hdr), DARKER * brightest, median, ppd)
+    if result.has_error:
+        raise ValueError(f"{test.path}: FLIP: {result.geterror()}")
+    error: Pixels = np.asarray(result.get_pixels(), np.float32)[..., 0]
     return error
 
 

@@ -25,14 +25,13 @@ THRESHOLDS: Mapping[str, tuple[str, float]] = {
     "-hardwarn": ("hard_warn", math.inf),
 }
 EVERY = "-a"
-WORDS = {"-q", "-v"}  # how much idiff prints
+QUIET = ("-q", "-v")  # how much idiff prints
 IMAGE = {"-o": 1, "-od": 0, "-abs": 0, "-scale": 1}  # of its image of the difference, and how many words follow
-ACCEPTED = ", ".join((*THRESHOLDS, EVERY, *sorted(WORDS), *IMAGE))
 
 
 @dataclass(frozen=True)
 class Flags:
-    """What the flags ask for.
+    """What the flags mean.
 
     `options`: all thresholds of `tolerance`. `every`: every part and MIP level is compared, not the first alone.
     `ignored`: those of the image of the difference, which is not written.
@@ -44,7 +43,7 @@ class Flags:
 
 
 def parse(text: str) -> Flags:
-    """The flags in a text, as a shell would divide it. Of one that is given twice the last counts, as with `idiff`.
+    """The flags in a text, as a shell would divide it. Of one that is set twice the last counts, as with `idiff`.
 
     ValueError, one line that begins with the flag, for what `idiff` does not know or reads as 0, and for `-p`.
     """
@@ -57,26 +56,27 @@ def parse(text: str) -> Flags:
     while words:
         word = words.pop(0)
         flag = word[1:] if word.startswith("--") else word  # idiff takes both
+        count = 1 if flag in THRESHOLDS else IMAGE.get(flag, 0)
+        values, words = words[:count], words[count:]
+        if len(values) < count:
+            raise ValueError(f"{word}: nothing follows; expected {word} VALUE")
         if flag in THRESHOLDS:
             option, default = THRESHOLDS[flag]
-            options[option] = _number(word, _next(word, words), whole=isinstance(default, int))
+            options[option] = _number(word, values[0], whole=isinstance(default, int))
         elif flag in IMAGE:
-            ignored.append(" ".join([word, *(_next(word, words) for _ in range(IMAGE[flag]))]))
-        elif flag == EVERY:
-            every = True
-        elif flag not in WORDS:
-            raise ValueError(_refused(word, flag))
+            ignored.append(" ".join([word, *values]))
+        elif flag == "-p":
+            raise ValueError("-p: idiff's perceptual test; expected --method flip, which replaces it")
+        elif not flag.startswith("-"):
+            raise ValueError(f"{word}: no flag; expected the flags alone, without idiff and the images")
+        elif flag != EVERY and flag not in QUIET:
+            raise ValueError(f"{word}: no flag of idiff; expected {', '.join((*THRESHOLDS, EVERY, *QUIET, *IMAGE))}")
+        every = every or flag == EVERY
     return Flags(options, every, tuple(ignored))
 
 
-def _next(flag: str, words: list[str]) -> str:
-    if not words:
-        raise ValueError(f"{flag}: nothing follows; expected {flag} VALUE")
-    return words.pop(0)
-
-
 def _number(flag: str, text: str, whole: bool) -> float:
-    """idiff reads what is no number as 0, and a negative number of pixels as one that lets everything pass."""
+    """Stricter than idiff, which reads what is no number as 0, and a negative count as one that passes everything."""
     try:
         value = math.nan if "_" in text else float(text)
     except ValueError:
@@ -84,11 +84,3 @@ def _number(flag: str, text: str, whole: bool) -> float:
     if not value >= 0 or (whole and not value.is_integer()):
         raise ValueError(f"{flag} {text}; expected a {'whole ' * whole}number of at least 0")
     return int(value) if whole else value
-
-
-def _refused(word: str, flag: str) -> str:
-    if flag == "-p":
-        return "-p: idiff's perceptual test; expected --method flip, which replaces it"
-    if not flag.startswith("-"):
-        return f"{word}: no flag; expected the flags alone, without idiff and the images"
-    return f"{word}: no flag of idiff; expected {ACCEPTED}"

@@ -59,19 +59,25 @@ def local_error(error: Pixels, ppd: float) -> tuple[Window, Pixels]:
     height, width = error.shape
     sums = np.zeros((height + 1, width + 1))
     np.cumsum(np.cumsum(error, 0, dtype=np.float64), 1, out=sums[1:, 1:])
-    around, found = np.zeros(error.shape, np.float32), []
+    around, worst = np.zeros(error.shape, np.float32), []
     for h, w, weight in windows(height, width, ppd):
         means = (sums[h:, w:] - sums[:-h, w:] - sums[h:, :-w] + sums[:-h, :-w]) / (h * w)
-        found.append(_worst(np.maximum(means, 0), weight, w, h))  # a difference of sums may be −1e-16
-        np.maximum(around, _centred(np.float32(weight) * means.astype(np.float32), error.shape), out=around)
-    return max(found, key=lambda window: window.value), around
+        worst.append(_worst(np.maximum(means, 0), weight, w, h))  # a difference of sums may be −1e-16
+        # At the centre of each window; next to the border those of the nearest window.
+        missing = [(gap // 2, gap - gap // 2) for gap in (h - 1, w - 1)]
+        np.maximum(around, np.pad(np.float32(weight) * means.astype(np.float32), missing, mode="edge"), out=around)
+    return max(worst, key=lambda window: window.value), around
 
 
 def patch_error(error: Pixels, ppd: float) -> Window:
     """The window with the largest error that is exceeded in all of it."""
-    side = _pixels(PATCH, ppd)
-    h, w = (min(side, size) for size in error.shape)
-    return _worst(_minima(_minima(error, h).T, w).T, 1.0, w, h)
+    from scipy.ndimage import minimum_filter
+
+    h, w = (min(_pixels(PATCH, ppd), size) for size in error.shape)
+    inside = tuple(
+        slice(side // 2, side // 2 + size - side + 1) for side, size in zip((h, w), error.shape, strict=True)
+    )
+    return _worst(minimum_filter(error, (h, w))[inside], 1.0, w, h)
 
 
 def _pixels(degrees: float, ppd: float) -> int:
@@ -82,20 +88,3 @@ def _worst(errors: Pixels, weight: float, width: int, height: int) -> Window:
     y, x = np.unravel_index(int(errors.argmax()), errors.shape)
     error = float(errors[y, x])
     return Window(weight * error, error, int(x), int(y), width, height)
-
-
-def _minima(values: Pixels, size: int) -> Pixels:
-    """The smallest of every `size` values along the first axis."""
-    covered = 1
-    while covered < size:
-        step = min(covered, size - covered)
-        values = np.minimum(values[:-step], values[step:])
-        covered += step
-    return values
-
-
-def _centred(means: Pixels, shape: tuple[int, ...]) -> Pixels:
-    """The means of the windows at the pixels of their centres; next to the border those of the nearest window."""
-    missing = [size - found for size, found in zip(shape, means.shape, strict=True)]
-    centred: Pixels = np.pad(means, [(each // 2, each - each // 2) for each in missing], mode="edge")
-    return centred

@@ -29,11 +29,23 @@ def made(reference: Image, path: Path | None, rectangles: Sequence[Rectangle], m
     """
     if path is None and not rectangles:
         return None
-    counts = np.ones(reference.pixels.shape[:2], bool) if path is None else _read(path, reference, most)
-    for rectangle in rectangles:
-        part = counts[_slices(reference, rectangle)]
+    height, width = reference.pixels.shape[:2]
+    counts: Mask = np.ones((height, width), bool)
+    if path is not None:
+        image = image_file.read(path, most)
+        if image.pixels.shape[:2] != (height, width):
+            size = f"{image.pixels.shape[1]} × {image.pixels.shape[0]}"
+            raise ValueError(f"{path}: {size}; expected a mask of {width} × {height}")
+        colours = image.select([name for name in image.channels if name != "A"] or image.channels)
+        if not np.isfinite(colours).all():
+            raise ValueError(f"{path}: values that are not finite; expected a mask from 0 to 1")
+        counts = colours.max(-1) >= WHITE
+    for x, y, columns, rows in rectangles:
+        left, top = x - reference.origin[0], y - reference.origin[1]
+        part = counts[max(top, 0) : max(top + rows, 0), max(left, 0) : max(left + columns, 0)]
         if not part.size:
-            raise ValueError(f"ignore = {list(rectangle)}; expected a rectangle that holds pixels of {reference.path}")
+            ignore = [x, y, columns, rows]
+            raise ValueError(f"ignore = {ignore}; expected a rectangle that holds pixels of {reference.path}")
         part[:] = False
     if not counts.any():
         raise ValueError(f"{path or 'ignore'}: leaves no pixel of {reference.path}; expected at least one")
@@ -47,7 +59,7 @@ def applied(image: Image, mask: Mask | None) -> Image:
     """
     if mask is None or image.pixels.shape[:2] != mask.shape:
         return image
-    variances = {name: np.where(mask, each, 0) for name, each in image.variances.items()}
+    variances = {name: np.where(mask, variance, 0) for name, variance in image.variances.items()}
     return replace(image, pixels=np.where(mask[..., None], image.pixels, 0), mask=mask, variances=variances)
 
 
@@ -55,23 +67,3 @@ def warning(mask: Mask | None) -> str:
     """What to tell of a mask that leaves out more than MOST; "" of others."""
     left_out = 0.0 if mask is None else 1 - float(mask.mean())
     return f"the mask leaves out {left_out:.0%} of the pixels" if left_out > MOST else ""
-
-
-def _read(path: Path, reference: Image, most: int) -> Mask:
-    found = image_file.read(path, most)
-    if found.pixels.shape[:2] != reference.pixels.shape[:2]:
-        height, width = reference.pixels.shape[:2]
-        raise ValueError(
-            f"{path}: {found.pixels.shape[1]} × {found.pixels.shape[0]}; expected a mask of {width} × {height}"
-        )
-    colours = found.select([name for name in found.channels if name != "A"] or found.channels)
-    if not np.isfinite(colours).all():
-        raise ValueError(f"{path}: values that are not finite; expected a mask from 0 to 1")
-    counts: Mask = colours.max(-1) >= WHITE
-    return counts
-
-
-def _slices(image: Image, rectangle: Rectangle) -> tuple[slice, slice]:
-    x, y, width, height = rectangle
-    left, top = x - image.origin[0], y - image.origin[1]
-    return slice(max(top, 0), max(top + height, 0)), slice(max(left, 0), max(left + width, 0))

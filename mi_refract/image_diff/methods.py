@@ -1,26 +1,46 @@
-"""The table of methods, and `compare`, which applies one of them to two images."""
+"""The table of methods, and `compare`, which applies one of them to two images.
+
+A method that calls two images equal must have been able to see a difference. So `compare` tests whether it would also
+have called the reference equal to black: for each group of channels that belong together, as a bright alpha or depth
+says nothing of a dim colour, and in each pixel.
+"""
 
 from __future__ import annotations
 
 import functools
 import inspect
 import typing
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mi_refract.io.image_file import Image
-from mi_refract.io.pixels import Pixels
+from mi_refract.io.pixels import Pixels, any_channel
 
-from . import black, channels, flip, pixelwise, tolerance, variances, welch
-from .comparison import Comparison, Verdict, aligned, not_compared, shared_channels
+from . import channels, flip, pixelwise, tolerance, variances, welch
+from .comparison import (
+    Comparison,
+    Verdict,
+    aligned,
+    finite,
+    nonfinite_result,
+    passes_black,
+    preconditions,
+    shared_channels,
+)
 
 AUTO = "auto"
+CHOSEN_BY_AUTO = ("welch", "tolerance")
 DECIDING = {"hard_fail", "allow_failures"}  # options that say by how much a single pixel may differ
+UNSEEN = 0.1  # share of the lit pixels that may differ so that black would be accepted there, too
+CLOSER = 100.0  # where the test image is so many times closer to the reference than black is, it is no black
+ROW_STEP = 16  # every so many rows show whether a method would see that an image is black
 
 Side = Image | Sequence[Image]
+Options = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -37,14 +57,15 @@ class Option:
 class Method:
     """A method of comparison.
 
-    `function(reference, test, **options)` takes one image a side; where `takes_renders`, a sequence of independent
-    renders. `passes_black(reference, options)`: whether these options would let an all-black test image pass; None
-    where that is impossible. `accepts_black(pixels, options)`: in which pixels; None where they are not judged alone.
+    `function(reference, test, **options)` takes one image a side, of the same channels in the same order, with finite
+    values; where `takes_renders`, a sequence of independent renders, as they are. `views(image, options)`: of an image
+    those parts, the last the whole, that are compared with black; None where black never passes. `accepts_black(pixels,
+    options)`: in which pixels black passes; None where pixels are not judged alone, nor channels in groups.
     """
 
     function: Callable[..., Comparison]
-    passes_black: black.PassesBlack | None = None
-    accepts_black: black.AcceptsBlack | None = None
+    views: Callable[[Image, Options], Iterable[Image]] | None = None
+    accepts_black: Callable[[Pixels, Options], NDArray[np.bool_]] | None = None
     takes_renders: bool = False
 
     @property
@@ -54,11 +75,11 @@ class Method:
 
     @functools.cached_property
     def options(self) -> dict[str, Option]:
-        """The keyword arguments by name, without `allow_nonfinite`, which every method has."""
+        """The keyword arguments by name, without `allow_nonfinite`, which is of every method."""
         hints = typing.get_type_hints(self.function, include_extras=True)
-        given = inspect.signature(self.function).parameters
+        parameters = inspect.signature(self.function).parameters
         return {
-            name: Option(name, typing.get_args(hint)[0], given[name].default, hint.__metadata__[0])
+            name: Option(name, typing.get_args(hint)[0], parameters[name].default, hint.__metadata__[0])
             for name, hint in hints.items()
             if typing.get_origin(hint) is Annotated
         }
@@ -73,13 +94,45 @@ class Method:
         return kind(value)
 
 
+def _rows(image: Image, options: Options) -> Iterator[Image]:
+    """Where black would be seen in some of the rows, the others need not be looked at: pixels are judged alone."""
+    yield replace(image, pixels=image.pixels[::ROW_STEP])
+    yield image
+
+
 METHODS = {
     "exact": Method(pixelwise.exact),
-    "tolerance": Method(tolerance.tolerance, tolerance.tolerance_passes_black, tolerance.tolerance_accepts_black),
-    "paired": Method(pixelwise.paired, pixelwise.paired_passes_black, pixelwise.paired_accepts_black),
+    "tolerance": Method(tolerance.tolerance, _rows, tolerance.accepts_black),
+    "paired": Method(pixelwise.paired, _rows, pixelwise.accepts_black),
     "welch": Method(welch.compare_renders, takes_renders=True),
-    "flip": Method(flip.flip, flip.flip_passes_black),
+    "flip": Method(flip.flip, flip.views),
 }
+
+
+def options_of_auto() -> dict[str, Option]:
+    """The options of the methods that "auto" chooses from; each is used where its method is chosen."""
+    return {name: option for method in CHOSEN_BY_AUTO for name, option in METHODS[method].options.items()}
+
+
+def choice(reference: Sequence[Image], test: Sequence[Image], *, spp: bool = False) -> tuple[str, str]:
+    """The method that "auto" is for these images, and why it is that one; "" for `tolerance`, which needs no reason.
+
+    It is `welch` where a side has several renders, or its variance is known. `spp`: whether an option says how many
+    samples per pixel there are. A render of `mi-refract render` always holds its variance: beside an image of somebody
+    else, of which nothing is known, it is compared as that is.
+    """
+    if max(len(reference), len(test)) > 1:
+        return "welch", "several renders"
+    known = [any(map(variances.has_variance, side)) for side in (reference, test)]
+    if all(known):
+        return "welch", "the variance of both is known"
+    if any(known):
+        (one,), (two,) = (reference, test) if known[0] else (test, reference)
+        name, other = ("reference", "new image") if known[0] else ("new image", "reference")
+        if not one.variances and variances.SPP in one.metadata and not spp and variances.SPP not in two.metadata:
+            return "tolerance", f"of the {other} neither variance nor samples per pixel are known"
+        return "welch", f"the variance of the {name} is known"
+    return "tolerance", ""
 
 
 def compare(
@@ -105,30 +158,21 @@ def compare(
     method that takes one, and images that cannot be compared.
     """
     sides = [[side] if isinstance(side, Image) else list(side) for side in (reference, test)]
-    if method == AUTO:
-        method, why = choice(*sides, spp=any(options.get(name) for name in ("spp", "spp_reference", "spp_test")))
-        options = {name: value for name, value in options.items() if name in METHODS[method].options or _unknown(name)}
-        found = replace(_compare(method, sides, allow_nonfinite, named, options), chosen=why)
-        failing = found.verdict is Verdict.EQUAL and found.metrics[0].value > 0
-        if method == "tolerance" and failing and not options.keys() & DECIDING:
-            a, b = (channels.without_variances(side[0], named) for side in sides)
-            one, two = (replace(a, pixels=_finite(x)) for x in aligned(a, b))
-            if far := tolerance.outrageous(
-                one, replace(two, path=b.path), options.get("fail", METHODS[method].options["fail"].default)
-            ):
-                return replace(
-                    found, verdict=Verdict.DIFFERENT, reason=f"one pixel is outrageous: {far}; {found.reason}"
-                )
-        return found
-    return _compare(method, sides, allow_nonfinite, named, options)
+    if method != AUTO:
+        return _compare(method, sides, allow_nonfinite, named, options)
+    method, why = choice(*sides, spp=any(options.get(name) for name in ("spp", "spp_reference", "spp_test")))
+    unused = options_of_auto().keys() - METHODS[method].options.keys()
+    options = {name: value for name, value in options.items() if name not in unused}
+    result = replace(_compare(method, sides, allow_nonfinite, named, options), chosen=why)
+    if method == "tolerance" and result.is_equal and result.metrics[0].value > 0 and not options.keys() & DECIDING:
+        a, b = _finite_pair(*(channels.without_variances(side[0], named) for side in sides))
+        if where := tolerance.outrageous(a, b, options.get("fail", METHODS[method].options["fail"].default)):
+            return result.but(Verdict.DIFFERENT, f"one pixel is far too bright: {where}")
+    return result
 
 
 def _compare(
-    method: str,
-    sides: list[list[Image]],
-    allow_nonfinite: bool,
-    named: Collection[str],
-    options: Mapping[str, Any],
+    method: str, sides: list[list[Image]], allow_nonfinite: bool, named: Collection[str], options: Options
 ) -> Comparison:
     if method not in METHODS:
         raise ValueError(f"method {method!r}; expected {AUTO}, {', '.join(METHODS)}")
@@ -136,94 +180,91 @@ def _compare(
     checked = {name: chosen.checked(method, name, value) for name, value in options.items()}
     if not all(sides):
         raise ValueError(f"{method}: no image on one side; expected at least one")
-    one, two = bare = [[channels.without_variances(image, named) for image in side] for side in sides]
-    single = len(one) == len(two) == 1
+    bare = [[channels.without_variances(image, named) for image in side] for side in sides]
+    single = len(bare[0]) == len(bare[1]) == 1
     if chosen.takes_renders:
-        one, two = sides if single else bare
-        found = chosen.function(one, two, allow_nonfinite=allow_nonfinite, **checked)
+        result = chosen.function(*(sides if single else bare), allow_nonfinite=allow_nonfinite, **checked)
+        doubt = _untested(sides[0][0], sides[1][0], allow_nonfinite) if single and result.is_equal else ""
     elif not single:
-        raise ValueError(f"{method}: {len(one)} and {len(two)} images; expected one a side")
+        raise ValueError(f"{method}: {len(bare[0])} and {len(bare[1])} images; expected one a side")
     else:
-        a, b, other = shared_channels(one[0], two[0])
-        found = chosen.function(a, b, allow_nonfinite=allow_nonfinite, **checked)
-        if other:
-            return replace(found, verdict=Verdict.DIFFERENT, reason=f"{other}; the others: {found.reason}", warning="")
-    if found.verdict is not Verdict.EQUAL:
-        return found
-    doubt = _untested(one, two, allow_nonfinite) if chosen.takes_renders else _blind_to(chosen, one[0], two[0], checked)
+        a, b, besides = shared_channels(bare[0][0], bare[1][0])
+        if reason := preconditions(a, b, allow_nonfinite):
+            result = nonfinite_result(method, reason, *aligned(a, b))
+        else:
+            a, b = _finite_pair(a, b)
+            result = chosen.function(a, b, **checked)
+        if besides:
+            reason = f"{besides}; the other channels: {result.reason}"
+            return replace(result, verdict=Verdict.DIFFERENT, reason=reason, warning="")
+        doubt = blind_to(chosen, a, b, checked) if result.is_equal else ""
     if doubt:
-        return replace(found, verdict=Verdict.INCONCLUSIVE, reason=f"{doubt}; {found.reason}")
-    return _of_the_finite(found, bare[0][0])
+        return result.but(Verdict.INCONCLUSIVE, doubt)
+    return _with_what_is_left_out(result, bare[0][0]) if result.is_equal else result
 
 
-def _of_the_finite(found: Comparison, reference: Image) -> Comparison:
-    """The comparison with what it left out; INCONCLUSIVE where that is all of a channel."""
-    count, empty = not_compared(reference) if found.verdict is Verdict.EQUAL else (0, [])
-    if not count:
-        return found
-    if empty:
-        reason = f"no value is finite, and nothing was compared, in {', '.join(empty)}; {found.reason}"
-        return replace(found, verdict=Verdict.INCONCLUSIVE, reason=reason)
-    return replace(found, reason=f"{found.reason}; not compared: {count} of {reference.pixels.size} values, not finite")
+def _finite_pair(reference: Image, test: Image) -> tuple[Image, Image]:
+    """Both with the channels in the reference's order, and 0 for what is not finite."""
+    a, b = (finite(pixels) for pixels in aligned(reference, test))
+    return replace(reference, pixels=a), replace(test, pixels=b, channels=reference.channels)
 
 
-def _blind_to(method: Method, reference: Image, test: Image, options: dict[str, Any]) -> str:
-    """What the method could not have seen. "" where both images are the same, or the reference is black."""
-    if method.passes_black is None:
-        return ""
-    a, b = (replace(reference, pixels=_finite(x)) for x in aligned(reference, test))
-    values = {name: option.default for name, option in method.options.items()} | options
-    text = black.blind_to(a, b, values, method.passes_black, method.accepts_black)
-    return text and f"{text} with these options"
+def _with_what_is_left_out(result: Comparison, reference: Image) -> Comparison:
+    """The result and how many values were not finite; INCONCLUSIVE where that is all of a channel."""
+    is_finite = np.isfinite(reference.pixels).reshape(-1, len(reference.channels))
+    if is_finite.all():
+        return result
+    if empty := [name for name, some in zip(reference.channels, is_finite.any(0), strict=True) if not some]:
+        return result.but(Verdict.INCONCLUSIVE, f"no value is finite, and nothing was compared, in {', '.join(empty)}")
+    count = int(is_finite.size - is_finite.sum())
+    return replace(result, reason=f"{result.reason}; not compared: {count} of {is_finite.size} values, not finite")
 
 
-def _finite(pixels: Pixels) -> Pixels:
-    """The pixels with 0 for what is not finite."""
-    return pixels if np.isfinite(pixels).all() else np.nan_to_num(pixels, posinf=0, neginf=0)
-
-
-def _untested(reference: Sequence[Image], test: Sequence[Image], allow_nonfinite: bool) -> str:
+def _untested(reference: Image, test: Image, allow_nonfinite: bool) -> str:
     """Which channels of single images whose variance is known have none themselves, and are not equal without."""
-    sides = variances.untested(reference[0], test[0]) if len(reference) == len(test) == 1 else []
-    if not sides:
+    if not (sides := variances.untested(reference, test)):
         return ""
-    found = compare("tolerance", *sides, allow_nonfinite=allow_nonfinite)
+    result = compare("tolerance", *sides, allow_nonfinite=allow_nonfinite)
     names = ", ".join(sides[0].channels)
-    return "" if found.verdict is Verdict.EQUAL else f"not tested, without variance: {names}: {found.reason}"
+    return "" if result.is_equal else f"not tested, without variance: {names}: {result.reason}"
 
 
-CHOSEN_BY_AUTO = ("welch", "tolerance")
+# Would black pass? -----------------------------------------------------------------------------------------------
 
 
-def options_of_auto() -> dict[str, Option]:
-    """The options of the methods that "auto" chooses from; each is used where its method is chosen."""
-    return {name: option for method in CHOSEN_BY_AUTO for name, option in METHODS[method].options.items()}
+def groups(names: Sequence[str]) -> dict[str, list[str]]:
+    """Channels by what they are part of: the colours, and the alpha and the depth, of each layer."""
+    parts: dict[str, list[str]] = {}
+    for name in names:
+        layer, dot, last = name.rpartition(".")
+        alone = last == "A" or (last == "Z" and not dot)  # a layer's X, Y, Z are a vector
+        parts.setdefault(name if alone else layer + dot, []).append(name)
+    return parts
 
 
-def _unknown(name: str) -> bool:
-    return name not in options_of_auto()
+def blind_to(method: Method, a: Image, b: Image, options: Options) -> str:
+    """What black would pass in, in place of the test image `b`; "" where a difference would have been seen.
 
-
-def automatic(reference: Side, test: Side) -> str:
-    """The method for these images: welch where a side has several renders, or its variance is known; else tolerance."""
-    return choice(*([side] if isinstance(side, Image) else side for side in (reference, test)))[0]
-
-
-def choice(reference: Sequence[Image], test: Sequence[Image], *, spp: bool = False) -> tuple[str, str]:
-    """The method for these images, and why it is that one; "" for the one that needs no reason.
-
-    `spp`: whether an option says how many samples per pixel there are. A render of `mi-refract render` holds its
-    variance unasked: beside an image of somebody else, of which nothing is known, it is compared as that is.
+    Nothing is said of what is the same in both images, or black in the reference. Both are finite and have the same
+    channels in the same order.
     """
-    if max(len(reference), len(test)) > 1:
-        return "welch", "several renders"
-    known = [any(map(variances.has_variance, side)) for side in (reference, test)]
-    if all(known):
-        return "welch", "the variance of both is known"
-    if any(known):
-        (one,), (two,) = (reference, test) if known[0] else (test, reference)
-        name, other = ("reference", "new image") if known[0] else ("new image", "reference")
-        if not one.variances and variances.SPP in one.metadata and not spp and variances.SPP not in two.metadata:
-            return "tolerance", f"of the {other} neither variance nor samples per pixel are known"
-        return "welch", f"the variance of the {name} is known"
-    return "tolerance", ""
+    if method.views is None:
+        return ""
+    options = {name: option.default for name, option in method.options.items()} | dict(options)
+    parts = list(groups(a.channels).values()) if method.accepts_black else [list(a.channels)]
+    for names in parts:
+        one, two = (replace(x, pixels=x.select(names), channels=tuple(names)) for x in (a, b))
+        if not one.pixels.any() or np.array_equal(one.pixels, two.pixels):
+            continue
+        of = f" in {', '.join(names)}," if len(parts) > 1 else ""
+        if passes_black(method.function, method.views(one, options), options):
+            return f"an all-black image would pass, too,{of} with these options"
+        if method.accepts_black:
+            y, x = np.nonzero(method.accepts_black(one.pixels, options))
+            dim, other = one.pixels[y, x], two.pixels[y, x]
+            unseen = any_channel(np.abs(dim - other) > np.abs(dim) / CLOSER) & any_channel(dim != 0)
+            share = float(unseen.sum() / max(any_channel(one.pixels != 0).sum(), 1))
+            if share > UNSEEN:
+                where = f"in {share:.0%} of the pixels that are not black,"
+                return f"black would pass, too,{of} {where} with these options"
+    return ""

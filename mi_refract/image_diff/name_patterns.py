@@ -8,31 +8,32 @@ A template is a relative path in which fields stand for parts of an image's path
 
 from __future__ import annotations
 
+import fnmatch
 import functools
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import PurePosixPath
 
 FIELDS = {"dir": ".+", "name": "[^/]+", "stem": "[^/]+", "suffix": r"\.[^./]+"}
-WILD = {"*": ".*", "?": "."}
-_PARTS = re.compile(r"(\{[^{}]*\}/?|[*?])")  # fields, with the slash behind them, and wild cards
+_FIELD = re.compile(r"\{([^{}]*)\}(/?)")  # with the slash behind it
 
 
 def matches(pattern: str, name: str) -> bool:
-    """Whether the whole name is one of the pattern."""
-    return _pattern(pattern).fullmatch(name) is not None
+    """Whether the whole name matches the pattern."""
+    return fnmatch.fnmatchcase(name, _without_classes(pattern))
 
 
-@functools.lru_cache(1024)
-def _pattern(pattern: str) -> re.Pattern[str]:
-    return re.compile("".join(WILD.get(part, re.escape(part)) for part in re.split(r"([*?])", pattern)), re.DOTALL)
+def _without_classes(pattern: str) -> str:
+    """For `fnmatch`, to which brackets mean a class of characters."""
+    return pattern.replace("[", "[[]")
 
 
 def is_template(text: str, names: Collection[str] = FIELDS) -> bool:
     """Whether it is a relative path that stays in its folder, with no other fields than these."""
-    rest = re.sub(r"\{[^{}]*\}", "", text)
     inside = not text.startswith("/") and ".." not in text.split("/")
-    return bool(text.strip()) and inside and not set("{}") & set(rest) and fields_of(text) <= set(names)
+    rest = _FIELD.sub("", text)
+    known = all(field in names for field, _ in _FIELD.findall(text))
+    return bool(text.strip()) and inside and known and not set("{}") & set(rest)
 
 
 def fields(name: str) -> dict[str, str]:
@@ -44,42 +45,42 @@ def fields(name: str) -> dict[str, str]:
 
 def fields_of(template: str) -> frozenset[str]:
     """The names of the fields in a template."""
-    return frozenset(part.rstrip("/")[1:-1] for part in _PARTS.findall(template) if part.startswith("{"))
+    return frozenset(field for field, _ in _FIELD.findall(template))
 
 
-def filled(template: str, values: dict[str, str]) -> str:
+def filled(template: str, values: Mapping[str, str]) -> str:
     """The template with the values in place of its fields; an empty {dir} goes with the slash behind it."""
-    return "".join(_filled(part, values) for part in _PARTS.split(template))
+    return _FIELD.sub(lambda match: values[match[1]] and values[match[1]] + match[2], template)
 
 
-def _filled(part: str, values: dict[str, str]) -> str:
-    if not part.startswith("{"):
-        return part
-    value = values[part.rstrip("/")[1:-1]]
-    return value + "/" * part.endswith("/") if value else ""
+def expanded(template: str, values: Mapping[str, str], names: list[str]) -> list[str]:
+    """The names that match the filled template: its `*` and `?` are wild, those in the values are not."""
+    literal = {field: re.sub(r"([*?[])", r"[\1]", value) for field, value in values.items()}
+    parts = (filled(part, literal) if part.startswith("{") else _without_classes(part) for part in _split(template))
+    pattern = "".join(parts)
+    return [name for name in names if fnmatch.fnmatchcase(name, pattern)]
 
 
-def expanded(template: str, values: dict[str, str], names: list[str]) -> list[str]:
-    """Those of `names` that the filled template means: its `*` and `?` are wild, the values of its fields are not."""
-    wanted = re.compile("".join(WILD.get(part) or re.escape(_filled(part, values)) for part in _PARTS.split(template)))
-    return [name for name in names if wanted.fullmatch(name)]
+def _split(template: str) -> list[str]:
+    """Its fields, each with the slash behind it, and what is between them."""
+    return re.split(r"(\{[^{}]*\}/?)", template)
 
 
 def parsed(template: str, name: str) -> dict[str, str] | None:
     """The values of the template's fields for which it is `name`; None where there are none."""
-    found = _parser(template).fullmatch(name)
-    return None if found is None else {field: value or "" for field, value in found.groupdict().items()}
+    match = _parser(template).fullmatch(name)
+    return match and {field: value or "" for field, value in match.groupdict().items()}
 
 
 @functools.lru_cache(64)
 def _parser(template: str) -> re.Pattern[str]:
-    text, seen = "", set[str]()
-    for part in _PARTS.split(template):
-        field = part.rstrip("/")[1:-1] if part.startswith("{") else ""
-        if not field:
-            text += WILD.get(part) or re.escape(part)
+    text, fields = "", set[str]()
+    for part in _split(template):
+        if not (match := _FIELD.fullmatch(part)):
+            text += re.escape(part)
             continue
-        group = f"(?P={field})" if field in seen else f"(?P<{field}>{FIELDS[field]})"
-        text += f"(?:{group}/)?" if part == "{dir}/" else group + "/" * part.endswith("/")
-        seen.add(field)
+        field, slash = match.groups()
+        group = f"(?P={field})" if field in fields else f"(?P<{field}>{FIELDS[field]})"
+        text += f"(?:{group}/)?" if field == "dir" and slash else group + slash
+        fields.add(field)
     return re.compile(text)

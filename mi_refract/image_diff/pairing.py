@@ -1,7 +1,7 @@
 """Which image of one folder is compared with which of the other: by their paths, or as the settings map them.
 
 In: two paths and the settings. Out: pairs with names, the other references that each may match, and what cannot be
-looked at. No image is read here.
+read. No image is read here.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from . import name_patterns
+from .results import Result
 from .settings import ComparisonSpec, Map, Settings
 
 ROOT = "{root}/"  # before a template of a path that is not beside the reference
@@ -43,9 +44,9 @@ def require_apart(reference: Path, test: Path, maps: Sequence[Map] = (), new: bo
     `maps`: where the settings have any, references and new images may share a folder. `new`: the reference need not
     exist yet.
     """
-    for role, path in {"test": test, **({} if new else {"reference": reference})}.items():
-        if not path.exists():
-            raise FileNotFoundError(f"{path}: no such {role} file or folder; expected one that is there")
+    for role, path in (("test", test), ("reference", reference)):
+        if not path.exists() and not (new and role == "reference"):
+            raise FileNotFoundError(f"{path}: no such {role} file or folder")
     if maps and test.is_dir():
         return
     if reference.exists() and reference.samefile(test):
@@ -61,50 +62,37 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Pair]:
     if known and reference.is_dir() != test.is_dir():
         raise ValueError(f"{reference}, {test}: cannot compare a folder with a file")
     if not test.is_dir():
-        return [_single(reference, test, settings)]
+        return [_pair_of_files(reference, test, settings)]
     (old, lost), (new, missed) = images_in(reference) if known else ({}, []), images_in(test)
     for folder, nothing in ((reference, known and not old and not lost), (test, not new and not missed)):
         if nothing:
             raise ValueError(f"{folder}: holds no image; expected at least one")
-    found = _mapped(old, new, settings.maps) if settings.maps else _of_one_name(old, new)
+    if settings.maps:
+        found = _mapped(old, new, settings.maps)
+    else:
+        found = [Pair(name, old.get(name), new.get(name), Path(name)) for name in sorted(old | new)]
     found = [replace(pair, target=reference / pair.target, how=settings.of(pair.name)) for pair in found]
-    found = _without_variants(*_without_own_files(found, old, (reference, test)))
+    # Masks and variances that the settings name for a pair are no images to compare.
+    own = {file for pair in found for file in _own_files(pair, (reference, test))}
+    found = [pair for pair in found if not {pair.reference, pair.test} - {None} <= own]
+    found = _with_all_variants(found, [path for path in old.values() if path not in own])
     if not found and not lost and not missed:
         raise ValueError(f"defaults.map fits no image in {reference} and {test}; expected templates of their paths")
     return [*found, *(Pair(name, None, None, reference / name, error=error) for name, error in lost + missed)]
 
 
-class Named(Protocol):
-    """What has the name of an image."""
-
-    @property
-    def name(self) -> str:
-        """The path of the image in its folder."""
-        ...
+Named = TypeVar("Named", Pair, Result)
 
 
-Each = TypeVar("Each", bound=Named)
+def named(items: Sequence[Named], patterns: Sequence[str]) -> list[Named]:
+    """The pairs, or results, whose names match one of the patterns; all without patterns.
 
-
-def named(pairs: Sequence[Each], names: Sequence[str]) -> list[Each]:
-    """Those pairs, or results, whose names are of one of the patterns; all without patterns.
-
-    ValueError for a pattern that fits none.
+    ValueError for a pattern that matches none.
     """
-    for name in names:
-        if not any(name_patterns.matches(name, pair.name) for pair in pairs):
-            raise ValueError(f"{name}: matches no image; expected the path of an image in its folder, * and ?")
-    return [pair for pair in pairs if not names or any(name_patterns.matches(name, pair.name) for name in names)]
-
-
-def _single(reference: Path, test: Path, settings: Settings) -> Pair:
-    pair = Pair(reference.name, reference if reference.exists() else None, test, reference, settings.of(reference.name))
-    if not pair.how.accept:
-        return pair
-    deep = any("/" in template for template in pair.how.accept)
-    beside = reference.parent.rglob("*") if deep else reference.parent.iterdir()
-    others = sorted(path for path in beside if path.is_file() and path != reference)
-    return _with_variants(pair, [path for path in others if not path.samefile(test)])
+    for pattern in patterns:
+        if not any(name_patterns.matches(pattern, item.name) for item in items):
+            raise ValueError(f"{pattern}: matches no image; expected the path of an image in its folder, * and ?")
+    return [item for item in items if not patterns or any(name_patterns.matches(p, item.name) for p in patterns)]
 
 
 def wrong_entries(settings: Settings, pairs: Sequence[Pair]) -> list[Pair]:
@@ -116,17 +104,19 @@ def wrong_entries(settings: Settings, pairs: Sequence[Pair]) -> list[Pair]:
 
 def error_of(pair: Pair, reference: Path) -> str:
     """Why the pair cannot be compared, as far as that is known before it is; "" for nothing."""
-    file = _mask(pair, reference if reference.is_dir() else reference.parent)
-    missing = f"{file}: no such file; expected a mask" if file and pair.reference and not file.exists() else ""
+    mask = _mask_of(pair, reference if reference.is_dir() else reference.parent)
+    missing = f"{mask}: no such file; expected a mask" if mask and pair.reference and not mask.exists() else ""
     return pair.error or pair.how.error or missing
 
 
-def _mask(pair: Pair, root: Path) -> Path | None:
-    return beside(pair.how.mask, pair.target, root) if pair.how.mask else None
-
-
-def _of_one_name(old: dict[str, Path], new: dict[str, Path]) -> list[Pair]:
-    return [Pair(name, old.get(name), new.get(name), Path(name)) for name in sorted(old | new)]
+def _pair_of_files(reference: Path, test: Path, settings: Settings) -> Pair:
+    pair = Pair(reference.name, reference if reference.exists() else None, test, reference, settings.of(reference.name))
+    if not pair.how.accept:
+        return pair
+    deep = any("/" in template for template in pair.how.accept)
+    beside = reference.parent.rglob("*") if deep else reference.parent.iterdir()
+    others = sorted(path for path in beside if path.is_file() and path != reference)
+    return _with_variants(pair, [path for path in others if not path.samefile(test)])
 
 
 def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> list[Pair]:
@@ -142,38 +132,32 @@ def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> 
             found[name] = replace(before, error=error)
     references = {pair.reference.resolve() for pair in found.values() if pair.reference}
     for name, file in new.items():
-        if name not in found and file.resolve() not in references and (target := _target(name, maps)):
+        if name in found or file.resolve() in references:
+            continue
+        fitting = ((each, name_patterns.parsed(each.test, name)) for each in maps)
+        targets = (name_patterns.filled(each.reference, values) for each, values in fitting if values is not None)
+        if target := next(targets, None):
             found[name] = Pair(name, None, file, Path(target))
     return [found[name] for name in sorted(found)]
-
-
-def _target(name: str, maps: Sequence[Map]) -> str:
-    """Where the reference of a new image would be; "" where no map says."""
-    parsed = ((each, name_patterns.parsed(each.test, name)) for each in maps)
-    return next((name_patterns.filled(each.reference, values) for each, values in parsed if values is not None), "")
 
 
 # Files beside a reference -------------------------------------------------------------------------------------------
 
 
-def _without_own_files(
-    found: list[Pair], old: dict[str, Path], roots: tuple[Path, Path]
-) -> tuple[list[Pair], list[Path]]:
-    """The pairs, and the references, without the masks and variances of other pairs: they are no images to compare."""
-    own = {file for pair in found for file in _own_files(pair, roots)}
-    kept = [pair for pair in found if not {pair.reference, pair.test} - {None} <= own]
-    return kept, [path for path in old.values() if path not in own]
+def _mask_of(pair: Pair, root: Path) -> Path | None:
+    """The mask that the settings name for a pair; `root`: the folder of the references."""
+    return beside(pair.how.mask, pair.target, root) if pair.how.mask else None
 
 
 def _own_files(pair: Pair, roots: tuple[Path, Path]) -> list[Path]:
     """The mask and the variances that the settings name for a pair."""
     how, sides = pair.how, zip((pair.reference, pair.test), roots, strict=True)
-    files = [file] if (file := _mask(pair, roots[0])) else []
+    files = [mask] if (mask := _mask_of(pair, roots[0])) else []
     files += [beside(how.variance, path, root) for path, root in sides if path] if how.reads_variance else []
     return [file for file in files if file not in (pair.reference, pair.test)]
 
 
-def _without_variants(found: list[Pair], references: list[Path]) -> list[Pair]:
+def _with_all_variants(found: list[Pair], references: list[Path]) -> list[Pair]:
     """The pairs with their variants. A reference that is one, and has no new image, is not one that was removed."""
     with_new = {pair.target for pair in found if pair.test}
     tests = {pair.test.resolve() for pair in found if pair.test}  # in a tree of both no image is its own reference
@@ -185,9 +169,9 @@ def _without_variants(found: list[Pair], references: list[Path]) -> list[Pair]:
 
 def _with_variants(pair: Pair, others: Sequence[Path]) -> Pair:
     """The pair with those of the other references that its settings accept as well."""
-    beside, own = pair.target.parent, pair.target.name
+    folder, own = pair.target.parent, pair.target.name
     values = name_patterns.fields(own)
-    names = {path.relative_to(beside).as_posix(): path for path in others if path.is_relative_to(beside)}
+    names = {path.relative_to(folder).as_posix(): path for path in others if path.is_relative_to(folder)}
     matched: dict[str, Path] = {}
     for template in pair.how.accept:
         if name_patterns.expanded(template, values, [own]):
@@ -204,17 +188,18 @@ def variant(target: Path, how: ComparisonSpec, name: str) -> Path:
     """
     if not name.strip() or name.startswith(".") or set(name) & set("/\\*?\0"):
         raise ValueError(f"--as-variant {name!r}; expected a part of a file name, as macos")
-    plain = [each for each in how.accept if not set(each) & set("*?")]
-    if named := [each for each in plain if name in each]:
-        return target.parent / name_patterns.filled(named[0], name_patterns.fields(target.name))
-    fitting = [each for each in how.accept if each.count("*") == 1 and "?" not in each]
-    if not fitting:
-        raise ValueError(
-            f"{target}: its settings have no `accept` with {name} or one *; expected in mi-refract.toml, below "
-            f'[defaults], accept = ["{{stem}}-{name}{{suffix}}"]'
-        )
-    filled = name_patterns.filled(fitting[0].replace("*", "{*}"), name_patterns.fields(target.name) | {"*": name})
-    return target.parent / filled
+    fields = name_patterns.fields(target.name)
+    for template in how.accept:
+        if not set(template) & set("*?") and name in template:
+            return target.parent / name_patterns.filled(template, fields)
+    for template in how.accept:
+        if template.count("*") == 1 and "?" not in template:
+            filled = name_patterns.filled(template.replace("*", "{*}"), fields | {"*": name})
+            return target.parent / filled
+    raise ValueError(
+        f"{target}: its settings have no `accept` with {name} or one *; expected in mi-refract.toml, below "
+        f'[defaults], accept = ["{{stem}}-{name}{{suffix}}"]'
+    )
 
 
 def beside(template: str, target: Path, root: Path) -> Path:
@@ -229,7 +214,8 @@ def beside(template: str, target: Path, root: Path) -> Path:
 def images_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
     """The files whose names end as an image's, by their path inside; (name, error) of folders that cannot be read.
 
-    Names that begin with a dot are left out. Links to folders are not followed, and an error: nobody would look there.
+    Names that begin with a dot are left out. Links to folders are not followed, and an error: what is in them would
+    not be compared.
     """
     found: dict[str, Path] = {}
     failed: list[tuple[str, str]] = []
@@ -242,15 +228,14 @@ def images_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
         for path in (Path(parent, name) for name in folders):
             if path.is_symlink():
                 failed.append((path.relative_to(folder).as_posix(), f"{path}: a link to a folder; expected a folder"))
-        for name in names:
-            path = Path(parent, name)
-            if path.suffix[1:].lower() in endings() and not name.startswith("."):
+        for path in (Path(parent, name) for name in names if not name.startswith(".")):
+            if path.suffix[1:].lower() in _endings():
                 found[path.relative_to(folder).as_posix()] = path
     return found, failed
 
 
 @functools.cache
-def endings() -> frozenset[str]:
+def _endings() -> frozenset[str]:
     """The file name endings, lower case without the dot, of the images that OpenImageIO reads."""
     import OpenImageIO as oiio
 

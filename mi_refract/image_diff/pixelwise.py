@@ -1,8 +1,4 @@
-"""Methods that look at every pixel alone: `exact` and `paired`; `tolerance` has a module of its own.
-
-`paired_passes_black` says whether an all-black test image would pass with the same options, `paired_accepts_black` in
-which pixels: there the method sees no difference.
-"""
+"""Methods that look at every pixel alone: `exact` and `paired`; `tolerance` has a module of its own."""
 
 from __future__ import annotations
 
@@ -16,15 +12,13 @@ from numpy.typing import NDArray
 from mi_refract.io.image_file import Image
 from mi_refract.io.pixels import Pixels
 
-from .comparison import Comparison, Metric, Verdict, checked_pixels, counted, verdict_of
+from .comparison import Comparison, Metric, Verdict, counted, verdict_of
 from .tile_statistics import median_nonblack, same_shape
 
 
-def exact(reference: Image, test: Image, *, allow_nonfinite: bool = False) -> Comparison:
+def exact(reference: Image, test: Image) -> Comparison:
     """Every value is the same."""
-    a, b, found = checked_pixels("exact", reference, test, allow_nonfinite)
-    if found:
-        return found
+    a, b = reference.pixels, test.pixels
     difference = _difference(a, b)
     changed = int((a != b).any(-1).sum())
     verdict = Verdict.DIFFERENT if changed else Verdict.EQUAL
@@ -73,7 +67,6 @@ def paired(
     reference: Image,
     test: Image,
     *,
-    allow_nonfinite: bool = False,
     threshold: Annotated[float, "a pixel is changed where a channel differs by more than this share"] = 1e-4,
     changed: Annotated[float, "share of the pixels that may be changed"] = 0.001,
     largest: Annotated[float, "largest change that is allowed, as a share"] = 100.0,
@@ -84,9 +77,7 @@ def paired(
     larger.
     """
     require_nonnegative(locals())
-    a, b, found = checked_pixels("paired", reference, test, allow_nonfinite)
-    if found:
-        return found
+    a, b = reference.pixels, test.pixels
     scale = _scale(a, b)
     measured = changes(a / scale, b / scale, threshold)
     share = measured.share * a[..., 0].size / counted(reference)
@@ -100,15 +91,7 @@ def paired(
     return Comparison("paired", verdict_of(metrics), reason, metrics, maps={"difference": _difference(a, b)})
 
 
-def paired_passes_black(reference: Image, options: Mapping[str, Any]) -> bool:
-    """Whether `paired` would call a black test image equal to `reference`; `options`: all of them, by name."""
-    a = reference.pixels
-    black = np.zeros_like(a)
-    measured = changes(a / _scale(a, black), black, options["threshold"])
-    return bool(measured.share <= options["changed"] and measured.largest <= options["largest"])
-
-
-def paired_accepts_black(a: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
+def accepts_black(a: Pixels, options: Mapping[str, Any]) -> NDArray[np.bool_]:
     """The pixels of the reference, H × W × C, that `paired` would take for unchanged if they were black; H × W."""
     accepted: NDArray[np.bool_] = (np.abs(a) / _scale(a, np.zeros_like(a)) <= options["threshold"]).all(-1)
     return accepted

@@ -19,16 +19,15 @@ from mi_refract.io.sanitise import printable
 from mi_refract.report.embedded_images import EmbeddedImages
 from mi_refract.report.html_page import rendered, write_beside
 
-from . import panes, report_rows
-from .panes import Most
-from .results import FAILED, Result, Results, Status
+from . import html_report, panes
+from .results import FAILED, Result, Results
 
-MOST = Most(2_000_000, 400_000, thumbnails=True)
+IMAGE_BYTES, MAP_BYTES = 2_000_000, 400_000
 BESIDE = ("report.css", "report.js", "diff.css", "diff.js")
 INDEX, PAGES = "index.html", "pages.js"
 FOLDERS = {"pairs": ".html", "thumbs": ".png"}  # and the ending of each file in them
 GENERATOR = b'<meta name="generator" content="mi-refract diff">'
-HEAD = 2000  # bytes of a page in which it says what generated it
+HEAD = 2000  # bytes of a page that hold the generator
 
 
 class Folder:
@@ -45,9 +44,9 @@ class Folder:
 
     def view(self, result: Result, results: Results) -> None:
         """Write the page of the result, and its thumbnails. OSError."""
-        shown = panes.of_result(result, MOST)
-        page, images = report_rows.page_of(result), EmbeddedImages()
-        item = report_rows.failure(result, results, shown) | {"panes": [images.add(pane) for pane in shown.panes]}
+        shown = panes.of_result(result, IMAGE_BYTES, MAP_BYTES, thumbs=True)
+        page, images = html_report.page_of(result), EmbeddedImages()
+        item = html_report.item(result, results, shown, images)
         content = {"title": "mi-refract diff", "sentence": result.name, "item": item, "ticks": ""}
         (self.path / page).write_bytes(rendered("diff_pair.html.j2", content, images, "../"))
         names = []
@@ -59,19 +58,11 @@ class Folder:
 
     def write(self, results: Results, context: Mapping[str, Any], replay: str = "", source: str = "") -> None:
         """Write the index, as `html_report.Page.write`. Errors: OSError."""
-        failed = results.of(*FAILED)
-        pages = [report_rows.page_of(result) for result in failed]
-        equal = [report_rows.line(result) for result in results.of(Status.EQUAL)]
-        content = report_rows.head(results, context, replay) | {
-            "failures": [
-                report_rows.row(result, self._thumbs[page]) for result, page in zip(failed, pages, strict=True)
-            ],
-            "equal": sorted(equal, key=lambda each: not each["warnings"]),
-            "skipped": [report_rows.line(result) for result in results.of(Status.SKIPPED)],
-            "ticks": report_rows.ticked(results, source),
-        }
+        failures = [html_report.item(result, results) for result in results.of(*FAILED)]
+        failures = [item | {"thumbs": self._thumbs[item["href"]]} for item in failures]
+        content = html_report.overview(results, context, replay, source) | {"failures": failures}
         (self.path / INDEX).write_bytes(rendered("diff_index.html.j2", content, beside=""))
-        listed = json.dumps([[page, printable(result.name)] for page, result in zip(pages, failed, strict=True)])
+        listed = json.dumps([[item["href"], printable(item["name"])] for item in failures])
         (self.path / PAGES).write_text(f"const PAGES = {listed};\n", "utf-8")
 
 
@@ -86,28 +77,24 @@ def require_free(path: Path, *sides: Path) -> None:
     if not path.is_dir():
         if path.exists():
             raise NotADirectoryError(f"{path}: expected a file name that ends in .html, or a folder")
-        return atomic.check_parent(path.resolve())
-    if foreign := _foreign(path):
+        atomic.check_parent(path.resolve())
+    elif foreign := _foreign(path):
         raise ValueError(f"{path}: holds {foreign}, no report of ours; expected a new or empty folder, or a report")
-    return None
 
 
 def _foreign(path: Path) -> str:
     """The name of what is no part of a report in a folder; "" where all is."""
-    entries = {entry.name: entry for entry in path.iterdir()}
-    if not entries:
-        return ""
-    known = {INDEX, PAGES, *BESIDE, *FOLDERS}
-    others = [name for name in sorted(entries) if name not in known]
-    for name, ending in FOLDERS.items():
-        inside = entries[name].iterdir() if name in entries and entries[name].is_dir() else ()
-        others += [f"{name}/{entry.name}" for entry in inside if entry.suffix != ending]
-    if others:
-        return others[0]
+    entries = sorted(path.iterdir())
+    for entry in entries:
+        if entry.name not in {INDEX, PAGES, *BESIDE, *FOLDERS}:
+            return entry.name
+        for inside in entry.iterdir() if entry.name in FOLDERS and entry.is_dir() else ():
+            if inside.suffix != FOLDERS[entry.name]:
+                return f"{entry.name}/{inside.name}"
     with contextlib.suppress(OSError), (path / INDEX).open("rb") as file:
         if GENERATOR in file.read(HEAD):
             return ""
-    return sorted(entries)[0]
+    return entries[0].name if entries else ""
 
 
 @contextlib.contextmanager
@@ -122,19 +109,11 @@ def writing(path: Path) -> Iterator[Folder]:
         with atomic.replacing(path, folder=True) as temporary:
             yield Folder(temporary)
             require_free(path)
-            old = _set_aside(path)
+            if path.exists():  # a folder that is not empty cannot be replaced in one step
+                old = path.rename(atomic.temporary_name(path, ""))
     except BaseException:
         if old and not path.exists():
             old.rename(path)
         raise
     if old:
         shutil.rmtree(old, ignore_errors=True)
-
-
-def _set_aside(path: Path) -> Path | None:
-    """The new name of the old report: a folder that is not empty cannot be replaced in one step."""
-    if not path.exists():
-        return None
-    old = atomic.temporary_name(path, "")
-    path.rename(old)
-    return old

@@ -42,13 +42,14 @@ INCONCLUSIVE = {"": 3, "pass": 0, "fail": 1}  # exit codes by what the user want
 
 @dataclass(frozen=True)
 class Result:
-    """One image: its name, and what was found. `error` is the line that says why there is no verdict.
+    """One image: its name, and the outcome. `error` is the line that says why there is no verdict.
 
-    `reference`, `test`: its files, or with renders its folders; None where that side has none. `how`: what was asked.
-    `images`: both sides as they were read, of several renders the mean; empty where they were not kept. `digests`: of
-    its files, variants too, when they were compared; None where that was not asked, or a file is unreadable.
-    `target`: where the reference is, or would be. `variants`: other references that the settings accept; `matched`: the
-    one of them that the new image is equal to. `warnings`: of its mask.
+    `reference`, `test`: its files, or with renders its folders; None where that side has none. `how`: the settings.
+    `images`: the sides that the comparison is about, or that could be read, by role, of several renders the mean; empty
+    where they were not kept; `unread`: why others are missing. `digests`: of its files, variants too, when they were
+    compared; None where that was not asked, or a file is unreadable. `target`: where the reference is, or would be.
+    `variants`: other references that the settings accept; `matched`: the one of them that the new image is equal to.
+    `warnings`: of its mask.
     """
 
     name: str
@@ -58,7 +59,8 @@ class Result:
     how: ComparisonSpec = field(default_factory=ComparisonSpec)
     comparison: Comparison | None = None
     error: str = ""
-    images: tuple[Image, ...] = ()
+    images: Mapping[str, Image] = field(default_factory=dict)
+    unread: str = ""
     digests: Mapping[Path, str] | None = None
     target: Path | None = None
     variants: tuple[Path, ...] = ()
@@ -83,31 +85,26 @@ class Result:
     def reason(self) -> str:
         """The reason for the status in one sentence."""
         if self.comparison:
-            return self.comparison.reason + self._of_variants
+            variants = ""
+            if self.matched:
+                variants = f"; matches {self.matched.name}"
+            elif self.variants and self.status is not Status.EQUAL:
+                count = len(self.variants)
+                variants = f"; nor is it {'its variant' if count == 1 else f'one of its {count} variants'}"
+            return self.comparison.reason + variants
         if self.status is Status.SKIPPED:
             return "skipped by the settings"
         sides = {Category.ADDED: "only among the new images", Category.REMOVED: "only among the references"}
         return self.error or sides[self.category]
 
-    @property
-    def _of_variants(self) -> str:
-        if self.matched:
-            return f"; matches {self.matched.name}"
-        count = len(self.variants)
-        return f"; nor is it {'its variant' if count == 1 else f'one of its {count} variants'}" if self._unequal else ""
-
-    @property
-    def _unequal(self) -> bool:
-        return bool(self.variants) and self.status is not Status.EQUAL
-
 
 @dataclass(frozen=True)
 class Results:
-    """What `diff` found, failures first.
+    """The outcome of `diff`, failures first.
 
-    `reference`, `test`: the paths as given; `renders`: each of them holds renders of one image. `inconclusive`: what
-    that counts as ("pass", "fail", or "" for an exit code of its own). `unused`: patterns of the settings that matched
-    no image. `flags`: of the command line, as given for all images; `by_file`: whether the settings map names.
+    `reference`, `test`: the paths; `renders`: each of them holds renders of one image. `inconclusive`: what that counts
+    as ("pass", "fail", or "" for an exit code of its own). `unused`: patterns of the settings that matched no image.
+    `flags`: the words of the command line that set the same for all images.
     """
 
     reference: Path
@@ -117,7 +114,12 @@ class Results:
     inconclusive: str = ""
     unused: tuple[str, ...] = ()
     flags: tuple[str, ...] = ()
-    by_file: bool = False
+
+    @property
+    def roots(self) -> tuple[Path, Path]:
+        """The folders of both sides."""
+        one, two = (path if path.is_dir() else path.parent for path in (self.reference, self.test))
+        return one, two
 
     def of(self, *statuses: Status) -> list[Result]:
         """The results with one of these statuses."""
@@ -132,30 +134,27 @@ class Results:
             return 1
         return INCONCLUSIVE[self.inconclusive] if self.of(Status.INCONCLUSIVE) else 0
 
+    def command(self, verb: str, *names: str, flags: Sequence[str] | None = None) -> str:
+        """The command line of `diff` or `accept` for the whole comparison, or for the images of these names alone."""
+        words = [as_word(path) for path in (self.reference, self.test)]
+        words += self.flags if flags is None else flags
+        words += ["--renders"] * (self.renders and verb == "diff")
+        return shlex.join(["mi-refract", verb, *words, *["--"] * any(x.startswith("-") for x in names), *names])
+
     def reproduce(self, result: Result) -> str:
         """The command that compares this image again; "" where one side has none."""
-        if result.how.needs_file or self.by_file:
-            return self._by_name("diff", result)
-        flags = (["--renders"] if self.renders else []) + result.how.flags
-        return _line("diff", result.reference, result.test, flags) if result.reference else ""
+        if result.reference is None or result.test is None:
+            return ""
+        return self.command("diff", *self._names(result))
 
     def accept(self, result: Result) -> str:
         """The command that makes the new image the reference; "" where there is none, or no need."""
-        if result.status is Status.EQUAL:
+        if result.test is None or result.status is Status.EQUAL:
             return ""
-        if result.how.needs_file or self.by_file:
-            return self._by_name("accept", result)
-        flags = [] if self.renders else result.how.flags
-        return _line("accept", result.target or self.reference, result.test, flags)
+        return self.command("accept", *self._names(result), flags=[] if self.renders else None)
 
-    def _by_name(self, verb: str, result: Result) -> str:
-        """The command of both folders for this image alone: the settings file says the rest."""
-        names = [result.name] if self.reference.is_dir() else []
-        return _line(verb, self.reference, self.test, [*names, *self.flags]) if result.test else ""
-
-
-def _line(verb: str, reference: Path, test: Path | None, flags: Sequence[str]) -> str:
-    return shlex.join(["mi-refract", verb, as_word(reference), as_word(test), *flags]) if test else ""
+    def _names(self, result: Result) -> list[str]:
+        return [result.name] if self.test.is_dir() and not self.renders else []
 
 
 def as_word(path: Path) -> str:

@@ -7,20 +7,55 @@ images that were downloaded from it.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from mi_refract.io import regular_file
+from mi_refract.io.typed_table import convert
 
 from .results import FAILED, Result, Results, Status
 from .settings import ComparisonSpec, Settings
 from .text_reports import SCHEMA
 
 MOST = 2**28  # bytes of a file
-DIGEST = 64  # characters of a SHA-256
-Table = Mapping[str, Any]
+EXPECTED = "expected a file that mi-refract diff --json wrote"
+PathText = Annotated[str, msgspec.Meta(min_length=1, pattern=r"^[^\0]*$")]
+Digest = Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?$")]
+
+
+class Digests(msgspec.Struct):
+    """The SHA-256 of the files of an image when they were compared; "" where there was none."""
+
+    reference: Digest
+    test: Digest
+    variants: list[Digest]
+
+
+class Entry(msgspec.Struct):
+    """What is needed of one image."""
+
+    name: str
+    status: Status
+    error: str = ""
+    reference: PathText | None = None
+    test: PathText | None = None
+    target: PathText | None = None
+    variants: list[PathText] = []
+    digests: Digests | None = None
+    options: dict[str, Any] = {}
+    variance: str = ""
+
+
+class Document(msgspec.Struct):
+    """What is needed of the file."""
+
+    reference: PathText
+    test: PathText
+    results: list[Entry]
+    renders: bool = False
 
 
 def read(path: str | Path, reference: Path | None = None, test: Path | None = None) -> Results:
@@ -29,20 +64,61 @@ def read(path: str | Path, reference: Path | None = None, test: Path | None = No
     ValueError for a file that `--json` did not write, of another version, of `--renders`, or with a path outside of the
     two; OSError where it cannot be read.
     """
-    found = _document(path)
-    if found.get("renders"):
+    try:
+        data = json.loads(regular_file.read_bytes(path, MOST))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not JSON ({error}); {EXPECTED}") from None
+    schema = data.get("schema") if isinstance(data, dict) else None
+    if schema != SCHEMA:
+        raise ValueError(f"{path}: schema {schema!r}; expected {SCHEMA}: {EXPECTED}")
+    try:
+        document = convert(data, Document, str(path))
+    except ValueError as error:
+        raise ValueError(f"{error}; {EXPECTED}") from None
+    if document.renders:
         raise ValueError(f"{path}: of --renders; expected of a comparison of single images")
-    one, two = _path(path, found, "reference"), _path(path, found, "test")
-    if one is None or two is None:
-        raise _not_ours(path, "reference, test")
-    roots = {"reference": (one, reference or one), "test": (two, test or two)}
-    results = []
-    for number, entry in enumerate(found["results"]):
-        where = f"{path}: results[{number}]"
-        if not isinstance(entry, dict) or entry.get("status") not in list(Status):
-            raise _not_ours(where, "status")
-        results.append(_result(where, entry, roots))
-    return Results(roots["reference"][1], roots["test"][1], tuple(results))
+    before = Path(document.reference), Path(document.test)
+    now = reference or before[0], test or before[1]
+    results = tuple(
+        _result(f"{path}: results[{number}]", entry, before, now) for number, entry in enumerate(document.results)
+    )
+    return Results(*now, results)
+
+
+def _result(where: str, entry: Entry, before: tuple[Path, Path], now: tuple[Path, Path]) -> Result:
+    if entry.status not in FAILED:
+        return Result(entry.name, entry.status, None, None)
+    reference = _moved(f"{where}.reference", entry.reference, before[0], now[0])
+    test = _moved(f"{where}.test", entry.test, before[1], now[1])
+    target = _moved(f"{where}.target", entry.target, before[0], now[0])
+    # Of single files, the variants lie beside the reference.
+    roots = (before[0].parent, now[0].parent) if entry.target == str(before[0]) else (before[0], now[0])
+    variants = tuple(filter(None, (_moved(f"{where}.variants", each, *roots) for each in entry.variants)))
+    digests = None
+    if entry.digests is not None:
+        if len(entry.digests.variants) != len(variants):
+            raise ValueError(f"{where}.digests: {len(entry.digests.variants)} of {len(variants)} variants; {EXPECTED}")
+        words = zip(variants, entry.digests.variants, strict=True)
+        pairs = [(reference, entry.digests.reference), (test, entry.digests.test), *words]
+        digests = {path: word for path, word in pairs if path}
+    how = ComparisonSpec(
+        options={"allow_nonfinite": entry.options.get("allow_nonfinite") is True}, variance=entry.variance
+    )
+    return Result(
+        entry.name, entry.status, reference, test, how, error=entry.error, digests=digests, target=target,
+        variants=variants,
+    )  # fmt: skip
+
+
+def _moved(where: str, text: str | None, before: Path, now: Path) -> Path | None:
+    """The path of the file as one in `now`. ValueError where it leads out of it, by `..` or by a link to a folder."""
+    if text is None:
+        return None
+    path = Path(text)
+    moved = now / path.relative_to(before) if path.is_relative_to(before) else None
+    if moved is None or not (moved == now or moved.parent.resolve().is_relative_to(now.resolve())):
+        raise ValueError(f"{where}: {path}; expected a path in {before}")
+    return moved
 
 
 def with_settings(found: Results, settings: Settings) -> Results:
@@ -50,87 +126,10 @@ def with_settings(found: Results, settings: Settings) -> Results:
 
     ValueError for an image with a variance in a file of its own, of which the file has no digest.
     """
-    for each in found.results:
-        if each.status in FAILED and (each.how.variance or settings.of(each.name).reads_variance):
-            raise ValueError(f"{each.name}: has a variance in a file of its own; expected accept without --from")
-    kept = [replace(settings.of(each.name), options=each.how.options) for each in found.results]
-    return replace(found, results=tuple(replace(each, how=how) for each, how in zip(found.results, kept, strict=True)))
-
-
-def _not_ours(path: str | Path, what: str) -> ValueError:
-    return ValueError(f"{path}: {what}; expected a file that mi-refract diff --json wrote")
-
-
-def _document(path: str | Path) -> dict[str, Any]:
-    try:
-        found = json.loads(regular_file.read_bytes(path, MOST))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: no JSON ({error}); expected a file that mi-refract diff --json wrote") from None
-    if not isinstance(found, dict) or not isinstance(found.get("results"), list):
-        raise _not_ours(path, "no results")
-    if found.get("schema") != SCHEMA:
-        raise ValueError(f"{path}: schema {found.get('schema')!r}; expected {SCHEMA}")
-    return found
-
-
-def _path(where: str | Path, table: Table, key: str) -> Path | None:
-    value = table.get(key)
-    if value is not None and (not isinstance(value, str) or not value or "\0" in value):
-        raise _not_ours(where, key)
-    return None if value is None else Path(value)
-
-
-def _result(where: str, entry: Table, roots: Mapping[str, tuple[Path, Path]]) -> Result:
-    name, error, status = entry.get("name"), entry.get("error", ""), Status(entry["status"])
-    if not isinstance(name, str) or not isinstance(error, str):
-        raise _not_ours(where, "name, error")
-    if status not in FAILED:
-        return Result(name, status, None, None)
-    one, two = (_moved(where, _path(where, entry, role), role, *roots[role]) for role in roots)
-    target = _moved(where, _path(where, entry, "target"), "target", *roots["reference"])
-    variants = _variants(where, entry, *roots["reference"])
-    digests = _digests(where, entry, [one, two, *variants])
-    result = Result(name, status, one, two, _how(entry), error=error)
-    return replace(result, target=target, variants=tuple(variants), digests=digests)
-
-
-def _how(entry: Table) -> ComparisonSpec:
-    options = entry.get("options")
-    nonfinite = isinstance(options, dict) and options.get("allow_nonfinite") is True
-    return ComparisonSpec(options={"allow_nonfinite": nonfinite}, variance=str(entry.get("variance") or ""))
-
-
-def _variants(where: str, entry: Table, before: Path, now: Path) -> list[Path]:
-    listed = entry.get("variants", [])
-    if not isinstance(listed, list):
-        raise _not_ours(where, "variants")
-    folder = (before.parent, now.parent) if entry.get("target") == str(before) else (before, now)  # of single files
-    paths = (_path(where, {"variants": each}, "variants") for each in listed)
-    return [moved for path in paths if (moved := _moved(where, path, "variants", *folder))]
-
-
-def _moved(where: str, path: Path | None, key: str, before: Path, now: Path) -> Path | None:
-    """The path of the file as one in `now`. ValueError where it leads out of it, by `..` or by a link to a folder."""
-    if path is None:
-        return None
-    inside = path.relative_to(before) if path.is_relative_to(before) else None
-    moved = now / inside if inside is not None else None
-    if moved is None or not (moved == now or moved.parent.resolve().is_relative_to(now.resolve())):
-        raise ValueError(f"{where}.{key}: {path}; expected a path in {before}")
-    return moved
-
-
-def _digests(where: str, entry: Table, paths: list[Path | None]) -> dict[Path, str] | None:
-    given = entry.get("digests")
-    if given is None:
-        return None
-    if not isinstance(given, dict) or not isinstance(given.get("variants"), list):
-        raise _not_ours(where, "digests")
-    words = [given.get("reference"), given.get("test"), *given["variants"]]
-    if len(words) != len(paths) or not all(map(_is_digest, words)):
-        raise _not_ours(where, "digests")
-    return {path: word for path, word in zip(paths, words, strict=True) if path}
-
-
-def _is_digest(word: Any) -> bool:
-    return isinstance(word, str) and len(word) in (0, DIGEST) and set(word) <= set("0123456789abcdef")
+    results = []
+    for result in found.results:
+        how = settings.of(result.name)
+        if result.status in FAILED and (result.how.variance or how.reads_variance):
+            raise ValueError(f"{result.name}: has a variance in a file of its own; expected accept without --from")
+        results.append(replace(result, how=replace(how, options=result.how.options)))
+    return replace(found, results=tuple(results))

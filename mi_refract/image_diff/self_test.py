@@ -14,11 +14,12 @@ the minimum detectable difference that it prints.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -29,12 +30,9 @@ from mi_refract.report.row import Row
 from . import methods
 from .channels import without_variances
 from .comparison import Verdict
-from .defects import DEFECTS, Defect, Renders, through_a_file
-from .folders import read_renders
+from .defects import DEFECTS, Renders, through_a_file
+from .file_pair import read_renders
 from .methods import METHODS
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
 
 STUDY = "self-test"
 TILE = METHODS["welch"].options["tile"].default
@@ -90,28 +88,23 @@ class Tally:
         """The upper bound of the rate where the trials are independent: exact, one-sided, at CONFIDENCE."""
         from scipy import stats
 
-        found = stats.binomtest(self.seen, self.trials, alternative="less")
-        return float(found.proportion_ci(CONFIDENCE, method="exact").high)
+        test = stats.binomtest(self.seen, self.trials, alternative="less")
+        return float(test.proportion_ci(CONFIDENCE, method="exact").high)
 
-    def ask(self, method: str, reference: Renders, test: Renders) -> None:
+    def compare(self, method: str, reference: Renders, test: Renders) -> None:
         """Compare the first image of each side, or all where the method takes several. A refusal counts as seen."""
         sides = [[image_file.named(name, x) for x in side] for name, side in (("reference", reference), ("test", test))]
         whole = METHODS[method].takes_renders
+        self.trials += 1
         try:
             found = methods.compare(method, *(side if whole else side[0] for side in sides))
         except (ValueError, OSError):
-            self.seen, self.trials = self.seen + 1, self.trials + 1
+            self.seen += 1
             return
-        self.trials += 1
         self.seen += found.verdict is Verdict.DIFFERENT
         self.inconclusive += found.verdict is Verdict.INCONCLUSIVE
         if math.isfinite(found.minimum_detectable):
             self.detectable.append(found.minimum_detectable)
-
-
-def _asked(renders: Pixels) -> list[str]:
-    """The methods that can be applied with this number of renders of other seeds."""
-    return [name for name, method in METHODS.items() if not method.takes_renders or 2 * len(renders) >= RENDERS]
 
 
 # Rows ----------------------------------------------------------------------------------------------------------
@@ -119,9 +112,10 @@ def _asked(renders: Pixels) -> list[str]:
 
 def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, setting: str) -> Row:
     """The share of trials in which each method saw the defect; "missed" counts the trials in which it had to."""
-    tallies = {method: Tally() for method in _asked(trials[0].other)}
+    several = 2 * len(trials[0].other) >= RENDERS
+    tallies = {method: Tally() for method in METHODS if several or not METHODS[method].takes_renders}
     changes, cleans, unread = [], [], 0
-    replay = {"trials": len(trials), "renders a side": len(trials[0].clean)}
+    replay: dict[str, Any] = {"trials": len(trials), "renders a side": len(trials[0].clean)}
     for trial in trials:
         try:
             spoilt = trial.spoil()
@@ -131,35 +125,23 @@ def detection(name: str, always_due: bool, trials: Sequence[Trial], case: str, s
         if np.array_equal(spoilt[0], trial.clean[0]):
             return Row(STUDY, name, case, setting, reason="left out: it changes nothing in these images")
         for method, tally in tallies.items():
-            tally.ask(method, trial.other if METHODS[method].takes_renders else trial.clean, spoilt)
+            tally.compare(method, trial.other if METHODS[method].takes_renders else trial.clean, spoilt)
         if not always_due:
             cleans.append([block_mean(image, TILE) for image in trial.clean])
             changes.append(np.mean([block_mean(image, TILE) for image in spoilt], 0) - np.mean(cleans[-1], 0))
     if unread == len(trials):
         values = {UNREADABLE: 1.0, "missed": 0.0}
         return Row(STUDY, name, case, setting, values, {"missed": 0.0}, reason="not read", replay=replay)
-    sizes = _sizes(np.array(changes), np.concatenate(cleans), tallies) if cleans else {}
-    return _row(name, always_due, tallies, sizes, replay, case, setting)
-
-
-def _row(
-    name: str,
-    always_due: bool,
-    tallies: dict[str, Tally],
-    sizes: dict[str, float],
-    replay: dict[str, int],
-    case: str,
-    setting: str,
-) -> Row:
-    large = sizes.get(RATIO, 0.0) > 1
+    size = sizes(np.array(changes), np.concatenate(cleans), tallies) if cleans else {}
+    large = size.get(RATIO, 0.0) > 1
     due = [m for m in tallies if always_due or m == "exact" or (large and METHODS[m].takes_renders)]
     values = {method: tally.rate for method, tally in tallies.items()}
-    values |= {"missed": float(sum(tallies[m].trials - tallies[m].seen for m in due)), **sizes}
+    values |= {"missed": float(sum(tallies[m].trials - tallies[m].seen for m in due)), **size}
     return Row(STUDY, name, case, setting, values, {"missed": 0.0}, replay=replay | {"due": due})
 
 
-def _sizes(changes: Pixels, clean: Pixels, tallies: dict[str, Tally]) -> dict[str, float]:
-    """Of the tile and channel where the change is largest compared with the noise there.
+def sizes(changes: Pixels, clean: Pixels, tallies: dict[str, Tally]) -> dict[str, float]:
+    """Of the tile and channel where the change is largest relative to the noise there: the size of a defect.
 
     The minimum detectable difference is printed for the median tile; in a noisier tile it is so much larger.
     """
@@ -194,32 +176,33 @@ def false_alarms(
     several = [method for method in METHODS if METHODS[method].takes_renders]
     for reference, test in pairs:
         for method in several:
-            tallies[method].ask(method, reference, test)
+            tallies[method].compare(method, reference, test)
     rng = np.random.default_rng(SEED)
     for reference, test in repeats:
         moved = last_bits(test, rng)
         for method in METHODS.keys() - several:
-            tallies[method].ask(method, reference, test if method == "exact" else moved)
-    return [_null_row(method, tally, case, setting, independent) for method, tally in tallies.items() if tally.trials]
+            tallies[method].compare(method, reference, test if method == "exact" else moved)
+    rows = []
+    for method, tally in tallies.items():
+        if not tally.trials:
+            continue
+        values = {"false alarms": tally.rate, "null pairs": float(tally.trials)}
+        values["inconclusive"] = tally.inconclusive / tally.trials
+        budget = "false alarms"
+        if independent and method in several:
+            budget = "bound"
+            values[budget] = tally.bound
+        if tally.detectable and method in several:
+            values[DETECTABLE] = float(np.median(tally.detectable))
+        reason = IDENTICAL if method == "exact" else ""
+        rows.append(Row(STUDY, f"null pairs, {method}", case, setting, values, {budget: FALSE_ALARMS}, reason=reason))
+    return rows
 
 
 def last_bits(pixels: Pixels, rng: np.random.Generator) -> Pixels:
     """Every value as one of its two neighbours in float32, at random, as another processor may round it."""
     towards = np.where(rng.random(pixels.shape) < 0.5, -np.inf, np.inf).astype(np.float32)
     return np.nextafter(pixels.astype(np.float32), towards)
-
-
-def _null_row(method: str, tally: Tally, case: str, setting: str, independent: bool) -> Row:
-    values = {"false alarms": tally.rate, "null pairs": float(tally.trials)}
-    values["inconclusive"] = tally.inconclusive / tally.trials
-    budget = "false alarms"
-    if independent and METHODS[method].takes_renders:
-        budget = "bound"
-        values[budget] = tally.bound
-    if tally.detectable and METHODS[method].takes_renders:
-        values[DETECTABLE] = float(np.median(tally.detectable))
-    reason = IDENTICAL if method == "exact" else ""
-    return Row(STUDY, f"null pairs, {method}", case, setting, values, {budget: FALSE_ALARMS}, reason=reason)
 
 
 # Given images ------------------------------------------------------------------------------------------------
@@ -250,13 +233,21 @@ def examine(renders: Pixels, case: str, trials: int = TRIALS, null_pairs: int = 
     rng, renders = np.random.default_rng(SEED), renders.astype(np.float32)  # as files hold them
     half = len(renders) // 2 if len(renders) >= RENDERS else 0
     setting = f"{len(renders)} renders" if len(renders) > 1 else "1 render"
+
+    def halves() -> tuple[Pixels, Pixels]:
+        if not half:
+            return renders[[rng.integers(len(renders))]], renders[:0]
+        order = rng.permutation(len(renders))
+        return renders[order[:half]], renders[order[half : 2 * half]]
+
     rows = []
     for name, defect in DEFECTS.items():
-        planted = [_split(renders, half, defect, rng) for _ in range(trials)]
+        splits = [halves() for _ in range(trials)]
+        planted = [Trial(clean, other, functools.partial(defect.spoil, clean)) for clean, other in splits]
         rows.append(detection(name, defect.always_due, planted, case, setting))
-    splits = (_halves(renders, half, rng) for _ in range(null_pairs if half else 0))
+    nulls = (halves() for _ in range(null_pairs if half else 0))
     repeats = ((renders[[i]], through_a_file(renders[i])[None]) for i in range(len(renders)))
-    rows += false_alarms(splits, repeats, case, setting, independent=False)
+    rows += false_alarms(nulls, repeats, case, setting, independent=False)
     if half:
         return [*rows, Row(STUDY, "renders", case, setting, {"noise": noise(renders)})]
     return [*rows, Row(STUDY, "renders", case, setting, reason="of fewer than four renders the noise is not known")]
@@ -269,46 +260,20 @@ def noise(renders: Pixels) -> float:
     return float(np.median(deviation[lit] / mean[lit])) if lit.any() else 0.0
 
 
-def _split(renders: Pixels, half: int, defect: Defect, rng: np.random.Generator) -> Trial:
-    if half:
-        clean, other = _halves(renders, half, rng)
-    else:
-        clean, other = renders[[rng.integers(len(renders))]], renders[:0]
-    return Trial(clean, other, lambda: defect.spoil(clean))
-
-
-def _halves(renders: Pixels, half: int, rng: np.random.Generator) -> tuple[Pixels, Pixels]:
-    order = rng.permutation(len(renders))
-    return renders[order[:half]], renders[order[half : 2 * half]]
-
-
-def failed(rows: Sequence[Row]) -> bool:
-    """Whether a defect that must be seen was missed, or a method called too many equal pairs different."""
-    return any(row.verdict == "fail" for row in rows)
-
-
-def table(rows: Sequence[Row]) -> RenderableType:
-    """What `examine` found, for rich's console: a line for each defect, a column for each method, and what failed."""
-    from rich.console import Group
-    from rich.table import Table
-    from rich.text import Text
-
-    shares = Table("seen", box=None, pad_edge=False)
-    for name in (*METHODS, "size"):
-        shares.add_column(name, justify="right")
-    shares.add_column("")
-    lines = []
+def table(rows: Sequence[Row]) -> list[tuple[str, ...]]:
+    """A line for each defect, a column for each method: the share of trials in which it saw the defect."""
+    lines: list[tuple[str, ...]] = [("seen", *METHODS, "size", "")]
     for row in rows:
         if row.subject in DEFECTS:
             size = f"{row.values['size']:.2%}" if "size" in row.values else ""
-            cells = [_share(row.values.get(name)) for name in METHODS]
-            shares.add_row(row.subject, *cells, size, row.reason)
-        elif row.values:
-            lines.append(f"{row.subject}: " + ", ".join(f"{name} {x:.3g}" for name, x in row.values.items()))
+            cells = [f"{row.values[name]:.0%}" if name in row.values else "–" for name in METHODS]
+            lines.append((row.subject, *cells, size, row.reason))
+    return lines
+
+
+def summary(rows: Sequence[Row]) -> list[str]:
+    """Lines about the renders and the equal pairs, and what failed."""
+    others = [row for row in rows if row.values and row.subject not in DEFECTS]
+    lines = [f"{row.subject}: " + ", ".join(f"{name} {x:.3g}" for name, x in row.values.items()) for row in others]
     broken = [f"{row.subject}: {', '.join(row.broken)}" for row in rows if row.verdict == "fail"]
-    lines.append(f"failed: {'; '.join(broken)}" if broken else "every defect that had to be seen was seen")
-    return Group(shares, *map(Text, lines))
-
-
-def _share(rate: float | None) -> str:
-    return "–" if rate is None else f"{rate:.0%}"
+    return [*lines, f"failed: {'; '.join(broken)}" if broken else "every defect that had to be seen was seen"]

@@ -1,8 +1,8 @@
-"""How each image is compared: what the command line says for all of them, and a settings file for some.
+"""How each image is compared: layers of settings, merged once.
 
-Three layers: the file's `[defaults]`, then the command line, then every `[[image]]` of the file whose name matches, in
-their order. A later layer replaces the keys that it gives, and inherits the others. Where it changes the method, the
-options of the method before it are dropped.
+The layers are the file's `[defaults]`, then the command line, then every `[[image]]` table whose name matches, in their
+order. Each is one mapping of the same keys. A later layer replaces the keys that it sets and inherits the others; where
+it changes the method, the options that the new method does not have are dropped.
 """
 
 from __future__ import annotations
@@ -16,29 +16,28 @@ from typing import Any
 
 from mi_refract.io.image_file import MAX_VALUES
 
-from . import idiff_flags
 from .channels import Names
 from .masks import Rectangle
 from .methods import AUTO, METHODS, options_of_auto
-from .name_patterns import fields_of, matches
+from .name_patterns import matches
 
+FILE = "mi-refract.toml"
+DEFAULTS, COMMAND_LINE = "defaults", "command line"
 SYSTEMS = {"linux": "linux", "darwin": "macos", "win32": "windows"}  # by sys.platform
 PROCESSORS = {"x86_64": "x86_64", "amd64": "x86_64", "arm64": "arm64", "aarch64": "arm64"}  # by platform.machine()
 TOLERANCE = "tolerance"  # the method that the flags of idiff are for
-FILE_ONLY = ("accept", "mask", "ignore")  # keys of `ComparisonSpec` that no option of the command line says
-OF_BOTH = ("variance", "channels")  # those that one of the file's tables and an option of its own say
 
 
 @dataclass(frozen=True)
 class ComparisonSpec:
-    """A method, those of its options that are given, and the `reason` from a settings file.
+    """How one image is compared: the method, the options that are set, and the `reason` from a settings file.
 
     `max_values`: width × height × channels of an image, at most. `skip`: not compared at all. `accept`: templates of
     other references, each as good as the first. `mask`, `ignore`: pixels that do not count, as a template of an image
     and as rectangles. `idiff`: the flags of `idiff` that the options come from. `variance`: a template of the image
     that holds the variance of one sample of each pixel. `channels`: those that are compared, by their names in the
-    reference and in the new image; none: all. `entries`: the tables of the settings file that say so. `error`: why they
-    cannot be followed.
+    reference and in the new image; none: all. `entries`: the tables of the settings file that apply. `error`: why the
+    settings cannot be applied.
     """
 
     method: str = AUTO
@@ -56,41 +55,19 @@ class ComparisonSpec:
     error: str = ""
 
     @property
-    def flags(self) -> list[str]:
-        """The command line's options that say the same, but for what FILE_ONLY names."""
-        words = [] if self.method == AUTO else ["--method", self.method]
-        given: Mapping[str, Any] = {}
-        if self.idiff is not None:
-            words, given = ["--idiff", self.idiff], idiff_flags.parse(self.idiff).options
-        for name, value in self.options.items():
-            if name in given and given[name] == value:
-                continue
-            if name != "allow_nonfinite":
-                words += ["--set", f"{name}={value}"]
-            elif value:
-                words += ["--allow-nonfinite", "*"]
-        words += ["--variance", self.variance] if self.variance else []
-        words += ["--channels", written(self.channels)] if self.channels else []
-        return words + ([] if self.max_values == MAX_VALUES else ["--max-values", str(self.max_values)])
-
-    @property
     def reads_variance(self) -> bool:
-        """Whether the method is one that knows what to do with the variance."""
+        """Whether the method is one that uses the variance."""
         return bool(self.variance) and self.method in (AUTO, "welch")
-
-    @property
-    def needs_file(self) -> bool:
-        """Whether the command line alone cannot say the same of two files."""
-        in_folder = bool({"root", "dir"} & fields_of(self.variance))
-        return in_folder or any(getattr(self, name) for name in FILE_ONLY)
 
 
 @dataclass(frozen=True)
 class Entry:
-    """An `[[image]]` table, or `[defaults]`: a pattern of names, and the keys that it gives.
+    """One layer of settings.
 
-    `values`: of `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `variance`, `channels`, `allow_nonfinite` and
-    the options of methods. `when`: platforms, one of which must be this one; none: all. `error`: what is wrong with it.
+    `pattern`: of the names of its images; "" for `[defaults]` and the command line, which are for all. `values`: of
+    `method`, `reason`, `skip`, `accept`, `mask`, `ignore`, `variance`, `channels`, `idiff`, `allow_nonfinite` and the
+    options of methods. `where`: its name in messages. `when`: platforms, one of which must be this one; none: all.
+    `error`: what is wrong with it.
     """
 
     pattern: str
@@ -102,7 +79,7 @@ class Entry:
     @property
     def here(self) -> bool:
         """Whether it is for this platform."""
-        return not self.when or any(set(each.split()) <= this_platform() for each in self.when)
+        return not self.when or any(set(words.split()) <= this_platform() for words in self.when)
 
 
 @dataclass(frozen=True)
@@ -115,69 +92,83 @@ class Map:
 
 @dataclass(frozen=True)
 class Settings:
-    """`default` for all images, `rules` by pattern of names, and the patterns whose values need not be finite.
+    """The layers in their order, and what holds for the whole comparison.
 
-    `defaults`: what the settings file says of all images; `default`, the command line's, goes before it.
+    `maps`: which reference belongs to which new image; none: the one of the same path. `max_values`: of each image.
+    `flags`: the words of the command line that set the same.
     """
 
-    default: ComparisonSpec = ComparisonSpec()
     rules: tuple[Entry, ...] = ()
-    allow_nonfinite: tuple[str, ...] = ()
-    defaults: Entry = Entry("*", {}, "defaults")
     maps: tuple[Map, ...] = ()
-    path: str = ""
+    max_values: int = MAX_VALUES
+    flags: tuple[str, ...] = ()
+
+    @classmethod
+    def for_all(cls, **values: Any) -> Settings:
+        """These values, such as `method="tolerance", fail=0.1`, for all images."""
+        return cls((Entry("", values, COMMAND_LINE),))
 
     def of(self, name: str) -> ComparisonSpec:
-        """How the image of this name is compared. Entries that cannot be followed are the `error` of what is found."""
-        entries = [each for each in self.rules if each.here and matches(each.pattern, name)]
-        reasons = [str(each.values["reason"]) for each in entries if "reason" in each.values]
-        how = replace(
-            self.default,
-            options={},
-            entries=tuple(each.where for each in (self.defaults, *entries) if each.values or each.error),
-            reason="; ".join(dict.fromkeys(reasons)),
-        )
-        if error := next((each.error for each in entries if each.error), "") or _conflict(entries):
-            return replace(how, error=error)
+        """How the image of this name is compared; what is wrong with the settings is the `error`."""
+        layers = [rule for rule in self.rules if rule.here and (not rule.pattern or matches(rule.pattern, name))]
+        reasons = dict.fromkeys(layer.values["reason"] for layer in layers if "reason" in layer.values)
+        entries = tuple(x.where for x in layers if x.where != COMMAND_LINE and (x.values or x.error))
+        spec = ComparisonSpec(reason="; ".join(reasons), max_values=self.max_values, entries=entries)
         try:
-            method, options = _method(
-                [("[defaults]", self.defaults.values), *self._command_line(name), *_layers(entries)]
-            )
+            return replace(spec, **_merged(layers))
         except ValueError as error:
-            return replace(how, error=str(error))
-        given = {key: value for key in OF_BOTH if (value := getattr(self.default, key))}
-        of_entries = {key: value for each in entries for key, value in each.values.items()}
-        others = {**self.defaults.values, **given, **of_entries}
-        kept = {key: others[key] for key in ("skip", *FILE_ONLY, *OF_BOTH) if key in others}
-        flags = of_entries.get("idiff", self.default.idiff)
-        flags = (self.defaults.values.get("idiff") if flags is None else flags) if method == TOLERANCE else None
-        return replace(how, method=method, options=options, idiff=flags, **kept)
-
-    def _command_line(self, name: str) -> list[tuple[str, Mapping[str, Any]]]:
-        given = dict(self.default.options) | ({} if self.default.method == AUTO else {"method": self.default.method})
-        if any(matches(pattern, name) for pattern in self.allow_nonfinite):
-            given["allow_nonfinite"] = True
-        return [("the command line", given)]
-
-    @property
-    def of_file(self) -> bool:
-        """Whether a settings file says anything."""
-        return bool(self.rules or self.maps or self.defaults.values)
-
-    @property
-    def flags(self) -> list[str]:
-        """The command line's options that say the same; `path`: the settings file, where it was named there."""
-        nonfinite = [word for name in self.allow_nonfinite for word in ("--allow-nonfinite", name)]
-        return [*self.default.flags, *nonfinite, *(["--settings", self.path] if self.path else [])]
+            return replace(spec, error=str(error))
 
     def unused(self, names: Sequence[str]) -> list[str]:
         """The patterns for this platform that match none of these names."""
-        patterns = [*(each.pattern for each in self.rules if each.here), *self.allow_nonfinite]
+        patterns = [rule.pattern for rule in self.rules if rule.here and rule.pattern]
         return [pattern for pattern in patterns if not any(matches(pattern, name) for name in names)]
 
 
+def _merged(layers: Sequence[Entry]) -> dict[str, Any]:
+    """The fields of `ComparisonSpec` that the layers set.
+
+    ValueError for a layer with an error, for two tables of the same pattern that contradict each other, and for an
+    option that the method does not have.
+    """
+    merged: dict[str, Any] = {"method": AUTO}
+    set_by: dict[str, str] = {}
+    tables: dict[tuple[str, str], Entry] = {}
+    for layer in layers:
+        if layer.error:
+            raise ValueError(layer.error)
+        for key, value in layer.values.items():
+            other = tables.setdefault((layer.pattern, key), layer)
+            if layer.pattern and key != "reason" and other.values[key] != value:
+                raise ValueError(
+                    f"{layer.where}: {key}: {value!r}, but {other.values[key]!r} in {other.where} for the same name "
+                    f"{layer.pattern!r}; expected one of them"
+                )
+            set_by[key] = layer.where
+        method = layer.values.get("method", merged["method"])
+        if method != merged["method"]:
+            merged = {k: v for k, v in merged.items() if k not in options_of(None) or k in options_of(method)}
+        merged |= layer.values
+    method = merged["method"]
+    options = {key: merged.pop(key) for key in list(merged) if key in options_of(None)}
+    for name in options.keys() - options_of(method):
+        expected = ", ".join(sorted(options_of(method) - {"allow_nonfinite", "idiff"})) or "none"
+        raise ValueError(f"{set_by[name]}: {name}: not an option of {method}; expected {expected}")
+    merged.pop("reason", None)
+    return merged | {"idiff": options.pop("idiff", None), "options": options}
+
+
+@functools.cache
+def options_of(method: str | None) -> frozenset[str]:
+    """The names of the options that a method takes, or of all methods, with what is set in the same way."""
+    if method is None:
+        return frozenset().union(*map(options_of, METHODS))
+    names = options_of_auto() if method == AUTO else METHODS[method].options
+    return frozenset(names) | {"allow_nonfinite"} | ({"idiff"} if method == TOLERANCE else set())
+
+
 def written(channels: Names) -> str:
-    """The channels as `--channels` takes them."""
+    """The channels as `--set channels=` takes them."""
     return ",".join(one if one == two else f"{one}={two}" for one, two in channels)
 
 
@@ -185,50 +176,3 @@ def this_platform() -> frozenset[str]:
     """The words that `when` may hold and that are true here: the system and the processor."""
     words = SYSTEMS.get(sys.platform), PROCESSORS.get(platform.machine().lower())
     return frozenset(word for word in words if word)
-
-
-def _layers(entries: Sequence[Entry]) -> list[tuple[str, Mapping[str, Any]]]:
-    return [(each.where, each.values) for each in entries]
-
-
-def _method(layers: Sequence[tuple[str, Mapping[str, Any]]]) -> tuple[str, dict[str, Any]]:
-    """The method and its options. ValueError for an option that the method does not have."""
-    method, options, given_by = AUTO, dict[str, Any](), dict[str, str]()
-    for where, values in layers:
-        if values.get("method", method) != method:
-            method = values["method"]
-            options = {name: value for name, value in options.items() if name in options_of(method)}
-        for name in values:
-            if name == "allow_nonfinite" or name in all_options():
-                options[name], given_by[name] = values[name], where
-    for name in options:
-        if name not in options_of(method):
-            accepted = ", ".join(sorted(options_of(method) - {"allow_nonfinite"})) or "none"
-            raise ValueError(f"{given_by[name]}.{name}: not an option of {method}; expected {accepted}")
-    return method, options
-
-
-@functools.cache
-def all_options() -> frozenset[str]:
-    """The names of the options of all methods."""
-    return frozenset(name for method in METHODS.values() for name in method.options)
-
-
-def options_of(method: str) -> frozenset[str]:
-    """The names of the options that a method takes, `allow_nonfinite` among them."""
-    names = options_of_auto() if method == AUTO else METHODS[method].options
-    return frozenset(names) | {"allow_nonfinite"}
-
-
-def _conflict(entries: Sequence[Entry]) -> str:
-    """Two entries of the same pattern that give the same key other values; "" where there are none."""
-    for i, one in enumerate(entries):
-        for other in entries[i + 1 :]:
-            both = [key for key in one.values if key in other.values and key != "reason"]
-            for key in both if one.pattern == other.pattern else []:
-                if one.values[key] != other.values[key]:
-                    return (
-                        f"{other.where}.{key}: {other.values[key]!r}, but {one.values[key]!r} in {one.where} for the "
-                        f"same name {one.pattern!r}; expected one of them"
-                    )
-    return ""

@@ -1,4 +1,4 @@
-"""The settings file `mi-refract.toml`, and options in words: what they may hold, and how they are read.
+"""The settings file `mi-refract.toml`, and the command line's `--set KEY=VALUE`, as layers of the same keys.
 
 [defaults]
 method = "tolerance"
@@ -12,241 +12,240 @@ reason = "single-precision caustic: last bits differ between processors"
 
 from __future__ import annotations
 
+import contextlib
+import tomllib
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from mi_refract.io.toml_schema import TABLES, TEXT, Key, Type, first_of, key_table, list_of, read, table, text
+import msgspec
+from msgspec import Meta
+
+from mi_refract.io.image_file import MAX_VALUES
+from mi_refract.io.typed_table import convert, key_table, parse_toml
 
 from . import idiff_flags, name_patterns
-from .channels import Names
 from .methods import AUTO, METHODS, options_of_auto
-from .settings import PROCESSORS, SYSTEMS, TOLERANCE, ComparisonSpec, Entry, Map, Settings, all_options
+from .settings import COMMAND_LINE, DEFAULTS, PROCESSORS, SYSTEMS, TOLERANCE, Entry, Map, Settings
 
-FILE = "mi-refract.toml"
 ACCEPTED = (AUTO, *METHODS)
 WORDS = tuple(dict.fromkeys((*SYSTEMS.values(), *PROCESSORS.values())))
-SIDES = 4  # numbers of a rectangle
+BESIDE = ("stem", "name", "suffix")  # fields of a template of a file beside the reference
+ANYWHERE = ("root", *name_patterns.FIELDS)
+
+Text = Annotated[str, Meta(min_length=1)]
+Length = Annotated[int, Meta(ge=1)]
 
 
-def _finite_or_inf(value: Any) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        return float(value) if value == value else None
-    except OverflowError:
-        return None
+class MapKeys(msgspec.Struct, forbid_unknown_fields=True):
+    """`map` of `[defaults]`."""
+
+    reference: str
+    test: str
+
+    def __post_init__(self) -> None:
+        """ValueError unless both have the same fields, and no `*`."""
+        for key in ("reference", "test"):
+            _check_template(key, getattr(self, key), name_patterns.FIELDS)
+        one, two = map(name_patterns.fields_of, (self.reference, self.test))
+        if one != two or not one or "*" in self.reference + self.test:
+            raise ValueError("expected the same fields in `reference` and `test`, and no `*`")
 
 
-def _template(names: Collection[str]) -> Type:
-    """Paths that may hold these fields."""
-    shown = ", ".join(f"{{{name}}}" for name in names)
-    return Type(
-        f"a path that may hold {shown}",
-        lambda value: value if isinstance(value, str) and name_patterns.is_template(value, names) else None,
-    )
+class Keys(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+    """The keys of `[defaults]`, of `[[image]]` and of `--set`."""
+
+    method: Annotated[str, Meta(description=f"the method: {', '.join(ACCEPTED)}")] = AUTO
+    allow_nonfinite: Annotated[bool, Meta(description="allow NaN or Inf where the other image has the same")] = False
+    accept: Annotated[
+        list[str] | None, Meta(description="further references beside the first: templates, `*` and `?` allowed")
+    ] = None
+    mask: Annotated[
+        str | None,
+        Meta(description="an image beside the reference: white pixels count, black do not; {root}: the top folder"),
+    ] = None
+    ignore: Annotated[
+        list[tuple[int, int, Length, Length]] | None,
+        Meta(description="rectangles of pixels that do not count: x, y, width, height"),
+    ] = None
+    variance: Annotated[
+        str | None, Meta(description="an image of the variance of one sample of each pixel, beside each side's own")
+    ] = None
+    channels: Annotated[
+        list[Text] | dict[Text, Text] | None,
+        Meta(description="the channels to compare: names, or { <of the reference> = <of the new image>, … }"),
+    ] = None
+
+    def __post_init__(self) -> None:
+        """ValueError for a method, a template or channels that do not exist."""
+        if self.method not in ACCEPTED:
+            raise ValueError(f"method: {self.method!r}; expected {', '.join(ACCEPTED)}")
+        for template in self.accept or ():
+            _check_template("accept", template, BESIDE)
+        for key, path in (("mask", self.mask), ("variance", self.variance)):
+            if path is not None:
+                _check_template(key, path, ANYWHERE)
+        if self.accept == [] or self.ignore == []:
+            raise ValueError(f"{'accept' if self.accept == [] else 'ignore'}: []; expected at least one")
+        if self.channels is not None:
+            names = list(self.channels.values()) if isinstance(self.channels, dict) else self.channels
+            if not names or len(set(names)) < len(names):
+                raise ValueError(f"channels: {names}; expected distinct names")
 
 
-def _rectangles(value: Any) -> tuple[tuple[int, ...], ...] | None:
-    found = list_of(list_of(lambda x: x if type(x) is int else None, SIDES, SIDES))(value)
-    return tuple(map(tuple, found)) if found and all(min(x[2:]) > 0 for x in found) else None
+class DefaultsKeys(Keys, forbid_unknown_fields=True, kw_only=True):
+    """The keys of `[defaults]`."""
+
+    map: Annotated[
+        MapKeys | list[MapKeys] | None,
+        Meta(description="templates { reference = …, test = … } of paths; without it, both sides have the same path"),
+    ] = None
 
 
-def channels_of(value: Any) -> Names | None:
-    """The names of channels of the reference and of the new image, from a list or a table; None for anything else."""
-    table = {name: name for name in value if text(name)} if isinstance(value, list) else value
-    if not isinstance(table, dict) or not table or len(table) != len(value):
-        return None
-    known = all(text(each) for pair in table.items() for each in pair)
-    return tuple(table.items()) if known and len(set(table.values())) == len(table) else None
+class ImageKeys(Keys, forbid_unknown_fields=True, kw_only=True):
+    """The keys of an `[[image]]` table."""
+
+    name: Annotated[Text, Meta(description="the image's path; `*` matches anything, `/` included, `?` one character")]
+    reason: Annotated[Text, Meta(description="why this image is not compared like the others")]
+    when: Annotated[
+        str | list[str] | None, Meta(description=f"the platforms, all by default: one or two of {', '.join(WORDS)}")
+    ] = None
+    skip: Annotated[bool, Meta(description="do not compare it")] = False
+
+    def __post_init__(self) -> None:
+        """ValueError for a blank reason and a platform that cannot exist, too."""
+        super().__post_init__()
+        if not self.reason.strip():
+            raise ValueError(f"reason: {self.reason!r}; expected text")
+        for platform in _listed(self.when):
+            words = set(platform.split())
+            kinds = [len(words & set(kind.values())) for kind in (SYSTEMS, PROCESSORS)]
+            if not words or not words <= set(WORDS) or max(kinds) > 1:
+                raise ValueError(f"when: {platform!r}; expected one or two of {', '.join(WORDS)}")
 
 
-def _platforms(value: Any) -> tuple[str, ...] | None:
-    found = [value] if isinstance(value, str) else value
-    known = list_of(lambda each: each if text(each) and _platform(each.split()) else None)(found)
-    return tuple(known) if known else None
+class Document(msgspec.Struct, forbid_unknown_fields=True):
+    """The file. An `[[image]]` table is checked on its own: what is wrong with it concerns its images alone."""
+
+    defaults: dict[str, Any] = {}
+    image: list[dict[str, Any]] = []
 
 
-def _platform(words: list[str]) -> bool:
-    """Whether there may be one that is all of it: one system, one processor."""
-    known = set(words) <= set(WORDS)
-    return known and all(len(set(words) & set(kind.values())) <= 1 for kind in (SYSTEMS, PROCESSORS))
+class NameKey(msgspec.Struct):
+    """What an `[[image]]` table must have, whatever is wrong with the rest."""
+
+    name: Text
 
 
-BOOL = Type("true or false", lambda value: value if isinstance(value, bool) else None)
-METHOD = Type(", ".join(ACCEPTED), lambda value: value if isinstance(value, str) and value in ACCEPTED else None)
-TEMPLATE = _template(name_patterns.FIELDS)
-BESIDE = _template(("stem", "name", "suffix"))
-MASK = _template(("root", *name_patterns.FIELDS))
-TEMPLATES = Type(f"a list, each {BESIDE.accepted}, and *", list_of(BESIDE.parse))
-RECTANGLES = Type("a list of [x, y, width, height], in pixels", _rectangles)
-PLATFORM = Type(f"of {', '.join(WORDS)}: one, two words, or a list of such", _platforms)
-CHANNELS = Type("a list of channels, or a table { <of the reference> = <of the new image>, … }", channels_of)
-MAP = Type("{ reference = …, test = … } or a list of such", first_of(table, list_of(table)))
-
-ANY_TEXT = Type("a text", lambda value: value if isinstance(value, str) else None)
-IDIFF = {"idiff": Key(ANY_TEXT, "flags of OpenImageIO's `idiff`, as they stand; the method is `tolerance`", None)}
-EVERYWHERE = {
-    "method": Key(METHOD, "the method; that of the command line by default", None),
-    "allow_nonfinite": Key(BOOL, "whether NaN or Inf is allowed where the other image has the same", None),
-    "accept": Key(TEMPLATES, "other references beside it, each as good; from the reference's own path", None),
-    "mask": Key(
-        MASK, "an image beside the reference in which white counts, black does not; {root}: their folder", None
-    ),
-    "variance": Key(
-        MASK, "an image of the variance of one sample of each pixel, beside each side's own; {root}: their folder", None
-    ),
-    "channels": Key(CHANNELS, "those that are compared; X, Y, Z are made of R, G, B where an image has none", None),
-    "ignore": Key(RECTANGLES, "rectangles of pixels that do not count", None),
-}
-DEFAULTS = EVERYWHERE | {
-    "map": Key(MAP, "templates of the paths of references and new images; without it, both have the same path", None)
-}
-IMAGE = {
-    "name": Key(TEXT, "the image's path inside its folder; `*` stands for anything, `/` included, `?` for a character"),
-    "reason": Key(TEXT, "why this image is not compared like the others"),
-    "when": Key(PLATFORM, "the platforms that this is for; all by default", None),
-    "skip": Key(BOOL, "whether it is not compared", None),
-} | EVERYWHERE
-TYPES: dict[type, Type] = {
-    float: Type("a number or inf", _finite_or_inf),
-    int: Type("a whole number", lambda value: value if type(value) is int else None),
-    str: TEXT,
-}
+def _check_template(key: str, text: str, names: Collection[str]) -> None:
+    if not name_patterns.is_template(text, names):
+        fields = ", ".join(f"{{{name}}}" for name in names)
+        raise ValueError(f"{key}: {text!r}; expected a relative path inside the folder that may hold {fields}")
 
 
-def load(path: str | Path, default: ComparisonSpec = ComparisonSpec(), allow_nonfinite: Sequence[str] = ()) -> Settings:  # noqa: B008
-    """The settings of a file, with `default` and `allow_nonfinite` from the command line.
+def load(path: str | Path, command_line: Entry | None = None, max_values: int = MAX_VALUES) -> Settings:
+    """The settings of a file, with the layer of the command line.
 
-    An entry with a name that is wrong in anything else is kept with its error: its images cannot be compared, the
-    others can. ValueError names the file and the key for whatever else is wrong; OSError as the system raises it.
+    A table with a name that is wrong in anything else is kept with its error: its images cannot be compared, the others
+    can. ValueError names the file and the key for whatever else is wrong; OSError as the system raises it.
     """
-    import tomllib  # where there is a file: it compiles its patterns
-
     path = Path(path)
-    try:
-        document = tomllib.loads(path.read_bytes().decode())
-        top = read(document, {"defaults": Key(Type("a table", table), "", {}), "image": Key(TABLES, "", [])})
-        defaults, maps = _defaults(top["defaults"])
-        rules = tuple(_entry(each, f"image[{i}]", str(path)) for i, each in enumerate(top["image"]))
-    except (ValueError, RecursionError) as error:
-        said = str(error) if isinstance(error, ValueError) else "brackets nested too deeply; expected TOML"
-        raise ValueError(" ".join(f"{path}: {said}".split())) from None
-    return Settings(default, rules, tuple(allow_nonfinite), defaults, maps)
+    document = parse_toml(path.read_bytes(), Document, str(path), infinite=True)
+    defaults = _values(document.defaults, DefaultsKeys, f"{path}: {DEFAULTS}")
+    maps = tuple(Map(each.reference, each.test) for each in _listed(defaults.pop("map", None)))
+    rules = [Entry("", defaults, DEFAULTS), *([command_line] if command_line else [])]
+    for number, table in enumerate(document.image):
+        where = f"image[{number}]"
+        name = convert({"name": table["name"]} if "name" in table else {}, NameKey, f"{path}: {where}").name
+        try:
+            values = _values(table, ImageKeys, f"{path}: {where}")
+        except ValueError as error:
+            rules.append(Entry(name, {}, where, error=str(error)))
+            continue
+        when = tuple(_listed(values.pop("when", None)))
+        del values["name"]
+        rules.append(Entry(name, values, where, when))
+    return Settings(tuple(rules), maps, max_values)
 
 
-def _defaults(given: dict[str, Any]) -> tuple[Entry, tuple[Map, ...]]:
-    values = _values(given, DEFAULTS, "defaults.")
-    found = values.pop("map", [])
-    return Entry("*", values, "defaults"), tuple(map(_map, [found] if isinstance(found, dict) else found))
+def from_words(method: str, words: Sequence[str], idiff: str | None = None) -> Entry:
+    """The layer of the command line: `--method`, `--set KEY=VALUE`, `--idiff`. ValueError for anything else."""
+    if method not in ACCEPTED:
+        raise ValueError(f"--method {method}; expected {', '.join(ACCEPTED)}")
+    table: dict[str, Any] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals or key in table:
+            raise ValueError(f"--set {word}; expected KEY=VALUE, each key once")
+        table[key] = _value(key, value)
+    if idiff is not None:
+        if method not in (AUTO, TOLERANCE):
+            raise ValueError(f"--idiff with --method {method}; expected --method {TOLERANCE}, or none")
+        table["idiff"], method = idiff, TOLERANCE
+    values = _values(table, Keys, "--set", method)
+    return Entry("", values if method == AUTO else {"method": method, **values}, COMMAND_LINE)
 
 
-def _map(given: dict[str, Any]) -> Map:
-    values = read(given, {side: Key(TEMPLATE, "") for side in ("reference", "test")}, "defaults.map.")
-    one, two = (name_patterns.fields_of(values[side]) for side in ("reference", "test"))
-    if one != two or not one or "*" in values["reference"] + values["test"]:
-        raise ValueError("defaults.map; expected the same fields in `reference` and `test`, and no `*`")
-    return Map(**values)
+def _value(key: str, text: str) -> Any:
+    """A value as the command line writes it: TOML in brackets, channels between commas, a number, a flag, or text."""
+    if text[:1] in ("[", "{"):
+        with contextlib.suppress(ValueError):  # it may be a template
+            return tomllib.loads(f"value = {text}")["value"]
+    if key == "channels":
+        parts = [part.partition("=") for part in text.split(",")]
+        pairs = [(one.strip(), (two if equals else one).strip()) for one, equals, two in parts]
+        return dict(pairs) if len(dict(pairs)) == len(pairs) else [one for one, _ in pairs]
+    for number in (int, float):
+        with contextlib.suppress(ValueError):
+            return number(text)
+    return {"true": True, "false": False}.get(text, text)
 
 
-def _entry(given: dict[str, Any], where: str, path: str) -> Entry:
-    name = read({"name": given["name"]} if "name" in given else {}, {"name": IMAGE["name"]}, f"{where}.")["name"]
-    try:
-        values = _values(given, IMAGE, f"{where}.")
-    except ValueError as error:
-        return Entry(name, {}, where, error=" ".join(f"{path}: {error}".split()))
-    when = values.pop("when", ())
-    return Entry(name, {key: value for key, value in values.items() if key != "name"}, where, when)
-
-
-def _values(given: dict[str, Any], keys: dict[str, Key], where: str) -> dict[str, Any]:
-    """The values of the keys that are given. Options are those of the method where there is one, else of any."""
-    method = read({k: v for k, v in given.items() if k == "method"}, {"method": EVERYWHERE["method"]}, where)["method"]
-    values = read(given, keys | (IDIFF if method in (None, TOLERANCE) else {}) | keys_of(method), where)
-    values = {key: tuple(values[key]) if key == "accept" else values[key] for key in given}
-    if "idiff" not in given:
+def _values(table: dict[str, Any], kind: type[Keys], where: str, method: str | None = None) -> dict[str, Any]:
+    """The checked values of the keys that are set. Options are those of the method, or of any where none is set."""
+    method = table.get("method", TOLERANCE if "idiff" in table else method)
+    fields = _options(method if method in ACCEPTED else None)
+    struct: Any = msgspec.defstruct(kind.__name__, fields, bases=(kind,), forbid_unknown_fields=True, kw_only=True)
+    checked = convert(table, struct, where, infinite=True)
+    values = {key: getattr(checked, key) for key in table}
+    for key in {"accept", "ignore"} & values.keys():
+        values[key] = tuple(values[key])
+    if "channels" in values:
+        named = values["channels"]
+        values["channels"] = tuple(named.items()) if isinstance(named, dict) else tuple(zip(named, named, strict=True))
+    if "idiff" not in values:
         return values
     try:
-        return {**idiff_flags.parse(values["idiff"]).options, "method": TOLERANCE, **values}
+        flags = idiff_flags.parse(values["idiff"])
     except ValueError as error:
-        raise ValueError(f"{where}idiff: {error}") from None
+        raise ValueError(f"{where}: idiff: {error}") from None
+    return {**flags.options, "method": TOLERANCE, **values}
 
 
-def keys_of(method: str | None) -> dict[str, Key]:
-    """The options of a method as keys; of all methods for None, of those that "auto" chooses from for that."""
+def _options(method: str | None) -> list[tuple[str, Any, Any]]:
+    """Name, type and default of the options of a method, of those that "auto" chooses from, or for None of all."""
+    options = options_of_auto() if method == AUTO else METHODS[method].options if method else {}
     if method is None:
-        every = [keys_of(name) for name in METHODS]
-        return {name: _any_of([keys[name] for keys in every if name in keys]) for name in sorted(all_options())}
-    options = options_of_auto() if method == AUTO else METHODS[method].options
-    return {name: Key(TYPES[option.type], option.help, option.default) for name, option in options.items()}
-
-
-def _any_of(keys: list[Key]) -> Key:
-    """A key of a name that several methods have; each checks it again."""
-    kinds = list(dict.fromkeys(key.type for key in keys))
-    one = Type(" or ".join(kind.accepted for kind in kinds), first_of(*(kind.parse for kind in kinds)))
-    return Key(one, keys[0].meaning, keys[0].default)
-
-
-def channels_from(words: str) -> Names:
-    """The channels of the command line: names, or REFERENCE=TEST, between commas. ValueError for anything else."""
-    parts = [each.strip() for each in words.split(",")]
-    pairs = [
-        (one.strip(), two.strip() if equals else one.strip()) for one, equals, two in (p.partition("=") for p in parts)
+        options = {name: option for each in METHODS.values() for name, option in each.options.items()}
+    fields: list[tuple[str, Any, Any]] = [
+        (name, Annotated[option.type, Meta(description=option.help)], option.default)
+        for name, option in options.items()
     ]
-    if (found := channels_of(dict(pairs))) is None or len(found) != len(pairs):
-        raise ValueError(f"--channels {words}; expected distinct names, or REFERENCE=TEST, between commas")
-    return found
+    if method in (None, TOLERANCE):
+        meaning = Meta(description="flags of OpenImageIO's `idiff`; the method is `tolerance`")
+        fields.append(("idiff", Annotated[str, meaning], ""))
+    return fields
 
 
-def variance_from(words: str) -> str:
-    """The template of the command line's `--variance`. ValueError for what is none."""
-    if MASK.parse(words) is None:
-        raise ValueError(f"--variance {words}; expected {MASK.accepted}")
-    return words
-
-
-def from_words(method: str, words: Sequence[str], idiff: str | None = None) -> ComparisonSpec:
-    """The method and its options from the command line's `NAME=VALUE` and `--idiff`. ValueError for anything else."""
-    if method not in ACCEPTED:
-        raise ValueError(f"--method {method}; expected {METHOD.accepted}")
-    if idiff is not None:
-        return _from_idiff(method, words, idiff)
-    keys = keys_of(method)
-    given: dict[str, Any] = {}
-    for word in words:
-        name, equals, value = word.partition("=")
-        if not equals or name in given:
-            raise ValueError(f"--set {word}; expected NAME=VALUE, each name once")
-        given[name] = _value(value, keys[name].type) if name in keys else value
-    values = read(given, keys, "--set ")
-    return ComparisonSpec(method, {name: values[name] for name in given})
-
-
-def _from_idiff(method: str, words: Sequence[str], flags: str) -> ComparisonSpec:
-    if method not in (AUTO, TOLERANCE):
-        raise ValueError(f"--idiff with --method {method}; accepted with --method {TOLERANCE}, or alone")
-    try:
-        given = idiff_flags.parse(flags).options
-    except ValueError as error:
-        raise ValueError(f"--idiff: {error}") from None
-    return ComparisonSpec(TOLERANCE, {**given, **from_words(TOLERANCE, words).options}, idiff=flags)
-
-
-def _value(value: str, kind: Type) -> Any:
-    """A number where the option is one; the text itself where that fails, for `read` to refuse."""
-    for numeric in (int, float) if kind is not TEXT else ():
-        try:
-            return numeric(value)
-        except ValueError:
-            continue
-    return value
+def _listed(value: Any) -> list[Any]:
+    """A list as it is, None as an empty one, anything else as a list of it."""
+    return value if isinstance(value, list) else [] if value is None else [value]
 
 
 def reference() -> str:
-    """What a settings file may hold, and the options of each method, in Markdown."""
-    parts = [key_table("`[defaults]`", DEFAULTS | IDIFF), key_table("`[[image]]`", IMAGE | IDIFF)]
+    """The keys of a settings file, and the options of each method, in Markdown."""
+    parts = [key_table("`[defaults]`", DefaultsKeys), key_table("`[[image]]`", ImageKeys)]
     for name, method in METHODS.items():
         parts.append(f"`{name}`: {method.summary}")
-        parts += [key_table("option", keys_of(name))] if keys_of(name) else []
+        parts += [key_table("option", msgspec.defstruct(name, fields))] if (fields := _options(name)) else []
     return "\n\n".join(parts)

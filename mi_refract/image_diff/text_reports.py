@@ -1,4 +1,4 @@
-"""The results of `diff` as text: for a terminal, for scripts (JSON), test runners (JUnit) and GitHub.
+"""The results of `diff` as text: printed, for scripts (JSON), test runners (JUnit) and GitHub.
 
 Names of files and messages of errors may hold any character: each format escapes what would be read as more than text.
 """
@@ -9,27 +9,24 @@ import json
 import math
 import os
 import re
+import sys
+import unicodedata
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 from urllib.parse import quote
 
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.sanitise import printable
 from mi_refract.report.number_text import compact, distinguishable
 from mi_refract.report.row import strict
-from mi_refract.report.text_table import Group, Table, Text
 
 from . import idiff_flags
-from .comparison import Metric
 from .pairing import Pair
 from .results import FAILED, Result, Results, Status
-from .settings import ComparisonSpec, written
-
-if TYPE_CHECKING:
-    from mi_refract.report import junit
+from .settings import written
 
 SCHEMA = 1
 FEW = 20  # equal images that are listed one by one
@@ -42,12 +39,69 @@ WORDS = {
     Status.SKIPPED: "skipped",
 }
 STYLES = {
-    Status.ERROR: "bold red",
-    Status.DIFFERENT: "bold red",
-    Status.INCONCLUSIVE: "yellow",
-    Status.EQUAL: "green",
-    Status.SKIPPED: "dim",
-}
+    "different": "bold red",
+    "added": "bold red",
+    "removed": "bold red",
+    "inconclusive": "yellow",
+    "equal": "green",
+    "skipped": "dim",
+}  # of rich, by the first word of a row
+Rows = list[tuple[str, ...]]  # of a table; the first holds the names of the columns
+
+
+# Terminal -----------------------------------------------------------------------------------------------------------
+
+
+def print_results(results: Results) -> None:
+    """Print the table on stdout, and on stderr a line for each image that could not be compared, and for warnings."""
+    print_errors(results)
+    lines = without_effect(results) + [f"{pattern}: matches no image" for pattern in results.unused]
+    for line in lines:
+        print(f"mi-refract: {printable(line)}", file=sys.stderr)
+    if len(results.results) > len(results.of(Status.ERROR)):
+        print_table(table(results), STYLES)
+        more = len([result for result in results.of(Status.EQUAL) if not result.warning]) - FEW
+        if more > 0:
+            print(f"… and {more} more that are equal")
+        print(sentence(results))
+
+
+def print_errors(results: Results) -> None:
+    """Print a line on stderr for each image that could not be compared."""
+    for result in results.of(Status.ERROR):
+        print(f"mi-refract: {printable(result.error)}", file=sys.stderr)
+
+
+def print_table(rows: Rows, styles: Mapping[str, str] | None = None) -> None:
+    """Print it on stdout: by rich on a terminal, else as plain text. `styles`: of rich, by the first cell of a row."""
+    terminal = sys.stdout.isatty()
+    if len(rows) < 2 or not (terminal or os.environ.get("FORCE_COLOR")):
+        print(plain(rows))
+        return
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    shown = Table(*rows[0], box=None, pad_edge=False)
+    for first, *others in rows[1:]:
+        shown.add_row(Text(first, style=(styles or {}).get(first, "")), *map(Text, others))
+    # In a file it is as wide as it must be: no line of a log is a wrapped one.
+    Console(width=None if terminal else 10_000).print(shown, highlight=False)
+
+
+def plain(rows: Rows) -> str:
+    """The rows in columns, one line each however long."""
+    widths = [max(map(_width, column)) for column in zip(*rows, strict=True)]
+    padded = ([cell + " " * (w - _width(cell)) for cell, w in zip(row, widths, strict=True)] for row in rows)
+    return "\n".join("  ".join(cells).rstrip() for cells in padded)
+
+
+def _width(text: str) -> int:
+    """The columns of a terminal that the text takes."""
+    if text.isascii():
+        return len(text)
+    wide = sum(unicodedata.east_asian_width(character) in "WF" for character in text)
+    return len(text) + wide - sum(unicodedata.combining(character) > 0 for character in text)
 
 
 def sentence(results: Results) -> str:
@@ -61,49 +115,37 @@ def sentence(results: Results) -> str:
     return f"{number} image{'' if number == 1 else 's'}: {counted}{warned}{also}"
 
 
-def table(results: Results) -> Group:
-    """Failures first, then equal images with a warning, FEW others, and the sentence."""
-    failed = [*results.of(Status.DIFFERENT, Status.INCONCLUSIVE), *_warned(results)]
+def table(results: Results) -> Rows:
+    """Failures first, then equal images with a warning, FEW others, and skipped ones."""
     equal = [result for result in results.of(Status.EQUAL) if not result.warning]
-    skipped = results.of(Status.SKIPPED)
-    rows = Table(("verdict", "image", "method", "why"))
-    for result in [*failed, *equal[:FEW], *skipped]:
-        status = Text(_word(result), style=STYLES[result.status])
-        rows.add_row(status, *(Text(printable(text)) for text in (result.name, _method_in_words(result), why(result))))
-    more = [Text(f"… and {len(equal) - FEW} more that are equal", style="dim")] if len(equal) > FEW else []
-    return Group((*([rows] if rows.rows else []), *more, Text(sentence(results))))
-
-
-def settings_table(pairs: Sequence[Pair]) -> Table:
-    """How each image would be compared, and the tables of the settings file that say so."""
-    rows = Table(("image", "compared by", "from", "why"))
-    for pair in pairs:
-        how = pair.how
-        options = [f"{name}={value}" for name, value in how.options.items()]
-        names = ", ".join(path.relative_to(pair.target.parent).as_posix() for path in pair.variants)
-        others = [f"or {names}"] if names else []
-        parts = ["skipped"] if how.skip else [how.method, *options, *others, *_pixels(how)]
-        cells = pair.name, ", ".join(parts), ", ".join(how.entries) or "–", how.reason
-        rows.add_row(*(Text(printable(cell)) for cell in cells))
+    failed = [*results.of(Status.DIFFERENT, Status.INCONCLUSIVE), *_warned(results)]
+    rows: Rows = [("verdict", "image", "method", "why")]
+    for result in [*failed, *equal[:FEW], *results.of(Status.SKIPPED)]:
+        cells = (_word(result), result.name, _method(result, in_words=True), why(result))
+        rows.append(tuple(map(printable, cells)))
     return rows
 
 
-def _pixels(how: ComparisonSpec) -> list[str]:
-    given = {"mask": how.mask, "variance": how.variance, "channels": written(how.channels)}
-    return [
-        *(f"{name} {each}" for name, each in given.items() if each),
-        *(f"without {list(each)}" for each in how.ignore),
-    ]
-
-
-def _warned(results: Results) -> list[Result]:
-    return [result for result in results.of(Status.EQUAL) if result.warning]
+def settings_table(pairs: Sequence[Pair]) -> Rows:
+    """How each image would be compared, and the tables of the settings file that say so."""
+    rows: Rows = [("image", "compared by", "from", "why")]
+    for pair in pairs:
+        how, parts = pair.how, ["skipped"]
+        if not how.skip:
+            parts = [how.method, *(f"{name}={value}" for name, value in how.options.items())]
+            variants = ", ".join(path.relative_to(pair.target.parent).as_posix() for path in pair.variants)
+            others = {"or": variants, "mask": how.mask, "variance": how.variance, "channels": written(how.channels)}
+            parts += [f"{name} {value}" for name, value in others.items() if value]
+            parts += [f"without {list(rectangle)}" for rectangle in how.ignore]
+        cells = pair.name, ", ".join(parts), ", ".join(how.entries) or "–", how.reason
+        rows.append(tuple(map(printable, cells)))
+    return rows
 
 
 def without_effect(results: Results) -> list[str]:
-    """A line for each set of `idiff`'s flags with some that are taken and do nothing."""
-    given = {result.how.idiff for result in results.results} - {None}
-    ignored = (idiff_flags.parse(flags or "").ignored for flags in sorted(given, key=str))
+    """A line for each set of `idiff`'s flags with some that have no effect here."""
+    texts = {result.how.idiff or "" for result in results.results}
+    ignored = (idiff_flags.parse(text).ignored for text in sorted(texts))
     return [f"idiff {' '.join(flags)}: no effect; --report OUT.html shows the difference" for flags in ignored if flags]
 
 
@@ -113,21 +155,28 @@ def why(result: Result) -> str:
     return result.reason + warned + (f" [{result.how.reason}]" if result.how.reason else "")
 
 
+def _warned(results: Results) -> list[Result]:
+    return [result for result in results.of(Status.EQUAL) if result.warning]
+
+
 def _word(result: Result) -> str:
     return str(result.category) if None in (result.reference, result.test) else str(result.status)
 
 
-def _method(result: Result) -> str:
-    return result.comparison.method if result.comparison else result.how.method
+def _method(result: Result, *, in_words: bool = False) -> str:
+    if result.comparison is None:
+        return result.how.method
+    return result.comparison.method_in_words if in_words else result.comparison.method
 
 
-def _method_in_words(result: Result) -> str:
-    return result.comparison.method_in_words if result.comparison else result.how.method
+# Files --------------------------------------------------------------------------------------------------------------
 
 
 def write_json(path: str | Path, results: Results) -> None:
     """Write `as_data` as strict JSON: NaN and the infinities become words. OSError."""
-    write_atomically(path, json.dumps(strict(as_data(results)), indent=1, allow_nan=False) + "\n")
+    data = as_data(results)
+    text = json.dumps(strict(data), indent=1, allow_nan=False)
+    write_atomically(path, text + "\n")
 
 
 def as_data(results: Results) -> dict[str, Any]:
@@ -146,7 +195,13 @@ def as_data(results: Results) -> dict[str, Any]:
 
 
 def _entry(results: Results, result: Result) -> dict[str, Any]:
-    found = result.comparison
+    found, how, digests = result.comparison, result.how, None
+    if result.digests is not None and result.status in FAILED:  # of what was compared; "" where there is no file
+        digests = {
+            "reference": result.digests[result.reference] if result.reference else "",
+            "test": result.digests[result.test] if result.test else "",
+            "variants": [result.digests[path] for path in result.variants],
+        }
     return {
         "name": result.name,
         "status": str(result.status),
@@ -157,17 +212,17 @@ def _entry(results: Results, result: Result) -> dict[str, Any]:
         "reference": result.reference,
         "test": result.test,
         "target": result.target,
-        "digests": _digests(result),
+        "digests": digests,
         "method": _method(result),
         "method_why": found.chosen if found else "",
-        "options": dict(result.how.options),
-        "idiff": result.how.idiff,
-        "channels": [list(pair) for pair in result.how.channels],
-        "variance": result.how.variance if result.how.reads_variance else "",
-        "mask": result.how.mask,
-        "ignore": [list(each) for each in result.how.ignore],
-        "why_so": result.how.reason,
-        "entries": list(result.how.entries),
+        "options": dict(how.options),
+        "idiff": how.idiff,
+        "channels": [list(pair) for pair in how.channels],
+        "variance": how.variance if how.reads_variance else "",
+        "mask": how.mask,
+        "ignore": [list(each) for each in how.ignore],
+        "why_so": how.reason,
+        "entries": list(how.entries),
         "matched": result.matched,
         "variants": list(result.variants),
         "metrics": [{"name": m.name, "value": m.value, "bound": m.bound} for m in (found.metrics if found else ())],
@@ -177,15 +232,6 @@ def _entry(results: Results, result: Result) -> dict[str, Any]:
     }
 
 
-def _digests(result: Result) -> dict[str, Any] | None:
-    """The SHA-256 of the files of an image that is not equal, as they were compared; "" where there is no file."""
-    if result.digests is None or result.status not in FAILED:
-        return None
-    sides = {"reference": result.reference, "test": result.test}
-    of = {role: result.digests[path] if path else "" for role, path in sides.items()}
-    return of | {"variants": [result.digests[path] for path in result.variants]}
-
-
 def write_junit(path: str | Path, results: Results) -> None:
     """One case for each image: "different" is a failure, "inconclusive" too unless it is to pass, no verdict an error.
 
@@ -193,24 +239,27 @@ def write_junit(path: str | Path, results: Results) -> None:
     """
     from mi_refract.report import junit
 
-    cases = [_case(results, result) for result in results.results]
+    cases = []
+    for result in results.results:
+        outcome: Literal["", "failure", "error", "skipped"]
+        outcome = "skipped" if result.status is Status.SKIPPED else _outcome(results, result)
+        details = [f"warning: {result.warning}"] if result.warning and not outcome else []
+        if outcome in ("failure", "error"):
+            for metric in result.comparison.metrics if result.comparison else ():
+                value, bound = compact(metric.value), ""
+                if metric.bound is not None:
+                    value, bound = distinguishable(metric.value, metric.bound)
+                details.append(f"{metric.name} {value}" + (f" (allowed {bound})" if bound else ""))
+            commands = {"reproduce": results.reproduce(result), "accept": results.accept(result)}
+            details += [f"{verb}: {line}" for verb, line in commands.items() if line]
+        kind = _word(result) if outcome in ("failure", "error") else ""
+        message = why(result) if outcome else ""
+        cases.append(junit.Case(_method(result), result.name, outcome, message, details, kind))
     junit.write_junit(path, "mi-refract diff", {str(results.test): cases})
 
 
-def _case(results: Results, result: Result) -> junit.Case:
-    from mi_refract.report import junit
-
-    kind = _kind(results, result)
-    if result.status is Status.SKIPPED:
-        return junit.Case(_method(result), result.name, "skipped", why(result))
-    if not kind:
-        warned = [f"warning: {result.warning}"] if result.warning else []
-        return junit.Case(_method(result), result.name, details=warned)
-    return junit.Case(_method(result), result.name, kind, why(result), _details(results, result), _word(result))
-
-
-def _kind(results: Results, result: Result) -> Literal["", "failure", "error"]:
-    """ "error", "failure", or "" for what does not fail the run."""
+def _outcome(results: Results, result: Result) -> Literal["", "failure", "error"]:
+    """Whether the image fails the run."""
     if result.status is Status.ERROR:
         return "error"
     passes = result.status in (Status.EQUAL, Status.SKIPPED) or (
@@ -219,41 +268,26 @@ def _kind(results: Results, result: Result) -> Literal["", "failure", "error"]:
     return "" if passes else "failure"
 
 
-def _details(results: Results, result: Result) -> list[str]:
-    metrics = [metric_text(metric) for metric in (result.comparison.metrics if result.comparison else ())]
-    commands = {"reproduce": results.reproduce(result), "accept": results.accept(result)}
-    return [*metrics, *(f"{verb}: {line}" for verb, line in commands.items() if line)]
-
-
-def metric_text(metric: Metric) -> str:
-    """ "largest change 0.12 (allowed 0.1)"."""
-    if metric.bound is None:
-        return f"{metric.name} {compact(metric.value)}"
-    value, bound = distinguishable(metric.value, metric.bound)
-    return f"{metric.name} {value} (allowed {bound})"
-
-
-# GitHub -----------------------------------------------------------------------------------------------------------
+# GitHub -------------------------------------------------------------------------------------------------------------
 
 
 def workflow_commands(results: Results) -> list[str]:
     """A workflow command for each image that is not equal, or has a warning."""
     lines = []
     for result in results.results:
-        if result.warning or result.status not in (Status.EQUAL, Status.SKIPPED):
-            level = "error" if _kind(results, result) else "warning"
-            file = _property(result.test or result.reference or result.name)
-            title = _property(f"{result.name}: {_word(result)}")
-            lines.append(f"::{level} file={file},title={title}::{_message(why(result))}")
+        if result.warning or result.status in FAILED:
+            level = "error" if _outcome(results, result) else "warning"
+            properties = {
+                "file": result.test or result.reference or result.name,
+                "title": f"{result.name}: {_word(result)}",
+            }
+            escaped = {k: _message(v).replace(":", "%3A").replace(",", "%2C") for k, v in properties.items()}
+            lines.append(f"::{level} file={escaped['file']},title={escaped['title']}::{_message(why(result))}")
     return lines
 
 
-def _message(text: Any) -> str:
+def _message(text: object) -> str:
     return printable(text).replace("%", "%25")
-
-
-def _property(text: Any) -> str:
-    return _message(text).replace(":", "%3A").replace(",", "%2C")
 
 
 @dataclass(frozen=True)
@@ -278,39 +312,38 @@ def append_summary(results: Results, pages: Pages | None = None) -> None:
 def markdown(results: Results, pages: Pages | None = None) -> str:
     """A heading with the sentence, where the report is, and a table of what is not equal or has a warning."""
     failed = [*results.of(*FAILED), *_warned(results)]
-    lines = [f"### mi-refract diff: {sentence(results)}", "", *(_where(pages) if pages else [])]
-    paged = pages is not None and any(map(pages.page, failed[:1]))
+    lines = [f"### mi-refract diff: {sentence(results)}", "", *([_where(pages), ""] if pages else [])]
+    columns = ["verdict", "image", "method", "why"]
+    if pages and any(map(pages.page, failed[:1])):
+        columns.append("page")
     if failed:
-        lines += ["| verdict | image | method | why |" + " page |" * paged, "|---|---|---|---|" + "---|" * paged]
+        lines += [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
     for result in failed[:SUMMARY_ROWS]:
-        cells = [_literal(cell) for cell in (_word(result), result.name, _method_in_words(result), why(result))]
-        cells += [_linked(pages, pages.page(result))] if pages and paged else []
+        words = (_word(result), result.name, _method(result, in_words=True), why(result))
+        cells = [_literal(word) for word in words]
+        if pages and "page" in columns:
+            page = pages.page(result)
+            cells.append(_link(page, pages.url + page if pages.url.endswith("/") else ""))
         lines.append(f"| {' | '.join(cells)} |")
     if len(failed) > SUMMARY_ROWS:
         lines += ["", f"… and {len(failed) - SUMMARY_ROWS} more"]
     return "\n".join(lines) + "\n\n"
 
 
-def _where(pages: Pages) -> list[str]:
+def _where(pages: Pages) -> str:
     """Where a reader finds the report: no summary can show an image of an artefact, nor link into one."""
     if pages.url:
-        first = "index.html" if pages.url.endswith("/") else ""
-        return [f"Report: [{_literal(pages.name)}]({_address(pages.url + first)})", ""]
+        return "Report: " + _link(pages.name, pages.url + ("index.html" if pages.url.endswith("/") else ""))
     run = [os.environ.get(f"GITHUB_{name}", "") for name in ("SERVER_URL", "REPOSITORY", "RUN_ID")]
     if not all(run):
-        return [f"Report: {_literal(pages.name)}", ""]
-    artefacts = _address(f"{run[0]}/{run[1]}/actions/runs/{run[2]}#artifacts")
-    return [f"Report: {_literal(pages.name)}, where it is uploaded among the [artefacts of this run]({artefacts})", ""]
+        return f"Report: {_literal(pages.name)}"
+    link = _link("artefacts of this run", f"{run[0]}/{run[1]}/actions/runs/{run[2]}#artifacts")
+    return f"Report: {_literal(pages.name)}, where it is uploaded among the {link}"
 
 
-def _linked(pages: Pages, page: str) -> str:
-    url = pages.url + page if pages.url.endswith("/") else ""
-    return f"[{_literal(page)}]({_address(url)})" if url else _literal(page)
-
-
-def _address(url: str) -> str:
-    """A URL that ends where the link does."""
-    return quote(printable(url), safe=":/?#&=%@+,;~$!*[]-._")
+def _link(text: str, url: str) -> str:
+    """The text with a link to a URL, which is escaped so that it ends where the link does; without one the text."""
+    return f"[{_literal(text)}]({quote(printable(url), safe=':/?#&=%@+,;~$!*[]-._')})" if url else _literal(text)
 
 
 def _literal(text: str) -> str:

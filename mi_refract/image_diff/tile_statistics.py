@@ -1,9 +1,10 @@
-"""Welch's t-test on the tiles of two sets of independent renders, from single tiles up to the whole image.
+"""Welch's t-test on the tiles of two images with known noise, from single tiles up to the whole image.
 
-Per tile and channel the means m₁, m₂ are compared by t = (m₁ − m₂)/√(v₁ + v₂). The variance v of a tile's mean is the
-sum of its pixels' variances over the renders, and its degrees of freedom follow Satterthwaite: a tile of 16² pixels
-knows its noise much better than the few renders do. (Welch 1947; Satterthwaite 1946; for renderers Jung, Hanika and
-Dachsbacher, "Detecting Bias in Monte Carlo Renderers using Welch's t-test", JCGT 2020.)
+Per tile and channel the means m₁, m₂ are compared by t = (m₁ − m₂)/√(v₁ + v₂), with v = s²/n for n samples of variance
+s². The variance v of a tile's mean is the sum of its pixels' variances, divided by their number squared. Its degrees of
+freedom follow Satterthwaite, f = v²/Σ(vᵢ²/fᵢ) over all pixels of both sides: a tile of 16² pixels knows its noise much
+better than the few renders do. (Welch, "The generalization of Student's problem", Biometrika 1947; Satterthwaite 1946;
+for renderers Jung, Hanika and Dachsbacher, "Detecting Bias in Monte Carlo Renderers using Welch's t-test", JCGT 2020.)
 
 Where one side has fewer samples than the other, n₂ < n₁, and light is rare, it may have none of that light in a tile,
 and a variance near 0. Equal images have the same variance σ² of a sample, so the estimates s₁², s₂² may be exchanged:
@@ -19,6 +20,7 @@ the variance of m₁ − m₂ is the larger of s₁²/n₁ + s₂²/n₂ and s�
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -28,7 +30,7 @@ from numpy.typing import NDArray
 from mi_refract.io.pixels import Pixels as Array
 from mi_refract.io.pixels import block_area, block_sum
 
-from .pixel_statistics import PixelSums
+from .pixel_statistics import Inflation, PixelSums, sums
 
 DARK = 1e-3  # a tile darker than this share of its channel's `median_nonblack` counts as that bright in ratios
 GROWTH = 4  # from one level of tiles to the next
@@ -46,24 +48,14 @@ CORRECTIONS = ("sidak", "holm")
 Flags = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, order=True)
-class Inflation:
-    """By how much tile means vary more than with independent pixels, at least 1: those of a wide filter correlate.
-
-    `freedom`: degrees of freedom of that estimate. Few tiles make it a guess, which t-tests have to know.
-    """
-
-    factor: float = 1.0
-    freedom: float = np.inf
-
-
 @dataclass(frozen=True)
 class Side:
-    """Totals per tile and channel: `mean`, `variance` of the means and its square, over pixels; `renders` one by one.
+    """One side of a comparison: totals per tile and channel, tiles × tiles × C, over the pixels of a tile.
 
-    `freedom`: degrees of freedom of a pixel's variance. `count`: samples behind a pixel, in the unit of the other side;
-    of all channels or of each. Without `renders` pixels are taken for independent. `correlated`: its `inflation`, where
-    that is known without `renders`.
+    `mean`: of the pixels; `variance`, `squares`: of the variances of these means, and of their squares. `freedom`:
+    degrees of freedom of a pixel's variance. `count`: samples of a pixel, in the unit of the other side; of all
+    channels or of each. `renders`: totals of each render; without them pixels are taken for independent, or to vary
+    together by `correlated`.
     """
 
     area: Array
@@ -84,14 +76,14 @@ class Side:
         return replace(self, area=area, mean=mean, variance=variance, squares=squares, renders=renders)
 
     def spread(self, inflation: Inflation) -> tuple[Array, Array]:
-        """The variance of the tile means, and its square over its degrees of freedom, summed over pixels."""
+        """The variance v of the tile means, and v²/f for its degrees of freedom f (Satterthwaite 1946)."""
         variance = self.variance * inflation.factor / self.area**2
         freedom = self.freedom / inflation.factor  # correlated pixels are fewer
         squares = self.squares * inflation.factor**2 / self.area**4 / freedom
         return variance, squares + variance**2 / inflation.freedom
 
     def inflation(self, margin: float = 0.0) -> Inflation:
-        """The inflation of all tiles of the image; 1 where it is not known, or without noise.
+        """How much more the tile means vary between renders than independent pixels would; `correlated` without them.
 
         `margin`: the equivalence margin. Where noise is below UNSEEN of it, as that of a plain sky, it may be the
         rounding of a sum, the same in all pixels of a render. Such a tile differs beyond the margin by 1000 σ of
@@ -106,33 +98,6 @@ class Side:
         return Inflation(max(1.0, float((between / self.variance[noisy]).mean())), freedom)
 
 
-def from_renders(renders: Sequence[Array], tile: int, count: float = 0.0) -> Side:
-    """One side from independent renders, each H × W × C; needs memory for a row of tiles only.
-
-    `count`: samples per pixel of all of them, if the other side's are known, too; 0: as many as there are renders.
-    """
-    height, width = renders[0].shape[:2]
-    columns = np.arange(0, width, tile)
-
-    def band(top: int) -> tuple[Array, Array]:
-        rows = np.empty((len(renders), *renders[0][top : top + tile].shape))
-        for row, render in zip(rows, renders, strict=True):
-            row[...] = render[top : top + tile]
-        each = np.add.reduceat(rows.sum(1), columns, -2)
-        with np.errstate(invalid="ignore"):
-            rows -= rows.mean(0)
-        variance = np.einsum("n...,n...->...", rows, rows) / (len(rows) * (len(rows) - 1))
-        noise = np.stack([variance.sum(0), np.einsum("y...,y...->...", variance, variance)])
-        return each, np.add.reduceat(noise, columns, -2)
-
-    from concurrent.futures import ThreadPoolExecutor
-
-    with ThreadPoolExecutor(WORKERS) as pool:
-        each, noise = (np.stack(x, -3) for x in zip(*pool.map(band, range(0, height, tile)), strict=True))
-    area, freedom = block_area(height, width, tile), len(renders) - 1.0
-    return Side(area, each.mean(0), noise[0], noise[1], freedom, count or len(renders), each)
-
-
 def from_variances(mean: Array, variance: Array, freedom: float, tile: int, count: Array | float = 1.0) -> Side:
     """One side from an image and the variance of its pixels, both H × W × C; `freedom`: of that variance.
 
@@ -144,13 +109,119 @@ def from_variances(mean: Array, variance: Array, freedom: float, tile: int, coun
 
 
 @dataclass(frozen=True)
+class OneSided:
+    """What the pixels show where the noise of one side alone is known.
+
+    `brighter`: d of `pixel_statistics` at every pixel, H × W × C; 0 in channels whose noise both sides know.
+    `exponent`: g of that module. `well_known`: the channels whose noise is known from so many samples that it holds the
+    rare light of the other side. `correlated`: how much more tile means vary than those of independent pixels.
+    """
+
+    brighter: Array
+    exponent: Array
+    well_known: Flags
+    correlated: Inflation
+
+    def p(self, level: Level, area: Array, tile: int) -> Array:
+        """Of no difference beyond the margin; 0 where the other side is not brighter.
+
+        Where the noise is well known, a pixel may move the mean of a tile by SINGLE of its standard error at most: what
+        bright pixels add beyond that may be rare light. If an event moves the mean by more than that, equal images have
+        λ < 1/SINGLE² = 11 of them in a tile. So clipped, k of them are SINGLE k − √λ < (k − λ)/√λ σ.
+        Elsewhere the pixels alone say how large the noise is.
+        """
+        from scipy import special
+
+        height, width = self.brighter.shape[:2]
+        most = (SINGLE * level.error * area).repeat(tile, 0)[:height].repeat(tile, 1)[:, :width]
+        clipped = block_sum(np.minimum(self.brighter, most), tile)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (clipped / area - level.allowed) / level.error
+        total, squares = (block_sum(x, tile)[None] for x in (self.brighter, np.square(self.brighter)))
+        by_pixels = PixelSums(total, squares, self.exponent).p(area, level.allowed, self.correlated)
+        p = np.where(self.well_known, special.stdtr(level.freedom, -t), by_pixels)
+        return np.where(total[0] > 0, np.nan_to_num(2 * p, nan=0.0), 0.0)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Both sides in tiles of side `tile`; `pixels`: the sums over their pixels, None where these are not tested.
+
+    `one_sided`: where the noise of one side alone is known. `odds`: of `with_silent_pixels`.
+    """
+
+    tile: int
+    one: Side
+    two: Side
+    pixels: PixelSums | None = None
+    one_sided: OneSided | None = None
+    odds: Array | float = 7.0
+
+    def levels(self, margin: float) -> Iterator[Level]:
+        """The tests of single tiles, then of blocks GROWTH times as wide, and so on to the whole image.
+
+        `margin`: the equivalence margin. The correlation of pixels is estimated from all tiles, and again from blocks
+        where there are many: those show it over larger distances.
+        """
+        tile, one, two, pixels = self.tile, self.one, self.two, self.pixels
+        inflations = one.inflation(margin), two.inflation(margin)
+        while True:
+            level = compare_tiles(one, two, margin, inflations)
+            if pixels:
+                p = pixels.p(one.area, np.square(level.allowed), max(inflations))
+                level = replace(level, of_pixels=np.where(level.silent, 1.0, np.nan_to_num(p, nan=0.0)))
+            if self.one_sided:
+                level = replace(level, shown=self.one_sided.p(level, one.area, tile))
+            yield level
+            if one.area.size == 1:
+                return
+            tile, one, two, pixels = GROWTH * tile, one.coarser(), two.coarser(), pixels and pixels.coarser(GROWTH)
+            if one.area.size >= POOLED:
+                inflations = max(inflations[0], one.inflation(margin)), max(inflations[1], two.inflation(margin))
+
+
+def from_renders(
+    reference: Sequence[Array], test: Sequence[Array], tile: int, counts: tuple[float, float] | None = None
+) -> Evidence:
+    """Two sets of independent renders, each H × W × C, at least 2 a side; needs memory for rows of tiles only.
+
+    `counts`: samples per pixel of all renders of each side; None: as many as there are renders.
+    """
+    sides = reference, test
+    counts = counts or (len(reference), len(test))
+
+    def band(top: int) -> tuple[list[tuple[Array, Array, Array]], PixelSums]:
+        """Of a row of tiles: totals of the renders, of their mean's variances and of the squares; the sums of u."""
+        rows = [np.array([render[top : top + tile] for render in side], np.float64) for side in sides]
+        with np.errstate(invalid="ignore", over="ignore"):
+            variances = [x.var(0, ddof=1) / len(x) for x in rows]
+            pixels = sums(rows[0].mean(0), variances[0], rows[1].mean(0), variances[1], tile, counts[0] / counts[1])
+            totals = [
+                (block_sum(x, tile), block_sum(v, tile), block_sum(v * v, tile))
+                for x, v in zip(rows, variances, strict=True)
+            ]
+        return totals, pixels
+
+    with ThreadPoolExecutor(WORKERS) as pool:
+        totals, pixels = zip(*pool.map(band, range(0, len(reference[0]), tile)), strict=True)
+    area = block_area(reference[0].shape[0], reference[0].shape[1], tile)
+    one, two = (
+        Side(area, renders.mean(0), variance, squares, len(renders) - 1.0, count, renders)
+        for of_side, count in zip(zip(*totals, strict=True), counts, strict=True)
+        for renders, variance, squares in [[np.concatenate(x, -3) for x in zip(*of_side, strict=True)]]
+    )
+    total, squares = (np.concatenate([getattr(x, name) for x in pixels], -3) for name in ("total", "squares"))
+    return Evidence(tile, one, two, PixelSums(total, squares))
+
+
+@dataclass(frozen=True)
 class Level:
-    """One level of tiles; every array is tiles × tiles × C.
+    """The tests of one level of tiles; every array is tiles × tiles × C.
 
     `t`: positive where the test is brighter. `p`: of no difference; `beyond`: of none beyond the margin; both 0 where a
     value is not finite. `silent`: no noise on either side, of which a t-test knows nothing: p is 1 there, and `off`
     where the means differ beyond the margin. `heavy`: noise from a few pixels only. `shown`: p of none beyond the
-    margin by the noise that the pixels show; 0 where that is not asked. `of_pixels`: p of no pixel beyond the margin;
+    margin by the noise that the pixels show; 0 where that is not tested. `of_pixels`: p of no pixel beyond the margin;
     `of_silent`: the same of tiles without noise; None where that is not tested.
     """
 
@@ -170,7 +241,7 @@ class Level:
 
     @property
     def lit(self) -> Flags:
-        """The tiles and channels with light; darker ones are not asked for relative differences."""
+        """The tiles and channels with light; for darker ones relative differences mean nothing."""
         return self.mean > DARK * median_nonblack(self.mean)
 
     def detectable(self, threshold: float) -> Array:
@@ -185,96 +256,41 @@ class Level:
         """By how much the differences that are seen exceed the margin; NaN without light or noise."""
         from scipy import special
 
-        asked = ~self.silent & self.lit
-        freedom = self.freedom[asked]
-        found = np.full(self.mean.shape, np.nan)
-        found[asked] = -special.stdtrit(freedom, threshold / 2) - special.stdtrit(freedom, MISSED)
-        return found * self.error
-
-
-@dataclass(frozen=True)
-class OneSided:
-    """What the pixels show where the noise of one side alone is known: d of `pixel_statistics`, 0 in other channels.
-
-    `sums`: of d, over tiles of side `tile`. `brighter`: d of every pixel, H × W × C. `well_known`: the channels whose
-    noise is known from so many samples that it holds the rare light of the other side. `correlated`: the `Inflation` of
-    tile means.
-    """
-
-    sums: PixelSums
-    tile: int
-    brighter: Array
-    well_known: Flags
-    correlated: Inflation
-
-    def coarser(self) -> OneSided:
-        """The same in tiles GROWTH times as wide."""
-        return replace(self, sums=self.sums.coarser(GROWTH), tile=GROWTH * self.tile)
-
-    def p(self, area: Array, level: Level) -> Array:
-        """Of no difference beyond the margin; 0 where the other side is not brighter.
-
-        Where the noise is well known, a pixel may move the mean of a tile by SINGLE of its standard error at most: what
-        bright pixels add beyond that may be rare light. If an event moves the mean by more than that, equal images have
-        λ < 1/SINGLE² = 11 of them in a tile. So clipped, k of them are SINGLE k − √λ < (k − λ)/√λ σ.
-        Elsewhere the pixels alone say how large the noise is.
-        """
-        from scipy import special
-
-        most = (SINGLE * level.error * area).repeat(self.tile, 0).repeat(self.tile, 1)
-        height, width = self.brighter.shape[:2]
-        clipped = block_sum(np.minimum(self.brighter, most[:height, :width]), self.tile)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = (clipped / area - level.allowed) / level.error
-        p = special.stdtr(level.freedom, -t)
-        by_pixels = self.sums.p(area, level.allowed, self.correlated.factor, self.correlated.freedom)
-        asked = self.sums.total[0] > 0
-        return np.where(asked, np.nan_to_num(2 * np.where(self.well_known, p, by_pixels), nan=0.0), 0.0)
-
-
-def levels(
-    reference: Side,
-    test: Side,
-    equivalence_margin: float,
-    pixels: PixelSums | None = None,
-    shown: OneSided | None = None,
-) -> Iterator[Level]:
-    """The test of single tiles, then of blocks GROWTH times as wide, and so on to the whole image."""
-    inflations = reference.inflation(equivalence_margin), test.inflation(equivalence_margin)
-    while True:
-        level = compare_tiles(reference, test, equivalence_margin, inflations)
-        level = level if shown is None else replace(level, shown=shown.p(reference.area, level))
-        yield level if pixels is None else _with_pixels(level, pixels, reference.area, max(inflations))
-        if reference.area.size == 1:
-            return
-        reference, test = reference.coarser(), test.coarser()
-        pixels = pixels and pixels.coarser(GROWTH)
-        shown = shown and shown.coarser()
-        if reference.area.size >= POOLED:
-            coarse = reference.inflation(equivalence_margin), test.inflation(equivalence_margin)
-            inflations = max(inflations[0], coarse[0]), max(inflations[1], coarse[1])
+        noisy = ~self.silent & self.lit
+        freedom = self.freedom[noisy]
+        quantiles = np.full(self.mean.shape, np.nan)
+        quantiles[noisy] = -special.stdtrit(freedom, threshold / 2) - special.stdtrit(freedom, MISSED)
+        return quantiles * self.error
 
 
 def compare_tiles(
-    one: Side,
-    two: Side,
-    equivalence_margin: float,
-    inflations: tuple[Inflation, Inflation] = (Inflation(), Inflation()),
+    one: Side, two: Side, margin: float, inflations: tuple[Inflation, Inflation] = (Inflation(), Inflation())
 ) -> Level:
-    """Welch's t-test of every tile; differences up to `equivalence_margin` × the tile's mean count as none.
+    """Welch's t-test of every tile; differences up to `margin` × the tile's mean count as none.
 
     That mean is the one of the side with more samples.
     """
     from scipy import special
 
+    def noise(ratio: Array | float) -> tuple[Array, Array, Flags]:
+        """The variance v of m₁ − m₂, v²/f, and whether v comes from few pixels.
+
+        `ratio`: 1 for s₁²/n₁ + s₂²/n₂, n₁/n₂ for s₁²/n₂ + s₂²/n₁.
+        """
+        (v1, d1), (v2, d2) = one.spread(inflations[0]), two.spread(inflations[1])
+        pixels = HEAVY * max(inflations).factor  # that share samples
+        squares = ratio**2 * one.squares + two.squares / ratio**2
+        few = (ratio * one.variance + two.variance / ratio) ** 2 < pixels * squares
+        return ratio * v1 + v2 / ratio, ratio**2 * d1 + d2 / ratio**2, few
+
     with np.errstate(divide="ignore", invalid="ignore"):
         m1, m2 = one.mean / one.area, two.mean / two.area
         ratio = one.count / two.count
-        own, exchanged = (_noise(one, two, inflations, each) for each in (1.0, ratio))
+        own, exchanged = noise(1.0), noise(ratio)
         larger = exchanged[0] > own[0]
         variance, squares, few = (np.where(larger, y, x) for x, y in zip(own, exchanged, strict=True))
         mean = np.abs(np.where(ratio >= 1, m1, m2))
-        allowed = equivalence_margin * np.maximum(mean, DARK * median_nonblack(mean))
+        allowed = margin * np.maximum(mean, DARK * median_nonblack(mean))
         silent, error, difference = variance == 0, np.sqrt(variance), m2 - m1
         freedom = np.where(silent, 1.0, variance**2 / squares)
         t = np.where(silent, 0.0, difference / error)
@@ -283,26 +299,6 @@ def compare_tiles(
     # NaN becomes 0: what is not finite equals nothing.
     p, p_beyond = (np.nan_to_num(2 * special.stdtr(freedom, -np.abs(x)), nan=0.0) for x in (t, beyond))
     return Level(t, p, p_beyond, silent, off, few & ~silent, mean, allowed, error, freedom)
-
-
-def _noise(
-    one: Side, two: Side, inflations: tuple[Inflation, Inflation], ratio: Array | float
-) -> tuple[Array, Array, Flags]:
-    """The variance of m₁ − m₂, s₁²/n₂ + s₂²/n₁ where `ratio` is n₁/n₂, s₁²/n₁ + s₂²/n₂ where it is 1.
-
-    Its square over its degrees of freedom; and whether it comes from few pixels.
-    """
-    (v1, d1), (v2, d2) = one.spread(inflations[0]), two.spread(inflations[1])
-    pixels = HEAVY * max(inflations).factor  # that share samples
-    few = (ratio * one.variance + two.variance / ratio) ** 2 < pixels * (
-        ratio**2 * one.squares + two.squares / ratio**2
-    )
-    return ratio * v1 + v2 / ratio, ratio**2 * d1 + d2 / ratio**2, few
-
-
-def _with_pixels(level: Level, pixels: PixelSums, area: Array, inflation: Inflation) -> Level:
-    p = pixels.p(area, np.square(level.allowed), inflation.factor, inflation.freedom)
-    return replace(level, of_pixels=np.where(level.silent, 1.0, np.nan_to_num(p, nan=0.0)))
 
 
 def with_silent_pixels(level: Level, a: Array, b: Array, margin: float, tile: int, odds: Array | float = 7.0) -> Level:
@@ -322,8 +318,7 @@ def with_silent_pixels(level: Level, a: Array, b: Array, margin: float, tile: in
     allowed = margin * np.maximum(np.abs(a), DARK * median_nonblack(np.abs(a)))
     moved = block_sum(difference > allowed, tile) > 0
     far = block_sum((difference > FAR * allowed).astype(np.float64), tile)
-    p = np.where(level.silent, odds**-far, 1.0)
-    return replace(level, off=level.off | (level.silent & moved), of_silent=p)
+    return replace(level, off=level.off | (level.silent & moved), of_silent=np.where(level.silent, odds**-far, 1.0))
 
 
 def median_nonblack(sizes: Array) -> Array:
@@ -333,26 +328,24 @@ def median_nonblack(sizes: Array) -> Array:
     return np.array([np.median(x[x > 0].astype(np.float64)) if (x > 0).any() else 0.0 for x in channels])
 
 
+# All tests of an image -----------------------------------------------------------------------------------------
+
+
 def sidak(family_error: float, count: int) -> float:
-    """The p below which one of `count` independent tests is an alarm (Šidák 1967): 1 − (1 − family_error)^(1/count)."""
+    """The p at which one of `count` independent tests is an alarm (Šidák 1967): 1 − (1 − family_error)^(1/count)."""
     return float(-np.expm1(np.log1p(-family_error) / max(count, 1)))
 
 
-def adjusted(p: Array) -> float:
-    """The smallest p after Šidák's correction; 1 where there are no tests."""
-    return float(-np.expm1(p.size * np.log1p(-min(float(p.min()), 1 - 1e-16)))) if p.size else 1.0
+def holm(family_error: float, p: Array) -> float:
+    """The p at which a test is an alarm by Holm's step-down (1979): its first step, or the last one rejected.
 
-
-def holm(p: Array, family_error: float) -> float:
-    """The p below which a test is an alarm by Holm's step-down (1979): its first step, or the last one rejected."""
+    Of the N tests, sorted by p, the i-th is rejected where it and all before have p ≤ family_error/(N + 1 − i).
+    """
     first = family_error / max(p.size, 1)
     ordered = np.sort(p, axis=None)
     kept = np.flatnonzero(ordered > family_error / np.arange(ordered.size, 0, -1))
     rejected = ordered[: kept[0]] if kept.size else ordered
     return max(first, float(rejected[-1])) if rejected.size else first
-
-
-# All tests of an image -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -366,27 +359,33 @@ class TileTests:
     @cached_property
     def p(self) -> Array:
         """The p of every test, in one dimension: of tiles with noise, of their pixels, and of tiles without noise."""
-        found = [level.beyond[~level.silent] for level in self.levels]
-        found += [level.of_pixels[~level.silent] for level in self.levels if level.of_pixels is not None]
-        found += [level.of_silent[level.silent] for level in self.levels if level.of_silent is not None]
-        return np.concatenate(found)
+        of_tiles = [level.beyond[~level.silent] for level in self.levels]
+        of_pixels = [level.of_pixels[~level.silent] for level in self.levels if level.of_pixels is not None]
+        of_silent = [level.of_silent[level.silent] for level in self.levels if level.of_silent is not None]
+        return np.concatenate([*of_tiles, *of_pixels, *of_silent])
 
     @cached_property
     def threshold(self) -> float:
         """The p at or below which a test is an alarm."""
         if self.correction == "holm":
-            return holm(self.p, self.family_error)
+            return holm(self.family_error, self.p)
         return sidak(self.family_error, self.p.size)
+
+    def _doubtful(self, level: Level) -> Flags:
+        return level.heavy | (level.shown > self.threshold)
+
+    def _alarms(self, level: Level) -> Flags:
+        return (level.beyond <= self.threshold) & ~level.silent
 
     @property
     def differing(self) -> int:
         """The number of tests of tiles that are alarms; heavy-tailed tiles are not among them."""
-        return sum(int((self._seen(level) & ~self._doubtful(level)).sum()) for level in self.levels)
+        return sum(int((self._alarms(level) & ~self._doubtful(level)).sum()) for level in self.levels)
 
     @property
     def heavy_differing(self) -> int:
         """The number of tests of heavy-tailed tiles that would be alarms."""
-        return sum(int((self._seen(level) & self._doubtful(level)).sum()) for level in self.levels)
+        return sum(int((self._alarms(level) & self._doubtful(level)).sum()) for level in self.levels)
 
     @property
     def pixels_differing(self) -> int:
@@ -410,13 +409,13 @@ class TileTests:
 
     @property
     def smallest_p(self) -> float:
-        """The smallest p after Šidák's correction."""
-        return adjusted(self.p)
+        """The smallest p after Šidák's correction, 1 − (1 − p)^N; 1 where there are no tests."""
+        return float(-np.expm1(self.p.size * np.log1p(-min(self.p.min(), 1 - 1e-16)))) if self.p.size else 1.0
 
     def minimum_detectable(self, level: int = 0) -> float:
         """The smallest relative difference that is seen in the median tile of a level; NaN where none has noise."""
-        found = self.levels[level].detectable(self.threshold)
-        return float(np.nanmedian(found)) if np.isfinite(found).any() else np.nan
+        detectable = self.levels[level].detectable(self.threshold)
+        return float(np.nanmedian(detectable)) if np.isfinite(detectable).any() else np.nan
 
     def hidden_share(self, resolution: float) -> float:
         """The share of the tiles with light whose noise hides a difference of `resolution`, in the worst channel."""
@@ -442,27 +441,22 @@ class TileTests:
             return np.nan
         return float(np.nanmin([1.0, np.nanmedian(enough), *enough[min(allowed, len(enough) - 1)]]))
 
-    def _seen(self, level: Level) -> Flags:
-        return (level.beyond <= self.threshold) & ~level.silent
 
-    def _doubtful(self, level: Level) -> Flags:
-        return level.heavy | (level.shown > self.threshold)
+# Stacks of renders ---------------------------------------------------------------------------------------------
 
 
-def compare_stacks(
-    reference: Array, test: Array, tile: int, family_error: float, equivalence_margin: float = 0.0
-) -> TileTests:
+def compare_stacks(reference: Array, test: Array, tile: int, family_error: float, margin: float = 0.0) -> TileTests:
     """Welch's test of single tiles of two stacks of independent renders, each renders × H × W × C.
 
     Pixels are taken for independent, as under a box filter. A tile with a value that is not finite is an alarm.
-    `equivalence_margin` is relative to the tile's mean, or to a thousandth of the channel's; above 0 it keeps tiles
-    without noise from differing by their last bits. ValueError for fewer than 2 renders a side, or another shape.
+    `margin`: the equivalence margin, relative to the tile's mean, or to a thousandth of the channel's; above 0 it keeps
+    tiles without noise from differing by their last bits. ValueError for fewer than 2 renders a side, another shape.
     """
     same_shape(reference[0], test[0])
     if min(len(reference), len(test)) < 2:
-        raise ValueError(f"welch: {len(reference)} and {len(test)} renders: at least 2 a side are needed")
-    one, two = (from_renders(list(side), tile) for side in (reference, test))
-    return TileTests([compare_tiles(one, two, equivalence_margin)], family_error)
+        raise ValueError(f"welch: {len(reference)} and {len(test)} renders; expected at least 2 a side")
+    evidence = from_renders(list(reference), list(test), tile)
+    return TileTests([compare_tiles(evidence.one, evidence.two, margin)], family_error)
 
 
 def relative_mse(image: Array, references: Array, epsilon: float = 0.01) -> float:

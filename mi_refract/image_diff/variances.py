@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from mi_refract.io import image_file
 from mi_refract.io.image_file import MAX_VALUES, Image
 from mi_refract.io.pixels import Pixels
-from mi_refract.io.toml_schema import shown
 
 from .channels import ROUNDED, XYZ, matched, means, selected, spreads
-from .pixel_correlation import RADIUS
+from .pixel_statistics import RADIUS
 
 # m2 − m² below 0 by its rounding, in half floats 2⁻¹¹ of m2 and twice that of m²: no error. In Mitsuba's test data
 # 0.0022 is the most as X, Y, Z; as R, G, B 100 of its 111 files of colour are further below.
@@ -75,22 +74,22 @@ def with_file(image: Image, path: Path, most: int = MAX_VALUES) -> Image:
     before those of the image's. OSError for a file that cannot be read; ValueError for one of another size, for one
     that has none of the channels, and for degrees of freedom that are none.
     """
-    found = image_file.read(path, most)
-    if found.pixels.shape[:2] != image.pixels.shape[:2]:
-        (height, width), wrong = image.pixels.shape[:2], found.pixels.shape[:2]
+    file = image_file.read(path, most)
+    if file.pixels.shape[:2] != image.pixels.shape[:2]:
+        (height, width), wrong = image.pixels.shape[:2], file.pixels.shape[:2]
         raise ValueError(f"{path}: {wrong[1]} × {wrong[0]}; expected a variance of {width} × {height}")
-    if FREEDOM in found.metadata:
-        said = {FREEDOM: _freedom(found), **{name: found.metadata.get(name, "") for name in (FILTER, AREA)}}
+    if FREEDOM in file.metadata:
+        said = {FREEDOM: _freedom(file), **{name: file.metadata.get(name, "") for name in (FILTER, AREA)}}
         image = replace(image, metadata=image.metadata | said)
-    if len(found.channels) == len(image.channels) == 1:
-        return replace(image, variances={image.channels[0]: found.pixels[..., 0]})
-    both = [name for name in found.channels if name in image.channels]
-    colours = list(XYZ) if set(XYZ) <= set(found.channels) and not set(XYZ) & set(image.channels) else []
-    if not both + colours:
-        has, needed = ", ".join(found.channels), ", ".join(image.channels)
+    if len(file.channels) == len(image.channels) == 1:
+        return replace(image, variances={image.channels[0]: file.pixels[..., 0]})
+    names = [name for name in file.channels if name in image.channels]
+    if set(XYZ) <= set(file.channels) and not set(XYZ) & set(image.channels):
+        names += XYZ
+    if not names:
+        has, needed = ", ".join(file.channels), ", ".join(image.channels)
         raise ValueError(f"{path}: variances of {has}; expected of channels of {image.path}, {needed}")
-    variances = {name: found.pixels[..., found.channels.index(name)] for name in both + colours}
-    return replace(image, variances=variances)
+    return replace(image, variances={name: file.select([name])[..., 0] for name in names})
 
 
 # Estimates ----------------------------------------------------------------------------------------------------------
@@ -109,63 +108,66 @@ def untested(reference: Image, test: Image) -> list[Image]:
     """Both images with those channels alone whose variance neither side knows; none where there are none."""
     sides = matched(reference, test)
     known = {name for image in sides for name in (*image.variances, *spreads(image.channels))}
-    alphas = [name for name in means(sides[0].channels) if all(_is_alpha(image, name) for image in sides)]
-    names = [name for name in means(sides[0].channels) if name not in (*known, *alphas)]
+    unknown = [name for name in means(sides[0].channels) if name not in known]
+    names = [name for name in unknown if not all(_is_alpha(image, name) for image in sides)]
     return [selected(image, {name: name for name in names}) for image in sides] if names else []
 
 
-def _estimate(image: Image, side: str, given: int, allow_nonfinite: bool) -> Estimate:
-    names, pairs, spp = means(image.channels), spreads(image.channels), samples(image, side, given)
+def _estimate(image: Image, side: str, spp: int, allow_nonfinite: bool) -> Estimate:
+    names, pairs, spp = means(image.channels), spreads(image.channels), samples(image, side, spp)
     mean = image.select(names).astype(np.float64)
     variance = np.full(mean.shape, np.nan)
     for i, name in enumerate(names):
         if name in image.variances:
-            variance[..., i] = _not_negative(image, name)
+            of_file = _not_negative(image, name)
+            variance[..., i] = _finite(image, name, mean[..., i], of_file, allow_nonfinite)
         elif name in pairs:
             spread, moment = pairs[name]
-            found = image.select([spread])[..., 0].astype(np.float64)
-            with np.errstate(invalid="ignore", over="ignore"):
-                found = (found - mean[..., i] ** 2) * spp / (spp - 1) if moment else found
-            variance[..., i] = np.maximum(found, 0)
-        else:
-            continue
-        variance[..., i] = _finite(image, name, mean[..., i], variance[..., i], allow_nonfinite)
-    for i, name in enumerate(names):
-        if name not in (*image.variances, *pairs) and _is_alpha(image, name):
+            of_channel = image.select([spread])[..., 0].astype(np.float64)
+            if moment:  # E x² − (E x)², without bias
+                with np.errstate(invalid="ignore", over="ignore"):
+                    of_channel = (of_channel - mean[..., i] ** 2) * spp / (spp - 1)
+            variance[..., i] = _finite(image, name, mean[..., i], np.maximum(of_channel, 0), allow_nonfinite)
+        elif _is_alpha(image, name):
             # Bhatia and Davis (2000): no variance of samples from 0 to 1 is larger.
             variance[..., i] = np.maximum(mean[..., i] * (1 - mean[..., i]), 0) * spp / (spp - 1)
     bare = replace(image, pixels=image.select(names), channels=tuple(names), variances={})
-    freedom = _freedom(image) if FREEDOM in image.metadata and (image.variances or pairs) else spp - 1
+    freedom = spp - 1
+    if FREEDOM in image.metadata and (image.variances or pairs):
+        freedom = _freedom(image)
     return Estimate(bare, variance, spp, freedom, _shared(image, freedom < spp - 1))
 
 
-def samples(image: Image, side: str, given: int, least: int = 2) -> int:
-    """The samples per pixel that are given, or else those of the header, which may hold anything.
+def samples(image: Image, side: str, spp: int, least: int = 2) -> int:
+    """The samples per pixel of an option, `spp`, or where that is 0 those of the header, which may hold anything.
 
     ValueError, which names the option of that `side`, for fewer than `least` and for what is no such number.
     """
-    found = given or image.metadata.get(SPP, "no samples per pixel")
-    if not re.fullmatch(r"[0-9]{1,15}(\.0)?", text := str(found)) or float(text) < least:
-        where = "samples per pixel:" if given else "its header names"
-        raise ValueError(f"{image.path}: {where} {shown(found)}; expected `spp` or `spp_{side}`, {least} to 10¹⁵")
-    return int(float(text))
+    value = spp or image.metadata.get(SPP, "no samples per pixel")
+    if (count := _whole(value)) < least:
+        where = "samples per pixel:" if spp else "its header names"
+        raise ValueError(f"{image.path}: {where} {value!r:.60}; expected `spp` or `spp_{side}`, {least} to 10¹⁵")
+    return count
 
 
 def _freedom(image: Image) -> int:
     """The degrees of freedom that the header names, which may hold anything."""
-    found = image.metadata[FREEDOM]
-    if not re.fullmatch(r"[0-9]{1,15}(\.0)?", text := str(found)) or float(text) < 1:
-        raise ValueError(f"{image.path}: {FREEDOM} = {shown(found)}; expected a whole number, 1 to 10¹⁵")
-    return int(float(text))
+    value = image.metadata[FREEDOM]
+    if (count := _whole(value)) < 1:
+        raise ValueError(f"{image.path}: {FREEDOM} = {value!r:.60}; expected a whole number, 1 to 10¹⁵")
+    return count
+
+
+def _whole(value: object) -> int:
+    """A whole number of up to 15 digits; −1 for anything else."""
+    return int(float(str(value))) if re.fullmatch(r"[0-9]{1,15}(\.0)?", str(value)) else -1
 
 
 def _shared(image: Image, of_passes: bool) -> float | None:
     """`Estimate.shared` as the header says; where it does not pixels may share samples, if passes were compared."""
     radius, area = (
-        float(found)
-        if re.fullmatch(r"[0-9]{1,6}(\.[0-9]{1,20})?", found := str(image.metadata.get(name, "")))
-        else None
-        for name in (FILTER, AREA)
+        float(text) if re.fullmatch(r"[0-9]{1,6}(\.[0-9]{1,20})?", text) else None
+        for text in (str(image.metadata.get(name, "")) for name in (FILTER, AREA))
     )
     if area is not None:
         return max(area, 1.0)
@@ -176,35 +178,37 @@ def _shared(image: Image, of_passes: bool) -> float | None:
 
 def _not_negative(image: Image, name: str) -> Pixels:
     """The variance from a file, with 0 for what is below by rounding. ValueError for what is negative beyond that."""
-    found = np.asarray(image.variances[name], np.float64)
+    variance = np.asarray(image.variances[name], np.float64)
     size = np.square(image.pixels, dtype=np.float64).max(-1)
-    for each in image.variances.values():
-        size = np.maximum(size, np.abs(each))
-    if (below := found < -NEGATIVE * size).any():
-        y, x = np.unravel_index(int(below.argmax()), below.shape)
-        hint = (
-            f"; of X, Y, Z that were written as colours, as Mitsuba's: channels = {list(XYZ)}" if name in "RGB" else ""
-        )
+    for other in image.variances.values():
+        size = np.maximum(size, np.abs(other))
+    if (below := variance < -NEGATIVE * size).any():
+        hint = f"; of X, Y, Z that were written as colours, as Mitsuba's: channels = {list(XYZ)}"
         raise ValueError(
-            f"{image.path}: its variance of {name} is negative in {below.sum()} pixels, the first at x = "
-            f"{x + image.origin[0]}, y = {y + image.origin[1]}; expected at least 0{hint}"
+            f"{image.path}: its variance of {name} is negative in {below.sum()} pixels, the first {_at(image, below)}; "
+            f"expected at least 0{hint if name in 'RGB' else ''}"
         )
-    return np.maximum(found, 0)
+    return np.maximum(variance, 0)
 
 
 def _finite(image: Image, name: str, mean: Pixels, variance: Pixels, allow: bool) -> Pixels:
     """The variance with 0 where the mean, or where that is allowed it, is not finite. ValueError elsewhere."""
     unknown = ~np.isfinite(variance)
     if (wrong := unknown & np.isfinite(mean)).any() and not allow:
-        y, x = np.unravel_index(int(wrong.argmax()), wrong.shape)
-        where = f"x = {x + image.origin[0]}, y = {y + image.origin[1]}"
-        raise ValueError(f"{image.path}: its variance of {name} is not finite at {where}; expected finite ones")
+        raise ValueError(
+            f"{image.path}: its variance of {name} is not finite {_at(image, wrong)}; expected finite values"
+        )
     return np.where(unknown, 0, variance)
+
+
+def _at(image: Image, flags: NDArray[np.bool_]) -> str:
+    y, x = np.unravel_index(int(flags.argmax()), flags.shape)
+    return f"at x = {x + image.origin[0]}, y = {y + image.origin[1]}"
 
 
 def _is_alpha(image: Image, name: str) -> bool:
     """Whether it is an alpha whose samples were from 0 to 1."""
-    if name != "A" and not name.endswith(".A"):
+    if name.rpartition(".")[2] != "A":
         return False
     alpha = image.select([name])
     return bool((alpha >= 0).all() and (alpha <= 1 + ROUNDED).all())

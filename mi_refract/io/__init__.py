@@ -1,7 +1,7 @@
 """Files, processes and tables, for all other rooms. Nothing here knows about refraction or Mitsuba.
 
 In: paths, pixels, commands, tables of TOML. Out: files that are complete or not there at all, images as arrays, the
-output of other programs, checked values; errors are one line that says what, where, and what would be accepted.
+output of other programs, checked values; errors are one line that says what, where, and what was expected.
 """
 
 __all__ = [
@@ -16,6 +16,5 @@ __all__ = [
     "provenance",
     "regular_file",
     "sanitise",
-    "toml_schema",
     "typed_table",
 ]

@@ -43,45 +43,37 @@ def write_exr(
     replaced. ValueError for a shape that does not fit `channels`, a name that does not end in .exr, or an attribute of
     another type; OSError for a folder that cannot be written or a full disk. The old file stays then.
     """
+    import OpenImageIO as oiio
+
     path = atomic.writable(path, SUFFIXES)
     pixels = np.ascontiguousarray(pixels, dtype=np.float32)
     if pixels.ndim != 3 or pixels.size == 0 or pixels.shape[2] != len(channels):
         raise ValueError(f"{path}: pixels of shape {pixels.shape}; expected H × W × {len(channels)} {tuple(channels)}")
     if len(set(channels)) != len(channels):
         raise ValueError(f"{path}: channels {tuple(channels)}; expected distinct names")
-    attributes = _attributes(path, metadata or {})
+    rows, columns, count = pixels.shape
+    spec = oiio.ImageSpec(columns, rows, count, "float")
+    spec.channelnames = tuple(channels)
+    for name, value in (metadata or {}).items():
+        if not isinstance(value, str | int | float):
+            raise ValueError(f"{path}: attribute {name} = {value!r}; expected str, int, float")
+        spec.attribute(name, str(value) if isinstance(value, int) and not -(2**31) <= value < 2**31 else value)
     try:
         with atomic.replacing(path, suffix=".exr") as temporary:  # OpenImageIO tells the format by the name
-            _write(temporary, pixels, channels, attributes)
+            output = oiio.ImageOutput.create(str(temporary))
+            if output is None:
+                raise OSError(one_line(oiio.geterror()))
+            done = output.open(str(temporary), spec) and output.write_image(pixels)
+            message = output.geterror()
+            if not (output.close() and done):
+                raise OSError(one_line(message or output.geterror()) or "OpenImageIO gives no reason")
+            # On a full disk `close` is True all the same when the image was small enough for a buffer.
+            source = oiio.ImageInput.open(str(temporary))
+            if source is None or source.read_scanlines(0, 0, rows - 1, rows, 0, 0, count, "float") is None:
+                raise OSError("the last row of pixels is missing; is the disk full?")
+            source.close()
     except OSError as error:
         raise OSError(f"{path}: cannot be written: {error.strerror or error}") from None
-
-
-def _write(path: Path, pixels: NDArray[np.float32], channels: Sequence[str], attributes: Metadata) -> None:
-    import OpenImageIO as oiio
-
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "float")
-    spec.channelnames = tuple(channels)
-    for name, value in attributes.items():
-        spec.attribute(name, value)
-    output = oiio.ImageOutput.create(str(path))
-    if output is None:
-        raise OSError(one_line(oiio.geterror()))
-    done = output.open(str(path), spec) and output.write_image(pixels)
-    message = output.geterror()
-    if not (output.close() and done):
-        raise OSError(one_line(message or output.geterror()) or "OpenImageIO gives no reason")
-    # On a full disk `close` is True all the same when the image was small enough for a buffer.
-    source, rows = oiio.ImageInput.open(str(path)), pixels.shape[0]
-    if source is None or source.read_scanlines(0, 0, rows - 1, rows, 0, 0, pixels.shape[2], "float") is None:
-        raise OSError("the last row of pixels is missing; is the disk full?")
-
-
-def _attributes(path: Path, metadata: Mapping[str, str | int | float]) -> Metadata:
-    for name, value in metadata.items():
-        if not isinstance(value, (str, int, float)):
-            raise ValueError(f"{path}: attribute {name} = {value!r}; expected str, int, float")
-    return {n: str(v) if isinstance(v, int) and not -(2**31) <= v < 2**31 else v for n, v in metadata.items()}
 
 
 @dataclass(frozen=True)
@@ -279,7 +271,11 @@ def _images(path: Path, source: Any, kind: str, most: int, first_only: bool, as_
     several = found[-1].part[0] > 0 or (first_only and source.seek_subimage(1, 0))
     levelled = {image.part[0] for image in found if image.part[1]}
     levelled |= {0} if first_only and source.seek_subimage(0, 1) else set()
-    return [replace(image, place=_place(image.part, several, image.part[0] in levelled)) for image in found]
+    places = [
+        ", ".join([f"part {part}"] * several + [f"MIP level {level}"] * (part in levelled))
+        for part, level in (image.part for image in found)
+    ]
+    return [replace(image, place=place) for image, place in zip(found, places, strict=True)]
 
 
 def _parts(source: Any) -> Iterator[tuple[int, int]]:
@@ -293,10 +289,6 @@ def _parts(source: Any) -> Iterator[tuple[int, int]]:
         part += 1
 
 
-def _place(part: tuple[int, int], several: bool, levelled: bool) -> str:
-    return ", ".join([f"part {part[0]}"] * several + [f"MIP level {part[1]}"] * levelled)
-
-
 def _check_size(path: Path, spec: Any, max_values: int, taken: int = 0, option: str = OPTION) -> None:
     """ValueError for more values than are allowed, beside those that other images of the file have taken."""
     if spec.width * spec.height * spec.nchannels > max_values - taken:
@@ -307,9 +299,14 @@ def _check_size(path: Path, spec: Any, max_values: int, taken: int = 0, option: 
 
 def _image(path: Path, source: Any, kind: str, values: tuple[int, int], as_idiff: bool) -> Image:
     """The part and MIP level that the source is at; `values`: how many a file may have, and has so far."""
+    import OpenImageIO as oiio
+
     spec = source.spec()
     found = source.format_name()
-    if path.suffix[1:].lower() not in _endings(found) or found == "null":  # which is black, whatever the file holds
+    # OpenImageIO's own list: "openexr:exr,sxr;png:png;…".
+    known = dict(pair.split(":") for pair in oiio.get_string_attribute("extension_list").split(";") if pair)
+    endings = known.get(found, found).split(",")
+    if path.suffix[1:].lower() not in endings or found == "null":  # which is black, whatever the file holds
         raise ImageError(f"{path}: holds an image of format {found}; expected the format that the name says")
     if spec.deep:
         raise ImageError(f"{path}: expected an image without deep samples")
@@ -335,14 +332,6 @@ def _image(path: Path, source: Any, kind: str, values: tuple[int, int], as_idiff
 def _without(path: Path, message: str) -> str:
     """OpenImageIO's words on one line, without the path that some of its readers put into them."""
     return one_line(message.replace(f"EXR Error ({path}): ", "").replace(str(path), path.name))
-
-
-def _endings(name: str) -> list[str]:
-    """The file name endings of a format, in OpenImageIO's own list: "openexr:exr,sxr;png:png;…"."""
-    import OpenImageIO as oiio
-
-    formats = dict(each.split(":") for each in oiio.get_string_attribute("extension_list").split(";") if each)
-    return formats.get(name, name).split(",")
 
 
 def read_exr(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> tuple[NDArray[np.float32], Metadata]:

@@ -6,13 +6,13 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import BinaryIO
+from io import BufferedReader
 
 _PIECE = 2**20  # bytes
 
 
 @contextmanager
-def opened(path: str | os.PathLike[str], most: int) -> Iterator[BinaryIO]:
+def opened(path: str | os.PathLike[str], most: int) -> Iterator[BufferedReader]:
     """The file, open for reading, of `most` bytes at most.
 
     ValueError for a larger one, or for what is no file: a pipe or a device may never end. OSError where it cannot be

@@ -2,7 +2,7 @@
 
 A field of a struct is a key: its annotation is the type, `Annotated[float, Meta(gt=0, description="…")]` adds limits
 and what the key means, its default makes it optional. The READMEs' tables of keys come from the same structs.
-Do not put a `pattern` for texts into a union with a list: msgspec 0.22 then frees a wrong pointer and crashes at exit.
+Do not put a `pattern` for texts into a union with a list: msgspec 0.22 then frees a wrong pointer at exit.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import msgspec
 T = TypeVar("T")
 
 
-def parse_toml(text: str | bytes, kind: type[T], where: str) -> T:
+def parse_toml(text: str | bytes, kind: type[T], where: str, *, infinite: bool = False) -> T:
     """The value of type `kind` that the TOML holds. ValueError as of `convert`, or for what is not TOML."""
     try:
         document = tomllib.loads(text if isinstance(text, str) else text.decode())
@@ -26,31 +26,33 @@ def parse_toml(text: str | bytes, kind: type[T], where: str) -> T:
         raise ValueError(f"{where}: brackets nested too deeply; expected TOML") from None
     except ValueError as error:
         raise ValueError(f"{where}: {error}; expected TOML") from None
-    return convert(document, kind, where)
+    return convert(document, kind, where, infinite=infinite)
 
 
-def convert(value: Any, kind: type[T], where: str) -> T:
-    """A tree of dicts and lists as a value of type `kind`.
+def convert(value: Any, kind: type[T], where: str, *, infinite: bool = False) -> T:
+    """A tree of dicts and lists as a value of type `kind`; `infinite`: numbers may be.
 
-    ValueError is one line: `where`, the path of the key, what it is, what was expected. NaN and infinity are refused.
+    ValueError is one line: `where`, the path of the key, what it is, what was expected. NaN is refused.
     """
     try:
-        _check_finite(value, "$")
+        _check_finite(value, "$", infinite)
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
         message, _, path = str(error).partition(" - at `")
-        key = re.sub(r"^\$\.?", "", path.removesuffix("`"))
+        key = re.sub(r"^(key` in `)?\$\.?", "", path.removesuffix("`"))
         message = f"{message[0].lower()}{message[1:]}"
+        if message.startswith("object contains unknown field") and not key:
+            message = f"unknown key{message[29:]}; expected {', '.join(getattr(kind, '__struct_encode_fields__', ()))}"
         raise ValueError(" ".join(f"{where}: {f'{key}: ' if key else ''}{message}".split())) from None
 
 
-def _check_finite(value: Any, path: str) -> None:
-    if isinstance(value, float) and not math.isfinite(value):
+def _check_finite(value: Any, path: str, infinite: bool) -> None:
+    if isinstance(value, float) and not math.isfinite(value) and not (infinite and math.isinf(value)):
         raise msgspec.ValidationError(f"Expected a finite number, got {value} - at `{path}`")
     if isinstance(value, dict | list):
         items = value.items() if isinstance(value, dict) else enumerate(value)
         for key, item in items:
-            _check_finite(item, f"{path}[{key}]" if isinstance(value, list) else f"{path}.{key}")
+            _check_finite(item, f"{path}[{key}]" if isinstance(value, list) else f"{path}.{key}", infinite)
 
 
 def key_table(title: str, kind: type[msgspec.Struct]) -> str:

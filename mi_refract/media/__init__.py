@@ -6,9 +6,8 @@ Dr.Jit arrays. Out: indices in double precision; Dr.Jit differentiates those of 
 
 from . import glass_catalogs
 from .dispersion import LINES
-from .materials import LABORATORY_AIR
+from .materials import LABORATORY_AIR, relative_index
 from .medium import Medium
-from .ratio import relative_index
 from .specification import index, parse
 
 __all__ = ["LABORATORY_AIR", "LINES", "Medium", "glass_catalogs", "index", "parse", "relative_index"]

@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from mi_refract.numerics import Number
+import drjit as dr
 
-from .number_kinds import root, where
+from mi_refract.numerics import Mask, Number
 
 # Spectral lines by their letters, in nm, as catalogues of glass print them.
 LINES = {
@@ -32,6 +32,25 @@ LINES = {
     "t": 1013.98,
 }
 Coefficients = Mapping[str, Number]
+
+
+def where(condition: Mask, x: Number, y: Number) -> Number:
+    """`x` where the condition holds, else `y`; of any kind of number. NumPy is imported where it is used."""
+    if any(map(dr.is_array_v, (condition, x, y))):
+        return dr.select(condition, x, y)
+    import numpy as np
+
+    return np.where(condition, x, y)
+
+
+def root(x: Number) -> Number:
+    """√x, NaN below 0; of any kind of number."""
+    if dr.is_array_v(x):
+        return dr.sqrt(x)
+    import numpy as np
+
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(x)
 
 
 class Dispersion(Protocol):
@@ -60,32 +79,21 @@ class Terms:
 
     def index(self, wavelength: Number, c: Coefficients) -> Number:
         """See `Dispersion`."""
-        total = self._sum(wavelength, c)
-        return total if self.power == 1 else root(total)
-
-    def _sum(self, wavelength: Number, c: Coefficients) -> Number:
         square = wavelength * wavelength
         total = self.constant + 0 * wavelength
         for name, p in self.powers:
-            total = total + c[name] * _to_power(square, p // 2)
+            power = 1 + 0 * square
+            for _ in range(abs(p) // 2):
+                power = power * square
+            total = total + c[name] * (1 / power if p < 0 else power)
         for b, r in self.resonances:
-            total = total + c[b] * (square / (square - self._pole(c[r])))
-        return total
-
-    def _pole(self, r: Number) -> Number:
-        return r * r if self.squared else r
+            total = total + c[b] * (square / (square - (c[r] * c[r] if self.squared else c[r])))
+        return total if self.power == 1 else root(total)
 
     def poles(self, c: Coefficients) -> dict[str, float]:
         """See `Dispersion`."""
-        found = {r: float(self._pole(c[r])) for _, r in self.resonances}
-        return {name: math.sqrt(pole) for name, pole in found.items() if pole > 0}
-
-
-def _to_power(x: Number, p: int) -> Number:
-    result = 1 + 0 * x
-    for _ in range(abs(p)):
-        result = result * x
-    return 1 / result if p < 0 else result
+        squares = {r: float(c[r] ** 2 if self.squared else c[r]) for _, r in self.resonances}
+        return {name: math.sqrt(square) for name, square in squares.items() if square > 0}
 
 
 @dataclass(frozen=True)
@@ -95,14 +103,11 @@ class Abbe:
     That is Cauchy's formula with two terms, through n_d, with V_d = (n_d − 1)/(n_F − n_C).
     """
 
-    @staticmethod
-    def _g(wavelength: Number) -> Number:
-        d, f, c = (LINES[line] ** -2 for line in "dFC")
-        return (1 / (wavelength * wavelength) - d) / (f - c)
-
     def index(self, wavelength: Number, c: Coefficients) -> Number:
         """See `Dispersion`."""
-        return c["n_d"] + (c["n_d"] - 1) / c["V_d"] * self._g(wavelength)
+        d, f, line_c = (LINES[line] ** -2 for line in "dFC")
+        g = (1 / (wavelength * wavelength) - d) / (f - line_c)
+        return c["n_d"] + (c["n_d"] - 1) / c["V_d"] * g
 
     def poles(self, c: Coefficients) -> dict[str, float]:
         """None: n is infinite at λ = 0 only."""

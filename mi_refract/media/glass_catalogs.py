@@ -19,7 +19,7 @@ import warnings
 from dataclasses import dataclass
 from typing import Any
 
-from .dispersion import LINES, Terms, polynomial, sellmeier
+from .dispersion import LINES, polynomial, sellmeier
 from .medium import ANY, Medium
 
 CATALOGS = {
@@ -65,24 +65,21 @@ def load(catalog: str, glass: str, label: str) -> Medium:
         raise ValueError(f"{text}; to read it: pip install 'mi-refract[glass]'") from None
     known = {_plain(name): name for name in glasses}
     if _plain(glass) not in known:
-        near = ", ".join(f"{catalog}:{known[each]}" for each in difflib.get_close_matches(_plain(glass), known, 3, 0.0))
+        near = ", ".join(f"{catalog}:{known[name]}" for name in difflib.get_close_matches(_plain(glass), known, 3, 0.0))
         raise ValueError(f"{label}: unknown glass; expected one of the catalogue's {len(glasses)}; nearest: {near}")
-    name = known[_plain(glass)]
-    if not glasses[name].coefficients:
+    row = glasses[name := known[_plain(glass)]]
+    if not row.coefficients:
         raise ValueError(f"{label}: its catalogue prints no formula of this glass; expected another, or table(…)")
-    form, coefficients = _in_nanometres(catalog, glasses[name].coefficients)
-    found = glasses[name]
-    return Medium(f"{catalog}:{name}", form, coefficients, found.range, "air", fitted=found.fitted)
+    if catalog in POWERS:
+        powers = zip(POWERS[catalog], row.coefficients, strict=True)
+        form, coefficients = polynomial({p: x / NANOMETRES**p for p, x in powers})
+    else:
+        form, coefficients = sellmeier([x * (1 if i < 3 else NANOMETRES**2) for i, x in enumerate(row.coefficients)])
+    return Medium(f"{catalog}:{name}", form, coefficients, row.range, "air", fitted=row.fitted)
 
 
 def _plain(name: str) -> str:
     return "".join(name.lower().split())
-
-
-def _in_nanometres(catalog: str, values: tuple[float, ...]) -> tuple[Terms, dict[str, float]]:
-    if catalog in POWERS:
-        return polynomial({p: x / NANOMETRES**p for p, x in zip(POWERS[catalog], values, strict=True)})
-    return sellmeier([x * (1 if i < 3 else NANOMETRES**2) for i, x in enumerate(values)])
 
 
 @functools.cache
@@ -112,12 +109,6 @@ def _glass(table: Any, name: str, most: tuple[float, float]) -> Glass:
 
 def _finite(series: Any) -> dict[Any, float]:
     """The entries that are numbers, by column: a line's letter or a wavelength in nm."""
-    found = {}
-    for column, value in series.items():
-        try:
-            number = float(value)
-        except (TypeError, ValueError):
-            continue
-        if math.isfinite(number):
-            found[column] = number
-    return found
+    pandas: Any = importlib.import_module("pandas")
+    numbers = pandas.to_numeric(series, errors="coerce")
+    return {column: float(x) for column, x in numbers.items() if math.isfinite(x)}

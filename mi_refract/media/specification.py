@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import itertools
 import math
 import re
@@ -42,27 +43,34 @@ def parse(spec: float | str, name: str = "") -> Medium:
     positive, or infinite, at a wavelength from 360 to 830 nm; and for numbers that are not finite.
     """
     label = f"{name} = {spec!r}" if name else repr(spec)
-    if isinstance(spec, (int, float)) and not isinstance(spec, bool):
-        if not 0 < spec < math.inf:
-            raise ValueError(f"{label}; expected a positive finite number, or a material's name")
-        return Medium(str(spec), CONSTANT, {"n": float(spec)})
-    if not isinstance(spec, str):
+    if isinstance(spec, str):
+        text = spec.strip()
+        if ":" in text.partition("(")[0]:
+            return _catalogued(text, label)
+        return _formula(text, label) if "(" in text else _of_mitsuba(text, label)
+    if isinstance(spec, bool) or not isinstance(spec, (int, float)) or not 0 < spec < math.inf:
         raise ValueError(f"{label}; expected a positive finite number, or a material's name")
-    text = spec.strip()
-    if ":" in text.partition("(")[0]:
-        return _catalogued(text, label)
-    if "(" in text:
-        return _formula(text, label)
-    return _of_mitsuba(text, label)
+    return Medium(str(spec), CONSTANT, {"n": float(spec)})
 
 
 def _formula(text: str, label: str) -> Medium:
+    """A medium that is valid up to the resonances on both sides of the visible, and has an index at all of it."""
     call = re.fullmatch(r"(\w+)\s*\((.*)\)", text)
     if not call or call[1] not in FORMULAS_OF_N:
         raise ValueError(f"{label}; expected {', '.join(f'{known}(…)' for known in FORMULAS_OF_N)}")
-    form, coefficients, valid = FORMULAS_OF_N[call[1]](call[2], label)
-    medium = _between_poles(Medium(text, form, coefficients, valid), label)
-    _check_visible(medium, label)
+    form, coefficients, (low, high) = FORMULAS_OF_N[call[1]](call[2], label)
+    for name, pole in form.poles(coefficients).items():
+        if VISIBLE[0] <= pole <= VISIBLE[1]:
+            raise ValueError(f"{label}: {name}: n is infinite at {pole:.6g} nm; expected no such pole in 360 … 830 nm")
+        low, high = (max(low, pole), high) if pole < VISIBLE[0] else (low, min(high, pole))
+    medium = Medium(text, form, coefficients, (low, high))
+    import numpy as np
+
+    low, high = max(low, VISIBLE[0]), min(high, VISIBLE[1])
+    wavelengths = np.linspace(low, high, 471)
+    if low <= high and (missing := np.isnan(medium.index_or_nan(wavelengths))).any():
+        at = wavelengths[missing][0]
+        raise ValueError(f"{label}: n is no positive number at {at:.6g} nm; expected one at all of 360 … 830 nm")
     return medium
 
 
@@ -76,35 +84,34 @@ def _numbers(arguments: str, label: str, counts: Sequence[int], says: str) -> li
     return values
 
 
-def _cauchy(arguments: str, label: str) -> Formula:
+def cauchy(arguments: str, label: str) -> Formula:
+    """Of `A, B, …`."""
     counts = range(1, len(CAUCHY_NAMES) + 1)
     return *dispersion.cauchy(_numbers(arguments, label, counts, "cauchy(A, B, …), λ in nm, up to 8")), ANY
 
 
-def _sellmeier(arguments: str, label: str) -> Formula:
-    values = _numbers(arguments, label, range(2, 14, 2), "sellmeier(B1, …, C1, …), as many C in nm² as B, up to 6")
-    for i, c in enumerate(values[len(values) // 2 :], 1):
-        if 0 < abs(c) < MICROMETRES:
-            raise ValueError(f"{label}: C{i} = {c:g}; expected nm²; from µm² multiply by 1e6")
-    return *dispersion.sellmeier(values), ANY
+def sellmeier(arguments: str, label: str, squared: bool = False) -> Formula:
+    """Of `B1, …, C1, …`; `squared`: of resonances L, whose squares are the C."""
+    name, letter, unit, factor = ("sellmeier_nm", "L", "nm", "1e3") if squared else ("sellmeier", "C", "nm²", "1e6")
+    says = f"{name}(B1, …, {letter}1, …), as many {letter} in {unit} as B, up to 6"
+    values = _numbers(arguments, label, range(2, 14, 2), says)
+    for i, x in enumerate(values[len(values) // 2 :], 1):
+        if 0 < abs(x) < MICROMETRES or (squared and x < 0):
+            micrometres = unit.replace("n", "µ")
+            raise ValueError(f"{label}: {letter}{i} = {x:g}; expected {unit}; from {micrometres} multiply by {factor}")
+    return *dispersion.sellmeier(values, squared), ANY
 
 
-def _sellmeier_nm(arguments: str, label: str) -> Formula:
-    values = _numbers(arguments, label, range(2, 14, 2), "sellmeier_nm(B1, …, L1, …), as many L in nm as B, up to 6")
-    for i, wavelength in enumerate(values[len(values) // 2 :], 1):
-        if wavelength < 0 or 0 < wavelength < MICROMETRES:
-            raise ValueError(f"{label}: L{i} = {wavelength:g}; expected nm; from µm multiply by 1e3")
-    return *dispersion.sellmeier(values, squared=True), ANY
-
-
-def _abbe(arguments: str, label: str) -> Formula:
+def abbe(arguments: str, label: str) -> Formula:
+    """Of `n_d, V_d`."""
     n_d, v_d = _numbers(arguments, label, [2], "abbe(n_d, V_d)")
     if v_d == 0:
         raise ValueError(f"{label}: V_d = 0; expected (n_d − 1)/(n_F − n_C), which is not 0")
     return Abbe(), {"n_d": n_d, "V_d": v_d}, ANY
 
 
-def _table(arguments: str, label: str) -> Formula:
+def table(arguments: str, label: str) -> Formula:
+    """Of `wavelength: n, …`."""
     accepted = "expected table(400: 1.53, 500: 1.52, …), two or more, wavelengths in nm, increasing"
     try:
         knots = [(float(w), float(n)) for w, n in (pair.split(":") for pair in arguments.split(","))]
@@ -121,40 +128,18 @@ def _table(arguments: str, label: str) -> Formula:
 
 
 FORMULAS_OF_N: dict[str, Callable[[str, str], Formula]] = {
-    "cauchy": _cauchy,
-    "sellmeier": _sellmeier,
-    "sellmeier_nm": _sellmeier_nm,
-    "abbe": _abbe,
-    "table": _table,
+    "cauchy": cauchy,
+    "sellmeier": sellmeier,
+    "sellmeier_nm": functools.partial(sellmeier, squared=True),
+    "abbe": abbe,
+    "table": table,
 }
-
-
-def _between_poles(medium: Medium, label: str) -> Medium:
-    """The medium, valid up to the resonances on both sides of the visible. ValueError for one within it."""
-    low, high = medium.valid
-    for name, pole in medium.dispersion.poles(medium.coefficients).items():
-        if VISIBLE[0] <= pole <= VISIBLE[1]:
-            raise ValueError(f"{label}: {name}: n is infinite at {pole:.6g} nm; expected no such pole in 360 … 830 nm")
-        low, high = (max(low, pole), high) if pole < VISIBLE[0] else (low, min(high, pole))
-    return Medium(medium.name, medium.dispersion, medium.coefficients, (low, high))
-
-
-def _check_visible(medium: Medium, label: str) -> None:
-    """ValueError where n is not a positive number at a visible wavelength of its range."""
-    import numpy as np
-
-    low, high = max(medium.valid[0], VISIBLE[0]), min(medium.valid[1], VISIBLE[1])
-    wavelengths = np.linspace(low, high, 471)
-    n = medium.index_or_nan(wavelengths)
-    if low <= high and np.isnan(n).any():
-        at = wavelengths[np.isnan(n)][0]
-        raise ValueError(f"{label}: n is no positive number at {at:.6g} nm; expected one at all of 360 … 830 nm")
 
 
 def _catalogued(text: str, label: str) -> Medium:
     known = {name.lower(): medium for name, medium in MATERIALS.items()}
-    if found := known.get(text.lower()):
-        return found
+    if medium := known.get(text.lower()):
+        return medium
     catalog, _, glass = (part.strip() for part in text.partition(":"))
     if catalog.upper() in glass_catalogs.CATALOGS:
         return glass_catalogs.load(catalog.upper(), glass, label)

@@ -34,3 +34,10 @@ Ray: TypeAlias = Any
 Interaction: TypeAlias = Any
 BSDFSample: TypeAlias = Any
 Spectrum: TypeAlias = Any
+# An unsigned integer: a Python int or `mi.UInt32`.
+Count: TypeAlias = Any
+# `mi.Point2f`.
+Point2: TypeAlias = Any
+# Mitsuba's medium of a shape or a sensor, and its texture.
+MediumPlugin: TypeAlias = Any
+Texture: TypeAlias = Any

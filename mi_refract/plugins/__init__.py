@@ -5,10 +5,10 @@ known to that variant by the names `PLUGIN`, `PLUGIN_<formula>` and `INTEGRATOR`
 `import mi_refract` registers them in every variant. Importing this room imports Mitsuba.
 """
 
-from typing import Any
+from mi_refract.numerics import Variant
 
 
-def register(variant: Any) -> None:
+def register(variant: Variant) -> None:
     """Make `refract`, `refract_<formula>` and `refract_path` known to one variant, given its module.
 
     Registering again is harmless. Registration is lost when the variant is switched: `mi_refract` repeats it then.

@@ -1,26 +1,181 @@
 """The indices of a boundary, as parameters of `refract`: numbers, names, dispersive media, textures.
 
-Mitsuba's names stay what they are in its table: constants. A texture holds an index in each point of the surface.
+Mitsuba's names stay what they are in its table: constants. A ratio of indices that is not one number is a function of
+the wavelength (`DispersiveRatio`) or of the point of the surface (`TexturedRatio`), in float64. Where there is no index
+it is NaN: such light is lost.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Collection, Mapping
+from typing import Any, ClassVar
 
+import drjit as dr
 import mitsuba as mi
 
 from mi_refract import media
+from mi_refract.formulas import LARGEST_RATIO, SMALLEST_RATIO
 from mi_refract.media import Medium
+from mi_refract.numerics import (
+    ArrayType,
+    Interaction,
+    Mask,
+    Number,
+    Properties,
+    Texture,
+    Variant,
+    differentiated,
+    replace_grad,
+)
 
-from .spectrum_parameter import read_knots
-
-ACCEPTED = "a positive finite number, or a material's name, a glass or formula (mi_refract.media), spectrum or texture"
-
+from .absorption import read_knots
+from .integrator_context import warn_once
 
 PLUGIN = "refract"
+DEFAULTS = {"int_ior": "bk7", "ext_ior": "air"}
+EXPECTED = "a positive finite number, or a material's name, a glass or formula (mi_refract.media), spectrum or texture"
+LOST = 1e-3  # of the colour of light of equal power at all wavelengths: the most that may lie outside a medium's range
 
 
-def read_ior(props: Any, name: str, default: str) -> float:
+def parameter_type(v: Variant) -> ArrayType:
+    """The type of a number that `mi.traverse` shows. In scalar variants Mitsuba cannot set a bare Python float."""
+    scalar: Any = dr.scalar
+    number: ArrayType = v.Float if dr.is_jit_v(v.Float) else scalar.Array1f
+    return number
+
+
+def one_number(name: str, value: Number) -> Number:
+    """The value of a parameter of `parameter_type`; ValueError where an edit gave it several entries."""
+    if len(value) != 1:
+        raise ValueError(f"{PLUGIN}: {name} has {len(value)} entries; expected one number")
+    return value[0]
+
+
+class DispersiveRatio:
+    """n_int/n_ext of two media by wavelength. Their coefficients are differentiable parameters, `int_ior_B` for one."""
+
+    DRJIT_STRUCT: ClassVar = {"shown": dict, "exact": dict}  # for frozen functions
+
+    def __init__(self, v: Variant, inside: Medium, outside: Medium) -> None:
+        """`v`: the variant's module."""
+        self.sides = {"int_ior": inside, "ext_ior": outside}
+        self.wide: ArrayType = dr.float64_array_t(v.Float)
+        shown = [(f"{s}_{k}", x) for s, m in self.sides.items() if m.dispersive for k, x in m.coefficients.items()]
+        number: Any = parameter_type(v)
+        wide: Any = self.wide
+        self.shown: dict[str, Number] = {name: number(value) for name, value in shown}
+        self.exact: dict[str, Number] = {name: wide(value) for name, value in shown}
+        # Opaque: an edit changes the data of a kernel and not its code.
+        dr.make_opaque(*self.shown.values(), *self.exact.values())
+
+    def at(self, wavelength: Number) -> Number:
+        """The ratio at a wavelength in nm, in float64; NaN outside the range of either medium.
+
+        Derivatives in the coefficients are formed anew in each call: the first `dr.backward` frees what it walks.
+        """
+        values = dict(self.exact)
+        for key, shown in self.shown.items():
+            if differentiated(shown):
+                values[key] = replace_grad(values[key], self.wide(shown))
+        coefficients = [{k[len(s) + 1 :]: x for k, x in values.items() if k.startswith(s)} for s in self.sides]
+        inside, outside = self.sides.values()
+        return media.relative_index(inside, outside, wavelength, *coefficients)
+
+    @property
+    def differentiated(self) -> bool:
+        """Whether a coefficient carries a derivative."""
+        return any(map(differentiated, self.shown.values()))
+
+    def traverse(self, cb: mi.TraversalCallback) -> None:
+        """Show the coefficients. No dot in a name: Mitsuba would call what was set by what follows the last one."""
+        for name, value in self.shown.items():
+            cb.put(name, value, mi.ParamFlags.Differentiable)
+
+    def changed(self, keys: Collection[str]) -> None:
+        """Take over coefficients that were set; those that were not keep their double precision."""
+        for key in [key for key in self.shown if not keys or key in keys]:
+            number = one_number(key, self.shown[key])
+            self.exact[key] = self.wide(dr.detach(self.shown[key]) if dr.is_jit_v(self.shown[key]) else number)
+        dr.make_opaque(*self.shown.values(), *self.exact.values())
+
+    def lines(self) -> list[str]:
+        """For the plugin's text."""
+        return [f"{side} = {medium.name}" for side, medium in self.sides.items()]
+
+
+class TexturedRatio:
+    """n_int/n_ext where one of them, or both, is a texture of numbers."""
+
+    DRJIT_STRUCT: ClassVar = {"sides": dict}  # for frozen functions
+    differentiated = False  # of numbers: a texture's values carry their own
+
+    def __init__(self, v: Variant, sides: Mapping[str, Texture | float]) -> None:
+        """`v`: the variant's module. `sides`: `int_ior` and `ext_ior`."""
+        self.sides = sides
+        self.wide: ArrayType = dr.float64_array_t(v.Float)
+
+    def at(self, si: Interaction, active: Mask) -> Number:
+        """The ratio in float64; NaN where it is not one."""
+        inside, outside = (self.wide(n if isinstance(n, float) else n.eval_1(si, active)) for n in self.sides.values())
+        eta = inside / outside
+        return dr.select((eta >= SMALLEST_RATIO) & (eta <= LARGEST_RATIO), eta, dr.nan)
+
+    def traverse(self, cb: mi.TraversalCallback) -> None:
+        """Show the textures."""
+        for name, texture in self.sides.items():
+            if not isinstance(texture, float):
+                cb.put(name, texture, mi.ParamFlags.Differentiable)
+
+    def changed(self, keys: Collection[str]) -> None:
+        """Nothing: textures take over what is set."""
+
+    def lines(self) -> list[str]:
+        """For the plugin's text."""
+        return [f"{side} = {index}" for side, index in self.sides.items()]
+
+
+def read_ratio(v: Variant, props: Properties) -> tuple[DispersiveRatio | TexturedRatio | None, float]:
+    """The ratio of a boundary where it is not one number, and the number: of the d line; 1 where a texture says it.
+
+    `v`: the variant's module. ValueError with plugin, parameter and what is expected.
+    """
+    indices = {name: read_index(v, props, name, default) for name, default in DEFAULTS.items()}
+    dispersive = [name for name, index in indices.items() if isinstance(index, Medium) and index.dispersive]
+    d_line = media.LINES["d"]
+    if not all(isinstance(index, Medium) for index in indices.values()):
+        if dispersive:
+            raise ValueError(f"{PLUGIN}: {dispersive[0]}; expected beside a texture one index for all wavelengths")
+        return TexturedRatio(v, {k: x.index(d_line) if isinstance(x, Medium) else x for k, x in indices.items()}), 1.0
+    inside, outside = indices.values()
+    number = float(media.relative_index(inside, outside, d_line))
+    for name in dispersive:
+        label, medium = f"{PLUGIN}: {name}: {indices[name].name}", indices[name]
+        if not v.is_spectral:
+            warn_once(f"{label}: all light has the index of the d line, 587.6 nm, here")
+        elif lost := lost_colour(medium):
+            text = f"{label} has an index from {medium.valid[0]:g} to {medium.valid[1]:g} nm"
+            if lost > LOST:
+                expected = f"a medium with at most {LOST:.1%}"
+                raise ValueError(f"{text}: outside it is {lost:.1%} of the colour; expected {expected}")
+            warn_once(f"{text}; other light ({lost:.1e} of the colour) is lost there")
+    return DispersiveRatio(v, inside, outside) if dispersive else None, number
+
+
+def lost_colour(medium: Medium) -> float:
+    """The largest share of X, Y and Z, of light of equal power at all wavelengths, outside a medium's range."""
+    import numpy as np
+
+    wavelengths = np.arange(mi.MI_CIE_MIN, mi.MI_CIE_MAX + 1.0)
+    response: Any = mi.cie1931_xyz
+    if dr.is_jit_v(mi.Float):
+        xyz = np.array(response(mi.Float(wavelengths)))
+    else:
+        xyz = np.array([[float(x) for x in response(float(w))] for w in wavelengths]).T
+    outside = (wavelengths < medium.valid[0]) | (wavelengths > medium.valid[1])
+    return float((xyz[:, outside].sum(1) / xyz.sum(1)).max())
+
+
+def read_ior(props: Properties, name: str, default: str) -> float:
     """An index of refraction that is one number, in double precision. ValueError for all else, and as `read_index`."""
     index = read_index(mi, props, name, default)
     if isinstance(index, Medium) and not index.dispersive:
@@ -28,10 +183,10 @@ def read_ior(props: Any, name: str, default: str) -> float:
     raise ValueError(f"{PLUGIN}: {name} = {props[name]}; expected here one index for all wavelengths, everywhere")
 
 
-def read_index(v: Any, props: Any, name: str, default: str) -> Any:
+def read_index(v: Variant, props: Properties, name: str, default: str) -> Medium | Texture:
     """The parameter's `Medium`, or a texture. `v`: the variant's module.
 
-    ValueError with plugin, parameter, value and what is accepted.
+    ValueError with plugin, parameter, value and what is expected.
     """
     value = props.get(name, default)
     label = f"{PLUGIN}: {name}"
@@ -41,7 +196,7 @@ def read_index(v: Any, props: Any, name: str, default: str) -> Any:
     if knots is None:
         if isinstance(value, mi.Object) and hasattr(value, "is_spatially_varying"):
             return value
-        raise ValueError(f"{label} = {value!r}; expected {ACCEPTED}")
+        raise ValueError(f"{label} = {value!r}; expected {EXPECTED}")
     if not knots.wavelengths:
         return media.parse(knots.values[0], name=label)
     table = "table(" + ", ".join(f"{w!r}: {n!r}" for w, n in zip(*knots, strict=True)) + ")"

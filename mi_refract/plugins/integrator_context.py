@@ -1,9 +1,9 @@
-"""Whether a BSDF is sampled for `refract_path`, which alone follows one wavelength and knows where a path is.
+"""How a BSDF knows that `refract_path` samples it: by a bit of the context.
 
-A BSDF is told a wavelength and a direction, and nothing of the path. Light of several wavelengths leaves a dispersive
-boundary in several directions, and glass absorbs along the way to the next boundary: both are the integrator's to do.
-A bit of the context says that it does. (No state beside the arguments would: Dr.Jit samples a BSDF again for
-derivatives, after the integrator has returned.)
+A BSDF's arguments are a wavelength and a direction; of the path it knows nothing. Light of several wavelengths leaves a
+dispersive boundary in several directions, and glass absorbs along the way to the next boundary: both need the
+integrator. The bit says that the integrator does both. (State beside the arguments would not do: Dr.Jit samples a BSDF
+again for derivatives, after the integrator has returned.)
 """
 
 from __future__ import annotations
@@ -12,21 +12,22 @@ from typing import Any
 
 import mitsuba as mi
 
-# Of a lobe that is for the first wavelength only. Mitsuba's own flags of BSDFs end at 1 << 16.
-DISPERSED = 1 << 30
-# In the mask of the types of lobes that a context asks for.
-_FOLLOWED = 1 << 30
-_said: set[str] = set()
+# A bit of `type_mask` in the context: the integrator follows wavelengths and media. The same bit of `sampled_type` in a
+# sample: the lobe is that of the first wavelength only.
+DISPERSED = _FOLLOWED = 1 << 30
+if any(int(flag) & DISPERSED for flag in mi.BSDFFlags):
+    raise ImportError("bit 30 of mitsuba.BSDFFlags is in use; expected a version of Mitsuba that leaves it free")
+warned: set[str] = set()  # what `warn_once` has logged
 
 
 def context() -> Any:
     """A context for sampling BSDFs, of an integrator that follows wavelengths and media along a path.
 
-    It is that of every render of `refract_path`: Dr.Jit traces the BSDFs of other scenes that are in memory as well.
+    Every render of `refract_path` has it: Dr.Jit traces the BSDFs of other scenes that are in memory as well.
     """
-    made = mi.BSDFContext()
-    made.type_mask |= _FOLLOWED
-    return made
+    asked = mi.BSDFContext()
+    asked.type_mask |= _FOLLOWED
+    return asked
 
 
 def is_followed(asked: Any) -> bool:
@@ -36,6 +37,6 @@ def is_followed(asked: Any) -> bool:
 
 def warn_once(text: str) -> None:
     """A warning in Mitsuba's log, once a process."""
-    if text not in _said:
-        _said.add(text)
+    if text not in warned:
+        warned.add(text)
         mi.Log(mi.LogLevel.Warn, text)  # type: ignore[operator]

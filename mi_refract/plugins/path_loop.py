@@ -1,8 +1,15 @@
-"""The path loop of `refract_path`: each lane follows one path after the other, with a stack of branches for later.
+"""The path loop of `refract_path`, in the terms of Mitsuba's `path` and `prb_basic`, with three optional parts.
 
-A plugin belongs to one variant, so everything here is given that variant's module, `v`. Paths are followed depth first:
-of a pair of delta lobes one is followed and the other pushed on the stack; where a path ends, the branch pushed last is
-popped. So the stack of a lane holds at most `split_depth` branches, however many paths the lane follows.
+Each part, and each section of the loop, is traced only where `PathFeatures` has it:
+
+- *absorption*: the throughput is multiplied by exp(−σ t) along each ray; σ is that of the medium that the ray is in.
+- *dispersion*: where the direction depends on the wavelength, the path goes on with its first wavelength, whose
+  throughput is multiplied by the number of wavelengths that the path carried.
+- *splitting*: at a boundary both lobes are followed, depth first. One lobe goes on at once, the other is pushed on a
+  stack; where a path ends, the branch that was pushed last is popped. So the stack of a lane has `split_depth` entries
+  at most, however many paths the lane follows.
+
+In scalar variants a pointer may be None and needs an `if`; in the others lanes are masked.
 """
 
 from __future__ import annotations
@@ -14,13 +21,30 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .absorption import absorbed
-from .emitter_sampling import NonConstantEmitters, SceneEmitters
-from .integrator_context import DISPERSED, context
-from .keyed_sampler import ONE
-from .scene_features import BOUNDARIES, all_shapes, bsdf_name
+from mi_refract.numerics import (
+    BSDF,
+    BSDFSample,
+    Count,
+    Emitter,
+    Interaction,
+    Mask,
+    Number,
+    Point2,
+    Ray,
+    Sampler,
+    Scene,
+    Spectrum,
+    Variant,
+    Vector3,
+)
 
-# Samples near 0 and near 1 pick the one lobe and the other; a lobe with a smaller power than these is not followed.
+from .absorption import absorbed
+from .integrator_context import DISPERSED, context
+from .medium_tracking import MediumTracker, ShapeMedia
+from .sampling import ONE, KeyedMultijitter, NonConstantEmitters, SceneEmitters, SceneSampler
+from .scene_features import BOUNDARIES, all_shapes, bsdf_name, plugin_number
+
+# Samples near 0 and near 1 select the two lobes of a boundary; a lobe of smaller probability is not followed.
 FIRST, LAST = 2.0**-25, ONE
 LOBES = mi.BSDFFlags
 
@@ -42,7 +66,7 @@ class PathFeatures:
     first_number: bool  # a BSDF sample takes `sample1`
     second_number: bool  # a BSDF sample takes `sample2`, two numbers; delta lobes need none
     all_of_hit: bool  # a hit needs more than its shading frame
-    dispersion: bool  # some boundary bends light by its wavelength
+    dispersion: bool  # some boundary refracts by wavelength
     absorption: bool  # some medium absorbs
     null: bool  # a BSDF may have a null lobe
 
@@ -53,51 +77,39 @@ class PathFeatures:
 
     @property
     def environment_after_loop(self) -> bool:
-        """Whether the environment is looked up once, after the loop: a lane has one path only."""
+        """Whether the environment is evaluated once, after the loop: a lane has one path only."""
         return self.environment and not self.split_depth
 
 
 @dataclass
 class LoopState:
-    """The state of a lane between vertices; None for parts that the features do not need."""
+    """The state of a lane between vertices; None for parts that the features leave out."""
 
-    ray: Any
-    throughput: Any
-    result: Any
-    depth: Any
-    active: Any
-    valid: Any
-    sampler: Any
-    eta: Any
-    escaped: Any = None
-    previous: Any = None  # the interaction at the vertex before,
-    pdf: Any = None  # the density of its BSDF sample,
-    delta: Any = None  # and whether that was of a delta lobe
-    specular_so_far: Any = None  # the path from the camera has had delta lobes only; after another lobe it is not split
-    share: Any = None  # the share of the pixel's light: the product of the powers of the lobes that were split
-    node: Any = None  # the number of this branch in the tree: 2 n and 2 n + 1 are the branches of n
-    waiting: Any = None  # how many branches are on the stack
+    ray: Ray
+    throughput: Spectrum
+    result: Spectrum  # radiance accumulated so far
+    depth: Count  # depth of the current vertex
+    active: Mask
+    valid_ray: Mask  # whether the pixel is opaque here
+    sampler: Sampler
+    eta: Number  # product of the relative indices along the path
+    escaped: Mask = None  # the ray has left the scene
+    # --- emitter sampling: the previous vertex, and the density and kind of its BSDF sample
+    prev_si: Interaction = None
+    prev_bsdf_pdf: Number = None
+    prev_bsdf_delta: Mask = None
+    # --- splitting
+    specular_so_far: Mask = None  # every lobe since the camera was a delta; after another the path is not split
+    share: Number = None  # share of the pixel's light: product of the probabilities of the lobes that were split
+    node: Count = None  # number of this branch in the tree: 2 n and 2 n + 1 are the branches of n
+    waiting: Count = None  # how many branches are on the stack
     stack: Any = None
-    truncated: Any = None
-    wavelength_count: Any = None  # how many wavelengths the path carries: all, or one since a dispersive boundary
-    sigma: Any = None  # absorption of the medium that the path is in
-    skipped: Any = None  # from the last vertex to the origin of the ray, which is beside the surface
-
-
-def branch_class(v: Any, plan: PathFeatures) -> type:
-    """The class of a branch on the stack: a path that goes on from a delta lobe. Local memory needs a type."""
-    fields = {
-        "o": v.Point3f,
-        "d": v.Vector3f,
-        "throughput": v.Spectrum,
-        "depth": v.UInt32,
-        "eta": v.Float,
-        "share": v.Float,
-        "node": v.UInt32,
-    }
-    fields |= {"wavelength_count": v.Float} if plan.dispersion else {}
-    fields |= {"sigma": v.UnpolarizedSpectrum, "skipped": v.Float} if plan.absorption else {}
-    return make_dataclass("Branch", fields.items())
+    truncated: Number = None  # `deterministic`: light that was dropped
+    # --- dispersion
+    wavelength_count: Number = None  # wavelengths that the path carries: all, or one after a dispersive boundary
+    # --- absorption
+    sigma: Spectrum = None  # of the medium that the ray is in
+    skipped: Number = None  # distance from the last vertex to the origin of the ray, which is beside the surface
 
 
 class ScalarStack:
@@ -116,7 +128,7 @@ class ScalarStack:
         return self.branches[index]
 
 
-def power_heuristic(a: Any, b: Any) -> Any:
+def power_heuristic(a: Number, b: Number) -> Number:
     """The weight a²/(a² + b²) of a sample whose technique has density `a`, where another has `b`; 0 if both are 0.
 
     Source: Veach 1997, section 9.2.4, β = 2.
@@ -126,61 +138,93 @@ def power_heuristic(a: Any, b: Any) -> Any:
     return dr.select(some, a / dr.select(some, a + b, 1), 0)
 
 
-class Trace:
-    """The path loop for one call of the integrator's `sample`.
+def at_fixed_direction(
+    v: Variant, context: Any, si: Interaction, bsdf: BSDF, bs: BSDFSample, weight: Spectrum, d: Vector3, active: Mask
+) -> tuple[Spectrum, Vector3, Number]:
+    """Weight, world direction and density of a sample, as they are differentiated.
 
-    In scalar variants a pointer may be None and needs an `if`; in the others its lanes are masked.
+    The direction of a delta lobe moves with the parameters. Any other direction is a fixed point of the integrand:
+    d/dx ∫ f dω = ∫ f'(ω)/p(ω) p(ω) dω, in which neither ω nor p is differentiated.
     """
+    smooth = active & mi.has_flag(bs.sampled_type, LOBES.Smooth)
+    wo = si.to_local(dr.detach(d))
+    value, pdf = bsdf.eval_pdf(context, si, wo, smooth)
+    if v.is_polarized:
+        value = si.to_world_mueller(value, -wo, si.wi)
+    smooth &= pdf > 0
+    value = value / dr.detach(dr.select(smooth, pdf, 1))
+    return dr.select(smooth, value, weight), dr.select(smooth, dr.detach(d), d), dr.select(smooth, pdf, bs.pdf)
 
-    def __init__(self, v: Any, scene: Any, plan: PathFeatures, numbers: Any, media: Any = None) -> None:
-        """`v`: the variant's module. `numbers`: `Sampled` or `KeyedMultijitter`. `media`: where there is absorption."""
-        self.media = media
-        self.v, self.scene, self.plan, self.numbers = v, scene, plan, numbers
-        self.vectorised, self.branch = dr.is_jit_v(v.Float), branch_class(v, plan)
-        self.context = context()
-        self.emitters = (NonConstantEmitters if plan.lamps_only else SceneEmitters)(v, scene)
-        self.flags = +(mi.RayFlags.All if plan.all_of_hit else mi.RayFlags.ShadingFrame)
+
+class PathLoop:
+    """The loop for one call of the integrator's `sample`."""
+
+    def __init__(
+        self,
+        v: Variant,
+        scene: Scene,
+        features: PathFeatures,
+        numbers: SceneSampler | KeyedMultijitter,
+        media: MediumTracker | ShapeMedia | None = None,
+    ) -> None:
+        """`v`: the variant's module. `media`: needed where `features.absorption`."""
+        self.v, self.scene, self.features, self.numbers = v, scene, features, numbers
+        self.media: Any = media
+        self.vectorised, self.context = dr.is_jit_v(v.Float), context()
+        self.emitters = (NonConstantEmitters if features.lamps_only else SceneEmitters)(v, scene)
+        self.ray_flags = +(mi.RayFlags.All if features.all_of_hit else mi.RayFlags.ShadingFrame)
         # Derivatives need loops that are evaluated. The kernels of their reverse sweep may run after the scene is gone,
-        # so these must not trace rays: what rays meet is evaluated at once.
+        # so they must not trace rays: what a ray meets is evaluated at once.
         self.evaluated = self.vectorised and not dr.flag(dr.JitFlag.SymbolicLoops)
-        if plan.split_depth and self.vectorised:
-            self.boundaries = self._boundaries()
+        # Local memory needs a type for its entries: of a branch, the part of `LoopState` that it has to itself.
+        branch = {"o": v.Point3f, "d": v.Vector3f, "throughput": v.Spectrum, "depth": v.UInt32, "eta": v.Float}
+        branch |= {"share": v.Float, "node": v.UInt32}
+        branch |= {"wavelength_count": v.Float} if features.dispersion else {}
+        branch |= {"sigma": v.UnpolarizedSpectrum, "skipped": v.Float} if features.absorption else {}
+        self.branch = make_dataclass("Branch", branch.items())
+        self.boundaries = self._boundaries() if features.split_depth and self.vectorised else []
 
-    def run(self, ray: Any, sampler: Any, active: Any) -> LoopState:
-        """Follow `ray` and all that it splits into; the state at the end, whose `result` is the radiance."""
-        way = self.media.way if self.plan.absorption else 0
-        if self.plan.hide_emitters and self.plan.area:
+    def run(self, ray: Ray, sampler: Sampler, active: Mask) -> LoopState:
+        """Follow `ray` and everything that it splits into. `result` of the state at the end is the radiance."""
+        v, features = self.v, self.features
+        skipped = self.media.way if features.absorption else 0
+
+        # ---------------------- Hide area emitters ----------------------
+        if features.hide_emitters and features.area:
             camera, ray = ray, self._past_emitters(ray, active)
-            way += dr.dot(ray.o - camera.o, ray.d)
-        start = self._start(ray, way, sampler, active)
-        (end,) = dr.while_loop((start,), lambda s: s.active, self._step, label="refract_path")
-        if self.plan.environment_after_loop:
-            self._add_environment(end)
-        return end
+            skipped += dr.dot(ray.o - camera.o, ray.d)
 
-    def _start(self, ray: Any, way: Any, sampler: Any, active: Any) -> LoopState:
-        v, plan = self.v, self.plan
-        valid = v.Bool(plan.environment and not plan.hide_emitters)
-        s = LoopState(ray, v.Spectrum(1), v.Spectrum(0), v.UInt32(0), active, valid, sampler, v.Float(1))
-        if plan.environment_after_loop:
+        # --------------------- Configure loop state ----------------------
+        valid_ray = v.Bool(features.environment and not features.hide_emitters)
+        s = LoopState(ray, v.Spectrum(1), v.Spectrum(0), v.UInt32(0), active, valid_ray, sampler, v.Float(1))
+        if features.environment_after_loop:
             s.escaped = v.Bool(False)
-        if plan.emitter_sampling:
-            s.previous, s.pdf, s.delta = dr.zeros(v.Interaction3f), v.Float(1), v.Bool(True)
-        if plan.split_depth:
+        if features.emitter_sampling:
+            s.prev_si, s.prev_bsdf_pdf, s.prev_bsdf_delta = dr.zeros(v.Interaction3f), v.Float(1), v.Bool(True)
+        if features.split_depth:
             s.share, s.node, s.waiting, s.specular_so_far = v.Float(1), v.UInt32(1), v.UInt32(0), v.Bool(True)
-            s.stack = dr.alloc_local(self.branch, plan.split_depth) if self.vectorised else ScalarStack()
-        if plan.deterministic:
+            s.stack = dr.alloc_local(self.branch, features.split_depth) if self.vectorised else ScalarStack()
+        if features.deterministic:
             s.truncated = v.Float(0)
-        if plan.dispersion:
+        if features.dispersion:
             s.wavelength_count = v.Float(dr.size_v(v.UnpolarizedSpectrum))
-        if plan.absorption:
-            s.sigma, s.skipped = v.UnpolarizedSpectrum(self.media.start), v.Float(way)
+        if features.absorption:
+            s.sigma, s.skipped = v.UnpolarizedSpectrum(self.media.start), v.Float(skipped)
+
+        (s,) = dr.while_loop((s,), lambda s: s.active, self._vertex, label="refract_path")
+
+        # ------------------ Environment, after the loop ------------------
+        if features.environment_after_loop:
+            si = dr.zeros(v.SurfaceInteraction3f)
+            si.t, si.time, si.wavelengths, si.wi = dr.inf, s.ray.time, s.ray.wavelengths, -s.ray.d
+            radiance = self._emitted(s, si, self.scene.environment(), s.escaped)
+            s.result += dr.select(s.escaped, self._times(s.throughput, radiance), 0)
         return s
 
-    def _past_emitters(self, ray: Any, active: Any) -> Any:
+    def _past_emitters(self, ray: Ray, active: Mask) -> Ray:
         """The ray from behind the area lights that it meets first."""
 
-        def step(ray: Any, active: Any) -> tuple[Any, Any]:
+        def step(ray: Ray, active: Mask) -> tuple[Ray, Mask]:
             si = self.scene.ray_intersect(ray, +mi.RayFlags.Minimal, True, active)
             if self.vectorised or si.is_valid():
                 active = active & si.is_valid() & operator.ne(si.shape.emitter(), None)
@@ -191,245 +235,218 @@ class Trace:
 
         return dr.while_loop((self.v.Ray3f(ray), active), lambda _, active: active, step)[0]
 
-    # One vertex ----------------------------------------------------------------------------------------------------
+    def _vertex(self, s: LoopState) -> tuple[LoopState]:
+        """One iteration: from a ray to the vertex that it meets, and on to the next ray."""
+        v, scene, features = self.v, self.scene, self.features
 
-    def _step(self, s: LoopState) -> tuple[LoopState]:
-        si = self._intersect(s)
-        hit = si.is_valid()
-        if self.plan.absorption:
-            s.throughput = self._times(s.throughput, self._left(s.sigma, si.t + s.skipped))
-        self._add_emission(s, si, hit)
-        onward = hit & (s.depth + 1 < self.plan.max_depth)
-        if self.plan.deterministic:
-            self._truncate(s, hit & (onward ^ True), 1)
-        # Where the last vertex is transparent the pixel is: `path` asks there, too.
-        if self.vectorised or onward or (hit and self.plan.null):
-            onward = self._scatter(s, si, si.bsdf(), hit, onward)
+        # ---------------------- Surface interaction ----------------------
+        if self.evaluated:
+            pi = scene.ray_intersect_preliminary(s.ray, s.depth == 0, s.active)
+            dr.eval(pi)
+            si = pi.compute_surface_interaction(s.ray, self.ray_flags, s.active)
         else:
-            s.valid = s.valid or hit
-        if self.plan.split_depth:
-            onward = self._pop(s, onward)
-        s.active = onward
+            si = scene.ray_intersect(s.ray, self.ray_flags, s.depth == 0)
+        hit = si.is_valid()
+        if features.absorption:
+            s.throughput = self._attenuated(s.throughput, s.sigma, si.t + s.skipped)
+
+        # ---------------------- Direct emission ----------------------
+        emitter: Emitter = None
+        met = hit
+        if features.environment_after_loop:
+            s.escaped = hit ^ True
+        if features.environment and not features.environment_after_loop:
+            emitter, met = si.emitter(scene), v.Bool(True)
+        elif features.area and (self.vectorised or hit):
+            emitter = si.shape.emitter()
+        if emitter is not None:
+            s.result += self._times(s.throughput, self._emitted(s, si, emitter, met))
+
+        # Should we continue tracing to reach one more vertex?
+        active_next = hit & (s.depth + 1 < features.max_depth)
+        if features.deterministic:
+            self._truncate(s, hit & (active_next ^ True), 1)
+        # Where the last vertex is transparent the pixel is: `path` samples the BSDF there, too.
+        if not (self.vectorised or active_next or (hit and features.null)):
+            s.valid_ray = s.valid_ray or hit
+            s.active = self._pop(s, active_next) if features.split_depth else active_next
+            return (s,)
+        bsdf = si.bsdf()
+        # Random numbers of split paths are those of their vertex in the tree.
+        key = (s.node * 0x9E3779B9 + s.depth) * 4 if features.split_depth else 0
+
+        # ---------------------- Emitter sampling ----------------------
+        active_em = active_next & mi.has_flag(bsdf.flags(), LOBES.Smooth) if features.emitter_sampling else False
+        if features.emitter_sampling and (self.vectorised or active_em):
+            ds, emitter_weight = self.emitters.sample(si, self.numbers.next_2d(s.sampler, key), active_em)
+            wo = si.to_local(ds.d)
+            bsdf_value, bsdf_pdf = bsdf.eval_pdf(self.context, si, wo, active_em)
+            active_em &= ds.pdf != 0
+            if not dr.grad_enabled(bsdf_value):  # a value of 0 needs no shadow ray, but may have a derivative
+                active_em &= dr.max(dr.abs(v.unpolarized_spectrum(bsdf_value))) > 0
+            active_em = active_em & (scene.ray_test(si.spawn_ray_to(ds.p), active_em) ^ True)
+            if self.evaluated:
+                dr.eval(active_em)
+            if v.is_polarized:
+                bsdf_value = si.to_world_mueller(bsdf_value, -wo, si.wi)
+            if features.absorption:
+                endless = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+                emitter_weight = self._attenuated(emitter_weight, s.sigma, dr.select(endless, dr.inf, ds.dist))
+            contribution = self._times(self._times(s.throughput, bsdf_value), emitter_weight)
+            contribution *= dr.select(ds.delta, 1, power_heuristic(ds.pdf, bsdf_pdf))
+            s.result = dr.select(active_em, s.result + contribution, s.result)
+
+        # ---------------------- BSDF sampling ----------------------
+        sample_1 = self.numbers.next_1d(s.sampler, key + 1) if features.first_number else None
+        sample_2 = self.numbers.next_2d(s.sampler, key + 2) if features.second_number else v.Point2f(0.5)
+        sample_1 = sample_2.x if sample_1 is None else sample_1
+        active_bsdf = hit if features.null else active_next
+        bsdf_sample, bsdf_weight = bsdf.sample(self.context, si, sample_1, sample_2, active_bsdf)
+        ray, throughput, optional = self._next(s, si, bsdf, bsdf_sample, bsdf_weight, active_next)
+
+        # ---- Update loop variables based on current interaction -----
+        s.valid_ray = s.valid_ray | (hit & (mi.has_flag(bsdf_sample.sampled_type, LOBES.Null) ^ True))
+        s.depth = s.depth + 1
+        if features.split_depth:
+            throughput = self._split(s, si, bsdf, bsdf_sample, sample_2, throughput, active_next)
+        s.eta = s.eta * bsdf_sample.eta
+        for name, value in optional.items():
+            setattr(s, name, dr.select(hit, value, getattr(s, name)))
+        # A ray that has left the scene is kept for the environment.
+        s.ray, s.throughput = dr.select(hit, ray, s.ray), dr.select(hit, throughput, s.throughput)
+        if features.emitter_sampling:
+            s.prev_si = dr.select(hit, v.Interaction3f(si), s.prev_si)
+            s.prev_bsdf_pdf = dr.select(hit, bsdf_sample.pdf, s.prev_bsdf_pdf)
+            s.prev_bsdf_delta = dr.select(hit, mi.has_flag(bsdf_sample.sampled_type, LOBES.Delta), s.prev_bsdf_delta)
+
+        # ---------------------- Stopping criterion ----------------------
+        throughput_max = dr.max(v.unpolarized_spectrum(s.throughput))
+        differentiated = dr.grad_enabled(s.throughput)
+        if not differentiated:  # a throughput of 0 may have a derivative
+            active_next = active_next & (throughput_max != 0)
+        if features.roulette:
+            # A branch must not be ended because it is one of several: its probability is that of an unsplit path.
+            unsplit = throughput_max / s.share if features.split_depth else throughput_max
+            rr_prob = dr.detach(dr.minimum(unsplit * dr.square(s.eta), 0.95))
+            if differentiated:
+                rr_prob = dr.select(rr_prob > 0, rr_prob, 0.5)
+            rr_active = active_next & (s.depth >= features.rr_depth)
+            rr_end = rr_active & (self.numbers.next_1d(s.sampler, key + 3) >= rr_prob)
+            s.throughput = dr.select(rr_active, s.throughput * dr.rcp(rr_prob), s.throughput)
+            active_next = active_next & (rr_end ^ True)
+
+        s.active = self._pop(s, active_next) if features.split_depth else active_next
         return (s,)
 
-    def _intersect(self, s: LoopState) -> Any:
-        if not self.evaluated:
-            return self.scene.ray_intersect(s.ray, self.flags, s.depth == 0)
-        found = self.scene.ray_intersect_preliminary(s.ray, s.depth == 0, s.active)
-        dr.eval(found)
-        return found.compute_surface_interaction(s.ray, self.flags, s.active)
-
-    def _scatter(self, s: LoopState, si: Any, bsdf: Any, hit: Any, onward: Any) -> Any:
-        """Emitter sampling, the next ray, and whether there is one."""
-        plan = self.plan
-        key = (s.node * 0x9E3779B9 + s.depth) * 4 if plan.split_depth else 0
-        if plan.emitter_sampling:
-            self._add_direct(s, si, bsdf, onward, key)
-        first = self.numbers.one(s.sampler, key + 1) if plan.first_number else None
-        second = self.numbers.two(s.sampler, key + 2) if plan.second_number else self.v.Point2f(0.5)
-        first = second.x if first is None else first
-        bs, weight = bsdf.sample(self.context, si, first, second, hit if plan.null else onward)
-        ray, throughput, inside = self._next(s, si, bsdf, bs, weight, onward)
-        s.valid = s.valid | (hit & (mi.has_flag(bs.sampled_type, LOBES.Null) ^ True))
-        s.depth = s.depth + 1
-        if plan.split_depth:
-            throughput = self._split(s, si, bsdf, bs, second, throughput, onward)
-        s.eta = s.eta * bs.eta
-        for name, value in inside.items():
-            setattr(s, name, dr.select(hit, value, getattr(s, name)))
-        # A ray that left the scene keeps all that the environment asks for.
-        s.ray, s.throughput = dr.select(hit, ray, s.ray), dr.select(hit, throughput, s.throughput)
-        if plan.emitter_sampling:
-            s.previous, s.pdf = dr.select(hit, self.v.Interaction3f(si), s.previous), dr.select(hit, bs.pdf, s.pdf)
-            s.delta = dr.select(hit, mi.has_flag(bs.sampled_type, LOBES.Delta), s.delta)
-        return self._roulette(s, onward, key)
-
-    def _next(self, s: LoopState, si: Any, bsdf: Any, bs: Any, weight: Any, active: Any) -> tuple[Any, Any, dict]:
-        """The ray after a sample of the BSDF, its throughput, and what else of the state the sample changes."""
-        if self.v.is_polarized:
+    def _next(
+        self, s: LoopState, si: Interaction, bsdf: BSDF, bs: BSDFSample, weight: Spectrum, active: Mask
+    ) -> tuple[Ray, Spectrum, dict[str, Any]]:
+        """The ray after a sample of the BSDF, its throughput, and the state of optional parts that it changes."""
+        v = self.v
+        if v.is_polarized:
             weight = si.to_world_mueller(weight, -bs.wo, si.wi)
         ray = si.spawn_ray(si.to_world(bs.wo))
         if dr.grad_enabled(weight, ray.d):
-            weight, ray.d, bs.pdf = self._at_fixed_direction(si, bsdf, bs, weight, ray.d, active)
-        throughput, changed = self._times(s.throughput, weight), {}
-        if self.plan.dispersion:
-            # The first wavelength stands for all that end here. Each is the first as often as any other.
+            weight, ray.d, bs.pdf = at_fixed_direction(v, self.context, si, bsdf, bs, weight, ray.d, active)
+        throughput, optional = self._times(s.throughput, weight), dict[str, Any]()
+        if self.features.dispersion:
+            # The first wavelength stands for all that end here; each is the first equally often.
             dispersed = (bs.sampled_type & DISPERSED) != 0
             throughput = throughput * dr.select(dispersed, s.wavelength_count, 1)
-            changed["wavelength_count"] = dr.select(dispersed, 1, s.wavelength_count)
-        if self.plan.absorption:
-            changed["sigma"] = self.media.cross(s, si, bs, bsdf, ray, active)
-            changed["skipped"] = dr.dot(ray.o - si.p, ray.d)
-        return ray, throughput, changed
+            optional["wavelength_count"] = dr.select(dispersed, 1, s.wavelength_count)
+        if self.features.absorption:
+            optional["sigma"] = self.media.cross(s.sigma, s.depth, si, bs, bsdf, ray, active)
+            optional["skipped"] = dr.dot(ray.o - si.p, ray.d)
+        return ray, throughput, optional
 
-    def _at_fixed_direction(
-        self, si: Any, bsdf: Any, bs: Any, weight: Any, d: Any, active: Any
-    ) -> tuple[Any, Any, Any]:
-        """Weight, direction and density of a sample, as they are differentiated.
+    def _emitted(self, s: LoopState, si: Interaction, emitter: Emitter, active: Mask) -> Spectrum:
+        """The radiance of an emitter that the ray has met, with its weight beside emitter sampling."""
+        radiance = emitter.eval(si, active)
+        if not self.features.emitter_sampling:
+            return radiance
+        ds = self.v.DirectionSample3f(self.scene, si, s.prev_si)
+        pdf = self.emitters.pdf(s.prev_si, ds, active & (s.prev_bsdf_delta ^ True))
+        return radiance * dr.select(s.prev_bsdf_delta, 1, power_heuristic(s.prev_bsdf_pdf, pdf))
 
-        The direction of a delta lobe moves with the parameters. Any other is a fixed place of the integrand:
-        d/dx ∫ f dω = ∫ f'(ω)/p(ω) p(ω) dω, where neither ω nor the p that it was drawn with is differentiated.
-        """
-        smooth = active & mi.has_flag(bs.sampled_type, LOBES.Smooth)
-        wo = si.to_local(dr.detach(d))
-        value, pdf = bsdf.eval_pdf(self.context, si, wo, smooth)
-        if self.v.is_polarized:
-            value = si.to_world_mueller(value, -wo, si.wi)
-        smooth &= pdf > 0
-        value = value / dr.detach(dr.select(smooth, pdf, 1))
-        return dr.select(smooth, value, weight), dr.select(smooth, dr.detach(d), d), dr.select(smooth, pdf, bs.pdf)
-
-    def _roulette(self, s: LoopState, onward: Any, key: Any) -> Any:
-        brightest = dr.max(self.v.unpolarized_spectrum(s.throughput))
-        differentiated = dr.grad_enabled(s.throughput)
-        if not differentiated:  # a throughput of 0 may have a derivative
-            onward = onward & (brightest != 0)
-        if not self.plan.roulette:
-            return onward
-        # A branch is not to be ended for being one of several: as if there had been no split.
-        whole = brightest / s.share if self.plan.split_depth else brightest
-        survival = dr.detach(dr.minimum(whole * dr.square(s.eta), 0.95))
-        if differentiated:
-            survival = dr.select(survival > 0, survival, 0.5)
-        late = onward & (s.depth >= self.plan.rr_depth)
-        ends = late & (self.numbers.one(s.sampler, key + 3) >= survival)
-        s.throughput = dr.select(late, s.throughput * dr.rcp(survival), s.throughput)
-        return onward & (ends ^ True)
-
-    def _times(self, a: Any, b: Any) -> Any:
+    def _times(self, a: Spectrum, b: Spectrum) -> Spectrum:
         return a @ b if self.v.is_polarized else a * b
 
-    def _left(self, sigma: Any, length: Any) -> Any:
-        """What a way of this length leaves of the light."""
+    def _attenuated(self, light: Spectrum, sigma: Spectrum, length: Number) -> Spectrum:
+        """Light after a distance in an absorbing medium."""
         share = absorbed(sigma, length)
-        return self.v.mueller.absorber(share) if self.v.is_polarized else share
+        return self._times(light, self.v.mueller.absorber(share) if self.v.is_polarized else share)
 
-    # Emitters ------------------------------------------------------------------------------------------------------
+    # Splitting -----------------------------------------------------------------------------------------------------
 
-    def _add_emission(self, s: LoopState, si: Any, hit: Any) -> None:
-        plan = self.plan
-        if plan.environment_after_loop:
-            s.escaped = hit ^ True
-        if plan.environment and not plan.environment_after_loop:
-            emitter, met = si.emitter(self.scene), self.v.Bool(True)
-        elif plan.area and (self.vectorised or hit):
-            emitter, met = si.shape.emitter(), hit
-        else:
-            return
-        if self.vectorised or emitter is not None:
-            s.result += self._times(s.throughput, self._emission(s, si, emitter, met))
-
-    def _add_environment(self, s: LoopState) -> None:
-        si = dr.zeros(self.v.SurfaceInteraction3f)
-        si.t, si.time, si.wavelengths, si.wi = dr.inf, s.ray.time, s.ray.wavelengths, -s.ray.d
-        found = self._emission(s, si, self.scene.environment(), s.escaped)
-        s.result += dr.select(s.escaped, self._times(s.throughput, found), 0)
-
-    def _emission(self, s: LoopState, si: Any, emitter: Any, active: Any) -> Any:
-        radiance = emitter.eval(si, active)
-        if not self.plan.emitter_sampling:
-            return radiance
-        ds = self.v.DirectionSample3f(self.scene, si, s.previous)
-        pdf = self.emitters.pdf(s.previous, ds, active & (s.delta ^ True))
-        return radiance * dr.select(s.delta, 1, power_heuristic(s.pdf, pdf))
-
-    def _add_direct(self, s: LoopState, si: Any, bsdf: Any, onward: Any, key: Any) -> None:
-        smooth = onward & mi.has_flag(bsdf.flags(), LOBES.Smooth)
-        if not self.vectorised and not smooth:
-            return
-        ds, radiance = self.emitters.sample(si, self.numbers.two(s.sampler, key), smooth)
-        wo = si.to_local(ds.d)
-        value, pdf = bsdf.eval_pdf(self.context, si, wo, smooth)
-        lit = smooth & (ds.pdf != 0)
-        if not dr.grad_enabled(value):  # what reflects nothing needs no shadow ray, but may have a derivative
-            lit &= dr.max(dr.abs(self.v.unpolarized_spectrum(value))) > 0
-        lit = lit & (self.scene.ray_test(si.spawn_ray_to(ds.p), lit) ^ True)
-        if self.evaluated:
-            dr.eval(lit)
-        if self.v.is_polarized:
-            value = si.to_world_mueller(value, -wo, si.wi)
-        if self.plan.absorption:
-            endless = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-            radiance = self._times(radiance, self._left(s.sigma, dr.select(endless, dr.inf, ds.dist)))
-        found = self._times(self._times(s.throughput, value), radiance)
-        found *= dr.select(ds.delta, 1, power_heuristic(ds.pdf, pdf))
-        s.result = dr.select(lit, s.result + found, s.result)
-
-    # Both lobes ----------------------------------------------------------------------------------------------------
-
-    def _split(self, s: LoopState, si: Any, bsdf: Any, bs: Any, second: Any, throughput: Any, onward: Any) -> Any:
-        """Push the other lobe where both are worth following; the throughput of the lobe that was sampled."""
-        plan, p = self.plan, dr.detach(bs.pdf)
-        pair = onward & s.specular_so_far & self._is_boundary(bsdf)
+    def _split(
+        self, s: LoopState, si: Interaction, bsdf: BSDF, bs: BSDFSample, sample_2: Point2, throughput: Spectrum,
+        active: Mask,
+    ) -> Spectrum:  # fmt: skip
+        """Push the lobe that was not sampled where both are worth following; the throughput of the other one."""
+        features, p = self.features, dr.detach(bs.pdf)
+        boundary = active & s.specular_so_far & self._is_boundary(bsdf)
         s.specular_so_far = s.specular_so_far & mi.has_flag(bs.sampled_type, LOBES.Delta)
-        both = pair & (s.depth <= plan.split_depth) & (s.share * dr.minimum(p, 1 - p) > plan.split_weight)
+        both = boundary & (s.depth <= features.split_depth) & (s.share * dr.minimum(p, 1 - p) > features.split_weight)
         if self.vectorised or both:
-            both = self._push(s, si, bsdf, bs, second, both)
-        if plan.deterministic:
-            # The sample 1/2 has picked the stronger lobe; the other one is lost.
-            self._truncate(s, pair & (both ^ True), 1 - p)
-            both = pair
+            reflected = mi.has_flag(bs.sampled_type, LOBES.DeltaReflection)
+            other, weight = bsdf.sample(self.context, si, dr.select(reflected, LAST, FIRST), sample_2, both)
+            both = both & (other.sampled_type != bs.sampled_type)
+            ray, other_throughput, optional = self._next(s, si, bsdf, other, weight * other.pdf, both)
+            # The lobe that was sampled has the odd number.
+            branch = self.branch(
+                ray.o, ray.d, other_throughput, s.depth, s.eta * other.eta, s.share * dr.detach(other.pdf), 2 * s.node,
+                **optional,
+            )  # fmt: skip
+            # The index of an idle lane must be in range as well: local memory is accessed there.
+            s.stack.write(branch, dr.select(both, s.waiting, 0), both)
+            s.waiting = dr.select(both, s.waiting + 1, s.waiting)
+            s.node = dr.select(both, 2 * s.node + 1, s.node)
+            s.share = dr.select(both, s.share * dr.detach(bs.pdf), s.share)
+        if features.deterministic:
+            # The sample 1/2 has selected the stronger lobe; the other one is dropped.
+            self._truncate(s, boundary & (both ^ True), 1 - p)
+            both = boundary
         return dr.select(both, throughput * bs.pdf, throughput)
 
-    def _truncate(self, s: LoopState, where: Any, share: Any) -> None:
-        # η²: what radiance lost where the path entered a denser medium it regains where it leaves.
+    def _pop(self, s: LoopState, active_next: Mask) -> Mask:
+        """Where a path has ended, go on with the branch that was pushed last."""
+        popped = (active_next ^ True) & (s.waiting > 0)
+        if not self.vectorised and not popped:
+            return active_next
+        s.waiting = dr.select(popped, s.waiting - 1, s.waiting)
+        branch = s.stack.read(dr.select(popped, s.waiting, 0), popped)
+        s.ray.o, s.ray.d = dr.select(popped, branch.o, s.ray.o), dr.select(popped, branch.d, s.ray.d)
+        for name in self.branch.__annotations__.keys() - {"o", "d"}:
+            setattr(s, name, dr.select(popped, getattr(branch, name), getattr(s, name)))
+        if self.features.emitter_sampling:
+            s.prev_bsdf_pdf, s.prev_bsdf_delta = dr.select(popped, 1, s.prev_bsdf_pdf), s.prev_bsdf_delta | popped
+        s.specular_so_far = s.specular_so_far | popped
+        return active_next | popped
+
+    def _truncate(self, s: LoopState, where: Mask, share: Number) -> None:
+        # η²: radiance that was lost where the path entered a denser medium is regained where it leaves.
         lost = dr.max(self.v.unpolarized_spectrum(s.throughput)) * dr.square(s.eta) * share
         s.truncated = dr.select(where, s.truncated + lost, s.truncated)
 
-    def _boundaries(self) -> list[tuple[Any, Any]]:
-        """The numbers of the BSDFs that are `BOUNDARIES`, as ranges: from, up to and without.
+    def _boundaries(self) -> list[tuple[Count, Count]]:
+        """The numbers of the BSDFs that are `BOUNDARIES`, as ranges: first, and one after the last.
 
         Mitsuba numbers BSDFs as they are loaded. Opaque: another scene is other data, not another kernel.
         """
         v, ranges = self.v, list[list[int]]()
-        bsdfs = [bsdf for shape in all_shapes(self.scene) if (bsdf := shape.bsdf()) is not None]
-        pointers: list[Any] = [
-            dr.reinterpret_array(v.UInt32, v.BSDFPtr(b)) for b in bsdfs if bsdf_name(b) in BOUNDARIES
-        ]
-        for number in sorted({int(pointer[0]) for pointer in pointers}):
+        bsdfs = [bsdf for shape in all_shapes(self.scene) if (bsdf := shape.bsdf()) and bsdf_name(bsdf) in BOUNDARIES]
+        for number in sorted({plugin_number(v, v.BSDFPtr(bsdf)) for bsdf in bsdfs}):
             if ranges and ranges[-1][1] == number:
                 ranges[-1][1] += 1
             else:
                 ranges.append([number, number + 1])
         return [(dr.opaque(v.UInt32, first), dr.opaque(v.UInt32, last)) for first, last in ranges]
 
-    def _is_boundary(self, bsdf: Any) -> Any:
+    def _is_boundary(self, bsdf: BSDF) -> Mask:
         """Whether a BSDF is known to have one reflected and one refracted direction, and no others."""
         if not self.vectorised:
             return bsdf_name(bsdf) in BOUNDARIES
-        number, found = dr.reinterpret_array(self.v.UInt32, bsdf), self.v.Bool(False)
+        number, inside = dr.reinterpret_array(self.v.UInt32, bsdf), self.v.Bool(False)
         for first, last in self.boundaries:
-            found |= (number >= first) & (number < last)
-        return found
-
-    def _push(self, s: LoopState, si: Any, bsdf: Any, bs: Any, second: Any, both: Any) -> Any:
-        reflected = mi.has_flag(bs.sampled_type, LOBES.DeltaReflection)
-        other, weight = bsdf.sample(self.context, si, dr.select(reflected, LAST, FIRST), second, both)
-        both = both & (other.sampled_type != bs.sampled_type)
-        ray, throughput, inside = self._next(s, si, bsdf, other, weight * other.pdf, both)
-        # The lobe that was sampled has the odd number.
-        branch = self.branch(
-            ray.o, ray.d, throughput, s.depth, s.eta * other.eta, s.share * dr.detach(other.pdf), 2 * s.node,
-            **inside,
-        )  # fmt: skip
-        # The index of an idle lane must be in range as well: local memory is accessed there.
-        s.stack.write(branch, dr.select(both, s.waiting, 0), both)
-        s.waiting = dr.select(both, s.waiting + 1, s.waiting)
-        s.node = dr.select(both, 2 * s.node + 1, s.node)
-        s.share = dr.select(both, s.share * dr.detach(bs.pdf), s.share)
-        return both
-
-    def _pop(self, s: LoopState, onward: Any) -> Any:
-        """Where a path has ended, pop the branch pushed last and go on with it."""
-        found = (onward ^ True) & (s.waiting > 0)
-        if not self.vectorised and not found:
-            return onward
-        s.waiting = dr.select(found, s.waiting - 1, s.waiting)
-        branch = s.stack.read(dr.select(found, s.waiting, 0), found)
-        s.ray.o, s.ray.d = dr.select(found, branch.o, s.ray.o), dr.select(found, branch.d, s.ray.d)
-        for name in self.branch.__annotations__.keys() - {"o", "d"}:
-            setattr(s, name, dr.select(found, getattr(branch, name), getattr(s, name)))
-        if self.plan.emitter_sampling:
-            s.pdf, s.delta = dr.select(found, 1, s.pdf), s.delta | found
-        s.specular_so_far = s.specular_so_far | found
-        return onward | found
+            inside |= (number >= first) & (number < last)
+        return inside

@@ -1,12 +1,16 @@
-"""The Mitsuba BSDF `refract`, which takes the place of `dielectric`. The mathematics is in `mi_refract.formulas`.
+"""The Mitsuba BSDF `refract`, a drop-in for `dielectric`. The mathematics is in `mi_refract.formulas`.
 
 | parameter | type | meaning and default | exposed | differentiable |
 |---|---|---|---|---|
-| `int_ior`, `ext_ior` | number, string, texture | index inside (`bk7`), outside (`air`) | if it varies | yes |
-| `eta` | number | int_ior / ext_ior, where neither varies by wavelength or point | yes | yes |
-| `specular_reflectance`, `…_transmittance` | number, texture | tint of the lobe (1) | yes | yes |
-| `int_absorption`, `ext_absorption`, … | number, spectrum | absorption of a side (none) | yes | yes |
-| `formula` | string | a key of FORMULAS, or `auto` (default) | no | no |
+| `int_ior`, `ext_ior` | number, string | index inside (`bk7`) and outside (`air`), also by name | as `eta` | yes |
+| | dispersive material, spectrum | index by wavelength, see `mi_refract.media` | `int_ior_A`, … | yes |
+| | texture | index by point | texture | yes |
+| `eta` | number | int_ior / ext_ior, only by `mi.traverse` | yes | yes |
+| `specular_reflectance`, `specular_transmittance` | number, texture | tint of the lobe (1) | texture | yes |
+| `int_absorption`, `ext_absorption` | number, spectrum | σ of the medium on that side (0) | spectrum | yes |
+| `int_colour`, `ext_colour` | number, spectrum | what white light keeps after the distance below | spectrum | yes |
+| `int_colour_distance`, `ext_colour_distance` | number | with the former; no default | no | no |
+| `formula` | string | a key of `FORMULAS`, or `auto` (default) | no | no |
 
 A plugin class belongs to one variant: `plugin_class` makes it of the functions below, `register` makes it known. In
 these functions `self.v` is the variant's module and `self.wide` its float64.
@@ -27,20 +31,35 @@ with (`DISPERSED` in `sampled_type`). For other integrators the index is that of
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from collections.abc import Collection
+from typing import Any, NamedTuple, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 
 from mi_refract.formulas import FORMULAS, LARGEST_RATIO, SMALLEST_RATIO, fresnel, local_cosines, resolve
 from mi_refract.media import LINES
-from mi_refract.numerics import differentiated, ieee_divide, replace_grad
+from mi_refract.numerics import (
+    BSDFSample,
+    Interaction,
+    Mask,
+    Number,
+    Point2,
+    Properties,
+    Spectrum,
+    Variant,
+    Vector3,
+    differentiated,
+    ieee_divide,
+    replace_grad,
+)
 
 from .absorption import BEYOND, HERE, absorbing_parameter, read_absorption
-from .index_parameter import PLUGIN
-from .index_ratio import DispersiveRatio, TexturedRatio, read_ratio
+from .index_parameter import PLUGIN, DispersiveRatio, TexturedRatio, one_number, parameter_type, read_ratio
 from .integrator_context import DISPERSED, is_followed, warn_once
 
+Refract: TypeAlias = Any  # an object of the class that `plugin_class` makes
+Context: TypeAlias = Any  # an `mi.BSDFContext`
 LOBES = ("specular_reflectance", "specular_transmittance")  # tint of the reflected and of the transmitted lobe
 FLAGS = mi.BSDFFlags
 FIXED_DIRECTIONS = "prb, prb_basic, prb_projective and prbvolpath do not differentiate the direction of a delta lobe"
@@ -52,35 +71,35 @@ SAME_DIRECTION = 1e-4  # a direction that was sampled comes back from world spac
 class Side(NamedTuple):
     """The boundary as seen from one side: k = n_from / n_to and κ = k² − 1, in float64."""
 
-    k: Any
-    contrast: Any
+    k: Number
+    contrast: Number
 
 
 class Ray(NamedTuple):
     """A refracted ray in the local frame: a = −wi, `eta` = n_to / n_from, `r` : `t` the unpolarised powers."""
 
-    a: Any
+    a: Vector3
     side: Side
-    wo: Any
-    eta: Any
-    transmitted: Any
-    r: Any
-    t: Any
-    active: Any  # where there is an index
+    wo: Vector3
+    eta: Number
+    transmitted: Mask
+    r: Number
+    t: Number
+    active: Mask  # where there is an index
 
 
 class OtherRay(NamedTuple):
     """What `refract_path` needs of a wavelength that is not the hero."""
 
     side: Side
-    found: Any  # where there is an index
-    r: Any  # reflectance; 0 where there is no index
+    valid: Mask  # where there is an index
+    r: Number  # reflectance; 0 where there is no index
 
 
 # Parameters ----------------------------------------------------------------------------------------------------------
 
 
-def read_parameters(self: Any, props: Any, formula: str = "auto") -> None:
+def read_parameters(self: Refract, props: Properties, formula: str = "auto") -> None:
     """ValueError with plugin, parameter and what is expected."""
     v = self.v
     v.BSDF.__init__(self, props)
@@ -94,9 +113,7 @@ def read_parameters(self: Any, props: Any, formula: str = "auto") -> None:
         raise ValueError(f"{PLUGIN}: {error}") from None
     self.textures = {name: props.get_texture(name, 1.0) for name in LOBES if name in props}
     self.absorptions = {side: read_absorption(PLUGIN, props, side) for side in ("int", "ext")}
-    # Scalar variants: Mitsuba can set an array of one number, but not a bare Python float.
-    number = v.Float if dr.is_jit_v(v.Float) else dr.scalar.Array1f
-    self.eta = number(eta)
+    self.eta = parameter_type(v)(eta)
     set_ratio(self, checked("int_ior / ext_ior", eta))
     both_sides = FLAGS.FrontSide | FLAGS.BackSide
     self.m_components = [
@@ -107,13 +124,13 @@ def read_parameters(self: Any, props: Any, formula: str = "auto") -> None:
 
 
 def checked(name: str, eta: float) -> float:
-    """`eta`; ValueError where it is no ratio of indices."""
+    """`eta`; ValueError where it is not a ratio of indices."""
     if not SMALLEST_RATIO <= eta <= LARGEST_RATIO:
         raise ValueError(f"{PLUGIN}: {name} = {eta!r}; expected a ratio from {SMALLEST_RATIO} to {LARGEST_RATIO}")
     return eta
 
 
-def set_ratio(self: Any, eta: Any) -> None:
+def set_ratio(self: Refract, eta: Number) -> None:
     """Set k from either side, in float64. Opaque: an edit changes the data of a kernel and not its code.
 
     A kernel gathers these numbers ray by ray, so there are no more than save it a division. κ = (k − 1)(k + 1) is
@@ -127,7 +144,7 @@ def set_ratio(self: Any, eta: Any) -> None:
     dr.make_opaque(self.eta, self.k_inner, self.k_outer)
 
 
-def traverse(self: Any, cb: Any) -> None:
+def traverse(self: Refract, cb: mi.TraversalCallback) -> None:
     """Show the parameters."""
     if self.varying:
         self.varying.traverse(cb)
@@ -139,61 +156,56 @@ def traverse(self: Any, cb: Any) -> None:
         cb.put(absorption.name, absorption.texture, mi.ParamFlags.Differentiable)
 
 
-def parameters_changed(self: Any, keys: Any) -> None:
-    """Take over what was set. ValueError for an index that is none."""
+def parameters_changed(self: Refract, keys: Collection[str]) -> None:
+    """Take over what was set. ValueError for a value that is not an index."""
     if self.varying:
         self.varying.changed(keys)
         if isinstance(self.varying, DispersiveRatio):
             set_ratio(self, self.varying.at(self.wide(LINES["d"])))
     elif not keys or "eta" in keys:
-        if len(self.eta) != 1:
-            raise ValueError(f"{PLUGIN}: eta has {len(self.eta)} entries; expected one number")
         if dr.is_jit_v(self.eta) and dr.flag(dr.JitFlag.FreezingScope):
-            # A number cannot be read while a function is recorded. An index that is none loses its light.
+            # A number cannot be read while a function is recorded. A value that is not an index loses its light.
             eta = self.wide(dr.detach(self.eta))
             set_ratio(self, dr.select((eta >= SMALLEST_RATIO) & (eta <= LARGEST_RATIO), eta, dr.nan))
             return
         # A number is read back, so that an edit compiles nothing. What was not edited keeps its double precision.
-        inner: Any = dr.slice(self.k_inner)
-        number, kept = float(self.eta[0]), float(inner)
+        kept: Any = dr.slice(self.k_inner)
+        number, kept = float(one_number("eta", self.eta)), float(kept)
         set_ratio(self, kept if dr.scalar.Array1f(kept)[0] == number else checked("eta", number))
 
 
-def ratios(self: Any, si: Any, by_wavelength: bool, active: Any) -> tuple[Any, Any, Any]:
-    """k from inside and from outside, in float64, and the lanes that have an index."""
-    if by_wavelength:
-        return faces(self.varying.at(self.wide(si.wavelengths[0])), active)
-    if isinstance(self.varying, TexturedRatio):
-        return faces(self.varying.at(si, active), active)
-    if not is_differentiated(self):
+def ratios(
+    self: Refract, si: Interaction, active: Mask, wavelength: Number | None = None
+) -> tuple[Number, Number, Mask]:
+    """k from inside and from outside, in float64, at a wavelength or of the d line; and the lanes that have one."""
+    if wavelength is not None or isinstance(self.varying, TexturedRatio):
+        eta = self.varying.at(si, active) if wavelength is None else self.varying.at(self.wide(wavelength))
+        valid = dr.isfinite(eta)
+        eta = dr.select(valid, eta, 1)
+        return eta, 1 / eta, active & valid
+    if not (self.varying.differentiated if self.varying else differentiated(self.eta)):
         return self.k_inner, self.k_outer, active
     eta = self.varying.at(self.wide(LINES["d"])) if self.varying else self.wide(self.eta)
     return replace_grad(self.k_inner, eta), replace_grad(self.k_outer, 1 / eta), active
 
 
-def faces(eta: Any, active: Any) -> tuple[Any, Any, Any]:
-    """k from inside and from outside where there is a ratio, 1 elsewhere; and where there is one."""
-    found = dr.isfinite(eta)
-    eta = dr.select(found, eta, 1)
-    return eta, 1 / eta, active & found
-
-
-def is_differentiated(self: Any) -> bool:
-    """Whether a number that the index is made of carries a derivative. (Textures: as their values.)"""
-    return self.varying.differentiated if self.varying else differentiated(self.eta)
-
-
 # Sampling ------------------------------------------------------------------------------------------------------------
 
 
-def sample(self: Any, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+def sample(
+    self: Refract, ctx: Context, si: Interaction, sample1: Number, sample2: Point2, active: Mask = True
+) -> tuple[BSDFSample, Spectrum]:
     """One of the two lobes, by `sample1`; see the module docstring."""
     v = self.v
     has_r, has_t = ctx.is_enabled(FLAGS.DeltaReflection, 0), ctx.is_enabled(FLAGS.DeltaTransmission, 1)
     if not (has_r or has_t):
         return dr.zeros(v.BSDFSample3f), v.Spectrum(0)
-    both, by_wavelength = has_r and has_t, goes_by_wavelength(self, ctx)
-    ray = refract(self, si, by_wavelength, active)
+    both, followed = has_r and has_t, is_followed(ctx)
+    by_wavelength = followed and self.dispersive
+    if self.dispersive and not followed:
+        names = " in ".join(medium.name for medium in self.varying.sides.values())
+        warn_once(f"{PLUGIN}: {names}: all light has the index of the d line; expected the integrator refract_path")
+    ray = refract(self, si, active, si.wavelengths[0] if by_wavelength else None)
     active, others = ray.active, other_rays(self, si, ray) if by_wavelength else []
 
     # --- The lobe ---
@@ -226,44 +238,33 @@ def sample(self: Any, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any
     elif by_wavelength:
         powers = [dr.select(selected_r, r, t) for r, t in zip(reflectances, (hero_t, *[0] * len(others)), strict=True)]
         weight = v.Spectrum(*powers) * scale
+    elif both:
+        # 1, with the derivative of log `value`: the choice of a lobe is detached, its probability is not.
+        one = replace_grad(v.Float(1), value / dr.detach(value)) if differentiated(value) else 1
+        weight = v.Spectrum(one * factor)
     else:
-        weight = v.Spectrum(attached(v, value) * factor if both else value * factor)
+        weight = v.Spectrum(value * factor)
     for name, texture in self.textures.items():
         selected = selected_r if name == LOBES[0] else selected_t
         tint = dr.select(selected, texture.eval(si, selected), v.UnpolarizedSpectrum(1))
         weight = weight @ v.mueller.absorber(tint) if v.is_polarized else weight * tint
-    if self.absorbing and not is_followed(ctx):
-        weight = v.Spectrum(refuse_others(self))
+    if self.absorbing and not followed:
+        # An infinite weight, where only `refract_path` can be right; in scalar variants an error. Dr.Jit calls the
+        # BSDFs of all scenes in memory, also where no light meets them: an error would be one of scenes that do not
+        # absorb. (Not NaN: some integrators drop such a sample.)
+        text = f"{PLUGIN}: {absorbing_parameter(self)}; expected the integrator refract_path, or no absorption"
+        if not dr.is_jit_v(v.Float):
+            raise RuntimeError(text)
+        warn_once(f"{text}; where light meets it, the image is infinite")
+        weight = v.Spectrum(dr.inf)
     return bs, dr.select(active, weight, 0)
 
 
-def goes_by_wavelength(self: Any, ctx: Any) -> bool:
-    """Whether the wavelengths go their own ways."""
-    followed = is_followed(ctx)
-    if self.dispersive and not followed:
-        names = self.varying.names()
-        warn_once(f"{PLUGIN}: {names}: all light has the index of the d line; expected the integrator refract_path")
-    return followed and self.dispersive
-
-
-def refuse_others(self: Any) -> Any:
-    """An infinite weight, where only `refract_path` can be right; in scalar variants a RuntimeError.
-
-    Dr.Jit asks the BSDFs of all scenes in memory, also where no light meets them: an error would be one of scenes that
-    do not absorb. (Some integrators leave out a sample that is NaN.)
-    """
-    text = f"{PLUGIN}: {absorbing_parameter(self)}; expected the integrator refract_path, or no absorption"
-    if not dr.is_jit_v(self.v.Float):
-        raise RuntimeError(text)
-    warn_once(f"{text}; where light meets it, the image is infinite")
-    return dr.inf
-
-
-def refract(self: Any, si: Any, by_wavelength: bool, active: Any) -> Ray:
+def refract(self: Refract, si: Interaction, active: Mask, wavelength: Number | None = None) -> Ray:
     """The ray's side, refracted direction and reflectance. The normal is a literal: Dr.Jit folds it away."""
     a, outside = -si.wi, si.wi.z >= 0
-    inner, outer, active = ratios(self, si, by_wavelength, active)
-    k, eta = (dr.select(outside, *x) for x in ((outer, inner), (inner, outer)))
+    inner, outer, active = ratios(self, si, active, wavelength)
+    k, eta = (dr.select(outside, *pair) for pair in ((outer, inner), (inner, outer)))
     side = Side(k, (k - 1) * (k + 1))
     # Unchecked: the ratio is checked where it is set, and NaN stays NaN.
     local = local_cosines(a.x, a.y, a.z, side.contrast)
@@ -272,25 +273,28 @@ def refract(self: Any, si: Any, by_wavelength: bool, active: Any) -> Ray:
     return Ray(a, side, wo, self.v.Float(eta), transmitted, *odds, active)
 
 
-def other_rays(self: Any, si: Any, ray: Ray) -> list[OtherRay]:
+def other_rays(self: Refract, si: Interaction, ray: Ray) -> list[OtherRay]:
     """The wavelengths but the first."""
-    v, found_rays = self.v, []
+    v, others = self.v, []
     for i in range(1, dr.size_v(v.UnpolarizedSpectrum)):
-        inner, outer, found = faces(self.varying.at(self.wide(si.wavelengths[i])), v.Bool(True))
+        inner, outer, valid = ratios(self, si, v.Bool(True), si.wavelengths[i])
         k = dr.select(si.wi.z >= 0, outer, inner)
         side = Side(k, (k - 1) * (k + 1))
         local = local_cosines(ray.a.x, ray.a.y, ray.a.z, side.contrast)
         r, t = fresnel.local_odds(local, local.radicand >= 0, *side)
-        found_rays.append(OtherRay(side, found, dr.select(found, v.Float(ieee_divide(r, r + t)), 0)))
-    return found_rays
+        others.append(OtherRay(side, valid, dr.select(valid, v.Float(ieee_divide(r, r + t)), 0)))
+    return others
 
 
-def attached(v: Any, value: Any) -> Any:
-    """1, with the derivative of log `value`: the choice of a lobe is detached, its probability is not."""
-    return replace_grad(v.Float(1), value / dr.detach(value)) if differentiated(value) else 1
-
-
-def mueller(self: Any, ctx: Any, si: Any, bs: Any, ray: Ray, selected_r: Any, others: list[OtherRay]) -> Any:
+def mueller(
+    self: Refract,
+    ctx: Context,
+    si: Interaction,
+    bs: BSDFSample,
+    ray: Ray,
+    selected_r: Mask,
+    others: list[OtherRay],
+) -> Spectrum:
     """The Mueller matrix of the selected lobe, turned into the implicit Stokes bases of both directions.
 
     `others`: the wavelengths but the first, which are reflected only; none where all go the same way.
@@ -302,29 +306,27 @@ def mueller(self: Any, ctx: Any, si: Any, bs: Any, ray: Ray, selected_r: Any, ot
         matrices: Any = [fresnel.mueller_reflection(cos_i, *other.side) for other in others]
         for i in range(4):
             for j in range(4):
-                more = (dr.select(other.found, m[i][j], 0) for other, m in zip(others, matrices, strict=True))
+                more = (dr.select(other.valid, m[i][j], 0) for other, m in zip(others, matrices, strict=True))
                 r[i][j] = v.UnpolarizedSpectrum(r[i][j], *more)
                 t[i][j] = v.UnpolarizedSpectrum(t[i][j], *[0] * len(others))
     entries = [[dr.select(selected_r, x, y) for x, y in zip(*rows, strict=True)] for rows in zip(r, t, strict=True)]
     matrix = v.Spectrum(entries) if others else v.Spectrum(v.Matrix4f(entries))
     # Radiance: light arrives along −wo and leaves along wi. Importance: the other way round.
     radiance = ctx.mode == mi.TransportMode.Radiance
-    arrival, departure = (-bs.wo, si.wi) if radiance else (-si.wi, bs.wo)
-    bases = [(d, perpendicular(v, d), v.mueller.stokes_basis(d)) for d in (arrival, departure)]
-    return v.mueller.rotate_mueller_basis(matrix, *bases[0], *bases[1])
-
-
-def perpendicular(v: Any, direction: Any) -> Any:
-    """The unit normal of the plane of incidence; any tangent where there is no such plane."""
-    axis = v.Vector3f(-direction.y, direction.x, 0)
-    length = dr.norm(axis)
-    return dr.select(length > 0, axis / dr.select(length > 0, length, 1), v.Vector3f(1, 0, 0))
+    bases = []
+    for direction in (-bs.wo, si.wi) if radiance else (-si.wi, bs.wo):
+        # The unit normal of the plane of incidence; any tangent where there is no such plane.
+        axis = v.Vector3f(-direction.y, direction.x, 0)
+        length = dr.norm(axis)
+        normal = dr.select(length > 0, axis / dr.select(length > 0, length, 1), v.Vector3f(1, 0, 0))
+        bases += [direction, normal, v.mueller.stokes_basis(direction)]
+    return v.mueller.rotate_mueller_basis(matrix, *bases)
 
 
 # Densities -----------------------------------------------------------------------------------------------------------
 
 
-def evaluate(self: Any, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+def evaluate(self: Refract, ctx: Context, si: Interaction, wo: Vector3, active: Mask = True) -> Spectrum:
     """0: a pair of delta lobes has no density anywhere. For `prb` and its kin, while they differentiate, more than 0.
 
     They sample without derivatives, in a symbolic loop, and differentiate log eval at the direction that was sampled;
@@ -337,7 +339,7 @@ def evaluate(self: Any, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
         return v.Spectrum(0)
     reflected = wo.z * si.wi.z > 0
     tints = [self.textures[x].eval(si, active) if x in self.textures else v.UnpolarizedSpectrum(1) for x in LOBES]
-    value, index = dr.select(reflected, *tints), ratios(self, si, False, active)[0]
+    value, index = dr.select(reflected, *tints), ratios(self, si, active)[0]
     if not (differentiated(value) or differentiated(index)):
         return v.Spectrum(0)
     if differentiated(index):
@@ -345,19 +347,19 @@ def evaluate(self: Any, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
             f"{PLUGIN}: the derivative in the index is infinite: {FIXED_DIRECTIONS}; expected {MOVING_DIRECTIONS}"
         )
         value *= replace_grad(v.Float(1), v.Float(index) * dr.inf)
-    ray = refract(self, si, False, active)
+    ray = refract(self, si, active)
     lobe = dr.select(reflected, v.Vector3f(ray.a.x, ray.a.y, si.wi.z), ray.wo)
     near = active & (dr.squared_norm(dr.detach(wo - lobe)) < SAME_DIRECTION**2)
     value = dr.select(near, value * VALUE_AT_LOBE, 0)
     return v.Spectrum(v.mueller.absorber(value)) if v.is_polarized else value
 
 
-def pdf(self: Any, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+def pdf(self: Refract, ctx: Context, si: Interaction, wo: Vector3, active: Mask = True) -> Number:
     """0: a delta lobe has no density."""
     return self.v.Float(0)
 
 
-def eval_pdf(self: Any, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+def eval_pdf(self: Refract, ctx: Context, si: Interaction, wo: Vector3, active: Mask = True) -> tuple[Spectrum, Number]:
     """0 and 0, as `pdf`; what `evaluate` is for `prb` alone."""
     return self.v.Spectrum(0), self.v.Float(0)
 
@@ -365,13 +367,13 @@ def eval_pdf(self: Any, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple
 # Attributes: Mitsuba finds what `traverse` shows, and gives 0 for what it does not find (an error in scalars) --------
 
 
-def has_attribute(self: Any, name: str, active: Any = True) -> Any:
+def has_attribute(self: Refract, name: str, active: Mask = True) -> Mask:
     """Those that `traverse` shows, and absorption where there is any."""
     v = self.v
     return v.Bool(self.absorbing) if name in (HERE, BEYOND) else v.BSDF.has_attribute(self, name, active)
 
 
-def eval_attribute(self: Any, name: str, si: Any, active: Any = True) -> Any:
+def eval_attribute(self: Refract, name: str, si: Interaction, active: Mask = True) -> Spectrum:
     """As `has_attribute`; 0 for any other, in vectorised variants."""
     v = self.v
     if name not in (HERE, BEYOND):
@@ -380,54 +382,53 @@ def eval_attribute(self: Any, name: str, si: Any, active: Any = True) -> Any:
     return dr.select((si.wi.z >= 0) ^ (name == HERE), *sides)
 
 
-def eval_attribute_1(self: Any, name: str, si: Any, active: Any = True) -> Any:
+def eval_attribute_1(self: Refract, name: str, si: Interaction, active: Mask = True) -> Number:
     """As `eval_attribute`."""
     if name == "eta" and not self.varying and not dr.is_jit_v(self.v.Float):
         return self.eta[0]  # Mitsuba finds no number in an array
     return self.v.BSDF.eval_attribute_1(self, name, si, active)
 
 
-def to_string(self: Any) -> str:
+def to_string(self: Refract) -> str:
     """The parameters, one a line."""
     chosen = f"{self.formula_name} (auto)" if self.requested == "auto" else self.formula_name
     lines = self.varying.lines() if self.varying else [f"eta = {self.eta[0]}"]
     lines += [f"formula = {chosen}", *(f"{name} = {texture}" for name, texture in self.textures.items())]
-    lines += [f"{each.name} = {each.texture}" for each in self.absorptions.values() if each]
+    lines += [f"{side.name} = {side.texture}" for side in self.absorptions.values() if side]
     return "Refract[\n" + "".join("  " + line.replace("\n", "\n  ") + ",\n" for line in lines) + "]"
 
 
 # The class -----------------------------------------------------------------------------------------------------------
 
 
-def is_dispersive(self: Any) -> bool:
-    """Whether light is bent by its wavelength, where `refract_path` asks."""
-    return self.v.is_spectral and isinstance(self.varying, DispersiveRatio)
-
-
-def is_absorbing(self: Any) -> bool:
-    """Whether a side absorbs light, which `refract_path` alone can do."""
-    return any(self.absorptions.values())
-
-
-def plugin_class(v: Any) -> type:
+def plugin_class(v: Variant) -> type:
     """The class of the plugin for one variant, given its module (`mitsuba.llvm_ad_rgb`, say)."""
-    methods: dict[str, Any] = {
+
+    def dispersive(self: Refract) -> bool:
+        """Whether the direction depends on the wavelength, where `refract_path` samples."""
+        return v.is_spectral and isinstance(self.varying, DispersiveRatio)
+
+    def absorbing(self: Refract) -> bool:
+        """Whether a side absorbs light, which only `refract_path` can render."""
+        return any(self.absorptions.values())
+
+    members = {
         "__doc__": "Smooth dielectric boundary; see the module docstring.",
         "v": v,
         "wide": dr.float64_array_t(v.Float),
         "__init__": read_parameters,
         "eval": evaluate,
-        "dispersive": property(is_dispersive),
-        "absorbing": property(is_absorbing),
+        "dispersive": property(dispersive),
+        "absorbing": property(absorbing),
     }
-    named = (traverse, parameters_changed, sample, pdf, eval_pdf, has_attribute, eval_attribute, eval_attribute_1)
-    return type("Refract", (v.BSDF,), methods | {each.__name__: each for each in (*named, to_string)})
+    named = traverse, parameters_changed, sample, pdf, eval_pdf, has_attribute, eval_attribute, eval_attribute_1
+    return type("Refract", (v.BSDF,), members | {method.__name__: method for method in (*named, to_string)})
 
 
-def register(variant: Any) -> None:
+def register(variant: Variant) -> None:
     """Make `refract` known to one variant, given its module; and `refract_<formula>` for every formula.
 
-    The latter are for scenes whose plugin is a parameter: there no word is left to name the formula with.
+    The latter are for scenes whose plugin is a parameter, so that no parameter is left to name the formula.
     Registering again is harmless.
     """
     plugin = plugin_class(variant)

@@ -1,10 +1,15 @@
 """The integrator `refract_path`: Mitsuba's `path` without what the scene does not need, and with both lobes of glass.
 
-Parameters: `max_depth`, `rr_depth`, `hide_emitters` as in `path`. `split_depth` (0): at so many boundaries of a path,
-counted from the camera, both lobes of glass are followed, each with its power, instead of one by chance.
-`split_weight` (0.01): but no lobe whose share of the light is smaller. `deterministic` (False): no lobe is chosen by
-chance, and lobes with a smaller share are dropped; the channel `truncated` holds what was dropped, and times the
-largest radiance it is a bound of the error.
+| parameter | type | meaning and default |
+|---|---|---|
+| `max_depth`, `rr_depth` | integer | as in `path`: longest path (-1: no limit), start of Russian roulette (5) |
+| `hide_emitters` | boolean | as in `path` (false) |
+| `split_depth` | integer | both lobes are followed at so many boundaries, counted from the camera (0) |
+| `split_weight` | number | a lobe whose share of the light would be smaller is not followed (0.01) |
+| `deterministic` | boolean | no lobe is chosen by chance; lobes with a smaller share are dropped (false) |
+| `camera_absorption`, `camera_colour`, `camera_colour_distance` | number, spectrum | the medium at the camera (none) |
+
+With `deterministic` the channel `truncated` holds what was dropped: times the largest radiance it bounds the error.
 
 Derivatives are attached: rays move with the index. Edges that move across a pixel, or in the view of a surface that is
 not smooth, are not in them. A render that is differentiated does not split.
@@ -18,11 +23,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mi_refract.numerics import Mask, MediumPlugin, Properties, Ray, Sampler, Scene, Sensor, Spectrum, Variant
+
 from .absorption import read_absorption
 from .integrator_context import warn_once
-from .keyed_sampler import KeyedMultijitter, Sampled
-from .medium_tracking import Crossings, MediumTracker, ShapeMedia, absorbs_only, check_media, check_wrappers, extinction
-from .path_loop import PathFeatures, Trace
+from .medium_tracking import Crossings, MediumTracker, ShapeMedia, check_media, check_wrappers, extinction
+from .path_loop import PathFeatures, PathLoop
+from .sampling import KeyedMultijitter, SceneSampler
 from .scene_features import SceneFeatures, inspect
 
 INTEGRATOR = "refract_path"
@@ -31,8 +38,8 @@ DEEPEST = 64  # split_depth: memory is set aside in every lane
 UNLIMITED = 2**32 - 1
 
 
-def read_count(props: Any, name: str, default: int, least: int) -> int:
-    """An integer parameter, at least `least`. ValueError with its name and what is accepted."""
+def read_count(props: Properties, name: str, default: int, least: int) -> int:
+    """An integer parameter, at least `least`. ValueError with its name and what is expected."""
     value = props.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         what = "-1 (no limit) or an integer ≥ 0" if least < 0 else f"an integer ≥ {least}"
@@ -40,15 +47,15 @@ def read_count(props: Any, name: str, default: int, least: int) -> int:
     return value
 
 
-def read_flag(props: Any, name: str) -> bool:
-    """A Boolean parameter, False where it is not given. ValueError with its name and what is accepted."""
+def read_flag(props: Properties, name: str) -> bool:
+    """A Boolean parameter, False where it is absent. ValueError with its name and what is expected."""
     value = props.get(name, False)
     if not isinstance(value, bool):
         raise ValueError(f"{INTEGRATOR}: {name} = {value!r}; expected true or false")
     return value
 
 
-def read_split(props: Any, deterministic: bool) -> tuple[int, float]:
+def read_split(props: Properties, deterministic: bool) -> tuple[int, float]:
     """`split_depth` and `split_weight`. ValueError if one sample could split into more than MOST_PATHS paths."""
     depth = read_count(props, "split_depth", DEEPEST if deterministic else 0, 0)
     weight = props.get("split_weight", 1e-3 if deterministic else 1e-2)
@@ -64,19 +71,18 @@ def read_split(props: Any, deterministic: bool) -> tuple[int, float]:
     return depth, float(weight)
 
 
-def _camera(v: Any, sensor: Any) -> Any:
-    """From the world to the camera, in whose space rays leave the plane z = 0; None where they start at the sensor."""
-    return sensor.world_transform().inverse() if isinstance(sensor, v.ProjectiveCamera) else None
-
-
-def integrator_class(v: Any) -> type:
+def integrator_class(v: Variant) -> type:
     """The class of the integrator for one variant, given its module."""
     vectorised = dr.is_jit_v(v.Float)
 
-    class RefractPath(v.SamplingIntegrator):
+    def to_camera(sensor: Sensor) -> Any:
+        """From the world to the camera, whose rays leave the plane z = 0; None where they start at the sensor."""
+        return sensor.world_transform().inverse() if isinstance(sensor, v.ProjectiveCamera) else None
+
+    class RefractPath(v.SamplingIntegrator):  # type: ignore[misc]
         """See the module docstring."""
 
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: Properties) -> None:
             super().__init__(props)
             depth = read_count(props, "max_depth", -1, -1)
             self.max_depth = depth if depth >= 0 else UNLIMITED
@@ -88,24 +94,21 @@ def integrator_class(v: Any) -> type:
             # Not the scene, which holds its integrator: a circle cannot be frozen.
             self.needs: SceneFeatures | None = None  # of the scene rendered last
             self.rendering = False  # between `begin_render` and `end_render`
-            self.near: Any = None  # the near plane of the sensor of this render, by its transformation
+            self.near: Any = None  # `to_camera` of the sensor of this render
             self.crossings: list[Crossings] = []  # one a pass; in scalar variants one in all
 
-        def begin_render(self, sensor: Any) -> None:
-            """To be called before `sample` where no `render` is; else each sample looks the scene up anew."""
+        def begin_render(self, sensor: Sensor) -> None:
+            """To be called before `sample` where `render` is not; else each sample inspects the scene anew."""
             self.needs, self.rendering, self.crossings = None, True, []
-            self.near = _camera(v, sensor)
+            self.near = to_camera(sensor)
 
         def end_render(self) -> None:
-            """To be called after what `sample` gave was evaluated. ValueError where absorption was contradictory."""
+            """To be called after the samples were evaluated. ValueError where absorption was contradictory."""
             self.rendering = False
-            self._refuse()
-
-        def _refuse(self) -> None:
             for crossings in self.crossings:
                 crossings.refuse()
 
-        def render(self, scene: Any, sensor: Any = 0, *more: Any, **named: Any) -> Any:
+        def render(self, scene: Scene, sensor: Sensor | int = 0, *more: Any, **named: Any) -> Any:
             self.begin_render(scene.sensors()[sensor] if isinstance(sensor, int) else sensor)
             try:
                 image = super().render(scene, sensor, *more, **named)
@@ -118,59 +121,47 @@ def integrator_class(v: Any) -> type:
             return ["truncated"] if self.deterministic else []
 
         def sample(
-            self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
-        ) -> tuple[Any, Any, list[Any]]:
+            self, scene: Scene, sampler: Sampler, ray: Ray, medium: MediumPlugin = None, active: Mask = True
+        ) -> tuple[Spectrum, Mask, list[Any]]:
             if self.max_depth == 0:
                 return v.Spectrum(0), v.Bool(False), [v.Float(0)] * len(self.aov_names())
-            plan = self.plan(scene)
+            needs = self.scene_features(scene)
+            features = self.path_features(needs)
             count = min(self.samples_per_pass, sampler.sample_count()) if vectorised else 1
-            numbers = KeyedMultijitter(v, sampler, count) if vectorised and plan.split_depth else Sampled()
-            media = self._media(scene, ray, medium) if plan.absorption else None
-            end = Trace(v, scene, plan, numbers, media).run(v.Ray3f(ray), sampler, v.Bool(active))
-            if plan.absorption and not self.rendering:  # another integrator evaluates the image, and asks no more
+            numbers = KeyedMultijitter(v, sampler, count) if vectorised and features.split_depth else SceneSampler()
+            media = self.media(scene, needs, ray, medium) if features.absorption else None
+            end = PathLoop(v, scene, features, numbers, media).run(v.Ray3f(ray), sampler, v.Bool(active))
+            if features.absorption and not self.rendering:  # another integrator evaluates the image
                 dr.eval(end.result)
-                self._refuse()
+                self.end_render()
                 self.crossings = []
-            return dr.select(end.valid, end.result, 0), end.valid, [end.truncated] if self.deterministic else []
+            return dr.select(end.valid_ray, end.result, 0), end.valid_ray, [end.truncated][: len(self.aov_names())]
 
-        def _media(self, scene: Any, ray: Any, medium: Any) -> MediumTracker | ShapeMedia:
-            sigma = self._sigma(ray, medium)
-            way = self._before(scene, ray) if medium is not None or self.camera else v.Float(0)
-            if self._needs(scene).shape_media:
-                return ShapeMedia(v, sigma, way)
-            return MediumTracker(v, scene, sigma, way, self._crossings(scene))
-
-        def _before(self, scene: Any, ray: Any) -> Any:
-            """The way from the camera to the origin of the ray, on the near plane.
-
-            Another integrator does not say which sensor it renders: the scene must have one.
-            """
-            sensors = scene.sensors()
-            if not self.rendering and len(sensors) != 1:
-                raise ValueError(f"{INTEGRATOR}: a camera in an absorbing medium; expected one sensor in the scene")
-            to_camera = self.near if self.rendering else _camera(v, sensors[0])
-            if to_camera is None:
-                return v.Float(0)
-            return (to_camera @ ray.o).z / (to_camera @ ray.d).z
-
-        def _crossings(self, scene: Any) -> Crossings:
-            if vectorised or not self.crossings:
-                self.crossings.append(Crossings(v, scene))
-            return self.crossings[-1]
-
-        def _sigma(self, ray: Any, medium: Any) -> Any:
-            """Absorption where the camera is: as told, or of the sensor's medium, or none."""
+        def media(
+            self, scene: Scene, needs: SceneFeatures, ray: Ray, medium: MediumPlugin
+        ) -> MediumTracker | ShapeMedia:
+            """The medium at the camera, and what follows the media along a path."""
+            sigma, way = 0, v.Float(0)
             if self.camera:
                 si = dr.zeros(v.SurfaceInteraction3f)
                 si.wavelengths = ray.wavelengths
-                return self.camera.eval(si, v.Bool(True))
-            if medium is None:
-                return 0
-            return extinction(v, medium, ray.wavelengths, v.Bool(True))
+                sigma = self.camera.eval(si, v.Bool(True))
+            elif medium is not None:
+                sigma = extinction(v, medium, ray.wavelengths, v.Bool(True))
+            if medium is not None or self.camera:  # rays start on the near plane
+                sensors = scene.sensors()
+                if not self.rendering and len(sensors) != 1:  # another integrator does not say which one it renders
+                    raise ValueError(f"{INTEGRATOR}: a camera in an absorbing medium; expected one sensor in the scene")
+                if (place := self.near if self.rendering else to_camera(sensors[0])) is not None:
+                    way = (place @ ray.o).z / (place @ ray.d).z
+            if needs.shape_media:
+                return ShapeMedia(v, sigma, way)
+            if vectorised or not self.crossings:
+                self.crossings.append(Crossings(v, scene))
+            return MediumTracker(v, scene, sigma, way, self.crossings[-1])
 
-        def plan(self, scene: Any) -> PathFeatures:
+        def path_features(self, needs: SceneFeatures) -> PathFeatures:
             """The features that are traced for a scene. ValueError where `deterministic` is set and impossible."""
-            needs = self._needs(scene)
             # Local memory has no derivatives, and the evaluated loops that derivatives need have no local memory.
             symbolic = not vectorised or dr.flag(dr.JitFlag.SymbolicLoops)
             if self.deterministic and not needs.deterministic:
@@ -201,28 +192,19 @@ def integrator_class(v: Any) -> type:
                 null=needs.null,
             )
 
-        def _needs(self, scene: Any) -> SceneFeatures:
-            """Looked up once a render, as an edit of the scene can change them.
+        def scene_features(self, scene: Scene) -> SceneFeatures:
+            """Of the scene as it is now, inspected once a render, as an edit of the scene can change them.
 
-            Another integrator that calls `sample` does not say when a render begins: then they are looked up anew.
+            Another integrator that calls `sample` does not say when a render begins: then they are inspected anew.
             """
             if self.needs is None or not self.rendering:
                 self.needs = inspect(scene)
                 if self.needs.absorbing:
                     check_wrappers(scene)
                 if self.needs.media:
-                    self._check_media(scene)
+                    check_media(v, scene)
                 mi.Log(mi.LogLevel.Info, f"{INTEGRATOR}: left out: {self.left_out()}")  # type: ignore[operator]
             return self.needs
-
-        def _check_media(self, scene: Any) -> None:
-            for sensor in scene.sensors():
-                if (medium := sensor.get_medium()) is not None and not absorbs_only(v, medium):
-                    raise ValueError(
-                        f"{INTEGRATOR}: the sensor's medium scatters or varies; expected a homogeneous medium with an "
-                        "albedo of 0"
-                    )
-            check_media(v, scene)
 
         def left_out(self) -> str:
             """What was left out of the scene rendered last, each feature with the reason."""
@@ -232,13 +214,13 @@ def integrator_class(v: Any) -> type:
 
         def to_string(self) -> str:
             depth = -1 if self.max_depth == UNLIMITED else self.max_depth
-            lines = [f"max_depth = {depth}", f"rr_depth = {self.rr_depth}", f"hide_emitters = {self.hide_emitters}"]
-            lines += [f"{name} = {getattr(self, name)}" for name in ("split_depth", "split_weight", "deterministic")]
+            names = ("rr_depth", "hide_emitters", "split_depth", "split_weight", "deterministic")
+            lines = [f"max_depth = {depth}", *(f"{name} = {getattr(self, name)}" for name in names)]
             return "RefractPath[\n" + "".join(f"  {x},\n" for x in [*lines, f"left out = {self.left_out()}"]) + "]"
 
     return RefractPath
 
 
-def register(variant: Any) -> None:
+def register(variant: Variant) -> None:
     """Make `refract_path` known to one variant, given its module. Registering again is harmless."""
     variant.register_integrator(INTEGRATOR, integrator_class(variant))

@@ -12,6 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
+
+from mi_refract.numerics import BSDF, Scene, Shape, Variant
 
 WRAPPERS = {"BlendBSDF", "BumpMap", "MaskBSDF", "NormalMap", "TwoSidedBRDF"}
 DEPOLARISING = {
@@ -101,7 +104,7 @@ class SceneFeatures:
     textured: bool  # a BSDF or a light may vary over its surface, or with its tangent
     null: bool  # some BSDF has a null lobe
     polarising: bool  # some BSDF acts on the state of polarisation
-    dispersive: bool  # some BSDF bends light by its wavelength
+    dispersive: bool  # some BSDF refracts by wavelength
     absorbing: bool  # some BSDF has an absorbing medium on one side
     media: bool  # some shape, sensor or emitter has a medium of Mitsuba's
     shape_media: bool  # some shape has one
@@ -112,80 +115,78 @@ class SceneFeatures:
     @property
     def left_out(self) -> dict[str, str]:
         """What an integrator can leave out: feature → the reason, in words."""
+        no_emitter = "no emitter can be sampled" if self.smooth else "every BSDF has delta lobes only"
+        constant = self.plain_environment and self.smooth
         reasons = {
-            "emitter sampling": "every BSDF has delta lobes only"
-            if not self.smooth
-            else ""
-            if self.sampleable
-            else "no emitter can be sampled",
-            "a random number": "" if self.both_numbers else "no BSDF samples with one number and with two as well",
-            "area lights": "" if self.area else "no shape emits",
-            "environment": "" if self.environment else "no environment emitter",
-            "sampling the environment": "what is the same everywhere is met by the BSDFs' own samples"
-            if self.plain_environment and self.smooth
-            else "",
-            "media": "" if self.media else "neither a shape, a sensor nor an emitter has a medium",
-            "null lobes": "" if self.null else "no BSDF has one",
-            "textures": "" if self.textured else "no BSDF and no area light varies over its surface",
-            "polarisation": "" if self.polarising else "no BSDF acts on it",
-            "dispersion": "" if self.dispersive else "no BSDF bends light by its wavelength",
-            "absorption": "" if self.absorbing else "no BSDF has an absorbing medium on a side",
+            "emitter sampling": (not (self.smooth and self.sampleable), no_emitter),
+            "a random number": (not self.both_numbers, "no BSDF samples with one number and with two as well"),
+            "area lights": (not self.area, "no shape emits"),
+            "environment": (not self.environment, "no environment emitter"),
+            "sampling the environment": (constant, "a constant one is met by the BSDFs' own samples"),
+            "media": (not self.media, "neither a shape, a sensor nor an emitter has a medium"),
+            "null lobes": (not self.null, "no BSDF has one"),
+            "textures": (not self.textured, "no BSDF and no area light varies over its surface"),
+            "polarisation": (not self.polarising, "no BSDF acts on it"),
+            "dispersion": (not self.dispersive, "no BSDF refracts by wavelength"),
+            "absorption": (not self.absorbing, "no BSDF has an absorbing medium on a side"),
         }
-        return {feature: reason for feature, reason in reasons.items() if reason}
+        return {feature: reason for feature, (left_out, reason) in reasons.items() if left_out}
 
 
-def inspect(scene: Any) -> SceneFeatures:
+def inspect(scene: Scene) -> SceneFeatures:
     """What a Mitsuba scene needs as it is now; an edit of its parameters can change that."""
-    import mitsuba as mi
-
     shapes, emitters, sky = all_shapes(scene), scene.emitters(), scene.environment()
     opaque = [shape.class_name() for shape in shapes if shape.class_name() not in KNOWN_SHAPES]
     bsdfs = [bsdf for shape in shapes if (outer := shape.bsdf()) and not _black(outer) for bsdf in nested(outer)]
-    names = [bsdf_name(bsdf) for bsdf in bsdfs]
-    unknown = tuple(sorted({name for name in names if name not in KNOWN} | set(opaque)))
+    names = {bsdf_name(bsdf) for bsdf in bsdfs}
+    unknown = tuple(sorted((names - KNOWN) | {*opaque}))
     everything = bool(unknown)
-    flags = 0
+    lobes, flags = mi.BSDFFlags, 0
     for bsdf in bsdfs:
         flags |= bsdf.flags()
-    lobes, sampled = mi.BSDFFlags, [emitter.flags() for emitter in emitters]
+    deltas = {bsdf_name(bsdf) for bsdf in bsdfs if not bsdf.flags() & +lobes.Smooth}
     lamps = [shape.emitter() for shape in shapes if shape.is_emitter()]
     shape_media = any(shape.interior_medium() or shape.exterior_medium() for shape in shapes)
-    end_media = any(end.get_medium() for end in (*emitters, *scene.sensors()))
     return SceneFeatures(
         smooth=everything or bool(flags & +lobes.Smooth),
         sampleable=bool(emitters),  # Mitsuba refuses a scene all of whose emitters have the weight 0
         lamps=any(not emitter.is_environment() and emitter.sampling_weight() > 0 for emitter in emitters),
-        area=bool(opaque) or any(shape.is_emitter() for shape in shapes),
+        area=bool(opaque or lamps),
         environment=sky is not None,
         plain_environment=sky is not None and sky.class_name() == "ConstantBackgroundEmitter",
-        both_numbers=bool(set(names) - EITHER) or everything,
+        both_numbers=everything or bool(names - EITHER),
         # An emitter that declares nothing may be anything.
-        delta_emitters=any(not flag or flag & +mi.EmitterFlags.Delta for flag in sampled),
+        delta_emitters=any(not emitter.flags() or emitter.flags() & +mi.EmitterFlags.Delta for emitter in emitters),
         only_glass=not (everything or flags & +(lobes.Smooth | lobes.Delta1D)),
         textured=everything
         or any(_textured(node) for node in (*bsdfs, *lamps))
-        or not {name for name, bsdf in zip(names, bsdfs, strict=True) if not bsdf.flags() & +lobes.Smooth}
-        <= WITHOUT_TANGENT
+        or not deltas <= WITHOUT_TANGENT
         or not {lamp.class_name() for lamp in lamps} <= PLAIN_LAMPS,
         null=everything or bool(flags & +lobes.Null),
-        polarising=any(name not in WRAPPERS | DEPOLARISING for name in names) or everything,
+        polarising=everything or bool(names - WRAPPERS - DEPOLARISING),
         dispersive=everything or any(getattr(bsdf, "dispersive", False) for bsdf in bsdfs),  # no plugin of Mitsuba's is
         absorbing=everything or any(getattr(bsdf, "absorbing", False) for bsdf in bsdfs),
-        media=shape_media or end_media,
+        media=shape_media or any(end.get_medium() for end in (*emitters, *scene.sensors())),
         shape_media=shape_media,
         refracting=everything or bool(flags & +lobes.Transmission),
-        deterministic=not everything and set(names) <= DETERMINISTIC,
+        deterministic=not everything and names <= DETERMINISTIC,
         unknown=unknown,
     )
 
 
-def all_shapes(scene: Any) -> list[Any]:
+def all_shapes(scene: Scene) -> list[Shape]:
     """The shapes of a scene, and those within its shape groups, which `scene.shapes()` leaves out."""
     groups = [child for child in _children(scene) if child.class_name() == "ShapeGroupPlugin"]
     return [*scene.shapes(), *(part for group in groups for part in _children(group) if hasattr(part, "bsdf"))]
 
 
-def bsdf_name(bsdf: Any) -> str:
+def plugin_number(v: Variant, pointer: Any) -> int:
+    """The number by which Mitsuba registered a plugin, of a pointer of one entry."""
+    numbers: Any = dr.reinterpret_array(v.UInt32, pointer)
+    return int(numbers[0])
+
+
+def bsdf_name(bsdf: BSDF) -> str:
     """The C++ class; of a Python plugin, which Mitsuba calls "BSDF", its own, with its module unless it is ours."""
     name, kind = bsdf.class_name(), type(bsdf)
     if name != "BSDF" and kind.__module__.startswith("mitsuba"):
@@ -193,7 +194,7 @@ def bsdf_name(bsdf: Any) -> str:
     return kind.__name__ if kind.__module__.startswith("mi_refract.") else f"{kind.__module__}.{kind.__name__}"
 
 
-def nested(bsdf: Any) -> Iterator[Any]:
+def nested(bsdf: BSDF) -> Iterator[BSDF]:
     """A BSDF, and those that it shows within it."""
     yield bsdf
     for child in _children(bsdf):
@@ -201,7 +202,7 @@ def nested(bsdf: Any) -> Iterator[Any]:
             yield from nested(child)
 
 
-def _textured(node: Any) -> bool:
+def _textured(node: mi.Object) -> bool:
     return any(
         hasattr(child, "is_spatially_varying")
         and (child.is_spatially_varying() or child.class_name() not in CONSTANT_TEXTURES)
@@ -209,7 +210,7 @@ def _textured(node: Any) -> bool:
     )
 
 
-def _black(bsdf: Any) -> bool:
+def _black(bsdf: BSDF) -> bool:
     # A frozen function is recorded for every value that will come.
     if bsdf_name(bsdf) != "SmoothDiffuse" or dr.flag(dr.JitFlag.FreezingScope):
         return False
@@ -217,25 +218,18 @@ def _black(bsdf: Any) -> bool:
     exact = reflectance.class_name() == "UniformSpectrum" or "spectral" not in bsdf.variant_name()
     if not exact or reflectance.is_spatially_varying() or reflectance.max() != 0:
         return False
-    import mitsuba as mi
-
     # The derivative of an image in a reflectance of 0 is not 0.
     return not any(dr.grad_enabled(value) for _, value in mi.traverse(bsdf))
 
 
-def _children(node: Any) -> list[Any]:
+def _children(node: mi.Object) -> list[Any]:
     """The Mitsuba objects that a plugin shows of itself."""
-    import mitsuba as mi
+    objects = []
 
     class Children(mi.TraversalCallback):
-        def __init__(self) -> None:
-            super().__init__()
-            self.found: list[Any] = []
-
         def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
             if isinstance(value, mi.Object):
-                self.found.append(value)
+                objects.append(value)
 
-    callback = Children()
-    node.traverse(callback)
-    return callback.found
+    node.traverse(Children())
+    return objects

@@ -3,6 +3,9 @@
 In: regimes of rays by name (`mi_refract.regimes`), or a file of rays; then a program's answers, as a file or on stdout.
 Out: a file of rays (CSV, .npz or EXR); for each regime the errors against certified directions, and the usual mistake
 that explains wrong answers; as text, JSON, JUnit XML or an HTML page. The command is `mi-refract rays`; see README.md.
+
+In the order of the data: `ray_set` (`media_rays`, `header`), `files` (`tables`), `run_program`; `check_answers` matches
+answers with rays and has them judged (`tir_signal`, `judged_answers`, `possible_directions`, `diagnosis`); `reports`.
 """
 
 __all__ = [
@@ -12,6 +15,6 @@ __all__ = [
     "renderer_file",
     "reports",
     "run_program",
-    "spread_check",
+    "tables",
     "tir_signal",
 ]

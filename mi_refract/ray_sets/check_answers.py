@@ -10,27 +10,30 @@ All rays, their answers and certified answers are arrays. Whatever takes more me
 
 from __future__ import annotations
 
-import functools
-from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mi_refract import oracle
-from mi_refract.formulas import FORMULAS, Budget
+from mi_refract.formulas import FORMULAS
 from mi_refract.regimes import Array, Rays
 
-from . import diagnosis, matched_answers, media_rays, tir_signal
+from . import diagnosis, media_rays, tir_signal
 from .diagnosis import Explanation
-from .header import PRECISIONS, Header, Ids, shown
+from .header import AUTO, FLAG, PRECISIONS, TIR, Header, Ids, shown
 from .judged_answers import Flags, JudgedAnswers, Table, certified, judge_answers, see
-from .matched_answers import MatchedAnswers, Piece
 from .ray_set import Answers, RaySet, in_regime
-from .tir_signal import AUTO, FLAG, LOOSEST, TIR, UNCLEAR
+from .tir_signal import LOOSEST, UNCLEAR
 
+PIECE = 2**18  # rays that are certified or judged at once, which takes 300 MB
 LISTED_IDS = 5
+SAME_ULPS = 4  # the largest relative difference between equal ratios of indices, where the file holds the indices
+
+
+# Findings ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class RegimeErrors:
     tir_beyond_bound: int  # those of them that are farther from the critical angle than the error bound excuses
     error_over_bound: float  # the largest ratio of an error to the bound of its ray
     undecidable: int  # rays whose bound is above 0.1 rad: a direction within it shows nothing
-    judged: int  # rays compared that are not so
+    judged: int  # rays compared that are not undecidable
     wrong: int  # rays beyond their bound: angle, length or TIR; without a direction, or with an impossible one
     exact: int  # answers that are the certified ones, rounded
     right: int  # answers that are the exact ones of inputs within RIGHT u, and not wrong
@@ -62,24 +65,14 @@ class RegimeErrors:
 class Problem:
     """A defect of the set of answers, seen `count` times; `text` lists the first ids."""
 
-    kind: str  # a key of PROBLEMS
+    kind: str  # one of UNFIT, "non-finite", "zero", "impossible", "index"
     count: int
     text: str
 
 
-# Each kind of problem, and whether the answers are then not those to the rays.
-PROBLEMS = {
-    "missing": True,
-    "duplicate": True,
-    "unknown": True,
-    "non-finite": False,
-    "zero": False,
-    "impossible": False,
-    "index": False,
-}
+UNFIT = ("missing", "duplicate", "unknown")  # problems of answers that are not those to the rays
 # Of RegimeErrors, those that are sums over the rays.
 COUNTS = ("tir_misclassified", "tir_beyond_bound", "undecidable", "judged", "wrong", "right", "exact")
-SAME_ULPS = 4  # the largest relative difference of a ratio of indices that is none, where the file holds the indices
 
 
 @dataclass(frozen=True)
@@ -89,7 +82,7 @@ class RatioDifference:
     largest: float
     id: int
     ray: str  # its media and wavelength; "" without
-    accepted: float
+    tolerance: float  # up to which two ratios count as equal
 
 
 @dataclass(frozen=True)
@@ -109,7 +102,11 @@ class Findings:
 
     def total(self, name: str) -> int:
         """The sum of a count of `RegimeErrors` over the regimes."""
-        return sum(getattr(each, name) for each in self.regimes)
+        return sum(getattr(regime, name) for regime in self.regimes)
+
+    def problem_count(self, *kinds: str) -> int:
+        """How many problems of these kinds there are."""
+        return sum(problem.count for problem in self.problems if problem.kind in kinds)
 
     @property
     def answered(self) -> int:
@@ -129,35 +126,91 @@ class Findings:
     @property
     def farthest(self) -> RegimeErrors:
         """The regime with the largest angle. ValueError where nothing was answered."""
-        return max(self.regimes, key=lambda each: (each.compared > 0, each.worst))
+        return max(self.regimes, key=lambda regime: (regime.compared > 0, regime.worst))
 
     @property
     def diagnosis(self) -> Explanation | None:
         """The mistake that explains the answers, where exactly one does."""
-        found = [each for each in self.explanations if each.explains]
-        return found[0] if len(found) == 1 else None
+        certain = [explanation for explanation in self.explanations if explanation.explains]
+        return certain[0] if len(certain) == 1 else None
 
     @property
     def exit_code(self) -> int:
         """0: all answers are within the bound. 1: some are wrong. 2: missing, duplicate, or answers to other rays.
 
-        1 also where no direction was judged: a program that answers nothing but rays in doubt, and those by giving
-        up, has shown nothing.
+        1 also where no direction was judged: a program that answers only undecidable rays has shown nothing.
         """
-        if not self.answered or any(PROBLEMS[problem.kind] for problem in self.problems):
+        if not self.answered or self.problem_count(*UNFIT):
             return 2
         return int(self.wrong > 0 or self.tir == UNCLEAR or bool(self.problems) or not self.total("judged"))
 
 
-# The certified answers to pieces of the set, by the numbers of the pieces.
-Certify = Callable[[Iterable[Rays]], Iterable[tuple[int, oracle.Certified]]]
-Judge = Callable[..., JudgedAnswers]  # of a Piece, with `exact=` its certified answers where they are known
+# Which answer belongs to which ray ---------------------------------------------------------------------------------
 
 
-def certify_here(pieces: Iterable[Rays]) -> Iterator[tuple[int, oracle.Certified]]:
-    """In this process, one piece after the other."""
-    for number, rays in enumerate(pieces):
-        yield number, certified(rays)
+@dataclass(frozen=True)
+class _Piece:
+    """Rays (N), their ids (N,), the answers b (N, 3), and the columns `transmitted` and `n_ratio` (N,), if given."""
+
+    rays: Rays
+    ids: Ids
+    b: Array
+    transmitted: Flags | None
+    n_ratio: Array | None
+
+    @property
+    def used(self) -> Rays:
+        """The rays as the program took them: with the ratio of the indices that it used, where it says so."""
+        if self.n_ratio is None:
+            return self.rays
+        return Rays(self.rays.a.astype(np.float64), self.rays.n.astype(np.float64), self.n_ratio)
+
+
+class _Matched:
+    """The rays that have an answer, by their rows (N,) in the set, with the first answer to each."""
+
+    def __init__(self, rays: RaySet, answers: Answers) -> None:
+        """`mismatches`: "missing", "duplicate" and "unknown" ids, each once, in order."""
+        ids, first, counts = np.unique(answers.ids, return_index=True, return_counts=True)
+        place = np.searchsorted(ids, rays.ids).clip(max=max(len(ids) - 1, 0))
+        answered = ids[place] == rays.ids if len(ids) else np.zeros(len(rays), bool)
+        self._rays, self._answers = rays, answers
+        self.rows = np.flatnonzero(answered)
+        self._answer_rows = first[place[self.rows]]
+        self.ids = rays.ids[self.rows]
+        self.mismatches: dict[str, Ids] = {
+            "missing": np.sort(rays.ids[~answered]),
+            "duplicate": ids[counts > 1],
+            "unknown": np.setdiff1d(ids, rays.ids, assume_unique=True),
+        }
+
+    def take(self, index: NDArray[np.intp] | slice) -> _Piece:
+        """Some of them."""
+        some, rows, answers = self.rows[index], self._answer_rows[index], self._answers
+        transmitted = None if answers.transmitted is None else answers.transmitted[rows]
+        ratios = None if answers.n_ratio is None else answers.n_ratio[rows]
+        return _Piece(self._rays.rays[some], self._rays.ids[some], answers.b[rows], transmitted, ratios)
+
+    def pieces(self, size: int) -> Iterator[_Piece]:
+        """All of them, `size` at a time."""
+        for start in range(0, len(self.rows), size):
+            yield self.take(slice(start, start + size))
+
+
+# The check ---------------------------------------------------------------------------------------------------------
+
+
+def check_options(tir: str, error_bound: str, most_backward: float) -> None:
+    """ValueError, one line, for an unknown name, or a limit of backward errors that is not above 0."""
+    names: tuple[tuple[str, str, Collection[str]], ...] = (
+        ("TIR signal", tir, (AUTO, *TIR)),
+        ("error bound", error_bound, FORMULAS),
+    )
+    for name, value, expected in names:
+        if value not in expected:
+            raise ValueError(f"{name} {value!r}: unknown; expected {', '.join(expected)}")
+    if not most_backward > 0:
+        raise ValueError(f"backward error {most_backward:g}; expected a positive number of roundings")
 
 
 def check(
@@ -167,136 +220,105 @@ def check(
     tir: str = AUTO,
     error_bound: str = LOOSEST,
     most_backward: float = np.inf,
-    certify: Certify = certify_here,
+    piece: int = PIECE,
 ) -> Findings:
     """Compare every answer with the certified direction.
 
     `tir`: how the answers signal total internal reflection, one of TIR; detected where it is AUTO. `error_bound`: the
     formula of FORMULAS whose a-priori bound the errors must keep. `most_backward`: the largest backward error, in u, of
-    an answer that is not wrong. `certify`: who certifies pieces of the set. ValueError for an unknown name, a
-    `most_backward` not above 0, tir = FLAG without the column `transmitted`, or answers whose header is that of other
+    an answer that is not wrong. `piece`: rays certified or judged at once; the findings do not depend on it. ValueError
+    as of `check_options`, for tir = FLAG without the column `transmitted`, or answers whose header is that of other
     rays.
     """
-    _check_name("tir", tir, (AUTO, *TIR))
-    _check_name("error_bound", error_bound, FORMULAS)
-    if not most_backward > 0:
-        raise ValueError(f"most_backward = {most_backward}; expected a positive number of roundings")
+    check_options(tir, error_bound, most_backward)
     if tir == FLAG and answers.transmitted is None:
-        raise ValueError("tir = 'flag': there is no column `transmitted`; expected answers with one")
-    if (given := answers.header.get("checksum")) not in (None, rays.header["checksum"]):
-        expected = f"{rays.header['checksum']}, or other rays with --rays FILE"
-        raise ValueError(f"the answers are to rays with the checksum {shown(given)}; expected {expected}")
-    matched, mismatches = matched_answers.match(rays, answers)
-    exact = dict(certify(piece.used for piece in matched.pieces()))
-    signal = tir if tir != AUTO else _signal(matched, exact)
-    judge = functools.partial(_judged, rays.precision, FORMULAS[error_bound].budget, signal, most_backward)
-    table, losses = _all_judged(matched, exact, judge)
-    ulp = float(np.finfo(PRECISIONS[rays.precision]).eps)
-    ratio, other_ratios = _ratio_difference(matched, ulp)
-    masks = {kind: table[kind] for kind in ("non-finite", "zero", "impossible")} | {"index": other_ratios}
-    unfit = {kind: matched.ids[mask] for kind, mask in masks.items()}
+        raise ValueError("TIR signal 'flag': the answers have no column `transmitted`")
+    if (checksum := answers.header.get("checksum")) not in (None, rays.header["checksum"]):
+        raise ValueError(
+            f"the answers are to rays with the checksum {shown(checksum)}; expected {rays.header['checksum']}"
+        )
+    matched, precision = _Matched(rays, answers), rays.precision
+    exact = [certified(part.used) for part in matched.pieces(piece)]
+    if tir != AUTO:
+        signal = tir
+    elif answers.transmitted is not None:
+        signal = FLAG
+    else:
+        seen = (see(x.b, x.used, precision, y) for x, y in zip(matched.pieces(piece), exact, strict=True))
+        signal = tir_signal.detect(seen)
+
+    def judge(part: _Piece, exact: oracle.Certified | None = None) -> JudgedAnswers:
+        columns = part.b, part.transmitted, part.used, precision, FORMULAS[error_bound].budget, signal
+        return judge_answers(*columns, exact=exact, most_backward=most_backward)
+
+    tables = [judge(matched.take(slice(0))).table]
+    tables += [judge(part, exact.pop(0)).table for part in matched.pieces(piece)]
+    table = np.concatenate(tables)
+    explanations: list[Explanation] = []
+    if table["beyond_bound"].any():
+        sample, printed = diagnosis.sample(table), matched.take(diagnosis.evenly(table["compared"])).b
+        explanations = diagnosis.explain(judge(matched.take(sample)), table, printed)
+    ulp = float(np.finfo(PRECISIONS[precision]).eps)
+    ratio, other_ratio = _ratio_difference(matched, rays.header, ulp)
+    masks = {kind: table[kind] for kind in ("non-finite", "zero", "impossible")} | {"index": other_ratio}
+    problems = matched.mismatches | {kind: matched.ids[mask] for kind, mask in masks.items()}
     return Findings(
-        precision=rays.precision,
+        precision=precision,
         ulp=ulp,
         error_bound=error_bound,
         tir=signal,
         tir_given=tir != AUTO,
-        regimes=tuple(_by_regime(matched, table)),
-        problems=tuple(_listed(kind, ids) for kind, ids in (mismatches | unfit).items() if len(ids)),
-        explanations=tuple(_explanations(matched, table, losses, judge)),
+        regimes=tuple(_by_regime(matched, rays.header, table)),
+        problems=tuple(Problem(kind, len(ids), _listed(ids)) for kind, ids in problems.items() if len(ids)),
+        explanations=tuple(explanations),
         header=rays.header,
         ratio=ratio,
     )
 
 
-def _check_name(name: str, value: str, expected: Collection[str]) -> None:
-    if value not in expected:
-        raise ValueError(f"{name} = {value!r}: unknown; expected {', '.join(expected)}")
-
-
-def _signal(matched: MatchedAnswers, exact: Mapping[int, oracle.Certified]) -> str:
-    """How the answers signal total internal reflection."""
-    if matched.answers.transmitted is not None:
-        return FLAG
-    precision = matched.rays.precision
-    return tir_signal.detect(see(x.b, x.used, precision, exact[number]) for number, x in enumerate(matched.pieces()))
-
-
-def _judged(
-    precision: str, budget: Budget, tir: str, most_backward: float, piece: Piece, exact: oracle.Certified | None = None
-) -> JudgedAnswers:
-    return judge_answers(
-        *(piece.b, piece.transmitted, piece.used, precision, budget, tir), exact=exact, most_backward=most_backward
-    )
-
-
-def _all_judged(
-    matched: MatchedAnswers, exact: dict[int, oracle.Certified], judge: Judge
-) -> tuple[Table, Mapping[str, int]]:
-    """The table of all answers, and how many of them `diagnosis.losses` account for. Takes pieces out of `exact`."""
-    tables, losses = [judge(matched.take(slice(0))).table], Counter[str]()
-    for number, piece in enumerate(matched.pieces()):
-        judged = judge(piece, exact.pop(number))
-        tables.append(judged.table)
-        losses.update(diagnosis.losses(judged.verdict))
-    return np.concatenate(tables), losses
-
-
-def _ratio_difference(matched: MatchedAnswers, ulp: float) -> tuple[RatioDifference | None, Flags]:
-    """The largest, and (N,) where it is more than that of one glass written in two ways; nothing if none is said."""
-    if matched.answers.n_ratio is None or not len(matched.rows):
-        return None, np.zeros(len(matched.rows), bool)
-    header, differences = matched.rays.header, matched.ratio_differences()
-    same = media_rays.SAME if media_rays.has_media(header) else SAME_ULPS * ulp
+def _ratio_difference(matched: _Matched, header: Header, ulp: float) -> tuple[RatioDifference | None, Flags]:
+    """The largest, and (N,) where the ratio is another than that of the ray; nothing where the answers have none."""
+    every = matched.take(slice(None))
+    if every.n_ratio is None or not len(every.ids):
+        return None, np.zeros(len(every.ids), bool)
+    k = every.rays.k.astype(np.float64)
+    differences = np.abs(every.n_ratio - k) / k
+    tolerance = media_rays.SAME if media_rays.has_media(header) else SAME_ULPS * ulp
     row = int(np.argmax(differences))
-    id_ = int(matched.ids[row])
-    return RatioDifference(float(differences[row]), id_, media_rays.described(header, id_), same), differences > same
+    id_ = int(every.ids[row])
+    largest = RatioDifference(float(differences[row]), id_, media_rays.described(header, id_), tolerance)
+    return largest, differences > tolerance
 
 
-def _listed(kind: str, ids: Ids) -> Problem:
+def _listed(ids: Ids) -> str:
     first, more = ", ".join(map(str, ids[:LISTED_IDS])), ", …" if len(ids) > LISTED_IDS else ""
-    return Problem(kind, len(ids), f"id{'' if len(ids) == 1 else 's'} {first}{more}")
+    return f"id{'' if len(ids) == 1 else 's'} {first}{more}"
 
 
-def _explanations(
-    matched: MatchedAnswers, table: Table, losses: Mapping[str, int], judge: Judge
-) -> Iterable[Explanation]:
-    if not table["beyond_bound"].any():
-        return []
-    evidence = diagnosis.Evidence(table, losses)
-    return diagnosis.explain(judge(matched.take(evidence.sample)), evidence, matched.take(evidence.printed).b)
-
-
-# By regime ---------------------------------------------------------------------------------------------------------
-
-
-def _by_regime(matched: MatchedAnswers, table: Table) -> Iterator[RegimeErrors]:
-    for name in matched.rays.header["regimes"]:
-        rows = np.flatnonzero(in_regime(matched.rays.header, name, matched.ids))
-        if len(rows):
-            found = table[rows]
-            worst = np.lexsort([found[key] for key in ("share", "impossible", "tir_beyond_bound", "blank")])[-1]
-            yield _regime_errors(name, found, _replay(matched.take(rows[worst : worst + 1])))
-
-
-def _regime_errors(name: str, found: Table, replay: dict[str, Any]) -> RegimeErrors:
-    compared = found[found["compared"]]
-    angles, backward = compared["angle"], found["backward"]
-    return RegimeErrors(
-        name,
-        rays=len(found),
-        compared=len(compared),
-        worst=_quantile(angles, 1),
-        p99=_quantile(angles, 0.99),
-        mean=float(angles.mean()) if len(angles) else np.nan,
-        length_error=float(compared["drift"].max()) if len(angles) else np.nan,
-        error_over_bound=float(found["share"].max()),
-        backward_median=_quantile(backward, 0.5),
-        backward_p99=_quantile(backward, 0.99),
-        backward_worst=_quantile(backward, 1),
-        replay=replay,
-        **{count: int(found[count].sum()) for count in COUNTS},
-    )
+def _by_regime(matched: _Matched, header: Header, table: Table) -> Iterator[RegimeErrors]:
+    for name in header["regimes"]:
+        rows = np.flatnonzero(in_regime(header, name, matched.ids))
+        if not len(rows):
+            continue
+        part = table[rows]
+        compared = part[part["compared"]]
+        angles, backward = compared["angle"], part["backward"]
+        worst = np.lexsort([part[key] for key in ("share", "impossible", "tir_beyond_bound", "blank")])[-1]
+        yield RegimeErrors(
+            name,
+            rays=len(part),
+            compared=len(compared),
+            worst=_quantile(angles, 1),
+            p99=_quantile(angles, 0.99),
+            mean=float(angles.mean()) if len(angles) else np.nan,
+            length_error=float(compared["drift"].max()) if len(angles) else np.nan,
+            error_over_bound=float(part["share"].max()),
+            backward_median=_quantile(backward, 0.5),
+            backward_p99=_quantile(backward, 0.99),
+            backward_worst=_quantile(backward, 1),
+            replay=_replay(matched.take(rows[worst : worst + 1])),
+            **{count: int(part[count].sum()) for count in COUNTS},
+        )
 
 
 def _quantile(errors: Array, share: float) -> float:
@@ -304,11 +326,11 @@ def _quantile(errors: Array, share: float) -> float:
     if not len(errors):
         return np.nan
     with np.errstate(invalid="ignore"):
-        found = float(np.quantile(errors, share))
-    return float(np.quantile(errors, share, method="higher")) if np.isnan(found) else found
+        value = float(np.quantile(errors, share))
+    return float(np.quantile(errors, share, method="higher")) if np.isnan(value) else value
 
 
-def _replay(one: Piece) -> dict[str, Any]:
+def _replay(one: _Piece) -> dict[str, Any]:
     """A ray with its answer in hexadecimal floats."""
     exact = certified(one.used)
     return {

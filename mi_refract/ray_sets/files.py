@@ -14,41 +14,31 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Mapping, Sequence, Sized
+from collections.abc import Sized
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mi_refract.io import image_file, regular_file
+from mi_refract.io import image_file
 from mi_refract.io.atomic import writable, write_atomically
-from mi_refract.regimes import Array, Rays
+from mi_refract.io.image_file import one_line
+from mi_refract.regimes import Rays
 
-from . import csv_table, media_rays, npz_arrays
 from . import header as headers
-from .csv_table import with_header
+from . import media_rays, tables
 from .header import FORMAT, PRECISIONS, Header
-from .ray_set import ROWS, Answers, RaySet, checksum, indices
+from .ray_set import Answers, RaySet, checksum, indices
+from .tables import SUFFIXES, Table
 
-SUFFIXES = (".csv", ".npz", ".exr")
 COLUMNS = ("id", "ax", "ay", "az", "nx", "ny", "nz", "n_from", "n_to")
+RAY_LAYOUTS = (COLUMNS, (*COLUMNS, *media_rays.COLUMNS))
 ANSWER_COLUMNS = ("id", "bx", "by", "bz")
-TRANSMITTED, N_RATIO = "transmitted", "n_ratio"  # optional columns of answers, each with or without the other
-WITH_MEDIA = (",".join(media_rays.COLUMNS),)  # of rays: both, or none
-RAY_ARRAYS = {"a": 3, "n": 3, "n_from": 1, "n_to": 1, **dict.fromkeys(media_rays.COLUMNS, 1)}  # of .npz: their widths
-ANSWER_ARRAYS = {"b": 3, TRANSMITTED: 1, N_RATIO: 1}
+TRANSMITTED, N_RATIO = "transmitted", "n_ratio"
+ANSWER_LAYOUTS = tuple((*ANSWER_COLUMNS, *more) for more in ((), (TRANSMITTED,), (N_RATIO,), (TRANSMITTED, N_RATIO)))
 LEAST_RATIO = 1e-9  # of answers: a thousandth of the least in any set
 MOST_RAYS = 2**28 // len(COLUMNS)  # 3e7: their numbers take 2 GiB, and checking them takes 8 GB
-_ROW_BYTES, _TOP_BYTES = 1024, 2**20  # of CSV: five times what the digits of a row need; for the header
-_TEXT_BYTES = 2**32  # of CSV in memory
+MOST_EXR_RAYS = 2**24  # float32 holds all ids up to this one
 _EXR_WIDTH = 1024
-_EXR_IDS = 2**24  # float32 holds all whole numbers up to this one
-_ATTRIBUTE = "mi_refract:rays"
-
-Table = tuple[Header, Array, tuple[str, ...]]  # the header, (N, columns) float64, and the columns' names
-
-
-# Writing ---------------------------------------------------------------------------------------------------------
 
 
 def write(path: str | Path, rays: RaySet) -> Path:
@@ -67,11 +57,8 @@ def write(path: str | Path, rays: RaySet) -> Path:
 
 def as_csv(rays: RaySet) -> str:
     """The text of the CSV file."""
-    return with_header(rays.header, _columns(rays.header), rays.numbers, whole=media_rays.WHOLE)
-
-
-def _columns(header: Header) -> tuple[str, ...]:
-    return (*COLUMNS, *(media_rays.COLUMNS if media_rays.has_media(header) else ()))
+    columns = RAY_LAYOUTS[media_rays.has_media(rays.header)]
+    return tables.csv_text(rays.header, columns, rays.numbers, whole=media_rays.WHOLE)
 
 
 def _as_npz(rays: RaySet) -> bytes:
@@ -90,20 +77,17 @@ def _as_npz(rays: RaySet) -> bytes:
 
 
 def _write_exr(path: Path, rays: RaySet) -> None:
-    """One pixel per ray, row by row, at most 1024 pixels wide. Unused pixels of the last row have the id −1."""
-    if rays.precision != "f32" or len(rays) > _EXR_IDS:
-        raise ValueError(f"{path}: {len(rays)} rays in {rays.precision}; expected in EXR: f32, up to {_EXR_IDS}")
+    """One pixel per ray, row by row, at most 1024 pixels wide."""
+    if rays.precision != "f32" or len(rays) > MOST_EXR_RAYS:
+        raise ValueError(f"{path}: {len(rays)} rays in {rays.precision}; expected in EXR: f32, up to {MOST_EXR_RAYS}")
     width = min(len(rays), _EXR_WIDTH)
     height = -(-len(rays) // width)
-    columns = _columns(rays.header)
+    columns = RAY_LAYOUTS[media_rays.has_media(rays.header)]
     pixels = np.zeros((height * width, len(columns)), np.float32)
-    pixels[len(rays) :, 0] = -1
+    pixels[len(rays) :, 0] = tables.EXR_UNUSED
     pixels[: len(rays)] = rays.numbers
-    metadata = {_ATTRIBUTE: json.dumps(rays.header), **image_file.NO_DATE}
+    metadata = {tables.EXR_HEADER: json.dumps(rays.header), **image_file.NO_DATE}
     image_file.write_exr(path, pixels.reshape(height, width, -1), columns, metadata)
-
-
-# Reading ---------------------------------------------------------------------------------------------------------
 
 
 def read(path: str | Path) -> RaySet:
@@ -113,38 +97,31 @@ def read(path: str | Path) -> RaySet:
     checksum that does not match (a file that was edited or cut short). OSError where the file cannot be read.
     """
     path = Path(path)
-    header, numbers, _ = _read(path, RAY_ARRAYS, COLUMNS, WITH_MEDIA, MOST_RAYS)
+    table = tables.read(path, RAY_LAYOUTS, MOST_RAYS)
     try:
-        if header.get("format") != FORMAT:
-            raise ValueError(f"not a file of rays; expected what `mi-refract rays export` writes ({FORMAT})")
-        headers.check(header, len(numbers))
-        media_rays.check(header)
-        rays = RaySet(_rays(header, numbers), np.arange(len(numbers)), header)
-        pieces = enumerate(rays.numbers_in_pieces())
-        same = all(np.array_equal(piece, numbers[i * ROWS : (i + 1) * ROWS]) for i, piece in pieces)
-        if not same or checksum(rays) != header["checksum"]:
-            found = "the checksum does not match, so it was edited or cut short"
-            raise ValueError(f"{found}; expected the file as it was exported")
-        _check_rays(rays.rays)
-        media_rays.check_ratios(header, rays.rays.k)
+        return _rays(table)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    return rays
+        raise ValueError(f"{path}: {one_line(str(error))}") from None
 
 
-def _rays(header: Header, numbers: Array) -> Rays:
-    precision = PRECISIONS[header["precision"]]
+def _rays(table: Table) -> RaySet:
+    header, numbers = table.header, table.numbers
+    if header.get("format") != FORMAT:
+        raise ValueError(f"not a file of rays; expected what `mi-refract rays export` writes ({FORMAT})")
+    headers.check(header, len(numbers))
+    media_rays.check(header)
     with np.errstate(all="ignore"):
-        a, n, k = numbers[:, 1:4], numbers[:, 4:7], numbers[:, 7] / numbers[:, 8]
-        return Rays(*(x.astype(precision) for x in (a, n, k)))
-
-
-def _check_rays(rays: Rays) -> None:
-    """ValueError, one line, where a ray has no refraction."""
-    a, n, k = rays.a, rays.n, rays.k
+        parts = numbers[:, 1:4], numbers[:, 4:7], numbers[:, 7] / numbers[:, 8]
+        a, n, k = (x.astype(PRECISIONS[header["precision"]]) for x in parts)
+    rays = RaySet(Rays(a, n, k), np.arange(len(numbers)), header)
+    # Equal numbers first: a file may hold digits that are lost in the set's precision.
+    if not np.array_equal(rays.numbers, numbers) or checksum(header, numbers) != header["checksum"]:
+        raise ValueError("the checksum does not match: the file was edited or cut short; expected it as exported")
     valid = np.isfinite(a).all(1) & np.isfinite(n).all(1) & a.any(1) & n.any(1) & np.isfinite(k) & (k > 0)
     if not valid.all():
         raise ValueError(f"ray {np.argmin(valid)} is invalid: zero or non-finite vector, or index ≤ 0")
+    media_rays.check_ratios(header, k)
+    return rays
 
 
 def read_answers(path: str | Path, *, most: int = MOST_RAYS) -> Answers:
@@ -152,14 +129,13 @@ def read_answers(path: str | Path, *, most: int = MOST_RAYS) -> Answers:
 
     ValueError, one line, where it holds none, or more. OSError where it cannot be read.
     """
-    path = Path(path)
-    return _answers(str(path), *_read(path, ANSWER_ARRAYS, ANSWER_COLUMNS, (TRANSMITTED, N_RATIO), most))
+    return _answers(str(path), tables.read(Path(path), ANSWER_LAYOUTS, most))
 
 
 def parse_answers(text: str | bytes, name: str = "answers") -> Answers:
     """The answers in the text of a CSV file. ValueError, one line that begins with `name`, where it holds none."""
     stream = io.BytesIO(text.encode() if isinstance(text, str) else text)
-    return _answers(name, *csv_table.read_table(name, stream, ANSWER_COLUMNS, (TRANSMITTED, N_RATIO), MOST_RAYS))
+    return _answers(name, tables.read_csv(name, stream, ANSWER_LAYOUTS, MOST_RAYS))
 
 
 def most_answers(rays: Sized) -> int:
@@ -167,51 +143,16 @@ def most_answers(rays: Sized) -> int:
     return 2 * len(rays) + 100
 
 
-def csv_bytes(rows: int) -> int:
-    """The largest size of CSV text with so many rows, in memory."""
-    return min(rows * _ROW_BYTES + _TOP_BYTES, _TEXT_BYTES)
-
-
-def _answers(name: str, header: Header, numbers: Array, names: Sequence[str]) -> Answers:
-    columns = dict(zip(names, numbers.T, strict=True))
-    ids, flags, ratios = columns["id"], columns.get(TRANSMITTED), columns.get(N_RATIO)
+def _answers(name: str, table: Table) -> Answers:
+    header: Header = table.header
+    columns = dict(zip(table.columns, table.numbers.T, strict=True))
+    ids, transmitted, ratios = columns["id"], columns.get(TRANSMITTED), columns.get(N_RATIO)
     if len(wrong := ids[~(np.abs(ids) < 2**53) | (np.rint(ids) != ids)]):
         found = f"{len(wrong)} ids are not whole numbers below 2^53, the first is {wrong[0]:g}"
         raise ValueError(f"{name}: {found}; expected the ids of the rays")
-    if flags is not None and len(wrong := flags[~np.isin(flags, (0, 1))]):
+    if transmitted is not None and len(wrong := transmitted[~np.isin(transmitted, (0, 1))]):
         raise ValueError(f"{name}: {TRANSMITTED} is {wrong[0]} for {len(wrong)} rays; expected 0 or 1")
     if ratios is not None and len(wrong := ratios[~((ratios >= LEAST_RATIO) & (ratios <= 1 / LEAST_RATIO))]):
         found = f"{N_RATIO} is {wrong[0]:g} for {len(wrong)} rays"
         raise ValueError(f"{name}: {found}; expected n_from / n_to, {LEAST_RATIO:g} … {1 / LEAST_RATIO:g}")
-    return Answers(ids.astype(np.int64), numbers[:, 1:4], None if flags is None else flags == 1, header, ratios)
-
-
-def _read(path: Path, arrays: Mapping[str, int], columns: Sequence[str], optional: Sequence[str], most: int) -> Table:
-    """The table in a file of any format, with `most` rows at most.
-
-    `arrays`: the arrays of an .npz file beside `id`, and their widths.
-    """
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"{path}: expected a file name that ends in {' or '.join(SUFFIXES)}")
-    if path.suffix.lower() == ".csv":
-        with regular_file.opened(path, most * _ROW_BYTES + _TOP_BYTES) as stream:
-            return csv_table.read_table(str(path), stream, columns, optional, most)
-    if path.suffix.lower() == ".npz":
-        text, numbers, present = npz_arrays.read(path, {"id": 1, **arrays}, csv_table.flat(optional), most)
-        return _header(text), numbers, (*columns, *(name for name in csv_table.flat(optional) if name in present))
-    image = image_file.read(path)
-    names = (*columns, *(name for name in csv_table.flat(optional) if name in image.channels))
-    pixels: NDArray[np.float64] = image.select(names).reshape(-1, len(names)).astype(np.float64)
-    numbers = pixels[pixels[:, 0] != -1]
-    if len(numbers) > most:
-        raise ValueError(f"{path}: {len(numbers)} rows; expected up to {most}")
-    return _header(image.metadata.get(_ATTRIBUTE, "")), numbers, names
-
-
-def _header(text: object) -> Header:
-    """The header in JSON text, empty where there is none."""
-    try:
-        header = headers.as_json(text) if isinstance(text, str) else {}
-    except ValueError:
-        return {}
-    return header if isinstance(header, dict) else {}
+    return Answers(ids.astype(np.int64), table.numbers[:, 1:4], transmitted, header, ratios)

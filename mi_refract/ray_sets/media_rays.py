@@ -17,8 +17,9 @@ import numpy as np
 from mi_refract import media
 from mi_refract.regimes import REGIMES, Array
 
-from .header import AIR, LARGEST_WAVELENGTH, MOST_MEDIA, PRECISIONS, Header, Ids, check_media, shown
+from .header import LARGEST_WAVELENGTH, MOST_MEDIA, PRECISIONS, Header, Ids, shown
 
+AIR = "air"
 COLUMNS = ("wavelength", "medium")
 WHOLE = ("medium",)  # those that hold whole numbers
 CONVENTION = (
@@ -26,9 +27,8 @@ CONVENTION = (
     "their indices at that wavelength, where air has the index 1"
 )
 SMALLEST, LARGEST = 1e-6, 1e6  # of ratios
-SAME = (
-    1e-5  # the relative difference of indices that a maker's five decimals, or another formula of a glass, leave open
-)
+# The relative difference of indices that a maker's five decimals, or another formula of a glass, leave open.
+SAME = 1e-5
 NAMES = tuple(name for name, regime in REGIMES.items() if regime.takes_k)
 _AIR = dataclasses.replace(media.parse(1.0), name=AIR, relative_to="air")
 
@@ -44,22 +44,25 @@ def header_of(specs: Sequence[str], wavelengths: Sequence[float], precision: str
     ValueError, one line, for none of either, too many, one given twice in the set's precision, what is no medium, or no
     index at one of the wavelengths.
     """
+    found = f"{len(specs)} media and {len(wavelengths)} wavelengths"
     if not len(specs) or not len(wavelengths):
-        found = f"{len(specs)} media and {len(wavelengths)} wavelengths"
         raise ValueError(f"{found}; expected neither, or at least one of each")
     if max(len(specs), len(wavelengths)) > MOST_MEDIA:
-        found = f"{len(specs)} media and {len(wavelengths)} wavelengths"
         raise ValueError(f"{found}; expected up to {MOST_MEDIA} of each")
-    if wrong := [each for each in wavelengths if not 0 < each < LARGEST_WAVELENGTH]:
+    if wrong := [x for x in wavelengths if not 0 < x < LARGEST_WAVELENGTH]:
         raise ValueError(f"wavelength {wrong[0]:g}; expected nm, above 0")
+    rounded = _rounded(wavelengths, precision)
+    if len(np.unique(rounded)) < len(rounded) or not rounded.all():
+        raise ValueError(
+            f"the wavelengths {shown(wavelengths)} are not all different in {precision}; expected each once"
+        )
     names = [_parsed(spec).name for spec in specs]
     if twice := [name for name in names if names.count(name) > 1]:
         raise ValueError(f"medium {shown(twice[0])}: {names.count(twice[0])} times; expected each once")
+    in_nm = [float(x) for x in wavelengths]
+    _ratios(tuple(names), tuple(in_nm), precision)
     pairs = [pair for name in names for pair in ([name, AIR], [AIR, name])]
-    header = {"wavelength, medium": CONVENTION, "media": pairs, "wavelengths": [float(each) for each in wavelengths]}
-    check_media(header, precision)
-    _ratios(tuple(names), tuple(header["wavelengths"]), precision)
-    return header
+    return {"wavelength, medium": CONVENTION, "media": pairs, "wavelengths": in_nm}
 
 
 def check(header: Header) -> None:
@@ -68,7 +71,7 @@ def check(header: Header) -> None:
         names = [pair[0] for pair in header["media"][::2]]
         made = header_of(names, header["wavelengths"], header["precision"])
         if header["media"] != made["media"]:
-            raise ValueError(f"the header's media is {shown(header['media'])}; expected {shown(made['media'])}")
+            raise ValueError(f"header: media: {shown(header['media'])}; expected {shown(made['media'])}")
         check_regimes(header)
 
 

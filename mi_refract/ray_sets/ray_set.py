@@ -11,8 +11,9 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,14 +28,6 @@ from .header import FORMAT, PRECISIONS, Header, Ids
 # Their vectors are unit up to the rounding of each component, as the documented formulas require.
 DEFAULT = tuple(name for name, regime in regimes.REGIMES.items() if regime.unit and not regime.rests_on_denormals)
 COUNT, PRECISION = 1000, "f32"
-ROWS = 2**16  # that are in float64 at once, which takes several times what the rays do
-CONVENTIONS = {
-    "a": "incident direction, pointing toward the surface",
-    "n": "normal, on the side that the ray comes from: n.a <= 0",
-    "n, two-sided": "normal, on either side of the surface",
-    "n_from, n_to": "indices of the media that the ray leaves and enters; k = n_from / n_to is exact",
-    "answer": "id, bx, by, bz: the direction after the surface; optionally transmitted: 1, or 0 where all is reflected",
-}
 
 
 def indices(k: Array) -> tuple[Array, Array]:
@@ -55,6 +48,10 @@ class RaySet:
     def __len__(self) -> int:
         """The number of rays."""
         return len(self.ids)
+
+    def __getitem__(self, mask: NDArray[np.bool_]) -> RaySet:
+        """The rays of a mask (N,), under the same header."""
+        return RaySet(self.rays[mask], self.ids[mask], self.header)
 
     @property
     def precision(self) -> str:
@@ -77,14 +74,8 @@ class RaySet:
     @property
     def numbers(self) -> Array:
         """(N, 9) float64: id, a, n, n_from, n_to; with media (N, 11): wavelength, medium."""
-        return np.concatenate(list(self.numbers_in_pieces()))
-
-    def numbers_in_pieces(self) -> Iterator[Array]:
-        """`numbers`, ROWS at a time."""
-        for i in range(0, len(self), ROWS):
-            ids, rays = self.ids[i : i + ROWS], self.rays[i : i + ROWS]
-            columns = [ids, rays.a, rays.n, *indices(rays.k), *media_rays.columns(self.header, ids).T]
-            yield np.column_stack(columns).astype(np.float64)
+        rays, of_media = self.rays, media_rays.columns(self.header, self.ids).T
+        return np.column_stack([self.ids, rays.a, rays.n, *indices(rays.k), *of_media]).astype(np.float64, copy=False)
 
 
 def in_regime(header: Header, name: str, ids: Ids) -> NDArray[np.bool_]:
@@ -104,7 +95,7 @@ class Answers:
 
     ids: Ids
     b: Array
-    transmitted: NDArray[np.bool_] | None = None
+    transmitted: NDArray[Any] | None = None
     header: Header = field(default_factory=dict)
     n_ratio: Array | None = None
 
@@ -117,6 +108,11 @@ class Answers:
             if (wrong := self.transmitted[~np.isin(self.transmitted, (0, 1))]).size:
                 raise ValueError(f"answers: transmitted is {wrong[0]}; expected 0 or 1")
             object.__setattr__(self, "transmitted", self.transmitted.astype(bool))  # `~` of an integer is another one
+
+    def __getitem__(self, mask: NDArray[np.bool_]) -> Answers:
+        """The answers of a mask (N,), under the same header."""
+        columns = [None if column is None else column[mask] for column in (self.transmitted, self.n_ratio)]
+        return Answers(self.ids[mask], self.b[mask], columns[0], self.header, columns[1])
 
 
 def default(media: Sequence[str] = ()) -> tuple[str, ...]:
@@ -137,26 +133,7 @@ def make(
     """`count` rays of each regime in `names`, by default those of `default`. Normals face the ray unless `two_sided`.
 
     `media`: what `mi_refract.media` parses; each ray passes between one of them and air, at one of the `wavelengths` in
-    nm. Errors as of `header_of`.
-    """
-    header = header_of(names, count, precision, seed, two_sided, media, wavelengths)
-    rays = Rays.joined([of_regime(name, header) for name in header["regimes"]])
-    made = RaySet(rays, np.arange(len(rays)), header)
-    return replace(made, header=header | {"checksum": checksum(made)})
-
-
-def header_of(
-    names: Iterable[str] | None,
-    count: int,
-    precision: str,
-    seed: int,
-    two_sided: bool,
-    media: Sequence[str] = (),
-    wavelengths: Sequence[float] = (),
-) -> Header:
-    """The header of the set that is made so, without its checksum.
-
-    ValueError for an unknown regime or precision, a regime given twice, or no ray at all; of media see
+    nm. ValueError, one line, for an unknown regime or precision, a regime given twice, no ray at all; of media see
     `media_rays.header_of` and `media_rays.check_regimes`.
     """
     from mi_refract import __version__
@@ -175,26 +152,27 @@ def header_of(
         "seed": seed,
         "count": count,
         "two_sided": two_sided,
-        **{key: text for key, text in CONVENTIONS.items() if key not in ("n", "n, two-sided")},
-        "n": CONVENTIONS["n, two-sided" if two_sided else "n"],
+        "a": "incident direction, pointing toward the surface",
+        "n_from, n_to": "indices of the media that the ray leaves and enters; k = n_from / n_to is exact",
+        "answer": "id, bx, by, bz: the direction after the surface; optionally transmitted: 1, or 0 where all is "
+        "reflected",
+        "n": "normal, on either side of the surface"
+        if two_sided
+        else "normal, on the side that the ray comes from: n.a <= 0",
         "regimes": {name: [i * count, (i + 1) * count - 1] for i, name in enumerate(names)},
     }
     if len(media) or len(wavelengths):
         header |= media_rays.header_of(media, wavelengths, precision)
         media_rays.check_regimes(header)
-    return header
-
-
-def of_regime(name: str, header: Header) -> Rays:
-    """The rays of one regime of the set with this header."""
-    precision, seed = PRECISIONS[header["precision"]], header["seed"]
-    if media_rays.has_media(header):
-        first, last = header["regimes"][name]
-        k = media_rays.ratios(header, np.arange(first, last + 1))
-        rays = regimes.make_given(name, k, precision, seed)
-    else:
-        rays = regimes.make(name, header["count"], precision, seed)
-    return rays if header["two_sided"] else facing(rays)
+    parts = []
+    for name, (first, last) in header["regimes"].items():
+        if media_rays.has_media(header):
+            k = media_rays.ratios(header, np.arange(first, last + 1))
+            parts.append(regimes.make_given(name, k, PRECISIONS[precision], seed))
+        else:
+            parts.append(regimes.make(name, count, PRECISIONS[precision], seed))
+    rays = Rays.joined(parts if two_sided else [facing(part) for part in parts])
+    return with_checksum(RaySet(rays, np.arange(len(rays)), header))
 
 
 def facing(rays: Rays) -> Rays:
@@ -203,10 +181,14 @@ def facing(rays: Rays) -> Rays:
     return Rays(rays.a, np.where(c[:, None] > 0, -rays.n, rays.n), rays.k)
 
 
-def checksum(rays: RaySet) -> str:
-    """SHA-256 of the header without its own line, and of the numbers. It does not depend on the file format."""
-    hashed = {key: value for key, value in rays.header.items() if key != "checksum"}
+def checksum(header: Header, numbers: Array) -> str:
+    """SHA-256 of the header without its own line, and of `RaySet.numbers`. It does not depend on the file format."""
+    hashed = {key: value for key, value in header.items() if key != "checksum"}
     digest = hashlib.sha256(json.dumps(hashed, sort_keys=True).encode())
-    for numbers in rays.numbers_in_pieces():
-        digest.update(numbers.astype("<f8").tobytes())
+    digest.update(np.ascontiguousarray(numbers, "<f8").data)
     return f"sha256:{digest.hexdigest()}"
+
+
+def with_checksum(rays: RaySet) -> RaySet:
+    """The set, with its checksum in the header."""
+    return replace(rays, header=rays.header | {"checksum": checksum(rays.header, rays.numbers)})

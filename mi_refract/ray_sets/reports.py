@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.sanitise import printable
@@ -27,32 +27,14 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 SCHEMA = 1
-COLUMNS = (
-    "rays",
-    "undecidable",
-    "worst / rad",
-    "worst / ulp",
-    "p99 / ulp",
-    "mean / ulp",
-    "TIR misclassified",
-    "TIR beyond bound",
-    "length error",
-    "error / bound",
-    "m, median",
-    "m, p99",
-    "m, worst",
-    "right",
-    "exact",
-    "wrong",
-)
 STYLES = {"wrong": "bold red", "within bound": "yellow", "right": "", "exact": "green"}
 TERMS = {
     "ulp": "the spacing of numbers at 1: 2⁻²³ in f32, 2⁻⁵² in f64",
     "worst, p99, mean": "angles to the certified direction, over the rays whose total internal reflection was "
     "classified correctly; rounding the exact answer costs up to 0.43 ulp",
-    "undecidable": "rays whose error bound is above 0.1 rad, where a direction within it shows little: all that "
-    "is judged there is the plane of incidence, the side of the surface, and what is forward",
-    "TIR misclassified": "rays that were called transmitted and are totally reflected, or the reverse",
+    "undecidable": "rays whose error bound is above 0.1 rad, where a direction within it shows little: only the plane "
+    "of incidence, the side of the surface, and forward or backward are judged",
+    "TIR misclassified": "rays called transmitted that are totally reflected, or the reverse",
     "TIR beyond bound": "those of them that are farther from the critical angle than rounding can explain",
     "length error": "the difference between the length of an answer and 1, or the length of a where that is nearer",
     "error / bound": "the largest ratio of an error to the a-priori bound of the chosen formula for that ray",
@@ -60,35 +42,36 @@ TERMS = {
     "relative to their lengths; u is half an ulp. Of a wrong decision on TIR: of inputs beyond the critical angle",
     "right": f"answers that are not wrong, with m up to {RIGHT:g}; the others are only as good as the error bound",
     "exact": "answers that are the certified direction, rounded: no formula can do better",
-    "wrong": "answers whose error is beyond the bound, whose TIR is misclassified beyond it, or that are no direction",
+    "wrong": "answers whose error exceeds the bound, whose TIR is misclassified beyond it, or that are no direction",
 }
 MEANING = f"right: backward error m ≤ {RIGHT:g} u (exact for inputs perturbed by at most {RIGHT:g} roundings)"
+_SIGNALLED = "total internal reflection is signalled by"
 SIGNALS = {
-    "zero": "total internal reflection is signalled by the zero vector",
-    "nan": "total internal reflection is signalled by NaN",
-    "reflected": "total internal reflection is signalled by the mirror direction",
-    "tangent": "total internal reflection is signalled by a vector along the surface",
-    "flag": "total internal reflection is signalled by transmitted = 0",
+    "zero": f"{_SIGNALLED} the zero vector",
+    "nan": f"{_SIGNALLED} NaN",
+    "reflected": f"{_SIGNALLED} the mirror direction",
+    "tangent": f"{_SIGNALLED} a vector along the surface",
+    "flag": f"{_SIGNALLED} transmitted = 0",
     NONE: "no ray is totally reflected",
-    UNCLEAR: "total internal reflection is signalled in no known way; expected the zero vector, NaN, the mirror "
-    "direction, a vector along the surface, or a column `transmitted`",
+    UNCLEAR: "the signal of total internal reflection is unknown or inconsistent; expected the zero vector, NaN, the "
+    "mirror direction, a vector along the surface, or a column `transmitted`",
 }
 PROBLEM_TEXTS = {
     "missing": "{} without an answer",
     "duplicate": "{} answered more than once",
     "unknown": "{} answers to rays that are not in the set",
-    "non-finite": "{} answers are NaN or infinite where that is no signal",
-    "zero": "{} answers are the zero vector where that is no signal",
+    "non-finite": "{} answers are NaN or infinite, which is not the signal of total internal reflection",
+    "zero": "{} answers are the zero vector, which is not the signal of total internal reflection",
     "impossible": "{} answers are outside the plane of incidence, or on the wrong side of the surface, by more than "
     "the rounding of any documented formula explains",
-    "index": "{} answers used another ratio of indices, n_ratio",
+    "index": "{} answers used a different ratio of indices (n_ratio)",
 }
 
 
 def sentence(found: Findings) -> str:
     """The result in one line, such as "200 of 13000 answers are wrong: eta inverted"."""
-    others = sum(each.count for each in found.problems if each.kind == "index")
-    return _directions(found) + (f"; {others} answers are for another ratio of indices" if others else "")
+    others = found.problem_count("index")
+    return _directions(found) + (f"; {others} answers are for a different ratio of indices" if others else "")
 
 
 def _directions(found: Findings) -> str:
@@ -103,16 +86,16 @@ def _directions(found: Findings) -> str:
     if found.wrong or found.tir == UNCLEAR:
         return f"{found.wrong} of {answers} are wrong"
     if not found.total("judged"):
-        return f"{answers}, none of them a direction{' that shows anything' if found.total('compared') else ''}"
+        return f"{answers}, none of them a {'decidable ' if found.total('compared') else ''}direction"
     if found.total("exact") == found.answered:
         return f"{answers}, all exact up to rounding"
     worst = f"the largest error is {compact(found.farthest.worst)} rad ({found.farthest.regime})"
     wide = found.total("undecidable")
-    open_ = f"; {wide} rays are undecidable (error bound above 0.1 rad)" if wide else ""
+    undecidable = f"; {wide} rays are undecidable (error bound above 0.1 rad)" if wide else ""
     if found.right == found.answered:
         return f"{answers}, all right; {worst}"
     others = f"the others are within the error bound of the formula {found.error_bound}"
-    return f"{found.right} of {answers} are right, {others}; {worst}{open_}"
+    return f"{found.right} of {answers} are right, {others}; {worst}{undecidable}"
 
 
 def problem_text(problem: Problem) -> str:
@@ -126,41 +109,58 @@ def signal(found: Findings) -> str:
 
 
 def ratio(found: Findings) -> list[str]:
-    """A line: how far the ratio that the program used is from that of the ray. None where it does not say."""
+    """A line: how far the ratio that the program used is from that of the ray. None where answers have no `n_ratio`."""
     if not found.ratio:
         return []
     which = f"id {found.ratio.id}" + (f", {found.ratio.ray}" if found.ratio.ray else "")
     text = f"n_ratio: the largest relative difference to n_from / n_to is {compact(found.ratio.largest)} ({which})"
-    return [f"{text}; up to {compact(found.ratio.accepted)} is none. Directions are judged for n_ratio"]
+    return [f"{text}; up to {compact(found.ratio.tolerance)} counts as equal. Directions are judged for n_ratio"]
 
 
 def explained(found: Findings) -> list[str]:
     """The mistakes that explain the answers, a line each; where none does, a line that says so, and the nearest one."""
-    if not found.explanations:
-        return []
-    certain = [each for each in found.explanations if each.explains]
-    if not certain and found.exit_code > 1:  # possibly answers to other rays: no mistake can be named
-        return []
-    if not certain:
-        nearest = max(found.explanations, key=lambda each: each.share)
-        return ["none of the usual mistakes explains the answers", *([_line(nearest)] if nearest.share > 0 else [])]
-    return [_line(each) for each in certain]
+
+    def line(mistake: Explanation) -> str:
+        share = f"{mistake.share:.1%} of the answers on which it has an effect"
+        return f"{mistake.mistake}: {mistake.text} ({share})"
+
+    certain = [line(mistake) for mistake in found.explanations if mistake.explains]
+    # Answers that do not match may be to other rays: then no mistake can be named.
+    if certain or not found.explanations or found.exit_code > 1:
+        return certain
+    nearest = max(found.explanations, key=lambda mistake: mistake.share)
+    return ["none of the usual mistakes explains the answers", *([line(nearest)] if nearest.share > 0 else [])]
 
 
-def _line(each: Explanation) -> str:
-    return f"{each.mistake}: {each.text} ({each.share:.1%} of the answers on which it has an effect)"
-
-
-def grade(each: RegimeErrors) -> str:
+def grade(errors: RegimeErrors) -> str:
     """ "exact", "right", "within bound" or "wrong"."""
-    if each.wrong:
+    if errors.wrong:
         return "wrong"
-    if each.right < each.rays:
+    if errors.right < errors.rays:
         return "within bound"
-    return "exact" if each.exact == each.rays else "right"
+    return "exact" if errors.exact == errors.rays else "right"
 
 
-# Terminal ----------------------------------------------------------------------------------------------------------
+def cells(errors: RegimeErrors, ulp: float) -> dict[str, str]:
+    """The numbers of a regime as text, by the name of the column; "–" where no direction was compared."""
+
+    def of_directions(x: float) -> str:
+        return compact(x) if errors.compared else "–"
+
+    return {
+        "rays": str(errors.rays),
+        "undecidable": str(errors.undecidable),
+        "worst / rad": of_directions(errors.worst),
+        **{f"{name} / ulp": of_directions(getattr(errors, name) / ulp) for name in ("worst", "p99", "mean")},
+        "TIR misclassified": str(errors.tir_misclassified),
+        "TIR beyond bound": str(errors.tir_beyond_bound),
+        "length error": of_directions(errors.length_error),
+        "error / bound": compact(errors.error_over_bound),
+        **{f"m, {name}": compact(getattr(errors, f"backward_{name}")) for name in ("median", "p99", "worst")},
+        "right": f"{errors.right / errors.rays:.1%}",
+        "exact": f"{errors.exact / errors.rays:.1%}",
+        "wrong": str(errors.wrong),
+    }
 
 
 def table(found: Findings) -> RenderableType:
@@ -169,37 +169,18 @@ def table(found: Findings) -> RenderableType:
     from rich.table import Table
     from rich.text import Text
 
-    rows = Table("", "regime", *COLUMNS, box=None, pad_edge=False)
-    for column in rows.columns[2:]:
-        column.justify = "right"
-    for each in found.regimes:
-        rows.add_row(
-            Text(grade(each), style=STYLES[grade(each)]),
-            Text(printable(each.regime)),
-            *_cells(each, found.ulp).values(),
-        )
     notes = [*map(problem_text, found.problems), *ratio(found), signal(found), *explained(found)]
     notes += [MEANING] if found.right > 0 and not found.wrong else []
-    return Group(*([rows] if found.regimes else []), *(Text(printable(line)) for line in (*notes, sentence(found))))
-
-
-def _cells(each: RegimeErrors, ulp: float) -> dict[str, str]:
-    """The numbers of a regime as text; "–" where no direction was compared."""
-    ulps = {f"{name} / ulp": getattr(each, name) / ulp for name in ("worst", "p99", "mean")}
-    shown = {name: compact(x) if each.compared else "–" for name, x in ({"worst / rad": each.worst} | ulps).items()}
-    return {
-        "rays": str(each.rays),
-        "undecidable": str(each.undecidable),
-        **shown,
-        "TIR misclassified": str(each.tir_misclassified),
-        "TIR beyond bound": str(each.tir_beyond_bound),
-        "length error": compact(each.length_error) if each.compared else "–",
-        "error / bound": compact(each.error_over_bound),
-        **{f"m, {name}": compact(getattr(each, f"backward_{name}")) for name in ("median", "p99", "worst")},
-        "right": f"{each.right / each.rays:.1%}",
-        "exact": f"{each.exact / each.rays:.1%}",
-        "wrong": str(each.wrong),
-    }
+    lines = [Text(printable(line)) for line in (*notes, sentence(found))]
+    if not found.regimes:
+        return Group(*lines)
+    rows = Table("", "regime", *cells(found.regimes[0], found.ulp), box=None, pad_edge=False)
+    for column in rows.columns[2:]:
+        column.justify = "right"
+    for errors in found.regimes:
+        word = Text(grade(errors), style=STYLES[grade(errors)])
+        rows.add_row(word, Text(printable(errors.regime)), *cells(errors, found.ulp).values())
+    return Group(rows, *lines)
 
 
 # Files -------------------------------------------------------------------------------------------------------------
@@ -236,39 +217,40 @@ def write_json(path: str | Path, found: Findings) -> None:
 
 def write_junit(path: str | Path, found: Findings, name: str) -> None:
     """One test case per regime, and one for the set of answers: an error where they do not match the rays."""
-    suites = {name: [_answers_case(found), *(_regime_case(found, each) for each in found.regimes)]}
-    junit.write_junit(path, "mi-refract rays", suites)
-
-
-def _answers_case(found: Findings) -> junit.Case:
-    group, name = "answers", "complete and understood"
-    if found.answered and not found.problems and found.tir != UNCLEAR:
-        return junit.Case(group, name)
-    lines = [*map(problem_text, found.problems), *ratio(found), signal(found)]
-    return junit.Case(group, name, "error" if found.exit_code == 2 else "failure", lines[0], lines)
-
-
-def _regime_case(found: Findings, each: RegimeErrors) -> junit.Case:
-    if not each.wrong:
-        return junit.Case("rays", each.regime)
-    numbers = [f"{key} {text}" for key, text in _cells(each, found.ulp).items()]
-    wrong = f"{each.wrong} of {each.rays} answers are wrong"
-    lines = [wrong, *explained(found), *numbers, json.dumps(strict(each.replay))]
-    return junit.Case("rays", each.regime, "failure", wrong, lines)
+    answers = junit.Case("answers", "complete and understood")
+    if not found.answered or found.problems or found.tir == UNCLEAR:
+        lines = [*map(problem_text, found.problems), *ratio(found), signal(found)]
+        outcome: Literal["error", "failure"] = "error" if found.exit_code == 2 else "failure"
+        answers = junit.Case(answers.group, answers.name, outcome, lines[0], lines)
+    cases = [answers]
+    for errors in found.regimes:
+        case = junit.Case("rays", errors.regime)
+        if errors.wrong:
+            wrong = f"{errors.wrong} of {errors.rays} answers are wrong"
+            numbers = [f"{key} {text}" for key, text in cells(errors, found.ulp).items()]
+            lines = [wrong, *explained(found), *numbers, json.dumps(strict(errors.replay))]
+            case = junit.Case("rays", errors.regime, "failure", wrong, lines)
+        cases.append(case)
+    junit.write_junit(path, "mi-refract rays", {name: cases})
 
 
 def write_html(path: str | Path, found: Findings, context: Mapping[str, Any], replay: str = "") -> None:
     """Write the HTML page. `context` is shown on top; `replay` is the command that repeats the check. OSError."""
-    texts = {name: regime.text for name, regime in REGIMES.items()}
-    rows = [
-        {
-            "name": each.regime,
-            "text": texts.get(each.regime, ""),
-            "cells": [(text, _state(name, each)) for name, text in _cells(each, found.ulp).items()],
-            "replay": json.dumps(strict(each.replay), indent=1),
-        }
-        for each in found.regimes
-    ]
+    rows = []
+    for errors in found.regimes:
+        shown = cells(errors, found.ulp)
+        failing = {"wrong": errors.wrong, "TIR beyond bound": errors.tir_beyond_bound}
+        failing["error / bound"] = errors.error_over_bound > 1
+        states = {name: "fail" for name, fails in failing.items() if fails}
+        states |= {"exact": "pass"} if grade(errors) == "exact" else {}
+        rows.append(
+            {
+                "name": errors.regime,
+                "text": REGIMES[errors.regime].text if errors.regime in REGIMES else "",
+                "cells": [(text, states.get(name, "")) for name, text in shown.items()],
+                "replay": json.dumps(strict(errors.replay), indent=1),
+            }
+        )
     noted = dict(zip(["ratio of indices"], ratio(found), strict=False))
     content = {
         "title": "mi-refract rays",
@@ -285,22 +267,10 @@ def write_html(path: str | Path, found: Findings, context: Mapping[str, Any], re
         "unclear": found.tir == UNCLEAR,
         "explained": explained(found),
         "explanations": found.explanations,
-        "head": COLUMNS,
+        "head": list(cells(found.regimes[0], found.ulp)) if found.regimes else [],
         "rows": rows,
         "terms": TERMS,
         "pi": math.pi,
         "command": replay,
     }
     write_page(path, "rays.html.j2", content, EmbeddedImages())
-
-
-def _state(column: str, each: RegimeErrors) -> str:
-    """The class of a cell: "fail", "pass" or none."""
-    failing = {
-        "wrong": each.wrong > 0,
-        "TIR beyond bound": each.tir_beyond_bound > 0,
-        "error / bound": each.error_over_bound > 1,
-    }
-    if failing.get(column):
-        return "fail"
-    return "pass" if column == "exact" and grade(each) == "exact" else ""

@@ -9,8 +9,9 @@ from pathlib import Path
 from mi_refract.io import process_group
 from mi_refract.io.errors import TooMuchOutputError
 
-from .files import as_csv, csv_bytes, most_answers, parse_answers
+from .files import as_csv, most_answers, parse_answers
 from .ray_set import Answers, RaySet
+from .tables import csv_bytes
 
 TIMEOUT = 300.0  # seconds
 

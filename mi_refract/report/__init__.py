@@ -15,6 +15,5 @@ __all__ = [
     "plots",
     "row",
     "run_report",
-    "text_table",
     "thumbnails",
 ]

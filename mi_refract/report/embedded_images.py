@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mi_refract.io.image_file import read
-from mi_refract.io.pixels import block_mean
+from mi_refract.io.pixels import Pixels, block_mean
 
+Codes = NDArray[np.uint16]  # the bits of halves
 LARGEST = 65504.0  # of the finite halves
 LINES = 64  # that are converted at once
 # Mantissa bits given up, by twos, before an image is made smaller: at 6 a value is within 1/32 of itself.
@@ -51,7 +53,7 @@ class EmbeddedImages:
         return self.embedded[-1]
 
 
-def encoded(pixels: Any, limit: float = np.inf, scale: float = 1.0) -> dict[str, Any]:
+def encoded(pixels: Pixels, limit: float = np.inf, scale: float = 1.0) -> dict[str, Any]:
     """H × W × (1 or 3) pixels / `scale` as base64 of about `limit` bytes; `note` says what it took.
 
     Where they do not fit, values are rounded, then blocks of pixels averaged.
@@ -72,14 +74,14 @@ def packed(text: str) -> str:
     return base64.b64encode(zlib.compress(text.encode(), 9)).decode()
 
 
-def shown(pixels: Any, channels: tuple[str, ...]) -> tuple[Any, str]:
+def shown(pixels: Pixels, channels: tuple[str, ...]) -> tuple[Pixels | None, str]:
     """The part of an image that a page can show: RGB or its one channel, and its name; (None, "") for neither."""
     if {"R", "G", "B"} <= set(channels):
         return pixels[..., [channels.index(name) for name in "RGB"]], "RGB"
     return (pixels, channels[0]) if len(channels) == 1 else (None, "")
 
 
-def strongest(values: Any, width: int) -> Any:
+def strongest(values: Pixels, width: int) -> Pixels:
     """H × W × C values as one channel of at most `width` columns: of every block the value of largest magnitude.
 
     A mean would let two errors cancel and one pixel drown. NaN is stronger than any number.
@@ -93,7 +95,7 @@ def strongest(values: Any, width: int) -> Any:
     return np.take_along_axis(blocks, place, -1)
 
 
-def _halves(pixels: Any, scale: float) -> Any:
+def _halves(pixels: Pixels, scale: float) -> Codes:
     """The bits of little-endian halves, of pixels / `scale`. Finite stays finite, and every NaN is the same."""
     codes = np.empty(pixels.shape, "<u2")
     for start in range(0, len(pixels), LINES):  # the intermediates of a whole image are several times its size
@@ -104,16 +106,16 @@ def _halves(pixels: Any, scale: float) -> Any:
     return codes
 
 
-def _rounded(codes: Any, bits: int) -> Any:
+def _rounded(codes: Codes, bits: int) -> Codes:
     """The codes with that many low bits cleared, rounded to nearest: never from finite to infinite."""
     if not bits:
         return codes
     magnitude = codes & np.uint16(0x7FFF)
     up = np.where(magnitude < 0x7C00, np.minimum(magnitude + (1 << bits - 1), 0x7BFF), magnitude).astype("<u2")
-    return up >> bits << bits | codes & np.uint16(0x8000)
+    return (up >> bits << bits | codes & np.uint16(0x8000)).astype("<u2")
 
 
-def _deflated(codes: Any) -> bytes:
+def _deflated(codes: Codes) -> bytes:
     """High bytes, then low bytes: a tenth to a half smaller than the halves in a row.
 
     Level 4: the default's matches take five times as long on rounded noise, for a hundredth of its size.
@@ -122,7 +124,7 @@ def _deflated(codes: Any) -> bytes:
     return zlib.compress(planes, 4)
 
 
-def _fitting(codes: Any, limit: float) -> int | None:
+def _fitting(codes: Codes, limit: float) -> int | None:
     """The fewest bits to round away for base64 of about `limit` bytes, by some of its lines; None if none do."""
     if codes.nbytes * 4 / 3 <= limit:
         return 0

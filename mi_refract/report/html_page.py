@@ -16,6 +16,7 @@ from .number_text import compact
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+    from markupsafe import Markup
 
 HERE = Path(__file__).parent / "templates"
 
@@ -63,14 +64,14 @@ def _environment() -> Environment:
     return environment
 
 
-def code(text: str) -> Any:
+def code(text: str) -> Markup:
     """Escaped HTML in which words between backticks are `<code>`."""
     from markupsafe import Markup, escape
 
     return Markup(re.sub("`([^`]*)`", r"<code>\1</code>", str(escape(printable_lines(text)))))
 
 
-def words(value: Any) -> str:
+def words(value: object) -> str:
     """A value of the context as text: mappings and lists separated by commas."""
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {words(item)}" for key, item in value.items())

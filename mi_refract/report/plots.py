@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes as Panel
     from matplotlib.figure import Figure
 
+    from mi_refract.io.pixels import Pixels
+
 Points = Sequence[tuple[float, float]]
 
 # Stand-in colours: matplotlib writes them, `_page_svg` turns each into the style sheet's variable.
@@ -112,7 +114,7 @@ def curves_svg(curves: Mapping[str, Points], axes: Axes, *, salt: str, size: tup
         return _page_svg(figure)
 
 
-def histogram_svg(values: Any, x: str, y: str, *, salt: str, bins: int = 20) -> str:
+def histogram_svg(values: Sequence[float] | Pixels, x: str, y: str, *, salt: str, bins: int = 20) -> str:
     """Shares of values from 0 to 1 in equal bins, and a dashed line where all would be the same. "" without values."""
     if not len(values):
         return ""

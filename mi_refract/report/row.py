@@ -99,7 +99,7 @@ class Row:
         return dataclasses.asdict(self) | {"verdict": self.verdict}
 
     @classmethod
-    def from_dict(cls, data: Any) -> Row:
+    def from_dict(cls, data: object) -> Row:
         """The row whose fields `data` holds, as JSON has them; other entries are ignored.
 
         Errors: ValueError, one line, for a missing field or another type.
@@ -133,7 +133,7 @@ def as_json(rows: Iterable[Row]) -> str:
     return json.dumps(strict([row.as_dict() for row in rows]), indent=1, allow_nan=False)
 
 
-def strict(value: Any) -> Any:
+def strict(value: object) -> Any:
     """`value` in the types strict JSON has: numpy's as lists and numbers, NaN and the infinities as words."""
     if isinstance(value, float):  # numpy's float64 too, hence the conversion
         return float(value) if math.isfinite(value) else str(float(value))

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import struct
 import zlib
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mi_refract.io.pixels import block_mean, srgb_encode
+from mi_refract.io.pixels import Pixels, block_mean, srgb_encode
 
 from .embedded_images import strongest
 
@@ -19,7 +18,7 @@ EQUAL, LESS, MORE = np.array((247, 247, 247)), np.array((33, 102, 172)), np.arra
 Bytes = NDArray[np.uint8]
 
 
-def of_image(pixels: Any, coded: bool) -> bytes:
+def of_image(pixels: Pixels, coded: bool) -> bytes:
     """H × W × (1 or 3) pixels; `coded`: they are sRGB codes, else linear light."""
     small = block_mean(pixels, -(-max(pixels.shape[:2]) // SIDE))
     unit = np.clip(np.nan_to_num(small), 0, 1)
@@ -28,7 +27,7 @@ def of_image(pixels: Any, coded: bool) -> bytes:
     return png(np.where(np.isnan(small).any(-1, keepdims=True), NOT_A_NUMBER, rgb))
 
 
-def of_difference(values: Any) -> bytes:
+def of_difference(values: Pixels) -> bytes:
     """H × W × C differences, of every block the strongest; colours are full at the upper hundredth of what is not 0."""
     block = -(-max(values.shape[:2]) // DIFFERENCE_SIDE)
     small = strongest(values, max(values.shape[1] // block, 1))[..., 0]

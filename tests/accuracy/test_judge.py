@@ -1,11 +1,21 @@
 """Errors of made-up answers are those that they were made with, and the verdict follows from them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from mi_refract import oracle
-from mi_refract.accuracy import Judgement, RayBounds, judge, lengths
-from mi_refract.accuracy.direction_errors import absolute_radicand, errors, errors_of_normalised
+from mi_refract import oracle, regimes
+from mi_refract.accuracy import (
+    Judgement,
+    RayBounds,
+    absolute_radicand,
+    errors,
+    errors_of_normalised,
+    judge,
+    lengths,
+    relative_radicand,
+)
 from mi_refract.formulas import FORMULAS, ROUNDING
 from mi_refract.regimes import Rays
 
@@ -31,25 +41,19 @@ def turned(exact, angle, length=1.0):
     return length * (np.cos(angle) * exact.direction + np.sin(angle) * TURN[:, 1])
 
 
-@pytest.mark.parametrize(("length", "drift"), [(1.0, 0.0), (1.25, 0.25), (0.5, 0.5)])
-def test_errors_are_relative_to_the_length_of_a(length, drift):
+@pytest.mark.parametrize("length", [0.5, 0.9, 1.0, 1.1, 1.25, 1.8, 2.0, 2.2])
+def test_errors_are_relative_to_the_length_of_a_or_of_normalised_answers_to_1_if_nearer(length):
+    """Of a of length 2: an answer of length 2 x is off by x − 1, or by 2 x − 1 where it may have been made unit."""
     given = rays(a_length=2.0)
     exact = certified(given)
-    found = errors(2 * turned(exact, 1e-3, length), given, exact)
-    np.testing.assert_allclose(found.angle, 1e-3, rtol=1e-9)
-    np.testing.assert_allclose(found.drift, drift, atol=1e-15)
-    chord = np.hypot(length * np.cos(1e-3) - 1, length * np.sin(1e-3))
-    np.testing.assert_allclose(found.chord, chord, rtol=1e-9)
-
-
-@pytest.mark.parametrize(("length", "drift"), [(1.0, 0.0), (2.0, 0.0), (1.1, 0.1), (2.2, 0.1), (0.9, 0.1), (1.8, 0.1)])
-def test_what_was_made_unit_is_as_right_as_what_kept_its_length(length, drift):
-    given = rays(a_length=2.0)
-    exact = certified(given)
-    found = errors_of_normalised(turned(exact, 1e-3, length), given, exact)
-    np.testing.assert_allclose(found.drift, drift, atol=1e-15)
-    np.testing.assert_allclose(found.angle, 1e-3, rtol=1e-9)
-    np.testing.assert_allclose(found.chord, 2 * np.sin(5e-4), rtol=1e-9)
+    b = turned(exact, 1e-3, 2 * length)
+    kept, normalised = errors(b, given, exact), errors_of_normalised(b, given, exact)
+    for found in (kept, normalised):
+        np.testing.assert_allclose(found.angle, 1e-3, rtol=1e-9)
+    np.testing.assert_allclose(kept.drift, abs(length - 1), atol=1e-15)
+    np.testing.assert_allclose(kept.chord, np.hypot(length * np.cos(1e-3) - 1, length * np.sin(1e-3)), rtol=1e-9)
+    np.testing.assert_allclose(normalised.drift, min(abs(length - 1), abs(2 * length - 1)), atol=1e-15)
+    np.testing.assert_allclose(normalised.chord, 2 * np.sin(5e-4), rtol=1e-9)
 
 
 def test_what_is_no_number_is_infinitely_wrong():
@@ -67,14 +71,23 @@ def test_the_radicand_does_not_depend_on_lengths(a_length, n_length):
     np.testing.assert_allclose(found, np.abs(1 - (RATIOS * SINES) ** 2), rtol=1e-12)
 
 
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+def test_near_the_critical_angle_the_relative_radicand_is_that_of_the_oracle(precision):
+    given = regimes.make("critical", 50, precision, seed=1)
+    exact = oracle.relative_radicand(given.a, given.n, given.k)
+    near = np.abs(exact) < 1e-2
+    assert near.sum() > 10
+    np.testing.assert_allclose(relative_radicand(given)[near].astype(float), np.abs(exact[near]), rtol=1e-2)
+
+
 def test_lengths_are_of_rows():
     np.testing.assert_array_equal(lengths(np.array([[3.0, 4.0, 12.0], [0.0, -2.0, 0.0]])), [13, 2])
 
 
-def verdict(b, transmitted, **more) -> Judgement:
+def verdict(b, transmitted, exact=None, **more) -> Judgement:
     given = rays()
-    exact = certified(given)
-    return judge(b, transmitted, RayBounds(given, exact, FORMULAS["decomposed"].budget, U), **more)
+    bounds = RayBounds(given, exact or certified(given), FORMULAS["decomposed"].budget, U)
+    return judge(b, transmitted, bounds, **more)
 
 
 def test_vectors_off_unit_widen_the_bound_by_what_making_them_unit_would_cost():
@@ -105,12 +118,11 @@ def test_an_error_is_judged_by_the_bound_of_its_ray():
 
 def test_a_misclassified_ray_is_not_compared_and_wrong_where_it_is_far_from_the_critical_angle():
     exact = certified(rays())
-    called = exact.transmitted ^ np.array([True, False, False, True])
-    found = verdict(exact.direction, called)
+    found = verdict(exact.direction, exact.transmitted ^ np.array([True, False, False, True]))
     assert found.misjudged.tolist() == found.far.tolist() == found.wrong.tolist() == [True, False, False, True]
     assert found.compared.tolist() == [False, True, True, False]
     assert found.values()["TIR misclassified, beyond its bound"] == 2
-    assert found.share.tolist()[0] == found.share.tolist()[3] == 0
+    assert found.share[[0, 3]].tolist() == [0, 0]
 
 
 def test_what_is_no_direction_is_not_compared():
@@ -120,6 +132,31 @@ def test_what_is_no_direction_is_not_compared():
     assert found.compared.tolist() == [False, True, True, False]
     assert found.wrong.tolist() == found.blank.tolist() == blank.tolist()
     assert not found.misjudged.any()
+
+
+@pytest.mark.parametrize("transmitted", [True, False])
+def test_a_ray_that_the_oracle_could_not_decide_never_passes(transmitted):
+    """Whatever the answer is: it is neither compared nor misclassified, and counts against the bound."""
+    exact, first = certified(rays()), np.arange(4) == 0
+    nan = {x: np.where(first, np.nan, getattr(exact, x)) for x in ("cos_t", "cos_i")}
+    open_ = replace(exact, undecided=first, transmitted=exact.transmitted & ~first, **nan)
+    found = verdict(exact.direction, exact.transmitted & ~first | (first & transmitted), open_)
+    assert found.compared.tolist() == [False, True, True, True]
+    assert found.misjudged.tolist() == [False] * 4
+    assert found.far.tolist() == found.wrong.tolist() == [True, False, False, False]
+    assert found.values()["TIR misclassified, beyond its bound"] == 1
+
+
+def test_an_infinite_error_never_passes_also_within_an_infinite_bound():
+    """At normal incidence with k = 1e300 the bound is infinite, and ∞/∞ is no share at most 1."""
+    n = np.array([[0.0, 0, 1]])
+    given = Rays(-n, n, np.array([1e300]))
+    exact = certified(given)
+    with np.errstate(over="ignore", invalid="ignore"):
+        bounds = RayBounds(given, exact, FORMULAS["decomposed"].budget, U)
+        found = judge(np.full((1, 3), np.nan), exact.transmitted, bounds)
+        assert np.isinf(bounds.chord) and np.isnan(found.share)
+        assert found.compared and found.wrong
 
 
 def test_the_bound_covers_the_error_that_it_was_derived_from():

@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from support.media_rays import CROWN, FLINT
 from support.ray_programs import glsl
 
 from mi_refract.ray_sets import files, ray_set, run_program
@@ -55,10 +56,6 @@ def answer(path, to, program=glsl, lines=()):
     Path(path).write_text("\n".join([*lines, "id,bx,by,bz", *rows, ""]))
 
 
-def header(to):
-    return [line for line in files.as_csv(to).splitlines() if line.startswith("#")]
-
-
 # export and check
 
 
@@ -83,7 +80,7 @@ def test_the_backward_error_may_be_the_verdict(call):
     assert code == 1 and out.splitlines()[-1].endswith("of 60 answers are wrong")
     assert "--backward-error 4" in Path("out.html").read_text()
     code, _, err = call("check", "answers.csv", "--rays", "rays.csv", "--backward-error", "0")
-    assert (code, err) == (2, "mi-refract: --backward-error 0; expected a positive number of roundings\n")
+    assert (code, err) == (2, "mi-refract: backward error 0; expected a positive number of roundings\n")
 
 
 def test_export_in_every_format_is_the_same_set(call):
@@ -112,67 +109,43 @@ def test_wrong_answers(call):
     assert out.splitlines()[-1] == "50 of 50 answers are wrong: eta inverted"
 
 
-def test_the_rays_may_be_named_by_the_options_of_export(call):
-    to = ray_set.make(["Brewster"], 40, "f64", 8)
-    answer("answers.csv", to, lines=header(to))
-    options = ("--regime", "Brewster", "--count", 40, "--precision", "f64", "--seed", 8)
-    code, out, _ = call("check", "answers.csv", *options)
-    assert (code, out.splitlines()[0]) == (0, "answers.csv: 40 rays, 1 regime, f64, seed 8")
-    answer("answers.csv", to, lines=[line.replace("sha256:", "sha256:0") for line in header(to)])
-    code, _, err = call("check", "answers.csv", *options)
-    assert (code, "the answers are to rays with the checksum 'sha256:0" in err) == (2, True)
-
-
 def test_answers_do_not_choose_the_rays(call):
-    """Right answers to one easy ray, with the header of that ray."""
+    """Right answers to one easy ray, with the header of that ray, are none to others."""
     to = ray_set.make(["near-normal"], 1)
-    answer("answers.csv", to, lines=header(to))
-    code, _, err = call("check", "answers.csv")
-    assert (code, "or other rays with --rays FILE" in err) == (2, True)
-    answer("answers.csv", to, lines=[line for line in header(to) if "checksum" not in line])
-    code, out, _ = call("check", "answers.csv")
+    header = [line for line in files.as_csv(to).splitlines() if line.startswith("#")]
+    answer("answers.csv", to, lines=header)
+    files.write("one.csv", to)
+    files.write("others.csv", ray_set.make())
+    assert call("check", "answers.csv", "--rays", "one.csv")[0] == 0
+    code, _, err = call("check", "answers.csv", "--rays", "others.csv")
+    assert (code, "the answers are to rays with the checksum 'sha256:" in err) == (2, True)
+    answer("answers.csv", to, lines=[line for line in header if "checksum" not in line])
+    code, out, _ = call("check", "answers.csv", "--rays", "others.csv")
     assert (code, "12999 without an answer" in out) == (2, True)
-    assert call("check", "answers.csv", "--regime", "near-normal", "--count", 1)[0] == 0
-
-
-def test_answers_without_a_header_are_to_the_default_rays(call):
     answer("answers.csv", ray_set.make())
     code, out, _ = call("check", "answers.csv")
-    told = "as of `export` without options; others: --rays FILE"
-    assert (code, out.splitlines()[0]) == (0, f"answers.csv: 13000 rays, 13 regimes, f32, seed 0, {told}")
-    answer("answers.csv", ray_set.make(seed=1))
-    assert call("check", "answers.csv")[0] == 1
+    assert (code, out.splitlines()[0]) == (0, "answers.csv: 13000 rays, 13 regimes, f32, seed 0")
 
 
 def test_the_error_bound_can_be_chosen(call):
     to = ray_set.make(["generic"], 50)
     answer("answers.csv", to)
-    chosen = ("--regime", "generic", "--count", 50)
-    assert call("check", "answers.csv", *chosen, "--error-bound", "wedge")[0] == 0
-    code, out, _ = call("check", "answers.csv", *chosen, "--error-bound", "promoted")
+    files.write("rays.csv", to)
+    assert call("check", "answers.csv", "--rays", "rays.csv", "--error-bound", "wedge")[0] == 0
+    code, out, _ = call("check", "answers.csv", "--rays", "rays.csv", "--error-bound", "promoted")
     assert (code, "none of the usual mistakes explains the answers" in out) == (1, True)
 
 
-DAMAGE = {
-    "no file": (None, 2, "No such file"),
-    "an empty file": ("", 2, "the table is empty"),
-    "other columns": ("id,x,y,z\n0,1,2,3\n", 2, "the first row is 'id,x,y,z'"),
-    "a short row": ("id,bx,by,bz\n0,0,1,0\n1,0,1", 2, "line 3 is '1,0,1'; expected 4 numbers"),
-    "no text": (b"\xfe\xff\x00", 2, "not text"),
-    "a flag of 2": ("id,bx,by,bz,transmitted\n0,0,1,0,2\n", 2, "transmitted is 2.0"),
-}
-
-
-@pytest.mark.parametrize("content, code, message", DAMAGE.values(), ids=DAMAGE)
-def test_invalid_answers(call, content, code, message):
+@pytest.mark.parametrize(
+    "content, message", [(None, "No such file"), ("id,bx,by,bz\n0,0,1,0\n1,0,1", "line 3 is '1,0,1'")]
+)
+def test_invalid_answers(call, content, message):
     files.write("rays.csv", ray_set.make(["generic"], 4))
-    if content is not None:
-        Path("answers.csv").write_bytes(content if isinstance(content, bytes) else content.encode())
-    found, out, err = call("check", "answers.csv", "--rays", "rays.csv")
-    assert (found, out) == (code, "")
-    assert err.startswith("mi-refract: ")
-    assert err.count("\n") == 1
-    assert message in err
+    if content:
+        Path("answers.csv").write_text(content)
+    code, out, err = call("check", "answers.csv", "--rays", "rays.csv")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith("mi-refract: ") and message in err
 
 
 def test_answers_that_are_not_those_to_the_rays(call):
@@ -195,15 +168,6 @@ def test_answers_that_are_not_those_to_the_rays(call):
     ]
 
 
-def test_rays_that_somebody_edited(call):
-    path = files.write("rays.csv", to := ray_set.make(["generic"], 50))
-    answer("answers.csv", to)
-    path.write_text(path.read_text().replace("0.3", "0.4", 1))
-    code, out, err = call("check", "answers.csv", "--rays", "rays.csv")
-    assert (code, out) == (2, "")
-    assert "rays.csv: the checksum does not match" in err
-
-
 BAD_OPTIONS = {
     "a regime": (("export", "--regime", "generc", "-o", "r.csv"), "regime 'generc': unknown"),
     "a precision": (("export", "--precision", "f16", "-o", "r.csv"), "precision 'f16': unknown"),
@@ -211,9 +175,15 @@ BAD_OPTIONS = {
     "an ending": (("export", "-o", "r.txt"), "expected a file name that ends in .csv or .npz or .exr"),
     "a folder": (("export", "-o", "none/r.csv"), "is not a folder"),
     "no file": (("export",), "--output"),
-    "a way to tell": (("check", "a.csv", "--tir", "zeros"), "--tir zeros: unknown; expected auto, zero, nan"),
-    "a formula": (("check", "a.csv", "--error-bound", "glsl"), "--error-bound glsl: unknown; expected wedge"),
-    "a report": (("check", "a.csv", "--report", "r.pdf"), "r.pdf: expected"),
+    "a signal": (
+        ("check", "a.csv", "--rays", "r.csv", "--tir", "zeros"),
+        "TIR signal 'zeros': unknown; expected auto, zero",
+    ),
+    "a formula": (
+        ("check", "a.csv", "--rays", "r.csv", "--error-bound", "glsl"),
+        "error bound 'glsl': unknown; expected wedge",
+    ),
+    "a report": (("check", "a.csv", "--rays", "r.csv", "--report", "r.pdf"), "r.pdf: expected"),
     "no command": (("run",), "COMMAND"),
     "rays twice": (
         ("run", "--rays", "r.csv", "--count", "5", "--", "true"),
@@ -238,7 +208,7 @@ def test_invalid_options(call, words, message):
 def test_what_is_not_installed_is_named(call, monkeypatch, package, words):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else find(name))
-    code, _, err = call("check", "answers.csv", *words)
+    code, _, err = call("check", "answers.csv", "--rays", "rays.csv", *words)
     assert (code, "pip install 'mi-refract[validation]'" in err) == (2, True)
 
 
@@ -363,7 +333,7 @@ def test_everything_at_once(call, program):
     assert code == 1
     assert "eta inverted" in out
     page = Path("out.html").read_text()
-    assert "mi-refract rays run --regime generic --regime critical --count 60 -- " in page
+    assert "mi-refract rays run --regime generic --regime critical --count 60 --report out.html " in page
     assert ElementTree.parse("out.xml").getroot().get("failures") == "3"
     assert json.loads(Path("out.json").read_text())["diagnosis"] == "eta inverted"
 
@@ -374,3 +344,74 @@ def test_a_pipe_is_refused_before_rays_are_made(run, tmp_path, monkeypatch):
     code, out, err = run("rays", "export", "-o", tmp_path / "rays.csv")
     assert (code, out) == (2, "")
     assert err == f"mi-refract: {tmp_path / 'rays.csv'}: is a pipe; expected the name of a file\n"
+
+
+# Media
+
+
+OF_MEDIA = ("--medium", CROWN, "--medium", FLINT, "--wavelengths", "486.1327,587.5618")
+GLASSES = ("--regime", "generic", "--count", 20, "--precision", "f64", "--seed", 4, *OF_MEDIA)
+# A program that looks up its own index, by the names of the media.
+TRACER = """
+import sys, json, numpy as np
+lines = sys.stdin.read().splitlines()
+media = next(json.loads(line[9:]) for line in lines if line.startswith("# media: "))
+rows = [line.split(",") for line in lines if not line.startswith("#")]
+assert rows[0][9:] == ["wavelength", "medium"], rows[0]
+x = np.array(rows[1:], float)
+def index(name, w):
+    if name == "air":
+        return 1.0
+    return 1.5046 + 4200 / w**2 if "cauchy" in name else np.interp(w, [400, 500, 700], [1.85, 1.80, 1.76])
+k = np.array([[index(media[int(i)][0], w) / index(media[int(i)][1], w)] for w, i in x[:, 9:]])
+a, n = x[:, 1:4], x[:, 4:7]
+c = (n * a).sum(1, keepdims=True)
+radicand = 1 - k * k * (1 - c * c)
+b = np.where(radicand < 0, 0, k * a - (k * c + np.sqrt(np.maximum(radicand, 0))) * n)
+print("id,bx,by,bz,n_ratio")
+for i, row, r in zip(x[:, 0], b.tolist(), k[:, 0].tolist()):
+    print("%d,%r,%r,%r,%r" % (i, *row, r))
+"""
+
+
+def test_a_lens_tracer_with_its_own_indices(call, tmp_path):
+    assert call("export", *GLASSES, "-o", "rays.csv")[:2] == (
+        0,
+        "rays.csv: 20 rays, 1 regime, f64, seed 4, 2 media at 2 wavelengths\n",
+    )
+    (tmp_path / "tracer.py").write_text(TRACER)
+    for chosen in (GLASSES, ("--rays", "rays.csv")):
+        words = ("run", *chosen, "--json", "out.json", "--report", "out.html", "--", sys.executable, "tracer.py")
+        assert call(*words)[::2] == (0, "")
+        assert json.loads(Path("out.json").read_text())["n_ratio"]["largest"] < 1e-15
+    call("run", *GLASSES, "--report", "out.html", "--", sys.executable, "tracer.py")
+    assert "--wavelengths 486.1327,587.5618" in Path("out.html").read_text()
+    (tmp_path / "tracer.py").write_text(TRACER.replace("1.5046", "1.506"))
+    code, out, _ = call("run", *GLASSES, "--", sys.executable, "tracer.py")
+    assert code == 1
+    assert "10 answers used a different ratio of indices (n_ratio): ids 0, 2, 4, 6, 8, …" in out
+    assert out.splitlines()[-1].endswith("; 10 answers are for a different ratio of indices")
+
+
+BAD_MEDIA = {
+    "no wavelengths": (("--medium", CROWN), "1 media and 0 wavelengths; expected neither, or at least one of each"),
+    "a word": (("--medium", CROWN, "--wavelengths", "F,d"), "--wavelengths F,d; expected numbers in nm"),
+    "nothing": (("--medium", CROWN, "--wavelengths", ""), "--wavelengths ; expected numbers in nm"),
+    "a regime": ((*OF_MEDIA, "--regime", "k >> 1"), "regime 'k ≫ 1' has ratios of indices of its own; expected with"),
+    "twice": ((*OF_MEDIA, "--rays", "r.csv"), "--rays r.csv and --medium: both choose the rays; expected one of them"),
+}
+
+
+@pytest.mark.parametrize("words, message", BAD_MEDIA.values(), ids=BAD_MEDIA)
+def test_invalid_media(call, words, message):
+    code, out, err = call("run", *words, "--", "true")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith("mi-refract: ") and message in err
+
+
+@pytest.mark.filterwarnings("default")
+def test_an_index_beyond_the_makers_fit_is_a_warning_in_one_line(call):
+    pytest.importorskip("opticalglass")
+    code, _, err = call("export", "--medium", "CDGM:D-ZF93", "--wavelengths", "2325", "-o", "r.csv")
+    assert (code, err.count("\n")) == (0, 1)
+    assert err.startswith("mi-refract: CDGM:D-ZF93: the index at 2325 nm is an extrapolation; ")

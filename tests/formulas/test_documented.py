@@ -10,8 +10,7 @@ import pytest
 from mi_refract import oracle, reflect, reflect_sandwich, refract_2d
 from mi_refract.accuracy import BUDGETS, evaluate, judge_formula
 from mi_refract.formulas import FORMULAS
-from mi_refract.regimes import REGIMES, Rays, make
-from validation.run.array_settings import Setting
+from mi_refract.regimes import REGIMES, Rays, make, radicand
 
 COUNTS = {"scalar": 25, "llvm": 1000, "cuda": 1000}
 EXACT = [name for name, formula in FORMULAS.items() if formula.budget.at_the_limit]
@@ -43,11 +42,18 @@ def broken(subject, rays, exact, setting, budget):
 @pytest.mark.parametrize("regime", REGIMES)
 @pytest.mark.parametrize("name", FORMULAS)
 def test_within_its_budget_in_every_regime(name, regime, setting, certified):
-    measured = Setting(setting.backend, setting.precision, setting.vector)
-    if reason := measured.no_budget(FORMULAS[name].budget, regime):
+    if reason := setting.no_budget(FORMULAS[name].budget, regime):
         pytest.skip(reason)
     rays, exact = certified(regime, COUNTS[setting.backend], setting.precision)
     assert broken(FORMULAS[name], rays, exact, setting, FORMULAS[name].budget) == {}
+
+
+def test_the_promoted_form_decides_exactly_beyond_2_to_the_minus_49_of_its_terms(float32):
+    """Also at grazing incidence, where n·a is the rest of products that are much larger."""
+    rays = make("critical, any k, to the ulp", 400_000, np.float32)
+    _, exact, terms = radicand(*(x.T.astype(float) for x in (rays.a, rays.n, rays.k)))
+    _, transmitted = evaluate(FORMULAS["promoted"], rays, float32.vector)
+    assert (np.abs(exact[0]) / terms)[transmitted != (exact[0] >= 0)].max() < 2.0**-49
 
 
 # Edges ---------------------------------------------------------------------------------------------------------

@@ -1,47 +1,67 @@
-"""What `mi-refract accept` and its engine take over, and what stays as it is."""
+"""`mi-refract accept`: which new images become references, which bytes are copied, and what is refused."""
 
 from __future__ import annotations
 
+import json
 import os
 import sys
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 import typer
 from support.diff_images import BROKEN, found, image, tree
 
-from mi_refract.cli import accept as cli_accept
 from mi_refract.image_diff import accept
 from mi_refract.image_diff import folders as diff
 from mi_refract.image_diff.results import Category
-from mi_refract.image_diff.settings import ComparisonSpec, Settings
+from mi_refract.image_diff.settings import Entry, Settings
+
+SETTINGS = '[defaults]\naccept = ["no-star.exr", "{stem}-?.exr", "{stem}-*.exr", "{stem}_*.exr"]\n'
+CHANGED = "changed since it was compared"
 
 
 def to_accept(old, new, *settings):
     return list(accept.changes(diff.diff(old, new, *settings, to_accept=True)))
 
 
+@pytest.fixture
+def terminal(monkeypatch):
+    """`terminal(answer)`: a person at a terminal; `answer(question)` may do more than answer."""
+
+    def sit(answer):
+        monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
+        monkeypatch.setattr(typer, "confirm", answer)
+
+    return sit
+
+
+@pytest.fixture
+def compared(run, pair, tmp_path):
+    """A folder with a pair that differs, an added image and a removed one, and the JSON of its comparison."""
+    old, new = pair
+    image(new / "inner" / "added.exr")
+    image(old / "removed.exr")
+    out = tmp_path / "out.json"
+    assert run("diff", old, new, "--json", out)[0] == 1
+    return old, new, out
+
+
+# What is copied ---------------------------------------------------------------------------------------------------
+
+
 def test_what_is_accepted(folders):
     old, new = folders
-    copies = to_accept(old, new)
+    before, copies = tree(old), to_accept(old, new)
     assert [(c.new, c.reference) for c in copies] == [(new / n, old / n) for n in ("added.exr", "inner/changed.exr")]
-    before = (old / "inner/changed.exr").read_bytes()
-    assert {p.name for p in old.rglob("*.exr")} == {"same.exr", "changed.exr", "removed.exr"}
-    assert (old / "inner/changed.exr").read_bytes() == before
+    assert tree(old) == before
     accept.accept(copies)
-    assert found(diff.diff(old, new)) == {
-        "removed.exr": ("different", "removed"),
-        "added.exr": ("equal", "unchanged"),
-        "inner/changed.exr": ("equal", "unchanged"),
-        "same.exr": ("equal", "unchanged"),
-    }
-    assert not list(old.rglob("*.part"))
+    assert tree(old) == before | {name: tree(new)[name] for name in ("added.exr", "inner/changed.exr")}
+    statuses = found(diff.diff(old, new))
+    assert [name for name, status in statuses.items() if status != ("equal", "unchanged")] == ["removed.exr"]
 
 
 def test_a_reference_that_is_not_there_yet(folders, tmp_path):
-    old, new = folders
+    new = folders[1]
     accept.accept(to_accept(tmp_path / "first", new))
     assert diff.diff(tmp_path / "first", new).exit_code == 0
     assert not (tmp_path / "first" / "notes.txt").exists()
@@ -50,22 +70,14 @@ def test_a_reference_that_is_not_there_yet(folders, tmp_path):
     assert results.results[0].category is Category.ADDED
     accept.accept(list(accept.changes(results)))
     assert one.read_bytes() == (new / "same.exr").read_bytes()
-    assert diff.diff(old, new, to_accept=True).exit_code == 1
 
 
 @pytest.mark.parametrize("name", ["truncated", "empty", "text", "deep", "zero size"])
-def test_a_bad_image_becomes_no_reference(folders, name):
-    old, new = folders
-    bad = new / "same.exr"
-    bad.unlink()
-    BROKEN[name](bad)
-    with pytest.raises(ValueError, match=r"same\.exr"):
-        to_accept(old, new)
-
-
-def test_a_bad_added_image_becomes_no_reference(folders):
-    BROKEN["truncated"](folders[1] / "added.exr")
-    with pytest.raises(ValueError, match=r"added\.exr"):
+@pytest.mark.parametrize("new", ["same.exr", "added.exr"])
+def test_a_bad_image_becomes_no_reference(folders, name, new):
+    (folders[1] / new).unlink()
+    BROKEN[name](folders[1] / new)
+    with pytest.raises(accept.UnreadableImage, match=new):
         to_accept(*folders)
 
 
@@ -83,53 +95,17 @@ def test_a_bad_reference_can_be_replaced(folders):
 
 def test_values_that_are_not_finite_become_no_reference(folders):
     image(folders[1] / "same.exr", value=np.inf)
-    with pytest.raises(ValueError, match="not finite; accepted with --allow-nonfinite"):
+    with pytest.raises(ValueError, match="not finite; expected with --set allow_nonfinite=true"):
         to_accept(*folders)
-    named = Settings(allow_nonfinite=("same.exr",))
-    assert len(to_accept(*folders, named)) == 3
+    assert len(to_accept(*folders, Settings((Entry("same.exr", {"allow_nonfinite": True}),)))) == 3
 
 
-def test_a_copy_that_fails_leaves_the_old_reference(folders, monkeypatch):
-    old, new = folders
-    before = (old / "inner/changed.exr").read_bytes()
-    monkeypatch.setattr("pathlib.Path.replace", lambda *a: (_ for _ in ()).throw(OSError("disk full")))
-    with pytest.raises(OSError, match="disk full"):
-        accept.accept(to_accept(old, new))
-    assert (old / "inner/changed.exr").read_bytes() == before
-    assert not list(old.rglob("*.part"))
-
-
-def test_a_name_with_a_dash_is_no_option_of_the_command(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    image(Path("-a.exr"))
-    image(Path("-b.exr"), gain=1.1)
-    results = diff.diff("-a.exr", "-b.exr")
-    assert results.reproduce(results.results[0]) == "mi-refract diff ./-a.exr ./-b.exr"
-    assert results.accept(results.results[0]) == "mi-refract accept ./-a.exr ./-b.exr"
-
-
-def test_the_commands_do_what_they_say(folders):
-    old, new = folders
-    results = diff.diff(old, new, Settings(ComparisonSpec("tolerance", {"fail": 0.01})))
-    by_name = {result.name: result for result in results.results}
-    pair = f"{old}/inner/changed.exr {new}/inner/changed.exr --method tolerance --set fail=0.01"
-    assert results.reproduce(by_name["inner/changed.exr"]) == f"mi-refract diff {pair}"
-    assert results.accept(by_name["inner/changed.exr"]) == f"mi-refract accept {pair}"
-    assert results.reproduce(by_name["added.exr"]) == ""
-    assert results.accept(by_name["added.exr"]).startswith(f"mi-refract accept {old}/added.exr {new}/added.exr")
-    assert results.accept(by_name["removed.exr"]) == results.accept(by_name["same.exr"]) == ""
+def test_results_without_digests_are_not_accepted(folders):
+    with pytest.raises(ValueError, match=r"added\.exr: compared without digests"):
+        list(accept.changes(diff.diff(*folders)))
 
 
 # What changes meanwhile -------------------------------------------------------------------------------------------
-
-
-def test_the_clock_of_a_file_does_not_matter(folders):
-    old, new = folders
-    ahead = time.time() + 3600
-    for name in ("added.exr", "inner/changed.exr"):
-        os.utime(new / name, (ahead, ahead))
-    accept.accept(to_accept(old, new))
-    assert (old / "added.exr").read_bytes() == (new / "added.exr").read_bytes()
 
 
 def rewritten(path):
@@ -145,7 +121,7 @@ def renamed(folder):
     folder.with_name("other").rename(folder)
 
 
-CHANGED = {
+CHANGES = {
     "new image": ("inner/changed.exr", lambda old, new: rewritten(new / "inner/changed.exr")),
     "new folder": ("inner/changed.exr", lambda old, new: renamed(new / "inner")),
     "link": ("linked.exr", lambda old, new: ((new / "linked.exr").unlink(), image(new / "linked.exr", gain=3.0))),
@@ -157,7 +133,7 @@ CHANGED = {
 }
 
 
-@pytest.mark.parametrize("name, change", CHANGED.values(), ids=CHANGED)
+@pytest.mark.parametrize(("name", "change"), CHANGES.values(), ids=CHANGES)
 def test_what_changed_since_it_was_compared_is_not_accepted(folders, tmp_path, name, change):
     old, new = folders
     image(new / "other" / "changed.exr", gain=3.0)
@@ -168,60 +144,56 @@ def test_what_changed_since_it_was_compared_is_not_accepted(folders, tmp_path, n
     assert len(copies) == 5
     change(old, new)
     before, all_before = tree(old), sorted(old.rglob("*"))
-    said = "'?$|: changed since it was compared"
-    with pytest.raises((OSError, ValueError), match=f"{name}({said})"):
+    with pytest.raises((OSError, ValueError), match=f"{name}('?$|: {CHANGED}|: not a regular file)"):
         accept.accept(copies)
-    assert tree(old) == before
-    assert sorted(old.rglob("*")) == all_before
+    assert (tree(old), sorted(old.rglob("*"))) == (before, all_before)
+
+
+WHILE = {
+    "new image": lambda old, new: rewritten(new / "inner/changed.exr"),
+    "reference": lambda old, new: rewritten(old / "inner/changed.exr"),
+    "disk full": lambda old, new: (_ for _ in ()).throw(OSError(28, "No space left on device")),
+}
+
+
+@pytest.mark.parametrize("change", WHILE.values(), ids=WHILE)
+@pytest.mark.parametrize("after", [1, 2])
+def test_what_goes_wrong_while_it_is_copied_replaces_nothing(folders, monkeypatch, change, after):
+    """After so many of the two copies were begun."""
+    copies, opened, begun = to_accept(*folders), accept.replacing, []
+
+    def late(path):
+        begun.append(path)
+        if len(begun) == after:
+            change(*folders)
+        return opened(path)
+
+    monkeypatch.setattr(accept, "replacing", late)
+    names = tree(folders[0]).keys()
+    with pytest.raises(OSError, match=rf"changed\.exr: {CHANGED}|No space"):
+        accept.accept(copies)
+    after_it = tree(folders[0])
+    assert after_it.keys() == names
+    assert after_it["inner/changed.exr"] != tree(folders[1])["inner/changed.exr"]
+
+
+def test_only_the_bytes_that_were_compared_are_copied(folders, monkeypatch):
+    """Even where what is read for the copy is not what was there before and after."""
+    copies, before, digest = to_accept(*folders), tree(folders[0]), accept.digest
+    kept = {copy.new: copy.compared for copy in copies}
+    monkeypatch.setattr(accept, "digest", lambda path: kept.get(path) or digest(path))
+    rewritten(folders[1] / "inner/changed.exr")
+    with pytest.raises(OSError, match=rf"changed\.exr: {CHANGED}"):
+        accept.accept(copies)
+    assert tree(folders[0]) == before
 
 
 def test_no_pipe_or_device_is_read(tmp_path):
     os.mkfifo(tmp_path / "a.exr")
     (tmp_path / "b.exr").symlink_to("/dev/null")
     for path in (tmp_path / "a.exr", tmp_path / "b.exr"):
-        with pytest.raises(ValueError, match=r"\.exr: expected a regular file"):
+        with pytest.raises(ValueError, match=r"\.exr: not a regular file"):
             diff.digest(path)
-
-
-@pytest.mark.parametrize("side", [0, 1])
-def test_what_changes_while_it_is_copied_is_not_accepted(folders, monkeypatch, side):
-    copies, copied = to_accept(*folders), accept._copied
-
-    def late(source, to):
-        digest = copied(source, to)
-        rewritten(folders[side] / "inner/changed.exr")
-        return digest
-
-    monkeypatch.setattr(accept, "_copied", late)
-    before = tree(folders[0]).keys()
-    with pytest.raises(OSError, match=r"changed\.exr: changed since it was compared"):
-        accept.accept(copies)
-    assert tree(folders[0]).keys() == before
-
-
-def test_only_bytes_that_were_shown_are_copied(folders, monkeypatch):
-    """Even where what is read for the copy is not what was there before and after."""
-    copies, before = to_accept(*folders), tree(folders[0])
-    monkeypatch.setattr(accept, "_require_unchanged", lambda copies: None)
-    rewritten(folders[1] / "inner/changed.exr")
-    with pytest.raises(OSError, match=r"changed\.exr: changed since it was compared"):
-        accept.accept(copies)
-    assert tree(folders[0]) == before
-
-
-def test_of_several_copies_none_is_made_where_one_fails(folders, monkeypatch):
-    """As on a full disk, after the first copy."""
-    copies, before, copied = to_accept(*folders), tree(folders[0]), accept._copied
-
-    def full(source, to):
-        if source == copies[-1].new:
-            raise OSError(28, "No space left on device", str(to))
-        return copied(source, to)
-
-    monkeypatch.setattr(accept, "_copied", full)
-    with pytest.raises(OSError, match="No space"):
-        accept.accept(copies)
-    assert tree(folders[0]) == before
 
 
 def test_a_reference_that_cannot_be_read_is_not_replaced(folders, monkeypatch):
@@ -238,66 +210,37 @@ def test_a_reference_that_cannot_be_read_is_not_replaced(folders, monkeypatch):
         to_accept(*folders)
 
 
-def test_results_without_digests_are_not_accepted(folders):
-    with pytest.raises(ValueError, match=r"added\.exr: compared without digests"):
-        list(accept.changes(diff.diff(*folders)))
-
-
 # The command ------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def terminal(monkeypatch):
-    """`terminal(True)`: a person at a terminal who says yes."""
-
-    def sit(answer):
-        asked = []
-        monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
-        monkeypatch.setattr(typer, "confirm", lambda text: asked.append(text) or answer)
-        return asked
-
-    return sit
-
-
-def test_accept(run, pair):
+def test_accept_copies_and_keeps_what_was_removed(run, pair):
     old, new = pair
     image(new / "inner" / "added.exr")
-    equal = {"equal.exr": tree(old)["equal.exr"]}  # not copied: another second of writing is no difference
+    image(old / "removed.exr")
+    kept = {name: tree(old)[name] for name in ("removed.exr", "equal.exr")}
     code, out, err = run("accept", old, new, "--yes")
     assert (code, err) == (0, "")
     assert f"{new}/louder.exr → {old}/louder.exr\n" in out
     assert f"{new}/inner/added.exr → {old}/inner/added.exr (new)\n" in out
     assert out.splitlines()[-1] == "2 accepted"
-    assert tree(old) == tree(new) | equal
+    assert tree(old) == tree(new) | kept
     assert run("accept", old, new, "--yes")[1].splitlines()[-1] == "nothing to accept"
-
-
-def test_accept_takes_nothing_that_changed_since(run, pair, monkeypatch):
-    before = tree(pair[0])
-
-    def late(count):
-        image(pair[1] / "louder.exr", value=0.1)
-        return True
-
-    monkeypatch.setattr(cli_accept, "_agreed", late)
-    code, out, err = run("accept", *pair)
-    assert code == 2
-    assert "accepted\n" not in out
-    assert "louder.exr: changed since it was compared; expected what was shown\n" in err
-    assert tree(pair[0]) == before
 
 
 def test_accept_asks_first(run, pair, terminal):
     old, new = pair
-    before = tree(old)
-    asked = terminal(False)
+    before, asked = tree(old), []
+    terminal(asked.append)
     code, out, _ = run("accept", old, new)
-    assert (code, out.splitlines()[-1]) == (1, "nothing accepted")
-    assert asked == ["Accept 1 as the reference?"]
+    assert (code, out.splitlines()[-1], asked) == (1, "nothing accepted", ["Accept 1 as the reference?"])
     assert tree(old) == before
-    terminal(True)
+    terminal(lambda question: image(new / "louder.exr", value=0.1) is not None)
+    code, out, err = run("accept", old, new)
+    assert code == 2 and "accepted\n" not in out and err.endswith(f"louder.exr: {CHANGED}\n")
+    assert tree(old) == before
+    terminal(lambda question: True)
     assert run("accept", old, new)[0] == 0
-    assert tree(old) == before | {"louder.exr": tree(new)["louder.exr"]}  # an EXR file holds the second it was written
+    assert tree(old) == before | {"louder.exr": tree(new)["louder.exr"]}
 
 
 def test_accept_does_not_ask_a_script(run, pair, monkeypatch):
@@ -305,39 +248,218 @@ def test_accept_does_not_ask_a_script(run, pair, monkeypatch):
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
     code, out, err = run("accept", *pair)
     assert (code, err) == (2, "mi-refract: accept asks on a terminal only; elsewhere expected --yes\n")
-    assert "louder.exr" in out
-    assert tree(pair[0]) == before
+    assert "louder.exr" in out and tree(pair[0]) == before
 
 
 def test_accept_judges_like_diff(run, pair):
     before = tree(pair[0])
-    tolerant = ["--method", "tolerance", "--set", "fail=0.2"]
-    assert run("accept", *pair, "--yes", *tolerant)[1].splitlines()[-1] == "nothing to accept"
+    assert "nothing to accept" in run("accept", *pair, "--yes", "--method", "tolerance", "--set", "fail=0.2")[1]
     assert tree(pair[0]) == before
 
 
-def test_accept_takes_all_or_nothing(run, pair):
-    """And says once why: each image that cannot be compared has a line."""
+def test_accept_takes_all_or_nothing(run, pair, tmp_path):
+    """And says once why: each image that cannot be compared has a line, also by the JSON of a comparison."""
+    out = tmp_path / "out.json"
     for broken in (["equal.exr"], ["equal.exr", "louder.exr"]):
         BROKEN["truncated"](pair[1] / broken[-1])
         before = tree(pair[0])
-        code, out, err = run("accept", *pair, "--yes")
-        assert code == 2 and "→" not in out
-        assert [line.partition(".exr:")[0] for line in err.splitlines()] == [
-            f"mi-refract: {pair[1] / name}".removesuffix(".exr") for name in broken
-        ]
-        assert tree(pair[0]) == before
+        run("diff", *pair, "--json", out)
+        for words in (pair, ("--from", out)):
+            code, said, err = run("accept", *words, "--yes")
+            assert code == 2 and "→" not in said
+            lines = [line.partition(".exr:")[0] for line in err.splitlines()]
+            assert lines == [f"mi-refract: {pair[1] / name}".removesuffix(".exr") for name in broken]
+            assert tree(pair[0]) == before
 
 
-def test_accept_says_what_diff_does_not_mind(run, pair):
-    for side in pair:
-        image(side / "louder.exr", value=np.nan)
-    code, _, err = run("accept", *pair, "--yes")
-    assert code == 2 and len({*err.splitlines()}) == err.count("\n") > 0
+# --from -----------------------------------------------------------------------------------------------------------
 
 
-def test_accept_keeps_what_was_removed(run, pair):
-    (pair[1] / "equal.exr").unlink()
-    assert run("accept", *pair, "--yes")[0] == 0
-    assert (pair[0] / "equal.exr").exists()
-    assert run("diff", *pair)[0] == 1
+def edited(path, change):
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+def entry(data, name):
+    return next(each for each in data["results"] if each["name"] == name)
+
+
+def test_the_json_holds_digests_of_what_is_not_equal(run, pair, compared, tmp_path):
+    by_name = {each["name"]: each for each in json.loads(compared[2].read_text())["results"]}
+    assert by_name["equal.exr"]["digests"] is None
+    digests = by_name["louder.exr"]["digests"]
+    assert digests["reference"] != digests["test"] and len(digests["test"]) == 64
+    assert by_name["inner/added.exr"]["digests"]["reference"] == ""
+
+
+def test_exactly_the_images_of_the_json_are_accepted(run, compared):
+    old, new, out = compared
+    before = tree(old)
+    image(new / "later.exr")
+    assert run("accept", old, new, "equal.exr", "--from", out)[:2] == (0, "nothing to accept\n")
+    assert run("accept", old, new, "inner/*", "--from", out, "--yes")[0] == 0
+    assert tree(old) == before | {"inner/added.exr": tree(new)["inner/added.exr"]}
+    (old / "inner" / "added.exr").unlink()
+    code, said, err = run("accept", "--from", out, "--yes")
+    assert (code, err, said.splitlines()[-1]) == (0, "", "2 accepted")
+    assert tree(old) == before | {name: tree(new)[name] for name in ("louder.exr", "inner/added.exr")}
+
+
+def test_the_json_of_another_machine_fits_the_same_bytes_elsewhere(run, compared, tmp_path):
+    old, new, out = compared
+    for side in (old, new):
+        side.rename(tmp_path / f"moved-{side.name}")
+    moved = tmp_path / "moved-old", tmp_path / "moved-new"
+    assert run("accept", "--from", out, "--yes")[0] == 2
+    assert run("accept", *moved, "--from", out, "--yes")[0] == 0
+    assert tree(moved[0])["louder.exr"] == tree(moved[1])["louder.exr"]
+
+
+def test_two_files_by_their_json(run, pair, tmp_path):
+    one, two, out = pair[0] / "louder.exr", pair[1] / "louder.exr", tmp_path / "out.json"
+    run("diff", one, two, "--json", out)
+    assert run("accept", "--from", out, "--yes")[0] == 0
+    assert one.read_bytes() == two.read_bytes()
+
+
+@pytest.mark.parametrize(("side", "name"), [(0, "louder.exr"), (1, "louder.exr"), (0, "inner/added.exr")])
+def test_what_changed_since_the_json_is_refused(run, compared, side, name):
+    path = compared[side] / name
+    rewritten(path) if path.exists() else image(path)
+    before = tree(compared[0])
+    assert run("accept", "--from", compared[2], "--yes")[::2] == (2, f"mi-refract: {path}: {CHANGED}\n")
+    assert tree(compared[0]) == before
+
+
+def test_nan_is_accepted_where_the_comparison_allowed_it(run, pair, tmp_path):
+    old, new = pair
+    image(new / "louder.exr", value=float("nan"))
+    out = tmp_path / "out.json"
+    for allowed, code in (([], 2), (["--set", "allow_nonfinite=true"], 0)):
+        run("diff", old, new, "--json", out, *allowed)
+        assert run("accept", "--from", out, "--yes")[0] == code
+
+
+OURS = "expected a file that mi-refract diff --json wrote"
+SPOILED = {
+    "no JSON": (b"{", "not JSON ("),
+    "too deep": (b"[" * 100_000, OURS),
+    "a list": (b"[]", f"schema None; expected 1: {OURS}"),
+    "no UTF-8": (b"\xff\xfe{", "not JSON ("),
+    "another": (b'{"schema": 1, "results": [3]}', OURS),
+    "schema": (lambda d: d.update(schema=99), "schema 99; expected 1"),
+    "no results": (lambda d: d.update(results={}), f"results: expected `array`, got `object`; {OURS}"),
+    "result": (lambda d: d["results"].insert(0, 3), f"results[0]: expected `object`, got `int`; {OURS}"),
+    "status": (lambda d: d["results"][0].update(status="fine"), "results[0].status: invalid enum value 'fine'"),
+    "status of a type": (lambda d: d["results"][0].update(status=[]), "results[0].status: expected `str`"),
+    "name": (lambda d: d["results"][0].update(name=None), "results[0].name: expected `str`"),
+    "renders": (lambda d: d.update(renders=True), "of --renders; expected "),
+    "path": (lambda d: d["results"][0].update(test=7), "results[0].test: expected "),
+    "NUL": (lambda d: d["results"][0].update(test="a\0b"), "results[0].test: expected "),
+    "outside": (lambda d: entry(d, "louder.exr").update(target="/etc/x.exr"), "expected a path in "),
+    "no digests": (lambda d: entry(d, "louder.exr").update(digests=None), "compared without digests"),
+    "digests": (lambda d: entry(d, "louder.exr").update(digests={"test": "a"}), "digests"),
+    "digest": (lambda d: entry(d, "louder.exr")["digests"].update(test="g" * 64), "digests.test: expected"),
+    "variants": (lambda d: entry(d, "louder.exr")["digests"]["variants"].append(""), "digests: 1 of 0 variants"),
+}
+
+
+@pytest.mark.parametrize(("change", "words"), SPOILED.values(), ids=SPOILED)
+def test_a_json_that_is_not_ours_is_one_line(run, compared, change, words):
+    old, _, out = compared
+    out.write_bytes(change) if isinstance(change, bytes) else edited(out, change)
+    before = tree(old)
+    code, said, err = run("accept", "--from", out, "--yes")
+    assert (code, said, err.count("\n")) == (2, "", 1)
+    assert err.startswith("mi-refract: ") and words in err
+    assert tree(old) == before
+
+
+@pytest.mark.parametrize("key", ["test", "target", "reference"])
+def test_no_path_of_the_json_leads_out_of_its_folder(run, compared, tmp_path, key):
+    old, new, out = compared
+    image(tmp_path / "elsewhere" / "louder.exr", gain=2.0)
+    root = new if key == "test" else old
+    (root / "link").symlink_to(tmp_path / "elsewhere")
+    before = tree(old) | tree(new) | tree(tmp_path / "elsewhere")
+    for path in (root / ".." / "elsewhere" / "louder.exr", root / "link" / "louder.exr"):
+        edited(out, lambda data, path=path: entry(data, "louder.exr").update({key: str(path)}))
+        code, said, err = run("accept", "--from", out, "--yes")
+        assert (code, said) == (2, "") and f"].{key}: {path}; expected a path in {root}\n" in err
+    assert tree(old) | tree(new) | tree(tmp_path / "elsewhere") == before
+
+
+def test_bad_words_with_from(run, compared):
+    old, new, out = compared
+    for words, message in [
+        (["--from", out.with_name("none.json")], "none.json"),
+        ([old, "--from", out], "one path; expected with --from both folders before any names, or none"),
+        (["--from", out, "--set", "fail=1"], "--from takes what was compared"),
+        ([old, new, "none*", "--from", out], "none*: matches no image; expected "),
+        ([], "two paths are needed"),
+    ]:
+        code, said, err = run("accept", *words, "--yes")
+        assert (code, said, err.count("\n")) == (2, "", 1)
+        assert message in err
+
+
+# --as-variant -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("by_json", [False, True])
+def test_a_variant_stands_beside_the_reference(run, pair, tmp_path, by_json):
+    old, new = pair
+    (old / "mi-refract.toml").write_text(SETTINGS)
+    before, out = tree(old), tmp_path / "out.json"
+    run("diff", old, new, "--json", out)
+    code, said, err = run("accept", *(["--from", out] if by_json else pair), "--as-variant", "macos", "--yes")
+    assert (code, err) == (0, "")
+    assert f"{new}/louder.exr → {old}/louder-macos.exr (new)\n" in said
+    assert tree(old) == before | {"louder-macos.exr": tree(new)["louder.exr"]}
+    assert run("diff", old, new)[0] == 0
+
+
+def test_a_variant_is_replaced_where_it_is_what_was_compared(run, pair, tmp_path, terminal):
+    old, new = pair
+    (old / "mi-refract.toml").write_text(SETTINGS)
+    image(old / "louder-macos.exr", gain=2.0)
+    out = tmp_path / "out.json"
+    run("diff", old, new, "--json", out)
+    terminal(lambda question: image(old / "louder-macos.exr", gain=3.0) is not None)
+    for words in ([old, new], ["--from", out]):
+        code, _, err = run("accept", *words, "--as-variant", "macos")
+        assert code == 2 and f"louder-macos.exr: {CHANGED}" in err
+    assert run("accept", old, new, "--as-variant", "macos", "--yes")[0] == 0
+    assert tree(old)["louder-macos.exr"] == tree(new)["louder.exr"]
+
+
+NO_ACCEPT = "settings have no `accept` with macos or one *; expected in mi-refract.toml, below [defaults]"
+
+
+@pytest.mark.parametrize(
+    ("settings", "name", "message"),
+    [
+        ("", "macos", NO_ACCEPT),
+        ('[defaults]\naccept = ["{stem}-*-*.exr"]', "macos", NO_ACCEPT),
+        *(
+            (SETTINGS, name, f"--as-variant '{name}'; expected a part of a file name")
+            for name in ("a/b", "*", " ", "..")
+        ),
+        ('[defaults]\naccept = ["equal-*.exr"]', "one", "equal-one.exr: the reference of another image"),
+        ('[defaults]\naccept = ["{stem}-*.png"]', "one", "expected a name that ends in .exr"),
+        ("added", "macos", "inner/added.exr: has no reference yet; expected without --as-variant"),
+    ],
+)
+def test_no_variant_where_its_name_says_nothing(run, pair, settings, name, message):
+    old, new = pair
+    if settings == "added":
+        image(new / "inner" / "added.exr")
+        settings = SETTINGS
+    (old / "mi-refract.toml").write_text(settings)
+    for side, gain in ((old, 1.0), (new, 1.2)):
+        image(side / "more.exr", gain=gain)
+    before = tree(old)
+    code, _, err = run("accept", old, new, "--as-variant", name, "--yes")
+    assert code == 2 and message in err and err.count("\n") == 1
+    assert tree(old) == before

@@ -1,8 +1,9 @@
-"""Pairs of images: who is compared with whom, settings, samples, exit codes, and what accepting writes."""
+"""Comparing files and folders: every pair has a result whatever goes wrong with it, exit codes, and commands."""
 
 from __future__ import annotations
 
 import os
+import shlex
 import threading
 import time
 from pathlib import Path
@@ -12,42 +13,49 @@ import OpenImageIO as oiio
 import pytest
 from support.diff_images import BROKEN, found, image, samples
 
+from mi_refract.image_diff import file_pair, methods
 from mi_refract.image_diff import folders as diff
-from mi_refract.image_diff import methods
+from mi_refract.image_diff.comparison import Comparison, Verdict
 from mi_refract.image_diff.results import Result, Results, Status
-from mi_refract.image_diff.settings import ComparisonSpec, Entry, Settings
+from mi_refract.image_diff.settings import Entry, Settings
 from mi_refract.io import image_file
 
 
 def test_folders_are_matched_by_name(folders):
-    results = diff.diff(*folders)
+    old, new = folders
+    results = diff.diff(old, new)
     assert found(results) == {
         "added.exr": ("different", "added"),
         "inner/changed.exr": ("different", "changed"),
         "removed.exr": ("different", "removed"),
         "same.exr": ("equal", "unchanged"),
     }
-    assert results.exit_code == 1
-    assert results.results[-1].name == "same.exr"  # failures first
+    assert (results.exit_code, results.results[-1].name) == (1, "same.exr")  # failures first
     assert {r.name: r.reason for r in results.results if not r.comparison} == {
         "added.exr": "only among the new images",
         "removed.exr": "only among the references",
     }
-
-
-def test_the_pair_is_the_one_of_that_name(folders):
-    old, new = folders
-    for result in diff.diff(old, new).results:
-        assert result.reference in (None, old / result.name)
-        assert result.test in (None, new / result.name)
+    for result in results.results:
+        assert result.reference in (None, old / result.name) and result.test in (None, new / result.name)
 
 
 def test_two_files_of_any_names(tmp_path):
-    image(tmp_path / "a.exr")
-    image(tmp_path / "b.exr")
-    image(tmp_path / "c.exr", gain=1.1)
+    for name, gain in (("a", 1), ("b", 1), ("c", 1.1)):
+        image(tmp_path / f"{name}.exr", gain=gain)
     assert found(diff.diff(tmp_path / "a.exr", tmp_path / "b.exr")) == {"a.exr": ("equal", "unchanged")}
     assert found(diff.diff(tmp_path / "a.exr", tmp_path / "c.exr")) == {"a.exr": ("different", "changed")}
+
+
+# Whatever goes wrong with one -------------------------------------------------------------------------------------
+
+
+def check_one_error(results, name, *words):
+    """That one image is an error of one line, and the others have their verdicts."""
+    (bad,) = results.of(Status.ERROR)
+    assert (bad.name, results.exit_code) == (name, 2)
+    assert "\n" not in bad.error and all(word in bad.error for word in words), bad.error
+    others = {"added.exr": "different", "inner/changed.exr": "different", "removed.exr": "different"}
+    assert {r.name: r.status for r in results.results if r.name not in (name, "same.exr")} == others
 
 
 @pytest.mark.parametrize("spoil", BROKEN.values(), ids=BROKEN)
@@ -56,61 +64,59 @@ def test_one_bad_image_keeps_no_other_from_being_compared(folders, side, spoil):
     bad = folders[side] / "same.exr"
     bad.unlink()
     spoil(bad)
-    results = diff.diff(*folders)
-    assert found(results)["same.exr"] == ("error", "unknown")
-    assert found(results)["inner/changed.exr"] == ("different", "changed")
-    assert results.exit_code == 2
-    (error,) = [result.error for result in results.of(Status.ERROR)]
-    assert "same.exr" in error
-    assert "\n" not in error
+    check_one_error(diff.diff(*folders), "same.exr", "same.exr")
 
 
-def test_no_permission(folders, monkeypatch):
-    """By a planted error: who runs as root may read everything."""
-    read = image_file.read_parts
+PLANTED = [
+    (PermissionError(13, "Permission denied", "/old/same.exr"), "/old/same.exr: Permission denied"),
+    (MemoryError("Unable to allocate 9 GiB"), "same.exr: out of memory: Unable to allocate 9 GiB"),
+    (RecursionError("too deep"), "same.exr: internal error: RecursionError: too deep"),
+    (OverflowError("a method's\nmistake"), "same.exr: internal error: OverflowError: a method's mistake"),
+    (AssertionError(), "same.exr: internal error: AssertionError"),
+]
 
-    def refuse(path, *most):
+
+@pytest.mark.parametrize(("error", "words"), PLANTED, ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize("where", ["read", "compare"])
+def test_no_error_with_one_image_ends_the_run(folders, monkeypatch, where, error, words):
+    module, name = {"read": (image_file, "read_parts"), "compare": (methods, "compare")}[where]
+    works = getattr(module, name)
+
+    def fail(first, *more, **options):
+        path = first if where == "read" else more[0][0].path
         if path.name == "same.exr":
-            raise PermissionError(13, "Permission denied", str(path))
-        return read(path, *most)
+            raise error
+        return works(first, *more, **options)
 
-    monkeypatch.setattr(image_file, "read_parts", refuse)
+    monkeypatch.setattr(module, name, fail)
+    check_one_error(diff.diff(*folders), "same.exr", words)
+
+
+@pytest.mark.parametrize("link", [os.symlink, os.link])
+def test_an_image_is_not_compared_with_itself(folders, link):
+    old, new = folders
+    (new / "same.exr").unlink()
+    link(old / "same.exr", new / "same.exr")
+    check_one_error(diff.diff(old, new), "same.exr", "the same file")
+
+
+def test_folders_inside_that_cannot_be_read_are_not_passed_over(folders, monkeypatch):
+    """Of the errors of the system, and links: each is an error on both sides."""
+    for side in folders:
+        (side / "linked").symlink_to(side / "inner")
+    walk = os.walk
+
+    def refuse(folder, onerror):
+        onerror(PermissionError(13, "Permission denied", str(folder / "locked")))
+        return walk(folder, onerror=onerror)
+
+    monkeypatch.setattr(os, "walk", refuse)
     results = diff.diff(*folders)
-    assert [(r.name, r.error) for r in results.of(Status.ERROR)] == [
-        ("same.exr", f"{folders[0] / 'same.exr'}: Permission denied")
-    ]
-    assert len(results.of(Status.DIFFERENT)) == 3
+    assert sorted(r.name for r in results.of(Status.ERROR)) == ["linked", "linked", "locked", "locked"]
+    assert (results.exit_code, len(results.results)) == (2, 8)
 
 
-@pytest.mark.parametrize(
-    "planted, words",
-    [
-        (MemoryError("Unable to allocate 9 GiB"), "out of memory: Unable to allocate 9 GiB"),
-        (RecursionError("too deep"), "internal error: RecursionError: too deep"),
-        (OverflowError("a method's\nmistake"), "internal error: OverflowError: a method's mistake"),
-        (AssertionError(), "internal error: AssertionError"),
-        (FloatingPointError(), "internal error: FloatingPointError"),
-    ],
-    ids=lambda x: type(x).__name__,
-)
-def test_no_error_with_one_image_ends_the_run(folders, monkeypatch, planted, words):
-    compare = methods.compare
-
-    def fail(method, one, two, **options):
-        if one[0].path.name == "same.exr":
-            raise planted
-        return compare(method, one, two, **options)
-
-    monkeypatch.setattr(methods, "compare", fail)
-    results = diff.diff(*folders)
-    assert (found(results)["same.exr"], found(results)["inner/changed.exr"][0]) == (("error", "unknown"), "different")
-    assert (results.exit_code, len(results.results)) == (2, 4)
-    (error,) = [result.error for result in results.of(Status.ERROR)]
-    assert error.startswith(f"{folders[1] / 'same.exr'}: {words}")
-    assert "\n" not in error
-
-
-@pytest.mark.parametrize("spp", [float("inf"), float("nan"), (4, 5, 6), (1.0, 2.0, 3.0), "many", -4, 1, 1e30, 2.5])
+@pytest.mark.parametrize("spp", [float("nan"), (4, 5, 6), (1.0, 2.0, 3.0), "many", -4, 1, 1e30, 2.5])
 def test_a_header_may_say_anything_of_its_samples(tmp_path, spp):
     for side in ("old", "new"):
         image(tmp_path / side / "same.exr")
@@ -128,16 +134,13 @@ def test_a_header_may_say_anything_of_its_samples(tmp_path, spp):
 
 def test_images_larger_than_allowed_are_not_compared(folders):
     most = 32 * 48 * 3
-    assert not diff.diff(*folders, Settings(ComparisonSpec(max_values=most))).of(Status.ERROR)
-    results = diff.diff(*folders, Settings(ComparisonSpec(max_values=most - 1)))
+    assert not diff.diff(*folders, Settings(max_values=most)).of(Status.ERROR)
+    results = diff.diff(*folders, Settings((Entry("same.exr", {"method": "exact"}),), max_values=most - 1))
     assert [r.name for r in results.of(Status.ERROR)] == ["inner/changed.exr", "same.exr"]
     ending = f"changed.exr: 48 × 32 × 3 values; expected up to {most - 1} values (max-values)"
     assert results.of(Status.ERROR)[0].error.endswith(ending)
-    assert results.reproduce(results.results[0]).endswith(f"changed.exr --max-values {most - 1}")
     with pytest.raises(ValueError, match="max-values"):
-        diff.read_renders(folders[0], most - 1)
-    ruled = Settings(ComparisonSpec(max_values=most - 1), rules=(Entry("same.exr", {"method": "exact"}),))
-    assert found(diff.diff(*folders, ruled))["same.exr"] == ("error", "unknown")
+        file_pair.read_renders(folders[0], most - 1)
 
 
 def test_pairs_that_are_compared_at_once_have_no_more_values_than_one_may(tmp_path, monkeypatch):
@@ -164,46 +167,14 @@ def test_pairs_that_are_compared_at_once_have_no_more_values_than_one_may(tmp_pa
     pair = 2 * 8 * 8 * 3
     for limit, least, largest in ((8 * 32 * 3, 2 * pair, 4 * pair), (10**6, 5 * pair, 11 * pair)):
         most[0] = 0
-        results = diff.diff(tmp_path / "old", tmp_path / "new", Settings(ComparisonSpec(max_values=limit)))
-        assert [r.name for r in results.results] == [
-            "broken.exr",
-            *sorted([f"{i}.exr" for i in range(12)]),
-            "large.exr",
-        ]
+        results = diff.diff(tmp_path / "old", tmp_path / "new", Settings(max_values=limit))
+        names = ["broken.exr", *sorted([f"{i}.exr" for i in range(12)]), "large.exr"]
+        assert [r.name for r in results.results] == names
         assert {r.status for r in results.results[1:]} == {Status.EQUAL}
         assert least <= most[0] <= largest
 
 
-def test_a_folder_inside_without_permission(folders, monkeypatch):
-    walk = os.walk
-
-    def refuse(folder, onerror):
-        onerror(PermissionError(13, "Permission denied", str(folder / "locked")))
-        return walk(folder, onerror=onerror)
-
-    monkeypatch.setattr(os, "walk", refuse)
-    results = diff.diff(*folders)
-    assert [r.name for r in results.of(Status.ERROR)] == ["locked", "locked"]
-    assert all("Permission denied" in r.error for r in results.of(Status.ERROR))
-    assert len(results.results) == 6
-
-
-@pytest.mark.parametrize("link", [os.symlink, os.link])
-def test_an_image_is_not_compared_with_itself(folders, link):
-    old, new = folders
-    (new / "same.exr").unlink()
-    link(old / "same.exr", new / "same.exr")
-    results = diff.diff(old, new)
-    assert found(results)["same.exr"] == ("error", "unknown")
-    assert "the same file" in results.results[0].error
-
-
-def test_a_link_to_a_folder_is_not_passed_over(folders):
-    for side in folders:
-        (side / "linked").symlink_to(side / "inner")
-    results = diff.diff(*folders)
-    assert [(r.name, r.status) for r in results.results[:2]] == [("linked", "error")] * 2
-    assert results.exit_code == 2
+# The whole --------------------------------------------------------------------------------------------------------
 
 
 def test_nothing_to_compare(folders, tmp_path):
@@ -222,18 +193,19 @@ def test_nothing_to_compare(folders, tmp_path):
         (tmp_path, new, ValueError, "one path contains the other"),
         (old, new / "same.exr", ValueError, "cannot compare a folder with a file"),
         (old / "same.exr", new, ValueError, "cannot compare a folder with a file"),
-        (old, tmp_path / "none", FileNotFoundError, "none"),
-        (tmp_path / "none", new, FileNotFoundError, "none"),
+        (old, tmp_path / "none", FileNotFoundError, "none: no such test file"),
+        (tmp_path / "none", new, FileNotFoundError, "none: no such reference file"),
     ]:
         with pytest.raises(error, match=message):
             diff.diff(reference, test)
 
 
 @pytest.mark.parametrize(
-    "statuses, inconclusive, code",
+    ("statuses", "inconclusive", "code"),
     [
         ([], "", 2),
-        (["equal", "equal"], "", 0),
+        (["skipped"], "", 2),
+        (["equal", "skipped"], "", 0),
         (["equal", "different", "inconclusive"], "", 1),
         (["equal", "inconclusive"], "", 3),
         (["equal", "inconclusive"], "pass", 0),
@@ -253,47 +225,76 @@ def test_maps_are_kept_on_request_and_where_images_differ(folders):
     assert kept == {"inner/changed.exr": True, "same.exr": False}
 
 
-def test_the_order_of_the_table_is_that_of_the_results(pair):
-    statuses = [result.status for result in diff.diff(*pair).results]
-    assert statuses == sorted(statuses, key=list(Status).index) == [Status.DIFFERENT, Status.EQUAL]
+@pytest.mark.parametrize(
+    ("name", "flags", "files", "expected"),
+    [
+        ("ball.exr", (), True, ("diff {old}/ball.exr {new}/ball.exr", "accept {old}/ball.exr {new}/ball.exr")),
+        ("ball.exr", ("--set", "fail=0.01"), False, ("diff {old} {new} --set fail=0.01 ball.exr",) * 2),
+        ("-a b.exr", (), False, ("diff {old} {new} -- '-a b.exr'",) * 2),
+    ],
+)
+def test_the_commands_do_what_they_say(tmp_path, run, name, flags, files, expected):
+    old, new = tmp_path / "old", tmp_path / "new"
+    for side, gain in ((old, 1.0), (new, 1.2)):
+        image(side / name, gain=gain)
+    settings = Settings.for_all(**{"fail": 0.01} if flags else {})
+    sides = (old / name, new / name) if files else (old, new)
+    results = diff.diff(*sides, Settings(settings.rules, flags=flags))
+    commands = results.reproduce(results.results[0]), results.accept(results.results[0])
+    words = [text.format(old=old, new=new).removeprefix("diff ").removeprefix("accept ") for text in expected]
+    assert commands == (f"mi-refract diff {words[0]}", f"mi-refract accept {words[1]}")
+    assert run(*shlex.split(commands[0])[1:])[0] == 1
+    assert run("accept", "--yes", *shlex.split(commands[1])[2:])[0] == 0
+    assert run(*shlex.split(commands[0])[1:])[0] == 0
 
 
-# Samples ----------------------------------------------------------------------------------------------------------
+def test_there_are_commands_only_for_what_can_be_done(folders):
+    results = diff.diff(*folders)
+    commands = {r.name: (bool(results.reproduce(r)), bool(results.accept(r))) for r in results.results}
+    assert commands == {
+        "added.exr": (False, True),
+        "inner/changed.exr": (True, True),
+        "removed.exr": (False, False),
+        "same.exr": (True, False),
+    }
 
 
-def test_samples(tmp_path):
-    old, same, other = (
-        samples(tmp_path / "old"),
-        samples(tmp_path / "same", first=100),
-        samples(tmp_path / "other", first=200, gain=1.3),
-    )
-    equal, different = (diff.diff(old, test, renders=True) for test in (same, other))
-    assert found(equal) == {"old": ("equal", "unchanged")}
-    assert found(different) == {"old": ("different", "changed")}
-    assert different.results[0].comparison.method == "welch"
-    assert (different.results[0].reference, different.results[0].test) == (old, other)
+def test_a_name_with_a_dash_is_no_option_of_the_command(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    image(Path("-a.exr"))
+    image(Path("-b.exr"), gain=1.1)
+    results = diff.diff("-a.exr", "-b.exr")
+    assert results.reproduce(results.results[0]) == "mi-refract diff ./-a.exr ./-b.exr"
 
 
-def test_samples_too_noisy_for_a_verdict(tmp_path):
-    old, new = samples(tmp_path / "old", 2, noise=1.0), samples(tmp_path / "new", 2, 100, noise=1.0)
+# Renders ----------------------------------------------------------------------------------------------------------
+
+
+def test_renders(tmp_path):
+    old = samples(tmp_path / "old")
+    for first, gain, status in ((100, 1.0, ("equal", "unchanged")), (200, 1.3, ("different", "changed"))):
+        new = samples(tmp_path / str(first), first=first, gain=gain)
+        results = diff.diff(old, new, renders=True)
+        (result,) = results.results
+        assert found(results) == {"old": status}
+        assert (result.comparison.method, result.reference, result.test) == ("welch", old, new)
+        assert results.reproduce(result) == f"mi-refract diff {old} {new} --renders"
+    old, new = samples(tmp_path / "few", 2, noise=1.0), samples(tmp_path / "others", 2, 100, noise=1.0)
     assert diff.diff(old, new, renders=True).exit_code == 3
 
 
-def test_bad_samples(tmp_path):
+def test_bad_renders(tmp_path):
     good = samples(tmp_path / "good")
     twice = samples(tmp_path / "twice", first=100)
     (twice / "again.exr").write_bytes((twice / "3.exr").read_bytes())
-    empty = tmp_path / "empty"
-    empty.mkdir()
+    (tmp_path / "empty").mkdir()
     for folder, message in [
-        (twice, r"the same pixels as .*; expected renders of different seeds"),
+        (twice, "expected renders of different seeds"),
         (samples(tmp_path / "one", 1, 200), "one"),
-        (empty, "empty: holds no image"),
+        (tmp_path / "empty", "empty: holds no image"),
     ]:
         results = diff.diff(good, folder, renders=True)
-        assert results.exit_code == 2
-        with pytest.raises(ValueError, match=message):
-            raise ValueError(results.results[0].error)
+        assert results.exit_code == 2 and message in results.results[0].error
     with pytest.raises(NotADirectoryError, match=r"0\.exr; expected with --renders: a folder"):
         diff.diff(good, twice / "0.exr", renders=True)
 
@@ -301,7 +302,19 @@ def test_bad_samples(tmp_path):
 def test_the_mean_of_renders_is_that_of_all_and_one_stays_as_it_is():
     pixels = np.arange(36, dtype=np.float32).reshape(3, 2, 2, 3) ** 2
     several = [image_file.Image(Path(f"{i}.exr"), each, ("R", "G", "B")) for i, each in enumerate(pixels)]
-    found = diff.mean_image(several)
-    np.testing.assert_allclose(found.pixels, pixels.mean(0), rtol=1e-6)
-    assert (found.path, found.pixels.dtype) == (Path("0.exr"), np.float32)
-    assert diff.mean_image(several[1:2]) is several[1]
+    mean = file_pair.mean_image(several)
+    np.testing.assert_allclose(mean.pixels, pixels.mean(0), rtol=1e-6)
+    assert (mean.path, mean.pixels.dtype) == (Path("0.exr"), np.float32)
+    assert file_pair.mean_image(several[1:2]) is several[1]
+
+
+def test_doubt_about_a_variant_is_no_difference(tmp_path, monkeypatch):
+    """Different from the reference, but perhaps equal to the variant: nobody can say."""
+    for name in ("old/a.exr", "old/a-2.exr", "new/a.exr"):
+        image(tmp_path / name, gain=1 + ("new" in name))
+    verdicts = {"a.exr": Verdict.DIFFERENT, "a-2.exr": Verdict.INCONCLUSIVE}
+    monkeypatch.setattr(
+        methods, "compare", lambda method, one, two, **options: Comparison(method, verdicts[one[0].path.name], "why")
+    )
+    (result,) = diff.diff(tmp_path / "old", tmp_path / "new", Settings.for_all(accept=("{stem}-*.exr",))).results
+    assert result.status is Status.INCONCLUSIVE

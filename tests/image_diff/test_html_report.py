@@ -1,20 +1,22 @@
-"""The page of `mi-refract diff`: failures first, true to the pixels, nothing executable, nothing fetched."""
+"""The one page of `mi-refract diff`: failures first, true to the pixels, nothing executable, nothing fetched."""
 
 import base64
+import html
 import math
+import random
 import re
 import zlib
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from support.browser import browse, needs_chromium, seen
+from support.diff_images import image as smooth
 
 from mi_refract.image_diff import flip, folders, html_report, panes
 from mi_refract.image_diff.comparison import Comparison, Metric, Verdict
 from mi_refract.image_diff.results import Result, Results, Status
-from mi_refract.image_diff.settings import ComparisonSpec, Settings
+from mi_refract.image_diff.settings import Settings
 from mi_refract.io import image_file
 from mi_refract.io.image_file import write_exr
 from mi_refract.report.embedded_images import ROUNDED, EmbeddedImages, encoded, strongest
@@ -33,81 +35,59 @@ def results(folder):
     """A pair that differs, one that cannot be compared, a removed image, one that is equal."""
     reference = image(folder / "reference" / "a.exr", 0.25)
     test = image(folder / "test" / "a.exr", 0.5)
+    one, two = {"reference": image_file.read(reference)}, {"test": image_file.read(test)}
     p = np.linspace(0, 1, 24, dtype=np.float32).reshape(4, 6)
     metrics = (Metric("tiles that differ", 12.0, 0.0), Metric("odd", math.nan, 1.0), Metric("smallest p", 1e-9))
     maps = {"t": 8 * p - 4, "p": p, "q": p, "flags": 0 * p}
     found = Comparison("welch", Verdict.DIFFERENT, "12 tiles differ.", metrics, 0.013, maps)
-    return Results(
-        folder / "reference",
-        folder / "test",
-        (
-            Result("gone.exr", Status.ERROR, folder / "gone.exr", test, error="gone.exr: <i>corrupt</i>"),
-            Result(EVIL, Status.DIFFERENT, reference, test, comparison=found),
-            Result("old.exr", Status.DIFFERENT, reference, None),
-            Result("same.exr", Status.EQUAL, reference, test, comparison=EQUAL),
-        ),
-    )
+    gone = Result("gone.exr", Status.ERROR, folder / "gone.exr", test, error="gone.exr: <i>corrupt</i>", images=two)
+    changed = Result(EVIL, Status.DIFFERENT, reference, test, comparison=found, images=one | two)
+    removed = Result("old.exr", Status.DIFFERENT, reference, None, images=one)
+    same = Result("same.exr", Status.EQUAL, reference, test, comparison=EQUAL)
+    return Results(folder / "reference", folder / "test", (gone, changed, removed, same))
 
 
 def several(found, count):
     """The results of a pair that differs, under that many names."""
-    each = found.results[1]
-    return Results(found.reference, found.test, tuple(replace(each, name=f"{i}.exr") for i in range(count)))
+    return replace(found, results=tuple(replace(found.results[1], name=f"{i}.exr") for i in range(count)))
 
 
-def html(folder, found=None):
+def written(folder, found=None):
     html_report.write(folder / "report.html", found or results(folder), {"version": "1 & 2"}, "mi-refract diff a b")
     return (folder / "report.html").read_text("utf-8")
+
+
+def page_of(sides, place, replay="mi-refract diff old new", source="", settings=folders.AS_ASKED):
+    """The page as the command writes it: each pair while its images are in memory."""
+    report = html_report.Page(place)
+    report.write(folders.diff(*sides, settings, view=report.view), {}, replay, source)
+    return place.read_text("utf-8")
 
 
 def roles(text):
     return re.findall('data-role="([^"]*)" data-paint="([^"]*)"', text)
 
 
-def test_an_image_that_cannot_be_shown_keeps_no_other_from_being_shown(tmp_path, monkeypatch):
-    made = panes._all
-
-    def fail(result, most):
-        if result.name == EVIL:
-            raise MemoryError("Unable to allocate 9 GiB")
-        return made(result, most)
-
-    monkeypatch.setattr(panes, "_all", fail)
-    text = html(tmp_path)
-    assert "Cannot be shown: out of memory: Unable to allocate 9 GiB" in text
-    assert dict(roles(text)).keys() == {"test", "reference"}  # of the one that cannot be compared, and of the removed
-
-
-def test_an_image_that_is_larger_than_allowed_is_not_read_for_the_page(tmp_path):
-    image(tmp_path / "old" / "same.exr", 0.5)
-    for side in ("old", "new"):
-        image(tmp_path / side / "added.exr", 0.5)
-    (tmp_path / "old" / "added.exr").unlink()
-    found = folders.diff(tmp_path / "old", tmp_path / "new", Settings(ComparisonSpec(max_values=71)))
-    assert "expected up to 71 values (max-values)" in html(tmp_path, found)
-
-
-# The text
+# The text ---------------------------------------------------------------------------------------------------------
 
 
 def test_failures_come_first_with_numbers_thresholds_and_commands(tmp_path):
-    text = html(tmp_path)
+    text = written(tmp_path)
     places = ("<h1>4 images: ", 'id="pair-1"', 'id="pair-3"', 'id="equal"', "same.exr")
     order = [text.index(place) for place in places]
     assert order == sorted(order)
     numbers = ('<td class="fail">12</td><td class="limit">&gt; 0', "≰ 1", "1e-9", "0.013", "≤ 1e-3")
-    for words in (*numbers, "1 &amp; 2", "12 tiles differ.", "removed", "No such file", "p-value"):
+    for words in (*numbers, "1 &amp; 2", "12 tiles differ.", "removed", "p-value", "mi-refract diff a b"):
         assert words in text, words
-    assert "mi-refract diff a b" in text
     found = results(tmp_path)
     for result in found.results[:2]:
         for command in (found.reproduce(result), found.accept(result)):
-            assert f"<dd><code>{command}</code></dd>" in text
+            assert f"<dd><code>{html.escape(command, quote=False)}</code></dd>" in text.replace("&#39;", "'")
     assert "mi-refract accept" not in text[text.index('id="equal"') : text.index("</main>")]
 
 
-def test_the_page_asks_for_nothing_and_runs_no_name(tmp_path):
-    text = html(tmp_path)
+def test_the_page_requests_nothing_and_runs_no_name(tmp_path):
+    text = written(tmp_path)
     assert not re.findall(r"https?:|@import|url\((?!#)|\bsrc=|<link|<iframe", text)
     assert "default-src 'none'" in text
     assert "&lt;script&gt;alert(1)" in text and "&lt;i&gt;corrupt" in text and "Within &lt;b&gt;bounds" in text
@@ -118,22 +98,61 @@ def test_the_page_asks_for_nothing_and_runs_no_name(tmp_path):
 
 def test_panes_of_a_pair_are_in_order_and_an_equal_one_has_none(tmp_path):
     found = results(tmp_path)
-    text = html(tmp_path, Results(found.reference, found.test, found.results[1:2]))
+    text = written(tmp_path, replace(found, results=found.results[1:2]))
     names = [("reference", "light"), ("test", "light"), ("difference", "signed"), ("flip", "heat"), ("t", "signed")]
     assert roles(text) == [*names, ("−log₁₀ q", "heat")]  # no flags: none is up
     assert "compare pair paired" in text
     scale, data = re.findall(r'data-scale="([^"]*)">([^<]*)<', text)[2]
     difference = float(scale) * decoded(data).astype(float)
     assert difference == pytest.approx(0.5 - 0.25)  # positive where the test is brighter
-    text = html(tmp_path, Results(found.reference, found.test, found.results[3:]))
+    text = written(tmp_path, replace(found, results=found.results[3:]))
     assert roles(text) == [] and "Image viewer" not in text
 
 
-def test_images_of_different_sizes_stand_side_by_side_and_are_not_laid_over_each_other(tmp_path):
-    sides = image(tmp_path / "r" / "a.exr", 1.0), image(tmp_path / "t" / "a.exr", 1.0, (4, 5, 3))
-    text = html(tmp_path, folders.diff(*sides))
-    assert roles(text) == [("reference", "light"), ("test", "light")]
-    assert "compare pair paired" not in text
+@pytest.mark.parametrize("method", ["tolerance", "flip"])
+def test_every_file_is_read_once_and_flip_runs_once_for_verdict_and_page(tmp_path, monkeypatch, method):
+    """Also those of images without a partner, and of pairs that cannot be compared."""
+    sides = tmp_path / "old", tmp_path / "new"
+    for side, value in zip(sides, (0.25, 0.5), strict=True):
+        image(side / "a.exr", value)
+        image(side / f"{side.name}.exr", value)
+        image(side / "sizes.exr", value, (4, 5 + len(str(value)), 3))
+    (sides[0] / "z.exr").write_text("broken")
+    image(sides[1] / "z.exr", 0.5)
+    reads, runs = [], []
+    read, flip_map = image_file.read_parts, flip.flip_map
+    monkeypatch.setattr(image_file, "read_parts", lambda path, *most: reads.append(path) or read(path, *most))
+    monkeypatch.setattr(flip, "flip_map", lambda *images: runs.append(images) or flip_map(*images))
+    text = page_of(sides, tmp_path / "out.html", settings=Settings.for_all(method=method))
+    assert sorted(reads) == sorted(path for side in sides for path in side.iterdir())
+    assert len(runs) == 1 and "flip" in dict(roles(text))
+    shown = [role for role, _ in roles(text)]
+    assert (shown.count("reference"), shown.count("test")) == (3, 4)  # but for the broken one
+    assert text.count("compare pair paired") == 1  # images of two sizes are not laid over each other
+
+
+def test_no_result_keeps_its_images(tmp_path):
+    alive = []
+    sides = [image(tmp_path / side / "a.exr", value) for side, value in (("r", 0.25), ("t", 0.5))]
+    found = folders.diff(*sides, view=lambda result, _: alive.append(len(result.images)))
+    assert alive == [2] and not found.results[0].images and not found.results[0].comparison.maps
+
+
+def test_an_image_that_cannot_be_shown_keeps_no_other_from_being_shown(tmp_path):
+    found = results(tmp_path)
+    flat = replace(found.results[1].images["test"], pixels=np.float32(3))
+    broken = replace(found.results[1], images={"reference": found.results[0].images["test"], "test": flat})
+    text = written(tmp_path, replace(found, results=(broken, *found.results[2:])))
+    assert "Cannot be shown: internal error: " in text
+    assert dict(roles(text)).keys() == {"reference"}  # of the removed image
+
+
+def test_an_image_that_is_larger_than_allowed_is_not_read_for_the_page(tmp_path):
+    image(tmp_path / "old" / "same.exr", 0.5)
+    for name in ("same", "added"):
+        image(tmp_path / "new" / f"{name}.exr", 0.5)
+    text = page_of((tmp_path / "old", tmp_path / "new"), tmp_path / "out.html", settings=Settings(max_values=71))
+    assert text.count("expected up to 71 values (max-values)") == 4 and roles(text) == []
 
 
 def test_renders_in_a_folder_are_shown_as_their_mean(tmp_path):
@@ -143,49 +162,97 @@ def test_renders_in_a_folder_are_shown_as_their_mean(tmp_path):
             image(tmp_path / side / f"{i}.exr", noise.astype(np.float32))
     found = folders.diff(tmp_path / "r", tmp_path / "t", renders=True, maps=True)
     assert found.exit_code == 1
-    images = re.findall(r'data-channels="3" data-scale="1.0">([^<]*)<', html(tmp_path, found))
-    means = [decoded(data).astype(float).mean() for data in images]
-    assert means == pytest.approx([1, 2], abs=0.01)
+    images = re.findall(r'data-channels="3" data-scale="1.0">([^<]*)<', written(tmp_path, found))
+    assert [decoded(data).astype(float).mean() for data in images] == pytest.approx([1, 2], abs=0.01)
 
 
-@pytest.mark.parametrize("method", ["tolerance", "flip"])
-def test_every_file_is_read_once_and_flip_runs_once_for_verdict_and_page(tmp_path, monkeypatch, method):
-    sides = [image(tmp_path / side / "a.exr", value) for side, value in (("r", 0.25), ("t", 0.5))]
-    reads, runs = [], []
-    read, flip_map = image_file.read_parts, flip.flip_map
-    monkeypatch.setattr(image_file, "read_parts", lambda path, *most: reads.append(path) or read(path, *most))
-    monkeypatch.setattr(flip, "flip_map", lambda *sides: runs.append(sides) or flip_map(*sides))
-    settings = Settings(ComparisonSpec(method))
-    whole = html(tmp_path, folders.diff(*sides, settings, maps=True))
-    assert sorted(reads) == sorted(sides) and len(runs) == 1 and "flip" in dict(roles(whole))
-    page = html_report.Page(tmp_path / "viewed.html")
-    found = folders.diff(*sides, settings, view=page.view)
-    page.write(found, {})
-    assert len(reads) == 4 and roles((tmp_path / "viewed.html").read_text()) == roles(whole)
-    assert not found.results[0].images and not found.results[0].comparison.maps
-    again = html(tmp_path, found)
-    assert len(reads) == 6 and roles(again) == [each for each in roles(whole) if each[0] != "local"]
+# A full page ------------------------------------------------------------------------------------------------------
 
 
-def test_a_pair_that_does_not_fit_any_more_is_left_out(tmp_path, monkeypatch):
-    found = results(tmp_path)
-    alone = html(tmp_path, Results(found.reference, found.test, found.results[1:2]))
-    size = panes.of_result(found.results[1], html_report.MOST).size
-    assert sum(len(data) for data in re.findall(r'data-scale="[^"]*">([^<]*)<', alone)) < size
-    for pairs, factor in ((1, 1.9), (2, 2.1)):
-        monkeypatch.setattr(html_report, "PAGE", factor * size)
-        text = html(tmp_path, several(found, 3))
-        assert len(roles(text)) == 6 * pairs and text.count("the page is full") == 3 - pairs
+@pytest.fixture
+def many(tmp_path):
+    """Six pairs that differ, one that is equal, one that cannot be compared."""
+    old, new = tmp_path / "old", tmp_path / "new"
+    for i in range(6):
+        smooth(old / f"{'ab'[i % 2]}/{i}.exr", noise=0.1)
+        smooth(new / f"{'ab'[i % 2]}/{i}.exr", seed=1, noise=0.1)
+    for side in (old, new):
+        smooth(side / "equal.exr")
+    smooth(old / "z.exr")
+    (new / "z.exr").write_bytes(b"no image")
+    return old, new
 
 
-def test_a_full_page_keeps_the_numbers_and_says_what_is_left_out(tmp_path, monkeypatch):
-    found = results(tmp_path)
-    monkeypatch.setattr(html_report, "PAGE", 1)
-    text = html(tmp_path, several(found, 3))
-    assert len(roles(text)) == 6 and text.count("the page is full") == 2 and text.count("12 tiles differ.") == 3
+def size_of(result):
+    return panes.of_result(result, html_report.IMAGE_BYTES, html_report.MAP_BYTES).size
 
 
-# The pixels
+@pytest.mark.parametrize(("share", "pairs"), [(0.1, 1), (1.9, 1), (2.1, 2)])
+def test_a_pair_that_does_not_fit_keeps_its_numbers_and_is_named(tmp_path, monkeypatch, share, pairs):
+    """The first is shown, however large."""
+    found = several(results(tmp_path), 3)
+    monkeypatch.setattr(html_report, "PAGE", share * size_of(found.results[0]))
+    text = written(tmp_path, found)
+    assert len(roles(text)) == 6 * pairs and text.count("12 tiles differ.") == 3
+    assert text.count("the page is full") == 3 - pairs
+    assert (
+        f"Left out, as a page has 15 MB at most: images of {3 - pairs} of 3 failures. A folder has them all: " in text
+    )
+    assert "<code>mi-refract diff a b --report report/</code>" in text
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_page_is_the_same_in_whatever_order_results_come(many, tmp_path, monkeypatch, seed):
+    found = folders.diff(*many, maps=True)
+    monkeypatch.setattr(html_report, "PAGE", 3.5 * size_of(found.results[1]))
+    failed = found.of(Status.ERROR, Status.DIFFERENT)
+    random.Random(seed).shuffle(failed)
+    report = html_report.Page(tmp_path / "shuffled.html")
+    for result in failed:
+        report.view(result, found)
+    held = sum(each.size for each in report._shown.values())
+    assert held <= 4.7 * size_of(found.results[1])  # memory does not grow with the number of failures
+    report.write(found, {}, "")
+    html_report.write(tmp_path / "ordered.html", found)
+    assert (tmp_path / "shuffled.html").read_bytes() == (tmp_path / "ordered.html").read_bytes()
+    assert "images of 3 of 7 failures" in (tmp_path / "ordered.html").read_text("utf-8")
+
+
+def test_a_page_of_thousands_is_no_larger_than_its_limit(tmp_path, monkeypatch):
+    long = "a long name/" * 20
+    bad = [Result(f"{long}{i}.exr", Status.ERROR, None, tmp_path / "b", error="bad " * 100) for i in range(900)]
+    equal = [
+        Result(f"{long}{i}.exr", Status.EQUAL, tmp_path / "a", tmp_path / "b", comparison=EQUAL) for i in range(300)
+    ]
+    monkeypatch.setattr(html_report, "LIMIT", 600_000)
+    text = written(tmp_path, Results(tmp_path / "a", tmp_path, (*bad, *equal)))
+    assert len(text.encode()) <= 600_000
+    listed = html.unescape(re.search("at most: (.*?)\\.", text)[1])
+    articles, lines = text.count("<article"), len(re.findall("<tr data-text", text))
+    more = [int(each) for each in re.findall(r"… and (\d+) more", text)]
+    assert articles >= 20 and lines >= articles and articles + lines + sum(more) == 1200
+    left = f"all but a line of {900 - articles - more[0]} failures, {more[0]} failures, {more[1]} equal images"
+    assert listed == left
+
+
+@pytest.mark.parametrize(("source", "flags"), [("", ""), ("out.json", " --from out.json")])
+def test_names_that_mean_something_can_be_ticked(many, tmp_path, source, flags):
+    text = page_of(many, tmp_path / "out.html", source=source)
+    assert f'data-command="mi-refract accept {many[0]} {many[1]}{flags}"' in text
+    names = [f"{d}/{i}.exr" for d in "ab" for i in range("ab".index(d), 6, 2)]
+    assert re.findall('data-word="([^"]*)"', text) == ["z.exr", *names]
+    one = [side / "a" / "0.exr" for side in many]
+    assert 'class="tick"' not in page_of(one, tmp_path / "out.html")
+
+
+def test_a_name_that_cannot_be_shown_as_it_is_cannot_be_ticked(tmp_path):
+    odd = Result("a\u202eb.exr", Status.DIFFERENT, None, tmp_path / "x")
+    fine = Result("it's.exr", Status.DIFFERENT, None, tmp_path / "x")
+    text = written(tmp_path, Results(tmp_path / "old", tmp_path, (odd, fine)))
+    assert list(map(html.unescape, re.findall('data-word="([^"]*)"', text))) == ["'it'\"'\"'s.exr'"]
+
+
+# The pixels -------------------------------------------------------------------------------------------------------
 
 
 def decoded(data):
@@ -231,31 +298,35 @@ def test_a_map_is_full_of_colour_where_its_upper_hundredth_is(peak, gain):
     """One pixel of 2500 is `peak` times as large as the others; the gain is in tenths of a power of ten."""
     values = np.full((50, 50, 1), float(peak > 0), np.float32)
     values[7, 9] = -peak
-    assert panes._map("difference", values, html_report.MOST.map)["gain"] == pytest.approx(gain)
+    assert panes.map_pane("difference", values, np.inf)["gain"] == pytest.approx(gain)
 
 
-def test_the_first_channel_stands_for_those_that_are_no_colours():
+@pytest.mark.parametrize(
+    ("shape", "note"), [((3, 961), "strongest of 2 × 2 pixels"), ((1, 960), ""), ((1025, 960), "")]
+)
+def test_a_map_shows_how_many_of_its_pixels_became_one(shape, note):
+    assert panes.map_pane("difference", np.ones((*shape, 1), np.float32), np.inf)["note"] == note
+
+
+def test_the_first_channel_stands_for_those_that_are_no_colours(tmp_path):
     pixels = np.random.default_rng(2).random((3, 4, 2)).astype(np.float32)
-    found = panes._in_shown_channels(image_file.Image(Path("a.exr"), pixels, ("depth.Z", "id")))
-    np.testing.assert_array_equal(found.pixels, pixels[..., :1])
-    assert found.channels == ("depth.Z",)
+    sides = [image(tmp_path / f"{x}.exr", pixels + x, channels=("depth.Z", "id")) for x in (0, 1)]
+    (result,) = folders.diff(*sides, maps=True).results
+    first, channel = panes.of_result(result, np.inf, np.inf).panes[0], result.images["reference"].channels[0]
+    assert first["note"] == f"channel {channel}" and first["channels"] == 1
+    shown = decoded(first["data"]).reshape(3, 4)
+    np.testing.assert_allclose(shown, image_file.read(sides[0]).select([channel])[..., 0], rtol=1e-3)
 
 
 @pytest.mark.parametrize(("rows", "kept"), [(1, 1), (512, 512), (513, 257), (1300, 434)])
-def test_a_histogram_is_of_512_rows_at_most(rows, kept, monkeypatch):
-    seen = []
-    monkeypatch.setattr(panes, "histogram_svg", lambda values, *words, salt: seen.append(values) or "")
+def test_a_histogram_is_of_512_rows_at_most(rows, kept, monkeypatch, tmp_path):
+    drawn = []
+    monkeypatch.setattr(panes, "histogram_svg", lambda values, *words, salt: drawn.append(values) or "")
     p_values = np.linspace(0, 1, 2 * rows, dtype=np.float32).reshape(rows, 2)
     p_values[0, 1] = np.nan
-    panes._histogram(p_values, "x")
-    assert len(seen[0]) == 2 * kept - 1
-
-
-@pytest.mark.parametrize("shape, note", [((3, 1), "strongest of 2 × 2 pixels"), ((1, 0), ""), ((1025, 0), "")])
-def test_a_map_says_how_many_of_its_pixels_became_one(shape, note):
-    height, wider = shape
-    pane = panes._map("difference", np.ones((height, panes.MAP_WIDTH + wider, 1), np.float32), html_report.MOST.map)
-    assert pane["note"] == note
+    comparison = Comparison("welch", Verdict.DIFFERENT, "", maps={"p": p_values})
+    panes.of_result(Result("x", Status.DIFFERENT, None, None, comparison=comparison), np.inf, np.inf)
+    assert len(drawn[0]) == 2 * kept - 1
 
 
 def test_images_of_a_page_have_keys_of_their_own():
@@ -267,9 +338,8 @@ def test_images_of_a_page_have_keys_of_their_own():
 def test_a_noisy_full_size_pair_stays_within_its_bytes(tmp_path):
     rng = np.random.default_rng(1)
     sides = [image(tmp_path / f"{side}.exr", rng.standard_exponential((1080, 1920, 3), np.float32)) for side in "rt"]
-    text = html(tmp_path, folders.diff(*sides, maps=True))
-    assert len(roles(text)) >= 4
-    assert (tmp_path / "report.html").stat().st_size <= 15e6
+    text = page_of(sides, tmp_path / "out.html")
+    assert len(roles(text)) >= 4 and len(text.encode()) <= 15e6
 
 
 # In a browser
@@ -315,7 +385,7 @@ const wait = setInterval(async () => {
 @needs_chromium
 def test_the_page_works_from_a_file(tmp_path):
     found = results(tmp_path)
-    text = html(tmp_path, Results(found.reference, found.test, found.results[1:]))
+    text = written(tmp_path, replace(found, results=found.results[1:]))
     page = tmp_path / "report.html"
     page.write_text(text.replace("</body>", SCRIPT), "utf-8")
     assert seen(page, tmp_path / "profile") == {
@@ -337,7 +407,55 @@ def test_the_browser_sees_a_request_and_an_error(tmp_path):
     """What the test above would miss if it could not fail."""
     page = tmp_path / "report.html"
     planted = "<script>fetch('https://example.invalid/x'); undefinedName()</script>" + SCRIPT
-    page.write_text(html(tmp_path).replace("</body>", planted), "utf-8")
+    page.write_text(written(tmp_path).replace("</body>", planted), "utf-8")
     _, console = browse(page, tmp_path / "profile")
     assert any("undefinedName" in line for line in console)
     assert any("Content Security Policy" in line for line in console)
+
+
+LIST_SCRIPT = """<script>
+const wait = setInterval(() => {
+  if (!root.dataset.ready) return;
+  clearInterval(wait);
+  const $ = (selector) => document.querySelector(selector);
+  const active = () => document.activeElement ?? document.body;
+  const press = (key) => active().dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
+  const visible = (selector) => all(selector).filter((each) => !each.hidden).map((each) => each.id || each.textContent);
+  const seen = {};
+  press("/");
+  active().value = "b/";
+  active().dispatchEvent(new Event("input", { bubbles: true }));
+  seen.strip = visible("nav [data-text]");
+  seen.articles = visible("article");
+  seen.count = $(".shown-count").value;
+  press("f");
+  press("x");
+  seen.typed = [root.dataset.mode, $(".accepting").hidden];
+  press("Enter");
+  press("x");
+  seen.ticked = $(".built").textContent.split(" ").slice(4);
+  press("f");
+  seen.mode = root.dataset.mode;
+  $(".clear").click();
+  press("/");
+  press("Escape");
+  $(".tick-shown").click();
+  seen.all = $(".ticked").textContent;
+  root.dataset.seen = JSON.stringify(seen);
+}, 20);
+</script></body>"""
+
+
+@needs_chromium
+def test_the_strip_of_names_is_searched_and_the_page_builds_the_command(many, tmp_path):
+    place = tmp_path / "out.html"
+    place.write_text(page_of(many, place).replace("</body>", LIST_SCRIPT), "utf-8")
+    assert seen(place, tmp_path / "profile") == {
+        "strip": ["b/1.exr", "b/3.exr", "b/5.exr"],
+        "articles": ["pair-5", "pair-6", "pair-7"],
+        "count": "3 of 8",
+        "typed": ["side", True],
+        "ticked": ["b/1.exr"],
+        "mode": "flicker",
+        "all": "7 ticked",
+    }

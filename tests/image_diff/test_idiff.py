@@ -15,8 +15,9 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from mi_refract.image_diff import parts
-from mi_refract.image_diff.comparison import Verdict
+from mi_refract.image_diff import folders
+from mi_refract.image_diff.results import Status
+from mi_refract.image_diff.settings import Settings
 from mi_refract.image_diff.settings_file import from_words
 
 FOUND = {"installed": shutil.which("idiff"), "wheel": shutil.which("idiff", path=str(Path(sys.executable).parent))}
@@ -81,11 +82,10 @@ def pair(rng, shape):
 
 def ours(words, *files):
     """The exit code that `idiff` would have, by our verdict; that black would pass, too, is nothing to `idiff`."""
-    how = from_words("auto", [], words)
-    found, _ = parts.compare(how, *(parts.read(path, how) for path in files))
-    if found.verdict is Verdict.DIFFERENT:
+    (found,) = folders.diff(*files, Settings((from_words("auto", [], words),))).results
+    if found.status is Status.DIFFERENT:
         return FAIL, found.reason
-    assert found.verdict is Verdict.EQUAL or "black" in found.reason
+    assert found.status is Status.EQUAL or "black" in found.reason
     return (WARNING if found.warning else PASS), found.reason
 
 
@@ -157,5 +157,4 @@ def test_colours_are_multiplied_by_alpha(idiff, tmp_path):
     for suffix in ("png", "tif"):
         files = [write(tmp_path / f"{name}.{suffix}", [pixels], "uint8") for name, pixels in (("a", a), ("b", b))]
         assert (idiff("", *files), ours("", *files)[0]) == (PASS, PASS)
-        how = from_words("tolerance", [])
-        assert parts.compare(how, *(parts.read(path, how) for path in files))[0].verdict is Verdict.DIFFERENT
+        assert folders.diff(*files, Settings.for_all(method="tolerance")).exit_code == 1

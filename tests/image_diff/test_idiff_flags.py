@@ -10,11 +10,8 @@ from xml.etree import ElementTree
 import pytest
 from support.diff_images import image
 
-from mi_refract.image_diff import folders
-from mi_refract.image_diff import settings_file as diff_settings
 from mi_refract.image_diff.idiff_flags import THRESHOLDS, parse
 from mi_refract.image_diff.methods import METHODS
-from mi_refract.image_diff.settings import ComparisonSpec, Settings
 
 OSL = "-a -fail 0.004 -failpercent 0.02 -hardfail 0.01 -warn 0.008 -warnpercent 0.02 -failrelative 0.001"
 
@@ -81,62 +78,6 @@ def test_bad_flags_are_one_line(text, message):
     assert "\n" not in str(error.value)
 
 
-# Settings ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def rules(tmp_path):
-    def write(text, name="*"):
-        path = tmp_path / "rules.toml"
-        path.write_text(f'[[image]]\nname = "{name}"\nreason = "r"\n{text}\n')
-        return diff_settings.load(path).rules
-
-    return write
-
-
-def test_a_rule_with_flags(rules):
-    how = Settings(rules=rules('idiff = "-a -fail .01 -allowfailures 2"')).of("x")
-    assert (how.method, how.options["fail"], how.options["allow_failures"]) == ("tolerance", 0.01, 2)
-    assert how.options["warn"] == 1e-6
-    assert how.flags == ["--idiff", "-a -fail .01 -allowfailures 2"]
-    more = Settings(rules=rules('method = "tolerance"\nidiff = ""\nhard_fail = 0.5')).of("x")
-    assert more.options == {**parse("").options, "hard_fail": 0.5}
-    assert more.flags == ["--idiff", "", "--set", "hard_fail=0.5"]
-    assert "image[0].idiff: unknown" in rules('method = "flip"\nidiff = ""')[0].error
-    assert "image[0].idiff: 3; expected a text" in rules("idiff = 3")[0].error
-
-
-def test_a_rule_without_flags_inherits_those_of_the_command_line(rules):
-    default = diff_settings.from_words("auto", [], "-a -fail .5")
-    how = Settings(default, rules('method = "tolerance"\nfail_percent = 3')).of("x")
-    assert (how.options["fail"], how.options["fail_percent"], how.idiff) == (0.5, 3.0, "-a -fail .5")
-    assert diff_settings.from_words("auto", ["fail_percent=3"], "-a -fail .5").options == how.options
-    assert Settings(default, rules('method = "exact"')).of("x") == ComparisonSpec(
-        "exact", {}, "r", entries=("image[0]",)
-    )
-    own = Settings(default, rules('idiff = "-fail .25"')).of("x")
-    assert (own.options["fail"], own.idiff) == (0.25, "-fail .25")
-
-
-def test_the_command_line_goes_before_the_flags_of_all(tmp_path):
-    path = tmp_path / "rules.toml"
-    path.write_text('[defaults]\nidiff = "-fail .01"')
-    own = diff_settings.load(path, diff_settings.from_words("auto", [], "-a -fail .5")).of("x")
-    assert (own.idiff, own.options["fail"]) == ("-a -fail .5", 0.5)
-    assert diff_settings.load(path).of("x").idiff == "-fail .01"
-
-
-def test_a_rule_with_bad_flags_is_an_error_of_its_images_alone(pair, rules, run, tmp_path):
-    rules('idiff = "-fale 1"', "louder.exr")
-    code, out, err = run("diff", *pair, "--settings", tmp_path / "rules.toml")
-    assert code == 2
-    assert err.startswith(
-        f"mi-refract: {tmp_path}/rules.toml: image[0].idiff: -fale: no flag of idiff; expected -fail,"
-    )
-    assert err.count("\n") == 1
-    assert out.splitlines()[-1] == "2 images: 1 could not be compared, 1 equal"
-
-
 # On the command line ----------------------------------------------------------------------------------------------
 
 
@@ -151,10 +92,10 @@ def test_flags_on_the_command_line(run, pair):
 @pytest.mark.parametrize(
     "words, message",
     [
-        (["--idiff", "-fale 1"], "--idiff: -fale: no flag of idiff; expected -fail, "),
-        (["--idiff", "-p"], "--idiff: -p: idiff's perceptual test; expected --method flip"),
-        (["--idiff", "", "--method", "exact"], "--idiff with --method exact; accepted with --method tolerance"),
-        (["--idiff", "", "--set", "fale=1"], "--set fale: unknown; expected "),
+        (["--idiff", "-fale 1"], "--set: idiff: -fale: no flag of idiff; expected -fail, "),
+        (["--idiff", "-p"], "--set: idiff: -p: idiff's perceptual test; expected --method flip"),
+        (["--idiff", "", "--method", "exact"], "--idiff with --method exact; expected --method tolerance, or none"),
+        (["--idiff", "", "--set", "fale=1"], "--set: unknown key `fale`; expected "),
     ],
 )
 def test_bad_flags_on_the_command_line(run, pair, words, message):
@@ -216,5 +157,3 @@ def test_many_equal_images_hide_no_warning(tmp_path, run):
             image(tmp_path / side / f"{i:02}.exr", gain=gain, shape=(4, 4, 3))
     _, text, _ = run("diff", tmp_path / "old", tmp_path / "new", "--idiff", "-fail .05 -failpercent 99")
     assert "29.exr" in text.splitlines()[1]
-    results = folders.diff(tmp_path / "old", tmp_path / "new", Settings(diff_settings.from_words("exact", [])))
-    assert [bool(result.warning) for result in results.results] == [False] * 30

@@ -53,17 +53,17 @@ def test_a_defect_is_as_large_as_in_the_tile_where_it_stands_out():
     clean = np.stack([mean + spread / np.sqrt(2), mean - spread / np.sqrt(2)])
     changes = np.array([[[-0.05], [0.1], [0.72], [9.0], [9.0]]])
     tally = self_test.Tally(detectable=[0.01, 0.02, 0.04])
-    found = self_test._sizes(np.stack([changes, changes]), clean, {"welch": tally, "exact": self_test.Tally()})
+    found = self_test.sizes(np.stack([changes, changes]), clean, {"welch": tally, "exact": self_test.Tally()})
     # 5 % in the quietest tile, 5 % in the median one, 18 % in one four times as noisy.
     assert found["size"] == pytest.approx(0.05)
     assert found[self_test.RATIO] == pytest.approx(0.05 / 0.02)
     assert found[self_test.DETECTABLE] == 0.02
     louder = changes * [[[1], [1], [2], [1], [1]]]
-    found = self_test._sizes(louder[None], clean, {"welch": tally})
+    found = self_test.sizes(louder[None], clean, {"welch": tally})
     assert (found["size"], found[self_test.RATIO]) == pytest.approx((0.36, 0.36 / (0.02 * 4)))
-    assert self_test._sizes(changes[None], clean[:1], {"welch": tally}) == {}
-    assert self_test._sizes(changes[None], clean, {"welch": self_test.Tally()}) == {}
-    assert self_test._sizes(changes[None], np.stack([mean, mean]), {"welch": tally}) == {}
+    assert self_test.sizes(changes[None], clean[:1], {"welch": tally}) == {}
+    assert self_test.sizes(changes[None], clean, {"welch": self_test.Tally()}) == {}
+    assert self_test.sizes(changes[None], np.stack([mean, mean]), {"welch": tally}) == {}
 
 
 def test_the_noise_is_that_of_the_lit_pixels():
@@ -191,6 +191,8 @@ def test_the_command_takes_a_folder_or_an_image_and_refuses_what_is_not_finite(t
 
 
 def test_a_method_that_takes_renders_is_asked_where_there_are_two_a_side():
-    enough = np.zeros((self_test.RENDERS // 2, 4, 4, 3))
-    every, single = set(methods.METHODS), {name for name, each in methods.METHODS.items() if not each.takes_renders}
-    assert set(self_test._asked(enough)) == every > single == set(self_test._asked(enough[1:]))
+    several = {name for name, method in methods.METHODS.items() if method.takes_renders}
+    for count, asked in ((2, methods.METHODS.keys()), (1, methods.METHODS.keys() - several)):
+        clean = renders(count)
+        trial = self_test.Trial(clean, renders(count, seed=2), lambda clean=clean: 2 * clean)
+        assert methods.METHODS.keys() & self_test.detection("gain", True, [trial], "", "").values.keys() == asked

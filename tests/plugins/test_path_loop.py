@@ -8,13 +8,13 @@ import math
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.glass_scenes import GLASS
 
-from mi_refract.plugins import emitter_sampling, path_loop
+from mi_refract.plugins import path_loop, sampling
 from mi_refract.rendering.scene_files import REPRODUCIBLE
 
 pytestmark = pytest.mark.usefixtures("scalar_variant")
 
-GLASS = {"type": "refract", "int_ior": 1.5, "ext_ior": 1.0}
 REFLECTED, TRANSMITTED, UPWARD = (0.0, 0.5), (0.999, 0.5), (0.5, 0.5)
 ALBEDO, RADIANCE = 0.5, 3.0
 
@@ -28,10 +28,10 @@ class Given:
     def next(self):
         return self.points.pop(0) if self.points else UPWARD
 
-    def one(self, sampler, key):
+    def next_1d(self, sampler, key):
         return self.next()[0] if key % 4 == 1 else 0.5
 
-    def two(self, sampler, key):
+    def next_2d(self, sampler, key):
         return mi.Point2f(*self.next()) if key % 4 == 2 else mi.Point2f(0.5)
 
 
@@ -50,12 +50,13 @@ def wall():
     return sheet(-1, bsdf={"type": "diffuse", "reflectance": ALBEDO})
 
 
-def follow(parts, points, o=(0, 0, 1), d=(0.6, 0, -0.8), **parameters):
-    """The radiance and the alpha of one sample along a ray."""
-    scene = mi.load_dict({"type": "scene"} | parts)
-    plan = mi.load_dict({"type": "refract_path"} | parameters).plan(scene)
-    end = path_loop.Trace(mi.scalar_rgb, scene, plan, Given(*points)).run(mi.Ray3f(o, d), None, True)
-    return np.array(end.result), bool(end.valid)
+def follow(parts, numbers, o=(0, 0, 1), d=(0.6, 0, -0.8), **parameters):
+    """The radiance and the alpha of one sample along a ray. `numbers`: points, or what gives numbers."""
+    scene, method = mi.load_dict({"type": "scene"} | parts), mi.load_dict({"type": "refract_path"} | parameters)
+    features = method.path_features(method.scene_features(scene))
+    numbers = Given(*numbers) if isinstance(numbers, list) else numbers
+    end = path_loop.PathLoop(mi.scalar_rgb, scene, features, numbers).run(mi.Ray3f(o, d), None, True)
+    return np.array(end.result), bool(end.valid_ray)
 
 
 def reflectance(cosine, k):
@@ -99,19 +100,16 @@ class Recorded(Given):
         super().__init__()
         self.keys = []
 
-    def one(self, sampler, key):
+    def next_1d(self, sampler, key):
         if key % 4 == 1:
             self.keys.append(key % 2**32)  # as unsigned numbers have it elsewhere
-        return super().one(sampler, key)
+        return super().next_1d(sampler, key)
 
 
 def test_no_two_vertices_of_branches_have_the_same_random_number():
     """Four sheets of glass, of which each splits, two of them on either side."""
-    parts = {f"sheet {z}": sheet(z, bsdf=GLASS) for z in range(4)}
-    scene = mi.load_dict({"type": "scene"} | parts)
-    plan = mi.load_dict({"type": "refract_path", "split_depth": 4, "split_weight": 1e-3, "max_depth": 7}).plan(scene)
-    numbers = Recorded()
-    path_loop.Trace(mi.scalar_rgb, scene, plan, numbers).run(mi.Ray3f((0, 0, 1.5), (0.6, 0, -0.8)), None, True)
+    numbers, parts = Recorded(), {f"sheet {z}": sheet(z, bsdf=GLASS) for z in range(4)}
+    follow(parts, numbers, (0, 0, 1.5), split_depth=4, split_weight=1e-3, max_depth=7)
     assert len(numbers.keys) > 10
     assert len(set(numbers.keys)) == len(numbers.keys)
 
@@ -165,7 +163,7 @@ def test_lamps_are_sampled_as_if_there_were_no_sky(weights):
     skies = {}, {"sky": {"type": "constant"}}
     # Mitsuba orders merged meshes by address: of two scenes, the lamps would not always be in the same order.
     dark, lit = (mi.load_dict({"type": "scene"} | lamps | sky, **REPRODUCIBLE) for sky in skies)
-    ours = emitter_sampling.NonConstantEmitters(mi.scalar_rgb, lit)
+    ours = sampling.NonConstantEmitters(mi.scalar_rgb, lit)
     si = dark.ray_intersect(mi.Ray3f([0.1, 0, -2], [0, 0, 1]))
     si.p = mi.Point3f(0.1, 0.2, -1)
     for x in (0.1, 0.3, 0.6, 0.9):

@@ -1,14 +1,13 @@
 """The plugin: what Mitsuba's tests ask of its own dielectric, what a drop-in must keep, and what ours does better."""
 
+import json
 import math
 
 import drjit as dr
 import numpy as np
 import pytest
-from support.variants import switch
+from support.glass_scenes import refusal
 
-import mi_refract  # noqa: F401  (registers the plugin)
-from mi_refract import backend
 from mi_refract.formulas import FORMULAS
 
 mi = pytest.importorskip("mitsuba")
@@ -181,7 +180,8 @@ def test_contrast_is_formed_in_double_and_rounded_once(typical_variant):
 def test_eta_can_be_read_and_edited(typical_variant):
     bsdf = load(int_ior=1.5, ext_ior=1)
     params = mi.traverse(bsdf)
-    assert number(params["eta"]) == 1.5
+    eta = params["eta"][0]  # an array of one number, as `roughdielectric` has it
+    assert (float(eta), f"{eta:.3f}", json.dumps(eta)) == (1.5, "1.500", "1.5")
     params["eta"] = 1.25
     params.update()
     bs, _ = sample(bsdf, (0.6, 0, 0.8), 0.9)
@@ -221,7 +221,7 @@ def test_attributes_are_those_of_rough_glass(typical_variant, name, tints):
     assert answers(bsdfs[0]) == answers(bsdfs[1])
 
 
-def test_an_attribute_is_asked_of_all_bsdfs_of_a_scene(jit):
+def test_an_attribute_is_asked_of_all_bsdfs_of_a_scene(llvm_variant):
     """As scripts that write feature buffers do: of glass that lacks it, beside a plaster that has it."""
     parts = {"glass": {"type": "sphere", "bsdf": {"type": "refract"}}}
     plaster = {"type": "plastic", "specular_reflectance": 0.5}
@@ -296,23 +296,20 @@ def test_a_direction_that_is_none_stays_none(typical_variant):
     ],
 )
 def test_bad_parameters_are_named_with_what_is_accepted(typical_variant, parameters, words):
-    with pytest.raises(RuntimeError) as error:
-        load(**parameters)
-    assert words in str(error.value).replace("\n", " ")
+    assert words in refusal(load, **parameters).replace("\n", " ")
 
 
 @pytest.mark.parametrize(("int_ior", "ext_ior"), [(1e300, 1), (1e-50, 1), (1e200, 1e-200), (1e-320, 1)])
 def test_indices_whose_ratio_is_beyond_float32_are_refused(typical_variant, int_ior, ext_ior):
-    with pytest.raises(RuntimeError, match=r"int_ior / ext_ior = .*; expected a ratio from"):
-        load(int_ior=int_ior, ext_ior=ext_ior)
+    said = refusal(load, int_ior=int_ior, ext_ior=ext_ior)
+    assert "int_ior / ext_ior = " in said and "; expected a ratio from" in said
 
 
 @pytest.mark.parametrize("eta", [0.0, -1.5, math.nan, math.inf])
 def test_an_edit_that_is_no_index_is_refused(typical_variant, eta):
     params = mi.traverse(load())
     params["eta"] = eta
-    with pytest.raises((ValueError, RuntimeError), match="eta = "):
-        params.update()
+    assert "eta = " in refusal(params.update)
 
 
 @pytest.mark.parametrize("z", [0.0, 1e-30, 1e-12, 1e-7, 1e-4])
@@ -337,85 +334,3 @@ def test_mueller_matrices_are_those_of_the_built_in(polarized_variant, z, sample
         x, y = (np.array(b.sample(context, interaction(wi), number, [0, 0])[1]) for b in (ours, theirs))
         assert x == pytest.approx(y, abs=3e-6)
         assert np.abs(y).max() > 0.1
-
-
-# Kernels and gradients -----------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def jit():
-    usable = [name for name, why in backend.usable_variants().items() if why is None and name.endswith("ad_rgb")]
-    if not usable:
-        pytest.skip("no LLVM or CUDA variant runs here")
-    switch(usable[0])
-    return usable[0]
-
-
-def ball(integrator, **parameters):
-    camera = mi.ScalarTransform4f().look_at([0, 0, 400], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": integrator, "max_depth": 3},
-            "sensor": {"type": "perspective", "fov": 20, "to_world": camera, "film": film},  # all of the ball
-            "ball": {"type": "sphere", "radius": 70, "bsdf": {"type": "refract"} | parameters},
-            "sky": {"type": "constant"},
-        }
-    )
-
-
-def test_an_edit_of_the_index_compiles_nothing(jit):
-    scene = ball("path", int_ior=1.5, ext_ior=1)
-    params = mi.traverse(scene)
-    key = next(name for name in params.keys() if name.endswith("eta"))  # noqa: SIM118
-
-    def compiled():
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-            dr.kernel_history_clear()
-            image = mi.render(scene, spp=4)
-            dr.eval(image)
-            return image, sum(not entry["cache_hit"] for entry in dr.kernel_history() if "cache_hit" in entry)
-
-    before, _ = compiled()
-    _, repeated = compiled()
-    params[key] = 1.7
-    params.update()
-    after, edited = compiled()
-    assert (repeated, edited) == (0, 0)
-    assert np.abs(np.array(after) - np.array(before)).max() > 0.1
-
-
-def test_gradient_of_an_image_in_the_index_matches_a_finite_difference(jit):
-    scene = ball("volpath", int_ior=1.5, ext_ior=1)
-    params = mi.traverse(scene)
-    key = next(name for name in params.keys() if name.endswith("eta"))  # noqa: SIM118
-
-    def mean(spp, seed):
-        return dr.mean(mi.render(scene, params, spp=spp, seed=seed), axis=None)
-
-    dr.enable_grad(params[key])
-    params.update()
-    dr.backward(mean(2048, 1))
-    gradient = number(dr.grad(params[key]))
-    dr.disable_grad(params[key])
-    means = []
-    for eta in (1.45, 1.55):
-        params[key] = eta
-        params.update()
-        means.append(number(mean(4096, 2)))
-    # The paths' noise is under 2 % of the slope; a detached direction or lobe gives five times it.
-    assert gradient == pytest.approx((means[1] - means[0]) / 0.1, rel=0.08)
-
-
-def test_a_scene_can_be_frozen(jit):
-    scene = ball("path", int_ior=1.5, ext_ior=1)
-    params = mi.traverse(scene)
-
-    @dr.freeze
-    def image(params, seed):
-        return mi.render(scene, params, spp=4, seed=seed)
-
-    plain = np.array(mi.render(scene, spp=4, seed=mi.UInt32(3)))
-    assert np.array(image(params, mi.UInt32(2))).shape == plain.shape
-    assert np.array(image(params, mi.UInt32(3))) == pytest.approx(plain)

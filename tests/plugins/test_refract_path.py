@@ -8,57 +8,36 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from scipy.stats import t
+from scipy.stats import chi2_contingency
+from support.glass_scenes import BLACK, GLASS, SKY, camera, equal_means, glass_ball, parameter, refusal, render, sky
 from support.variants import switch
 
 from mi_refract.image_diff import pixelwise, tile_statistics
-from mi_refract.plugins import keyed_sampler, path_loop, refract_path, scene_features
+from mi_refract.plugins import refract_path, sampling, scene_features
 from mi_refract.rendering import scene_files
 from validation.run.context import SCENES
 
-MIXED = ("sphere", "nested")
-AROUND, DOWN = 0.6 + 0.4 * np.sin(np.arange(64) * 2 * np.pi / 64 + 0.3), np.linspace(0, 0.7, 32)
-SKY = (AROUND[None, :, None] + DOWN[:, None, None]).astype(np.float32) * np.ones(3, np.float32)
-
-BOX = {"type": "box"}
-BLACK = {"type": "diffuse", "reflectance": 0.0}
+PLACE = mi.ScalarTransform4f
 
 
 def load(name, resolution=32, **parameters):
     return mi.load_file(str(SCENES / f"{name}.xml"), **scene_files.REPRODUCIBLE, res=resolution, **parameters)
 
 
-def render(scene, spp=16, seed=0, **parameters):
-    method = mi.load_dict({"type": "refract_path", "max_depth": 16} | parameters)
-    return np.array(mi.render(scene, integrator=method, spp=spp, seed=seed), dtype=float)
-
-
 def by_path(scene, spp=16, seed=0, **parameters):
     return render(scene, spp, seed, **parameters, type="path")
-
-
-def glass_ball(resolution=24, sampler=None, **parts):
-    place = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
-    sensor = {
-        "type": "perspective",
-        "sampler": sampler or {"type": "independent"},
-        "fov": 30,
-        "to_world": place,
-        "film": {"type": "hdrfilm", "width": resolution, "height": resolution, "pixel_format": "rgb", "rfilter": BOX},
-    }
-    ball = {"type": "sphere", "bsdf": {"type": "refract", "int_ior": 1.5, "ext_ior": 1.0}}
-    return mi.load_dict({"type": "scene", "sensor": sensor, "ball": ball} | parts)
-
-
-def sky():
-    return {"type": "envmap", "bitmap": mi.Bitmap(SKY)}
 
 
 # The same image ----------------------------------------------------------------------------------------------
 
 
-def is_that_of_path(name, monkeypatch, **parameters):
+@pytest.mark.parametrize(("name", "parameters"), [("sphere", {}), ("nested", {"max_depth": 6, "rr_depth": 1})])
+def test_where_nothing_is_left_out_the_numbers_and_the_image_are_those_of_path(
+    name, parameters, each_variant, monkeypatch
+):
     """With Russian roulette and emitter sampling both integrators draw the same numbers in the same order."""
+    if name == "nested" and not each_variant.endswith("rgb"):
+        pytest.skip("RGB variants stand for the others")
 
     def everything(scene):
         return dataclasses.replace(scene_features.inspect(scene), both_numbers=True, plain_environment=False)
@@ -71,87 +50,46 @@ def is_that_of_path(name, monkeypatch, **parameters):
     assert pixelwise.changes(theirs, ours, 1e-4).share <= 1e-3
 
 
-def test_where_nothing_is_left_out_the_numbers_and_the_image_are_those_of_path(each_variant, monkeypatch):
-    is_that_of_path("sphere", monkeypatch)
-
-
-def test_in_nested_glass_the_numbers_and_the_image_are_those_of_path(rgb_variant, monkeypatch):
-    is_that_of_path("nested", monkeypatch, max_depth=6, rr_depth=1)
+FOLLOWED = [(name, {}) for name in ("balls", "slab", "sphere", "nested")]
+FOLLOWED += [(name, {"split_depth": 1}) for name in ("balls", "sphere")]
+FOLLOWED += [(name, {"split_depth": 4, "rr_depth": 3}) for name in ("slab", "lightpipe", "nested")]
 
 
 @functools.cache
 def stack_of_path(name):
-    """Eight images of a scene, one a seed; every test that compares with `path` by Welch's test reads these."""
     scene = load(name)
     return np.stack([by_path(scene, seed=i) for i in range(8)])
-
-
-@functools.cache
-def stack(name, **parameters):
-    """As many by `refract_path`, of other seeds."""
-    scene = load(name)
-    return np.stack([render(scene, seed=100 + i, **parameters) for i in range(8)])
-
-
-FOLLOWED = [(name, {}) for name in ("balls", "slab", *MIXED)]
-FOLLOWED += [(name, {"split_depth": 1}) for name in ("balls", "sphere")]
-FOLLOWED += [(name, {"split_depth": 4, "rr_depth": 3}) for name in ("slab", "lightpipe", "nested")]
 
 
 @pytest.mark.parametrize(("name", "parameters"), FOLLOWED, ids=str)
 def test_other_numbers_give_the_same_mean(name, parameters, llvm_variant):
     """Welch's test on tiles, one false alarm in 1000 images."""
-    theirs, ours = stack_of_path(name), stack(name, **parameters)
+    scene, theirs = load(name), stack_of_path(name)
+    ours = np.stack([render(scene, seed=100 + i, **parameters) for i in range(8)])
     assert tile_statistics.compare_stacks(theirs, ours, 8, 1e-3, 1e-5).alarms == 0
     assert ours.mean() == pytest.approx(theirs.mean(), rel=2e-2)
 
 
 def lamps():
     """A wall in a constant sky and three lamps before it, one of them small and bright, one that has no surface."""
-    place = mi.ScalarTransform4f
-    wall = {"type": "rectangle", "to_world": place().translate([0, 0, -2]).scale(4)}
+    wall = {"type": "rectangle", "to_world": PLACE().translate([0, 0, -2]).scale(4)}
     sky = {"type": "constant", "radiance": 0.2}
-    found = {"wall": wall, "sky": sky, "spot": {"type": "point", "position": [0, 3, 2], "intensity": 4.0}}
+    parts = {"wall": wall, "sky": sky, "spot": {"type": "point", "position": [0, 3, 2], "intensity": 4.0}}
     for i, (x, size, radiance) in enumerate([(-1.5, 0.6, 3.0), (1.5, 0.1, 40.0)]):
         emitter = {"type": "area", "radiance": radiance, "sampling_weight": 1.0 + i}
-        where = place().translate([x, 2, 1]).rotate([0, 1, 0], 180).scale(size)
-        found[f"lamp {i}"] = {"type": "rectangle", "to_world": where, "emitter": emitter}
-    return found
+        where = PLACE().translate([x, 2, 1]).rotate([0, 1, 0], 180).scale(size)
+        parts[f"lamp {i}"] = {"type": "rectangle", "to_world": where, "emitter": emitter}
+    return parts
 
 
-@functools.cache
-def stack_of_lamps(variant, kind="refract_path", first=100, **parameters):
-    """Eight images of the lamps in the variant that is set."""
+@pytest.mark.parametrize("split_depth", [0, 2])
+def test_lamps_are_chosen_by_their_weights_and_the_sky_is_met(split_depth, typical_variant):
+    """Welch's test on one tile, one false alarm in 1000."""
     vectorised = dr.is_jit_v(mi.Float)
     scene, spp = glass_ball(24 if vectorised else 4, **lamps()), 64 if vectorised else 8
-    return np.stack([render(scene, spp, first + i, type=kind, **parameters) for i in range(8)])
-
-
-def lamps_that_alarm(variant, ours):
-    """Welch's test on one tile, one false alarm in 1000."""
-    theirs = stack_of_lamps(variant, "path", 0)
-    return tile_statistics.compare_stacks(theirs, ours, theirs.shape[1], 1e-3, 1e-5).alarms
-
-
-def test_lamps_are_chosen_by_their_weights_and_the_sky_is_met(typical_variant):
-    ours = stack_of_lamps(typical_variant, split_depth=2)
-    assert lamps_that_alarm(typical_variant, ours) == 0
-
-
-def test_without_a_split_lamps_are_chosen_alike_and_a_probability_that_is_off_is_seen(llvm_variant, monkeypatch):
-    assert lamps_that_alarm("llvm_ad_rgb", stack_of_lamps("llvm_ad_rgb")) == 0
-    choose = mi.DiscreteDistribution.sample_reuse_pmf
-    slip = lambda *a: (*choose(*a)[:2], mi.Float(0.4))  # noqa: E731
-    monkeypatch.setattr(mi.DiscreteDistribution, "sample_reuse_pmf", slip)
-    assert lamps_that_alarm("llvm_ad_rgb", stack_of_lamps.__wrapped__("llvm_ad_rgb")) > 0
-
-
-@pytest.mark.parametrize("name", ["area", "environment", "all_of_hit"])
-def test_leaving_out_what_a_scene_needs_is_seen(name, llvm_variant, monkeypatch):
-    scene = "slab" if name == "all_of_hit" else "sphere"
-    monkeypatch.setattr(refract_path, "PathFeatures", lambda *a, **k: path_loop.PathFeatures(*a, **k | {name: False}))
-    ours = stack.__wrapped__(scene)  # not one that is there already
-    assert tile_statistics.compare_stacks(stack_of_path(scene), ours, 8, 1e-3, 1e-5).alarms > 0
+    theirs = np.stack([by_path(scene, spp, i) for i in range(8)])
+    ours = np.stack([render(scene, spp, 100 + i, split_depth=split_depth) for i in range(8)])
+    assert tile_statistics.compare_stacks(theirs, ours, theirs.shape[1], 1e-3, 1e-5).alarms == 0
 
 
 @pytest.mark.parametrize("name", ["sphere", "slab"])
@@ -165,10 +103,8 @@ def test_parameters_mean_what_they_mean_to_path(name, parameters, llvm_variant):
 
 
 def test_nothing_to_see_is_black(rgb_variant):
-    film = {"type": "hdrfilm", "width": 4, "height": 4, "pixel_format": "rgb"}
-    sensor = {"type": "perspective", "film": film}
     for parts in ({}, {"ball": {"type": "sphere"}}, {"ball": {"type": "sphere", "bsdf": {"type": "refract"}}}):
-        scene = mi.load_dict({"type": "scene", "sensor": sensor} | parts)
+        scene = mi.load_dict({"type": "scene", "sensor": camera(4)} | parts)
         for parameters in ({}, {"split_depth": 2, "max_depth": -1}):
             assert (render(scene, 2, **parameters) == 0).all()
     assert (render(glass_ball(sky=sky()), 2, max_depth=0) == 0).all()
@@ -187,44 +123,52 @@ def test_splitting_takes_noise_away_and_scalars_do_it_too(rgb_variant):
     assert noise[3] < 0.8 * noise[0]
 
 
-def test_strata_are_those_of_correlated_multi_jitter(llvm_variant):
-    """Of 12 samples of each of 5 pixels every stratum holds one, of rows, columns and cells; keys are independent."""
+def multijitter(pixels):
+    """12 samples a pixel; numbers of one dimension and of two by key, pixel by pixel."""
     sampler = mi.load_dict({"type": "independent", "sample_count": 12})
-    sampler.seed(3, 60)
-    numbers = keyed_sampler.KeyedMultijitter(mi, sampler, 12)
-    one = np.array(numbers.one(sampler, mi.UInt32(7))).reshape(5, 12)
-    x, y = np.array(numbers.two(sampler, mi.UInt32(8))).reshape(2, 5, 12)
-    for strata_of, count in ((one, 12), (x, 12), (y, 12)):
-        assert (np.sort(np.floor(strata_of * count), axis=1) == np.arange(count)).all()
+    sampler.seed(3, 12 * pixels)
+    numbers = sampling.KeyedMultijitter(mi, sampler, 12)
+    one = lambda key: np.array(numbers.next_1d(sampler, mi.UInt32(key))).reshape(pixels, 12)  # noqa: E731
+    two = lambda key: np.array(numbers.next_2d(sampler, mi.UInt32(key))).reshape(2, pixels, 12)  # noqa: E731
+    return one, two
+
+
+def test_strata_are_those_of_correlated_multi_jitter(llvm_variant):
+    """Every stratum holds one sample, of rows, columns and cells; a number depends on its key alone."""
+    one, two = multijitter(5)
+    x, y = two(8)
+    for strata_of in (one(7), x, y):
+        assert (np.sort(np.floor(strata_of * 12), axis=1) == np.arange(12)).all()
     assert (np.sort(np.floor(x * 4) * 3 + np.floor(y * 3), axis=1) == np.arange(12)).all()
-    other = np.array(numbers.one(sampler, mi.UInt32(9))).reshape(5, 12)
-    assert (np.argsort(one, axis=1) != np.argsort(other, axis=1)).any(axis=1).all()
-    assert (np.argsort(one[0]) != np.argsort(one[1])).any()
-    assert (np.array(numbers.one(sampler, mi.UInt32(7))).reshape(5, 12) == one).all()  # whatever was drawn before
+    assert (np.argsort(one(7), axis=1) != np.argsort(one(9), axis=1)).any(axis=1).all()
+    assert (np.argsort(one(7)[0]) != np.argsort(one(7)[1])).any()
+    assert (one(7) == one(7)).all()  # whatever was drawn before
 
 
 def test_rows_and_columns_are_permuted_within_their_cells(llvm_variant):
-    """Of 3 rows all 6 orders, of 4 columns the 8 that Kensler's function has; other ones for another key."""
-    sampler = mi.load_dict({"type": "independent", "sample_count": 12})
-    sampler.seed(3, 12 * 400)
-    numbers = keyed_sampler.KeyedMultijitter(mi, sampler, 12)
+    """Of 3 rows all 6 orders, of 4 columns the 8 that Kensler's function has, one independent of the other (chi-square,
+    one false alarm in 10,000 keys)."""
+    _, two = multijitter(400)
     seen = []
     for key in (8, 9):
-        x, y = np.array(numbers.two(sampler, mi.UInt32(key))).reshape(2, 400, 12)
+        x, y = two(key)
         column, row = np.floor(x * 4).astype(int), np.floor(y * 3).astype(int)
         inner_row, inner_column = np.floor(x * 12).astype(int) % 3, np.floor(y * 12).astype(int) % 4
         orders = [
             [tuple(inner[p, np.unique(outer[p], return_index=True)[1]].tolist()) for p in range(400)]
             for inner, outer in ((inner_row, row), (inner_column, column))
         ]
-        assert [len(set(each)) for each in orders] == [6, 8]
+        assert [len(set(order)) for order in orders] == [6, 8]
+        numbers = [np.unique(order, axis=0, return_inverse=True)[1].ravel() for order in orders]
+        assert chi2_contingency(np.histogram2d(*numbers, bins=(6, 8))[0]).pvalue > 1e-4
         seen.append(orders)
     assert all(one != other for one, other in zip(*seen, strict=True))
 
 
 def test_a_deterministic_image_errs_by_what_it_says_was_truncated(llvm_variant):
     """The ball from one point: no noise but the position in the pixel, which is its centre in every sample."""
-    scene = glass_ball(sky=sky(), sampler={"type": "multijitter", "jitter": False})
+    sensor = camera() | {"sampler": {"type": "multijitter", "jitter": False}}
+    scene = glass_ball(sky=sky(), sensor=sensor)
     exact, coarse = (
         render(scene, 1, deterministic=True, split_weight=weight, max_depth=64) for weight in (2.5e-4, 0.05)
     )
@@ -237,16 +181,6 @@ def test_a_deterministic_image_errs_by_what_it_says_was_truncated(llvm_variant):
     assert exact[..., 3].max() < 0.01
 
 
-def test_a_white_sky_shows_what_was_truncated(llvm_variant):
-    scene = load("slab", sampler="multijitter")
-    flat = glass_ball(sky={"type": "constant"})
-    image, truncated = np.split(render(flat, 1, 1, deterministic=True), [3], axis=2)
-    assert (image <= 1 + 1e-5).all()
-    assert (image >= 1 - 1e-5 - truncated).all()
-    assert 1e-4 < truncated.max() < 1e-2
-    assert render(scene, 1, deterministic=True).shape == (32, 32, 4)
-
-
 @pytest.mark.parametrize(
     "bsdf",
     [
@@ -257,71 +191,18 @@ def test_a_white_sky_shows_what_was_truncated(llvm_variant):
     ids=lambda bsdf: bsdf["type"],
 )
 def test_what_would_be_left_to_chance_is_refused(bsdf, llvm_variant):
-    with pytest.raises(RuntimeError) as caught:
-        render(glass_ball(sky=sky(), other={"type": "sphere", "bsdf": bsdf}), 1, deterministic=True)
-    assert "expected scenes of smooth dielectrics and conductors" in str(caught.value.__cause__)
+    scene = glass_ball(sky=sky(), other={"type": "sphere", "bsdf": bsdf})
+    assert "expected scenes of smooth dielectrics and conductors" in refusal(render, scene, 1, deterministic=True)
+
+
+def test_an_image_without_chance_is_not_differentiated(llvm_variant):
+    scene = glass_ball(sky=sky())
+    params = mi.traverse(scene)
+    dr.enable_grad(params[parameter(params, ".eta")])
+    params.update()
     method = mi.load_dict({"type": "refract_path", "max_depth": 5, "deterministic": True})
     with pytest.raises(ValueError, match="expected renders that are not differentiated"):
-        derivative(glass_ball(sky=sky()), method, "backward")
-
-
-# Derivatives ---------------------------------------------------------------------------------------------------
-
-
-def eta_of(scene):
-    parameters = mi.traverse(scene)
-    return parameters, next(key for key in [*parameters.keys()] if key.endswith(".eta"))
-
-
-def derivative(scene, method, direction):
-    parameters, key = eta_of(scene)
-    dr.enable_grad(parameters[key])
-    if direction == "forward":
-        dr.set_grad(parameters[key], 1)
-    parameters.update()
-    image = dr.mean(mi.render(scene, parameters, integrator=method, spp=256), axis=None)
-    if direction == "forward":
-        return float(dr.forward_to(image).array[0])
-    dr.backward(image)
-    return float(dr.grad(parameters[key])[0])
-
-
-def difference(scene, method, step=0.04):
-    parameters, key = eta_of(scene)
-    means = []
-    for eta in (1.5 - step, 1.5 + step):
-        parameters[key] = mi.Float(eta)
-        parameters.update()
-        means.append(np.array(mi.render(scene, integrator=method, spp=1024)).mean(dtype=float))
-    return (means[1] - means[0]) / (2 * step)
-
-
-def of_five_vertices(kind="refract_path", **parameters):
-    return mi.load_dict({"type": kind, "max_depth": 5, "rr_depth": 100} | parameters)
-
-
-def test_the_derivative_in_the_index_is_that_of_the_image(llvm_variant):
-    """Smooth light and no edges, so that nothing is discontinuous. Standard errors are below 2 % on either side."""
-
-    def by(direction, method):
-        return derivative(glass_ball(sky=sky()), method, direction)
-
-    method = of_five_vertices()
-    expected, found = difference(glass_ball(sky=sky()), method), by("backward", method)
-    assert found == pytest.approx(expected, rel=0.12)
-    assert by("forward", method) == pytest.approx(expected, rel=0.12)
-    # What would split does not where it is differentiated: the numbers are the same.
-    assert by("backward", of_five_vertices(split_depth=2)) == pytest.approx(found, rel=1e-4)
-    # `path` detaches the directions that it samples.
-    assert abs(by("forward", of_five_vertices("path")) / expected - 1) > 1
-
-
-def test_beside_what_is_not_glass_the_derivative_is_that_of_the_image_as_well(llvm_variant):
-    """As above, by the derivative whose kernel compiles the fastest."""
-    place = mi.ScalarTransform4f().translate([0, -1.2, 0]).rotate([1, 0, 0], -90).scale(4e3)
-    one, other = (glass_ball(sky=sky(), floor={"type": "rectangle", "to_world": place}) for _ in range(2))
-    found = derivative(one, of_five_vertices(), "backward")
-    assert found == pytest.approx(difference(other, of_five_vertices()), rel=0.12)
+        dr.backward(dr.mean(mi.render(scene, params, integrator=method, spp=4), axis=None))
 
 
 # What is left out, and what is refused -------------------------------------------------------------------------
@@ -349,33 +230,6 @@ def test_what_is_left_out_is_not_in_the_kernel_and_is_said(llvm_variant, monkeyp
     assert operations(scene, method) > lean + 0.6 * saved
 
 
-@pytest.mark.parametrize("split_depth", [0, 2])
-def test_a_frozen_render_follows_the_index_and_a_lamp_that_turns_grey(split_depth, llvm_variant):
-    """What is recorded must hold for any value: a lamp's black surface counts as one that may reflect."""
-    lamp = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(9)}
-    scene = glass_ball(sky=sky(), lamp=lamp | {"emitter": {"type": "area"}, "bsdf": BLACK})
-    parameters = mi.traverse(scene)
-    eta = next(key for key in [*parameters.keys()] if key.endswith(".eta"))
-    grey = next(key for key in [*parameters.keys()] if "reflectance" in key)
-    method = mi.load_dict({"type": "refract_path", "max_depth": 5, "rr_depth": 100, "split_depth": split_depth})
-
-    @dr.freeze
-    def frozen(parameters, seed):
-        return mi.render(scene, integrator=method, spp=16, seed=seed)
-
-    seed, before = dr.opaque(mi.UInt32, 3), None
-    for key, value in ((eta, 1.5), (eta, 1.3), (grey, 0.8), (eta, 1.7)):
-        parameters[key] = type(parameters[key])(value)
-        parameters.update()
-        found = np.array(frozen(parameters, seed), dtype=float)
-        # Without the recording a black lamp needs no emitter sample: other numbers, the same mean.
-        traced = render(scene, 16, 3, max_depth=5, rr_depth=100, split_depth=split_depth)
-        assert found.mean() == pytest.approx(traced.mean(), rel=0.01)
-        assert before is None or abs(found.mean() / before - 1) > 0.002
-        before = found.mean()
-    assert frozen.n_recordings <= 2
-
-
 @pytest.mark.parametrize(
     ("parameters", "said"),
     [
@@ -399,10 +253,7 @@ def test_a_frozen_render_follows_the_index_and_a_lamp_that_turns_grey(split_dept
     ids=str,
 )
 def test_what_cannot_be_is_refused_in_one_line(parameters, said, rgb_variant):
-    with pytest.raises(RuntimeError) as caught:
-        mi.load_dict({"type": "refract_path"} | parameters)
-    message = str(caught.value)
-    assert said in message
+    assert said in refusal(mi.load_dict, {"type": "refract_path"} | parameters)
 
 
 @pytest.mark.parametrize(
@@ -424,13 +275,11 @@ def test_parameters_and_their_defaults_are_written_out(parameters, written, scal
 
 
 def test_an_unknown_parameter_is_refused():
-    with pytest.raises(RuntimeError, match="unreferenced"):
-        mi.load_dict({"type": "refract_path", "max_dept": 3})
+    assert "unreferenced" in refusal(mi.load_dict, {"type": "refract_path", "max_dept": 3})
 
 
 # Where flags, tangents and seeds were taken for granted ---------------------------------------------------------
 
-GLASS = {"type": "refract", "int_ior": 1.5, "ext_ior": 1.0}
 TILT = np.array([0.5 + 0.5 * np.sin(np.radians(20)), 0.5, 0.5 + 0.5 * np.cos(np.radians(20))])
 NORMAL_MAP = {"type": "bitmap", "bitmap": mi.Bitmap(TILT.reshape(1, 1, 3).astype(np.float32)), "raw": True}
 STEPS = {"type": "bitmap", "bitmap": mi.Bitmap(np.linspace(0, 1, 16, dtype=np.float32).reshape(4, 4, 1)), "raw": True}
@@ -445,18 +294,11 @@ NOT_BOUNDARIES = {
 }
 
 
-def equal_means(theirs, ours, alpha=1e-4):
-    """Whether means of independent renders are within chance; `alpha` is the rate of false alarms."""
-    theirs, ours = (np.array(x).reshape(len(x), -1).mean(axis=1) for x in (theirs, ours))
-    deviation = np.sqrt(theirs.var(ddof=1) / len(theirs) + ours.var(ddof=1) / len(ours))
-    return abs(theirs.mean() - ours.mean()) <= t.ppf(1 - alpha / 2, len(ours) - 1) * deviation + 1e-6 * theirs.mean()
-
-
 @pytest.mark.parametrize("split_depth", [0, 1, 3])
 @pytest.mark.parametrize("name", NOT_BOUNDARIES)
 def test_glass_in_a_wrapper_is_that_of_path(name, split_depth, llvm_variant):
     """Where a wrapper chooses between two glasses, or refuses a lobe. One false alarm in 10,000 for each."""
-    oblique = mi.ScalarTransform4f().rotate([0, 1, 0], 70).scale(9)  # the camera sees the sheet from 20° above it
+    oblique = PLACE().rotate([0, 1, 0], 70).scale(9)  # the camera sees the sheet from 20° above it
     scene = glass_ball(sky=sky(), ball={"type": "rectangle", "to_world": oblique, "bsdf": NOT_BOUNDARIES[name]})
     theirs = [by_path(scene, 64, seed, rr_depth=100) for seed in range(8)]
     ours = [render(scene, 64, 100 + seed, rr_depth=100, split_depth=split_depth) for seed in range(8)]
@@ -476,13 +318,13 @@ def test_what_needs_a_tangent_has_it_in_a_scene_of_glass_only(variant, shape, bs
     """A matt ball out of sight changes nothing: with it a hit has all its parts."""
     needs_variant(variant)
     switch(variant)
-    turned = mi.ScalarTransform4f().rotate([1, 2, 0], 30)
+    turned = PLACE().rotate([1, 2, 0], 30)
     part = {"type": shape, "to_world": turned, "bsdf": bsdf}
     front = {"type": "sphere", "center": [0, 0, 2], "radius": 0.8, "bsdf": GLASS | {"int_ior": 1.01}}
     behind = {"type": "sphere", "center": [0, 0, 90], "bsdf": {"type": "diffuse"}}
     lamp = {"type": "envmap", "bitmap": mi.Bitmap(SKY)}
     if bsdf is POLARIZER:  # light that is polarised by another one behind it
-        other = mi.ScalarTransform4f().translate([0, 0, -3]).scale(3)
+        other = PLACE().translate([0, 0, -3]).scale(3)
         second = {"type": "rectangle", "to_world": other, "bsdf": POLARIZER | {"theta": 70.0}}
     else:
         second = {"type": "sphere", "center": [0, 0, -3], "bsdf": GLASS}
@@ -493,13 +335,19 @@ def test_what_needs_a_tangent_has_it_in_a_scene_of_glass_only(variant, shape, bs
     assert equal_means(beside, alone)
 
 
-@pytest.mark.parametrize("around", ["moment", "aov", "alone"])
+AROUND = {"moment": {"type": "moment"}, "aov": {"type": "aov", "aovs": "d:depth"}, "alone": {}}
+
+
+def within(around, **parameters):
+    """`refract_path`, called by another integrator or not."""
+    inner = {"type": "refract_path"} | parameters
+    return mi.load_dict(AROUND[around] | {"inner": inner} if AROUND[around] else inner)
+
+
+@pytest.mark.parametrize("around", AROUND)
 def test_other_seeds_have_other_numbers_whatever_calls(around, llvm_variant):
     """The mean of 16 images has 1/16 of the squared error of one; numbers that repeat leave most of it."""
-    scene = load("balls", 24)
-    inner = {"type": "refract_path", "max_depth": 8, "split_depth": 1}
-    more = {"moment": {}, "aov": {"aovs": "d:depth"}, "alone": {}}[around]
-    method = mi.load_dict(inner if around == "alone" else {"type": around, "inner": inner} | more)
+    scene, method = load("balls", 24), within(around, max_depth=8, split_depth=1)
     images = np.array([np.array(mi.render(scene, integrator=method, spp=4, seed=s))[..., :3] for s in range(16)])
     whole = np.mean([render(scene, 1024, 100 + seed, max_depth=8, split_depth=1) for seed in range(2)], axis=0)
     assert np.square(images.mean(axis=0) - whole).mean() < np.square(images - whole).mean() / 8
@@ -520,16 +368,15 @@ def test_passes_of_the_film_have_other_numbers(samples_per_pass, llvm_variant):
 @pytest.mark.parametrize("split_depth", [0, 1, 2])
 def test_a_lamp_behind_a_grille_is_as_bright_as_by_path(spp, split_depth, llvm_variant):
     """Numbers that leave out a part of the square leave out lamps. One false alarm in 10,000 for each case."""
-    place = mi.ScalarTransform4f
-    lattice = {"type": "bitmap", "bitmap": mi.Bitmap(np.kron(np.eye(2, dtype=np.float32), np.ones((1, 1)))[..., None])}
-    lattice |= {"raw": True, "filter_type": "nearest", "to_uv": place().scale([8, 8, 1])}
+    lattice = {"type": "bitmap", "bitmap": mi.Bitmap(np.eye(2, dtype=np.float32)[..., None])}
+    lattice |= {"raw": True, "filter_type": "nearest", "to_uv": PLACE().scale([8, 8, 1])}
     grille = {"type": "mask", "opacity": lattice, "b": {"type": "diffuse", "reflectance": 0.0}}
     parts = {
-        "floor": {"type": "rectangle", "to_world": place().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(6)},
-        "grille": {"type": "rectangle", "to_world": place().translate([0, 2, 0]).rotate([1, 0, 0], 90), "bsdf": grille},
+        "floor": {"type": "rectangle", "to_world": PLACE().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(6)},
+        "grille": {"type": "rectangle", "to_world": PLACE().translate([0, 2, 0]).rotate([1, 0, 0], 90), "bsdf": grille},
         "lamp": {
             "type": "rectangle",
-            "to_world": place().translate([0, 2.2, 0]).rotate([1, 0, 0], 90),
+            "to_world": PLACE().translate([0, 2.2, 0]).rotate([1, 0, 0], 90),
             "emitter": {"type": "area", "radiance": 5.0},
         },
     }
@@ -539,21 +386,17 @@ def test_a_lamp_behind_a_grille_is_as_bright_as_by_path(spp, split_depth, llvm_v
     assert equal_means(theirs, ours)
 
 
-@pytest.mark.parametrize("around", ["moment", "aov", "alone"])
+@pytest.mark.parametrize("around", AROUND)
 def test_an_edit_is_seen_whatever_calls(around, llvm_variant):
     """A black floor that turns grey."""
-    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -2]).scale(9), "bsdf": BLACK}
+    floor = {"type": "rectangle", "to_world": PLACE().translate([0, 0, -2]).scale(9), "bsdf": BLACK}
     scene = glass_ball(floor=floor, spot={"type": "point", "position": [0, 4, 4], "intensity": 30.0})
-    inner, more = {"type": "refract_path", "max_depth": 5}, {"aovs": "d:depth"} if around == "aov" else {}
-    method = mi.load_dict(inner if around == "alone" else {"type": around, "inner": inner} | more)
-    params = mi.traverse(scene)
-    means = []
+    method, params, means = within(around, max_depth=5), mi.traverse(scene), []
     for grey in (0.0, 0.5):
-        params[next(key for key in [*params.keys()] if "reflectance" in key)] = grey
+        params[parameter(params, "reflectance.value")] = grey
         params.update()
         means.append(np.array(mi.render(scene, integrator=method, spp=16))[..., :3].mean())
-    assert means[0] == 0
-    assert means[1] == pytest.approx(by_path(scene, 64, max_depth=5).mean(), rel=0.05)
+    assert means == [0, pytest.approx(by_path(scene, 64, max_depth=5).mean(), rel=0.05)]
 
 
 @pytest.mark.parametrize(
@@ -562,12 +405,8 @@ def test_an_edit_is_seen_whatever_calls(around, llvm_variant):
 def test_at_the_last_vertex_what_is_transparent_is_so(bsdf, rgb_variant):
     """Alpha with a `max_depth` of 1 is the opacity: 16 σ of the samples."""
     vectorised = dr.is_jit_v(mi.Float)
-    film = {"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgba", "rfilter": BOX}
-    place = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
-    sheet = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(9), "bsdf": bsdf}
-    scene = mi.load_dict(
-        {"type": "scene", "sensor": {"type": "perspective", "to_world": place, "film": film}, "sheet": sheet}
-    )
+    sheet = {"type": "rectangle", "to_world": PLACE().scale(9), "bsdf": bsdf}
+    scene = mi.load_dict({"type": "scene", "sensor": camera(8, pixel_format="rgba"), "sheet": sheet})
     spp = 64 if vectorised else 8
     alpha = render(scene, spp, max_depth=1, hide_emitters=True)[..., 3].mean()
     opacity = bsdf.get("opacity", 0.0)
@@ -576,7 +415,6 @@ def test_at_the_last_vertex_what_is_transparent_is_so(bsdf, rgb_variant):
 
 ROUGH = {
     "rough metal": ({"type": "roughconductor", "alpha": 0.15}, "alpha.value", 0.15),
-    "rougher metal": ({"type": "roughconductor", "alpha": 0.3}, "alpha.value", 0.3),
     "rough glass": ({"type": "roughdielectric", "alpha": 0.3}, "alpha.value", 0.3),
     "grey": ({"type": "diffuse", "reflectance": 0.0}, "reflectance.value", 0.0),
 }
@@ -588,10 +426,9 @@ def test_derivatives_off_the_glass_are_those_of_finite_differences(name, needs_v
     needs_variant("llvm_ad_rgb")
     switch("llvm_ad_rgb")
     bsdf, end, value = ROUGH[name]
-    sheet = {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -30).scale(3), "bsdf": bsdf}
-    place = mi.ScalarTransform4f
-    above = place().look_at([0, 3.5, 2], [0, 0, 0], [1, 0, 0]).scale(0.8)
-    below = place().look_at([0, 0.5, -4], [0, 0, 0], [1, 0, 0]).scale(0.8)
+    sheet = {"type": "rectangle", "to_world": PLACE().rotate([1, 0, 0], -30).scale(3), "bsdf": bsdf}
+    above = PLACE().look_at([0, 3.5, 2], [0, 0, 0], [1, 0, 0]).scale(0.8)
+    below = PLACE().look_at([0, 0.5, -4], [0, 0, 0], [1, 0, 0]).scale(0.8)
     light = {"type": "rectangle", "emitter": {"type": "area", "radiance": 5.0}}
     scene = glass_ball(16, ball=sheet, above=light | {"to_world": above}, below=light | {"to_world": below})
     method = mi.load_dict({"type": "refract_path", "max_depth": 4, "rr_depth": 100})

@@ -6,13 +6,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from support.glass_scenes import BLACK
 from support.variants import switch
 
 from mi_refract.plugins.scene_features import EITHER, inspect
 from validation.run.context import SCENES
 
 GLASS_ONLY = {"balls", "fibre", "furnace", "glasses64", "lightpipe", "mirage", "rainbow_drop", "slab"}
-BLACK = {"type": "diffuse", "reflectance": 0.0}
 LAMP = {"type": "rectangle", "emitter": {"type": "area"}}
 
 
@@ -168,44 +168,6 @@ def test_the_scenes(variant, needs_variant):
     assert {name for name, needs in found.items() if needs.only_glass} == GLASS_ONLY
     assert {name for name, needs in found.items() if not needs.environment} == {"fibre", "mirage"}
     assert all(needs.polarising and not needs.unknown for needs in found.values())
-
-
-def met(scene, rays=512, depth=12):
-    """What paths from the camera meet with a weight, by the BSDFs' own samples and not by what they declare."""
-    rng, context, found = np.random.default_rng(3), mi.BSDFContext(), set()
-    for _ in range(rays):
-        ray, _ = scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(rng.random(2)), mi.Point2f(0.5))
-        for _ in range(depth):
-            si = scene.ray_intersect(ray)
-            if not si.is_valid():
-                found |= {"environment"} if scene.environment() else set()
-                break
-            found |= {"area"} if si.shape.is_emitter() else set()
-            sample, weight = si.bsdf().sample(context, si, rng.random(), mi.Point2f(rng.random(2)))
-            if not np.any(np.array(weight)):
-                break
-            found |= {"smooth"} if mi.has_flag(sample.sampled_type, mi.BSDFFlags.Smooth) else set()
-            ray = si.spawn_ray(si.to_world(sample.wo))
-    return found
-
-
-def unseen(needs, seen):
-    """What was met though the scene does not need it."""
-    return {name for name in seen if not getattr(needs, name)}
-
-
-@pytest.mark.parametrize("name", sorted(path.stem for path in SCENES.glob("*.xml")))
-def test_no_path_meets_what_the_scene_does_not_need(name, scalar_variant):
-    scene = mi.load_file(str(SCENES / f"{name}.xml"), res=4)
-    needs = inspect(scene)
-    if needs.absorbing:
-        with pytest.raises(RuntimeError, match="expected the integrator refract_path, or no absorption"):
-            met(scene)
-        return
-    seen = met(scene)
-    assert unseen(needs, seen) == set()
-    wrong = dataclasses.replace(needs, smooth=False, area=False, environment=False)
-    assert seen and unseen(wrong, seen) == seen
 
 
 def test_what_is_left_out_has_its_reason(scalar_variant):

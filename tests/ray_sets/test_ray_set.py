@@ -1,17 +1,20 @@
-"""Ray sets: exact, replayable, and an error for what is no set."""
+"""Ray sets: exact, replayable, and an error for what is no set. The room's README: its program is right."""
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
+from support.ray_programs import BAD
+from support.readme import python_blocks
 
 from mi_refract import regimes
 from mi_refract.numerics import float_expansions
-from mi_refract.ray_sets import ray_set
+from mi_refract.ray_sets import check_answers, ray_set, run_program
 
-
-def bits(found):
-    return [getattr(found.rays, name).tobytes() for name in "ank"]
+README = Path(ray_set.__file__).with_name("README.md")
 
 
 def test_the_rays_are_the_regimes_own():
@@ -28,8 +31,7 @@ def test_normals_face_the_ray(precision):
     names = ("generic", "grazing", "on a denormal", "tangential")
     either, facing = (ray_set.make(names, 200, precision, two_sided=t).rays for t in (True, False))
     side = [float_expansions.dot(r.n.T.astype(float), r.a.T.astype(float))[0] for r in (either, facing)]
-    assert (side[0] > 0).any()
-    assert (side[1] <= 0).all()
+    assert (side[0] > 0).any() and (side[1] <= 0).all()
     np.testing.assert_array_equal(np.abs(facing.n), np.abs(either.n))
     np.testing.assert_array_equal(facing.a, either.a)
 
@@ -48,3 +50,15 @@ def test_normals_face_the_ray(precision):
 def test_invalid_sets(given, message):
     with pytest.raises(ValueError, match=message):
         ray_set.make(**given)
+
+
+def test_the_program_in_the_readme_is_right(tmp_path):
+    (tmp_path / "my_tracer.py").write_text(python_blocks(README)[0])
+    rays = ray_set.make(count=50)
+    answers = run_program.answers_of([sys.executable, str(tmp_path / "my_tracer.py")], rays)
+    assert check_answers.check(rays, answers).exit_code == 0
+
+
+@pytest.mark.parametrize("mistake", [*BAD, "f32 where f64 was claimed", "too few digits"])
+def test_every_mistake_is_in_the_table_of_the_readme(mistake):
+    assert f"| {mistake} |" in README.read_text()

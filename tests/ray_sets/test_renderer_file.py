@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.readme import python_blocks
 
 from mi_refract.ray_sets import ray_set, renderer_file
 
@@ -66,8 +67,8 @@ deviation = {{ prism = "no dispersion" }}
 """
     found = renderer_file.load(folder(text))
     (call,) = found.rays
-    assert (found.name, found.title, found.licence, call.tir, call.gives_up) == ("mine", "T", "L", "nan", 1e-6)
-    assert call.recorded == {"random": (1e-6, 1e-6), "near-critical": (1e-4, 2e-4)}
+    assert (found.title, found.licence, call.tir, call.gives_up) == ("T", "L", "nan", 1e-6)
+    assert [call.recorded_range(x) for x in ("random", "near-critical", "x")] == [(1e-6, 1e-6), (1e-4, 2e-4), None]
     assert call.deviations == {"random": "rounds η"}
     assert found.images.spp == {"sphere": 64} and found.images.deviations == {"prism": "no dispersion"}
     words = renderer_file.filled(found.images.command, scene="/s", spp=4, seed=1, image="i.exr")
@@ -77,19 +78,26 @@ deviation = {{ prism = "no dispersion" }}
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "title: missing"),
-        ('title = "T"\n', "rays: missing; expected [[rays]], [images] or both"),
-        (f'title = "T"\n{RAYS}speed = 3\n', "rays[0].speed: unknown"),
-        (f'title = "T"\n{RAYS.replace("f32", "f16")}', "rays[0].precision: 'f16'"),
-        (f'title = "T"\n{RAYS}{RAYS}', "rays: 'r, f32' is there twice"),
-        (f'title = "T"\n{RAYS.replace("./r", "{rays}")}', "command: {rays}: 'rays'; expected {python}"),
-        (f'title = "T"\n{RAYS}gives_up = -1\n', "rays[0].gives_up: -1"),
-        (
-            f'title = "T"\n{RAYS}recorded = {{ random = [2, 1] }}\n',
-            "rays[0].recorded.random: [2, 1]; expected a number",
+        ("", "object missing required field `title`"),
+        ('title = "T"\n', "no [[rays]] and no [images]; expected one of them"),
+        (f'title = "T"\n{RAYS}speed = 3\n', "rays[0]: object contains unknown field `speed`"),
+        (f'title = "T"\n{RAYS.replace("f32", "f16")}', "rays[0].precision: invalid enum value 'f16'"),
+        (f'title = "T"\n{RAYS}{RAYS}', "rays: two functions have the title 'r, f32'"),
+        (f'title = "T"\n{RAYS.replace("./r", "{rays}")}', "rays[0]: command: {rays}: 'rays'; expected {python}"),
+        (f'title = "T"\n{RAYS}gives_up = -1\n', "rays[0].gives_up: expected `float` >= 0"),
+        *(
+            (f'title = "T"\n{RAYS}recorded = {{ random = {x} }}\n', f"random: {x}; expected a number above 0")
+            for x in ("[2.0, 1.0]", "[1.0]", "-1.0", "0.0")
         ),
-        (f'title = "T"\n{RAYS}[[rays.deviation]]\nregime = "x"\n', "rays[0].deviation[0].reason: missing"),
-        ('title = "T"\n[images]\nexport = "json"\ncommand = ["x"]\nspp = { a = 0 }\n', "images.spp.a: 0; expected"),
+        (f'title = "T"\n{RAYS}recorded = {{ random = nan }}\n', "rays[0].recorded.random: expected a finite number"),
+        (
+            f'title = "T"\n{RAYS}[[rays.deviation]]\nregime = "x"\n',
+            "deviation[0]: object missing required field `reason`",
+        ),
+        (
+            'title = "T"\n[images]\nexport = "json"\ncommand = ["x"]\nspp = { a = 0 }\n',
+            "images.spp[...]: expected `int` >= 1",
+        ),
         ("title = ", "Invalid value"),
         ("x = " + "[" * 100_000, "brackets nested too deeply"),
     ],
@@ -114,14 +122,46 @@ def test_options_that_contradict_a_renderer(folder, run, options, said):
     assert status == 2 and said in err and err.count("\n") == 1
 
 
-def test_a_known_deviation_is_named_and_excuses_nothing(folder, run):
-    call = RAYS.replace('["./r"]', '["cat", "/dev/null"]')
-    where = folder(f'title = "T"\n{RAYS.replace("./r", "false")}')
-    assert run("rays", "run", "--renderer", where, "--count", 5)[0] == 2
-    program = (
-        "import sys; print('id,bx,by,bz'); [print(f'{r.split(\",\")[0]},0,0,1') for r in sys.stdin if r[0].isdigit()]"
+PROGRAM = python_blocks(README)[0]
+INVERTED = PROGRAM.replace("rows[:, 7:8] / rows[:, 8:9]", "rows[:, 8:9] / rows[:, 7:8]")
+
+
+@pytest.fixture
+def renderer(folder):
+    """`renderer("right", "wrong")`: a folder with these functions; `signal` is what each declares."""
+
+    def made(*programs, signal="auto"):
+        text = "title = 'T'\n"
+        for i, name in enumerate(programs):
+            text += f"[[rays]]\ntitle = 'function {i}'\nprecision = 'f32'\ncommand = ['{{python}}', '{name}.py']\n"
+            text += f"total_internal_reflection = '{signal}'\n"
+            text += "[[rays.deviation]]\nregime = 'critical'\nreason = 'inverts k'\n" * (name == "wrong")
+        where = folder(text)
+        (where / "right.py").write_text(PROGRAM)
+        (where / "wrong.py").write_text(INVERTED)
+        return "rays", "run", "--renderer", where, "--regime", "critical", "--count", 20
+
+    return made
+
+
+@pytest.mark.parametrize("programs", [("right", "right"), ("wrong", "right"), ("right", "wrong")])
+def test_one_wrong_function_of_a_renderer_is_enough_and_a_known_deviation_excuses_nothing(renderer, run, programs):
+    status, out, _ = run(*renderer(*programs))
+    assert status == programs.count("wrong") == out.count("answers are wrong"), out
+    assert ("known deviation of function" in out and ": critical: inverts k" in out) == bool(status)
+
+
+@pytest.mark.parametrize(
+    ("signal", "option", "expected"), [("zero", (), 0), ("auto", (), 0), ("nan", (), 1), ("nan", ("--tir", "zero"), 0)]
+)
+def test_the_declared_signal_of_total_internal_reflection_is_that_of_the_check(renderer, run, signal, option, expected):
+    """The function answers zeros. An option goes before the declaration."""
+    status, out, _ = run(*renderer("right", signal=signal), *option)
+    assert status == expected, out
+    assert ("zero vector, which is not the signal" in out) == bool(expected)
+
+
+def test_a_function_that_fails_is_an_error(folder, run):
+    assert (
+        run("rays", "run", "--renderer", folder(f'title = "T"\n{RAYS.replace("./r", "false")}'), "--count", 5)[0] == 2
     )
-    call = RAYS.replace('["./r"]', f"['{{python}}', '-c', '''{program.replace('{', '{{').replace('}', '}}')}''']")
-    where = folder(f'title = "T"\n{call}[[rays.deviation]]\nregime = "generic"\nreason = "always along z"\n')
-    status, out, _ = run("rays", "run", "--renderer", where, "--regime", "generic", "--count", 20)
-    assert status == 1 and "known of r: generic: always along z" in out

@@ -1,8 +1,10 @@
-"""The reports of a check: JSON, JUnit and the HTML page."""
+"""The reports of a check: the sentence for every kind of result, JSON, JUnit and the HTML page."""
 
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import replace
 from html.parser import HTMLParser
 from xml.etree import ElementTree
 
@@ -12,7 +14,85 @@ from support.browser import browse, needs_chromium
 from support.ray_programs import glsl
 
 from mi_refract.ray_sets import check_answers, ray_set, reports
+from mi_refract.ray_sets.check_answers import Findings, Problem, RegimeErrors
+from mi_refract.ray_sets.diagnosis import Explanation
 from mi_refract.ray_sets.ray_set import Answers
+from mi_refract.ray_sets.tir_signal import NONE, UNCLEAR
+
+ERRORS = ("p99", "mean", "length_error", "error_over_bound", "backward_median", "backward_p99", "backward_worst")
+MISSING = Problem("missing", 3, "ids 1, 5, 8")
+CERTAIN = Explanation("eta inverted", "k was n_to / n_from", 0.97, 1e-3, True)
+LIKELY, NEVER = (Explanation("handedness", f"text {share}", share, math.nan, False) for share in (0.25, 0.0))
+
+
+def regime(name="generic", worst=2e-7, **changes):
+    counts = {"rays": 10, "compared": 9, "judged": 9, "wrong": 0, "right": 8, "exact": 4, "undecidable": 0}
+    counts |= {"tir_misclassified": 0, "tir_beyond_bound": 0} | changes
+    return RegimeErrors(name, worst=worst, **dict.fromkeys(ERRORS, 0.0), **counts, replay={})
+
+
+def found(*regimes, problems=(), explanations=(), tir="zero", tir_given=False):
+    return Findings("f32", 2.0**-23, "decomposed", tir, tir_given, regimes, problems, explanations, {})
+
+
+LARGEST = "the largest error is 3e-7 rad (critical)"
+OTHERS = "the others are within the error bound of the formula decomposed"
+SOME_RIGHT = f"16 of 20 answers are right, {OTHERS}; {LARGEST}"
+TWO = regime(), regime("critical", 3e-7)
+MISMATCH = "10 answers, but they do not match the rays"
+NONE_OF_THEM = "none of the usual mistakes explains the answers"
+LINE = "eta inverted: k was n_to / n_from (97.0% of the answers on which it has an effect)"
+NEAREST = "handedness: text 0.25 (25.0% of the answers on which it has an effect)"
+
+
+@pytest.mark.parametrize(
+    ("result", "code", "said"),
+    [
+        (found(), 2, "no ray was answered"),
+        (found(*TWO), 0, SOME_RIGHT),
+        (found(*TWO, regime("k", math.nan, rays=0, compared=0, judged=0, right=0)), 0, SOME_RIGHT),
+        (found(*(replace(x, right=10) for x in TWO)), 0, f"20 answers, all right; {LARGEST}"),
+        (found(regime(undecidable=2), TWO[1]), 0, f"{SOME_RIGHT}; 2 rays are undecidable (error bound above 0.1 rad)"),
+        (found(regime(exact=10)), 0, "10 answers, all exact up to rounding"),
+        (found(regime(wrong=2)), 1, "2 of 10 answers are wrong"),
+        (found(regime(), tir=UNCLEAR), 1, "0 of 10 answers are wrong"),
+        (found(regime(wrong=2), explanations=(LIKELY, CERTAIN)), 1, "2 of 10 answers are wrong: eta inverted"),
+        (found(regime(wrong=2), explanations=(CERTAIN, CERTAIN)), 1, "2 of 10 answers are wrong"),
+        (found(regime(), problems=(MISSING,)), 2, MISMATCH),
+        (found(regime(wrong=2), problems=(MISSING,)), 2, f"{MISMATCH}; 2 of them are wrong"),
+        (found(regime(judged=0)), 1, "10 answers, none of them a decidable direction"),
+        (found(regime(compared=0, judged=0)), 1, "10 answers, none of them a direction"),
+    ],
+)  # fmt: skip
+def test_the_sentence(result, code, said):
+    assert (result.exit_code, reports.sentence(result)) == (code, said)
+
+
+@pytest.mark.parametrize(
+    ("result", "lines"),
+    [
+        (found(regime()), []),
+        (found(regime(wrong=1), explanations=(NEVER, CERTAIN)), [LINE]),
+        (found(regime(wrong=1), explanations=(NEVER, LIKELY)), [NONE_OF_THEM, NEAREST]),
+        (found(regime(wrong=1), explanations=(NEVER,)), [NONE_OF_THEM]),
+        (found(regime(wrong=1), explanations=(LIKELY,), problems=(MISSING,)), []),
+        (found(regime(wrong=1), explanations=(CERTAIN,), problems=(MISSING,)), [LINE]),
+    ],
+)
+def test_the_explanations(result, lines):
+    assert reports.explained(result) == lines
+
+
+def test_a_problem_a_signal_and_a_grade():
+    assert reports.problem_text(MISSING) == "3 without an answer: ids 1, 5, 8"
+    cases = [(tir, declared) for tir in ("zero", NONE, UNCLEAR) for declared in (False, True)]
+    signals = [reports.signal(found(tir=tir, tir_given=declared)) for tir, declared in cases]
+    assert [text.endswith(" (detected)") for text in signals] == [True] + [False] * 5
+    assert signals[1] == "total internal reflection is signalled by the zero vector"
+    grades = [
+        reports.grade(regime(**x)) for x in ({}, {"right": 10}, {"right": 10, "exact": 10}, {"wrong": 1, "right": 10})
+    ]
+    assert grades == ["within bound", "right", "exact", "wrong"]
 
 
 @pytest.fixture(scope="module")
@@ -25,22 +105,21 @@ def findings():
     return {"right": right, "wrong": check_answers.check(to, Answers(to.ids[:-2], wrong[:-2]))}
 
 
-@pytest.mark.parametrize("name", ["right", "wrong"])
-def test_json(tmp_path, findings, name):
-    found = findings[name]
-    reports.write_json(tmp_path / "out.json", found)
+@pytest.mark.parametrize("name, code, diagnosis", [("right", 0, None), ("wrong", 2, "eta inverted")])
+def test_json(tmp_path, findings, name, code, diagnosis):
+    result = findings[name]
+    reports.write_json(tmp_path / "out.json", result)
 
     def refuse(word):
         raise AssertionError(word)
 
     data = json.loads((tmp_path / "out.json").read_text(), parse_constant=refuse)
-    assert data["schema"] == 1  # which its readers ask for
-    assert data["exit_code"] == found.exit_code == {"right": 0, "wrong": 2}[name]
-    assert data["diagnosis"] == {"right": None, "wrong": "eta inverted"}[name]
-    assert data["rays"]["checksum"] == found.header["checksum"]
-    assert data["wrong"] == sum(each["wrong"] for each in data["regimes"])
-    assert data["regimes"][0]["worst_ulps"] == found.regimes[0].worst * 2**23
-    assert data["total_internal_reflection"] == {"signal": found.tir, "detected": True}
+    assert data["schema"] == 1
+    assert (data["exit_code"], data["diagnosis"]) == (result.exit_code, data["diagnosis"]) == (code, diagnosis)
+    assert data["rays"]["checksum"] == result.header["checksum"]
+    assert data["wrong"] == sum(x["wrong"] for x in data["regimes"])
+    assert data["regimes"][0]["worst_ulps"] == result.regimes[0].worst * 2**23
+    assert data["total_internal_reflection"] == {"signal": result.tir, "detected": True}
 
 
 @pytest.mark.parametrize("name, failures, errors", [("right", 0, 0), ("wrong", 3, 1)])
@@ -48,16 +127,10 @@ def test_junit(tmp_path, findings, name, failures, errors):
     reports.write_junit(tmp_path / "out.xml", findings[name], "a & b \x1b[31m <program>")
     root = ElementTree.parse(tmp_path / "out.xml").getroot()
     for element in (root, root[0]):
-        assert {key: int(element.get(key)) for key in ("tests", "failures", "errors")} == {
-            "tests": 4,
-            "failures": failures,
-            "errors": errors,
-        }
+        assert [int(element.get(key)) for key in ("tests", "failures", "errors")] == [4, failures, errors]
     assert root[0].get("name") == "a & b \ufffd[31m <program>"
     assert [case.get("name") for case in root[0]][1:] == ["generic", "k ≫ 1", "critical"]
-    assert len(root.findall(".//failure")) == failures
-    for failure in root.findall(".//failure"):
-        assert "eta inverted" in failure.text
+    assert ["eta inverted" in failure.text for failure in root.findall(".//failure")] == [True] * failures
 
 
 class Page(HTMLParser):
@@ -79,18 +152,17 @@ class Page(HTMLParser):
 
 @pytest.mark.parametrize("name", ["right", "wrong"])
 def test_the_page_stands_alone(tmp_path, findings, name):
-    found = findings[name]
-    told = "<script>alert(1)</script> & \x1b"
-    reports.write_html(tmp_path / "out.html", found, {"answers": told}, f"mi-refract rays run -- {told}")
+    hostile = "<script>alert(1)</script> & \x1b"
+    reports.write_html(tmp_path / "out.html", findings[name], {"answers": hostile}, f"mi-refract rays run -- {hostile}")
     text = (tmp_path / "out.html").read_text()
     page = Page(text)
     assert not page.open
     assert all(link.startswith("#") for link in page.links)
     assert "<script>alert" not in text
-    assert reports.sentence(found) in text
+    assert reports.sentence(findings[name]) in text
     assert text.count('<tr class="replay">') == 3
-    assert ("Diagnosis" in text) == ("2 without an answer" in text) == (name == "wrong")
-    assert ("eta inverted" in text) == (name == "wrong")
+    for words in ("Diagnosis", "2 without an answer", "eta inverted"):
+        assert (words in text) == (name == "wrong")
 
 
 @needs_chromium

@@ -10,19 +10,16 @@ from mi_refract.ray_sets import tir_signal
 from mi_refract.ray_sets.tir_signal import SeenAnswers
 from mi_refract.regimes import Rays
 
-U = 2.0**-53
 K = 1.4
 
 
-def rays(radicands):
-    """In float64, totally reflected: 1 − k² sin² θ is each of these."""
+def seen(radicands, b=None):
+    """Answers to rays in float64: 1 − k² sin² θ is each of the radicands, negative under total internal reflection."""
     sin = np.sqrt(1 - np.asarray(radicands)) / K
     a = np.stack([sin, 0 * sin, -np.sqrt(1 - sin**2)], 1)
-    return Rays(a, np.tile([0.0, 0.0, 1.0], (len(sin), 1)), np.full(len(sin), K))
-
-
-def seen(given, b):
-    return SeenAnswers(b, given, oracle.refract(given.a, given.n, given.k, fresnel=False, progress=False), U)
+    rays = Rays(a, np.tile([0.0, 0.0, 1.0], (len(sin), 1)), np.full(len(sin), K))
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    return SeenAnswers(a if b is None else np.array(b), rays, exact, 2.0**-53)
 
 
 ZERO, ALONG = [0.0, 0, 0], [1.0, 0, 0]
@@ -40,19 +37,14 @@ ZERO, ALONG = [0.0, 0, 0], [1.0, 0, 0]
 )
 @pytest.mark.parametrize("size", [3, 10])
 def test_the_signal_that_most_rays_agree_on(radicands, b, signal, size):
-    given = rays(radicands)
-    pieces = [seen(given[i : i + size], np.array(b)[i : i + size]) for i in range(0, 10, size)]
-    assert tir_signal.detect(pieces) == signal
+    assert tir_signal.detect(seen(radicands[i : i + size], b[i : i + size]) for i in range(0, 10, size)) == signal
 
 
-def test_a_mirror_direction_is_one_at_any_length():
-    """Of transmitted rays the answer is along the refracted direction, and both are three times as long as asked."""
-    given = rays([-0.5, -0.2, 0.3, 0.6])
-    exact = oracle.refract(given.a, given.n, given.k, fresnel=False, progress=False)
-    mirror = given.a * [1, 1, -1]
-    for length in (1 / 3, 1.0, 3.0):
-        b = length * np.where(exact.transmitted[:, None], exact.direction, mirror)
-        assert (
-            tir_signal.reflected(seen(given, b), None, "reflected", np.ones(4, bool)).tolist()
-            == [True] * 2 + [False] * 2
-        )
+@pytest.mark.parametrize("length", [1 / 3, 1.0, 3.0])
+def test_a_mirror_direction_is_one_at_any_length(length):
+    """Also of transmitted rays the answer is along the refracted direction at any length."""
+    answers = seen([-0.5, -0.2, 0.3, 0.6])
+    exact = answers.exact
+    b = length * np.where(exact.transmitted[:, None], exact.direction, answers.rays.a * [1, 1, -1])
+    called = tir_signal.reflected(seen([-0.5, -0.2, 0.3, 0.6], b), None, "reflected", np.ones(4, bool))
+    assert called.tolist() == [True] * 2 + [False] * 2

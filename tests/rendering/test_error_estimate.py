@@ -107,6 +107,17 @@ def test_the_estimate_without_its_interval_would_not_do():
     assert count_beyond("rare", lambda sums: relative_error(sums).value) > MOST
 
 
+# Student's t at 97.5 %, of 1 to 3 degrees of freedom (tables).
+@pytest.mark.parametrize("contrasts, t", [([1.0, 3.0], 12.7062), ([4.0, 5.0, 6.0], 4.30265), ([1, 2, 3, 2], 3.18245)])
+def test_the_interval_is_that_of_one_more_contrast(contrasts, t):
+    """s² ± t s_c √(1 + 1/m), as the root of s²/n over the mean."""
+    sums = PassSums(100, len(contrasts) + 1, np.full(SIZE, 200.0), np.zeros(SIZE), contrasts=contrasts)
+    squared, half = np.mean(contrasts), t * np.std(contrasts, ddof=1) * math.sqrt(1 + 1 / len(contrasts))
+    found = relative_error(sums)
+    expected = [math.sqrt(max(x, 0) / 100) / 2 for x in (squared, squared - half, squared + half)]
+    assert [found.value, found.low, found.high] == pytest.approx(expected, rel=1e-3)  # t has six digits
+
+
 def test_little_is_known_of_one_pass_or_of_black():
     assert math.isnan(relative_error(leaf(np.ones(SIZE))).value)
     assert math.isnan(relative_error(sums_of("normal", np.zeros(SIZE), 9)).value)
@@ -126,21 +137,21 @@ def test_pixels_that_are_not_finite_are_left_out():
     assert worst_tile(tree.sums()) == pytest.approx(1 / math.sqrt(128), rel=0.2)
 
 
-def test_the_worst_tile_but_one_in_a_hundred():
-    truth, tree = np.ones((16 * 12, 16 * 12, 1)), PassTree()
-    noise = np.full_like(truth, 0.1)
-    noise[:16, :16], noise[16:32, :32] = 5, 1  # of 144 tiles one with five times the noise, and two
+@pytest.mark.parametrize(
+    ("side", "truth", "noise", "expected"),
+    [
+        (192, 1.0, {(16, 16): 5, (32, 32): 1}, 1 / 4),  # of 144 tiles one has 5 in place of 0.1, and three have 1
+        (64, 0.0, {}, 0.01 / 4),  # a dark tile is judged as if it had 1 % of the mean
+    ],
+)
+def test_the_worst_tile_but_one_in_a_hundred(side, truth, noise, expected):
+    image, deviation, tree = np.ones((side, side, 1)), np.full((side, side, 1), 0.1 if noise else 1e-4), PassTree()
+    image[:16, :16] = truth
+    for (height, width), value in reversed(noise.items()):
+        deviation[:height, :width] = value
     for _ in range(16):
-        tree.add(leaf(RNG.normal(truth, noise)))
-    assert worst_tile(tree.sums()) == pytest.approx(1 / 4, rel=0.1)
-
-
-def test_a_dark_tile_is_judged_as_one_of_a_hundredth():
-    truth, tree = np.ones((64, 64, 1)), PassTree()
-    truth[:16, :16] = 0
-    for _ in range(16):
-        tree.add(leaf(RNG.normal(truth, 0.04 * 0.01)))
-    assert worst_tile(tree.sums()) == pytest.approx(0.01, rel=0.1)
+        tree.add(leaf(RNG.normal(image, deviation)))
+    assert worst_tile(tree.sums()) == pytest.approx(expected, rel=0.1)
 
 
 def test_without_scipy_there_is_no_interval(monkeypatch):

@@ -48,7 +48,7 @@ def findings():
 
 
 FORMS = {
-    "terminal": lambda results, path: printed(text_reports.table(results)),
+    "terminal": lambda results, path: text_reports.plain(text_reports.table(results)),
     "GitHub": lambda results, path: "\n".join(
         line.replace("::", "", 1) for line in text_reports.workflow_commands(results)
     ),

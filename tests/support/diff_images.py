@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import OpenImageIO as oiio
 
-from mi_refract.io.image_file import write_exr
+from mi_refract.io.image_file import Image, write_exr
 
 SIZE = (32, 48, 3)
+
+
+def of(pixels, channels=None, **rest):
+    """An image in memory, of R, G, B, or of Y where there is one channel."""
+    pixels = np.asarray(pixels, np.float32)
+    names = ("Y",) if pixels.shape[-1] == 1 else tuple("RGBA"[: pixels.shape[-1]])
+    return Image(Path("a.exr"), pixels, channels or names, **rest)
+
+
+def metric(found, begin):
+    """The value of the metric whose name begins so."""
+    return next(each.value for each in found.metrics if each.name.startswith(begin))
 
 
 def image(path, seed=0, *, gain=1.0, noise=0.0, shape=SIZE, value=None, channels=("R", "G", "B")):

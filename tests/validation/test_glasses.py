@@ -94,7 +94,7 @@ def test_a_glass_that_is_not_answered_fails():
 
 
 def test_another_signal_of_total_reflection_is_seen():
-    assert failing(rows(told="nan")) == {"critical": {"told otherwise"}}
+    assert failing(rows(told="nan")) == {"critical": {"other TIR signal"}}
 
 
 # In a process ----------------------------------------------------------------------------------------------------

@@ -3,9 +3,9 @@
 import pytest
 
 from mi_refract import backend
-from mi_refract.plugins.path_loop import Trace
+from mi_refract.plugins import path_loop
+from validation.renders import gradients
 from validation.run.context import PROFILES, Context
-from validation.stability import gradients
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def test_a_direction_that_stays_attached_is_seen(context, monkeypatch):
     (sound,) = gradients.rows(context, metal)
     assert sound.verdict == "pass"
     assert sound.values["detectable"] < 0.05
-    monkeypatch.setattr(Trace, "_at_fixed_direction", lambda self, si, bsdf, bs, weight, d, active: (weight, d, bs.pdf))
+    monkeypatch.setattr(path_loop, "at_fixed_direction", lambda v, context, si, bsdf, bs, w, d, active: (w, d, bs.pdf))
     (attached,) = gradients.rows(context, metal)
     assert "z" in attached.broken and attached.values["off"] > 0.05
     (through,) = gradients.rows(context, glass)

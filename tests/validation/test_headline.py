@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 
 import pytest
 
@@ -94,6 +95,8 @@ def test_what_is_said_and_what_is_not(rows, question, state, present, absent):
     assert answer["state"] == state, answer
     assert [words for words in present if words not in answer["text"]] == [], answer["text"]
     assert [words for words in absent if words in answer["text"]] == [], answer["text"]
+    for text in (answer["text"] for answer in answers(*rows)):
+        assert not re.search(r"[a-z][.,;:][A-Za-z]| [.,;:]|  ", text), text
 
 
 def test_what_was_not_run_is_counted_by_what_would_make_it_run():

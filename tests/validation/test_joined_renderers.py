@@ -105,7 +105,10 @@ def test_its_images_are_compared(joined, context, monkeypatch, needs_variant):
         (TOML + IMAGES.replace("mitsuba", "vray"), "images.export: 'vray'; expected "),
         (TOML + IMAGES.replace("sphere", "teapot"), "images.spp, images.deviation: 'teapot'; expected sphere"),
         (TOML.replace("program.py", "{nothing}"), "command: {python} {nothing}: 'nothing'; expected {python}"),
-        (TOML + "[install]\ncargo = ['x']\n", "install: object contains unknown field `cargo`"),
+        (
+            TOML + "[install]\nmegabytes = 1\npip = ['x']\ncargo = ['x']\n",
+            "install: unknown key `cargo`; expected megabytes",
+        ),
     ],
 )
 def test_what_cannot_join_is_misuse_in_a_line(tmp_path, capsys, toml, said):

@@ -65,7 +65,7 @@ def test_an_inconclusive_image_is_no_equal_one():
     found = matrix_page.matrix(rows)["images"]
     assert [(each["system"], each["wrong"]) for each in found] == [("A", False), ("B", False), ("C", True)]
     assert [each["sentence"].partition(":")[0] for each in found][1:] == ["inconclusive", "different"]
-    assert matrix_page._picture(found[1]["scenes"]["sphere"])[1] != "pass"
+    assert matrix_page.scene_cell(found[1]["scenes"]["sphere"])[1] != "pass"
 
 
 @pytest.fixture
@@ -88,7 +88,11 @@ def test_the_command_writes_both(folder):
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [(None, "no such file"), ("{", "holds no rows"), ('{"rows": [{"study": "other"}]}', "no system was asked")],
+    [
+        (None, "no such file"),
+        ("{", "no rows of a validation"),
+        ('{"rows": [{"study": "other"}]}', "no rows of other systems"),
+    ],
 )
 def test_without_rows_there_is_no_page(tmp_path, capsys, content, said):
     if content:

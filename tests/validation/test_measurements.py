@@ -10,7 +10,7 @@ from mi_refract import FORMULAS, oracle, regimes
 from mi_refract.accuracy import errors
 from mi_refract.plugins import refract as bsdf
 from validation import limits
-from validation.directions import bsdf_samples, keep_worst, per_formula
+from validation.directions import bsdf_samples, per_formula
 from validation.renders import against_dielectric, colours, scene_needs
 from validation.run import array_settings as settings
 from validation.run import render_methods
@@ -172,10 +172,3 @@ def test_a_scene_is_loaded_in_the_same_order_every_time(context):
     scenes = [render_methods.opened(SCENES / "diamond.xml", "dielectric", 8) for _ in range(12)]
     images = [render_methods.Camera(scene)(1, seed=0)[0] for scene in scenes]
     assert all((image == images[0]).all() for image in images)
-
-
-def test_keeping_the_worst_rays_refuses_what_is_no_formula(capsys):
-    assert keep_worst.main(["promoted", "nope"]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("validation.directions.keep_worst: unknown formula 'nope'; expected ")
-    assert len(error.splitlines()) == 1

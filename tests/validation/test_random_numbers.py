@@ -2,14 +2,14 @@
 
 import pytest
 
-from mi_refract.plugins.keyed_sampler import KeyedMultijitter
+from mi_refract.plugins.sampling import KeyedMultijitter
 from validation.renders import random_numbers
 
 
 class OneSeed(KeyedMultijitter):
     """Rows and columns are permuted by the seed of the cells, changed by constants: as this package once did."""
 
-    def two(self, sampler, key):
+    def next_2d(self, sampler, key):
         v, (permutation, noise) = self.v, self.v.sample_tea_32(self.pixel, key)
         cell = v.permute_kensler(self.index, self.count, permutation)
         row = cell // self.columns
@@ -24,7 +24,7 @@ class OneSeed(KeyedMultijitter):
 class Unpermuted(KeyedMultijitter):
     """The samples of a pixel in the same order in every dimension."""
 
-    def one(self, sampler, key):
+    def next_1d(self, sampler, key):
         noise = self._unit(self.v.sample_tea_32(self.lane, key)[0])
         return self._placed(self.v.Float(self.index), noise, self.count)
 

@@ -33,7 +33,8 @@ from validation.suite.renderers.system import (
 )
 
 # The figures of those who write down GLSL's formula.
-RECORDED_F64 = next(call.recorded for call in SYSTEMS["pyglm"].calls if call.precision == "f64")
+PYGLM = next(call for call in SYSTEMS["pyglm"].calls if call.precision == "f64")
+RECORDED_F64 = {name: list(PYGLM.recorded_range(name)) for name in PYGLM.recorded}
 STANDARD, FULL = (SimpleNamespace(profile=SimpleNamespace(name=name)) for name in ("standard", "full"))
 # What every program below does right unless `{defect}` says otherwise.
 PROGRAM = f"""
@@ -60,7 +61,7 @@ DEFECTS = {
     "an id missing": ("", "rays.ids, b = rays.ids[1:], b[1:]", "unfit"),
     "an id twice": ("", "rays.ids, b = rays.ids[:1] + rays.ids, np.vstack([b[:1], b])", "unfit"),
     "an id of nobody": ("", "rays.ids, b = rays.ids + ('9999',), np.vstack([b, b[:1]])", "unfit"),
-    "told by NaN": ("", "b = np.where(d < 0, np.nan, b)", "told otherwise"),
+    "told by NaN": ("", "b = np.where(d < 0, np.nan, b)", "other TIR signal"),
     "exception": ("raise RuntimeError('out of glass')", "", "unanswered"),
     "killed": ("os.kill(os.getpid(), 9)", "", "unanswered"),
     "hangs": ("time.sleep(1000)", "", "unanswered"),
@@ -123,7 +124,7 @@ def test_what_cannot_run_here_is_not_run(rows_of):
 
 
 def test_a_recorded_error_is_a_goal_on_both_sides(rows_of):
-    much, little = (dict.fromkeys(RECORDED_F64, (x, x)) for x in (1e-2, 1e-30))
+    much, little = (dict.fromkeys(RECORDED_F64, x) for x in (1e-2, 1e-30))
     for recorded_error in (much, little):
         rows = [row for row in rows_of(recorded_error=recorded_error) if row.case in RECORDED_F64]
         assert all(row.missed == {per_ray.OFF_RECORDED: limits.RECORDED} and row.verdict == "pass" for row in rows)
@@ -155,7 +156,7 @@ def test_the_sets_are_what_they_say(precision, few):
     through = {name: exact.transmitted[rays.regime == name].mean() for name in per_ray.SETS}
     assert (through["grazing"], through[TOTAL]) == (1, 0)
     assert through["near-critical"] > 0.9, "rounding may put a ray on the other side"
-    assert ray_set.checksum(rays) == rays.header["checksum"]
+    assert ray_set.with_checksum(rays).header == rays.header
 
 
 def test_the_built_in_runs_and_is_right(few):

@@ -1,6 +1,7 @@
 """Screen, sweep and search: they agree with the oracle, find planted defects, and the worst rays are replayed."""
 
 import dataclasses
+import itertools
 
 import drjit as dr
 import numpy as np
@@ -11,8 +12,8 @@ from mi_refract.accuracy import errors, evaluate, judge_formula
 from mi_refract.formulas import FORMULAS
 from mi_refract.regimes import REGIMES, Rays
 from validation import limits
-from validation.directions import search, sweep, worst_rays
-from validation.directions.worst_rays import Found
+from validation.directions import search, sweep
+from validation.directions.search import Found
 from validation.reference.fast_reference import Screen
 from validation.run.array_settings import Setting, budget_of
 
@@ -161,7 +162,7 @@ def test_the_search_finds_defects_that_sampling_misses(measured):
     def over(subject):
         herd = search.climb("promoted", subject, ["critical"], measured, 40)
         found = search.certify("promoted", subject, herd, measured)
-        return {f.line.objective for f in found if f.share > {"chord": 1, "decision": 0}[f.line.objective]}
+        return {f.objective for f in found if f.share > {"chord": 1, "decision": 0}[f.objective]}
 
     assert over(rare_twice) == {"chord", "decision"}
     assert over(FORMULAS["promoted"]) == set()
@@ -169,11 +170,16 @@ def test_the_search_finds_defects_that_sampling_misses(measured):
 
 def test_the_herd_stays_in_its_domain_and_gets_no_better(measured):
     names = ("generic", "lengths", "axes, signed zeros")
-    first, last = (search.climb("promoted", FORMULAS["promoted"], names, measured, g) for g in (0, 12))
-    assert (last.score >= first.score).all() and (last.score > first.score).any()
-    assert search._inside(last.rays, last, np.arange(len(last))).all()
-    again = search.climb("promoted", FORMULAS["promoted"], names, measured, 12)
-    assert again.rays.a.tobytes() == last.rays.a.tobytes()
+    herds = [search.climb("promoted", FORMULAS["promoted"], names, measured, g) for g in (0, 1, 2, 12, 12)]
+    for before, after in itertools.pairwise(herds):
+        assert (after.score >= before.score).all()
+    assert (herds[3].score > herds[0].score).any()
+    assert herds[4].rays.a.tobytes() == herds[3].rays.a.tobytes()
+    unit, slack = herds[3].regime == 0, 3**0.5 / 2 * measured.roundoff  # rounding moves a length by √3/2 u
+    for v in (herds[3].rays.a, herds[3].rays.n):
+        length = np.sqrt((v.astype(np.longdouble) ** 2).sum(1))
+        assert np.where(unit, np.abs(length - 1) <= slack, (length > 1e-18) & (length < 1e18)).all()
+    assert ((herds[3].rays.k >= 1e-6) & (herds[3].rays.k <= np.where(unit, 1.5, 1e6))).all()
 
 
 def test_every_formula_has_its_rows(in_float32, scalar_context, monkeypatch):
@@ -189,41 +195,28 @@ def test_every_formula_has_its_rows(in_float32, scalar_context, monkeypatch):
 # The worst rays ------------------------------------------------------------------------------------------------
 
 
-def line(score=1.0, x=0.5, formula="promoted", objective="chord"):
-    return Found("float32", formula, "generic", objective, score, (float(x).hex(),) * 7)
+LINE = "float32 | promoted | generic | chord | 0.8700 | 0x1.8p-1 0x0p+0 -0x1p-1 | 0x0p+0 0x0p+0 0x1p+0 | 0x1.8p+0"
 
 
-def test_the_file_keeps_the_worst_once_and_sorted(tmp_path):
-    path = tmp_path / "worst.txt"
-    assert worst_rays.read(path) == []
-    assert worst_rays.keep([line(1, 0.1), line(3, 0.3), line(2, 0.2), line(3, 0.3)], path) == worst_rays.MOST == 2
-    assert [found.score for found in worst_rays.read(path)] == [3, 2]
-    before = path.read_bytes()
-    assert worst_rays.keep([line(0.5, 0.4), line(2, 0.2)], path) == 0
-    assert path.read_bytes() == before
-    assert worst_rays.keep([line(1, 0.1, objective="decision"), line(9, 0.9, formula="cross")], path) == 2
-    assert [(f.formula, f.objective) for f in worst_rays.read(path)] == [
-        ("cross", "chord"),
-        ("promoted", "chord"),
-        ("promoted", "chord"),
-        ("promoted", "decision"),
-    ]
-    rays = worst_rays.rays_of(worst_rays.read(path), "float32")
-    assert rays.k.dtype == np.float32
-    assert rays.a[0, 0] == np.float32(0.9)
+def test_a_line_is_a_ray():
+    found = Found.parse(LINE)
+    assert (found.formula, found.regime, found.objective, found.score) == ("promoted", "generic", "chord", 0.87)
+    assert Found.parse(found.line()) == found
+    assert search.rays_of([found], "float32").k.tolist() == [1.5] and not len(search.rays_of([found], "float64"))
 
 
-@pytest.mark.parametrize("text", ["float32 | promoted", "p|f|r|o|1|0 0|0 0 1|1", "p|f|r|o|1|0 0 nan|0 0 1|1"])
+@pytest.mark.parametrize(
+    "text", ["float32 | promoted", "p | f | r | o | 1 | 0 0 nan | 0 0 1 | 1", "p | f | r | o | 1 | 0 0 | 0 0 1 | 1"]
+)
 def test_a_line_that_is_no_ray_is_refused(text, tmp_path):
-    path = tmp_path / "worst.txt"
-    path.write_text(text.replace("|", " | ") + "\n")
+    (tmp_path / "worst.txt").write_text(f"# remark\n{LINE}\n{text}\n")
     with pytest.raises(ValueError, match="not"):
-        worst_rays.read(path)
+        search.worst_rays(tmp_path / "worst.txt")
 
 
 def broken(name, subject, lines, setting):
     """The lines on which `subject` breaks the budget of `name`, and by what."""
-    rays = worst_rays.rays_of(lines, setting.precision.__name__)
+    rays = search.rays_of(lines, setting.precision.__name__)
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
     seen = judge_formula(subject, rays, exact, setting.vector, budget_of(name))
     counted = [not setting.no_budget(budget_of(name), line.regime) for line in lines]
@@ -235,7 +228,7 @@ def broken(name, subject, lines, setting):
 
 @pytest.fixture(scope="module")
 def lines(setting):
-    return [found for found in worst_rays.read() if found.precision == setting.name]
+    return [found for found in search.worst_rays() if found.precision == setting.name]
 
 
 @pytest.mark.parametrize("name", FORMULAS)
@@ -246,11 +239,10 @@ def test_every_formula_is_within_its_budget_on_the_worst_rays(name, setting, lin
 
 @pytest.mark.parametrize("mutant", ["decomposed", "cross"])
 def test_the_replay_sees_a_form_that_cancels(mutant, measured):
-    lines = [found for found in worst_rays.read() if found.precision == measured.precision.__name__]
+    lines = [found for found in search.worst_rays() if found.precision == measured.precision.__name__]
     assert len(broken("promoted", FORMULAS[mutant], lines, measured)) > len(lines) / 2
 
 
 def test_the_worst_rays_are_of_all_formulas_and_of_most_regimes(setting, lines):
     assert {found.formula for found in lines} == set(FORMULAS)
-    assert {found.regime for found in lines} <= set(REGIMES)
-    assert len({found.regime for found in lines}) >= len(REGIMES) / 2
+    assert len({found.regime for found in lines} & set(REGIMES)) >= len(REGIMES) / 2

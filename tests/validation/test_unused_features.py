@@ -6,7 +6,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from support.variants import switch
 
 from mi_refract import backend
 from mi_refract.plugins import refract
@@ -15,14 +14,9 @@ from validation.run.context import PROFILES, Context
 
 
 @pytest.fixture
-def context(tmp_path):
-    variants = backend.usable_variants()
-    usable = [name for name, why in variants.items() if why is None and name.endswith("ad_rgb")]
-    if not usable:
-        pytest.skip("no LLVM or CUDA variant runs here")
-    switch(usable[0])
+def context(tmp_path, llvm_variant):
     quick = dataclasses.replace(PROFILES["standard"], repeats=3)
-    return Context(quick, tmp_path, usable[0], backend.detect(), variants)
+    return Context(quick, tmp_path, "llvm_ad_rgb", backend.detect(), backend.usable_variants())
 
 
 def planted(monkeypatch, **methods):
@@ -123,25 +117,6 @@ def test_a_first_image_is_one_that_no_cache_knows(context):
         assert not largest["cache_hit"]
         assert not largest["cache_disk"]
         assert all(entry["cache_hit"] for entry in later)
-
-
-def test_times_are_ratios_with_goals(context):
-    seconds = {unused_features.PLUGIN: 1.0, unused_features.BUILTIN: 4.0}
-    row = unused_features.ratio_row(context, "case", "edit", seconds.get, 0.2)
-    assert row.values["edit / dielectric"] == 0.25
-    assert row.missed == {"edit / dielectric": 0.2}
-
-
-def test_a_frozen_image_is_the_traced_one_and_follows_an_edit(context):
-    with unused_features.alone(unused_features.PLUGIN, 3) as balls:
-        image, seen = balls.frozen(), []
-        for seed, eta in ((1, 1.3), (2, 1.3), (3, 1.9), (4, 1.4)):
-            balls.edit(eta)
-            seen.append(np.array(image(balls.params, dr.opaque(mi.UInt32, seed))))
-            assert seen[-1] == pytest.approx(np.array(balls.image(mi.UInt32(seed))), abs=1e-6)
-        # The second call tells Dr.Jit what varies. An edit is not traced again.
-        assert image.n_recordings == 2
-        assert np.abs(seen[2] - seen[1]).max() > 0.1
 
 
 def test_a_frozen_image_that_does_not_follow_an_edit_is_seen(context, monkeypatch):

@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -18,7 +19,7 @@ import numpy as np
 
 from mi_refract.image_diff import self_test
 from mi_refract.image_diff.defects import DEFECTS
-from mi_refract.plugins import read_ior, refract
+from mi_refract.plugins import PLUGIN, read_ior, refract
 from mi_refract.rendering.scene_files import REPRODUCIBLE
 from mi_refract.report.row import Row
 from validation.run.context import SCENES, Context
@@ -48,23 +49,21 @@ ONE_ALARM = 1 / TRIALS  # of pairs that are equal: one alarm by chance is one ti
 
 # Defects of a renderer -----------------------------------------------------------------------------------------
 
+Make = Callable[[Any, type], Any]  # a spoilt glass of a plugin's properties and its class
 
-def _with_index(change: Callable[[float], float]) -> Callable[[Any, type], Any]:
+
+def _with_indices(change: Callable[[float, float], tuple[float, float]]) -> Make:
+    """Other indices inside and outside."""
+
     def make(props: Any, plugin: type) -> Any:
-        props["int_ior"] = change(read_ior(props, "int_ior", "bk7"))
+        inner, outer = read_ior(props, "int_ior", "bk7"), read_ior(props, "ext_ior", "air")
+        props["int_ior"], props["ext_ior"] = change(inner, outer)
         return plugin(props)
 
     return make
 
 
-def _turned(props: Any, plugin: type) -> Any:
-    """Seen from the wrong side of its surface: the media trade places."""
-    inner, outer = read_ior(props, "int_ior", "bk7"), read_ior(props, "ext_ior", "air")
-    props["int_ior"], props["ext_ior"] = outer, inner
-    return plugin(props)
-
-
-def _sampling(change: Callable[..., tuple[Any, Any]]) -> Callable[[Any, type], Any]:
+def _sampling(change: Callable[..., tuple[Any, Any]]) -> Make:
     """`change(sample, ctx, si, sample1, sample2, active)`, `sample` being the plugin's own."""
 
     def make(props: Any, plugin: type) -> Any:
@@ -77,13 +76,13 @@ def _sampling(change: Callable[..., tuple[Any, Any]]) -> Callable[[Any, type], A
     return make
 
 
-def _unscaled(sample: Any, ctx: Any, si: Any, *rest: Any) -> tuple[Any, Any]:
-    bs, weight = sample(ctx, si, *rest)
+def _unscaled(sample: Any, *args: Any) -> tuple[Any, Any]:
+    bs, weight = sample(*args)
     return bs, weight * dr.square(bs.eta)  # 1 where it is reflected
 
 
-def _black_inside(sample: Any, ctx: Any, si: Any, *rest: Any) -> tuple[Any, Any]:
-    bs, weight = sample(ctx, si, *rest)
+def _black_inside(sample: Any, *args: Any) -> tuple[Any, Any]:
+    bs, weight = sample(*args)
     return bs, dr.select((bs.sampled_component == 0) & (bs.pdf >= 1), 0, weight)  # no other reflection is certain
 
 
@@ -95,10 +94,10 @@ def _swapped_lobes(sample: Any, ctx: Any, si: Any, sample1: Any, sample2: Any, a
     return dr.select(choice, transmitted, reflected), dr.select(choice, t, r)
 
 
-GLASSES: dict[str, tuple[str, Callable[[Any, type], Any]]] = {
-    "IOR + 0.5 %": ("the glass's index", _with_index(lambda ior: 1.005 * ior)),
-    "IOR + 1e-3": ("the glass's index", _with_index(lambda ior: ior + 1e-3)),
-    "flipped normal": ("the media trade places", _turned),
+GLASSES: dict[str, tuple[str, Make]] = {
+    "IOR + 0.5 %": ("the glass's index", _with_indices(lambda inner, outer: (1.005 * inner, outer))),
+    "IOR + 1e-3": ("the glass's index", _with_indices(lambda inner, outer: (inner + 1e-3, outer))),
+    "flipped normal": ("the media trade places", _with_indices(lambda inner, outer: (outer, inner))),
     "missing η²": ("radiance is not scaled at a boundary", _sampling(_unscaled)),
     "black TIR": ("total internal reflection gives nothing back", _sampling(_black_inside)),
     "swapped lobes": ("reflection as often as transmission should be", _sampling(_swapped_lobes)),
@@ -122,41 +121,35 @@ def register(variant: Any) -> None:
 # Renders -------------------------------------------------------------------------------------------------------
 
 
-def opened(name: str, glass: str = refract.PLUGIN, resolution: int = RESOLUTION, count: int = 1, **more: Any) -> Camera:
-    """A scene of `scenes/`, `count` times side by side; the ball with its lamp."""
+def opened(name: str, glass: str = PLUGIN, resolution: int = RESOLUTION, count: int = 1, **more: Any) -> Camera:
+    """A scene of `scenes/`, the ball with its lamp; `count` cameras side by side on one film.
+
+    Pixels are independent, so these are as many renders.
+    """
     import mitsuba as mi
 
     text = (SCENES / f"{name}.xml").read_text().replace('value="meshes/', f'value="{SCENES}/meshes/')
     text = text.replace("</scene>", LAMP) if name == "sphere" else text
-    text = _side_by_side(text, count, resolution)
+    sensor, film, sampler = (re.findall(rf"<{tag} .*?</{tag}>", text, re.DOTALL)[0] for tag in PARTS)
+    wide = film.replace('name="width" value="$res"', f'name="width" value="{count * resolution}"')
+    text = text.replace(sensor, f'<sensor type="batch">{count * sensor}{wide}{sampler}</sensor>')
     return Camera(mi.load_string(text, **REPRODUCIBLE, bsdf=glass, res=resolution, **more))
 
 
-def _side_by_side(text: str, count: int, resolution: int) -> str:
-    """The scene with `count` of its cameras on one film: pixels are independent, so these are as many renders."""
-    sensor, film, sampler = (re.findall(rf"<{tag} .*?</{tag}>", text, re.DOTALL)[0] for tag in PARTS)
-    wide = film.replace('name="width" value="$res"', f'name="width" value="{count * resolution}"')
-    return text.replace(sensor, f'<sensor type="batch">{count * sensor}{wide}{sampler}</sensor>')
-
-
-def _renders(camera: Camera, first: int, count: int = RENDERS, spp: int = SPP) -> np.ndarray:
-    return np.stack([camera(spp, seed)[0] for seed in range(first, first + count)])
-
-
-def _later(camera: Camera, first: int) -> Callable[[], np.ndarray]:
-    return lambda: _renders(camera, first)
+def _renders(camera: Camera, first: int, spp: int = SPP) -> np.ndarray:
+    return np.stack([camera(spp, seed)[0] for seed in range(first, first + RENDERS)])
 
 
 def trials(name: str, count: int, resolution: int = RESOLUTION, spp: int = SPP) -> list[self_test.Trial]:
     """Clean renders, nothing planted: no seed is used twice."""
     camera = opened(name, resolution=resolution)
-    seeds = [2 * RENDERS * trial for trial in range(count)]
-    return [
-        self_test.Trial(
-            _renders(camera, seed, spp=spp), _renders(camera, seed + RENDERS, spp=spp), _later(camera, seed)
-        )
-        for seed in seeds
-    ]
+    sides = [[_renders(camera, seed, spp) for seed in (first, first + RENDERS)] for first in _seeds(count)]
+    return [self_test.Trial(clean, other, functools.partial(np.copy, clean)) for clean, other in sides]
+
+
+def _seeds(count: int) -> range:
+    """The first seed of each trial."""
+    return range(0, 2 * RENDERS * count, 2 * RENDERS)
 
 
 # Judged --------------------------------------------------------------------------------------------------------
@@ -181,16 +174,26 @@ def defect_rows(context: Context, name: str) -> list[Row]:
 
     register(getattr(mi, context.variant))
     clean = trials(name, TRIALS)
-    cameras = {defect: opened(name, f"{GLASS} {defect}") for defect in GLASSES}
-    rows = [_row(defect, clean, name, context, camera) for defect, camera in cameras.items()]
+
+    def row(defect: str, camera: Camera) -> Row:
+        """Of renders with the seeds of the clean ones."""
+        spoilt = [
+            replace(trial, spoil=functools.partial(_renders, camera, seed))
+            for trial, seed in zip(clean, _seeds(len(clean)), strict=True)
+        ]
+        return self_test.detection(defect, False, spoilt, name, context.variant)
+
+    rows = [row(defect, opened(name, f"{GLASS} {defect}")) for defect in GLASSES]
     rows += _image_defects(clean, name, context)
-    rows.append(_row(OTHER_SAMPLER, clean, name, context, opened(name, sampler="multijitter")))
-    every = np.concatenate([t.clean for t in clean])
-    about = {"resolution": RESOLUTION, "spp": SPP, "renders": len(every)}
-    return [
-        *rows,
-        Row(NAME, "renders", name, context.variant, {"noise": self_test.noise(every)}, replay=about),
-    ]
+    other = row(OTHER_SAMPLER, opened(name, sampler="multijitter"))
+    if other.values:
+        other = replace(
+            other, budgets=other.budgets | {"welch": ONE_ALARM}, reason="no defect: `welch` must not see it"
+        )
+    every = np.concatenate([trial.clean for trial in clean])
+    replay = {"resolution": RESOLUTION, "spp": SPP, "renders": len(every)}
+    noise = Row(NAME, "renders", name, context.variant, {"noise": self_test.noise(every)}, replay=replay)
+    return [*rows, other, noise]
 
 
 def image_defect_rows(context: Context, name: str) -> list[Row]:
@@ -202,27 +205,9 @@ def image_defect_rows(context: Context, name: str) -> list[Row]:
 def _image_defects(clean: list[self_test.Trial], name: str, context: Context) -> list[Row]:
     rows = []
     for defect, planted in DEFECTS.items():
-        spoilt = [self_test.Trial(t.clean, t.other, functools.partial(planted.spoil, t.clean)) for t in clean]
+        spoilt = [replace(trial, spoil=functools.partial(planted.spoil, trial.clean)) for trial in clean]
         rows.append(self_test.detection(defect, planted.always_due, spoilt, name, context.variant))
     return rows
-
-
-def _row(defect: str, clean: list[self_test.Trial], name: str, context: Context, camera: Camera) -> Row:
-    seeds = [2 * RENDERS * trial for trial in range(len(clean))]
-    spoilt = [self_test.Trial(t.clean, t.other, _later(camera, seed)) for t, seed in zip(clean, seeds, strict=True)]
-    row = self_test.detection(defect, False, spoilt, name, context.variant)
-    if defect != OTHER_SAMPLER or not row.values:
-        return row
-    return Row(
-        row.study,
-        row.subject,
-        row.case,
-        row.setting,
-        row.values,
-        row.budgets | {"welch": ONE_ALARM},
-        reason="no defect: `welch` must not see it",
-        replay=row.replay,
-    )
 
 
 def null_rows(context: Context, name: str) -> list[Row]:
@@ -231,17 +216,17 @@ def null_rows(context: Context, name: str) -> list[Row]:
         return [Row(NAME, "null pairs", name, context.variant, reason=SCALAR)]
     count = NULL_PAIRS[context.profile.name]
     first, second = (opened(name, resolution=NULL_RESOLUTION, count=SHEET) for _ in range(2))
-    sides = (_sheet(first, seed) for seed in range(count * 2 * NULL_RENDERS // SHEET))
-    parts = (part for sheet in sides for part in np.split(sheet, SHEET // (2 * NULL_RENDERS)))
+
+    def sheet(camera: Camera, seed: int) -> np.ndarray:
+        """One render, cut into its independent images."""
+        return np.stack(np.split(camera(NULL_SPP, seed)[0], SHEET, axis=1))
+
+    sheets = (sheet(first, seed) for seed in range(count * 2 * NULL_RENDERS // SHEET))
+    parts = (part for images in sheets for part in np.split(images, SHEET // (2 * NULL_RENDERS)))
     pairs = ((part[:NULL_RENDERS], part[NULL_RENDERS:]) for part in parts)
-    again = ((_sheet(first, seed), _sheet(second, seed)) for seed in range(count // SHEET))
-    repeats = ((x[None], y[None]) for sheets in again for x, y in zip(*sheets, strict=True))
+    again = ((sheet(first, seed), sheet(second, seed)) for seed in range(count // SHEET))
+    repeats = ((x[None], y[None]) for both in again for x, y in zip(*both, strict=True))
     return self_test.false_alarms(pairs, repeats, name, context.variant)
-
-
-def _sheet(camera: Camera, seed: int) -> np.ndarray:
-    """One render, cut into its independent images."""
-    return np.stack(np.split(camera(NULL_SPP, seed)[0], SHEET, axis=1))
 
 
 STUDY = Study(NAME, "Image comparison, planted defects", f"{about(__doc__)} {about(self_test.__doc__)}", TERMS, tasks)

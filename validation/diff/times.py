@@ -24,7 +24,7 @@ import numpy as np
 
 from mi_refract.image_diff import folders, html_report
 from mi_refract.image_diff.methods import AUTO, METHODS
-from mi_refract.image_diff.settings import ComparisonSpec, Settings
+from mi_refract.image_diff.settings import Settings
 from mi_refract.io import image_file
 from mi_refract.report.row import Row
 from validation import limits
@@ -70,6 +70,16 @@ print([line.split()[1] for line in open("/proc/self/status") if line.startswith(
 """
 
 
+@dataclass(frozen=True)
+class Subject:
+    """What is timed, on which images, and the subject to whose time its own is a `ratio`; "" for none."""
+
+    case: str
+    run: Callable[[], object]
+    beside: str = ""
+    ratio: str = "time / reading"
+
+
 def tasks(context: Context) -> list[Task]:
     """One task: its subjects take turns."""
     return [Task("diff, times", functools.partial(measure, SIZES[context.profile.name], context.variant), timed=True)]
@@ -80,12 +90,21 @@ def measure(size: Size, setting: str) -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         write(root, size)
-        page = root / "page.html"
-        readings, subjects = _readings(root), _subjects(root, page)
-        seconds = kernel_timing.rounds(readings | subjects, _clock, size.rounds)  # the first round is a warm-up
-        rows = [_row(name, seconds, size, setting) for name in (*readings, *subjects)]
-        rows.append(_page_row(page, size, setting))
-        return [*rows, _memory_row(root, size, setting)]
+        subjects = subjects_of(root, size)
+        timed = {name: subject.run for name, subject in subjects.items()}
+        seconds = kernel_timing.rounds(timed, _clock, size.rounds)  # the first round is a warm-up
+        rows = []
+        for name, subject in subjects.items():
+            values = kernel_timing.interval("seconds", seconds[name])
+            if subject.beside:
+                values |= kernel_timing.ratio(subject.ratio, seconds[name], seconds[subject.beside])
+            goals = {"seconds": limits.DIFF_SECONDS[name]} if size == GOAL_SIZE and name in limits.DIFF_SECONDS else {}
+            replay = {"seed": SEED, "rounds": size.rounds}
+            rows.append(Row(NAME, name, subject.case, setting, values, goals=goals, replay=replay))
+        values = {"MB of page": (root / "page.html").stat().st_size / MEGABYTE}
+        budgets = {"MB of page": limits.PAGE_MEGABYTES}
+        rows.append(Row(NAME, "size of the page", subjects["page"].case, setting, values, budgets))
+        return [*rows, _memory_row(root, subjects["welch"].case, setting)]
 
 
 def write(root: Path, size: Size) -> None:
@@ -108,95 +127,60 @@ def write(root: Path, size: Size) -> None:
             image_file.write_exr(root / side / f"{number:04}.exr", np.float32(gain) * small * noise)
 
 
-def _reading(name: str) -> str:
-    """The subject that reads the same files as this one; "" for the page, and for those themselves."""
-    if name in (AUTO, SHELL):
-        return "read the folder" if name == AUTO else LIBRARIES
-    return ("read the renders" if METHODS[name].takes_renders else "read the pair") if name in METHODS else ""
-
-
-def _readings(root: Path) -> dict[str, Callable[[], object]]:
-    renders, many = ([sorted((root / f"{kind}{side}").iterdir()) for side in "ab"] for kind in ("", "many_"))
+def subjects_of(root: Path, size: Size) -> dict[str, Subject]:
+    """Reading alone; the verdict of each method, and of a folder; and the page of the image that differs."""
+    a, b = root / "a", root / "b"
+    one = f"{size.width} × {size.height}"
+    several, many = f"{one}, {RENDERS} + {RENDERS}", f"{size.pairs} pairs of {SMALL}²"
+    files = [[sorted((root / f"{kind}{side}").iterdir()) for side in "ab"] for kind in ("", "many_")]
 
     def read(sides: list[list[Path]]) -> None:
         with ThreadPoolExecutor(2) as pool:
             for pair in zip(*sides, strict=True):
                 list(pool.map(image_file.read, pair))
 
-    pair = [side[:1] for side in renders]
-    files = {"read the pair": pair, "read the renders": renders, "read the folder": many}
-    found: dict[str, Callable[[], object]] = {name: functools.partial(read, sides) for name, sides in files.items()}
-    return found | {LIBRARIES: functools.partial(_process, "-c", "import OpenImageIO, numpy")}
-
-
-def _subjects(root: Path, page: Path) -> dict[str, Callable[[], object]]:
-    """The verdict of each method, of a folder, and the page of the image that differs."""
-    a, b = root / "a", root / "b"
     found = {
-        name: functools.partial(
-            folders.diff,
-            *((a, b) if method.takes_renders else (a / "0.exr", b / "0.exr")),
-            Settings(ComparisonSpec(name)),
-            renders=method.takes_renders,
-        )
-        for name, method in METHODS.items()
+        "read the pair": Subject(one, functools.partial(read, [side[:1] for side in files[0]])),
+        "read the renders": Subject(several, functools.partial(read, files[0])),
+        "read the folder": Subject(many, functools.partial(read, files[1])),
+        LIBRARIES: Subject("", functools.partial(python, "-c", "import OpenImageIO, numpy")),
     }
-    many = functools.partial(folders.diff, root / "many_a", root / "many_b")
-    judged = folders.diff(a / "0.exr", b / "0.exr", Settings(ComparisonSpec("tolerance")), maps=True)
+    for name, method in METHODS.items():
+        sides = (a, b) if method.takes_renders else (a / "0.exr", b / "0.exr")
+        compare = functools.partial(folders.diff, *sides, Settings.for_all(method=name), renders=method.takes_renders)
+        beside = "read the renders" if method.takes_renders else "read the pair"
+        found[name] = Subject(several if method.takes_renders else one, compare, beside)
+    found[AUTO] = Subject(many, functools.partial(folders.diff, root / "many_a", root / "many_b"), "read the folder")
     small = [str(root / side / "0000.exr") for side in ("many_a", "many_b")]
-    shell = functools.partial(_process, "-m", "mi_refract.cli", "diff", *small)
-    return found | {AUTO: many, SHELL: shell, "page": functools.partial(html_report.write, page, judged)}
+    shell = functools.partial(python, "-m", "mi_refract.cli", "diff", *small)
+    found[SHELL] = Subject(f"a pair of {SMALL}²", shell, LIBRARIES, "time / libraries")
+    judged = folders.diff(a / "0.exr", b / "0.exr", Settings.for_all(method="tolerance"), maps=True)
+    found["page"] = Subject(one, functools.partial(html_report.write, root / "page.html", judged))
+    return found
 
 
-def _process(*words: str) -> None:
-    """Python with these words. Byte code is kept, as where the package is installed; OSError where it fails."""
+def python(*words: str) -> str:
+    """What Python prints. Byte code is kept, as where the package is installed; OSError where it fails."""
     kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     done = subprocess.run([sys.executable, *words], env=kept, capture_output=True, text=True)
     if done.returncode:
         raise OSError(f"diff, times: {done.stderr.strip()}")
+    return done.stdout
 
 
-def _clock(subject: Callable[[], object]) -> float:
+def _clock(run: Callable[[], object]) -> float:
     start = time.perf_counter()
-    subject()
+    run()
     return time.perf_counter() - start
 
 
-def _case(name: str, size: Size) -> str:
-    reading = _reading(name) or name
-    if reading == LIBRARIES:
-        return f"a pair of {SMALL}²" if name == SHELL else ""
-    if reading == "read the folder":
-        return f"{size.pairs} pairs of {SMALL}²"
-    return f"{size.width} × {size.height}" + (f", {RENDERS} + {RENDERS}" if reading == "read the renders" else "")
-
-
-def _row(name: str, seconds: dict[str, list[float]], size: Size, setting: str) -> Row:
-    values = kernel_timing.interval("seconds", seconds[name])
-    if reading := _reading(name):
-        ratio = "time / libraries" if reading == LIBRARIES else "time / reading"
-        values |= kernel_timing.ratio(ratio, seconds[name], seconds[reading])
-    goals = {"seconds": limits.DIFF_SECONDS[name]} if size == GOAL_SIZE and name in limits.DIFF_SECONDS else {}
-    replay = {"seed": SEED, "rounds": size.rounds}
-    return Row(NAME, name, _case(name, size), setting, values, goals=goals, replay=replay)
-
-
-def _page_row(page: Path, size: Size, setting: str) -> Row:
-    values = {"MB of page": page.stat().st_size / MEGABYTE}
-    return Row(NAME, "size of the page", _case("", size), setting, values, {"MB of page": limits.PAGE_MEGABYTES})
-
-
-def _memory_row(root: Path, size: Size, setting: str) -> Row:
+def _memory_row(root: Path, case: str, setting: str) -> Row:
     """Of the process with the most: Welch's test of all renders, with its page."""
-    subject, case = "memory", _case("welch", size)
     if not Path("/proc/self/status").exists():
-        return Row(NAME, subject, case, setting, reason="this system does not say a process's peak")
+        return Row(NAME, "memory", case, setting, reason="this system does not say a process's peak")
     words = ["diff", str(root / "a"), str(root / "b"), "--renders", "--report", str(root / "welch.html")]
-    done = subprocess.run([sys.executable, "-c", PROCESS, *words], capture_output=True, text=True)
-    if done.returncode:
-        raise OSError(f"diff, times: {done.stderr.strip()}")
-    values = {"MB of memory": 1024 * json.loads(done.stdout.split()[-1]) / MEGABYTE}
-    return Row(NAME, subject, case, setting, values, {"MB of memory": limits.MEMORY_MEGABYTES})
+    values = {"MB of memory": 1024 * json.loads(python("-c", PROCESS, *words).split()[-1]) / MEGABYTE}
+    return Row(NAME, "memory", case, setting, values, {"MB of memory": limits.MEMORY_MEGABYTES})
 
 
 STUDY = Study(NAME, "Diff, times", about(__doc__), TERMS, tasks)

@@ -17,6 +17,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -85,7 +86,7 @@ def scene(rng: np.random.Generator) -> list[Shape]:
 def drawn(shapes: list[Shape], samples: int = SAMPLES, turn: float = 0.0, shift: float = 0.0) -> Pixels:
     """The image in codes, of `samples`² samples a pixel on a grid that is turned within the pixel and shifted."""
     grid = (np.arange(samples) + 0.5) / samples - 0.5
-    dx, dy = (each.ravel() for each in np.meshgrid(grid, grid))
+    dx, dy = (x.ravel() for x in np.meshgrid(grid, grid))
     dx, dy = dx * np.cos(turn) - dy * np.sin(turn) + 0.5 + shift, dx * np.sin(turn) + dy * np.cos(turn) + 0.5
     rows, columns = np.mgrid[:SIZE, :SIZE]
     x, y = columns[..., None] + dx, rows[..., None] + dy
@@ -101,55 +102,47 @@ def shown(codes: Pixels, rounded: bool = True) -> Image:
     return Image(Path("codes.png"), codes.astype(np.float32), ("R", "G", "B"), stored="uint8")
 
 
-Pair = tuple[Image, Image]
-
-
-def _last_bits(rng: np.random.Generator) -> Pair:
-    image = drawn(scene(rng))
-    return shown(image, rounded=False), shown(image * (1 + rng.choice([-1, 1], image.shape) * 2.0**-23), rounded=False)
-
-
-def _one_code(rng: np.random.Generator) -> Pair:
-    image = np.clip(drawn(scene(rng)), 0, 254)
-    return shown(image), shown(np.round(image) + 1)
-
-
-def _dithered(rng: np.random.Generator) -> Pair:
-    image = drawn(scene(rng))
-    return shown(image), shown(image + rng.uniform(-0.5, 0.5, image.shape))
-
-
-def _other_pattern(rng: np.random.Generator) -> Pair:
-    shapes = scene(rng)
-    return shown(drawn(shapes)), shown(drawn(shapes, turn=0.46))
-
-
-def _fewer_samples(rng: np.random.Generator) -> Pair:
-    shapes = scene(rng)
-    return shown(drawn(shapes)), shown(drawn(shapes, samples=2))
-
-
-def _quarter_pixel(rng: np.random.Generator) -> Pair:
-    shapes = scene(rng)
-    return shown(drawn(shapes)), shown(drawn(shapes, shift=0.25))
-
-
 def light(codes: Pixels) -> Image:
     """Codes as stops: an HDR image of 6 stops."""
     return Image(Path("light.exr"), np.exp2(codes / 255 * 6 - 3).astype(np.float32), ("R", "G", "B"))
 
 
-def _half_floats(rng: np.random.Generator) -> Pair:
+Rng = np.random.Generator
+Pair = tuple[Image, Image]
+Change = Callable[[Rng], Pair]
+
+
+# Changes that nobody sees ------------------------------------------------------------------------------------------
+
+
+def of_codes(
+    change: Callable[[Rng, Pixels], Pixels], least: float = 0, most: float = 255, rounded: bool = True
+) -> Change:
+    """The codes of a scene, from `least` to `most`, and what they are changed to."""
+
+    def make(rng: Rng) -> Pair:
+        codes = np.clip(drawn(scene(rng)), least, most)
+        return shown(codes, rounded), shown(change(rng, codes), rounded)
+
+    return make
+
+
+def redrawn(**how: Any) -> Change:
+    """A scene drawn twice, once otherwise."""
+
+    def make(rng: Rng) -> Pair:
+        shapes = scene(rng)
+        return shown(drawn(shapes)), shown(drawn(shapes, **how))
+
+    return make
+
+
+def _half_floats(rng: Rng) -> Pair:
     image = light(drawn(scene(rng)))
     return image, replace(image, pixels=image.pixels.astype(np.float16).astype(np.float32))
 
 
-def _no_antialiasing(rng: np.random.Generator) -> Pair:
-    shapes = scene(rng)
-    return shown(drawn(shapes)), shown(drawn(shapes, samples=1))
-
-
-def _jpeg(rng: np.random.Generator) -> Pair:
+def _jpeg(rng: Rng) -> Pair:
     import OpenImageIO as oiio
 
     image = shown(drawn(scene(rng)))
@@ -163,83 +156,68 @@ def _jpeg(rng: np.random.Generator) -> Pair:
         return image, image_file.read(path)
 
 
-def _with(rng: np.random.Generator, change: Callable[[Pixels, float, float], tuple[Pixels, Pixels]]) -> Pair:
-    """`change(codes, x, y)` at a place at least 28 pixels from the border."""
+# Changes that a person sees ----------------------------------------------------------------------------------------
+
+
+def somewhere(rng: Rng) -> tuple[Pixels, float, float]:
+    """The codes of a scene, and a place at least 28 pixels from the border."""
     x, y = rng.uniform(28, SIZE - 28, 2)
-    one, two = change(drawn(scene(rng)), x, y)
-    return shown(one), shown(two)
+    return drawn(scene(rng)), x, y
 
 
-def _patch(image: Pixels, x: float, y: float, side: int, colour: Pixels | float) -> Pixels:
+def patched(image: Pixels, x: float, y: float, side: int, colour: Pixels | float) -> Pixels:
+    """With a square of one colour around that place."""
     image = image.copy()
     left, top = int(x) - side // 2, int(y) - side // 2
     image[top : top + side, left : left + side] = colour
     return image
 
 
-def _recoloured(rng: np.random.Generator) -> Pair:
-    """A box of 0.12 to 0.18 degrees, 140 codes more of red or green, with or without another primary, or of all."""
-    side, gray, primaries = int(rng.integers(8, 13)), rng.uniform(20, 100), rng.choice([0, 1], 3)
-    other = gray + 140 * (primaries if primaries[:2].any() else np.ones(3))
-    return _with(rng, lambda image, x, y: (_patch(image, x, y, side, gray), _patch(image, x, y, side, other)))
-
-
-def _blued(rng: np.random.Generator) -> Pair:
-    """A box of 0.12 to 0.18 degrees, 140 codes more of blue alone, for which the eye is the least sharp."""
+def _recoloured(rng: Rng, blue: bool = False) -> Pair:
     side, gray = int(rng.integers(8, 13)), rng.uniform(20, 100)
-    other = gray + 140 * np.array([0, 0, 1])
-    return _with(rng, lambda image, x, y: (_patch(image, x, y, side, gray), _patch(image, x, y, side, other)))
+    primaries = np.array([0, 0, 1]) if blue else rng.choice([0, 1], 3)
+    other = gray + 140 * (primaries if blue or primaries[:2].any() else np.ones(3))
+    at = somewhere(rng)
+    return shown(patched(*at, side, gray)), shown(patched(*at, side, other))
 
 
-def _highlight(rng: np.random.Generator) -> Pair:
-    """Of a standard deviation of 0.05 to 0.07 degrees and 140 to 180 codes, on dark gray; gone."""
+def _highlight(rng: Rng) -> Pair:
     sigma, height, gray = rng.uniform(3.3, 4.7), rng.uniform(140, 180), rng.uniform(30, 75)
     rows, columns = np.mgrid[:SIZE, :SIZE]
-
-    def change(image: Pixels, x: float, y: float) -> tuple[Pixels, Pixels]:
-        plain = _patch(image, x, y, 40, gray)
-        light = height * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2))
-        return plain + light[..., None], plain
-
-    return _with(rng, change)
+    image, x, y = somewhere(rng)
+    plain = patched(image, x, y, 40, gray)
+    more = height * np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2))
+    return shown(plain + more[..., None]), shown(plain)
 
 
-def _moved(rng: np.random.Generator) -> Pair:
-    """A box of 0.12 to 0.24 degrees and a contrast of 180 codes, by three pixels."""
+def _moved(rng: Rng) -> Pair:
     side, gray = int(rng.integers(8, 17)), rng.uniform(10, 70)
-
-    def change(image: Pixels, x: float, y: float) -> tuple[Pixels, Pixels]:
-        plain = _patch(image, x, y, 40, gray)
-        return _patch(plain, x, y, side, gray + 180), _patch(plain, x + 3, y, side, gray + 180)
-
-    return _with(rng, change)
+    image, x, y = somewhere(rng)
+    plain = patched(image, x, y, 40, gray)
+    return shown(patched(plain, x, y, side, gray + 180)), shown(patched(plain, x + 3, y, side, gray + 180))
 
 
-def _line(rng: np.random.Generator) -> Pair:
-    """A line of one pixel and 0.3 degrees, of a contrast of 225 to 255 codes; gone."""
+def _line(rng: Rng) -> Pair:
     contrast = rng.uniform(225, 255)
-
-    def change(image: Pixels, x: float, y: float) -> tuple[Pixels, Pixels]:
-        plain = _patch(image, x, y, 40, 255 - contrast)
-        line = plain.copy()
-        line[int(y), int(x) - 10 : int(x) + 10] = 255
-        return line, plain
-
-    return _with(rng, change)
+    image, x, y = somewhere(rng)
+    plain = patched(image, x, y, 40, 255 - contrast)
+    line = plain.copy()
+    line[int(y), int(x) - 10 : int(x) + 10] = 255
+    return shown(line), shown(plain)
 
 
-def _surface(rng: np.random.Generator) -> Pair:
-    """A surface of 0.3 to 0.6 degrees, 14 to 20 codes brighter."""
+def _surface(rng: Rng) -> Pair:
     side, more = int(rng.integers(20, 41)), rng.uniform(14, 20)
     gray = rng.uniform(30, 200)
-    return _with(rng, lambda image, x, y: (_patch(image, x, y, side, gray), _patch(image, x, y, side, gray + more)))
+    at = somewhere(rng)
+    return shown(patched(*at, side, gray)), shown(patched(*at, side, gray + more))
 
 
-def _lit_surface(rng: np.random.Generator) -> Pair:
-    """HDR: a surface of 0.3 to 0.6 degrees in a quarter more light."""
-    side, (x, y), stops = int(rng.integers(20, 41)), rng.uniform(28, SIZE - 28, 2), drawn(scene(rng))
+def _lit_surface(rng: Rng) -> Pair:
+    side = int(rng.integers(20, 41))
+    stops, x, y = somewhere(rng)
     codes = float(stops[int(y), int(x)].mean())
-    one, two = (light(_patch(stops, x, y, side, codes + more)) for more in (0.0, np.log2(1.25) * 255 / 6))
+    one, two = (light(patched(stops, x, y, side, codes + more)) for more in (0.0, np.log2(1.25) * 255 / 6))
     return one, two
 
 
@@ -251,27 +229,45 @@ class Kind:
     """
 
     text: str
-    make: Callable[[np.random.Generator], Pair]
+    make: Change
     due: bool | None = False
 
 
 KINDS = {
-    "last bits": Kind("relative 2⁻²³", _last_bits),
-    "one code": Kind("everywhere one more of 255", _one_code),
-    "dithering": Kind("rounded with and without noise of half a code", _dithered),
-    "other antialiasing": Kind("the 16 samples on a grid that is turned", _other_pattern),
-    "less antialiasing": Kind("4 samples instead of 16", _fewer_samples),
-    "a quarter pixel": Kind("the camera has moved so far", _quarter_pixel),
+    "last bits": Kind(
+        "relative 2⁻²³", of_codes(lambda rng, x: x * (1 + rng.choice([-1, 1], x.shape) * 2.0**-23), rounded=False)
+    ),
+    "one code": Kind("everywhere one more of 255", of_codes(lambda rng, x: np.round(x) + 1, most=254)),
+    "dithering": Kind(
+        "rounded with and without noise of half a code", of_codes(lambda rng, x: x + rng.uniform(-0.5, 0.5, x.shape))
+    ),
+    "other antialiasing": Kind("the 16 samples on a grid that is turned", redrawn(turn=0.46)),
+    "less antialiasing": Kind("4 samples instead of 16", redrawn(samples=2)),
+    "a quarter pixel": Kind("the camera has moved so far", redrawn(shift=0.25)),
     "JPEG": Kind("quality 98, without subsampling of the colours", _jpeg),
     "half floats": Kind("an HDR image of 6 stops, rounded to 11 bits", _half_floats),
-    "no antialiasing": Kind("1 sample instead of 16; seen in some images", _no_antialiasing, due=None),
-    "colour of an object": Kind(_recoloured.__doc__ or "", _recoloured, due=True),
-    "highlight": Kind(_highlight.__doc__ or "", _highlight, due=True),
-    "moved object": Kind(_moved.__doc__ or "", _moved, due=True),
-    "line": Kind(_line.__doc__ or "", _line, due=True),
-    "brighter surface": Kind(_surface.__doc__ or "", _surface, due=True),
-    "light on a surface": Kind(_lit_surface.__doc__ or "", _lit_surface, due=True),
-    "blue of an object": Kind(_blued.__doc__ or "", _blued, due=None),
+    "no antialiasing": Kind("1 sample instead of 16; seen in some images", redrawn(samples=1), due=None),
+    "colour of an object": Kind(
+        "A box of 0.12 to 0.18 degrees, 140 codes more of red or green, with or without another primary, or of all.",
+        _recoloured,
+        due=True,
+    ),
+    "highlight": Kind(
+        "Of a standard deviation of 0.05 to 0.07 degrees and 140 to 180 codes, on dark gray; gone.",
+        _highlight,
+        due=True,
+    ),
+    "moved object": Kind(
+        "A box of 0.12 to 0.24 degrees and a contrast of 180 codes, by three pixels.", _moved, due=True
+    ),
+    "line": Kind("A line of one pixel and 0.3 degrees, of a contrast of 225 to 255 codes; gone.", _line, due=True),
+    "brighter surface": Kind("A surface of 0.3 to 0.6 degrees, 14 to 20 codes brighter.", _surface, due=True),
+    "light on a surface": Kind("HDR: a surface of 0.3 to 0.6 degrees in a quarter more light.", _lit_surface, due=True),
+    "blue of an object": Kind(
+        "A box of 0.12 to 0.18 degrees, 140 codes more of blue alone, for which the eye is the least sharp.",
+        functools.partial(_recoloured, blue=True),
+        due=None,
+    ),
 }
 CASES = {False: "not seen", True: "seen", None: "seen in part"}
 
@@ -291,21 +287,21 @@ def tasks(context: Context) -> list[Task]:
 def errors(pair: Pair) -> tuple[float, float, float]:
     """The local FLIP error, the error throughout a patch, and the larger of both over their bounds."""
     local, patch = flip.flip(*pair).metrics[:2]
-    return local.value, patch.value, max(each.value / (each.bound or np.nan) for each in (local, patch))
+    return local.value, patch.value, max(metric.value / (metric.bound or np.nan) for metric in (local, patch))
 
 
 def kind_row(name: str, count: int) -> Row:
     """What `flip` finds in pairs of one kind."""
     kind = KINDS[name]
     own = np.random.SeedSequence((seeds.current(SEED), list(KINDS).index(name))).spawn(count)
-    found = np.array([errors(kind.make(np.random.default_rng(each))) for each in own])
-    different = int((found[:, 2] > 1).sum())
-    values = {LOCAL: float(np.median(found[:, 0])), THROUGHOUT: float(np.median(found[:, 1]))}
+    local, throughout, error = np.array([errors(kind.make(np.random.default_rng(seed))) for seed in own]).T
+    different = int((error > 1).sum())
+    values = {LOCAL: float(np.median(local)), THROUGHOUT: float(np.median(throughout)), ALARMS: different / count}
     if kind.due is True:
-        values |= {ERROR: float(found[:, 2].min()), ALARMS: different / count, MISSED: float(count - different)}
+        values |= {ERROR: float(error.min()), MISSED: float(count - different)}
         budgets = {MISSED: 0.0}
     else:
-        values |= {ERROR: float(found[:, 2].max()), ALARMS: different / count}
+        values[ERROR] = float(error.max())
         values[BOUND] = Tally(seen=different, trials=count).bound
         budgets = {ALARMS: FALSE_ALARMS} | ({BOUND: FALSE_ALARMS} if count >= TRIALS["standard"] else {})
     budgets = {} if kind.due is None else budgets
@@ -333,19 +329,22 @@ def _smallest(make: Callable[[int], Pair], most: int) -> float:
 
 def _square(side: int, codes: int) -> Pair:
     plain = np.full((WIDE, WIDE, 3), float(GRAY))
-    return shown(plain), shown(_patch(plain, WIDE / 2, WIDE / 2, side, GRAY + codes))
+    return shown(plain), shown(patched(plain, WIDE / 2, WIDE / 2, side, GRAY + codes))
 
 
 def _edge(quarters: int) -> Pair:
     """A black half-plane on white, at the angle where a move by one pixel makes the largest error of those tried."""
     shapes = [Shape(1, SIZE / 2, SIZE / 2, 4.0 * SIZE, 0.0, np.full(3, 255.0))]
     moved = [Shape(1, SIZE / 2 - 2 * SIZE + x, SIZE / 2, 2.0 * SIZE, 0.4, np.zeros(3)) for x in (0.0, quarters / 4)]
-    one, two = (shown(drawn([*shapes, each])) for each in moved)
+    one, two = (shown(drawn([*shapes, shape])) for shape in moved)
     return one, two
 
 
-def _again(context: Context) -> list[Row]:
-    return [kind_row(name, TRIALS[context.profile.name]) for name in KINDS]
-
-
-STUDY = Study(NAME, "Image comparison, visible changes", about(__doc__), TERMS, tasks, again=_again)
+STUDY = Study(
+    NAME,
+    "Image comparison, visible changes",
+    about(__doc__),
+    TERMS,
+    tasks,
+    again=lambda context: tasks(context)[0].run(),
+)

@@ -4,4 +4,4 @@ In: the table of formulas, rays of every regime, certified answers of the oracle
 total internal reflections and kernel times, and the worst rays found.
 """
 
-__all__ = ["bsdf_samples", "per_formula", "planted_defects", "search", "sweep", "worst_rays"]
+__all__ = ["bsdf_samples", "per_formula", "planted_defects", "search", "sweep"]

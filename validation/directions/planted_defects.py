@@ -37,195 +37,144 @@ COUNT, SCALAR_COUNT = 400, 20  # rays per regime
 EXACT = tuple(name for name, formula in FORMULAS.items() if formula.budget.at_the_limit)
 
 
+Answer = tuple[Any, Any]  # b and transmitted
+
+
 @dataclass(frozen=True)
 class Mutant:
-    """`make(formula)` is the formula with the defect; `of` are the formulas to which it applies.
+    """`answer(formula, a, n, k)` is that of the formula with the defect; `of` are the formulas to which it applies.
 
     `rare`: it shows on too few rays to be looked for on scalar arrays, which cost a call per operation.
     """
 
     text: str
-    make: Callable[[Any], Subject]
+    answer: Callable[[Any, Any, Any, Any], Answer]
     of: tuple[str, ...] = tuple(FORMULAS)
     rare: bool = False
 
-
-# Slips one makes -----------------------------------------------------------------------------------------------
-
-
-def _swapped_ratio(f: Any) -> Subject:
-    return lambda a, n, k: f(a, n, 1 / k)
+    def make(self, formula: Any) -> Subject:
+        """The formula with the defect."""
+        return functools.partial(self.answer, formula)
 
 
-def _ratio_off(f: Any) -> Subject:
-    return lambda a, n, k: f(a, n, k * (1 + 2.0**-10))
+# Defects of any formula f ----------------------------------------------------------------------------------------
 
 
-def _flipped_normal(f: Any) -> Subject:
-    def subject(a: Any, n: Any, k: Any) -> Any:
+def _flipped_normal(f: Any, a: Any, n: Any, k: Any) -> Answer:
+    b, transmitted = f(a, n, k)
+    return dr.select(transmitted, b - n * (2 * dr.dot(n, b)), b), transmitted
+
+
+def _one_sided(f: Any, a: Any, n: Any, k: Any) -> Answer:
+    b, transmitted = f(a, n, k)
+    along = dr.dot(n, b)
+    return dr.select(transmitted, b - n * (along + dr.abs(along)), b), transmitted
+
+
+def _slipped_cross(f: Any, a: Any, n: Any, k: Any) -> Answer:
+    b, transmitted = f(a, n, k)
+    x, y, z = wedge(n, a)
+    return b + contract(n, type(a)(0 * x, -2 * y, 0 * z)) * dr.select(transmitted, k, 1), transmitted
+
+
+def _never_reflected(f: Any, a: Any, n: Any, k: Any) -> Answer:
+    b, transmitted = f(a, n, k)
+    return dr.select(transmitted, b, a), transmitted
+
+
+def _decided(change: Callable[[Any], Any]) -> Callable[[Any, Any, Any, Any], Answer]:
+    def answer(f: Any, a: Any, n: Any, k: Any) -> Answer:
         b, transmitted = f(a, n, k)
-        return dr.select(transmitted, b - n * (2 * dr.dot(n, b)), b), transmitted
+        return b, change(transmitted)
 
-    return subject
+    return answer
 
 
-def _one_sided(f: Any) -> Subject:
-    def subject(a: Any, n: Any, k: Any) -> Any:
+def _scaled(factor: Callable[[Any], Any]) -> Callable[[Any, Any, Any, Any], Answer]:
+    def answer(f: Any, a: Any, n: Any, k: Any) -> Answer:
         b, transmitted = f(a, n, k)
-        along = dr.dot(n, b)
-        return dr.select(transmitted, b - n * (along + dr.abs(along)), b), transmitted
+        return b * factor(n), transmitted
 
-    return subject
-
-
-def _slipped_cross(f: Any) -> Subject:
-    def subject(a: Any, n: Any, k: Any) -> Any:
-        b, transmitted = f(a, n, k)
-        x, y, z = wedge(n, a)
-        return b + contract(n, type(a)(0 * x, -2 * y, 0 * z)) * dr.select(transmitted, k, 1), transmitted
-
-    return subject
+    return answer
 
 
-def _never_reflected(f: Any) -> Subject:
-    def subject(a: Any, n: Any, k: Any) -> Any:
-        b, transmitted = f(a, n, k)
-        return dr.select(transmitted, b, a), transmitted
+def _patched(owner: Any, name: str, replacement: Any) -> Callable[[Any, Any, Any, Any], Answer]:
+    def answer(f: Any, a: Any, n: Any, k: Any) -> Answer:
+        with mock.patch.object(owner, name, replacement):
+            return f(a, n, k)
 
-    return subject
-
-
-def _always(decision: bool) -> Callable[[Any], Subject]:
-    def make(f: Any) -> Subject:
-        def subject(a: Any, n: Any, k: Any) -> Any:
-            b, transmitted = f(a, n, k)
-            return b, transmitted | True if decision else transmitted & False
-
-        return subject
-
-    return make
+    return answer
 
 
-def _last_bit(f: Any) -> Subject:
-    def subject(a: Any, n: Any, k: Any) -> Any:
-        b, transmitted = f(a, n, k)
-        return b * (1 + 2 * dr.epsilon(type(a))), transmitted
-
-    return subject
+# Defects of the documents, as printed ----------------------------------------------------------------------------
 
 
-def _unit_normal_assumed(f: Any) -> Subject:
-    def subject(a: Any, n: Any, k: Any) -> Any:
-        b, transmitted = f(a, n, k)
-        return b * dr.dot(n, n), transmitted
-
-    return subject
-
-
-def _narrow_contrast(f: Any) -> Subject:
-    return lambda a, n, k: f(a, n, k, contrast=k * k - 1)
+def _printed_000(f: Any, a: Any, n: Any, k: Any) -> Answer:
+    w, a2 = wedge(n, a), dr.dot(a, a)
+    radicand = a2 - k * k * dr.dot(w, w)
+    refracted = k * contract(n, w) - n * dr.safe_sqrt(radicand)
+    return dr.select(radicand >= 0, refracted, a - n * (2 * dr.dot(n, a))), radicand >= 0
 
 
-def _plain_radicand(f: Any) -> Subject:
-    return lambda a, n, k: FORMULAS["wedge_contrast"](a, n, k)
+def _printed_001(f: Any, a: Any, n: Any, k: Any) -> Answer:
+    b, transmitted = f(a, n, k)
+    c = k * dr.cross(a, n)
+    length, cos = dr.norm(c), dr.dot(a, n)
+    t = length * dr.cross(n, c * dr.rcp(length)) + n * dr.mulsign(dr.safe_sqrt(1 - length * length), cos)
+    return dr.select(transmitted, t, b), transmitted
 
 
-def _patched(owner: Any, name: str, replacement: Any) -> Callable[[Any], Subject]:
-    def make(f: Any) -> Subject:
-        def subject(a: Any, n: Any, k: Any) -> Any:
-            with mock.patch.object(owner, name, replacement):
-                return f(a, n, k)
-
-        return subject
-
-    return make
+def _printed_002(f: Any, a: Any, n: Any, k: Any) -> Answer:
+    c = dr.dot(n, a)
+    radicand = 1 - k * k * (1 - c * c)
+    refracted = n * (-k * c - dr.safe_sqrt(radicand)) + k * a
+    return dr.select(radicand >= 0, refracted, a - n * (2 * c)), radicand >= 0
 
 
-def _unfused(x: Any, y: Any, z: Any) -> Any:
-    return x * y + z
-
-
-def _truncated(x: error_free.TripleWord) -> error_free.DoubleWord:
-    return error_free.DoubleWord(x.hi, 0 * x.hi)
-
-
-def _plainly_collected(x: error_free.TripleWord) -> error_free.TripleWord:
-    return error_free.TripleWord(x.hi, (sum(x.first),), 0 * x.hi)
-
-
-# Slips of the documents, as printed ----------------------------------------------------------------------------
-
-
-def _printed_000(f: Any) -> Subject:
-    def subject(a: Any, n: Any, k: Any) -> Any:
-        w, a2 = wedge(n, a), dr.dot(a, a)
-        radicand = a2 - k * k * dr.dot(w, w)
-        refracted = k * contract(n, w) - n * dr.safe_sqrt(radicand)
-        return dr.select(radicand >= 0, refracted, a - n * (2 * dr.dot(n, a))), radicand >= 0
-
-    return subject
-
-
-def _printed_001(f: Any) -> Subject:
-    def subject(a: Any, n: Any, k: Any) -> Any:
-        b, transmitted = f(a, n, k)
-        c = k * dr.cross(a, n)
-        length, cos = dr.norm(c), dr.dot(a, n)
-        t = length * dr.cross(n, c * dr.rcp(length)) + n * dr.mulsign(dr.safe_sqrt(1 - length * length), cos)
-        return dr.select(transmitted, t, b), transmitted
-
-    return subject
-
-
-def _printed_002(f: Any) -> Subject:
-    def subject(a: Any, n: Any, k: Any) -> Any:
-        c = dr.dot(n, a)
-        radicand = 1 - k * k * (1 - c * c)
-        refracted = n * (-k * c - dr.safe_sqrt(radicand)) + k * a
-        return dr.select(radicand >= 0, refracted, a - n * (2 * c)), radicand >= 0
-
-    return subject
-
-
-def _printed_004(f: Any) -> Subject:
+def _printed_004(f: Any, a: Any, n: Any, k: Any) -> Answer:
     """X = k R/(1 + R²) with R = sin/cos, in the plane of incidence."""
-
-    def subject(a: Any, n: Any, k: Any) -> Any:
-        c = dr.dot(n, a)
-        tangent = a - n * c
-        x = k * dr.abs(c) * dr.norm(tangent)  # R/(1 + R²) = sin cos
-        transmitted = x <= 1
-        refracted = tangent * (k * dr.abs(c)) + n * dr.mulsign(dr.safe_sqrt(1 - x * x), c)
-        return dr.select(transmitted, refracted, tangent - n * c), transmitted
-
-    return subject
+    c = dr.dot(n, a)
+    tangent = a - n * c
+    x = k * dr.abs(c) * dr.norm(tangent)  # R/(1 + R²) = sin cos
+    refracted = tangent * (k * dr.abs(c)) + n * dr.mulsign(dr.safe_sqrt(1 - x * x), c)
+    return dr.select(x <= 1, refracted, tangent - n * c), x <= 1
 
 
 MUTANTS = {
-    "control": Mutant("the formula as it is", lambda f: f),
-    "swapped k": Mutant("n_to / n_from for n_from / n_to", _swapped_ratio),
-    "k off": Mutant("a ratio that is off by 2⁻¹⁰", _ratio_off),
+    "control": Mutant("the formula as it is", lambda f, a, n, k: f(a, n, k)),
+    "swapped k": Mutant("n_to / n_from for n_from / n_to", lambda f, a, n, k: f(a, n, 1 / k)),
+    "k off": Mutant("a ratio that is off by 2⁻¹⁰", lambda f, a, n, k: f(a, n, k * (1 + 2.0**-10))),
     "flipped normal": Mutant("the root with the wrong sign: the refracted ray comes back", _flipped_normal),
     "one-sided": Mutant("the root without the sign of n·a", _one_sided),
     "slipped cross product": Mutant("n × a with a wrong sign in one component", _slipped_cross),
     "no mirror": Mutant("total internal reflection lets the ray pass", _never_reflected),
-    "always transmitted": Mutant("`transmitted` is True for every ray", _always(True)),
-    "never transmitted": Mutant("`transmitted` is False for every ray", _always(False)),
+    "always transmitted": Mutant(
+        "`transmitted` is True for every ray", _decided(lambda transmitted: transmitted | True)
+    ),
+    "never transmitted": Mutant(
+        "`transmitted` is False for every ray", _decided(lambda transmitted: transmitted & False)
+    ),
     "000 as printed": Mutant("n·a < 0 assumed", _printed_000, ("wedge",)),
     "001 as printed": Mutant("‖c‖ (n × ĉ), with ĉ = 0/0 at normal incidence", _printed_001, ("cross",)),
     "002 as printed": Mutant("N·L < 0 assumed", _printed_002, ("decomposed",)),
     "004 as printed": Mutant("X = k R/(1 + R²)", _printed_004, ("rotated",)),
-    "one ulp": Mutant("the result times 1 + 2u", _last_bit, EXACT),
-    "unit normal assumed": Mutant("the division by n² left out", _unit_normal_assumed, EXACT),
-    "plain radicand": Mutant("(n·a)² − κ w² in working precision", _plain_radicand, EXACT),
-    "narrow contrast": Mutant("κ = k² − 1 in working precision", _narrow_contrast, EXACT),
-    "no fma": Mutant("x y + z rounded twice", _patched(dr, "fma", _unfused), ("compensated",)),
+    "one ulp": Mutant("the result times 1 + 2u", _scaled(lambda n: 1 + 2 * dr.epsilon(type(n))), EXACT),
+    "unit normal assumed": Mutant("the division by n² left out", _scaled(lambda n: dr.dot(n, n)), EXACT),
+    "plain radicand": Mutant(
+        "(n·a)² − κ w² in working precision", lambda f, a, n, k: FORMULAS["wedge_contrast"](a, n, k), EXACT
+    ),
+    "narrow contrast": Mutant(
+        "κ = k² − 1 in working precision", lambda f, a, n, k: f(a, n, k, contrast=k * k - 1), EXACT
+    ),
+    "no fma": Mutant("x y + z rounded twice", _patched(dr, "fma", lambda x, y, z: x * y + z), ("compensated",)),
     "truncated radicand": Mutant(
-        "its low part dropped", _patched(error_free.TripleWord, "double", _truncated), ("compensated",)
+        "its low part dropped",
+        _patched(error_free.TripleWord, "double", lambda x: error_free.DoubleWord(x.hi, 0 * x.hi)),
+        ("compensated",),
     ),
     "radicand of second order": Mutant(
         "sums of first order rounded",
-        _patched(error_free.TripleWord, "collected", _plainly_collected),
+        _patched(error_free.TripleWord, "collected", lambda x: error_free.TripleWord(x.hi, (sum(x.first),), 0 * x.hi)),
         ("compensated",),
         rare=True,
     ),
@@ -248,13 +197,14 @@ def tasks(context: Context) -> list[Task]:
 
 def _rows(setting: Setting) -> list[Row]:
     sample = draw(SCALAR_COUNT if setting.is_scalar else COUNT, setting.precision)
-    return [_row(name, formula, setting, sample) for name in MUTANTS for formula in MUTANTS[name].of]
+    return [row(name, formula, setting, sample) for name in MUTANTS for formula in MUTANTS[name].of]
 
 
-RARE = "shows on one ray in a hundred; scalar arrays are asked for too few"
+RARE = "shows on one ray in a hundred; scalar arrays compute too few"
 
 
-def _row(name: str, formula: str, setting: Setting, sample: Sample) -> Row:
+def row(name: str, formula: str, setting: Setting, sample: Sample) -> Row:
+    """How one mutant of a formula did."""
     if MUTANTS[name].rare and setting.is_scalar:
         return Row(NAME, name, formula, setting.label, reason=RARE)
     found = sample.judge(name, formula, setting.vector)
@@ -278,16 +228,11 @@ class Sample:
     def judge(self, mutant: str, formula: str, vector: Any) -> Judgement:
         """Check a mutant against the bound of the formula it was made from, on the rays that this formula accepts."""
         spoilt, budget = MUTANTS[mutant].make(FORMULAS[formula]), FORMULAS[formula].budget
-        part = self if budget.at_the_limit else self.only(self.unit)
-        return judge_formula(spoilt, part.rays, part.exact, vector, budget)
-
-    def only(self, mask: np.ndarray) -> Sample:
-        """The rays of a mask (N,)."""
-
-        def part(x: Any) -> Any:
-            return type(x)(**{f.name: getattr(x, f.name)[mask] for f in dataclasses.fields(x)})
-
-        return Sample(part(self.rays), part(self.exact), self.regime[mask], self.unit[mask])
+        if budget.at_the_limit:
+            return judge_formula(spoilt, self.rays, self.exact, vector, budget)
+        fields = {field.name: getattr(self.exact, field.name)[self.unit] for field in dataclasses.fields(self.exact)}
+        exact = oracle.Certified(**fields)
+        return judge_formula(spoilt, self.rays[self.unit], exact, vector, budget)
 
     def strongest(self, found: Judgement) -> str:
         """ "regime, metric value": a wrong decision before a wrong direction, where most rays see it."""
@@ -306,10 +251,10 @@ def draw(count: int, precision: type) -> Sample:
     parts = {name: regimes.make(name, count, precision, seeds.current(SEED)) for name in entries}
     parts["along an axis"] = _along_axes(precision)
     units = [*(entry.unit for entry in entries.values()), True]
-    a, n, k = (np.concatenate([getattr(rays, x) for rays in parts.values()]) for x in ("a", "n", "k"))
-    lengths = [len(rays.k) for rays in parts.values()]
-    exact = oracle.refract(a, n, k, fresnel=False, progress=False)
-    return Sample(Rays(a, n, k), exact, np.repeat(list(parts), lengths), np.repeat(units, lengths))
+    rays = Rays.joined(list(parts.values()))
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    lengths = list(map(len, parts.values()))
+    return Sample(rays, exact, np.repeat(list(parts), lengths), np.repeat(units, lengths))
 
 
 def _along_axes(precision: type) -> Rays:

@@ -6,7 +6,8 @@ quantities are maximised: the chord error, and the distance from the critical an
 is still misclassified. Some children are put within a few ulps of the critical angle. All rays stay in the domain: unit
 vectors stay unit up to rounding, lengths within 1e-18 … 1e18, ratios within those of the regime.
 
-`python -m validation.directions.keep_worst` adds the worst to tests/data/worst_rays.txt, which the tests replay.
+The tests replay the worst rays of earlier searches, tests/data/worst_rays.txt. A row of this study lists its worst rays
+as lines of that file.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.random import Generator
@@ -27,12 +29,9 @@ from validation import repeated
 from validation.reference.fast_reference import Screen
 from validation.run import seeds
 from validation.run.array_settings import Setting, budget_of, settings
-from validation.run.context import Context, Profile
+from validation.run.context import Context
 from validation.run.metrics import ERROR_OVER_BOUND, MISCLASSIFIED_FAR
 from validation.study import Study, Task, about
-
-from . import worst_rays
-from .worst_rays import Found
 
 NAME = "search"
 TERMS = {
@@ -45,9 +44,7 @@ SAMPLE, LARGEST_SAMPLE = 4000, 1 << 16
 FAMILIES = 6  # per regime and objective
 CHILDREN = 24
 TRIALS = 1024
-OBJECTIVES = ("chord", "decision")
-# Of what is allowed: above it a ray is worth keeping. Formulas at the limit are near it by rounding alone.
-WORTH_KEEPING = {True: 0.9, False: 0.25}
+WORST_RAYS = Path(__file__).parents[2] / "tests" / "data" / "worst_rays.txt"
 
 
 def tasks(context: Context) -> list[Task]:
@@ -63,14 +60,14 @@ def tasks(context: Context) -> list[Task]:
 def _rows(context: Context, name: str, setting: Setting) -> list[Row]:
     if setting.vector is None:
         return [Row(NAME, name, "all regimes", setting.label, reason=setting.reason)]
-    generations, sample = context.profile.generations, _sample_size(context.profile)
+    generations, sample = context.profile.generations, min(context.profile.sweep_rays // 10, LARGEST_SAMPLE)
     herd = climb(name, FORMULAS[name], domain(name, setting), setting, generations, seeds.current(SEED), sample)
     found = certify(name, FORMULAS[name], herd, setting)
-    chords = [f for f in found if f.line.objective == "chord"]
-    far = [f.line.line() for f in found if f.line.objective == "decision" and f.share > 0]
+    chords = [f for f in found if f.objective == "chord"]
+    far = [f.line() for f in found if f.objective == "decision" and f.share > 0]
     values = {ERROR_OVER_BOUND: max((f.share for f in chords), default=0.0), MISCLASSIFIED_FAR: float(len(far))}
     values["rays tried"] = float(generations * CHILDREN * len(herd))
-    worst_lines = [f.line.line() for f in sorted(chords, key=lambda f: -f.share)[:3]]
+    worst_lines = [f.line() for f in sorted(chords, key=lambda f: -f.share)[:3]]
     replay = {
         "seed": seeds.current(SEED),
         "sample": sample,
@@ -79,10 +76,6 @@ def _rows(context: Context, name: str, setting: Setting) -> list[Row]:
         "misclassified": far[:3],
     }
     return [Row(NAME, name, "all regimes", setting.label, values, BUDGETS, replay=replay)]
-
-
-def _sample_size(profile: Profile) -> int:
-    return min(profile.sweep_rays // 10, LARGEST_SAMPLE)
 
 
 # The herd ------------------------------------------------------------------------------------------------------
@@ -234,14 +227,39 @@ def _inside(rays: Rays, herd: Herd, parents: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Certified:
-    """A line, and its chord error over the bound; for a decision 1 where it had to be right, else 0."""
+class Found:
+    """A line of the file. `numbers` are a, n and k as seven hexadecimal floats.
 
-    line: Found
-    share: float
+    `objective` and `score`: "chord", the certified chord error in u; "decision" for a ray whose total internal
+    reflection the formula misclassifies, |D| in u² of the radicand's terms. `share`, not in the file: the chord
+    error over its bound; of a decision 1 where it had to be right, else 0.
+    """
+
+    precision: str
+    formula: str
+    regime: str
+    objective: str
+    score: float
+    numbers: tuple[str, ...]
+    share: float = 0.0
+
+    def line(self) -> str:
+        """The line as it stands in the file."""
+        vectors = " ".join(self.numbers[:3]), " ".join(self.numbers[3:6]), self.numbers[6]
+        fields = self.precision, self.formula, self.regime, self.objective, f"{self.score:.4g}", *vectors
+        return " | ".join(fields)
+
+    @classmethod
+    def parse(cls, line: str) -> Found:
+        """ValueError where the line is not of this form."""
+        precision, formula, regime, objective, score, a, n, k = line.split(" | ")
+        numbers = (*a.split(), *n.split(), k)
+        if len(numbers) != 7 or not np.isfinite([float.fromhex(x) for x in numbers]).all():
+            raise ValueError(f"not a ray: {line!r}; expected three numbers for a, three for n, one for k")
+        return cls(precision, formula, regime, objective, float(score), numbers)
 
 
-def certify(name: str, subject: Subject, herd: Herd, setting: Setting) -> list[Certified]:
+def certify(name: str, subject: Subject, herd: Herd, setting: Setting) -> list[Found]:
     """Every parent's certified score, held to the budget of `name`."""
     rays, u = herd.rays, setting.roundoff
     exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
@@ -249,27 +267,25 @@ def certify(name: str, subject: Subject, herd: Herd, setting: Setting) -> list[C
     margin = np.abs(oracle.relative_radicand(rays.a, rays.n, rays.k)) / u**2
     found = []
     for i, wrong in enumerate((seen.misjudged | seen.far).tolist()):
-        objective, score = ("decision", margin[i]) if wrong else ("chord", seen.chord[i] / u)
-        line = Found.at(rays, i, name, herd.names[herd.regime[i]], objective, float(score))
-        found.append(Certified(line, float(seen.far[i] if wrong else seen.share[i])))
+        objective, score, share = (
+            ("decision", margin[i], seen.far[i]) if wrong else ("chord", seen.chord[i] / u, seen.share[i])
+        )
+        ray, regime = rays.hexed(i), herd.names[herd.regime[i]]
+        numbers = *ray["a"], *ray["n"], ray["k"]
+        found.append(Found(rays.k.dtype.name, name, regime, objective, float(score), numbers, float(share)))
     return found
 
 
-def worth_keeping(found: Iterable[Certified]) -> list[Found]:
-    """The lines whose error over bound is above WORTH_KEEPING."""
-    return [f.line for f in found if f.share > WORTH_KEEPING[budget_of(f.line.formula).at_the_limit]]
+def worst_rays(path: Path = WORST_RAYS) -> list[Found]:
+    """The worst rays of earlier searches. ValueError: a line that is none."""
+    return [Found.parse(line) for line in path.read_text().splitlines() if line and not line.startswith("#")]
 
 
-def rescored(name: str, setting: Setting) -> list[Found]:
-    """The lines of the file for `name` in that precision, with the scores of the present formula."""
-    precision = np.dtype(setting.precision).name
-    lines = [line for line in worst_rays.read() if (line.formula, line.precision) == (name, precision)]
-    rays, u = worst_rays.rays_of(lines, precision), setting.roundoff
-    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-    seen = judge_formula(FORMULAS[name], rays, exact, setting.vector, budget_of(name))
-    far = np.where(seen.misjudged, np.abs(oracle.relative_radicand(rays.a, rays.n, rays.k)) / u**2, 0.0)
-    scores = {"chord": seen.chord / u, "decision": far}
-    return [line.scored(float(scores[line.objective][i])) for i, line in enumerate(lines)]
+def rays_of(found: Iterable[Found], precision: str) -> Rays:
+    """The rays of the lines of that precision, exactly."""
+    numbers = [[float.fromhex(x) for x in line.numbers] for line in found if line.precision == precision]
+    table = np.array(numbers, dtype=precision).reshape(-1, 7)
+    return Rays(table[:, :3], table[:, 3:6], table[:, 6])
 
 
 STUDY = Study(NAME, "Search", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))

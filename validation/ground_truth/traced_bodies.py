@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from mi_refract.plugins.refract import PLUGIN
+from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation import limits
 from validation.reference.optical_systems import Array

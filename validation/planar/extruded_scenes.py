@@ -19,7 +19,7 @@ import numpy as np
 
 from mi_refract.planar import Event, Paths, Segments
 from mi_refract.planar.curves import points
-from mi_refract.plugins.refract import PLUGIN
+from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation import repeated
 from validation.reference.layered_scenes import OFFSET

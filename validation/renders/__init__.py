@@ -7,6 +7,7 @@ the images as EXR files.
 __all__ = [
     "against_dielectric",
     "colours",
+    "gradients",
     "invisible_changes",
     "neighbours",
     "random_numbers",

@@ -23,7 +23,7 @@ import numpy as np
 from mi_refract.formulas import FORMULAS, automatic
 from mi_refract.image_diff import pixelwise, tile_statistics
 from mi_refract.io import image_file
-from mi_refract.plugins.refract import PLUGIN
+from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing
@@ -104,7 +104,7 @@ def _compare(context: Context, path: Path, plugin: str) -> list[Row]:
             replay,
             images,
             curves,
-        )
+        ),
     ]
 
 
@@ -120,46 +120,31 @@ def _images(profile: Profile, *cameras: Camera) -> list[np.ndarray]:
     return [np.stack([camera(profile.spp, seed)[0] for seed in range(profile.pairs)]) for camera in cameras]
 
 
-def _at_the_limit() -> list[str]:
-    """The plugins with those formulas at the rounding limit that are not the default."""
-    import mitsuba as mi
-
-    default = automatic(dr.backend_v(mi.Float))
-    return [f"{PLUGIN}_{name}" for name, formula in FORMULAS.items() if formula.budget.at_the_limit and name != default]
-
-
 def _timed(
     context: Context, path: Path, plugin: str, cameras: dict[str, Camera]
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """The times of `_times`, and the goals for those that have one."""
-    profile = context.profile
-    # Both forms at the rounding limit are timed, whichever of them is the default; `quick` saves their kernels.
-    others = _at_the_limit() if plugin == PLUGIN and not profile.quick else []
-    times = _times(profile, cameras | {name: Camera(opened(path, name, profile.resolution)) for name in others})
-    # A Python plugin costs a call per operation in scalar variants: its time is demanded of compiled ones only.
-    demanded = [] if context.variant.startswith("scalar") else _metrics([plugin, *others])
-    return times, dict.fromkeys(demanded, limits.RENDER_TIME)
-
-
-def _times(profile: Profile, cameras: dict[str, Camera]) -> dict[str, float]:
-    """Values "time / dielectric" of the first camera, and by name of the others; the built-in's is not shown."""
+    """Values "time / dielectric" of the plugin, and by name of others; and the goals for those that have one."""
     import mitsuba as mi
 
+    profile, others = context.profile, list[str]()
+    if plugin == PLUGIN and not profile.quick:  # which saves kernels
+        # Both forms at the rounding limit are timed, whichever of them is the default.
+        default = automatic(dr.backend_v(mi.Float))
+        others = [name for name, formula in FORMULAS.items() if formula.budget.at_the_limit and name != default]
+        others = [f"{PLUGIN}_{name}" for name in others]
+    cameras = cameras | {name: Camera(opened(path, name, profile.resolution)) for name in others}
     _, seconds = cameras[BUILTIN](profile.spp, seed=0)
     spp = profile.spp
     if dr.is_jit_v(mi.Float):  # a scalar plugin costs calls per sample: no number of them outweighs those
         spp *= 2 ** max(0, math.ceil(math.log2(TIMED / seconds)))
-    found = kernel_timing.rounds(cameras, lambda camera: camera(spp, seed=0)[1], profile.repeats)
-    ours = [name for name in cameras if name != BUILTIN]
+    times = kernel_timing.rounds(cameras, lambda camera: camera(spp, seed=0)[1], profile.repeats)
+    metrics = {plugin: TIME} | {name: f"{TIME}, {name.removeprefix(PLUGIN + '_')}" for name in others}
     values = {"timed renders": float(profile.repeats), "timed spp": float(spp)}
-    for name, metric in zip(ours, _metrics(ours), strict=True):
-        values |= kernel_timing.ratio(metric, found[name], found[BUILTIN])
-    return values
-
-
-def _metrics(plugins: list[str]) -> list[str]:
-    others = [f"{TIME}, {name.removeprefix(PLUGIN + '_')}" for name in plugins[1:]]
-    return [TIME, *others]
+    for name, metric in metrics.items():
+        values |= kernel_timing.ratio(metric, times[name], times[BUILTIN])
+    # A Python plugin costs a call per operation in scalar variants: its time is demanded of compiled ones only.
+    demanded = [] if context.variant.startswith("scalar") else metrics.values()
+    return values, dict.fromkeys(demanded, limits.RENDER_TIME)
 
 
 def _paired(test: np.ndarray, reference: np.ndarray) -> dict[str, float]:

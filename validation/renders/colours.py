@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mi_refract.io import image_file
-from mi_refract.plugins.refract import PLUGIN
+from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation.run.context import Context, beyond_builtin
 from validation.run.render_methods import Camera, opened, under

@@ -11,7 +11,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from .invisible_changes import GLASS, Nodes
+from .cases import BLACK, GLASS, Nodes, bitmap
 
 WIDE = 6  # cells beside each other
 
@@ -19,14 +19,13 @@ WIDE = 6  # cells beside each other
 def uneven(shape: tuple[int, int], low: float, high: float, grain: int = 1) -> Nodes:
     """A bitmap of two values in blocks without an order: hard edges at every scale."""
     blocks = np.random.default_rng(3).random(shape) < 0.5
-    image = np.kron(np.where(blocks, high, low), np.ones((grain, grain)))[..., None] * np.ones(3)
-    return {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(image.astype(np.float32))}
+    return bitmap(np.kron(np.where(blocks, high, low), np.ones((grain, grain)))[..., None] * np.ones(3))
 
 
 def bars(place: Any, spans: Iterable[tuple[float, float]], name: str) -> Nodes:
     """Black bars across the square [-1, 1]² of `place`, each from and to a place in x."""
     parts = [mi.ScalarTransform4f().translate([(a + b) / 2, 0, 0]).scale([(b - a) / 2, 1, 1]) for a, b in spans]
-    bar = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.0}}
+    bar = {"type": "rectangle", "bsdf": BLACK}
     return {f"{name}{i}": bar | {"to_world": place @ part} for i, part in enumerate(parts)}
 
 

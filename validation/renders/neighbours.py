@@ -18,7 +18,7 @@ import functools
 import gc
 import itertools
 import statistics
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import mitsuba as mi
@@ -28,13 +28,12 @@ from mi_refract.formulas import FORMULAS
 from mi_refract.plugins import inspect
 from mi_refract.report.row import Row
 from validation import limits
-from validation.repeated import by_tasks
 from validation.run.context import Context
+from validation.run.render_methods import OURS
 from validation.run.seeds import current
-from validation.study import Study, Task, about
 
+from .cases import GLASS, TURNED, Case, Nodes, flat, study, variants
 from .glass_cells import CELLS, WIDE, scene, uneven
-from .invisible_changes import GLASS, Nodes, texture
 
 TERMS = {
     "alarms": "means that differ by more than noise does but once in 10⁸ tests: of all, of one setting, of one cell",
@@ -53,14 +52,13 @@ SMOOTH: dict[str, Nodes] = {name: {} for name in ("diffuse", "plastic", "hair", 
 SMOOTH |= {f"rough{name}": ROUGH for name in ("dielectric", "conductor", "plastic")} | {"pplastic": ROUGH}
 SMOOTH |= {"principled": MIXED | {"clearcoat": 0.5, "sheen": 0.5}, "principledthin": MIXED | {"diff_trans": 0.8}}
 BSDFS = DELTA | SMOOTH | {f"refract_{formula}": GLASS for formula in FORMULAS}
-TURNED = [0.5 + 0.5 * np.sin(0.35), 0.5, 0.5 + 0.5 * np.cos(0.35)]  # by 20 degrees
 WRAPPERS: dict[str, Callable[[Nodes], Nodes]] = {
     "alone": lambda bsdf: bsdf,
     "mask": lambda bsdf: {"type": "mask", "opacity": 0.6, "b": bsdf},
     "blendbsdf": lambda bsdf: {"type": "blendbsdf", "weight": 0.3, "a": bsdf, "b": GLASS},
     "twosided": lambda bsdf: {"type": "twosided", "b": bsdf},
     "bumpmap": lambda bsdf: {"type": "bumpmap", "arbitrary": uneven((8, 8), 0.0, 0.1), "b": bsdf},
-    "normalmap": lambda bsdf: {"type": "normalmap", "normalmap": texture(TURNED), "b": bsdf},
+    "normalmap": lambda bsdf: {"type": "normalmap", "normalmap": flat(TURNED), "b": bsdf},
 }
 Settings = tuple[tuple[int, int], ...]  # split depth, samples per pixel
 SETTINGS: dict[str, Settings] = {
@@ -92,29 +90,27 @@ def measured(view: Any, bsdfs: int, method: Nodes, spp: int, samples: float, see
     channels = np.s_[..., 3:] if "hide_emitters" in method else np.s_[..., :3]
     cells = np.array(pair, float)[channels].mean(-1)[:, ::-1].reshape(2, tall, pixels, WIDE, pixels)
     noise = np.square(cells[0] - cells[1]).sum((1, 3)) / 4 / pixels**4
-    found = np.stack([cells.mean((0, 2, 4)), noise]).reshape(2, -1)[:, : bsdfs * len(CELLS)]
-    return found.reshape(2, bsdfs, len(CELLS))
+    means = np.stack([cells.mean((0, 2, 4)), noise]).reshape(2, -1)[:, : bsdfs * len(CELLS)]
+    return means.reshape(2, bsdfs, len(CELLS))
 
 
-def tasks(context: Context) -> list[Task]:
+def cases(context: Context) -> Iterator[Case]:
     """One per variant and wrapper; the profile `quick` renders a few BSDFs in the variant of the run."""
-    if context.scalar:
-        reason = "scalar variants would render for hours"
-        return [Task(NAME, lambda: [Row(NAME, "refract_path", "every BSDF", context.variant, reason=reason)])]
-    rgb, family = context.variant, context.variant.removesuffix("rgb")
-    cases: list[Any] = [(rgb, wrapper, names, ((1, 4),), "") for wrapper, names in QUICK.items()]
+    rgb = context.variant
+    settings: list[Any] = [(rgb, wrapper, names, ((1, 4),), "") for wrapper, names in QUICK.items()]
     if not context.profile.quick:
         every, few = (*DELTA, *SMOOTH), (*DELTA, "diffuse")
-        cases = [
-            (variant, wrapper, tuple(BSDFS) if wrapper == "alone" else every if variant == rgb else few, settings, "")
-            for variant in (rgb, f"{family}spectral", f"{family}spectral_polarized")
-            for wrapper, settings in SETTINGS.items()
+        settings = [
+            (variant, wrapper, tuple(BSDFS) if wrapper == "alone" else every if variant == rgb else few, counts, "")
+            for variant in variants(context)
+            for wrapper, counts in SETTINGS.items()
         ]
         counts = (0, 4), (0, 25), *itertools.product((1, 3), COUNTS)
-        cases.append((rgb, "alone", ("diffuse", "plastic"), counts, "every count"))
-        cases += [(rgb, x, ("null", "dielectric", "diffuse"), ((0, 4), (1, 4)), "alpha") for x in ("alone", "mask")]
-    usable = [case for case in cases if context.variants.get(case[0]) is None]
-    return [Task(f"{NAME}: {case[0]} {titled(*case[1::3])}", functools.partial(rows, *case)) for case in usable]
+        settings.append((rgb, "alone", ("diffuse", "plastic"), counts, "every count"))
+        masked = ("null", "dielectric", "diffuse")
+        settings += [(rgb, wrapper, masked, ((0, 4), (1, 4)), "alpha") for wrapper in ("alone", "mask")]
+    for setting in settings:
+        yield Case(f"{setting[0]} {titled(setting[1], setting[-1])}", setting[0], functools.partial(rows, *setting))
 
 
 def titled(wrapper: str, way: str) -> str:
@@ -124,37 +120,31 @@ def titled(wrapper: str, way: str) -> str:
 
 def groups(variant: str, wrapper: str, names: Iterable[str]) -> tuple[list[dict[str, Nodes]], dict[str, str]]:
     """The BSDFs whose scenes have the same features, in groups; by name, why Mitsuba does not load the others."""
-    found: dict[Any, dict[str, Nodes]] = {}
+    together: dict[Any, dict[str, Nodes]] = {}
     refused = {}
     for name in names:
         bsdf = WRAPPERS[wrapper](BSDFS[name] | {"type": name})
         try:
-            found.setdefault(inspect(scene([bsdf], variant)), {})[name] = bsdf
+            together.setdefault(inspect(scene([bsdf], variant)), {})[name] = bsdf
         except RuntimeError as error:
             refused[name] = str(error).rpartition("[")[2].partition("] ")[2].partition("\n")[0]
-    return list(found.values()), refused
+    return list(together.values()), refused
 
 
 def rows(variant: str, wrapper: str, names: tuple[str, ...], settings: Settings, way: str = "") -> list[Row]:
     """A row for each BSDF, and one for each setting; those that Mitsuba refuses in its own words."""
-    before: Any = mi.variant()
-    mi.set_variant(variant)
-    try:
-        together, refused = groups(variant, wrapper, names)
-        parts = zip(*(images(list(each.values()), variant, settings, way) for each in together), strict=True)
-        test, noise, expected, uncertain = (np.concatenate(part, -2) for part in parts)
-    finally:
-        mi.set_variant(before)
+    together, refused = groups(variant, wrapper, names)
+    parts = zip(*(images(list(group.values()), variant, settings, way) for group in together), strict=True)
+    test, noise, expected, uncertain = (np.concatenate(part, -2) for part in parts)
     cases: dict[str, Any] = {name: np.s_[:, [i]] for i, name in enumerate(itertools.chain(*together))}
     cases |= {f"split {depth}, {spp} spp": np.s_[[i], :] for i, (depth, spp) in enumerate(settings)}
     budgets, replay = {"alarms": 0.0, "detectable": limits.NEIGHBOUR}, {"seed": current(SEED), "samples": WAYS[way][1]}
-    title, found = titled(wrapper, way), []
+    title, table = titled(wrapper, way), []
     for case, part in cases.items():
         values = judged(test[part], noise[part], expected[part[1]], uncertain[part[1]])
-        found.append(Row(NAME, "refract_path", f"{title}: {case}", variant, values, budgets, replay=replay))
-    for name, reason in refused.items():
-        found.append(Row(NAME, "refract_path", f"{title}: {name}", variant, reason=f"Mitsuba: {reason}"))
-    return found
+        table.append(Row(NAME, OURS, f"{title}: {case}", variant, values, budgets, replay=replay))
+    why = {name: f"Mitsuba: {reason}" for name, reason in refused.items()}
+    return table + [Row(NAME, OURS, f"{title}: {name}", variant, reason=reason) for name, reason in why.items()]
 
 
 def images(bsdfs: list[Nodes], variant: str, settings: Settings, way: str) -> tuple[Any, Any, Any, Any]:
@@ -163,10 +153,12 @@ def images(bsdfs: list[Nodes], variant: str, settings: Settings, way: str) -> tu
     seed, (parameters, samples) = current(SEED), WAYS[way]
     measure = functools.partial(measured, scene(bsdfs, variant), len(bsdfs))
     expected, uncertain = measure({"type": "path"} | parameters, 64, samples, seed + 5000)
-    ours, found = {"type": "refract_path"} | parameters, []
-    for i, (depth, spp) in enumerate(settings):
-        found.append(measure(ours | {"split_depth": depth}, spp, samples / len(settings), seed + 2 * i))
-    test, noise = np.stack(found, 1)
+    ours = {"type": OURS} | parameters
+    renders = [
+        measure(ours | {"split_depth": depth}, spp, samples / len(settings), seed + 2 * i)
+        for i, (depth, spp) in enumerate(settings)
+    ]
+    test, noise = np.stack(renders, 1)
     return test, noise, expected, uncertain
 
 
@@ -184,4 +176,4 @@ def judged(test: Any, noise: Any, expected: Any, uncertain: Any) -> dict[str, fl
     return values | {"detectable": detectable[2], "detectable, each": detectable[1]}
 
 
-STUDY = Study(NAME, "Glass and its neighbours", about(__doc__), TERMS, tasks, again=by_tasks(tasks))
+STUDY = study(NAME, "Glass and its neighbours", __doc__, TERMS, cases)

@@ -10,6 +10,7 @@ draws says nothing of what the next one draws. Numbers of 20 keys are pooled.
 from __future__ import annotations
 
 import functools
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -17,13 +18,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mi_refract.plugins.keyed_sampler import KeyedMultijitter
+from mi_refract.plugins.sampling import KeyedMultijitter
 from mi_refract.report.row import Row
 from validation import limits
-from validation.repeated import by_tasks
 from validation.run.context import Context
+from validation.run.render_methods import OURS
 from validation.run.seeds import current
-from validation.study import Study, Task, about
+
+from .cases import Case, study
 
 NAME, SEED = "random numbers", 2040
 TERMS = {
@@ -34,52 +36,40 @@ TERMS = {
 }
 KEYS, SEEDS, LANES, CELLS = 20, 5, 2**16, 32
 QUICK = (1, 4, 7, 16, 32, 64, 100, 256)
-PARTS = [range(first, first + 30) for first in range(1, 301, 30)]
 TESTS = 300 * SEEDS * 6  # of the whole study: the kinds are those of `histograms`
 EDGE = 2.0**-20  # nearer to an edge a float32 may round to either side
 
 
-def tasks(context: Context) -> list[Task]:
+def cases(context: Context) -> Iterator[Case]:
     """Counts from 1 to 300; in the profile `quick` a few, one seed."""
-    if context.scalar:
-        reason = "scalar variants draw the sampler's own numbers"
-        return [Task(NAME, lambda: [Row(NAME, "refract_path", "every count", context.variant, reason=reason)])]
     quick = context.profile.quick
-    parts: list[Sequence[int]] = [QUICK] if quick else [*PARTS]
-    return [
-        Task(f"{NAME}: {c[0]} to {c[-1]}", functools.partial(rows, context.variant, c, 1 if quick else SEEDS))
-        for c in parts
-    ]
+    for counts in [QUICK] if quick else [range(first, first + 30) for first in range(1, 301, 30)]:
+        work = functools.partial(rows, context.variant, counts, 1 if quick else SEEDS)
+        yield Case(f"{counts[0]} to {counts[-1]}", context.variant, work)
 
 
 def rows(variant: str, counts: Sequence[int], seeds: int, source: Any = KeyedMultijitter) -> list[Row]:
     """One row per kind of number; `source` makes them, as `KeyedMultijitter` does."""
     from scipy.stats import chi2
 
-    p: dict[str, list[float]] = {}
-    unstratified: dict[str, int] = {}
-    for count in counts:
-        for seed in range(seeds):
-            pooled: dict[str, Any] = {}
-            for kind, histogram, broken in histograms(source, count, current(SEED) + seed):
-                pooled[kind] = pooled.get(kind, 0) + histogram
-                unstratified[kind] = unstratified.get(kind, 0) + broken
-            for kind, seen in pooled.items():
-                expected = seen.sum() / seen.size
-                p.setdefault(kind, []).append(float(chi2.sf(((seen - expected) ** 2).sum() / expected, seen.size - 1)))
-    found = []
-    for kind, each in p.items():
-        values = {
-            "alarms": float(sum(x < limits.NUMBERS_ALARM / TESTS for x in each)),
-            "tests": float(len(each)),
-            "least p": min(each) * len(each),
-            "not stratified": float(unstratified[kind]),
-        }
-        case, replay = f"{kind}, {counts[0]} to {counts[-1]} samples", {"seed": current(SEED), "keys": KEYS}
-        found.append(
-            Row(NAME, "refract_path", case, variant, values, {"alarms": 0, "not stratified": 0}, replay=replay)
-        )
-    return found
+    p, unstratified = defaultdict[str, list[float]](list), Counter[str]()
+    for count, seed in ((count, seed) for count in counts for seed in range(seeds)):
+        pooled: dict[str, Any] = {}
+        for kind, histogram, broken in histograms(source, count, current(SEED) + seed):
+            pooled[kind] = pooled.get(kind, 0) + histogram
+            unstratified[kind] += broken
+        for kind, seen in pooled.items():
+            expected = seen.sum() / seen.size
+            p[kind].append(float(chi2.sf(((seen - expected) ** 2).sum() / expected, seen.size - 1)))
+    budgets, replay = {"alarms": 0.0, "not stratified": 0.0}, {"seed": current(SEED), "keys": KEYS}
+    table = []
+    for kind, tests in p.items():
+        alarms = sum(x < limits.NUMBERS_ALARM / TESTS for x in tests)
+        values = {"alarms": alarms, "tests": len(tests), "least p": min(tests) * len(tests)}
+        numbers = {name: float(x) for name, x in (values | {"not stratified": unstratified[kind]}).items()}
+        case = f"{kind}, {counts[0]} to {counts[-1]} samples"
+        table.append(Row(NAME, OURS, case, variant, numbers, budgets, replay=replay))
+    return table
 
 
 def histograms(make: Any, count: int, seed: int) -> Iterator[tuple[str, Any, int]]:
@@ -87,32 +77,32 @@ def histograms(make: Any, count: int, seed: int) -> Iterator[tuple[str, Any, int
     pixels = max(LANES // count, 1)
     sampler = mi.load_dict({"type": "independent", "sample_count": count})
     sampler.seed(seed, pixels * count)
-    source, random = make(mi, sampler, count), np.random.default_rng(seed)
-    before: Any = None
-    pick: Any = None
+    source, random, before = make(mi, sampler, count), np.random.default_rng(seed), [np.empty(0)] * 3
+    pick = np.arange(pixels), np.zeros(pixels, int)
     for key in range(KEYS):
         if key % 2 == 0:
             pick = np.arange(pixels), random.integers(0, count, pixels)
         keys = mi.UInt32(2 * key), mi.UInt32(2 * key + 1)
         dr.make_opaque(keys)  # the next key is new data, not a new kernel
-        numbers = source.one(sampler, keys[0]), source.two(sampler, keys[1])
+        numbers = source.next_1d(sampler, keys[0]), source.next_2d(sampler, keys[1])
         dr.eval(numbers)
         z = np.array(numbers[0], float).reshape(pixels, count)
         x, y = np.array(numbers[1], float).reshape(2, pixels, count)
-        yield "one", _cells(z[pick]), torn(count, z) if key < 2 else 0
-        broken = torn(count, x) + torn(count, y) + torn(source.rows, y, source.columns, x) if key < 2 else 0
-        yield "two", _cells(x[pick], y[pick]), broken
+        now, torn_2d = [z[pick], x[pick], y[pick]], 0
+        if key < 2:
+            torn_2d = torn(count, x) + torn(count, y) + torn(source.rows, y, source.columns, x)
+        yield "one", cells(now[0]), torn(count, z) if key < 2 else 0
+        yield "two", cells(*now[1:]), torn_2d
         if key % 2:  # disjoint pairs: those that share a key are not independent
-            yield "one and one", _cells(before[0], z[pick]), 0
-            yield "one and two", _cells(before[0], y[pick]), 0
-            yield "two x and two x", _cells(before[1], x[pick]), 0
-            yield "two y and two x", _cells(before[2], x[pick]), 0
-        before = z[pick], x[pick], y[pick]
+            pairs = {"one and one": (0, 0), "one and two": (0, 2), "two x and two x": (1, 1), "two y and two x": (2, 1)}
+            for kind, (first, second) in pairs.items():
+                yield kind, cells(before[first], now[second]), 0
+        before = now
 
 
-def _cells(x: Any, y: Any = 0.0) -> Any:
+def cells(x: Any, y: Any = None) -> Any:
     """Numbers in each of 32² cells: of the interval or of the square."""
-    cell = (x * CELLS**2).astype(int) if np.isscalar(y) else (x * CELLS).astype(int) * CELLS + (y * CELLS).astype(int)
+    cell = (x * CELLS**2).astype(int) if y is None else (x * CELLS).astype(int) * CELLS + (y * CELLS).astype(int)
     return np.bincount(cell, minlength=CELLS**2)
 
 
@@ -124,4 +114,4 @@ def torn(rows: int, y: Any, columns: int = 1, x: Any = 0.0) -> int:
     return int((suspects & ~(at_edge[0] | at_edge[1]).any(axis=1)).sum())
 
 
-STUDY = Study(NAME, "Random numbers of split paths", about(__doc__), TERMS, tasks, again=by_tasks(tasks))
+STUDY = study(NAME, "Random numbers of split paths", __doc__, TERMS, cases)

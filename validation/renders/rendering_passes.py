@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from mi_refract.io.image_file import write_exr
-from mi_refract.plugins.refract import PLUGIN
+from mi_refract.plugins import PLUGIN
 from mi_refract.rendering import error_estimate
 from mi_refract.rendering.end_conditions import Limits
 from mi_refract.rendering.long_render import Job, LongRender, resume

@@ -11,8 +11,7 @@ import dataclasses
 import functools
 from pathlib import Path
 
-from mi_refract.plugins import scene_features
-from mi_refract.plugins.refract import PLUGIN
+from mi_refract.plugins import PLUGIN, scene_features
 from mi_refract.report.row import Row
 from validation.run.context import Context
 from validation.run.render_methods import opened

@@ -17,8 +17,8 @@ import drjit as dr
 import numpy as np
 
 from mi_refract.formulas import FORMULAS
-from mi_refract.plugins import integrator_context
-from mi_refract.plugins.refract import LOBES, PLUGIN
+from mi_refract.plugins import PLUGIN, integrator_context
+from mi_refract.plugins.refract import LOBES
 from mi_refract.report.row import Row
 from validation import limits
 from validation.run import kernel_timing
@@ -27,6 +27,8 @@ from validation.run.glass_balls import RESOLUTION, Balls, alone, compiled, secon
 from validation.run.kernel_timing import kernels
 from validation.run.render_methods import opened, under
 from validation.study import Study, Task, about
+
+from .cases import flat
 
 TERMS = {
     "operations": "Dr.Jit's count for the whole kernel; of `sample` alone, or of a render",
@@ -52,25 +54,26 @@ SPECTRAL, DISPERSIVE = "llvm_ad_spectral", "cauchy(1.5, 4000)"
 SCALAR = "scalar variants have no kernels"
 
 
+_row = functools.partial(Row, NAME, PLUGIN)
+
+
 def tasks(context: Context) -> list[Task]:
     """One per feature; in the profile `quick` those without scenes of many glasses."""
-    calls = Task("features: scalar calls", functools.partial(scalar_rows, context), timed=True)
+    calls = Task("features: scalar calls", scalar_rows, timed=True)
     if context.variant.startswith("scalar"):
-        return [Task("features", lambda: [Row(NAME, PLUGIN, "kernels", context.variant, reason=SCALAR)]), calls]
+        return [Task("features", lambda: [_row("kernels", context.variant, reason=SCALAR)]), calls]
     operations_only = Task("features: operations", lambda: operation_rows(context) + wavelength_rows(context))
     if context.profile.quick:
         return [operations_only, calls]
+    work = functools.partial
+    first = {f"first image, {count} glasses": work(first_image_rows, context, count) for count in limits.FIRST_IMAGE}
+    timed = first | {"edit": work(edit_rows, context), "frozen": work(frozen_rows, context)}
     return [
         operations_only,
-        Task("features: glasses", functools.partial(glass_rows, context)),
-        Task("features: optimisation", functools.partial(optimisation_rows, context)),
-        *(
-            Task(f"features: first image, {n} glasses", functools.partial(first_image_rows, context, n), timed=True)
-            for n in limits.FIRST_IMAGE
-        ),
-        Task("features: edit", functools.partial(edit_rows, context), timed=True),
-        Task("features: frozen", functools.partial(frozen_rows, context), timed=True),
-        Task("features: boundaries", functools.partial(boundary_rows, context)),
+        Task("features: glasses", work(glass_rows, context)),
+        Task("features: optimisation", work(optimisation_rows, context)),
+        *(Task(f"features: {name}", rows, timed=True) for name, rows in timed.items()),
+        Task("features: boundaries", work(boundary_rows, context)),
         calls,
     ]
 
@@ -116,30 +119,24 @@ def operations(
 def wavelength_rows(context: Context) -> list[Row]:
     """What glass pays for dispersion and absorption that it has not, and dispersive glass where nobody follows it."""
     if reason := context.variants.get(SPECTRAL, "not in this wheel"):
-        return [Row(NAME, PLUGIN, "dispersion", SPECTRAL, reason=reason)]
+        return [_row("dispersion", SPECTRAL, reason=reason)]
     with under(SPECTRAL):
         plain = operations(PLUGIN)
-        found = {
+        counts = {
             "no dispersion": operations(PLUGIN, followed=True),
             "dispersion, by `path`": operations(PLUGIN, {"int_ior": DISPERSIVE}),
             "dispersion": operations(PLUGIN, {"int_ior": DISPERSIVE}, followed=True),
             "absorption": operations(PLUGIN, {"int_absorption": 0.5}, followed=True),
         }
-    return [
-        Row(
-            NAME,
-            PLUGIN,
-            case,
-            SPECTRAL,
-            {"operations": count, "added": count - plain},
-            {} if case == "dispersion" else {"added": 0.0},
-            replay={"rays": RAYS, "int_ior": DISPERSIVE},
-        )
-        for case, count in found.items()
-    ]
+    replay = {"rays": RAYS, "int_ior": DISPERSIVE}
+    rows = []
+    for case, count in counts.items():
+        budgets = {} if case == "dispersion" else {"added": 0.0}
+        rows.append(_row(case, SPECTRAL, {"operations": count, "added": count - plain}, budgets, replay=replay))
+    return rows
 
 
-def scalar_rows(context: Context) -> list[Row]:
+def scalar_rows() -> list[Row]:
     """Time of a call of `sample` in a scalar variant: a plugin in Python, against the built-in's C++."""
     import mitsuba as mi
 
@@ -157,14 +154,7 @@ def scalar_rows(context: Context) -> list[Row]:
 
         seconds = kernel_timing.rounds({name: name for name in bsdfs}, clock, PAIRS)
     values = kernel_timing.ratio(f"call / {BUILTIN}", seconds[PLUGIN], seconds[BUILTIN])
-    return [Row(NAME, PLUGIN, "a call of sample", "scalar_rgb", values, replay={"calls": CALLS})]
-
-
-def bitmap() -> dict[str, Any]:
-    """A constant texture of 2 × 2 pixels."""
-    import mitsuba as mi
-
-    return {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32))}
+    return [_row("a call of sample", "scalar_rgb", values, replay={"calls": CALLS})]
 
 
 def operation_rows(context: Context) -> list[Row]:
@@ -181,7 +171,7 @@ def operation_rows(context: Context) -> list[Row]:
         budgets = {"added": values[f"added, {BUILTIN}"]} if less else {}
         goals = {"operations": plain[BUILTIN]} if case == "plain" else {}
         replay = {"rays": RAYS} | {key: str(value) for key, value in asked.items()}
-        return Row(NAME, PLUGIN, case, variant, values, budgets, goals, replay=replay)
+        return _row(case, variant, values, budgets, goals, replay=replay)
 
     rows = [
         row("plain"),
@@ -190,11 +180,11 @@ def operation_rows(context: Context) -> list[Row]:
         row("importance mode", less=True, importance=True),
     ]
     rows += [row(f"{lobe}, a number", parameters={lobe: 0.5}) for lobe in LOBES]
-    rows += [row(f"{lobe}, a bitmap", parameters={lobe: bitmap()}) for lobe in LOBES]
+    rows += [row(f"{lobe}, a bitmap", parameters={lobe: flat(0.5, 2)}) for lobe in LOBES]
     rows.append(row("derivative in eta", shared=False, differentiate=True))
     polarised = context.variant.replace("rgb", "mono_polarized")
     if reason := context.variants[polarised]:
-        rows.append(Row(NAME, PLUGIN, "polarised", polarised, reason=reason))
+        rows.append(_row("polarised", polarised, reason=reason))
     else:
         rows.append(row("polarised", variant=polarised))
     rows += [row(f"formula {name}", shared=False, parameters={"formula": name}) for name in FORMULAS]
@@ -221,11 +211,7 @@ def rows_of_glasses(context: Context, plugin: str) -> list[Row]:
         with alone(plugin, count) as balls:
             size = size_of(balls)
             balls.edit(1.77)
-            values = {
-                "operations": size,
-                "operations, over two glasses": size - two,
-                "compiled": compiled(balls.image),
-            }
+            values = {"operations": size, "operations, over two glasses": size - two, "compiled": compiled(balls.image)}
         budgets = {"operations, over two glasses": 0.0, "compiled": 0.0} if plugin == PLUGIN else {}
         rows.append(Row(NAME, plugin, f"{count} glasses", context.variant, values, budgets, replay={"glasses": count}))
     return rows
@@ -236,14 +222,9 @@ def optimisation_rows(context: Context) -> list[Row]:
     with alone(PLUGIN, 1, integrator="volpath", max_depth=3) as balls:
         before = float(balls.params[balls.eta][0])
         first, *later = (compiled(functools.partial(step, balls)) for _ in range(STEPS))
-        values = {
-            "compiled": sum(later),
-            "compiled, first step": first,
-            "eta moved": abs(float(balls.params[balls.eta][0]) - before),
-        }
-    return [
-        Row(NAME, PLUGIN, "optimisation of eta", context.variant, values, {"compiled": 0.0}, replay={"steps": STEPS})
-    ]
+        values = {"compiled": sum(later), "compiled, first step": first}
+        values |= {"eta moved": abs(float(balls.params[balls.eta][0]) - before)}
+    return [_row("optimisation of eta", context.variant, values, {"compiled": 0.0}, replay={"steps": STEPS})]
 
 
 def step(balls: Balls) -> Any:
@@ -291,9 +272,8 @@ def ratio_row(context: Context, case: str, metric: str, clock: Callable[[str], f
     seconds = kernel_timing.rounds({PLUGIN: PLUGIN, BUILTIN: BUILTIN}, clock, PAIRS)
     values = kernel_timing.ratio(f"{metric} / {BUILTIN}", seconds[PLUGIN], seconds[BUILTIN])
     values |= {f"{metric}, {plugin}": float(np.median(x)) for plugin, x in seconds.items()}
-    return Row(
-        NAME, PLUGIN, case, context.variant, values, goals={f"{metric} / {BUILTIN}": goal}, replay={"pairs": PAIRS}
-    )
+    goals = {f"{metric} / {BUILTIN}": goal}
+    return _row(case, context.variant, values, goals=goals, replay={"pairs": PAIRS})
 
 
 def frozen_rows(context: Context) -> list[Row]:
@@ -314,17 +294,8 @@ def frozen_rows(context: Context) -> list[Row]:
             balls.edit(1.77)
             values[f"off after an edit{name}"] = float(np.abs(np.array(replay(seed) - balls.image())).max())
             del replay, subjects
-    return [
-        Row(
-            NAME,
-            PLUGIN,
-            f"frozen, {count} glasses",
-            context.variant,
-            values,
-            {"off after an edit": limits.FROZEN},
-            replay={"glasses": count},
-        )
-    ]
+    case, budgets = f"frozen, {count} glasses", {"off after an edit": limits.FROZEN}
+    return [_row(case, context.variant, values, budgets, replay={"glasses": count})]
 
 
 def boundary_rows(context: Context) -> list[Row]:
@@ -335,7 +306,7 @@ def boundary_rows(context: Context) -> list[Row]:
             plugin: boundaries(opened(SCENES / f"{name}.xml", plugin, RESOLUTION)) for plugin in (PLUGIN, BUILTIN)
         }
         values[f"boundaries / {BUILTIN}"] = values[PLUGIN] / values[BUILTIN]
-        rows.append(Row(NAME, PLUGIN, f"{name}: boundaries", context.variant, values, replay={"seed": SEED}))
+        rows.append(_row(f"{name}: boundaries", context.variant, values, replay={"seed": SEED}))
     return rows
 
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
-import os
 import random
 import shutil
 import signal
@@ -23,6 +22,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import chdir
 from dataclasses import dataclass
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -91,43 +91,54 @@ def sample(root: Path, count: int, seed: int) -> list[Mutant]:
             key = repr((seed, name, line.strip(), before[line.strip()]))
             drawn.append((hashlib.sha256(key.encode()).hexdigest(), name, number))
     found: list[Mutant] = []
-    by_file: dict[str, list[Mutant]] = {}
     for digest, name, number in sorted(drawn):
         if len(found) == count:
             break
-        if name not in by_file:
-            by_file[name] = every(root, name)
-        here = [mutant for mutant in by_file[name] if mutant.number == number]
-        # A binary operator has eleven replacements: first choose the kind of change, then the change.
-        kinds = sorted({mutant.operator.partition("_")[0] for mutant in here})
-        if kinds:
-            rng = random.Random(digest)
-            kind = rng.choice(kinds)
-            found.append(rng.choice([mutant for mutant in here if mutant.operator.partition("_")[0] == kind]))
+        places = _places((root / name).read_text("utf-8")).get(number, [])
+        kinds = sorted({operator.partition("_")[0] for operator, _ in places})
+        rng = random.Random(digest)
+        rng.shuffle(kinds)  # a binary operator has eleven replacements: the kind of change is drawn before the change
+        chosen = (rng.choice([x for x in places if x[0].partition("_")[0] == kind]) for kind in kinds)
+        mutants = (_mutant(root, name, number, *place) for place in chosen)
+        found += [mutant for mutant in mutants if mutant][:1]
     return found
 
 
 def every(root: Path, name: str) -> list[Mutant]:
-    """All mutants of a file that change what it does."""
+    """All mutants of a file."""
+    places = _places((root / name).read_text("utf-8"))
+    mutants = (_mutant(root, name, number, *place) for number, here in places.items() for place in here)
+    return [mutant for mutant in mutants if mutant]
+
+
+@cache
+def _places(source: str) -> dict[int, list[tuple[str, int]]]:
+    """Operators and occurrences by line; without the operators that take arguments."""
     from cosmic_ray.ast import ast_nodes, get_ast
+    from cosmic_ray.operators.provider import OperatorProvider
+
+    nodes: list[Any] = list(ast_nodes(get_ast(source)))
+    provider = OperatorProvider()
+    found: dict[int, list[tuple[str, int]]] = {}
+    for name in sorted(name for name in provider if not provider[name].arguments()):
+        starts = (start for node in nodes for start, _ in provider[name]().mutation_positions(node))
+        for occurrence, (number, _) in enumerate(starts):
+            found.setdefault(number, []).append((name, occurrence))
+    return found
+
+
+def _mutant(root: Path, name: str, number: int, operator: str, occurrence: int) -> Mutant | None:
+    """The mutant; None where it does not compile, or cannot change what the module does."""
     from cosmic_ray.mutating import mutate_code
     from cosmic_ray.operators.provider import OperatorProvider
 
     source = (root / name).read_text("utf-8")
-    nodes: list[Any] = list(ast_nodes(get_ast(source)))
-    unchanged, old, provider, found = _behaviour(source), source.splitlines(), OperatorProvider(), []
-    for operator in sorted(provider):
-        if provider[operator].arguments():
-            continue
-        instance = provider[operator]()
-        places = [start for node in nodes for start, _ in instance.mutation_positions(node)]
-        for occurrence, (number, _) in enumerate(places):
-            changed = str(mutate_code(source, instance, occurrence))
-            if _behaviour(changed) not in (unchanged, ""):
-                new = changed.splitlines() if operator != "RemoveDecorator" else [""] * len(old)
-                line, becomes = (" ".join(text[number - 1].split()) for text in (old, new))
-                found.append(Mutant(name, operator, occurrence, number, line, becomes))
-    return found
+    changed = str(mutate_code(source, OperatorProvider()[operator](), occurrence))
+    if _behaviour(changed) in (_behaviour(source), ""):
+        return None
+    new = changed.splitlines() if operator != "RemoveDecorator" else [""] * number
+    line, becomes = (" ".join(text[number - 1].split()) for text in (source.splitlines(), new))
+    return Mutant(name, operator, occurrence, number, line, becomes)
 
 
 def _behaviour(source: str) -> str:
@@ -172,13 +183,13 @@ def examine(mutants: Sequence[Mutant], root: Path = ROOT) -> Iterator[tuple[Muta
                 shutil.copy2(entry, copy)
             elif entry.name in COPIED:
                 shutil.copytree(entry, copy / entry.name, ignore=shutil.ignore_patterns("__pycache__"))
-        os.environ |= {"PYTHONPATH": str(copy), "TMPDIR": str(temporary), "PYTHONDONTWRITEBYTECODE": "1"}
-        os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-        os.environ.pop("PYTEST_ADDOPTS", None)
         passed: set[str] = set()
         for path in dict.fromkeys(mutant.path for mutant in mutants):
             config = load_config(str(CONFIG))
-            config["test-command"] = command = config.test_command.format(tests=" ".join(guards(root, path)))
+            command = config.test_command.format(
+                tree=copy, temporary=temporary, python=sys.executable, tests=" ".join(guards(root, path))
+            )
+            config["test-command"] = command
             room = Path(path).parts[1]
             with chdir(copy), use_db(str(Path(folder, "session.sqlite"))) as database:
                 if room not in passed:

@@ -103,7 +103,7 @@ def _texts(facts: dict[str, Any]) -> dict[str, str]:
     """The answer to each question; "" where nothing was measured."""
     from jinja2 import Environment, StrictUndefined
 
-    environment = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(undefined=StrictUndefined)
     filters: dict[str, Any] = {"degrees": degrees, "percent": percent, "span": span}
     environment.filters |= filters | {"extract": lambda name, mapping: mapping[name]}
     template = environment.from_string(Path(__file__).with_suffix(".j2").read_text("utf-8"))

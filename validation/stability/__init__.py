@@ -4,4 +4,4 @@ In: formulas, Fresnel's equations, and scenes of many layers. Out: rows with eac
 problem, which is the error that rounded inputs alone may cause.
 """
 
-__all__ = ["derivatives", "energy", "gradients", "layered_paths", "optical_chains"]
+__all__ = ["derivatives", "energy", "layered_paths", "optical_chains"]

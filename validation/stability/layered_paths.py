@@ -20,7 +20,7 @@ import numpy as np
 
 from mi_refract.formulas import FORMULAS, automatic
 from mi_refract.image_diff import pixelwise
-from mi_refract.plugins.refract import PLUGIN
+from mi_refract.plugins import PLUGIN
 from mi_refract.rendering import scene_files
 from mi_refract.report.row import Row
 from validation import limits

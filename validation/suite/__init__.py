@@ -9,7 +9,6 @@ __all__ = [
     "lenses",
     "matrix",
     "matrix_page",
-    "matrix_table",
     "per_ray",
     "rendered_images",
     "small_mistakes",

@@ -19,7 +19,7 @@ from importlib.util import find_spec
 import numpy as np
 
 from mi_refract.ray_sets import check_answers, media_rays, ray_set
-from mi_refract.ray_sets.check_answers import PROBLEMS, Findings, RegimeErrors
+from mi_refract.ray_sets.check_answers import UNFIT, Findings, RegimeErrors
 from mi_refract.ray_sets.files import as_csv, parse_answers
 from mi_refract.ray_sets.ray_set import Answers, RaySet
 from mi_refract.report.row import Reason, Row
@@ -46,7 +46,7 @@ TERMS = {
     MISCLASSIFIED: "rays whose total internal reflection was misclassified",
     "wrong": "rays beyond the bound, misclassified although the bound decides them, or without a direction",
     "unfit": "answers that are missing, duplicate, or to rays that were not given",
-    "told otherwise": "1 where the program signals total internal reflection in another way than was recorded",
+    "other TIR signal": "1 where the program signals total internal reflection in another way than was recorded",
     "unanswered": "rays without an answer, because the program crashed, hung, or did not say its indices",
 }
 
@@ -119,7 +119,7 @@ def _in_order(rays: RaySet, answers: Answers) -> np.ndarray:
 def _direction_row(
     title: str, regime: str, errors: RegimeErrors | None, findings: Findings, told: str, system: str
 ) -> Row:
-    values = {"unfit": float(sum(each.count for each in findings.problems if PROBLEMS[each.kind]))}
+    values = {"unfit": float(findings.problem_count(*UNFIT))}
     budgets = {"unfit": 0.0, "wrong": 0.0}
     if errors is None:
         return Row(NAME, title, regime, "f64", values | {"wrong": np.nan}, budgets, reason=system)
@@ -127,7 +127,7 @@ def _direction_row(
     values |= {MISCLASSIFIED: float(errors.tir_misclassified), "wrong": float(errors.wrong)}
     budgets |= {ERROR_OVER_BOUND: 1.0}
     if regime == "critical":
-        values["told otherwise"], budgets["told otherwise"] = float(findings.tir != told), 0.0
+        values["other TIR signal"], budgets["other TIR signal"] = float(findings.tir != told), 0.0
     text = f"{system}; total internal reflection: {findings.tir}"
     return Row(NAME, title, regime, "f64", values, budgets, reason=text, replay={"worst": errors.replay})
 

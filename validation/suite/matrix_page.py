@@ -1,7 +1,7 @@
 """The matrix as a page of its own, and as JSON: every system against every check, and what it gets wrong in a sentence.
 
 It is made from the `rows.json` of a validation. Systems are in the order of how far they are from right: those with a
-wrong answer last, and otherwise by their largest backward error but where k is large, which hardly anyone gets right.
+wrong answer last, and otherwise by their largest backward error, where k is large last of all: few are right there.
 """
 
 from __future__ import annotations
@@ -31,8 +31,7 @@ TERMS = {
     "number": "the largest backward error of the set, in roundings u: each answer is the exact refraction of inputs a, "
     f"n and k off by no more. Up to {RIGHT:g} the answers are right; above, they are as good as a textbook's formula, "
     "unless the cell says wrong",
-    "images": "the image's mean beside that of the reference, relative; and the difference that would have been seen "
-    "in a tile",
+    "images": "the image's mean relative to that of the reference; and the smallest difference that a tile could show",
     "not run": "the system was not installed where this page was made; the command installs it",
 } | {name: rays.text for name, rays in per_ray.SETS.items()}
 TERMS[LARGE] += (
@@ -43,17 +42,16 @@ TERMS[LARGE] += (
 
 def read(folder: Path) -> Stored:
     """The matrix of the validation whose report is in a folder. ValueError or OSError where there is none."""
-    path = folder / ROWS
-    accepted = f"expected the folder of {MADE_BY} --out {folder}"
+    path, expected = folder / ROWS, f"expected the folder of {MADE_BY} --out {folder}"
     try:
         document = json.loads(path.read_text("utf-8"))
         rows = [row for row in document["rows"] if row["study"] in (per_ray.NAME, rendered_images.NAME)]
     except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such file; {accepted}") from None
+        raise FileNotFoundError(f"{path}: no such file; {expected}") from None
     except (ValueError, KeyError, TypeError):
-        raise ValueError(f"{path}: holds no rows; {accepted}") from None
+        raise ValueError(f"{path}: no rows of a validation; {expected}") from None
     if not rows:
-        raise ValueError(f"{path}: no system was asked; {accepted}")
+        raise ValueError(f"{path}: no rows of other systems; {expected}")
     return matrix(rows)
 
 
@@ -65,8 +63,8 @@ def matrix(rows: Iterable[Stored]) -> Stored:
         systems.setdefault((row["study"], row["subject"], precision), []).append(row)
     found: dict[str, list[Stored]] = {"rays": [], "images": [], "not_run": []}
     for (study, title, precision), cells in systems.items():
-        ran = [cell for cell in cells if cell["values"]]
         about = {"system": title} | ({"precision": precision} if precision else {})
+        ran = [cell for cell in cells if cell["values"]]
         if not ran:
             found["not_run"].append(about | {"reason": cells[0]["reason"]})
         elif study == per_ray.NAME:
@@ -74,48 +72,34 @@ def matrix(rows: Iterable[Stored]) -> Stored:
         else:
             found["images"].append(about | _images(ran))
     found["rays"].sort(key=_distance)
-    found["images"].sort(key=lambda each: (each["wrong"], each["system"]))
+    found["images"].sort(key=lambda image: (image["wrong"], image["system"]))
     return {"schema": SCHEMA} | found
 
 
 def _rays(cells: list[Stored]) -> Stored:
-    sets = {
-        cell["case"]: {
-            "verdict": _grade(cell),
-            "backward_error": cell["values"].get(per_ray.BACKWARD),
-            "worst_angle": cell["values"].get(WORST_ANGLE),
-        }
-        for cell in cells
-    }
-    said = cells[0]["replay"]
-    about = {name: said.get(name, "") for name in ("version", "total internal reflection", "remark")}
-    wrong = any(each["verdict"] == "wrong" for each in sets.values())
-    return about | {"wrong": wrong, "sentence": sentence(sets, about["remark"]), "sets": sets}
-
-
-def _grade(cell: Stored) -> str:
-    """ "right", "as good as a textbook's formula", or "wrong"."""
-    if cell["verdict"] == "fail":
-        return "wrong"
-    backward = cell["values"].get(per_ray.BACKWARD)
-    return "right" if isinstance(backward, (int, float)) and backward <= RIGHT else "within bound"
-
-
-def sentence(sets: Stored, remark: str = "") -> str:
-    """What a system gets wrong."""
-    parts = []
-    if wrong := [name for name, each in sets.items() if each["verdict"] == "wrong"]:
-        parts.append(f"wrong: {', '.join(wrong)}")
+    """What a function of refraction got wrong, and its numbers by set."""
+    sets = {}
+    for cell in cells:
+        backward = cell["values"].get(per_ray.BACKWARD)
+        right = isinstance(backward, (int, float)) and backward <= RIGHT
+        verdict = "wrong" if cell["verdict"] == "fail" else "right" if right else "within bound"
+        worst = cell["values"].get(WORST_ANGLE)
+        sets[cell["case"]] = {"verdict": verdict, "backward_error": backward, "worst_angle": worst}
+    replay = cells[0]["replay"]
+    about = {name: replay.get(name, "") for name in ("version", "total internal reflection", "remark")}
+    wrong = [name for name, x in sets.items() if x["verdict"] == "wrong"]
     off = [
         f"{name} (up to {_shown(x['backward_error'])})" for name, x in sets.items() if x["verdict"] == "within bound"
     ]
-    if off:
-        parts.append(f"exact only for inputs more than {RIGHT:g} roundings off: {', '.join(off)}")
-    text = "; ".join(parts) or "right in every set"
-    return text + (f"; {remark}" if remark else "")
+    parts = [f"wrong: {', '.join(wrong)}"] if wrong else []
+    parts += [f"exact only for inputs more than {RIGHT:g} roundings off: {', '.join(off)}"] if off else []
+    sentence = "; ".join(parts) or "right in every set"
+    remark = f"; {about['remark']}" if about["remark"] else ""
+    return about | {"wrong": bool(wrong), "sentence": sentence + remark, "sets": sets}
 
 
 def _images(cells: list[Stored]) -> Stored:
+    """What differs in the images of a renderer, and its numbers by scene."""
     scenes = {
         cell["case"]: {
             "verdict": cell["replay"].get("verdict", "not rendered"),
@@ -124,18 +108,18 @@ def _images(cells: list[Stored]) -> Stored:
         }
         for cell in cells
     }
-    differs = [name for name, each in scenes.items() if each["verdict"] != "equal"]
-    reasons = dict.fromkeys(cell["reason"] for cell in cells if cell["case"] in differs)
+    reasons = dict.fromkeys(cell["reason"] for cell in cells if scenes[cell["case"]]["verdict"] != "equal")
     wrong = any(cell["verdict"] == "fail" for cell in cells)
     return {"wrong": wrong, "sentence": "; ".join(reasons) or "equal to within noise in every scene", "scenes": scenes}
 
 
 def _distance(system: Stored) -> tuple[bool, float, float, str]:
-    def largest(names: Iterable[str]) -> float:
-        found = [system["sets"][name]["backward_error"] for name in names if name in system["sets"]]
-        return max((x if isinstance(x, (int, float)) else math.inf for x in found), default=0.0)
-
-    return system["wrong"], largest(set(system["sets"]) - {LARGE}), largest([LARGE]), system["system"]
+    errors = {
+        name: x["backward_error"] if isinstance(x["backward_error"], (int, float)) else math.inf
+        for name, x in system["sets"].items()
+    }
+    large = errors.pop(LARGE, 0.0)
+    return system["wrong"], max(errors.values(), default=0.0), large, system["system"]
 
 
 def _shown(value: Any) -> str:
@@ -152,22 +136,22 @@ def write_json(path: Path, found: Stored) -> None:
 
 def write_html(path: Path, found: Stored) -> None:
     """One page that needs no network. OSError."""
-    right = sum(not each["wrong"] for each in found["rays"])
-    drawn = f", {len(found['images'])} renderers by images" if found["images"] else ""
+    right = sum(not system["wrong"] for system in found["rays"])
+    images = f", {len(found['images'])} renderers by images" if found["images"] else ""
     content = {
         "title": "Refraction by other systems",
-        "sentence": f"Who refracts right: {len(found['rays'])} functions ray by ray{drawn}",
+        "sentence": f"Which systems refract right: {len(found['rays'])} functions by rays{images}",
         "counts": [
             ("pass", "functions without a wrong answer", right),
             ("fail", "with wrong answers", len(found["rays"]) - right),
             ("info", "not run", len(found["not_run"])),
         ],
         "sets": list(per_ray.SETS),
-        "rays": [each | {"cells": [_cell(each["sets"].get(name)) for name in per_ray.SETS]} for each in found["rays"]],
+        "rays": [x | {"cells": [set_cell(x["sets"].get(name)) for name in per_ray.SETS]} for x in found["rays"]],
         "scenes": list(rendered_images.SCENES),
         "renderers": [
-            each | {"cells": [_picture(each["scenes"].get(name)) for name in rendered_images.SCENES]}
-            for each in found["images"]
+            x | {"cells": [scene_cell(x["scenes"].get(name)) for name in rendered_images.SCENES]}
+            for x in found["images"]
         ],
         "not_run": found["not_run"],
         "terms": TERMS,
@@ -176,8 +160,8 @@ def write_html(path: Path, found: Stored) -> None:
     write_page(path, "matrix.html.j2", content, EmbeddedImages())
 
 
-def _cell(found: Stored | None) -> tuple[str, str]:
-    """The text of a cell and its class."""
+def set_cell(found: Stored | None) -> tuple[str, str]:
+    """The text of a cell and its class, of a set of rays."""
     if not found:
         return "–", ""
     states = {"right": "pass", "within bound": "missed", "wrong": "fail"}
@@ -185,11 +169,12 @@ def _cell(found: Stored | None) -> tuple[str, str]:
     return wrong + _shown(found["backward_error"]), states[found["verdict"]]
 
 
-def _picture(found: Stored | None) -> tuple[str, str]:
+def scene_cell(found: Stored | None) -> tuple[str, str]:
+    """The text of a cell and its class, of a scene."""
     if not found:
         return "–", ""
     state = {"equal": "pass", "different": "fail"}.get(found["verdict"], "missed")
     if not isinstance(found["mean_difference"], (int, float)):
         return found["verdict"], state
-    seen = f", seen from {found['detectable']:.2%}" if isinstance(found["detectable"], (int, float)) else ""
-    return f"{found['verdict']}: {found['mean_difference']:+.2%}{seen}", state
+    visible = f", visible from {found['detectable']:.2%}" if isinstance(found["detectable"], (int, float)) else ""
+    return f"{found['verdict']}: {found['mean_difference']:+.2%}{visible}", state

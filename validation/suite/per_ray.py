@@ -1,30 +1,28 @@
 """Per ray: the refraction of other programs, each in a process of its own, against the certified answer.
 
-A program reads rays as CSV and answers with directions; `mi-refract rays run` does and checks the same. Each answer
-should be the exact refraction of inputs within 4 roundings of those given (a goal), and must be within the bound of
-the textbook formula, in the program's precision, for that ray. The worst errors of each program were recorded earlier
-on rays of the same kinds (the rays themselves were not kept), of the programs that came later on these very rays, at
-the default seed; another goal is to be within a factor of 3 of these. Goals are shown where they are missed and fail no
-run: the worst of some thousand rays depends on which they are. The set "random" is the first one, as it was before any
+A program reads rays as CSV and answers with directions, as for `mi-refract rays run`. Each answer should be the exact
+refraction of inputs within 4 roundings of those given (a goal), and must be within the bound of the textbook formula
+for that ray, in the program's precision. A second goal: the worst error is within a factor of 3 of the one recorded
+earlier, on rays of the same kinds, or for later programs on these very rays at the default seed. A missed goal is shown
+and fails no run: the worst of some thousand rays depends on which they are. The set "random" was fixed before any
 result. After the first results its rays near the critical angle were left out, for chance decides how near they come,
 and it was made twice as large: that is the set "random, apart". The goal is the same for both. The set "near-critical"
-was never changed. A program fails that is installed and crashes, hangs, or answers rays that it was not given. One that
-is not installed, or says that it cannot run on this machine, is not run.
+was never changed. An installed program fails if it crashes, hangs, or answers rays that it was not given. One that is
+not installed, or reports that it cannot run on this machine, is not run.
 """
 
 from __future__ import annotations
 
 import functools
-import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from mi_refract import regimes
 from mi_refract.accuracy import absolute_radicand
 from mi_refract.ray_sets import check_answers, ray_set
-from mi_refract.ray_sets.check_answers import PROBLEMS, Findings, RegimeErrors
+from mi_refract.ray_sets.check_answers import UNFIT, Findings, RegimeErrors
 from mi_refract.ray_sets.files import as_csv, parse_answers
 from mi_refract.ray_sets.header import PRECISIONS
 from mi_refract.ray_sets.judged_answers import RIGHT
@@ -54,6 +52,7 @@ NAME = "per_ray"
 SEED = 2040
 RECORDED, OFF_RECORDED = "recorded", "off the recorded"
 BACKWARD = "backward error / u"
+OTHER_SIGNAL = "other TIR signal"
 LEFT_OUT = 4e-4  # cos²θ_t in size, up to which rays are not in the set APART
 
 
@@ -70,34 +69,37 @@ class Set:
     stream: int
 
 
-def _random(rng: np.random.Generator, count: int, eps: float) -> tuple[np.ndarray, np.ndarray]:
+Angles = tuple[np.ndarray, np.ndarray]  # of incidence, and k
+
+
+def _random(rng: np.random.Generator, count: int, eps: float) -> Angles:
     return np.arccos(rng.uniform(0, 1, count)), 1.5 ** rng.choice([-1.0, 1.0], count)
 
 
-def _apart(rng: np.random.Generator, count: int, eps: float) -> tuple[np.ndarray, np.ndarray]:
+def _apart(rng: np.random.Generator, count: int, eps: float) -> Angles:
     cosine, k = rng.uniform(0, 1, 2 * count), 1.5 ** rng.choice([-1.0, 1.0], 2 * count)
     apart = np.flatnonzero(np.abs(1 - k * k * (1 - cosine * cosine)) > LEFT_OUT)[:count]
     return np.arccos(cosine[apart]), k[apart]
 
 
-def _critical(rng: np.random.Generator, count: int, eps: float) -> tuple[np.ndarray, np.ndarray]:
+def _critical(rng: np.random.Generator, count: int, eps: float) -> Angles:
     k = rng.uniform(1.05, 2.5, count)
     return np.arcsin(1 / k) - _spread(rng, 1e-7, 1e-3, count), k
 
 
-def _grazing(rng: np.random.Generator, count: int, eps: float) -> tuple[np.ndarray, np.ndarray]:
+def _grazing(rng: np.random.Generator, count: int, eps: float) -> Angles:
     return np.pi / 2 - _spread(rng, 1e-5, 1e-2, count), np.full(count, 1 / 1.5)
 
 
-def _matched(rng: np.random.Generator, count: int, eps: float) -> tuple[np.ndarray, np.ndarray]:
+def _matched(rng: np.random.Generator, count: int, eps: float) -> Angles:
     return np.arccos(rng.uniform(0.1, 1, count)), 1 + _spread(rng, 1e-7, 1e-3, count) * rng.choice([-1.0, 1.0], count)
 
 
-def _total(rng: np.random.Generator, count: int, eps: float) -> tuple[np.ndarray, np.ndarray]:
+def _total(rng: np.random.Generator, count: int, eps: float) -> Angles:
     return rng.uniform(np.arcsin(1 / 1.5) + 0.01, np.pi / 2 - 0.01, count), np.full(count, 1.5)
 
 
-def _large(rng: np.random.Generator, count: int, eps: float) -> tuple[np.ndarray, np.ndarray]:
+def _large(rng: np.random.Generator, count: int, eps: float) -> Angles:
     k = _spread(rng, 10, 1e4, count)
     return np.arcsin(rng.uniform(0, 0.999, count) / k), k
 
@@ -128,7 +130,7 @@ TERMS = {name: f"{rays.count} rays: {rays.text}" for name, rays in SETS.items()}
     "given up": "rays left out: so near to the critical angle that the system treats them as totally reflected",
     "not seen to deviate": "1 where every answer is right and the system is known to be wrong there",
     "unfit": "answers that are missing, duplicate, or to rays that were not given",
-    "told otherwise": "1 where the program signals total internal reflection in another way than was recorded",
+    OTHER_SIGNAL: "1 where the program signals total internal reflection in another way than was recorded",
     "unanswered": "rays without an answer, because the program crashed, hung or printed none",
 }
 
@@ -144,48 +146,39 @@ def tasks(context: Context) -> list[Task]:
 
 def call_rows(system: System, call: RaysCommand, context: Context) -> list[Row]:
     """A row per set of rays, or one that says why there is none."""
+
+    def only(reason: str, values: Numbers | None = None, budgets: Numbers | None = None) -> list[Row]:
+        return [Row(NAME, call.title, "every set", call.precision, values or {}, budgets or {}, reason=reason)]
+
     if reason := environments.absent(system):
-        return [_unmeasured(call, reason)]
+        return only(reason)
     if not system.small and context.profile.name != "full":
-        return [_unmeasured(call, Reason(f"{system.megabytes} MB: in the full profile only", "`--profile full`"))]
+        return only(Reason(f"{system.megabytes} MB: in the full profile only", "`--profile full`"))
     rays = given(call.precision)
     try:
-        text = environments.ask(system, call.command, as_csv(rays))
-        answers = parse_answers(text, call.title)
-    except environments.Unable as reason_here:
-        return [_unmeasured(call, f"cannot run here: {reason_here}")]
+        answers = parse_answers(environments.ask(system, call.command, as_csv(rays)), call.title)
+    except environments.Unable as cause:
+        return only(f"cannot run here: {cause}")
     except (environments.Broken, ValueError) as defect:
-        values = {"unanswered": float(len(rays))}
-        return [Row(NAME, call.title, "every set", call.precision, values, {"unanswered": 0}, reason=str(defect))]
+        return only(str(defect), {"unanswered": float(len(rays))}, {"unanswered": 0.0})
     return rows(call, rays, answers)
-
-
-def _unmeasured(call: RaysCommand, reason: str) -> Row:
-    return Row(NAME, call.title, "every set", call.precision, reason=reason)
 
 
 @seeds.cached
 def given(precision: str) -> RaySet:
     """All sets, one after the other."""
-    parts = {name: _made(kind, PRECISIONS[precision]) for name, kind in SETS.items()}
-    return _gathered(parts, precision)
-
-
-def _made(kind: Set, precision: type) -> regimes.Rays:
-    rng = np.random.default_rng([seeds.current(SEED), kind.stream])
-    normal: np.ndarray = regimes.normalised(rng.normal(size=(kind.count, 3))).astype(precision)
-    a, n, k = regimes.rays_at(kind.draw, rng, normal)
-    # As `mi-refract rays export` writes them: a program need not know rays from behind.
-    return ray_set.facing(regimes.Rays(a.astype(precision), n.astype(precision), k.astype(precision)))
-
-
-def _gathered(parts: dict[str, regimes.Rays], precision: str) -> RaySet:
-    ends = itertools.accumulate(map(len, parts.values()))
-    ids = {name: [end - len(part), end - 1] for (name, part), end in zip(parts.items(), ends, strict=True)}
+    parts, ids, first = [], {}, 0
+    dtype = PRECISIONS[precision]
+    for name, kind in SETS.items():
+        rng = np.random.default_rng([seeds.current(SEED), kind.stream])
+        normal: np.ndarray = regimes.normalised(rng.normal(size=(kind.count, 3))).astype(dtype)
+        a, n, k = (x.astype(dtype) for x in regimes.rays_at(kind.draw, rng, normal))
+        # As `mi-refract rays export` writes them: a program need not know rays from behind.
+        parts.append(ray_set.facing(regimes.Rays(a, n, k)))
+        ids[name] = [first, first + kind.count - 1]
+        first += kind.count
     header = {"precision": precision, "seed": seeds.current(SEED), "regimes": ids}
-    joined = regimes.Rays.joined(list(parts.values()))
-    rays = RaySet(joined, np.arange(len(joined)), header)
-    return replace(rays, header=header | {"checksum": ray_set.checksum(rays)})
+    return ray_set.with_checksum(RaySet(regimes.Rays.joined(parts), np.arange(first), header))
 
 
 # Judged ------------------------------------------------------------------------------------------------------------
@@ -194,13 +187,16 @@ def _gathered(parts: dict[str, regimes.Rays], precision: str) -> RaySet:
 def rows(call: RaysCommand, rays: RaySet, answers: Answers) -> list[Row]:
     """One per set."""
     left_out = absolute_radicand(rays.rays) < call.gives_up
-    findings = check_answers.check(_only(rays, ~left_out), _without(answers, rays.ids[left_out]))
-    known = "; ".join(filter(None, (call.lengths, call.remark)))
-    about = _remark(findings, str(answers.header.get("system", "")), known)
+    findings = check_answers.check(rays[~left_out], answers[~np.isin(answers.ids, rays.ids[left_out])])
+    version = str(answers.header.get("system", ""))
+    problems = [f"{problem.kind} {problem.text}" for problem in findings.problems]
+    mistake = [findings.diagnosis.text] if findings.diagnosis else []
+    signal = f"total internal reflection: {findings.tir}"
+    remark = "; ".join(filter(None, (version, signal, call.lengths, call.remark, *problems, *mistake)))
+    errors = {regime.regime: regime for regime in findings.regimes}
     made = []
     for name in SETS:
-        figures = next((each for each in findings.regimes if each.regime == name), None)
-        values, budgets, goals = _measured(name, call, findings, figures)
+        values, budgets, goals = _measured(name, call, findings, errors.get(name))
         deviates = f"; known to deviate: {call.deviations[name]}" if name in call.deviations else ""
         if call.gives_up:
             values["given up"] = float(left_out[rays.regime == name].sum())
@@ -208,65 +204,41 @@ def rows(call: RaysCommand, rays: RaySet, answers: Answers) -> list[Row]:
             "set": SETS[name].text,
             "seed": seeds.current(SEED),
             "command": " ".join(call.command),
-            "worst": figures.replay if figures else None,
-            "version": str(answers.header.get("system", "")),
+            "worst": errors[name].replay if name in errors else None,
+            "version": version,
             "total internal reflection": findings.tir,
             "remark": call.remark,
         }
-        made.append(Row(NAME, call.title, name, call.precision, values, budgets, goals, about + deviates, replay))
+        made.append(Row(NAME, call.title, name, call.precision, values, budgets, goals, remark + deviates, replay))
     return made
 
 
-def _only(rays: RaySet, mask: np.ndarray) -> RaySet:
-    return replace(rays, rays=rays.rays[mask], ids=rays.ids[mask])
-
-
-def _without(answers: Answers, ids: np.ndarray) -> Answers:
-    kept = ~np.isin(answers.ids, ids)
-    flags = None if answers.transmitted is None else answers.transmitted[kept]
-    return replace(answers, ids=answers.ids[kept], b=answers.b[kept], transmitted=flags)
-
-
-def _remark(findings: Findings, system: str, known: str) -> str:
-    """Who answered, the signal of total internal reflection, what is wrong with the answers, and what explains them."""
-    problems = [f"{each.kind} {each.text}" for each in findings.problems]
-    mistake = [findings.diagnosis.text] if findings.diagnosis else []
-    return "; ".join(filter(None, (system, f"total internal reflection: {findings.tir}", known, *problems, *mistake)))
-
-
 def _measured(
-    name: str, call: RaysCommand, findings: Findings, figures: RegimeErrors | None
+    name: str, call: RaysCommand, findings: Findings, errors: RegimeErrors | None
 ) -> tuple[Numbers, Numbers, Numbers]:
     """Values, budgets and goals. Where no ray of the set was answered, all that can be said is that it was not."""
-    values = {"unfit": float(sum(each.count for each in findings.problems if PROBLEMS[each.kind]))}
-    budgets = {"unfit": 0.0, "wrong": 0.0}
-    goals: Numbers = {}
-    if figures is None:
-        return values | {"wrong": math.nan}, budgets, goals
-    if figures.compared:
-        values |= {WORST_ANGLE: figures.worst, "p99 rad": figures.p99, "mean rad": figures.mean}
+    values = {"unfit": float(findings.problem_count(*UNFIT))}
+    budgets, goals = {"unfit": 0.0, "wrong": 0.0}, {BACKWARD: RIGHT}
+    if errors is None:
+        return values | {"wrong": math.nan}, budgets, {}
+    if errors.compared:
+        values |= {WORST_ANGLE: errors.worst, "p99 rad": errors.p99, "mean rad": errors.mean}
     values |= {
-        ERROR_OVER_BOUND: figures.error_over_bound,
-        MISCLASSIFIED: float(figures.tir_misclassified),
-        "wrong": float(figures.wrong),
+        ERROR_OVER_BOUND: errors.error_over_bound,
+        MISCLASSIFIED: float(errors.tir_misclassified),
+        "wrong": float(errors.wrong),
+        "median backward error / u": errors.backward_median,
+        "p99 backward error / u": errors.backward_p99,
+        BACKWARD: errors.backward_worst,
     }
-    values |= {
-        "median backward error / u": figures.backward_median,
-        "p99 backward error / u": figures.backward_p99,
-        BACKWARD: figures.backward_worst,
-    }
-    goals[BACKWARD] = RIGHT
     budgets[ERROR_OVER_BOUND] = 1.0
     if name == TOTAL:
-        values["told otherwise"], budgets["told otherwise"] = float(findings.tir != call.tir), 0.0
-    if name in call.recorded:
-        values |= {
-            RECORDED: call.recorded[name][1],
-            OFF_RECORDED: off(figures.worst, *call.recorded[name]),
-        }
+        values[OTHER_SIGNAL], budgets[OTHER_SIGNAL] = float(findings.tir != call.tir), 0.0
+    if recorded := call.recorded_range(name):
+        values |= {RECORDED: recorded[1], OFF_RECORDED: off(errors.worst, *recorded)}
         goals[OFF_RECORDED] = limits.RECORDED
     if name in call.deviations:
-        values["not seen to deviate"] = float(figures.wrong == 0)
+        values["not seen to deviate"] = float(errors.wrong == 0)
         budgets = {"unfit": 0.0, "not seen to deviate": 0.0}
     return values, budgets, goals
 

@@ -24,7 +24,7 @@ from mi_refract.image_diff.comparison import Comparison, Verdict
 from mi_refract.image_diff.methods import compare
 from mi_refract.io import image_file
 from mi_refract.io.image_file import Image
-from mi_refract.plugins.refract import PLUGIN
+from mi_refract.plugins import PLUGIN
 from mi_refract.rendering import scene_files
 from mi_refract.report.row import Reason, Row
 from mi_refract.scene_export import from_mitsuba, write_files

@@ -18,7 +18,6 @@ from mi_refract.formulas import FORMULAS
 from mi_refract.ray_sets import ray_set
 from mi_refract.ray_sets.header import PRECISIONS
 from mi_refract.ray_sets.judged_answers import RIGHT, JudgedAnswers, judge_answers
-from mi_refract.ray_sets.ray_set import RaySet
 from mi_refract.ray_sets.tir_signal import LOOSEST
 from mi_refract.report.row import Row
 from validation import limits, repeated
@@ -47,11 +46,6 @@ def textbook(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
     return np.where(radicand < 0, 0, k * a - (k * c + np.sqrt(np.maximum(radicand, 0))) * n)
 
 
-def half_precision(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
-    """k through a 16-bit float."""
-    return textbook(a, n, k.astype(np.float16).astype(k.dtype))
-
-
 def tilted(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
     """n off by 1e-6 rad, within the plane of incidence."""
     t = a - _dot(n, a) * n
@@ -66,11 +60,6 @@ def by_angles(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
     refracted = np.arcsin(np.minimum(sine, 1).astype(np.float32)).astype(k.dtype)
     t = a - _dot(n, a) * n
     return np.where(sine > 1, 0, np.sin(refracted) * t / np.sqrt(_dot(t, t)) - np.cos(refracted) * n)
-
-
-def not_unit(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
-    """n shorter by 1e-6, as interpolation leaves it, and not made unit."""
-    return textbook(a, n * n.dtype.type(1 - 1e-6), k)
 
 
 def rounded_contrast(a: Vectors, n: Vectors, k: Vectors) -> Vectors:
@@ -96,10 +85,12 @@ class Mistake:
 
 
 MISTAKES = {
-    "eta rounded to half precision": Mistake(half_precision, "generic"),
+    "eta rounded to half precision": Mistake(
+        lambda a, n, k: textbook(a, n, k.astype(np.float16).astype(k.dtype)), "generic"
+    ),
     "normal off by 1e-6 rad": Mistake(tilted, "generic"),
     "angles by acos in float32": Mistake(by_angles, "near-normal"),
-    "normal not made unit": Mistake(not_unit, "critical"),
+    "normal not made unit": Mistake(lambda a, n, k: textbook(a, n * n.dtype.type(1 - 1e-6), k), "critical"),
     "k² − 1 in float32": Mistake(
         rounded_contrast,
         "matched",
@@ -121,32 +112,28 @@ def rows(name: str, precision: str) -> list[Row]:
     """One."""
     mistake = MISTAKES[name]
     rays = ray_set.make([mistake.regime], COUNT, precision, seeds.current(SEED))
-    with_it, without = (judged(answer, rays) for answer in (mistake.answer, textbook))
-    seen = float((with_it.backward > RIGHT).mean())
+
+    def judged(answer: Answer) -> JudgedAnswers:
+        with np.errstate(all="ignore"):
+            b = answer(rays.rays.a, rays.rays.n, rays.rays.k[:, None])
+        if b.dtype != rays.rays.a.dtype:
+            raise TypeError(f"{name}: answers in {b.dtype}; expected {rays.rays.a.dtype}")
+        return judge_answers(b.astype(np.float64), None, rays.rays, precision, FORMULAS[LOOSEST].budget, "zero")
+
+    with_it, without = judged(mistake.answer), judged(textbook)
     values = {
         "passed before": float(1 - with_it.verdict.wrong.mean()),
-        "seen": seen,
+        "seen": float((with_it.backward > RIGHT).mean()),
         "m, median": float(np.median(with_it.backward)),
         "m, worst": float(with_it.backward.max()),
         "m, worst, without": float(without.backward.max()),
         "not seen": float(with_it.backward.max() <= limits.TEXTBOOK_BACKWARD),
     }
     harmless = mistake.harmless[1] if precision == mistake.harmless[0] else ""
-    budgets: dict[str, float] = {"m, worst, without": limits.TEXTBOOK_BACKWARD} | (
-        {} if harmless else {"not seen": 0.0}
-    )
+    budgets: dict[str, float] = {"m, worst, without": limits.TEXTBOOK_BACKWARD}
+    budgets |= {} if harmless else {"not seen": 0.0}
     replay = {"regime": mistake.regime, "count": COUNT, "seed": seeds.current(SEED)}
     return [Row(NAME, name, mistake.regime, precision, values, budgets, reason=harmless, replay=replay)]
-
-
-def judged(answer: Answer, rays: RaySet) -> JudgedAnswers:
-    """The answers to a set in its precision."""
-    given = rays.rays
-    with np.errstate(all="ignore"):
-        b = answer(given.a, given.n, given.k[:, None])
-    if b.dtype != given.a.dtype:
-        raise TypeError(f"{answer.__name__}: answers in {b.dtype}; expected {given.a.dtype}")
-    return judge_answers(b.astype(np.float64), None, given, rays.precision, FORMULAS[LOOSEST].budget, "zero")
 
 
 STUDY = Study(NAME, "Small mistakes", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))

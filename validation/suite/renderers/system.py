@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Annotated
 
 import msgspec
+from msgspec import Meta
 
 from mi_refract.io.typed_table import convert
-from mi_refract.ray_sets.renderer_file import ImagesCommand, RaysCommand, RendererFile
+from mi_refract.ray_sets import renderer_file
+from mi_refract.ray_sets.renderer_file import ImagesCommand, RaysCommand, Text
 
 SCRIPTS = Path(__file__).parent / "scripts"
 LOCKS = Path(__file__).parent / "locks"
@@ -80,39 +82,48 @@ class System:
         return "with this package" if self.folder is None or self.folder.parent.name == "systems" else str(self.folder)
 
 
-class Install(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    """The table [install] of a system's file. `apt`: PACKAGE=VERSION; `program` and `version` belong to it."""
+class Install(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [install]: one of pip, npm and apt."""
 
-    megabytes: Annotated[int, msgspec.Meta(ge=1, le=100_000)]
-    pip: tuple[str, ...] = ()
-    python: str = ""
-    built: str = ""
-    npm: tuple[str, ...] = ()
-    apt: tuple[str, ...] = ()
-    program: str = ""
-    version: str = ""
-    small: bool = False
+    megabytes: Annotated[int, Meta(ge=1, le=100_000)]  # on disk
+    pip: tuple[Text, ...] = ()  # packages of PyPI, in an environment of their own
+    python: str = ""  # the one version of Python that they are for
+    built: str = ""  # the one of them that has no wheel
+    npm: tuple[Text, ...] = ()  # packages of npm, in a folder of their own
+    apt: tuple[Text, ...] = ()  # packages of the distribution, as PACKAGE=VERSION
+    program: str = ""  # of apt: the program that is found in PATH
+    version: str = ""  # of apt: what the program says of itself
+    small: bool = False  # fit for every run
+
+    def __post_init__(self) -> None:
+        """ValueError for none of them, or several."""
+        if sum(map(bool, (self.pip, self.npm, self.apt))) != 1:
+            raise ValueError("expected one of pip, npm and apt")
 
     @property
     def needs(self) -> Pip | Npm | Apt:
         """What is to be installed."""
         if self.npm:
             return Npm(self.npm)
-        return Apt(self.program, self.apt, self.version) if self.apt else Pip(self.pip, self.python, self.built)
+        if self.apt:
+            return Apt(self.program, self.apt, self.version)
+        return Pip(self.pip, self.python, self.built)
 
 
-def from_file(known: RendererFile) -> System:
-    """The system that a file describes. ValueError for an unknown key of [install]."""
-    install = None if known.install is None else convert(known.install, Install, f"{known.folder}: install")
+def load(folder: Path) -> System:
+    """The system of a folder with a `mi-refract-renderer.toml`. Errors as of `renderer_file.load`."""
+    known = renderer_file.load(folder)
+    where = f"{folder / renderer_file.NAME}: install"
+    install = None if known.install is None else convert(known.install, Install, where)
     return System(
-        known.name,
+        folder.resolve().name,
         known.title,
         known.licence,
         install.needs if install else None,
         megabytes=install.megabytes if install else 0,
-        small=install.small if install else True,
+        small=install is None or install.small,
         calls=known.rays,
         lens=known.lens,
         images=known.images,
-        folder=known.folder,
+        folder=folder,
     )

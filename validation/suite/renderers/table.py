@@ -12,18 +12,17 @@ from pathlib import Path
 
 from mi_refract.ray_sets import renderer_file
 
-from .system import System, from_file
+from .system import System, load
 
 SYSTEMS_FOLDER = Path(__file__).parent / "systems"
 SYSTEMS: dict[str, System] = {
-    path.parent.name: from_file(renderer_file.load(path.parent))
-    for path in sorted(SYSTEMS_FOLDER.glob(f"*/{renderer_file.NAME}"))
+    path.parent.name: load(path.parent) for path in sorted(SYSTEMS_FOLDER.glob(f"*/{renderer_file.NAME}"))
 }
 
 
 def join(folder: Path) -> System:
-    """Take the renderer of a folder into the table. ValueError where one has its name; errors as of `load`."""
-    system = from_file(renderer_file.load(folder))
+    """Take the renderer of a folder into the table. ValueError where one has its name; other errors as of `load`."""
+    system = load(folder)
     if system.name in SYSTEMS:
         raise ValueError(f"{folder}: {system.name!r} is in the table; expected a folder of another name")
     SYSTEMS[system.name] = system

@@ -10,10 +10,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-Nodes = dict[str, Any]
+from .cases import GLASS, MATT, Nodes, bitmap, camera, environment
+
 SIZE = 16
-GLASS = {"type": "refract", "int_ior": 1.5, "ext_ior": 1.0}
-MATT = {"type": "diffuse", "reflectance": 0.6}
 ROUGH, ROUGH_GLASS = {"type": "roughconductor", "alpha": 0.2}, {"type": "roughdielectric", "alpha": 0.5, "int_ior": 2.2}
 PRINCIPLED = {"type": "principled", "metallic": 1.0, "roughness": 0.4}
 CONSTANT, POINT = {"type": "constant"}, {"type": "point", "position": [1, 2, 1]}
@@ -26,24 +25,21 @@ CAUCHY = "cauchy(1.5, 10000)"
 
 def scene(fov: float, **parts: Any) -> Nodes:
     """A camera before the origin."""
-    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "pixel_format": "rgb", "rfilter": {"type": "box"}}
-    view = mi.ScalarTransform4f().look_at([0.3, 0.5, 4], [0.1, 0, 0], [0, 1, 0])
-    sensor = {"type": "perspective", "fov": fov, "to_world": view, "film": film, "sampler": {"type": "independent"}}
-    return {"type": "scene", "sensor": sensor} | parts
+    return {"type": "scene", "sensor": camera(SIZE, fov, [0.3, 0.5, 4], (0.1, 0, 0))} | parts
 
 
-def bitmap(low: float, high: float, channels: int = 3) -> Nodes:
+def waves(low: float, high: float, channels: int = 3) -> Nodes:
     """A texture without edges."""
     u, v = np.meshgrid(*[np.linspace(0, 2 * np.pi, 8)] * 2)
-    waves = np.stack([0.5 + 0.25 * (np.sin(u + i) + np.sin(v + 2 * i)) for i in range(channels)], axis=2)
-    return {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap((low + (high - low) * waves).astype(np.float32))}
+    pixels = np.stack([0.5 + 0.25 * (np.sin(u + i) + np.sin(v + 2 * i)) for i in range(channels)], axis=2)
+    return bitmap(low + (high - low) * pixels)
 
 
 def sky() -> Nodes:
     """Stripes without edges."""
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 64), np.linspace(0, np.pi, 32))
     stripes = [np.exp(np.sin(v) * (np.sin(u + i) + 1.5 * np.sin(3 * u + i))) for i in (0, 2, 4)]
-    return {"type": "envmap", "bitmap": mi.Bitmap(np.stack(stripes, axis=2).astype(np.float32))}
+    return environment(np.stack(stripes, axis=2))
 
 
 def ball(fov: float = 12, **glass: Any) -> Nodes:
@@ -101,42 +97,22 @@ def blend(other: Nodes) -> Nodes:
     return {"type": "blendbsdf", "weight": 0.4, "a": {"type": "diffuse", "reflectance": 0.1}, "b": other}
 
 
-# Parameters ----------------------------------------------------------------------------------------------------
+# Cases ---------------------------------------------------------------------------------------------------------
 
-
-def value(x: Any, before: Any) -> Any:
-    """The parameter is x."""
-    return type(before)(x)
-
-
-def times(x: Any, before: Any) -> Any:
-    """x times what it was."""
-    return before * x
-
-
-def turned(x: Any, before: Any) -> Any:
-    """The normals of vertices, by x degrees."""
-    return dr.ravel(mi.Transform4f().rotate([0, 1, 0], x) @ dr.unravel(mi.Normal3f, before))
-
-
-def moved(x: Any, before: Any) -> Any:
-    """By x to the side."""
-    return before @ mi.Transform4f().translate([x, 0, 0])
-
-
-def rotated(x: Any, before: Any) -> Any:
-    """By x degrees."""
-    return before @ mi.Transform4f().rotate([1, 0, 0], x)
-
-
-def scaled(x: Any, before: Any) -> Any:
-    """By the factor x."""
-    return before @ mi.Transform4f().scale(x)
+# The parameter at x, by what it was.
+CHANGES: dict[str, Callable[[Any, Any], Any]] = {
+    "value": lambda x, before: type(before)(x),
+    "times": lambda x, before: before * x,
+    "turned": lambda x, before: dr.ravel(mi.Transform4f().rotate([0, 1, 0], x) @ dr.unravel(mi.Normal3f, before)),
+    "moved": lambda x, before: before @ mi.Transform4f().translate([x, 0, 0]),
+    "rotated": lambda x, before: before @ mi.Transform4f().rotate([1, 0, 0], x),
+    "scaled": lambda x, before: before @ mi.Transform4f().scale(x),
+}
 
 
 @dataclass(frozen=True)
-class Case:
-    """The parameter whose name ends with `key` is `of(x, what it was)`; the derivative is that in x, there.
+class Gradient:
+    """The parameter whose name ends with `key` is that of CHANGES[change] at x = `at`.
 
     `step`: h. `others`: integrators of Mitsuba beside. `excluded`: why none of them can have this derivative.
     """
@@ -145,7 +121,7 @@ class Case:
     key: str
     at: float
     step: float
-    of: Callable[[Any, Any], Any] = value
+    change: str = "value"
     others: tuple[str, ...] = ("path",)
     spp: int = 256
     excluded: str = ""
@@ -159,51 +135,51 @@ GRAZING = "rays that graze glass have derivatives of any size: the noise does no
 DELTA = "the choice of a delta lobe has no derivative"
 # fmt: off
 CASES = {
-    "albedo": Case(room, "floor.bsdf.reflectance.value", 0.6, 0.03, others=ALL),
-    "albedo, textured": Case(
-        lambda: room(MATT | {"reflectance": bitmap(0.2, 0.9)}), "floor.bsdf.reflectance.data", 1, 0.03, times),
-    "radiance of a lamp": Case(
+    "albedo": Gradient(room, "floor.bsdf.reflectance.value", 0.6, 0.03, others=ALL),
+    "albedo, textured": Gradient(
+        lambda: room(MATT | {"reflectance": waves(0.2, 0.9)}), "floor.bsdf.reflectance.data", 1, 0.03, "times"),
+    "radiance of a lamp": Gradient(
         lambda: room(light=lamp(0, 2, 0, size=1.5)), "radiance.value", 5, 0.5, others=ALL, spp=1024),
-    "radiance of an `envmap`": Case(room, "light.data", 1, 0.1, times),
-    "radiance of a `constant`": Case(lambda: room(light=CONSTANT), "radiance.value", 1, 0.1),
-    "intensity of a `point`": Case(lambda: room(light=POINT), "intensity.value", 1, 0.1),
-    "`specular_reflectance`": Case(
+    "radiance of an `envmap`": Gradient(room, "light.data", 1, 0.1, "times"),
+    "radiance of a `constant`": Gradient(lambda: room(light=CONSTANT), "radiance.value", 1, 0.1),
+    "intensity of a `point`": Gradient(lambda: room(light=POINT), "intensity.value", 1, 0.1),
+    "`specular_reflectance`": Gradient(
         lambda: room(specular_reflectance=0.7), "specular_reflectance.value", 0.7, 0.03, spp=1024),
-    "`specular_transmittance`": Case(
+    "`specular_transmittance`": Gradient(
         lambda: room(specular_transmittance=0.7), "specular_transmittance.value", 0.7, 0.03, others=ALL),
-    "`int_absorption`": Case(lambda: room(int_absorption=0.5), "int_absorption.value", 0.5, 0.03, others=()),
-    "`alpha` of `roughconductor`": Case(
+    "`int_absorption`": Gradient(lambda: room(int_absorption=0.5), "int_absorption.value", 0.5, 0.03, others=()),
+    "`alpha` of `roughconductor`": Gradient(
         lambda: plane(ROUGH, lamp(0, 2.4, 1.8, size=0.8)), "alpha.value", 0.2, 0.01, others=ALL, spp=512),
-    "`alpha` of `roughconductor`, in glass": Case(lambda: core(ROUGH), "alpha.value", 0.2, 0.01, spp=512),
-    "`alpha` of `roughdielectric`": Case(
+    "`alpha` of `roughconductor`, in glass": Gradient(lambda: core(ROUGH), "alpha.value", 0.2, 0.01, spp=512),
+    "`alpha` of `roughdielectric`": Gradient(
         lambda: plane(ROUGH_GLASS), "alpha.value", 0.5, 0.02, others=ALL, spp=1024),
-    "`roughness` of `principled`": Case(lambda: plane(PRINCIPLED), "roughness.value", 0.4, 0.02, spp=512),
-    "`eta`": Case(ball, "eta", 1.5, 0.01, others=ALL),
-    "`eta`, a matt ball within": Case(lambda: core(MATT), "ball.bsdf.eta", 1.5, 0.04, others=ALL, spp=2048),
-    "`int_ior`, textured": Case(
-        lambda: ball(int_ior=bitmap(1.4, 1.6, 1)), "int_ior.data", 1, 0.005, times, others=ALL),
-    "`int_ior_A`": Case(lambda: ball(int_ior=CAUCHY), "int_ior_A", 1.5, 0.01, others=(), spp=512, spectral=True),
-    "`int_ior_B`": Case(lambda: ball(int_ior=CAUCHY), "int_ior_B", 1e4, 2e3, others=(), spp=512, spectral=True),
-    "normals of matt vertices": Case(lambda: mesh(MATT), "normals", 0, 2, turned),
-    "normals of rough vertices": Case(lambda: mesh(ROUGH), "normals", 0, 1, turned, others=ALL),
-    "normals of glass vertices": Case(lambda: mesh(GLASS), "normals", 0, 1, turned, others=ALL),
-    "translation of glass": Case(ball, "ball.to_world", 0, 0.004, moved, others=ALL),
-    "rotation of glass": Case(lambda: plane(GLASS), "plane.to_world", 0, 0.5, rotated),
-    "scale of glass": Case(ball, "ball.to_world", 1, 0.01, scaled),
-    "translation of the camera": Case(ball, "sensor.to_world", 0, 0.004, moved),
-    "`weight` of a `blendbsdf`, both matt": Case(
+    "`roughness` of `principled`": Gradient(lambda: plane(PRINCIPLED), "roughness.value", 0.4, 0.02, spp=512),
+    "`eta`": Gradient(ball, "eta", 1.5, 0.01, others=ALL),
+    "`eta`, a matt ball within": Gradient(lambda: core(MATT), "ball.bsdf.eta", 1.5, 0.04, others=ALL, spp=2048),
+    "`int_ior`, textured": Gradient(
+        lambda: ball(int_ior=waves(1.4, 1.6, 1)), "int_ior.data", 1, 0.005, "times", others=ALL),
+    "`int_ior_A`": Gradient(lambda: ball(int_ior=CAUCHY), "int_ior_A", 1.5, 0.01, others=(), spp=512, spectral=True),
+    "`int_ior_B`": Gradient(lambda: ball(int_ior=CAUCHY), "int_ior_B", 1e4, 2e3, others=(), spp=512, spectral=True),
+    "normals of matt vertices": Gradient(lambda: mesh(MATT), "normals", 0, 2, "turned"),
+    "normals of rough vertices": Gradient(lambda: mesh(ROUGH), "normals", 0, 1, "turned", others=ALL),
+    "normals of glass vertices": Gradient(lambda: mesh(GLASS), "normals", 0, 1, "turned", others=ALL),
+    "translation of glass": Gradient(ball, "ball.to_world", 0, 0.004, "moved", others=ALL),
+    "rotation of glass": Gradient(lambda: plane(GLASS), "plane.to_world", 0, 0.5, "rotated"),
+    "scale of glass": Gradient(ball, "ball.to_world", 1, 0.01, "scaled"),
+    "translation of the camera": Gradient(ball, "sensor.to_world", 0, 0.004, "moved"),
+    "`weight` of a `blendbsdf`, both matt": Gradient(
         lambda: room(blend(MATT)), "weight.value", 0.4, 0.03, others=ALL),
-    "`weight` of a `blendbsdf`, matt and glass": Case(
+    "`weight` of a `blendbsdf`, matt and glass": Gradient(
         lambda: core(MATT, blend(GLASS)), "weight.value", 0.4, 0.03, others=ALL, excluded=DELTA),
-    "`eta`, a checkerboard behind": Case(tiles, "eta", 1.5, 0.03, others=ALL, spp=1024, excluded=PIXEL),
-    "translation of a matt ball, its outline in view": Case(
-        lambda: scene(40, ball={"type": "sphere", "bsdf": MATT}, light=sky()), "ball.to_world", 0, 0.004, moved,
+    "`eta`, a checkerboard behind": Gradient(tiles, "eta", 1.5, 0.03, others=ALL, spp=1024, excluded=PIXEL),
+    "translation of a matt ball, its outline in view": Gradient(
+        lambda: scene(40, ball={"type": "sphere", "bsdf": MATT}, light=sky()), "ball.to_world", 0, 0.004, "moved",
         others=ALL, excluded=PIXEL),
-    "`eta` of a ball between a lamp and a matt plane": Case(
+    "`eta` of a ball between a lamp and a matt plane": Gradient(
         lambda: plane(MATT, lamp(0, 2.6, 1.73, size=0.3), ball=LENS), "ball.bsdf.eta", 1.5, 0.02, others=ALL, spp=1024,
         excluded=VERTEX),
-    "translation of glass, its outline in view": Case(
-        lambda: ball(40), "ball.to_world", 0, 0.004, moved, others=ALL, spp=2048, excluded=GRAZING),
+    "translation of glass, its outline in view": Gradient(
+        lambda: ball(40), "ball.to_world", 0, 0.004, "moved", others=ALL, spp=2048, excluded=GRAZING),
 }
 # fmt: on
 QUICK = ("`alpha` of `roughconductor`", "`eta`")

@@ -9,7 +9,7 @@ from support.diff_images import image as smooth
 
 from mi_refract.image_diff import accept, folders
 from mi_refract.image_diff.methods import METHODS
-from mi_refract.image_diff.settings import ComparisonSpec, Settings
+from mi_refract.image_diff.settings import Entry, Settings
 from mi_refract.image_diff.settings_file import from_words
 from mi_refract.io import image_file
 from mi_refract.io.image_file import read, read_parts
@@ -52,8 +52,8 @@ def with_change(images, number, by=0.5):
     return [pixels + by if i == number else pixels for i, pixels in enumerate(images)]
 
 
-def compared(one, two, how=ComparisonSpec()):  # noqa: B008
-    (result,) = folders.diff(one, two, Settings(how), maps=True).results
+def compared(one, two, how=Entry("", {})):  # noqa: B008
+    (result,) = folders.diff(one, two, Settings((how,)), maps=True).results
     return result
 
 
@@ -85,13 +85,13 @@ def test_the_limit_holds_for_all_together(tmp_path):
 @pytest.mark.parametrize("write, images, place", [(parts, SMALL, "part 2"), (levels, PYRAMID, "MIP level 2")])
 def test_a_change_in_any_of_them_is_different_and_placed(tmp_path, method, write, images, place):
     one = write(tmp_path / "a.exr", images)
-    same = compared(one, write(tmp_path / "b.exr", images), ComparisonSpec(method))
+    same = compared(one, write(tmp_path / "b.exr", images), Entry("", {"method": method}))
     assert str(same.status) == "equal"
-    found = compared(one, write(tmp_path / "c.exr", with_change(images, 2)), ComparisonSpec(method))
+    found = compared(one, write(tmp_path / "c.exr", with_change(images, 2)), Entry("", {"method": method}))
     assert str(found.status) == "different"
     assert found.reason.startswith(f"{place}: ")
     assert found.reason.endswith(f"; different: 1 of {len(images)} parts and MIP levels")
-    assert [image.pixels.shape for image in found.images] == [images[2].shape] * 2
+    assert [image.pixels.shape for image in found.images.values()] == [images[2].shape] * 2
 
 
 @pytest.mark.parametrize("number, words", [(2, "part 2 is missing"), (1, "part 1 is missing, and 1 more")])
@@ -110,34 +110,17 @@ def test_without_a_the_first_is_compared_as_idiff_does_and_that_is_said(tmp_path
     assert str(compared(one, two, from_words("auto", [], "-a -fail .01")).status) == "different"
 
 
-def test_with_flags_of_idiff_colours_are_multiplied_by_alpha(tmp_path):
-    for name, colour in (("a.tif", 0.5), ("b.tif", 0.25)):
-        spec = oiio.ImageSpec(4, 4, 4, "uint8")
-        spec.attribute("oiio:UnassociatedAlpha", 1)
-        output = oiio.ImageOutput.create(str(tmp_path / name))
-        pixels = np.full((4, 4, 4), colour, np.float32) * np.float32([1, 1, 1, 0])
-        assert output.open(str(tmp_path / name), spec) and output.write_image(pixels) and output.close()
-    pair = tmp_path / "a.tif", tmp_path / "b.tif"
-    assert str(compared(*pair, from_words("auto", [], "-fail 0")).status) == "equal"
-    assert str(compared(*pair).status) == "different"
-
-
-def test_a_warning_says_where(tmp_path):
-    one, two = parts(tmp_path / "a.exr", SMALL), parts(tmp_path / "b.exr", with_change(SMALL, 1, 0.01))
-    found = compared(one, two, from_words("auto", [], "-a -fail .001 -failpercent 99"))
-    assert str(found.status) == "different"
-    two = parts(tmp_path / "c.exr", [SMALL[0], np.where(SMALL[1] > 0.9, SMALL[1] + 0.01, SMALL[1]), SMALL[2]])
-    found = compared(one, two, from_words("auto", [], "-a -fail .001 -failpercent 60"))
-    assert str(found.status) == "equal"
-    assert found.warning.startswith("part 1: ") and "> warn_percent = 0" in found.warning
-
-
-def test_of_several_warnings_the_others_are_counted(tmp_path):
+def test_a_warning_names_its_place_and_the_others_are_counted(tmp_path):
+    flags = from_words("auto", [], "-a -fail .001 -failpercent 60")
     one = parts(tmp_path / "a.exr", SMALL)
-    two = parts(tmp_path / "b.exr", [np.where(each > 0.9, each + 0.01, each) for each in SMALL])
-    found = compared(one, two, from_words("auto", [], "-a -fail .001 -failpercent 60"))
+    some = [np.where(each > 0.9, each + 0.01, each) for each in SMALL]
+    found = compared(one, parts(tmp_path / "b.exr", [SMALL[0], some[1], SMALL[2]]), flags)
+    assert str(found.status) == "equal"
+    assert found.warning.startswith("part 1: ") and found.warning.endswith("> warn_percent = 0)")
+    found = compared(one, parts(tmp_path / "c.exr", some), flags)
     assert found.warning.startswith("part 0: ")
     assert found.warning.endswith(", and in 2 more parts and MIP levels")
+    assert compared(one, parts(tmp_path / "d.exr", [some[0], SMALL[1] + 1, SMALL[2]]), flags).warning == ""
 
 
 def test_what_cannot_be_compared_is_named_with_its_place(tmp_path):

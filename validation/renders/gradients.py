@@ -10,7 +10,7 @@ Edges that move, in the image or in the view of a matt surface, are in none of t
 them, rows record by how much each integrator is off. In the profile `full` Mitsuba's own stand beside, with a render
 each; else `path` where something is excluded.
 
-`python -m validation stability`
+`python -m validation renders`
 """
 
 from __future__ import annotations
@@ -26,13 +26,12 @@ import numpy as np
 
 from mi_refract.report.row import Row
 from validation import limits
-from validation.repeated import by_tasks
 from validation.run.context import Context
-from validation.run.render_methods import OURS, under
+from validation.run.render_methods import OURS
 from validation.run.seeds import current
-from validation.study import Study, Task, about
 
-from .gradient_scenes import CASES, QUICK, Case
+from . import cases
+from .gradient_scenes import CASES, CHANGES, QUICK, Gradient
 
 NAME = "gradients"
 TERMS = {
@@ -50,7 +49,7 @@ RENDERS, SEED = 3, 2037
 class Images:
     """The images of a case by an integrator, and their derivatives in the case's parameter."""
 
-    def __init__(self, case: Case, integrator: str, **parameters: int) -> None:
+    def __init__(self, case: Gradient, integrator: str, **parameters: int) -> None:
         """`parameters` of the integrator."""
         self.case, self.scene = case, mi.load_dict(case.make(), parallel=False, optimize=False)
         self.integrator: Any = mi.load_dict({"type": integrator, "max_depth": 6, "rr_depth": 100} | parameters)
@@ -58,27 +57,27 @@ class Images:
         (self.key,) = [key for key in self.params.keys() if key.endswith(case.key)]  # noqa: SIM118  no dictionary
         self.before = dr.detach(self.params[self.key])
 
-    def _set(self, x: float) -> None:
-        self.params[self.key] = self.case.of(dr.opaque(mi.Float, x), self.before)
+    def set(self, x: Any) -> None:
+        """The parameter as it is at `x`."""
+        self.params[self.key] = CHANGES[self.case.change](x, self.before)
         self.params.update()
 
     @contextmanager
-    def _attached(self) -> Iterator[Any]:
+    def attached(self) -> Iterator[Any]:
         """The parameter, for a while: Dr.Jit differentiates all plugins that are in memory."""
         x = dr.opaque(mi.Float, self.case.at)
         dr.enable_grad(x)
-        self.params[self.key] = self.case.of(x, self.before)
-        self.params.update()
+        self.set(x)
         try:
             yield x
         finally:
-            self._set(self.case.at)
+            self.set(dr.opaque(mi.Float, self.case.at))
 
     def differences(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """D and D(h), as images."""
 
         def image(x: float) -> np.ndarray:
-            self._set(x)
+            self.set(dr.opaque(mi.Float, x))
             return np.array(mi.render(self.scene, integrator=self.integrator, spp=self.case.spp, seed=seed), float)
 
         at, h = self.case.at, self.case.step
@@ -87,73 +86,64 @@ class Images:
 
     def forward(self, seed: int) -> np.ndarray:
         """The derivative of the image."""
-        with self._attached() as x:
+        with self.attached() as x:
             dr.forward(x, dr.ADFlag.ClearEdges)  # Mitsuba's forward mode begins at the parameters of the scene
             return np.array(self.integrator.render_forward(self.scene, params=x, spp=self.case.spp, seed=seed), float)
 
     def backward(self, weights: np.ndarray, seed: int) -> float:
         """That of the sum of the weighted pixels."""
-        given = mi.TensorXf(weights.astype(np.float32))
-        with self._attached() as x:
-            self.integrator.render_backward(self.scene, params=x, grad_in=given, spp=self.case.spp, seed=seed)
+        grad_in = mi.TensorXf(weights.astype(np.float32))
+        with self.attached() as x:
+            self.integrator.render_backward(self.scene, params=x, grad_in=grad_in, spp=self.case.spp, seed=seed)
             return float(dr.grad(x)[0])
 
 
-def tasks(context: Context) -> list[Task]:
-    """One a case; two in the profile `quick`."""
-    if context.scalar:
-        reason = "scalar variants have no derivatives"
-        return [Task(NAME, lambda: [Row(NAME, OURS, "every case", context.variant, reason=reason)])]
-    names = QUICK if context.profile.quick else tuple(CASES)
-    return [Task(f"{NAME}: {name}", functools.partial(rows, context, name)) for name in names]
+def all_cases(context: Context) -> Iterator[cases.Case]:
+    """Two in the profile `quick`."""
+    for name in QUICK if context.profile.quick else CASES:
+        variant = cases.variants(context)[CASES[name].spectral]
+        yield cases.Case(name, variant, functools.partial(rows, context, name))
 
 
 def rows(context: Context, name: str) -> list[Row]:
     """A row of `refract_path`, and one of each of Mitsuba's integrators that stand beside it."""
-    case = CASES[name]
+    case, variant = CASES[name], cases.variants(context)[CASES[name].spectral]
     others = case.others if context.profile.name == "full" else ("path",) if case.excluded else ()
-    variant = context.variant.replace("rgb", "spectral") if case.spectral else context.variant
-    if reason := context.variants.get(variant):
-        return [Row(NAME, OURS, name, variant, reason=reason)]
     seed = current(SEED)
     replay = {"seed": seed, "spp": case.spp, "renders": RENDERS, "step": case.step}
-    with under(variant):
-        split = Images(case, OURS, split_depth=2)
-        weights = split.differences(seed)[0]
-        weights /= np.sqrt((weights**2).mean())
-        expected, near = weights * np.mean([split.differences(seed + 1 + i) for i in range(RENDERS)], axis=0)
-        ours = Images(case, OURS)
-        found = weights * [ours.forward(seed + 100 + i) for i in range(RENDERS)]
-        values, error = compared(found.mean(axis=0), expected)
-        backward = split.backward(weights / weights.size, seed + 100) - float(found[0].mean())
-        beside = [other(case, each, weights, expected, variant, replay) for each in others]
-    worse = [is_right(row.values) and not is_right(values) for row in beside if row.subject == "path"]
+    split, ours = Images(case, OURS, split_depth=2), Images(case, OURS)
+    weights = split.differences(seed)[0]
+    weights /= np.sqrt((weights**2).mean())
+    expected, near = weights * np.mean([split.differences(seed + 1 + i) for i in range(RENDERS)], axis=0)
+    forward = weights * [ours.forward(seed + 100 + i) for i in range(RENDERS)]
+    values, error = compared(forward.mean(axis=0), expected)
+    backward = split.backward(weights / weights.size, seed + 100) - float(forward[0].mean())
+
+    beside = []  # what other integrators give, or how they refuse; nothing is demanded
+    for integrator in others:
+        row = functools.partial(Row, NAME, integrator, name, variant)
+        try:
+            theirs = weights * Images(case, integrator).forward(seed + 100)
+        except RuntimeError as refusal:
+            beside.append(row(reason=f"an error: {str(refusal).splitlines()[0]}"))
+            continue
+        finite = np.isfinite(theirs).all()
+        beside.append(row(compared(theirs, expected)[0], replay=replay) if finite else row(reason="infinite"))
+    by_path = any(row.subject == "path" and is_right(row.values) for row in beside)
     values |= {"truncation": abs(float(near.mean() / expected.mean()) - 1), "backward": abs(backward) / error}
-    values |= {"right by path only": float(any(worse))}
+    values |= {"right by path only": float(by_path and not is_right(values))}
     budgets = {"backward": limits.BACKWARD_MODE, "right by path only": 0.0}
     if not case.excluded:
         budgets |= {"z": limits.GRADIENT_ALARM, "detectable": limits.GRADIENT, "truncation": limits.TRUNCATION}
     return [Row(NAME, OURS, name, variant, values, budgets, reason=case.excluded, replay=replay), *beside]
 
 
-def other(case: Case, integrator: str, weights: Any, expected: Any, variant: str, replay: dict[str, Any]) -> Row:
-    """What another integrator gives, or how it refuses; nothing is demanded."""
-    name = next(name for name, each in CASES.items() if each is case)
-    try:
-        found = weights * Images(case, integrator).forward(replay["seed"] + 100)
-    except RuntimeError as error:
-        return Row(NAME, integrator, name, variant, reason=f"an error: {str(error).splitlines()[0]}")
-    if not np.isfinite(found).all():
-        return Row(NAME, integrator, name, variant, reason="infinite")
-    return Row(NAME, integrator, name, variant, compared(found, expected)[0], replay=replay)
-
-
-def compared(found: np.ndarray, expected: np.ndarray) -> tuple[dict[str, float], float]:
+def compared(gradient: np.ndarray, expected: np.ndarray) -> tuple[dict[str, float], float]:
     """The values of a row, and the standard error of the difference."""
-    terms, gradient, mean = (found - expected).sum(axis=2) / found.size, float(found.mean()), float(expected.mean())
+    terms, g, mean = (gradient - expected).sum(axis=2) / gradient.size, float(gradient.mean()), float(expected.mean())
     error = float(np.sqrt((terms**2).sum()))
-    values = {"gradient": gradient, "differences": mean, "off": abs(gradient / mean - 1)}
-    return values | {"z": abs(gradient - mean) / error, "detectable": limits.GRADIENT_ALARM * error / mean}, error
+    values = {"gradient": g, "differences": mean, "off": abs(g / mean - 1)}
+    return values | {"z": abs(g - mean) / error, "detectable": limits.GRADIENT_ALARM * error / mean}, error
 
 
 def is_right(values: dict[str, float]) -> bool:
@@ -161,4 +151,4 @@ def is_right(values: dict[str, float]) -> bool:
     return bool(values) and values["z"] <= limits.GRADIENT_ALARM and values["detectable"] <= limits.GRADIENT
 
 
-STUDY = Study(NAME, "Gradients of images", about(__doc__), TERMS, tasks, again=by_tasks(tasks))
+STUDY = cases.study(NAME, "Gradients of images", __doc__, TERMS, all_cases)

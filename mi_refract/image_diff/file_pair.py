@@ -1,0 +1,158 @@
+"""Comparing a new image with one reference: two files, or two folders of renders, with what the settings say of them.
+
+Of files with several images every part and MIP level is compared with the one of the same number. The verdict is the
+worst of them, with the place of the image that it is about. A part or level that only one of the files has is a
+difference.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from mi_refract.io import image_file
+from mi_refract.io.bounded_map import bounded_map
+from mi_refract.io.image_file import MAX_VALUES, Image
+
+from . import channels, idiff_flags, masks, methods, pairing, variances
+from .comparison import Comparison, Verdict
+from .results import Result
+from .settings import ComparisonSpec
+
+WORST = (Verdict.DIFFERENT, Verdict.INCONCLUSIVE, Verdict.EQUAL)
+THREADS = 8
+Part = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A comparison, the two images that it is about, and what to warn of."""
+
+    images: tuple[Image, Image]
+    comparison: Comparison
+    warning: str
+
+
+def read(path: Path, how: ComparisonSpec) -> list[Image]:
+    """Every image of a file; with flags of `idiff` in the numbers that it compares, and without -a the first alone.
+
+    Raises what `image_file.read_parts` raises.
+    """
+    if how.idiff is None:
+        return image_file.read_parts(path, how.max_values)
+    first_only = not idiff_flags.parse(how.idiff).every
+    return image_file.read_parts(path, how.max_values, first_only=first_only, as_idiff=True)
+
+
+def read_renders(folder: Path, max_values: int = MAX_VALUES) -> list[Image]:
+    """The renders of one image in a folder. ValueError where two are the same, seed and all; otherwise as `read`."""
+    found, failed = pairing.images_in(folder)
+    if failed:
+        raise OSError(failed[0][1])
+    if not found:
+        raise ValueError(f"{folder}: holds no image; expected several renders of one")
+    read = functools.partial(image_file.read, max_values=max_values)
+    images = list(bounded_map(read, found.values(), lambda path: 0, max_values, THREADS))  # all are needed at once
+    sums: dict[float, Image] = {}
+    for image in images:
+        other = sums.setdefault(float(image.pixels.sum(dtype=np.float64)), image)
+        if other is not image and np.array_equal(image.pixels, other.pixels):
+            raise ValueError(f"{image.path}: the same pixels as {other.path}; expected renders of different seeds")
+    return images
+
+
+def mean_image(images: Sequence[Image]) -> Image:
+    """The first image with the mean of the pixels of all; one image, or the first of several parts, as it is."""
+    first = images[0]
+    if len(images) == 1 or first.place:
+        return first
+    pixels = sum((image.pixels for image in images[1:]), start=first.pixels) / np.float32(len(images))
+    return replace(first, pixels=pixels)
+
+
+def compare(
+    path: Path, sides: tuple[Sequence[Image], Sequence[Image]], result: Result, roots: tuple[Path, Path]
+) -> Judged:
+    """Compare the images of both sides as `result.how` says; `path`: of the reference, `roots`: the folders.
+
+    ValueError or OSError where a mask or a variance is missing or does not fit, and as `methods.compare`, with the
+    place of the image.
+    """
+    how = result.how
+    bare = [channels.without_variances(images[0]) for images in sides]
+    whole = dict.fromkeys(name for image in bare for name in image.channels)
+    reference, test = (
+        channels.chosen(_with_variance(images, root, how), how.channels, side)
+        for side, (images, root) in enumerate(zip(sides, roots, strict=True))
+    )
+    if how.reads_variance and not (len(reference) > 1 or variances.has_variance(reference[0])):
+        raise FileNotFoundError(f"{pairing.beside(how.variance, path, roots[0])}: no such file; expected a variance")
+    file = pairing.beside(how.mask, result.target or path, roots[0]) if how.mask else None
+    if (file or how.ignore) and reference[-1].place:
+        raise ValueError(f"{path}: several parts or MIP levels; expected with a mask one image")
+    mask = masks.made(reference[0], file, how.ignore, how.max_values)
+    reference, test = ([masks.applied(image, mask) for image in side] for side in (reference, test))
+    if path.is_dir():
+        comparison = methods.compare(how.method, reference, test, named=[one for one, _ in how.channels], **how.options)
+        images = mean_image(reference), mean_image(test)
+    else:
+        comparison, images = _compare_parts(how, reference, test)
+    chosen = {name for pair in how.channels for name in pair}
+    if chosen and (left := [name for name in whole if name not in chosen]):  # what was not compared is reported
+        comparison = replace(comparison, reason=f"{comparison.reason}; not compared: {', '.join(left)}")
+    return Judged(images, comparison, masks.warning(mask))
+
+
+def _with_variance(images: Sequence[Image], root: Path, how: ComparisonSpec) -> Sequence[Image]:
+    """A single image with the variance that lies beside it, where the settings name one and it is there."""
+    if not how.reads_variance or len(images) > 1:
+        return images
+    file = pairing.beside(how.variance, images[0].path, root)
+    if file == images[0].path:
+        raise ValueError(f"variance = {how.variance!r}: is {file} itself; expected the name of another image")
+    return [variances.with_file(images[0], file, how.max_values)] if file.exists() else images
+
+
+def _compare_parts(
+    how: ComparisonSpec, reference: Sequence[Image], test: Sequence[Image]
+) -> tuple[Comparison, tuple[Image, Image]]:
+    """The worst comparison of all parts that both files have, and the two images that it is about."""
+    one, two = ({image.part: image for image in side} for side in (reference, test))
+    found: dict[Part, Comparison] = {}
+    for part in one:
+        if part in two:
+            place = one[part].place or two[part].place
+            try:
+                named = [name for name, _ in how.channels]
+                found[part] = methods.compare(how.method, [one[part]], [two[part]], named=named, **how.options)
+            except ValueError as error:
+                raise ValueError(f"{error} ({place})" if place else str(error)) from None
+    places = {part: one[part].place or two[part].place for part in found}
+    shown = min(found, key=lambda part: WORST.index(found[part].verdict))
+    worst, reason = found[shown], found[shown].reason
+    if places[shown] and len(found) == 1:
+        reason += f"; of several images in the file only {places[shown]} is compared"
+    elif places[shown]:
+        alike = sum(each.verdict is worst.verdict for each in found.values())
+        reason = f"{places[shown]}: {reason}; {worst.verdict}: {alike} of {len(found)} parts and MIP levels"
+    verdict, warning = worst.verdict, _warning(found, places)
+    if lone := sorted(one.keys() ^ two.keys()):
+        more = f", and {len(lone) - 1} more" if len(lone) > 1 else ""
+        changed = "is missing" if lone[0] in one else "was added"
+        verdict, warning = Verdict.DIFFERENT, ""
+        reason = f"{(one | two)[lone[0]].place} {changed}{more}; {reason}"
+    return replace(worst, verdict=verdict, reason=reason, warning=warning, part=shown), (one[shown], two[shown])
+
+
+def _warning(found: Mapping[Part, Comparison], places: Mapping[Part, str]) -> str:
+    """The first warning, with its place, and how many there are; none where an image is different."""
+    warned = [part for part in found if found[part].warning]
+    if not warned or any(each.verdict is Verdict.DIFFERENT for each in found.values()):
+        return ""
+    place = f"{places[warned[0]]}: " if places[warned[0]] else ""
+    more = f", and in {len(warned) - 1} more parts and MIP levels" if len(warned) > 1 else ""
+    return f"{place}{found[warned[0]].warning}{more}"

@@ -1,0 +1,142 @@
+"""Random numbers of paths, also of paths that split, and the choice of an emitter."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+
+from mi_refract.numerics import Count, Interaction, Mask, Number, Point2, Sampler, Scene, Spectrum, Variant
+
+ONE = 1 - 2.0**-24  # the largest float32 below 1
+
+
+class SceneSampler:
+    """The scene's own sampler: numbers in the order in which they are drawn; keys are ignored."""
+
+    def next_1d(self, sampler: Sampler, key: Count) -> Number:
+        """A number in [0, 1)."""
+        return sampler.next_1d()
+
+    def next_2d(self, sampler: Sampler, key: Count) -> Point2:
+        """A point in [0, 1)²."""
+        return sampler.next_2d()
+
+
+class KeyedMultijitter:
+    """Stratified numbers for the lanes of a wavefront, in which the samples of a pixel lie side by side.
+
+    A Mitsuba sampler counts dimensions in the order in which numbers are drawn: a path that draws one number more would
+    shift the dimensions of all that follow. Here a number depends on its key. Each key is a dimension of its own that
+    is stratified over the samples of a pixel: correlated multi-jittered sampling (Kensler 2013).
+
+    The scene's sampler seeds them: it alone knows the seed and the pass of every render, also where another integrator
+    calls this one.
+    """
+
+    def __init__(self, v: Variant, sampler: Sampler, count: int) -> None:
+        """Draw a point of the sampler as the seed of each pixel.
+
+        Args:
+            v: the variant's module.
+            sampler: seeded, one lane a sample.
+            count: samples of a pixel in this wavefront.
+        """
+        self.v, lanes = v, sampler.wavefront_size()
+        # A symbolic loop cannot read another lane, so there each lane is a pixel of its own.
+        self.count = count if lanes % count == 0 and not dr.flag(dr.JitFlag.SymbolicScope) else 1
+        self.rows = next(r for r in range(math.isqrt(self.count), 0, -1) if self.count % r == 0)
+        self.columns = self.count // self.rows
+        self.lane = dr.arange(v.UInt32, lanes)
+        pixel = self.lane // self.count
+        self.index = self.lane - pixel * self.count
+        seed = v.sample_tea_32(*(dr.reinterpret_array(v.UInt32, x) for x in dr.detach(sampler.next_2d())))[0]
+        if self.count > 1:
+            seed = dr.gather(v.UInt32, seed, self.lane - self.index)  # of the first lane of the pixel
+        self.pixel = v.sample_tea_32(pixel, seed)[0]
+
+    def next_1d(self, sampler: Sampler, key: Count) -> Number:
+        """A number in [0, 1): the n samples of a pixel with the same key lie in n equal intervals, one in each."""
+        v, (permutation, noise) = self.v, self.v.sample_tea_32(self.pixel, key)
+        stratum = v.permute_kensler(self.index, self.count, permutation)
+        return self._placed(stratum, self._unit(v.sample_tea_32(self.lane, noise)[0]), self.count)
+
+    def next_2d(self, sampler: Sampler, key: Count) -> Point2:
+        """A point in [0, 1)²: stratified in cells of rows × columns, and in x and in y alone."""
+        v, (of_cells, noise) = self.v, self.v.sample_tea_32(self.pixel, key)
+        # Seeds that differ by a known constant give permutations that depend on each other: each has a hash of its own.
+        of_rows, of_columns = v.sample_tea_32(noise, of_cells)
+        cell = v.permute_kensler(self.index, self.count, of_cells)
+        row = cell // self.columns
+        column = cell - row * self.columns
+        # Within its cell a sample has a row and a column to itself, too.
+        inner_row = v.permute_kensler(row, self.rows, of_rows)
+        inner_column = v.permute_kensler(column, self.columns, of_columns)
+        x, y = (self._unit(word) for word in v.sample_tea_32(self.lane, noise))
+        x, y = self._placed(inner_row, x, self.rows), self._placed(inner_column, y, self.columns)
+        return v.Point2f(self._placed(column, x, self.columns), self._placed(row, y, self.rows))
+
+    def _unit(self, word: Count) -> Number:
+        """24 bits as a number in [0, 1)."""
+        return self.v.Float(word >> 8) * 2.0**-24
+
+    def _placed(self, stratum: Count, x: Number, count: int) -> Number:
+        return dr.minimum((self.v.Float(stratum) + x) * (1 / count), ONE)
+
+
+class SceneEmitters:
+    """All emitters, chosen by Mitsuba."""
+
+    def __init__(self, v: Variant, scene: Scene) -> None:
+        """`v`: the variant's module."""
+        self.scene = scene
+
+    def sample(self, si: Interaction, sample: Point2, active: Mask) -> tuple[Interaction, Spectrum]:
+        """A direction toward an emitter, and its radiance over the density; occlusion is not tested."""
+        direction: tuple[Interaction, Spectrum] = self.scene.sample_emitter_direction(si, sample, False, active)
+        return direction
+
+    def pdf(self, reference: Interaction, ds: Interaction, active: Mask) -> Number:
+        """The density per solid angle, seen from `reference`, with which `sample` returns `ds`."""
+        return self.scene.pdf_emitter_direction(reference, ds, active)
+
+
+class NonConstantEmitters:
+    """All emitters but a constant environment, chosen by their sampling weights.
+
+    Light that is the same from all directions adds little noise where only the BSDF is sampled; the noise is that of
+    what occludes it. Sampling it as an emitter would leave fewer samples for the others.
+    """
+
+    def __init__(self, v: Variant, scene: Scene) -> None:
+        """`v`: the variant's module."""
+        self.v, emitters = v, scene.emitters()
+        kept = [i for i, emitter in enumerate(emitters) if not emitter.is_environment()]
+        weights = [float(emitters[i].sampling_weight()) for i in kept]
+        self.total, self.vectorised = sum(weights), dr.is_jit_v(v.Float)
+        if not self.total:  # no emitter is sampled
+            return
+        if self.vectorised:
+            self.pointers = dr.gather(v.EmitterPtr, scene.emitters_dr(), v.UInt32(kept))
+        else:
+            self.pointers = [emitters[i] for i in kept]
+        self.choice = v.DiscreteDistribution(weights) if len(kept) > 1 else None
+
+    def sample(self, si: Interaction, sample: Point2, active: Mask) -> tuple[Interaction, Spectrum]:
+        """As `SceneEmitters.sample`."""
+        v, index, probability = self.v, self.v.UInt32(0), 1.0
+        if self.choice:
+            index, x, probability = self.choice.sample_reuse_pmf(sample.x, active)
+            sample = v.Point2f(x, sample.y)
+        emitter = dr.gather(v.EmitterPtr, self.pointers, index, active) if self.vectorised else self.pointers[index]
+        ds, radiance = emitter.sample_direction(si, sample, active)
+        ds.pdf *= probability
+        return ds, radiance / probability
+
+    def pdf(self, reference: Interaction, ds: Interaction, active: Mask) -> Number:
+        """As `SceneEmitters.pdf`; 0 for the environment."""
+        if not self.vectorised and (ds.emitter is None or ds.emitter.is_environment() or not active):
+            return 0.0
+        lamp = active & (ds.emitter.is_environment() ^ True)
+        pdf = ds.emitter.pdf_direction(reference, ds, lamp) * ds.emitter.sampling_weight() / self.total
+        return dr.select(lamp, pdf, 0)

@@ -1,0 +1,86 @@
+"""What the studies of `refract_path` share: one task a case, each under its variant of Mitsuba, and parts of scenes."""
+
+from __future__ import annotations
+
+import functools
+import gc
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from mi_refract.report.row import Row
+from validation.repeated import by_tasks
+from validation.run.context import Context
+from validation.run.render_methods import OURS, under
+from validation.study import Study, Task, about
+
+Nodes = dict[str, Any]  # for `mi.load_dict`
+GLASS = {"type": "refract", "int_ior": 1.5, "ext_ior": 1.0}
+MATT = {"type": "diffuse", "reflectance": 0.6}
+BLACK = {"type": "diffuse", "reflectance": 0.0}
+
+
+@dataclass(frozen=True)
+class Case:
+    """`rows()`, called under `variant`, measures it. `title`: no other case of the study has it."""
+
+    title: str
+    variant: str
+    rows: Callable[[], list[Row]]
+
+
+def study(
+    name: str, title: str, doc: str | None, terms: Mapping[str, str], cases: Callable[[Context], Iterable[Case]]
+) -> Study:
+    """A study with a task for each case, all of them repeated with other seeds."""
+
+    def rows(context: Context, case: Case) -> list[Row]:
+        if reason := context.variants.get(case.variant):
+            return [Row(name, OURS, case.title, case.variant, reason=reason)]
+        gc.collect()  # Dr.Jit compiles every plugin that is alive
+        with under(case.variant):
+            return case.rows()
+
+    def tasks(context: Context) -> list[Task]:
+        if context.scalar:
+            reason = "scalar variants have no derivatives and no numbers of split paths, and would render for hours"
+            return [Task(name, lambda: [Row(name, OURS, "every case", context.variant, reason=reason)])]
+        return [Task(f"{name}: {case.title}", functools.partial(rows, context, case)) for case in cases(context)]
+
+    return Study(name, title, about(doc), terms, tasks, again=by_tasks(tasks))
+
+
+def variants(context: Context) -> tuple[str, str, str]:
+    """Of the run's backend: RGB, spectral and polarised."""
+    family = context.variant.removesuffix("rgb")
+    return context.variant, f"{family}spectral", f"{family}spectral_polarized"
+
+
+def camera(size: int, fov: float, origin: list[float], target: tuple[float, float, float] = (0, 0, 0)) -> Nodes:
+    """Of `size`² independent pixels."""
+    film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb", "rfilter": {"type": "box"}}
+    view = mi.ScalarTransform4f().look_at(origin, [*target], [0, 1, 0])
+    return {"type": "perspective", "fov": fov, "to_world": view, "film": film, "sampler": {"type": "independent"}}
+
+
+def bitmap(pixels: Any, **parameters: Any) -> Nodes:
+    """A texture of numbers, height × width (× channels)."""
+    pixels = np.asarray(pixels, np.float32)
+    image = mi.Bitmap(pixels if pixels.ndim == 3 else pixels[..., None])
+    return {"type": "bitmap", "bitmap": image, "raw": True} | parameters
+
+
+def flat(value: Any, size: int = 1) -> Nodes:
+    """A bitmap of one value, a number or three."""
+    return bitmap(np.ones((size, size, 3)) * np.asarray(value))
+
+
+def environment(pixels: Any) -> Nodes:
+    """Light from all directions, height × width × 3."""
+    return {"type": "envmap", "bitmap": mi.Bitmap(np.asarray(pixels, np.float32))}
+
+
+TURNED = [0.5 + 0.5 * np.sin(0.35), 0.5, 0.5 + 0.5 * np.cos(0.35)]  # a normal map: by 20 degrees
