@@ -182,7 +182,7 @@ def test_rays_start_at_round_numbers_where_they_can(tmp_path):
 
 
 BAD = {  # what is replaced, by what: the place and what was found or expected
-    "unknown key": ("max_depth = 5", "max_depths = 5", "unknown field `max_depths`"),
+    "unknown key": ("max_depth = 5", "max_depths = 5", "unknown key `max_depths`; expected title, index"),
     "unknown key of a shape": ("facets = 20", "radius = 3", "shape[2]: object contains unknown field `radius`"),
     "missing key": ("radius = 0.2", "", "shape[1]: object missing required field `radius`"),
     "wrong type": ("radius = 2\n", 'radius = "2"\n', "shape[0].radius: expected `float`, got `str`"),
