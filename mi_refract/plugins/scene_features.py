@@ -224,12 +224,17 @@ def _black(bsdf: BSDF) -> bool:
 
 def _children(node: mi.Object) -> list[Any]:
     """The Mitsuba objects that a plugin shows of itself."""
-    objects = []
 
     class Children(mi.TraversalCallback):
+        def __init__(self) -> None:
+            super().__init__()
+            # Not in a closure of the class: classes live until the garbage collector runs, and scenes would with them.
+            self.objects: list[Any] = []
+
         def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
             if isinstance(value, mi.Object):
-                objects.append(value)
+                self.objects.append(value)
 
-    node.traverse(Children())
-    return objects
+    callback = Children()
+    node.traverse(callback)
+    return callback.objects

@@ -156,6 +156,7 @@ def test_a_moving_edge_in_the_view_of_a_matt_point_is_a_warning(matt, llvm_varia
     dr.enable_grad(params[parameter(params, ".eta")])
     params.update()
     dr.backward(dr.mean(mi.render(scene, params, integrator=method, spp=1), axis=None))
+    assert np.isfinite(numbers(dr.grad(params[parameter(params, ".eta")]))).all()
     lines = [text for text in said if "derivatives leave out edges of area lights that move" in text]
     assert len(lines) == matt
 
