@@ -70,18 +70,22 @@ def main(arguments: list[str] | None = None) -> int:
 @app.command(epilog="`python -m validation renderers` lists and installs other renderers.")
 def _command(
     studies: Annotated[
-        list[str] | None, typer.Argument(metavar="STUDY", help=f"Of {', '.join(ROOMS)}; all by default.")
+        list[str] | None,
+        typer.Argument(
+            metavar="STUDY",
+            help=f"Studies to run: {', '.join(ROOMS)}. Default: all; of the profile quick, a selection.",
+        ),
     ] = None,
     profile: Annotated[
         str, typer.Option(help=f"How much is measured: {', '.join(f'{k} ({v})' for k, v in PROFILES.items())}.")
     ] = "quick",
     out: Annotated[Path, typer.Option(help="Folder of the report.")] = Path("out"),
     write_tables: Annotated[
-        bool, typer.Option("--write-tables", help="Write the tables of the READMEs and the gallery, too.")
+        bool, typer.Option("--write-tables", help="Also write the tables of the READMEs and the gallery.")
     ] = False,
-    goals: Annotated[bool, typer.Option("--goals", help="Print the goals of timing, too.")] = False,
+    goals: Annotated[bool, typer.Option("--goals", help="Also print the goals for run times.")] = False,
     scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Run what times nothing on this Dask scheduler's workers.")
+        str | None, typer.Option(metavar="ADDRESS", help="Run tasks that measure no times on this Dask scheduler.")
     ] = None,
     workers: Annotated[
         int | None,
@@ -92,7 +96,7 @@ def _command(
         typer.Option(
             "--renderer",
             metavar="FOLDER",
-            help="Take the renderer of FOLDER/mi-refract-renderer.toml into `suite`, too.",
+            help="Also run the renderer of FOLDER/mi-refract-renderer.toml in `suite`.",
         ),
     ] = None,
 ) -> int:

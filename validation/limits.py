@@ -197,24 +197,6 @@ TEXTBOOK_BACKWARD = limit(8.0, "u: 7.8 for directions and 5.8 for decisions, the
 SUITE_ERROR = limit(1e-4, "probability of any alarm in a pair of equal images")
 LINE_DETECTABLE = limit(0.01, "of the image's mean: with more noise a dispersive image could be wrong and pass")
 
-
-def table() -> dict[str, Limit]:
-    """All of them by name, those of a group as "NAME, key"."""
-    found: dict[str, Limit] = {}
-
-    def collect(name: str, value: object) -> None:
-        if isinstance(value, Limit):
-            found[name] = value
-        elif isinstance(value, dict):
-            for key, each in value.items():
-                collect(f"{name}, {key}", each)
-
-    for name, value in globals().items():
-        if name.isupper():
-            collect(name, value)
-    return found
-
-
 EXPORT_SYSTEMATIC = limit(
     0.01,
     "of the image's mean: half floats err by 2⁻¹¹; a grid of 16 × 16 samples by 1/16 of a pixel's contrast where an "

@@ -18,9 +18,9 @@ from mi_refract.io import image_file
 from mi_refract.io.atomic import update_between, write_atomically
 from mi_refract.io.pixels import srgb_encode
 from mi_refract.plugins import PLUGIN
+from mi_refract.report.embedded_images import png
 from mi_refract.report.number_text import compact
 from mi_refract.report.row import Row
-from mi_refract.report.thumbnails import png
 from validation.diff import visible_changes
 from validation.directions import per_formula
 from validation.efficiency import changing_indices, error_against_time

@@ -37,17 +37,23 @@ def tasks(study: Study, context: Context) -> list[Task]:
 
 
 def rows_of(study: Study, context: Context, shift: int) -> list[Row]:
-    """One row with the worst share of a budget, and, in full, every row that breaks one."""
+    """One row with the worst share of a budget, and, in full, every row that breaks one.
+
+    Where nothing could be run, the one row is not run, for the reason of the study's rows.
+    """
     assert study.again is not None
     with shifted(shift), tempfile.TemporaryDirectory() as folder:  # images are those of the study's own seed
-        found = [replace(row, images={}) for row in study.again(replace(context, out=Path(folder))) if row.values]
+        rows = [replace(row, images={}) for row in study.again(replace(context, out=Path(folder)))]
+    found, case = [row for row in rows if row.values], f"other seed {shift}"
+    if rows and not found:
+        return [replace(rows[0], subject="every subject", case=case, setting="")]
     shares = [share(row.values[m], bound) for row in found for m, bound in row.budgets.items()]
     broken = [replace(row, case=f"{row.case}, other seed {shift}") for row in found if row.broken]
     values = {"checks": float(len(shares)), "broken": float(len(broken)), "largest share": max(shares, default=0.0)}
     values |= {"nothing checked": float(not shares)}
     replay = {"seeds": f"each {STEP * shift} above the study's own", "profile": context.profile.name}
     budgets = {"broken": 0.0, "nothing checked": 0.0}
-    return [Row(study.name, "every subject", f"other seed {shift}", "", values, budgets, replay=replay), *broken]
+    return [Row(study.name, "every subject", case, "", values, budgets, replay=replay), *broken]
 
 
 def share(value: float, bound: float) -> float:

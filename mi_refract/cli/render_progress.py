@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.pixels import srgb_encode
 from mi_refract.io.sanitise import printable
-from mi_refract.report.thumbnails import png
+from mi_refract.report.embedded_images import png
 
 from .quantities import shown_error
 

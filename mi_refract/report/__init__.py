@@ -15,5 +15,4 @@ __all__ = [
     "plots",
     "row",
     "run_report",
-    "thumbnails",
 ]

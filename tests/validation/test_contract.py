@@ -167,6 +167,12 @@ def test_a_repetition_that_checks_nothing_fails():
     assert repeated.rows_of(nothing, context("scalar_rgb"), 1)[0].broken == {"nothing checked": 0.0}
 
 
+def test_a_repetition_of_what_cannot_be_run_is_not_run():
+    absent = Study("s", "S", "", {}, lambda c: [], again=lambda c: [Row("s", "x", "y", "", reason="install x")])
+    (row,) = repeated.rows_of(absent, context("scalar_rgb"), 1)
+    assert (row.verdict, row.case, row.reason) == ("not run", "other seed 1", "install x")
+
+
 def test_what_is_drawn_is_kept_by_seed():
     calls = []
     draw = seeds.cached(lambda x: calls.append(x) or seeds.current(x))
@@ -208,10 +214,15 @@ def test_a_study_holds_its_bounds_none_of_which_is_a_hundred_times_too_wide(name
     assert [row.reason for row in tightness.rows(rows) if row.verdict != "pass"] == []
 
 
+def limits_in(value):
+    nested = value.values() if isinstance(value, dict) else ()
+    return [value] if isinstance(value, limits.Limit) else [limit for each in nested for limit in limits_in(each)]
+
+
 def test_a_limit_is_a_number_with_a_reason():
-    table = limits.table()
-    assert len(table) > 50
-    assert [name for name, limit in table.items() if not (limit.reason and math.isfinite(limit) and limit > 0)] == []
+    every = [limit for name, value in vars(limits).items() if name.isupper() for limit in limits_in(value)]
+    assert len(every) > 50
+    assert [limit for limit in every if not (limit.reason and math.isfinite(limit) and limit > 0)] == []
 
 
 def test_limits_on_noise_let_no_defect_hide_that_they_are_for():

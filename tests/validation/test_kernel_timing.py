@@ -5,13 +5,12 @@ import time
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 import pytest
 from scipy.stats import binom
 
 from mi_refract import FORMULAS, backend
 from validation.run import kernel_timing
-from validation.run.array_settings import BUILTIN, settings
+from validation.run.array_settings import BUILTIN, Setting, settings
 from validation.run.context import SCALAR_PROFILES, Context
 
 PROFILE = dataclasses.replace(SCALAR_PROFILES["standard"], scalar_rays=20, streamed_rays=2000, repeats=9)
@@ -24,18 +23,12 @@ def context(tmp_path):
 
 @pytest.mark.parametrize("count", [9, 11, 21])
 def test_the_interval_of_a_median_covers_it_19_times_in_20(count):
-    """Exact coverage from the ranks it takes; then 2000 samples, false alarm 1e-5 by 4.3σ of the binomial."""
+    """The exact coverage of the ranks that it takes; one rank further in it would be less than 95 %."""
     found = kernel_timing.interval("t", list(map(float, range(1, count + 1))))
     rank = int(found["t, low"])
     assert (found["t"], found["t, high"]) == ((count + 1) / 2, count + 1 - rank)
     coverage = 1 - 2 * binom.cdf(rank - 1, count, 0.5)
     assert coverage >= 0.95 > 1 - 2 * binom.cdf(rank, count, 0.5)
-    samples = np.random.default_rng(6).exponential(size=(2000, count))
-    inside = 0
-    for x in samples.tolist():
-        interval = kernel_timing.interval("t", x)
-        inside += interval["t, low"] <= np.log(2) <= interval["t, high"]
-    assert abs(inside - 2000 * coverage) <= 4.3 * np.sqrt(2000 * coverage * (1 - coverage))
 
 
 def test_a_ratio_is_that_of_one_round():
@@ -57,7 +50,7 @@ def test_every_second_round_runs_backwards_and_the_first_is_thrown_away():
     assert seconds == {"a": [4, 5, 8], "b": [3, 6, 7]}
 
 
-def test_a_slow_subject_is_seen_on_every_backend_that_runs(context):
+def test_a_slow_subject_is_seen_on_every_backend_that_runs(context, monkeypatch):
     def slow(a, n, k):
         if not dr.is_jit_v(a):
             time.sleep(2e-3)
@@ -69,27 +62,16 @@ def test_a_slow_subject_is_seen_on_every_backend_that_runs(context):
     for setting in settings(context):
         if setting.vector is None:
             continue
-        formulas = {"decomposed": FORMULAS["decomposed"], "slow": slow}
-        patched = _With(setting, formulas)
-        found = kernel_timing.measure(context, patched)
+        several = {"decomposed": FORMULAS["decomposed"], "slow": slow}
+        monkeypatch.setattr(Setting, "subjects", several)
+        found = kernel_timing.measure(context, setting)
         assert set(found) == {"copy", "decomposed", "slow"}
         assert found["slow"]["time / plain, low"] > 1.5
-        assert found["decomposed"]["time / plain"] == 1
-        assert found["copy"]["time / copy"] == 1
+        assert found["decomposed"]["time / plain"] == found["copy"]["time / copy"] == 1
         assert ("ns per ray" in found["slow"]) == (setting.backend == "cuda")
         if not setting.is_scalar:
             assert found["slow"]["operations"] > found["decomposed"]["operations"]
             assert found["slow"]["compile ms"] > 1  # NaN where a cache had the kernel
-
-
-class _With:
-    """A setting with other subjects."""
-
-    def __init__(self, setting, subjects):
-        self._setting, self.subjects = setting, subjects
-
-    def __getattr__(self, name):
-        return getattr(self._setting, name)
 
 
 def test_goals_are_those_of_the_table(context):

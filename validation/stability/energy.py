@@ -78,7 +78,7 @@ def setting_rows(context: Context, setting: Setting) -> list[Row]:
 
 
 @seeds.cached
-def given(regime: str, count: int, precision: type) -> tuple[np.ndarray, np.ndarray, oracle.Certified]:
+def regime_rays(regime: str, count: int, precision: type) -> tuple[np.ndarray, np.ndarray, oracle.Certified]:
     """(cos_i, k) of a regime's rays, rounded, and the certified answers for them."""
     rays = regimes.make(regime, count, precision, seeds.current(SEED))
     a, n = (v.astype(np.longdouble) for v in (rays.a, rays.n))
@@ -87,18 +87,18 @@ def given(regime: str, count: int, precision: type) -> tuple[np.ndarray, np.ndar
     return cos_i, rays.k, oracle.fresnel(cos_i, rays.k)
 
 
-def each(function: Callable[..., tuple], setting: Setting, *numbers: np.ndarray) -> list[np.ndarray]:
+def evaluated(function: Callable[..., tuple], setting: Setting, *numbers: np.ndarray) -> list[np.ndarray]:
     """`function` of every lane of the numbers, as numpy arrays: real or complex in extended precision, or masks."""
     if setting.is_scalar:
-        lanes = [[plain(x) for x in function(*map(float, lane))] for lane in zip(*numbers, strict=True)]
+        lanes = [[to_numpy(x) for x in function(*map(float, lane))] for lane in zip(*numbers, strict=True)]
         return [np.array(x) for x in zip(*lanes, strict=True)]
     number = dr.value_t(setting.vector)
     found = function(*(number(x) for x in numbers))
     dr.eval(found)
-    return [np.broadcast_to(plain(x), len(numbers[0])) for x in found]
+    return [np.broadcast_to(to_numpy(x), len(numbers[0])) for x in found]
 
 
-def plain(x: Any) -> Any:
+def to_numpy(x: Any) -> Any:
     """A number of Dr.Jit as one of numpy, extended."""
     if dr.is_complex_v(x):
         return np.array(x.real, np.longdouble) + 1j * np.array(x.imag, np.longdouble)
@@ -106,13 +106,13 @@ def plain(x: Any) -> Any:
     return array if array.dtype == bool else array.astype(np.longdouble)
 
 
-def ours(cos_i: Any, k: Any) -> tuple:
+def formula_powers(cos_i: Any, k: Any) -> tuple:
     """R, T and the decision of `mi_refract.formulas`, of a cosine and k."""
     cos_t, transmitted = fresnel.refracted_cosine(cos_i, k)
     return *fresnel.powers(cos_i, cos_t, transmitted, k), transmitted
 
 
-def builtin(variant: str | None) -> Callable[[Any, Any], tuple]:
+def mitsuba_powers(variant: str | None) -> Callable[[Any, Any], tuple]:
     """The same of Mitsuba's function in a variant."""
     import mitsuba
 
@@ -128,15 +128,15 @@ def builtin(variant: str | None) -> Callable[[Any, Any], tuple]:
 
 def regime_rows(regime: str, setting: Setting, count: int) -> list[Row]:
     """Powers, amplitudes and, where Mitsuba runs, its own function in a regime."""
-    cos_i, k, exact = given(regime, count, setting.precision)
+    cos_i, k, exact = regime_rays(regime, count, setting.precision)
     replay = {"regime": regime, "text": regimes.REGIMES[regime].text, "count": count, "seed": seeds.current(SEED)}
-    found = power_errors(each(ours, setting, cos_i, k), exact, setting)
+    found = power_errors(evaluated(formula_powers, setting, cos_i, k), exact, setting)
     budgets = SUMMED | {MISCLASSIFIED: 0.0}
     rows = [Row(NAME, "powers", regime, setting.label, found, budgets, replay=replay)]
     # The certified amplitudes are doubles, right to 2⁻⁵³ of each part: float64 is held to that much more.
     slack, u = float(setting.precision is np.float64), setting.roundoff
     values: dict[str, float] = {}
-    computed = each(fresnel.amplitudes, setting, cos_i, k)
+    computed = evaluated(fresnel.amplitudes, setting, cos_i, k)
     for name, r, certified in zip("sp", computed, (exact.amplitude_s, exact.amplitude_p), strict=True):
         size, error = np.maximum(np.abs(certified), np.finfo(setting.precision).tiny), np.abs(r - certified)
         values[f"r_{name} / u"] = worst((error / size)[exact.transmitted]) / u
@@ -145,7 +145,7 @@ def regime_rows(regime: str, setting: Setting, count: int) -> list[Row]:
     rows.append(Row(NAME, "amplitudes", regime, setting.label, values, budgets, replay=replay))
     if setting.mitsuba:
         rows.append(pipeline_row(regime, setting, cos_i, k, replay))
-        found = power_errors(each(builtin(setting.mitsuba), setting, cos_i, k), exact, setting)
+        found = power_errors(evaluated(mitsuba_powers(setting.mitsuba), setting, cos_i, k), exact, setting)
         rows.append(Row(NAME, BUILTIN, regime, setting.label, found, replay=replay))
     return rows
 
@@ -187,7 +187,7 @@ def pipeline_row(regime: str, setting: Setting, cos_i: np.ndarray, k: np.ndarray
     terms = np.maximum(z * z, np.abs(k.astype(np.longdouble) ** 2 - 1) * (x * x + y * y))
     far = exact.cos_t**2 * lengths(a) ** 2 > limits.RADICAND / setting.roundoff * terms
     far |= ~exact.transmitted
-    values = power_errors(each(powers, setting, *a.T, k), exact, setting, far)
+    values = power_errors(evaluated(powers, setting, *a.T, k), exact, setting, far)
     values |= {"nearer than rounding": float((~far).sum())}
     return Row(NAME, "pipeline", regime, setting.label, values, POWERS | {MISCLASSIFIED: 0.0}, replay=replay)
 
@@ -217,8 +217,8 @@ def reciprocity_row(setting: Setting, count: int) -> Row:
         return fresnel.powers(cos_i, cos_t, transmitted, k)[1], back, transmitted
 
     for regime in CASES:
-        cos_i, k, exact = given(regime, count, setting.precision)
-        there, back, transmitted = each(both, setting, cos_i, k)
+        cos_i, k, exact = regime_rays(regime, count, setting.precision)
+        there, back, transmitted = evaluated(both, setting, cos_i, k)
         # A cosine of 0 goes no way back; and neither does one that float32 cannot square.
         used = transmitted & (exact.transmittance > np.finfo(setting.precision).tiny)
         back_error = max(back_error, worst(np.abs(there[used] / back[used] - 1)) / setting.roundoff)
@@ -240,7 +240,7 @@ def diffuse_row(setting: Setting, index: float) -> Row:
         ("outside", (outside, inside), 1 / index, -contrast / index**2),
         ("inside", (inside, outside), index, contrast),
     ):
-        r, t = each(lambda c, y, k=k, kappa=kappa: fresnel.powers(c, y, y > 0, k, kappa), setting, *cosines)
+        r, t = evaluated(lambda c, y, k=k, kappa=kappa: fresnel.powers(c, y, y > 0, k, kappa), setting, *cosines)
         share = np.longdouble(1) if side == "outside" else 1 / np.longdouble(index) ** 2
         reflected, exact = share * (weight * r).sum() + (1 - share), hemispherical(index)[side]
         transmitted = share * (weight * t).sum()
@@ -258,12 +258,12 @@ def matched_row(setting: Setting) -> Row:
     """The error of R against |k − 1|, from an ulp on, at four cosines."""
     steps = np.geomspace(2 * setting.roundoff, 0.1, 40)
     cosines = (0.05, 0.3, 0.7, 1.0)
-    given: Any = np.meshgrid(1 - steps, cosines)
-    k, cos_i = (x.ravel().astype(setting.precision) for x in given)
+    grid: Any = np.meshgrid(1 - steps, cosines)
+    k, cos_i = (x.ravel().astype(setting.precision) for x in grid)
     exact, curves = oracle.fresnel(cos_i, k), {}
-    subjects = {"powers": ours} | ({BUILTIN: builtin(setting.mitsuba)} if setting.mitsuba else {})
+    subjects = {"powers": formula_powers} | ({BUILTIN: mitsuba_powers(setting.mitsuba)} if setting.mitsuba else {})
     for name, subject in subjects.items():
-        r = each(subject, setting, cos_i, k)[0]
+        r = evaluated(subject, setting, cos_i, k)[0]
         error = relative(r, exact.reflectance, exact.reflectance_low, setting).reshape(len(cosines), -1).max(0)
         curves[name] = list(zip(steps.tolist(), (error / setting.roundoff).tolist(), strict=True))
     values = {"R / u": worst(np.array([y for _, y in curves["powers"]]))}

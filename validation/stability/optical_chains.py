@@ -51,7 +51,7 @@ TERMS = {
     "error / condition": "the worst error over condition · u of its ray",
     "error": "the worst error; of a mirage, relative, of the cosine where the ray ends; of directions, in radians",
     **{f"{angle}°": f"the same of the ray that enters at {angle}°" for angle in PASSING},
-    MISCLASSIFIED: "rays that turned instead of passing or the reverse, and missed total internal reflections",
+    MISCLASSIFIED: "rays that turned back where they must pass or the reverse, and missed total internal reflections",
     "turning height": "distance of the layer in which a ray turned from the right one, over all layers",
     "length drift": "relative change of the length of the direction",
     "over print": "the largest deviation from CODE V's printed numbers, over their rounding",
