@@ -29,8 +29,9 @@ def held(path: Path, what: str, place: Path | None = None, expected: str = "anot
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if path.exists() and os.path.samestat(path.lstat(), os.fstat(file)):
-                break
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(path.lstat(), os.fstat(file)):
+                    break
             os.close(file)  # its holder removed it meanwhile
         except BlockingIOError:
             os.close(file)

@@ -9,10 +9,10 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from .errors import TooMuchOutputError
 
@@ -56,11 +56,12 @@ def run(
     if not 0 <= timeout <= LONGEST:
         raise ValueError(f"timeout {timeout:g} s; expected 0 … {LONGEST:g} s")
     pipe, errors, deadline = subprocess.PIPE, subprocess.PIPE if keep_stderr else None, time.monotonic() + timeout
-    with _signals_raise():
+    with _signals_raise() as begin:
         process = subprocess.Popen(
             list(command), bufsize=0, stdin=pipe, stdout=pipe, stderr=errors, cwd=cwd, env=env, start_new_session=True
         )
         try:
+            begin()
             threading.Thread(target=_feed, args=(process, given), daemon=True).start()
             out, said = _read(process, deadline, most)
             process.wait(max(0, deadline - time.monotonic()))
@@ -107,19 +108,34 @@ def _read(process: subprocess.Popen[bytes], deadline: float, most: int) -> tuple
 
 
 @contextlib.contextmanager
-def _signals_raise() -> Iterator[None]:
-    """SIGTERM and SIGHUP, where they would end us at once, raise SystemExit meanwhile. In the main thread only."""
-    numbers = []
+def _signals_raise() -> Iterator[Callable[[], None]]:
+    """SIGINT, SIGTERM and SIGHUP, where they would end us, raise within: from the call of what is yielded on.
+
+    What comes before it raises then: the program that is being started must be known to be ended. In the main thread.
+    """
+    caught: list[int] = []
+    ready: list[bool] = []
+
+    def end(number: int) -> NoReturn:
+        raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(128 + number)
+
+    def note(number: int, frame: object) -> None:
+        caught.append(number)
+        if ready:
+            end(number)
+
+    def begin() -> None:
+        ready.append(True)
+        if caught:
+            end(caught[0])
+
+    before: dict[signal.Signals, Any] = {}
     if threading.current_thread() is threading.main_thread():
-        numbers = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) is signal.SIG_DFL]
-    for each in numbers:
-        signal.signal(each, _exit)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+                before[number] = signal.signal(number, note)
     try:
-        yield
+        yield begin
     finally:
-        for each in numbers:
-            signal.signal(each, signal.SIG_DFL)
-
-
-def _exit(number: int, frame: object) -> NoReturn:
-    raise SystemExit(128 + number)
+        for number, handler in before.items():
+            signal.signal(number, handler)
