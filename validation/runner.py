@@ -201,23 +201,20 @@ def _warn(text: str) -> None:
 
 def run_on_worker(asked: TaskList, name: str) -> Outcome:
     """The task of that name, in a folder of its own. Its errors pass."""
-    threads, scratch = on_worker.threads(), on_worker.scratch_folder()
-    return on_worker.one_at_a_time(lambda: _run_task(asked, name, threads, scratch))
+    scratch = on_worker.scratch_folder()
 
+    def run_task() -> Outcome:
+        from mi_refract import backend
 
-def _run_task(asked: TaskList, name: str, threads: int, scratch: str) -> Outcome:
-    from mi_refract import backend
+        profile = profiles(asked.variant)[asked.profile]
+        with tempfile.TemporaryDirectory(dir=scratch) as folder:
+            context = Context(profile, Path(folder), asked.variant, backend.detect(), backend.usable_variants())
+            studies = [import_module(f"validation.{module}").STUDY for module in asked.modules]
+            finished = timed(next(task for task in tasks(studies, context) if task.name == name))
+            paths = [path for path in Path(folder).rglob("*") if path.is_file()]
+            return Outcome(finished, {str(path.relative_to(folder)): path.read_bytes() for path in paths})
 
-    if on_worker.variant() != asked.variant:
-        backend.activate(asked.variant)
-    on_worker.limit_threads(threads)
-    profile = profiles(asked.variant)[asked.profile]
-    with tempfile.TemporaryDirectory(dir=scratch) as folder:
-        context = Context(profile, Path(folder), asked.variant, backend.detect(), backend.usable_variants())
-        studies = [import_module(f"validation.{module}").STUDY for module in asked.modules]
-        finished = timed(next(task for task in tasks(studies, context) if task.name == name))
-        files = {str(path.relative_to(folder)): path.read_bytes() for path in Path(folder).rglob("*") if path.is_file()}
-        return Outcome(finished, files)
+    return on_worker.in_variant(asked.variant, run_task)
 
 
 @contextmanager

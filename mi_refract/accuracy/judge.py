@@ -87,7 +87,7 @@ def lengths(v: Array) -> Array:
 class RayBounds:
     """What an error bound, `budget`, allows for each ray. Arrays are (N,).
 
-    `roundoff`: that of the answers' precision. `normalised`: whoever answers may make `a`, `n` and `b` unit.
+    `roundoff`: that of the answers' precision. `normalised`: `a`, `n` and `b` may have been made unit.
     """
 
     rays: Rays

@@ -57,8 +57,8 @@ class Commands(TyperGroup):
         """The command of that name; None where there is none."""
         if cmd_name not in COMMANDS:
             return None
-        found = COMMANDS[cmd_name]
-        command = getattr(importlib.import_module(f".{found.module}", __package__), found.attribute)
+        entry = COMMANDS[cmd_name]
+        command = getattr(importlib.import_module(f".{entry.module}", __package__), entry.attribute)
         if not isinstance(command, typer.Typer):
             single = typer.Typer(add_completion=False, rich_markup_mode=None)
             single.command(cmd_name)(command)

@@ -139,7 +139,7 @@ def diff(
         report_folder.require_free(Path(report), reference, test)
     with _report(report) as page:
         with _progress() as progress:
-            found = folders.diff(
+            results = folders.diff(
                 reference,
                 test,
                 chosen,
@@ -150,21 +150,27 @@ def diff(
                 digests=bool(json),
                 progress=progress,
             )
-        text_reports.print_results(found)
+        text_reports.print_results(results)
         if page:
             from mi_refract.io.provenance import provenance
 
             software = {key.rpartition(":")[2]: value for key, value in provenance().items() if ":" in key}
-            page.write(found, software, found.command("diff", *(names or [])), str(json or ""))
+            page.write(results, software, results.command("diff", *(names or [])), str(json or ""))
     if junit:
-        text_reports.write_junit(junit, found)
+        text_reports.write_junit(junit, results)
     if json:
-        text_reports.write_json(json, found)
+        text_reports.write_json(json, results)
     if github:
-        for line in text_reports.workflow_commands(found):
+        for line in text_reports.workflow_commands(results):
             print(line)
-        text_reports.append_summary(found, _pages(report, report_url) if report else None)
-    raise typer.Exit(found.exit_code)
+        pages = None
+        if report:
+            from mi_refract.image_diff import html_report
+
+            page_of = html_report.page_of if _is_folder(report) else lambda result: ""
+            pages = text_reports.Pages(report, page_of, report_url)
+        text_reports.append_summary(results, pages)
+    raise typer.Exit(results.exit_code)
 
 
 def accept(
@@ -203,19 +209,21 @@ def accept(
             raise ValueError(f"{reference}: one path; expected with --from both folders before any names, or none")
         if options or method != AUTO or idiff is not None:
             raise ValueError("--from takes what was compared; expected no --method, --set or --idiff")
-        found = results_file.read(source, reference, test)
-        found = replace(found, results=tuple(pairing.named(found.results, names or [])))
-        found = results_file.with_settings(found, _settings(found.reference, AUTO, [], None, settings, max_values))
-        text_reports.print_errors(found)
+        results = results_file.read(source, reference, test)
+        results = replace(results, results=tuple(pairing.named(results.results, names or [])))
+        results = results_file.with_settings(
+            results, _settings(results.reference, AUTO, [], None, settings, max_values)
+        )
+        text_reports.print_errors(results)
     elif reference is None or test is None:
         raise ValueError("two paths are needed; expected mi-refract accept REFERENCE TEST, or --from OUT.json")
     else:
         chosen = _settings(reference, method, options or [], idiff, settings, max_values)
         with _progress() as progress:
-            found = folders.diff(reference, test, chosen, names=names or [], to_accept=True, progress=progress)
-        text_reports.print_results(found)
+            results = folders.diff(reference, test, chosen, names=names or [], to_accept=True, progress=progress)
+        text_reports.print_results(results)
     try:
-        copies = list(accepting.changes(found, as_variant))
+        copies = list(accepting.changes(results, as_variant))
     except accepting.UnreadableImage as error:
         if error.result.status is Status.ERROR:  # and printed
             raise typer.Exit(MISUSE) from None
@@ -300,12 +308,6 @@ def _is_folder(report: str) -> bool:
     path = Path(report)
     named_so = report.endswith(("/", os.sep)) or not path.suffix
     return bool(report) and (named_so or (path.suffix.lower() not in HTML and path.is_dir()))
-
-
-def _pages(report: str, url: str) -> text_reports.Pages:
-    from mi_refract.image_diff import html_report
-
-    return text_reports.Pages(report, html_report.page_of if _is_folder(report) else lambda result: "", url)
 
 
 @contextlib.contextmanager

@@ -123,7 +123,7 @@ def check(
 ) -> None:
     """Check a file of answers against certified ones.
 
-    Exit code 0: every answer is right; 1: some are wrong; 2: the answers do not match the rays.
+    Exit code 0: no answer is wrong; 1: some are; 2: the answers do not match the rays.
     """
     checked = _checker(context, tir, formula, backward, report, junit, json)
     rays = files.read(file) if file else ray_set.make()
@@ -170,8 +170,8 @@ def run(
 ) -> None:
     """Run a command on rays and check its answers.
 
-    Exit code 0: every answer is right; 1: some are wrong; 2: the answers do not match the rays, or the command fails or
-    exceeds its time limit. With --renderer, the largest exit code of its functions.
+    Exit code 0: no answer is wrong; 1: some are; 2: the answers do not match the rays, or the command fails or exceeds
+    its time limit. With --renderer, the largest exit code of its functions.
     """
     checked = _checker(context, tir, formula, backward, report, junit, json)
     choosing = (*CHOOSING, *([] if renderer else ["precision"]))

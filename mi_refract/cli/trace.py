@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -16,8 +16,8 @@ from mi_refract.planar.path_tree import as_data, follow_scene, summary, with_ray
 from .doctor import probe
 
 
-def _print_keys(asked: bool) -> None:
-    if asked:
+def _print_keys(wanted: bool) -> None:
+    if wanted:
         print(scene_file.reference())
         raise typer.Exit
 
@@ -54,21 +54,24 @@ def trace(
     if output:
         atomic.writable(output, figure.FORMATS)
         figure.require_matplotlib()
-    given: dict[str, Any] = {"branches": branches, "max_depth": max_depth}
     screen = focal_points.plane(plane) if plane else None
-    asked = light.parsed(wavelengths) if wavelengths else None
-    read = scene_file.load(scene, asked)
-    loaded = replace(read, **{name: value for name, value in given.items() if value is not None})
+    loaded = scene_file.load(scene, light.parsed(wavelengths) if wavelengths else None)
+    if branches is not None:
+        loaded = replace(loaded, branches=branches)
+    if max_depth is not None:
+        loaded = replace(loaded, max_depth=max_depth)
     if rays:
         loaded = with_rays(loaded, rays)
     traced = follow_scene(loaded, formula=formula, precision=precision, backend=arrays)
     if output:
         figure.save(output, loaded, traced)
-    found = focal_points.groups(loaded, traced, screen) if table or screen else []
+    focal = {}
+    if table or screen:
+        focal["foci"] = focal_points.groups(loaded, traced, screen)
     if as_json:
-        focal = {"foci": [asdict(group) for group in found]} if table or screen else {}
-        print(json_text(as_data(loaded, traced) | focal))
+        data = {name: [asdict(group) for group in groups] for name, groups in focal.items()}
+        print(json_text(as_data(loaded, traced) | data))
     else:
         print(printable(f"{scene.name}: {summary(loaded, traced)}"))
-        if found:
-            print(focal_points.table(found))
+        if focal.get("foci"):
+            print(focal_points.table(focal["foci"]))

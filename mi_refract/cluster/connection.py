@@ -9,12 +9,15 @@ import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 from mi_refract.io.errors import LostSchedulerError, MissingExtraError, NoWorkersError, UsageError
 
 from . import local_cluster
 
+Client: TypeAlias = Any  # a `distributed.Client`
+Future: TypeAlias = Any  # a `distributed.Future`
+Security: TypeAlias = Any  # a `distributed.Security`
 PATIENCE = 6.0  # seconds until a scheduler must have answered
 _EXPECTED = (
     "expected the address of a Dask scheduler, such as tcp://host:8786, or tls://host:8786 and the files of "
@@ -55,7 +58,7 @@ def _require_dask() -> None:
 
 
 @contextlib.contextmanager
-def connected(scheduler: str | None = None, workers: int | None = None) -> Iterator[Any]:
+def connected(scheduler: str | None = None, workers: int | None = None) -> Iterator[Client]:
     """A `distributed.Client` of the scheduler at an address, or of so many processes of one thread each, started here.
 
     The processes speak TLS. A client of a `tls://` scheduler takes certificates from Dask's configuration, and refuses
@@ -65,7 +68,7 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
     if (scheduler is None) == (workers is None):
         raise UsageError("expected either --scheduler ADDRESS or --workers N")
     _require_dask()
-    from distributed.security import Security
+    from distributed import security as dask_security
 
     with contextlib.ExitStack() as stack:
         stack.enter_context(warnings.catch_warnings())
@@ -77,7 +80,7 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
         else:
             address = str(scheduler)
             # None: as Dask's configuration says.
-            security = Security(require_encryption=address.startswith("tls://") or None)
+            security = dask_security.Security(require_encryption=address.startswith("tls://") or None)
         client = _client(address, security)
         try:
             yield client
@@ -86,8 +89,8 @@ def connected(scheduler: str | None = None, workers: int | None = None) -> Itera
                 client.close(timeout=2.0)
 
 
-def _client(address: str, security: Any) -> Any:
-    from distributed import Client
+def _client(address: str, security: Security) -> Client:
+    import distributed
 
     try:
         # First, as a client that found nobody would take 16 s to give up.
@@ -95,14 +98,16 @@ def _client(address: str, security: Any) -> Any:
         if kind != "Scheduler":
             raise ValueError(f"a {kind} answers")
         # Results come from the workers themselves where these can be reached, else through the scheduler.
-        return Client(address, security=security, timeout=PATIENCE, set_as_default=False, direct_to_workers=True)
+        return distributed.Client(
+            address, security=security, timeout=PATIENCE, set_as_default=False, direct_to_workers=True
+        )
     except Exception as error:
         texts = [" ".join(str(cause).split()) for cause in (error.__cause__, error) if cause is not None]
         text = re.sub(r"in <[^>]*>: ", "", next(filter(None, texts), f"not within {PATIENCE:.0f} s"))
         raise ConnectionError(f"--scheduler {address}: no Dask scheduler answers: {text[:200]}; {_EXPECTED}") from None
 
 
-async def _kind(address: str, security: Any) -> str:
+async def _kind(address: str, security: Security) -> str:
     """What answers at an address, as it says."""
     from distributed import rpc
 
@@ -112,7 +117,7 @@ async def _kind(address: str, security: Any) -> str:
 
 
 @contextlib.contextmanager
-def cluster_errors(client: Any) -> Iterator[None]:
+def cluster_errors(client: Client) -> Iterator[None]:
     """Within, Dask's errors are one line: LostSchedulerError where its scheduler has gone, NoWorkersError for a task
     that has ended several workers.
     """

@@ -9,14 +9,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from . import on_worker
-from .connection import cluster_errors
+from .connection import Client, Future, cluster_errors
 from .workers import Workers
 
 AHEAD = 2  # calls for each thread of the workers
 _POLL, _FETCHED = 0.5, 30.0  # seconds
 
 
-def finished(client: Any, futures: Sequence[Any]) -> list[Any]:
+def finished(client: Client, futures: Sequence[Future]) -> list[Future]:
     """Those of the futures that are done, after waiting a little for one. Errors: those of `cluster_errors`."""
     from distributed import wait
 
@@ -25,7 +25,7 @@ def finished(client: Any, futures: Sequence[Any]) -> list[Any]:
     return [future for future in futures if future.done()]
 
 
-def fetched(client: Any, future: Any) -> tuple[Any, ...]:
+def fetched(client: Client, future: Future) -> tuple[Any, ...]:
     """(result,) of a future that is done; () where it was lost with its worker, and is being computed again.
 
     The task's own error passes; errors of `cluster_errors`.

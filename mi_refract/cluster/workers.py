@@ -9,7 +9,7 @@ from typing import Any
 from mi_refract.io.errors import NoWorkersError
 
 from . import worker_facts
-from .connection import cluster_errors
+from .connection import Client, Future, cluster_errors
 
 PATIENCE = 120.0  # seconds until the first workers must have answered: they import Mitsuba, and try libLLVM
 NOBODY = 30.0  # seconds until a scheduler must have a worker at all
@@ -28,7 +28,7 @@ class Workers:
 
     def __init__(
         self,
-        client: Any,
+        client: Client,
         variant: str,
         expected: Mapping[str, str],
         tolerated: Collection[str] = (),
@@ -98,7 +98,7 @@ class Workers:
                 options: dict[str, Any] = {"workers": [address], "pure": False, "priority": 1000}
                 self._asked[address] = self.client.submit(eval, self._question, **options)
 
-    def _judge(self, address: str, threads: int, answer: Any) -> None:
+    def _judge(self, address: str, threads: int, answer: Future) -> None:
         there: dict[str, str] = {}
         if answer.status != "finished":
             error = answer.exception() if answer.status == "error" else None

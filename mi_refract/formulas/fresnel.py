@@ -18,13 +18,11 @@ to 2²⁰; in float64 cosines above 1e-150, or 0.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
 
 from mi_refract.numerics import (
-    ArrayType,
     DoubleWord,
     Mask,
     Number,
@@ -76,7 +74,11 @@ def powers(cos_i: Number, cos_t: Number, transmitted: Mask, k: Number, contrast:
     c, ratio = lift(cos_i), lift(k)
     kappa = ratio * ratio - 1 if contrast is None else lift(contrast)
     number = type(cos_i)
-    r, t = _powers(c, *_through(lift, transmitted, cos_t), _fma(-c, c, 1), ratio, kappa)
+    y = lift(dr.select(transmitted, cos_t, 0 * cos_t))  # NaN stays
+    wide: Any = dr.float64_array_t(number)
+    # Of float32 the 1e-300 leaves nothing: R ≤ 1e-300/16c⁴ at k = 1. It is there for a cos_t that underflowed to 0.
+    mirror = dr.select(transmitted, wide(1e-300), wide(1))
+    r, t = _powers(c, y, mirror, _fma(-c, c, 1), ratio, kappa)
     return number(r), number(t)
 
 
@@ -102,15 +104,6 @@ def local_odds(ray: LocalCosines, transmitted: Mask, k: Number, contrast: Number
     # κ = 0 is always transmitted, or tangential: without the 1 that would be 0 : 0.
     mirror, power = (dr.select(transmitted, *x) for x in ((0 * p, 1), (2 * ratio * p, 0)))
     return dr.fma(kappa * kappa, dr.fma(q, q, p * p), mirror), power * dr.fma(d_s, d_s, d_p * d_p)
-
-
-def _through(lift: Callable[[Number], Number], transmitted: Mask, cos_t: Number) -> tuple[Any, Any]:
-    """(cos_t or 0, about 0 or 1) where light is transmitted or not. NaN stays.
-
-    Of float32 the 1e-300 leaves nothing: R ≤ 1e-300/16c⁴ at k = 1. It is there for a cos_t that underflowed to 0.
-    """
-    wide: Any = dr.float64_array_t(type(cos_t))
-    return lift(dr.select(transmitted, cos_t, 0 * cos_t)), dr.select(transmitted, wide(1e-300), wide(1))
 
 
 def _powers(c: Number, y: Number, mirror: Number, sin2: Number, k: Number, kappa: Number) -> tuple[Any, Any]:
@@ -178,7 +171,8 @@ def amplitudes(cos_i: Number, k: Number, contrast: Number = None) -> tuple[Any, 
     d_s, d_p = (dr.select(transmitted, d, 1) for d in (dr.fma(k, c, y), dr.fma(k, y, c)))
     # Of float64 each term is a few roundings: κ and the defect u, each d² 4u, products and quotient 3u.
     r_s, r_p = kappa / (d_s * d_s), kappa * brewster / (d_p * d_p)
-    number = _complex_type(cos_i)
+    is_float = isinstance(cos_i, float)
+    number: Any = dr.scalar.Complex2f64 if is_float else dr.replace_shape_t(type(cos_i), (2, -1), "complex")
     (s_re, s_im), (p_re, p_im) = _phase(k * c, y), _phase(c, k * y)
     return (
         number(dr.select(transmitted, r_s, s_re), dr.select(transmitted, 0, s_im)),
@@ -264,9 +258,3 @@ def _phase(x: Number, y: Number) -> tuple[Any, Any]:
     length = dr.sqrt(x * x + y * y)
     x, y = dr.select(length > 0, ieee_divide(x, length), 0 * length), dr.select(length > 0, ieee_divide(y, length), 1)
     return (x - y) * (x + y), 2 * x * y
-
-
-def _complex_type(number: Number) -> ArrayType:
-    if isinstance(number, float):
-        return dr.scalar.Complex2f64
-    return dr.replace_shape_t(type(number), (2, -1), "complex")

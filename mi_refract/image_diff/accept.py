@@ -77,20 +77,17 @@ def changes(results: Results, variant: str = "") -> Iterator[Copy]:
         if target.suffix.lower() != result.test.suffix.lower():
             raise ValueError(f"{target}: expected a name that ends in {result.test.suffix}, as {result.test} does")
         yield Copy(result.test, target, result.digests[result.test], result.digests.get(target, ""))
-        if result.how.reads_variance:
-            yield from _copy_of_variance(result.test, target, results, result)
-
-
-def _copy_of_variance(new: Path, target: Path, results: Results, result: Result) -> Iterator[Copy]:
-    """A copy of the new image's variance, where the reference has one; ValueError where the new image has none."""
-    digests, (references, tests) = result.digests or {}, results.roots
-    source, to = (pairing.beside(result.how.variance, *side) for side in ((new, tests), (target, references)))
-    if source.exists():
-        yield Copy(source, to, digests.get(source, ""), digests.get(to, ""))
-    elif to.exists():
-        raise ValueError(
-            f"{source}: no such file, and {to} belongs to a different render; expected a variance of {new}"
-        )
+        if result.how.reads_variance:  # it goes with the image
+            references, tests = results.roots
+            source = pairing.beside(result.how.variance, result.test, tests)
+            to = pairing.beside(result.how.variance, target, references)
+            if source.exists():
+                yield Copy(source, to, result.digests.get(source, ""), result.digests.get(to, ""))
+            elif to.exists():
+                raise ValueError(
+                    f"{source}: no such file, and {to} belongs to a different render; expected a variance of "
+                    f"{result.test}"
+                )
 
 
 def accept(copies: Sequence[Copy]) -> None:

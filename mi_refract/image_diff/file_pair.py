@@ -8,7 +8,7 @@ difference.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -50,13 +50,13 @@ def read(path: Path, how: ComparisonSpec) -> list[Image]:
 
 def read_renders(folder: Path, max_values: int = MAX_VALUES) -> list[Image]:
     """The renders of one image in a folder. ValueError where two are the same, seed and all; otherwise as `read`."""
-    found, failed = pairing.images_in(folder)
+    paths, failed = pairing.images_in(folder)
     if failed:
         raise OSError(failed[0][1])
-    if not found:
+    if not paths:
         raise ValueError(f"{folder}: holds no image; expected several renders of one")
     read = functools.partial(image_file.read, max_values=max_values)
-    images = list(bounded_map(read, found.values(), lambda path: 0, max_values, THREADS))  # all are needed at once
+    images = list(bounded_map(read, paths.values(), lambda path: 0, max_values, THREADS))  # all are needed at once
     sums: dict[float, Image] = {}
     for image in images:
         other = sums.setdefault(float(image.pixels.sum(dtype=np.float64)), image)
@@ -122,37 +122,32 @@ def _compare_parts(
 ) -> tuple[Comparison, tuple[Image, Image]]:
     """The worst comparison of all parts that both files have, and the two images that it is about."""
     one, two = ({image.part: image for image in side} for side in (reference, test))
-    found: dict[Part, Comparison] = {}
+    compared: dict[Part, Comparison] = {}
     for part in one:
         if part in two:
             place = one[part].place or two[part].place
             try:
                 named = [name for name, _ in how.channels]
-                found[part] = methods.compare(how.method, [one[part]], [two[part]], named=named, **how.options)
+                compared[part] = methods.compare(how.method, [one[part]], [two[part]], named=named, **how.options)
             except ValueError as error:
                 raise ValueError(f"{error} ({place})" if place else str(error)) from None
-    places = {part: one[part].place or two[part].place for part in found}
-    shown = min(found, key=lambda part: WORST.index(found[part].verdict))
-    worst, reason = found[shown], found[shown].reason
-    if places[shown] and len(found) == 1:
+    places = {part: one[part].place or two[part].place for part in compared}
+    shown = min(compared, key=lambda part: WORST.index(compared[part].verdict))
+    worst, reason = compared[shown], compared[shown].reason
+    if places[shown] and len(compared) == 1:
         reason += f"; of several images in the file only {places[shown]} is compared"
     elif places[shown]:
-        alike = sum(each.verdict is worst.verdict for each in found.values())
-        reason = f"{places[shown]}: {reason}; {worst.verdict}: {alike} of {len(found)} parts and MIP levels"
-    verdict, warning = worst.verdict, _warning(found, places)
+        alike = sum(comparison.verdict is worst.verdict for comparison in compared.values())
+        reason = f"{places[shown]}: {reason}; {worst.verdict}: {alike} of {len(compared)} parts and MIP levels"
+    verdict, warning = worst.verdict, ""
+    warned = [part for part in compared if compared[part].warning]
+    if warned and verdict is not Verdict.DIFFERENT:
+        place = f"{places[warned[0]]}: " if places[warned[0]] else ""
+        more = f", and in {len(warned) - 1} more parts and MIP levels" if len(warned) > 1 else ""
+        warning = f"{place}{compared[warned[0]].warning}{more}"
     if lone := sorted(one.keys() ^ two.keys()):
         more = f", and {len(lone) - 1} more" if len(lone) > 1 else ""
         changed = "is missing" if lone[0] in one else "was added"
         verdict, warning = Verdict.DIFFERENT, ""
         reason = f"{(one | two)[lone[0]].place} {changed}{more}; {reason}"
     return replace(worst, verdict=verdict, reason=reason, warning=warning, part=shown), (one[shown], two[shown])
-
-
-def _warning(found: Mapping[Part, Comparison], places: Mapping[Part, str]) -> str:
-    """The first warning, with its place, and how many there are; none where an image is different."""
-    warned = [part for part in found if found[part].warning]
-    if not warned or any(each.verdict is Verdict.DIFFERENT for each in found.values()):
-        return ""
-    place = f"{places[warned[0]]}: " if places[warned[0]] else ""
-    more = f", and in {len(warned) - 1} more parts and MIP levels" if len(warned) > 1 else ""
-    return f"{place}{found[warned[0]].warning}{more}"

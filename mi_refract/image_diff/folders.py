@@ -68,12 +68,12 @@ def diff(
         raise NotADirectoryError(f"{test if reference.is_dir() else reference}; expected with --renders: a folder")
     unused = settings.unused([pair.name for pair in every]) if reference.is_dir() and not renders else []
     pairs = [*pairing.named(every, names), *pairing.wrong_entries(settings, every)]
-    found = Results(reference, test, (), renders, inconclusive, tuple(unused), settings.flags)
+    results = Results(reference, test, (), renders, inconclusive, tuple(unused), settings.flags)
 
     def compare(pair: Pair) -> Result:
-        result = _compared(pair, found, keep=maps or view is not None, digests=(digests or to_accept) and not renders)
+        result = _compared(pair, results, keep=maps or view is not None, digests=(digests or to_accept) and not renders)
         if view and result.status in FAILED:
-            view(result, found)
+            view(result, results)
         if maps or not result.images:
             return result
         comparison = replace(result.comparison, maps={}) if result.comparison else None
@@ -81,12 +81,12 @@ def diff(
 
     # Together, the pairs that are compared at once have no more values than one pair may have.
     most = 2 * settings.max_values
-    results = map(compare, pairs) if len(pairs) == 1 else bounded_map(compare, pairs, _values, most, WORKERS)
+    compared = map(compare, pairs) if len(pairs) == 1 else bounded_map(compare, pairs, _values, most, WORKERS)
     done: list[Result] = []
-    for result in results:
+    for result in compared:
         done.append(result)
         progress(len(done), len(pairs))
-    return replace(found, results=tuple(sorted(done, key=lambda result: list(Status).index(result.status))))
+    return replace(results, results=tuple(sorted(done, key=lambda result: list(Status).index(result.status))))
 
 
 def _values(pair: Pair) -> int:

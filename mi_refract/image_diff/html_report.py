@@ -105,7 +105,7 @@ def _cut(failures: list[dict[str, Any]], equal: list[dict[str, Any]], articles: 
     """The lists, no longer than that, and what was left out of them."""
     further, more_equal = failures[articles:], max(len(equal) - lines, 0)
     more = max(len(further) - lines, 0)
-    without = sum(each["note"] == FULL for each in failures[:articles])
+    without = sum(entry["note"] == FULL for entry in failures[:articles])
     left_out = {
         f"images of {without} of {len(failures)} failures": without,
         f"all but a line of {len(further) - more} failures": len(further) - more,
@@ -141,7 +141,7 @@ def overview(results: Results, context: Mapping[str, Any], replay: str, source: 
         "context": {"reference": str(results.reference), "test": str(results.test)} | dict(context),
         "unused": results.unused,
         "command": replay,
-        "equal": sorted(equal, key=lambda each: not each["warning"]),
+        "equal": sorted(equal, key=lambda entry: not entry["warning"]),
         "skipped": [item(result, results) for result in results.of(Status.SKIPPED)],
         "ticks": results.command("accept", flags=["--from", source] if source else None) if folders else "",
     }
@@ -151,7 +151,7 @@ def item(
     result: Result, results: Results, shown: Shown | None = None, images: EmbeddedImages | None = None
 ) -> dict[str, Any]:
     """What a page says of an image; with `shown`, whose panes go to `images`, all of it."""
-    found, why, href = result.comparison, cause(result), page_of(result)
+    comparison, why, href = result.comparison, cause(result), page_of(result)
     times, worst = excess(result)
     folder = PurePosixPath(result.name).parent.as_posix()
     words = (result.name, result.status, result.category, why)
@@ -159,11 +159,11 @@ def item(
         "name": result.name,
         "status": str(result.status),
         "category": str(result.category),
-        "method": found.method_in_words if found else "",
+        "method": comparison.method_in_words if comparison else "",
         "reason": result.reason,
         "asked": result.how.reason,
         "warning": result.warning,
-        "metrics": [_metric(metric) for metric in found.metrics] if found else [],
+        "metrics": [_metric(metric) for metric in comparison.metrics] if comparison else [],
         "text": " ".join(words).lower(),
         "word": word(result),
         "href": href,
@@ -174,10 +174,11 @@ def item(
     }
     if shown is None or images is None:
         return text
+    detectable = comparison.minimum_detectable if comparison else math.nan
     sizes = {(pane["width"], pane["height"]) for pane in shown.panes[:2]}
     commands = {"reproduce": results.reproduce(result), "accept": results.accept(result)}
     return text | {
-        "minimum_detectable": found.minimum_detectable if found and math.isfinite(found.minimum_detectable) else None,
+        "minimum_detectable": detectable if math.isfinite(detectable) else None,
         "panes": [images.add(pane) for pane in shown.panes],
         "paired": len(sizes) == 1 and len(shown.panes) > 1,
         "note": shown.note,

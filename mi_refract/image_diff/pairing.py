@@ -68,17 +68,22 @@ def pairs(reference: Path, test: Path, settings: Settings) -> list[Pair]:
         if nothing:
             raise ValueError(f"{folder}: holds no image; expected at least one")
     if settings.maps:
-        found = _mapped(old, new, settings.maps)
+        pairs = _mapped(old, new, settings.maps)
     else:
-        found = [Pair(name, old.get(name), new.get(name), Path(name)) for name in sorted(old | new)]
-    found = [replace(pair, target=reference / pair.target, how=settings.of(pair.name)) for pair in found]
-    # Masks and variances that the settings name for a pair are no images to compare.
-    own = {file for pair in found for file in _own_files(pair, (reference, test))}
-    found = [pair for pair in found if not {pair.reference, pair.test} - {None} <= own]
-    found = _with_all_variants(found, [path for path in old.values() if path not in own])
-    if not found and not lost and not missed:
+        pairs = [Pair(name, old.get(name), new.get(name), Path(name)) for name in sorted(old | new)]
+    pairs = [replace(pair, target=reference / pair.target, how=settings.of(pair.name)) for pair in pairs]
+    own: set[Path] = set()  # masks and variances that the settings name for a pair: they are no images to compare
+    for pair in pairs:
+        sides = [(path, root) for path, root in ((pair.reference, reference), (pair.test, test)) if path]
+        files = {mask} if (mask := _mask_of(pair, reference)) else set()
+        if pair.how.reads_variance:
+            files |= {beside(pair.how.variance, path, root) for path, root in sides}
+        own |= files - {pair.reference, pair.test}
+    pairs = [pair for pair in pairs if not {pair.reference, pair.test} - {None} <= own]
+    pairs = _with_all_variants(pairs, [path for path in old.values() if path not in own])
+    if not pairs and not lost and not missed:
         raise ValueError(f"defaults.map fits no image in {reference} and {test}; expected templates of their paths")
-    return [*found, *(Pair(name, None, None, reference / name, error=error) for name, error in lost + missed)]
+    return [*pairs, *(Pair(name, None, None, reference / name, error=error) for name, error in lost + missed)]
 
 
 Named = TypeVar("Named", Pair, Result)
@@ -121,24 +126,24 @@ def _pair_of_files(reference: Path, test: Path, settings: Settings) -> Pair:
 
 def _mapped(old: dict[str, Path], new: dict[str, Path], maps: Sequence[Map]) -> list[Pair]:
     """Pairs by the first map that fits. What no map calls a reference is none; a reference is no new image."""
-    found: dict[str, Pair] = {}
-    for each, (path, file) in itertools.product(maps, old.items()):
-        if (values := name_patterns.parsed(each.reference, path)) is None:
+    pairs: dict[str, Pair] = {}
+    for rule, (path, file) in itertools.product(maps, old.items()):
+        if (values := name_patterns.parsed(rule.reference, path)) is None:
             continue
-        name = name_patterns.filled(each.test, values)
-        before = found.setdefault(name, Pair(name, file, new.get(name), Path(path)))
+        name = name_patterns.filled(rule.test, values)
+        before = pairs.setdefault(name, Pair(name, file, new.get(name), Path(path)))
         if before.reference != file:
             error = f"{file}: a second reference, beside {before.reference}; expected one for {name}"
-            found[name] = replace(before, error=error)
-    references = {pair.reference.resolve() for pair in found.values() if pair.reference}
+            pairs[name] = replace(before, error=error)
+    references = {pair.reference.resolve() for pair in pairs.values() if pair.reference}
     for name, file in new.items():
-        if name in found or file.resolve() in references:
+        if name in pairs or file.resolve() in references:
             continue
-        fitting = ((each, name_patterns.parsed(each.test, name)) for each in maps)
-        targets = (name_patterns.filled(each.reference, values) for each, values in fitting if values is not None)
+        fitting = ((rule, name_patterns.parsed(rule.test, name)) for rule in maps)
+        targets = (name_patterns.filled(rule.reference, values) for rule, values in fitting if values is not None)
         if target := next(targets, None):
-            found[name] = Pair(name, None, file, Path(target))
-    return [found[name] for name in sorted(found)]
+            pairs[name] = Pair(name, None, file, Path(target))
+    return [pairs[name] for name in sorted(pairs)]
 
 
 # Files beside a reference -------------------------------------------------------------------------------------------
@@ -149,22 +154,14 @@ def _mask_of(pair: Pair, root: Path) -> Path | None:
     return beside(pair.how.mask, pair.target, root) if pair.how.mask else None
 
 
-def _own_files(pair: Pair, roots: tuple[Path, Path]) -> list[Path]:
-    """The mask and the variances that the settings name for a pair."""
-    how, sides = pair.how, zip((pair.reference, pair.test), roots, strict=True)
-    files = [mask] if (mask := _mask_of(pair, roots[0])) else []
-    files += [beside(how.variance, path, root) for path, root in sides if path] if how.reads_variance else []
-    return [file for file in files if file not in (pair.reference, pair.test)]
-
-
-def _with_all_variants(found: list[Pair], references: list[Path]) -> list[Pair]:
+def _with_all_variants(pairs: list[Pair], references: list[Path]) -> list[Pair]:
     """The pairs with their variants. A reference that is one, and has no new image, is not one that was removed."""
-    with_new = {pair.target for pair in found if pair.test}
-    tests = {pair.test.resolve() for pair in found if pair.test}  # in a tree of both no image is its own reference
+    with_new = {pair.target for pair in pairs if pair.test}
+    tests = {pair.test.resolve() for pair in pairs if pair.test}  # in a tree of both no image is its own reference
     others = [path for path in references if path not in with_new and path.resolve() not in tests]
-    found = [_with_variants(pair, others) for pair in found]
-    taken = {path for pair in found for path in pair.variants}
-    return [pair for pair in found if pair.test or pair.target not in taken]
+    pairs = [_with_variants(pair, others) for pair in pairs]
+    taken = {path for pair in pairs for path in pair.variants}
+    return [pair for pair in pairs if pair.test or pair.target not in taken]
 
 
 def _with_variants(pair: Pair, others: Sequence[Path]) -> Pair:
@@ -217,7 +214,7 @@ def images_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
     Names that begin with a dot are left out. Links to folders are not followed, and an error: what is in them would
     not be compared.
     """
-    found: dict[str, Path] = {}
+    images: dict[str, Path] = {}
     failed: list[tuple[str, str]] = []
 
     def note(error: OSError) -> None:
@@ -230,8 +227,8 @@ def images_in(folder: Path) -> tuple[dict[str, Path], list[tuple[str, str]]]:
                 failed.append((path.relative_to(folder).as_posix(), f"{path}: a link to a folder; expected a folder"))
         for path in (Path(parent, name) for name in names if not name.startswith(".")):
             if path.suffix[1:].lower() in _endings():
-                found[path.relative_to(folder).as_posix()] = path
-    return found, failed
+                images[path.relative_to(folder).as_posix()] = path
+    return images, failed
 
 
 @functools.cache

@@ -9,7 +9,7 @@ import functools
 import math
 import os
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -63,7 +63,10 @@ def of_result(result: Result, image_bytes: float, map_bytes: float, *, thumbs: b
 def _shown(result: Result, image_bytes: float, map_bytes: float, thumbs: bool) -> Shown:
     sides = {role: _in_shown_channels(image) for role, image in result.images.items()}
     maps = dict(result.comparison.maps) if result.comparison else {}
-    makers: list[Callable[[], Pane]] = [functools.partial(_image, *side, image_bytes) for side in sides.items()]
+    makers: list[Callable[[], Pane]] = []
+    for role, image in sides.items():
+        channel = "" if len(image.channels) == 3 else f"channel {image.channels[0]}"
+        makers.append(functools.partial(_pane, role, _paint(image), None, image.pixels, image_bytes, note=channel))
     small = {}
     if thumbs and sides:
         role, image = list(sides.items())[-1]
@@ -106,12 +109,10 @@ def _paint(image: Image) -> str:
     return "code" if flip.encoding(image) == "sRGB" else "light"
 
 
-def _image(role: str, image: Image, most: float) -> Pane:
-    channel = "" if len(image.channels) == 3 else f"channel {image.channels[0]}"
-    return _pane(role, _paint(image), None, encoded(image.pixels, most), channel)
-
-
-def _pane(role: str, paint: str, gain: float | None, embedded: Mapping[str, Any], note: str) -> Pane:
+def _pane(
+    role: str, paint: str, gain: float | None, pixels: Pixels, most: float, scale: float = 1.0, note: str = ""
+) -> Pane:
+    embedded = encoded(pixels, most, scale)
     notes = ", ".join(filter(None, (note, embedded["note"])))
     return {"role": role, "paint": paint, "gain": gain, **embedded, "note": notes}
 
@@ -126,7 +127,7 @@ def map_pane(name: str, values: Pixels, most: float, note: str = "") -> Pane:
     side = -(-values.shape[1] // MAP_WIDTH)
     reduced = f"strongest of {side} × {side} pixels" if side > 1 else ""
     paint = "signed" if name in SIGNED else "heat"
-    return _pane(name, paint, gain, encoded(small, most, largest), note or reduced)
+    return _pane(name, paint, gain, small, most, largest, note or reduced)
 
 
 def _flip(reference: Image, test: Image, most: float) -> Pane:

@@ -121,15 +121,15 @@ def _moved(where: str, text: str | None, before: Path, now: Path) -> Path | None
     return moved
 
 
-def with_settings(found: Results, settings: Settings) -> Results:
+def with_settings(results: Results, settings: Settings) -> Results:
     """The results with `settings`, of which the file says no more than whether values need be finite.
 
     ValueError for an image with a variance in a file of its own, of which the file has no digest.
     """
-    results = []
-    for result in found.results:
+    changed = []
+    for result in results.results:
         how = settings.of(result.name)
         if result.status in FAILED and (result.how.variance or how.reads_variance):
             raise ValueError(f"{result.name}: has a variance in a file of its own; expected accept without --from")
-        results.append(replace(result, how=replace(how, options=result.how.options)))
-    return replace(found, results=tuple(results))
+        changed.append(replace(result, how=replace(how, options=result.how.options)))
+    return replace(results, results=tuple(changed))

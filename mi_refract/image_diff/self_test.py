@@ -97,14 +97,14 @@ class Tally:
         whole = METHODS[method].takes_renders
         self.trials += 1
         try:
-            found = methods.compare(method, *(side if whole else side[0] for side in sides))
+            comparison = methods.compare(method, *(side if whole else side[0] for side in sides))
         except (ValueError, OSError):
             self.seen += 1
             return
-        self.seen += found.verdict is Verdict.DIFFERENT
-        self.inconclusive += found.verdict is Verdict.INCONCLUSIVE
-        if math.isfinite(found.minimum_detectable):
-            self.detectable.append(found.minimum_detectable)
+        self.seen += comparison.verdict is Verdict.DIFFERENT
+        self.inconclusive += comparison.verdict is Verdict.INCONCLUSIVE
+        if math.isfinite(comparison.minimum_detectable):
+            self.detectable.append(comparison.minimum_detectable)
 
 
 # Rows ----------------------------------------------------------------------------------------------------------

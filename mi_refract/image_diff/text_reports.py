@@ -195,7 +195,7 @@ def as_data(results: Results) -> dict[str, Any]:
 
 
 def _entry(results: Results, result: Result) -> dict[str, Any]:
-    found, how, digests = result.comparison, result.how, None
+    comparison, how, digests = result.comparison, result.how, None
     if result.digests is not None and result.status in FAILED:  # of what was compared; "" where there is no file
         digests = {
             "reference": result.digests[result.reference] if result.reference else "",
@@ -214,19 +214,21 @@ def _entry(results: Results, result: Result) -> dict[str, Any]:
         "target": result.target,
         "digests": digests,
         "method": _method(result),
-        "method_why": found.chosen if found else "",
+        "method_why": comparison.chosen if comparison else "",
         "options": dict(how.options),
         "idiff": how.idiff,
         "channels": [list(pair) for pair in how.channels],
         "variance": how.variance if how.reads_variance else "",
         "mask": how.mask,
-        "ignore": [list(each) for each in how.ignore],
+        "ignore": [list(rectangle) for rectangle in how.ignore],
         "why_so": how.reason,
         "entries": list(how.entries),
         "matched": result.matched,
         "variants": list(result.variants),
-        "metrics": [{"name": m.name, "value": m.value, "bound": m.bound} for m in (found.metrics if found else ())],
-        "minimum_detectable_difference": found.minimum_detectable if found else math.nan,
+        "metrics": [
+            {"name": m.name, "value": m.value, "bound": m.bound} for m in (comparison.metrics if comparison else ())
+        ],
+        "minimum_detectable_difference": comparison.minimum_detectable if comparison else math.nan,
         "reproduce": results.reproduce(result),
         "accept": results.accept(result),
     }

@@ -205,12 +205,12 @@ def from_renders(
     with ThreadPoolExecutor(WORKERS) as pool:
         totals, pixels = zip(*pool.map(band, range(0, len(reference[0]), tile)), strict=True)
     area = block_area(reference[0].shape[0], reference[0].shape[1], tile)
-    one, two = (
-        Side(area, renders.mean(0), variance, squares, len(renders) - 1.0, count, renders)
-        for of_side, count in zip(zip(*totals, strict=True), counts, strict=True)
-        for renders, variance, squares in [[np.concatenate(x, -3) for x in zip(*of_side, strict=True)]]
-    )
-    total, squares = (np.concatenate([getattr(x, name) for x in pixels], -3) for name in ("total", "squares"))
+    in_tiles = []
+    for of_side, count in zip(zip(*totals, strict=True), counts, strict=True):
+        renders, variance, squares = (np.concatenate(bands, -3) for bands in zip(*of_side, strict=True))
+        in_tiles.append(Side(area, renders.mean(0), variance, squares, len(renders) - 1.0, count, renders))
+    total, squares = (np.concatenate([getattr(u, name) for u in pixels], -3) for name in ("total", "squares"))
+    one, two = in_tiles
     return Evidence(tile, one, two, PixelSums(total, squares))
 
 

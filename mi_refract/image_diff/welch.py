@@ -52,19 +52,19 @@ def compare_renders(
 ) -> Comparison:
     """Independent renders: Welch's t-test on the means of tiles and channels.
 
-    Two or more renders a side, or one a side whose variance is known (module `variances`): then pixels are taken for
-    independent, as under a box filter. A wider filter leaves the means of tiles as they are, and hides differences of
-    pixels. Where the variance is that of filtered pixels, the header says how wide the filter is, or
-    `pixel_statistics.inflation` estimates it. Tests the mean of single tiles, of blocks of them, and of the whole
-    image; and whether their pixels scatter more than their noise explains.
+    It takes two or more renders a side, or one a side whose variance is known (module `variances`); then pixels are
+    assumed to be independent, as under a box filter. A wider filter does not change the means of tiles, and hides
+    differences of pixels. Where the variance is that of filtered pixels, the header says how wide the filter is, or
+    `pixel_statistics.inflation` estimates it. The tests are of the mean of single tiles, of blocks of tiles and of the
+    whole image, and of whether the pixels of each differ by more than their noise explains.
 
-    Where the variance of one side alone is known, that of a sample is taken to be the same on the other (a z-test, for
-    many samples). A renderer that samples worse than the reference did is different, then, however right its mean is.
+    Where the variance of one side alone is known, the other side is assumed to have the same variance per sample (a
+    z-test, for many samples). A renderer with more noise per sample is then different, even if its mean is right.
 
-    A side with fewer samples than the other one is not taken to have less noise per sample than that one: it may have
-    missed rare light. Renders count alike, unless all of them say their samples per pixel.
+    The side with fewer samples is never assumed to have less noise per sample than the other: it may have missed rare
+    light. Each render counts as one sample, unless the samples per pixel of all of them are known.
 
-    EQUAL, however noisy, where both hold the variance themselves and are the same in every value of every channel.
+    EQUAL, however noisy, where both hold their variance and are identical in every value of every channel.
     INCONCLUSIVE where the only tiles that differ are unsuited to a t-test (with the noise of a few pixels, or without
     noise, and by little or in a few pixels), and where the noise hides differences of `resolution`, with the number of
     samples that would show them. ValueError for fewer renders, the same render twice, options out of range, images that
@@ -83,9 +83,9 @@ def compare_renders(
             raise ValueError(f"{name} = {value!r}; expected {expected}")
     single = len(reference) == len(test) == 1 and (has_variance(reference[0]) or has_variance(test[0]))
     same = single and same_noise(reference[0], test[0])
-    counts = spp_reference or spp, spp_test or spp
+    set_spp = spp_reference or spp, spp_test or spp
     if single:
-        known = estimates(reference[0], test[0], counts, allow_nonfinite)
+        known = estimates(reference[0], test[0], set_spp, allow_nonfinite)
         reference, test = [known[0].image], [known[1].image]
     for image in (*reference[1:], *test):
         if reason := preconditions(reference[0], image, allow_nonfinite):
@@ -100,7 +100,7 @@ def compare_renders(
         channels, evidence = _of_estimates(*known, tile)
         counts = known[0].spp, known[1].spp
     else:
-        counts, unit = _checked_counts(reference, test, counts)
+        counts, unit = _checked_counts(reference, test, set_spp)
         a, b = ([finite(aligned(reference[0], image)[1]) for image in side] for side in (reference, test))
         evidence = from_renders(a, b, tile, counts)
     levels = list(replace(evidence, pixels=evidence.pixels if pixels == "yes" else None).levels(equivalence_margin))

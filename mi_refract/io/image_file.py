@@ -12,15 +12,17 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from . import atomic
 from .errors import ImageError
 
 Metadata = dict[str, Any]
+ImageInput: TypeAlias = Any  # an `OpenImageIO.ImageInput`
+ImageSpec: TypeAlias = Any  # an `OpenImageIO.ImageSpec`
 SUFFIXES = (".exr",)
 MAX_VALUES = 2**28  # width × height × channels of an image: 1 GiB as float32
 ATTRIBUTES = 4096  # of an EXR file
@@ -70,6 +72,7 @@ def write_exr(
             # On a full disk `close` is True all the same when the image was small enough for a buffer.
             source = oiio.ImageInput.open(str(temporary))
             if source is None or source.read_scanlines(0, 0, rows - 1, rows, 0, 0, count, "float") is None:
+                (source or oiio).geterror()  # or OpenImageIO would print it at the end of the process
                 raise OSError("the last row of pixels is missing; is the disk full?")
             source.close()
     except OSError as error:
@@ -150,7 +153,7 @@ def count_values(path: str | os.PathLike[str], max_values: int = MAX_VALUES) -> 
         source.close()
 
 
-def _checked(path: Path, max_values: int, multiplied: bool) -> tuple[Any, str]:
+def _checked(path: Path, max_values: int, multiplied: bool) -> tuple[ImageInput, str]:
     """OpenImageIO's reader of a file that may hold an image, and its kind for error messages."""
     kind = path.suffix[1:].upper() or "image"
     try:
@@ -221,7 +224,7 @@ _opening = threading.Lock()  # OpenImageIO has one limit for all that it opens
 
 def _opened(
     path: Path, kind: str, max_values: int, max_bytes: int, multiplied: bool = False, option: str = OPTION
-) -> Any:
+) -> ImageInput:
     """OpenImageIO's reader of the file, if its pixels take up to `max_bytes`. Some formats are decoded here."""
     import OpenImageIO as oiio
 
@@ -243,7 +246,7 @@ def _opened(
     return source
 
 
-def named(name: str, pixels: Any) -> Image:
+def named(name: str, pixels: ArrayLike) -> Image:
     """An image made of an array, H × W × C or H × W, with a name instead of a file.
 
     Channels are called R, G, B (, A) where there are three or four, else channel0, channel1 … Integers are kept as
@@ -258,7 +261,7 @@ def named(name: str, pixels: Any) -> Image:
     return Image(Path(name), pixels, channels)
 
 
-def _images(path: Path, source: Any, kind: str, most: int, first_only: bool, as_idiff: bool) -> list[Image]:
+def _images(path: Path, source: ImageInput, kind: str, most: int, first_only: bool, as_idiff: bool) -> list[Image]:
     """The images of an open file, in the order of parts and MIP levels, with their places."""
     found: list[Image] = []
     for part in _parts(source):
@@ -278,7 +281,7 @@ def _images(path: Path, source: Any, kind: str, most: int, first_only: bool, as_
     return [replace(image, place=place) for image, place in zip(found, places, strict=True)]
 
 
-def _parts(source: Any) -> Iterator[tuple[int, int]]:
+def _parts(source: ImageInput) -> Iterator[tuple[int, int]]:
     """Each part and MIP level by number; the source is at it. Not counted first: some formats are decoded here."""
     part = 0
     while source.seek_subimage(part, 0):
@@ -289,7 +292,7 @@ def _parts(source: Any) -> Iterator[tuple[int, int]]:
         part += 1
 
 
-def _check_size(path: Path, spec: Any, max_values: int, taken: int = 0, option: str = OPTION) -> None:
+def _check_size(path: Path, spec: ImageSpec, max_values: int, taken: int = 0, option: str = OPTION) -> None:
     """ValueError for more values than are allowed, beside those that other images of the file have taken."""
     if spec.width * spec.height * spec.nchannels > max_values - taken:
         beside = f" beside {taken} of other parts and MIP levels" if taken else ""
@@ -297,7 +300,7 @@ def _check_size(path: Path, spec: Any, max_values: int, taken: int = 0, option: 
         raise ImageError(f"{path}: {size}; expected up to {max_values} values{option}")
 
 
-def _image(path: Path, source: Any, kind: str, values: tuple[int, int], as_idiff: bool) -> Image:
+def _image(path: Path, source: ImageInput, kind: str, values: tuple[int, int], as_idiff: bool) -> Image:
     """The part and MIP level that the source is at; `values`: how many a file may have, and has so far."""
     import OpenImageIO as oiio
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import re
-from typing import Any
 
 MARK = "\ufffd"
 
@@ -30,7 +29,7 @@ _ANYWHERE = re.compile(r"##(?=\w*\[)")
 _AT_THE_START = re.compile(r"^(\s*):(?=:)")
 
 
-def printable(text: Any) -> str:
+def printable(text: object) -> str:
     """The text on one line, without a character that is not shown, or that more than shows; U+FFFD stands for each.
 
     Commands to the runner of a CI service are broken up: of `##[error]` and of a leading `::` one character is
@@ -40,12 +39,12 @@ def printable(text: Any) -> str:
     return _AT_THE_START.sub(rf"\1{MARK}", _ANYWHERE.sub(f"#{MARK}", shown))
 
 
-def printable_lines(text: Any) -> str:
+def printable_lines(text: object) -> str:
     """The same for a text of several lines, of which \\n is kept."""
     return "\n".join(map(printable, str(text).split("\n")))
 
 
-def json_text(value: Any, indent: int | None = None) -> str:
+def json_text(value: object, indent: int | None = None) -> str:
     """JSON of the value, for a terminal or a log: any string comes back unchanged from it, but is not shown as such.
 
     ValueError for numbers that are not finite.

@@ -78,7 +78,11 @@ def _keys(kind: type[msgspec.Struct]) -> list[tuple[str, str, str]]:
         described = isinstance(field.type, msgspec.inspect.Metadata)
         schema = field.type.extra_json_schema or {} if described else {}
         bare = field.type.type if described else field.type
-        default = "" if field.required or field.default in (None, msgspec.NODEFAULT) else f"; default {field.default!r}"
+        default = (
+            ""
+            if field.required or field.default in (None, "", (), msgspec.NODEFAULT)
+            else f"; default {field.default!r}"
+        )
         keys.append((field.encode_name, _type_text(bare), f"{schema.get('description', '')}{default}"))
     return keys
 

@@ -149,13 +149,13 @@ def choose_backend(name: str | None, precision: str) -> ArrayBackend:
     """
     if precision not in PRECISIONS:
         raise ValueError(f"precision = {precision!r}; expected {', '.join(PRECISIONS)}")
-    found = detect()
-    llvm = found["llvm"]
+    backends = detect()
+    llvm = backends["llvm"]
     name = name or ("llvm" if llvm.usable else "scalar")
-    if name not in found:
-        raise ValueError(f"backend = {name!r}; expected {', '.join(found)}")
-    if not found[name].usable:
-        raise ValueError(f"backend = {name!r} cannot run here: {found[name].reason}")
+    if name not in backends:
+        raise ValueError(f"backend = {name!r}; expected {', '.join(backends)}")
+    if not backends[name].usable:
+        raise ValueError(f"backend = {name!r} cannot run here: {backends[name].reason}")
     if name != "scalar":
         return ArrayBackend(name, precision)
     if precision == "float32":

@@ -52,31 +52,24 @@ def around(scene: PlanarScene, traced: Sequence[Branches]) -> View:
 
 def legs(traced: Sequence[Branches], view: View) -> Legs:
     """The legs inside the view, each once; rays that escape end at its edge."""
-    parts = [_legs(branches, number, len(traced), view) for number, branches in enumerate(traced)]
-    columns = ([getattr(part, name) for part in parts] for name in ("start", "end", "weight", "colour"))
-    return Legs(*map(np.concatenate, columns))
-
-
-def _legs(branches: Branches, number: int, colours: int, view: View) -> Legs:
-    start, end, own = branches.paths.points, _ends(branches, view), branches.own
-    colour = np.full(own.shape, number)
-    if colours > 1:  # they separate at the first boundary
-        colour[:, 0] = SHARED
-        own[:, 0] &= number == 0
-    start, end, inside = clip(start[own], end[own], view)
-    return Legs(start, end, branches.weights[own], colour[own]).where(inside)
-
-
-def _ends(branches: Branches, view: View) -> Array:
-    """Where legs end (P × (D+1) × 2); NaN where there is no leg, as after the last boundary of a path that stopped."""
     x0, x1, y0, y1 = view
-    ends = np.full_like(branches.paths.points, np.nan)
-    ends[:, :-1] = branches.paths.points[:, 1:]
-    away = np.flatnonzero(branches.end == Event.ESCAPED)
-    tips = branches.tips[away]
-    reach = np.hypot(*(tips - [(x0 + x1) / 2, (y0 + y1) / 2]).T) + math.hypot(x1 - x0, y1 - y0)
-    ends[away, branches.last[away]] = tips + branches.paths.directions[away] * reach[:, None]
-    return ends
+    parts = []
+    for number, branches in enumerate(traced):
+        start, own = branches.paths.points, branches.own
+        # NaN where there is no leg, as after the last boundary of a path that stopped.
+        end = np.full_like(start, np.nan)
+        end[:, :-1] = start[:, 1:]
+        away = np.flatnonzero(branches.end == Event.ESCAPED)
+        tips = branches.tips[away]
+        reach = np.hypot(*(tips - [(x0 + x1) / 2, (y0 + y1) / 2]).T) + math.hypot(x1 - x0, y1 - y0)
+        end[away, branches.last[away]] = tips + branches.paths.directions[away] * reach[:, None]
+        colour = np.full(own.shape, number)
+        if len(traced) > 1:  # they separate at the first boundary
+            colour[:, 0] = SHARED
+            own[:, 0] &= number == 0
+        first, last, inside = clip(start[own], end[own], view)
+        parts.append([x[inside] for x in (first, last, branches.weights[own], colour[own])])
+    return Legs(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def clip(start: Array, end: Array, view: View) -> tuple[Array, Array, NDArray[np.bool_]]:

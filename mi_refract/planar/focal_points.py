@@ -80,12 +80,12 @@ def spread(origins: Array, directions: Array) -> Spread:
     """The focus and spot of lines through `origins` along unit `directions` (N × 2, N ≥ 1)."""
     focus = closest_point(origins, directions)
     behind = focus is not None and bool(np.median(((focus - origins) * directions).sum(axis=1)) < 0)
-    found = Spread(len(origins), _point(focus), behind)
+    result = Spread(len(origins), _point(focus), behind)
     if len(origins) > 1 and (spot := _spot(origins, directions)):
         place, offsets = spot
         rms, largest = float(np.sqrt(np.mean(offsets**2))), float(np.abs(offsets).max())
-        return replace(found, spot=_point(place), rms=rms, largest=largest)
-    return found
+        return replace(result, spot=_point(place), rms=rms, largest=largest)
+    return result
 
 
 def closest_point(origins: Array, directions: Array) -> Array | None:
@@ -147,7 +147,7 @@ class Group:
 
 def groups(scene: PlanarScene, traced: Sequence[Branches], plane: Plane | None = None) -> list[Group]:
     """The escaped rays, grouped by colour, beam and partial reflections, on whatever side of a shape they leave."""
-    found = []
+    result = []
     for colour, branches in enumerate(traced):
         escaped = (branches.end == Event.ESCAPED) & (branches.last > 0)
         for beam in range(int(scene.beams.max()) + 1):
@@ -155,8 +155,8 @@ def groups(scene: PlanarScene, traced: Sequence[Branches], plane: Plane | None =
                 members = escaped & (scene.beams[branches.rays] == beam) & (branches.reflect == reflect)
                 if members.any():
                     spread = _of_group(scene, colour, branches, np.flatnonzero(members), plane)
-                    found.append(Group(scene.colours[colour], beam, reflect, spread))
-    return found
+                    result.append(Group(scene.colours[colour], beam, reflect, spread))
+    return result
 
 
 def _of_group(

@@ -102,15 +102,15 @@ class ConicArcs(LineSegments):
         single = once & too
         root = (dr.select(own, x, dr.select(single, z, y)) for x, y, z in zip(start.other, one, other, strict=True))
         ways = to_a, to_c, to_b
-        found, ahead = self._found(ray, i, ways, w, tuple(root), dr.select(own, turn < 0, a_left), ends)
-        found, ahead = dr.select(straight, line, found), dr.select(straight, line_ahead, ahead)
-        ahead = self._beyond(start, found, ahead) & dr.select(straight, once, valid | single)
+        hit, ahead = self._hit(ray, i, ways, w, tuple(root), dr.select(own, turn < 0, a_left), ends)
+        hit, ahead = dr.select(straight, line, hit), dr.select(straight, line_ahead, ahead)
+        ahead = self._beyond(start, hit, ahead) & dr.select(straight, once, valid | single)
         ahead = dr.select(own, start.again, ahead) & active
-        best = dr.select(ahead & self._before(found, best), found, best)
+        best = dr.select(ahead & self._before(hit, best), hit, best)
         # Where there are two crossings, neither is at a vertex, but for rounding: their distances decide.
-        found, ahead = self._found(ray, i, ways, w, other, negated(a_left), ends)
+        hit, ahead = self._hit(ray, i, ways, w, other, negated(a_left), ends)
         ahead &= active & too & negated(once | own | straight)
-        return dr.select(ahead & (found.distance < best.distance), found, best)
+        return dr.select(ahead & (hit.distance < best.distance), hit, best)
 
     def _beyond(self, start: Start, hit: Hit, ahead: Mask) -> Mask:
         """Whether a hit is ahead of the ray's start, which may be at a vertex that both curves share.
@@ -130,7 +130,7 @@ class ConicArcs(LineSegments):
         first = self._turned(other, own, (hit.bend, dr.select(left, bend, -bend)), dr.select(left, -1, 1))
         return dr.select(near, negated(first), ahead)
 
-    def _found(
+    def _hit(
         self, ray: Ray, i: Index, ways: Three, w: Number, root: Root, to_left: Mask, ends: Ends
     ) -> tuple[Hit, Mask]:
         """A root as a hit, and whether it is ahead."""

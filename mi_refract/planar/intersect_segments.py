@@ -124,21 +124,16 @@ class LineSegments:
         """Quantities of the ray's start, computed once per ray, not per segment."""
         a, b, vertices = self._of(ray.own, ray.own != NOWHERE)
         (s, r), e = self._shares(ray), b - a
-        return Start(self._own(ray, vertices), (-e * r, e * s), self._sides(ray, e, s, r))
+        own = type(vertices)(*(dr.select(ray.own != NOWHERE, v, NOWHERE) for v in vertices))
+        # f of both ends: of a ray that leaves to the left, the segment starts on the left and ends on the right.
+        size = dr.maximum(dr.abs(cross(ray.d, e)), SIGN * (dr.abs(e.x) + dr.abs(e.y)))
+        size = dr.select(ray.left, size, -size)
+        return Start(own, (-e * r, e * s), (size * r, -size * s))
 
     def _shares(self, ray: Ray) -> tuple[Number, Number]:
         """s and r of the ray's start, kept off both ends of the segment by u² of it: signs stay, no number changes."""
         least = self.arrays.roundoff**2
         return dr.maximum(ray.s, least), dr.maximum(ray.r, least)
-
-    def _own(self, ray: Ray, vertices: Vertices) -> Vertices:
-        return type(vertices)(*(dr.select(ray.own != NOWHERE, v, NOWHERE) for v in vertices))
-
-    def _sides(self, ray: Ray, e: Vector2, s: Number, r: Number) -> tuple[Number, Number]:
-        """f of both ends: of a ray that leaves to the left, the segment starts on the left and ends on the right."""
-        size = dr.maximum(dr.abs(cross(ray.d, e)), SIGN * (dr.abs(e.x) + dr.abs(e.y)))
-        size = dr.select(ray.left, size, -size)
-        return size * r, -size * s
 
     def none(self) -> Hit:
         """No crossing, at distance ∞."""
@@ -159,12 +154,12 @@ class LineSegments:
         """The crossing of segment i, if it comes before `best`."""
         a, b, vertices = self._of(i, active)
         seen = self._seen(ray, start, vertices[0], a), self._seen(ray, start, vertices[1], b)
-        found, ahead = self._crossing(ray, start, i, b - a, vertices, seen)
+        hit, ahead = self._crossing(ray, start, i, b - a, vertices, seen)
         # Of two segments that share a vertex, the turn between them says which comes first, whatever λ rounds to.
-        turn = cross(found.along, best.along)
-        first = dr.select(found.right == best.right, turn < 0, found.distance < best.distance)
-        first = ahead & active & dr.select(found.left == best.left, turn > 0, first)
-        return dr.select(first, found, best)
+        turn = cross(hit.along, best.along)
+        first = dr.select(hit.right == best.right, turn < 0, hit.distance < best.distance)
+        first = ahead & active & dr.select(hit.left == best.left, turn > 0, first)
+        return dr.select(first, hit, best)
 
     def _crossing(
         self, ray: Ray, start: Start, i: Index, e: Vector2, vertices: Vertices, seen: tuple[Seen, Seen]

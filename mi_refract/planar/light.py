@@ -61,9 +61,9 @@ def of_names(names: Sequence[str] | None) -> Light:
     return Light(tuple(names)) if names else Light()
 
 
-def of_wavelengths(asked: Sequence[float] | int, power: str = "flat") -> Light:
+def of_wavelengths(nm: Sequence[float] | int, power: str = "flat") -> Light:
     """Colours by wavelength in nm, or so many evenly spread over the visible. power: of POWERS."""
-    spread = np.linspace(*VISIBLE, asked) if isinstance(asked, int) else np.array(asked, float)
+    spread = np.linspace(*VISIBLE, nm) if isinstance(nm, int) else np.array(nm, float)
     wavelengths = tuple(float(w) for w in spread)
     powers = _daylight(wavelengths) if power == "D65" else (1.0,) * len(wavelengths)
     return Light(tuple(f"{w:.6g} nm" for w in wavelengths), wavelengths, powers)

@@ -17,6 +17,7 @@ elsewhere, a ray may miss a thin layer there, or meet its two sides in the wrong
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +27,7 @@ import numpy as np
 from mi_refract.backend import activate
 from mi_refract.numerics import Mask, Number
 
-from .array_backend import ArrayBackend, Index, Scatter, Vector2, negated
+from .array_backend import ArrayBackend, Index, Scatter, Table, Vector2, negated
 from .intersect_segments import NOWHERE, Hit, LineSegments, Ray, Start
 from .segments import Array
 
@@ -86,24 +87,24 @@ class MeshAcceleration:
         self, boundaries: LineSegments, ray: Ray, start: Start, search: SearchState, active: Mask
     ) -> tuple[Hit, SearchState, Mask]:
         """The first boundary found so far, from where to search on, and whether no other can come before it."""
-        found, t, stroke = self._stroke(dr.fma(ray.d, search.gone, self._beside(ray, start)), ray.d, active)
+        hit, t, stroke = self._stroke(dr.fma(ray.d, search.gone, self._beside(ray, start)), ray.d, active)
         own = active & (ray.own != NOWHERE)
         corner = own & self._near_end(ray.own, ray, own)
 
-        def tried(best: Hit, stroke: Index, found: Mask, corner: Mask, held: Index) -> Hit:
-            best = boundaries.nearer(best, ray, start, stroke, found & (stroke < boundaries.count))
+        def tried(best: Hit, stroke: Index, hit: Mask, corner: Mask, held: Index) -> Hit:
+            best = boundaries.nearer(best, ray, start, stroke, hit & (stroke < boundaries.count))
             # In a wedge all neighbours are tried: their strokes may be met in any order, and the start may lie beyond
             # one of them, or beyond the stroke of the vertex between.
-            vague = found & self._near_end(best.segment, best, found)
+            vague = hit & self._near_end(best.segment, best, hit)
             lists = dr.select(vague, stroke, NOWHERE), dr.select(corner, ray.own, NOWHERE)
             return self._also(best, boundaries, ray, start, held, lists)
 
         # A branch, not a select: neighbouring rays mostly agree.
         held = dr.select(active, search.held, NOWHERE)
-        given = boundaries.none(), stroke, found, corner, held
-        best = dr.if_stmt(given, found | corner | (held != NOWHERE), tried, lambda best, *_: best, label="stroke")
+        state = boundaries.none(), stroke, hit, corner, held
+        best = dr.if_stmt(state, hit | corner | (held != NOWHERE), tried, lambda best, *_: best, label="stroke")
         gone = search.gone + t
-        settled = negated(found) | (best.distance * self.scale <= gone + MARGIN)
+        settled = negated(hit) | (best.distance * self.scale <= gone + MARGIN)
         return best, SearchState(gone + STEP, best.segment), settled
 
     def _near_end(self, segment: Index, at: Hit | Ray, active: Mask) -> Mask:
@@ -114,30 +115,24 @@ class MeshAcceleration:
 
     def _crowded(self, a: Array, b: Array, vertices: Any) -> tuple[int, int] | None:
         """Two segments that share no vertex, one less than SHORTEST from the middle or a quarter of the other."""
-        e = b - a
+        arrays, e = self.arrays, b - a
         across = np.column_stack([-e[:, 1], e[:, 0]]) / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), 1e-300)
-        for share in (0.25, 0.5, 0.75):
-            for d in (across, -across):
-                stroke = self._within(a + share * e + OFFSET * d, d)
-                seen = np.flatnonzero(stroke < len(a))
-                other = stroke[seen]
-                apart = (vertices[seen, :, None] != vertices[other][:, None]).all((1, 2))
-                if apart.any():
-                    return int(seen[apart][0]), int(other[apart][0])
+        for share, d in itertools.product((0.25, 0.5, 0.75), (across, -across)):
+            places, directions = arrays.table(a + share * e + OFFSET * d), arrays.table(d)
+
+            def work(lane: Index, scatter: Scatter, places: Table = places, directions: Table = directions) -> None:
+                q, way = arrays.gather(places, lane), arrays.gather(directions, lane)
+                hit, t, stroke = self._stroke(q, way, arrays.mask(True))
+                scatter("nearby", 0, stroke, hit & (t < SHORTEST))
+
+            buffer = arrays.buffer(arrays.index, NOWHERE, (1, len(a)))
+            stroke = arrays.run(len(a), {"nearby": buffer}, work)["nearby"][0]
+            seen = np.flatnonzero(stroke < len(a))
+            other = stroke[seen]
+            apart = (vertices[seen, :, None] != vertices[other][:, None]).all((1, 2))
+            if apart.any():
+                return int(seen[apart][0]), int(other[apart][0])
         return None
-
-    def _within(self, q: Array, d: Array) -> Any:
-        """The strokes that rays from `q` along `d` (N × 2) meet within SHORTEST (N), NOWHERE for none."""
-        arrays, nearby = self.arrays, {"nearby": self.arrays.buffer(self.arrays.index, NOWHERE, (1, len(q)))}
-        places, directions = arrays.table(q), arrays.table(d)
-
-        def work(lane: Index, scatter: Scatter) -> None:
-            found, t, stroke = self._stroke(
-                arrays.gather(places, lane), arrays.gather(directions, lane), arrays.mask(True)
-            )
-            scatter("nearby", 0, stroke, found & (t < SHORTEST))
-
-        return arrays.run(len(q), nearby, work)["nearby"][0]
 
     def _beside(self, ray: Ray, start: Start) -> Vector2:
         """Where to trace from: the ray's start, moved off its own segment, to the side to which the ray goes."""

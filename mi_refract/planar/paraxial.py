@@ -78,7 +78,7 @@ class Axis:
 
 def _along(place: Array, direction: Array, way: float) -> Point:
     """A place on the axis; a coordinate that is 0 but for rounding is 0."""
-    x, y = np.where(np.abs(found := place + way * direction) > LOST * (np.abs(place).max() + abs(way)), found, 0.0)
+    x, y = np.where(np.abs(point := place + way * direction) > LOST * (np.abs(place).max() + abs(way)), point, 0.0)
     return float(x), float(y)
 
 

@@ -72,14 +72,15 @@ def follow(
     branches: int = 0,
     *,
     least: float = LEAST,
-    most: int | None = None,
+    most: int = MOST,
+    taken: int = 0,
     **how: Any,
 ) -> Branches:
     """Follow rays (N × 2) with up to `branches` partial reflections, each of more than `least` of the ray's power.
 
     how: formula, precision, backend, as for `planar.trace`. Only the first 32 boundaries of a path reflect in part.
-    ValueError as there, for a negative number of branches, and, before they are followed, for more than `most` legs
-    (None: MOST).
+    ValueError as there, for a negative number of branches, and, before they are followed, for more than `most` legs,
+    of which `taken` are those of other colours.
     """
     if branches < 0:
         raise ValueError(f"branches = {branches}; expected a whole number from 0")
@@ -87,9 +88,8 @@ def follow(
     rays, reflect = np.arange(len(origins)), np.zeros(len(origins), np.uint32)
     orders: list[Branches] = []
     while True:
-        _check_size(
-            rays.size + sum(len(order.rays) for order in orders), max_depth, len(orders), MOST if most is None else most
-        )
+        paths_so_far = rays.size + sum(len(order.rays) for order in orders)
+        _check_size(paths_so_far, max_depth, len(orders), most, taken)
         paths = trace(origins[rays], directions[rays], max_depth, reflect=reflect, weights=True)
         orders.append(Branches(paths, rays, reflect))
         weights, events = orders[-1].weights, paths.events[:, :-1]
@@ -105,21 +105,21 @@ def follow(
     return Branches(Paths(**columns), rays, reflect)
 
 
-def _check_size(paths: int, max_depth: int, reflections: int, most: int) -> None:
-    if paths * (max_depth + 1) > most:
+def _check_size(paths: int, max_depth: int, reflections: int, most: int = MOST, taken: int = 0) -> None:
+    if paths * (max_depth + 1) > most - taken:
         size = f"{paths} paths of up to {max_depth} boundaries with up to {reflections} partial reflections"
-        rest = "" if most == MOST else f", of which other colours take {MOST - most}"
-        raise ValueError(f"{size}; expected fewer rays, branches or boundaries, {MOST} legs altogether{rest}")
+        rest = f", of which other colours take {taken}" if taken else ""
+        raise ValueError(f"{size}; expected fewer rays, branches or boundaries, {most} legs altogether{rest}")
 
 
-def follow_scene(scene: PlanarScene, **how: Any) -> tuple[Branches, ...]:
-    """The paths of a scene, one `Branches` per colour; `how` and errors as for `follow`, for all colours together."""
-    _check_size(len(scene.origins) * len(scene.segments), scene.max_depth, 0, MOST)
+def follow_scene(scene: PlanarScene, *, most: int = MOST, **how: Any) -> tuple[Branches, ...]:
+    """The paths of a scene, one `Branches` per colour; options and errors as for `follow`, for all colours together."""
+    _check_size(len(scene.origins) * len(scene.segments), scene.max_depth, 0, most)
     rays = scene.origins, scene.directions, scene.max_depth, scene.branches
     traced: list[Branches] = []
     for segments in scene.segments:
-        used = sum(branches.paths.events.size for branches in traced)
-        traced.append(follow(segments, *rays, most=MOST - used, **how))
+        taken = sum(branches.paths.events.size for branches in traced)
+        traced.append(follow(segments, *rays, most=most, taken=taken, **how))
     return tuple(traced)
 
 
@@ -129,7 +129,7 @@ def with_rays(scene: PlanarScene, count: int) -> PlanarScene:
     ValueError for more rays than `follow` accepts.
     """
     sizes = np.bincount(scene.beams).tolist()
-    _check_size(sum(count if size > 1 else size for size in sizes), scene.max_depth, 0, MOST)
+    _check_size(sum(count if size > 1 else size for size in sizes), scene.max_depth, 0)
     parts = []
     for beam in np.unique(scene.beams):
         origins, directions = scene.origins[scene.beams == beam], scene.directions[scene.beams == beam]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,54 +43,37 @@ def boundaries(parts: list[Part]) -> tuple[Segments, ...]:
     weight = np.concatenate([c.weight for c in curves])
     media = np.array([(part.left, part.right) for part in parts])[owner]
     kept = first != last
-    _present(parts, np.bincount(owner, kept), np.abs(vertices).max())
-    for i, j in _again(_numbers(np.minimum(first, last), np.maximum(first, last), bends)):
-        if kept[j]:
-            side = int(first[i] != first[j])
-            media[i, side] = _filled(media[i, side], parts[owner[i]].where, parts[owner[j]])
-            kept[j] = False
+    for part, pieces in zip(parts, np.bincount(owner, kept), strict=True):
+        if not pieces:
+            size = f"beside coordinates of {np.abs(vertices).max():g}; expected above {NEAR:.0e} of that"
+            raise ValueError(f"{part.where}: a point, {size}")
+    _, original, same = np.unique(
+        _numbers(np.minimum(first, last), np.maximum(first, last), bends), return_index=True, return_inverse=True
+    )
+    original = original[same]  # of each piece, the first one that runs where it does
+    for j in np.flatnonzero((original != np.arange(len(owner))) & kept):
+        i, part, earlier = int(original[j]), parts[owner[j]], parts[owner[original[j]]].where
+        if not part.curve.closed:
+            raise ValueError(f"{part.where}: it runs along {earlier}; expected a boundary of its own")
+        side = int(first[i] != first[j])
+        if tuple(media[i, side]) != part.right:
+            there, outside = (", ".join(f"{x:g}" for x in n) for n in (media[i, side], part.right))
+            text = f"along {earlier} there is index {there}; expected {outside}, what it lies in"
+            raise ValueError(f"{part.where}: {text}")
+        media[i, side], kept[j] = part.left, False
     arcs = () if straight[kept].all() else (control[kept], weight[kept])
     left, right = media[kept].transpose(1, 2, 0)
     return tuple(Segments(start[kept], end[kept], *n, *arcs) for n in zip(left, right, strict=True))
 
 
-def _present(parts: list[Part], pieces: NDArray[Any], largest: float) -> None:
-    """ValueError for a part of which merging leaves no piece."""
-    for part, left in zip(parts, pieces, strict=True):
-        if not left:
-            raise ValueError(
-                f"{part.where}: a point, beside coordinates of {largest:g}; expected above {NEAR:.0e} of that"
-            )
-
-
-def _filled(there: Array, earlier: str, part: Part) -> Indices:
-    """The index on the side of an earlier part's edge along which `part` runs: that of its inside."""
-    if not part.curve.closed:
-        raise ValueError(f"{part.where}: it runs along {earlier}; expected a boundary of its own")
-    if tuple(there) != part.right:
-        found, outside = _indices(there), _indices(part.right)
-        raise ValueError(f"{part.where}: along {earlier} there is index {found}; expected {outside}, what it lies in")
-    return part.left
-
-
-def _indices(n: Any) -> str:
-    return ", ".join(f"{x:g}" for x in n)
-
-
 def _merged(points: Array) -> tuple[Array, Numbers]:
     """The points, near ones replaced by the first of them, and for each point the number of its place."""
-    near = NEAR * np.abs(points).max()
-    ids = _numbers(*(_groups(x, near) for x in points.T))
-    _, first, ids = np.unique(ids, return_index=True, return_inverse=True)
+    near, groups = NEAR * np.abs(points).max(), np.empty(points.shape, np.intp)
+    for x, numbers in zip(points.T, groups.T, strict=True):  # the same number for neighbours at most `near` apart
+        order = np.argsort(x)
+        numbers[order] = np.cumsum(np.diff(x[order], prepend=x[order[0]]) > near)
+    _, first, ids = np.unique(_numbers(*groups.T), return_index=True, return_inverse=True)
     return points[first[ids]], ids
-
-
-def _groups(x: Array, near: float) -> Numbers:
-    """A number for each value, the same for neighbours at most `near` apart."""
-    order = np.argsort(x)
-    groups = np.empty(len(x), np.intp)
-    groups[order] = np.cumsum(np.diff(x[order], prepend=x[order[0]]) > near)
-    return groups
 
 
 def _numbers(*columns: Numbers) -> Numbers:
@@ -100,11 +82,3 @@ def _numbers(*columns: Numbers) -> Numbers:
     for column in columns[1:]:
         ids = np.unique(ids * (column.max() + 1) + column, return_inverse=True)[1]
     return ids
-
-
-def _again(numbers: Numbers) -> Iterator[tuple[int, int]]:
-    """Of each number that occurs more than once: its first place and each later one."""
-    _, first, inverse = np.unique(numbers, return_index=True, return_inverse=True)
-    firsts = first[inverse]
-    for j in np.flatnonzero(firsts != np.arange(len(numbers))):
-        yield int(firsts[j]), int(j)

@@ -2,8 +2,8 @@
 
 The oracle certifies every ray. An answer is right where its error is within the a-priori bound of a documented formula
 for that very ray. Errors are angles, over the rays whose total internal reflection was classified correctly; the error
-of the length is reported separately. Where answers say which ratio of indices the program used, directions are compared
-with the certified ones for that ratio, and the ratio with that of the ray.
+of the length is reported separately. Where answers have a column `n_ratio`, the program's ratio of indices, directions
+are compared with the certified ones for that ratio, and the ratio with that of the ray.
 
 All rays, their answers and certified answers are arrays. Whatever takes more memory than these is done in pieces.
 """
@@ -124,11 +124,6 @@ class Findings:
         return self.total("right")
 
     @property
-    def farthest(self) -> RegimeErrors:
-        """The regime with the largest angle. ValueError where nothing was answered."""
-        return max(self.regimes, key=lambda regime: (regime.compared > 0, regime.worst))
-
-    @property
     def diagnosis(self) -> Explanation | None:
         """The mistake that explains the answers, where exactly one does."""
         certain = [explanation for explanation in self.explanations if explanation.explains]
@@ -160,7 +155,7 @@ class _Piece:
 
     @property
     def used(self) -> Rays:
-        """The rays as the program took them: with the ratio of the indices that it used, where it says so."""
+        """The rays as the program took them: with the ratio of the indices that it used, where it reports it."""
         if self.n_ratio is None:
             return self.rays
         return Rays(self.rays.a.astype(np.float64), self.rays.n.astype(np.float64), self.n_ratio)

@@ -136,13 +136,13 @@ def judge_answers(
 def _backward(seen: SeenAnswers, reflected: Flags, tir: str, verdict: Judgement) -> Array:
     transmitted, rays = seen.exact.transmitted, seen.rays
     mirror = reflected & (tir == "reflected")
-    found = np.zeros(len(seen.b))
+    error = np.zeros(len(seen.b))
     directed = ~reflected | (mirror & ~transmitted)
-    found[directed] = backward_error.of_directions(seen.b[directed], rays[directed], mirror[directed])
+    error[directed] = backward_error.of_directions(seen.b[directed], rays[directed], mirror[directed])
     lost = reflected & transmitted
-    found[lost] = backward_error.of_decisions(rays[lost])
+    error[lost] = backward_error.of_decisions(rays[lost])
     with np.errstate(over="ignore"):
-        return np.where(verdict.blank, np.inf, found / seen.u)
+        return np.where(verdict.blank, np.inf, error / seen.u)
 
 
 def _impossible(seen: SeenAnswers, reflected: Flags, tir: str, verdict: Judgement) -> Flags:
@@ -150,12 +150,12 @@ def _impossible(seen: SeenAnswers, reflected: Flags, tir: str, verdict: Judgemen
     excused = ~verdict.compared | (verdict.bounds.chord > possible_directions.UNDECIDABLE)
     candidates = seen.is_direction & excused
     bounds = replace(verdict.bounds, budget=FORMULAS[LOOSEST].budget)
-    found = np.zeros(len(candidates), bool)
+    impossible = np.zeros(len(candidates), bool)
     for mask, test in (
         (candidates & ~reflected, possible_directions.possible),
         (candidates & reflected & (tir == "tangent"), possible_directions.possible_tangent),
         (candidates & reflected & (tir == "reflected"), possible_directions.possible_mirror),
     ):
         some = np.flatnonzero(mask)
-        found[some] = ~test(seen.b, bounds, some)
-    return found
+        impossible[some] = ~test(seen.b, bounds, some)
+    return impossible

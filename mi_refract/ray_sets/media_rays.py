@@ -1,4 +1,4 @@
-"""Sets whose ratios of indices are those of media at wavelengths: which ray has which, and what the header says of it.
+"""Sets whose ratios of indices are those of media at wavelengths: the media and the wavelength of each ray.
 
 Each ray has a wavelength and a pair of media, [from, to]: one of them is a medium of `mi_refract.media`, the other is
 air, whose index is 1. Both follow from the header and from the ray's place in its regime, so they are never stored:
@@ -39,10 +39,10 @@ def has_media(header: Mapping[str, Any]) -> bool:
 
 
 def header_of(specs: Sequence[str], wavelengths: Sequence[float], precision: str) -> Header:
-    """What the header of a set says of its media and of its wavelengths in nm, in addition.
+    """The keys of a header for these media, and wavelengths in nm.
 
-    ValueError, one line, for none of either, too many, one given twice in the set's precision, what is no medium, or no
-    index at one of the wavelengths.
+    ValueError, one line, for none of either, too many, duplicates in the set's precision, an unknown medium, or one
+    without an index at one of the wavelengths.
     """
     found = f"{len(specs)} media and {len(wavelengths)} wavelengths"
     if not len(specs) or not len(wavelengths):
@@ -66,7 +66,7 @@ def header_of(specs: Sequence[str], wavelengths: Sequence[float], precision: str
 
 
 def check(header: Header) -> None:
-    """ValueError, one line, where it says of media what `header_of` does not. Precondition: `header.check` passed."""
+    """ValueError, one line, for keys of media that `header_of` does not write. Precondition: `header.check` passed."""
     if has_media(header):
         names = [pair[0] for pair in header["media"][::2]]
         made = header_of(names, header["wavelengths"], header["precision"])

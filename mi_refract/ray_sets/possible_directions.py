@@ -1,4 +1,4 @@
-"""What is certain of an answer whose error bound excuses its direction: no rounding of a formula gives any other.
+"""Which directions are possible where the error bound is too wide to judge them: what rounding of a formula can give.
 
 A documented formula is off by L = linear u K in any direction, and by its root along the normal (see
 `mi_refract.formulas.bounds`). With t the direction of `a` along the surface, m the normal on the side that the
@@ -6,8 +6,8 @@ transmitted ray goes to, D = cos²θ_t, it answers, at any length s > 0,
 
     b = s (k sinθ t + r m + δ),   |δ| ≤ L,   r ≥ 0,   |r² − D| ≤ x
 
-So b is in the plane of incidence, forward, and not on the side that the ray came from, whatever x is. Of a vector that
-signals total internal reflection the same is certain, along the surface, and of a mirror direction all is.
+So b is in the plane of incidence, forward, and not on the side that the ray came from, whatever x is. A vector along
+the surface that signals total internal reflection is in that plane and forward; a mirror direction is known entirely.
 """
 
 from __future__ import annotations
@@ -38,34 +38,34 @@ class Components:
 def possible(b: Array, bounds: RayBounds, some: Index) -> Flags:
     """(M,) the answers of `b` (N, 3) to the rays `some` (M indices) that a transmitted direction may be."""
     u, k, exact = bounds.u[some], bounds.k[some], bounds.exact
-    given, incident = _components(b, bounds, some)
+    answer, incident = _components(b, bounds, some)
     e = k * incident.along
     root2 = np.where(exact.transmitted[some], exact.cos_t[some] ** 2, 1 - e * e)
     x = bounds.budget.radicand_error_bound(u, k)
     low, high = (np.sqrt(np.maximum(root2 + sign * x, 0)) for sign in (-1, 1))
     either = bounds.budget.side_open(u, exact.cos_i[some])
-    onward = np.where(either, np.abs(given.onward), given.onward)
-    plane = given.along**2 + given.across**2
+    onward = np.where(either, np.abs(answer.onward), answer.onward)
+    plane = answer.along**2 + answer.across**2
     with np.errstate(invalid="ignore", divide="ignore"):
-        nearest = np.where(plane > 0, e * onward * given.along / plane, low).clip(low, high)
-    off = np.sqrt((nearest**2 + e * e) * given.across**2 + (e * onward - nearest * given.along) ** 2)
-    return _within(off, e * given.along + nearest * onward, np.hypot(e, nearest), _slack(bounds, some))
+        nearest = np.where(plane > 0, e * onward * answer.along / plane, low).clip(low, high)
+    off = np.sqrt((nearest**2 + e * e) * answer.across**2 + (e * onward - nearest * answer.along) ** 2)
+    return _within(off, e * answer.along + nearest * onward, np.hypot(e, nearest), _slack(bounds, some))
 
 
 def possible_tangent(b: Array, bounds: RayBounds, some: Index) -> Flags:
     """(M,) as `possible`, of vectors along the surface."""
-    given, incident = _components(b, bounds, some)
-    e, length = bounds.k[some] * incident.along, np.hypot(given.along, given.across)
+    answer, incident = _components(b, bounds, some)
+    e, length = bounds.k[some] * incident.along, np.hypot(answer.along, answer.across)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return _within(e * given.across / length, given.along, e, _slack(bounds, some))
+        return _within(e * answer.across / length, answer.along, e, _slack(bounds, some))
 
 
 def possible_mirror(b: Array, bounds: RayBounds, some: Index) -> Flags:
     """(M,) as `possible`, of mirror directions."""
-    given, incident = _components(b, bounds, some)
+    answer, incident = _components(b, bounds, some)
     e, back = incident.along, -incident.onward
-    off = np.sqrt(given.across**2 + (e * given.onward - back * given.along) ** 2)
-    return _within(off, e * given.along + back * given.onward, np.ones(len(some)), _slack(bounds, some, 1.0))
+    off = np.sqrt(answer.across**2 + (e * answer.onward - back * answer.along) ** 2)
+    return _within(off, e * answer.along + back * answer.onward, np.ones(len(some)), _slack(bounds, some, 1.0))
 
 
 def _within(off: Array, forward: Array, size: Array, slack: Array) -> Flags:

@@ -1,4 +1,4 @@
-"""Sets of incident rays for other programs' refraction, and the answers that come back.
+"""Sets of incident rays for other programs, and their answers.
 
 A set holds one or several regimes of `mi_refract.regimes`, rounded to float32 or float64. The same regimes, count,
 precision and seed give the same set, bit for bit. The ratio n_from / n_to is exact: n_to is a power of two, 1 where it
@@ -90,7 +90,7 @@ class Answers:
     """A program's answers: ids (N,), b (N, 3) float64, the column `transmitted` (N,) if there is one, the header.
 
     `transmitted`: of True and False, or of 1 and 0.
-    `n_ratio`: (N,) the n_from / n_to that the program used, if it says so.
+    `n_ratio`: (N,) the n_from / n_to that the program used, if it reports it.
     """
 
     ids: Ids
@@ -133,7 +133,7 @@ def make(
     """`count` rays of each regime in `names`, by default those of `default`. Normals face the ray unless `two_sided`.
 
     `media`: what `mi_refract.media` parses; each ray passes between one of them and air, at one of the `wavelengths` in
-    nm. ValueError, one line, for an unknown regime or precision, a regime given twice, no ray at all; of media see
+    nm. ValueError, one line, for an unknown regime or precision, a duplicate regime, no ray at all; of media see
     `media_rays.header_of` and `media_rays.check_regimes`.
     """
     from mi_refract import __version__

@@ -68,34 +68,35 @@ PROBLEM_TEXTS = {
 }
 
 
-def sentence(found: Findings) -> str:
+def sentence(findings: Findings) -> str:
     """The result in one line, such as "200 of 13000 answers are wrong: eta inverted"."""
-    others = found.problem_count("index")
-    return _directions(found) + (f"; {others} answers are for a different ratio of indices" if others else "")
+    others = findings.problem_count("index")
+    return _directions(findings) + (f"; {others} answers are for a different ratio of indices" if others else "")
 
 
-def _directions(found: Findings) -> str:
-    if not found.answered:
+def _directions(findings: Findings) -> str:
+    if not findings.answered:
         return "no ray was answered"
-    answers = f"{found.answered} answers"
-    if found.diagnosis:
-        return f"{found.wrong} of {answers} are wrong: {found.diagnosis.mistake}"
-    if found.exit_code > 1:
-        wrong = f"; {found.wrong} of them are wrong" if found.wrong else ""
+    answers = f"{findings.answered} answers"
+    if findings.diagnosis:
+        return f"{findings.wrong} of {answers} are wrong: {findings.diagnosis.mistake}"
+    if findings.exit_code > 1:
+        wrong = f"; {findings.wrong} of them are wrong" if findings.wrong else ""
         return f"{answers}, but they do not match the rays{wrong}"
-    if found.wrong or found.tir == UNCLEAR:
-        return f"{found.wrong} of {answers} are wrong"
-    if not found.total("judged"):
-        return f"{answers}, none of them a {'decidable ' if found.total('compared') else ''}direction"
-    if found.total("exact") == found.answered:
+    if findings.wrong or findings.tir == UNCLEAR:
+        return f"{findings.wrong} of {answers} are wrong"
+    if not findings.total("judged"):
+        return f"{answers}, none of them a {'decidable ' if findings.total('compared') else ''}direction"
+    if findings.total("exact") == findings.answered:
         return f"{answers}, all exact up to rounding"
-    worst = f"the largest error is {compact(found.farthest.worst)} rad ({found.farthest.regime})"
-    wide = found.total("undecidable")
+    farthest = max(findings.regimes, key=lambda x: (x.compared > 0, x.worst))
+    worst = f"the largest error is {compact(farthest.worst)} rad ({farthest.regime})"
+    wide = findings.total("undecidable")
     undecidable = f"; {wide} rays are undecidable (error bound above 0.1 rad)" if wide else ""
-    if found.right == found.answered:
+    if findings.right == findings.answered:
         return f"{answers}, all right; {worst}"
-    others = f"the others are within the error bound of the formula {found.error_bound}"
-    return f"{found.right} of {answers} are right, {others}; {worst}{undecidable}"
+    others = f"the others are within the error bound of the formula {findings.error_bound}"
+    return f"{findings.right} of {answers} are right, {others}; {worst}{undecidable}"
 
 
 def problem_text(problem: Problem) -> str:
@@ -103,32 +104,32 @@ def problem_text(problem: Problem) -> str:
     return f"{PROBLEM_TEXTS[problem.kind].format(problem.count)}: {problem.text}"
 
 
-def signal(found: Findings) -> str:
+def signal(findings: Findings) -> str:
     """How the answers signal total internal reflection, in one line."""
-    return SIGNALS[found.tir] + ("" if found.tir_given or found.tir in (NONE, UNCLEAR) else " (detected)")
+    return SIGNALS[findings.tir] + ("" if findings.tir_given or findings.tir in (NONE, UNCLEAR) else " (detected)")
 
 
-def ratio(found: Findings) -> list[str]:
+def ratio(findings: Findings) -> list[str]:
     """A line: how far the ratio that the program used is from that of the ray. None where answers have no `n_ratio`."""
-    if not found.ratio:
+    if not findings.ratio:
         return []
-    which = f"id {found.ratio.id}" + (f", {found.ratio.ray}" if found.ratio.ray else "")
-    text = f"n_ratio: the largest relative difference to n_from / n_to is {compact(found.ratio.largest)} ({which})"
-    return [f"{text}; up to {compact(found.ratio.tolerance)} counts as equal. Directions are judged for n_ratio"]
+    which = f"id {findings.ratio.id}" + (f", {findings.ratio.ray}" if findings.ratio.ray else "")
+    text = f"n_ratio: the largest relative difference to n_from / n_to is {compact(findings.ratio.largest)} ({which})"
+    return [f"{text}; up to {compact(findings.ratio.tolerance)} counts as equal. Directions are judged for n_ratio"]
 
 
-def explained(found: Findings) -> list[str]:
+def explained(findings: Findings) -> list[str]:
     """The mistakes that explain the answers, a line each; where none does, a line that says so, and the nearest one."""
 
     def line(mistake: Explanation) -> str:
         share = f"{mistake.share:.1%} of the answers on which it has an effect"
         return f"{mistake.mistake}: {mistake.text} ({share})"
 
-    certain = [line(mistake) for mistake in found.explanations if mistake.explains]
+    certain = [line(mistake) for mistake in findings.explanations if mistake.explains]
     # Answers that do not match may be to other rays: then no mistake can be named.
-    if certain or not found.explanations or found.exit_code > 1:
+    if certain or not findings.explanations or findings.exit_code > 1:
         return certain
-    nearest = max(found.explanations, key=lambda mistake: mistake.share)
+    nearest = max(findings.explanations, key=lambda mistake: mistake.share)
     return ["none of the usual mistakes explains the answers", *([line(nearest)] if nearest.share > 0 else [])]
 
 
@@ -163,82 +164,82 @@ def cells(errors: RegimeErrors, ulp: float) -> dict[str, str]:
     }
 
 
-def table(found: Findings) -> RenderableType:
+def table(findings: Findings) -> RenderableType:
     """The regimes, the problems of the set, the diagnosis and the sentence, for rich's console."""
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
 
-    notes = [*map(problem_text, found.problems), *ratio(found), signal(found), *explained(found)]
-    notes += [MEANING] if found.right > 0 and not found.wrong else []
-    lines = [Text(printable(line)) for line in (*notes, sentence(found))]
-    if not found.regimes:
+    notes = [*map(problem_text, findings.problems), *ratio(findings), signal(findings), *explained(findings)]
+    notes += [MEANING] if findings.right > 0 and not findings.wrong else []
+    lines = [Text(printable(line)) for line in (*notes, sentence(findings))]
+    if not findings.regimes:
         return Group(*lines)
-    rows = Table("", "regime", *cells(found.regimes[0], found.ulp), box=None, pad_edge=False)
+    rows = Table("", "regime", *cells(findings.regimes[0], findings.ulp), box=None, pad_edge=False)
     for column in rows.columns[2:]:
         column.justify = "right"
-    for errors in found.regimes:
+    for errors in findings.regimes:
         word = Text(grade(errors), style=STYLES[grade(errors)])
-        rows.add_row(word, Text(printable(errors.regime)), *cells(errors, found.ulp).values())
+        rows.add_row(word, Text(printable(errors.regime)), *cells(errors, findings.ulp).values())
     return Group(rows, *lines)
 
 
 # Files -------------------------------------------------------------------------------------------------------------
 
 
-def as_data(found: Findings) -> dict[str, Any]:
+def as_data(findings: Findings) -> dict[str, Any]:
     """`{"schema": 1, "exit_code", "sentence", "precision", …, "regimes": [...], "explanations": [...]}`."""
-    diagnosis = found.diagnosis
-    regimes = [dataclasses.asdict(each) | {"worst_ulps": each.worst / found.ulp} for each in found.regimes]
+    diagnosis = findings.diagnosis
+    regimes = [dataclasses.asdict(x) | {"worst_ulps": x.worst / findings.ulp} for x in findings.regimes]
     return {
         "schema": SCHEMA,
-        "exit_code": found.exit_code,
-        "sentence": sentence(found),
-        "precision": found.precision,
-        "ulp": found.ulp,
-        "error_bound": found.error_bound,
-        "total_internal_reflection": {"signal": found.tir, "detected": not found.tir_given},
-        "answered": found.answered,
-        "wrong": found.wrong,
-        "right": found.right,
-        "problems": [dataclasses.asdict(each) for each in found.problems],
+        "exit_code": findings.exit_code,
+        "sentence": sentence(findings),
+        "precision": findings.precision,
+        "ulp": findings.ulp,
+        "error_bound": findings.error_bound,
+        "total_internal_reflection": {"signal": findings.tir, "detected": not findings.tir_given},
+        "answered": findings.answered,
+        "wrong": findings.wrong,
+        "right": findings.right,
+        "problems": [dataclasses.asdict(x) for x in findings.problems],
         "regimes": regimes,
         "diagnosis": diagnosis.mistake if diagnosis else None,
-        "explanations": [dataclasses.asdict(each) for each in found.explanations],
-        "rays": found.header,
-        **({"n_ratio": dataclasses.asdict(found.ratio)} if found.ratio else {}),
+        "explanations": [dataclasses.asdict(x) for x in findings.explanations],
+        "rays": findings.header,
+        **({"n_ratio": dataclasses.asdict(findings.ratio)} if findings.ratio else {}),
     }
 
 
-def write_json(path: str | Path, found: Findings) -> None:
+def write_json(path: str | Path, findings: Findings) -> None:
     """Write `as_data` as strict JSON: NaN and the infinities become words. OSError where that fails."""
-    write_atomically(path, json.dumps(strict(as_data(found)), indent=1, allow_nan=False) + "\n")
+    write_atomically(path, json.dumps(strict(as_data(findings)), indent=1, allow_nan=False) + "\n")
 
 
-def write_junit(path: str | Path, found: Findings, name: str) -> None:
+def write_junit(path: str | Path, findings: Findings, name: str) -> None:
     """One test case per regime, and one for the set of answers: an error where they do not match the rays."""
     answers = junit.Case("answers", "complete and understood")
-    if not found.answered or found.problems or found.tir == UNCLEAR:
-        lines = [*map(problem_text, found.problems), *ratio(found), signal(found)]
-        outcome: Literal["error", "failure"] = "error" if found.exit_code == 2 else "failure"
+    if not findings.answered or findings.problems or findings.tir == UNCLEAR:
+        lines = [*map(problem_text, findings.problems), *ratio(findings), signal(findings)]
+        outcome: Literal["error", "failure"] = "error" if findings.exit_code == 2 else "failure"
         answers = junit.Case(answers.group, answers.name, outcome, lines[0], lines)
     cases = [answers]
-    for errors in found.regimes:
+    for errors in findings.regimes:
         case = junit.Case("rays", errors.regime)
         if errors.wrong:
             wrong = f"{errors.wrong} of {errors.rays} answers are wrong"
-            numbers = [f"{key} {text}" for key, text in cells(errors, found.ulp).items()]
-            lines = [wrong, *explained(found), *numbers, json.dumps(strict(errors.replay))]
+            numbers = [f"{key} {text}" for key, text in cells(errors, findings.ulp).items()]
+            lines = [wrong, *explained(findings), *numbers, json.dumps(strict(errors.replay))]
             case = junit.Case("rays", errors.regime, "failure", wrong, lines)
         cases.append(case)
     junit.write_junit(path, "mi-refract rays", {name: cases})
 
 
-def write_html(path: str | Path, found: Findings, context: Mapping[str, Any], replay: str = "") -> None:
+def write_html(path: str | Path, findings: Findings, context: Mapping[str, Any], replay: str = "") -> None:
     """Write the HTML page. `context` is shown on top; `replay` is the command that repeats the check. OSError."""
     rows = []
-    for errors in found.regimes:
-        shown = cells(errors, found.ulp)
+    for errors in findings.regimes:
+        shown = cells(errors, findings.ulp)
         failing = {"wrong": errors.wrong, "TIR beyond bound": errors.tir_beyond_bound}
         failing["error / bound"] = errors.error_over_bound > 1
         states = {name: "fail" for name, fails in failing.items() if fails}
@@ -251,23 +252,23 @@ def write_html(path: str | Path, found: Findings, context: Mapping[str, Any], re
                 "replay": json.dumps(strict(errors.replay), indent=1),
             }
         )
-    noted = dict(zip(["ratio of indices"], ratio(found), strict=False))
+    noted = dict(zip(["ratio of indices"], ratio(findings), strict=False))
     content = {
         "title": "mi-refract rays",
-        "sentence": sentence(found),
-        "state": "fail" if found.exit_code else "pass",
+        "sentence": sentence(findings),
+        "state": "fail" if findings.exit_code else "pass",
         "counts": [
-            ("pass", "right", found.right),
-            ("info", "within the error bound only", found.answered - found.right - found.wrong),
-            ("fail", "wrong", found.wrong),
+            ("pass", "right", findings.right),
+            ("info", "within the error bound only", findings.answered - findings.right - findings.wrong),
+            ("fail", "wrong", findings.wrong),
         ],
-        "context": {"precision": found.precision, "error bound": found.error_bound, **context, **noted},
-        "problems": [problem_text(each) for each in found.problems],
-        "signal": signal(found),
-        "unclear": found.tir == UNCLEAR,
-        "explained": explained(found),
-        "explanations": found.explanations,
-        "head": list(cells(found.regimes[0], found.ulp)) if found.regimes else [],
+        "context": {"precision": findings.precision, "error bound": findings.error_bound, **context, **noted},
+        "problems": [problem_text(x) for x in findings.problems],
+        "signal": signal(findings),
+        "unclear": findings.tir == UNCLEAR,
+        "explained": explained(findings),
+        "explanations": findings.explanations,
+        "head": list(cells(findings.regimes[0], findings.ulp)) if findings.regimes else [],
         "rows": rows,
         "terms": TERMS,
         "pi": math.pi,

@@ -1,4 +1,4 @@
-"""A program's answers to a ray set: rays go to its stdin, answers come from its stdout, both as CSV."""
+"""A program's answers to a ray set: it reads rays from stdin and writes answers to stdout, both as CSV."""
 
 from __future__ import annotations
 

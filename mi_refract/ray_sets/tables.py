@@ -181,7 +181,7 @@ def _array_name(column: str) -> str:
 
 
 def _read_npz(path: Path, layouts: Sequence[Layout], most: int) -> Table:
-    """What is not asked for, or is larger than it may be, is not unpacked."""
+    """Other arrays, and those that are too large, are not unpacked."""
     largest = most * _NUMBER_BYTES * max(map(len, layouts)) + _NPZ_MORE_BYTES
     with regular_file.opened(path, largest) as stream:
         try:

@@ -84,7 +84,7 @@ DETECTORS: dict[str, Callable[[SeenAnswers], Flags]] = {
 
 
 def detect(pieces: Iterable[SeenAnswers]) -> str:
-    """The signal that the answers to totally reflected rays agree on, or NONE, or UNCLEAR; the rays come in pieces.
+    """The signal that the answers to totally reflected rays agree on, or NONE, or UNCLEAR. `pieces`: of one set.
 
     Where some rays are far beyond the critical angle, they decide alone.
     """

@@ -90,16 +90,13 @@ def tangential(rng: Generator, n: Array) -> Triple:
     product = np.cross(whole, v)
     x, y = rounded(normalised(rng.normal(size=(count, 2))), n.dtype).T
     turn, zero = rng.integers(0, 3, count), np.zeros(count)
-    flat_a, flat_n = (_turned(np.stack(c, axis=1), turn) for c in ((x, y, zero), (-y, x, zero)))
+    # Moved on cyclically by 0, 1 or 2 components.
+    order = (np.arange(3) - turn[:, None]) % 3
+    flat_a, flat_n = (np.take_along_axis(np.stack(c, 1), order, axis=1) for c in ((x, y, zero), (-y, x, zero)))
     flat = (rng.random(count) < 0.5) | ~product.any(axis=1)
     a, n = np.where(flat[:, None], flat_a, product), np.where(flat[:, None], flat_n, whole)
     _, k = mixed(rng, count, float(np.finfo(n.dtype).eps))
     return a * power_of_two(rng, count), n * power_of_two(rng, count), k
-
-
-def _turned(v: Array, turn: Index) -> Array:
-    """The components of every vector moved on cyclically by 0, 1 or 2."""
-    return np.take_along_axis(v, (np.arange(3) - turn[:, None]) % 3, axis=1)
 
 
 @functools.cache

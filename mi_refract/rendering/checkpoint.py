@@ -23,6 +23,7 @@ from mi_refract.io.errors import CheckpointError
 
 from .pass_sums import ARRAYS, PassSums, PassTree
 
+Identity = dict[str, Any]  # everything that the bits of a render depend on, by name
 FORMAT = 2
 # Seconds from the state of one checkpoint to that of the next, unless a pass takes longer. A kill loses as many, and
 # those in which the next one is written.
@@ -40,17 +41,15 @@ class Progress:
     """What a render has: `base`, an older image that it refines, the `tree` of its passes, and `rest`.
 
     `identity`: everything that the bits depend on. `rest`: the last pass, where it has fewer samples than the others.
-    `seconds`: of rendering; `machines`: where; `base_ended_by`: what ended the render of the base. `lock` is held
-    where any of it changes or is written.
+    `seconds`: of rendering; `machines`: where. `lock` is held where any of it changes or is written.
     """
 
-    identity: dict[str, Any]
+    identity: Identity
     tree: PassTree = field(default_factory=PassTree)
     base: PassSums | None = None
     rest: PassSums | None = None
     seconds: float = 0.0
     machines: set[str] = field(default_factory=set)
-    base_ended_by: str = ""
     lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     @property
@@ -117,7 +116,7 @@ def write(path: Path, progress: Progress) -> None:
         np.savez(file, **arrays)
 
 
-def read(path: Path, identity: dict[str, Any]) -> Progress:
+def read(path: Path, identity: Identity) -> Progress:
     """The progress that a file holds. CheckpointError for a damaged file, and for one of a render of another identity.
 
     OSError where the file cannot be opened.
@@ -147,7 +146,7 @@ def read(path: Path, identity: dict[str, Any]) -> Progress:
     return progress
 
 
-def changes(before: dict[str, Any], now: dict[str, Any]) -> str:
+def changes(before: Identity, now: Identity) -> str:
     """What differs between two identities, but for the size of passes, by name; "" where nothing does."""
     texts = []
     for name in {**before, **now}.keys() - {PASS}:

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-from mi_refract import backend
 from mi_refract.cluster import on_worker
 from mi_refract.cluster.connection import cluster_errors
 from mi_refract.cluster.spread import fetched, finished
@@ -67,13 +66,10 @@ def render_node(bundle: SceneBundle, variant: str, seed: int, level: int, first:
     `seed`: of the render. Errors: those of `load_scene` and of the scene itself, with the paths of the machine that
     made the bundle.
     """
-    address, threads, folder = on_worker.address(), on_worker.threads(), on_worker.scratch_folder()
+    address, folder = on_worker.address(), on_worker.scratch_folder()
 
     def rendered() -> Part:
         began, bad = time.monotonic(), [0]
-        if on_worker.variant() != variant:
-            backend.activate(variant)
-        on_worker.limit_threads(threads)
         scene, root = scene_bundle.load(bundle, variant, folder)
         renderer = pass_renderer(scene, seed)
 
@@ -92,7 +88,7 @@ def render_node(bundle: SceneBundle, variant: str, seed: int, level: int, first:
             sums = made(level, first)
         return Part(sums, {address: max(bad)}, time.monotonic() - began)
 
-    return on_worker.one_at_a_time(rendered)
+    return on_worker.in_variant(variant, rendered)
 
 
 def fold(*parts: Part) -> Part:
@@ -122,7 +118,7 @@ class _Node:
 
     @property
     def stop(self) -> int:
-        return self.first + ARITY**self.level
+        return self.first + int(ARITY**self.level)
 
 
 class ClusterPasses:

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import mitsuba as mi
 import numpy as np
@@ -30,8 +30,8 @@ from mi_refract.numerics import Scene
 from mi_refract.plugins.scene_parser import ParsedScene
 
 from . import checkpoint, error_estimate, rendered_file
-from .checkpoint import PASS, CheckpointWriter, Progress
-from .end_conditions import NO_NOISE, Limits, reached
+from .checkpoint import PASS, CheckpointWriter, Identity, Progress
+from .end_conditions import Limits, reached
 from .pass_plan import PassPlan, next_stop, plan_passes
 from .pass_sums import PassSums
 from .render_pass import PassRenderer, pass_renderer
@@ -118,7 +118,7 @@ def resume(
     return LongRender(job, path, limits, parsed, scene, renderer, spp, chosen, progress)
 
 
-def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> dict[str, Any]:
+def _identity(job: Job, parsed: ParsedScene, renderer: PassRenderer) -> Identity:
     """Everything that the bits of a render depend on, by names for messages; but for PASS, which its plan says."""
     digest = hashlib.sha256()
     for name, path in [*(("", xml) for xml in parsed.xml), *parsed.files(job.allow_plugins).items()]:
@@ -212,7 +212,15 @@ class LongRender:
         self.checkpoints.wait()
         total = progress.sums()
         assert total is not None
-        header = rendered_file.header(progress, total, self._metadata(), self.ended_by)
+        metadata = {
+            "mi_refract:variant": str(mi.variant()),
+            "mi_refract:seed": self.job.seed,
+            "mi_refract:scene": str(self.job.scene),
+            "mi_refract:defines": json.dumps(dict(self.job.defines), sort_keys=True),
+            "mi_refract:formulas": ", ".join(formulas_in(self.scene)) or "none",
+        }
+        metadata |= provenance() | self.renderer.filter_header
+        header = rendered_file.header(progress, total, metadata, self.ended_by)
         if not nothing_new:
             rendered_file.write(self.output, self.renderer.channels, total, header)
         self.checkpoints.path.unlink(missing_ok=True)
@@ -221,8 +229,6 @@ class LongRender:
     def end(self) -> str:
         """What ends the render with what it has; "" where passes are left to render."""
         progress, full = self.progress, self.plan.full_passes
-        if progress.base_ended_by == NO_NOISE:
-            return NO_NOISE
         passes = progress.passes
         if passes == 1 or (passes and next_stop(passes - 1) == passes):
             sums = progress.sums()
@@ -267,16 +273,6 @@ class LongRender:
         """What changes when another render writes the image or the checkpoint."""
         paths = (self.output, self.checkpoints.path)
         return [(s.st_ino, s.st_mtime_ns) if path.exists() and (s := path.stat()) else None for path in paths]
-
-    def _metadata(self) -> Metadata:
-        own = {
-            "mi_refract:variant": str(mi.variant()),
-            "mi_refract:seed": self.job.seed,
-            "mi_refract:scene": str(self.job.scene),
-            "mi_refract:defines": json.dumps(dict(self.job.defines), sort_keys=True),
-            "mi_refract:formulas": ", ".join(formulas_in(self.scene)) or "none",
-        }
-        return provenance() | own | self.renderer.filter_header
 
 
 def render_to_exr(

@@ -77,34 +77,31 @@ class PassSums:
         (Chan et al. 1979), and exactly 0 where all samples are equal.
         """
         channels, count = self.total.shape[-1], 1 / self.spp + 1 / other.spp
-        a, b, c, d = (each.reshape(-1, channels) for each in (self.total, self.between, other.total, other.between))
+        a, b, c, d = (x.reshape(-1, channels) for x in (self.total, self.between, other.total, other.between))
         growth, known, rows = 0.0, 0, max(1, _PIECE // channels)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             for i in range(0, len(a), rows):
                 piece = slice(i, i + rows)
                 u, v = self._weights_of(piece), other._weights_of(piece)
+                both: Any = u + v
+                if isinstance(both, np.ndarray):
+                    both[both == 0] = 1  # no sample has reached such a pixel, and its totals are 0 as well
                 apart = a[piece] * v
                 apart -= c[piece] * u
-                apart /= _not_zero(u + v)
+                apart /= both
                 apart *= apart
                 apart *= count
                 b[piece] += d[piece]
                 b[piece] += apart
                 a[piece] += c[piece]
-                more, of = _finite_sum(apart[:, : self.colours])
-                growth, known = growth + more, known + of
+                colours = apart[:, : self.colours]
+                if not np.isfinite(total := float(colours.sum())):
+                    colours = colours[np.isfinite(colours)]
+                    total = float(colours.sum())
+                growth, known = growth + total, known + colours.size
         self.contrasts = [*self.contrasts, *other.contrasts, growth / known if known else np.nan]
-        self._add_counts(other)
-
-    def _weights_of(self, piece: slice) -> Any:
-        """Of some pixels, once for each channel; one number where it is that of all."""
-        if self.weights is None:
-            return float(self.spp)
-        return np.repeat(self.weights.reshape(-1, 1)[piece], self.total.shape[-1], 1)
-
-    def _add_counts(self, other: PassSums) -> None:
         if self.weights is not None or other.weights is not None:  # one of them may come from a finished image
-            ours, theirs = (each.spp if each.weights is None else each.weights for each in (self, other))
+            ours, theirs = (x.spp if x.weights is None else x.weights for x in (self, other))
             self.weights = np.asarray(ours + theirs)
         self.passes += other.passes
         self.spp += other.spp
@@ -113,20 +110,11 @@ class PassSums:
         else:
             self.within = self.within + other.within
 
-
-def _finite_sum(values: Doubles) -> tuple[float, int]:
-    """Of the values that are finite: their sum and number."""
-    if np.isfinite(total := float(values.sum())):
-        return total, values.size
-    finite = np.isfinite(values)
-    return float(values[finite].sum()), int(finite.sum())
-
-
-def _not_zero(weights: Any) -> Any:
-    """1 in place of 0: no sample has reached such a pixel, and its totals are 0 as well."""
-    if isinstance(weights, np.ndarray):
-        weights[weights == 0] = 1
-    return weights
+    def _weights_of(self, piece: slice) -> Any:
+        """Of some pixels, once for each channel; one number where it is that of all."""
+        if self.weights is None:
+            return float(self.spp)
+        return np.repeat(self.weights.reshape(-1, 1)[piece], self.total.shape[-1], 1)
 
 
 class PassTree:
@@ -147,31 +135,25 @@ class PassTree:
             while len(self.levels) <= level:
                 self.levels.append(None)
                 self.counts.append(0)
-            if (sums := self.levels[level]) is None:
-                self.levels[level] = node
-            else:
+            if (sums := self.levels[level]) is not None:
                 sums.add(node)
+                node = sums
             self.counts[level] += 1
             if self.counts[level] < ARITY:
+                self.levels[level] = node
                 return
-            node, self.levels[level], self.counts[level] = self._taken(level), None, 0
+            self.levels[level], self.counts[level] = None, 0
             level += 1
-
-    def _taken(self, level: int) -> PassSums:
-        sums = self.levels[level]
-        assert sums is not None
-        return sums
 
     def sums(self) -> PassSums | None:
         """The sums of all passes, in memory of their own; None without passes."""
-        found: PassSums | None = None
+        total: PassSums | None = None
         for sums in reversed(self.levels):
-            if sums is not None:
-                if found is None:
-                    found = sums.copy()
-                else:
-                    found.add(sums)
-        return found
+            if sums is not None and total is not None:
+                total.add(sums)
+            elif sums is not None:
+                total = sums.copy()
+        return total
 
 
 def aligned_nodes(first: int, stop: int, largest: int) -> list[tuple[int, int]]:

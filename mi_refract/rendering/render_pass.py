@@ -13,17 +13,20 @@ import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from mi_refract.io.image_file import Metadata
+from mi_refract.numerics import Scene, Spectrum
 
 from .pass_plan import FEW, scalar_seed_of, seed_of
 from .pass_sums import Doubles, PassSums
-from .sample_sums import Film, image_sums
+from .sample_sums import Film, Filter, image_sums
+
+MitsubaFilm: TypeAlias = Any  # an `mi.Film`
 
 # One thread would be the caller's own, which keeps denormals: the others take them for 0, and bits would differ.
 LEAST_THREADS = 2
@@ -35,7 +38,7 @@ COLOURS = ("R", "G", "B", "X", "Y", "Z")
 class PassRenderer:
     """A scene, the seed of its render, and what its first sensor's film holds; of the present variant."""
 
-    scene: Any
+    scene: Scene
     seed: int
     channels: tuple[str, ...]
     moments: bool  # whether samples can be kept: then second moments are known, too
@@ -73,25 +76,20 @@ class PassRenderer:
             sampler.set_sample_count(spp)
         return int(sampler.sample_count())
 
-    def _seed_without_samples(self, number: int) -> int:
-        if dr.is_jit_v(mi.Float):
-            return seed_of(self.seed, number)
-        film = self.scene.sensors()[0].film()
-        border = 2 * film.rfilter().border_size() if film.sample_border() else 0
-        width, height = self.size
-        return scalar_seed_of(self.seed, number, (width + border) * (height + border))
-
     def render(self, number: int, spp: int) -> PassSums:
         """Pass `number`. The scene's own errors pass; InterruptedError where Mitsuba stopped before the last sample."""
-        within = None
+        within, film = None, self.scene.sensors()[0].film()
         with _quiet():
             if self.moments:
                 squares = number < FEW - 1  # more passes say it better
-                total, weights, within = _sums(
-                    self.scene, self.channels, spp, seed_of(self.seed, number), squares=squares
-                )
+                seed = seed_of(self.seed, number)
+                total, weights, within = _sums(self.scene, self.channels, spp, seed, squares=squares)
+            elif dr.is_jit_v(mi.Float):
+                total, weights = _rendered(self.scene, spp, seed_of(self.seed, number))
             else:
-                total, weights = _rendered(self.scene, spp, self._seed_without_samples(number))
+                border = 2 * film.rfilter().border_size() if film.sample_border() else 0
+                pixels = (self.size[0] + border) * (self.size[1] + border)
+                total, weights = _rendered(self.scene, spp, scalar_seed_of(self.seed, number, pixels))
         if self.expected is None or weights is None:
             return PassSums(spp, 1, total, np.zeros_like(total), within, colours=self.colours)
         total, weights = total / self.expected, weights / self.expected
@@ -99,15 +97,19 @@ class PassRenderer:
         return PassSums(spp, 1, total, np.zeros_like(total), within, weights, colours=self.colours)
 
 
-def pass_renderer(scene: Any, seed: int) -> PassRenderer:
+def pass_renderer(scene: Scene, seed: int) -> PassRenderer:
     """How to render the passes of a loaded scene, with its first sensor."""
     film, integrator = scene.sensors()[0].film(), scene.integrator()
     film.prepare(integrator.aov_names())
     channels = tuple(str(field.name) for field in film.bitmap().struct_())
-    return PassRenderer(scene, seed, channels, _keeps_samples(scene), expected=_expected_weights(film))
+    # Samples can be kept where the integrator only gives samples, and the film only takes them.
+    plain = type(integrator).render is mi.SamplingIntegrator.render or hasattr(integrator, "begin_render")
+    special = film.sample_border() or mi.has_flag(film.flags(), mi.FilmFlags.Special)
+    keeps = dr.is_jit_v(mi.Float) and isinstance(integrator, mi.SamplingIntegrator) and plain and not special
+    return PassRenderer(scene, seed, channels, keeps, expected=_expected_weights(film))
 
 
-def _expected_weights(film: Any) -> Doubles | None:
+def _expected_weights(film: MitsubaFilm) -> Doubles | None:
     """∫ w over all places of samples, for each pixel, H × W × 1; None for a box. Filters are products of two in 1D."""
     rfilter = film.rfilter()
     if rfilter.is_box_filter():
@@ -125,20 +127,12 @@ def _expected_weights(film: Any) -> Doubles | None:
     return np.asarray(along(height)[:, None, None] * along(width)[:, None])
 
 
-def _weights(rfilter: Any) -> Doubles:
+def _weights(rfilter: Filter) -> Doubles:
     """The weights in one dimension, at STEPs from −radius to radius."""
     half = math.ceil(rfilter.radius() / STEP)
     places = (np.arange(-half, half) + 0.5) * STEP
     found = rfilter.eval(mi.Float(places)) if dr.is_jit_v(mi.Float) else [rfilter.eval(place) for place in places]
     return np.where(np.abs(places) <= rfilter.radius(), np.array(found, np.float64), 0)
-
-
-def _keeps_samples(scene: Any) -> bool:
-    """Whether `_pixels` can render the scene: its integrator only gives samples, and its film only takes them."""
-    film, integrator = scene.sensors()[0].film(), scene.integrator()
-    plain = type(integrator).render is mi.SamplingIntegrator.render or hasattr(integrator, "begin_render")
-    special = film.sample_border() or mi.has_flag(film.flags(), mi.FilmFlags.Special)
-    return dr.is_jit_v(mi.Float) and isinstance(integrator, mi.SamplingIntegrator) and plain and not special
 
 
 @contextlib.contextmanager
@@ -153,7 +147,7 @@ def _quiet() -> Iterator[None]:
         logger.set_log_level(before)
 
 
-def _rendered(scene: Any, spp: int, seed: int) -> tuple[Doubles, Doubles | None]:
+def _rendered(scene: Scene, spp: int, seed: int) -> tuple[Doubles, Doubles | None]:
     """`total` and `weights` by `mi.render`; by one thread where it would add in the order of threads."""
     film = scene.sensors()[0].film()
     box = film.rfilter().is_box_filter()
@@ -189,12 +183,11 @@ def _set_threads(count: int) -> None:
 
 
 def _sums(
-    scene: Any, channels: tuple[str, ...], spp: int, seed: int, *, squares: bool
+    scene: Scene, channels: tuple[str, ...], spp: int, seed: int, *, squares: bool
 ) -> tuple[Doubles, Doubles | None, Doubles | None]:
-    """What `image_sums` gives, of samples with this seed."""
-    sensors_film = scene.sensors()[0].film()
-    rfilter = sensors_film.rfilter()
-    width, height = (int(n) for n in sensors_film.crop_size())
+    """`image_sums` of samples with this seed."""
+    rfilter = scene.sensors()[0].film().rfilter()
+    width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
     film = Film(width, height, spp, None if rfilter.is_box_filter() else rfilter)
     if dr.thread_count() < LEAST_THREADS:
         dr.set_thread_count(LEAST_THREADS)
@@ -205,7 +198,7 @@ def _sums(
     return found
 
 
-def _samples(scene: Any, channels: tuple[str, ...], spp: int, seed: int) -> tuple[list[Any], Any]:
+def _samples(scene: Scene, channels: tuple[str, ...], spp: int, seed: int) -> tuple[list[Any], Any]:
     """The values of all samples by channels, those of a pixel in a row, and their places on the film."""
     from mitsuba.ad.integrators.common import ADIntegrator  # there is none in scalar variants
 
@@ -225,7 +218,7 @@ def _samples(scene: Any, channels: tuple[str, ...], spp: int, seed: int) -> tupl
     return values, mi.Point2f(place) - mi.Point2f(sensor.film().crop_offset())
 
 
-def _colours(channels: tuple[str, ...], radiance: Any, wavelengths: Any) -> list[Any]:
+def _colours(channels: tuple[str, ...], radiance: Spectrum, wavelengths: Spectrum) -> list[Any]:
     """What the film makes of a sample's spectrum: R, G, B, or X, Y, Z, or Y."""
     if mi.is_spectral:
         rgb = mi.spectrum_to_srgb(radiance, wavelengths)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mi_refract.io import image_file
 from mi_refract.io.image_file import Metadata, write_exr
 
-from .checkpoint import Progress, changes
+from .checkpoint import Identity, Progress, changes
 from .pass_plan import FEW
 from .pass_sums import PassSums
 
@@ -51,7 +50,7 @@ def nonfinite_pixels(sums: PassSums) -> int:
     return int((~np.isfinite(sums.total).all(-1)).sum())
 
 
-def read(output: Path, channels: tuple[str, ...], identity: dict[str, Any]) -> Progress | None:
+def read(output: Path, channels: tuple[str, ...], identity: Identity) -> Progress | None:
     """The finished render that a file holds, to be refined; None where there is none of this identity.
 
     Its sums are those of the file's float32.
@@ -63,7 +62,7 @@ def read(output: Path, channels: tuple[str, ...], identity: dict[str, Any]) -> P
         contrasts = [float(contrast) for contrast in json.loads(said["contrasts"])]
         machines = {name for name in str(said["machines"]).split(", ") if name}
         progress = Progress(identity, seconds=float(said["render_seconds"]), machines=machines)
-        progress.base_ended_by, variance_from = str(said["ended_by"]), said["variance_from"]
+        variance_from = said["variance_from"]
         if changes(json.loads(said["identity"]), identity) or not 1 <= passes <= spp or len(contrasts) != passes - 1:
             return None
         mean = image.select(channels).astype(np.float64)

@@ -7,13 +7,17 @@ pixel it takes in those of its neighbours, too, in several kernels.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mi_refract.numerics import Number, Point2
+
 from .pass_sums import Doubles
+
+Filter: TypeAlias = Any  # an `mi.ReconstructionFilter`, or None
 
 
 class Film:
@@ -22,14 +26,15 @@ class Film:
     No dataclass: Dr.Jit would take it for a part of a loop's state.
     """
 
-    def __init__(self, width: int, height: int, spp: int, rfilter: Any) -> None:
+    def __init__(self, width: int, height: int, spp: int, rfilter: Filter) -> None:
         """As above."""
         self.width, self.height, self.spp, self.rfilter = width, height, spp, rfilter
 
     @property
     def reach(self) -> int:
         """To how many pixels on each side."""
-        return math.ceil(self.rfilter.radius() - 0.5)
+        radius: float = self.rfilter.radius()
+        return math.ceil(radius - 0.5)
 
     def pixels(self) -> tuple[Any, Any]:
         """Their x and y."""
@@ -37,19 +42,19 @@ class Film:
         y = index // width
         return index - y * width, y
 
-    def at(self, x: Any, y: Any) -> tuple[Any, Any]:
+    def at(self, x: Number, y: Number) -> tuple[Any, Any]:
         """Whether there is a pixel x, y, and its number."""
         inside = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
         return inside, mi.UInt32(dr.select(inside, x + y * dr.opaque(mi.Int32, self.width), 0))
 
-    def weight(self, apart: Any) -> Any:
+    def weight(self, apart: Number) -> Any:
         """Of a sample so far from the middle of a pixel, along one axis."""
         near = dr.abs(apart) <= self.rfilter.radius()
         return dr.select(near, self.rfilter.eval(apart), 0)
 
 
 def image_sums(
-    values: list[Any], place: Any, film: Film, *, squares: bool
+    values: list[Number], place: Point2, film: Film, *, squares: bool
 ) -> tuple[Doubles, Doubles | None, Doubles | None]:
     """Σ w v of all pixels, H × W × C; Σ w, None under a box; for `squares` Σ (w (v − mean))² over the samples.
 
@@ -73,7 +78,7 @@ def image_sums(
     return total, others[0], others[1]
 
 
-def _box_sums(values: list[Any], film: Film, *, squares: bool) -> tuple[list[Any], list[Any]]:
+def _box_sums(values: list[Number], film: Film, *, squares: bool) -> tuple[list[Any], list[Any]]:
     """Of every pixel Σ v by channels; and for `squares` Σ (v − mean)², else nothing.
 
     Σ (v − mean)² = Σ d² − (Σ d)²/n of n samples, where d is the difference from the pixel's first: 0 if all are equal.
@@ -88,7 +93,9 @@ def _box_sums(values: list[Any], film: Film, *, squares: bool) -> tuple[list[Any
 
 
 @dr.syntax
-def _box_loop(values, first, film, step, squares):  # Dr.Jit rewrites it
+def _box_loop(
+    values: list[Number], first: list[Number], film: Film, step: int, squares: bool
+) -> tuple[list[Any], list[Any]]:
     """Σ v and Σ d² by channels. Where `step` samples in a row are read at once, it takes half the time."""
     pixels, steps = film.width * film.height, dr.opaque(mi.UInt32, film.spp // step)
     start = dr.arange(mi.UInt32, pixels) * steps
@@ -107,12 +114,12 @@ def _box_loop(values, first, film, step, squares):  # Dr.Jit rewrites it
     return totals, squared
 
 
-def _in_a_row(values: Any, index: Any, step: int, pixels: int) -> Any:
+def _in_a_row(values: Number, index: Number, step: int, pixels: int) -> Any:
     kind: Any = mi.ArrayXf
     return dr.gather(kind, values, index, shape=(step, pixels))
 
 
-def _weighted_sums(values: list[Any], place: Any, film: Film) -> list[Any]:
+def _weighted_sums(values: list[Number], place: Point2, film: Film) -> list[Any]:
     """Of every pixel Σ w v by channels, and Σ w, over the samples that reach it, always added in the same order.
 
     For each row of neighbours every pixel adds up its own samples with the weights that they have in each of them.
@@ -130,7 +137,7 @@ def _weighted_sums(values: list[Any], place: Any, film: Film) -> list[Any]:
 
 
 @dr.syntax
-def _own_samples(values, place, x, y, film):  # Dr.Jit rewrites it
+def _own_samples(values: list[Number], place: Point2, x: Number, y: Number, film: Film) -> list[list[Any]]:
     """Σ w v by channels, and Σ w, over the samples of each pixel, with their weights in the pixels of a row."""
     spp = dr.opaque(mi.UInt32, film.spp)
     first = dr.arange(mi.UInt32, film.width * film.height) * spp
@@ -150,7 +157,7 @@ def _own_samples(values, place, x, y, film):  # Dr.Jit rewrites it
 
 
 @dr.syntax
-def _squared_sums(values, place, means, film):  # Dr.Jit rewrites it
+def _squared_sums(values: list[Number], place: Point2, means: list[Number], film: Film) -> list[Any]:
     """Of every pixel Σ (z − z̄)², by channels, of z = w (v − mean) over the samples that reach it.
 
     z̄ is the mean over those that lie in one pixel: their number there is fixed, so that pixels are strata.

@@ -87,4 +87,5 @@ def test_a_comparison_imports_what_it_needs(pair, tmp_path, options):
         out, err = process.communicate(timeout=60)
     assert "2 images: " in out
     assert "'OpenImageIO'" in err
+    assert ("'msgspec'" in err) == bool(options)  # which reads settings
     assert not [name for name in UNUSED if f"'{name}'" in err]

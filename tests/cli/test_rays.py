@@ -83,14 +83,6 @@ def test_the_backward_error_may_be_the_verdict(call):
     assert (code, err) == (2, "mi-refract: backward error 0; expected a positive number of roundings\n")
 
 
-def test_export_in_every_format_is_the_same_set(call):
-    for ending in ("csv", "npz", "exr"):
-        assert call("export", "--count", 5, "--two-sided", "-o", f"rays.{ending}")[0] == 0
-    found = [files.read(f"rays.{ending}") for ending in ("csv", "npz", "exr")]
-    assert len({each.header["checksum"] for each in found}) == 1
-    assert found[0].header["two_sided"] is True
-
-
 def test_the_regimes(call):
     code, out, err = call("export", "--regimes")
     assert (code, err) == (0, "")
@@ -98,15 +90,6 @@ def test_the_regimes(call):
     assert "only with --regime" in out
     assert call("export", "--regime", "k >> 1", "--count", 2, "-o", "rays.csv")[0] == 0
     assert set(files.read("rays.csv").regime) == {"k ≫ 1"}
-
-
-def test_wrong_answers(call):
-    to = ray_set.make(["generic"], 50)
-    files.write("rays.csv", to)
-    answer("answers.csv", to, lambda a, n, k: glsl(a, n, 1 / k))
-    code, out, err = call("check", "answers.csv", "--rays", "rays.csv")
-    assert (code, err) == (1, "")
-    assert out.splitlines()[-1] == "50 of 50 answers are wrong: eta inverted"
 
 
 def test_answers_do_not_choose_the_rays(call):
@@ -146,26 +129,6 @@ def test_invalid_answers(call, content, message):
     code, out, err = call("check", "answers.csv", "--rays", "rays.csv")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert err.startswith("mi-refract: ") and message in err
-
-
-def test_answers_that_are_not_those_to_the_rays(call):
-    to = ray_set.make(["generic"], 50)
-    files.write("rays.csv", to)
-    answer("answers.csv", to)
-    text = Path("answers.csv").read_text().splitlines()
-    Path("answers.csv").write_text("\n".join([*text[:41], text[5], "77,0,0,1"]))
-    code, out, err = call("check", "answers.csv", "--rays", "rays.csv", "--json", "out.json")
-    assert (code, err) == (2, "")
-    assert "10 without an answer: ids 40, 41, 42, 43, 44, …" in out
-    assert "1 answered more than once: id 4\n" in out
-    assert "1 answers to rays that are not in the set: id 77\n" in out
-    assert out.splitlines()[-1] == "40 answers, but they do not match the rays"
-    data = json.loads(Path("out.json").read_text())
-    assert [(each["kind"], each["count"]) for each in data["problems"]] == [
-        ("missing", 10),
-        ("duplicate", 1),
-        ("unknown", 1),
-    ]
 
 
 BAD_OPTIONS = {

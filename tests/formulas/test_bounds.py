@@ -118,42 +118,51 @@ def test_a_decision_far_from_the_critical_angle_is_held_against_the_subject(samp
     assert mirrored.radicand_needed.max() > 14
 
 
+def judged(a, k, answer, budget):
+    """The judgement of one ray on the z axis; `answer(a, exact)`: b, and whether it is transmitted."""
+    rays = regimes.Rays(np.array([a], float), np.array([[0.0, 0.0, 1.0]]), np.array([k], float))
+    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
+    return judge_formula(lambda a, n, k: answer(list(a), exact), rays, exact, list, budget)
+
+
+def crossed(a, exact):
+    """The exact direction on the wrong side of the surface."""
+    x, y, z = exact.direction[0].tolist()
+    return [x, y, -z], True
+
+
 @pytest.mark.parametrize("transmitted", [True, False])
 @pytest.mark.parametrize(("side", "cos_i", "held"), [(4.0, 2 * U, False), (4.0, 32 * U, True), (0.0, 2 * U, True)])
 def test_next_to_the_surface_either_side_is_right_where_the_side_is_open(side, cos_i, held, transmitted):
     """A ray into the denser medium that comes out on the wrong side, or is taken for a tangential one."""
-    rays = regimes.Rays(np.array([[1.0, 0.0, -cos_i]]), np.array([[0.0, 0.0, 1.0]]), np.array([0.5]))
-    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-    x, _, z = exact.direction[0]
-    crossed = ([float(x), 0.0, -float(z)] if transmitted else list(rays.a[0])), transmitted
-    found = judge_formula(lambda a, n, k: crossed, rays, exact, list, Budget(10, 14, 1, side=side))
+    answer = crossed if transmitted else lambda a, exact: (a, False)
+    found = judged((1, 0, -cos_i), 0.5, answer, Budget(10, 14, 1, side=side))
     assert found.wrong.tolist() == [held]
     assert found.crossed.tolist() == [transmitted and not held]
+
+
+@pytest.mark.parametrize("name", [name for name, formula in FORMULAS.items() if formula.budget.side])
+@pytest.mark.parametrize(("cos_i", "held"), [(3 * U, False), (12 * U, True)])
+def test_the_side_is_known_three_times_as_far_from_the_surface_as_it_need_not_be(name, cos_i, held):
+    """n·a by three products and two sums is off by 3 u of its terms, and by what rounding a and n costs: 4 u."""
+    assert judged((1, 0, -cos_i), 0.5, crossed, FORMULAS[name].budget).wrong.tolist() == [held]
 
 
 @pytest.mark.parametrize(("steps", "far"), [(0, False), (1, True), (-1, True)])
 def test_at_the_limit_a_decision_is_held_to_the_terms_of_the_radicand(steps, far):
     """sin θ = 4/5: critical at k = 5/4 exactly, and an ulp of k is 1e16 times more than what is left undecided."""
-    k = np.array([1.25 + steps * 2.0**-52])
-    rays = regimes.Rays(np.array([[4.0, 0.0, -3.0]]), np.array([[0.0, 0.0, 1.0]]), k)
-    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-    found = judge_formula(lambda a, n, k: (list(a), not exact.transmitted[0]), rays, exact, list, ROUNDING)
-    assert found.misjudged.tolist() == [True]
-    assert found.far.tolist() == [far]
+    found = judged((4, 0, -3), 1.25 + steps * 2.0**-52, lambda a, exact: (a, not exact.transmitted[0]), ROUNDING)
+    assert (found.misjudged.tolist(), found.far.tolist()) == ([True], [far])
 
 
 @pytest.mark.parametrize(("length", "bound"), [(1.0, 0.8724), (1 + 2.0**-52, 1.005), (3.0, 1.005)])
 def test_the_length_of_the_ray_itself_says_which_rounding_it_is_held_to(length, bound):
-    rays = regimes.Rays(np.array([[0.0, 0.0, -length]]), np.array([[0.0, 0.0, 1.0]]), np.array([1.5]))
-    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-    found = judge_formula(lambda a, n, k: (list(a), True), rays, exact, list, ROUNDING)
+    found = judged((0, 0, -length), 1.5, lambda a, exact: (a, True), ROUNDING)
     assert found.bounds.chord == pytest.approx(bound * U)
 
 
 def test_a_mirrored_ray_next_to_the_surface_has_not_crossed_it():
-    rays = regimes.Rays(np.array([[1.0, 0.0, -2 * U]]), np.array([[0.0, 0.0, 1.0]]), np.array([1.5]))
-    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-    found = judge_formula(lambda a, n, k: ([1.0, 0.0, 3 * U], False), rays, exact, list, cancelling(1))
+    found = judged((1, 0, -2 * U), 1.5, lambda a, exact: ([1.0, 0.0, 3 * U], False), cancelling(1))
     assert found.chord[0] > 0
     assert not found.wrong[0] and not found.crossed[0]
 
@@ -165,18 +174,6 @@ def test_a_ray_that_the_oracle_could_not_decide_breaks_the_budget():
     b, transmitted = exact.direction.astype(np.longdouble), exact.transmitted
     assert not judge(b, transmitted, RayBounds(rays, exact, ROUNDING, U)).wrong.any()
     assert np.flatnonzero(judge(b, transmitted, RayBounds(rays, unknown, ROUNDING, U)).wrong).tolist() == [7]
-
-
-@pytest.mark.parametrize("name", [name for name, formula in FORMULAS.items() if formula.budget.side])
-@pytest.mark.parametrize(("cos_i", "held"), [(3 * U, False), (12 * U, True)])
-def test_the_side_is_known_three_times_as_far_from_the_surface_as_it_need_not_be(name, cos_i, held):
-    """n·a by three products and two sums is off by 3 u of its terms, and by what rounding a and n costs: 4 u."""
-    rays = regimes.Rays(np.array([[1.0, 0.0, -cos_i]]), np.array([[0.0, 0.0, 1.0]]), np.array([0.5]))
-    exact = oracle.refract(rays.a, rays.n, rays.k, fresnel=False, progress=False)
-    x, _, z = exact.direction[0]
-    budget = FORMULAS[name].budget
-    found = judge_formula(lambda a, n, k: ([float(x), 0.0, -float(z)], True), rays, exact, list, budget)
-    assert found.wrong.tolist() == [held]
 
 
 @pytest.mark.parametrize("precision", [np.float32, np.float64])

@@ -168,28 +168,6 @@ def test_four_renders_are_split_and_three_are_not(monkeypatch):
     assert "null pairs, welch" not in three and three["renders"].verdict == "not run"
 
 
-def test_the_command_takes_a_folder_or_an_image_and_refuses_what_is_not_finite(tmp_path, run, monkeypatch):
-    monkeypatch.setattr(self_test.examine, "__defaults__", (2, 20))
-    for i, image in enumerate(renders(4)):
-        image_file.write_exr(tmp_path / f"{i}.exr", image)
-    code, out, _ = run("self-test", tmp_path)
-    assert code == 0
-    assert "every defect that had to be seen was seen" in out
-    code, out, _ = run("self-test", tmp_path / "0.exr")
-    assert code == 0
-    assert "–" in out  # no noise is known of one image: nothing for welch
-    monkeypatch.setattr(methods, "compare", lambda m, *sides: Comparison(m, Verdict.EQUAL, ""))
-    code, out, _ = run("self-test", tmp_path / "0.exr")
-    assert code == 1
-    assert "failed: " in out
-    image_file.write_exr(tmp_path / "bad.exr", np.full_like(IMAGE, np.nan))
-    code, _, err = run("self-test", tmp_path / "bad.exr")
-    assert code == 2 and "finite" in err
-    image_file.write_exr(tmp_path / "bad.exr", IMAGE[1:])
-    code, _, err = run("self-test", tmp_path)
-    assert code == 2 and "differ from" in err
-
-
 def test_a_method_that_takes_renders_is_asked_where_there_are_two_a_side():
     several = {name for name, method in methods.METHODS.items() if method.takes_renders}
     for count, asked in ((2, methods.METHODS.keys()), (1, methods.METHODS.keys() - several)):

@@ -166,8 +166,9 @@ def test_an_option_out_of_its_range_is_no_verdict(folders):
 # The file ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_readme_names_every_method_and_its_settings_are_accepted(load):
+def test_the_readme_names_every_method_and_key_and_its_settings_are_accepted(load):
     text = README.read_text("utf-8")
+    assert all(table in text for table in settings_file.reference().split("\n\n")[:2])
     assert all(f"| `{name}` |" in text for name in methods.METHODS)
     examples = [load(each) for each in re.findall("```toml\n(.*?)```", text, re.DOTALL)]
     assert [rule.error for chosen in examples for rule in chosen.rules if rule.error] == []

@@ -214,8 +214,8 @@ def lit(size, dot=1000.0, at=(7, 9), width=1, channel=slice(None)):
     return image(plain), image(spoilt)
 
 
-@pytest.mark.parametrize("size", [64, 71, 128, 256, 1024])
 @pytest.mark.parametrize("dot, channel", [(1000.0, slice(None)), (500.0, 1), (-500.0, 1)])
+@pytest.mark.parametrize("size", [64, 71, 256, 1024])
 def test_auto_sees_one_outrageous_pixel_at_any_size(size, dot, channel):
     """`tolerance` itself lets 0.02 % of the pixels be anything: from 71² on that is one."""
     plain, spoilt = lit(size, dot, channel=channel)

@@ -419,27 +419,25 @@ SIDES = {
 
 @pytest.mark.parametrize("light", RARE)
 @pytest.mark.parametrize("form", SIDES)
-@pytest.mark.parametrize("first", [0, 1])
-def test_rare_light_that_the_smaller_side_missed_is_no_difference(light, form, first):
+def test_rare_light_that_the_smaller_side_missed_is_no_difference(light, form):
     """At 0.1 % two or more alarms of 10 pairs have probability 4.5e-5, of any of these cases below 1e-3."""
     alarms = 0
     for seed in SEEDS:
         sides = SIDES[form](np.random.default_rng(seed), *RARE[light])
-        found = compare("auto", sides[first], sides[1 - first])
+        found = compare("auto", *(sides if seed % 2 else sides[::-1]))
         alarms += found.verdict is DIFFERENT
         assert found.verdict is not EQUAL
         assert found.verdict is DIFFERENT or found.reason.endswith("would decide")
     assert alarms <= 1
 
 
-@pytest.mark.parametrize("known_side", [0, 1])
-def test_rare_light_is_no_evidence_for_a_side_of_many_samples_that_does_not_know_its_noise(known_side):
+def test_rare_light_is_no_evidence_for_a_side_of_many_samples_that_does_not_know_its_noise():
     """The other one, of 16 samples, has seen a few of its events: all others are its own. Bound as above."""
     alarms = 0
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
         sides = [lit(rng, 16, 1.0, 1e-3), bare(lit(rng, 4096, 1.0, 1e-3))]
-        alarms += compare("auto", sides[known_side], sides[1 - known_side]).verdict is DIFFERENT
+        alarms += compare("auto", *(sides if seed % 2 else sides[::-1])).verdict is DIFFERENT
     assert alarms <= 1
 
 

@@ -157,6 +157,32 @@ def test_without_fresnel_only_fresnel_is_missing():
     assert not np.isnan(c.reflectance).any() and not np.isnan(c.amplitude_s).any()
 
 
+# Derivatives. -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("k", [0.7, 1.0, 1.4, 30.0])
+def test_derivatives_are_quotients_of_differences(k):
+    """Of transmitted and of totally reflected rays of any length, along a and along k; of R, which is even in k."""
+    (a, n, _), h = rays(30), 1e-6
+    along, along_k = np.random.default_rng(5).normal(size=a.shape), 0.3
+
+    def b(step):
+        moved = a + step * along
+        return oracle.refract(moved, n, k + step * along_k).direction * np.linalg.norm(moved, axis=1)[:, None]
+
+    certified = oracle.refract(a, n, k)
+    assert (~certified.transmitted).any() == (k > 1) and certified.transmitted.any() == (k < 30)
+    # Where the answer bends little within h.
+    far = (np.abs(oracle.relative_radicand(a, n, np.full(len(a), k))) > 0.01) & (certified.cos_i > 0.05)
+    exact = oracle.derivatives.derivative(a, n, k, along, along_k)
+    assert far.sum() > 20
+    np.testing.assert_allclose(exact[far], ((b(h) - b(-h)) / (2 * h))[far], rtol=1e-5, atol=1e-6)
+    cos_i = certified.cos_i[far]
+    slope = oracle.derivatives.derivative_of_powers(cos_i, k, np.full(len(cos_i), 0.2), along_k)
+    above, below = (oracle.fresnel(cos_i + step * 0.2, k + step * along_k).reflectance for step in (h, -h))
+    np.testing.assert_allclose(slope, (above - below) / (2 * h), rtol=1e-5, atol=1e-8)
+
+
 # Precision, progress, errors. -------------------------------------------------------------------------------
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +9,7 @@ import pytest
 
 from mi_refract import media
 from mi_refract.planar import light
-from mi_refract.planar.focal_points import groups
 from mi_refract.planar.light import Light, of_wavelengths
-from mi_refract.planar.path_tree import follow_scene
 from mi_refract.planar.scene_file import load
 
 SCENES = Path(__file__).parents[2] / "scenes" / "planar"
@@ -114,40 +111,3 @@ def test_daylight_has_the_powers_of_cie():
     """D65 at 450, 560 and 650 nm: 117.008, 100 and 80.0268."""
     powers = of_wavelengths([450, 560, 650], "D65").powers
     assert np.array(powers) / powers[1] == pytest.approx([1.17008, 1, 0.800268], rel=2e-5)
-
-
-# Scenes that ship -------------------------------------------------------------------------------------------------
-
-
-def test_the_achromat_has_a_focus_for_each_wavelength():
-    """Nearest at the d line, and farther on both sides."""
-    scene = load(SCENES / "achromat.toml")
-    found = {float(group.colour.split()[0]): group.spread.focus[0] for group in groups(scene, follow_scene(scene))}
-    assert len(found) == 6
-    nearest = min(found, key=found.get)
-    assert nearest == pytest.approx(587.562)
-    assert max(found.values()) - min(found.values()) < 0.3
-
-
-def test_between_both_bows_no_reflected_ray_goes():
-    """At 51° from the sun's counterpoint red ends at 42.4° in the primary and begins at 50.4° in the secondary."""
-    scene = load(SCENES / "double_rainbow.toml", [650.0])
-    (traced,) = follow_scene(scene)
-    once, twice = (traced.reflect == 2), (traced.reflect == 6)
-    x, y = traced.paths.directions[once | twice].T
-    angle = np.degrees(np.arctan2(np.abs(y), -x))  # from the way back to the sun
-    n = media.index("MATERIAL:water", 650.0) / media.LABORATORY_AIR.index(650.0)
-    edges = [bow(n, 1), bow(n, 2)]
-    assert edges == pytest.approx([42.4, 50.4], abs=0.4)
-    one, two = np.split(angle, [int(once.sum())])
-    assert one.max() == pytest.approx(edges[0], abs=0.01) and one.max() < edges[0] + 1e-9
-    assert two.min() == pytest.approx(edges[1], abs=0.05) and two.min() > edges[1] - 1e-9
-
-
-def bow(n, reflections):
-    """The angle of the bow from the way back to the sun, in degrees: cos²θ = (n² − 1)/(p(p + 2)), p reflections."""
-    theta = math.acos(math.sqrt((n * n - 1) / (reflections * (reflections + 2))))
-    deviation = 2 * (theta - math.asin(math.sin(theta) / n)) + reflections * (
-        math.pi - 2 * math.asin(math.sin(theta) / n)
-    )
-    return math.degrees(abs(math.pi - deviation % (2 * math.pi)))

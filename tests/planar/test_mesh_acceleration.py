@@ -16,27 +16,6 @@ def circle(count, n=1.5):
     return polygon(np.column_stack([np.cos(angle), np.sin(angle)]), n)
 
 
-def spikes(count=40):
-    """Wedges so sharp that both sides are within the margin of the strokes near the tip."""
-    angle = np.repeat(np.linspace(0, 2 * np.pi, count, endpoint=False), 2)
-    angle[1::2] += 1e-4 * np.arange(1, count + 1)
-    radius = np.tile([1.0, 0.2], count)
-    return polygon(np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]), 1.3)
-
-
-def tiles(count=6):
-    """Squares of as many media, in air: four of them meet at each inner corner."""
-    n = np.ones((count + 2, count + 2))
-    n[1:-1, 1:-1] = np.random.default_rng(4).uniform(1.1, 1.9, (count, count))
-    parts = []
-    for i in range(count + 1):
-        for j in range(count):
-            parts.append(((i, j), (i, j + 1), n[i, j + 1], n[i + 1, j + 1]))
-            parts.append(((j, i), (j + 1, i), n[j + 1, i + 1], n[j + 1, i]))
-    start, end, left, right = map(np.array, zip(*parts, strict=True))
-    return Segments(start / count * 2 - 1, end / count * 2 - 1, left, right)
-
-
 def lattice(count=5):
     """Squares cut in two along a diagonal, half of them of another medium than their other half, in air."""
     rng = np.random.default_rng(3)
@@ -135,12 +114,8 @@ CASES = {
     "circle, along segments": (circle(2000), along_segments(circle(2000))),
     "star": (star(300), anywhere),
     "star, at tips": (star(300), at_vertices(star(300))),
-    "tiles": (tiles(), anywhere),
-    "tiles, at corners": (tiles(), at_vertices(tiles())),
-    "tiles, along edges": (tiles(), along_segments(tiles())),
     "lattice, along its edges": (lattice(), within_segments(lattice())),
     "star, far away": (far(star(300)), across(far(star(300)))),
-    "spikes": (spikes(), at_vertices(spikes())),
     "slivers": (slivers(), across(slivers())),
 }
 

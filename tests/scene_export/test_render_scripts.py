@@ -58,25 +58,6 @@ def test_cycles_has_a_limit_of_bounces(tmp_path, monkeypatch):
     assert bpy.context.scene.render.threads_mode != "FIXED"
 
 
-def test_cycles_materials(tmp_path, monkeypatch):
-    bpy = fake_bpy.run(written("cycles", tmp_path / "new"), monkeypatch)
-    glass, diffuse, light = (bpy.data.materials.made[f"material{i}"] for i in range(3))
-    inputs = {}
-    for kind, made in (("BsdfGlass", glass), ("BsdfDiffuse", diffuse), ("Emission", light)):
-        assert made.use_nodes
-        node = made.node_tree.only(f"ShaderNode{kind}")
-        inputs[kind] = {key: each.default_value for key, each in node.inputs.items()}
-    assert inputs == {
-        "BsdfGlass": {"Color": (1, 1, 1, 1), "Roughness": 0, "IOR": 1.2},
-        "BsdfDiffuse": {"Color": (0.1, 0.2, 0.3, 1), "Roughness": 0},
-        "Emission": {"Color": (1, 2, 3, 1), "Strength": 1},
-    }
-    back = light.node_tree.only("ShaderNodeBsdfDiffuse")
-    assert back.inputs["Color"].default_value == (0, 0, 0, 1)
-    sky = bpy.context.scene.world.node_tree.only("ShaderNodeBackground")
-    assert sky.inputs["Color"].default_value == (0.5, 0.25, 1, 1)
-
-
 class Session:
     """A render that has ended when it was asked three times."""
 

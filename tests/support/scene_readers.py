@@ -269,8 +269,11 @@ def cycles(folder, monkeypatch):
         tree = material.node_tree
         surface, _ = tree.source(tree.only("ShaderNodeOutputMaterial"), "Surface")
         if surface.kind == "ShaderNodeBsdfGlass":
+            assert surface.inputs["Roughness"].default_value == 0
+            assert surface.inputs["Color"].default_value == (1, 1, 1, 1)
             found.indices[name] = surface.inputs["IOR"].default_value
         elif surface.kind == "ShaderNodeBsdfDiffuse":
+            assert surface.inputs["Roughness"].default_value == 0
             found.colours[name] = surface.inputs["Color"].default_value[:3]
         else:
             found.lights[name] = _cycles_light(tree, surface)

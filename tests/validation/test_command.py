@@ -144,9 +144,8 @@ def test_a_worker_sends_files_and_errors_as_they_are(monkeypatch, scalar_variant
 
     study = Study("s", "", "", {}, lambda c: [Task(f.__name__, functools.partial(f, c)) for f in (writes, fails)])
     monkeypatch.setattr(runner, "import_module", lambda name: types.SimpleNamespace(STUDY=study))
-    for name, value in {"threads": 1, "scratch_folder": None}.items():
-        monkeypatch.setattr(runner.on_worker, name, lambda value=value: value)
-    monkeypatch.setattr(runner.on_worker, "limit_threads", lambda threads: None)
+    monkeypatch.setattr(runner.on_worker, "scratch_folder", lambda: None)
+    monkeypatch.setattr(runner.on_worker, "in_variant", lambda variant, call: call())
     one = dataclasses.replace(ASKED, modules=("one",))
     outcome = runner.run_on_worker(one, "writes")
     assert outcome.files == {"images/a.exr": b"pixels"} and outcome.finished[0][0].images == {"test": "images/a.exr"}

@@ -39,72 +39,44 @@ def test_an_export_is_rendered_as_mitsuba_renders_the_scene(title, needs):
     assert row.verdict == "pass", (row.values, row.reason)
 
 
-def edited(target, name, pattern, new):
-    """The target's files with a change in one of them."""
-    make = write_files.TARGETS[target]
-
-    def files(plain):
-        made = make(plain)
-        text, count = re.subn(pattern, new, made[name].decode())
-        assert count, pattern
-        return made | {name: text.encode()}
-
-    return files
-
-
-def under_the_ground(target, direction_at):
-    """The target's files with a sky upside down."""
-    make = write_files.TARGETS[target]
-    return lambda plain: make(plain) | sky_exr(plain, lambda u, v: direction_at(u, 1 - v))
-
-
 DEFECTS = {
-    "indices swapped": (
-        "LuxCore",
-        lambda: edited(
-            "luxcore",
-            "scene.scn",
-            r"interiorior = (.*)\n(.*)exteriorior = (.*)",
-            r"interiorior = \3\n\2exteriorior = \1",
-        ),
+    "LuxCore: indices": (
+        "scene.scn",
+        r"interiorior = (.*)\n(.*)exteriorior = (.*)",
+        r"interiorior = \3\n\2exteriorior = \1",
     ),
-    "index inverted": (
-        "Cycles",
-        lambda: edited(
-            "cycles", "render.py", r'entry\["int_ior"\] / entry\["ext_ior"\]', 'entry["ext_ior"] / entry["int_ior"]'
-        ),
-    ),
-    "camera mirrored": ("POV-Ray", lambda: edited("povray", "scene.pov", "right Right", "right -Right")),
-    "vertical angle of view": (
-        "Radiance",
-        lambda: edited("radiance", "camera.vf", r"-vh (\S+) -vv \S+", r"-vh \1 -vv \1"),
-    ),
-    "no diffuse light": ("Radiance", lambda: edited("radiance", "README.txt", r"-ab \d+", "-ab 0")),
-    "sky of Radiance": ("Radiance", lambda: edited("radiance", "sky.cal", r"Acos\(y\)", "Acos(-y)")),
-    "rays of raysect's camera weighed": (
-        "raysect",
-        lambda: edited("raysect", "render.py", r"\(ray, 1\.0\) for ray, _", "(ray, w) for ray, w"),
-    ),
-    "scene of raysect too large": (
-        "raysect",
-        lambda: edited("raysect", "render.py", r"SIZE, FAR = 0\.5", "SIZE, FAR = 500"),
-    ),
-    "indices of raysect": (
-        "raysect",
-        lambda: edited("raysect", "render.py", r'\(entry\["int_ior"\]', '(entry["ext_ior"]'),
-    ),
-    "sky of LuxCore": ("LuxCore", lambda: under_the_ground("luxcore", luxcore.direction_at)),
-    "sky of Cycles": ("Cycles", lambda: under_the_ground("cycles", scene_json.cycles_direction_at)),
-    "sky of POV-Ray": ("POV-Ray", lambda: under_the_ground("povray", povray.direction_at)),
+    "LuxCore: sky": luxcore.direction_at,
+    "Cycles: index": ("render.py", r'entry\["int_ior"\] / entry\["ext_ior"\]', 'entry["ext_ior"] / entry["int_ior"]'),
+    "Cycles: sky": scene_json.cycles_direction_at,
+    "POV-Ray: camera mirrored": ("scene.pov", "right Right", "right -Right"),
+    "POV-Ray: sky": povray.direction_at,
+    "Radiance: vertical angle of view": ("camera.vf", r"-vh (\S+) -vv \S+", r"-vh \1 -vv \1"),
+    "Radiance: no diffuse light": ("README.txt", r"-ab \d+", "-ab 0"),
+    "Radiance: sky": ("sky.cal", r"Acos\(y\)", "Acos(-y)"),
+    "raysect: rays weighed": ("render.py", r"\(ray, 1\.0\) for ray, _", "(ray, w) for ray, w"),
+    "raysect: scene too large": ("render.py", r"SIZE, FAR = 0\.5", "SIZE, FAR = 500"),
+    "raysect: indices": ("render.py", r'\(entry\["int_ior"\]', '(entry["ext_ior"]'),
 }
 
 
 @pytest.mark.parametrize("defect", DEFECTS)
 def test_a_defect_of_an_export_is_seen(defect, needs, monkeypatch):
     """Also with an eighth of the samples: noise makes the allowance larger."""
-    title, make = DEFECTS[defect]
+    title, change = defect.partition(":")[0], DEFECTS[defect]
     needs(title)
-    monkeypatch.setitem(write_files.TARGETS, IMAGE_RENDERERS[title].system, make())
+    target = IMAGE_RENDERERS[title].system
+    make = write_files.TARGETS[target]
+
+    def files(plain):
+        made = make(plain)
+        if callable(change):
+            return made | sky_exr(plain, lambda u, v: change(u, 1 - v))
+        name, pattern, new = change
+        text, count = re.subn(pattern, new, made[name].decode())
+        assert count, pattern
+        return made | {name: text.encode()}
+
+    monkeypatch.setitem(write_files.TARGETS, target, files)
     monkeypatch.setattr(exports, "THEIRS", {name: spp // 8 for name, spp in exports.THEIRS.items()})
     (row,) = exports.rows(FULL, title)
     assert exports.OVER in row.broken, row.values

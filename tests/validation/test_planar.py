@@ -11,7 +11,7 @@ from mi_refract.backend import detect
 from mi_refract.planar import Event, Paths, Segments, path_loop, shapes
 from mi_refract.planar import tracer as tracer
 from mi_refract.planar.intersect_arcs import ConicArcs
-from validation.planar import against_retrace, closed_paths, extruded_scenes, joints, times, wall_scene
+from validation.planar import against_retrace, closed_paths, extruded_scenes, joints, times
 from validation.planar.error_growth import _transfer, growth
 from validation.reference.planar_retrace import retrace
 from validation.run.array_settings import settings
@@ -242,7 +242,7 @@ def test_the_wrong_root_behind_a_joint_is_seen(scalar, monkeypatch):
 
 def extruded(case, spawn="along the ray", segments=None):
     spawn, offset = extruded_scenes.SPAWNS[spawn]
-    paths = extruded_scenes.trace(wall_scene.extrude(segments or case.segments), case, spawn)
+    paths = extruded_scenes.trace(extruded_scenes.extrude(segments or case.segments), case, spawn)
     return against_retrace.judge(paths, case, extruded_scenes.U, offset)
 
 
@@ -256,7 +256,7 @@ def test_walls_do_what_segments_do(spawn, llvm_variant):
 def test_wrong_walls_are_seen(llvm_variant):
     """Rays moved along the normal without leave, swapped media, an index off by 1e-5, and a wall that is not there."""
     case = extruded_scenes.faceted(against_retrace.case_of(against_retrace.FOLDER / "prism.toml", 30))
-    paths = extruded_scenes.trace(wall_scene.extrude(case.segments), case, extruded_scenes.SPAWNS["spawn_ray"][0])
+    paths = extruded_scenes.trace(extruded_scenes.extrude(case.segments), case, extruded_scenes.SPAWNS["spawn_ray"][0])
     assert against_retrace.judge(paths, case, extruded_scenes.U)["error / bound"] > 1
     s = case.segments
     assert extruded(case, segments=Segments(s.start, s.end, s.n_right, s.n_left))[WRONG_PATH_FAR] > 0

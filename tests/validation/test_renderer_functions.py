@@ -21,8 +21,6 @@ CALLS = {
     if call.lengths
 }
 HEADER = "id,ax,ay,az,nx,ny,nz,n_from,n_to"
-# A plane of batoid between media of index 1.5 and 1, and a ray of speed 1: as from index 1.
-SPEED = "import batoid; ray = batoid.RayVector(0, 0, -1, 0.6, 0, 0.8); media = map(batoid.ConstMedium, (1.5, 1))"
 
 
 @pytest.fixture(scope="module")
@@ -91,29 +89,6 @@ def test_vectors_of_other_lengths_are_treated_as_the_table_says(name, vectors):
         pytest.skip(f"cannot run here: {reason_here}")
 
 
-@pytest.mark.parametrize(
-    ("before", "meaning"),
-    [
-        ("", USED),
-        ("a = a / np.linalg.norm(a, axis=1, keepdims=True)", SCALED),
-        ("s = np.linalg.norm(a, axis=1, keepdims=True); a, k = a / s, k / s", BY_SPEED),
-        ("n = n / np.linalg.norm(n, axis=1, keepdims=True)", None),
-    ],
-)
-def test_each_treatment_is_told_from_the_others(before, meaning, vectors, tmp_path):
-    path = tmp_path / "program.py"
-    path.write_text(
-        f"import sys; sys.path.insert(0, {str(SCRIPTS)!r})\nimport numpy as np, table\nrays = table.Rays('float64')\n"
-        f"a, n, k = rays.a, rays.n, rays.k[:, None]\n{before}\nc = (a * n).sum(1, keepdims=True)\n"
-        "d = 1 - k * k * (1 - c * c)\nb = np.where(d < 0, 0, k * a - (k * c + np.sqrt(np.abs(d))) * n)\n"
-        "table.write(rays, b, 'a program')\n"
-    )
-    for claimed in MEANINGS:
-        call = RaysCommand("a program", "f64", ("{python}", str(path)), "zero", lengths=claimed)
-        found = means(System("a", "A", "none", None, 0), call, vectors)
-        assert (found == {claimed}) == (claimed == meaning), claimed
-
-
 def test_every_treatment_of_lengths_has_a_meaning_and_is_said():
     assert {call.lengths for _, call in CALLS.values()} == set(MEANINGS)
     rays = per_ray.given("f64")
@@ -122,14 +97,6 @@ def test_every_treatment_of_lengths_has_a_meaning_and_is_said():
         answers = parse_answers("\n".join(["id,bx,by,bz", *(f"{i},0,0,0" for i in rays.ids.tolist())]), "a")
         reason = per_ray.rows(call, rays, answers)[0].reason
         assert "known" in reason and lengths in reason and "; ;" not in reason
-
-
-def test_batoid_takes_the_first_index_from_the_speed_and_not_from_the_medium():
-    if reason := environments.absent(SYSTEMS["batoid"]):
-        pytest.skip(reason)
-    asked = f"{SPEED}; batoid.Plane().refract(ray, *media); print(*ray.v[0].tolist())"
-    direction = environments.run([environments.python(SYSTEMS["batoid"]), "-c", asked]).split()
-    np.testing.assert_allclose([float(x) for x in direction], [0.6, 0, 0.8], atol=1e-15)
 
 
 def test_raysect_s_reciprocals_of_lengths_count_near_the_critical_angle():

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import functools
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -102,12 +102,6 @@ def image(mean: Array, variance: Array | None, **header: float) -> Image:
     return Image(Path("drawn.exr"), mean.astype(np.float32), names, metadata=metadata)
 
 
-def passes(stack: Array, n: int, area: float, known: bool) -> Image:
-    """With the variance between passes, as `mi-refract render` writes it under a filter of that area."""
-    spread = stack.var(0, ddof=1) * n / len(stack) if known else None
-    return image(stack.mean(0), spread, spp=n, variance_freedom=len(stack) - 1, filter_area=area)
-
-
 @dataclass(frozen=True)
 class Form:
     """What is known of both sides.
@@ -125,8 +119,7 @@ class Form:
         """Both sides, of so many samples each."""
         if self.kind == "unnamed":
             counts = tuple(np.clip(counts, 16, 256))
-        drawn = [self._drawn(draw, rng, n) for n in counts]
-        return [self._side(*x, n, known) for x, n, known in zip(drawn, counts, self.known, strict=True)]
+        return self.sides([self._drawn(draw, rng, n) for n in counts], counts)
 
     def _drawn(self, draw: Draw, rng: Rng, n: int) -> tuple[Array, Array | float]:
         """The mean and Σ(x − mean)² of samples; or images of n samples in all, and (Σw)²/Σw² of their filter."""
@@ -140,14 +133,19 @@ class Form:
         stack = gaussian_filter(stack, (0, self.deviation, self.deviation, 0), mode="wrap")
         return stack, float(1 / np.square(weights).sum() ** 2)
 
-    def _side(self, drawn: Array, other: Any, n: int, known: bool) -> Side:
-        if self.kind == "samples":
-            return image(drawn, other / (n - 1) if known else None, spp=n)
-        if self.kind == "passes":
-            return passes(drawn, n, other, known)
-        header = {"spp": n // len(drawn)} if self.kind == "renders" else {}
-        # No two are the same, as no real ones are.
-        return [image(x * (1 + 1e-6 * i), None, **header) for i, x in enumerate(drawn)]
+    def sides(self, drawn: Sequence[tuple[Array, Any]], counts: Sequence[int]) -> list[Side]:
+        """Both sides, of what `_drawn` gives."""
+        sides: list[Side] = []
+        for (x, other), n, known in zip(drawn, counts, self.known, strict=True):
+            if self.kind == "samples":
+                sides.append(image(x, other / (n - 1) if known else None, spp=n))
+            elif self.kind == "passes":  # as `mi-refract render` writes them
+                spread = x.var(0, ddof=1) * n / len(x) if known else None
+                sides.append(image(x.mean(0), spread, spp=n, variance_freedom=len(x) - 1, filter_area=other))
+            else:  # no two are the same, as no real ones are
+                header = {"spp": n // len(x)} if self.kind == "renders" else {}
+                sides.append([image(render * (1 + 1e-6 * i), None, **header) for i, render in enumerate(x)])
+        return sides
 
 
 FORMS = {
@@ -236,20 +234,22 @@ def scene_rows(context: Context, pairs: int) -> list[Row]:
     import mitsuba as mi
 
     loaded: Any = mi.load_dict(scene())
-    forms = {"passes": (True, True), "reference": (True, False), "new image": (False, True)}
-    results: dict[str, list[Comparison]] = {form: [] for form in (*forms, "renders")}
+    forms = {
+        "passes": Form("passes"),
+        "reference": Form("passes", known=(True, False)),
+        "new image": Form("passes", known=(False, True)),
+        "renders": Form("renders"),
+    }
+    results: dict[str, list[Comparison]] = {name: [] for name in forms}
     seeds = iter(range(current(SEED), current(SEED) + 10_000))
     for counts in ((64, 64), (1024, 16), (16, 1024)) * pairs:
         stacks = [
             np.array([mi.render(loaded, spp=n // PASSES, seed=next(seeds)) for _ in range(PASSES)], float)
             for n in counts
         ]
-        for form, known in forms.items():
-            sides = (passes(x, n, 1.0, each) for x, n, each in zip(stacks, counts, known, strict=True))
-            results[form].append(compare("welch", *sides))
-        several = ([image(x, None, spp=n // PASSES) for x in stack] for stack, n in zip(stacks, counts, strict=True))
-        results["renders"].append(compare("welch", *several))
-    return [null_row(form, "lamp through glass", x, context.variant) for form, x in results.items()]
+        for name, form in forms.items():
+            results[name].append(compare("welch", *form.sides([(stack, 1.0) for stack in stacks], counts)))
+    return [null_row(name, "lamp through glass", found, context.variant) for name, found in results.items()]
 
 
 def power_rows(pairs: int) -> list[Row]:

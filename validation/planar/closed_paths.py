@@ -4,8 +4,7 @@ In a box mirror images unfold a path of total reflections into a straight line; 
 side is along an axis. An ellipse of eccentricity 1/n focuses rays along its axis into its far focus; a circle around
 that focus lets them leave the glass unrefracted. A ball refracts rays from a point R/n from its centre as though they
 came from n R. A prism of apex A deviates rays by i + asin(n sin(A − asin(sin i/n))) − A, a drop by
-π + 2 asin b − 4 asin(b/n) for its first rainbow. A lens of arcs is also compared with the same lens in facets, each of
-which is turned by up to half the angle to the next one.
+π + 2 asin b − 4 asin(b/n) for its first rainbow.
 """
 
 from __future__ import annotations
@@ -37,12 +36,10 @@ TERMS = against_retrace.TERMS | {
     "error / u": "the same in units of roundoff",
     "box": "total internal reflections in a box of index 1.5, by their number; answers from mirror images",
 }
-AXES = {"x": "reflections, or facets", "y": "deviation", "x_scale": "log", "y_scale": "log", "slope": None}
 NAME = "planar_closed"
 SEED = 2032
 REFLECTIONS = (20, 200, 2000)
 INDEX, FOCAL_LENGTH = 1.5, 9.0
-FACETS = (100, 1000, 10_000, 100_000)
 
 
 @dataclass(frozen=True)
@@ -82,7 +79,7 @@ def _setting_rows(context: Context, setting: Setting) -> list[Row]:
     counts = REFLECTIONS[:2] if context.profile.quick else REFLECTIONS
     rows = [_box_row(setting, count, 4 if few else 16) for count in counts]
     rows += [_row(setting, name, make(8 if few else 500)) for name, make in CLOSED.items()]
-    return rows if few or context.profile.quick else [*rows, _curves_row(setting), _facet_row(setting)]
+    return rows
 
 
 def _row(setting: Setting, name: str, closed: Closed) -> Row:
@@ -158,21 +155,6 @@ def _box_row(setting: Setting, count: int, rays: int) -> Row:
     return Row(NAME, "trace", f"box, {count}", setting.label, values, budgets(setting), replay=replay)
 
 
-def _curves_row(setting: Setting) -> Row:
-    """The median ray's distance from its place, and the worst's, reflection by reflection."""
-    case = box(REFLECTIONS[-1], 16)
-    off = np.hypot(*(case.trace(setting).points - case.exact.points).transpose(2, 0, 1)) / case.extent
-    shown = np.unique(np.geomspace(1, REFLECTIONS[-1], 30).astype(int))
-    curves = {
-        f"place, {name}": [(float(j), float(of(off[:, j]))) for j in shown]
-        for name, of in (("median", np.median), ("worst", np.max))
-    }
-    bound = setting.roundoff / case.extent * case.bounds[0].max(0)
-    curves["bound"] = [(float(j), float(bound[j])) for j in shown]
-    values = {"place after all": curves["place, worst"][-1][1]}
-    return Row(NAME, "trace", "box, by reflections", setting.label, values, curves=curves)
-
-
 # Lenses and prisms ---------------------------------------------------------------------------------------------
 
 
@@ -189,10 +171,9 @@ def _along_x(height: Array) -> tuple[Array, Array]:
 
 
 @functools.cache
-def ellipse_lens(rays: int, facets: int = 0) -> Closed:
+def ellipse_lens(rays: int) -> Closed:
     """Index 3/2, focal length 9, aperture 3."""
     curve = shapes.ellipse_lens(INDEX, FOCAL_LENGTH, thickness=4.0, radius=3.0)
-    curve = curve.faceted(facets) if facets else curve
     height = 2.9 * np.linspace(-1, 1, 2 * (rays // 2))
     return Closed(_case("ellipse lens", curve, INDEX, *_along_x(height), depth=2), reach=FOCAL_LENGTH)
 
@@ -233,18 +214,4 @@ def _unit_at(angle: Array) -> Array:
 CLOSED = {"ellipse lens": ellipse_lens, "aplanatic ball": ball, "rainbow": rainbow, "prism": prism}
 
 
-def _facet_row(setting: Setting) -> Row:
-    """The spot of the lens in facets, beside that of arcs."""
-    spots = [(float(m), _spot(setting, m)) for m in FACETS]
-    arcs = _spot(setting, 0)
-    curves = {"facets": spots, "arcs": [(m, arcs) for m, _ in spots]}
-    values, case = {"error": spots[-1][1], "arcs": arcs}, "ellipse lens, by facets"
-    return Row(NAME, "trace", case, setting.label, values, replay={"facets": FACETS}, curves=curves)
-
-
-def _spot(setting: Setting, facets: int) -> float:
-    closed = ellipse_lens(40, facets)
-    return float(np.max(np.nan_to_num(closed.error(closed.case.trace(setting)), nan=np.inf)))
-
-
-STUDY = Study(NAME, "Planar, closed answers", about(__doc__), TERMS, tasks, axes=AXES, again=repeated.by_tasks(tasks))
+STUDY = Study(NAME, "Planar, closed answers", about(__doc__), TERMS, tasks, again=repeated.by_tasks(tasks))

@@ -17,18 +17,19 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_refract.planar import Event, Paths
+from mi_refract.planar import Event, Paths, Segments
+from mi_refract.planar.curves import points
 from mi_refract.plugins import PLUGIN
 from mi_refract.report.row import Row
 from validation import repeated
 from validation.reference.layered_scenes import OFFSET
 from validation.reference.planar_retrace import Array
-from validation.run import path_overlay, seeds
+from validation.run import seeds
 from validation.run.array_settings import Setting
 from validation.run.context import Context
 from validation.study import Study, Task, about
 
-from . import against_retrace, wall_scene
+from . import against_retrace
 from .against_retrace import FOLDER, Case, judge
 
 TERMS = against_retrace.TERMS | {
@@ -43,7 +44,6 @@ U = 2.0**-24
 FACETS = 64  # of an arc, at most
 Spawn = Callable[[Any, Any], Any]
 LARGEST = 1500  # walls; arcs have fewer facets where there are more of them
-DRAWN, SHOWN, PIXELS = "along the ray", 9, 192  # rays in an image, and its size before it is enlarged
 RAYS = 100  # of the file's, and as many scattered
 
 
@@ -61,7 +61,7 @@ def scene_rows(context: Context, path: Path) -> list[Row]:
     if context.variant.startswith("scalar"):
         return [Row(NAME, PLUGIN, path.stem, context.variant, reason=SCALAR)]
     case = faceted(against_retrace.case_of(path, RAYS))
-    scene, rows = wall_scene.extrude(case.segments), []
+    scene, rows = extrude(case.segments), []
     planar_paths = {
         name: case.trace(Setting(context.variant.split("_")[0], np.dtype(name).type)) for name in ("float32", "float64")
     }
@@ -69,25 +69,10 @@ def scene_rows(context: Context, path: Path) -> list[Row]:
         paths = trace(scene, case, spawn)
         values = judge(paths, case, U, offset)
         values |= {f"from planar {p}": apart(paths, other) / case.extent for p, other in planar_paths.items()}
-        replay = {
-            "scene": path.name,
-            "walls": len(case.segments),
-            "rays": len(case.origins),
-            "seed": seeds.current(against_retrace.SEED),
-        }
-        images = {"overlay": _image(context, scene, case, paths)} if name == DRAWN else {}
-        rows.append(
-            Row(
-                NAME,
-                f"{PLUGIN}, {name}",
-                path.stem,
-                context.variant,
-                values,
-                against_retrace.GROWN,
-                replay=replay,
-                images=images,
-            )
-        )
+        replay = {"scene": path.name, "walls": len(case.segments), "rays": len(case.origins)}
+        replay["seed"] = seeds.current(against_retrace.SEED)
+        subject, bounds = f"{PLUGIN}, {name}", against_retrace.GROWN
+        rows.append(Row(NAME, subject, path.stem, context.variant, values, bounds, replay=replay))
     return rows
 
 
@@ -98,32 +83,62 @@ def apart(some: Paths, others: Paths) -> float:
     return float(np.nanmax(distance)) if same.any() else float("nan")
 
 
-def _image(context: Context, scene: Any, case: Case, extruded: Paths) -> str:
-    """The walls from above, the exact paths over them, and where Mitsuba's rays meet the walls."""
-    view = wall_scene.Plan(scene, case.segments, PIXELS)
-    shown = np.linspace(0, len(case.origins) // 2 - 1, SHOWN).astype(int)
-    exact = case.exact
-    ends = exact.points[shown, exact.met[shown]] + case.extent * exact.directions[shown]
-    legs = [
-        _flat(np.concatenate([points[np.isfinite(points[:, 0])], [end]]))
-        for points, end in zip(exact.points[shown], ends, strict=True)
-    ]
-    met = extruded.points[shown, 1:].reshape(-1, 2)
-    drawn = path_overlay.draw(view, legs, _flat(met[np.isfinite(met[:, 0])]))
-    return path_overlay.save(context.out, f"extruded {case.name}", drawn, {"scene": f"{case.name}.toml"})
-
-
-def _flat(points: Array) -> Array:
-    """In the plane z = 0."""
-    return np.column_stack([points, np.zeros(len(points))]).astype(float)
-
-
 def faceted(case: Case) -> Case:
     """The same with facets for arcs, refracted wherever possible."""
     facets = max(1, min(FACETS, LARGEST // len(case.segments)))
-    segments, every = wall_scene.facets(case.segments, facets), case.reflect == 0
+    segments, every = chords(case.segments, facets), case.reflect == 0
     origins, directions = case.origins[every], case.directions[every]
     return Case(case.name, segments, origins, directions, case.max_depth, case.reflect[every])
+
+
+# The walls -----------------------------------------------------------------------------------------------------
+
+Z = -1.0, 2.0  # a ray at z = 0 does not meet the triangles' common edge in the middle of a wall
+
+
+def chords(segments: Segments, count: int) -> Segments:
+    """Each arc as `count` chords; straight segments as they are."""
+    if segments.control is None:
+        return segments
+    straight = (segments.control == (segments.start + segments.end) / 2).all(1)
+    along = points(segments, count)[~straight]
+    pieces = (segments.start[straight], along[:, :-1]), (segments.end[straight], along[:, 1:])
+    start, end = (np.concatenate([x, y.reshape(-1, 2)]) for x, y in pieces)
+    media = [np.append(n[straight], np.repeat(n[~straight], count)) for n in (segments.n_left, segments.n_right)]
+    return Segments(start, end, *media)
+
+
+def extrude(segments: Segments) -> Any:
+    """A Mitsuba scene of walls, their normals to the left. Faces carry the number of their segment."""
+    import mitsuba as mi
+
+    media = np.stack([segments.n_left, segments.n_right], 1)
+    pairs, which = np.unique(media, axis=0, return_inverse=True)
+    meshes = {f"walls_{k}": _mesh(segments, np.flatnonzero(which.ravel() == k)) for k in range(len(pairs))}
+    return mi.load_dict({"type": "scene", **meshes})
+
+
+def _mesh(segments: Segments, chosen: Array) -> Any:
+    """Of the segments `chosen`, which part the same two media."""
+    import mitsuba as mi
+
+    count = len(chosen)
+    ends = [np.asarray(x)[chosen] for x in (segments.start, segments.end)]
+    corners = [np.column_stack([end, np.full(count, z)]) for z in Z for end in ends]
+    # Start, end, start above, end above; seen from the left of the segment, counter-clockwise.
+    faces = 4 * np.arange(count)[:, None, None] + np.array([[0, 3, 1], [0, 2, 3]])
+    ior = {"ext_ior": float(segments.n_left[chosen[0]]), "int_ior": float(segments.n_right[chosen[0]])}
+    properties = mi.Properties()
+    properties["face_normals"] = True
+    properties["glass"] = mi.load_dict({"type": PLUGIN, **ior})
+    mesh = mi.Mesh("walls", 4 * count, 2 * count, props=properties)
+    parameters = mi.traverse(mesh)
+    for key, values in (("positions", np.stack(corners, 1).astype(np.float32)), ("faces", faces.astype(np.uint32))):
+        name = next(name for name in parameters.keys() if name.endswith(key))  # noqa: SIM118  no dictionary
+        parameters[name] = type(parameters[name])(values.ravel())
+    mesh.add_attribute("face_segment", 1, np.repeat(chosen, 2).astype(float).tolist())
+    parameters.update()
+    return mesh
 
 
 # The rays ------------------------------------------------------------------------------------------------------
@@ -151,7 +166,7 @@ def trace(scene: Any, case: Case, spawn: Spawn) -> Paths:
 
     sampling, count, depth = mi.BSDFContext(), len(case.origins), case.max_depth
     flat = [np.column_stack([x, np.zeros(count)]).T for x in (case.origins, case.directions)]
-    points = dr.full(mi.Float, dr.nan, 2 * depth * count)
+    places = dr.full(mi.Float, dr.nan, 2 * depth * count)
     hits, events = dr.full(mi.Int32, -1, depth * count), dr.full(mi.UInt32, int(Event.NONE), (depth + 1) * count)
     lane = dr.arange(mi.UInt32, count)
 
@@ -160,7 +175,7 @@ def trace(scene: Any, case: Case, spawn: Spawn) -> Paths:
         found = active & si.is_valid()
         inside = found & (j < depth)
         for axis in (0, 1):
-            dr.scatter(points, si.p[axis], (axis * depth + j) * count + lane, inside)
+            dr.scatter(places, si.p[axis], (axis * depth + j) * count + lane, inside)
         segment = si.shape.eval_attribute_1("face_segment", si, inside)
         dr.scatter(hits, mi.Int32(dr.round(segment)), j * count + lane, inside)
         bs, _ = si.bsdf().sample(sampling, si, 1 - 2.0**-24, [0.5, 0.5], inside)
@@ -173,7 +188,7 @@ def trace(scene: Any, case: Case, spawn: Spawn) -> Paths:
     ray = mi.Ray3f(mi.Point3f(flat[0]), mi.Vector3f(flat[1]))
     start: Any = mi.UInt32(0), dr.full(mi.Bool, True, count), ray
     last: Any = dr.while_loop(start, lambda *state: state[1], step)
-    met = np.array(points, float).reshape(2, depth, count).transpose(2, 1, 0)
+    met = np.array(places, float).reshape(2, depth, count).transpose(2, 1, 0)
     return Paths(
         np.concatenate([case.origins[:, None], met], 1),
         np.array(last[2].d, float).T[:, :2],

@@ -50,10 +50,10 @@ THEIRS = {"POV-Ray": 256, "Cycles": 512, "LuxCore": 1024, "Radiance": 512}  # sa
 
 def scene(diffuse: bool = True) -> PlainScene:
     """The balls of `balls`, seen from another place, with a lamp; `diffuse`: and with a patch."""
-    given = from_mitsuba.load(SCENES / "balls.xml", level=LEVEL)
+    balls = from_mitsuba.load(SCENES / "balls.xml", level=LEVEL)
     width, height = SIZE
     camera = dataclasses.replace(
-        given.camera,
+        balls.camera,
         origin=(30.0, 15.0, 240.0),
         target=(3.0, -4.0, 0.0),
         up=(0.3, 1.0, 0.2),
@@ -64,7 +64,7 @@ def scene(diffuse: bool = True) -> PlainScene:
     extra = [_quad("lamp", (-100.0, 22.0), (-72.0, 50.0), Light((3.0, 2.0, 1.0)))]
     if diffuse:
         extra.append(_quad("patch", (70.0, -50.0), (105.0, 10.0), Diffuse((0.2, 0.5, 0.9))))
-    return dataclasses.replace(given, name="balls", meshes=(*given.meshes, *extra), sky=askew(), camera=camera)
+    return dataclasses.replace(balls, name="balls", meshes=(*balls.meshes, *extra), sky=askew(), camera=camera)
 
 
 def _quad(name: str, low: tuple[float, float], high: tuple[float, float], material: Material) -> Mesh:
@@ -105,9 +105,9 @@ def spp(title: str) -> int:
 
 def drawn(title: str) -> np.ndarray:
     """Renders by another renderer: renders × height × width × 3."""
-    given, seeds = scene(diffuse=title != "POV-Ray"), range(1, RENDERS + 1)
+    plain, seeds = scene(diffuse=title != "POV-Ray"), range(1, RENDERS + 1)
     with tempfile.TemporaryDirectory() as folder:
-        images = IMAGE_RENDERERS[title].draw(given, Path(folder), spp(title), seeds)
+        images = IMAGE_RENDERERS[title].draw(plain, Path(folder), spp(title), seeds)
     return np.stack([image.pixels for image in images]).astype(np.float64)
 
 

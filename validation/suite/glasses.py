@@ -96,8 +96,8 @@ def rows(title: str, catalogue: GlassCatalogue, rays: RaySet, answers: Answers) 
     """Directions by regime, then indices by glass."""
     findings = check_answers.check(rays, answers)
     system = str(answers.header.get("system", ""))
-    found = {each.regime: each for each in findings.regimes}
-    made = [_direction_row(title, name, found.get(name), findings, catalogue.told, system) for name in REGIMES]
+    errors = {regime.regime: regime for regime in findings.regimes}
+    made = [_direction_row(title, name, errors.get(name), findings, catalogue.tir, system) for name in REGIMES]
     used = _in_order(rays, answers)
     wavelength, pair = media_rays.columns(rays.header, rays.ids).T
     off = np.abs(used / rays.rays.k - 1)
@@ -117,7 +117,7 @@ def _in_order(rays: RaySet, answers: Answers) -> np.ndarray:
 
 
 def _direction_row(
-    title: str, regime: str, errors: RegimeErrors | None, findings: Findings, told: str, system: str
+    title: str, regime: str, errors: RegimeErrors | None, findings: Findings, tir: str, system: str
 ) -> Row:
     values = {"unfit": float(findings.problem_count(*UNFIT))}
     budgets = {"unfit": 0.0, "wrong": 0.0}
@@ -127,7 +127,7 @@ def _direction_row(
     values |= {MISCLASSIFIED: float(errors.tir_misclassified), "wrong": float(errors.wrong)}
     budgets |= {ERROR_OVER_BOUND: 1.0}
     if regime == "critical":
-        values["other TIR signal"], budgets["other TIR signal"] = float(findings.tir != told), 0.0
+        values["other TIR signal"], budgets["other TIR signal"] = float(findings.tir != tir), 0.0
     text = f"{system}; total internal reflection: {findings.tir}"
     return Row(NAME, title, regime, "f64", values, budgets, reason=text, replay={"worst": errors.replay})
 

@@ -7,7 +7,7 @@ earlier, on rays of the same kinds, or for later programs on these very rays at 
 and fails no run: the worst of some thousand rays depends on which they are. The set "random" was fixed before any
 result. After the first results its rays near the critical angle were left out, for chance decides how near they come,
 and it was made twice as large: that is the set "random, apart". The goal is the same for both. The set "near-critical"
-was never changed. An installed program fails if it crashes, hangs, or answers rays that it was not given. One that is
+was never changed. An installed program fails if it crashes, hangs, or answers rays of no set. One that is
 not installed, or reports that it cannot run on this machine, is not run.
 """
 
@@ -122,14 +122,14 @@ TERMS = {name: f"{rays.count} rays: {rays.text}" for name, rays in SETS.items()}
     RECORDED: "the largest such angle recorded earlier for this system",
     OFF_RECORDED: "the ratio of the two, taken above 1; 1 inside a recorded range",
     ERROR_OVER_BOUND: "the largest error of a ray over its a-priori bound, that of the textbook formula",
-    BACKWARD: "the largest one: each answer is the exact refraction of inputs within so many roundings of those given",
+    BACKWARD: "the largest one: each answer is the exact refraction of inputs perturbed by that many roundings",
     "median backward error / u": "the median of them",
     "p99 backward error / u": "exceeded by one answer in 100",
     MISCLASSIFIED: "rays whose total internal reflection was misclassified",
     "wrong": "rays beyond the bound, misclassified although the bound decides them, or without a direction",
     "given up": "rays left out: so near to the critical angle that the system treats them as totally reflected",
     "not seen to deviate": "1 where every answer is right and the system is known to be wrong there",
-    "unfit": "answers that are missing, duplicate, or to rays that were not given",
+    "unfit": "answers that are missing, duplicate, or to rays of no set",
     OTHER_SIGNAL: "1 where the program signals total internal reflection in another way than was recorded",
     "unanswered": "rays without an answer, because the program crashed, hung or printed none",
 }
@@ -145,7 +145,7 @@ def tasks(context: Context) -> list[Task]:
 
 
 def call_rows(system: System, call: RaysCommand, context: Context) -> list[Row]:
-    """A row per set of rays, or one that says why there is none."""
+    """A row per set of rays, or one with the reason why there is none."""
 
     def only(reason: str, values: Numbers | None = None, budgets: Numbers | None = None) -> list[Row]:
         return [Row(NAME, call.title, "every set", call.precision, values or {}, budgets or {}, reason=reason)]

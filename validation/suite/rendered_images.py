@@ -92,27 +92,27 @@ def environment(resolution: int) -> PlainScene:
 
 def furnace(resolution: int) -> PlainScene:
     """The ball on a white floor that absorbs nothing, in a white sky: a correct image is 1 everywhere."""
-    given, white = _scene("sphere", resolution), (1.0, 1.0, 1.0)
+    plain, white = _scene("sphere", resolution), (1.0, 1.0, 1.0)
 
     def bright(mesh: Mesh) -> Mesh:
         return dataclasses.replace(mesh, material=Diffuse(white)) if isinstance(mesh.material, Diffuse) else mesh
 
-    meshes = tuple(bright(mesh) for mesh in given.meshes if not isinstance(mesh.material, Light))
-    return dataclasses.replace(given, name="furnace", meshes=meshes, sky=white)
+    meshes = tuple(bright(mesh) for mesh in plain.meshes if not isinstance(mesh.material, Light))
+    return dataclasses.replace(plain, name="furnace", meshes=meshes, sky=white)
 
 
 def caustic(resolution: int) -> PlainScene:
     """The floor beside the ball's shadow, where its lamp is focused. No glass is in the image, and no sky shines."""
-    given = _scene("sphere", resolution)
+    plain = _scene("sphere", resolution)
 
     def higher(mesh: Mesh) -> Mesh:
         lifted = isinstance(mesh.material, Glass)
         return dataclasses.replace(mesh, vertices=mesh.vertices + np.array([0, 30, 0])) if lifted else mesh
 
     origin, target = (140.0, 60.0, 40.0), (42.0, 0.0, 9.0)
-    camera = dataclasses.replace(given.camera, origin=origin, target=target, fov_x_degrees=20.0)
-    meshes = tuple(map(higher, given.meshes))
-    return dataclasses.replace(given, name="caustic", meshes=meshes, sky=(0.0, 0.0, 0.0), camera=camera)
+    camera = dataclasses.replace(plain.camera, origin=origin, target=target, fov_x_degrees=20.0)
+    meshes = tuple(map(higher, plain.meshes))
+    return dataclasses.replace(plain, name="caustic", meshes=meshes, sky=(0.0, 0.0, 0.0), camera=camera)
 
 
 def askew() -> Environment:
@@ -210,17 +210,17 @@ def pair_rows(context: Context, title: str, scene: str) -> list[Row]:
         return [no_images(row, error)]
     ours, known = reference(scene, size), known_to_differ(title, scene)
     # Not their pixels: some of the renderers sample every pixel on one grid, whatever the seed.
-    found = compare("welch", ours, theirs, family_error=limits.SUITE_ERROR, resolution=size.wanted, pixels="no")
-    values = measured(found, *(np.stack([image.pixels for image in side]) for side in (ours, theirs)))
+    comparison = compare("welch", ours, theirs, family_error=limits.SUITE_ERROR, resolution=size.wanted, pixels="no")
+    values = measured(comparison, *(np.stack([image.pixels for image in side]) for side in (ours, theirs)))
     goals, budgets = {INCONCLUSIVE: 0.0}, {"tests that differ": 0.0, "tiles that differ without noise": 0.0}
-    reason = f"{found.verdict}: {found.reason}"
+    reason = f"{comparison.verdict}: {comparison.reason}"
     if known:
-        values["not seen to differ"] = float(found.verdict is not Verdict.DIFFERENT)
+        values["not seen to differ"] = float(comparison.verdict is not Verdict.DIFFERENT)
         budgets = {"not seen to differ": 0.0}
-        reason += f"; {known}" if found.verdict is Verdict.DIFFERENT else ""
+        reason += f"; {known}" if comparison.verdict is Verdict.DIFFERENT else ""
     else:
         goals[DETECTABLE] = size.wanted
-    replay = {"verdict": str(found.verdict), "scene": scene, "resolution": size.resolution, "spp": spp}
+    replay = {"verdict": str(comparison.verdict), "scene": scene, "resolution": size.resolution, "spp": spp}
     replay |= {"reference spp": SCENES[scene].more * size.spp, "seeds": list(seeds)}
     replay["renderer"] = SYSTEMS[renderer.system].source
     return [row(values, budgets, goals, reason, replay, _saved(context, title, scene, ours, theirs))]
@@ -236,17 +236,17 @@ def reference(scene: str, size: Size) -> list[Image]:
     return [image_file.named(f"{PLUGIN} {scene} {i}", pixels) for i, pixels in enumerate(renders)]
 
 
-def measured(found: Comparison, ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
+def measured(comparison: Comparison, ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
     """The numbers of a pair; `ours` and `theirs` are renders × height × width × 3."""
-    metrics = {metric.name: metric.value for metric in found.metrics}
+    metrics = {metric.name: metric.value for metric in comparison.metrics}
     noise = sum(side.var(0, ddof=1).mean() / len(side) for side in (ours.astype(float), theirs.astype(float)))
     rmse = np.sqrt(np.square(theirs.mean(0) - ours.mean(0)).mean())
     values = {
         "tests that differ": metrics.get("tests of tiles and channels that differ", np.nan),
         "tiles that differ without noise": metrics.get("tiles without noise that differ", np.nan),
-        DETECTABLE: found.minimum_detectable,
+        DETECTABLE: comparison.minimum_detectable,
         DETECTABLE_IMAGE: metrics.get("minimum detectable difference of the whole image", np.nan),
-        INCONCLUSIVE: float(found.verdict is Verdict.INCONCLUSIVE),
+        INCONCLUSIVE: float(comparison.verdict is Verdict.INCONCLUSIVE),
         MEAN_DIFFERENCE: float(theirs.mean() / ours.mean() - 1),
     }
     return values | ({"RMSE / noise": float(rmse / np.sqrt(noise))} if noise > 0 else {})

@@ -62,8 +62,8 @@ SHOWN = {name: TERMS[name] for name in ("tests that differ", "tiles that differ 
 
 def tasks(context: Context) -> list[Task]:
     """One per line, and the control."""
-    found = [Task(f"{NAME}: {line}", functools.partial(line_rows, context, line)) for line in WANTED]
-    return [*found, Task(f"{NAME}: {MIXED}", functools.partial(mixed_rows, context))]
+    lines = [Task(f"{NAME}: {line}", functools.partial(line_rows, context, line)) for line in WANTED]
+    return [*lines, Task(f"{NAME}: {MIXED}", functools.partial(mixed_rows, context))]
 
 
 def _why_not(context: Context) -> str:

@@ -6,7 +6,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from ..plain_scene import Colour, Diffuse, Environment, Glass, Material, Mesh, PlainScene
+from ..plain_scene import Colour, Diffuse, Environment, Glass, Material, PlainScene
 from .shared_files import Files, exr, numbers, ply_files, readme
 
 COMMANDS = "mi-refract render scene.xml -o image.exr --spp 1024        (-D bsdf=dielectric for Mitsuba's own glass)"
@@ -50,20 +50,19 @@ def files(plain: PlainScene) -> Files:
     """The files of the export, by name."""
     camera = plain.camera
     vectors = {name: numbers(getattr(camera, name), ", ") for name in ("origin", "target", "up")}
-    shapes = "\n".join(map(_shape, plain.meshes))
-    text = SCENE.format(camera=camera, max_depth=plain.max_depth, shapes=shapes, sky=_sky(plain.sky), **vectors)
-    sky = {"sky.exr": exr(plain.sky.pixels)} if isinstance(plain.sky, Environment) else {}
-    own = {"scene.xml": text.encode(), "README.txt": readme(plain, "Mitsuba", COMMANDS, ())}
-    return ply_files(plain) | sky | own
-
-
-def _shape(mesh: Mesh) -> str:
-    return f"""
+    shapes = "\n".join(
+        f"""
     <shape type="ply" id={quoteattr(mesh.name)}>
         <string name="filename" value={quoteattr(mesh.name + ".ply")}/>
         <boolean name="face_normals" value="true"/>
         {_material(mesh.material)}
     </shape>"""
+        for mesh in plain.meshes
+    )
+    text = SCENE.format(camera=camera, max_depth=plain.max_depth, shapes=shapes, sky=_sky(plain.sky), **vectors)
+    sky = {"sky.exr": exr(plain.sky.pixels)} if isinstance(plain.sky, Environment) else {}
+    own = {"scene.xml": text.encode(), "README.txt": readme(plain, "Mitsuba", COMMANDS, ())}
+    return ply_files(plain) | sky | own
 
 
 def _material(material: Material) -> str:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ..plain_scene import Camera, Colour, Diffuse, Environment, Glass, Material, PlainScene
-from .shared_files import Array, Files, material_names, numbers, readme
+from .shared_files import Files, material_names, numbers, readme
 
 COMMANDS = """
 oconv scene.rad > scene.oct
@@ -71,7 +71,10 @@ def _sky(sky: Colour | Environment) -> tuple[str, Files]:
     height, width = sky.pixels.shape[:2]
     pixels = np.concatenate([sky.pixels, sky.pixels[:, :1]], axis=1)
     head = f"2\n0 {height - 1} {height}\n0 {width} {width + 1}\n"
-    maps = {f"sky_{c}.dat": (head + _table(pixels[..., i])).encode() for i, c in enumerate("rgb")}
+    maps = {}
+    for i, colour in enumerate("rgb"):
+        rows = [" ".join(map(repr, row)) for row in pixels[..., i].astype(float).tolist()]
+        maps[f"sky_{colour}.dat"] = (head + "\n".join(rows) + "\n").encode()
     x, y, z = (f"({a!r})*Dx + ({b!r})*Dy + ({c!r})*Dz" for a, b, c in sky.rotation.T.tolist())
     functions = (
         f"x = {x};\ny = {y};\nz = {z};\nturn = atan2(x, -z)/(2*PI) - {0.5 / width!r};\n"
@@ -79,7 +82,3 @@ def _sky(sky: Colour | Environment) -> tuple[str, Files]:
     )
     lines = "void colordata map 9 noop noop noop sky_r.dat sky_g.dat sky_b.dat sky.cal row column 0 0\n"
     return f"{lines}map glow sky 0 0 4 1 1 1 0\n{source}", maps | {"sky.cal": functions.encode()}
-
-
-def _table(values: Array) -> str:
-    return "\n".join(" ".join(map(repr, row)) for row in values.astype(float).tolist()) + "\n"

@@ -31,16 +31,16 @@ def main(arguments: list[str]) -> int:
 @app.command()
 def _command(
     listed: Annotated[
-        bool, typer.Option("--list", help="Print what there is, and whether it is installed (default).")
+        bool, typer.Option("--list", help="List the renderers and whether they are installed (default).")
     ] = False,
     install: Annotated[str, typer.Option(metavar="NAME,…", help=f"Install some of {', '.join(SYSTEMS)}.")] = "",
     page: Annotated[
-        Path | None, typer.Option(metavar="OUT.html", help="Write how they did as a page, from the last validation.")
+        Path | None, typer.Option(metavar="OUT.html", help="Write the results of the last validation as an HTML page.")
     ] = None,
-    data: Annotated[Path | None, typer.Option("--json", metavar="OUT.json", help="Write the same as JSON.")] = None,
-    out: Annotated[Path, typer.Option(help="Folder of that validation's report.")] = Path("out"),
+    data: Annotated[Path | None, typer.Option("--json", metavar="OUT.json", help="Write them as JSON.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the validation report.")] = Path("out"),
 ) -> int:
-    """List or install the other renderers and libraries that can be run here, or write a page of how they did."""
+    """List or install the other renderers and libraries, or write a page of their results."""
     if page or data:
         return _write(page, data, out)
     wanted = [name.strip() for name in install.split(",") if name.strip()]

@@ -15,7 +15,6 @@ from mi_refract.io import process_group
 from mi_refract.io.atomic import write_atomically
 from mi_refract.io.errors import TooMuchOutputError
 from mi_refract.ray_sets import renderer_file
-from mi_refract.report.row import Reason
 
 from .system import LOCKS, SCRIPTS, Apt, Npm, Pip, System
 
@@ -44,18 +43,16 @@ def folder(system: System) -> Path:
 
 
 def absent(system: System) -> str:
-    """ "" where the system is installed in its pinned version; otherwise the command that brings it."""
-    return (
-        "" if _present(system) else Reason(f"{COMMAND} {system.name}", f"other renderers, by `{COMMAND} {system.name}`")
-    )
-
-
-def _present(system: System) -> bool:
+    """ "" where the system is installed in its pinned version; otherwise the command that installs it."""
     if isinstance(system.needs, Apt):
-        found = shutil.which(system.needs.program)
-        wanted = system.needs.version
-        return found is not None and (not wanted or wanted in _said_version(found))
-    return system.needs is None or _marked(system)
+        program, version = shutil.which(system.needs.program), system.needs.version
+        present = program is not None and (not version or version in _said_version(program))
+    else:
+        try:
+            present = system.needs is None or json.loads(_marker(system).read_text()) == _mark(system)
+        except (OSError, ValueError):
+            present = False
+    return "" if present else f"{COMMAND} {system.name}"
 
 
 @functools.cache
@@ -66,13 +63,6 @@ def _said_version(program: str) -> str:
     except (OSError, TimeoutError, TooMuchOutputError):
         return ""
     return (ended.out + ended.said).decode(errors="replace")
-
-
-def _marked(system: System) -> bool:
-    try:
-        return bool(json.loads(_marker(system).read_text()) == _mark(system))
-    except (OSError, ValueError):
-        return False
 
 
 def _marker(system: System) -> Path:
@@ -116,7 +106,13 @@ def install(system: System) -> None:
         try:
             _do(system, [*root, "apt-get", "install", "-y", "-qq", "--no-install-recommends", *needs.packages])
         except OSError as error:
-            raise OSError(f"{error}; {_carried(needs)}") from None
+            try:
+                names = [package.partition("=")[0] for package in needs.packages]
+                listed = run(["apt-cache", "madison", *names], timeout=_ASKING).splitlines()
+            except (Broken, Unable):
+                listed = []
+            versions = sorted({" ".join("".join(line.split("|")[:2]).split()) for line in listed})
+            raise OSError(f"{error}; this distribution has {', '.join(versions) or 'none'}") from None
         _said_version.cache_clear()
         return
     if not locked(system).exists():
@@ -130,7 +126,11 @@ def install(system: System) -> None:
         _do(system, ["npm", "ci", *options, "--prefix", str(folder(system))])
     elif isinstance(needs, Pip):
         # This environment's pip for the other one: to make one there costs more than most of what it would install.
-        _do(system, [_interpreter(system, needs.python), "-m", "venv", "--without-pip", str(folder(system))])
+        own = f"{sys.version_info[0]}.{sys.version_info[1]}"
+        interpreter = sys.executable if needs.python in ("", own) else shutil.which(f"python{needs.python}")
+        if interpreter is None:
+            raise OSError(f"{system.name}: needs Python {needs.python}; expected a python{needs.python} in PATH")
+        _do(system, [interpreter, "-m", "venv", "--without-pip", str(folder(system))])
         pip = [sys.executable, "-m", "pip", "--python", python(system), "install"]
         options = ["--quiet", "--disable-pip-version-check", "--no-input", "--no-compile", "--no-deps"]
         # To build a package would run, and fetch, code without a hash; not so without isolation, by locked tools.
@@ -140,26 +140,6 @@ def install(system: System) -> None:
             safe = ["--require-hashes", "--no-binary", ":all:", "--no-build-isolation"]
             _do(system, [*pip, *options, *safe, "--requirement", str(locked_source(system))])
     write_atomically(_marker(system), json.dumps(_mark(system)))
-
-
-def _carried(needs: Apt) -> str:
-    """Which versions of the packages the distribution has."""
-    try:
-        listed = run(
-            ["apt-cache", "madison", *(package.partition("=")[0] for package in needs.packages)], timeout=_ASKING
-        )
-    except (Broken, Unable):
-        listed = ""
-    found = sorted({" ".join(line.split("|")[:2]).strip() for line in listed.splitlines()})
-    return f"this distribution has {', '.join(' '.join(each.split()) for each in found) or 'none'}"
-
-
-def _interpreter(system: System, version: str) -> str:
-    if version in ("", f"{sys.version_info[0]}.{sys.version_info[1]}"):
-        return sys.executable
-    if found := shutil.which(f"python{version}"):
-        return found
-    raise OSError(f"{system.name}: needs Python {version}; expected a python{version} in PATH")
 
 
 def _do(system: System, command: Sequence[str]) -> None:

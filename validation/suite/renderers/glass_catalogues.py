@@ -35,13 +35,13 @@ class OtherIndex:
 class GlassCatalogue:
     """Glasses of a system: `script` of scripts/, asked for `glasses`, reads rays with media and answers with `n_ratio`.
 
-    `glasses`: those of GLASSES that it has. `told`: the signal of total internal reflection. `others`: those with
+    `glasses`: those of GLASSES that it has. `tir`: the signal of total internal reflection. `others`: those with
     another index there.
     """
 
     script: str
     glasses: tuple[str, ...]
-    told: str
+    tir: str
     others: Mapping[str, OtherIndex] = field(default_factory=dict)
 
 

@@ -38,9 +38,9 @@ def refract(rays, precision, call, functions=""):
     except Exception as error:  # of whatever kind: libraries that are missing, a driver that is too old
         print(f"no {precision} in OpenGL 4.3 by EGL ({error}); Debian: libegl1 libgl1-mesa-dri", file=sys.stderr)
         sys.exit(77)
-    given = context.buffer(np.column_stack([rays.a, rays.n, rays.k]).astype(precision).tobytes())
+    rows = context.buffer(np.column_stack([rays.a, rays.n, rays.k]).astype(precision).tobytes())
     answer = context.buffer(reserve=3 * len(rays) * np.dtype(precision).itemsize)
-    given.bind_to_storage_buffer(0)
+    rows.bind_to_storage_buffer(0)
     answer.bind_to_storage_buffer(1)
     shader.run(group_x=-(-len(rays) // 64))
     b = np.frombuffer(answer.read(), precision).reshape(-1, 3)

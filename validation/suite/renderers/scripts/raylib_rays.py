@@ -9,6 +9,6 @@ import table
 rays = table.Rays("float32")
 b = np.empty_like(rays.a)
 for i, (a, n, k) in enumerate(zip(rays.a.tolist(), rays.n.tolist(), rays.k.tolist(), strict=True)):
-    found = raylib.Vector3Refract(a, n, k)
-    b[i] = found.x, found.y, found.z
+    direction = raylib.Vector3Refract(a, n, k)
+    b[i] = direction.x, direction.y, direction.z
 table.write(rays, b, f"raylib {version('raylib')}")

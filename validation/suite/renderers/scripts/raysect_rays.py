@@ -42,8 +42,8 @@ def index(maker, name, wavelength):
 
 
 def refract(*ray):
-    found = bent(*ray, True) or bent(*ray, False)
-    return found.x, found.y, found.z
+    daughter = bent(*ray, True) or bent(*ray, False)
+    return daughter.x, daughter.y, daughter.z
 
 
 def bent(a, n, left, entered, wavelengths, transmission_only):

@@ -24,11 +24,11 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
 """
 
 
-def refract(device, given, name):
+def refract(device, rows, name):
     """(N, 7) of ray, normal and ratio to (N, 3)."""
     usage = wgpu.BufferUsage.STORAGE | wgpu.BufferUsage.COPY_SRC
-    rays = device.create_buffer_with_data(data=given, usage=usage)
-    answers = device.create_buffer(size=3 * len(given) * given.itemsize, usage=usage)
+    rays = device.create_buffer_with_data(data=rows, usage=usage)
+    answers = device.create_buffer(size=3 * len(rows) * rows.itemsize, usage=usage)
     module = device.create_shader_module(code=SOURCE.replace("FLOAT", name))
     pipeline = device.create_compute_pipeline(layout="auto", compute={"module": module, "entry_point": "main"})
     entries = [{"binding": i, "resource": {"buffer": buffer}} for i, buffer in enumerate((rays, answers))]
@@ -36,20 +36,22 @@ def refract(device, given, name):
     step = encoder.begin_compute_pass()
     step.set_pipeline(pipeline)
     step.set_bind_group(0, device.create_bind_group(layout=pipeline.get_bind_group_layout(0), entries=entries))
-    step.dispatch_workgroups(-(-len(given) // 64))
+    step.dispatch_workgroups(-(-len(rows) // 64))
     step.end()
     device.queue.submit([encoder.finish()])
-    return np.frombuffer(device.queue.read_buffer(answers), given.dtype).reshape(-1, 3)
+    return np.frombuffer(device.queue.read_buffer(answers), rows.dtype).reshape(-1, 3)
 
 
 precision = sys.argv[1] if len(sys.argv) > 1 else "float32"
 name, features = {"float32": ("f32", []), "float64": ("f64", ["shader-f64"])}[precision]
 rays = table.Rays(precision)
 try:
-    found = [each for each in wgpu.gpu.enumerate_adapters_sync() if each.info.get("backend_type") == "Vulkan"]
-    device = found[0].request_device_sync(required_features=features)
+    adapters = [
+        adapter for adapter in wgpu.gpu.enumerate_adapters_sync() if adapter.info.get("backend_type") == "Vulkan"
+    ]
+    device = adapters[0].request_device_sync(required_features=features)
 except Exception as error:  # of whatever kind: no loader, no adapter, one without such numbers
     print(f"no {precision} by Vulkan ({error!r}); Debian: mesa-vulkan-drivers libvulkan1", file=sys.stderr)
     sys.exit(77)
 b = refract(device, np.column_stack([rays.a, rays.n, rays.k]).astype(precision), name)
-table.write(rays, b, f"{found[0].info['device']}, wgpu {version('wgpu')}, {precision}")
+table.write(rays, b, f"{adapters[0].info['device']}, wgpu {version('wgpu')}, {precision}")
