@@ -212,6 +212,12 @@ def test_a_study_holds_its_bounds_none_of_which_is_a_hundred_times_too_wide(name
     assert any(row.verdict == "pass" for row in rows)
     assert all(math.isfinite(bound) and bound >= 0 for row in rows for bound in row.budgets.values())
     assert [row.reason for row in tightness.rows(rows) if row.verdict != "pass"] == []
+    used: dict[limits.Limit, list[float]] = {}  # one metric may have several limits
+    for row in rows:
+        for metric, bound in row.budgets.items() if row.values else ():
+            if isinstance(bound, limits.Limit) and (row.study, metric) not in tightness.EXCLUDES:
+                used.setdefault(bound, []).append(row.values[metric] / bound)
+    assert [limit.reason for limit, shares in used.items() if max(shares) * tightness.LOOSE < 1] == []
 
 
 def limits_in(value):
