@@ -78,8 +78,10 @@ def run(
 
 def _feed(process: subprocess.Popen[bytes], given: bytes) -> None:
     assert process.stdin
+    rest = memoryview(given)
     with contextlib.suppress(OSError):  # nobody reads it
-        process.stdin.write(given)
+        while rest:
+            rest = rest[process.stdin.write(rest) :]  # Linux writes up to 2 GiB at a time
     with contextlib.suppress(OSError):
         process.stdin.close()
 
