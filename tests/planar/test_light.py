@@ -70,7 +70,7 @@ BAD = {
     "negative": ("[486.1327, 587.5618]", "[-500]", "wavelengths[0]: expected `float` > 0.0"),
     "many": ("[486.1327, 587.5618]", "257", "wavelengths: expected `int` <= 256"),
     "both": ("wavelengths =", 'colours = ["red", "blue"]\nwavelengths =', "colours: beside wavelengths; expected one"),
-    "light": ("wavelengths =", 'light = "A"\nwavelengths =', "light: invalid enum value 'A'"),
+    "light": ("wavelengths =", 'light = "A"\nwavelengths =', "light: invalid enum value 'A'; expected D65, flat"),
 }
 
 
