@@ -73,7 +73,7 @@ def _command(
         list[str] | None,
         typer.Argument(
             metavar="STUDY",
-            help=f"Studies to run: {', '.join(ROOMS)}. Default: all; of the profile quick, a selection.",
+            help=f"Studies to run: {', '.join(ROOMS)}. Default: all studies; in the profile quick, a selection.",
         ),
     ] = None,
     profile: Annotated[

@@ -363,7 +363,7 @@ def _light(table: SceneTable, wavelengths: Sequence[float] | int | None) -> Ligh
     if chosen is None:
         return of_names(table.colours)
     if table.colours:
-        raise ValueError("colours: beside wavelengths; expected one of them")
+        raise ValueError("colours and wavelengths are both set; expected one of them")
     return of_wavelengths(chosen, table.light)
 
 
@@ -378,20 +378,21 @@ def _parts(tables: Sequence[AnyShape], ambient: Indices, light: Light) -> list[P
         n = {key: light.indices(x, f"{where}.{key}") for key, x in values.items() if x is not None}
         if isinstance(shape, Inside) and shape.within is not None:
             if shape.outside is not None:
-                raise ValueError(f"{where}.within: {shape.within!r}, beside `outside`; expected one of them")
+                raise ValueError(f"{where}.within: {shape.within!r}, but `outside` is set too; expected one of them")
             if shape.within not in media:
-                known = ", ".join(map(repr, media)) or "none so far"
+                known = ", ".join(map(repr, media)) or "none"
                 raise ValueError(f"{where}.within: {shape.within!r}; expected the name of a shape above: {known}")
             n["outside"] = media[shape.within]
         n.setdefault("outside", ambient)
         if isinstance(shape, Solid) and shape.name:
             if shape.name in media:
-                raise ValueError(f"{where}.name: {shape.name!r} is another shape's; expected a new one")
+                raise ValueError(f"{where}.name: {shape.name!r} is the name of another shape; expected a unique name")
             media[shape.name] = n["n"]
         curves = shape.layers if isinstance(shape, Luneburg) else 1
         pieces += curves * max(shape.facets or 4, len(getattr(shape, "points", ()))) * len(light)
         if pieces > PIECES:
-            raise ValueError(f"{where}: {pieces} pieces and more; expected {PIECES}, colours times those of all shapes")
+            most = f"at most {PIECES} pieces of curves in all shapes together, once for each colour"
+            raise ValueError(f"{where}: {pieces} or more pieces; expected {most}")
         first = len(parts)
         try:
             with np.errstate(all="ignore"):
@@ -414,7 +415,7 @@ def _rays(tables: Sequence[AnyBeam]) -> tuple[Array, Array, NDArray[np.intp]]:
     sizes = list(itertools.accumulate(len(b.origins) if isinstance(b, Rays) else b.count for b in tables))
     for j, count in enumerate(sizes):
         if count > RAYS:
-            raise ValueError(f"beam[{j}].count: {count} rays with the beams before; expected up to {RAYS}")
+            raise ValueError(f"beam[{j}].count: {count} rays in this beam and those before it; expected up to {RAYS}")
     rays = []
     for j, beam in enumerate(tables):
         try:

@@ -130,7 +130,7 @@ def explained(findings: Findings) -> list[str]:
     if certain or not findings.explanations or findings.exit_code > 1:
         return certain
     nearest = max(findings.explanations, key=lambda mistake: mistake.share)
-    return ["none of the usual mistakes explains the answers", *([line(nearest)] if nearest.share > 0 else [])]
+    return ["none of the common mistakes explains the answers", *([line(nearest)] if nearest.share > 0 else [])]
 
 
 def grade(errors: RegimeErrors) -> str:

@@ -192,7 +192,9 @@ def test_a_folder_with_anything_else_is_left_alone(sides, tmp_path, name):
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         (place / name).write_text("mine")
         before = tree(place)
-        with pytest.raises(ValueError, match=r"report: holds .*, no report of ours; expected a new or empty folder"):
+        with pytest.raises(
+            ValueError, match=r"report: contains .*, not part of a report; expected a new or empty folder"
+        ):
             written(sides, place)
         assert tree(place) == before
 

@@ -76,7 +76,7 @@ REASONS = {
     "killed": "was killed by SIGKILL",
     "bytes": "no text",
     "an id missing": "id 0",
-    "hangs": "no end within 2 s",
+    "hangs": "did not end within 2 s",
 }
 
 
@@ -387,7 +387,7 @@ def test_a_program_that_hangs_takes_its_children_with_it(tmp_path):
     child = f"p = subprocess.Popen(['sleep', '1000']); open({str(where)!r}, 'w').write(str(p.pid))"
     hangs = [sys.executable, "-c", f"import subprocess, time; {child}; time.sleep(1000)"]
     for timeout in (3, 60):  # a busy machine may not even have started it in the shorter time
-        with pytest.raises(environments.Broken, match=f"no end within {timeout} s"):
+        with pytest.raises(environments.Broken, match=f"did not end within {timeout} s"):
             environments.run(hangs, "", timeout)
         if where.exists():
             break
