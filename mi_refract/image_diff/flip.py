@@ -43,7 +43,7 @@ def flip(
     test: Image,
     *,
     local: Annotated[
-        float, "mean FLIP error allowed in any square of 0.12 degrees, 0 to 1; in wider ones less"
+        float, "mean FLIP error allowed in any square of 0.12 degrees, 0 to 1; less in wider squares"
     ] = LOCAL,
     patch: Annotated[float, "FLIP error that may fill a square of 0.24 degrees, 0 to 1"] = PATCH,
     largest: Annotated[float, "FLIP error that no pixel may exceed, 0 to 1"] = 1.0,

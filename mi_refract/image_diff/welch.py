@@ -42,13 +42,13 @@ def compare_renders(
     resolution: Annotated[
         float, "relative difference of a tile that the noise must not hide, or the result is inconclusive"
     ] = 0.05,
-    hidden: Annotated[float, "share of the tiles, in any channel, whose noise may hide it"] = 0.1,
+    hidden: Annotated[float, "share of the tiles, in any channel, whose noise may hide such a difference"] = 0.1,
     pixels: Annotated[
         str, "test single pixels as well: yes; no for renders that share a fixed grid of samples"
     ] = "yes",
-    spp: Annotated[int, "samples per pixel of each image; 0: as their headers say"] = 0,
-    spp_reference: Annotated[int, "the reference's, where the sides differ; 0: `spp`"] = 0,
-    spp_test: Annotated[int, "the new image's, where the sides differ; 0: `spp`"] = 0,
+    spp: Annotated[int, "samples per pixel of each image; 0: the number in its header"] = 0,
+    spp_reference: Annotated[int, "samples per pixel of the reference, where the sides differ; 0: `spp`"] = 0,
+    spp_test: Annotated[int, "samples per pixel of the new image, where the sides differ; 0: `spp`"] = 0,
 ) -> Comparison:
     """Independent renders: Welch's t-test on the means of tiles and channels.
 

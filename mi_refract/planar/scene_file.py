@@ -191,7 +191,7 @@ class Parallel(Beam, tag="parallel", kw_only=True):
 
     start: Annotated[Point, _doc("start of the first ray")] = field(name="from")
     to: Annotated[Point, _doc("start of the last ray")]
-    direction: Annotated[Direction, _doc("of all rays: degrees, or [x, y] that is not [0, 0]")]
+    direction: Annotated[Direction, _doc("direction of all rays: degrees, or [x, y] that is not [0, 0]")]
     count: Annotated[Count, _doc("number of rays; 1: from the middle")]
 
 
@@ -207,7 +207,7 @@ class Rays(Beam, tag="rays", kw_only=True):
     """Rays one by one."""
 
     origins: Annotated[Points, _doc("their starts")]
-    directions: Annotated[list[Direction], _doc("one for each start, as of `parallel`")]
+    directions: Annotated[list[Direction], _doc("a direction for each start, as for `parallel`")]
 
     def __post_init__(self) -> None:
         """ValueError for another number of directions than of origins."""
@@ -261,7 +261,7 @@ class SceneTable(Struct, kw_only=True, forbid_unknown_fields=True):
 
     title: Annotated[Text | None, _doc("title of the figure; the file's name by default")] = None
     index: Annotated[Index, _doc("index of the medium around all shapes, as `n` of a shape")] = 1.0
-    colours: Annotated[Names | None, _doc("names, by matplotlib; one for each index")] = None
+    colours: Annotated[Names | None, _doc("names that matplotlib knows; one for each index")] = None
     wavelengths: Annotated[Wavelengths | None, _doc("in nm, in place of `colours`; or how many, 380 to 730 nm")] = None
     light: Annotated[Literal["flat", "D65"], _doc("powers of the wavelengths: equal, or of daylight")] = "flat"
     max_depth: Annotated[int, Meta(ge=1, le=100_000), _doc("largest number of boundaries that a ray meets")] = 16

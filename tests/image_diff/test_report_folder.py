@@ -144,7 +144,7 @@ def test_warnings_variants_and_masks_are_shown(tmp_path):
         "matches a-macos.exr" in index.text and index.text.count("warning: the mask leaves out 83% of the pixels") == 2
     )
     assert index.of("details")[0].keys() == {"open"}  # an equal image with a warning is not folded away
-    assert "nor is it its variant" in index.text
+    assert "its variant differs, too" in index.text
     (page,) = (tmp_path / "report" / "pairs").iterdir()
     assert "left out" in [each["data-role"] for each in Page(page).of("div", "pane")]
 

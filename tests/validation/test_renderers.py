@@ -285,7 +285,9 @@ def test_the_list_says_what_is_there(elsewhere, capsys, monkeypatch):
     assert command.main(["renderers"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == list(SYSTEMS)
-    assert [line.split()[1] for line in lines] == ["here" if s.needs is None else "absent" for s in SYSTEMS.values()]
+    assert [line.split()[1] for line in lines] == [
+        "installed" if s.needs is None else "absent" for s in SYSTEMS.values()
+    ]
 
 
 @pytest.mark.parametrize(
