@@ -228,7 +228,7 @@ def test_a_page_of_thousands_is_no_larger_than_its_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(html_report, "LIMIT", 600_000)
     text = written(tmp_path, Results(tmp_path / "a", tmp_path, (*bad, *equal)))
     assert len(text.encode()) <= 600_000
-    listed = html.unescape(re.search("at most: (.*?)\\.", text)[1])
+    listed = html.unescape(re.search("limited to 15 MB: (.*?)\\.", text)[1])
     articles, lines = text.count("<article"), len(re.findall("<tr data-text", text))
     more = [int(each) for each in re.findall(r"… and (\d+) more", text)]
     assert articles >= 20 and lines >= articles and articles + lines + sum(more) == 1200
