@@ -13,7 +13,7 @@ from .connection import Client, Future, cluster_errors
 from .workers import Workers
 
 AHEAD = 2  # calls for each thread of the workers
-_POLL, _FETCHED = 0.5, 30.0  # seconds
+_POLL, _FETCHED = 0.5, 20.0  # seconds
 
 
 def finished(client: Client, futures: Sequence[Future]) -> list[Future]:

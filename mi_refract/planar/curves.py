@@ -11,10 +11,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .segments import Array, Segments
 
@@ -59,7 +58,7 @@ class Curve:
         vertices = np.roll(self.vertices[::-1], 1, 0) if self.closed else self.vertices[::-1]
         return replace(self, vertices=vertices, control=self.control[::-1], weight=self.weight[::-1])
 
-    def mapped(self, matrix: Any, at: Any = (0.0, 0.0)) -> Curve:
+    def mapped(self, matrix: ArrayLike, at: ArrayLike = (0.0, 0.0)) -> Curve:
         """The curve under p → matrix · p + at. A reflection reverses it, so that its left side stays its left side.
 
         ValueError for a matrix that is singular or not finite.

@@ -23,6 +23,7 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
+from numpy.typing import NDArray
 
 from mi_refract.backend import activate
 from mi_refract.numerics import Mask, Number
@@ -58,7 +59,7 @@ class MeshAcceleration:
     crowded: two segments that share no vertex and are too close to each other; None where none were seen.
     """
 
-    def __init__(self, arrays: ArrayBackend, start: Array, end: Array, vertices: Any) -> None:
+    def __init__(self, arrays: ArrayBackend, start: Array, end: Array, vertices: NDArray[np.integer]) -> None:
         """Build the mesh and the lists of neighbours, and look for segments that are too close."""
         import mitsuba
 
@@ -113,7 +114,7 @@ class MeshAcceleration:
         near_a, near_b = self.arrays.gather(self.wedges, segment, some)
         return negated(some) | (at.r < near_a) | (at.s < near_b)
 
-    def _crowded(self, a: Array, b: Array, vertices: Any) -> tuple[int, int] | None:
+    def _crowded(self, a: Array, b: Array, vertices: NDArray[np.integer]) -> tuple[int, int] | None:
         """Two segments that share no vertex, one less than SHORTEST from the middle or a quarter of the other."""
         arrays, e = self.arrays, b - a
         across = np.column_stack([-e[:, 1], e[:, 0]]) / np.maximum(np.linalg.norm(e, axis=1, keepdims=True), 1e-300)
@@ -172,7 +173,7 @@ class MeshAcceleration:
         return dr.while_loop(state, lambda i, stroke, best, going: going, test, label="also")[2]
 
 
-def _strokes(a: Array, b: Array, vertices: Any) -> tuple[Array, Array]:
+def _strokes(a: Array, b: Array, vertices: NDArray[np.integer]) -> tuple[Array, Array]:
     """Both ends of every stroke: those of the segments from `a` to `b` (M × 2), then those of the vertices."""
     e = b - a
     length = np.linalg.norm(e, axis=1, keepdims=True)
@@ -187,7 +188,7 @@ def _strokes(a: Array, b: Array, vertices: Any) -> tuple[Array, Array]:
     return np.concatenate([a - MARGIN * e, place - across]), np.concatenate([b + MARGIN * e, place + across])
 
 
-def _wedge_shares(a: Array, b: Array, vertices: Any) -> Array:
+def _wedge_shares(a: Array, b: Array, vertices: NDArray[np.integer]) -> Array:
     """M × 2: the share of each segment, from either end, where the next one at that vertex is within 4 MARGIN."""
     ways = np.stack([b - a, a - b], 1).reshape(-1, 2)
     angle, number = np.arctan2(ways[:, 1], ways[:, 0]), vertices.ravel()
@@ -230,7 +231,7 @@ def _upright(of: str, a: Array, b: Array) -> Any:
     return mi.parser.instantiate(config, state)
 
 
-def _around(vertices: Any, count: int) -> tuple[Any, Any]:
+def _around(vertices: NDArray[np.integer], count: int) -> tuple[Any, Any]:
     """(first, around): stroke i names the segments in `around` from first[i] to the next NOWHERE, but not its own.
 
     count: the number of vertices.

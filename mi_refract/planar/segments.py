@@ -5,10 +5,9 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
@@ -24,7 +23,7 @@ REFLECT_BITS = 32  # boundaries on a path at which `reflect` can ask for reflect
 ARC_FIELDS = "control", "weight"
 
 
-def finite_array(name: str, values: Any, shape: tuple[int, ...]) -> Array:
+def finite_array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     """`values` as float64 of that shape. ValueError, which calls it `name`, for another shape, NaN or Inf."""
     try:
         array = np.asarray(values, dtype=np.float64)

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .curves import Curve, area, joined, polygonal, unit
 from .segments import Array
@@ -18,7 +19,7 @@ from .segments import Array
 FLAT = 8 * 2.0**-53
 
 
-def polyline(points: Any, arcs: Sequence[float] | None = None) -> Curve:
+def polyline(points: ArrayLike, arcs: Sequence[float] | None = None) -> Curve:
     """An open curve from point to point (K × 2). `arcs`: degrees by which each piece turns left, a circle; 0: straight.
 
     ValueError for fewer than 2 points, another number of pieces, or |degrees| ≥ 360.
@@ -26,7 +27,7 @@ def polyline(points: Any, arcs: Sequence[float] | None = None) -> Curve:
     return _chain(points, arcs, closed=False)
 
 
-def polygon(points: Any, arcs: Sequence[float] | None = None) -> Curve:
+def polygon(points: ArrayLike, arcs: Sequence[float] | None = None) -> Curve:
     """The same, closed by one more piece from the last point to the first; reversed where it runs clockwise.
 
     ValueError as for `polyline`, and for a polygon without area. It is not checked whether the polygon crosses itself.
@@ -38,7 +39,7 @@ def polygon(points: Any, arcs: Sequence[float] | None = None) -> Curve:
     return curve if size > 0 else curve.reversed()
 
 
-def _chain(points: Any, arcs: Sequence[float] | None, closed: bool) -> Curve:
+def _chain(points: ArrayLike, arcs: Sequence[float] | None, closed: bool) -> Curve:
     corners = np.array(points, float).reshape(-1, 2)
     pieces = len(corners) - (not closed)
     turns = [0.0] * pieces if arcs is None else [float(turn) for turn in arcs]

@@ -19,6 +19,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
 
 from .array_backend import ArrayBackend, choose_backend
 from .intersect_arcs import ConicArcs
@@ -34,16 +35,16 @@ FEW = 48  # up to so many segments, trying all is faster than a query of the mes
 
 def trace(
     segments: Segments,
-    origins: Any,
-    directions: Any,
+    origins: ArrayLike,
+    directions: ArrayLike,
     max_depth: int,
     *,
     formula: str | None = None,
     precision: str = "float64",
     backend: str | None = None,
     method: str = "auto",
-    reflect: Any = 0,
-    n_start: Any = None,
+    reflect: ArrayLike = 0,
+    n_start: ArrayLike | None = None,
     weights: bool = False,
 ) -> Paths:
     """Follow rays from `origins` along `directions` (N × 2, of any length) until they escape.
@@ -92,17 +93,17 @@ class Tracer:
 
     def __call__(
         self,
-        origins: Any,
-        directions: Any,
+        origins: ArrayLike,
+        directions: ArrayLike,
         max_depth: int,
         *,
-        reflect: Any = 0,
-        n_start: Any = None,
+        reflect: ArrayLike = 0,
+        n_start: ArrayLike | None = None,
         weights: bool = False,
     ) -> Paths:
         """The paths of rays from `origins` along `directions` (N × 2)."""
-        origins = finite_array("origins", origins, (len(origins), 2) if np.ndim(origins) else (0, 2))
-        directions = _scaled(finite_array("directions", directions, origins.shape))
+        origins = finite_array("origins", origins, (*(np.shape(origins)[:1] or (0,)), 2))
+        along = _scaled(finite_array("directions", directions, origins.shape))
         count = len(origins)
         if isinstance(max_depth, bool) or not isinstance(max_depth, int | np.integer) or max_depth < 1:
             raise ValueError(f"max_depth = {max_depth!r}; expected a whole number, 1 or more")
@@ -112,12 +113,12 @@ class Tracer:
         none = np.ndim(reflect) == 0 and reflect == 0
         mirrored = None if none else _each("reflect", reflect, count, "iu", np.uint32)
         _check_range("origins", origins, self.farthest)
-        fields = self.loop(origins - self.middle, directions, index, mirrored, max_depth, weights)
+        fields = self.loop(origins - self.middle, along, index, mirrored, max_depth, weights)
         if self.middle.any():
             fields["points"] = (fields["points"] + self.middle).astype(fields["points"].dtype)
             fields["points"][0] = origins
-        directions = fields.pop("directions")[0]
-        return Paths(directions=directions, **{name: np.swapaxes(x, 0, 1) for name, x in fields.items()})
+        last = fields.pop("directions")[0]
+        return Paths(directions=last, **{name: np.swapaxes(x, 0, 1) for name, x in fields.items()})
 
 
 def _scaled(directions: Array) -> Array:
@@ -157,7 +158,7 @@ def _centred(segments: Segments) -> tuple[Segments, Array]:
     return replace(segments, start=start, end=end, control=control), middle
 
 
-def _each(name: str, values: Any, count: int, kinds: str, kind: Any) -> Any:
+def _each(name: str, values: ArrayLike, count: int, kinds: str, kind: DTypeLike) -> Any:
     """One value per ray, of numpy type `kind`. ValueError for another shape, type or range."""
     array = np.asarray(values)
     whole = kind is np.uint32
