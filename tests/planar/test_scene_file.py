@@ -299,7 +299,7 @@ def test_what_a_scene_asks_for_is_counted_before_it_is_made(tmp_path, text, expe
     "shape, expected",
     [
         ('kind = "lens"\ncurvature = [0.1, 0.2]\nthickness = 1', "shape[0].curvature = [0.1, 0.2]: the surfaces never"),
-        ('kind = "lens"\ncurvature = [1, -1]\nthickness = 1\nradius = 2', "shape[0].radius = 2: a surface ends"),
+        ('kind = "lens"\ncurvature = [1, -1]\nthickness = 1\nradius = 2', "shape[0].radius = 2: a surface is smaller"),
         ('kind = "ellipse_lens"\nfocal_length = 1\nthickness = 2\nradius = 1', "shape[0].n = 1.5, thickness = 2;"),
         ('kind = "polygon"\npoints = [[0, 0], [1, 1]]', "shape[0].points: they enclose no area"),
         ('kind = "polygon"\npoints = [[0, 0]]', "shape[0].points: 1; expected at least 2"),
