@@ -445,10 +445,7 @@ NO_ACCEPT = "no template in `accept` contains macos or exactly one *; add to [de
     [
         ("", "macos", NO_ACCEPT),
         ('[defaults]\naccept = ["{stem}-*-*.exr"]', "macos", NO_ACCEPT),
-        *(
-            (SETTINGS, name, f"--as-variant '{name}'; expected a part of a file name")
-            for name in ("a/b", "*", " ", "..")
-        ),
+        *((SETTINGS, name, f"--as-variant '{name}'; expected part of a file name") for name in ("a/b", "*", " ", "..")),
         ('[defaults]\naccept = ["equal-*.exr"]', "one", "equal-one.exr: also the reference of another image"),
         ('[defaults]\naccept = ["{stem}-*.png"]', "one", "expected a name that ends in .exr"),
         ("added", "macos", "inner/added.exr: has no reference yet; accept it without --as-variant first"),

@@ -187,5 +187,7 @@ def test_a_variant_by_a_template_that_holds_its_name(tmp_path):
     how = ComparisonSpec(accept=("{stem}-arm64{suffix}", "{stem}-macos{suffix}", "{stem}-*{suffix}"))
     for name in ("macos", "arm64", "icx"):
         assert pairing.variant(tmp_path / "a/ball.exr", how, name) == tmp_path / f"a/ball-{name}.exr"
-    with pytest.raises(ValueError, match=r"no `accept` with icx or one \*; expected .*-icx\{suffix\}"):
+    with pytest.raises(
+        ValueError, match=r"no template in `accept` contains icx or exactly one \*; add .*-icx\{suffix\}"
+    ):
         pairing.variant(tmp_path / "ball.exr", ComparisonSpec(accept=("{stem}-macos{suffix}",)), "icx")

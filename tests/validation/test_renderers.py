@@ -74,7 +74,7 @@ BY_A_DRIVER = ("glsl", "materialx", "wgsl")
 REASONS = {
     "exception": "ended with status 1: RuntimeError: out of glass",
     "killed": "was killed by SIGKILL",
-    "bytes": "no text",
+    "bytes": "bytes that are not text",
     "an id missing": "id 0",
     "hangs": "did not end within 2 s",
 }
